@@ -1,0 +1,58 @@
+"""Hysteresis-Based RL on MuJoCo: learned policies that measurement noise cannot break at a decision.
+
+The stages, in the order of the data flow: `tasks`, `training`, `critical_set`, `partition`,
+`extended_sets`, `retraining`, `hybrid`, `simulation`, `replay`; `pipeline` runs them all.
+Importing this package needs neither torch nor a GL library.
+"""
+
+from hyrl_mj import mjcf as _mjcf  # first: it chooses the GL backend before mujoco is imported
+from hyrl_mj.critical_set import CriticalSet, find_critical_set
+from hyrl_mj.envs.gym_env import register_envs
+from hyrl_mj.errors import BadArtifact, BadInput, HyrlError, NoRenderer, SimulationDiverged
+from hyrl_mj.extended_sets import ExtendedSets, extend
+from hyrl_mj.hybrid import HybridController
+from hyrl_mj.noise import Noise
+from hyrl_mj.partition import Partition, make_partition
+from hyrl_mj.pipeline import Run, load_run, run
+from hyrl_mj.policies import MlpPolicy, Policy
+from hyrl_mj.sets import StateSet
+from hyrl_mj.settings import Settings
+from hyrl_mj.simulation import Controller, HybridArc, closed_loop, simulate
+from hyrl_mj.tasks import Chart, Outcome, Task, get_task, register, task_names
+
+__version__ = "0.1.0"
+__all__ = [
+    "BadArtifact",
+    "BadInput",
+    "Chart",
+    "Controller",
+    "CriticalSet",
+    "ExtendedSets",
+    "HybridArc",
+    "HybridController",
+    "HyrlError",
+    "MlpPolicy",
+    "NoRenderer",
+    "Noise",
+    "Outcome",
+    "Partition",
+    "Policy",
+    "Run",
+    "Settings",
+    "SimulationDiverged",
+    "StateSet",
+    "Task",
+    "closed_loop",
+    "extend",
+    "find_critical_set",
+    "get_task",
+    "load_run",
+    "make_partition",
+    "register",
+    "run",
+    "simulate",
+    "task_names",
+]
+
+register_envs()
+del _mjcf

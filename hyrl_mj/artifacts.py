@@ -1,0 +1,99 @@
+"""Files of a run directory: no pickles, versioned, and written whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+
+from hyrl_mj.errors import BadArtifact
+
+# Raised whenever a file of an older version can no longer be read.
+VERSION = 1
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a temporary path beside `path`; rename it to `path` when the block ends well."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.partial{path.suffix}")
+    try:
+        yield temporary
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn whatever a damaged file makes its reader raise into one clear sentence."""
+    if not path.is_file():
+        raise BadArtifact(f"there is no file {path}: run the stage that writes it first")
+    try:
+        yield
+    except BadArtifact as error:
+        raise BadArtifact(f"{path}: {error}") from error
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, SafetensorError) as error:
+        raise BadArtifact(
+            f"{path} cannot be read ({type(error).__name__}: {error}): it is truncated or not what "
+            "its name says; run the stage that writes it again"
+        ) from error
+
+
+def check_version(found: Any, kind: str, wanted: str) -> None:
+    """Raise `BadArtifact` unless the file says that it is `wanted` of this version."""
+    if kind != wanted:
+        raise BadArtifact(f"it holds {kind!r}, not {wanted!r}")
+    if found != VERSION:
+        raise BadArtifact(
+            f"it is of version {found}, this hyrl_mj reads version {VERSION}: "
+            "run the stage that writes it again"
+        )
+
+
+def write_json(path: Path, content: Mapping[str, Any], kind: str) -> None:
+    """Write a JSON object with its kind and version."""
+    with replacing(path) as temporary:
+        text = json.dumps({"kind": kind, "version": VERSION, **content}, indent=2)
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def read_json(path: Path, kind: str) -> dict[str, Any]:
+    """Read what `write_json` wrote."""
+    with reading(path):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        check_version(content.pop("version"), content.pop("kind"), kind)
+        return content
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], kind: str) -> None:
+    """Write named arrays as npz with their kind and version."""
+    with replacing(path) as temporary:
+        np.savez_compressed(temporary, kind=np.array(kind), version=np.array(VERSION), **arrays)
+
+
+def read_arrays(path: Path, kind: str) -> dict[str, np.ndarray]:
+    """Read what `write_arrays` wrote."""
+    with reading(path), np.load(path, allow_pickle=False) as file:
+        content = {name: file[name] for name in file.files}
+        check_version(int(content.pop("version")), str(content.pop("kind")), kind)
+        return content
+
+
+def write_tensors(path: Path, tensors: dict[str, np.ndarray]) -> None:
+    """Write named tensors as safetensors."""
+    with replacing(path) as temporary:
+        save_file({k: np.ascontiguousarray(v) for k, v in tensors.items()}, temporary)
+
+
+def read_tensors(path: Path) -> dict[str, np.ndarray]:
+    """Read what `write_tensors` wrote."""
+    with reading(path):
+        return load_file(path)

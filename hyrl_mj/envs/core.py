@@ -1,0 +1,143 @@
+"""The batched core under every environment: n episodes of one task, stepped together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hyrl_mj.noise import Noise
+from hyrl_mj.tasks.base import Outcome, Task
+
+
+@dataclass(frozen=True)
+class Domain:
+    """A part of the state space that training is restricted to (paper, Step 6).
+
+    Attributes:
+        starts: draws n chart points (n, d) with a generator.
+        contains: (n, d) -> (n,) bool; an episode that leaves it is over.
+        exit_reward: the reward for leaving it.
+    """
+
+    starts: Callable[[int, np.random.Generator], np.ndarray]
+    contains: Callable[[np.ndarray], np.ndarray]
+    exit_reward: float
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What one step of n episodes gave; all arrays have n rows.
+
+    Attributes:
+        observation: (n, k) float32, noise included.
+        reward: (n,) of the true state after the step.
+        terminated: (n,) bool, the task (or leaving the domain) ended the episode.
+        truncated: (n,) bool, its time was up.
+        outcome: (n,) `Outcome`; RUNNING unless the episode is over.
+    """
+
+    observation: np.ndarray
+    reward: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    outcome: np.ndarray
+
+    @property
+    def done(self) -> np.ndarray:
+        """(n,) bool, the episode is over."""
+        return self.terminated | self.truncated
+
+
+class BatchedEnv:
+    """n episodes of one task. Its faces add nothing but the conventions of their libraries.
+
+    Args:
+        task: what is played.
+        n: number of episodes side by side.
+        noise: measurement noise on the observations; reward and end see the true state.
+        domain: where episodes start and stay; by default the task's starts, and everywhere.
+        max_steps: samples until truncation, by default the task's.
+        threads: threads of the physics, 0 for all cores; the result does not depend on it.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        n: int,
+        *,
+        noise: Noise | None = None,
+        domain: Domain | None = None,
+        max_steps: int | None = None,
+        threads: int = 0,
+    ):
+        self.task, self.n, self.domain = task, n, domain
+        self.noise = noise or Noise()
+        self.max_steps = max_steps or task.max_steps
+        self.plant = task.plant(n, threads)
+        self._rng = np.random.default_rng()
+        self._samples = np.zeros(n, dtype=int)
+        self._everyone = np.arange(n)
+
+    def seed(self, seed: int | None) -> None:
+        """Restart the generator from which starts and noise are drawn."""
+        self._rng = np.random.default_rng(seed)
+
+    def reset(self, ids: np.ndarray | None = None, z: np.ndarray | None = None) -> np.ndarray:
+        """Start new episodes in the rows `ids` (all by default).
+
+        Args:
+            ids: (k,) rows.
+            z: (k, d) chart points to start from, by default drawn from the start distribution.
+
+        Returns:
+            (k, o) float32, their first observations.
+        """
+        ids = self._everyone if ids is None else ids
+        if z is None:
+            draw = self.task.starts if self.domain is None else self.domain.starts
+            z = draw(len(ids), self._rng)
+        self.plant.set_state(self.task.qpos(z), ids=ids)
+        self._samples[ids] = 0
+        return self._observe(ids)
+
+    def step(self, u: np.ndarray) -> StepResult:
+        """Advance every episode by one sample; the caller resets those that are over.
+
+        Args:
+            u: (n, m) inputs in the plant's units.
+        """
+        self.plant.step(u)
+        self._samples += 1
+        measurement = self.plant.measurement
+        outcome = self.task.ending(measurement)
+        terminated = outcome != Outcome.RUNNING
+        reward = self.task.reward(measurement)
+        if self.domain is not None:
+            left = ~terminated & ~self.domain.contains(self.task.z(measurement))
+            reward[left] = self.domain.exit_reward
+            terminated = terminated | left
+            outcome[left] = Outcome.OUT_OF_BOUNDS
+        truncated = ~terminated & (self._samples >= self.max_steps)
+        if truncated.any():
+            outcome[truncated] = self.task.verdict(measurement[truncated])
+        return StepResult(self._observe(self._everyone), reward, terminated, truncated, outcome)
+
+    @property
+    def z(self) -> np.ndarray:
+        """The true chart points (n, d)."""
+        return self.task.z(self.plant.measurement)
+
+    def inputs(self, actions: np.ndarray) -> np.ndarray:
+        """Inputs (n, m) in the plant's units for actions: levels (n,) int, or inputs (n, m) to clip."""
+        levels = self.task.input_levels
+        if levels is not None:
+            return levels[np.asarray(actions, dtype=int)]
+        return np.clip(np.asarray(actions, dtype=float), *self.task.input_limits)
+
+    def _observe(self, ids: np.ndarray) -> np.ndarray:
+        measured = self.plant.measurement[ids]
+        noise = self.noise.sample(self._samples[ids], measured.shape[1], self._rng)
+        measured = measured + noise * self.task.noisy
+        return self.task.observation(measured).astype(np.float32)

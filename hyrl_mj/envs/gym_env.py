@@ -1,0 +1,187 @@
+"""The batched core as a Gymnasium environment and as a Gymnasium vector environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from hyrl_mj.envs.core import BatchedEnv
+from hyrl_mj.errors import BadInput
+from hyrl_mj.noise import Noise
+from hyrl_mj.rendering import SceneRenderer
+from hyrl_mj.tasks.base import Outcome, Task, get_task, task_names
+
+
+def observation_space(task: Task) -> spaces.Box:
+    """The space of a task's observations."""
+    low, high = np.float32(task.observation_low), np.float32(task.observation_high)
+    return spaces.Box(low, high, dtype=np.float32)
+
+
+def action_space(task: Task) -> spaces.Space[Any]:
+    """The space of a task's inputs: one of its levels, or physical units within the MJCF's limits."""
+    if task.input_levels is not None:
+        return spaces.Discrete(len(task.input_levels))
+    low, high = task.input_limits
+    return spaces.Box(np.float32(low), np.float32(high), dtype=np.float32)
+
+
+class TaskEnv(gym.Env[np.ndarray, Any]):
+    """One episode of a task, for `gymnasium.make`.
+
+    `info["z"]` is the true chart point (d,). When an episode is over, `info["outcome"]` says why:
+    "reached", "crashed", "out_of_bounds" or "stalled".
+
+    Args:
+        task: its name.
+        noise: measurement noise on the observation.
+        render_mode: None or "rgb_array".
+        camera: a camera of the MJCF.
+        width, height: of the rendered picture [pixels].
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+
+    def __init__(
+        self,
+        task: str,
+        *,
+        noise: Noise | None = None,
+        render_mode: str | None = None,
+        camera: str = "overhead",
+        width: int = 640,
+        height: int = 480,
+    ):
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise BadInput(f"render_mode {render_mode!r} is unknown: None or 'rgb_array'")
+        self.core = BatchedEnv(get_task(task), 1, noise=noise, threads=1)
+        self.metadata = {**self.metadata, "render_fps": round(1 / self.core.task.dt)}
+        self.observation_space = observation_space(self.core.task)
+        self.action_space = action_space(self.core.task)
+        self.render_mode, self._camera, self._size = render_mode, camera, (width, height)
+        self._renderer: SceneRenderer | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode, at the chart point `options["z"]` if given."""
+        super().reset(seed=seed)
+        self.core.seed(int(self.np_random.integers(2**63)))
+        z = (options or {}).get("z")
+        if z is not None:
+            z = self.core.task.check_state(z)
+        return self.core.reset(z=z)[0], {"z": self.core.z[0]}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Apply one action for one sample; see `gymnasium.Env.step`."""
+        result = self.core.step(self.core.inputs(np.asarray(action)[None]))
+        info: dict[str, Any] = {"z": self.core.z[0]}
+        if result.done[0]:
+            info["outcome"] = _label(result.outcome[0])
+        terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
+        return result.observation[0], float(result.reward[0]), terminated, truncated, info
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """The scene as (height, width, 3) uint8 in render mode "rgb_array", else None."""
+        if self.render_mode is None:
+            return None
+        if self._renderer is None:
+            self._renderer = SceneRenderer(self.core.task.model, *self._size)
+        self._renderer.place(self.core.plant.qpos[0], self._camera)
+        return self._renderer.draw()
+
+    def close(self) -> None:
+        """Give the GL context back."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+
+class TaskVectorEnv(VectorEnv):
+    """n episodes of a task at once, for `gymnasium.make_vec` with the mode "vector_entry_point".
+
+    Episodes that end start anew in the same step: `infos["final_obs"]` holds their last
+    observations and `infos["final_info"]` their outcomes, both masked by `infos["_final_obs"]`.
+
+    Args:
+        task: its name.
+        num_envs: n.
+        noise: measurement noise on the observations.
+        max_episode_steps: samples until truncation, by default the task's.
+        threads: threads of the physics, 0 for all cores; the result does not depend on it.
+    """
+
+    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def __init__(
+        self,
+        task: str,
+        num_envs: int = 1,
+        *,
+        noise: Noise | None = None,
+        max_episode_steps: int | None = None,
+        threads: int = 0,
+    ):
+        self.core = BatchedEnv(
+            get_task(task), num_envs, noise=noise, max_steps=max_episode_steps, threads=threads
+        )
+        self.num_envs = num_envs
+        self.single_observation_space = observation_space(self.core.task)
+        self.single_action_space = action_space(self.core.task)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+    def reset(  # type: ignore[override]
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start all episodes, at the chart points `options["z"]` (n, d) if given."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self.core.seed(seed)
+        z = (options or {}).get("z")
+        if z is not None:
+            z = self.core.task.check_state(z)
+        return self.core.reset(z=z), {"z": self.core.z}
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Apply one action to each episode for one sample; see `VectorEnv.step`."""
+        result = self.core.step(self.core.inputs(actions))
+        observation = result.observation
+        infos: dict[str, Any] = {}
+        ended = np.flatnonzero(result.done)
+        if len(ended):
+            final_obs = np.full(self.num_envs, None, dtype=object)
+            outcome = np.full(self.num_envs, None, dtype=object)
+            for i in ended:
+                final_obs[i], outcome[i] = observation[i].copy(), _label(result.outcome[i])
+            final_info = {"outcome": outcome, "_outcome": result.done, "z": self.core.z}
+            infos = {"final_obs": final_obs, "_final_obs": result.done}
+            infos |= {"final_info": final_info, "_final_info": result.done}
+            observation[ended] = self.core.reset(ended)
+        infos |= {"z": self.core.z}
+        return observation, result.reward, result.terminated, result.truncated, infos
+
+
+def register_envs() -> None:
+    """Make every task known to `gymnasium.make` and `gymnasium.make_vec`."""
+    for name in task_names():
+        task = get_task(name)
+        if task.env_id not in gym.registry:
+            gym.register(
+                id=task.env_id,
+                entry_point="hyrl_mj.envs.gym_env:TaskEnv",
+                vector_entry_point="hyrl_mj.envs.gym_env:TaskVectorEnv",
+                kwargs={"task": name},
+                max_episode_steps=task.max_steps,
+            )
+
+
+def _label(outcome: int) -> str:
+    return Outcome(outcome).label

@@ -1,0 +1,102 @@
+"""Stage 7: the hybrid system that joins the mode policies with hysteresis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from hyrl_mj.errors import BadInput
+from hyrl_mj.policies import Policy
+from hyrl_mj.sets import Complement, StateSet
+from hyrl_mj.tasks.base import Task
+
+
+@dataclass(frozen=True)
+class HybridController:
+    """H = (C, F, D, G) with state (z, q) (paper, Step 7), sampled: a pure function, no hidden state.
+
+    In mode q the policy pi_q flows on C_q = M_ext_q. On D_q, the closure of the rest, q jumps, to the
+    other mode; with more than two, to the one whose flow set holds z most deeply.
+
+    Attributes:
+        task: gives the chart and checks measurements.
+        policies: the policy of each mode.
+        flow_sets: C_q of each mode.
+    """
+
+    task: Task
+    policies: Mapping[int, Policy]
+    flow_sets: Mapping[int, StateSet]
+
+    @property
+    def modes(self) -> tuple[int, ...]:
+        """The modes, in ascending order."""
+        return tuple(sorted(self.policies))
+
+    def flow_set(self, q: int) -> StateSet:
+        """C_q, where mode q flows."""
+        self._check_modes(np.array([q]))
+        return self.flow_sets[q]
+
+    def jump_set(self, q: int) -> StateSet:
+        """D_q, where mode q jumps."""
+        return Complement(self.flow_set(q))
+
+    def initial_mode(self, measured: np.ndarray) -> np.ndarray:
+        """The mode whose flow set holds the first measurement most deeply.
+
+        Args:
+            measured: (n, p) measurements.
+
+        Returns:
+            (n,) int modes.
+        """
+        z = self.task.z(self.task.check_measurement(measured))
+        return np.array(self.modes)[self._distances(z).argmin(axis=0)]
+
+    def step(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """One sample: jump where z lies in D_q, then u = pi_q(measured).
+
+        Args:
+            q: (n,) int modes.
+            measured: (n, p) measurements.
+
+        Returns:
+            u (n, m), inputs in the plant's units; q_next (n,) int, the modes after the jumps.
+
+        Raises:
+            BadInput: wrong shapes, values that are not finite, or unknown modes.
+        """
+        measured = self.task.check_measurement(measured)
+        q = np.asarray(q)
+        if q.shape != (len(measured),):
+            raise BadInput(f"{len(measured)} measurements need q of shape ({len(measured)},), got {q.shape}")
+        self._check_modes(q)
+        q_next = self._jump(q, self.task.z(measured))
+        u = np.empty((len(measured), len(self.task.inputs)))
+        for mode, policy in self.policies.items():
+            rows = q_next == mode
+            if rows.any():
+                u[rows] = policy.act(measured[rows])
+        return u, q_next
+
+    def _jump(self, q: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """The modes (n,) after the jumps that z (n, d) calls for."""
+        if len(self.modes) == 1:
+            return q.copy()
+        distances = self._distances(z)
+        row, column = np.searchsorted(self.modes, q), np.arange(len(q))
+        jumps = distances[row, column] >= 0
+        distances[row, column] = np.inf
+        return np.where(jumps, np.array(self.modes)[distances.argmin(axis=0)], q)
+
+    def _distances(self, z: np.ndarray) -> np.ndarray:
+        """Signed distance of z (n, d) to every flow set: (modes, n)."""
+        return np.stack([self.flow_sets[q].signed_distance(z) for q in self.modes])
+
+    def _check_modes(self, q: np.ndarray) -> None:
+        wrong = ~np.isin(q, self.modes)
+        if wrong.any():
+            raise BadInput(f"mode {q[wrong][0]} is unknown: choose one of {self.modes}")

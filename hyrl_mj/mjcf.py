@@ -1,0 +1,109 @@
+"""Find and compile MJCF models; read their geometry, so that it is written down nowhere else."""
+
+import os
+import sys
+from functools import lru_cache
+from pathlib import Path
+
+
+def choose_gl_backend() -> None:
+    """Ask MuJoCo for EGL on a Linux machine without a display, unless the user has chosen.
+
+    MuJoCo reads `MUJOCO_GL` when it is first imported, so this has to come before.
+    """
+    headless = not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    if sys.platform.startswith("linux") and headless and "mujoco" not in sys.modules:
+        os.environ.setdefault("MUJOCO_GL", "egl")
+
+
+choose_gl_backend()
+
+import mujoco  # noqa: E402  (after the choice of the backend)
+import numpy as np  # noqa: E402
+
+from hyrl_mj.errors import BadInput, unknown  # noqa: E402
+
+
+def models_dir() -> Path:
+    """The folder with the MJCF files: in the installed package, else beside it in the checkout."""
+    package = Path(__file__).resolve().parent
+    installed = package / "models"
+    return installed if installed.is_dir() else package.parent / "models"
+
+
+@lru_cache
+def load(path: Path) -> mujoco.MjModel:
+    """Compile an MJCF file. Compiled models are shared: treat them as read-only.
+
+    Raises:
+        BadInput: the file is missing or MuJoCo cannot compile it.
+    """
+    if not path.is_file():
+        raise BadInput(f"there is no MJCF model at {path}")
+    try:
+        return mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise BadInput(f"MuJoCo cannot compile {path}: {error}") from error
+
+
+def load_task_model(name: str) -> mujoco.MjModel:
+    """The compiled model `models/<name>.xml` of a task."""
+    return load(models_dir() / f"{name}.xml")
+
+
+def object_id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
+    """The id of a named object.
+
+    Raises:
+        BadInput: the model has no such object; the message lists those it has.
+    """
+    index = mujoco.mj_name2id(model, kind, name)
+    if index < 0:
+        label = kind.name.removeprefix("mjOBJ_").lower()
+        raise unknown(f"{label} in model {model_name(model)}", name, names(model, kind))
+    return index
+
+
+def names(model: mujoco.MjModel, kind: mujoco.mjtObj) -> list[str]:
+    """The names of all objects of one kind, in the order of their ids."""
+    count = {
+        mujoco.mjtObj.mjOBJ_ACTUATOR: model.nu,
+        mujoco.mjtObj.mjOBJ_CAMERA: model.ncam,
+        mujoco.mjtObj.mjOBJ_GEOM: model.ngeom,
+        mujoco.mjtObj.mjOBJ_SENSOR: model.nsensor,
+        mujoco.mjtObj.mjOBJ_SITE: model.nsite,
+    }[kind]
+    return [mujoco.mj_id2name(model, kind, i) or f"({i})" for i in range(count)]
+
+
+def model_name(model: mujoco.MjModel) -> str:
+    """The name that the MJCF gives the model."""
+    return bytes(model.names).split(b"\0", 1)[0].decode()
+
+
+def site_pos(model: mujoco.MjModel, name: str) -> np.ndarray:
+    """Position of a site in its body's frame: (3,) [m]."""
+    return model.site_pos[object_id(model, mujoco.mjtObj.mjOBJ_SITE, name)].copy()
+
+
+def site_size(model: mujoco.MjModel, name: str) -> np.ndarray:
+    """Half sizes of a site: (3,) [m]."""
+    return model.site_size[object_id(model, mujoco.mjtObj.mjOBJ_SITE, name)].copy()
+
+
+def geom_pos(model: mujoco.MjModel, name: str) -> np.ndarray:
+    """Position of a geom in its body's frame: (3,) [m]."""
+    return model.geom_pos[object_id(model, mujoco.mjtObj.mjOBJ_GEOM, name)].copy()
+
+
+def geom_size(model: mujoco.MjModel, name: str) -> np.ndarray:
+    """Sizes of a geom, for a cylinder (radius, half height, 0): (3,) [m]."""
+    return model.geom_size[object_id(model, mujoco.mjtObj.mjOBJ_GEOM, name)].copy()
+
+
+def sample_time(model: mujoco.MjModel) -> float:
+    """The controller's sample time [s]: the custom numeric `sample_time`, else the timestep."""
+    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "sample_time")
+    if index < 0:
+        return float(model.opt.timestep)
+    return float(model.numeric_data[model.numeric_adr[index]])

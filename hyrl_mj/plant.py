@@ -1,0 +1,169 @@
+"""n copies of a compiled model that are stepped together: the physics under every task."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from hyrl_mj import mjcf
+from hyrl_mj.errors import BadInput, SimulationDiverged
+
+# A float32 policy may overshoot an input limit by a rounding error; more than this is a mistake.
+INPUT_TOLERANCE = 1e-6
+
+
+class Plant:
+    """n copies of a MuJoCo model with named inputs, advanced by one controller sample at a time.
+
+    Args:
+        model: the compiled model; the plant keeps a copy of it.
+        inputs: names of the actuators that the policy drives, in the order of the columns of u. The
+            others hold the control of the model's first keyframe, or zero.
+        n: number of copies.
+        threads: threads of the physics, 0 for all cores. The result does not depend on it.
+    """
+
+    def __init__(self, model: mujoco.MjModel, inputs: Sequence[str], n: int, threads: int = 0):
+        actuator = mujoco.mjtObj.mjOBJ_ACTUATOR
+        self.n = n
+        self.model = copy.copy(model)
+        # A bad state has to stay visible: MuJoCo would reset it and only count a warning. Inputs are
+        # checked here, and clamping them would be in the way of running backward.
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
+        self.sample_time = mjcf.sample_time(model)
+        self.substeps = max(round(self.sample_time / model.opt.timestep), 1)
+        self.columns = [mjcf.object_id(model, actuator, name) for name in inputs]
+        self.low, self.high = input_limits(model, inputs)
+        self._held = model.key_ctrl[0].copy() if model.nkey else np.zeros(model.nu)
+        self._batch = Batch(self.model, n, threads)
+        self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
+        self._ctrl, self._sensors = self._batch.bind("ctrl"), self._batch.bind("sensordata")
+
+    @property
+    def measurement(self) -> np.ndarray:
+        """What the sensors give now, without noise: (n, p), a copy."""
+        return self._sensors.copy()
+
+    @property
+    def qpos(self) -> np.ndarray:
+        """Generalised positions: (n, nq), a copy."""
+        return self._qpos.copy()
+
+    @property
+    def state(self) -> np.ndarray:
+        """MuJoCo's whole state, rows of `mjSTATE_INTEGRATION`: (n, nstate), a copy."""
+        return self._batch.state.copy()
+
+    def set_state(
+        self, qpos: np.ndarray, qvel: np.ndarray | None = None, ids: np.ndarray | None = None
+    ) -> None:
+        """Put the copies `ids` (all by default) into a state and make their sensors current.
+
+        Args:
+            qpos: (k, nq) generalised positions, k the number of copies addressed.
+            qvel: (k, nv) generalised velocities; zero by default.
+            ids: (k,) indices of the copies.
+
+        Raises:
+            BadInput: a wrong shape or a value that is not finite.
+        """
+        count = self.n if ids is None else len(ids)
+        qpos = _checked("qpos", qpos, (count, self.model.nq))
+        qvel = np.zeros((count, self.model.nv)) if qvel is None else qvel
+        qvel = _checked("qvel", qvel, (count, self.model.nv))
+        rows = slice(None) if ids is None else ids
+        self._qpos[rows], self._qvel[rows] = qpos, qvel
+        self._ctrl[rows] = self._held
+        self._batch.forward(ids, mujoco.mjtStage.mjSTAGE_POS)
+
+    def step(self, u: np.ndarray, ids: np.ndarray | None = None) -> None:
+        """Advance the copies `ids` (all by default) by one sample under the inputs u.
+
+        Args:
+            u: (k, m) inputs in the plant's physical units.
+            ids: (k,) indices of the copies.
+
+        Raises:
+            BadInput: a wrong shape, a value that is not finite, or one outside the input limits.
+            SimulationDiverged: a copy left the finite numbers.
+        """
+        self._advance(self._controls(u, ids), ids)
+
+    def step_backward(self, u: np.ndarray, ids: np.ndarray | None = None) -> None:
+        """Undo `step`: one sample of x' = -f(x, u), for plants with kinematic actuators only.
+
+        Raises:
+            BadInput: as `step`, or the plant cannot be run backward.
+        """
+        if not self.invertible:
+            raise BadInput(
+                f"the plant {mjcf.model_name(self.model)} cannot be run backward: that takes a "
+                "velocity actuator with kv >= 1e6 on every degree of freedom, one to one"
+            )
+        self._advance(-self._controls(u, ids), ids)
+
+    @property
+    def invertible(self) -> bool:
+        """Whether each degree of freedom simply follows its own velocity actuator."""
+        model = self.model
+        driven = sorted(model.actuator_trnid[:, 0])
+        follows = -model.actuator_biasprm[:, 2] >= 1e6
+        return bool(model.nq == model.nv and driven == list(range(model.njnt)) and follows.all())
+
+    def _controls(self, u: np.ndarray, ids: np.ndarray | None) -> np.ndarray:
+        count = self.n if ids is None else len(ids)
+        u = _checked("input", u, (count, len(self.columns)))
+        wrong = (u < self.low - INPUT_TOLERANCE) | (u > self.high + INPUT_TOLERANCE)
+        if wrong.any():
+            row, column = np.argwhere(wrong)[0]
+            raise BadInput(
+                f"input {u[row, column]:g} in simulation {row if ids is None else ids[row]} is "
+                f"outside the limits [{self.low[column]:g}, {self.high[column]:g}] of the MJCF"
+            )
+        ctrl = np.tile(self._held, (count, 1))
+        ctrl[:, self.columns] = np.clip(u, self.low, self.high)
+        return ctrl
+
+    def _advance(self, ctrl: np.ndarray, ids: np.ndarray | None) -> None:
+        rows = slice(None) if ids is None else ids
+        self._ctrl[rows] = ctrl
+        self._batch.step(ids, self.substeps, mujoco.mjtStage.mjSTAGE_POS)
+        # What MuJoCo itself calls bad: not a number, infinite, or beyond mjMAXVAL.
+        for name, values in (("qpos", self._qpos), ("qvel", self._qvel)):
+            bad = ~(np.abs(values) <= mujoco.mjMAXVAL)
+            if bad.any():
+                row, column = np.argwhere(bad)[0]
+                raise SimulationDiverged(
+                    f"simulation {row} of {self.n} of {mjcf.model_name(self.model)} diverged: "
+                    f"{name}[{column}] is {values[row, column]:g}; try a smaller timestep in the MJCF"
+                )
+
+
+def input_limits(model: mujoco.MjModel, inputs: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper limits (m,), (m,) of the named actuators, from their `ctrlrange`.
+
+    Raises:
+        BadInput: the model has no such actuator, or it has no limits.
+    """
+    columns = [mjcf.object_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in inputs]
+    for name, column in zip(inputs, columns, strict=True):
+        if not model.actuator_ctrllimited[column]:
+            raise BadInput(f"actuator {name} needs a ctrlrange in the MJCF: its input limits")
+    low, high = model.actuator_ctrlrange[columns].T
+    return low.copy(), high.copy()
+
+
+def _checked(name: str, values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    values = np.asarray(values, dtype=float)
+    if values.shape != shape:
+        raise BadInput(f"{name} has shape {values.shape}, it must be {shape}")
+    bad = ~np.isfinite(values)
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        raise BadInput(f"{name}[{row}, {column}] is {values[row, column]}, it must be finite")
+    return values

@@ -1,0 +1,214 @@
+"""Sets in a task's chart, as signed distances: negative inside, positive outside, in chart units."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from scipy import ndimage
+
+from hyrl_mj.errors import BadInput
+from hyrl_mj.tasks.base import Chart
+
+
+class StateSet(Protocol):
+    """A closed set of chart points."""
+
+    def signed_distance(self, z: np.ndarray) -> np.ndarray:
+        """(n,) distance of points (n, d) to the boundary, negative inside, in chart units."""
+        ...
+
+    def contains(self, z: np.ndarray) -> np.ndarray:
+        """(n,) bool, whether points (n, d) lie in the set."""
+        ...
+
+
+@dataclass(frozen=True)
+class Everything:
+    """The whole chart, without a boundary."""
+
+    def signed_distance(self, z: np.ndarray) -> np.ndarray:
+        return np.full(len(z), -np.inf)
+
+    def contains(self, z: np.ndarray) -> np.ndarray:
+        return np.ones(len(z), dtype=bool)
+
+
+@dataclass(frozen=True)
+class Complement:
+    """The closure of all that lies outside another set."""
+
+    inner: StateSet
+
+    def signed_distance(self, z: np.ndarray) -> np.ndarray:
+        return -self.inner.signed_distance(z)
+
+    def contains(self, z: np.ndarray) -> np.ndarray:
+        return self.inner.signed_distance(z) >= 0
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Nodes that cover a chart, equally spaced along each coordinate.
+
+    Attributes:
+        chart: what it covers. A periodic coordinate has no node at the end of the period.
+        counts: number of nodes along each coordinate.
+    """
+
+    chart: Chart
+    counts: tuple[int, ...]
+
+    @staticmethod
+    def with_cells(chart: Chart, cells: int) -> Grid:
+        """A grid with square cells (in chart units), `cells` of them along the longest side."""
+        sides = np.subtract(chart.high, chart.low)
+        number = np.maximum(np.round(cells * sides / sides.max()).astype(int), 2)
+        return Grid(chart, tuple(int(k) for k in number + ~np.array(chart.periodic)))
+
+    @cached_property
+    def spacing(self) -> np.ndarray:
+        """Distance between nodes along each coordinate (d,)."""
+        gaps = np.array(self.counts) - ~np.array(self.chart.periodic)
+        return np.subtract(self.chart.high, self.chart.low) / gaps
+
+    @property
+    def cell(self) -> float:
+        """The longest side of a cell."""
+        return float(self.spacing.max())
+
+    @cached_property
+    def nodes(self) -> np.ndarray:
+        """All nodes (N, d), the last coordinate running fastest."""
+        axes = [
+            low + step * np.arange(count)
+            for low, step, count in zip(self.chart.low, self.spacing, self.counts, strict=True)
+        ]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+
+    def index(self, z: np.ndarray) -> np.ndarray:
+        """Fractional indices (n, d) of points, kept on the grid."""
+        index = (self.chart.wrap(z) - self.chart.low) / self.spacing
+        return np.where(self.chart.periodic, index, np.clip(index, 0, np.array(self.counts) - 1))
+
+    def nearest(self, z: np.ndarray) -> np.ndarray:
+        """Flat indices (n,) of the nodes nearest to points (n, d)."""
+        index = np.round(self.index(z)).astype(int) % self.counts
+        return np.ravel_multi_index(tuple(index.T), self.counts)
+
+    def interpolate(self, values: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """Multilinear interpolation (n,) of values at the nodes (N,) at points (n, d)."""
+        index = self.index(z)
+        below = np.floor(index).astype(int)
+        share = index - below
+        result = np.zeros(len(index))
+        for corner in np.ndindex(*(2,) * len(self.counts)):
+            weight = np.where(corner, share, 1 - share).prod(axis=1)
+            at = np.where(self.chart.periodic, (below + corner) % self.counts,
+                          np.minimum(below + corner, np.array(self.counts) - 1))
+            result += weight * values[np.ravel_multi_index(tuple(at.T), self.counts)]
+        return result
+
+
+@dataclass(frozen=True)
+class GridSet:
+    """A set given by its signed distance at the nodes of a grid, interpolated in between.
+
+    Attributes:
+        grid: the nodes.
+        values: (N,) signed distances, in chart units.
+    """
+
+    grid: Grid
+    values: np.ndarray
+
+    def __post_init__(self) -> None:
+        if self.values.shape != (np.prod(self.grid.counts),):
+            raise BadInput(f"{self.values.shape} signed distances do not fit {self.grid.counts} nodes")
+        self.values.setflags(write=False)
+
+    @staticmethod
+    def from_mask(grid: Grid, inside: np.ndarray) -> GridSet:
+        """The set whose nodes are `inside` (N,) bool; its boundary runs half-way between nodes."""
+        inside = inside.reshape(grid.counts)
+        if inside.all() or not inside.any():
+            far = float(np.linalg.norm(np.subtract(grid.chart.high, grid.chart.low)))
+            return GridSet(grid, np.full(inside.size, -far if inside.all() else far))
+        wide, middle = _unrolled(grid, inside)
+        outward = ndimage.distance_transform_edt(~wide, sampling=grid.spacing)[middle]
+        inward = ndimage.distance_transform_edt(wide, sampling=grid.spacing)[middle]
+        half = grid.cell / 2
+        return GridSet(grid, np.where(inside, half - inward, outward - half).ravel())
+
+    def signed_distance(self, z: np.ndarray) -> np.ndarray:
+        return self.grid.interpolate(self.values, z)
+
+    def contains(self, z: np.ndarray) -> np.ndarray:
+        return self.signed_distance(z) <= 0
+
+    def __or__(self, other: GridSet) -> GridSet:
+        return GridSet(self.grid, np.minimum(self.values, other.values))
+
+    def __and__(self, other: GridSet) -> GridSet:
+        return GridSet(self.grid, np.maximum(self.values, other.values))
+
+    def __invert__(self) -> GridSet:
+        return GridSet(self.grid, -self.values)
+
+    def dilated(self, by: float) -> GridSet:
+        """All points within `by` of the set (in chart units)."""
+        return GridSet(self.grid, self.values - by)
+
+    def eroded(self, by: float) -> GridSet:
+        """The points of the set that are deeper than `by` in it."""
+        return GridSet(self.grid, self.values + by)
+
+    @property
+    def mask(self) -> np.ndarray:
+        """(N,) bool, the nodes in the set."""
+        return self.values <= 0
+
+    @cached_property
+    def _nearest_inside(self) -> np.ndarray:
+        """(N,) flat index of the inner node that is nearest to each node."""
+        grid, inside = self.grid, self.mask.reshape(self.grid.counts)
+        wide, middle = _unrolled(grid, inside)
+        at = ndimage.distance_transform_edt(
+            ~wide, sampling=grid.spacing, return_distances=False, return_indices=True
+        )
+        index = [
+            (i[middle] - part.start) % n
+            for i, part, n in zip(at, middle, grid.counts, strict=True)
+        ]
+        return np.ravel_multi_index(tuple(index), grid.counts).ravel()
+
+    def project(self, z: np.ndarray) -> np.ndarray:
+        """Points (n, d) of the set: z itself where it is inside, else the nearest node inside."""
+        inside = self.contains(z)
+        if inside.all() or not self.mask.any():
+            return z
+        nearest = self.grid.nodes[self._nearest_inside[self.grid.nearest(z)]]
+        return np.where(inside[:, None], z, nearest)
+
+
+def _unrolled(grid: Grid, mask: np.ndarray) -> tuple[np.ndarray, tuple[slice, ...]]:
+    """The mask with half a period more at either end of periodic coordinates, and where it is in it.
+
+    That much holds the shortest way between any two of its nodes.
+    """
+    extra = [n // 2 + 1 if p else 0 for n, p in zip(grid.counts, grid.chart.periodic, strict=True)]
+    wide = np.pad(mask, [(k, k) for k in extra], mode="wrap")
+    return wide, tuple(slice(k, k + n) for k, n in zip(extra, grid.counts, strict=True))
+
+
+def grid_arrays(grid: Grid) -> dict[str, np.ndarray]:
+    """A grid as arrays, for an artifact."""
+    return {"grid_counts": np.array(grid.counts)}
+
+
+def grid_from(arrays: Mapping[str, np.ndarray], chart: Chart) -> Grid:
+    """The grid that `grid_arrays` described."""
+    return Grid(chart, tuple(int(n) for n in arrays["grid_counts"]))

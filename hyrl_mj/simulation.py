@@ -1,0 +1,284 @@
+"""The closed loop of task, noise and controller, in bulk, and the hybrid arcs that it produces."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from hyrl_mj import artifacts
+from hyrl_mj.errors import BadInput
+from hyrl_mj.noise import Noise
+from hyrl_mj.policies import Policy
+from hyrl_mj.progress import Progress
+from hyrl_mj.tasks.base import Outcome, Task
+
+
+class Controller(Protocol):
+    """A pure function of mode and measurement; see `hyrl_mj.hybrid.HybridController`."""
+
+    @property
+    def modes(self) -> tuple[int, ...]:
+        """Its modes."""
+        ...
+
+    def initial_mode(self, measured: np.ndarray) -> np.ndarray:
+        """The mode (n,) to start in, from the first measurements (n, p)."""
+        ...
+
+    def step(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Inputs (n, m) and next modes (n,) for modes (n,) and measurements (n, p)."""
+        ...
+
+
+@dataclass(frozen=True)
+class PolicyController:
+    """A single policy as a controller with one mode, 0, that never jumps."""
+
+    policy: Policy
+
+    @property
+    def modes(self) -> tuple[int, ...]:
+        return (0,)
+
+    def initial_mode(self, measured: np.ndarray) -> np.ndarray:
+        return np.zeros(len(measured), dtype=int)
+
+    def step(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self.policy.act(measured), q
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """n closed-loop runs over at most K samples. A run that ended stays where it ended.
+
+    Attributes:
+        path: (K + 1, n, d) true chart points at the samples, periodic coordinates unwrapped.
+        length: (n,) samples until the end of each run.
+        outcome: (n,) `Outcome`; RUNNING where the run was cut off before the task's time was up.
+        q0: (n,) modes at the start.
+        before: (K, n) modes at each sample before a jump, and
+        q: (K, n) after it. Recorded only on demand, like the following.
+        measured: (K, n, p) noisy measurements.
+        u: (K, n, m) inputs.
+        state: (K + 1, n, nstate) MuJoCo's states.
+    """
+
+    path: np.ndarray
+    length: np.ndarray
+    outcome: np.ndarray
+    q0: np.ndarray
+    before: np.ndarray
+    q: np.ndarray
+    measured: np.ndarray
+    u: np.ndarray
+    state: np.ndarray
+
+
+def closed_loop(
+    task: Task,
+    controller: Controller,
+    z0: np.ndarray,
+    *,
+    noise: Noise | None = None,
+    q0: np.ndarray | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    backward: bool = False,
+    record: bool = False,
+    label: str = "simulating",
+) -> Rollout:
+    """Run the closed loop from many starts at once.
+
+    Args:
+        task: the robot and its job.
+        controller: what closes the loop.
+        z0: (n, d) starts, chart points.
+        noise: on the measurement; none by default.
+        q0: (n,) start modes; by default the controller picks them from the first measurement.
+        steps: samples to run, by default until the task's time is up.
+        seed: of the noise; the same seed and n give the same signals whatever the controller.
+        backward: run x' = -f(x, u) instead; runs then have no end but the last step.
+        record: whether modes, measurements, inputs and states are kept.
+        label: what the progress bar says.
+    """
+    noise = noise or Noise()
+    limit = task.max_steps if steps is None else steps
+    n, rng, plant = len(z0), np.random.default_rng(seed), task.plant(len(z0))
+    plant.set_state(task.qpos(z0))
+    measurement = plant.measurement
+    q = np.zeros(n, dtype=int) if q0 is None else np.asarray(q0, dtype=int).copy()
+    outcome = np.full(n, Outcome.RUNNING) if backward else task.ending(measurement)
+    length = np.zeros(n, dtype=int)
+    path = [task.z(measurement)]
+    first_mode = q.copy()
+    kept: dict[str, list[np.ndarray]] = {name: [] for name in ("before", "q", "measured", "u")}
+    states = [plant.state] if record else []
+    progress = Progress(label, limit, "samples")
+    for k in range(limit):
+        active = np.flatnonzero(outcome == Outcome.RUNNING)
+        if not len(active):
+            break
+        signal = noise.sample(np.full(n, k), measurement.shape[1], rng) * task.noisy
+        measured = measurement + signal
+        if k == 0 and q0 is None:
+            q[:] = controller.initial_mode(measured)
+            first_mode = q.copy()
+        before, u = q.copy(), np.full((n, len(task.inputs)), np.nan)
+        u[active], q[active] = controller.step(q[active], measured[active])
+        (plant.step_backward if backward else plant.step)(u[active], active)
+        measurement = plant.measurement
+        path.append(task.z(measurement))
+        length[active] = k + 1
+        if not backward:
+            outcome[active] = task.ending(measurement[active])
+        if record:
+            for name, value in (("before", before), ("q", q.copy()), ("measured", measured), ("u", u)):
+                kept[name].append(value)
+            states.append(plant.state)
+        progress.update(k + 1)
+    progress.close()
+    if limit >= task.max_steps and not backward:
+        late = outcome == Outcome.RUNNING
+        outcome[late] = task.verdict(measurement[late])
+    shapes = {"before": (), "q": (), "measured": (len(task.noisy),), "u": (len(task.inputs),)}
+    arrays = {k: np.array(values).reshape(-1, n, *shapes[k]) for k, values in kept.items()}
+    return Rollout(np.array(path), length, outcome, first_mode, **arrays, state=np.array(states))
+
+
+@dataclass(frozen=True)
+class HybridArc:
+    """A solution of the hybrid closed loop on its hybrid time domain (paper, Section II-D).
+
+    It has one row a sample and one more for every jump: a jump at time t gives two rows with the same
+    t, the first with j and the old mode, the second with j + 1 and the new one.
+
+    Attributes:
+        task: name of the task.
+        controller: "policy" or "hyrl", or what the caller calls it.
+        t: (N,) time [s].
+        j: (N,) number of jumps so far.
+        z: (N, d) true chart points, periodic coordinates unwrapped.
+        measured: (N, p) noisy measurements; not a number in the last row, which ends the arc.
+        q: (N,) modes.
+        u: (N, m) inputs applied from this row on; not a number where none is: in the last row, and
+            in the first of the two rows of a jump.
+        state: (N, nstate) MuJoCo's state (`mjSTATE_INTEGRATION`).
+        outcome: "reached", "crashed", "out_of_bounds", "stalled", or "running" if it was cut off.
+        noise: kind of the measurement noise.
+        bound: its bound eps.
+    """
+
+    task: str
+    controller: str
+    t: np.ndarray
+    j: np.ndarray
+    z: np.ndarray
+    measured: np.ndarray
+    q: np.ndarray
+    u: np.ndarray
+    state: np.ndarray
+    outcome: str
+    noise: str
+    bound: float
+
+    def at(self, t: float) -> int:
+        """The last row at or before a time [s]."""
+        return int(np.searchsorted(self.t, t + 1e-9, side="right") - 1)
+
+    def save(self, path: Path) -> None:
+        """Write the arc as npz."""
+        arrays = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
+        artifacts.write_arrays(path, arrays, kind="hybrid arc")
+
+    @staticmethod
+    def load(path: Path) -> HybridArc:
+        """Read what `save` wrote.
+
+        Raises:
+            BadArtifact: the file is missing, truncated, or not a hybrid arc of this version.
+        """
+        arrays = artifacts.read_arrays(path, kind="hybrid arc")
+        with artifacts.reading(path):
+            values = {f.name: arrays[f.name] for f in fields(HybridArc)}
+            return HybridArc(**{k: v.item() if v.ndim == 0 else v for k, v in values.items()})
+
+
+def simulate(
+    task: Task,
+    controller: Controller | Policy,
+    z0: np.ndarray,
+    noise: Noise | None = None,
+    q0: int | np.ndarray | None = None,
+    horizon: float | None = None,
+    seed: int = 0,
+    name: str = "",
+) -> HybridArc | list[HybridArc]:
+    """Simulate the closed loop in MuJoCo.
+
+    Args:
+        task: the robot and its job.
+        controller: a controller, or a policy.
+        z0: one start (d,), or n starts (n, d), in the chart.
+        noise: on the measurement; none by default.
+        q0: the start mode, or one for each start; by default the controller picks it.
+        horizon: time to simulate [s], by default the task's.
+        seed: of the noise.
+        name: what the arcs call the controller; by default "policy" for a policy, else "hyrl".
+
+    Returns:
+        One arc for one start, a list of arcs for several.
+
+    Raises:
+        BadInput: a start outside the chart, an unknown mode, or a horizon that is not positive.
+    """
+    single = np.ndim(z0) == 1
+    starts = task.check_state(z0)
+    steps = None if horizon is None else _steps(task, horizon)
+    if not isinstance(controller, PolicyController) and hasattr(controller, "act"):
+        controller = PolicyController(controller)
+    if q0 is not None:
+        q0 = np.broadcast_to(np.asarray(q0), len(starts))
+        unknown = q0[~np.isin(q0, controller.modes)]
+        if len(unknown):
+            raise BadInput(f"mode {unknown[0]} is unknown: choose one of {controller.modes}")
+    rollout = closed_loop(
+        task, controller, starts, noise=noise, q0=q0, steps=steps, seed=seed, record=True
+    )
+    name = name or ("policy" if isinstance(controller, PolicyController) else "hyrl")
+    arcs = [_arc(task, name, rollout, i, noise or Noise()) for i in range(len(starts))]
+    return arcs[0] if single else arcs
+
+
+def _steps(task: Task, horizon: float) -> int:
+    if not (math.isfinite(horizon) and horizon > 0):
+        raise BadInput(f"horizon {horizon} s cannot be used: give a finite time > 0")
+    return max(round(horizon / task.dt), 1)
+
+
+def _arc(task: Task, name: str, rollout: Rollout, i: int, noise: Noise) -> HybridArc:
+    """Run i of a rollout as a hybrid arc."""
+    end = rollout.length[i]
+    before, after = rollout.before[:end, i], rollout.q[:end, i]
+    jumped = before != after
+    # One row a sample, a row more in front of it where there was a jump, and one for the end.
+    rows = np.repeat(np.arange(end + 1), np.append(1 + jumped, 1))
+    old = np.append(rows[1:] == rows[:-1], False)
+    last_mode = after[-1:] if end else rollout.q0[i : i + 1]
+    q = np.where(old, np.append(before, last_mode)[rows], np.append(after, last_mode)[rows])
+    jumps = np.append(jumped.cumsum(), jumped.sum())
+    u = _ended(rollout.u[:end, i])[rows]
+    u[old] = np.nan
+    return HybridArc(
+        task=task.name, controller=name, t=rows * task.dt, j=jumps[rows] - old,
+        z=rollout.path[rows, i], measured=_ended(rollout.measured[:end, i])[rows], q=q, u=u, state=rollout.state[rows, i],
+        outcome=Outcome(rollout.outcome[i]).label, noise=noise.kind, bound=noise.bound,
+    )
+
+
+def _ended(values: np.ndarray) -> np.ndarray:
+    """(K, c) with a last row that holds no numbers."""
+    return np.vstack([values, np.full((1, values.shape[1]), np.nan)])

@@ -1,0 +1,6 @@
+"""The robots: one file each, named as its MJCF."""
+
+from hyrl_mj.tasks import unit_circle, vehicle
+from hyrl_mj.tasks.base import Chart, Outcome, Task, get_task, register, task_names
+
+__all__ = ["Chart", "Outcome", "Task", "get_task", "register", "task_names", "unit_circle", "vehicle"]

@@ -1,0 +1,286 @@
+"""What a task is: a plant with a measurement, a chart, an observation, a reward, an end and starts."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+
+import mujoco
+import numpy as np
+from scipy.spatial import cKDTree
+
+from hyrl_mj import mjcf
+from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.plant import Plant, input_limits
+
+
+class Outcome(IntEnum):
+    """How an episode stands, or ended."""
+
+    RUNNING = 0
+    REACHED = 1
+    CRASHED = 2
+    OUT_OF_BOUNDS = 3
+    STALLED = 4
+
+    @property
+    def label(self) -> str:
+        """The name for people and for `info`: "reached", "crashed", ..."""
+        return self.name.lower()
+
+
+@dataclass(frozen=True)
+class Chart:
+    """The coordinates z in which the critical set and all sets live.
+
+    Attributes:
+        names: one a coordinate.
+        units: one a coordinate.
+        low, high: (d,) ends of the charted box; for a periodic coordinate one period.
+        periodic: (d,) whether a coordinate lives on a circle.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    periodic: tuple[bool, ...]
+
+    @property
+    def dimension(self) -> int:
+        return len(self.names)
+
+    def wrap(self, z: np.ndarray) -> np.ndarray:
+        """The same points (n, d), periodic coordinates brought into [low, high)."""
+        low, period = np.array(self.low), np.subtract(self.high, self.low)
+        return np.where(self.periodic, low + np.mod(z - low, period), z)
+
+    def difference(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """a - b (n, d), the short way round in periodic coordinates."""
+        delta, period = np.subtract(a, b), np.subtract(self.high, self.low)
+        return np.where(self.periodic, delta - period * np.round(delta / period), delta)
+
+    def contains(self, z: np.ndarray) -> np.ndarray:
+        """Whether points (n, d) lie in the charted box: (n,) bool."""
+        inside = (z >= self.low) & (z <= self.high)
+        return np.asarray((inside | self.periodic).all(axis=-1))
+
+    def tree(self, points: np.ndarray) -> cKDTree:
+        """A search tree of points (n, d) that knows of the periods; ask it with `in_box` points."""
+        # Coordinates that are not periodic get a box so large that its other side is never near.
+        period = np.subtract(self.high, self.low)
+        return cKDTree(self.in_box(points), boxsize=np.where(self.periodic, period, 1e6 * period))
+
+    def in_box(self, z: np.ndarray) -> np.ndarray:
+        """Points (n, d) in the coordinates of `tree`: never negative."""
+        shift = np.where(self.periodic, 0.0, 1e3 * np.subtract(self.high, self.low))
+        return self.wrap(z) - self.low + shift
+
+    def format(self, z: np.ndarray) -> str:
+        """One point (d,) for people: "x = 0.1 m, y = -0.2 m"."""
+        return ", ".join(
+            f"{n} = {v:.4g} {u}" for n, v, u in zip(self.names, z, self.units, strict=True)
+        )
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """A mirror symmetry: mirrored observations call for mirrored inputs and earn the same reward.
+
+    Attributes:
+        observation: (k,) +1 or -1, what the mirror does to each column of the observation.
+        inputs: (m,) +1 or -1, what it does to each input.
+    """
+
+    observation: tuple[int, ...]
+    inputs: tuple[int, ...]
+
+
+class Task(ABC):
+    """A robot with a job: the base of the files in `hyrl_mj/tasks`.
+
+    A task is stateless. Its methods take batches: measurements (n, p), chart points (n, d), inputs
+    (n, m), in the units of the MJCF. Geometry and limits are read from the compiled model.
+    """
+
+    #: the task's name, also that of its MJCF `models/<name>.xml`
+    name: str
+    #: the id under which Gymnasium knows it
+    env_id: str
+    #: one line for `hyrl-mj list`
+    description: str
+    #: coordinates of the critical set and of all sets
+    chart: Chart
+    #: names of the actuators that the policy drives
+    inputs: tuple[str, ...]
+    #: None for a continuous input; else the number of equally spaced levels of each single input
+    levels: int | None = None
+    #: columns of the measurement that noise acts on
+    noisy: tuple[bool, ...]
+    #: samples after which an episode is truncated
+    max_steps: int
+    #: horizon T of the backward propagation [s]
+    horizon: float
+    #: the reward that no state is worse than; leaving a mode's extended set counts as this for ever
+    worst_reward: float
+    #: the paper's replay starts (k, d)
+    replay_starts: tuple[tuple[float, ...], ...]
+    #: what the runs of each mode do, in the order of the modes
+    mode_names: tuple[str, ...]
+    #: SB3 algorithm that trains it: "ppo" or "dqn"
+    algorithm: str
+    #: the hyperplane with respect to which its reward is symmetric, if any (paper, Section IV-B)
+    mirror: Mirror | None = None
+    #: bounds of the observation (k,), (k,), noise included
+    observation_low: tuple[float, ...]
+    observation_high: tuple[float, ...]
+
+    @cached_property
+    def model(self) -> mujoco.MjModel:
+        """The compiled MJCF (shared: do not write to it)."""
+        return mjcf.load_task_model(self.name)
+
+    @cached_property
+    def dt(self) -> float:
+        """Sample time of the controller [s]."""
+        return mjcf.sample_time(self.model)
+
+    @cached_property
+    def input_limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper limit of the inputs (m,), (m,), from the MJCF."""
+        return input_limits(self.model, self.inputs)
+
+    @cached_property
+    def input_levels(self) -> np.ndarray | None:
+        """The inputs of a discrete task, (levels, m), else None."""
+        low, high = self.input_limits
+        return None if self.levels is None else np.linspace(low, high, self.levels)
+
+    @property
+    def measurement_columns(self) -> int:
+        """p, the number of columns of the measurement."""
+        return len(self.noisy)
+
+    def plant(self, n: int, threads: int = 0) -> Plant:
+        """n copies of the robot."""
+        return Plant(self.model, self.inputs, n, threads)
+
+    def check_state(self, z: np.ndarray) -> np.ndarray:
+        """Chart points as a float array (n, d).
+
+        Raises:
+            BadInput: wrong shape, not finite, or outside the chart.
+        """
+        try:
+            z = np.atleast_2d(np.asarray(z, dtype=float))
+        except (TypeError, ValueError):
+            raise BadInput(f"a state of {self.name} is {self.chart.dimension} numbers, got {z!r}") from None
+        if z.ndim != 2 or z.shape[1] != self.chart.dimension:
+            raise BadInput(
+                f"a state of {self.name} is {self.chart.dimension} number(s) "
+                f"({', '.join(self.chart.names)}), got shape {z.shape}"
+            )
+        bad = ~(np.isfinite(z).all(axis=1) & self.chart.contains(z))
+        if bad.any():
+            arena = ", ".join(
+                f"{low:g} <= {name} <= {high:g} {unit}"
+                for name, unit, low, high, periodic in zip(
+                    self.chart.names, self.chart.units, self.chart.low, self.chart.high,
+                    self.chart.periodic, strict=True,
+                )
+                if not periodic
+            )
+            raise BadInput(
+                f"state {np.argmax(bad)} ({self.chart.format(z[bad][0])}) is outside {self.name}: "
+                f"{arena or 'give finite numbers'}"
+            )
+        return z
+
+    def check_measurement(self, measured: np.ndarray) -> np.ndarray:
+        """A measurement as a float array (n, p).
+
+        Raises:
+            BadInput: wrong shape or not finite.
+        """
+        measured = np.asarray(measured, dtype=float)
+        if measured.ndim != 2 or measured.shape[1] != self.measurement_columns:
+            raise BadInput(
+                f"a measurement of {self.name} has shape (n, {self.measurement_columns}), "
+                f"got {measured.shape}"
+            )
+        if not np.isfinite(measured).all():
+            row, column = np.argwhere(~np.isfinite(measured))[0]
+            raise BadInput(
+                f"measurement[{row}, {column}] is {measured[row, column]}, it must be finite"
+            )
+        return measured
+
+    def qpos(self, z: np.ndarray) -> np.ndarray:
+        """The full position (n, nq) that belongs to chart points z (n, d)."""
+        return z
+
+    def z(self, measured: np.ndarray) -> np.ndarray:
+        """Chart points (n, d) of measurements (n, p)."""
+        return measured
+
+    def with_z(self, measured: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """The measurements (n, p) changed so that their chart points are z (n, d)."""
+        return z
+
+    @abstractmethod
+    def observation(self, measured: np.ndarray) -> np.ndarray:
+        """What the network is fed: (n, k)."""
+
+    @abstractmethod
+    def reward(self, measurement: np.ndarray) -> np.ndarray:
+        """Reward (n,) of the true state after the step."""
+
+    @abstractmethod
+    def ending(self, measurement: np.ndarray) -> np.ndarray:
+        """`Outcome` (n,) int of states that end an episode, RUNNING where it goes on."""
+
+    @abstractmethod
+    def verdict(self, measurement: np.ndarray) -> np.ndarray:
+        """`Outcome` (n,) int of episodes that still ran when their time was up."""
+
+    @abstractmethod
+    def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """n starts drawn from the task's start distribution: (n, d)."""
+
+    @abstractmethod
+    def direction(self, path: np.ndarray) -> np.ndarray:
+        """Which way runs went.
+
+        Args:
+            path: (K + 1, n, d) chart points over time, not wrapped; a run that ended stays put.
+
+        Returns:
+            (n,) int: the mode whose way the run went, -1 where there was nothing to decide.
+        """
+
+
+_REGISTRY: dict[str, type[Task]] = {}
+
+
+def register(task: type[Task]) -> type[Task]:
+    """Class decorator: make a task known by its name."""
+    _REGISTRY[task.name] = task
+    return task
+
+
+def task_names() -> list[str]:
+    """The names of all tasks."""
+    return sorted(_REGISTRY)
+
+
+def get_task(name: str) -> Task:
+    """The task of that name.
+
+    Raises:
+        BadInput: there is none; the message lists those there are.
+    """
+    if name not in _REGISTRY:
+        raise unknown("task", name, task_names())
+    return _REGISTRY[name]()

@@ -1,0 +1,66 @@
+"""The unit circle: turn a pointer to the set-point, clockwise or counter-clockwise (paper, Example 1)."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from hyrl_mj import mjcf
+from hyrl_mj.tasks.base import Chart, Mirror, Outcome, Task, register
+
+PI = np.pi
+# The pointer has arrived when it is this close to the set-point [rad].
+BAND = 0.3
+
+
+@register
+class UnitCircle(Task):
+    name = "unit_circle"
+    env_id = "hyrl_mj/UnitCircle-v0"
+    description = "turn a pointer to the set-point, clockwise or counter-clockwise (PPO)"
+    chart = Chart(("theta",), ("rad",), (0.0,), (2 * PI,), (True,))
+    inputs = ("turn_rate",)
+    noisy = (True,)
+    max_steps = 150
+    horizon = 0.5
+    worst_reward = -1.0
+    replay_starts = tuple((factor * PI,) for factor in (0.75, 0.9, 1.0, 1.1, 1.25))
+    mode_names = ("clockwise", "counter-clockwise")
+    algorithm = "ppo"
+    mirror = Mirror((1, -1), (-1,))
+    observation_low, observation_high = (-1.0, -1.0), (1.0, 1.0)
+
+    @cached_property
+    def set_point(self) -> float:
+        """Angle of the set-point [rad]."""
+        x, y, _ = mjcf.site_pos(self.model, "set_point")
+        return float(np.arctan2(y, x))
+
+    def error(self, theta: np.ndarray) -> np.ndarray:
+        """Angle from the set-point in [-pi, pi]: (n,) [rad]."""
+        return self.chart.difference(theta, self.set_point)[:, 0]
+
+    def observation(self, measured: np.ndarray) -> np.ndarray:
+        return np.hstack([np.cos(measured), np.sin(measured)])
+
+    def reward(self, measurement: np.ndarray) -> np.ndarray:
+        return -np.abs(self.error(measurement)) / PI
+
+    def ending(self, measurement: np.ndarray) -> np.ndarray:
+        return np.full(len(measurement), Outcome.RUNNING)
+
+    def verdict(self, measurement: np.ndarray) -> np.ndarray:
+        arrived = np.abs(self.error(measurement)) <= BAND
+        return np.where(arrived, Outcome.REACHED, Outcome.STALLED)
+
+    def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        # Half of them the paper's, where the decision is; the others all over the circle.
+        opposite = self.set_point + PI + rng.uniform(-0.2, 0.2, (n, 1))
+        anywhere = rng.uniform(self.chart.low, self.chart.high, (n, 1))
+        return np.where(rng.random((n, 1)) < 0.5, opposite, anywhere)
+
+    def direction(self, path: np.ndarray) -> np.ndarray:
+        turned = path[-1, :, 0] - path[0, :, 0]
+        decided = np.abs(self.error(path[0])) > BAND
+        return np.where(decided, np.where(turned < 0, 0, 1), -1)

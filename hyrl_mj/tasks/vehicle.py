@@ -1,0 +1,105 @@
+"""Obstacle avoidance: drive past a pillar on its left or on its right (paper, Example 2)."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from hyrl_mj import mjcf
+from hyrl_mj.tasks.base import Chart, Mirror, Outcome, Task, register
+
+CRASH_DISTANCE = 1e-3  # [m] from the obstacle's surface
+ON_THE_LINE = 1e-6  # [m] the error that sixty samples of the kinematic actuator add up to
+
+
+@register
+class Vehicle(Task):
+    name = "vehicle"
+    env_id = "hyrl_mj/ObstacleAvoidance-v0"
+    description = "drive past a pillar on its left or on its right (DQN)"
+    inputs = ("lateral_velocity",)
+    levels = 5
+    noisy = (False, True)
+    max_steps = 60
+    horizon = 0.3
+    worst_reward = 0.0
+    replay_starts = ((0.0, -0.15), (0.0, -0.055), (0.0, 0.0), (0.0, 0.055), (0.0, 0.15))
+    mode_names = ("left", "right")
+    algorithm = "dqn"
+    mirror = Mirror((1, 1, -1), (-1,))
+
+    @cached_property
+    def chart(self) -> Chart:  # type: ignore[override]
+        low, high = self.arena
+        return Chart(("x", "y"), ("m", "m"), tuple(low), tuple(high), (False, False))
+
+    @cached_property
+    def arena(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner of the arena (2,), (2,) [m]."""
+        centre, half = mjcf.site_pos(self.model, "arena"), mjcf.site_size(self.model, "arena")
+        return (centre - half)[:2], (centre + half)[:2]
+
+    @cached_property
+    def obstacle(self) -> np.ndarray:
+        """Centre of the obstacle (2,) [m]."""
+        return mjcf.geom_pos(self.model, "obstacle")[:2]
+
+    @cached_property
+    def radius(self) -> float:
+        """Radius of the obstacle [m]."""
+        return float(mjcf.geom_size(self.model, "obstacle")[0])
+
+    @cached_property
+    def set_point(self) -> np.ndarray:
+        """Where to drive (2,) [m]."""
+        return mjcf.site_pos(self.model, "set_point")[:2]
+
+    @cached_property
+    def observation_low(self) -> tuple[float, ...]:  # type: ignore[override]
+        return (0.0, 0.0, 2 * self.arena[0][1])
+
+    @cached_property
+    def observation_high(self) -> tuple[float, ...]:  # type: ignore[override]
+        diagonal = np.linalg.norm(self.arena[1] - self.arena[0])
+        return (2 * diagonal, 2 * diagonal, 2 * self.arena[1][1])
+
+    def clearance(self, z: np.ndarray) -> np.ndarray:
+        """Distance to the obstacle's surface, d_o: (n,) [m]."""
+        return np.maximum(np.linalg.norm(z - self.obstacle, axis=-1) - self.radius, 0.0)
+
+    def distance_to_go(self, z: np.ndarray) -> np.ndarray:
+        """Distance to the set-point, d_g: (n,) [m]."""
+        return np.linalg.norm(z - self.set_point, axis=-1)
+
+    def observation(self, measured: np.ndarray) -> np.ndarray:
+        y = measured[:, 1]
+        return np.stack([self.clearance(measured), self.distance_to_go(measured), y], axis=-1)
+
+    def reward(self, measurement: np.ndarray) -> np.ndarray:
+        d_o = self.clearance(measurement)
+        barrier = (d_o - 1.5) ** 2 - np.log(np.maximum(d_o, 1e-6))
+        return np.maximum(0.0, 3.5 - self.distance_to_go(measurement) - 0.1 * barrier)
+
+    def ending(self, measurement: np.ndarray) -> np.ndarray:
+        x, y = measurement.T
+        low, high = self.arena
+        ends = np.full(len(measurement), Outcome.RUNNING)
+        ends[x > self.set_point[0] + ON_THE_LINE] = Outcome.REACHED
+        ends[(y <= low[1]) | (y >= high[1])] = Outcome.OUT_OF_BOUNDS
+        ends[self.clearance(measurement) <= CRASH_DISTANCE] = Outcome.CRASHED
+        return ends
+
+    def verdict(self, measurement: np.ndarray) -> np.ndarray:
+        passed = measurement[:, 0] >= self.set_point[0] - ON_THE_LINE
+        return np.where(passed, Outcome.REACHED, Outcome.STALLED)
+
+    def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        return rng.uniform((0.0, -1.0), (0.5, 1.0), (n, 2))
+
+    def direction(self, path: np.ndarray) -> np.ndarray:
+        # Runs start before the pillar; one that never gets beside it is judged where it ended.
+        beside = path[:, :, 0] >= self.obstacle[0]
+        when = np.where(beside.any(axis=0), beside.argmax(axis=0), len(path) - 1)
+        y = path[when, np.arange(path.shape[1]), 1]
+        return np.where(beside[0], -1, np.where(y > self.obstacle[1], 0, 1))

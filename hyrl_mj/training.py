@@ -1,0 +1,198 @@
+"""Train a policy with SB3 on the batched environments (paper, Steps 1 and 6)."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import torch
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
+from torch import nn
+
+from hyrl_mj import symmetry
+from hyrl_mj.envs.core import BatchedEnv, Domain
+from hyrl_mj.envs.sb3_env import TaskVecEnv
+from hyrl_mj.errors import BadInput
+from hyrl_mj.noise import Noise
+from hyrl_mj.policies import MlpPolicy
+from hyrl_mj.progress import Progress
+from hyrl_mj.settings import Training
+from hyrl_mj.tasks.base import Task
+
+ALGORITHMS: dict[str, type[PPO] | type[DQN]] = {"ppo": PPO, "dqn": DQN}
+ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}
+# The learning rate falls to this share of its first value, not to zero: the last samples count too.
+FINAL_RATE = 0.02
+# How often the policy is evaluated, and checkpointed if it is the best so far; on how many episodes.
+EVALUATIONS = 15
+EPISODES = 256
+
+
+def train(
+    task: Task,
+    settings: Training,
+    seed: int,
+    *,
+    noise: Noise | None = None,
+    domain: Domain | None = None,
+    start_from: MlpPolicy | None = None,
+    log_dir: Path | None = None,
+    label: str = "training",
+) -> MlpPolicy:
+    """Train one policy, and return the best that was met on the way.
+
+    Value-based training in particular goes up and down; as with SB3's `EvalCallback`, the policy is
+    evaluated at intervals on the same episodes, with and without the noise, and the best one is kept.
+
+    Args:
+        task: what to learn.
+        settings: how.
+        seed: of weights, exploration, starts and noise; the same seed gives the same policy on the
+            same machine, at any number of physics threads.
+        noise: measurement noise during training.
+        domain: restricts starts and episodes to a part of the state space.
+        start_from: a policy whose weights to go on from; its network replaces `settings.hidden`.
+        log_dir: where TensorBoard logs and checkpoints go; none are written by default.
+        label: what the progress bar says.
+
+    Returns:
+        The policy with the highest mean return.
+    """
+    model = build(task, settings, seed, noise=noise, domain=domain, start_from=start_from)
+    if log_dir is not None:
+        model.set_logger(configure(str(log_dir / "tensorboard"), ["tensorboard"]))
+    noises = {Noise(), noise or Noise()}
+
+    def score(policy: MlpPolicy) -> float:
+        returns = [mean_return(task, policy, kind, domain) for kind in noises]
+        return float(np.mean(returns))
+
+    watch = _Watch(task, settings.samples, log_dir, label, score)
+    with single_threaded_torch():
+        model.learn(settings.samples, callback=watch, log_interval=10)
+    assert watch.best is not None
+    return watch.best
+
+
+def build(
+    task: Task,
+    settings: Training,
+    seed: int,
+    *,
+    noise: Noise | None = None,
+    domain: Domain | None = None,
+    start_from: MlpPolicy | None = None,
+) -> BaseAlgorithm:
+    """The SB3 algorithm that `train` runs, ready to learn."""
+    if task.algorithm not in ALGORITHMS:
+        raise BadInput(f"algorithm {task.algorithm!r} is unknown: choose one of {', '.join(ALGORITHMS)}")
+    hidden = settings.hidden if start_from is None else start_from.hidden
+    activation = settings.activation if start_from is None else start_from.activation
+    mirrored = settings.symmetric and start_from is None and task.mirror is not None
+    if mirrored:
+        hidden = tuple(2 * width for width in hidden)
+    rate = settings.learning_rate
+    model = ALGORITHMS[task.algorithm](
+        "MlpPolicy",
+        TaskVecEnv(BatchedEnv(task, settings.envs, noise=noise, domain=domain)),
+        seed=seed,
+        device="cpu",
+        gamma=settings.gamma,
+        learning_rate=(lambda left: rate * max(left, FINAL_RATE)) if settings.anneal else rate,
+        policy_kwargs={"net_arch": list(hidden), "activation_fn": ACTIVATIONS[activation]},
+        **settings.options,
+    )
+    if start_from is not None:
+        state = {name: torch.as_tensor(np.array(w)) for name, w in start_from.weights.items()}
+        model.policy.load_state_dict(state)
+        if isinstance(model, PPO):
+            # A trained agent hardly explores any more, but half of a mode's extended set asks it to go
+            # the other way.
+            nn.init.zeros_(model.policy.log_std)
+    if mirrored:
+        symmetry.impose(model.policy, task)
+    return model
+
+
+def export(model: BaseAlgorithm, task: Task) -> MlpPolicy:
+    """The policy that an SB3 algorithm has learned so far, as a plain network."""
+    state = symmetry.plain_state(model.policy)
+    weights = {name: tensor.detach().cpu().numpy().copy() for name, tensor in state.items()}
+    activation = next(n for n, a in ACTIVATIONS.items() if a is model.policy.activation_fn)
+    return MlpPolicy(task, task.algorithm, activation, weights)
+
+
+@contextmanager
+def single_threaded_torch() -> Iterator[None]:
+    """Small networks are faster on one thread, and their sums do not depend on the machine."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with warnings.catch_warnings():
+            # SB3 wonders about large multiples of n_steps * n_envs; ours are chosen.
+            warnings.simplefilter("ignore", UserWarning)
+            yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def mean_return(
+    task: Task, policy: MlpPolicy, noise: Noise, domain: Domain | None = None, episodes: int = EPISODES
+) -> float:
+    """Mean undiscounted return over episodes from the start distribution, always the same ones."""
+    env = BatchedEnv(task, episodes, noise=noise, domain=domain)
+    env.seed(0)
+    observation = env.reset()
+    returns, running = np.zeros(episodes), np.ones(episodes, dtype=bool)
+    while running.any():
+        result = env.step(policy.inputs(observation))
+        returns += np.where(running, result.reward, 0.0)
+        running &= ~result.done
+        observation = result.observation
+    return float(returns.mean())
+
+
+class _Watch(BaseCallback):
+    """Progress bar, evaluation at intervals, the best policy so far and its checkpoint."""
+
+    def __init__(
+        self,
+        task: Task,
+        samples: int,
+        log_dir: Path | None,
+        label: str,
+        score: Callable[[MlpPolicy], float],
+    ):
+        super().__init__()
+        self.best: MlpPolicy | None = None
+        self._task, self._log_dir, self._score = task, log_dir, score
+        self._interval = max(samples // EVALUATIONS, 1)
+        self._next = self._interval
+        self._best_score = -np.inf
+        self._progress = Progress(label, samples, "samples")
+
+    def _on_step(self) -> bool:
+        self._progress.update(self.num_timesteps)
+        if self.num_timesteps >= self._next:
+            self._next += self._interval
+            self._evaluate()
+        return True
+
+    def _on_training_end(self) -> None:
+        self._evaluate()
+        self._progress.close()
+
+    def _evaluate(self) -> None:
+        policy = export(self.model, self._task)
+        score = self._score(policy)
+        self.logger.record("eval/mean_return", score)
+        if score > self._best_score:
+            self._best_score, self.best = score, policy
+            if self._log_dir is not None:
+                policy.save(self._log_dir / "checkpoint.safetensors")
