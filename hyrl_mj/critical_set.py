@@ -100,7 +100,7 @@ def find_critical_set(task: Task, policy: Policy, cells: int, resolution: float)
         task: gives chart, plant, and the direction of a run.
         policy: closes the loop.
         cells: grid points along the longest side of the chart from which the search starts.
-        resolution: length of the last rods, in chart units.
+        resolution: length of the last rods, as a share of the first.
 
     Returns:
         The critical set; it may be empty.
@@ -113,7 +113,7 @@ def find_critical_set(task: Task, policy: Policy, cells: int, resolution: float)
     while True:
         parts = _part(task, policy, *_ends(task, centre, axis, length))
         centre, axis, length = centre[parts], axis[parts], length[parts]
-        if not len(centre) or length.max() <= resolution:
+        if not len(centre) or length.max() <= resolution * grid.cell:
             break
         offset = np.zeros((len(centre), d))
         offset[np.arange(len(centre)), axis] = length / 4
@@ -121,7 +121,7 @@ def find_critical_set(task: Task, policy: Policy, cells: int, resolution: float)
         axis, length = np.tile(axis, 2), np.tile(length / 2, 2)
     centre = centre[_differ(task, policy, *_ends(task, centre, axis, length))]
     points = np.unique(task.chart.wrap(centre), axis=0) if len(centre) else np.empty((0, d))
-    return CriticalSet(points, _pieces(task, points, LINK * grid.cell), resolution, grid.cell)
+    return CriticalSet(points, _pieces(task, points, LINK * grid.cell), resolution * grid.cell, grid.cell)
 
 
 def _ends(

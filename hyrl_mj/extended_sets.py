@@ -9,7 +9,6 @@ import numpy as np
 
 from hyrl_mj import artifacts
 from hyrl_mj.critical_set import CriticalSet
-from hyrl_mj.errors import BadArtifact
 from hyrl_mj.partition import Partition, PartPolicy, part_policies
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import Grid, GridSet
@@ -72,10 +71,7 @@ class ExtendedSets:
         """
         arrays = artifacts.read_arrays(path, kind="extended sets")
         with artifacts.reading(path):
-            counts = tuple(int(n) for n in arrays["grid_counts"])
-            if len(counts) != task.chart.dimension:
-                raise BadArtifact(f"its grid has {len(counts)} dimensions, not those of {task.name}")
-            grid = Grid(task.chart, counts)
+            grid = Grid.from_counts(task.chart, arrays["grid_counts"])
             return ExtendedSets(
                 modes=tuple(int(q) for q in arrays["modes"]),
                 sets=tuple(GridSet(grid, values) for values in arrays["signed_distance"]),

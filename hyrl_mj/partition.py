@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from hyrl_mj import artifacts
 from hyrl_mj.critical_set import CriticalSet
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import Grid, GridSet
@@ -34,6 +36,47 @@ class Partition:
     def grid(self) -> Grid:
         """The grid that the parts live on."""
         return self.parts[0].grid
+
+    def sentence(self, task: Task) -> str:
+        """The result for people."""
+        shares = ", ".join(
+            f"{q} ({_mode_name(task, q)}) {100 * part.mask.mean():.0f}%"
+            for q, part in zip(self.modes, self.parts, strict=True)
+        )
+        return f"share of the chart by mode: {shares}"
+
+    def save(self, path: Path) -> None:
+        """Write it as npz."""
+        artifacts.write_arrays(
+            path,
+            {
+                "modes": np.array(self.modes),
+                "grid_counts": np.array(self.grid.counts),
+                "signed_distance": np.stack([part.values for part in self.parts]),
+                "succeeds": self.succeeds,
+            },
+            kind="partition",
+        )
+
+    @staticmethod
+    def load(path: Path, task: Task) -> Partition:
+        """Read what `save` wrote.
+
+        Raises:
+            BadArtifact: the file is missing, truncated, or not a partition of this task.
+        """
+        arrays = artifacts.read_arrays(path, kind="partition")
+        with artifacts.reading(path):
+            grid = Grid.from_counts(task.chart, arrays["grid_counts"])
+            return Partition(
+                modes=tuple(int(q) for q in arrays["modes"]),
+                parts=tuple(GridSet(grid, values) for values in arrays["signed_distance"]),
+                succeeds=arrays["succeeds"],
+            )
+
+
+def _mode_name(task: Task, mode: int) -> str:
+    return task.mode_names[mode] if mode < len(task.mode_names) else "?"
 
 
 def make_partition(task: Task, policy: Policy, critical: CriticalSet, cells: int) -> Partition:

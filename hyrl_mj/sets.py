@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -68,6 +67,17 @@ class Grid:
         sides = np.subtract(chart.high, chart.low)
         number = np.maximum(np.round(cells * sides / sides.max()).astype(int), 2)
         return Grid(chart, tuple(int(k) for k in number + ~np.array(chart.periodic)))
+
+    @staticmethod
+    def from_counts(chart: Chart, counts: np.ndarray) -> Grid:
+        """A grid with so many nodes along each coordinate.
+
+        Raises:
+            BadInput: their number is not that of the chart's coordinates.
+        """
+        if len(counts) != chart.dimension:
+            raise BadInput(f"a grid of {len(counts)} dimensions does not fit the chart {chart.names}")
+        return Grid(chart, tuple(int(n) for n in counts))
 
     @cached_property
     def spacing(self) -> np.ndarray:
@@ -203,12 +213,3 @@ def _unrolled(grid: Grid, mask: np.ndarray) -> tuple[np.ndarray, tuple[slice, ..
     wide = np.pad(mask, [(k, k) for k in extra], mode="wrap")
     return wide, tuple(slice(k, k + n) for k, n in zip(extra, grid.counts, strict=True))
 
-
-def grid_arrays(grid: Grid) -> dict[str, np.ndarray]:
-    """A grid as arrays, for an artifact."""
-    return {"grid_counts": np.array(grid.counts)}
-
-
-def grid_from(arrays: Mapping[str, np.ndarray], chart: Chart) -> Grid:
-    """The grid that `grid_arrays` described."""
-    return Grid(chart, tuple(int(n) for n in arrays["grid_counts"]))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from hyrl_mj.errors import BadArtifact, BadInput, unknown
 from hyrl_mj.noise import check_bound
+from hyrl_mj.tasks.base import Task
 
 PRESETS = ("fast", "paper", "smoke")
 
@@ -55,7 +56,7 @@ class Settings:
         stage6: training of each mode's policy (stage 6).
         cells: grid cells along the longest side of the chart; cells are square in chart units.
         rods: grid points along the longest side from which the search for critical points starts.
-        resolution: length of the last rods, as a share of the grid's cells.
+        resolution: length of the last rods, as a share of the first.
     """
 
     task: str
@@ -67,7 +68,7 @@ class Settings:
     stage6: Training
     cells: int
     rods: int
-    resolution: float = 0.02
+    resolution: float = 1 / 32
 
     def __post_init__(self) -> None:
         check_bound(self.noise)
@@ -95,3 +96,74 @@ class Settings:
             return Settings(**{**content, **stages})
         except (KeyError, TypeError) as error:
             raise BadArtifact(f"its settings are not those of this version ({error})") from error
+
+
+# The networks and samples of each preset, by algorithm: stage 1, then stage 6.
+_DQN_FAST = Training(
+    samples=200_000, envs=64, hidden=(64, 64), activation="relu", learning_rate=1e-3, anneal=True,
+    gamma=0.9664, symmetric=True,
+    options={
+        "buffer_size": 200_000, "learning_starts": 2_000, "batch_size": 256, "train_freq": 1,
+        "gradient_steps": 4, "target_update_interval": 3_000, "n_steps": 5,
+        "exploration_initial_eps": 1.0, "exploration_fraction": 0.5, "exploration_final_eps": 0.05,
+    },
+)
+_PPO_FAST = Training(
+    samples=160_000, envs=128, hidden=(64, 64), activation="tanh", learning_rate=3e-3, anneal=True,
+    gamma=0.95, symmetric=True, options={"n_steps": 32, "batch_size": 1024, "n_epochs": 8},
+)
+_PAPER = Training(
+    samples=1_000_000, envs=1, hidden=(64, 64), activation="relu", learning_rate=1.946e-4,
+    anneal=False, gamma=0.9664, symmetric=False,
+)
+_TRAINING: dict[str, dict[str, tuple[Training, Training]]] = {
+    "dqn": {
+        "fast": (
+            _DQN_FAST,
+            replace(
+                _DQN_FAST, samples=100_000, symmetric=False,
+                options={**_DQN_FAST.options, "exploration_initial_eps": 0.5},
+            ),
+        ),
+        "paper": (_PAPER, replace(_PAPER, samples=300_000)),
+        "smoke": (replace(_DQN_FAST, samples=10_000), replace(_DQN_FAST, samples=4_000, symmetric=False)),
+    },
+    "ppo": {
+        "fast": (_PPO_FAST, replace(_PPO_FAST, samples=100_000, symmetric=False)),
+        "paper": (
+            _PAPER,
+            replace(_PAPER, samples=100_000, hidden=(112, 112), learning_rate=3.45e-4, gamma=0.9637),
+        ),
+        "smoke": (replace(_PPO_FAST, samples=24_576), replace(_PPO_FAST, samples=8_192, symmetric=False)),
+    },
+}
+# Grid points along the longest side of the chart, by its dimension: search of M*, and sets.
+_RODS = {1: 120, 2: 120, 3: 24}
+_CELLS = {1: 2880, 2: 240, 3: 48}
+
+
+def preset(
+    task: Task, name: str = "fast", *, noise: float = 0.1, seed: int = 0, horizon: float | None = None
+) -> Settings:
+    """The settings of a preset.
+
+    Args:
+        task: what they are for.
+        name: "fast", "paper" (the paper's training), or "smoke" (seconds, to see that all runs).
+        noise: bound eps of the measurement noise that the controller has to survive.
+        seed: of everything random.
+        horizon: time T of the backward propagation [s]; by default the paper's.
+
+    Raises:
+        BadInput: an unknown preset, or a value that cannot be used.
+    """
+    if name not in PRESETS:
+        raise unknown("preset", name, PRESETS)
+    stage1, stage6 = _TRAINING[task.algorithm][name]
+    dimension = task.chart.dimension
+    return Settings(
+        task=task.name, preset=name, seed=seed, noise=noise,
+        horizon=task.horizon if horizon is None else horizon,
+        stage1=stage1, stage6=stage6,
+        cells=_CELLS[min(dimension, 3)], rods=_RODS[min(dimension, 3)],
+    )

@@ -58,7 +58,7 @@ class Rollout:
     Attributes:
         path: (K + 1, n, d) true chart points at the samples, periodic coordinates unwrapped.
         length: (n,) samples until the end of each run.
-        outcome: (n,) `Outcome`; RUNNING where the run was cut off before the task's time was up.
+        outcome: (n,) `Outcome`.
         q0: (n,) modes at the start.
         before: (K, n) modes at each sample before a jump, and
         q: (K, n) after it. Recorded only on demand, like the following.
@@ -141,7 +141,7 @@ def closed_loop(
             states.append(plant.state)
         progress.update(k + 1)
     progress.close()
-    if limit >= task.max_steps and not backward:
+    if not backward:
         late = outcome == Outcome.RUNNING
         outcome[late] = task.verdict(measurement[late])
     shapes = {"before": (), "q": (), "measured": (len(task.noisy),), "u": (len(task.inputs),)}

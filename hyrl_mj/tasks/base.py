@@ -17,7 +17,7 @@ from hyrl_mj.plant import Plant, input_limits
 
 
 class Outcome(IntEnum):
-    """How an episode stands, or ended."""
+    """How an episode stands, or ended. RUNNING at its end means that it was cut off on its way."""
 
     RUNNING = 0
     REACHED = 1
@@ -125,8 +125,9 @@ class Task(ABC):
     horizon: float
     #: the reward that no state is worse than; leaving a mode's extended set counts as this for ever
     worst_reward: float
-    #: the paper's replay starts (k, d)
+    #: the paper's replay starts (k, d), and how long they are watched [s]
     replay_starts: tuple[tuple[float, ...], ...]
+    replay_time: float
     #: what the runs of each mode do, in the order of the modes
     mode_names: tuple[str, ...]
     #: SB3 algorithm that trains it: "ppo" or "dqn"

@@ -25,6 +25,7 @@ class Vehicle(Task):
     horizon = 0.3
     worst_reward = 0.0
     replay_starts = ((0.0, -0.15), (0.0, -0.055), (0.0, 0.0), (0.0, 0.055), (0.0, 0.15))
+    replay_time = 3.0
     mode_names = ("left", "right")
     algorithm = "dqn"
     mirror = Mirror((1, 1, -1), (-1,))
@@ -92,7 +93,7 @@ class Vehicle(Task):
 
     def verdict(self, measurement: np.ndarray) -> np.ndarray:
         passed = measurement[:, 0] >= self.set_point[0] - ON_THE_LINE
-        return np.where(passed, Outcome.REACHED, Outcome.STALLED)
+        return np.where(passed, Outcome.REACHED, Outcome.RUNNING)
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         return rng.uniform((0.0, -1.0), (0.5, 1.0), (n, 2))

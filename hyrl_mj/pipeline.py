@@ -1,0 +1,336 @@
+"""The stages in order, and the run directory that they fill and resume from."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+from hyrl_mj import artifacts
+from hyrl_mj.critical_set import CriticalSet, find_critical_set
+from hyrl_mj.errors import BadArtifact, BadInput, NoRenderer, unknown
+from hyrl_mj.extended_sets import ExtendedSets, extend
+from hyrl_mj.hybrid import HybridController
+from hyrl_mj.noise import Noise
+from hyrl_mj.partition import Partition, make_partition
+from hyrl_mj.policies import MlpPolicy
+from hyrl_mj.settings import Settings, preset
+from hyrl_mj.simulation import HybridArc, simulate
+from hyrl_mj.tasks.base import Task, get_task
+
+Say = Callable[[str], None]
+PACKAGES = ("mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "mediapy")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run directory. What it holds is read when it is asked for.
+
+    Attributes:
+        path: the directory.
+        settings: how it was made.
+    """
+
+    path: Path
+    settings: Settings
+
+    @cached_property
+    def task(self) -> Task:
+        """The task."""
+        return get_task(self.settings.task)
+
+    @cached_property
+    def policy(self) -> MlpPolicy:
+        """The policy of stage 1."""
+        return self._of_task(MlpPolicy.load(self.path / "policy.safetensors"))
+
+    @cached_property
+    def critical_set(self) -> CriticalSet:
+        """M*, of stage 2."""
+        return CriticalSet.load(self.path / "critical_set.npz")
+
+    @cached_property
+    def partition(self) -> Partition:
+        """The parts M_i, of stage 3."""
+        return Partition.load(self.path / "partition.npz", self.task)
+
+    @cached_property
+    def extended_sets(self) -> ExtendedSets:
+        """The extended sets M_ext_i, of stage 5."""
+        return ExtendedSets.load(self.path / "extended_sets.npz", self.task)
+
+    @cached_property
+    def controller(self) -> HybridController:
+        """The hybrid controller, of stage 7."""
+        extended = self.extended_sets
+        policies = {
+            q: self._of_task(MlpPolicy.load(self.path / f"mode_{q}.safetensors"))
+            for q in extended.modes
+        }
+        return HybridController(
+            self.task, policies, dict(zip(extended.modes, extended.sets, strict=True))
+        )
+
+    def arcs(self) -> list[HybridArc]:
+        """The simulated arcs, in the order of their files' names."""
+        return [HybridArc.load(path) for path in sorted((self.path / "arcs").glob("*.npz"))]
+
+    def _of_task(self, policy: MlpPolicy) -> MlpPolicy:
+        if policy.task.name != self.settings.task:
+            raise BadArtifact(
+                f"{self.path} is a run of {self.settings.task}, but holds a policy for "
+                f"{policy.task.name}: run the stage that writes it again"
+            )
+        return policy
+
+
+def load_run(path: str | Path) -> Run:
+    """Open a run directory.
+
+    Raises:
+        BadArtifact: it is not one.
+    """
+    path = Path(path)
+    config = path / "config.json"
+    if not config.is_file():
+        raise BadArtifact(
+            f"{path} is not a run directory: it has no config.json; "
+            "make one with hyrl-mj run TASK --out DIR"
+        )
+    content = artifacts.read_json(config, kind="run")
+    with artifacts.reading(config):
+        return Run(path, Settings.from_json(content["settings"]))
+
+
+def write_config(run: Run) -> None:
+    """Write `config.json`: every setting, and the versions that go with them."""
+    versions = {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
+    content = {"settings": run.settings.to_json(), "versions": versions}
+    artifacts.write_json(run.path / "config.json", content, kind="run")
+
+
+def open_or_create(path: str | Path, settings: Settings) -> Run:
+    """The run directory at `path` with these settings, made if it is not there yet.
+
+    Raises:
+        BadInput: there is a run with other settings; the message names them.
+    """
+    path = Path(path)
+    if (path / "config.json").exists():
+        run = load_run(path)
+        if run.settings != settings:
+            old, new = run.settings.to_json(), settings.to_json()
+            differing = [name for name in new if old[name] != new[name]]
+            raise BadInput(
+                f"{path} holds a run with other settings ({', '.join(differing)}): "
+                "choose another --out, or remove it"
+            )
+        return run
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise BadInput(f"{path} is there and is not a run directory: choose another --out")
+    run = Run(path, settings)
+    write_config(run)
+    return run
+
+
+# ---- the stages: each reads the artifacts of those before it and writes its own
+
+
+def train_stage(run: Run, say: Say) -> None:
+    """Stage 1: train the policy."""
+    from hyrl_mj.training import train
+
+    s = run.settings
+    logs = run.path / "logs" / "stage1"
+    policy = train(run.task, s.stage1, s.seed, log_dir=logs, label="stage 1")
+    policy.save(run.path / "policy.safetensors")
+    say(f"policy of {sum(w.size for w in policy.weights.values())} weights")
+
+
+def critical_set_stage(run: Run, say: Say) -> None:
+    """Stage 2: find the critical set."""
+    s = run.settings
+    critical = find_critical_set(run.task, run.policy, s.rods, s.resolution)
+    critical.save(run.path / "critical_set.npz")
+    say(critical.sentence(run.task))
+
+
+def partition_stage(run: Run, say: Say) -> None:
+    """Stage 3: partition the chart."""
+    partition = make_partition(run.task, run.policy, run.critical_set, run.settings.cells)
+    partition.save(run.path / "partition.npz")
+    say(partition.sentence(run.task))
+
+
+def extended_sets_stage(run: Run, say: Say) -> None:
+    """Stages 4 and 5: extend the parts over the critical set."""
+    s = run.settings
+    sets = extend(run.task, run.policy, run.critical_set, run.partition, s.horizon, s.noise)
+    sets.save(run.path / "extended_sets.npz")
+    say(sets.sentence(run.task))
+
+
+def retrain_stage(run: Run, say: Say) -> None:
+    """Stages 6 and 7: train the policy of each mode."""
+    from hyrl_mj.retraining import retrain
+
+    s, sets = run.settings, run.extended_sets
+    for q in sets.modes:
+        logs = run.path / "logs" / f"mode_{q}"
+        policy = retrain(run.task, run.policy, sets, q, s.stage6, s.seed, logs)
+        policy.save(run.path / f"mode_{q}.safetensors")
+    say(f"policies of {len(sets.modes)} modes")
+
+
+def simulate_stage(run: Run, say: Say) -> None:
+    """Simulate the paper's replay starts, and one on M*, under the paper's noise."""
+    arcs = replay_arcs(run)
+    for name, arc in arcs.items():
+        arc.save(run.path / "arcs" / f"{name}.npz")
+    hyrl = [arc for arc in arcs.values() if arc.controller == "hyrl"]
+    reached = sum(arc.outcome == "reached" for arc in hyrl)
+    say(f"{len(arcs)} arcs; the hybrid controller reaches the set-point in {reached} of {len(hyrl)}")
+
+
+def replay_stage(run: Run, say: Say) -> None:
+    """Render the replay of the start on M*; without GL or ffmpeg say why, and go on."""
+    from hyrl_mj.replay import render_replay
+
+    try:
+        render_replay(run.task, critical_pairs(run), run.path / "replay.mp4")
+        say(f"video at {run.path / 'replay.mp4'}")
+    except NoRenderer as error:
+        say(f"no video: {error}")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of the pipeline: its function, and the files that tell that it has been done."""
+
+    name: str
+    work: Callable[[Run, Say], None]
+    outputs: tuple[str, ...]
+
+
+STAGES = (
+    Stage("train", train_stage, ("policy.safetensors", "policy.json")),
+    Stage("critical-set", critical_set_stage, ("critical_set.npz",)),
+    Stage("partition", partition_stage, ("partition.npz",)),
+    Stage("extended-sets", extended_sets_stage, ("extended_sets.npz",)),
+    Stage("retrain", retrain_stage, ("mode_*.safetensors",)),
+    Stage("simulate", simulate_stage, ("arcs/*.npz",)),
+    Stage("replay", replay_stage, ("replay.mp4",)),
+)
+
+
+def run_stage(run: Run, name: str, say: Say = print) -> Run:
+    """Run one stage from what is on disk; the run is returned anew, with its result.
+
+    Raises:
+        BadInput: there is no stage of that name.
+    """
+    stages = {stage.name: stage for stage in STAGES}
+    if name not in stages:
+        raise unknown("stage", name, stages)
+    stages[name].work(run, lambda text: say(f"{name}: {text}"))
+    return load_run(run.path)
+
+
+def done(run: Run, index: int) -> bool:
+    """Whether a stage's files are there and no older than those of the stages before it."""
+    times = [_times(run, stage) for stage in STAGES[: index + 1]]
+    earlier = [t for stage_times in times[:-1] for t in stage_times]
+    return bool(times[-1]) and min(times[-1]) >= max(earlier, default=0)
+
+
+def _times(run: Run, stage: Stage) -> list[int]:
+    found = [sorted(run.path.glob(pattern)) for pattern in stage.outputs]
+    return [p.stat().st_mtime_ns for paths in found for p in paths] if all(found) else []
+
+
+def run(
+    task: str,
+    *,
+    noise: float = 0.1,
+    seed: int = 0,
+    preset_name: str = "fast",
+    out: str | Path | None = None,
+    horizon: float | None = None,
+    say: Say = print,
+) -> Run:
+    """Run all stages, or those that are missing from the run directory.
+
+    Args:
+        task: its name.
+        noise: bound eps of the measurement noise to survive, in chart units.
+        seed: of everything random.
+        preset_name: "fast", "paper" or "smoke".
+        out: the run directory, by default `runs/<task>`.
+        horizon: time T of the backward propagation [s], by default the paper's.
+        say: told a line about each stage.
+
+    Raises:
+        BadInput: a value that cannot be used.
+    """
+    settings = preset(get_task(task), preset_name, noise=noise, seed=seed, horizon=horizon)
+    current = open_or_create(out or Path("runs") / task, settings)
+    for index, stage in enumerate(STAGES):
+        if done(current, index):
+            say(f"{stage.name}: done before")
+        else:
+            current = run_stage(current, stage.name, say)
+    return current
+
+
+def change_horizon(run: Run, horizon: float) -> Run:
+    """The run with another horizon T [s] in its `config.json`."""
+    run = Run(run.path, replace(run.settings, horizon=horizon))
+    write_config(run)
+    return run
+
+
+def critical_start(run: Run) -> np.ndarray | None:
+    """The point (d,) of M* that is nearest to the replay starts, or None if M* is empty."""
+    points = run.critical_set.points
+    if not len(points):
+        return None
+    centre = np.mean(run.task.replay_starts, axis=0)
+    return points[np.linalg.norm(run.task.chart.difference(points, centre), axis=1).argmin()]
+
+
+def replay_arcs(run: Run) -> dict[str, HybridArc]:
+    """The paper's replays (Section V), with a start on M* of our own added, by the names of their files.
+
+    Both controllers meet the same noise: alternating, with the run's bound.
+    """
+    starts: Sequence[tuple[float, ...] | np.ndarray] = list(run.task.replay_starts)
+    names = [f"start{i}" for i in range(len(starts))]
+    critical = critical_start(run)
+    if critical is not None:
+        starts, names = [*starts, critical], [*names, "critical"]
+    z0 = np.array(starts, dtype=float)
+    noise = Noise("alternating", run.settings.noise)
+    loops = [("policy", run.policy, 0)] + [("hyrl", run.controller, q) for q in run.controller.modes]
+    arcs = {}
+    for who, controller, q0 in loops:
+        found = simulate(
+            run.task, controller, z0, noise=noise, q0=q0, horizon=run.task.replay_time,
+            seed=run.settings.seed,
+        )
+        for name, arc in zip(names, found, strict=True):
+            arcs[f"{name}_{who}" + (f"_q{q0}" if who == "hyrl" else "")] = arc
+    return arcs
+
+
+def critical_pairs(run: Run) -> list[tuple[HybridArc, HybridArc]]:
+    """Stage-1 policy and hybrid controller from the same start on M*, for each start mode."""
+    folder = run.path / "arcs"
+    start = "critical" if (folder / "critical_policy.npz").is_file() else "start0"
+    policy = HybridArc.load(folder / f"{start}_policy.npz")
+    modes = run.controller.modes
+    return [(policy, HybridArc.load(folder / f"{start}_hyrl_q{q}.npz")) for q in modes]
