@@ -24,14 +24,14 @@ def retrain(
     seed: int,
     log_dir: Path | None = None,
 ) -> MlpPolicy:
-    """Train the policy of one mode, from the stage-1 policy (paper, Step 6).
+    """Train the policy of one mode (paper, Step 6).
 
     Measurements are noisy: a policy that passes an obstacle closer than the noise bound is led into
     it, and no switching cures that.
 
     Args:
         task: what to learn.
-        policy: the stage-1 policy, whose weights training starts from.
+        policy: the stage-1 policy; with `settings.warm_start` training goes on from its weights.
         extended: M_ext_i and W_i, from stage 5.
         mode: the mode to train.
         settings: how to train.
@@ -47,7 +47,7 @@ def retrain(
         seed=int(np.random.SeedSequence([seed, 1 + mode]).generate_state(1)[0]),
         noise=Noise("uniform", extended.noise),
         domain=domain,
-        start_from=policy,
+        start_from=policy if settings.warm_start else None,
         log_dir=log_dir,
         label=f"mode {mode}",
     )

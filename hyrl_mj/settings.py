@@ -28,6 +28,8 @@ class Training:
         gamma: discount factor.
         symmetric: whether the network is made to respect the task's mirror symmetry, if it has one.
             It then has twice the width.
+        warm_start: whether training goes on from the weights of stage 1 (stage 6 only). A Gaussian
+            policy that has made up its mind does not try the other way any more: PPO starts afresh.
         options: further keywords of the SB3 algorithm.
     """
 
@@ -39,6 +41,7 @@ class Training:
     anneal: bool
     gamma: float
     symmetric: bool
+    warm_start: bool = False
     options: dict[str, Any] = field(default_factory=dict)
 
 
@@ -121,20 +124,26 @@ _TRAINING: dict[str, dict[str, tuple[Training, Training]]] = {
         "fast": (
             _DQN_FAST,
             replace(
-                _DQN_FAST, samples=100_000, symmetric=False,
+                _DQN_FAST, samples=100_000, symmetric=False, warm_start=True,
                 options={**_DQN_FAST.options, "exploration_initial_eps": 0.5},
             ),
         ),
-        "paper": (_PAPER, replace(_PAPER, samples=300_000)),
-        "smoke": (replace(_DQN_FAST, samples=10_000), replace(_DQN_FAST, samples=4_000, symmetric=False)),
+        "paper": (_PAPER, replace(_PAPER, samples=300_000, warm_start=True)),
+        "smoke": (
+            replace(_DQN_FAST, samples=10_000),
+            replace(_DQN_FAST, samples=4_000, symmetric=False, warm_start=True),
+        ),
     },
     "ppo": {
-        "fast": (_PPO_FAST, replace(_PPO_FAST, samples=100_000, symmetric=False)),
+        "fast": (_PPO_FAST, replace(_PPO_FAST, gamma=0.98, symmetric=False)),
         "paper": (
             _PAPER,
             replace(_PAPER, samples=100_000, hidden=(112, 112), learning_rate=3.45e-4, gamma=0.9637),
         ),
-        "smoke": (replace(_PPO_FAST, samples=24_576), replace(_PPO_FAST, samples=8_192, symmetric=False)),
+        "smoke": (
+            replace(_PPO_FAST, samples=24_576),
+            replace(_PPO_FAST, samples=8_192, gamma=0.98, symmetric=False),
+        ),
     },
 }
 # Grid points along the longest side of the chart, by its dimension: search of M*, and sets.

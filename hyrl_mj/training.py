@@ -70,7 +70,7 @@ def train(
     noises = {Noise(), noise or Noise()}
 
     def score(policy: MlpPolicy) -> float:
-        returns = [mean_return(task, policy, kind, domain) for kind in noises]
+        returns = [mean_return(task, policy, kind, domain, settings.gamma) for kind in noises]
         return float(np.mean(returns))
 
     watch = _Watch(task, settings.samples, log_dir, label, score)
@@ -111,10 +111,6 @@ def build(
     if start_from is not None:
         state = {name: torch.as_tensor(np.array(w)) for name, w in start_from.weights.items()}
         model.policy.load_state_dict(state)
-        if isinstance(model, PPO):
-            # A trained agent hardly explores any more, but half of a mode's extended set asks it to go
-            # the other way.
-            nn.init.zeros_(model.policy.log_std)
     if mirrored:
         symmetry.impose(model.policy, task)
     return model
@@ -143,17 +139,22 @@ def single_threaded_torch() -> Iterator[None]:
 
 
 def mean_return(
-    task: Task, policy: MlpPolicy, noise: Noise, domain: Domain | None = None, episodes: int = EPISODES
+    task: Task,
+    policy: MlpPolicy,
+    noise: Noise,
+    domain: Domain | None = None,
+    gamma: float = 1.0,
+    episodes: int = EPISODES,
 ) -> float:
-    """Mean undiscounted return over episodes from the start distribution, always the same ones."""
+    """Mean return, discounted by gamma, over episodes from the start distribution, always the same."""
     env = BatchedEnv(task, episodes, noise=noise, domain=domain)
     env.seed(0)
     observation = env.reset()
-    returns, running = np.zeros(episodes), np.ones(episodes, dtype=bool)
-    while running.any():
+    returns, weight = np.zeros(episodes), np.ones(episodes)
+    while weight.any():
         result = env.step(policy.inputs(observation))
-        returns += np.where(running, result.reward, 0.0)
-        running &= ~result.done
+        returns += weight * result.reward
+        weight *= gamma * ~result.done
         observation = result.observation
     return float(returns.mean())
 
