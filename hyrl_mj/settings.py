@@ -30,6 +30,8 @@ class Training:
             It then has twice the width.
         warm_start: whether training goes on from the weights of stage 1 (stage 6 only). A Gaussian
             policy that has made up its mind does not try the other way any more: PPO starts afresh.
+        episode: samples until an episode is truncated, by default the task's; shorter ones see more of
+            the starts.
         options: further keywords of the SB3 algorithm.
     """
 
@@ -42,6 +44,7 @@ class Training:
     gamma: float
     symmetric: bool
     warm_start: bool = False
+    episode: int | None = None
     options: dict[str, Any] = field(default_factory=dict)
 
 
@@ -111,9 +114,10 @@ _DQN_FAST = Training(
         "exploration_initial_eps": 1.0, "exploration_fraction": 0.5, "exploration_final_eps": 0.05,
     },
 )
+# Short episodes: the decision falls in their first second.
 _PPO_FAST = Training(
     samples=160_000, envs=128, hidden=(64, 64), activation="tanh", learning_rate=3e-3, anneal=True,
-    gamma=0.95, symmetric=True, options={"n_steps": 32, "batch_size": 1024, "n_epochs": 8},
+    gamma=0.98, symmetric=True, episode=20, options={"n_steps": 32, "batch_size": 1024, "n_epochs": 8},
 )
 _PAPER = Training(
     samples=1_000_000, envs=1, hidden=(64, 64), activation="relu", learning_rate=1.946e-4,
@@ -135,14 +139,14 @@ _TRAINING: dict[str, dict[str, tuple[Training, Training]]] = {
         ),
     },
     "ppo": {
-        "fast": (_PPO_FAST, replace(_PPO_FAST, gamma=0.98, symmetric=False)),
+        "fast": (_PPO_FAST, replace(_PPO_FAST, symmetric=False, episode=40)),
         "paper": (
             _PAPER,
             replace(_PAPER, samples=100_000, hidden=(112, 112), learning_rate=3.45e-4, gamma=0.9637),
         ),
         "smoke": (
             replace(_PPO_FAST, samples=24_576),
-            replace(_PPO_FAST, samples=8_192, gamma=0.98, symmetric=False),
+            replace(_PPO_FAST, samples=8_192, symmetric=False, episode=40),
         ),
     },
 }

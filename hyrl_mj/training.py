@@ -98,9 +98,10 @@ def build(
     if mirrored:
         hidden = tuple(2 * width for width in hidden)
     rate = settings.learning_rate
+    env = BatchedEnv(task, settings.envs, noise=noise, domain=domain, max_steps=settings.episode)
     model = ALGORITHMS[task.algorithm](
         "MlpPolicy",
-        TaskVecEnv(BatchedEnv(task, settings.envs, noise=noise, domain=domain)),
+        TaskVecEnv(env),
         seed=seed,
         device="cpu",
         gamma=settings.gamma,

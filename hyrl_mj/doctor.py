@@ -1,0 +1,113 @@
+"""The doctor: what this machine has, what it lacks, and how to mend that."""
+
+from __future__ import annotations
+
+import os
+import platform
+import signal
+import subprocess
+import sys
+import tempfile
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+
+from hyrl_mj.errors import NoRenderer
+from hyrl_mj.rendering import GL_CURE, video
+
+# Distributions whose versions matter; not imported for it, since torch takes seconds.
+DISTRIBUTIONS = (
+    "mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "scipy", "safetensors", "mediapy",
+    "imageio-ffmpeg", "pillow",
+)
+RENDER_TIMEOUT = 60.0  # [s]
+
+_ONE_FRAME = """
+from hyrl_mj.errors import HyrlError
+from hyrl_mj.rendering import SceneRenderer
+from hyrl_mj.tasks import get_task, task_names
+try:
+    model = get_task(task_names()[0]).model
+    renderer = SceneRenderer(model, 64, 48)
+    renderer.place(model.qpos0, "overhead")
+    blank = renderer.draw().std() == 0
+    renderer.close()
+except HyrlError as error:
+    raise SystemExit(str(error))
+if blank:
+    raise SystemExit("the picture is blank")
+"""
+
+
+def report() -> tuple[list[str], bool]:
+    """Examine this machine.
+
+    Returns:
+        Lines for people, with the cure for what is missing; whether all is well.
+    """
+    lines = [f"python             {platform.python_version()}"]
+    missing = []
+    for name in DISTRIBUTIONS:
+        version = _version(name)
+        lines.append(f"{name:<18} {version or 'MISSING'}")
+        if version is None:
+            missing.append(name)
+    if missing:
+        lines.append(f"cure: pip install {' '.join(missing)}")
+    picture, film = _rendering_problem(), _encoding_problem()
+    lines.append(f"GL backend         MUJOCO_GL={os.environ.get('MUJOCO_GL', '(not set)')}")
+    lines.append(f"one picture        {'rendered' if picture is None else f'FAILED: {picture}'}")
+    lines.append(f"one video          {'encoded' if film is None else f'FAILED: {film}'}")
+    well = not missing and picture is None and film is None
+    if not well:
+        lines.append("Training and analysis need neither pictures nor videos.")
+    return lines, well
+
+
+def _version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _rendering_problem() -> str | None:
+    """Why no picture can be rendered, and the cure; None if one can.
+
+    In a child process: a broken GL driver may take its process down.
+    """
+    package = str(Path(__file__).resolve().parents[1])
+    paths = os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH")]))
+    try:
+        child = subprocess.run(
+            [sys.executable, "-c", _ONE_FRAME], env={**os.environ, "PYTHONPATH": paths},
+            capture_output=True, text=True, errors="replace", timeout=RENDER_TIMEOUT,
+        )
+    except subprocess.TimeoutExpired:
+        return f"no picture within {RENDER_TIMEOUT:g} s; {GL_CURE}"
+    if child.returncode == 0:
+        return None
+    if child.returncode < 0:
+        return f"the GL driver crashed ({_signal(-child.returncode)}); {GL_CURE}"
+    said = child.stderr.strip().splitlines() or ["it said nothing"]
+    return said[-1] if GL_CURE in said[-1] else f"{said[-1]}; {GL_CURE}"
+
+
+def _signal(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+def _encoding_problem() -> str | None:
+    """Why no video can be encoded, and the cure; None if one can."""
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            with video(Path(folder) / "trial.mp4", 64, 48, 10) as add:
+                for level in (0, 128, 255):
+                    add(np.full((48, 64, 3), level, dtype=np.uint8))
+        except NoRenderer as error:
+            return str(error)
+    return None

@@ -1,0 +1,62 @@
+"""The doctor finds what is missing, and says how to mend it."""
+
+from __future__ import annotations
+
+import imageio_ffmpeg
+import pytest
+
+from hyrl_mj import doctor
+
+
+@pytest.fixture
+def healthy(monkeypatch):
+    """A machine that renders and encodes, whatever this one can do."""
+    monkeypatch.setattr(doctor, "_rendering_problem", lambda: None)
+    monkeypatch.setattr(doctor, "_encoding_problem", lambda: None)
+
+
+def test_versions_without_importing(healthy):
+    lines, well = doctor.report()
+    text = "\n".join(lines)
+    assert well, text
+    assert "cure" not in text
+    for name in ("python", *doctor.DISTRIBUTIONS):
+        assert any(line.startswith(name + " ") for line in lines)
+
+
+def test_a_missing_distribution(healthy, monkeypatch):
+    monkeypatch.setattr(doctor, "DISTRIBUTIONS", ("numpy", "no-such-distribution"))
+    lines, well = doctor.report()
+    assert not well
+    assert "cure: pip install no-such-distribution" in lines
+
+
+def test_no_gl(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    monkeypatch.setattr(doctor, "_encoding_problem", lambda: None)
+    lines, well = doctor.report()
+    assert not well
+    (line,) = [line for line in lines if line.startswith("one picture")]
+    assert "FAILED" in line
+    assert line.count(doctor.GL_CURE) == 1
+
+
+@pytest.mark.parametrize(
+    ("code", "says"),
+    [("import os; os.abort()", "SIGABRT"), ("import time; time.sleep(60)", "within")],
+)
+def test_a_gl_driver_that_crashes_or_hangs(monkeypatch, code, says):
+    monkeypatch.setattr(doctor, "_ONE_FRAME", code)
+    monkeypatch.setattr(doctor, "RENDER_TIMEOUT", 2.0)
+    problem = doctor._rendering_problem()
+    assert problem is not None
+    assert says in problem
+    assert doctor.GL_CURE in problem
+
+
+def test_ffmpeg(monkeypatch, tmp_path):
+    assert doctor._encoding_problem() is None
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(tmp_path / "ffmpeg"))
+    problem = doctor._encoding_problem()
+    assert problem is not None
+    assert "pip install" in problem
