@@ -1,24 +1,42 @@
 """Find and compile MJCF models; read their geometry, so that it is written down nowhere else."""
 
+import importlib
 import os
 import sys
 from functools import lru_cache
 from pathlib import Path
 
 
-def choose_gl_backend() -> None:
-    """Ask MuJoCo for EGL on a Linux machine without a display, unless the user has chosen.
+def import_mujoco() -> str:
+    """Import MuJoCo with a GL backend that does not stop it, and tell why there is none, if so.
 
-    MuJoCo reads `MUJOCO_GL` when it is first imported, so this has to come before.
+    MuJoCo reads `MUJOCO_GL` when it is first imported, and with a backend that is unknown or not
+    installed the import itself fails. Training and analysis need no GL, so they go on without it.
     """
     headless = not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     if sys.platform.startswith("linux") and headless and "mujoco" not in sys.modules:
         os.environ.setdefault("MUJOCO_GL", "egl")
+    try:
+        importlib.import_module("mujoco")
+        return ""
+    # Each backend fails in its own way: RuntimeError, ImportError, AttributeError, ...
+    except Exception as error:
+        asked = os.environ.get("MUJOCO_GL", "")
+        if not asked:
+            raise
+        problem = f"{type(error).__name__}: {error}"
+    for name in [name for name in sys.modules if name.split(".")[0] == "mujoco"]:
+        del sys.modules[name]
+    os.environ["MUJOCO_GL"] = "disable"
+    importlib.import_module("mujoco")
+    os.environ["MUJOCO_GL"] = asked
+    return problem
 
 
-choose_gl_backend()
+# Why MuJoCo runs without GL although a backend was asked for; empty if it does not.
+GL_PROBLEM = import_mujoco()
 
-import mujoco  # noqa: E402  (after the choice of the backend)
+import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 
 from hyrl_mj.errors import BadInput, unknown  # noqa: E402

@@ -112,9 +112,8 @@ def video(
 
 def _no_gl(error: Exception) -> NoRenderer:
     backend = os.environ.get("MUJOCO_GL", "")
-    return NoRenderer(
-        f"off-screen rendering failed with MUJOCO_GL={backend!r} ({_short(error)}): {GL_CURE}"
-    )
+    cause = mjcf.GL_PROBLEM or _short(error)
+    return NoRenderer(f"off-screen rendering failed with MUJOCO_GL={backend!r} ({cause}): {GL_CURE}")
 
 
 def _short(error: Exception) -> str:
