@@ -40,7 +40,15 @@ def reading(path: Path) -> Iterator[None]:
         yield
     except BadArtifact as error:
         raise BadArtifact(f"{path}: {error}") from error
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, SafetensorError) as error:
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        EOFError,
+        zipfile.BadZipFile,
+        SafetensorError,
+    ) as error:
         raise BadArtifact(
             f"{path} cannot be read ({type(error).__name__}: {error}): it is truncated or not what "
             "its name says; run the stage that writes it again"
@@ -76,7 +84,8 @@ def read_json(path: Path, kind: str) -> dict[str, Any]:
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], kind: str) -> None:
     """Write named arrays as npz with their kind and version."""
     with replacing(path) as temporary:
-        np.savez_compressed(temporary, kind=np.array(kind), version=np.array(VERSION), **arrays)
+        content: dict[str, Any] = {"kind": kind, "version": VERSION, **arrays}
+        np.savez_compressed(temporary, **content)
 
 
 def read_arrays(path: Path, kind: str) -> dict[str, np.ndarray]:

@@ -177,7 +177,10 @@ def main() -> None:
     progress.enabled = sys.stderr.isatty()
     try:
         tyro.extras.subcommand_cli_from_dict(
-            COMMANDS, prog="hyrl-mj", description="Hysteresis-Based RL on MuJoCo.", sort_subcommands=False
+            COMMANDS,
+            prog="hyrl-mj",
+            description="Hysteresis-Based RL on MuJoCo.",
+            sort_subcommands=False,
         )
     except HyrlError as error:
         print(f"hyrl-mj: {error}", file=sys.stderr)
@@ -186,7 +189,9 @@ def main() -> None:
         print(f"hyrl-mj: {error.strerror}: {error.filename}", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:
-        print("hyrl-mj: interrupted; what was finished is kept, run again to resume", file=sys.stderr)
+        print(
+            "hyrl-mj: interrupted; what was finished is kept, run again to resume", file=sys.stderr
+        )
         sys.exit(130)
 
 

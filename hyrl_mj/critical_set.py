@@ -53,7 +53,9 @@ class CriticalSet:
             )
         low, high = self.points.min(axis=0), self.points.max(axis=0)
         ranges = ", ".join(
-            f"{name} {a:.4g} to {b:.4g} {unit}" if b - a > self.resolution else f"{name} {(a + b) / 2:.4g} {unit}"
+            f"{name} {a:.4g} to {b:.4g} {unit}"
+            if b - a > self.resolution
+            else f"{name} {(a + b) / 2:.4g} {unit}"
             for name, unit, a, b in zip(task.chart.names, task.chart.units, low, high, strict=True)
         )
         pieces = "1 piece" if self.pieces == 1 else f"{self.pieces} pieces"
@@ -121,7 +123,9 @@ def find_critical_set(task: Task, policy: Policy, cells: int, resolution: float)
         axis, length = np.tile(axis, 2), np.tile(length / 2, 2)
     centre = centre[_differ(task, policy, *_ends(task, centre, axis, length))]
     points = np.unique(task.chart.wrap(centre), axis=0) if len(centre) else np.empty((0, d))
-    return CriticalSet(points, _pieces(task, points, LINK * grid.cell), resolution * grid.cell, grid.cell)
+    return CriticalSet(
+        points, _pieces(task, points, LINK * grid.cell), resolution * grid.cell, grid.cell
+    )
 
 
 def _ends(

@@ -18,8 +18,16 @@ from hyrl_mj.rendering import GL_CURE, video
 
 # Distributions whose versions matter; not imported for it, since torch takes seconds.
 DISTRIBUTIONS = (
-    "mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "scipy", "safetensors", "mediapy",
-    "imageio-ffmpeg", "pillow",
+    "mujoco",
+    "gymnasium",
+    "stable-baselines3",
+    "torch",
+    "numpy",
+    "scipy",
+    "safetensors",
+    "mediapy",
+    "imageio-ffmpeg",
+    "pillow",
 )
 RENDER_TIMEOUT = 60.0  # [s]
 
@@ -81,8 +89,12 @@ def _rendering_problem() -> str | None:
     paths = os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH")]))
     try:
         child = subprocess.run(
-            [sys.executable, "-c", _ONE_FRAME], env={**os.environ, "PYTHONPATH": paths},
-            capture_output=True, text=True, errors="replace", timeout=RENDER_TIMEOUT,
+            [sys.executable, "-c", _ONE_FRAME],
+            env={**os.environ, "PYTHONPATH": paths},
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=RENDER_TIMEOUT,
         )
     except subprocess.TimeoutExpired:
         return f"no picture within {RENDER_TIMEOUT:g} s; {GL_CURE}"

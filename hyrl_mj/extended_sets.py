@@ -45,7 +45,9 @@ class ExtendedSets:
             return "one mode, its set is everything"
         both = self.sets[0] & self.sets[1]
         share = both.mask.mean()
-        return f"{len(self.sets)} extended sets, the first two share {100 * share:.1f}% of the chart"
+        return (
+            f"{len(self.sets)} extended sets, the first two share {100 * share:.1f}% of the chart"
+        )
 
     def save(self, path: Path) -> None:
         """Write them as npz."""

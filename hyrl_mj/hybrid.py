@@ -72,7 +72,9 @@ class HybridController:
         measured = self.task.check_measurement(measured)
         q = np.asarray(q)
         if q.shape != (len(measured),):
-            raise BadInput(f"{len(measured)} measurements need q of shape ({len(measured)},), got {q.shape}")
+            raise BadInput(
+                f"{len(measured)} measurements need q of shape ({len(measured)},), got {q.shape}"
+            )
         self._check_modes(q)
         q_next = self._jump(q, self.task.z(measured))
         u = np.empty((len(measured), len(self.task.inputs)))

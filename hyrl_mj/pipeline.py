@@ -194,7 +194,9 @@ def simulate_stage(run: Run, say: Say) -> None:
         arc.save(run.path / "arcs" / f"{name}.npz")
     hyrl = [arc for arc in arcs.values() if arc.controller == "hyrl"]
     reached = sum(arc.outcome == "reached" for arc in hyrl)
-    say(f"{len(arcs)} arcs; the hybrid controller reaches the set-point in {reached} of {len(hyrl)}")
+    say(
+        f"{len(arcs)} arcs; the hybrid controller reaches the set-point in {reached} of {len(hyrl)}"
+    )
 
 
 def replay_stage(run: Run, say: Say) -> None:
@@ -315,13 +317,21 @@ def replay_arcs(run: Run) -> dict[str, HybridArc]:
         starts, names = [*starts, critical], [*names, "critical"]
     z0 = np.array(starts, dtype=float)
     noise = Noise("alternating", run.settings.noise)
-    loops = [("policy", run.policy, 0)] + [("hyrl", run.controller, q) for q in run.controller.modes]
+    loops = [("policy", run.policy, 0)] + [
+        ("hyrl", run.controller, q) for q in run.controller.modes
+    ]
     arcs = {}
     for who, controller, q0 in loops:
         found = simulate(
-            run.task, controller, z0, noise=noise, q0=q0, horizon=run.task.replay_time,
+            run.task,
+            controller,
+            z0,
+            noise=noise,
+            q0=q0,
+            horizon=run.task.replay_time,
             seed=run.settings.seed,
         )
+        assert isinstance(found, list)
         for name, arc in zip(names, found, strict=True):
             arcs[f"{name}_{who}" + (f"_q{q0}" if who == "hyrl" else "")] = arc
     return arcs

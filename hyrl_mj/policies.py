@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -13,11 +13,18 @@ from hyrl_mj import artifacts
 from hyrl_mj.errors import BadArtifact
 from hyrl_mj.tasks.base import Task, get_task
 
-ACTIVATIONS = {"relu": lambda x: np.maximum(x, 0), "tanh": np.tanh}
+
+def relu(x: np.ndarray) -> np.ndarray:
+    """max(x, 0), of any shape."""
+    return np.maximum(x, 0)
+
+
+ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"relu": relu, "tanh": np.tanh}
 # Rows that go through a network at a time: the hidden layers then stay in the processor's cache.
 CHUNK = 4096
 
 
+@runtime_checkable
 class Policy(Protocol):
     """Anything that answers a measurement with an input."""
 

@@ -16,8 +16,14 @@ class Progress:
 
     def __init__(self, label: str, total: int, unit: str):
         self._bar = tqdm(
-            desc=label, total=total, unit=f" {unit}", unit_scale=True, delay=0.5,
-            leave=False, dynamic_ncols=True, disable=not enabled,
+            desc=label,
+            total=total,
+            unit=f" {unit}",
+            unit_scale=True,
+            delay=0.5,
+            leave=False,
+            dynamic_ncols=True,
+            disable=not enabled,
         )
 
     def update(self, done: int) -> None:

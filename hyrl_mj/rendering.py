@@ -113,7 +113,9 @@ def video(
 def _no_gl(error: Exception) -> NoRenderer:
     backend = os.environ.get("MUJOCO_GL", "")
     cause = mjcf.GL_PROBLEM or _short(error)
-    return NoRenderer(f"off-screen rendering failed with MUJOCO_GL={backend!r} ({cause}): {GL_CURE}")
+    return NoRenderer(
+        f"off-screen rendering failed with MUJOCO_GL={backend!r} ({cause}): {GL_CURE}"
+    )
 
 
 def _short(error: Exception) -> str:

@@ -78,8 +78,10 @@ def render_replay(
         )
     layout = Layout(*size)
     shows = [
-        (Track(task, policy, f"RL policy ({task.algorithm.upper()})", modes=False),
-         Track(task, hybrid, f"HyRL, started in {_mode(task, hybrid.q[0])}", modes=True))
+        (
+            Track(task, policy, f"RL policy ({task.algorithm.upper()})", modes=False),
+            Track(task, hybrid, f"HyRL, started in {_mode(task, hybrid.q[0])}", modes=True),
+        )
         for policy, hybrid in pairs
     ]
     total = sum(_frames(show, fps) for show in shows)
@@ -213,8 +215,12 @@ def _disc(
 
 
 def _add(
-    scene: mujoco.MjvScene, kind: mujoco.mjtGeom, size: tuple[float, float, float],
-    pos: np.ndarray, axes: np.ndarray, colour: RGB,
+    scene: mujoco.MjvScene,
+    kind: mujoco.mjtGeom,
+    size: tuple[float, float, float],
+    pos: np.ndarray,
+    axes: np.ndarray,
+    colour: RGB,
 ) -> None:
     """Add a geom to the scene, unless a very long path has used up all there are."""
     if scene.ngeom < scene.maxgeom:

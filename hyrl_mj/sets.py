@@ -76,7 +76,9 @@ class Grid:
             BadInput: their number is not that of the chart's coordinates.
         """
         if len(counts) != chart.dimension:
-            raise BadInput(f"a grid of {len(counts)} dimensions does not fit the chart {chart.names}")
+            raise BadInput(
+                f"a grid of {len(counts)} dimensions does not fit the chart {chart.names}"
+            )
         return Grid(chart, tuple(int(n) for n in counts))
 
     @cached_property
@@ -117,8 +119,11 @@ class Grid:
         result = np.zeros(len(index))
         for corner in np.ndindex(*(2,) * len(self.counts)):
             weight = np.where(corner, share, 1 - share).prod(axis=1)
-            at = np.where(self.chart.periodic, (below + corner) % self.counts,
-                          np.minimum(below + corner, np.array(self.counts) - 1))
+            at = np.where(
+                self.chart.periodic,
+                (below + corner) % self.counts,
+                np.minimum(below + corner, np.array(self.counts) - 1),
+            )
             result += weight * values[np.ravel_multi_index(tuple(at.T), self.counts)]
         return result
 
@@ -137,7 +142,9 @@ class GridSet:
 
     def __post_init__(self) -> None:
         if self.values.shape != (np.prod(self.grid.counts),):
-            raise BadInput(f"{self.values.shape} signed distances do not fit {self.grid.counts} nodes")
+            raise BadInput(
+                f"{self.values.shape} signed distances do not fit {self.grid.counts} nodes"
+            )
         self.values.setflags(write=False)
 
     @staticmethod
@@ -190,8 +197,7 @@ class GridSet:
             ~wide, sampling=grid.spacing, return_distances=False, return_indices=True
         )
         index = [
-            (i[middle] - part.start) % n
-            for i, part, n in zip(at, middle, grid.counts, strict=True)
+            (i[middle] - part.start) % n for i, part, n in zip(at, middle, grid.counts, strict=True)
         ]
         return np.ravel_multi_index(tuple(index), grid.counts).ravel()
 
@@ -212,4 +218,3 @@ def _unrolled(grid: Grid, mask: np.ndarray) -> tuple[np.ndarray, tuple[slice, ..
     extra = [n // 2 + 1 if p else 0 for n, p in zip(grid.counts, grid.chart.periodic, strict=True)]
     wide = np.pad(mask, [(k, k) for k in extra], mode="wrap")
     return wide, tuple(slice(k, k + n) for k, n in zip(extra, grid.counts, strict=True))
-

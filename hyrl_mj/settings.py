@@ -106,29 +106,59 @@ class Settings:
 
 # The networks and samples of each preset, by algorithm: stage 1, then stage 6.
 _DQN_FAST = Training(
-    samples=200_000, envs=64, hidden=(64, 64), activation="relu", learning_rate=1e-3, anneal=True,
-    gamma=0.9664, symmetric=True,
+    samples=200_000,
+    envs=64,
+    hidden=(64, 64),
+    activation="relu",
+    learning_rate=1e-3,
+    anneal=True,
+    gamma=0.9664,
+    symmetric=True,
     options={
-        "buffer_size": 200_000, "learning_starts": 2_000, "batch_size": 256, "train_freq": 1,
-        "gradient_steps": 4, "target_update_interval": 3_000, "n_steps": 5,
-        "exploration_initial_eps": 1.0, "exploration_fraction": 0.5, "exploration_final_eps": 0.05,
+        "buffer_size": 200_000,
+        "learning_starts": 2_000,
+        "batch_size": 256,
+        "train_freq": 1,
+        "gradient_steps": 4,
+        "target_update_interval": 3_000,
+        "n_steps": 5,
+        "exploration_initial_eps": 1.0,
+        "exploration_fraction": 0.5,
+        "exploration_final_eps": 0.05,
     },
 )
 # Short episodes: the decision falls in their first second.
 _PPO_FAST = Training(
-    samples=160_000, envs=128, hidden=(64, 64), activation="tanh", learning_rate=3e-3, anneal=True,
-    gamma=0.98, symmetric=True, episode=20, options={"n_steps": 32, "batch_size": 1024, "n_epochs": 8},
+    samples=160_000,
+    envs=128,
+    hidden=(64, 64),
+    activation="tanh",
+    learning_rate=3e-3,
+    anneal=True,
+    gamma=0.98,
+    symmetric=True,
+    episode=20,
+    options={"n_steps": 32, "batch_size": 1024, "n_epochs": 8},
 )
 _PAPER = Training(
-    samples=1_000_000, envs=1, hidden=(64, 64), activation="relu", learning_rate=1.946e-4,
-    anneal=False, gamma=0.9664, symmetric=False,
+    samples=1_000_000,
+    envs=1,
+    hidden=(64, 64),
+    activation="relu",
+    learning_rate=1.946e-4,
+    anneal=False,
+    gamma=0.9664,
+    symmetric=False,
 )
 _TRAINING: dict[str, dict[str, tuple[Training, Training]]] = {
     "dqn": {
         "fast": (
             _DQN_FAST,
             replace(
-                _DQN_FAST, samples=100_000, symmetric=False, warm_start=True,
+                _DQN_FAST,
+                samples=100_000,
+                symmetric=False,
+                warm_start=True,
                 options={**_DQN_FAST.options, "exploration_initial_eps": 0.5},
             ),
         ),
@@ -142,7 +172,9 @@ _TRAINING: dict[str, dict[str, tuple[Training, Training]]] = {
         "fast": (_PPO_FAST, replace(_PPO_FAST, symmetric=False, episode=40)),
         "paper": (
             _PAPER,
-            replace(_PAPER, samples=100_000, hidden=(112, 112), learning_rate=3.45e-4, gamma=0.9637),
+            replace(
+                _PAPER, samples=100_000, hidden=(112, 112), learning_rate=3.45e-4, gamma=0.9637
+            ),
         ),
         "smoke": (
             replace(_PPO_FAST, samples=24_576),
@@ -156,7 +188,12 @@ _CELLS = {1: 2880, 2: 240, 3: 48}
 
 
 def preset(
-    task: Task, name: str = "fast", *, noise: float = 0.1, seed: int = 0, horizon: float | None = None
+    task: Task,
+    name: str = "fast",
+    *,
+    noise: float = 0.1,
+    seed: int = 0,
+    horizon: float | None = None,
 ) -> Settings:
     """The settings of a preset.
 
@@ -175,8 +212,13 @@ def preset(
     stage1, stage6 = _TRAINING[task.algorithm][name]
     dimension = task.chart.dimension
     return Settings(
-        task=task.name, preset=name, seed=seed, noise=noise,
+        task=task.name,
+        preset=name,
+        seed=seed,
+        noise=noise,
         horizon=task.horizon if horizon is None else horizon,
-        stage1=stage1, stage6=stage6,
-        cells=_CELLS[min(dimension, 3)], rods=_RODS[min(dimension, 3)],
+        stage1=stage1,
+        stage6=stage6,
+        cells=_CELLS[min(dimension, 3)],
+        rods=_RODS[min(dimension, 3)],
     )

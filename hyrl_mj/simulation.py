@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadInput
@@ -136,7 +137,12 @@ def closed_loop(
         if not backward:
             outcome[active] = task.ending(measurement[active])
         if record:
-            for name, value in (("before", before), ("q", q.copy()), ("measured", measured), ("u", u)):
+            for name, value in (
+                ("before", before),
+                ("q", q.copy()),
+                ("measured", measured),
+                ("u", u),
+            ):
                 kept[name].append(value)
             states.append(plant.state)
         progress.update(k + 1)
@@ -203,14 +209,14 @@ class HybridArc:
         """
         arrays = artifacts.read_arrays(path, kind="hybrid arc")
         with artifacts.reading(path):
-            values = {f.name: arrays[f.name] for f in fields(HybridArc)}
+            values: dict[str, Any] = {f.name: arrays[f.name] for f in fields(HybridArc)}
             return HybridArc(**{k: v.item() if v.ndim == 0 else v for k, v in values.items()})
 
 
 def simulate(
     task: Task,
     controller: Controller | Policy,
-    z0: np.ndarray,
+    z0: ArrayLike,
     noise: Noise | None = None,
     q0: int | np.ndarray | None = None,
     horizon: float | None = None,
@@ -238,17 +244,16 @@ def simulate(
     single = np.ndim(z0) == 1
     starts = task.check_state(z0)
     steps = None if horizon is None else _steps(task, horizon)
-    if not isinstance(controller, PolicyController) and hasattr(controller, "act"):
-        controller = PolicyController(controller)
+    loop = PolicyController(controller) if isinstance(controller, Policy) else controller
     if q0 is not None:
         q0 = np.broadcast_to(np.asarray(q0), len(starts))
-        unknown = q0[~np.isin(q0, controller.modes)]
+        unknown = q0[~np.isin(q0, loop.modes)]
         if len(unknown):
-            raise BadInput(f"mode {unknown[0]} is unknown: choose one of {controller.modes}")
+            raise BadInput(f"mode {unknown[0]} is unknown: choose one of {loop.modes}")
     rollout = closed_loop(
-        task, controller, starts, noise=noise, q0=q0, steps=steps, seed=seed, record=True
+        task, loop, starts, noise=noise, q0=q0, steps=steps, seed=seed, record=True
     )
-    name = name or ("policy" if isinstance(controller, PolicyController) else "hyrl")
+    name = name or ("policy" if isinstance(loop, PolicyController) else "hyrl")
     arcs = [_arc(task, name, rollout, i, noise or Noise()) for i in range(len(starts))]
     return arcs[0] if single else arcs
 
@@ -273,9 +278,18 @@ def _arc(task: Task, name: str, rollout: Rollout, i: int, noise: Noise) -> Hybri
     u = _ended(rollout.u[:end, i])[rows]
     u[old] = np.nan
     return HybridArc(
-        task=task.name, controller=name, t=rows * task.dt, j=jumps[rows] - old,
-        z=rollout.path[rows, i], measured=_ended(rollout.measured[:end, i])[rows], q=q, u=u, state=rollout.state[rows, i],
-        outcome=Outcome(rollout.outcome[i]).label, noise=noise.kind, bound=noise.bound,
+        task=task.name,
+        controller=name,
+        t=rows * task.dt,
+        j=jumps[rows] - old,
+        z=rollout.path[rows, i],
+        measured=_ended(rollout.measured[:end, i])[rows],
+        q=q,
+        u=u,
+        state=rollout.state[rows, i],
+        outcome=Outcome(rollout.outcome[i]).label,
+        noise=noise.kind,
+        bound=noise.bound,
     )
 
 

@@ -9,6 +9,8 @@ the first with the mirrored second. The result is a plain network of twice the w
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import nn
@@ -17,7 +19,7 @@ from torch.nn.utils import parametrize
 from hyrl_mj.tasks.base import Task
 
 
-def impose(policy: nn.Module, task: Task) -> None:
+def impose(policy: Any, task: Task) -> None:
     """Tie the weights of an SB3 MLP policy (PPO or DQN) so that it respects `task.mirror`.
 
     Args:
@@ -39,7 +41,9 @@ def impose(policy: nn.Module, task: Task) -> None:
         _tie([*policy.mlp_extractor.value_net, policy.value_net], signs, torch.eye(1))
     rate = policy.optimizer.param_groups[0]["lr"]
     trained = policy.q_net if task.algorithm == "dqn" else policy
-    policy.optimizer = policy.optimizer_class(trained.parameters(), lr=rate, **policy.optimizer_kwargs)
+    policy.optimizer = policy.optimizer_class(
+        trained.parameters(), lr=rate, **policy.optimizer_kwargs
+    )
 
 
 def plain_state(policy: nn.Module) -> dict[str, torch.Tensor]:

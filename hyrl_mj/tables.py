@@ -16,7 +16,9 @@ def print_summary(run: Run) -> None:
     """Print how policy and hybrid controller did from the replay starts, under the same noise."""
     arcs = replayed(run)
     modes = run.controller.modes
-    table = Table(title=f"{run.task.name}: alternating noise {run.settings.noise:g}, seed {run.settings.seed}")
+    table = Table(
+        title=f"{run.task.name}: alternating noise {run.settings.noise:g}, seed {run.settings.seed}"
+    )
     table.add_column("start")
     table.add_column(f"policy ({run.policy.algorithm.upper()})")
     for q in modes:
@@ -32,7 +34,13 @@ def print_summary(run: Run) -> None:
     print(run.critical_set.sentence(run.task))
     for q in modes:
         print(f"mode {q}: {extent(run, q)}")
-    hyrl = [a for name, row in arcs.items() if name != "critical" for k, a in row.items() if k != "policy"]
+    hyrl = [
+        a
+        for name, row in arcs.items()
+        if name != "critical"
+        for k, a in row.items()
+        if k != "policy"
+    ]
     reached = sum(arc.outcome == "reached" for arc in hyrl)
     print(f"HyRL reaches the set-point from {reached} of {len(hyrl)} of the paper's starts")
     video = run.path / "replay.mp4"
@@ -58,7 +66,9 @@ def extent(run: Run, mode: int) -> str:
         inside = members.mask
         nodes = members.grid.nodes[:, 0]
         ends = nodes[inside & ~np.roll(inside, -1)], nodes[inside & ~np.roll(inside, 1)]
-        arcs = ", ".join(f"{a / np.pi:.3f} pi to {b / np.pi:.3f} pi" for b, a in zip(*ends, strict=True))
+        arcs = ", ".join(
+            f"{a / np.pi:.3f} pi to {b / np.pi:.3f} pi" for b, a in zip(*ends, strict=True)
+        )
         return f"{name}, extended set {arcs}"
     return f"{name}, extended set {100 * members.mask.mean():.1f}% of the chart"
 

@@ -91,7 +91,9 @@ def build(
 ) -> BaseAlgorithm:
     """The SB3 algorithm that `train` runs, ready to learn."""
     if task.algorithm not in ALGORITHMS:
-        raise BadInput(f"algorithm {task.algorithm!r} is unknown: choose one of {', '.join(ALGORITHMS)}")
+        raise BadInput(
+            f"algorithm {task.algorithm!r} is unknown: choose one of {', '.join(ALGORITHMS)}"
+        )
     hidden = settings.hidden if start_from is None else start_from.hidden
     activation = settings.activation if start_from is None else start_from.activation
     mirrored = settings.symmetric and start_from is None and task.mirror is not None

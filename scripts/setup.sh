@@ -14,29 +14,31 @@ if [ -z "$python" ]; then
   exit 2
 fi
 
-# Rendering without a screen takes a GL library that pip does not bring. Without root there is no video,
+# Installs Debian packages if we may: as root, or with a sudo that asks for no password.
+apt_install() {
+  local as_root=""
+  [ "$(id -u)" = 0 ] || as_root="sudo -n"
+  command -v apt-get >/dev/null && $as_root true 2>/dev/null || return 1
+  echo "Installing $* ..."
+  { $as_root apt-get update -qq && $as_root apt-get install -y -qq "$@"; } >/dev/null 2>&1
+}
+
+# Rendering without a screen takes a GL library that pip does not bring. Without it there is no video,
 # and everything else runs.
 if [ "$(uname)" = Linux ] && ! ldconfig -p 2>/dev/null | grep -q 'libEGL\.so\.1'; then
-  as_root=""
-  [ "$(id -u)" = 0 ] || as_root="sudo -n"
-  if command -v apt-get >/dev/null && $as_root true 2>/dev/null; then
-    echo "Installing libegl1 and libgl1-mesa-dri for off-screen rendering ..."
-    { $as_root apt-get update -qq && $as_root apt-get install -y -qq libegl1 libgl1-mesa-dri; } \
-      >/dev/null 2>&1 || echo "That failed: there will be no videos."
-  else
+  apt_install libegl1 libgl1-mesa-dri ||
     echo "There will be no videos: for them, apt-get install libegl1 libgl1-mesa-dri as root."
-  fi
 fi
 
 venv="${HYRL_MJ_VENV:-.venv}"
-if ! [ -x "$venv/bin/python" ]; then
+if ! [ -x "$venv/bin/pip" ]; then
   echo "Making a virtual environment in $venv ..."
-  if ! "$python" -m venv "$venv" 2>/dev/null; then
-    # Debian ships venv without pip's installer unless python3-venv is there.
-    rm -rf "$venv"
-    echo "Python's venv module is incomplete: apt-get install python3-venv, and run this again." >&2
-    exit 2
-  fi
+  # Debian ships Python without what venv needs to bring pip along.
+  "$python" -m venv "$venv" >/dev/null 2>&1 ||
+    { apt_install python3-venv && "$python" -m venv --clear "$venv" >/dev/null; } || {
+      echo "Python's venv is incomplete: apt-get install python3-venv as root, and run this again." >&2
+      exit 2
+    }
 fi
 echo "Installing hyrl_mj into $venv (a minute or two the first time) ..."
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable "$1"

@@ -19,7 +19,8 @@ from hyrl_mj.tasks.base import Outcome, Task, get_task, task_names
 
 def observation_space(task: Task) -> spaces.Box:
     """The space of a task's observations."""
-    low, high = np.float32(task.observation_low), np.float32(task.observation_high)
+    low = np.array(task.observation_low, dtype=np.float32)
+    high = np.array(task.observation_high, dtype=np.float32)
     return spaces.Box(low, high, dtype=np.float32)
 
 
@@ -86,7 +87,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
         return result.observation[0], float(result.reward[0]), terminated, truncated, info
 
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
+    def render(self) -> np.ndarray | None:
         """The scene as (height, width, 3) uint8 in render mode "rgb_array", else None."""
         if self.render_mode is None:
             return None
@@ -136,7 +137,7 @@ class TaskVectorEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
-    def reset(  # type: ignore[override]
+    def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start all episodes, at the chart points `options["z"]` (n, d) if given."""

@@ -3,4 +3,13 @@
 from hyrl_mj.tasks import unit_circle, vehicle
 from hyrl_mj.tasks.base import Chart, Outcome, Task, get_task, register, task_names
 
-__all__ = ["Chart", "Outcome", "Task", "get_task", "register", "task_names", "unit_circle", "vehicle"]
+__all__ = [
+    "Chart",
+    "Outcome",
+    "Task",
+    "get_task",
+    "register",
+    "task_names",
+    "unit_circle",
+    "vehicle",
+]

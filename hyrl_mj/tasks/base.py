@@ -9,6 +9,7 @@ from functools import cached_property
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from hyrl_mj import mjcf
@@ -168,7 +169,7 @@ class Task(ABC):
         """n copies of the robot."""
         return Plant(self.model, self.inputs, n, threads)
 
-    def check_state(self, z: np.ndarray) -> np.ndarray:
+    def check_state(self, z: ArrayLike) -> np.ndarray:
         """Chart points as a float array (n, d).
 
         Raises:
@@ -177,7 +178,9 @@ class Task(ABC):
         try:
             z = np.atleast_2d(np.asarray(z, dtype=float))
         except (TypeError, ValueError):
-            raise BadInput(f"a state of {self.name} is {self.chart.dimension} numbers, got {z!r}") from None
+            raise BadInput(
+                f"a state of {self.name} is {self.chart.dimension} numbers, got {z!r}"
+            ) from None
         if z.ndim != 2 or z.shape[1] != self.chart.dimension:
             raise BadInput(
                 f"a state of {self.name} is {self.chart.dimension} number(s) "
@@ -188,8 +191,12 @@ class Task(ABC):
             arena = ", ".join(
                 f"{low:g} <= {name} <= {high:g} {unit}"
                 for name, unit, low, high, periodic in zip(
-                    self.chart.names, self.chart.units, self.chart.low, self.chart.high,
-                    self.chart.periodic, strict=True,
+                    self.chart.names,
+                    self.chart.units,
+                    self.chart.low,
+                    self.chart.high,
+                    self.chart.periodic,
+                    strict=True,
                 )
                 if not periodic
             )

@@ -40,7 +40,7 @@ class UnitCircle(Task):
 
     def error(self, theta: np.ndarray) -> np.ndarray:
         """Angle from the set-point in [-pi, pi]: (n,) [rad]."""
-        return self.chart.difference(theta, self.set_point)[:, 0]
+        return self.chart.difference(theta, np.array([self.set_point]))[:, 0]
 
     def observation(self, measured: np.ndarray) -> np.ndarray:
         return np.hstack([np.cos(measured), np.sin(measured)])

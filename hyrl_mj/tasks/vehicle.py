@@ -62,7 +62,7 @@ class Vehicle(Task):
 
     @cached_property
     def observation_high(self) -> tuple[float, ...]:  # type: ignore[override]
-        diagonal = np.linalg.norm(self.arena[1] - self.arena[0])
+        diagonal = float(np.linalg.norm(self.arena[1] - self.arena[0]))
         return (2 * diagonal, 2 * diagonal, 2 * self.arena[1][1])
 
     def clearance(self, z: np.ndarray) -> np.ndarray:
