@@ -106,8 +106,8 @@ def simulate_run(
     kind = Noise(noise, run.settings.noise if eps is None else eps)
     z0 = run.task.check_state([start])[0]
     loops = (("policy", run.policy, None), ("hyrl", run.controller, q0))
-    for name, controller, mode in loops:
-        arc = simulate(run.task, controller, z0, kind, mode, horizon, seed)
+    arcs = {name: simulate(run.task, c, z0, kind, q, horizon, seed) for name, c, q in loops}
+    for name, arc in arcs.items():
         assert isinstance(arc, HybridArc)
         arc.save(run.path / "arcs" / f"latest_{name}.npz")
         end = run.task.chart.format(arc.z[-1])

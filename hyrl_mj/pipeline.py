@@ -180,11 +180,15 @@ def retrain_stage(run: Run, say: Say) -> None:
     from hyrl_mj.retraining import retrain
 
     s, sets = run.settings, run.extended_sets
-    for q in sets.modes:
-        logs = run.path / "logs" / f"mode_{q}"
-        policy = retrain(run.task, run.policy, sets, q, s.stage6, s.seed, logs)
+    logs = run.path / "logs"
+    # Saved together, so that an interrupted stage does not look done.
+    policies = {
+        q: retrain(run.task, run.policy, sets, q, s.stage6, s.seed, logs / f"mode_{q}")
+        for q in sets.modes
+    }
+    for q, policy in policies.items():
         policy.save(run.path / f"mode_{q}.safetensors")
-    say(f"policies of {len(sets.modes)} modes")
+    say(f"policies of {len(policies)} modes")
 
 
 def simulate_stage(run: Run, say: Say) -> None:
@@ -225,7 +229,7 @@ STAGES = (
     Stage("partition", partition_stage, ("partition.npz",)),
     Stage("extended-sets", extended_sets_stage, ("extended_sets.npz",)),
     Stage("retrain", retrain_stage, ("mode_*.safetensors",)),
-    Stage("simulate", simulate_stage, ("arcs/*.npz",)),
+    Stage("simulate", simulate_stage, ("arcs/start*.npz",)),
     Stage("replay", replay_stage, ("replay.mp4",)),
 )
 
