@@ -133,7 +133,8 @@ def _ends(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The two ends (n, d), (n, d) of rods, kept inside the chart."""
     offset = np.zeros_like(centre)
-    offset[np.arange(len(centre)), axis] = length / 2
+    # A hair longer than the grid: halves of a rod overlap, and M* cannot fall between them.
+    offset[np.arange(len(centre)), axis] = length / 2 * (1 + 1e-9)
     low = np.where(task.chart.periodic, -np.inf, task.chart.low)
     high = np.where(task.chart.periodic, np.inf, task.chart.high)
     return np.clip(centre - offset, low, high), np.clip(centre + offset, low, high)

@@ -30,6 +30,13 @@ class HybridController:
     policies: Mapping[int, Policy]
     flow_sets: Mapping[int, StateSet]
 
+    def __post_init__(self) -> None:
+        if set(self.policies) != set(self.flow_sets) or not self.policies:
+            raise BadInput(
+                f"policies of modes {sorted(self.policies)} do not fit flow sets of modes "
+                f"{sorted(self.flow_sets)}: give one of each for every mode"
+            )
+
     @property
     def modes(self) -> tuple[int, ...]:
         """The modes, in ascending order."""

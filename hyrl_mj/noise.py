@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 
@@ -55,6 +56,6 @@ def check_bound(bound: float) -> float:
     Raises:
         BadInput: it is negative, infinite or not a number.
     """
-    if not (isinstance(bound, int | float) and math.isfinite(bound) and bound >= 0):
+    if not (isinstance(bound, Real) and math.isfinite(bound) and bound >= 0):
         raise BadInput(f"noise bound {bound!r} cannot be used: give a finite number >= 0")
     return float(bound)

@@ -10,6 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from hyrl_mj import artifacts
 from hyrl_mj.critical_set import CriticalSet, find_critical_set
@@ -243,7 +244,9 @@ def run_stage(run: Run, name: str, say: Say = print) -> Run:
     stages = {stage.name: stage for stage in STAGES}
     if name not in stages:
         raise unknown("stage", name, stages)
-    stages[name].work(run, lambda text: say(f"{name}: {text}"))
+    # The physics has the cores; BLAS threads that wait for one of them only stall.
+    with threadpool_limits(1, user_api="blas"):
+        stages[name].work(run, lambda text: say(f"{name}: {text}"))
     return load_run(run.path)
 
 

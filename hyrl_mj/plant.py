@@ -67,15 +67,15 @@ class Plant:
         Args:
             qpos: (k, nq) generalised positions, k the number of copies addressed.
             qvel: (k, nv) generalised velocities; zero by default.
-            ids: (k,) indices of the copies.
+            ids: (k,) indices of the copies, ascending.
 
         Raises:
             BadInput: a wrong shape or a value that is not finite.
         """
         count = self.n if ids is None else len(ids)
-        qpos = _checked("qpos", qpos, (count, self.model.nq))
+        qpos = _checked("qpos", qpos, (count, self.model.nq), ids)
         qvel = np.zeros((count, self.model.nv)) if qvel is None else qvel
-        qvel = _checked("qvel", qvel, (count, self.model.nv))
+        qvel = _checked("qvel", qvel, (count, self.model.nv), ids)
         rows = slice(None) if ids is None else ids
         self._qpos[rows], self._qvel[rows] = qpos, qvel
         self._ctrl[rows] = self._held
@@ -86,7 +86,7 @@ class Plant:
 
         Args:
             u: (k, m) inputs in the plant's physical units.
-            ids: (k,) indices of the copies.
+            ids: (k,) indices of the copies, ascending.
 
         Raises:
             BadInput: a wrong shape, a value that is not finite, or one outside the input limits.
@@ -117,12 +117,12 @@ class Plant:
 
     def _controls(self, u: np.ndarray, ids: np.ndarray | None) -> np.ndarray:
         count = self.n if ids is None else len(ids)
-        u = _checked("input", u, (count, len(self.columns)))
+        u = _checked("input", u, (count, len(self.columns)), ids)
         wrong = (u < self.low - INPUT_TOLERANCE) | (u > self.high + INPUT_TOLERANCE)
         if wrong.any():
             row, column = np.argwhere(wrong)[0]
             raise BadInput(
-                f"input {u[row, column]:g} in simulation {row if ids is None else ids[row]} is "
+                f"input {u[row, column]:g} of simulation {row if ids is None else ids[row]} is "
                 f"outside the limits [{self.low[column]:g}, {self.high[column]:g}] of the MJCF"
             )
         ctrl = np.tile(self._held, (count, 1))
@@ -158,12 +158,17 @@ def input_limits(model: mujoco.MjModel, inputs: Sequence[str]) -> tuple[np.ndarr
     return low.copy(), high.copy()
 
 
-def _checked(name: str, values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def _checked(
+    name: str, values: np.ndarray, shape: tuple[int, int], ids: np.ndarray | None
+) -> np.ndarray:
     values = np.asarray(values, dtype=float)
     if values.shape != shape:
         raise BadInput(f"{name} has shape {values.shape}, it must be {shape}")
     bad = ~np.isfinite(values)
     if bad.any():
         row, column = np.argwhere(bad)[0]
-        raise BadInput(f"{name}[{row}, {column}] is {values[row, column]}, it must be finite")
+        simulation = row if ids is None else ids[row]
+        raise BadInput(
+            f"{name}[{column}] of simulation {simulation} is {values[row, column]}, it must be finite"
+        )
     return values

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -58,6 +59,17 @@ class MlpPolicy:
             raise BadArtifact(
                 f"the network takes {given[0]} and gives {given[1]} numbers, "
                 f"the task {self.task.name} needs {wanted[0]} and {wanted[1]}"
+            )
+        for (_, bias), (weight, _) in pairwise(layers):
+            if weight.shape[1] != len(bias):
+                raise BadArtifact(
+                    f"a layer gives {len(bias)} numbers and the next takes {weight.shape[1]}"
+                )
+        if not all(np.isfinite(w).all() and np.isfinite(b).all() for w, b in layers):
+            raise BadArtifact("the network has weights that are not finite")
+        if self.activation not in ACTIVATIONS:
+            raise BadArtifact(
+                f"activation {self.activation!r} is unknown: choose one of {', '.join(ACTIVATIONS)}"
             )
         object.__setattr__(self, "_network", layers)
 

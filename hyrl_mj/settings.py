@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, field, replace
+from numbers import Integral, Real
 from typing import Any
 
 from hyrl_mj.errors import BadArtifact, BadInput, unknown
@@ -78,10 +79,12 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_bound(self.noise)
-        if not (math.isfinite(self.horizon) and self.horizon > 0):
-            raise BadInput(f"horizon {self.horizon} s cannot be used: give a finite time > 0")
-        if self.seed < 0:
-            raise BadInput(f"seed {self.seed} cannot be used: give an integer >= 0")
+        if not (
+            isinstance(self.horizon, Real) and math.isfinite(self.horizon) and self.horizon > 0
+        ):
+            raise BadInput(f"horizon {self.horizon!r} s cannot be used: give a finite time > 0")
+        if not isinstance(self.seed, Integral) or self.seed < 0:
+            raise BadInput(f"seed {self.seed!r} cannot be used: give an integer >= 0")
 
     def to_json(self) -> dict[str, Any]:
         """As nested dicts."""

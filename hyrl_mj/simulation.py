@@ -152,6 +152,7 @@ def closed_loop(
         outcome[late] = task.verdict(measurement[late])
     shapes = {"before": (), "q": (), "measured": (len(task.noisy),), "u": (len(task.inputs),)}
     arrays = {k: np.array(values).reshape(-1, n, *shapes[k]) for k, values in kept.items()}
+    arrays |= {k: arrays[k].astype(int) for k in ("before", "q")}
     return Rollout(np.array(path), length, outcome, first_mode, **arrays, state=np.array(states))
 
 
@@ -246,7 +247,12 @@ def simulate(
     steps = None if horizon is None else _steps(task, horizon)
     loop = PolicyController(controller) if isinstance(controller, Policy) else controller
     if q0 is not None:
-        q0 = np.broadcast_to(np.asarray(q0), len(starts))
+        q0 = np.asarray(q0)
+        if q0.shape not in ((), (len(starts),)):
+            raise BadInput(
+                f"{len(starts)} starts need one q0 or {len(starts)}, got shape {q0.shape}"
+            )
+        q0 = np.broadcast_to(q0, len(starts))
         unknown = q0[~np.isin(q0, loop.modes)]
         if len(unknown):
             raise BadInput(f"mode {unknown[0]} is unknown: choose one of {loop.modes}")

@@ -13,6 +13,7 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
+from threadpoolctl import threadpool_limits
 from torch import nn
 
 from hyrl_mj import symmetry
@@ -27,10 +28,13 @@ from hyrl_mj.tasks.base import Task
 
 ALGORITHMS: dict[str, type[PPO] | type[DQN]] = {"ppo": PPO, "dqn": DQN}
 ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}
+# How often TensorBoard gets a point: PPO counts rollouts, DQN episodes.
+LOG_INTERVAL = {"ppo": 1, "dqn": 100}
 # The learning rate falls to this share of its first value, not to zero: the last samples count too.
 FINAL_RATE = 0.02
-# How often the policy is evaluated, and checkpointed if it is the best so far; on how many episodes.
-EVALUATIONS = 15
+# How often the policy is evaluated in the second half of the training, and checkpointed if it is the
+# best so far; on how many episodes.
+EVALUATIONS = 8
 EPISODES = 256
 
 
@@ -74,8 +78,8 @@ def train(
         return float(np.mean(returns))
 
     watch = _Watch(task, settings.samples, log_dir, label, score)
-    with single_threaded_torch():
-        model.learn(settings.samples, callback=watch, log_interval=10)
+    with single_threaded():
+        model.learn(settings.samples, callback=watch, log_interval=LOG_INTERVAL[task.algorithm])
     assert watch.best is not None
     return watch.best
 
@@ -128,12 +132,12 @@ def export(model: BaseAlgorithm, task: Task) -> MlpPolicy:
 
 
 @contextmanager
-def single_threaded_torch() -> Iterator[None]:
-    """Small networks are faster on one thread, and their sums do not depend on the machine."""
+def single_threaded() -> Iterator[None]:
+    """One thread for torch and BLAS: small networks are faster, and sums do not depend on the machine."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), threadpool_limits(1, user_api="blas"):
             # SB3 wonders about large multiples of n_steps * n_envs; ours are chosen.
             warnings.simplefilter("ignore", UserWarning)
             yield
@@ -176,8 +180,8 @@ class _Watch(BaseCallback):
         super().__init__()
         self.best: MlpPolicy | None = None
         self._task, self._log_dir, self._score = task, log_dir, score
-        self._interval = max(samples // EVALUATIONS, 1)
-        self._next = self._interval
+        self._interval = max(samples // 2 // EVALUATIONS, 1)
+        self._next = samples // 2
         self._best_score = -np.inf
         self._progress = Progress(label, samples, "samples")
 

@@ -188,8 +188,12 @@ def test_without_gl_one_message_says_what_to_install():
         "except hyrl_mj.NoRenderer as error: print(error)\n"
     )
     child = subprocess.run(
-        [sys.executable, "-c", code], env={**os.environ, "MUJOCO_GL": "disable"},
-        capture_output=True, text=True, check=True, timeout=60,
+        [sys.executable, "-c", code],
+        env={**os.environ, "MUJOCO_GL": "disable"},
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
     )
     assert "MUJOCO_GL='disable'" in child.stdout
     assert "apt-get install libegl1 libgl1-mesa-dri" in child.stdout

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hyrl_mj.errors import BadInput
 from hyrl_mj.noise import Noise
 from hyrl_mj.tasks.base import Outcome, Task
 
@@ -132,9 +133,16 @@ class BatchedEnv:
     def inputs(self, actions: np.ndarray) -> np.ndarray:
         """Inputs (n, m) in the plant's units for actions: levels (n,) int, or inputs (n, m) to clip."""
         levels = self.task.input_levels
-        if levels is not None:
-            return levels[np.asarray(actions, dtype=int)]
-        return np.clip(np.asarray(actions, dtype=float), *self.task.input_limits)
+        if levels is None:
+            return np.clip(np.asarray(actions, dtype=float), *self.task.input_limits)
+        actions = np.asarray(actions)
+        whole = np.issubdtype(actions.dtype, np.integer)
+        if not whole or (actions < 0).any() or (actions >= len(levels)).any():
+            raise BadInput(
+                f"action {actions!r} cannot be used: {self.task.name} takes integers from 0 to "
+                f"{len(levels) - 1}"
+            )
+        return levels[actions]
 
     def _observe(self, ids: np.ndarray) -> np.ndarray:
         measured = self.plant.measurement[ids]

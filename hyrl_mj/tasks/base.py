@@ -181,7 +181,7 @@ class Task(ABC):
             raise BadInput(
                 f"a state of {self.name} is {self.chart.dimension} numbers, got {z!r}"
             ) from None
-        if z.ndim != 2 or z.shape[1] != self.chart.dimension:
+        if z.ndim != 2 or z.shape[1] != self.chart.dimension or not len(z):
             raise BadInput(
                 f"a state of {self.name} is {self.chart.dimension} number(s) "
                 f"({', '.join(self.chart.names)}), got shape {z.shape}"

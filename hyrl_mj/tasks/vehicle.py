@@ -87,7 +87,7 @@ class Vehicle(Task):
         low, high = self.arena
         ends = np.full(len(measurement), Outcome.RUNNING)
         ends[x > self.set_point[0] + ON_THE_LINE] = Outcome.REACHED
-        ends[(y <= low[1]) | (y >= high[1])] = Outcome.OUT_OF_BOUNDS
+        ends[(y <= low[1] + ON_THE_LINE) | (y >= high[1] - ON_THE_LINE)] = Outcome.OUT_OF_BOUNDS
         ends[self.clearance(measurement) <= CRASH_DISTANCE] = Outcome.CRASHED
         return ends
 

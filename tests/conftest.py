@@ -1,0 +1,26 @@
+"""Fixtures that many tests share: the registered tasks."""
+
+import os
+
+# Before NumPy is there: matrices are small here, and BLAS threads that wait for a busy core take
+# ten times as long as none.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import pytest
+
+import hyrl_mj
+
+
+@pytest.fixture(scope="session")
+def circle():
+    return hyrl_mj.get_task("unit_circle")
+
+
+@pytest.fixture(scope="session")
+def vehicle():
+    return hyrl_mj.get_task("vehicle")
+
+
+@pytest.fixture(scope="session", params=hyrl_mj.task_names())
+def task(request):
+    return hyrl_mj.get_task(request.param)

@@ -1,0 +1,182 @@
+"""Planted truths: policies whose critical set is known, and a task in three dimensions."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from hyrl_mj.hybrid import HybridController
+from hyrl_mj.tasks import Chart, Outcome, Task
+
+
+def euler(task, z, u):
+    """One sample of the paper's equations, S + f(S, A) dt: chart points (n, d), inputs (n, 1)."""
+    velocity = u if task.name == "unit_circle" else np.hstack([np.ones((len(z), 1)), u])
+    return z + velocity * 0.05
+
+
+def random_inputs(task, n, rng):
+    """Inputs (n, m) all over the input limits."""
+    low, high = task.input_limits
+    return rng.uniform(low, high, (n, len(low)))
+
+
+def random_states(task, n, rng):
+    """Chart points (n, d) all over the chart."""
+    return rng.uniform(task.chart.low, task.chart.high, (n, task.chart.dimension))
+
+
+@dataclass(frozen=True)
+class ChartPolicy:
+    """A policy given as a rule from chart points (n, d) to inputs (n, m)."""
+
+    task: Task
+    rule: Callable[[np.ndarray], np.ndarray]
+
+    def act(self, measured):
+        return self.rule(self.task.z(self.task.check_measurement(measured)))
+
+
+@dataclass(frozen=True)
+class AnalyticSet:
+    """A set given by a signed distance in closed form."""
+
+    distance: Callable[[np.ndarray], np.ndarray]
+
+    def signed_distance(self, z):
+        return self.distance(z)
+
+    def contains(self, z):
+        return self.distance(z) <= 0
+
+
+# ---- unit circle
+
+
+def circle_policy(task, critical=np.pi):
+    """Clockwise (-1) below the critical angle, counter-clockwise (+1) above it."""
+    return ChartPolicy(task, lambda z: np.where(task.chart.wrap(z) < critical, -1.0, 1.0))
+
+
+def two_way_circle_policy(task, first=2.0, between=3.0, second=4.0):
+    """Runs part at two angles, and meet at a third one between them and at the set-point."""
+
+    def rule(z):
+        theta = task.chart.wrap(z)
+        down = (theta < first) | ((theta >= between) & (theta < second))
+        return np.where(down, -1.0, 1.0)
+
+    return ChartPolicy(task, rule)
+
+
+# ---- vehicle
+
+
+def pass_on(side, y, clear=0.9):
+    """Steer to one side (+1 left, -1 right) until beside the obstacle, then straight on: (n, 1)."""
+    return np.where(side * y < clear, side, 0.0)[:, None]
+
+
+def sign_policy(task, line=lambda x: 0 * x):
+    """Pass on the left above the line y = line(x), on the right below it."""
+    return ChartPolicy(
+        task, lambda z: pass_on(np.where(z[:, 1] >= line(z[:, 0]), 1.0, -1.0), z[:, 1])
+    )
+
+
+def one_way_policy(task, side=1.0, clear=0.9):
+    """Pass on one side, from wherever."""
+    return ChartPolicy(task, lambda z: pass_on(np.full(len(z), side), z[:, 1], clear))
+
+
+def ideal_controller(task, overlap=0.15):
+    """The vehicle's hybrid controller with ideal policies; the flow sets share |y| <= `overlap`."""
+    return HybridController(
+        task,
+        {0: one_way_policy(task, 1.0), 1: one_way_policy(task, -1.0)},
+        {
+            0: AnalyticSet(lambda z: -z[:, 1] - overlap),
+            1: AnalyticSet(lambda z: z[:, 1] - overlap),
+        },
+    )
+
+
+# ---- a task with a chart of three dimensions
+
+CUBE = """
+<mujoco model="cube">
+  <option timestep="0.05" integrator="implicitfast" gravity="0 0 0">
+    <flag contact="disable" constraint="disable"/>
+  </option>
+  <worldbody>
+    <body>
+      <joint name="a" type="slide" axis="1 0 0"/>
+      <joint name="b" type="slide" axis="0 1 0"/>
+      <joint name="c" type="slide" axis="0 0 1"/>
+      <geom type="sphere" size="0.1" mass="1"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <velocity name="va" joint="a" kv="1e9" ctrlrange="-1 1"/>
+    <velocity name="vb" joint="b" kv="1e9" ctrlrange="-1 1"/>
+    <velocity name="vc" joint="c" kv="1e9" ctrlrange="-1 1"/>
+  </actuator>
+  <sensor>
+    <jointpos joint="a"/> <jointpos joint="b"/> <jointpos joint="c"/>
+  </sensor>
+</mujoco>
+"""
+
+
+class Cube(Task):
+    """A point that moves at will in a cube; runs differ by whether a level rises or falls.
+
+    Args:
+        level: chart points (n, 3) -> (n,).
+    """
+
+    name = "cube"
+    description = "planted"
+    chart = Chart(("a", "b", "c"), ("m",) * 3, (-1.0,) * 3, (1.0,) * 3, (False,) * 3)
+    inputs = ("va", "vb", "vc")
+    noisy = (True,) * 3
+    max_steps = 12
+    horizon = 0.3
+
+    def __init__(self, level):
+        self.level = level
+        self.model = mujoco.MjModel.from_xml_string(CUBE)
+
+    def observation(self, measured):
+        return measured
+
+    def reward(self, measurement):
+        return np.zeros(len(measurement))
+
+    def ending(self, measurement):
+        return np.full(len(measurement), Outcome.RUNNING)
+
+    def verdict(self, measurement):
+        return np.full(len(measurement), Outcome.RUNNING)
+
+    def starts(self, n, rng):
+        return rng.uniform(-1, 1, (n, 3))
+
+    def direction(self, path):
+        return np.where(self.level(path[-1]) > self.level(path[0]), 0, 1)
+
+
+def plane_policy(task, normal, parting):
+    """Along +normal or -normal, by `parting(level)` in {-1, +1}."""
+    return ChartPolicy(task, lambda z: parting(task.level(z))[:, None] * normal)
+
+
+def sphere_policy(task, radius):
+    """Out of a sphere or to its centre."""
+
+    def rule(z):
+        r = np.linalg.norm(z, axis=1, keepdims=True)
+        return np.where(r >= radius, 1.0, -1.0) * z / np.maximum(r, 0.05)
+
+    return ChartPolicy(task, rule)

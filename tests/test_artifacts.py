@@ -1,0 +1,277 @@
+"""Artifacts come back as they were, are replaced whole or not at all, and named if damaged."""
+
+import json
+import os
+import pickle
+
+import numpy as np
+import pytest
+
+from hyrl_mj import BadArtifact, CriticalSet, artifacts
+from hyrl_mj.extended_sets import ExtendedSets
+from hyrl_mj.partition import Partition
+from hyrl_mj.sets import Grid, GridSet
+
+ARRAYS = {"a": np.arange(500.0).reshape(50, 10), "name": np.array("word"), "flag": np.array([True])}
+CONTENT = {"x": 1.5, "items": [1, 2, 3]}
+
+
+class Bomb:
+    """What must never go off: unpickling this would make a file."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+def write(kind, path):
+    if kind == "npz":
+        artifacts.write_arrays(path, ARRAYS, "thing")
+    elif kind == "json":
+        artifacts.write_json(path, CONTENT, "thing")
+    else:
+        artifacts.write_tensors(path, {"a": np.float32(ARRAYS["a"])})
+
+
+def read(kind, path, what="thing"):
+    if kind == "npz":
+        return artifacts.read_arrays(path, what)
+    return artifacts.read_json(path, what) if kind == "json" else artifacts.read_tensors(path)
+
+
+@pytest.fixture(params=["npz", "json", "safetensors"])
+def kind(request):
+    return request.param
+
+
+@pytest.fixture
+def path(kind, tmp_path):
+    path = tmp_path / "folder" / f"file.{kind}"
+    write(kind, path)
+    return path
+
+
+def assert_one_sentence_about(error, path):
+    text = str(error.value)
+    assert str(path) in text
+    assert "\n" not in text
+    assert len(text) < 500
+
+
+# ---- there and back
+
+
+def test_arrays_come_back(tmp_path):
+    write("npz", tmp_path / "a.npz")
+    back = read("npz", tmp_path / "a.npz")
+    assert back.keys() == ARRAYS.keys()
+    for name, values in ARRAYS.items():
+        np.testing.assert_array_equal(back[name], values)
+        assert back[name].dtype == values.dtype
+
+
+def test_json_comes_back(tmp_path):
+    write("json", tmp_path / "a.json")
+    assert read("json", tmp_path / "a.json") == CONTENT
+
+
+def test_tensors_come_back_whatever_their_layout(tmp_path):
+    transposed = np.arange(6, dtype=np.float32).reshape(2, 3).T
+    artifacts.write_tensors(tmp_path / "a.safetensors", {"t": transposed})
+    np.testing.assert_array_equal(read("safetensors", tmp_path / "a.safetensors")["t"], transposed)
+
+
+def test_nothing_else_is_left_in_the_folder(path):
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+# ---- damage
+
+
+def test_a_missing_file_names_the_cure(kind, tmp_path):
+    with pytest.raises(BadArtifact, match="run the stage that writes it") as caught:
+        read(kind, tmp_path / f"no.{kind}")
+    assert_one_sentence_about(caught, tmp_path / f"no.{kind}")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9, 0.95])
+def test_a_truncated_file_is_a_bad_artifact(kind, path, share):
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(BadArtifact) as caught:
+        read(kind, path)
+    assert_one_sentence_about(caught, path)
+
+
+def test_noise_in_a_file_is_a_bad_artifact_or_harmless(kind, path):
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    for place in rng.integers(0, len(whole), 200):
+        damaged = bytearray(whole)
+        damaged[place] ^= 0xFF
+        path.write_bytes(damaged)
+        try:
+            read(kind, path)
+        except BadArtifact:
+            pass
+        except Exception as error:
+            pytest.fail(f"byte {place}: {type(error).__name__}: {error}")
+
+
+JSONS = ["3", "null", '"word"', "[]", "[1]", "{}", "{", '{"kind": "thing"}']
+
+
+@pytest.mark.parametrize("text", JSONS)
+def test_json_that_is_not_ours(tmp_path, text):
+    path = tmp_path / "a.json"
+    path.write_text(text)
+    with pytest.raises(BadArtifact) as caught:
+        artifacts.read_json(path, "thing")
+    assert_one_sentence_about(caught, path)
+
+
+def test_an_npz_that_is_not_ours(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, a=np.zeros(3))
+    with pytest.raises(BadArtifact):
+        artifacts.read_arrays(path, "thing")
+    np.save(tmp_path / "b.npy", np.zeros(3))
+    (tmp_path / "b.npy").rename(path)
+    with pytest.raises(BadArtifact):
+        artifacts.read_arrays(path, "thing")
+
+
+def test_another_version_is_named(tmp_path):
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps({"kind": "thing", "version": 99}))
+    with pytest.raises(BadArtifact, match=r"version 99.*reads version 1") as caught:
+        artifacts.read_json(path, "thing")
+    assert_one_sentence_about(caught, path)
+    np.savez(tmp_path / "a.npz", kind=np.array("thing"), version=np.array(99))
+    with pytest.raises(BadArtifact, match="version 99"):
+        artifacts.read_arrays(tmp_path / "a.npz", "thing")
+
+
+@pytest.mark.parametrize("ending", ["json", "npz"])
+def test_another_kind_is_named(ending, tmp_path):
+    write(ending, tmp_path / f"a.{ending}")
+    with pytest.raises(BadArtifact, match=r"'thing', not 'other thing'"):
+        read(ending, tmp_path / f"a.{ending}", "other thing")
+
+
+def test_a_pickle_in_an_npz_is_refused_and_not_run(tmp_path):
+    path, crater = tmp_path / "a.npz", tmp_path / "crater"
+    bomb = np.array([Bomb(crater)], dtype=object)
+    np.savez(path, kind=np.array("thing"), version=np.array(1), a=bomb)
+    with pytest.raises(BadArtifact):
+        artifacts.read_arrays(path, "thing")
+    assert not crater.exists()
+
+
+@pytest.mark.parametrize("ending", ["json", "npz", "safetensors"])
+def test_a_pickle_under_another_name_is_refused_and_not_run(ending, tmp_path):
+    path, crater = tmp_path / f"a.{ending}", tmp_path / "crater"
+    path.write_bytes(pickle.dumps(Bomb(crater)))
+    with pytest.raises(BadArtifact):
+        read(ending, path)
+    assert not crater.exists()
+
+
+# ---- writing
+
+
+def test_an_interrupted_write_leaves_the_old_file(path):
+    before = path.read_bytes()
+
+    def interrupted():
+        with artifacts.replacing(path) as temporary:
+            temporary.write_bytes(before[:10])
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert path.read_bytes() == before
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    write("json", tmp_path / "a.json")
+    before = (tmp_path / "a.json").read_bytes()
+    with pytest.raises(TypeError):
+        artifacts.write_json(tmp_path / "a.json", {"x": object()}, "thing")
+    assert (tmp_path / "a.json").read_bytes() == before
+    write("npz", tmp_path / "a.npz")
+    before = (tmp_path / "a.npz").read_bytes()
+    with pytest.raises((ValueError, TypeError)):
+        artifacts.write_arrays(tmp_path / "a.npz", {"x": np.array([object()])}, "thing")
+    assert (tmp_path / "a.npz").read_bytes() == before
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.json", "a.npz"]
+
+
+# ---- the stages' artifacts
+
+
+@pytest.fixture
+def grid_set(vehicle):
+    grid = Grid.with_cells(vehicle.chart, 12)
+    return GridSet.from_mask(grid, grid.nodes[:, 1] >= 0)
+
+
+def test_a_critical_set_comes_back(tmp_path):
+    critical = CriticalSet(np.array([[0.1, 0.2], [0.3, 0.4]]), np.array([0, 1]), 0.01, 0.3)
+    critical.save(tmp_path / "c.npz")
+    back = CriticalSet.load(tmp_path / "c.npz")
+    np.testing.assert_array_equal(back.points, critical.points)
+    np.testing.assert_array_equal(back.component, critical.component)
+    assert (back.resolution, back.spacing, back.pieces) == (0.01, 0.3, 2)
+
+
+def test_a_partition_comes_back(tmp_path, vehicle, grid_set):
+    whole = Partition((0, 1), (grid_set, ~grid_set), grid_set.mask)
+    whole.save(tmp_path / "p.npz")
+    back = Partition.load(tmp_path / "p.npz", vehicle)
+    assert back.modes == (0, 1)
+    assert back.grid.counts == whole.grid.counts
+    np.testing.assert_array_equal(back.parts[1].values, whole.parts[1].values)
+    np.testing.assert_array_equal(back.succeeds, whole.succeeds)
+
+
+def test_extended_sets_come_back(tmp_path, vehicle, grid_set):
+    sets = ExtendedSets((0, 1), (grid_set, ~grid_set), (grid_set.mask, ~grid_set.mask), 0.3, 0.1)
+    sets.save(tmp_path / "e.npz")
+    back = ExtendedSets.load(tmp_path / "e.npz", vehicle)
+    assert (back.modes, back.horizon, back.noise) == ((0, 1), 0.3, 0.1)
+    for loaded, kept in zip(back.sets, sets.sets, strict=True):
+        np.testing.assert_array_equal(loaded.values, kept.values)
+    for loaded, kept in zip(back.winning, sets.winning, strict=True):
+        np.testing.assert_array_equal(loaded, kept)
+
+
+def test_sets_of_another_task_are_refused(tmp_path, circle, grid_set):
+    Partition((0,), (grid_set,), grid_set.mask).save(tmp_path / "p.npz")
+    with pytest.raises(BadArtifact, match=r"p\.npz"):
+        Partition.load(tmp_path / "p.npz", circle)
+    ExtendedSets((0,), (grid_set,), (grid_set.mask,), 0.3, 0.1).save(tmp_path / "e.npz")
+    with pytest.raises(BadArtifact, match=r"e\.npz"):
+        ExtendedSets.load(tmp_path / "e.npz", circle)
+
+
+def test_one_artifact_is_not_another(tmp_path, vehicle, grid_set):
+    Partition((0,), (grid_set,), grid_set.mask).save(tmp_path / "p.npz")
+    with pytest.raises(BadArtifact, match="'partition', not 'extended sets'"):
+        ExtendedSets.load(tmp_path / "p.npz", vehicle)
+    with pytest.raises(BadArtifact, match="'partition', not 'critical set'"):
+        CriticalSet.load(tmp_path / "p.npz")
+
+
+def test_sets_that_do_not_fit_their_grid_are_refused(tmp_path, vehicle, grid_set):
+    arrays = {
+        "modes": np.array([0]),
+        "grid_counts": np.array([5, 5]),
+        "signed_distance": grid_set.values[None],
+        "succeeds": grid_set.mask,
+    }
+    artifacts.write_arrays(tmp_path / "p.npz", arrays, "partition")
+    with pytest.raises(BadArtifact, match=r"p\.npz"):
+        Partition.load(tmp_path / "p.npz", vehicle)

@@ -1,0 +1,220 @@
+"""The command line: what people type, and what they are told when it is wrong."""
+
+import os
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import hyrl_mj
+from hyrl_mj import cli, pipeline
+
+
+def call(*arguments):
+    """Run the command line in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "hyrl_mj.cli", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory):
+    """A whole run of the unit circle in the smoke preset, made by the command line."""
+    path = tmp_path_factory.mktemp("runs") / "circle"
+    done = call("run", "unit_circle", "--preset", "smoke", "--out", path)
+    assert done.returncode == 0, done.stderr
+    return path, done.stdout
+
+
+@pytest.fixture
+def copied(finished, tmp_path):
+    """A copy of it, to be damaged."""
+    return shutil.copytree(finished[0], tmp_path / "run")
+
+
+def contents(path):
+    return {p: p.read_bytes() for p in sorted(path.rglob("*")) if p.is_file()}
+
+
+def assert_one_sentence(process, *parts):
+    assert process.returncode == 2, process.stdout + process.stderr
+    assert "Traceback" not in process.stderr
+    for part in parts:
+        assert part in process.stderr
+
+
+def test_run_ends_with_a_table_and_leaves_every_artifact(finished):
+    path, said = finished
+    for words in ("policy (PPO)", "HyRL, q0 = 0", "HyRL, q0 = 1", "on M*", "critical set of"):
+        assert words in said
+    names = ["config.json", "policy.safetensors", "policy.json", "critical_set.npz"]
+    names += ["partition.npz", "extended_sets.npz", "mode_0.safetensors", "mode_1.safetensors"]
+    names += ["arcs/start0_policy.npz", "arcs/critical_hyrl_q1.npz", "replay.mp4", "replay.png"]
+    assert [n for n in names if not (path / n).is_file()] == []
+    assert not list(path.rglob("*.partial*"))
+
+
+def test_run_again_does_nothing_again(finished):
+    before = contents(finished[0])
+    again = call("run", "unit_circle", "--preset", "smoke", "--out", finished[0])
+    assert again.returncode == 0
+    assert again.stdout.count("done before") == len(pipeline.STAGES)
+    assert contents(finished[0]) == before
+
+
+def test_a_stage_runs_again_and_those_after_it_are_out_of_date(copied):
+    assert call("critical-set", copied).returncode == 0
+    run = hyrl_mj.load_run(copied)
+    assert [pipeline.done(run, i) for i in range(3)] == [True, True, False]
+
+
+def test_a_new_horizon_is_used_and_kept(copied):
+    before = hyrl_mj.load_run(copied).extended_sets
+    assert call("extended-sets", copied, "--horizon", "0.2").returncode == 0
+    run = hyrl_mj.load_run(copied)
+    assert run.settings.horizon == run.extended_sets.horizon == 0.2
+    for short, long in zip(run.extended_sets.sets, before.sets, strict=True):
+        assert short.mask.sum() < long.mask.sum()
+        assert not (short.mask & ~long.mask).any()
+
+
+def test_simulate_prints_both_ends(finished):
+    done = call("simulate", finished[0], "--start", "3.0", "--q0", "1", "--noise", "uniform")
+    assert done.returncode == 0, done.stderr
+    assert "policy " in done.stdout
+    assert "hyrl " in done.stdout
+
+
+def test_list_and_help():
+    assert "vehicle" in call("list").stdout
+    for command in cli.COMMANDS:
+        helped = call(command, "--help")
+        assert helped.returncode == 0
+        assert "usage: hyrl-mj" in helped.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["run", "unicycle"], ["'unicycle'", "unit_circle, vehicle"]),
+        (["run", "vehicle", "--preset", "quick"], ["'quick'", "fast, paper, smoke"]),
+        (["run", "vehicle", "--noise", "-0.1"], ["-0.1", ">= 0"]),
+        (["run", "vehicle", "--noise", "nan"], ["nan", ">= 0"]),
+        (["run", "vehicle", "--noise", "much"], ["--noise", "'much'"]),
+        (["run", "vehicle", "--horizon", "0"], ["horizon 0", "> 0"]),
+        (["run", "vehicle", "--seed", "-1"], ["seed -1", ">= 0"]),
+        (["traim"], ["traim", "critical-set"]),
+    ],
+)
+def test_bad_input_before_anything_is_made(arguments, parts, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    assert_one_sentence(call(*arguments), *parts)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (["simulate", "--start", "nan"], ["theta = nan"]),
+        (["simulate", "--start", "1", "2"], ["theta", "shape"]),
+        (["simulate", "--start", "1", "--q0", "5"], ["mode 5", "(0, 1)"]),
+        (["simulate", "--start", "1", "--noise", "white"], ["'white'", "uniform"]),
+        (["simulate", "--start", "1", "--eps", "-1"], ["-1", ">= 0"]),
+        (["simulate", "--start", "1", "--horizon", "0"], ["horizon 0", "> 0"]),
+        (["simulate", "--q0", "1"], ["--start"]),
+        (["extended-sets", "--horizon", "0"], ["horizon 0", "> 0"]),
+        (["replay", "--camera", "top"], ["'top'", "overhead, chase"]),
+        (["replay", "--size", "big"], ["'big'", "640x480"]),
+        (["replay", "--fps", "0"], ["at 0 frames a second"]),
+    ],
+)
+def test_bad_input_leaves_the_run_as_it_was(arguments, parts, finished):
+    before = contents(finished[0])
+    command, *options = arguments
+    assert_one_sentence(call(command, finished[0], *options), *parts)
+    assert contents(finished[0]) == before
+
+
+def test_a_folder_that_is_no_run(tmp_path):
+    (tmp_path / "file.txt").write_text("mine")
+    assert_one_sentence(call("simulate", tmp_path), "not a run directory")
+    assert_one_sentence(call("run", "vehicle", "--out", tmp_path), "choose another --out")
+    assert (tmp_path / "file.txt").read_text() == "mine"
+
+
+def test_other_settings_do_not_overwrite_a_run(finished):
+    done = call("run", "unit_circle", "--preset", "smoke", "--seed", "7", "--out", finished[0])
+    assert_one_sentence(done, "other settings (seed)")
+
+
+@pytest.mark.parametrize(
+    ("name", "command"),
+    [
+        ("policy.safetensors", "critical-set"),
+        ("critical_set.npz", "partition"),
+        ("partition.npz", "extended-sets"),
+        ("extended_sets.npz", "retrain"),
+        ("mode_1.safetensors", "simulate"),
+        ("arcs/critical_policy.npz", "replay"),
+        ("config.json", "train"),
+    ],
+)
+def test_a_truncated_artifact_is_named(name, command, copied):
+    damaged = copied / name
+    damaged.write_bytes(damaged.read_bytes()[: damaged.stat().st_size // 2])
+    before = contents(copied)
+    assert_one_sentence(call(command, copied), str(damaged))
+    assert contents(copied) == before
+
+
+def test_without_gl_the_run_is_whole_and_says_why_there_is_no_video(copied):
+    (copied / "replay.mp4").unlink()
+    process = subprocess.run(
+        [sys.executable, "-m", "hyrl_mj.cli", "run", "unit_circle", "--preset", "smoke"]
+        + ["--out", str(copied)],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "MUJOCO_GL": "disable"},
+    )
+    assert process.returncode == 0, process.stderr
+    assert "no video: " in process.stdout
+    assert "apt-get install libegl1" in process.stdout
+    assert "Traceback" not in process.stderr
+
+
+def test_load_run_acts_as_the_contract_says_without_torch(finished):
+    program = f"""
+import sys
+sys.modules["torch"] = sys.modules["stable_baselines3"] = None  # importing them raises
+import numpy as np, hyrl_mj
+run = hyrl_mj.load_run({str(finished[0])!r})
+measured = np.linspace(-7, 7, 50)[:, None]
+assert run.policy.act(measured).shape == (50, 1)
+q = run.controller.initial_mode(measured)
+assert q.shape == (50,) and set(q) <= set(run.controller.modes) == {{0, 1}}
+u, after = run.controller.step(q, measured)
+assert u.shape == (50, 1) and after.shape == (50,) and np.abs(u).max() <= 1
+for mode in run.controller.modes:
+    flow, jump = run.controller.flow_set(mode), run.controller.jump_set(mode)
+    assert (flow.contains(measured) | jump.contains(measured)).all()
+    assert flow.signed_distance(measured).shape == (50,)
+arc = hyrl_mj.simulate(run.task, run.controller, [3.0], hyrl_mj.Noise("alternating", 0.1), q0=1)
+print(arc.outcome)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() in ("reached", "stalled")
+
+
+def test_a_policy_of_another_task_is_refused(copied):
+    policy = hyrl_mj.load_run(copied).policy
+    description = copied / "policy.json"
+    description.write_text(description.read_text().replace("unit_circle", "vehicle"))
+    assert_one_sentence(call("critical-set", copied), "vehicle")
+    assert np.isfinite(policy.act(np.zeros((1, 1)))).all()

@@ -1,0 +1,334 @@
+"""The environments keep the conventions of Gymnasium and SB3, and all play the same episodes."""
+
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env as gymnasium_check
+from stable_baselines3.common.env_checker import check_env as sb3_check
+
+from hyrl_mj import BadInput, Noise
+from hyrl_mj.envs.core import BatchedEnv, Domain
+from hyrl_mj.envs.gym_env import TaskEnv
+from hyrl_mj.envs.sb3_env import TaskVecEnv
+
+LEFT, AHEAD, RIGHT = 4, 2, 0
+IDS = {"unit_circle": "hyrl_mj/UnitCircle-v0", "vehicle": "hyrl_mj/ObstacleAvoidance-v0"}
+
+
+def make(name, **kwargs):
+    return gym.make(IDS[name], **kwargs)
+
+
+def make_vec(name, num_envs, **kwargs):
+    return gym.make_vec(IDS[name], num_envs, vectorization_mode="vector_entry_point", **kwargs)
+
+
+def vehicle_outcome(z, action):
+    """Play one action from z to the end: the last step."""
+    env = make("vehicle")
+    env.reset(seed=0, options={"z": z})
+    while True:
+        observation, reward, terminated, truncated, info = env.step(action)
+        if terminated or truncated:
+            return observation, reward, terminated, truncated, info
+        assert "outcome" not in info
+
+
+@pytest.mark.parametrize("check", [gymnasium_check, sb3_check])
+def test_the_checkers_of_both_libraries_are_content(task, check):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check(make(task.name).unwrapped)
+
+
+def test_make_knows_the_sample_time_and_the_limit(task):
+    env = make(task.name)
+    assert env.unwrapped.metadata["render_fps"] == 20
+    assert env.spec.max_episode_steps == task.max_steps
+    assert env.unwrapped.observation_space == env.observation_space
+
+
+def test_spaces(circle):
+    assert make("vehicle").action_space == gym.spaces.Discrete(5)
+    assert make("unit_circle").action_space == gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    vec = make_vec("vehicle", 3)
+    assert vec.observation_space.shape == (3, 3)
+    assert vec.action_space == gym.spaces.MultiDiscrete([5, 5, 5])
+
+
+# ---- seeds
+
+
+def record_single(name, seed, steps=100):
+    env = make(name)
+    env.action_space.seed(seed)
+    observation, _ = env.reset(seed=seed)
+    log = [observation]
+    for _ in range(steps):
+        observation, reward, terminated, truncated, _ = env.step(env.action_space.sample())
+        log += [observation, np.array([reward, terminated, truncated])]
+        if terminated or truncated:
+            log.append(env.reset()[0])
+    return np.concatenate(log)
+
+
+def record_vector(name, seed, threads):
+    env = make_vec(name, 32, threads=threads, noise=Noise("uniform", 0.1))
+    env.action_space.seed(seed)
+    log = [env.reset(seed=seed)[0].ravel()]
+    for _ in range(200):
+        log += [np.ravel(part) for part in env.step(env.action_space.sample())[:4]]
+    return np.concatenate(log)
+
+
+def test_a_seed_repeats_episodes_bit_for_bit(task):
+    np.testing.assert_array_equal(record_single(task.name, 3), record_single(task.name, 3))
+    assert not np.array_equal(record_single(task.name, 3)[:3], record_single(task.name, 4)[:3])
+
+
+def test_a_seed_repeats_vector_episodes_at_any_number_of_threads(task):
+    first = record_vector(task.name, 3, threads=1)
+    np.testing.assert_array_equal(first, record_vector(task.name, 3, threads=1))
+    np.testing.assert_array_equal(first, record_vector(task.name, 3, threads=2))
+
+
+def test_a_later_reset_without_seed_goes_on_with_other_starts(task):
+    env = make_vec(task.name, 4)
+    first, _ = env.reset(seed=1)
+    assert not np.array_equal(env.reset()[0], first)
+
+
+def test_the_vector_env_plays_the_episodes_of_the_single_env(task):
+    starts = np.array(task.replay_starts)
+    vec = make_vec(task.name, len(starts))
+    vec.action_space.seed(0)
+    singles = [make(task.name) for _ in starts]
+    observations, infos = vec.reset(options={"z": starts})
+    np.testing.assert_allclose(infos["z"], starts, atol=1e-12)
+    running = np.ones(len(starts), dtype=bool)
+    for env, z, observation in zip(singles, starts, observations, strict=True):
+        np.testing.assert_array_equal(env.reset(options={"z": z})[0], observation)
+    for _ in range(task.max_steps):
+        actions = vec.action_space.sample()
+        observations, rewards, terminated, truncated, infos = vec.step(actions)
+        for i in np.flatnonzero(running):
+            observation, reward, *ends, info = singles[i].step(actions[i])
+            ended = terminated[i] or truncated[i]
+            seen = infos["final_obs"][i] if ended else observations[i]
+            np.testing.assert_array_equal(observation, seen)
+            assert (reward, *ends) == (rewards[i], terminated[i], truncated[i])
+            if ended:
+                assert info["outcome"] == infos["final_info"]["outcome"][i]
+                running[i] = False
+    assert not running.any()
+
+
+# ---- how episodes end
+
+
+def test_a_crash_terminates():
+    _, _, terminated, truncated, info = vehicle_outcome([0.0, 0.0], AHEAD)
+    assert (terminated, truncated, info["outcome"]) == (True, False, "crashed")
+    assert info["z"] == pytest.approx([0.75, 0.0], abs=1e-6)
+
+
+def test_leaving_the_arena_terminates():
+    _, _, terminated, truncated, info = vehicle_outcome([0.0, 0.51], LEFT)
+    assert (terminated, truncated, info["outcome"]) == (True, False, "out_of_bounds")
+    assert info["z"] == pytest.approx([1.0, 1.51], abs=1e-6)
+
+
+def test_crossing_the_line_terminates():
+    _, _, terminated, truncated, info = vehicle_outcome([0.2, 1.0], AHEAD)
+    assert (terminated, truncated, info["outcome"]) == (True, False, "reached")
+    assert info["z"] == pytest.approx([3.05, 1.0], abs=1e-6)
+
+
+def test_the_end_of_time_truncates():
+    env = make("unit_circle")
+    env.reset(options={"z": [np.pi]})
+    steps = [env.step(np.zeros(1, np.float32)) for _ in range(150)]
+    assert [step[3] for step in steps] == [False] * 149 + [True]
+    assert not any(step[2] for step in steps)
+    assert steps[-1][4]["outcome"] == "stalled"
+    env.reset(options={"z": [1.0]})
+    steps = [env.step(np.full(1, -1.0 if k < 20 else 0.0, np.float32)) for k in range(150)]
+    assert steps[-1][4]["outcome"] == "reached"
+
+
+def test_sixty_samples_from_the_start_line_are_the_time_limit():
+    *_, terminated, truncated, info = vehicle_outcome([0.0, 1.0], AHEAD)
+    assert (terminated, truncated, info["outcome"]) == (False, True, "reached")
+    assert info["z"][0] == pytest.approx(3.0, abs=1e-6)
+
+
+def test_the_return_is_that_of_the_formula():
+    env = make("unit_circle")
+    env.reset(options={"z": [np.pi]})
+    rewards = [env.step(np.array([1.0], np.float32))[1] for _ in range(10)]
+    expected = [-(np.pi - 0.05 * k) / np.pi for k in range(1, 11)]
+    np.testing.assert_allclose(rewards, expected, atol=1e-7)
+
+
+def test_a_start_is_followed_to_the_bit_and_a_bad_one_refused(task):
+    env = make(task.name)
+    z = np.array(task.replay_starts[0])
+    np.testing.assert_array_equal(env.reset(options={"z": z})[1]["z"], z)
+    with pytest.raises(BadInput, match=task.name):
+        env.reset(options={"z": np.full(task.chart.dimension, np.nan)})
+
+
+def test_a_nan_action_never_reaches_mujoco():
+    env = make("unit_circle").unwrapped
+    env.reset(seed=0)
+    before = env.core.plant.state
+    with pytest.raises(BadInput, match="nan"):
+        env.step(np.array([np.nan], np.float32))
+    np.testing.assert_array_equal(env.core.plant.state, before)
+
+
+@pytest.mark.parametrize("action", [-1, 5, 1.7])
+def test_an_action_that_is_no_level_is_refused(action):
+    env = make("vehicle").unwrapped
+    env.reset(seed=0)
+    with pytest.raises(BadInput, match=str(action)):
+        env.step(action)
+
+
+def test_actions_beyond_the_limits_are_clipped():
+    env = make("unit_circle").unwrapped
+    env.reset(options={"z": [1.0]})
+    assert env.step(np.array([9.0], np.float32))[4]["z"] == pytest.approx([1.05], abs=1e-6)
+
+
+# ---- autoreset
+
+
+def test_a_vector_episode_starts_anew_in_the_same_step():
+    env = make_vec("vehicle", 2)
+    env.reset(seed=0, options={"z": [[0.6, 0.0], [0.0, 1.0]]})
+    for _ in range(3):
+        observations, _, terminated, _, infos = env.step(np.array([AHEAD, AHEAD]))
+    np.testing.assert_array_equal(terminated, [True, False])
+    np.testing.assert_array_equal(infos["_final_obs"], [True, False])
+    np.testing.assert_allclose(infos["final_obs"][0], [0.0, 2.25, 0.0], atol=1e-6)
+    assert infos["final_obs"][1] is None
+    assert infos["final_info"]["outcome"][0] == "crashed"
+    np.testing.assert_allclose(infos["final_info"]["z"][0], [0.75, 0.0], atol=1e-6)
+    assert 0 <= infos["z"][0, 0] <= 0.5
+    fresh = env.unwrapped.core.task.observation(infos["z"])
+    np.testing.assert_allclose(observations, fresh, atol=1e-6)
+
+
+def test_observations_are_not_overwritten_by_later_steps(task):
+    env = make_vec(task.name, 4)
+    first, _ = env.reset(seed=0)
+    kept = first.copy()
+    env.step(env.action_space.sample())
+    np.testing.assert_array_equal(first, kept)
+
+
+def test_an_episode_with_its_own_limit():
+    env = make_vec("unit_circle", 2, max_episode_steps=7)
+    env.reset(seed=0)
+    ends = [env.step(np.zeros((2, 1), np.float32))[3].all() for _ in range(14)]
+    assert ends == ([False] * 6 + [True]) * 2
+
+
+# ---- SB3
+
+
+def sb3(task, n, **kwargs):
+    env = TaskVecEnv(BatchedEnv(task, n, **kwargs))
+    env.seed(0)
+    return env
+
+
+def test_sb3_gets_terminal_observation_and_episode(vehicle):
+    env = sb3(vehicle, 3)
+    env.reset()
+    env.core.reset(z=np.array([[0.6, 0.0], [2.9, 1.0], [0.0, 1.0]]))
+    for _ in range(3):
+        observation, reward, done, infos = env.step(np.array([AHEAD] * 3))
+    np.testing.assert_array_equal(done, [True, True, False])
+    assert [info.get("outcome") for info in infos] == ["crashed", "reached", None]
+    np.testing.assert_allclose(infos[0]["terminal_observation"], [0.0, 2.25, 0.0], atol=1e-6)
+    assert [info.get("TimeLimit.truncated") for info in infos] == [False, False, None]
+    assert infos[0]["episode"]["l"] == 3
+    path = np.array([[0.65, 0.0], [0.7, 0.0], [0.75, 0.0]])
+    assert infos[0]["episode"]["r"] == pytest.approx(vehicle.reward(path).sum(), abs=1e-6)
+    assert infos[2] == {}
+    assert reward.shape == (3,)
+    np.testing.assert_allclose(observation, vehicle.observation(env.core.z), atol=1e-6)
+
+
+def test_sb3_is_told_that_time_was_up(circle):
+    env = sb3(circle, 2, max_steps=5)
+    env.reset()
+    for _ in range(5):
+        _, _, done, infos = env.step(np.zeros((2, 1)))
+    assert done.all()
+    assert all(info["TimeLimit.truncated"] and info["episode"]["l"] == 5 for info in infos)
+    _, _, done, infos = env.step(np.zeros((2, 1)))
+    assert not done.any()
+
+
+# ---- noise and domain
+
+
+def test_noise_is_on_the_observation_only(vehicle):
+    env = BatchedEnv(vehicle, 2, noise=Noise("alternating", 0.1))
+    start = np.array([[0.0, 0.5], [0.2, -0.5]])
+    np.testing.assert_allclose(env.reset(z=start)[:, 2], [0.6, -0.4], atol=1e-6)
+    result = env.step(np.zeros((2, 1)))
+    np.testing.assert_allclose(result.observation[:, 2], [0.4, -0.6], atol=1e-6)
+    after = start + np.array([0.05, 0.0])
+    np.testing.assert_allclose(env.z, after, atol=1e-6)
+    np.testing.assert_allclose(result.reward, vehicle.reward(after), atol=1e-6)
+    # x is measured without noise: the clearance is that of (x, y + noise)
+    noisy = vehicle.observation(after + np.array([0.0, -0.1]))
+    np.testing.assert_allclose(result.observation, noisy, atol=1e-6)
+
+
+def test_leaving_the_domain_ends_an_episode_with_its_own_reward(circle):
+    domain = Domain(
+        starts=lambda n, rng: np.full((n, 1), 1.0),
+        contains=lambda z: np.abs(z[:, 0] - 1.0) < 0.12,
+        exit_reward=-30.0,
+    )
+    env = BatchedEnv(circle, 2, domain=domain)
+    env.reset()
+    u = np.array([[1.0], [0.0]])
+    results = [env.step(u) for _ in range(3)]
+    ends = np.array([r.terminated for r in results])
+    np.testing.assert_array_equal(ends, [[False, False], [False, False], [True, False]])
+    assert results[2].reward[0] == -30.0
+    assert results[2].reward[1] == pytest.approx(-1 / np.pi)
+
+
+# ---- pictures
+
+
+def test_rgb_array_shows_the_scene(task):
+    env = make(task.name, render_mode="rgb_array")
+    env.reset(options={"z": task.replay_starts[0]})
+    picture = env.render()
+    assert picture.shape == (480, 640, 3)
+    assert picture.dtype == np.uint8
+    assert picture.std() > 10
+    action = 1.0 if task.levels is None else LEFT
+    for _ in range(10):
+        env.step(np.array([action], np.float32) if task.levels is None else action)
+    assert (env.render() != picture).any(axis=2).sum() > 50, "the robot has moved"
+    env.close()
+
+
+def test_no_render_mode_no_picture(task):
+    assert make(task.name).unwrapped.render() is None
+
+
+def test_an_unknown_render_mode_is_refused():
+    with pytest.raises(BadInput, match="'ansi' is unknown: None or 'rgb_array'"):
+        TaskEnv("vehicle", render_mode="ansi")

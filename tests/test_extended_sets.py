@@ -1,0 +1,136 @@
+"""Extended sets reach over the critical set as far as backward motion, room and noise say."""
+
+import numpy as np
+import pytest
+from planted import circle_policy, one_way_policy, sign_policy
+
+from hyrl_mj import extend, find_critical_set, make_partition
+from hyrl_mj.extended_sets import distance_to
+
+PI = np.pi
+# From the axis an obstacle of radius 0.75 at x = 1.5 can be passed only if x <= this.
+LAST_CHANCE = 1.5 - 0.75 * np.sqrt(2)
+
+
+class Case:
+    """A task with a planted policy, its critical set and its partition."""
+
+    def __init__(self, task, policy, rods, cells):
+        self.task, self.policy = task, policy
+        self.critical = find_critical_set(task, policy, rods, 1 / 32)
+        self.partition = make_partition(task, policy, self.critical, cells)
+
+    def extend(self, horizon, noise):
+        return extend(self.task, self.policy, self.critical, self.partition, horizon, noise)
+
+
+@pytest.fixture(scope="module")
+def on_circle(circle):
+    return Case(circle, circle_policy(circle), 121, 720)
+
+
+@pytest.fixture(scope="module")
+def on_vehicle(vehicle):
+    return Case(vehicle, sign_policy(vehicle), 60, 120)
+
+
+@pytest.fixture(scope="module")
+def vehicle_sets(on_vehicle):
+    return {noise: on_vehicle.extend(0.3, noise) for noise in (0.0, 0.1)}
+
+
+def overlap(sets, x):
+    """Half the distance between the far edges of the two sets at a given x [m]."""
+    y = np.linspace(-1.4, 1.4, 2801)
+    z = np.stack([np.full_like(y, x), y], axis=-1)
+    left, right = (y[s.contains(z)] for s in sets.sets)
+    return (right.max() - left.min()) / 2
+
+
+# ---- unit circle
+
+
+@pytest.mark.parametrize("horizon", [0.2, 0.5])
+def test_the_circle_s_sets_reach_the_horizon_over_the_critical_angle(on_circle, horizon):
+    sets = on_circle.extend(horizon, 0.1)
+    assert sets.modes == (0, 1)
+    theta = np.linspace(0.5, 2 * PI - 0.5, 20_000)
+    clockwise, counter = (theta[s.contains(theta[:, None])] for s in sets.sets)
+    cell = sets.sets[0].grid.cell
+    assert clockwise.max() == pytest.approx(PI + horizon, abs=2 * cell)
+    assert counter.min() == pytest.approx(PI - horizon, abs=2 * cell)
+    assert clockwise.min() == 0.5
+    assert np.diff(clockwise).max() < 1e-3, "a hole"
+
+
+def test_both_sets_hold_the_set_point_with_room_for_the_noise(on_circle):
+    sets = on_circle.extend(0.5, 0.1)
+    around = np.linspace(-0.38, 0.38, 50)[:, None]
+    assert all(s.contains(around).all() for s in sets.sets)
+
+
+def test_noise_widens_the_sets_when_the_horizon_is_short(on_circle):
+    theta = np.linspace(2, 4, 20_000)[:, None]
+    for noise in (0.1, 0.3):
+        reach = theta[on_circle.extend(0.05, noise).sets[0].contains(theta)].max()
+        assert reach >= PI + noise - 2 * on_circle.partition.grid.cell
+
+
+# ---- vehicle
+
+
+@pytest.mark.parametrize("x", [0.0, 0.1, 0.2, 0.3, 0.4])
+def test_without_noise_the_overlap_is_what_can_still_be_won(vehicle_sets, on_vehicle, x):
+    cell = on_vehicle.partition.grid.cell
+    assert overlap(vehicle_sets[0.0], x) == pytest.approx(min(0.3, LAST_CHANCE - x), abs=cell)
+
+
+@pytest.mark.parametrize("x", [0.0, 0.05, 0.1, 0.15, 0.2])
+def test_with_noise_there_is_room_for_it(vehicle_sets, on_vehicle, x):
+    # The noise acts across; the room is measured at right angles to the edge, or across.
+    cell = on_vehicle.partition.grid.cell
+    width = overlap(vehicle_sets[0.1], x)
+    assert width <= max(0.1, min(0.3, LAST_CHANCE - x - 0.1)) + cell
+    assert width >= max(0.1, min(0.3, LAST_CHANCE - x - 0.1 * np.sqrt(2))) - cell
+
+
+@pytest.mark.parametrize("x", [0.0, 0.2, 0.4, 0.5, 0.7])
+def test_the_overlap_is_never_narrower_than_the_noise(vehicle_sets, x):
+    assert overlap(vehicle_sets[0.1], x) >= 0.1 - 2e-3
+
+
+def test_the_set_point_and_what_lies_behind_the_obstacle_is_in_every_set(vehicle_sets):
+    z = np.array([[3.0, 0.0], [2.9, 0.1], [2.4, -0.5], [2.0, 1.0]])
+    for sets in vehicle_sets.values():
+        assert all(s.contains(z).all() for s in sets.sets)
+
+
+def test_the_winning_nodes_do_win(vehicle_sets):
+    sets = vehicle_sets[0.1]
+    nodes = sets.sets[0].grid.nodes
+    at = np.argmin(np.abs(nodes - [0.0, -0.2]).sum(axis=1))
+    late = np.argmin(np.abs(nodes - [0.4, -0.2]).sum(axis=1))
+    assert sets.winning[0][at]
+    assert sets.winning[1][at]
+    assert not sets.winning[0][late]
+
+
+def test_the_sets_hold_their_parts(on_vehicle, vehicle_sets):
+    for sets in vehicle_sets.values():
+        for part, extended in zip(on_vehicle.partition.parts, sets.sets, strict=True):
+            assert extended.mask[part.mask].all()
+
+
+def test_a_single_mode_keeps_everything(vehicle):
+    case = Case(vehicle, one_way_policy(vehicle), 20, 30)
+    sets = case.extend(0.3, 0.1)
+    assert sets.modes == (0,)
+    assert sets.sets[0].mask.all()
+    assert sets.sentence(vehicle) == "one mode, its set is everything"
+    far = distance_to(vehicle, case.critical, np.zeros((3, 2)))
+    np.testing.assert_array_equal(far, [np.inf] * 3)
+
+
+def test_the_distance_to_the_critical_set_goes_the_short_way(circle, on_circle):
+    distance = distance_to(circle, on_circle.critical, np.array([[0.0], [PI + 1], [7 * PI - 1]]))
+    np.testing.assert_allclose(distance, [PI, 1.0, 1.0], atol=2e-3)

@@ -1,0 +1,162 @@
+"""The hybrid controller jumps exactly on its jump set, and is a pure function."""
+
+import numpy as np
+import pytest
+from planted import AnalyticSet, ChartPolicy, ideal_controller, random_states
+
+from hyrl_mj import BadInput, HybridController
+from hyrl_mj.sets import Everything
+
+
+def constant(task, value):
+    return ChartPolicy(task, lambda z: np.full((len(z), 1), value))
+
+
+@pytest.fixture
+def two(vehicle):
+    return ideal_controller(vehicle, overlap=0.2)
+
+
+@pytest.fixture
+def three(circle):
+    """Three modes around the circle, each centred on its own third, half-width 1.3 rad."""
+    centres = {1: 0.0, 4: 2 * np.pi / 3, 7: 4 * np.pi / 3}
+    return HybridController(
+        circle,
+        {q: constant(circle, k / 10) for k, q in enumerate(centres)},
+        {
+            q: AnalyticSet(lambda z, c=c: np.abs(circle.chart.difference(z, c))[:, 0] - 1.3)
+            for q, c in centres.items()
+        },
+    )
+
+
+# ---- jumps
+
+
+def test_it_jumps_exactly_on_the_jump_set(two, vehicle):
+    z = random_states(vehicle, 2000, np.random.default_rng(0))
+    for q in two.modes:
+        modes = np.full(2000, q)
+        _, after = two.step(modes, z)
+        np.testing.assert_array_equal(after != modes, two.jump_set(q).contains(z))
+
+
+def test_on_the_boundary_it_jumps(two):
+    z = np.array([[0.1, -0.2], [0.1, -0.2 + 1e-9], [0.1, 0.2], [0.1, 0.2 - 1e-9]])
+    np.testing.assert_array_equal(two.step(np.array([0, 0, 1, 1]), z)[1], [1, 0, 0, 1])
+
+
+def test_after_a_jump_the_state_lies_in_the_other_flow_set(two, three, vehicle, circle):
+    for controller, task in ((two, vehicle), (three, circle)):
+        z = random_states(task, 2000, np.random.default_rng(0))
+        for q in controller.modes:
+            _, after = controller.step(np.full(2000, q), z)
+            for other in set(controller.modes) - {q}:
+                rows = after == other
+                assert rows.any()
+                assert controller.flow_set(other).contains(z[rows]).all()
+
+
+def test_the_mode_after_the_jump_acts(two):
+    z = np.array([[0.1, -0.3], [0.1, 0.0], [0.1, 0.3]])
+    u, q = two.step(np.array([0, 0, 0]), z)
+    np.testing.assert_array_equal(u[:, 0], [-1.0, 1.0, 1.0])
+    np.testing.assert_array_equal(q, [1, 0, 0])
+
+
+def test_with_three_modes_it_jumps_to_the_deepest(three):
+    third = 2 * np.pi / 3
+    theta = np.array([[third - 0.2], [third + 0.9], [third + 1.2], [2 * third], [0.5]])
+    u, q = three.step(np.full(5, 1), theta)
+    np.testing.assert_array_equal(q, [4, 4, 7, 7, 1])
+    np.testing.assert_allclose(u[:, 0], [0.1, 0.1, 0.2, 0.2, 0.0])
+    with_overlap = np.array([[1.25]])
+    assert three.step(np.array([1]), with_overlap)[1] == [1], "hysteresis: it flows on while it may"
+    assert three.initial_mode(with_overlap) == [4]
+
+
+def test_the_initial_mode_is_the_deepest(two, three):
+    z = np.array([[0.1, 0.05], [0.1, -0.05], [0.1, 0.9]])
+    np.testing.assert_array_equal(two.initial_mode(z), [0, 1, 0])
+    np.testing.assert_array_equal(three.initial_mode(np.array([[0.1], [2.0], [4.0]])), [1, 4, 7])
+
+
+def test_a_single_mode_never_jumps(vehicle):
+    nowhere = AnalyticSet(lambda z: np.ones(len(z)))
+    for flow_set in (Everything(), nowhere):
+        controller = HybridController(vehicle, {0: constant(vehicle, 0.5)}, {0: flow_set})
+        z = random_states(vehicle, 100, np.random.default_rng(0))
+        u, q = controller.step(np.zeros(100, dtype=int), z)
+        np.testing.assert_array_equal(q, 0)
+        np.testing.assert_array_equal(u, 0.5)
+        np.testing.assert_array_equal(controller.initial_mode(z), 0)
+
+
+def test_flow_and_jump_set_meet_on_the_boundary_only(two, vehicle):
+    z = random_states(vehicle, 1000, np.random.default_rng(0))
+    flow, jump = two.flow_set(0), two.jump_set(0)
+    np.testing.assert_array_equal(flow.signed_distance(z), -jump.signed_distance(z))
+    np.testing.assert_array_equal(flow.contains(z), ~jump.contains(z))
+
+
+# ---- a pure function
+
+
+def test_step_is_pure(two, vehicle):
+    z = random_states(vehicle, 500, np.random.default_rng(0))
+    q = np.arange(500) % 2
+    z_before, q_before = z.copy(), q.copy()
+    first = two.step(q, z)
+    two.step(1 - q, z[::-1])
+    second = two.step(q, z)
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(z, z_before)
+    np.testing.assert_array_equal(q, q_before)
+    assert not np.shares_memory(first[1], q)
+
+
+def test_a_batch_gives_what_its_rows_give(three, circle):
+    z = random_states(circle, 300, np.random.default_rng(0))
+    q = np.array(three.modes)[np.arange(300) % 3]
+    u, after = three.step(q, z)
+    for i in range(300):
+        u_i, q_i = three.step(q[i : i + 1], z[i : i + 1])
+        assert (u_i[0, 0], q_i[0]) == (u[i, 0], after[i])
+    assert u.shape == (300, 1)
+    assert after.dtype.kind == "i"
+
+
+def test_no_robots_are_no_problem(two):
+    u, q = two.step(np.zeros(0, dtype=int), np.zeros((0, 2)))
+    assert (u.shape, q.shape) == ((0, 1), (0,))
+
+
+# ---- bad input
+
+
+@pytest.mark.parametrize("mode", [2, -1, 0.5, np.nan])
+def test_an_unknown_mode_lists_the_known(two, mode):
+    with pytest.raises(BadInput, match=r"unknown: choose one of \(0, 1\)") as caught:
+        two.step(np.array([0, mode]), np.zeros((2, 2)))
+    assert str(mode) in str(caught.value)
+    with pytest.raises(BadInput, match=r"choose one of \(0, 1\)"):
+        two.flow_set(mode)
+    with pytest.raises(BadInput, match=r"choose one of \(0, 1\)"):
+        two.jump_set(mode)
+
+
+@pytest.mark.parametrize("q", [0, np.zeros(3, dtype=int), np.zeros((2, 1), dtype=int)])
+def test_modes_of_the_wrong_shape_are_refused(two, q):
+    with pytest.raises(BadInput, match=r"2 measurements need q of shape \(2,\)"):
+        two.step(q, np.zeros((2, 2)))
+
+
+def test_bad_measurements_are_refused(two):
+    with pytest.raises(BadInput, match=r"measurement\[1, 1\] is nan"):
+        two.step(np.zeros(2, dtype=int), np.array([[0.0, 0.0], [0.0, np.nan]]))
+    with pytest.raises(BadInput, match=r"\(n, 2\)"):
+        two.initial_mode(np.zeros((2, 3)))
+    with pytest.raises(BadInput, match=r"measurement\[0, 0\] is inf"):
+        two.initial_mode(np.full((1, 2), np.inf))

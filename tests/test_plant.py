@@ -1,0 +1,230 @@
+"""The plants are the paper's equations, and never take what they cannot digest."""
+
+import mujoco
+import numpy as np
+import pytest
+from planted import euler, random_inputs, random_states
+
+from hyrl_mj import mjcf
+from hyrl_mj.errors import BadInput, SimulationDiverged
+from hyrl_mj.plant import Plant
+from hyrl_mj.tasks.vehicle import Vehicle
+
+PAIRS = 10_000
+
+
+def test_one_sample_is_the_papers_equation(task):
+    rng = np.random.default_rng(1)
+    z, u = random_states(task, PAIRS, rng), random_inputs(task, PAIRS, rng)
+    plant = task.plant(PAIRS)
+    plant.set_state(task.qpos(z))
+    plant.step(u)
+    np.testing.assert_allclose(task.z(plant.measurement), euler(task, z, u), rtol=0, atol=1e-6)
+
+
+def test_whole_episodes_are_the_papers_equation(task):
+    rng, n = np.random.default_rng(2), 50
+    z = random_states(task, n, rng)
+    plant = task.plant(n)
+    plant.set_state(task.qpos(z))
+    for _ in range({"unit_circle": 150, "vehicle": 60}[task.name]):
+        u = random_inputs(task, n, rng)
+        z = euler(task, z, u)
+        plant.step(u)
+        np.testing.assert_allclose(task.z(plant.measurement), z, rtol=0, atol=1e-6)
+
+
+def test_step_backward_inverts_step(task):
+    rng = np.random.default_rng(3)
+    z, u = random_states(task, PAIRS, rng), random_inputs(task, PAIRS, rng)
+    plant = task.plant(PAIRS)
+    plant.set_state(task.qpos(z))
+    plant.step(u)
+    plant.step_backward(u)
+    np.testing.assert_allclose(task.z(plant.measurement), z, rtol=0, atol=1e-6)
+
+
+def test_step_backward_moves_the_other_way(task):
+    z, u = np.array(task.replay_starts[:1]), np.array([[0.5]])
+    plant = task.plant(1)
+    plant.set_state(task.qpos(z))
+    plant.step_backward(u)
+    np.testing.assert_allclose(task.z(plant.measurement), 2 * z - euler(task, z, u), atol=1e-6)
+
+
+def test_the_number_of_threads_changes_no_bit(task):
+    states = []
+    for threads in (1, 2):
+        rng = np.random.default_rng(4)
+        plant = task.plant(300, threads)
+        plant.set_state(task.qpos(random_states(task, 300, rng)))
+        for _ in range(20):
+            plant.step(random_inputs(task, 300, rng))
+        states.append(plant.state)
+    np.testing.assert_array_equal(*states)
+
+
+def test_only_the_addressed_copies_move(vehicle):
+    plant = vehicle.plant(4)
+    plant.set_state(np.zeros((4, 2)))
+    plant.step(np.array([[1.0], [-1.0]]), np.array([1, 3]))
+    expected = [[0, 0], [0.05, 0.05], [0, 0], [0.05, -0.05]]
+    np.testing.assert_allclose(plant.qpos, expected, atol=1e-9)
+    np.testing.assert_array_equal(plant.measurement, plant.qpos)
+
+
+def test_set_state_forgets_the_last_input_and_keeps_the_speed(vehicle):
+    plant = vehicle.plant(1)
+    plant.set_state(np.zeros((1, 2)))
+    plant.step(np.array([[1.0]]))
+    plant.set_state(np.zeros((1, 2)))
+    np.testing.assert_array_equal(plant.measurement, [[0.0, 0.0]])
+    plant.step(np.array([[0.0]]))
+    np.testing.assert_allclose(plant.measurement, [[0.05, 0.0]], atol=1e-9)
+
+
+def test_input_limits_and_sample_time_stand_in_the_mjcf(task):
+    low, high = task.input_limits
+    np.testing.assert_array_equal([low, high], [[-1.0], [1.0]])
+    assert task.dt == 0.05
+
+
+# ---- bad input
+
+BAD_INPUTS = {
+    "nan": np.array([[0.0], [0.0], [np.nan]]),
+    "inf": np.array([[0.0], [0.0], [-np.inf]]),
+    "too much": np.array([[0.0], [0.0], [1.5]]),
+}
+
+
+@pytest.mark.parametrize("u", BAD_INPUTS.values(), ids=BAD_INPUTS.keys())
+def test_a_bad_input_names_its_simulation_and_changes_nothing(task, u):
+    plant = task.plant(3)
+    plant.set_state(task.qpos(np.array(task.replay_starts[:3])))
+    before = plant.state
+    with pytest.raises(BadInput, match=r"simulation 2") as caught:
+        plant.step(u)
+    assert f"{u[2, 0]:g}" in str(caught.value)
+    np.testing.assert_array_equal(plant.state, before)
+
+
+@pytest.mark.parametrize("value", [np.nan, 1.5])
+def test_a_bad_input_to_some_copies_names_the_copy(vehicle, value):
+    plant = vehicle.plant(5)
+    plant.set_state(np.zeros((5, 2)))
+    with pytest.raises(BadInput, match=r"simulation 4"):
+        plant.step(np.array([[0.0], [value]]), np.array([1, 4]))
+
+
+@pytest.mark.parametrize("shape", [(3,), (3, 2), (2, 1), (1, 3)])
+def test_an_input_of_the_wrong_shape_says_the_right_one(task, shape):
+    plant = task.plant(3)
+    before = plant.state
+    with pytest.raises(BadInput, match=r"\(3, 1\)"):
+        plant.step(np.zeros(shape))
+    np.testing.assert_array_equal(plant.state, before)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_bad_state_names_its_simulation_and_changes_nothing(task, value):
+    plant = task.plant(3)
+    plant.set_state(task.qpos(np.array(task.replay_starts[:3])))
+    before, qpos = plant.state, plant.qpos
+    qpos[1, 0] = value
+    with pytest.raises(BadInput, match=r"\[1, 0\]|simulation 1") as caught:
+        plant.set_state(qpos)
+    assert str(value) in str(caught.value)
+    with pytest.raises(BadInput, match="qvel"):
+        plant.set_state(np.ones_like(qpos), np.full_like(qpos, value))
+    np.testing.assert_array_equal(plant.state, before)
+
+
+def test_a_state_of_the_wrong_shape_says_the_right_one(vehicle):
+    with pytest.raises(BadInput, match=r"qpos has shape \(3, 1\).*\(3, 2\)"):
+        vehicle.plant(3).set_state(np.zeros((3, 1)))
+
+
+def test_an_unknown_actuator_lists_the_known(vehicle):
+    with pytest.raises(BadInput, match=r"'steering'.*forward_speed, lateral_velocity"):
+        Plant(vehicle.model, ("steering",), 1)
+
+
+def test_an_input_without_limits_is_refused(vehicle):
+    with pytest.raises(BadInput, match=r"forward_speed needs a ctrlrange"):
+        Plant(vehicle.model, ("forward_speed",), 1)
+
+
+# ---- plants that go wrong
+
+ROCKET = """
+<mujoco model="rocket">
+  <option timestep="0.05" gravity="0 0 0"/>
+  <worldbody>
+    <body>
+      <joint name="x" type="slide"/>
+      <geom size="0.1" mass="1" contype="0"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="thrust" joint="x" gear="1e15" ctrlrange="-1 1"/>
+  </actuator>
+  <sensor>
+    <jointpos joint="x"/>
+  </sensor>
+</mujoco>
+"""
+
+
+@pytest.fixture
+def rocket(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its log into the working directory
+    path = tmp_path / "rocket.xml"
+    path.write_text(ROCKET)
+    return Plant(mjcf.load(path), ("thrust",), 3)
+
+
+def test_a_diverging_simulation_is_named(rocket):
+    with pytest.raises(SimulationDiverged, match=r"simulation 1 of 3 of rocket diverged"):
+        rocket.step(np.array([[0.0], [1.0], [0.0]]))
+
+
+def test_a_diverged_simulation_can_be_set_back(rocket):
+    with pytest.raises(SimulationDiverged):
+        rocket.step(np.ones((3, 1)))
+    rocket.set_state(np.zeros((3, 1)))
+    rocket.step(np.zeros((3, 1)))
+    np.testing.assert_array_equal(rocket.measurement, np.zeros((3, 1)))
+
+
+def test_a_plant_with_inertia_cannot_run_backward(rocket):
+    assert not rocket.invertible
+    with pytest.raises(BadInput, match=r"rocket cannot be run backward"):
+        rocket.step_backward(np.zeros((3, 1)))
+
+
+def test_a_model_that_is_not_there_or_not_one(tmp_path):
+    with pytest.raises(BadInput, match=r"no MJCF model at .*nothing\.xml"):
+        mjcf.load(tmp_path / "nothing.xml")
+    (tmp_path / "broken.xml").write_text("<mujoco><worldbody></mujoco>")
+    with pytest.raises(BadInput, match=r"cannot compile .*broken\.xml"):
+        mjcf.load(tmp_path / "broken.xml")
+
+
+# ---- geometry is read from the MJCF
+
+
+def test_the_task_follows_the_geometry_of_its_mjcf():
+    spec = mujoco.MjSpec.from_file(str(mjcf.models_dir() / "vehicle.xml"))
+    spec.geom("obstacle").size[0] = 0.5
+    spec.geom("obstacle").pos[:2] = 1.2, 0.1
+    spec.site("arena").size[1] = 1.1
+    spec.site("set_point").pos[0] = 2.5
+    spec.actuator("lateral_velocity").ctrlrange = (-2.0, 2.0)
+    task = Vehicle()
+    task.model = spec.compile()
+    np.testing.assert_allclose(task.clearance(np.array([[0.2, 0.1]])), [0.5])
+    assert task.chart.low == (0.0, -1.1)
+    assert task.chart.high == (3.0, 1.1)
+    np.testing.assert_allclose(task.distance_to_go(np.array([[0.0, 0.0]])), [2.5])
+    np.testing.assert_allclose(task.input_levels[:, 0], [-2, -1, 0, 1, 2])

@@ -1,0 +1,230 @@
+"""Sets on grids agree with shapes whose distance is known, the better the finer the grid."""
+
+import numpy as np
+import pytest
+
+from hyrl_mj import BadInput, Chart
+from hyrl_mj.sets import Complement, Everything, Grid, GridSet
+
+PI = np.pi
+LINE = Chart(("x",), ("m",), (-1.0,), (1.0,), (False,))
+RING = Chart(("theta",), ("rad",), (0.0,), (2 * PI,), (True,))
+PLANE = Chart(("x", "y"), ("m", "m"), (-1.0, -1.0), (2.0, 1.0), (False, False))
+TUBE = Chart(("theta", "y"), ("rad", "m"), (0.0, -1.0), (2 * PI, 1.0), (True, False))
+
+
+def interval(z):
+    return np.maximum(-0.5 - z[:, 0], z[:, 0] - 0.3)
+
+
+def disc(z):
+    return np.linalg.norm(z - [0.4, 0.1], axis=1) - 0.6
+
+
+def arc(z):
+    """The arc of half-width 0.8 around 0.2: it runs over the seam at 0."""
+    return np.abs(RING.difference(z, 0.2))[:, 0] - 0.8
+
+
+def patch(z):
+    """A disc on the tube, over its seam."""
+    return np.linalg.norm(TUBE.difference(z, [0.1, 0.0]), axis=1) - 0.7
+
+
+SHAPES = {
+    "interval": (LINE, interval),
+    "disc": (PLANE, disc),
+    "arc": (RING, arc),
+    "patch": (TUBE, patch),
+}
+
+
+def points(chart, n=4000, seed=0):
+    return np.random.default_rng(seed).uniform(chart.low, chart.high, (n, chart.dimension))
+
+
+def on_grid(chart, shape, cells):
+    grid = Grid.with_cells(chart, cells)
+    return GridSet.from_mask(grid, shape(grid.nodes) <= 0)
+
+
+def worst_error(chart, shape, cells):
+    """Largest error of the signed distance near the boundary."""
+    z = points(chart)
+    exact = shape(z)
+    near = np.abs(exact) < 0.25
+    return np.abs(on_grid(chart, shape, cells).signed_distance(z) - exact)[near].max()
+
+
+@pytest.fixture(params=SHAPES.values(), ids=SHAPES.keys())
+def case(request):
+    return request.param
+
+
+# ---- signed distance
+
+
+def test_signed_distance_is_right_to_a_cell(case):
+    chart, shape = case
+    for cells in (50, 100):
+        assert worst_error(chart, shape, cells) <= 1.5 * Grid.with_cells(chart, cells).cell
+
+
+def test_its_error_shrinks_with_the_grid(case):
+    chart, shape = case
+    coarse, fine = (worst_error(chart, shape, cells) for cells in (20, 240))
+    assert fine < coarse / 6
+
+
+def test_contains_is_a_distance_of_at_most_zero(case):
+    chart, shape = case
+    z = points(chart)
+    whole = on_grid(chart, shape, 60)
+    inside = whole.contains(z)
+    np.testing.assert_array_equal(inside, whole.signed_distance(z) <= 0)
+    clear = np.abs(shape(z)) > 1.5 * whole.grid.cell
+    np.testing.assert_array_equal(inside[clear], shape(z[clear]) <= 0)
+    np.testing.assert_array_equal(whole.mask, whole.contains(whole.grid.nodes))
+
+
+def test_a_full_and_an_empty_set(case):
+    chart, _ = case
+    grid, z = Grid.with_cells(chart, 20), points(chart)
+    full = GridSet.from_mask(grid, np.ones(len(grid.nodes), dtype=bool))
+    empty = GridSet.from_mask(grid, np.zeros(len(grid.nodes), dtype=bool))
+    assert full.contains(z).all()
+    assert not empty.contains(z).any()
+    assert full.eroded(0.5).contains(z).all()
+    assert not empty.dilated(0.5).contains(z).any()
+
+
+# ---- algebra
+
+
+def test_union_intersection_complement():
+    left, right = on_grid(PLANE, disc, 90), on_grid(PLANE, lambda z: disc(z - [0.5, 0.0]), 90)
+    z = points(PLANE)
+    a, b = left.signed_distance(left.grid.nodes), right.signed_distance(right.grid.nodes)
+    nodes = left.grid.nodes
+    np.testing.assert_array_equal((left | right).contains(nodes), (a <= 0) | (b <= 0))
+    np.testing.assert_array_equal((left & right).contains(nodes), (a <= 0) & (b <= 0))
+    np.testing.assert_allclose((~left).signed_distance(z), -left.signed_distance(z))
+    np.testing.assert_allclose((~~left).values, left.values)
+
+
+def test_dilation_and_erosion_move_the_boundary_by_their_amount():
+    whole = on_grid(PLANE, disc, 150)
+    z = np.array([[0.4 + 0.6 + dx, 0.1] for dx in (-0.25, -0.15, 0.15, 0.25)])
+    np.testing.assert_array_equal(whole.dilated(0.2).contains(z), [True, True, True, False])
+    np.testing.assert_array_equal(whole.eroded(0.2).contains(z), [True, False, False, False])
+
+
+def test_dilation_runs_over_the_seam():
+    whole = on_grid(RING, arc, 360).dilated(0.3)
+    angles = np.array([[0.2 + 1.05], [0.2 + 1.15], [0.2 - 1.05], [0.2 - 1.15], [2 * PI - 0.01]])
+    np.testing.assert_array_equal(whole.contains(angles), [True, False, True, False, True])
+
+
+def test_complement_shares_the_boundary_and_nothing_else():
+    grid = Grid.with_cells(LINE, 4)
+    whole = GridSet(grid, np.array([-1.0, -0.5, 0.0, 0.5, 1.0]))
+    z = np.array([[-0.5], [0.0], [0.5]])
+    np.testing.assert_array_equal(whole.contains(z), [True, True, False])
+    np.testing.assert_array_equal(Complement(whole).contains(z), [False, True, True])
+    np.testing.assert_array_equal(Complement(whole).signed_distance(z), [0.5, 0.0, -0.5])
+
+
+def test_everything():
+    z = points(PLANE)
+    assert Everything().contains(z).all()
+    assert (Everything().signed_distance(z) < -1e9).all()
+    assert not Complement(Everything()).contains(z).any()
+
+
+# ---- periods
+
+
+def test_any_winding_is_the_same_point(case):
+    chart, shape = case
+    whole, z = on_grid(chart, shape, 40), points(chart)
+    distance = whole.signed_distance(z)
+    turns = np.where(chart.periodic, 6 * PI, 0.0)
+    for shifted in (z + turns, z - turns):
+        np.testing.assert_allclose(whole.signed_distance(shifted), distance, atol=1e-9)
+
+
+def test_the_distance_is_continuous_over_the_seam():
+    whole = on_grid(RING, arc, 180)
+    seam = whole.signed_distance(np.array([[2 * PI - 1e-9], [0.0], [2 * PI]]))
+    np.testing.assert_allclose(seam, seam[0], atol=1e-6)
+
+
+def test_chart_difference_goes_the_short_way():
+    delta = RING.difference(np.array([[0.1], [6.0], [1.0]]), np.array([[6.0], [0.1], [0.5]]))
+    np.testing.assert_allclose(delta[:, 0], [2 * PI - 5.9, 5.9 - 2 * PI, 0.5])
+
+
+# ---- grids
+
+
+def test_cells_are_square_and_periods_have_no_double_node():
+    grid = Grid.with_cells(PLANE, 30)
+    assert grid.counts == (31, 21)
+    np.testing.assert_allclose(grid.spacing, [0.1, 0.1])
+    ring = Grid.with_cells(RING, 8)
+    np.testing.assert_allclose(ring.nodes[:, 0], np.arange(8) * PI / 4)
+    assert Grid.with_cells(TUBE, 60).counts == (60, 20)
+
+
+def test_interpolation_is_exact_for_linear_functions():
+    grid, z = Grid.with_cells(PLANE, 12), points(PLANE)
+    slopes = np.array([2.0, -3.0])
+    values = grid.nodes @ slopes + 1
+    np.testing.assert_allclose(grid.interpolate(values, z), z @ slopes + 1, atol=1e-9)
+    outside = np.array([[9.0, 0.0], [0.0, -9.0]])
+    np.testing.assert_allclose(grid.interpolate(values, outside), [5.0, 4.0], atol=1e-9)
+
+
+def test_the_nearest_node_is_the_nearest(case):
+    chart, _ = case
+    grid, z = Grid.with_cells(chart, 20), points(chart, 300)
+    distance = np.linalg.norm(chart.difference(z[:, None], grid.nodes[None]), axis=2)
+    chosen = distance[np.arange(len(z)), grid.nearest(z)]
+    np.testing.assert_allclose(chosen, distance.min(axis=1), atol=1e-9)
+
+
+def test_a_grid_of_another_dimension_or_size_is_refused():
+    with pytest.raises(BadInput, match="2 dimensions"):
+        Grid.from_counts(LINE, np.array([3, 3]))
+    with pytest.raises(BadInput, match=r"\(5,\).*\(3,\)"):
+        GridSet(Grid(LINE, (3,)), np.zeros(5))
+
+
+def test_the_values_of_a_set_are_frozen():
+    whole = on_grid(LINE, interval, 20)
+    with pytest.raises(ValueError, match="read-only"):
+        whole.values[0] = 1.0
+
+
+# ---- projection
+
+
+def test_projection_leaves_inner_points_and_finds_the_nearest_for_others(case):
+    chart, shape = case
+    whole, z = on_grid(chart, shape, 60), points(chart, 500)
+    projected = whole.project(z)
+    inside = whole.contains(z)
+    np.testing.assert_array_equal(projected[inside], z[inside])
+    assert whole.contains(projected).all()
+    nodes = whole.grid.nodes[whole.mask]
+    brute = np.linalg.norm(chart.difference(z[:, None], nodes[None]), axis=2).min(axis=1)
+    ours = np.linalg.norm(chart.difference(z, projected), axis=1)
+    # The nearest to the node nearest to z: off by half a cell's diagonal, there and back.
+    slack = np.linalg.norm(whole.grid.spacing)
+    assert (ours[~inside] <= brute[~inside] + slack + 1e-9).all()
+
+
+def test_projection_onto_an_empty_set_leaves_points_where_they_are():
+    grid = Grid.with_cells(LINE, 10)
+    empty, z = GridSet.from_mask(grid, np.zeros(11, dtype=bool)), points(LINE, 5)
+    np.testing.assert_array_equal(empty.project(z), z)

@@ -1,0 +1,318 @@
+"""The batched closed loop equals plain ones, and its hybrid arcs live on hybrid time domains."""
+
+import mujoco
+import numpy as np
+import pytest
+from planted import (
+    ChartPolicy,
+    circle_policy,
+    euler,
+    ideal_controller,
+    one_way_policy,
+    sign_policy,
+)
+
+from hyrl_mj import BadArtifact, BadInput, HybridArc, Noise, Outcome, closed_loop, simulate
+from hyrl_mj.simulation import PolicyController
+
+ALTERNATING = Noise("alternating", 0.1)
+
+
+@pytest.fixture
+def chattering(vehicle):
+    """Flow sets so narrow that alternating noise makes the modes jump at every sample."""
+    return ideal_controller(vehicle, overlap=0.02)
+
+
+@pytest.fixture
+def jumping_arc(vehicle, chattering):
+    return simulate(vehicle, chattering, np.array([0.0, 0.01]), ALTERNATING, q0=0)
+
+
+def vehicle_starts(n):
+    return np.random.default_rng(0).uniform((0.0, -1.0), (0.5, 1.0), (n, 2))
+
+
+# ---- plain twins
+
+
+def formula_run(task, controller, z, q, bound):
+    """One closed loop, sample by sample, by the paper's equation: path, modes, outcome."""
+    path, modes = [z], []
+    for k in range(task.max_steps):
+        if task.ending(z[None])[0] != Outcome.RUNNING:
+            break
+        noise = (bound if k % 2 == 0 else -bound) * np.array(task.noisy)
+        u, next_mode = controller.step(np.array([q]), (z + noise)[None])
+        q = next_mode[0]
+        z = euler(task, z[None], u)[0]
+        path.append(z)
+        modes.append(q)
+    outcome = task.ending(z[None])[0]
+    return np.array(path), modes, outcome or task.verdict(z[None])[0]
+
+
+def plant_run(task, controller, z, bound):
+    """The same in MuJoCo, one simulation by itself: its path."""
+    plant, q = task.plant(1, threads=1), np.zeros(1, dtype=int)
+    plant.set_state(task.qpos(z[None]))
+    path = [plant.measurement[0]]
+    for k in range(task.max_steps):
+        if task.ending(plant.measurement)[0] != Outcome.RUNNING:
+            break
+        noise = np.where(task.noisy, bound if k % 2 == 0 else -bound, 0.0)
+        u, q = controller.step(q, plant.measurement + noise)
+        plant.step(u)
+        path.append(plant.measurement[0])
+    return np.array(path)
+
+
+def cases(circle, vehicle):
+    theta = np.random.default_rng(0).uniform(0, 2 * np.pi, (40, 1))
+    return [
+        (vehicle, ideal_controller(vehicle, 0.15), vehicle_starts(40)),
+        (vehicle, PolicyController(sign_policy(vehicle)), vehicle_starts(40)),
+        (circle, PolicyController(circle_policy(circle)), theta),
+    ]
+
+
+def test_it_equals_the_formula_one_by_one(circle, vehicle):
+    for task, controller, starts in cases(circle, vehicle):
+        q0 = np.zeros(len(starts), dtype=int)
+        rollout = closed_loop(task, controller, starts, noise=ALTERNATING, q0=q0, record=True)
+        for i, start in enumerate(starts):
+            path, modes, outcome = formula_run(task, controller, start, 0, 0.1)
+            end = rollout.length[i]
+            assert end == len(path) - 1
+            np.testing.assert_allclose(rollout.path[: end + 1, i], path, rtol=0, atol=1e-6)
+            np.testing.assert_array_equal(rollout.q[:end, i], modes)
+            assert rollout.outcome[i] == outcome
+
+
+def test_it_equals_single_simulations_to_the_bit(circle, vehicle):
+    for task, controller, starts in cases(circle, vehicle):
+        q0 = np.zeros(len(starts), dtype=int)
+        rollout = closed_loop(task, controller, starts, noise=ALTERNATING, q0=q0)
+        for i, start in enumerate(starts[:10]):
+            path = plant_run(task, controller, start, 0.1)
+            np.testing.assert_array_equal(rollout.path[: rollout.length[i] + 1, i], path)
+
+
+def test_a_run_that_ended_stays_where_it_ended(vehicle):
+    rollout = closed_loop(vehicle, PolicyController(sign_policy(vehicle)), vehicle_starts(50))
+    assert len(set(rollout.length)) > 1
+    for i, end in enumerate(rollout.length):
+        rest = rollout.path[end:, i]
+        np.testing.assert_array_equal(rest, np.broadcast_to(rest[0], rest.shape))
+
+
+def test_backward_undoes_forward(vehicle):
+    loop = PolicyController(one_way_policy(vehicle, clear=9.0))
+    starts = vehicle_starts(20)
+    forward = closed_loop(vehicle, loop, starts, steps=6)
+    back = closed_loop(vehicle, loop, forward.path[-1], steps=6, backward=True)
+    np.testing.assert_allclose(back.path[-1], starts, atol=1e-6)
+    assert (back.outcome == Outcome.RUNNING).all()
+
+
+def test_a_policy_that_gives_nan_is_stopped_before_mujoco(vehicle):
+    policy = ChartPolicy(vehicle, lambda z: np.where(z[:, :1] > 0.3, np.nan, 0.0))
+    with pytest.raises(BadInput, match=r"simulation 1"):
+        simulate(vehicle, policy, np.array([[0.0, 0.0], [0.1, 0.0]]))
+
+
+# ---- what it is all about
+
+
+def test_noise_leads_the_plain_policy_into_the_obstacle(vehicle):
+    still = simulate(vehicle, sign_policy(vehicle), np.array([0.0, 0.0]))
+    noisy = simulate(vehicle, sign_policy(vehicle), np.array([0.0, 0.0]), ALTERNATING)
+    assert (still.outcome, noisy.outcome) == ("reached", "crashed")
+    assert np.abs(noisy.z[:, 1]).max() < 0.06, "it dithers"
+    assert noisy.controller == "policy"
+
+
+def test_hysteresis_does_not_mind(vehicle):
+    controller = ideal_controller(vehicle, 0.15)
+    for q0 in (0, 1):
+        arcs = simulate(vehicle, controller, np.array(vehicle.replay_starts), ALTERNATING, q0=q0)
+        assert [arc.outcome for arc in arcs] == ["reached"] * 5
+        assert max(arc.j[-1] for arc in arcs) <= 1
+        assert arcs[0].controller == "hyrl"
+
+
+def test_noise_stalls_the_plain_policy_on_the_circle(circle):
+    start = np.array([np.pi])
+    assert simulate(circle, circle_policy(circle), start).outcome == "reached"
+    stalled = simulate(circle, circle_policy(circle), start, ALTERNATING, horizon=4.0)
+    assert stalled.outcome == "stalled"
+    assert np.abs(stalled.z - np.pi).max() < 0.11
+
+
+# ---- hybrid arcs
+
+
+def test_time_doubles_exactly_where_j_rises(jumping_arc):
+    dt, dj = np.diff(jumping_arc.t), np.diff(jumping_arc.j)
+    assert jumping_arc.j[-1] >= 5, "the case has jumps"
+    assert (jumping_arc.t[0], jumping_arc.j[0]) == (0.0, 0)
+    assert (dt >= 0).all()
+    np.testing.assert_array_equal(dj == 1, dt == 0)
+    np.testing.assert_array_equal(dj == 0, dt > 0)
+    np.testing.assert_allclose(dt[dt > 0], 0.05)
+
+
+def test_modes_change_only_at_jumps_and_nothing_else_does(jumping_arc):
+    jump = np.diff(jumping_arc.j) == 1
+    np.testing.assert_array_equal(np.diff(jumping_arc.q) != 0, jump)
+    before, after = np.flatnonzero(jump), np.flatnonzero(jump) + 1
+    for values in (jumping_arc.z, jumping_arc.measured, jumping_arc.state):
+        np.testing.assert_array_equal(values[before], values[after])
+    assert np.isnan(jumping_arc.u[before]).all(), "a jump costs no time"
+    assert np.isfinite(jumping_arc.u[after]).all()
+
+
+def test_the_last_row_ends_the_arc(jumping_arc):
+    assert np.isnan(jumping_arc.u[-1]).all()
+    assert np.isnan(jumping_arc.measured[-1]).all()
+    assert np.isfinite(jumping_arc.z[-1]).all()
+    rows = ("t", "j", "z", "measured", "q", "u", "state")
+    assert len({len(getattr(jumping_arc, name)) for name in rows}) == 1
+
+
+def test_every_flow_step_is_the_plants_equation(jumping_arc, vehicle):
+    flow = np.flatnonzero(np.diff(jumping_arc.t) > 0)
+    expected = euler(vehicle, jumping_arc.z[flow], jumping_arc.u[flow])
+    np.testing.assert_allclose(jumping_arc.z[flow + 1], expected, atol=1e-6)
+
+
+def test_the_input_is_what_the_mode_says(jumping_arc, chattering):
+    acts = np.flatnonzero(np.isfinite(jumping_arc.u[:, 0]))
+    u, q = chattering.step(jumping_arc.q[acts], jumping_arc.measured[acts])
+    np.testing.assert_array_equal(u, jumping_arc.u[acts])
+    np.testing.assert_array_equal(q, jumping_arc.q[acts])
+
+
+def test_the_kept_state_gives_the_scene_back_without_a_policy(jumping_arc, vehicle):
+    data = mujoco.MjData(vehicle.model)
+    signature = mujoco.mjtState.mjSTATE_INTEGRATION
+    assert jumping_arc.state.shape[1] == mujoco.mj_stateSize(vehicle.model, signature)
+    for row in (0, 7, -1):
+        mujoco.mj_setState(vehicle.model, data, jumping_arc.state[row], signature)
+        np.testing.assert_array_equal(data.qpos, jumping_arc.z[row])
+        assert data.time == pytest.approx(jumping_arc.t[row])
+
+
+def test_at_finds_the_last_row_of_a_time(jumping_arc):
+    for t in (0.0, 0.05, 0.3):
+        row = jumping_arc.at(t)
+        assert jumping_arc.t[row] == pytest.approx(t)
+        assert row == len(jumping_arc.t) - 1 or jumping_arc.t[row + 1] > t + 0.04
+    assert jumping_arc.at(0.07) == jumping_arc.at(0.05)
+    assert jumping_arc.at(99.0) == len(jumping_arc.t) - 1
+
+
+def test_the_horizon_cuts_an_arc(circle):
+    arc = simulate(circle, circle_policy(circle), np.array([2.0]), horizon=0.5)
+    assert arc.t[-1] == pytest.approx(0.5)
+    np.testing.assert_allclose(arc.z[:, 0], 2.0 - arc.t, atol=1e-6)
+    assert arc.outcome == "stalled"
+
+
+def test_angles_are_not_wrapped(circle):
+    arc = simulate(circle, circle_policy(circle), np.array([6.0]), horizon=1.0)
+    assert np.abs(np.diff(arc.z[:, 0])).max() < 0.051
+    assert arc.z[:, 0].max() > 2 * np.pi
+
+
+def test_one_start_gives_one_arc_and_several_a_list(vehicle):
+    assert isinstance(simulate(vehicle, sign_policy(vehicle), np.zeros(2)), HybridArc)
+    arcs = simulate(vehicle, sign_policy(vehicle), np.zeros((3, 2)))
+    assert [type(arc) for arc in arcs] == [HybridArc] * 3
+
+
+def test_a_start_that_is_over_already(vehicle):
+    arc = simulate(vehicle, ideal_controller(vehicle), np.array([1.5, 0.0]), q0=1)
+    assert arc.outcome == "crashed"
+    assert (arc.t.tolist(), arc.j.tolist(), arc.q.tolist()) == ([0.0], [0], [1])
+    assert arc.q.dtype.kind == "i"
+    assert arc.j.dtype.kind == "i"
+
+
+def test_an_arc_comes_back_from_disk(jumping_arc, tmp_path):
+    jumping_arc.save(tmp_path / "arc.npz")
+    back = HybridArc.load(tmp_path / "arc.npz")
+    for name, values in vars(jumping_arc).items():
+        np.testing.assert_array_equal(getattr(back, name), values)
+        assert type(getattr(back, name)) is type(values)
+    (tmp_path / "arc.npz").write_bytes((tmp_path / "arc.npz").read_bytes()[:-100])
+    with pytest.raises(BadArtifact, match=r"arc\.npz"):
+        HybridArc.load(tmp_path / "arc.npz")
+
+
+# ---- noise
+
+
+def signals(arcs):
+    """The noise that each arc met, one row a sample."""
+    return [(arc.measured - arc.z)[np.isfinite(arc.u[:, 0])] for arc in arcs]
+
+
+def test_two_controllers_meet_the_same_noise(vehicle):
+    starts, noise = vehicle_starts(8), Noise("uniform", 0.1)
+    first = simulate(vehicle, sign_policy(vehicle), starts, noise, seed=3)
+    second = simulate(vehicle, ideal_controller(vehicle), starts, noise, q0=1, seed=3)
+    for a, b in zip(signals(first), signals(second), strict=True):
+        common = min(len(a), len(b))
+        assert common > 10
+        np.testing.assert_allclose(a[:common], b[:common], atol=1e-12)
+
+
+def test_the_seed_fixes_the_noise_and_another_changes_it(vehicle):
+    def measured(seed):
+        noise, start = Noise("uniform", 0.1), np.array([0.0, 0.5])
+        return simulate(vehicle, one_way_policy(vehicle), start, noise, seed=seed).measured[:-1]
+
+    np.testing.assert_array_equal(measured(1), measured(1))
+    assert not np.array_equal(measured(1), measured(2))
+
+
+def test_noise_acts_on_the_noisy_columns_only(jumping_arc):
+    noise = (jumping_arc.measured - jumping_arc.z)[:-1]
+    np.testing.assert_array_equal(noise[:, 0], 0.0)
+    np.testing.assert_allclose(np.abs(noise[:, 1]), 0.1, atol=1e-12)
+    assert (jumping_arc.noise, jumping_arc.bound) == ("alternating", 0.1)
+
+
+# ---- bad input
+
+
+@pytest.mark.parametrize("horizon", [0, -1.0, np.nan, np.inf])
+def test_a_horizon_that_is_none(vehicle, horizon):
+    with pytest.raises(BadInput, match=rf"horizon {horizon} s .*finite time > 0"):
+        simulate(vehicle, sign_policy(vehicle), np.zeros(2), horizon=horizon)
+
+
+def test_a_start_outside_the_arena(vehicle):
+    with pytest.raises(BadInput, match=r"y = 2 m\) is outside vehicle"):
+        simulate(vehicle, sign_policy(vehicle), np.array([0.0, 2.0]))
+    with pytest.raises(BadInput, match="vehicle is 2 number"):
+        simulate(vehicle, sign_policy(vehicle), np.zeros(3))
+
+
+@pytest.mark.parametrize("mode", [2, -1, 0.5])
+def test_an_unknown_mode(vehicle, mode):
+    with pytest.raises(BadInput, match=rf"mode {mode} is unknown: choose one of \(0, 1\)"):
+        simulate(vehicle, ideal_controller(vehicle), np.zeros(2), q0=mode)
+    with pytest.raises(BadInput, match=r"mode 1 is unknown: choose one of \(0,\)"):
+        simulate(vehicle, sign_policy(vehicle), np.zeros(2), q0=1)
+
+
+def test_start_modes_that_do_not_match_the_starts(vehicle):
+    with pytest.raises(BadInput, match=r"\(2,\)"):
+        simulate(vehicle, ideal_controller(vehicle), np.zeros((3, 2)), q0=np.array([0, 1]))
+
+
+def test_no_starts_at_all(vehicle):
+    with pytest.raises(BadInput):
+        simulate(vehicle, ideal_controller(vehicle), np.zeros((0, 2)))

@@ -1,0 +1,256 @@
+"""Every registered task is whole and consistent; the paper's two have the paper's numbers."""
+
+import mujoco
+import numpy as np
+import pytest
+from planted import random_inputs, random_states
+
+import hyrl_mj
+from hyrl_mj import BadInput, Outcome, mjcf
+from hyrl_mj.envs.gym_env import observation_space
+
+PI = np.pi
+
+
+# ---- every task
+
+
+def test_both_tasks_are_registered():
+    assert {"unit_circle", "vehicle"} <= set(hyrl_mj.task_names())
+
+
+def test_it_has_its_named_parts(task):
+    assert {"overhead", "chase"} <= set(mjcf.names(task.model, mujoco.mjtObj.mjOBJ_CAMERA))
+    assert set(task.inputs) <= set(mjcf.names(task.model, mujoco.mjtObj.mjOBJ_ACTUATOR))
+    sensors = mjcf.names(task.model, mujoco.mjtObj.mjOBJ_SENSOR)
+    assert len(sensors) == task.measurement_columns
+    assert not any(name.startswith("(") for name in sensors), "a sensor without a name"
+    joints = [task.model.joint(i).name for i in range(task.model.njnt)]
+    bodies = [task.model.body(i).name for i in range(task.model.nbody)]
+    assert all(joints)
+    assert all(bodies)
+    assert mjcf.model_name(task.model) == task.name
+
+
+def test_its_descriptions_fit_its_dimensions(task):
+    d = task.chart.dimension
+    for part in (task.chart.units, task.chart.low, task.chart.high, task.chart.periodic):
+        assert len(part) == d
+    assert all(len(start) == d for start in task.replay_starts)
+    assert len(task.observation_low) == len(task.observation_high)
+    assert task.description
+    assert len(task.mode_names) == 2
+
+
+def test_its_starts_lie_in_the_chart(task):
+    z = task.starts(5000, np.random.default_rng(0))
+    assert z.shape == (5000, task.chart.dimension)
+    assert task.chart.contains(z).all()
+    np.testing.assert_array_equal(task.check_state(z), z)
+    np.testing.assert_array_equal(task.starts(5000, np.random.default_rng(0)), z)
+
+
+def test_an_episode_stays_finite_and_its_observations_in_their_space(task):
+    rng, space = np.random.default_rng(0), observation_space(task)
+    plant = task.plant(32)
+    plant.set_state(task.qpos(random_states(task, 32, rng)))
+    for _ in range(task.max_steps):
+        plant.step(random_inputs(task, 32, rng))
+        running = task.ending(plant.measurement) == Outcome.RUNNING
+        observation = task.observation(plant.measurement[running]).astype(np.float32)
+        assert all(space.contains(o) for o in observation)
+        assert np.isfinite(task.reward(plant.measurement)).all()
+        assert (task.reward(plant.measurement[running]) >= task.worst_reward).all()
+
+
+def test_episodes_repeat_bit_for_bit(task):
+    def episode():
+        rng = np.random.default_rng(5)
+        plant = task.plant(8)
+        plant.set_state(task.qpos(task.starts(8, rng)))
+        for _ in range(task.max_steps):
+            plant.step(random_inputs(task, 8, rng))
+        return plant.state
+
+    np.testing.assert_array_equal(episode(), episode())
+
+
+def test_what_the_plant_returns_is_not_its_memory(task):
+    plant = task.plant(2)
+    plant.set_state(task.qpos(np.array(task.replay_starts[:2])))
+    returned = [plant.measurement, plant.qpos, plant.state, task.z(plant.measurement)]
+    kept = [values.copy() for values in returned]
+    plant.step(np.ones((2, len(task.inputs))))
+    for values, copy in zip(returned, kept, strict=True):
+        np.testing.assert_array_equal(values, copy)
+    after = plant.state
+    for values in (plant.measurement, plant.qpos, plant.state):
+        values[:] = 7.0
+    np.testing.assert_array_equal(plant.state, after)
+
+
+def test_a_plant_does_not_write_to_the_shared_model(task):
+    before = task.model.opt.disableflags
+    task.plant(1)
+    assert task.model.opt.disableflags == before
+
+
+def test_chart_and_position_belong_together(task):
+    z = random_states(task, 100, np.random.default_rng(0))
+    plant = task.plant(100)
+    plant.set_state(task.qpos(z))
+    np.testing.assert_allclose(task.z(plant.measurement), z, atol=1e-12)
+    other = random_states(task, 100, np.random.default_rng(1))
+    np.testing.assert_allclose(task.z(task.with_z(plant.measurement, other)), other, atol=1e-12)
+
+
+def test_its_mirror_image_earns_the_same_reward(task):
+    z = random_states(task, 500, np.random.default_rng(0))
+    image = z * [1, -1] if task.name == "vehicle" else -z
+    np.testing.assert_allclose(task.reward(image), task.reward(z), atol=1e-12)
+    np.testing.assert_array_equal(task.ending(image), task.ending(z))
+    signs = np.array(task.mirror.observation)
+    np.testing.assert_allclose(task.observation(image), task.observation(z) * signs, atol=1e-12)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_state_that_is_not_finite_is_refused(task, value):
+    z = np.array(task.replay_starts[:3], dtype=float)
+    z[1, -1] = value
+    with pytest.raises(BadInput, match="state 1") as caught:
+        task.check_state(z)
+    assert str(value) in str(caught.value)
+
+
+ILL_SHAPED = [np.zeros((2, 5)), np.zeros((2, 2, 2)), [], "here", [[0.0], [0.0, 1.0]]]
+
+
+@pytest.mark.parametrize("z", ILL_SHAPED)
+def test_a_state_of_the_wrong_shape_names_the_coordinates(task, z):
+    with pytest.raises(BadInput, match=task.name):
+        task.check_state(z)
+
+
+def test_bad_measurements_are_refused(task):
+    p = task.measurement_columns
+    with pytest.raises(BadInput, match=rf"\(n, {p}\)"):
+        task.check_measurement(np.zeros((2, p + 1)))
+    with pytest.raises(BadInput, match=rf"\(n, {p}\)"):
+        task.check_measurement(np.zeros(p))
+    measured = np.zeros((2, p))
+    measured[1, 0] = np.nan
+    with pytest.raises(BadInput, match=r"measurement\[1, 0\] is nan"):
+        task.check_measurement(measured)
+
+
+def test_an_unknown_task_lists_the_known():
+    with pytest.raises(BadInput, match=r"'vehicel'.*unit_circle, vehicle.*Did you mean 'vehicle'"):
+        hyrl_mj.get_task("vehicel")
+
+
+# ---- unit circle
+
+
+@pytest.mark.parametrize(
+    ("theta", "reward"),
+    [
+        (0.0, 0.0),
+        (PI, -1.0),
+        (PI / 2, -0.5),
+        (-PI / 2, -0.5),
+        (2 * PI - 0.3, -0.3 / PI),
+        (5 * PI, -1.0),
+    ],
+)
+def test_circle_reward(circle, theta, reward):
+    assert circle.reward(np.array([[theta]])) == pytest.approx(reward, abs=1e-12)
+
+
+def test_circle_observation_is_the_point_on_the_circle(circle):
+    expected = [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]]
+    observation = circle.observation(np.array([[0.0], [PI / 2], [3 * PI]]))
+    np.testing.assert_allclose(observation, expected, atol=1e-12)
+
+
+def test_circle_takes_any_winding(circle):
+    np.testing.assert_array_equal(circle.check_state([7 * PI]), [[7 * PI]])
+    wrapped = circle.chart.wrap(np.array([[-PI / 2], [9 * PI]]))
+    np.testing.assert_allclose(wrapped, [[1.5 * PI], [PI]])
+
+
+def test_circle_verdict(circle):
+    theta = np.array([[0.0], [0.3], [-0.3], [0.301], [PI], [2 * PI + 0.2]])
+    labels = [Outcome(k).label for k in circle.verdict(theta)]
+    assert labels == ["reached", "reached", "reached", "stalled", "stalled", "reached"]
+    assert (circle.ending(theta) == Outcome.RUNNING).all()
+
+
+def test_circle_direction(circle):
+    path = np.array([[[3.0], [3.0], [0.2]], [[1.0], [5.0], [0.1]]])
+    np.testing.assert_array_equal(circle.direction(path), [0, 1, -1])
+
+
+# ---- vehicle
+
+
+@pytest.mark.parametrize(
+    ("z", "reward"),
+    [
+        ((0.0, 0.0), 0.4149818),
+        ((3.0, 0.0), 3.4149818),
+        ((1.5, 1.0), 1.4023447),
+        ((0.0, 1.4), 0.2118604),
+        ((1.5, 0.0), 0.3934490),
+        ((0.75, 0.0), 0.0),
+    ],
+)
+def test_vehicle_reward(vehicle, z, reward):
+    assert vehicle.reward(np.array([z])) == pytest.approx(reward, abs=1e-6)
+
+
+def test_vehicle_observation(vehicle):
+    observation = vehicle.observation(np.array([[0.0, 0.0], [1.5, -1.0], [1.5, 0.2]]))
+    far = np.hypot(1.5, 1.0), np.hypot(1.5, 0.2)
+    expected = [[0.75, 3.0, 0.0], [0.25, far[0], -1.0], [0.0, far[1], 0.2]]
+    np.testing.assert_allclose(observation, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("z", "outcome"),
+    [
+        ((0.0, 0.0), "running"),
+        ((1.5, 0.752), "running"),
+        ((1.5, 0.7505), "crashed"),
+        ((1.5, 0.0), "crashed"),
+        ((1.0, 1.5), "out_of_bounds"),
+        ((1.0, -1.6), "out_of_bounds"),
+        ((1.0, 1.4999), "running"),
+        ((3.0, 0.0), "running"),
+        ((3.001, 0.3), "reached"),
+    ],
+)
+def test_vehicle_ending(vehicle, z, outcome):
+    assert Outcome(vehicle.ending(np.array([z]))[0]).label == outcome
+
+
+def test_vehicle_verdict_at_the_line(vehicle):
+    labels = [Outcome(k).label for k in vehicle.verdict(np.array([[3.0, 0.1], [2.95, 0.1]]))]
+    assert labels == ["reached", "running"]
+
+
+def test_vehicle_levels(vehicle):
+    np.testing.assert_array_equal(vehicle.input_levels[:, 0], [-1.0, -0.5, 0.0, 0.5, 1.0])
+
+
+def test_vehicle_direction(vehicle):
+    start = [[0.0, 0.1], [0.0, 0.1], [0.0, 0.0], [2.0, 1.0]]
+    end = [[1.5, 0.9], [1.6, -0.9], [0.7, -0.1], [2.1, 1.0]]
+    np.testing.assert_array_equal(vehicle.direction(np.array([start, end])), [0, 1, 1, -1])
+
+
+@pytest.mark.parametrize("z", [(-0.1, 0.0), (3.1, 0.0), (0.0, 1.6), (1.0, -9.0)])
+def test_vehicle_state_outside_the_arena(vehicle, z):
+    with pytest.raises(BadInput, match=r"outside .*0 <= x <= 3 m, -1.5 <= y <= 1.5 m") as caught:
+        vehicle.check_state([(0.0, 0.0), z])
+    assert f"x = {z[0]:g} m, y = {z[1]:g} m" in str(caught.value)
+    assert "state 1" in str(caught.value)

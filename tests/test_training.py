@@ -1,0 +1,184 @@
+"""Training improves the policy in seconds, is reproducible, and leaves logs and checkpoints."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from planted import ideal_controller
+
+from hyrl_mj import BadInput, MlpPolicy, Noise, training
+from hyrl_mj.envs.core import BatchedEnv, Domain
+from hyrl_mj.extended_sets import ExtendedSets
+from hyrl_mj.retraining import mode_domain
+from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.settings import preset
+
+# Samples of the quickest training that still updates the networks several times.
+FEW = {"ppo": 8_192, "dqn": 4_000}
+
+
+@pytest.fixture
+def quick(task):
+    return replace(preset(task, "smoke").stage1, samples=FEW[task.algorithm])
+
+
+@pytest.fixture(scope="module")
+def smoke(task, tmp_path_factory):
+    """The smoke preset, trained with logs: the policy and its log folder."""
+    logs = tmp_path_factory.mktemp(task.name)
+    return training.train(task, preset(task, "smoke").stage1, seed=0, log_dir=logs), logs
+
+
+def assert_same_weights(a, b):
+    assert a.weights.keys() == b.weights.keys()
+    for name in a.weights:
+        np.testing.assert_array_equal(a.weights[name], b.weights[name], err_msg=name)
+
+
+def untrained(task):
+    return training.export(training.build(task, preset(task, "smoke").stage1, seed=0), task)
+
+
+def test_training_returns_the_best_policy_that_it_met(task, monkeypatch):
+    """Whatever the evaluations say, the policy with the highest score comes back."""
+    scores, policies = iter([3.0, 9.0, *[5.0] * 100]), []
+
+    def scripted(task, policy, *_):
+        policies.append(policy)
+        return next(scores)
+
+    monkeypatch.setattr(training, "mean_return", scripted)
+    best = training.train(task, preset(task, "smoke").stage1, seed=0)
+    assert len(policies) > 2
+    assert best is policies[1]
+
+
+def test_ppo_learns_the_circle_with_the_smoke_preset(circle):
+    policy = training.train(circle, preset(circle, "smoke").stage1, seed=0)
+    before = training.mean_return(circle, untrained(circle), Noise())
+    assert training.mean_return(circle, policy, Noise()) > before + 10
+
+
+def test_dqn_learns_the_vehicle_with_some_more_samples(vehicle):
+    settings = replace(preset(vehicle, "smoke").stage1, samples=40_000)
+    policy = training.train(vehicle, settings, seed=0)
+    assert training.mean_return(vehicle, policy, Noise()) > 85
+
+
+def test_it_writes_a_checkpoint_of_the_best_policy_and_tensorboard_logs(smoke):
+    policy, logs = smoke
+    assert_same_weights(MlpPolicy.load(logs / "checkpoint.safetensors"), policy)
+    events = list((logs / "tensorboard").glob("events.out.tfevents.*"))
+    assert events
+    assert events[0].stat().st_size > 200
+
+
+def test_without_a_log_folder_nothing_is_written(task, quick, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    training.train(task, quick, seed=0)
+    assert not any(tmp_path.iterdir())
+
+
+def test_the_seed_fixes_every_weight(task, quick):
+    first = training.train(task, quick, seed=4)
+    assert_same_weights(first, training.train(task, quick, seed=4))
+    other = training.train(task, quick, seed=5)
+    assert any(not np.array_equal(first.weights[n], other.weights[n]) for n in first.weights)
+
+
+def test_threads_of_the_physics_do_not_matter(task, quick, monkeypatch):
+    policies = []
+    for threads in (1, 2):
+        monkeypatch.setattr(training, "BatchedEnv", partial(BatchedEnv, threads=threads))
+        policies.append(training.train(task, quick, seed=4, noise=Noise("uniform", 0.1)))
+    assert_same_weights(*policies)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_torch_gets_its_threads_back(fails):
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        with pytest.raises(KeyError) if fails else training.single_threaded():
+            if fails:
+                with training.single_threaded():
+                    raise KeyError
+            assert torch.get_num_threads() == 1
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_training_restores_torchs_threads(vehicle):
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        settings = replace(preset(vehicle, "smoke").stage1, samples=2_500)
+        training.train(vehicle, settings, seed=0)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_it_goes_on_from_a_policy(task):
+    start = untrained(task)
+    model = training.build(task, preset(task, "smoke").stage6, seed=1, start_from=start)
+    assert_same_weights(training.export(model, task), start)
+
+
+def test_an_unknown_algorithm_lists_the_known(vehicle):
+    class Odd(type(vehicle)):
+        algorithm = "sac"
+
+    with pytest.raises(BadInput, match="'sac' is unknown: choose one of ppo, dqn"):
+        training.build(Odd(), preset(vehicle, "smoke").stage1, 0)
+
+
+# ---- returns
+
+
+def test_mean_return_of_a_known_policy(circle):
+    """A policy that never moves: 150 times the reward of its start, or the discounted sum."""
+    policy = untrained(circle)
+    still = replace(policy, weights={n: 0 * w for n, w in policy.weights.items()})
+    starts = Domain(lambda n, rng: np.full((n, 1), 1.0), lambda z: np.full(len(z), True), -1.0)
+    for gamma, factor in ((1.0, 150), (0.9, (1 - 0.9**150) / 0.1)):
+        value = training.mean_return(circle, still, Noise(), starts, gamma, episodes=4)
+        assert value == pytest.approx(-factor / np.pi, rel=1e-6)
+
+
+# ---- where modes are trained
+
+
+@pytest.fixture(scope="module")
+def vehicle_sets(vehicle):
+    grid = Grid.with_cells(vehicle.chart, 60)
+    ideal = ideal_controller(vehicle, 0.15)
+    sets = tuple(GridSet(grid, ideal.flow_set(q).signed_distance(grid.nodes)) for q in (0, 1))
+    winning = tuple(grid.nodes[:, 0] < 0.4 for _ in sets)
+    return ExtendedSets((0, 1), sets, winning, 0.3, 0.1)
+
+
+def test_mode_starts_cover_the_set_with_room_for_the_noise(vehicle, vehicle_sets):
+    domain = mode_domain(vehicle, vehicle_sets, 0, gamma=0.9)
+    z = domain.starts(5000, np.random.default_rng(0))
+    cell = vehicle_sets.sets[0].grid.cell
+    assert vehicle.chart.contains(z).all()
+    assert -0.25 - cell <= z[:, 1].min() <= -0.2
+    assert z[:, 1].max() > 1.4
+    assert z[:, 0].max() <= 0.4 + cell
+    again = domain.starts(5000, np.random.default_rng(0))
+    np.testing.assert_array_equal(z, again)
+
+
+def test_a_mode_that_leaves_its_set_pays_for_ever(vehicle, circle, vehicle_sets):
+    domain = mode_domain(vehicle, vehicle_sets, 1, gamma=0.9)
+    inside = domain.contains(np.array([[0.1, 0.24], [0.1, 0.26], [0.1, -1.0]]))
+    np.testing.assert_array_equal(inside, [True, False, True])
+    assert domain.exit_reward == 0.0
+    grid = Grid.with_cells(circle.chart, 60)
+    whole = GridSet.from_mask(grid, np.ones(60, dtype=bool))
+    sets = ExtendedSets((0,), (whole,), (whole.mask,), 0.5, 0.1)
+    assert mode_domain(circle, sets, 0, gamma=0.9).exit_reward == pytest.approx(-10.0)
