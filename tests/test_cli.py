@@ -75,10 +75,10 @@ def test_a_stage_runs_again_and_those_after_it_are_out_of_date(copied):
 
 def test_a_new_horizon_is_used_and_kept(copied):
     before = hyrl_mj.load_run(copied).extended_sets
-    assert call("extended-sets", copied, "--horizon", "0.2").returncode == 0
+    assert call("extended-sets", copied, "--horizon", "3").returncode == 0
     run = hyrl_mj.load_run(copied)
-    assert run.settings.horizon == run.extended_sets.horizon == 0.2
-    for short, long in zip(run.extended_sets.sets, before.sets, strict=True):
+    assert run.settings.horizon == run.extended_sets.horizon == 3
+    for short, long in zip(before.sets, run.extended_sets.sets, strict=True):
         assert short.mask.sum() < long.mask.sum()
         assert not (short.mask & ~long.mask).any()
 
@@ -176,8 +176,17 @@ def test_a_truncated_artifact_is_named(name, command, copied):
 def test_without_gl_the_run_is_whole_and_says_why_there_is_no_video(copied):
     (copied / "replay.mp4").unlink()
     process = subprocess.run(
-        [sys.executable, "-m", "hyrl_mj.cli", "run", "unit_circle", "--preset", "smoke"]
-        + ["--out", str(copied)],
+        [
+            sys.executable,
+            "-m",
+            "hyrl_mj.cli",
+            "run",
+            "unit_circle",
+            "--preset",
+            "smoke",
+            "--out",
+            copied,
+        ],
         capture_output=True,
         text=True,
         env={**os.environ, "MUJOCO_GL": "disable"},
