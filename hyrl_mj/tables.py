@@ -19,15 +19,15 @@ def print_summary(run: Run) -> None:
     table = Table(
         title=f"{run.task.name}: alternating noise {run.settings.noise:g}, seed {run.settings.seed}"
     )
-    table.add_column("start")
+    units = dict.fromkeys(run.task.chart.units)
+    table.add_column(f"start ({', '.join(run.task.chart.names)}) in {', '.join(units)}")
     table.add_column(f"policy ({run.policy.algorithm.upper()})")
     for q in modes:
         table.add_column(f"HyRL, q0 = {q}")
     for row, columns in sorted(arcs.items(), key=lambda item: item[0] == "critical"):
-        start = run.task.chart.format(columns["policy"].z[0])
-        name = f"{start} (on M*)" if row == "critical" else start
+        start = _point(run, columns["policy"].z[0])
         cells = [_cell(run, columns[c]) for c in ("policy", *(f"hyrl_q{q}" for q in modes))]
-        table.add_row(name, *cells)
+        table.add_row(f"{start} on M*" if row == "critical" else start, *cells)
     # Off a terminal rich assumes 80 columns, which would cut the cells.
     console = Console()
     Console(width=None if console.is_terminal else 120).print(table)
@@ -74,5 +74,9 @@ def extent(run: Run, mode: int) -> str:
 
 
 def _cell(run: Run, arc: HybridArc) -> str:
-    end = ", ".join(f"{v:.2f}" for v in run.task.chart.wrap(arc.z[-1:])[0])
-    return f"{arc.outcome} {arc.t[-1]:.1f} s at ({end})"
+    return f"{arc.outcome} {arc.t[-1]:.1f} s {_point(run, run.task.chart.wrap(arc.z[-1:])[0])}"
+
+
+def _point(run: Run, z: np.ndarray) -> str:
+    """A chart point (d,), to a thousandth."""
+    return f"({', '.join(f'{v + 0.0:.3f}' for v in np.round(z, 3))})"
