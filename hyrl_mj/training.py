@@ -32,9 +32,9 @@ ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}
 LOG_INTERVAL = {"ppo": 1, "dqn": 100}
 # The learning rate falls to this share of its first value, not to zero: the last samples count too.
 FINAL_RATE = 0.02
-# How often the policy is evaluated in the second half of the training, and checkpointed if it is the
-# best so far; on how many episodes.
-EVALUATIONS = 8
+# How often the policy is checkpointed, and in the second half of the training also evaluated; on how
+# many episodes.
+CHECKPOINTS = 16
 EPISODES = 256
 
 
@@ -167,7 +167,7 @@ def mean_return(
 
 
 class _Watch(BaseCallback):
-    """Progress bar, evaluation at intervals, the best policy so far and its checkpoint."""
+    """Progress bar, checkpoints at intervals, and the best policy of the second half."""
 
     def __init__(
         self,
@@ -179,9 +179,8 @@ class _Watch(BaseCallback):
     ):
         super().__init__()
         self.best: MlpPolicy | None = None
-        self._task, self._log_dir, self._score = task, log_dir, score
-        self._interval = max(samples // 2 // EVALUATIONS, 1)
-        self._next = samples // 2
+        self._task, self._samples, self._log_dir, self._score = task, samples, log_dir, score
+        self._next = self._interval = max(samples // CHECKPOINTS, 1)
         self._best_score = -np.inf
         self._progress = Progress(label, samples, "samples")
 
@@ -189,18 +188,20 @@ class _Watch(BaseCallback):
         self._progress.update(self.num_timesteps)
         if self.num_timesteps >= self._next:
             self._next += self._interval
-            self._evaluate()
+            self._checkpoint()
         return True
 
     def _on_training_end(self) -> None:
-        self._evaluate()
+        self._checkpoint()
         self._progress.close()
 
-    def _evaluate(self) -> None:
+    def _checkpoint(self) -> None:
         policy = export(self.model, self._task)
-        score = self._score(policy)
-        self.logger.record("eval/mean_return", score)
-        if score > self._best_score:
-            self._best_score, self.best = score, policy
-            if self._log_dir is not None:
-                policy.save(self._log_dir / "checkpoint.safetensors")
+        if self._log_dir is not None:
+            policy.save(self._log_dir / "checkpoint.safetensors")
+        # An untrained policy can have a lucky return.
+        if self.num_timesteps >= self._samples // 2:
+            score = self._score(policy)
+            self.logger.record("eval/mean_return", score)
+            if score > self._best_score:
+                self._best_score, self.best = score, policy

