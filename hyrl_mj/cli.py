@@ -44,7 +44,7 @@ def run(
         task: a task, see `hyrl-mj list`.
         noise: bound of the measurement noise to survive, in rad (unit_circle) or m (vehicle).
         seed: of everything random.
-        preset: fast, paper (the paper's training: hours), or smoke (seconds, to see that all runs).
+        preset: fast, paper (the paper's training, ten minutes), or smoke (seconds).
         horizon: horizon T of the backward propagation in s; by default the paper's.
         out: the run directory; by default runs/TASK.
     """
@@ -72,9 +72,10 @@ def extended_sets(run_dir: RunDir, horizon: float | None = None) -> None:
         horizon: a new horizon T of the backward propagation in s.
     """
     run = pipeline.load_run(run_dir)
-    if horizon is not None:
-        run = pipeline.change_horizon(run, horizon)
-    pipeline.run_stage(run, "extended-sets")
+    if horizon is None:
+        pipeline.run_stage(run, "extended-sets")
+    else:
+        pipeline.extend_again(run, horizon)
 
 
 def simulate_run(

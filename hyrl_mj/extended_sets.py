@@ -15,7 +15,7 @@ from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import PolicyController, closed_loop
 from hyrl_mj.tasks.base import Outcome, Task
 
-# The neighbourhood of M* is at least this many cells wide, also when there is no noise.
+# The neighbourhood of M* is at least this many cells wide, and as wide as the loop goes in one sample.
 NEIGHBOURHOOD_CELLS = 4
 # Gaps between the samples of the backward runs that are closed, in cells.
 GAP_CELLS = 1.5
@@ -108,12 +108,13 @@ def extend(
         noise: bound eps of the measurement noise.
     """
     grid = partition.grid
-    near = max(noise, NEIGHBOURHOOD_CELLS * grid.cell)
+    near = max(noise, NEIGHBOURHOOD_CELLS * grid.cell, one_sample(task, policy, grid))
     sets, winning = [], []
     for part, pi in zip(partition.parts, part_policies(task, policy, partition, near), strict=True):
         reached = part | backward_reach(task, pi, critical, part, near, horizon)
-        wins = part_wins(task, pi, partition, part, reached.dilated(noise + 2 * grid.cell))
+        wins = part_wins(task, pi, partition, part, reached.dilated(2 * noise + 2 * grid.cell))
         winning.append(wins)
+        # Nodes that were not asked, far from the critical set, do not take room away.
         roomy = GridSet.from_mask(grid, wins | ~part.mask & ~reached.dilated(noise).mask)
         sets.append((reached & roomy.eroded(noise)) | part.dilated(noise))
     return ExtendedSets(partition.modes, tuple(sets), tuple(winning), horizon, noise)
@@ -130,12 +131,27 @@ def backward_reach(
     if len(nodes):
         loop = PolicyController(pi)
         path = closed_loop(task, loop, nodes, steps=steps, backward=True, label="backward").path
-        z = path.reshape(-1, task.chart.dimension)
+        z = between_samples(path, grid)
         visited[grid.nearest(z[task.chart.contains(z)])] = True
     # Close the gaps between samples, together with the part that they leave.
     gap = GAP_CELLS * grid.cell
     wide = GridSet.from_mask(grid, visited | part.mask).dilated(gap)
     return GridSet.from_mask(grid, wide.mask).eroded(gap)
+
+
+def between_samples(path: np.ndarray, grid: Grid) -> np.ndarray:
+    """Points (N, d) along sampled paths (K + 1, n, d), so close that they miss no cell of the grid."""
+    hops = np.diff(path, axis=0)
+    count = max(int(np.ceil(np.abs(hops / grid.spacing).max(initial=0.0))), 1)
+    shares = np.arange(count)[:, None, None, None] / count
+    d = path.shape[-1]
+    return np.concatenate([(path[:-1] + shares * hops).reshape(-1, d), path[-1]])
+
+
+def one_sample(task: Task, policy: Policy, grid: Grid) -> float:
+    """The longest way that the closed loop goes in one sample, in chart units."""
+    path = closed_loop(task, PolicyController(policy), grid.nodes, steps=1).path
+    return float(np.linalg.norm(path[-1] - path[0], axis=1).max())
 
 
 def part_wins(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from numbers import Real
+from numbers import Integral, Real
 
 import numpy as np
 
@@ -48,6 +48,17 @@ class Noise:
         if self.kind == "alternating":
             return np.broadcast_to(np.where(k % 2 == 0, self.bound, -self.bound)[:, None], shape)
         return np.zeros(shape)
+
+
+def check_seed(seed: int) -> int:
+    """The seed itself, if it is one.
+
+    Raises:
+        BadInput: it is not an integer from 0 to 2**32 - 1, what NumPy, torch and SB3 all take.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= seed < 2**32:
+        raise BadInput(f"seed {seed!r} cannot be used: give an integer from 0 to 4294967295")
+    return int(seed)
 
 
 def check_bound(bound: float) -> float:

@@ -40,7 +40,7 @@ class Partition:
     def sentence(self, task: Task) -> str:
         """The result for people."""
         shares = ", ".join(
-            f"{q} ({_mode_name(task, q)}) {100 * part.mask.mean():.0f}%"
+            f"{task.mode_name(q)} {100 * part.mask.mean():.0f}%"
             for q, part in zip(self.modes, self.parts, strict=True)
         )
         return f"share of the chart by mode: {shares}"
@@ -73,10 +73,6 @@ class Partition:
                 parts=tuple(GridSet(grid, values) for values in arrays["signed_distance"]),
                 succeeds=arrays["succeeds"],
             )
-
-
-def _mode_name(task: Task, mode: int) -> str:
-    return task.mode_names[mode] if mode < len(task.mode_names) else "?"
 
 
 def make_partition(task: Task, policy: Policy, critical: CriticalSet, cells: int) -> Partition:

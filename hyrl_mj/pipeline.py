@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
@@ -77,9 +77,16 @@ class Run:
             self.task, policies, dict(zip(extended.modes, extended.sets, strict=True))
         )
 
-    def arcs(self) -> list[HybridArc]:
-        """The simulated arcs, in the order of their files' names."""
-        return [HybridArc.load(path) for path in sorted((self.path / "arcs").glob("*.npz"))]
+    def arc_paths(self) -> dict[tuple[str, str], Path]:
+        """The files of the replays by start ("start0", ..., "critical") and controller."""
+        starts = [f"start{i}" for i in range(len(self.task.replay_starts))]
+        starts += ["critical"] if len(self.critical_set.points) else []
+        loops = ["policy"] + [f"hyrl_q{q}" for q in self.extended_sets.modes]
+        return {(s, c): self.path / "arcs" / f"{s}_{c}.npz" for s in starts for c in loops}
+
+    def arcs(self) -> dict[tuple[str, str], HybridArc]:
+        """The replays by start ("start0", ..., "critical") and controller ("policy", "hyrl_q0", ...)."""
+        return {key: HybridArc.load(path) for key, path in self.arc_paths().items()}
 
     def _of_task(self, policy: MlpPolicy) -> MlpPolicy:
         if policy.task.name != self.settings.task:
@@ -126,10 +133,16 @@ def open_or_create(path: str | Path, settings: Settings) -> Run:
         run = load_run(path)
         if run.settings != settings:
             old, new = run.settings.to_json(), settings.to_json()
-            differing = [name for name in new if old[name] != new[name]]
+            differing = [
+                f"{name}: {old[name]} there, {new[name]} asked for"
+                if not isinstance(new[name], dict)
+                else name
+                for name in new
+                if old[name] != new[name]
+            ]
             raise BadInput(
-                f"{path} holds a run with other settings ({', '.join(differing)}): "
-                "choose another --out, or remove it"
+                f"{path} holds a run with other settings ({'; '.join(differing)}): "
+                "choose another --out, give the same settings, or remove it"
             )
         return run
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
@@ -182,26 +195,43 @@ def retrain_stage(run: Run, say: Say) -> None:
 
     s, sets = run.settings, run.extended_sets
     logs = run.path / "logs"
-    # Saved together, so that an interrupted stage does not look done.
     policies = {
         q: retrain(run.task, run.policy, sets, q, s.stage6, s.seed, logs / f"mode_{q}")
         for q in sets.modes
     }
     for q, policy in policies.items():
         policy.save(run.path / f"mode_{q}.safetensors")
+    remove_others(run.path.glob("mode_*"), mode_paths(run))
     say(f"policies of {len(policies)} modes")
+
+
+def mode_paths(run: Run) -> list[Path]:
+    """The files of the mode policies."""
+    suffixes = (".safetensors", ".json")
+    return [run.path / f"mode_{q}{suffix}" for q in run.extended_sets.modes for suffix in suffixes]
+
+
+def remove_others(found: Iterable[Path], wanted: Iterable[Path]) -> None:
+    """Remove what an earlier run of a stage, with other modes or starts, has left."""
+    for path in set(found) - set(wanted):
+        path.unlink()
 
 
 def simulate_stage(run: Run, say: Say) -> None:
     """Simulate the paper's replay starts, and one on M*, under the paper's noise."""
-    arcs = replay_arcs(run)
-    for name, arc in arcs.items():
-        arc.save(run.path / "arcs" / f"{name}.npz")
-    hyrl = [arc for arc in arcs.values() if arc.controller == "hyrl"]
-    reached = sum(arc.outcome == "reached" for arc in hyrl)
-    say(
-        f"{len(arcs)} arcs; the hybrid controller reaches the set-point in {reached} of {len(hyrl)}"
-    )
+    arcs, paths = replay_arcs(run), run.arc_paths()
+    for key, arc in arcs.items():
+        arc.save(paths[key])
+    folder = run.path / "arcs"
+    remove_others(folder.glob("*.npz"), [*paths.values(), *folder.glob("latest_*.npz")])
+    say(f"{len(arcs)} arcs; {replay_sentence(run, arcs)}")
+
+
+def replay_sentence(run: Run, arcs: Mapping[tuple[str, str], HybridArc]) -> str:
+    """From how many of the paper's starts the hybrid controller reaches the set-point, for people."""
+    hyrl = [arc for (start, who), arc in arcs.items() if start != "critical" and who != "policy"]
+    reached = [arc.outcome == "reached" and run.task.arrived(arc.z[-1:])[0] for arc in hyrl]
+    return f"HyRL reaches the set-point from {sum(reached)} of {len(hyrl)} of the paper's starts"
 
 
 def replay_stage(run: Run, say: Say) -> None:
@@ -221,17 +251,21 @@ class Stage:
 
     name: str
     work: Callable[[Run, Say], None]
-    outputs: tuple[str, ...]
+    outputs: Callable[[Run], list[Path]]
+
+
+def _files(*names: str) -> Callable[[Run], list[Path]]:
+    return lambda run: [run.path / name for name in names]
 
 
 STAGES = (
-    Stage("train", train_stage, ("policy.safetensors", "policy.json")),
-    Stage("critical-set", critical_set_stage, ("critical_set.npz",)),
-    Stage("partition", partition_stage, ("partition.npz",)),
-    Stage("extended-sets", extended_sets_stage, ("extended_sets.npz",)),
-    Stage("retrain", retrain_stage, ("mode_*.safetensors",)),
-    Stage("simulate", simulate_stage, ("arcs/start*.npz",)),
-    Stage("replay", replay_stage, ("replay.mp4",)),
+    Stage("train", train_stage, _files("policy.safetensors", "policy.json")),
+    Stage("critical-set", critical_set_stage, _files("critical_set.npz")),
+    Stage("partition", partition_stage, _files("partition.npz")),
+    Stage("extended-sets", extended_sets_stage, _files("extended_sets.npz")),
+    Stage("retrain", retrain_stage, mode_paths),
+    Stage("simulate", simulate_stage, lambda run: list(run.arc_paths().values())),
+    Stage("replay", replay_stage, _files("replay.mp4")),
 )
 
 
@@ -252,14 +286,14 @@ def run_stage(run: Run, name: str, say: Say = print) -> Run:
 
 def done(run: Run, index: int) -> bool:
     """Whether a stage's files are there and no older than those of the stages before it."""
-    times = [_times(run, stage) for stage in STAGES[: index + 1]]
-    earlier = [t for stage_times in times[:-1] for t in stage_times]
-    return bool(times[-1]) and min(times[-1]) >= max(earlier, default=0)
-
-
-def _times(run: Run, stage: Stage) -> list[int]:
-    found = [sorted(run.path.glob(pattern)) for pattern in stage.outputs]
-    return [p.stat().st_mtime_ns for paths in found for p in paths] if all(found) else []
+    try:
+        outputs = [stage.outputs(run) for stage in STAGES[: index + 1]]
+    except BadArtifact:  # a stage before it has not been done, so its outputs are not known
+        return False
+    if not all(path.is_file() for paths in outputs for path in paths):
+        return False
+    times = [[path.stat().st_mtime_ns for path in paths] for paths in outputs]
+    return min(times[-1]) >= max((t for earlier in times[:-1] for t in earlier), default=0)
 
 
 def run(
@@ -296,11 +330,13 @@ def run(
     return current
 
 
-def change_horizon(run: Run, horizon: float) -> Run:
-    """The run with another horizon T [s] in its `config.json`."""
-    run = Run(run.path, replace(run.settings, horizon=horizon))
-    write_config(run)
-    return run
+def extend_again(run: Run, horizon: float, say: Say = print) -> Run:
+    """Run stages 4 and 5 with another horizon T [s], and keep it in `config.json` if that went well."""
+    changed = Run(run.path, replace(run.settings, horizon=horizon))
+    extended_sets_stage(changed, lambda text: say(f"extended-sets: {text}"))
+    write_config(changed)
+    say(f"go on with hyrl-mj run {run.settings.task} --horizon {horizon:g} --out {run.path}")
+    return load_run(run.path)
 
 
 def critical_start(run: Run) -> np.ndarray | None:
@@ -312,42 +348,34 @@ def critical_start(run: Run) -> np.ndarray | None:
     return points[np.linalg.norm(run.task.chart.difference(points, centre), axis=1).argmin()]
 
 
-def replay_arcs(run: Run) -> dict[str, HybridArc]:
-    """The paper's replays (Section V), with a start on M* of our own added, by the names of their files.
+def replay_arcs(run: Run) -> dict[tuple[str, str], HybridArc]:
+    """The paper's replays (Section V), with a start on M* of our own added, by start and controller.
 
-    Both controllers meet the same noise: alternating, with the run's bound.
+    All controllers meet the same noise: alternating, with the run's bound.
     """
-    starts: Sequence[tuple[float, ...] | np.ndarray] = list(run.task.replay_starts)
+    starts: list[Sequence[float] | np.ndarray] = list(run.task.replay_starts)
     names = [f"start{i}" for i in range(len(starts))]
     critical = critical_start(run)
     if critical is not None:
         starts, names = [*starts, critical], [*names, "critical"]
     z0 = np.array(starts, dtype=float)
     noise = Noise("alternating", run.settings.noise)
-    loops = [("policy", run.policy, 0)] + [
-        ("hyrl", run.controller, q) for q in run.controller.modes
-    ]
-    arcs = {}
-    for who, controller, q0 in loops:
-        found = simulate(
-            run.task,
-            controller,
-            z0,
-            noise=noise,
-            q0=q0,
-            horizon=run.task.replay_time,
-            seed=run.settings.seed,
-        )
-        assert isinstance(found, list)
-        for name, arc in zip(names, found, strict=True):
-            arcs[f"{name}_{who}" + (f"_q{q0}" if who == "hyrl" else "")] = arc
+    s, horizon = run.settings, run.task.replay_time
+    found = {"policy": simulate(run.task, run.policy, z0, noise, horizon=horizon, seed=s.seed)}
+    for q in run.controller.modes:
+        loop = simulate(run.task, run.controller, z0, noise, q, horizon, s.seed)
+        found[f"hyrl_q{q}"] = loop
+    arcs: dict[tuple[str, str], HybridArc] = {}
+    for who, several in found.items():
+        assert isinstance(several, list)
+        arcs |= {(name, who): arc for name, arc in zip(names, several, strict=True)}
     return arcs
 
 
 def critical_pairs(run: Run) -> list[tuple[HybridArc, HybridArc]]:
-    """Stage-1 policy and hybrid controller from the same start on M*, for each start mode."""
-    folder = run.path / "arcs"
-    start = "critical" if (folder / "critical_policy.npz").is_file() else "start0"
-    policy = HybridArc.load(folder / f"{start}_policy.npz")
-    modes = run.controller.modes
-    return [(policy, HybridArc.load(folder / f"{start}_hyrl_q{q}.npz")) for q in modes]
+    """Stage-1 policy and hybrid controller from the same start, on M* if there is one, for each mode."""
+    paths = run.arc_paths()
+    start = "critical" if ("critical", "policy") in paths else "start0"
+    policy = HybridArc.load(paths[start, "policy"])
+    modes = run.extended_sets.modes
+    return [(policy, HybridArc.load(paths[start, f"hyrl_q{q}"])) for q in modes]

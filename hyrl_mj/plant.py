@@ -41,6 +41,7 @@ class Plant:
         self.low, self.high = input_limits(model, inputs)
         self._held = model.key_ctrl[0].copy() if model.nkey else np.zeros(model.nu)
         self._batch = Batch(self.model, n, threads)
+        self._initial = self._batch.state[0].copy()
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._ctrl, self._sensors = self._batch.bind("ctrl"), self._batch.bind("sensordata")
 
@@ -77,6 +78,7 @@ class Plant:
         qvel = np.zeros((count, self.model.nv)) if qvel is None else qvel
         qvel = _checked("qvel", qvel, (count, self.model.nv), ids)
         rows = slice(None) if ids is None else ids
+        self._batch.state[rows] = self._initial  # time, activations and warm starts, too
         self._qpos[rows], self._qvel[rows] = qpos, qvel
         self._ctrl[rows] = self._held
         self._batch.forward(ids, mujoco.mjtStage.mjSTAGE_POS)

@@ -69,6 +69,8 @@ def render_replay(
         BadInput: no pairs, an impossible size, or an unknown camera.
         NoRenderer: there is no GL library or no video encoder.
     """
+    if path.suffix != ".mp4":
+        raise BadInput(f"a replay is an mp4, {path} is not: give a name that ends in .mp4")
     if not pairs:
         raise BadInput("there is nothing to replay: give at least one pair of arcs")
     if any(n % 2 or n < least for n, least in zip(size, SMALLEST, strict=True)) or fps < 1:
@@ -85,7 +87,7 @@ def render_replay(
         for policy, hybrid in pairs
     ]
     total = sum(_frames(show, fps) for show in shows)
-    done, posters = 0, []
+    done = 0
     with (
         closing(Progress("rendering", total, "frames")) as progress,
         closing(SceneRenderer(task.model, size[0], layout.scene_height)) as renderer,
@@ -96,9 +98,10 @@ def render_replay(
                 add(frame)
                 done += 1
                 progress.update(done)
-            posters.append(frame)
+            if show is shows[0]:
+                poster = frame
     with artifacts.replacing(path.with_suffix(".png")) as temporary:
-        Image.fromarray(posters[0]).save(temporary)
+        Image.fromarray(poster).save(temporary)
 
 
 def _frames(show: Sequence[Track], fps: int) -> int:
@@ -305,7 +308,7 @@ class Layout:
 
 def _mode(task: Task, q: int) -> str:
     """A mode for people: "q = 0 (left)"."""
-    return f"q = {q} ({task.mode_names[q]})" if 0 <= q < len(task.mode_names) else f"q = {q}"
+    return f"q = {task.mode_name(int(q))}"
 
 
 def _noise(arc: HybridArc) -> str:

@@ -13,6 +13,7 @@ from hyrl_mj.policies import MlpPolicy
 from hyrl_mj.sets import GridSet
 from hyrl_mj.settings import Training
 from hyrl_mj.tasks.base import Outcome, Task
+from hyrl_mj.training import train
 
 
 def retrain(
@@ -38,14 +39,12 @@ def retrain(
         seed: of everything random; each mode derives its own from it.
         log_dir: where logs and checkpoints go.
     """
-    from hyrl_mj.training import train
-
     domain = mode_domain(task, extended, mode, settings.gamma)
     return train(
         task,
         settings,
         seed=int(np.random.SeedSequence([seed, 1 + mode]).generate_state(1)[0]),
-        noise=Noise("uniform", extended.noise),
+        noise=Noise("uniform", extended.noise) if extended.noise else Noise(),
         domain=domain,
         start_from=policy if settings.warm_start else None,
         log_dir=log_dir,

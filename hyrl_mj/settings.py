@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, field, replace
-from numbers import Integral, Real
+from numbers import Real
 from typing import Any
 
 from hyrl_mj.errors import BadArtifact, BadInput, unknown
-from hyrl_mj.noise import check_bound
+from hyrl_mj.noise import check_bound, check_seed
 from hyrl_mj.tasks.base import Task
 
 PRESETS = ("fast", "paper", "smoke")
@@ -83,8 +83,7 @@ class Settings:
             isinstance(self.horizon, Real) and math.isfinite(self.horizon) and self.horizon > 0
         ):
             raise BadInput(f"horizon {self.horizon!r} s cannot be used: give a finite time > 0")
-        if not isinstance(self.seed, Integral) or self.seed < 0:
-            raise BadInput(f"seed {self.seed!r} cannot be used: give an integer >= 0")
+        check_seed(self.seed)
 
     def to_json(self) -> dict[str, Any]:
         """As nested dicts."""

@@ -12,10 +12,13 @@ from numpy.typing import ArrayLike
 
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadInput
-from hyrl_mj.noise import Noise
+from hyrl_mj.noise import Noise, check_seed
 from hyrl_mj.policies import Policy
 from hyrl_mj.progress import Progress
 from hyrl_mj.tasks.base import Outcome, Task
+
+# The longest time that `simulate` records [s]: an hour.
+LONGEST = 3600.0
 
 
 class Controller(Protocol):
@@ -114,7 +117,9 @@ def closed_loop(
     q = np.zeros(n, dtype=int) if q0 is None else np.asarray(q0, dtype=int).copy()
     outcome = np.full(n, Outcome.RUNNING) if backward else task.ending(measurement)
     length = np.zeros(n, dtype=int)
-    path = [task.z(measurement)]
+    path = np.empty((limit + 1, n, task.chart.dimension))
+    path[0] = task.z(measurement)
+    last = 0
     first_mode = q.copy()
     kept: dict[str, list[np.ndarray]] = {name: [] for name in ("before", "q", "measured", "u")}
     states = [plant.state] if record else []
@@ -132,7 +137,8 @@ def closed_loop(
         u[active], q[active] = controller.step(q[active], measured[active])
         (plant.step_backward if backward else plant.step)(u[active], active)
         measurement = plant.measurement
-        path.append(task.z(measurement))
+        last = k + 1
+        path[last] = task.z(measurement)
         length[active] = k + 1
         if not backward:
             outcome[active] = task.ending(measurement[active])
@@ -153,7 +159,7 @@ def closed_loop(
     shapes = {"before": (), "q": (), "measured": (len(task.noisy),), "u": (len(task.inputs),)}
     arrays = {k: np.array(values).reshape(-1, n, *shapes[k]) for k, values in kept.items()}
     arrays |= {k: arrays[k].astype(int) for k in ("before", "q")}
-    return Rollout(np.array(path), length, outcome, first_mode, **arrays, state=np.array(states))
+    return Rollout(path[: last + 1], length, outcome, first_mode, **arrays, state=np.array(states))
 
 
 @dataclass(frozen=True)
@@ -174,7 +180,8 @@ class HybridArc:
         u: (N, m) inputs applied from this row on; not a number where none is: in the last row, and
             in the first of the two rows of a jump.
         state: (N, nstate) MuJoCo's state (`mjSTATE_INTEGRATION`).
-        outcome: "reached", "crashed", "out_of_bounds", "stalled", or "running" if it was cut off.
+        outcome: "reached", "crashed", "out_of_bounds"; if none of them came, the task's verdict at the
+            end: "reached" or "stalled" for a task of regulation, else "running".
         noise: kind of the measurement noise.
         bound: its bound eps.
     """
@@ -240,10 +247,12 @@ def simulate(
         One arc for one start, a list of arcs for several.
 
     Raises:
-        BadInput: a start outside the chart, an unknown mode, or a horizon that is not positive.
+        BadInput: a start outside the chart, an unknown mode, modes that do not fit the starts, a bad
+            seed, or a horizon that is not positive.
     """
-    single = np.ndim(z0) == 1
     starts = task.check_state(z0)
+    single = np.ndim(z0) < 2
+    check_seed(seed)
     steps = None if horizon is None else _steps(task, horizon)
     loop = PolicyController(controller) if isinstance(controller, Policy) else controller
     if q0 is not None:
@@ -265,8 +274,8 @@ def simulate(
 
 
 def _steps(task: Task, horizon: float) -> int:
-    if not (math.isfinite(horizon) and horizon > 0):
-        raise BadInput(f"horizon {horizon} s cannot be used: give a finite time > 0")
+    if not (math.isfinite(horizon) and 0 < horizon <= LONGEST):
+        raise BadInput(f"horizon {horizon:g} s cannot be used: give a time > 0 and <= {LONGEST:g} s")
     return max(round(horizon / task.dt), 1)
 
 

@@ -13,8 +13,8 @@ import numpy as np
 
 import hyrl_mj
 from hyrl_mj.envs.core import BatchedEnv
+from hyrl_mj.pipeline import replay_sentence
 from hyrl_mj.simulation import PolicyController, closed_loop
-from hyrl_mj.tables import replayed
 
 
 def circle_return(task: hyrl_mj.Task, policy: hyrl_mj.MlpPolicy, starts: int = 10_000) -> float:
@@ -51,11 +51,8 @@ def vehicle_share(task: hyrl_mj.Task, policy: hyrl_mj.MlpPolicy) -> float:
 
 def describe(run: hyrl_mj.Run) -> str:
     """The figures of one run in one paragraph."""
-    arcs = replayed(run)
-    paper = [
-        a for n, row in arcs.items() if n != "critical" for k, a in row.items() if k != "policy"
-    ]
-    reached = [a for a in paper if a.outcome == "reached"]
+    arcs = run.arcs()
+    paper = [a for (start, who), a in arcs.items() if start != "critical" and who != "policy"]
     lines = [f"{run.path}: {run.task.name}, seed {run.settings.seed}"]
     points = run.critical_set.points
     if run.task.name == "unit_circle":
@@ -68,9 +65,7 @@ def describe(run: hyrl_mj.Run) -> str:
             edge = far[far < 1.5 * np.pi].max() if q == 0 else far[far > 0.5 * np.pi].min()
             lines.append(f"  mode {q} reaches to {edge / np.pi:.4f} pi")
         ends = [abs(run.task.chart.difference(a.z[-1], np.zeros(1)))[0] for a in paper]
-        lines.append(
-            f"  HyRL {len(reached)} of {len(paper)}, at most {max(ends):.3f} rad off after 4 s"
-        )
+        lines.append(f"  at most {max(ends):.3f} rad off after 4 s")
     else:
         share = vehicle_share(run.task, run.policy)
         lines.append(f"  passes from {100 * share:.2f}% of the winnable starts")
@@ -79,9 +74,11 @@ def describe(run: hyrl_mj.Run) -> str:
             f"  M* for x in [0, 0.4]: {len(near)} points, |y| <= {abs(near[:, 1]).max():.4f} m"
         )
         off = max(abs(a.z[-1, 1]) for a in paper)
-        lines.append(f"  HyRL {len(reached)} of {len(paper)}, |y| <= {off:.3f} m at the end")
-    for who, arc in arcs.get("critical", {}).items():
-        lines.append(f"  from M*: {who} {arc.outcome} after {arc.t[-1]:.2f} s")
+        lines.append(f"  |y| <= {off:.3f} m at the end")
+    lines.append(f"  {replay_sentence(run, arcs)}")
+    for (start, who), arc in arcs.items():
+        if start == "critical":
+            lines.append(f"  from M*: {who} {arc.outcome} after {arc.t[-1]:.2f} s")
     return "\n".join(lines)
 
 

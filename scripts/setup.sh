@@ -25,7 +25,7 @@ apt_install() {
 
 # Rendering without a screen takes a GL library that pip does not bring. Without it there is no video,
 # and everything else runs.
-if [ "$(uname)" = Linux ] && ! ldconfig -p 2>/dev/null | grep -q 'libEGL\.so\.1'; then
+if [ "$(uname)" = Linux ] && ! PATH="$PATH:/usr/sbin:/sbin" ldconfig -p 2>/dev/null | grep -q 'libEGL\.so\.1'; then
   apt_install libegl1 libgl1-mesa-dri ||
     echo "There will be no videos: for them, apt-get install libegl1 libgl1-mesa-dri as root."
 fi

@@ -160,6 +160,9 @@ class Cube(Task):
     def verdict(self, measurement):
         return np.full(len(measurement), Outcome.RUNNING)
 
+    def arrived(self, z):
+        return np.full(len(z), True)
+
     def starts(self, n, rng):
         return rng.uniform(-1, 1, (n, 3))
 

@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -80,6 +81,33 @@ def test_a_new_horizon_is_used_and_kept(copied):
     assert not pipeline.done(run, [stage.name for stage in pipeline.STAGES].index("retrain"))
 
 
+@pytest.mark.parametrize("name", ["mode_1.safetensors", "arcs/start0_hyrl_q1.npz"])
+def test_a_stage_that_was_cut_off_is_not_done(name, copied):
+    (copied / name).unlink()
+    again = call("run", "unit_circle", "--preset", "smoke", "--out", copied)
+    assert again.returncode == 0, again.stderr
+    stage = "retrain" if name.startswith("mode") else "simulate"
+    assert f"{stage}: done before" not in again.stdout
+    assert (copied / name).is_file()
+
+
+def test_a_run_without_a_critical_set_has_one_mode_and_leaves_nothing_of_two(copied):
+    run = hyrl_mj.load_run(copied)
+    none = replace(run.critical_set, points=np.empty((0, 1)), component=np.zeros(0, dtype=int))
+    none.save(copied / "critical_set.npz")
+    again = call("run", "unit_circle", "--preset", "smoke", "--out", copied)
+    assert again.returncode == 0, again.stderr
+    assert "no critical set found" in again.stdout
+    assert "extended set everything" in again.stdout
+    assert "of 5 of the paper's starts" in again.stdout
+    assert hyrl_mj.load_run(copied).controller.modes == (0,)
+    left = {p.name for p in [*copied.glob("mode_*"), *(copied / "arcs").iterdir()]}
+    assert not {n for n in left if "critical" in n or "1." in n.replace("start1", "")}
+    assert (
+        call("run", "unit_circle", "--preset", "smoke", "--out", copied).stdout.count("done") == 7
+    )
+
+
 def test_simulate_prints_both_ends(finished):
     done = call("simulate", finished[0], "--start", "3.0", "--q0", "1", "--noise", "uniform")
     assert done.returncode == 0, done.stderr
@@ -104,7 +132,8 @@ def test_list_and_help():
         (["run", "vehicle", "--noise", "nan"], ["nan", ">= 0"]),
         (["run", "vehicle", "--noise", "much"], ["--noise", "'much'"]),
         (["run", "vehicle", "--horizon", "0"], ["horizon 0", "> 0"]),
-        (["run", "vehicle", "--seed", "-1"], ["seed -1", ">= 0"]),
+        (["run", "vehicle", "--seed", "-1"], ["seed -1", "from 0 to"]),
+        (["run", "vehicle", "--seed", "5000000000"], ["seed 5000000000", "from 0 to"]),
         (["traim"], ["traim", "critical-set"]),
     ],
 )
@@ -127,6 +156,9 @@ def test_bad_input_before_anything_is_made(arguments, parts, tmp_path, monkeypat
         (["simulate", "--q0", "1"], ["--start"]),
         (["extended-sets", "--horizon", "0"], ["horizon 0", "> 0"]),
         (["replay", "--camera", "top"], ["'top'", "overhead, chase"]),
+        (["replay", "--out", "film.gif"], ["film.gif", ".mp4"]),
+        (["simulate", "--start", "1", "--seed", "-1"], ["seed -1", "from 0 to"]),
+        (["simulate", "--start", "1", "--horizon", "1e12"], ["horizon 1e+12", "3600"]),
         (["replay", "--size", "big"], ["'big'", "640x480"]),
         (["replay", "--fps", "0"], ["at 0 frames a second"]),
     ],
@@ -147,7 +179,7 @@ def test_a_folder_that_is_no_run(tmp_path):
 
 def test_other_settings_do_not_overwrite_a_run(finished):
     done = call("run", "unit_circle", "--preset", "smoke", "--seed", "7", "--out", finished[0])
-    assert_one_sentence(done, "other settings (seed)")
+    assert_one_sentence(done, "seed: 0 there, 7 asked for")
 
 
 @pytest.mark.parametrize(

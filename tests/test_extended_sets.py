@@ -63,6 +63,17 @@ def test_the_circle_s_sets_reach_the_horizon_over_the_critical_angle(on_circle, 
     assert np.diff(clockwise).max() < 1e-3, "a hole"
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.01, 0.02, 0.05])
+def test_little_noise_leaves_no_holes_on_a_fine_grid(circle, noise):
+    case = Case(circle, circle_policy(circle), 121, 2880)
+    for members in case.extend(0.5, noise).sets:
+        edges = np.count_nonzero(members.mask != np.roll(members.mask, 1))
+        assert edges == 2
+    theta = np.linspace(0.5, 2 * PI - 0.5, 20_000)[:, None]
+    reach = theta[case.extend(0.5, noise).sets[0].contains(theta)].max()
+    assert reach == pytest.approx(PI + 0.5, abs=0.01)
+
+
 def test_both_sets_hold_the_set_point_with_room_for_the_noise(on_circle):
     sets = on_circle.extend(0.5, 0.1)
     around = np.linspace(-0.38, 0.38, 50)[:, None]

@@ -56,7 +56,10 @@ class Chart:
     def wrap(self, z: np.ndarray) -> np.ndarray:
         """The same points (n, d), periodic coordinates brought into [low, high)."""
         low, period = np.array(self.low), np.subtract(self.high, self.low)
-        return np.where(self.periodic, low + np.mod(z - low, period), z)
+        turned = np.mod(z - low, period)
+        # The remainder of a tiny negative number rounds up to the period itself.
+        turned = np.where(turned < period, turned, 0.0)
+        return np.where(self.periodic, low + turned, z)
 
     def difference(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """a - b (n, d), the short way round in periodic coordinates."""
@@ -165,6 +168,11 @@ class Task(ABC):
         """p, the number of columns of the measurement."""
         return len(self.noisy)
 
+    def mode_name(self, mode: int) -> str:
+        """A mode for people: "0 (left)"."""
+        known = 0 <= mode < len(self.mode_names)
+        return f"{mode} ({self.mode_names[mode]})" if known else str(mode)
+
     def plant(self, n: int, threads: int = 0) -> Plant:
         """n copies of the robot."""
         return Plant(self.model, self.inputs, n, threads)
@@ -252,6 +260,10 @@ class Task(ABC):
     @abstractmethod
     def verdict(self, measurement: np.ndarray) -> np.ndarray:
         """`Outcome` (n,) int of episodes that still ran when their time was up."""
+
+    @abstractmethod
+    def arrived(self, z: np.ndarray) -> np.ndarray:
+        """Whether chart points (n, d) at the end of an episode are close to the set-point: (n,) bool."""
 
     @abstractmethod
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:

@@ -52,8 +52,10 @@ class UnitCircle(Task):
         return np.full(len(measurement), Outcome.RUNNING)
 
     def verdict(self, measurement: np.ndarray) -> np.ndarray:
-        arrived = np.abs(self.error(measurement)) <= BAND
-        return np.where(arrived, Outcome.REACHED, Outcome.STALLED)
+        return np.where(self.arrived(measurement), Outcome.REACHED, Outcome.STALLED)
+
+    def arrived(self, z: np.ndarray) -> np.ndarray:
+        return np.abs(self.error(z)) <= BAND
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         # Half of them the paper's, where the decision is; the others all over the circle.

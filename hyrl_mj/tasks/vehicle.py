@@ -10,6 +10,7 @@ from hyrl_mj import mjcf
 from hyrl_mj.tasks.base import Chart, Mirror, Outcome, Task, register
 
 CRASH_DISTANCE = 1e-3  # [m] from the obstacle's surface
+LANE = 0.2  # [m] from the set-point, across
 ON_THE_LINE = 1e-6  # [m] the error that sixty samples of the kinematic actuator add up to
 
 
@@ -94,6 +95,9 @@ class Vehicle(Task):
     def verdict(self, measurement: np.ndarray) -> np.ndarray:
         passed = measurement[:, 0] >= self.set_point[0] - ON_THE_LINE
         return np.where(passed, Outcome.REACHED, Outcome.RUNNING)
+
+    def arrived(self, z: np.ndarray) -> np.ndarray:
+        return np.abs(z[:, 1] - self.set_point[1]) <= LANE
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         return rng.uniform((0.0, -1.0), (0.5, 1.0), (n, 2))
