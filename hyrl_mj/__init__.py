@@ -13,8 +13,9 @@ from hyrl_mj.extended_sets import ExtendedSets, extend
 from hyrl_mj.hybrid import HybridController
 from hyrl_mj.noise import Noise
 from hyrl_mj.partition import Partition, make_partition
-from hyrl_mj.pipeline import Run, load_run, run
+from hyrl_mj.pipeline import run
 from hyrl_mj.policies import MlpPolicy, Policy
+from hyrl_mj.run_directory import Run, load_run
 from hyrl_mj.sets import StateSet
 from hyrl_mj.settings import Settings
 from hyrl_mj.simulation import Controller, HybridArc, closed_loop, simulate

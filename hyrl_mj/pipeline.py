@@ -1,155 +1,25 @@
-"""The stages in order, and the run directory that they fill and resume from."""
+"""The stages in order: each fills its part of a run directory, from which any can start again."""
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from hyrl_mj import artifacts
-from hyrl_mj.critical_set import CriticalSet, find_critical_set
-from hyrl_mj.errors import BadArtifact, BadInput, NoRenderer, unknown
-from hyrl_mj.extended_sets import ExtendedSets, extend
-from hyrl_mj.hybrid import HybridController
+from hyrl_mj.critical_set import find_critical_set
+from hyrl_mj.errors import BadArtifact, NoRenderer, unknown
+from hyrl_mj.extended_sets import extend
 from hyrl_mj.noise import Noise
-from hyrl_mj.partition import Partition, make_partition
-from hyrl_mj.policies import MlpPolicy
-from hyrl_mj.settings import Settings, preset
+from hyrl_mj.partition import make_partition
+from hyrl_mj.run_directory import Run, load_run, open_or_create, write_config
+from hyrl_mj.settings import preset
 from hyrl_mj.simulation import HybridArc, simulate
-from hyrl_mj.tasks.base import Task, get_task
+from hyrl_mj.tasks.base import get_task
 
 Say = Callable[[str], None]
-PACKAGES = ("mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "mediapy")
-
-
-@dataclass(frozen=True)
-class Run:
-    """A run directory. What it holds is read when it is asked for.
-
-    Attributes:
-        path: the directory.
-        settings: how it was made.
-    """
-
-    path: Path
-    settings: Settings
-
-    @cached_property
-    def task(self) -> Task:
-        """The task."""
-        return get_task(self.settings.task)
-
-    @cached_property
-    def policy(self) -> MlpPolicy:
-        """The policy of stage 1."""
-        return self._of_task(MlpPolicy.load(self.path / "policy.safetensors"))
-
-    @cached_property
-    def critical_set(self) -> CriticalSet:
-        """M*, of stage 2."""
-        return CriticalSet.load(self.path / "critical_set.npz")
-
-    @cached_property
-    def partition(self) -> Partition:
-        """The parts M_i, of stage 3."""
-        return Partition.load(self.path / "partition.npz", self.task)
-
-    @cached_property
-    def extended_sets(self) -> ExtendedSets:
-        """The extended sets M_ext_i, of stage 5."""
-        return ExtendedSets.load(self.path / "extended_sets.npz", self.task)
-
-    @cached_property
-    def controller(self) -> HybridController:
-        """The hybrid controller, of stage 7."""
-        extended = self.extended_sets
-        policies = {
-            q: self._of_task(MlpPolicy.load(self.path / f"mode_{q}.safetensors"))
-            for q in extended.modes
-        }
-        return HybridController(
-            self.task, policies, dict(zip(extended.modes, extended.sets, strict=True))
-        )
-
-    def arc_paths(self) -> dict[tuple[str, str], Path]:
-        """The files of the replays by start ("start0", ..., "critical") and controller."""
-        starts = [f"start{i}" for i in range(len(self.task.replay_starts))]
-        starts += ["critical"] if len(self.critical_set.points) else []
-        loops = ["policy"] + [f"hyrl_q{q}" for q in self.extended_sets.modes]
-        return {(s, c): self.path / "arcs" / f"{s}_{c}.npz" for s in starts for c in loops}
-
-    def arcs(self) -> dict[tuple[str, str], HybridArc]:
-        """The replays by start ("start0", ..., "critical") and controller ("policy", "hyrl_q0", ...)."""
-        return {key: HybridArc.load(path) for key, path in self.arc_paths().items()}
-
-    def _of_task(self, policy: MlpPolicy) -> MlpPolicy:
-        if policy.task.name != self.settings.task:
-            raise BadArtifact(
-                f"{self.path} is a run of {self.settings.task}, but holds a policy for "
-                f"{policy.task.name}: run the stage that writes it again"
-            )
-        return policy
-
-
-def load_run(path: str | Path) -> Run:
-    """Open a run directory.
-
-    Raises:
-        BadArtifact: it is not one.
-    """
-    path = Path(path)
-    config = path / "config.json"
-    if not config.is_file():
-        raise BadArtifact(
-            f"{path} is not a run directory: it has no config.json; "
-            "make one with hyrl-mj run TASK --out DIR"
-        )
-    content = artifacts.read_json(config, kind="run")
-    with artifacts.reading(config):
-        return Run(path, Settings.from_json(content["settings"]))
-
-
-def write_config(run: Run) -> None:
-    """Write `config.json`: every setting, and the versions that go with them."""
-    versions = {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
-    content = {"settings": run.settings.to_json(), "versions": versions}
-    artifacts.write_json(run.path / "config.json", content, kind="run")
-
-
-def open_or_create(path: str | Path, settings: Settings) -> Run:
-    """The run directory at `path` with these settings, made if it is not there yet.
-
-    Raises:
-        BadInput: there is a run with other settings; the message names them.
-    """
-    path = Path(path)
-    if (path / "config.json").exists():
-        run = load_run(path)
-        if run.settings != settings:
-            old, new = run.settings.to_json(), settings.to_json()
-            differing = [
-                f"{name}: {old[name]} there, {new[name]} asked for"
-                if not isinstance(new[name], dict)
-                else name
-                for name in new
-                if old[name] != new[name]
-            ]
-            raise BadInput(
-                f"{path} holds a run with other settings ({'; '.join(differing)}): "
-                "choose another --out, give the same settings, or remove it"
-            )
-        return run
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise BadInput(f"{path} is there and is not a run directory: choose another --out")
-    run = Run(path, settings)
-    write_config(run)
-    return run
 
 
 # ---- the stages: each reads the artifacts of those before it and writes its own

@@ -275,7 +275,9 @@ def simulate(
 
 def _steps(task: Task, horizon: float) -> int:
     if not (math.isfinite(horizon) and 0 < horizon <= LONGEST):
-        raise BadInput(f"horizon {horizon:g} s cannot be used: give a time > 0 and <= {LONGEST:g} s")
+        raise BadInput(
+            f"horizon {horizon:g} s cannot be used: give a time > 0 and <= {LONGEST:g} s"
+        )
     return max(round(horizon / task.dt), 1)
 
 

@@ -6,7 +6,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hyrl_mj.pipeline import Run, replay_sentence
+from hyrl_mj.pipeline import replay_sentence
+from hyrl_mj.run_directory import Run
 from hyrl_mj.simulation import HybridArc
 
 

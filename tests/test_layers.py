@@ -18,7 +18,7 @@ PACKAGE = Path(hyrl_mj.__file__).parent
 ORDER = (
     "errors", "progress", "mjcf", "plant", "noise", "tasks", "settings", "artifacts", "policies",
     "rendering", "envs", "simulation", "symmetry", "training", "sets", "critical_set", "partition",
-    "extended_sets", "retraining", "hybrid", "replay", "doctor", "pipeline", "tables",
+    "extended_sets", "retraining", "hybrid", "run_directory", "replay", "doctor", "pipeline", "tables",
     "cli",
 )  # fmt: skip
 
