@@ -158,7 +158,7 @@ _TRAINING: dict[str, dict[str, tuple[Training, Training]]] = {
             _DQN_FAST,
             replace(
                 _DQN_FAST,
-                samples=100_000,
+                samples=150_000,
                 symmetric=False,
                 warm_start=True,
                 options={**_DQN_FAST.options, "exploration_initial_eps": 0.5},

@@ -19,11 +19,11 @@ from hyrl_mj import symmetry
 from hyrl_mj.envs.core import BatchedEnv, Domain
 from hyrl_mj.envs.sb3_env import TaskVecEnv
 from hyrl_mj.errors import BadInput
-from hyrl_mj.noise import Noise
+from hyrl_mj.noise import KINDS, Noise
 from hyrl_mj.policies import MlpPolicy
 from hyrl_mj.progress import Progress
 from hyrl_mj.settings import Training
-from hyrl_mj.tasks.base import Task
+from hyrl_mj.tasks.base import Outcome, Task
 
 ALGORITHMS: dict[str, type[PPO] | type[DQN]] = {"ppo": PPO, "dqn": DQN}
 ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}
@@ -33,7 +33,7 @@ LOG_INTERVAL = {"ppo": 1, "dqn": 100}
 FINAL_RATE = 0.02
 # How often the policy is checkpointed, and in the second half of the training also evaluated; on how
 # many episodes.
-CHECKPOINTS = 16
+CHECKPOINTS = 32
 EPISODES = 256
 
 
@@ -48,10 +48,11 @@ def train(
     log_dir: Path | None = None,
     label: str = "training",
 ) -> MlpPolicy:
-    """Train one policy, and return the best that was met on the way.
+    """Train one policy, and return the best that was met in the second half.
 
     Value-based training in particular goes up and down; as with SB3's `EvalCallback`, the policy is
-    evaluated at intervals on the same episodes, with and without the noise, and the best one is kept.
+    evaluated at intervals on the same episodes, without noise and with each kind of it. The best is the
+    one that most often ends at the set-point, and among equals the one with the highest return.
 
     Args:
         task: what to learn.
@@ -65,16 +66,18 @@ def train(
         label: what the progress bar says.
 
     Returns:
-        The policy with the highest mean return.
+        The best policy.
     """
     model = build(task, settings, seed, noise=noise, domain=domain, start_from=start_from)
     if log_dir is not None:
         model.set_logger(configure(str(log_dir / "tensorboard"), ["tensorboard"]))
-    noises = {Noise(), noise or Noise()}
+    bound = 0.0 if noise is None else noise.bound
+    noises = [Noise(kind, bound) for kind in KINDS] if bound else [Noise()]
 
-    def score(policy: MlpPolicy) -> float:
-        returns = [mean_return(task, policy, kind, domain, settings.gamma) for kind in noises]
-        return float(np.mean(returns))
+    def score(policy: MlpPolicy) -> tuple[float, float]:
+        found = [evaluate(task, policy, kind, domain, settings.gamma) for kind in noises]
+        success, returns = np.mean(found, axis=0)
+        return float(success), float(returns)
 
     watch = _Watch(task, settings.samples, log_dir, label, score)
     with single_threaded():
@@ -142,25 +145,32 @@ def single_threaded() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def mean_return(
+def evaluate(
     task: Task,
     policy: MlpPolicy,
     noise: Noise,
     domain: Domain | None = None,
     gamma: float = 1.0,
     episodes: int = EPISODES,
-) -> float:
-    """Mean return, discounted by gamma, over episodes from the start distribution, always the same."""
+) -> tuple[float, float]:
+    """How a policy does in episodes from the start distribution, always the same ones.
+
+    Returns:
+        The share of episodes that end at the set-point, and the mean return, discounted by gamma.
+    """
     env = BatchedEnv(task, episodes, noise=noise, domain=domain)
     env.seed(0)
     observation = env.reset()
     returns, weight = np.zeros(episodes), np.ones(episodes)
+    success = np.zeros(episodes, dtype=bool)
     while weight.any():
         result = env.step(policy.inputs(observation))
         returns += weight * result.reward
+        ended = result.done & (weight > 0)
+        success[ended] = (result.outcome == Outcome.REACHED)[ended] & task.arrived(env.z[ended])
         weight *= gamma * ~result.done
         observation = result.observation
-    return float(returns.mean())
+    return float(success.mean()), float(returns.mean())
 
 
 class _Watch(BaseCallback):
@@ -172,13 +182,13 @@ class _Watch(BaseCallback):
         samples: int,
         log_dir: Path | None,
         label: str,
-        score: Callable[[MlpPolicy], float],
+        score: Callable[[MlpPolicy], tuple[float, float]],
     ):
         super().__init__()
         self.best: MlpPolicy | None = None
         self._task, self._samples, self._log_dir, self._score = task, samples, log_dir, score
         self._next = self._interval = max(samples // CHECKPOINTS, 1)
-        self._best_score = -np.inf
+        self._best_score = (-np.inf, -np.inf)
         self._progress = Progress(label, samples, "samples")
 
     def _on_step(self) -> bool:
@@ -199,6 +209,7 @@ class _Watch(BaseCallback):
         # An untrained policy can have a lucky return.
         if self.num_timesteps >= self._samples // 2:
             score = self._score(policy)
-            self.logger.record("eval/mean_return", score)
+            self.logger.record("eval/success", score[0])
+            self.logger.record("eval/mean_return", score[1])
             if score > self._best_score:
                 self._best_score, self.best = score, policy

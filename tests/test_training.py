@@ -43,13 +43,13 @@ def untrained(task):
 
 def test_training_returns_the_best_policy_that_it_met(task, monkeypatch):
     """Whatever the evaluations say, the policy with the highest score comes back."""
-    scores, policies = iter([3.0, 9.0, *[5.0] * 100]), []
+    scores, policies = iter([(0.5, 3.0), (0.9, -1.0), *[(0.9, -2.0)] * 100]), []
 
     def scripted(task, policy, *_):
         policies.append(policy)
         return next(scores)
 
-    monkeypatch.setattr(training, "mean_return", scripted)
+    monkeypatch.setattr(training, "evaluate", scripted)
     best = training.train(task, preset(task, "smoke").stage1, seed=0)
     assert len(policies) > 2
     assert best is policies[1]
@@ -57,14 +57,14 @@ def test_training_returns_the_best_policy_that_it_met(task, monkeypatch):
 
 def test_ppo_learns_the_circle_with_the_smoke_preset(circle):
     policy = training.train(circle, preset(circle, "smoke").stage1, seed=0)
-    before = training.mean_return(circle, untrained(circle), Noise())
-    assert training.mean_return(circle, policy, Noise()) > before + 10
+    before = training.evaluate(circle, untrained(circle), Noise())[1]
+    assert training.evaluate(circle, policy, Noise())[1] > before + 10
 
 
 def test_dqn_learns_the_vehicle_with_some_more_samples(vehicle):
     settings = replace(preset(vehicle, "smoke").stage1, samples=40_000)
     policy = training.train(vehicle, settings, seed=0)
-    assert training.mean_return(vehicle, policy, Noise()) > 85
+    assert training.evaluate(vehicle, policy, Noise())[1] > 85
 
 
 def test_it_writes_the_latest_checkpoint_and_tensorboard_logs(smoke):
@@ -142,13 +142,14 @@ def test_an_unknown_algorithm_lists_the_known(vehicle):
 # ---- returns
 
 
-def test_mean_return_of_a_known_policy(circle):
+def test_evaluation_of_a_known_policy(circle):
     """A policy that never moves: 150 times the reward of its start, or the discounted sum."""
     policy = untrained(circle)
     still = replace(policy, weights={n: 0 * w for n, w in policy.weights.items()})
     starts = Domain(lambda n, rng: np.full((n, 1), 1.0), lambda z: np.full(len(z), True), -1.0)
     for gamma, factor in ((1.0, 150), (0.9, (1 - 0.9**150) / 0.1)):
-        value = training.mean_return(circle, still, Noise(), starts, gamma, episodes=4)
+        success, value = training.evaluate(circle, still, Noise(), starts, gamma, episodes=4)
+        assert success == 0
         assert value == pytest.approx(-factor / np.pi, rel=1e-6)
 
 
