@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file, save
 
 from hyrl_mj.errors import BadArtifact
 
@@ -99,7 +99,7 @@ def read_arrays(path: Path, kind: str) -> dict[str, np.ndarray]:
 def write_tensors(path: Path, tensors: dict[str, np.ndarray]) -> None:
     """Write named tensors as safetensors."""
     with replacing(path) as temporary:
-        save_file({k: np.ascontiguousarray(v) for k, v in tensors.items()}, temporary)
+        temporary.write_bytes(save({k: np.ascontiguousarray(v) for k, v in tensors.items()}))
 
 
 def read_tensors(path: Path) -> dict[str, np.ndarray]:

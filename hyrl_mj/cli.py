@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -187,7 +188,8 @@ def main() -> None:
         print(f"hyrl-mj: {error}", file=sys.stderr)
         sys.exit(error.exit_status)
     except OSError as error:
-        print(f"hyrl-mj: {error.strerror}: {error.filename}", file=sys.stderr)
+        where = "" if error.filename is None else f": {os.fsdecode(error.filename)}"
+        print(f"hyrl-mj: {error.strerror}{where}", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:
         print(

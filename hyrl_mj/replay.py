@@ -22,6 +22,7 @@ from hyrl_mj.tasks.base import Task
 # The site of the MJCF whose path is drawn.
 TRACKED = "tracked"
 HOLD = 1.0  # [s] that the last frame of a pair stays
+FASTEST = 240  # [frames/s]
 SMALLEST = (160, 120)  # [pixels] of a panel, for captions that can be read
 
 RGB = tuple[int, int, int]
@@ -73,10 +74,13 @@ def render_replay(
         raise BadInput(f"a replay is an mp4, {path} is not: give a name that ends in .mp4")
     if not pairs:
         raise BadInput("there is nothing to replay: give at least one pair of arcs")
-    if any(n % 2 or n < least for n, least in zip(size, SMALLEST, strict=True)) or fps < 1:
+    if (
+        any(n % 2 or n < least for n, least in zip(size, SMALLEST, strict=True))
+        or not 1 <= fps <= FASTEST
+    ):
         raise BadInput(
             f"no video of {size[0]} x {size[1]} pixels at {fps} frames a second: "
-            f"give even numbers from {SMALLEST[0]} x {SMALLEST[1]}, and at least 1"
+            f"give even sizes from {SMALLEST[0]} x {SMALLEST[1]}, and 1 to {FASTEST} frames"
         )
     layout = Layout(*size)
     shows = [

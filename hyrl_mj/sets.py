@@ -145,6 +145,8 @@ class GridSet:
             raise BadInput(
                 f"{self.values.shape} signed distances do not fit {self.grid.counts} nodes"
             )
+        if not np.isfinite(self.values).all():
+            raise BadInput("signed distances must be finite, and some are not")
         self.values.setflags(write=False)
 
     @staticmethod

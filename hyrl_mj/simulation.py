@@ -253,6 +253,10 @@ def simulate(
     starts = task.check_state(z0)
     single = np.ndim(z0) < 2
     check_seed(seed)
+    if not (noise is None or isinstance(noise, Noise)):
+        raise BadInput(
+            f'noise {noise!r} cannot be used: give a hyrl_mj.Noise("alternating", 0.1), say'
+        )
     steps = None if horizon is None else _steps(task, horizon)
     loop = PolicyController(controller) if isinstance(controller, Policy) else controller
     if q0 is not None:

@@ -32,6 +32,10 @@ fi
 
 venv="${HYRL_MJ_VENV:-.venv}"
 if ! [ -x "$venv/bin/pip" ]; then
+  if ! mkdir -p "$venv" 2>/dev/null; then
+    echo "$PWD cannot be written to: set HYRL_MJ_VENV to a folder that can, and run this again." >&2
+    exit 2
+  fi
   echo "Making a virtual environment in $venv ..."
   # Debian ships Python without what venv needs to bring pip along.
   "$python" -m venv "$venv" >/dev/null 2>&1 ||

@@ -228,3 +228,9 @@ def test_projection_onto_an_empty_set_leaves_points_where_they_are():
     grid = Grid.with_cells(LINE, 10)
     empty, z = GridSet.from_mask(grid, np.zeros(11, dtype=bool)), points(LINE, 5)
     np.testing.assert_array_equal(empty.project(z), z)
+
+
+def test_distances_that_are_no_numbers_are_refused(circle):
+    grid = Grid.with_cells(circle.chart, 20)
+    with pytest.raises(BadInput, match="finite"):
+        GridSet(grid, np.full(20, np.nan))

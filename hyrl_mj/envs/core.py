@@ -73,6 +73,8 @@ class BatchedEnv:
         max_steps: int | None = None,
         threads: int = 0,
     ):
+        if n < 1:
+            raise BadInput(f"{n} episodes side by side cannot be played: give at least 1")
         self.task, self.n, self.domain = task, n, domain
         self.noise = noise or Noise()
         self.max_steps = max_steps or task.max_steps
