@@ -5,6 +5,7 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+from gl import needs_gl
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
@@ -311,6 +312,7 @@ def test_leaving_the_domain_ends_an_episode_with_its_own_reward(circle):
 # ---- pictures
 
 
+@needs_gl
 def test_rgb_array_shows_the_scene(task):
     env = make(task.name, render_mode="rgb_array")
     env.reset(options={"z": task.replay_starts[0]})

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gl import needs_gl
 from PIL import Image
 
 import hyrl_mj
@@ -52,17 +53,6 @@ def pair() -> tuple[HybridArc, HybridArc]:
     assert arc.outcome == "reached"
     assert arc.j[-1] == 1
     return crash, arc
-
-
-def can_render() -> bool:
-    try:
-        SceneRenderer(TASK.model, 64, 48).close()
-    except NoRenderer:
-        return False
-    return True
-
-
-needs_gl = pytest.mark.skipif(not can_render(), reason="no GL library on this machine")
 
 
 def frames_of(path: Path) -> np.ndarray:
