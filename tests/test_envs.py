@@ -37,6 +37,7 @@ def vehicle_outcome(z, action):
         assert "outcome" not in info
 
 
+@needs_gl  # Gymnasium's checker renders
 @pytest.mark.parametrize("check", [gymnasium_check, sb3_check])
 def test_the_checkers_of_both_libraries_are_content(task, check):
     with warnings.catch_warnings():
