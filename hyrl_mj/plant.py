@@ -35,8 +35,7 @@ class Plant:
         # checked here, and clamping them would be in the way of running backward.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
-        self.sample_time = mjcf.sample_time(model)
-        self.substeps = max(round(self.sample_time / model.opt.timestep), 1)
+        self.substeps = max(round(mjcf.sample_time(model) / model.opt.timestep), 1)
         self.columns = [mjcf.object_id(model, actuator, name) for name in inputs]
         self.low, self.high = input_limits(model, inputs)
         self._held = model.key_ctrl[0].copy() if model.nkey else np.zeros(model.nu)

@@ -119,7 +119,6 @@ def closed_loop(
     length = np.zeros(n, dtype=int)
     path = np.empty((limit + 1, n, task.chart.dimension))
     path[0] = task.z(measurement)
-    last = 0
     first_mode = q.copy()
     kept: dict[str, list[np.ndarray]] = {name: [] for name in ("before", "q", "measured", "u")}
     states = [plant.state] if record else []
@@ -137,8 +136,7 @@ def closed_loop(
         u[active], q[active] = controller.step(q[active], measured[active])
         (plant.step_backward if backward else plant.step)(u[active], active)
         measurement = plant.measurement
-        last = k + 1
-        path[last] = task.z(measurement)
+        path[k + 1] = task.z(measurement)
         length[active] = k + 1
         if not backward:
             outcome[active] = task.ending(measurement[active])
@@ -159,7 +157,8 @@ def closed_loop(
     shapes = {"before": (), "q": (), "measured": (len(task.noisy),), "u": (len(task.inputs),)}
     arrays = {k: np.array(values).reshape(-1, n, *shapes[k]) for k, values in kept.items()}
     arrays |= {k: arrays[k].astype(int) for k in ("before", "q")}
-    return Rollout(path[: last + 1], length, outcome, first_mode, **arrays, state=np.array(states))
+    path = path[: length.max() + 1]
+    return Rollout(path, length, outcome, first_mode, **arrays, state=np.array(states))
 
 
 @dataclass(frozen=True)
