@@ -19,6 +19,10 @@ from hyrl_mj.tasks.base import Outcome, Task
 NEIGHBOURHOOD_CELLS = 4
 # Gaps between the samples of the backward runs that are closed, in cells.
 GAP_CELLS = 1.5
+# A horizon is long enough when the backward runs have filled this share of the overlap that is wanted.
+FILLED = 0.995
+# The longest horizon that is tried [s].
+LONGEST_HORIZON = 2.0
 
 
 @dataclass(frozen=True)
@@ -31,6 +35,8 @@ class ExtendedSets:
         winning: W_i as (N,) bool over the grid's nodes: where pi_i reaches its goal.
         horizon: time T of the backward propagation [s].
         noise: bound eps of the measurement noise that the sets are made for.
+        narrow: (K, d) points of M* at which a mode has less room than the noise asks for.
+        room: (K,) the room there is, across, in chart units; 2 eps are asked for.
     """
 
     modes: tuple[int, ...]
@@ -38,6 +44,8 @@ class ExtendedSets:
     winning: tuple[np.ndarray, ...]
     horizon: float
     noise: float
+    narrow: np.ndarray
+    room: np.ndarray
 
     def sentence(self, task: Task) -> str:
         """How far the sets overlap, for people."""
@@ -45,8 +53,20 @@ class ExtendedSets:
             return "one mode, its set is everything"
         both = self.sets[0] & self.sets[1]
         share = both.mask.mean()
+        text = (
+            f"{len(self.sets)} extended sets, T = {self.horizon:.2g} s, "
+            f"the first two share {100 * share:.1f}% of the chart"
+        )
+        if not len(self.narrow):
+            return text
+        low, high, chart = self.narrow.min(axis=0), self.narrow.max(axis=0), task.chart
+        where = ", ".join(
+            f"{name} {a:.3g} to {b:.3g} {unit}" if b - a > 1e-3 else f"{name} {a:.3g} {unit}"
+            for name, unit, a, b in zip(chart.names, chart.units, low, high, strict=True)
+        )
         return (
-            f"{len(self.sets)} extended sets, the first two share {100 * share:.1f}% of the chart"
+            f"{text}; no overlap can be wide enough for noise {self.noise:g} at {where}: "
+            f"{2 * self.noise:g} of room are needed there and as little as {self.room.min():.2g} is left"
         )
 
     def save(self, path: Path) -> None:
@@ -60,6 +80,8 @@ class ExtendedSets:
                 "winning": np.stack(self.winning),
                 "horizon": np.array(self.horizon),
                 "noise": np.array(self.noise),
+                "narrow": self.narrow,
+                "room": self.room,
             },
             kind="extended sets",
         )
@@ -80,6 +102,8 @@ class ExtendedSets:
                 winning=tuple(arrays["winning"]),
                 horizon=float(arrays["horizon"]),
                 noise=float(arrays["noise"]),
+                narrow=arrays["narrow"],
+                room=arrays["room"],
             )
 
 
@@ -88,8 +112,8 @@ def extend(
     policy: Policy,
     critical: CriticalSet,
     partition: Partition,
-    horizon: float,
     noise: float,
+    horizon: float | None = None,
 ) -> ExtendedSets:
     """Extend the parts over M*.
 
@@ -99,33 +123,98 @@ def extend(
 
         M_ext_i = ((M_i u X_i) n (W_i eroded by eps)) u (M_i dilated by eps)
 
+    Erosion and dilation act along the coordinates that are measured with noise.
+
     Args:
         task: gives plant and chart.
         policy: the stage-1 policy.
         critical: M*, from stage 2.
         partition: M_i, from stage 3.
-        horizon: time T of the backward propagation [s].
         noise: bound eps of the measurement noise.
+        horizon: time T of the backward propagation [s]. By default the shortest with which every set
+            reaches 2 eps and one sample over M*, where its mode still succeeds, and then no farther.
     """
-    grid = partition.grid
-    near = max(noise, NEIGHBOURHOOD_CELLS * grid.cell, one_sample(task, policy, grid))
-    sets, winning = [], []
-    for part, pi in zip(partition.parts, part_policies(task, policy, partition, near), strict=True):
-        reached = part | backward_reach(task, pi, critical, part, near, horizon)
-        wins = part_wins(task, pi, partition, part, reached.dilated(2 * noise + 2 * grid.cell))
-        winning.append(wins)
-        # Nodes that were not asked, far from the critical set, do not take room away.
-        roomy = GridSet.from_mask(grid, wins | ~part.mask & ~reached.dilated(noise).mask)
-        sets.append((reached & roomy.eroded(noise)) | part.dilated(noise))
-    return ExtendedSets(partition.modes, tuple(sets), tuple(winning), horizon, noise)
+    grid, parts = partition.grid, partition.parts
+    eps, hop = task.noise_in_chart(noise), longest_hop(task, policy, grid)
+    near = max(noise, NEIGHBOURHOOD_CELLS * grid.cell, float(np.linalg.norm(hop)))
+    pis = part_policies(task, policy, partition, near)
+    wanted = [part.dilated_by_box(2 * eps + hop * (task.noise_in_chart(1.0) > 0)) for part in parts]
+    # W_i, asked for wherever a set may come to lie.
+    radius = 3 * noise + near + (0.0 if horizon is None else horizon / task.dt * near)
+    winning = tuple(
+        part_wins(task, pi, partition, part, part.dilated(radius))
+        for pi, part in zip(pis, parts, strict=True)
+    )
+    roomy = [
+        GridSet.from_mask(grid, wins | ~part.dilated(radius).mask).eroded_by_box(eps)
+        for wins, part in zip(winning, parts, strict=True)
+    ]
+    # Only M* is to be covered; parts that meet again elsewhere, at the set-point, have nothing to decide.
+    around = distance_to(task, critical, grid.nodes) <= float(np.linalg.norm(2 * eps + hop))
+    reached = list(parts)
+    steps = [max(round(horizon / task.dt), 1)] if horizon else range(1, _longest(task) + 1)
+    for k in steps if len(parts) > 1 else ():
+        reached = [
+            part | backward_reach(task, pi, critical, part, near, k)
+            for pi, part in zip(pis, parts, strict=True)
+        ]
+        goals = [
+            (w & r).mask & ~p.mask & around for w, r, p in zip(wanted, roomy, parts, strict=True)
+        ]
+        filled = [r.mask[goal].mean() for r, goal in zip(reached, goals, strict=True) if goal.any()]
+        if min(filled, default=1.0) >= FILLED:
+            break
+    if horizon is None:
+        reached = [r & w for r, w in zip(reached, wanted, strict=True)]
+    sets = tuple(
+        (r & room) | part.dilated_by_box(eps)
+        for r, room, part in zip(reached, roomy, parts, strict=True)
+    )
+    narrow, room = room_along(task, critical, partition, winning, eps)
+    taken = horizon or (k * task.dt if len(parts) > 1 else 0.0)
+    return ExtendedSets(partition.modes, sets, winning, taken, noise, narrow, room)
+
+
+def _longest(task: Task) -> int:
+    return round(LONGEST_HORIZON / task.dt)
+
+
+def room_along(
+    task: Task,
+    critical: CriticalSet,
+    partition: Partition,
+    winning: tuple[np.ndarray, ...],
+    eps: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where on M* some mode has less than 2 eps (d,) of room across M*, though a mode can win there.
+
+    Returns:
+        Points (K, d) of M*, and the room (K,) at each: how far to either side all modes still succeed.
+    """
+    grid, points = partition.grid, critical.points
+    shares = np.arange(0.0, 1.0 + 1e-9, 0.02)
+    reach = 2 * eps.max(initial=0.0)
+    if not len(points) or not reach or len(winning) < 2:
+        return np.empty((0, task.chart.dimension)), np.empty(0)
+    room = np.full(len(points), reach)
+    for direction in np.vstack([np.diag(2 * eps), -np.diag(2 * eps)]):
+        if not direction.any():
+            continue
+        line = grid.nearest((points[:, None] + shares[:, None] * direction).reshape(-1, len(eps)))
+        for wins in winning:
+            ok = wins[line].reshape(len(points), -1)
+            first = np.where(ok.all(axis=1), len(shares), ok.argmin(axis=1))
+            room = np.minimum(room, np.maximum(first - 1, 0) * 0.02 * reach)
+    someone = np.any([wins[grid.nearest(points)] for wins in winning], axis=0)
+    narrow = someone & (room < reach - grid.cell)
+    return points[narrow], room[narrow]
 
 
 def backward_reach(
-    task: Task, pi: PartPolicy, critical: CriticalSet, part: GridSet, near: float, horizon: float
+    task: Task, pi: PartPolicy, critical: CriticalSet, part: GridSet, near: float, steps: int
 ) -> GridSet:
     """X_i: what the backward closed loop reaches outside M_i from the neighbourhood of M*."""
     grid = part.grid
-    steps = max(round(horizon / task.dt), 1)
     nodes = grid.nodes[part.mask & (distance_to(task, critical, grid.nodes) <= near)]
     visited = np.zeros(len(grid.nodes), dtype=bool)
     if len(nodes):
@@ -148,10 +237,10 @@ def between_samples(path: np.ndarray, grid: Grid) -> np.ndarray:
     return np.concatenate([(path[:-1] + shares * hops).reshape(-1, d), path[-1]])
 
 
-def one_sample(task: Task, policy: Policy, grid: Grid) -> float:
-    """The longest way that the closed loop goes in one sample, in chart units."""
+def longest_hop(task: Task, policy: Policy, grid: Grid) -> np.ndarray:
+    """The longest way (d,) that the closed loop goes in one sample along each coordinate."""
     path = closed_loop(task, PolicyController(policy), grid.nodes, steps=1).path
-    return float(np.linalg.norm(path[-1] - path[0], axis=1).max())
+    return np.asarray(np.abs(path[-1] - path[0]).max(axis=0))
 
 
 def part_wins(

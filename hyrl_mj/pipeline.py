@@ -54,7 +54,7 @@ def partition_stage(run: Run, say: Say) -> None:
 def extended_sets_stage(run: Run, say: Say) -> None:
     """Stages 4 and 5: extend the parts over the critical set."""
     s = run.settings
-    sets = extend(run.task, run.policy, run.critical_set, run.partition, s.horizon, s.noise)
+    sets = extend(run.task, run.policy, run.critical_set, run.partition, s.noise, s.horizon)
     sets.save(run.path / "extended_sets.npz")
     say(sets.sentence(run.task))
 

@@ -55,6 +55,11 @@ class Plant:
         return self._qpos.copy()
 
     @property
+    def qvel(self) -> np.ndarray:
+        """Generalised velocities: (n, nv), a copy."""
+        return self._qvel.copy()
+
+    @property
     def state(self) -> np.ndarray:
         """MuJoCo's whole state, rows of `mjSTATE_INTEGRATION`: (n, nstate), a copy."""
         return self._batch.state.copy()

@@ -75,7 +75,7 @@ class MlpPolicy:
 
     @property
     def _levels(self) -> np.ndarray | None:
-        return self.task.input_levels if self.algorithm == "dqn" else None
+        return self.task.input_levels
 
     @property
     def hidden(self) -> tuple[int, ...]:
@@ -106,7 +106,8 @@ class MlpPolicy:
         return np.clip(outputs.astype(float), low, high)
 
     def outputs(self, observation: np.ndarray) -> np.ndarray:
-        """The network's last layer for observations (n, k): action values, or the mean input."""
+        """The network's last layer for observations (n, k): action values or preferences of a
+        discrete task's levels, else the mean input."""
         observation = observation.astype(np.float32)
         if len(observation) <= CHUNK:
             return self._forward(observation)

@@ -8,12 +8,23 @@ import numpy as np
 
 from hyrl_mj.envs.core import Domain
 from hyrl_mj.extended_sets import ExtendedSets
+from hyrl_mj.game import LOST, NEVER, Answers, noisy_moves, solve
+from hyrl_mj.lattice import Lattice
 from hyrl_mj.noise import Noise
 from hyrl_mj.policies import MlpPolicy
-from hyrl_mj.sets import GridSet
 from hyrl_mj.settings import Training
+from hyrl_mj.simulation import PolicyController, closed_loop
 from hyrl_mj.tasks.base import Outcome, Task
-from hyrl_mj.training import train
+from hyrl_mj.training import Score, train
+
+# Of the starts of training episodes this share is where the game is lost, if it is; of the others this
+# share comes from where the task starts, the rest from all over the mode's domain.
+LOST_SHARE = 0.2
+TASK_SHARE = 0.7
+# States that fail in k samples are met in proportion to k to this power: failures are learned backward.
+URGENCY = -1.5
+# Starts of the episodes without noise whose end is judged.
+EPISODES = 256
 
 
 def retrain(
@@ -27,8 +38,9 @@ def retrain(
 ) -> MlpPolicy:
     """Train the policy of one mode (paper, Step 6).
 
-    Measurements are noisy: a policy that passes an obstacle closer than the noise bound is led into
-    it, and no switching cures that.
+    A policy that passes an obstacle closer than the noise bound is led into it, and no switching cures
+    that. So the reward is that of the worst state that the measurement may stand for, and training goes
+    on where the worst-case game is lost.
 
     Args:
         task: what to learn.
@@ -36,42 +48,98 @@ def retrain(
         extended: M_ext_i and W_i, from stage 5.
         mode: the mode to train.
         settings: how to train.
-        seed: of everything random; each mode derives its own from it.
+        seed: of everything random; each mode and attempt derives its own from it.
         log_dir: where logs and checkpoints go.
+
+    Returns:
+        The best policy of all attempts.
     """
-    domain = mode_domain(task, extended, mode, settings.gamma)
-    return train(
-        task,
-        settings,
-        seed=int(np.random.SeedSequence([seed, 1 + mode]).generate_state(1)[0]),
-        noise=Noise("uniform", extended.noise) if extended.noise else Noise(),
-        domain=domain,
-        start_from=policy if settings.warm_start else None,
-        log_dir=log_dir,
-        label=f"mode {mode}",
+    ground = ModeGround(task, extended, mode)
+    domain = Domain(
+        ground.starts,
+        extended.sets[ground.index].dilated_by_box(task.noise_in_chart(extended.noise)).contains,
+        task.worst_reward / (1 - settings.gamma),
+        extended.noise * np.array(task.noisy, dtype=float),
     )
+    best: tuple[Score, MlpPolicy] | None = None
+    for attempt in range(settings.attempts):
+        found = train(
+            task,
+            settings,
+            seed=int(np.random.SeedSequence([seed, 1 + mode, attempt]).generate_state(1)[0]),
+            # Without a game to find the worst noise, chance has to do.
+            noise=Noise() if ground.lattice else Noise("uniform", extended.noise),
+            domain=domain,
+            start_from=policy if settings.warm_start else None,
+            judge=ground if ground.lattice else None,
+            log_dir=log_dir,
+            label=f"mode {mode}" + (f", attempt {attempt + 1}" if attempt else ""),
+        )
+        if not ground.lattice:
+            return found
+        score = ground(found)
+        if best is None or score > best[0]:
+            best = score, found
+        if score >= ground.enough:
+            break
+    assert best is not None
+    return best[1]
 
 
-def mode_domain(task: Task, extended: ExtendedSets, mode: int, gamma: float) -> Domain:
-    """Where mode i is trained: every state whose measurement can lie in M_ext_i.
+class ModeGround:
+    """Where one mode has to win: judges its policies there, and draws starts from it (a `Judge`).
 
-    That is M_ext_i dilated by the noise bound. Starts are drawn from it evenly, where the mode can
-    still succeed; leaving it ends an episode and counts as the worst reward for ever.
+    It is every state whose measurement can lie in M_ext_i and from which the mode can still succeed.
+
+    Args:
+        task: what is to be learned.
+        extended: M_ext_i and W_i.
+        mode: the mode.
     """
-    i = extended.modes.index(mode)
-    within: GridSet = extended.sets[i].dilated(extended.noise)
-    grid = within.grid
-    plant = task.plant(len(grid.nodes))
-    plant.set_state(task.qpos(grid.nodes))
-    alive = task.ending(plant.measurement) == Outcome.RUNNING
-    nodes = np.flatnonzero(within.mask & extended.winning[i] & alive)
-    if not len(nodes):
-        # The stage-1 policy never succeeds here; training may still find a way.
-        nodes = np.flatnonzero(within.mask & alive)
 
-    def starts(n: int, rng: np.random.Generator) -> np.ndarray:
-        jitter = rng.uniform(-0.5, 0.5, (n, task.chart.dimension)) * grid.spacing
-        z = grid.nodes[rng.choice(nodes, n)] + jitter
-        return np.where(task.chart.periodic, z, np.clip(z, task.chart.low, task.chart.high))
+    def __init__(self, task: Task, extended: ExtendedSets, mode: int):
+        self.task, self.noise = task, task.noise_in_chart(extended.noise)
+        self.index = extended.modes.index(mode)
+        self.grid = extended.sets[self.index].grid
+        self.lattice: Lattice | None = None
+        if Lattice.possible(task):
+            self.lattice = Lattice.of(task, self.grid)
+        within = extended.sets[self.index].dilated_by_box(self.noise).mask
+        plant = task.plant(len(self.grid.nodes))
+        plant.set_state(task.qpos(self.grid.nodes))
+        alive = task.ending(plant.measurement) == Outcome.RUNNING
+        # If the stage-1 policy never succeeds here, training may still find a way.
+        wins = extended.winning[self.index]
+        self.wanted = within & alive & (wins if (within & alive & wins).any() else True)
+        self.nodes = np.flatnonzero(self.wanted)
+        early = self.nodes[task.may_start(self.grid.nodes[self.nodes])]
+        self.early = early if len(early) else self.nodes
+        self.lost, self._weight = np.empty(0, dtype=int), np.empty(0)
+        self.enough: Score = (0.0, -task.precision)
 
-    return Domain(starts, within.contains, task.worst_reward / (1 - gamma))
+    def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """n starts (n, d): where the game is lost, where the task starts, and all over."""
+        at = np.where(
+            rng.random(n) < TASK_SHARE, rng.choice(self.early, n), rng.choice(self.nodes, n)
+        )
+        if len(self.lost):
+            lost = rng.choice(self.lost, n, p=self._weight)
+            at = np.where(rng.random(n) < LOST_SHARE, lost, at)
+        chart, d = self.task.chart, self.task.chart.dimension
+        z = self.grid.nodes[at] + rng.uniform(-0.5, 0.5, (n, d)) * self.grid.spacing
+        return np.where(chart.periodic, z, np.clip(z, chart.low, chart.high))
+
+    def __call__(self, policy: MlpPolicy) -> Score:
+        """Minus the share of states lost, and minus how far from the set-point it ends without noise."""
+        assert self.lattice is not None
+        loop = PolicyController(policy)
+        moves = noisy_moves(Answers.of(self.lattice, loop, self.noise), self.noise)
+        value = solve(moves)[0, :-2]
+        self.lost = np.flatnonzero(self.wanted & (value >= NEVER))
+        samples = np.where(value > NEVER, LOST - value, self.task.max_steps)[self.lost]
+        weight = np.maximum(samples, 1.0) ** URGENCY
+        self._weight = weight / weight.sum()
+        rng = np.random.default_rng(0)
+        rollout = closed_loop(self.task, loop, self.grid.nodes[rng.choice(self.early, EPISODES)])
+        missed = self.task.miss(rollout.path[-1]).max()
+        return -len(self.lost) / len(self.nodes), -float(missed)

@@ -185,6 +185,20 @@ class GridSet:
         """The points of the set that are deeper than `by` in it."""
         return GridSet(self.grid, self.values + by)
 
+    def dilated_by_box(self, half: np.ndarray) -> GridSet:
+        """All points z + n with z in the set and |n_i| <= half_i (d,), to whole nodes."""
+        window = np.round(half / self.grid.spacing).astype(int)
+        if not window.any():
+            return self
+        shape, periodic = self.grid.counts, self.grid.chart.periodic
+        return GridSet.from_mask(
+            self.grid, within_reach(self.mask.reshape(shape), window, periodic).ravel()
+        )
+
+    def eroded_by_box(self, half: np.ndarray) -> GridSet:
+        """The points z of which all z + n, |n_i| <= half_i (d,), are in the set or off the chart."""
+        return ~(~self).dilated_by_box(half)
+
     @property
     def mask(self) -> np.ndarray:
         """(N,) bool, the nodes in the set."""
@@ -210,6 +224,16 @@ class GridSet:
             return z
         nearest = self.grid.nodes[self._nearest_inside[self.grid.nearest(z)]]
         return np.where(inside[:, None], z, nearest)
+
+
+def within_reach(mask: np.ndarray, window: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
+    """Whether some node of a mask lies within so many nodes (d,) along each axis: bool, of its shape."""
+    found = mask.astype(np.uint8)
+    for axis, (w, wraps) in enumerate(zip(window, periodic, strict=True)):
+        if w:
+            size, mode = min(2 * w + 1, mask.shape[axis]), "wrap" if wraps else "constant"
+            found = ndimage.maximum_filter1d(found, size, axis, mode=mode)
+    return found.astype(bool)
 
 
 def _unrolled(grid: Grid, mask: np.ndarray) -> tuple[np.ndarray, tuple[slice, ...]]:

@@ -20,6 +20,7 @@ class Training:
     """How SB3 trains one policy.
 
     Attributes:
+        algorithm: of SB3, "ppo" or "dqn".
         samples: environment samples in all.
         envs: episodes side by side.
         hidden: widths of the hidden layers.
@@ -33,9 +34,12 @@ class Training:
             policy that has made up its mind does not try the other way any more: PPO starts afresh.
         episode: samples until an episode is truncated, by default the task's; shorter ones see more of
             the starts.
+        attempts: how often training starts again, with another seed, until its policy is good enough
+            (stage 6 only); the best is kept.
         options: further keywords of the SB3 algorithm.
     """
 
+    algorithm: str
     samples: int
     envs: int
     hidden: tuple[int, ...]
@@ -46,6 +50,7 @@ class Training:
     symmetric: bool
     warm_start: bool = False
     episode: int | None = None
+    attempts: int = 1
     options: dict[str, Any] = field(default_factory=dict)
 
 
@@ -58,7 +63,7 @@ class Settings:
         preset: the name of the preset that the others started from.
         seed: of everything random.
         noise: bound eps of the measurement noise that the controller has to survive.
-        horizon: time T of the backward propagation [s].
+        horizon: time T of the backward propagation [s]; None to size the sets to the noise.
         stage1: training of the first policy (stage 1).
         stage6: training of each mode's policy (stage 6).
         cells: grid cells along the longest side of the chart; cells are square in chart units.
@@ -70,7 +75,7 @@ class Settings:
     preset: str
     seed: int
     noise: float
-    horizon: float
+    horizon: float | None
     stage1: Training
     stage6: Training
     cells: int
@@ -79,7 +84,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_bound(self.noise)
-        if not (
+        if self.horizon is not None and not (
             isinstance(self.horizon, Real) and math.isfinite(self.horizon) and self.horizon > 0
         ):
             raise BadInput(f"horizon {self.horizon!r} s cannot be used: give a finite time > 0")
@@ -106,8 +111,9 @@ class Settings:
             raise BadArtifact(f"its settings are not those of this version ({error})") from error
 
 
-# The networks and samples of each preset, by algorithm: stage 1, then stage 6.
+# Stage 1 of each preset, by algorithm.
 _DQN_FAST = Training(
+    algorithm="dqn",
     samples=200_000,
     envs=64,
     hidden=(64, 64),
@@ -131,6 +137,7 @@ _DQN_FAST = Training(
 )
 # Short episodes: the decision falls in their first second.
 _PPO_FAST = Training(
+    algorithm="ppo",
     samples=160_000,
     envs=128,
     hidden=(64, 64),
@@ -143,6 +150,7 @@ _PPO_FAST = Training(
     options={"n_steps": 32, "batch_size": 1024, "n_epochs": 8},
 )
 _PAPER = Training(
+    algorithm="dqn",
     samples=1_000_000,
     envs=1,
     hidden=(64, 64),
@@ -152,35 +160,42 @@ _PAPER = Training(
     gamma=0.9664,
     symmetric=False,
 )
+# Stage 6. The modes of a discrete task are trained by PPO, too: the ways differ by less than the error of
+# a freely trained value function, and a policy that is learned directly does not depend on it.
+_MODES_CONTINUOUS = replace(_PPO_FAST, symmetric=False, episode=40, attempts=3)
+_MODES_DISCRETE = replace(
+    _MODES_CONTINUOUS,
+    samples=400_000,
+    activation="relu",
+    gamma=0.9,
+    episode=None,
+    options={**_PPO_FAST.options, "ent_coef": 0.003, "gae_lambda": 0.9},
+)
 _TRAINING: dict[str, dict[str, tuple[Training, Training]]] = {
     "dqn": {
-        "fast": (
-            _DQN_FAST,
-            replace(
-                _DQN_FAST,
-                samples=150_000,
-                symmetric=False,
-                warm_start=True,
-                options={**_DQN_FAST.options, "exploration_initial_eps": 0.5},
-            ),
-        ),
+        "fast": (_DQN_FAST, _MODES_DISCRETE),
         "paper": (_PAPER, replace(_PAPER, samples=300_000, warm_start=True)),
         "smoke": (
             replace(_DQN_FAST, samples=10_000),
-            replace(_DQN_FAST, samples=4_000, symmetric=False, warm_start=True),
+            replace(_MODES_DISCRETE, samples=8_192, attempts=1),
         ),
     },
     "ppo": {
-        "fast": (_PPO_FAST, replace(_PPO_FAST, symmetric=False, episode=40)),
+        "fast": (_PPO_FAST, _MODES_CONTINUOUS),
         "paper": (
-            _PAPER,
+            replace(_PAPER, algorithm="ppo"),
             replace(
-                _PAPER, samples=100_000, hidden=(112, 112), learning_rate=3.45e-4, gamma=0.9637
+                _PAPER,
+                algorithm="ppo",
+                samples=100_000,
+                hidden=(112, 112),
+                learning_rate=3.45e-4,
+                gamma=0.9637,
             ),
         ),
         "smoke": (
             replace(_PPO_FAST, samples=24_576),
-            replace(_PPO_FAST, samples=8_192, symmetric=False, episode=40),
+            replace(_MODES_CONTINUOUS, samples=8_192, attempts=1),
         ),
     },
 }
@@ -204,7 +219,8 @@ def preset(
         name: "fast", "paper" (the paper's training), or "smoke" (seconds, to see that all runs).
         noise: bound eps of the measurement noise that the controller has to survive.
         seed: of everything random.
-        horizon: time T of the backward propagation [s]; by default the paper's.
+        horizon: time T of the backward propagation [s]; by default the sets are sized to the noise, and
+            preset "paper" takes the paper's T.
 
     Raises:
         BadInput: an unknown preset, or a value that cannot be used.
@@ -212,13 +228,14 @@ def preset(
     if name not in PRESETS:
         raise unknown("preset", name, PRESETS)
     stage1, stage6 = _TRAINING[task.algorithm][name]
+    task.check_noise(noise)
     dimension = task.chart.dimension
     return Settings(
         task=task.name,
         preset=name,
         seed=seed,
         noise=noise,
-        horizon=task.horizon if horizon is None else horizon,
+        horizon=task.horizon if horizon is None and name == "paper" else horizon,
         stage1=stage1,
         stage6=stage6,
         cells=_CELLS[min(dimension, 3)],

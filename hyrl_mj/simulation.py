@@ -3,56 +3,28 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from hyrl_mj import artifacts
+from hyrl_mj.adversary import NOT_STARTED, Adversary, Lookahead
+from hyrl_mj.controllers import Controller, PolicyController
 from hyrl_mj.errors import BadInput
-from hyrl_mj.noise import Noise, check_seed
+from hyrl_mj.noise import Noise, Recorded, check_seed
+from hyrl_mj.plant import Plant
 from hyrl_mj.policies import Policy
 from hyrl_mj.progress import Progress
 from hyrl_mj.tasks.base import Outcome, Task
 
+# What may disturb the measurement.
+AnyNoise = Noise | Recorded | Adversary
 # The longest time that `simulate` records [s]: an hour.
 LONGEST = 3600.0
-
-
-class Controller(Protocol):
-    """A pure function of mode and measurement; see `hyrl_mj.hybrid.HybridController`."""
-
-    @property
-    def modes(self) -> tuple[int, ...]:
-        """Its modes."""
-        ...
-
-    def initial_mode(self, measured: np.ndarray) -> np.ndarray:
-        """The mode (n,) to start in, from the first measurements (n, p)."""
-        ...
-
-    def step(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Inputs (n, m) and next modes (n,) for modes (n,) and measurements (n, p)."""
-        ...
-
-
-@dataclass(frozen=True)
-class PolicyController:
-    """A single policy as a controller with one mode, 0, that never jumps."""
-
-    policy: Policy
-
-    @property
-    def modes(self) -> tuple[int, ...]:
-        return (0,)
-
-    def initial_mode(self, measured: np.ndarray) -> np.ndarray:
-        return np.zeros(len(measured), dtype=int)
-
-    def step(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return self.policy.act(measured), q
 
 
 @dataclass(frozen=True)
@@ -87,7 +59,7 @@ def closed_loop(
     controller: Controller,
     z0: np.ndarray,
     *,
-    noise: Noise | None = None,
+    noise: AnyNoise | None = None,
     q0: np.ndarray | None = None,
     steps: int | None = None,
     seed: int = 0,
@@ -114,7 +86,8 @@ def closed_loop(
     n, rng, plant = len(z0), np.random.default_rng(seed), task.plant(len(z0))
     plant.set_state(task.qpos(z0))
     measurement = plant.measurement
-    q = np.zeros(n, dtype=int) if q0 is None else np.asarray(q0, dtype=int).copy()
+    q = np.full(n, NOT_STARTED) if q0 is None else np.asarray(q0, dtype=int).copy()
+    disturb = _disturbance(task, controller, noise, n, rng)
     outcome = np.full(n, Outcome.RUNNING) if backward else task.ending(measurement)
     length = np.zeros(n, dtype=int)
     path = np.empty((limit + 1, n, task.chart.dimension))
@@ -127,7 +100,7 @@ def closed_loop(
         active = np.flatnonzero(outcome == Outcome.RUNNING)
         if not len(active):
             break
-        signal = noise.sample(np.full(n, k), measurement.shape[1], rng) * task.noisy
+        signal = disturb(k, plant, q)
         measured = measurement + signal
         if k == 0 and q0 is None:
             q[:] = controller.initial_mode(measured)
@@ -159,6 +132,21 @@ def closed_loop(
     arrays |= {k: arrays[k].astype(int) for k in ("before", "q")}
     path = path[: length.max() + 1]
     return Rollout(path, length, outcome, first_mode, **arrays, state=np.array(states))
+
+
+def _disturbance(
+    task: Task, controller: Controller, noise: AnyNoise, n: int, rng: np.random.Generator
+) -> Callable[[int, Plant, np.ndarray], np.ndarray]:
+    """The noise (n, p) as a function of the sample's number, the plant and the modes."""
+    if isinstance(noise, Noise) and noise.kind == "adversarial":
+        noise = Lookahead(task, controller, noise)
+    if not isinstance(noise, Noise | Recorded):
+        adversary = noise
+        return lambda k, plant, q: adversary.choose(plant, q)
+    signal = noise
+    columns = task.measurement_columns
+    acts = np.ones(columns) if signal.everywhere else np.array(task.noisy, dtype=float)
+    return lambda k, plant, q: signal.sample(np.full(n, k), columns, rng) * acts
 
 
 @dataclass(frozen=True)
@@ -224,7 +212,7 @@ def simulate(
     task: Task,
     controller: Controller | Policy,
     z0: ArrayLike,
-    noise: Noise | None = None,
+    noise: AnyNoise | None = None,
     q0: int | np.ndarray | None = None,
     horizon: float | None = None,
     seed: int = 0,
@@ -252,10 +240,12 @@ def simulate(
     starts = task.check_state(z0)
     single = np.ndim(z0) < 2
     check_seed(seed)
-    if not (noise is None or isinstance(noise, Noise)):
+    if not (noise is None or isinstance(noise, Noise | Recorded) or hasattr(noise, "choose")):
         raise BadInput(
             f'noise {noise!r} cannot be used: give a hyrl_mj.Noise("alternating", 0.1), say'
         )
+    if isinstance(noise, Noise):
+        task.check_noise(noise.bound, noise.everywhere)
     steps = None if horizon is None else _steps(task, horizon)
     loop = PolicyController(controller) if isinstance(controller, Policy) else controller
     if q0 is not None:
@@ -284,7 +274,7 @@ def _steps(task: Task, horizon: float) -> int:
     return max(round(horizon / task.dt), 1)
 
 
-def _arc(task: Task, name: str, rollout: Rollout, i: int, noise: Noise) -> HybridArc:
+def _arc(task: Task, name: str, rollout: Rollout, i: int, noise: AnyNoise) -> HybridArc:
     """Run i of a rollout as a hybrid arc."""
     end = rollout.length[i]
     before, after = rollout.before[:end, i], rollout.q[:end, i]

@@ -29,18 +29,19 @@ def impose(policy: Any, task: Task) -> None:
     assert task.mirror is not None
     signs = torch.tensor(task.mirror.observation, dtype=torch.float32)
     turn = torch.tensor(task.mirror.inputs, dtype=torch.float32).diag()
-    if task.algorithm == "dqn":
-        levels = np.asarray(task.input_levels)
-        mirrored = levels * task.mirror.inputs
-        pairs = np.abs(levels[:, None] - mirrored[None]).sum(axis=-1).argmin(axis=1)
-        swap = torch.eye(len(levels))[pairs]
+    if task.input_levels is not None:
+        mirrored = task.input_levels * task.mirror.inputs
+        pairs = np.abs(task.input_levels[:, None] - mirrored[None]).sum(axis=-1).argmin(axis=1)
+        turn = torch.eye(len(pairs))[pairs]
+    values = hasattr(policy, "q_net")
+    if values:
         for network in (policy.q_net.q_net, policy.q_net_target.q_net):
-            _tie([*network], signs, swap)
+            _tie([*network], signs, turn)
     else:
         _tie([*policy.mlp_extractor.policy_net, policy.action_net], signs, turn)
         _tie([*policy.mlp_extractor.value_net, policy.value_net], signs, torch.eye(1))
     rate = policy.optimizer.param_groups[0]["lr"]
-    trained = policy.q_net if task.algorithm == "dqn" else policy
+    trained = policy.q_net if values else policy
     policy.optimizer = policy.optimizer_class(
         trained.parameters(), lr=rate, **policy.optimizer_kwargs
     )

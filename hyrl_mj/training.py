@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -18,21 +19,21 @@ from torch import nn
 from hyrl_mj import symmetry
 from hyrl_mj.envs.core import BatchedEnv, Domain
 from hyrl_mj.envs.sb3_env import TaskVecEnv
-from hyrl_mj.errors import BadInput
-from hyrl_mj.noise import KINDS, Noise
+from hyrl_mj.errors import unknown
+from hyrl_mj.noise import SIGNALS, Noise
 from hyrl_mj.policies import MlpPolicy
 from hyrl_mj.progress import Progress
 from hyrl_mj.settings import Training
 from hyrl_mj.tasks.base import Outcome, Task
 
+Score = tuple[float, ...]
 ALGORITHMS: dict[str, type[PPO] | type[DQN]] = {"ppo": PPO, "dqn": DQN}
 ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}
 # How often TensorBoard gets a point: PPO counts rollouts, DQN episodes.
 LOG_INTERVAL = {"ppo": 1, "dqn": 100}
 # The learning rate falls to this share of its first value, not to zero: the last samples count too.
 FINAL_RATE = 0.02
-# How often the policy is checkpointed, and in the second half of the training also evaluated; on how
-# many episodes.
+# How often the policy is checkpointed and judged; on how many episodes.
 CHECKPOINTS = 32
 EPISODES = 256
 
@@ -45,14 +46,15 @@ def train(
     noise: Noise | None = None,
     domain: Domain | None = None,
     start_from: MlpPolicy | None = None,
+    judge: Judge | None = None,
     log_dir: Path | None = None,
     label: str = "training",
 ) -> MlpPolicy:
-    """Train one policy, and return the best that was met in the second half.
+    """Train one policy, and return the best that was met.
 
-    Value-based training in particular goes up and down; as with SB3's `EvalCallback`, the policy is
-    evaluated at intervals on the same episodes, without noise and with each kind of it. The best is the
-    one that most often ends at the set-point, and among equals the one with the highest return.
+    Training goes up and down; as with SB3's `EvalCallback`, the policy is judged at intervals. By default
+    that is done in the second half, on the same episodes every time: the best is the one that most often
+    ends at the set-point, and among equals the one with the highest return.
 
     Args:
         task: what to learn.
@@ -62,6 +64,8 @@ def train(
         noise: measurement noise during training.
         domain: restricts starts and episodes to a part of the state space.
         start_from: a policy whose weights to go on from; its network replaces `settings.hidden`.
+        judge: scores policies instead, from the beginning, and ends the training early once one is good
+            enough.
         log_dir: where TensorBoard logs and checkpoints go; none are written by default.
         label: what the progress bar says.
 
@@ -71,17 +75,13 @@ def train(
     model = build(task, settings, seed, noise=noise, domain=domain, start_from=start_from)
     if log_dir is not None:
         model.set_logger(configure(str(log_dir / "tensorboard"), ["tensorboard"]))
-    bound = 0.0 if noise is None else noise.bound
-    noises = [Noise(kind, bound) for kind in KINDS] if bound else [Noise()]
-
-    def score(policy: MlpPolicy) -> tuple[float, float]:
-        found = [evaluate(task, policy, kind, domain, settings.gamma) for kind in noises]
-        success, returns = np.mean(found, axis=0)
-        return float(success), float(returns)
-
-    watch = _Watch(task, settings.samples, log_dir, label, score)
+    watch = _Watch(
+        settings, judge or _Episodes(task, noise or Noise(), domain, settings.gamma), log_dir, label
+    )
+    watch.from_the_start = judge is not None
     with single_threaded():
-        model.learn(settings.samples, callback=watch, log_interval=LOG_INTERVAL[task.algorithm])
+        model.learn(settings.samples, callback=watch, log_interval=LOG_INTERVAL[settings.algorithm])
+    watch.close()
     assert watch.best is not None
     return watch.best
 
@@ -96,10 +96,8 @@ def build(
     start_from: MlpPolicy | None = None,
 ) -> BaseAlgorithm:
     """The SB3 algorithm that `train` runs, ready to learn."""
-    if task.algorithm not in ALGORITHMS:
-        raise BadInput(
-            f"algorithm {task.algorithm!r} is unknown: choose one of {', '.join(ALGORITHMS)}"
-        )
+    if settings.algorithm not in ALGORITHMS:
+        raise unknown("algorithm", settings.algorithm, ALGORITHMS)
     hidden = settings.hidden if start_from is None else start_from.hidden
     activation = settings.activation if start_from is None else start_from.activation
     mirrored = settings.symmetric and start_from is None and task.mirror is not None
@@ -107,7 +105,7 @@ def build(
         hidden = tuple(2 * width for width in hidden)
     rate = settings.learning_rate
     env = BatchedEnv(task, settings.envs, noise=noise, domain=domain, max_steps=settings.episode)
-    model = ALGORITHMS[task.algorithm](
+    model = ALGORITHMS[settings.algorithm](
         "MlpPolicy",
         TaskVecEnv(env),
         seed=seed,
@@ -130,7 +128,8 @@ def export(model: BaseAlgorithm, task: Task) -> MlpPolicy:
     state = symmetry.plain_state(model.policy)
     weights = {name: tensor.detach().cpu().numpy().copy() for name, tensor in state.items()}
     activation = next(n for n, a in ACTIVATIONS.items() if a is model.policy.activation_fn)
-    return MlpPolicy(task, task.algorithm, activation, weights)
+    algorithm = next(name for name, kind in ALGORITHMS.items() if isinstance(model, kind))
+    return MlpPolicy(task, algorithm, activation, weights)
 
 
 @contextmanager
@@ -173,43 +172,70 @@ def evaluate(
     return float(success.mean()), float(returns.mean())
 
 
-class _Watch(BaseCallback):
-    """Progress bar, checkpoints at intervals, and the best policy of the second half."""
+class Judge(Protocol):
+    """What tells good policies from bad ones.
 
-    def __init__(
-        self,
-        task: Task,
-        samples: int,
-        log_dir: Path | None,
-        label: str,
-        score: Callable[[MlpPolicy], tuple[float, float]],
-    ):
+    Attributes:
+        enough: a score with which training may end.
+    """
+
+    enough: Score
+
+    def __call__(self, policy: MlpPolicy) -> Score:
+        """The score of a policy; scores are compared from left to right, the higher the better."""
+        ...
+
+
+class _Episodes:
+    """Judges by episodes without noise and with each kind of it."""
+
+    enough: Score = (np.inf,)
+
+    def __init__(self, task: Task, noise: Noise, domain: Domain | None, gamma: float):
+        self._task, self._domain, self._gamma = task, domain, gamma
+        self._noises = [Noise(k, noise.bound) for k in SIGNALS] if noise.bound else [Noise()]
+
+    def __call__(self, policy: MlpPolicy) -> Score:
+        found = [evaluate(self._task, policy, n, self._domain, self._gamma) for n in self._noises]
+        success, returns = np.mean(found, axis=0)
+        return float(success), float(returns)
+
+
+class _Watch(BaseCallback):
+    """Progress bar, checkpoints at intervals, and the best policy."""
+
+    def __init__(self, settings: Training, judge: Judge, log_dir: Path | None, label: str):
         super().__init__()
         self.best: MlpPolicy | None = None
-        self._task, self._samples, self._log_dir, self._score = task, samples, log_dir, score
-        self._next = self._interval = max(samples // CHECKPOINTS, 1)
-        self._best_score = (-np.inf, -np.inf)
-        self._progress = Progress(label, samples, "samples")
+        self.best_score: Score = (-np.inf,)
+        self.from_the_start = False
+        self._samples, self._judge, self._log_dir = settings.samples, judge, log_dir
+        self._next = self._interval = max(settings.samples // CHECKPOINTS, 1)
+        self._progress = Progress(label, settings.samples, "samples")
 
     def _on_step(self) -> bool:
         self._progress.update(self.num_timesteps)
         if self.num_timesteps >= self._next:
             self._next += self._interval
             self._checkpoint()
-        return True
+        return self.best_score < self._judge.enough
 
     def _on_training_end(self) -> None:
-        self._checkpoint()
+        if self.best_score < self._judge.enough:
+            self._checkpoint()
+
+    def close(self) -> None:
+        """Take the progress bar away."""
         self._progress.close()
 
     def _checkpoint(self) -> None:
-        policy = export(self.model, self._task)
+        policy = export(self.model, self.training_env.core.task)
         if self._log_dir is not None:
             policy.save(self._log_dir / "checkpoint.safetensors")
-        # An untrained policy can have a lucky return.
-        if self.num_timesteps >= self._samples // 2:
-            score = self._score(policy)
-            self.logger.record("eval/success", score[0])
-            self.logger.record("eval/mean_return", score[1])
-            if score > self._best_score:
-                self._best_score, self.best = score, policy
+        # An untrained policy can be lucky in a few episodes.
+        if self.from_the_start or self.num_timesteps >= self._samples // 2:
+            score = self._judge(policy)
+            for i, value in enumerate(score):
+                self.logger.record(f"eval/score_{i}", value)
+            if score > self.best_score:
+                self.best_score, self.best = score, policy

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -20,11 +21,14 @@ class Domain:
         starts: draws n chart points (n, d) with a generator.
         contains: (n, d) -> (n,) bool; an episode that leaves it is over.
         exit_reward: the reward for leaving it.
+        caution: (p,) how wrong a measurement may be: if given, the reward is the least that any state
+            within it of the measured one earns, and where one of them has failed the task's worst.
     """
 
     starts: Callable[[int, np.random.Generator], np.ndarray]
     contains: Callable[[np.ndarray], np.ndarray]
     exit_reward: float
+    caution: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -103,7 +107,7 @@ class BatchedEnv:
             z = draw(len(ids), self._rng)
         self.plant.set_state(self.task.qpos(z), ids=ids)
         self._samples[ids] = 0
-        return self._observe(ids)
+        return self.task.observation(self._measure(ids)).astype(np.float32)
 
     def step(self, u: np.ndarray) -> StepResult:
         """Advance every episode by one sample; the caller resets those that are over.
@@ -117,7 +121,12 @@ class BatchedEnv:
         outcome = self.task.ending(measurement)
         terminated = outcome != Outcome.RUNNING
         reward = self.task.reward(measurement)
+        measured = self._measure(self._everyone)
         if self.domain is not None:
+            if self.domain.caution is not None:
+                reward = np.minimum(
+                    reward, cautious_reward(self.task, measured, self.domain.caution)
+                )
             left = ~terminated & ~self.domain.contains(self.task.z(measurement))
             reward[left] = self.domain.exit_reward
             terminated = terminated | left
@@ -125,7 +134,8 @@ class BatchedEnv:
         truncated = ~terminated & (self._samples >= self.max_steps)
         if truncated.any():
             outcome[truncated] = self.task.verdict(measurement[truncated])
-        return StepResult(self._observe(self._everyone), reward, terminated, truncated, outcome)
+        observation = self.task.observation(measured).astype(np.float32)
+        return StepResult(observation, reward, terminated, truncated, outcome)
 
     @property
     def z(self) -> np.ndarray:
@@ -146,8 +156,25 @@ class BatchedEnv:
             )
         return levels[actions]
 
-    def _observe(self, ids: np.ndarray) -> np.ndarray:
-        measured = self.plant.measurement[ids]
-        noise = self.noise.sample(self._samples[ids], measured.shape[1], self._rng)
-        measured = measured + noise * self.task.noisy
-        return self.task.observation(measured).astype(np.float32)
+    def _measure(self, ids: np.ndarray) -> np.ndarray:
+        """Noisy measurements (k, p) of the rows `ids`."""
+        true = self.plant.measurement[ids]
+        noise = self.noise.sample(self._samples[ids], true.shape[1], self._rng)
+        acts = np.ones(true.shape[1]) if self.noise.everywhere else np.array(self.task.noisy)
+        return np.asarray(true + noise * acts)
+
+
+def cautious_reward(task: Task, measured: np.ndarray, caution: np.ndarray) -> np.ndarray:
+    """The least reward (n,) of states within `caution` (p,) of measurements (n, p).
+
+    A policy whose reward depends on where it might be keeps clear of what noise could hide, without
+    having to meet the noise: what it observes and what it earns go together.
+    """
+    shares = (-1.0, -0.5, 0.0, 0.5, 1.0) if np.count_nonzero(caution) <= 2 else (-1.0, 0.0, 1.0)
+    worst = np.full(len(measured), np.inf)
+    for signs in product(*[shares if c else (0.0,) for c in caution]):
+        state = measured + signs * caution
+        ending = task.ending(state)
+        failed = (ending != Outcome.RUNNING) & (ending != Outcome.REACHED)
+        worst = np.minimum(worst, np.where(failed, task.worst_reward, task.reward(state)))
+    return worst

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from hyrl_mj import mjcf
 from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.noise import check_bound
 from hyrl_mj.plant import Plant, input_limits
 
 
@@ -129,6 +130,11 @@ class Task(ABC):
     horizon: float
     #: the reward that no state is worse than; leaving a mode's extended set counts as this for ever
     worst_reward: float
+    #: lower and upper corner of the box that starts come from, chart points (d,), (d,)
+    start_low: tuple[float, ...]
+    start_high: tuple[float, ...]
+    #: how close to the set-point a policy should come without noise [chart units]
+    precision: float = 0.0
     #: the paper's replay starts (k, d), and how long they are watched [s]
     replay_starts: tuple[tuple[float, ...], ...]
     replay_time: float
@@ -266,8 +272,44 @@ class Task(ABC):
         """Whether chart points (n, d) at the end of an episode are close to the set-point: (n,) bool."""
 
     @abstractmethod
+    def miss(self, z: np.ndarray) -> np.ndarray:
+        """How far chart points (n, d) at the end of an episode are off the set-point: (n,), chart units."""
+
+    def danger(self, measurement: np.ndarray) -> np.ndarray:
+        """How dangerous states are, the greater the worse: (n,). What adversarial noise works towards."""
+        return -self.reward(measurement)
+
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """n starts drawn from the task's start distribution: (n, d)."""
+        return rng.uniform(self.start_low, self.start_high, (n, self.chart.dimension))
+
+    def may_start(self, z: np.ndarray) -> np.ndarray:
+        """Whether chart points (n, d) lie in the box that starts come from: (n,) bool."""
+        z, slack = self.chart.wrap(z), 1e-9
+        inside = (z >= np.subtract(self.start_low, slack)) & (z <= np.add(self.start_high, slack))
+        return np.asarray(inside.all(axis=1))
+
+    def noise_in_chart(self, bound: float, everywhere: bool = False) -> np.ndarray:
+        """How far a measured chart point may be from the true one, by coordinate: (d,)."""
+        d = self.chart.dimension
+        return bound * (np.ones(d) if everywhere else np.array(self.noisy[:d], dtype=float))
+
+    def check_noise(self, bound: float, everywhere: bool = False) -> float:
+        """The noise bound itself, if measurements still tell something about this task.
+
+        Raises:
+            BadInput: it is not a number >= 0, or so large that it hides the whole chart.
+        """
+        check_bound(bound)
+        sides = np.subtract(self.chart.high, self.chart.low)
+        hit = self.noise_in_chart(1.0, everywhere) > 0
+        limit = float(sides[hit].min() / 2) if hit.any() else np.inf
+        if bound >= limit:
+            raise BadInput(
+                f"noise bound {bound:g} hides the whole state space of {self.name}: "
+                f"give one below {limit:.3g} {self.chart.units[int(np.argmax(hit))]}"
+            )
+        return float(bound)
 
     @abstractmethod
     def direction(self, path: np.ndarray) -> np.ndarray:

@@ -25,6 +25,8 @@ class UnitCircle(Task):
     max_steps = 150
     horizon = 0.5
     worst_reward = -1.0
+    start_low, start_high = chart.low, chart.high
+    precision = 0.05
     replay_starts = tuple((factor * PI,) for factor in (0.75, 0.9, 1.0, 1.1, 1.25))
     replay_time = 4.0
     mode_names = ("clockwise", "counter-clockwise")
@@ -55,7 +57,10 @@ class UnitCircle(Task):
         return np.where(self.arrived(measurement), Outcome.REACHED, Outcome.STALLED)
 
     def arrived(self, z: np.ndarray) -> np.ndarray:
-        return np.abs(self.error(z)) <= BAND
+        return self.miss(z) <= BAND
+
+    def miss(self, z: np.ndarray) -> np.ndarray:
+        return np.abs(self.error(z))
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         # Half of them the paper's, where the decision is; the others all over the circle.

@@ -25,6 +25,8 @@ class Vehicle(Task):
     max_steps = 60
     horizon = 0.3
     worst_reward = 0.0
+    start_low, start_high = (0.0, -1.0), (0.5, 1.0)
+    precision = 0.04
     replay_starts = ((0.0, -0.15), (0.0, -0.055), (0.0, 0.0), (0.0, 0.055), (0.0, 0.15))
     replay_time = 3.0
     mode_names = ("left", "right")
@@ -97,10 +99,13 @@ class Vehicle(Task):
         return np.where(passed, Outcome.REACHED, Outcome.RUNNING)
 
     def arrived(self, z: np.ndarray) -> np.ndarray:
-        return np.abs(z[:, 1] - self.set_point[1]) <= LANE
+        return self.miss(z) <= LANE
 
-    def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        return rng.uniform((0.0, -1.0), (0.5, 1.0), (n, 2))
+    def miss(self, z: np.ndarray) -> np.ndarray:
+        return np.abs(z[:, 1] - self.set_point[1])
+
+    def danger(self, measurement: np.ndarray) -> np.ndarray:
+        return -self.clearance(measurement)
 
     def direction(self, path: np.ndarray) -> np.ndarray:
         # Runs start before the pillar; one that never gets beside it is judged where it ended.

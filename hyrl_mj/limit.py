@@ -1,0 +1,122 @@
+"""What any controller could win: the limit beside every score of the worst-case game.
+
+The limit is a controller that knows the true state to steer by, but has to decide the way by what it
+measures. It picks the side of the first measurement, and from there each way is taken as well as it can be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hyrl_mj.game import NEVER, Moves, nodes_within
+from hyrl_mj.lattice import Lattice
+from hyrl_mj.partition import Partition
+from hyrl_mj.sets import within_reach
+
+
+@dataclass(frozen=True)
+class Limit:
+    """How each way could be taken by somebody who knows the state.
+
+    Attributes:
+        lattice: of the states.
+        parts: (Q, N) bool, M_i at the nodes.
+        side: (N,) number of the mode whose part a node lies in.
+        samples: (Q, N) least number of samples until arrival by each mode's way, `NEVER` where it is
+            closed.
+        level: (Q, N) the input level that does it.
+        hop: (d,) longest way of one sample, along each coordinate.
+    """
+
+    lattice: Lattice
+    parts: np.ndarray
+    side: np.ndarray
+    samples: np.ndarray
+    level: np.ndarray
+    hop: np.ndarray
+
+    @staticmethod
+    def of(lattice: Lattice, partition: Partition) -> Limit:
+        """Find the ways on a lattice, by backward recursion over the best input.
+
+        A run goes mode i's way if it enters M_i and then stays there until it arrives; before that it may
+        pass through other parts, but not where several meet again.
+        """
+        at = partition.grid.nearest(lattice.grid.nodes)
+        parts = np.stack([part.mask[at] for part in partition.parts])
+        samples, level = np.empty(parts.shape, dtype=int), np.empty(parts.shape, dtype=int)
+        after = lattice.after[:, 0]
+        for i, part in enumerate(parts):
+            # The two places behind the nodes: arrived is in every part, failed in none.
+            shared = np.append(part & np.delete(parts, i, axis=0).any(axis=0), [True, False])
+            allowed = np.where(part, np.append(part, [True, False])[after], ~shared[after])
+            samples[i], level[i] = _fewest(lattice, allowed)
+        moved = np.abs(
+            lattice.grid.chart.difference(
+                lattice.grid.nodes[np.minimum(after, lattice.nodes - 1)], lattice.grid.nodes
+            )
+        )
+        moved[after >= lattice.nodes] = 0.0
+        return Limit(
+            lattice, parts, parts.argmax(axis=0), samples, level, moved.max(axis=(0, 1))
+        )
+
+    def winnable(self, bound: np.ndarray) -> np.ndarray:
+        """Where "pick the side of the first measurement, then hold it" always wins: (N,) bool."""
+        wins = self.samples < NEVER
+        return np.asarray(
+            np.all(
+                [won | ~self._reach(self.side == i, bound) for i, won in enumerate(wins)], axis=0
+            )
+        )
+
+    def moves(self, bound: np.ndarray) -> Moves:
+        """The adversary's moves against the limit under noise within bounds (d,).
+
+        Its flow sets are those of stage 5, with the ways that are really open in place of W_i.
+        """
+        lattice, modes = self.lattice, len(self.parts)
+        noisy = np.where(bound > 0, self.hop, 0.0)
+        goes = []
+        for i, part in enumerate(self.parts):
+            roomy = ~self._reach(self.samples[i] >= NEVER, bound)
+            flows = self._reach(part, 2 * bound + noisy) & roomy | self._reach(part, bound)
+            goes.append(np.where(flows, i, self.side))
+        state, counts, target = [], [], []
+        for row, goal in enumerate([*goes, self.side]):
+            possible = np.stack([self._reach(goal == i, bound) for i in range(modes)], axis=-1)
+            node, mode = np.nonzero(possible & lattice.running[:, None])
+            end = lattice.after[self.level[mode, node], 0, node]
+            target.append(end + mode * lattice.places)
+            found = np.bincount(node, minlength=lattice.nodes)
+            state.append(np.flatnonzero(found) + row * lattice.places)
+            counts.append(found[found > 0])
+        return Moves(lattice, modes + 1, *map(np.concatenate, (state, counts, target)))
+
+    def _reach(self, mask: np.ndarray, bound: np.ndarray) -> np.ndarray:
+        """The nodes (N,) bool from which noise within bounds (d,) can show a node of the mask."""
+        grid = self.lattice.grid
+        window = nodes_within(self.lattice, bound)
+        return within_reach(mask.reshape(grid.counts), window, grid.chart.periodic).ravel()
+
+
+def _fewest(lattice: Lattice, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The fewest samples (N,) until arrival over allowed transitions (A, N), and the level to take."""
+    after = lattice.after[:, 0]
+    samples = np.full(lattice.places, NEVER)
+    samples[:-2][lattice.arrived] = 0
+    samples[-2] = 0
+    level = np.zeros(lattice.nodes, dtype=int)
+    open_ = np.flatnonzero(lattice.running & ~lattice.arrived)
+    while len(open_):
+        found = np.where(allowed[:, open_], samples[after[:, open_]], NEVER)
+        best = found.argmin(axis=0)
+        fewest = found[best, np.arange(len(open_))]
+        done = fewest < NEVER
+        if not done.any():
+            break
+        samples[open_[done]], level[open_[done]] = fewest[done] + 1, best[done]
+        open_ = open_[~done]
+    return samples[:-2], level
