@@ -1,24 +1,26 @@
 """Hysteresis-Based RL on MuJoCo: learned policies that measurement noise cannot break at a decision.
 
 The stages, in the order of the data flow: `tasks`, `training`, `critical_set`, `partition`,
-`extended_sets`, `retraining`, `hybrid`, `simulation`, `replay`; `pipeline` runs them all.
+`extended_sets`, `retraining`, `hybrid`, `robustness`, `simulation`, `replay`; `pipeline` runs them all.
 Importing this package needs neither torch nor a GL library.
 """
 
 from hyrl_mj import mjcf as _mjcf  # first: it chooses the GL backend before mujoco is imported
+from hyrl_mj.controllers import Controller
 from hyrl_mj.critical_set import CriticalSet, find_critical_set
 from hyrl_mj.envs.gym_env import register_envs
 from hyrl_mj.errors import BadArtifact, BadInput, HyrlError, NoRenderer, SimulationDiverged
 from hyrl_mj.extended_sets import ExtendedSets, extend
 from hyrl_mj.hybrid import HybridController
-from hyrl_mj.noise import Noise
+from hyrl_mj.noise import Noise, Recorded
 from hyrl_mj.partition import Partition, make_partition
 from hyrl_mj.pipeline import run
 from hyrl_mj.policies import MlpPolicy, Policy
+from hyrl_mj.robustness import Game, Score
 from hyrl_mj.run_directory import Run, load_run
 from hyrl_mj.sets import StateSet
 from hyrl_mj.settings import Settings
-from hyrl_mj.simulation import Controller, HybridArc, closed_loop, simulate
+from hyrl_mj.simulation import HybridArc, closed_loop, simulate
 from hyrl_mj.tasks import Chart, Outcome, Task, get_task, register, task_names
 
 __version__ = "0.1.0"
@@ -29,6 +31,7 @@ __all__ = [
     "Controller",
     "CriticalSet",
     "ExtendedSets",
+    "Game",
     "HybridArc",
     "HybridController",
     "HyrlError",
@@ -38,7 +41,9 @@ __all__ = [
     "Outcome",
     "Partition",
     "Policy",
+    "Recorded",
     "Run",
+    "Score",
     "Settings",
     "SimulationDiverged",
     "StateSet",

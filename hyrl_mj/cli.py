@@ -11,10 +11,13 @@ from typing import Annotated
 import tyro
 
 from hyrl_mj import pipeline, progress
-from hyrl_mj.errors import BadInput, HyrlError
-from hyrl_mj.noise import Noise
-from hyrl_mj.simulation import HybridArc, simulate
-from hyrl_mj.tables import print_summary
+from hyrl_mj.controllers import Controller, PolicyController
+from hyrl_mj.errors import BadInput, HyrlError, unknown
+from hyrl_mj.lattice import Lattice
+from hyrl_mj.noise import KINDS, Noise
+from hyrl_mj.robustness import LARGEST, Game, worst_signal
+from hyrl_mj.simulation import AnyNoise, HybridArc, simulate
+from hyrl_mj.tables import print_robustness, print_summary
 from hyrl_mj.tasks.base import get_task, task_names
 
 Positional = tyro.conf.Positional
@@ -46,7 +49,8 @@ def run(
         noise: bound of the measurement noise to survive, in rad (unit_circle) or m (vehicle).
         seed: of everything random.
         preset: fast, paper (the paper's training, ten minutes), or smoke (seconds).
-        horizon: horizon T of the backward propagation in s; by default the paper's.
+        horizon: horizon T of the backward propagation in s; by default the extended sets are sized to the
+            noise. The paper has 0.5 (unit_circle) and 0.3 (vehicle).
         out: the run directory; by default runs/TASK.
     """
     result = pipeline.run(
@@ -94,7 +98,8 @@ def simulate_run(
         run_dir: a run directory.
         start: start in chart coordinates: theta in rad (unit_circle), or x y in m (vehicle).
         q0: start mode; by default the controller picks it from the first measurement.
-        noise: none, uniform or alternating.
+        noise: none, uniform, alternating, adversarial (the most dangerous one sample ahead), or worst (the
+            signal with which the exact game is lost, or arrival is latest).
         eps: bound of the noise in chart units; by default the run's.
         horizon: time to simulate in s; by default the task's.
         seed: of the noise.
@@ -105,16 +110,62 @@ def simulate_run(
             raise BadInput("--q0, --noise, --eps, --horizon and --seed need a --start")
         print_summary(pipeline.run_stage(run, "simulate"))
         return
-    kind = Noise(noise, run.settings.noise if eps is None else eps)
+    if noise not in (*KINDS, "worst"):
+        raise unknown("noise", noise, (*KINDS, "worst"))
+    bound = run.task.check_noise(run.settings.noise if eps is None else eps)
     z0 = run.task.check_state([start])[0]
-    loops = (("policy", run.policy, None), ("hyrl", run.controller, q0))
-    arcs = {name: simulate(run.task, c, z0, kind, q, horizon, seed) for name, c, q in loops}
-    for name, arc in arcs.items():
+    loops: dict[str, Controller] = {
+        "policy": PolicyController(run.policy),
+        "hyrl": run.controller,
+    }
+    game = None
+    if noise == "worst":
+        game = Game(run.task, run.partition, loops, max(bound, LARGEST))
+    for name, loop in loops.items():
+        mode = q0 if name == "hyrl" else None
+        signal: AnyNoise = (
+            worst_signal(game, name, loop, z0[None], bound, mode) if game else Noise(noise, bound)
+        )
+        arc = simulate(run.task, loop, z0, signal, mode, horizon, seed)
         assert isinstance(arc, HybridArc)
         arc.save(run.path / "arcs" / f"latest_{name}.npz")
         end = run.task.chart.format(arc.z[-1])
         print(f"{name:7} {arc.outcome:14} t = {arc.t[-1]:.2f} s, {arc.j[-1]} jumps, {end}")
     print(f"saved as {run.path / 'arcs'}/latest_*.npz")
+
+
+def robustness(
+    run_dir: RunDir,
+    eps: float | None = None,
+    episodes: int | None = None,
+    noise: str = "uniform,alternating,adversarial",
+    all_coordinates: bool = False,
+    seed: int = 0,
+) -> None:
+    """Find out what measurement noise can do: worst-case game, margins, and episodes in bulk.
+
+    Writes robustness.json, figures/robustness_map.png and figures/robustness_curve.png.
+
+    Args:
+        run_dir: a run directory.
+        eps: bound of the noise in chart units; by default the run's.
+        episodes: noisy episodes to simulate for each kind of noise and controller; by default none where
+            the worst case can be played exactly, on charts of one or two dimensions.
+        noise: kinds of noise in the episodes, separated by commas: uniform, alternating, adversarial.
+        all_coordinates: noise on every coordinate of the measurement, not only on those the task calls
+            noisy.
+        seed: of starts and noise of the episodes.
+    """
+    run = pipeline.load_run(run_dir)
+    kinds = [kind.strip() for kind in noise.split(",")]
+    for kind in kinds:
+        if kind not in KINDS:
+            raise unknown("noise", kind, KINDS)
+    if episodes is None:
+        Lattice.check(run.task)
+    pipeline.examine_run(run, eps, kinds, episodes, all_coordinates, seed)
+    print_robustness(pipeline.load_run(run_dir))
+    print(f"pictures in {run.path / 'figures'}")
 
 
 def replay(
@@ -168,6 +219,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "partition": stage_command("partition", "Run stage 3 again: partition the chart."),
     "extended-sets": extended_sets,
     "retrain": stage_command("retrain", "Run stage 6 again: train the policy of each mode."),
+    "robustness": robustness,
     "simulate": simulate_run,
     "replay": replay,
     "doctor": doctor,

@@ -152,22 +152,34 @@ def solve(moves: Moves) -> np.ndarray:
         flat[state] = found
 
 
-def lasting(moves: Moves) -> np.ndarray:
+def lasting(moves: Moves, start: np.ndarray | None = None) -> np.ndarray:
     """The nodes (N,) bool at which a run can still be after any number of samples, in some mode.
 
     For a task that is over some day there are none.
+
+    Args:
+        moves: of the adversary.
+        start: (N,) bool, the nodes where runs start, in any mode; by default all.
     """
     lattice = moves.lattice
-    alive = np.zeros(moves.rows * lattice.places, dtype=bool)
-    alive[moves.state] = True
-    alive[(moves.rows - 1) * lattice.places :] = False
+    runs = np.zeros((moves.rows, lattice.places), dtype=bool)
+    runs.reshape(-1)[moves.state] = True
+    runs[-1] = False  # one sample later a run has started
+    alive = runs.copy()
+    if start is not None:
+        alive[:, :-2] &= start
+    grows = start is not None  # first to all that can be reached, then down to what remains
     while True:
-        reached = np.zeros_like(alive)
-        reached[moves.target[np.repeat(alive[moves.state], moves.counts)]] = True
-        reached &= alive
-        if (reached == alive).all():
-            return np.asarray(alive.reshape(moves.rows, -1)[:, :-2].any(axis=0))
-        alive = reached
+        reached = np.zeros(runs.size, dtype=bool)
+        reached[moves.target[np.repeat(alive.reshape(-1)[moves.state], moves.counts)]] = True
+        after = reached.reshape(runs.shape) & runs
+        if grows:
+            after |= alive
+        if (after == alive).all():
+            if not grows:
+                return np.asarray(alive[:, :-2].any(axis=0))
+            grows = False
+        alive = after
 
 
 class WorstNoise:

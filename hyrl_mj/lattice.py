@@ -15,7 +15,7 @@ from hyrl_mj.sets import Grid
 from hyrl_mj.tasks.base import Outcome, Task
 
 # Cells along the longest side of the chart, by its dimension.
-CELLS = {1: 6000, 2: 480}
+CELLS = {1: 12_000, 2: 480}
 # A sample that ends this close to a node, in cells, ends on it.
 ON_NODE = 1e-3
 
@@ -97,7 +97,7 @@ class Lattice:
 
         Args:
             task: its chart is that of the lattice.
-            grid: the nodes; by default 6000 cells along a line, 480 x 480 in the plane.
+            grid: the nodes; by default 12,000 cells along a line, 480 x 480 in the plane.
 
         Raises:
             BadInput: the plant's state is more than the chart, or the chart has three dimensions.

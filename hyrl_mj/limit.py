@@ -52,16 +52,14 @@ class Limit:
             # The two places behind the nodes: arrived is in every part, failed in none.
             shared = np.append(part & np.delete(parts, i, axis=0).any(axis=0), [True, False])
             allowed = np.where(part, np.append(part, [True, False])[after], ~shared[after])
-            samples[i], level[i] = _fewest(lattice, allowed)
+            samples[i], level[i] = fewest_samples(lattice, allowed)
         moved = np.abs(
             lattice.grid.chart.difference(
                 lattice.grid.nodes[np.minimum(after, lattice.nodes - 1)], lattice.grid.nodes
             )
         )
         moved[after >= lattice.nodes] = 0.0
-        return Limit(
-            lattice, parts, parts.argmax(axis=0), samples, level, moved.max(axis=(0, 1))
-        )
+        return Limit(lattice, parts, parts.argmax(axis=0), samples, level, moved.max(axis=(0, 1)))
 
     def winnable(self, bound: np.ndarray) -> np.ndarray:
         """Where "pick the side of the first measurement, then hold it" always wins: (N,) bool."""
@@ -102,7 +100,7 @@ class Limit:
         return within_reach(mask.reshape(grid.counts), window, grid.chart.periodic).ravel()
 
 
-def _fewest(lattice: Lattice, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def fewest_samples(lattice: Lattice, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The fewest samples (N,) until arrival over allowed transitions (A, N), and the level to take."""
     after = lattice.after[:, 0]
     samples = np.full(lattice.places, NEVER)

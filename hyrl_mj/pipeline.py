@@ -5,21 +5,29 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from hyrl_mj import artifacts
+from hyrl_mj.controllers import Controller, PolicyController
 from hyrl_mj.critical_set import find_critical_set
-from hyrl_mj.errors import BadArtifact, NoRenderer, unknown
+from hyrl_mj.errors import BadArtifact, BadInput, NoRenderer, unknown
 from hyrl_mj.extended_sets import extend
-from hyrl_mj.noise import Noise
+from hyrl_mj.lattice import Lattice
+from hyrl_mj.noise import KINDS, Noise
 from hyrl_mj.partition import make_partition
+from hyrl_mj.robustness import BEATEN, WON, WON_FROM_SOME, episodes, examine, save
 from hyrl_mj.run_directory import Run, load_run, open_or_create, write_config
+from hyrl_mj.sets import Grid
 from hyrl_mj.settings import preset
 from hyrl_mj.simulation import HybridArc, simulate
 from hyrl_mj.tasks.base import get_task
 
 Say = Callable[[str], None]
+# Noisy episodes of a run whose worst case cannot be played exactly.
+EPISODES = 10_000
 
 
 # ---- the stages: each reads the artifacts of those before it and writes its own
@@ -73,6 +81,11 @@ def retrain_stage(run: Run, say: Say) -> None:
         policy.save(run.path / f"mode_{q}.safetensors")
     remove_others(run.path.glob("mode_*"), mode_paths(run))
     say(f"policies of {len(policies)} modes")
+
+
+def robustness_stage(run: Run, say: Say) -> None:
+    """Find out what noise can do to the policy and to the hybrid controller."""
+    examine_run(run, say=say)
 
 
 def mode_paths(run: Run) -> list[Path]:
@@ -134,6 +147,7 @@ STAGES = (
     Stage("partition", partition_stage, _files("partition.npz")),
     Stage("extended-sets", extended_sets_stage, _files("extended_sets.npz")),
     Stage("retrain", retrain_stage, mode_paths),
+    Stage("robustness", robustness_stage, _files("robustness.json")),
     Stage("simulate", simulate_stage, lambda run: list(run.arc_paths().values())),
     Stage("replay", replay_stage, _files("replay.mp4")),
 )
@@ -184,7 +198,7 @@ def run(
         seed: of everything random.
         preset_name: "fast", "paper" or "smoke".
         out: the run directory, by default `runs/<task>`.
-        horizon: time T of the backward propagation [s], by default the paper's.
+        horizon: time T of the backward propagation [s]; by default the sets are sized to the noise.
         say: told a line about each stage.
 
     Raises:
@@ -207,6 +221,85 @@ def extend_again(run: Run, horizon: float, say: Say = print) -> Run:
     write_config(changed)
     say(f"go on with hyrl-mj run {run.settings.task} --horizon {horizon:g} --out {run.path}")
     return load_run(run.path)
+
+
+def examine_run(
+    run: Run,
+    eps: float | None = None,
+    kinds: Sequence[str] = (),
+    count: int | None = None,
+    everywhere: bool = False,
+    seed: int = 0,
+    say: Say = print,
+) -> dict[str, Any]:
+    """Examine policy and hybrid controller under noise, and write `robustness.json` with its pictures.
+
+    Where the exact game can be played it is; noisy episodes are added on demand, and where they are all
+    that there is. Files are written when all is known.
+
+    Args:
+        run: with its mode policies.
+        eps: noise bound, by default the run's. The scores are for none, half of it, and it.
+        kinds: of the noise in episodes, by default all.
+        count: number of episodes for each kind and controller.
+        everywhere: whether noise acts on all columns of the measurement.
+        seed: of starts and noise of the episodes.
+        say: told the result in a line.
+
+    Returns:
+        What is in `robustness.json`.
+
+    Raises:
+        BadInput: a value that cannot be used.
+    """
+    from hyrl_mj import figures
+
+    task, critical = run.task, run.critical_set
+    eps = run.settings.noise if eps is None else eps
+    task.check_noise(eps, everywhere)
+    exact = Lattice.possible(task)
+    if count is None and not exact:
+        count = EPISODES
+    if count is not None and count < 1:
+        raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
+    noises = tuple(Noise(kind, eps, everywhere) for kind in kinds or KINDS[1:])
+    loops: dict[str, Controller] = {
+        "policy": PolicyController(run.policy),
+        "hyrl": run.controller,
+    }
+    content: dict[str, Any] = {"eps": eps, "everywhere": everywhere, "game": None, "episodes": []}
+    winnable = None
+    if exact:
+        bounds = tuple(dict.fromkeys((0.0, eps / 2, eps)))
+        game, maps = examine(task, critical, run.partition, loops, bounds, everywhere)
+        grid = Grid.from_counts(task.chart, maps["grid_counts"])
+        winnable = grid, np.isin(maps["map_hyrl"], (WON, WON_FROM_SOME, BEATEN))
+        content["game"] = game
+    if count is not None:
+        content["episodes"] = episodes(task, critical, loops, noises, count, seed, winnable)
+    if exact:
+        folder = run.path / "figures"
+        figures.robustness_map(task, game, maps, critical, folder / "robustness_map.png")
+        figures.robustness_curve(task, game, folder / "robustness_curve.png")
+        artifacts.write_arrays(run.path / "robustness.npz", maps, kind="robustness maps")
+    save(run.path / "robustness.json", content)
+    say(robustness_sentence(content))
+    return content
+
+
+def robustness_sentence(content: Mapping[str, Any]) -> str:
+    """The most important figures, for people."""
+    if content["game"] is None:
+        worst = {
+            who: min(r["reached"] for r in content["episodes"] if r["controller"] == who)
+            for who in ("policy", "hyrl")
+        }
+        return ", ".join(f"{who} reaches in {100 * x:.1f}% or more" for who, x in worst.items())
+    policy, hyrl = (content["game"]["scores"][who][-1] for who in ("policy", "hyrl"))
+    return (
+        f"worst case at noise {hyrl['eps']:g}: the policy wins {100 * policy['won']:.2f}% of the winnable "
+        f"starts, HyRL {100 * hyrl['won']:.2f}%, from every q0 {100 * hyrl['won_any']:.2f}%"
+    )
 
 
 def critical_start(run: Run) -> np.ndarray | None:

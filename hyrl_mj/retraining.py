@@ -8,8 +8,9 @@ import numpy as np
 
 from hyrl_mj.envs.core import Domain
 from hyrl_mj.extended_sets import ExtendedSets
-from hyrl_mj.game import LOST, NEVER, Answers, noisy_moves, solve
+from hyrl_mj.game import LOST, NEVER, Answers, Moves, lasting, noisy_moves, solve
 from hyrl_mj.lattice import Lattice
+from hyrl_mj.limit import fewest_samples
 from hyrl_mj.noise import Noise
 from hyrl_mj.policies import MlpPolicy
 from hyrl_mj.settings import Training
@@ -23,8 +24,11 @@ LOST_SHARE = 0.2
 TASK_SHARE = 0.7
 # States that fail in k samples are met in proportion to k to this power: failures are learned backward.
 URGENCY = -1.5
-# Starts of the episodes without noise whose end is judged.
-EPISODES = 256
+# The latest arrival may be this share behind the fewest samples there are. The grid itself makes up for
+# half of it: it errs by up to a cell a sample to the side of the noise.
+ALLOWED_DELAY = 0.07
+# About so many episodes without noise are judged by where they end.
+EPISODES = 2000
 
 
 def retrain(
@@ -115,7 +119,11 @@ class ModeGround:
         early = self.nodes[task.may_start(self.grid.nodes[self.nodes])]
         self.early = early if len(early) else self.nodes
         self.lost, self._weight = np.empty(0, dtype=int), np.empty(0)
-        self.enough: Score = (0.0, -task.precision)
+        self.enough: Score = (0.0, -1.0)
+        if self.lattice:
+            inside = np.append(within, [True, False])[self.lattice.after[:, 0]]
+            fewest, _ = fewest_samples(self.lattice, inside)
+            self.fewest = int(fewest[self.nodes][fewest[self.nodes] < NEVER].max(initial=0))
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """n starts (n, d): where the game is lost, where the task starts, and all over."""
@@ -130,7 +138,12 @@ class ModeGround:
         return np.where(chart.periodic, z, np.clip(z, chart.low, chart.high))
 
     def __call__(self, policy: MlpPolicy) -> Score:
-        """Minus the share of states lost, and minus how far from the set-point it ends without noise."""
+        """Minus the share of states lost; minus delay or miss, whichever is more beyond what is allowed.
+
+        The delay is that of the latest arrival behind the fewest samples there are. The miss is how far
+        off the set-point the noise can keep a run for ever, beyond the noise bound itself; where runs end,
+        how far off they end without noise.
+        """
         assert self.lattice is not None
         loop = PolicyController(policy)
         moves = noisy_moves(Answers.of(self.lattice, loop, self.noise), self.noise)
@@ -139,7 +152,18 @@ class ModeGround:
         samples = np.where(value > NEVER, LOST - value, self.task.max_steps)[self.lost]
         weight = np.maximum(samples, 1.0) ** URGENCY
         self._weight = weight / weight.sum()
-        rng = np.random.default_rng(0)
-        rollout = closed_loop(self.task, loop, self.grid.nodes[rng.choice(self.early, EPISODES)])
-        missed = self.task.miss(rollout.path[-1]).max()
-        return -len(self.lost) / len(self.nodes), -float(missed)
+        if len(self.lost):
+            return -len(self.lost) / len(self.nodes), -np.inf
+        delay = value[self.nodes].max() / max(self.fewest, 1) - 1
+        return 0.0, -float(
+            max(delay / ALLOWED_DELAY, self._miss(loop, moves) / self.task.precision)
+        )
+
+    def _miss(self, loop: PolicyController, moves: Moves) -> float:
+        assert self.lattice is not None
+        still = lasting(moves, self.wanted)
+        if still.any():
+            return float(self.task.miss(self.grid.nodes[still]).max() - self.noise.max())
+        chosen = self.early[:: max(len(self.early) // EPISODES, 1)]
+        rollout = closed_loop(self.task, loop, self.grid.nodes[chosen], quiet=True)
+        return float(self.task.miss(rollout.path[-1]).max())

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
-from hyrl_mj import artifacts
+from hyrl_mj import artifacts, robustness
 from hyrl_mj.critical_set import CriticalSet
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.extended_sets import ExtendedSets
@@ -70,6 +71,11 @@ class Run:
         return HybridController(
             self.task, policies, dict(zip(extended.modes, extended.sets, strict=True))
         )
+
+    @cached_property
+    def robustness(self) -> dict[str, Any]:
+        """What `robustness.json` holds."""
+        return robustness.load(self.path / "robustness.json")
 
     def arc_paths(self) -> dict[tuple[str, str], Path]:
         """The files of the replays by start ("start0", ..., "critical") and controller."""

@@ -162,11 +162,18 @@ _PAPER = Training(
 )
 # Stage 6. The modes of a discrete task are trained by PPO, too: the ways differ by less than the error of
 # a freely trained value function, and a policy that is learned directly does not depend on it.
-_MODES_CONTINUOUS = replace(_PPO_FAST, symmetric=False, episode=40, attempts=3)
+_MODES_CONTINUOUS = replace(
+    _PPO_FAST,
+    samples=320_000,
+    activation="relu",
+    gamma=0.95,
+    symmetric=False,
+    episode=40,
+    attempts=3,
+)
 _MODES_DISCRETE = replace(
     _MODES_CONTINUOUS,
     samples=400_000,
-    activation="relu",
     gamma=0.9,
     episode=None,
     options={**_PPO_FAST.options, "ent_coef": 0.003, "gae_lambda": 0.9},

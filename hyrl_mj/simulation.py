@@ -65,6 +65,7 @@ def closed_loop(
     seed: int = 0,
     backward: bool = False,
     record: bool = False,
+    quiet: bool = False,
     label: str = "simulating",
 ) -> Rollout:
     """Run the closed loop from many starts at once.
@@ -79,6 +80,7 @@ def closed_loop(
         seed: of the noise; the same seed and n give the same signals whatever the controller.
         backward: run x' = -f(x, u) instead; runs then have no end but the last step.
         record: whether modes, measurements, inputs and states are kept.
+        quiet: show no progress bar, because the caller has one.
         label: what the progress bar says.
     """
     noise = noise or Noise()
@@ -95,7 +97,7 @@ def closed_loop(
     first_mode = q.copy()
     kept: dict[str, list[np.ndarray]] = {name: [] for name in ("before", "q", "measured", "u")}
     states = [plant.state] if record else []
-    progress = Progress(label, limit, "samples")
+    progress = None if quiet else Progress(label, limit, "samples")
     for k in range(limit):
         active = np.flatnonzero(outcome == Outcome.RUNNING)
         if not len(active):
@@ -122,8 +124,10 @@ def closed_loop(
             ):
                 kept[name].append(value)
             states.append(plant.state)
-        progress.update(k + 1)
-    progress.close()
+        if progress:
+            progress.update(k + 1)
+    if progress:
+        progress.close()
     if not backward:
         late = outcome == Outcome.RUNNING
         outcome[late] = task.verdict(measurement[late])

@@ -17,9 +17,9 @@ from hyrl_mj.training import build, export
 PACKAGE = Path(hyrl_mj.__file__).parent
 ORDER = (
     "errors", "progress", "mjcf", "plant", "noise", "tasks", "settings", "artifacts", "policies",
-    "rendering", "envs", "simulation", "symmetry", "training", "sets", "critical_set", "partition",
-    "extended_sets", "retraining", "hybrid", "run_directory", "replay", "doctor", "pipeline", "tables",
-    "cli",
+    "controllers", "adversary", "rendering", "envs", "simulation", "symmetry", "training", "sets",
+    "lattice", "game", "critical_set", "partition", "limit", "extended_sets", "retraining", "hybrid",
+    "robustness", "run_directory", "figures", "replay", "doctor", "pipeline", "tables", "cli",
 )  # fmt: skip
 
 

@@ -133,8 +133,8 @@ class Task(ABC):
     #: lower and upper corner of the box that starts come from, chart points (d,), (d,)
     start_low: tuple[float, ...]
     start_high: tuple[float, ...]
-    #: how close to the set-point a policy should come without noise [chart units]
-    precision: float = 0.0
+    #: how far off the set-point a policy may be because of itself, not of noise [chart units]
+    precision: float = np.inf
     #: the paper's replay starts (k, d), and how long they are watched [s]
     replay_starts: tuple[tuple[float, ...], ...]
     replay_time: float

@@ -26,7 +26,7 @@ class UnitCircle(Task):
     horizon = 0.5
     worst_reward = -1.0
     start_low, start_high = chart.low, chart.high
-    precision = 0.05
+    precision = 0.015
     replay_starts = tuple((factor * PI,) for factor in (0.75, 0.9, 1.0, 1.1, 1.25))
     replay_time = 4.0
     mode_names = ("clockwise", "counter-clockwise")

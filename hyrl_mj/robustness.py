@@ -1,0 +1,389 @@
+"""How much measurement noise a controller survives: worst-case scores, margins, and episodes in bulk."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import binomtest
+
+from hyrl_mj import artifacts
+from hyrl_mj.controllers import Controller
+from hyrl_mj.critical_set import CriticalSet
+from hyrl_mj.errors import BadInput
+from hyrl_mj.extended_sets import distance_to
+from hyrl_mj.game import NEVER, Answers, Moves, WorstNoise, lasting, noisy_moves, solve
+from hyrl_mj.lattice import Lattice
+from hyrl_mj.limit import Limit
+from hyrl_mj.noise import Noise, Recorded
+from hyrl_mj.partition import Partition
+from hyrl_mj.progress import Progress
+from hyrl_mj.sets import Grid
+from hyrl_mj.simulation import Rollout, closed_loop
+from hyrl_mj.tasks.base import Outcome, Task
+
+# The controller that nothing can beat, beside those that are examined.
+LIMIT = "limit"
+# Noise bounds of the curve, and the largest one that is looked at [chart units].
+CURVE = tuple(round(0.0125 * k, 4) for k in range(25))
+LARGEST = CURVE[-1]
+# Cells of the lattice in the plane on which the curve is played; the scores take a finer one.
+CURVE_CELLS = 240
+# Classes of the maps.
+WON, WON_FROM_SOME, BEATEN, UNWINNABLE, OVER = range(5)
+MAP_CLASSES = (
+    "won from every start mode",
+    "won if the controller picks the start mode",
+    "lost to the worst noise",
+    "not winnable",
+    "over",
+)
+# Episodes that are simulated together: memory does not grow with their number.
+BATCH = 32_768
+
+
+@dataclass(frozen=True)
+class Score:
+    """What a controller wins in the worst case.
+
+    Attributes:
+        eps: bound of the noise.
+        winnable: share of the start region that can be won at all.
+        won: share of the winnable starts that are won if the controller picks its start mode.
+        won_any: share of them that are won from every start mode.
+        time, time_any: worst time to arrival [s] from the starts that are won.
+        excursion: how far off the set-point the noise can bring or keep a run for ever; None where every
+            run is over some day.
+    """
+
+    eps: float
+    winnable: float
+    won: float
+    won_any: float
+    time: float
+    time_any: float
+    excursion: float | None
+
+
+class Game:
+    """The worst-case game of one task, for several controllers and any noise bound.
+
+    Args:
+        task: what is played.
+        partition: M_i, from which the limit takes its sides.
+        controllers: by name; each is asked once.
+        largest: the largest noise bound that will be played.
+        everywhere: whether noise acts on all coordinates, not only on those the task calls noisy.
+        grid: nodes of the lattice, by default the finest.
+
+    Raises:
+        BadInput: the chart has three dimensions, the plant's state is more than the chart, or a controller
+            gives inputs that cannot be applied.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        partition: Partition,
+        controllers: Mapping[str, Controller],
+        largest: float = LARGEST,
+        everywhere: bool = False,
+        grid: Grid | None = None,
+    ):
+        self.task, self.everywhere, self.largest = task, everywhere, largest
+        task.check_noise(largest, everywhere)
+        self.lattice = Lattice.of(task, grid)
+        self.limit = Limit.of(self.lattice, partition)
+        most = self.bound(largest)
+        self.answers = {name: Answers.of(self.lattice, c, most) for name, c in controllers.items()}
+
+    def bound(self, eps: float) -> np.ndarray:
+        """Noise bounds by coordinate (d,)."""
+        return self.task.noise_in_chart(eps, self.everywhere)
+
+    @cached_property
+    def starts(self) -> np.ndarray:
+        """(N,) bool, the nodes of the start region."""
+        return self.task.may_start(self.lattice.grid.nodes) & self.lattice.running
+
+    def moves(self, name: str, eps: float) -> Moves:
+        """The adversary's moves against a controller, or against the limit."""
+        if eps > self.largest:
+            raise BadInput(
+                f"noise {eps:g} is beyond the largest that was prepared, {self.largest:g}"
+            )
+        bound = self.bound(eps)
+        return self.limit.moves(bound) if name == LIMIT else noisy_moves(self.answers[name], bound)
+
+    def value(self, name: str, eps: float) -> np.ndarray:
+        """The game's value (modes + 1, places), the last row for runs that have not started."""
+        return solve(self.moves(name, eps))
+
+    def winnable(self, eps: float) -> np.ndarray:
+        """(N,) bool, the nodes from which a way picked by the first measurement can be held."""
+        return self.limit.winnable(self.bound(eps))
+
+    def score(self, name: str, eps: float) -> Score:
+        """The score of a controller, or of the limit."""
+        moves = self.moves(name, eps)
+        value = solve(moves)[:, :-2]
+        region = self.starts & self.winnable(eps)
+        own, worst = value[-1, region], value[:-1, region].max(axis=0, initial=0)
+        still = lasting(moves) & ~self.lattice.failed
+        nodes, dt = self.lattice.grid.nodes, self.task.dt
+        return Score(
+            eps=eps,
+            winnable=float(region.sum() / max(self.starts.sum(), 1)),
+            won=_share(own < NEVER),
+            won_any=_share(worst < NEVER),
+            time=float(own[own < NEVER].max(initial=0) * dt),
+            time_any=float(worst[worst < NEVER].max(initial=0) * dt),
+            excursion=float(self.task.miss(nodes[still]).max()) if still.any() else None,
+        )
+
+    def map(self, name: str, eps: float) -> np.ndarray:
+        """The class (N,) of every node, an index into `MAP_CLASSES`."""
+        value = self.value(name, eps)[:, :-2]
+        classes = np.full(self.lattice.nodes, BEATEN, dtype=np.int8)
+        classes[value[-1] < NEVER] = WON_FROM_SOME
+        classes[(value < NEVER).all(axis=0)] = WON
+        classes[(classes == BEATEN) & ~self.winnable(eps)] = UNWINNABLE
+        classes[~self.lattice.running] = OVER
+        return classes
+
+    def margin(self, name: str) -> float | None:
+        """The largest noise bound at which the whole winnable start region is won, by bisection.
+
+        It is known to one cell of the lattice; None if not even without noise all of it is won.
+        """
+        cell = float(self.lattice.grid.spacing[self.bound(1.0) > 0].min())
+
+        def all_won(cells: int) -> bool:
+            eps = cells * cell
+            own = self.value(name, eps)[-1, :-2]
+            return bool((own[self.starts & self.winnable(eps)] < NEVER).all())
+
+        low, high = 0, int(self.largest / cell + 1e-6)
+        if not all_won(low):
+            return None
+        if all_won(high):
+            return high * cell
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (middle, high) if all_won(middle) else (low, middle)
+        return low * cell
+
+    def worst_noise(self, name: str, eps: float) -> WorstNoise:
+        """The adversary's noise, to simulate with."""
+        return WorstNoise(self.answers[name], self.bound(eps), self.value(name, eps))
+
+
+def _share(won: np.ndarray) -> float:
+    return float(won.mean()) if len(won) else 1.0
+
+
+def worst_signal(
+    game: Game, name: str, controller: Controller, z0: np.ndarray, eps: float, q0: int | None = None
+) -> Recorded:
+    """The worst noise signal against a controller from starts (n, d), sample by sample.
+
+    `simulate` with it from the same starts gives the runs that the game foresees.
+    """
+    noise = game.worst_noise(name, eps)
+    modes = None if q0 is None else np.full(len(z0), q0)
+    rollout = closed_loop(game.task, controller, z0, noise=noise, q0=modes, record=True)
+    true = _true_measurements(game.task, rollout)
+    values = np.where(np.isnan(rollout.u).any(axis=-1)[..., None], 0.0, rollout.measured - true)
+    return Recorded(values, kind="worst")
+
+
+def _true_measurements(task: Task, rollout: Rollout) -> np.ndarray:
+    """What the sensors of a rollout gave before noise: (K, n, p)."""
+    path = rollout.path[: len(rollout.measured)]
+    return np.stack([task.with_z(m, z) for m, z in zip(rollout.measured, path, strict=True)])
+
+
+def examine(
+    task: Task,
+    critical: CriticalSet,
+    partition: Partition,
+    controllers: Mapping[str, Controller],
+    bounds: tuple[float, ...],
+    everywhere: bool = False,
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Play the game: scores at some noise bounds, margins, the curve over all bounds, and the maps.
+
+    Args:
+        task: what is played.
+        critical: M*; the margin is profiled along it.
+        partition: M_i.
+        controllers: by name.
+        bounds: noise bounds of the scores; the maps are drawn for the last.
+        everywhere: whether noise acts on all coordinates.
+
+    Returns:
+        What goes into `robustness.json`, and the arrays of the maps.
+    """
+    for eps in bounds:
+        task.check_noise(eps, everywhere)
+    names = [*controllers, LIMIT]
+    plane = task.chart.dimension == 2
+    progress = Progress("worst-case game", len(bounds) + len(CURVE) + 2, "noise bounds")
+    fine = Game(task, partition, controllers, max(*bounds, LARGEST), everywhere)
+    scores: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
+    for k, eps in enumerate(bounds):
+        for name in names:
+            scores[name].append(vars(fine.score(name, eps)))
+        progress.update(k + 1)
+    margins = {name: fine.margin(name) for name in controllers}
+    progress.update(len(bounds) + 1)
+    maps = {f"map_{name}": fine.map(name, bounds[-1]) for name in controllers}
+    grid = Grid.with_cells(task.chart, CURVE_CELLS) if plane else None
+    coarse = Game(task, partition, controllers, LARGEST, everywhere, grid) if plane else fine
+    along = critical.points[task.may_start(critical.points)]
+    at = coarse.lattice.grid.nearest(along)
+    curve: dict[str, Any] = {"eps": list(CURVE), "winnable": []}
+    curve |= {name: {"won": [], "won_any": [], "time_any": []} for name in names}
+    holds = {name: np.ones(len(along), dtype=bool) for name in names}
+    profile = {name: np.full(len(along), np.nan) for name in names}
+    for k, eps in enumerate(CURVE):
+        region = coarse.starts & coarse.winnable(eps)
+        curve["winnable"].append(float(region.sum() / max(coarse.starts.sum(), 1)))
+        for name in names:
+            value = coarse.value(name, eps)[:, :-2]
+            own, worst = value[-1], value[:-1].max(axis=0)
+            curve[name]["won"].append(_share(own[region] < NEVER))
+            curve[name]["won_any"].append(_share(worst[region] < NEVER))
+            times = worst[region & (worst < NEVER)]
+            curve[name]["time_any"].append(float(times.max(initial=0) * task.dt))
+            holds[name] &= own[at] < NEVER
+            profile[name][holds[name]] = eps
+        progress.update(len(bounds) + 2 + k)
+    progress.close()
+    spacing = fine.lattice.grid.spacing.tolist()
+    content = {
+        "everywhere": everywhere,
+        "lattice": {
+            "spacing": spacing,
+            "exact": fine.lattice.exact,
+            "curve_spacing": coarse.lattice.grid.spacing.tolist(),
+        },
+        "scores": scores,
+        "margin": margins,
+        "curve": curve,
+        "profile": {
+            "points": along.tolist(),
+            **{k: [None if np.isnan(x) else float(x) for x in v] for k, v in profile.items()},
+        },
+    }
+    arrays = {"grid_counts": np.array(fine.lattice.grid.counts), "eps": np.array(bounds[-1])}
+    return content, arrays | maps
+
+
+def episodes(
+    task: Task,
+    critical: CriticalSet,
+    controllers: Mapping[str, Controller],
+    noises: tuple[Noise, ...],
+    count: int,
+    seed: int = 0,
+    winnable: tuple[Grid, np.ndarray] | None = None,
+) -> list[dict[str, Any]]:
+    """Noisy episodes in bulk: outcomes by noise, controller and start region.
+
+    All controllers meet the same starts; signals that do not look at the loop are the same, too.
+
+    Args:
+        task: what is played, from its start distribution.
+        critical: M*; starts within twice the noise bound of it are a region of their own.
+        controllers: by name.
+        noises: kinds and bounds.
+        count: episodes for each noise and controller.
+        seed: of starts and noise.
+        winnable: a grid and which of its nodes can be won; starts that cannot are a region of their own.
+
+    Returns:
+        One record for each noise, controller and region: how many episodes had each outcome, and the
+        share that reached the set-point with its 95% interval (Wilson).
+
+    Raises:
+        BadInput: no episodes, or a noise bound that hides the state space.
+    """
+    if count < 1:
+        raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
+    for noise in noises:
+        task.check_noise(noise.bound, noise.everywhere)
+    progress = Progress("noisy episodes", count * len(noises) * len(controllers), "episodes")
+    records, done = [], 0
+    for noise in noises:
+        for name, controller in controllers.items():
+            counts: dict[str, np.ndarray] = {}
+            for first in range(0, count, BATCH):
+                n = min(BATCH, count - first)
+                draw, signal = np.random.SeedSequence([seed, first]).generate_state(2)
+                z0 = task.starts(n, np.random.default_rng(draw))
+                rollout = closed_loop(
+                    task, controller, z0, noise=noise, seed=int(signal), quiet=True
+                )
+                for region, inside in _regions(task, critical, noise.bound, winnable, z0).items():
+                    counts.setdefault(region, np.zeros(len(Outcome), dtype=int))
+                    counts[region] += np.bincount(rollout.outcome[inside], minlength=len(Outcome))
+                done += n
+                progress.update(done)
+            records += [
+                _record(noise, name, region, found)
+                for region, found in counts.items()
+                if found.any()
+            ]
+    progress.close()
+    return records
+
+
+def _regions(
+    task: Task,
+    critical: CriticalSet,
+    bound: float,
+    winnable: tuple[Grid, np.ndarray] | None,
+    z0: np.ndarray,
+) -> dict[str, np.ndarray]:
+    """The start regions: which of the starts (n, d) lie in each, (n,) bool."""
+    near = distance_to(task, critical, z0) <= 2 * bound
+    if winnable is None:
+        return {"near M*": near, "elsewhere": ~near}
+    grid, can = winnable
+    open_ = can[grid.nearest(z0)]
+    return {"near M*": near & open_, "elsewhere": ~near & open_, "not winnable": ~open_}
+
+
+def _record(noise: Noise, name: str, region: str, counts: np.ndarray) -> dict[str, Any]:
+    reached, total = int(counts[Outcome.REACHED]), int(counts.sum())
+    interval = binomtest(reached, total).proportion_ci(0.95, method="wilson")
+    return {
+        "noise": noise.kind,
+        "eps": noise.bound,
+        "everywhere": noise.everywhere,
+        "controller": name,
+        "region": region,
+        "episodes": total,
+        "outcomes": {Outcome(i).label: int(c) for i, c in enumerate(counts) if c},
+        "reached": reached / total,
+        "interval": [float(interval.low), float(interval.high)],
+    }
+
+
+def save(path: Path, content: Mapping[str, Any]) -> None:
+    """Write `robustness.json`."""
+    artifacts.write_json(path, content, kind="robustness")
+
+
+def load(path: Path) -> dict[str, Any]:
+    """Read what `save` wrote.
+
+    Raises:
+        BadArtifact: the file is missing, truncated, or not of this version.
+    """
+    return artifacts.read_json(path, kind="robustness")
