@@ -47,19 +47,16 @@ class Limit:
         at = partition.grid.nearest(lattice.grid.nodes)
         parts = np.stack([part.mask[at] for part in partition.parts])
         samples, level = np.empty(parts.shape, dtype=int), np.empty(parts.shape, dtype=int)
-        after = lattice.after[:, 0]
+        after = lattice.after[:, :1]  # to the limit's side: the nearest node
         for i, part in enumerate(parts):
             # The two places behind the nodes: arrived is in every part, failed in none.
             shared = np.append(part & np.delete(parts, i, axis=0).any(axis=0), [True, False])
             allowed = np.where(part, np.append(part, [True, False])[after], ~shared[after])
-            samples[i], level[i] = fewest_samples(lattice, allowed)
-        moved = np.abs(
-            lattice.grid.chart.difference(
-                lattice.grid.nodes[np.minimum(after, lattice.nodes - 1)], lattice.grid.nodes
-            )
-        )
-        moved[after >= lattice.nodes] = 0.0
-        return Limit(lattice, parts, parts.argmax(axis=0), samples, level, moved.max(axis=(0, 1)))
+            samples[i], level[i] = fewest_samples(lattice, after, allowed)
+        nodes, ends = lattice.grid.nodes, after[:, 0]
+        moved = lattice.grid.chart.difference(nodes[np.minimum(ends, lattice.nodes - 1)], nodes)
+        hop = np.abs(moved[ends < lattice.nodes]).max(axis=0)
+        return Limit(lattice, parts, parts.argmax(axis=0), samples, level, hop)
 
     def winnable(self, bound: np.ndarray) -> np.ndarray:
         """Where "pick the side of the first measurement, then hold it" always wins: (N,) bool."""
@@ -100,16 +97,26 @@ class Limit:
         return within_reach(mask.reshape(grid.counts), window, grid.chart.periodic).ravel()
 
 
-def fewest_samples(lattice: Lattice, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The fewest samples (N,) until arrival over allowed transitions (A, N), and the level to take."""
-    after = lattice.after[:, 0]
+def fewest_samples(
+    lattice: Lattice, after: np.ndarray, allowed: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The fewest samples until arrival without noise, over allowed transitions.
+
+    Args:
+        lattice: gives the places.
+        after: (A, C, N) where each level leads; of several places around its end the worst counts.
+        allowed: (A, C, N) bool.
+
+    Returns:
+        (N,) int, `NEVER` where there is no way, and (N,) int, the level to take.
+    """
     samples = np.full(lattice.places, NEVER)
     samples[:-2][lattice.arrived] = 0
     samples[-2] = 0
     level = np.zeros(lattice.nodes, dtype=int)
     open_ = np.flatnonzero(lattice.running & ~lattice.arrived)
     while len(open_):
-        found = np.where(allowed[:, open_], samples[after[:, open_]], NEVER)
+        found = np.where(allowed[..., open_], samples[after[..., open_]], NEVER).max(axis=1)
         best = found.argmin(axis=0)
         fewest = found[best, np.arange(len(open_))]
         done = fewest < NEVER

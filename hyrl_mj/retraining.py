@@ -24,9 +24,8 @@ LOST_SHARE = 0.2
 TASK_SHARE = 0.7
 # States that fail in k samples are met in proportion to k to this power: failures are learned backward.
 URGENCY = -1.5
-# The latest arrival may be this share behind the fewest samples there are. The grid itself makes up for
-# half of it: it errs by up to a cell a sample to the side of the noise.
-ALLOWED_DELAY = 0.07
+# The latest arrival may be this share behind the fewest samples there are.
+ALLOWED_DELAY = 0.03
 # About so many episodes without noise are judged by where they end.
 EPISODES = 2000
 
@@ -59,12 +58,6 @@ def retrain(
         The best policy of all attempts.
     """
     ground = ModeGround(task, extended, mode)
-    domain = Domain(
-        ground.starts,
-        extended.sets[ground.index].dilated_by_box(task.noise_in_chart(extended.noise)).contains,
-        task.worst_reward / (1 - settings.gamma),
-        extended.noise * np.array(task.noisy, dtype=float),
-    )
     best: tuple[Score, MlpPolicy] | None = None
     for attempt in range(settings.attempts):
         found = train(
@@ -73,7 +66,7 @@ def retrain(
             seed=int(np.random.SeedSequence([seed, 1 + mode, attempt]).generate_state(1)[0]),
             # Without a game to find the worst noise, chance has to do.
             noise=Noise() if ground.lattice else Noise("uniform", extended.noise),
-            domain=domain,
+            domain=ground.domain(settings.gamma),
             start_from=policy if settings.warm_start else None,
             judge=ground if ground.lattice else None,
             log_dir=log_dir,
@@ -102,18 +95,20 @@ class ModeGround:
     """
 
     def __init__(self, task: Task, extended: ExtendedSets, mode: int):
-        self.task, self.noise = task, task.noise_in_chart(extended.noise)
-        self.index = extended.modes.index(mode)
-        self.grid = extended.sets[self.index].grid
+        self.task, self.extended = task, extended
+        self.noise = task.noise_in_chart(extended.noise)
+        index = extended.modes.index(mode)
+        self.within = extended.sets[index].dilated_by_box(self.noise)
+        self.grid = self.within.grid
         self.lattice: Lattice | None = None
         if Lattice.possible(task):
             self.lattice = Lattice.of(task, self.grid)
-        within = extended.sets[self.index].dilated_by_box(self.noise).mask
+        within = self.within.mask
         plant = task.plant(len(self.grid.nodes))
         plant.set_state(task.qpos(self.grid.nodes))
         alive = task.ending(plant.measurement) == Outcome.RUNNING
         # If the stage-1 policy never succeeds here, training may still find a way.
-        wins = extended.winning[self.index]
+        wins = extended.winning[index]
         self.wanted = within & alive & (wins if (within & alive & wins).any() else True)
         self.nodes = np.flatnonzero(self.wanted)
         early = self.nodes[task.may_start(self.grid.nodes[self.nodes])]
@@ -121,9 +116,16 @@ class ModeGround:
         self.lost, self._weight = np.empty(0, dtype=int), np.empty(0)
         self.enough: Score = (0.0, -1.0)
         if self.lattice:
-            inside = np.append(within, [True, False])[self.lattice.after[:, 0]]
-            fewest, _ = fewest_samples(self.lattice, inside)
+            after = self.lattice.after
+            inside = np.append(within, [True, False])[after]
+            fewest, _ = fewest_samples(self.lattice, after, inside)
             self.fewest = int(fewest[self.nodes][fewest[self.nodes] < NEVER].max(initial=0))
+
+    def domain(self, gamma: float) -> Domain:
+        """Where training goes on; leaving it counts as the worst reward for ever."""
+        caution = self.extended.noise * np.array(self.task.noisy, dtype=float)
+        exit_reward = self.task.worst_reward / (1 - gamma)
+        return Domain(self.starts, self.within.contains, exit_reward, caution)
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """n starts (n, d): where the game is lost, where the task starts, and all over."""

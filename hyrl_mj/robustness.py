@@ -42,6 +42,8 @@ MAP_CLASSES = (
     "not winnable",
     "over",
 )
+# About so many episodes without noise tell how far off the set-point they end.
+QUIET_EPISODES = 4000
 # Episodes that are simulated together: memory does not grow with their number.
 BATCH = 32_768
 
@@ -112,7 +114,7 @@ class Game:
 
     def moves(self, name: str, eps: float) -> Moves:
         """The adversary's moves against a controller, or against the limit."""
-        if eps > self.largest:
+        if eps > self.largest + 1e-9:
             raise BadInput(
                 f"noise {eps:g} is beyond the largest that was prepared, {self.largest:g}"
             )
@@ -264,6 +266,12 @@ def examine(
             profile[name][holds[name]] = eps
         progress.update(len(bounds) + 2 + k)
     progress.close()
+    quiet_starts = coarse.lattice.grid.nodes[coarse.starts & coarse.winnable(0.0)]
+    quiet_starts = quiet_starts[:: max(len(quiet_starts) // QUIET_EPISODES, 1)]
+    ends = {
+        name: closed_loop(task, controller, quiet_starts, quiet=True)
+        for name, controller in controllers.items()
+    }
     spacing = fine.lattice.grid.spacing.tolist()
     content = {
         "everywhere": everywhere,
@@ -274,6 +282,9 @@ def examine(
         },
         "scores": scores,
         "margin": margins,
+        "miss_without_noise": {
+            name: float(task.miss(rollout.path[-1]).max()) for name, rollout in ends.items()
+        },
         "curve": curve,
         "profile": {
             "points": along.tolist(),

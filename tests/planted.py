@@ -6,7 +6,10 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from hyrl_mj.critical_set import CriticalSet
 from hyrl_mj.hybrid import HybridController
+from hyrl_mj.partition import Partition
+from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.tasks import Chart, Outcome, Task
 
 
@@ -51,6 +54,24 @@ class AnalyticSet:
         return self.distance(z) <= 0
 
 
+def halves(task, cells=240):
+    """The partition of either task by its axis of symmetry; where the ways have joined both parts hold."""
+    grid = Grid.with_cells(task.chart, cells)
+    if task.name == "unit_circle":
+        first, joined = grid.nodes[:, 0] < np.pi, task.arrived(grid.nodes)
+    else:
+        first, joined = grid.nodes[:, 1] >= 0, grid.nodes[:, 0] >= task.obstacle[0]
+    parts = tuple(GridSet.from_mask(grid, part | joined) for part in (first, ~first))
+    return Partition((0, 1), parts, np.ones(len(grid.nodes), dtype=bool))
+
+
+def decisions(task):
+    """The critical set that belongs to `halves`."""
+    on_axis = np.stack([np.linspace(0, 0.45, 10), np.zeros(10)], axis=-1)
+    points = np.array([[np.pi]]) if task.name == "unit_circle" else on_axis
+    return CriticalSet(points, np.zeros(len(points), dtype=int), resolution=0.01, spacing=0.05)
+
+
 # ---- unit circle
 
 
@@ -68,6 +89,55 @@ def two_way_circle_policy(task, first=2.0, between=3.0, second=4.0):
         return np.where(down, -1.0, 1.0)
 
     return ChartPolicy(task, rule)
+
+
+def circle_controller(task, overlap=0.4):
+    """Clockwise or counter-clockwise at full speed; the flow sets share pi +- `overlap`."""
+    return HybridController(
+        task,
+        {0: ChartPolicy(task, lambda z: -np.ones_like(z)), 1: ChartPolicy(task, np.ones_like)},
+        {
+            0: AnalyticSet(lambda z: task.chart.wrap(z)[:, 0] - np.pi - overlap),
+            1: AnalyticSet(lambda z: np.pi - overlap - task.chart.wrap(z)[:, 0]),
+        },
+    )
+
+
+def homing(offset, dead=0.0):
+    """Back to offset 0 in one sample, if that can be; nothing up to `dead`: inputs (n, 1)."""
+    return np.where(np.abs(offset) <= dead, 0.0, np.clip(-offset / 0.05, -1.0, 1.0))
+
+
+def homing_policy(task, dead=0.0):
+    """Homing to the set-point, the short way."""
+    return ChartPolicy(task, lambda z: homing(task.chart.difference(z, np.zeros(1)), dead))
+
+
+def homing_controller(task, overlap=0.4, near=1.0):
+    """Homing clockwise or counter-clockwise; the flow sets share pi +- `overlap` and 0 +- `near`."""
+    turn = 2 * np.pi
+
+    def clockwise(z):
+        theta = task.chart.wrap(z)
+        return homing(np.where(theta > turn - near, theta - turn, theta))
+
+    def counter(z):
+        theta = task.chart.wrap(z)
+        return homing(np.where(theta < near, theta, theta - turn))
+
+    def below(z):
+        theta = task.chart.wrap(z)[:, 0]
+        return np.minimum(theta - np.pi - overlap, turn - near - theta)
+
+    def above(z):
+        theta = task.chart.wrap(z)[:, 0]
+        return np.minimum(np.pi - overlap - theta, theta - near)
+
+    return HybridController(
+        task,
+        {0: ChartPolicy(task, clockwise), 1: ChartPolicy(task, counter)},
+        {0: AnalyticSet(below), 1: AnalyticSet(above)},
+    )
 
 
 # ---- vehicle
@@ -90,11 +160,11 @@ def one_way_policy(task, side=1.0, clear=0.9):
     return ChartPolicy(task, lambda z: pass_on(np.full(len(z), side), z[:, 1], clear))
 
 
-def ideal_controller(task, overlap=0.15):
+def ideal_controller(task, overlap=0.15, clear=0.9):
     """The vehicle's hybrid controller with ideal policies; the flow sets share |y| <= `overlap`."""
     return HybridController(
         task,
-        {0: one_way_policy(task, 1.0), 1: one_way_policy(task, -1.0)},
+        {0: one_way_policy(task, 1.0, clear), 1: one_way_policy(task, -1.0, clear)},
         {
             0: AnalyticSet(lambda z: -z[:, 1] - overlap),
             1: AnalyticSet(lambda z: z[:, 1] - overlap),

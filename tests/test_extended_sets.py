@@ -21,7 +21,7 @@ class Case:
         self.partition = make_partition(task, policy, self.critical, cells)
 
     def extend(self, horizon, noise):
-        return extend(self.task, self.policy, self.critical, self.partition, horizon, noise)
+        return extend(self.task, self.policy, self.critical, self.partition, noise, horizon)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from planted import ideal_controller
 from hyrl_mj import BadInput, MlpPolicy, Noise, training
 from hyrl_mj.envs.core import BatchedEnv, Domain
 from hyrl_mj.extended_sets import ExtendedSets
-from hyrl_mj.retraining import mode_domain
+from hyrl_mj.retraining import ModeGround
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.settings import preset
 
@@ -127,16 +127,15 @@ def test_training_restores_torchs_threads(vehicle):
 
 def test_it_goes_on_from_a_policy(task):
     start = untrained(task)
-    model = training.build(task, preset(task, "smoke").stage6, seed=1, start_from=start)
+    settings = preset(task, "paper").stage6
+    model = training.build(task, settings, seed=1, start_from=start)
     assert_same_weights(training.export(model, task), start)
 
 
 def test_an_unknown_algorithm_lists_the_known(vehicle):
-    class Odd(type(vehicle)):
-        algorithm = "sac"
-
-    with pytest.raises(BadInput, match="'sac' is unknown: choose one of ppo, dqn"):
-        training.build(Odd(), preset(vehicle, "smoke").stage1, 0)
+    settings = replace(preset(vehicle, "smoke").stage1, algorithm="sac")
+    with pytest.raises(BadInput, match="unknown algorithm 'sac': choose one of ppo, dqn"):
+        training.build(vehicle, settings, 0)
 
 
 # ---- returns
@@ -162,11 +161,11 @@ def vehicle_sets(vehicle):
     ideal = ideal_controller(vehicle, 0.15)
     sets = tuple(GridSet(grid, ideal.flow_set(q).signed_distance(grid.nodes)) for q in (0, 1))
     winning = tuple(grid.nodes[:, 0] < 0.4 for _ in sets)
-    return ExtendedSets((0, 1), sets, winning, 0.3, 0.1)
+    return ExtendedSets((0, 1), sets, winning, 0.3, 0.1, np.empty((0, 2)), np.empty(0))
 
 
 def test_mode_starts_cover_the_set_with_room_for_the_noise(vehicle, vehicle_sets):
-    domain = mode_domain(vehicle, vehicle_sets, 0, gamma=0.9)
+    domain = ModeGround(vehicle, vehicle_sets, 0).domain(gamma=0.9)
     z = domain.starts(5000, np.random.default_rng(0))
     cell = vehicle_sets.sets[0].grid.cell
     assert vehicle.chart.contains(z).all()
@@ -178,11 +177,11 @@ def test_mode_starts_cover_the_set_with_room_for_the_noise(vehicle, vehicle_sets
 
 
 def test_a_mode_that_leaves_its_set_pays_for_ever(vehicle, circle, vehicle_sets):
-    domain = mode_domain(vehicle, vehicle_sets, 1, gamma=0.9)
-    inside = domain.contains(np.array([[0.1, 0.24], [0.1, 0.26], [0.1, -1.0]]))
+    domain = ModeGround(vehicle, vehicle_sets, 1).domain(gamma=0.9)
+    inside = domain.contains(np.array([[0.1, 0.22], [0.1, 0.28], [0.1, -1.0]]))
     np.testing.assert_array_equal(inside, [True, False, True])
     assert domain.exit_reward == 0.0
     grid = Grid.with_cells(circle.chart, 60)
     whole = GridSet.from_mask(grid, np.ones(60, dtype=bool))
-    sets = ExtendedSets((0,), (whole,), (whole.mask,), 0.5, 0.1)
-    assert mode_domain(circle, sets, 0, gamma=0.9).exit_reward == pytest.approx(-10.0)
+    sets = ExtendedSets((0,), (whole,), (whole.mask,), 0.5, 0.1, np.empty((0, 1)), np.empty(0))
+    assert ModeGround(circle, sets, 0).domain(gamma=0.9).exit_reward == pytest.approx(-10.0)
