@@ -14,6 +14,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Rectangle, Wedge
 
@@ -24,29 +25,26 @@ from hyrl_mj.sets import Grid
 from hyrl_mj.tasks.base import Task
 
 DPI = 200  # [pixels/inch]
-WIDTH = 8.0  # [inches] of a picture
+WIDTH, PAD = 7.8, 0.1  # [inches] of a picture, and of the margin around it
 COLUMNS = 2  # panels beside each other
 INK, PAPER, PALE = "#232830", "#ffffff", "#8b919b"
 # As MAP_CLASSES: told apart by colour-blind people, and by their lightness alone.
 CLASS_COLOURS = ("#7cc0e8", "#f2c530", "#d55e00", "#5c2a6b", "#dcdee2")
-SENTENCES = tuple(
-    {
-        UNWINNABLE: "not winnable, whatever the controller",
-        OVER: "over: obstacle, or the run has ended",
-    }.get(k, sentence)
-    for k, sentence in enumerate(MAP_CLASSES)
-)
+SENTENCES = dict(enumerate(MAP_CLASSES)) | {
+    UNWINNABLE: "not winnable, whatever the controller",
+    OVER: "over: obstacle, or the run has ended",
+}
 TITLES = {"policy": "RL policy", "hyrl": "HyRL"}
 # Of the curves: ink as the policy's path in the replay, then blue, purple and vermilion.
 CURVE_COLOURS = ("#2d323c", "#0072b2", "#aa4499", "#d55e00")
 LIMIT_COLOUR = "#a9dcc9"
 MARKERS = "osD^"
 # Nodes of a curve from one marker to the next.
-MARK_EVERY = 4
+MARK_EVERY = 6
 # Rows of the marks of margins, above the curves [%].
 TOP, ROW = 105, 5
 # Width of lines over a map, the paper around the ink first.
-CASING = ((PAPER, 3.2), (INK, 1.4))
+CASING = ((PAPER, 2.8), (INK, 1.4))
 # Radii of a ring, its ticks and their labels; the dots of M* lie inside, where they hide no class.
 OUTER, INNER, CRITICAL, TICK, LABEL, EDGE = 1.0, 0.7, 0.6, 1.05, 1.18, 1.25
 STYLE = {
@@ -123,6 +121,9 @@ def robustness_curve(task: Task, content: Mapping[str, Any], path: Path) -> None
     eps, scores = np.array(curve["eps"]), content["scores"]
     run_eps = max(score["eps"] for score in scores[names[0]])
     lasting = any(score["excursion"] is not None for name in names for score in scores[name])
+    # A controller has its colour whoever else is in the picture.
+    known = list(dict.fromkeys([*TITLES, *names]))
+    numbers = {name: known.index(name) for name in names}
     where, unit = _noisy(task, content["everywhere"])
     heights = (3.6, 2.0) if lasting else (3.6,)
     with _figure(path, (WIDTH, 2.0 + sum(heights))) as figure:
@@ -133,17 +134,16 @@ def robustness_curve(task: Task, content: Mapping[str, Any], path: Path) -> None
             len(heights), 1, sharex=True, squeeze=False, height_ratios=heights
         ).ravel()
         shares = panels[0]
-        handles: dict[str, Artist] = {}
-        handles |= _limit(shares, eps, curve[LIMIT])
-        for k, name in enumerate(names):
-            handles |= _won(shares, k, len(names), name, eps, curve[name])
+        handles = _limit(shares, eps, curve[LIMIT])
+        for name, number in numbers.items():
+            handles |= _won(shares, number, name, eps, curve[name])
         (line,) = shares.plot(eps, 100 * np.array(curve["winnable"]), color=PALE, linewidth=1)
-        handles["starts that are winnable, of all"] = line
-        handles |= _margins(shares, content["margin"], names, unit)
+        handles["winnable share of the start region"] = line
+        handles |= _margins(shares, content["margin"], numbers, unit)
         shares.set(ylabel="winnable starts that are won [%]", yticks=range(0, 101, 20))
         if lasting:
-            for k, name in enumerate(names):
-                _times(panels[1], k, len(names), eps, curve[name])
+            for name, number in numbers.items():
+                _times(panels[1], number, eps, curve[name])
             panels[1].set_ylabel("worst time to arrival,\nstarts that are won [s]")
         for panel in panels:
             panel.axvline(run_eps, color=INK, linewidth=1, linestyle=(0, (1, 2)), zorder=1)
@@ -153,7 +153,7 @@ def robustness_curve(task: Task, content: Mapping[str, Any], path: Path) -> None
         right = max(eps[-1], run_eps)
         panels[-1].set(xlabel=f"noise bound eps on {where} [{unit}]", xlim=(0, 1.01 * right))
         shares.annotate(
-            f"eps = {run_eps:g} {unit}",
+            f"this run: eps = {run_eps:g} {unit}",
             (run_eps, 1),
             xycoords=("data", "axes fraction"),
             xytext=(0, 3),
@@ -174,10 +174,12 @@ def _figure(path: Path, size: tuple[float, float]) -> Iterator[Figure]:
     """A figure of a size [inches], written to `path` when the block ends well."""
     # The user's own matplotlibrc must not change what is drawn here.
     with style.context(["default", STYLE]):
-        figure = Figure(figsize=size, layout="compressed")
+        layout = ConstrainedLayoutEngine(compress=True, h_pad=PAD, w_pad=PAD)
+        figure = Figure(figsize=size, layout=layout)
         yield figure
         with artifacts.replacing(path) as temporary:
-            figure.savefig(temporary, format="png", dpi=DPI)
+            # Panels of a fixed aspect leave room, which is cut off.
+            figure.savefig(temporary, format="png", dpi=DPI, bbox_inches="tight", pad_inches=PAD)
 
 
 # ---- words
@@ -223,7 +225,7 @@ def _angle(value: float) -> str:
 def _panel_height(task: Task, ring: bool) -> float:
     """Height [inches] that a panel takes with its title and labels."""
     if ring:
-        return 3.8
+        return 4.1
     sides = np.subtract(task.chart.high, task.chart.low)
     return 1.1 + (float(3.2 * sides[1] / sides[0]) if len(sides) == 2 else 0.5)
 
@@ -231,12 +233,10 @@ def _panel_height(task: Task, ring: bool) -> float:
 def _head(panel: Axes, name: str, score: Mapping[str, Any]) -> None:
     """Write the controller and what it wins over its panel."""
     won, won_any = _percent(score["won"]), _percent(score["won_any"])
-    line = f"{won} of the winnable starts won"
-    if won_any != won:
-        line = f"{won} of winnable starts won, {won_any} from any mode"
-    panel.set_title(TITLES.get(name, name), fontsize=11, fontweight="bold", pad=22)
+    panel.set_title(TITLES.get(name, name), fontsize=11, fontweight="bold", pad=36)
     panel.annotate(
-        line,
+        f"{won} of the winnable starts won,\n"
+        + ("from every start mode" if won == won_any else f"{won_any} from every start mode"),
         (0.5, 1),
         xycoords="axes fraction",
         xytext=(0, 6),
@@ -297,32 +297,38 @@ def _ring(
     ends = np.append(begins[1:], begins[:1] + len(classes))
     if not len(begins):
         begins, ends = np.array([0]), np.array([len(classes)])
-    for begin, end in zip(begins, ends, strict=True):
-        theta = origin + step * (begin - 0.5), origin + step * (end - 0.5)
-        colour = CLASS_COLOURS[classes[begin]]
+    # The shortest arcs last, with an edge: those of a single node are seen, too.
+    for arc in np.argsort(begins - ends):
+        theta = origin + step * (begins[arc] - 0.5), origin + step * (ends[arc] - 0.5)
+        colour = CLASS_COLOURS[classes[begins[arc]]]
         panel.add_patch(
-            Wedge((0, 0), OUTER, *theta, width=OUTER - INNER, color=colour, linewidth=0)
+            Wedge((0, 0), OUTER, *theta, width=OUTER - INNER, color=colour, linewidth=0.8)
         )
     for radius in (OUTER, INNER):
         panel.add_patch(Circle((0, 0), radius, fill=False, edgecolor=INK, linewidth=0.8))
     # Quarters of the period, as hours on a clock face.
     for quarter in low + period * np.arange(4) / 4:
-        x, y = (float(at) for at in _on_ring(task, quarter))
-        panel.plot([OUTER * x, TICK * x], [OUTER * y, TICK * y], color=INK, linewidth=0.8)
+        at = np.array(_on_ring(task, quarter))
+        panel.plot(*np.outer(at, (OUTER, TICK)), color=INK, linewidth=0.8)
         text = _angle(quarter) if task.chart.units[0] == "rad" else f"{quarter:g}"
-        panel.text(LABEL * x, LABEL * y, text, ha="center", va="center")
+        panel.text(LABEL * at[0], LABEL * at[1], text, ha="center", va="center")
     panel.text(0, 0, _axis_label(task, 0), ha="center", va="center")
-    panel.set(xlim=(-EDGE, EDGE), ylim=(-EDGE, EDGE), aspect="equal")
+    panel.set(xlim=(-EDGE, EDGE), ylim=(-EDGE, EDGE), aspect="equal", anchor="S")
     panel.set_axis_off()
     found: dict[str, Artist] = {}
     first, last = (360 * corner[0] / period for corner in (task.start_low, task.start_high))
     if last - first < 360 - step:
-        arc = Wedge((0, 0), TICK, first, last, width=0.03, color=INK, linewidth=0)
-        found["start region"] = panel.add_patch(arc)
+        found["start region"] = panel.add_patch(
+            Wedge((0, 0), TICK, first, last, width=0.03, color=INK, linewidth=0)
+        )
     x, y = _on_ring(task, critical.points[:, 0])
     for colour, width in CASING:
         panel.plot(
-            [INNER * x, OUTER * x], [INNER * y, OUTER * y], color=colour, linewidth=width, zorder=3
+            [CRITICAL * x, OUTER * x],
+            [CRITICAL * y, OUTER * y],
+            color=colour,
+            linewidth=width,
+            zorder=3,
         )
     return found | _points(panel, CRITICAL * x, CRITICAL * y)
 
@@ -337,19 +343,12 @@ def _points(panel: Axes, x: np.ndarray, y: np.ndarray) -> dict[str, Artist]:
     """Mark the points of M* (n,), (n,); returns as `_box`."""
     if not len(x):
         return {}
-    (line,) = panel.plot(
-        x,
-        y,
-        linestyle="none",
-        marker="o",
-        markersize=5,
-        color=INK,
-        markeredgecolor=PAPER,
-        markeredgewidth=0.7,
-        clip_on=False,
-        zorder=4,
-    )
-    return {"critical set M*": line}
+    # All the paper first: where points lie close together they make one line.
+    for colour, size in ((PAPER, 5.0), (INK, 3.6)):
+        (dots,) = panel.plot(
+            x, y, "o", markersize=size, color=colour, markeredgewidth=0, clip_on=False, zorder=4
+        )
+    return {"critical set M*": dots}
 
 
 # ---- curves
@@ -363,15 +362,22 @@ def _limit(panel: Axes, eps: np.ndarray, curve: Mapping[str, Any]) -> dict[str, 
     """
     looks: dict[str, Any] = {"color": LIMIT_COLOUR, "linewidth": 7, "solid_capstyle": "butt"}
     (won,) = panel.plot(eps, 100 * np.array(curve["won"]), **looks)
-    return {"limit: what any controller could win": won}
+    if _same(curve):
+        return {"limit of any controller": won}
+    looks |= {"linestyle": (0, (1.2, 0.5)), "linewidth": 4}
+    (won_any,) = panel.plot(eps, 100 * np.array(curve["won_any"]), **looks)
+    return {
+        "limit of any controller, picks the start mode": won,
+        "limit of any controller, from every start mode": won_any,
+    }
 
 
 def _won(
-    panel: Axes, number: int, total: int, name: str, eps: np.ndarray, curve: Mapping[str, Any]
+    panel: Axes, number: int, name: str, eps: np.ndarray, curve: Mapping[str, Any]
 ) -> dict[str, Artist]:
     """Draw what a controller wins; returns as `_limit`."""
     won, won_any = 100 * np.array(curve["won"]), 100 * np.array(curve["won_any"])
-    title, looks = TITLES.get(name, name), _looks(number, total)
+    title, looks = TITLES.get(name, name), _looks(number)
     (line,) = panel.plot(eps, won, **looks)
     if _same(curve):
         return {title: line}
@@ -379,9 +385,9 @@ def _won(
     return {f"{title}, picks the start mode": line, f"{title}, from every start mode": dashed}
 
 
-def _times(panel: Axes, number: int, total: int, eps: np.ndarray, curve: Mapping[str, Any]) -> None:
+def _times(panel: Axes, number: int, eps: np.ndarray, curve: Mapping[str, Any]) -> None:
     """Draw the worst time to arrival; where nothing is won there is none."""
-    looks = _looks(number, total) | ({} if _same(curve) else _dashed(number))
+    looks = _looks(number) | ({} if _same(curve) else _dashed(number))
     won = np.array(curve["won_any"]) > 0
     panel.plot(eps, np.where(won, curve["time_any"], np.nan), **looks)
 
@@ -391,7 +397,7 @@ def _same(curve: Mapping[str, Any]) -> bool:
     return bool(np.allclose(curve["won"], curve["won_any"], atol=1e-9))
 
 
-def _looks(number: int, total: int) -> dict[str, Any]:
+def _looks(number: int) -> dict[str, Any]:
     """How the curve of a controller looks.
 
     Where curves coincide the first is thin and lies on thicker ones, and no marker hides another's.
@@ -399,9 +405,10 @@ def _looks(number: int, total: int) -> dict[str, Any]:
     return {
         "color": CURVE_COLOURS[number % len(CURVE_COLOURS)],
         "linewidth": 1.5 + 1.3 * number,
-        "zorder": 3 + (total - number) / total,
+        "zorder": 3 + 1 / (1 + number),
         "marker": MARKERS[number % len(MARKERS)],
         "markersize": 6,
+        "clip_on": False,
         "markevery": (2 * number % MARK_EVERY, MARK_EVERY),
     }
 
@@ -418,16 +425,17 @@ def _dashed(number: int) -> dict[str, Any]:
 
 
 def _margins(
-    panel: Axes, margins: Mapping[str, float | None], names: Sequence[str], unit: str
+    panel: Axes, margins: Mapping[str, float | None], numbers: Mapping[str, int], unit: str
 ) -> dict[str, Artist]:
     """Mark the margins above the curves, a row for each controller; returns as `_limit`."""
     found: dict[str, Artist] = {}
-    for row, name in enumerate(names):
+    panel.set_ylim(-3, TOP + ROW * len(numbers))
+    for row, (name, number) in enumerate(numbers.items()):
         margin, title = margins[name], TITLES.get(name, name)
-        looks = {**_looks(row, len(names)), "marker": "v", "linestyle": "none", "markevery": None}
-        at = [] if margin is None else [margin]
-        (mark,) = panel.plot(at, [TOP + ROW * row] * len(at), **looks)
-        value = "none" if margin is None else f"{margin:.3g} {unit}"
-        found[f"margin of {title}: {value}"] = mark if at else Line2D([], [], linestyle="none")
-    panel.set_ylim(-3, TOP + ROW * len(names))
+        if margin is None:
+            found[f"margin of {title}: none"] = Line2D([], [], linestyle="none")
+            continue
+        looks = _looks(number) | {"marker": "v", "linestyle": "none", "markevery": None}
+        (mark,) = panel.plot([margin], [TOP + ROW * row], **looks)
+        found[f"margin of {title}: all is won up to {margin:.3g} {unit}"] = mark
     return found

@@ -12,13 +12,17 @@ from hyrl_mj.policies import Policy
 from hyrl_mj.sets import Complement, StateSet
 from hyrl_mj.tasks.base import Task
 
+# A point this close to the edge of a flow set is on it [chart units].
+ON_EDGE = 1e-9
+
 
 @dataclass(frozen=True)
 class HybridController:
     """H = (C, F, D, G) with state (z, q) (paper, Step 7), sampled: a pure function, no hidden state.
 
     In mode q the policy pi_q flows on C_q = M_ext_q. On D_q, the closure of the rest, q jumps, to the
-    other mode; with more than two, to the one whose flow set holds z most deeply.
+    other mode; with more than two, to the one whose flow set holds z most deeply. On the edge, where
+    both are allowed, it flows: noise of just the bound that the sets are made for does not flip it.
 
     Attributes:
         task: gives the chart and checks measurements.
@@ -97,7 +101,7 @@ class HybridController:
             return q.copy()
         distances = self._distances(z)
         row, column = np.searchsorted(self.modes, q), np.arange(len(q))
-        jumps = distances[row, column] >= 0
+        jumps = distances[row, column] > ON_EDGE
         distances[row, column] = np.inf
         return np.where(jumps, np.array(self.modes)[distances.argmin(axis=0)], q)
 

@@ -15,6 +15,9 @@ from hyrl_mj.lattice import Lattice
 from hyrl_mj.partition import Partition
 from hyrl_mj.sets import within_reach
 
+# Parts whose depths differ by no more than this meet there [chart units].
+ON_BOUNDARY = 1e-9
+
 
 @dataclass(frozen=True)
 class Limit:
@@ -23,7 +26,7 @@ class Limit:
     Attributes:
         lattice: of the states.
         parts: (Q, N) bool, M_i at the nodes.
-        side: (N,) number of the mode whose part a node lies in.
+        sides: (Q, N) bool, whether a measurement there calls for each mode; on the boundary, several.
         samples: (Q, N) least number of samples until arrival by each mode's way, `NEVER` where it is
             closed.
         level: (Q, N) the input level that does it.
@@ -32,7 +35,7 @@ class Limit:
 
     lattice: Lattice
     parts: np.ndarray
-    side: np.ndarray
+    sides: np.ndarray
     samples: np.ndarray
     level: np.ndarray
     hop: np.ndarray
@@ -46,6 +49,7 @@ class Limit:
         """
         at = partition.grid.nearest(lattice.grid.nodes)
         parts = np.stack([part.mask[at] for part in partition.parts])
+        depth = np.stack([part.signed_distance(lattice.grid.nodes) for part in partition.parts])
         samples, level = np.empty(parts.shape, dtype=int), np.empty(parts.shape, dtype=int)
         after = lattice.after[:, :1]  # to the limit's side: the nearest node
         for i, part in enumerate(parts):
@@ -56,14 +60,19 @@ class Limit:
         nodes, ends = lattice.grid.nodes, after[:, 0]
         moved = lattice.grid.chart.difference(nodes[np.minimum(ends, lattice.nodes - 1)], nodes)
         hop = np.abs(moved[ends < lattice.nodes]).max(axis=0)
-        return Limit(lattice, parts, parts.argmax(axis=0), samples, level, hop)
+        sides = depth <= depth.min(axis=0) + ON_BOUNDARY
+        return Limit(lattice, parts, sides, samples, level, hop)
 
     def winnable(self, bound: np.ndarray) -> np.ndarray:
         """Where "pick the side of the first measurement, then hold it" always wins: (N,) bool."""
         wins = self.samples < NEVER
         return np.asarray(
             np.all(
-                [won | ~self._reach(self.side == i, bound) for i, won in enumerate(wins)], axis=0
+                [
+                    won | ~self._reach(side, bound)
+                    for won, side in zip(wins, self.sides, strict=True)
+                ],
+                axis=0,
             )
         )
 
@@ -74,13 +83,13 @@ class Limit:
         """
         lattice, modes = self.lattice, len(self.parts)
         noisy = np.where(bound > 0, self.hop, 0.0)
-        goes = []
+        goes, side = [], self.sides.argmax(axis=0)
         for i, part in enumerate(self.parts):
             roomy = ~self._reach(self.samples[i] >= NEVER, bound)
             flows = self._reach(part, 2 * bound + noisy) & roomy | self._reach(part, bound)
-            goes.append(np.where(flows, i, self.side))
+            goes.append(np.where(flows, i, side))
         state, counts, target = [], [], []
-        for row, goal in enumerate([*goes, self.side]):
+        for row, goal in enumerate([*goes, side]):
             possible = np.stack([self._reach(goal == i, bound) for i in range(modes)], axis=-1)
             node, mode = np.nonzero(possible & lattice.running[:, None])
             end = lattice.after[self.level[mode, node], 0, node]

@@ -67,7 +67,7 @@ def halves(task, cells=240):
 
 def decisions(task):
     """The critical set that belongs to `halves`."""
-    on_axis = np.stack([np.linspace(0, 0.45, 10), np.zeros(10)], axis=-1)
+    on_axis = np.stack([np.linspace(0, 0.4, 9), np.zeros(9)], axis=-1)
     points = np.array([[np.pi]]) if task.name == "unit_circle" else on_axis
     return CriticalSet(points, np.zeros(len(points), dtype=int), resolution=0.01, spacing=0.05)
 
@@ -232,6 +232,9 @@ class Cube(Task):
 
     def arrived(self, z):
         return np.full(len(z), True)
+
+    def miss(self, z):
+        return np.zeros(len(z))
 
     def starts(self, n, rng):
         return rng.uniform(-1, 1, (n, 3))

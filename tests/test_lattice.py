@@ -115,7 +115,9 @@ def test_neighbouring_levels_lead_a_cell_apart_at_most(circle, cells):
 
 def test_the_circle_s_nodes_have_arrived_within_the_band(around_circle):
     theta = around_circle.grid.nodes[:, 0]
-    np.testing.assert_array_equal(around_circle.arrived, np.abs((theta + 3) % (2 * np.pi) - 3) <= 0.3)
+    np.testing.assert_array_equal(
+        around_circle.arrived, np.abs((theta + 3) % (2 * np.pi) - 3) <= 0.3
+    )
     assert around_circle.running.all()
     assert not around_circle.failed.any()
 

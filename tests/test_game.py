@@ -1,0 +1,442 @@
+"""The worst-case game: a slow plain twin, planted controllers with known values, and MuJoCo itself."""
+
+from functools import cache
+from itertools import count, pairwise, product
+
+import numpy as np
+import pytest
+from planted import (
+    circle_controller,
+    circle_policy,
+    halves,
+    homing_controller,
+    homing_policy,
+    ideal_controller,
+    one_way_policy,
+    sign_policy,
+)
+
+from hyrl_mj import HybridController, Noise, simulate
+from hyrl_mj.controllers import PolicyController
+from hyrl_mj.errors import BadInput
+from hyrl_mj.game import LOST, NEVER, Answers, lasting, noisy_moves, solve
+from hyrl_mj.lattice import ON_NODE, Lattice
+from hyrl_mj.robustness import Game, worst_signal
+from hyrl_mj.sets import Grid
+from hyrl_mj.tasks import Outcome
+
+PI = np.pi
+# On 754 nodes the circle's own samples at full speed lead from node to node: 2 pi / 754 = 0.05 / 6.00003.
+EXACT = 754
+# From the axis the pillar can be passed only if x <= this.
+LAST_CHANCE = 1.5 - 0.751 * np.sqrt(2)
+
+
+# ---- a slow plain twin
+
+
+def around(grid, z):
+    """The numbers of the nodes around a point (d,)."""
+    index = (grid.chart.wrap(z[None])[0] - grid.chart.low) / grid.spacing
+    near = []
+    for i, n, periodic in zip(index, grid.counts, grid.chart.periodic, strict=True):
+        on_node = abs(i - round(i)) <= ON_NODE
+        either = {round(i)} if on_node else {int(np.floor(i)), int(np.ceil(i))}
+        near.append({k % n if periodic else min(max(k, 0), n - 1) for k in either})
+    return {int(np.ravel_multi_index(at, grid.counts)) for at in product(*near)}
+
+
+def twin_moves(lattice, controller, bound):
+    """Where noise can lead (row, node): one state, one noise and one sample of the plant at a time."""
+    task, grid, modes = lattice.task, lattice.grid, controller.modes
+    plant, periodic = task.plant(1), np.array(grid.chart.periodic)
+    window = [int(b / s + 1e-6) for b, s in zip(bound, grid.spacing, strict=True)]
+
+    @cache
+    def ends(node, level):
+        plant.set_state(task.qpos(grid.nodes[[node]]))
+        plant.step(lattice.levels[[level]])
+        ending, z = task.ending(plant.measurement)[0], task.z(plant.measurement)
+        if ending == Outcome.REACHED:
+            return {lattice.nodes}
+        lives = ending == Outcome.RUNNING and task.chart.contains(z)[0]
+        return around(grid, z[0]) if lives else {lattice.nodes + 1}
+
+    @cache
+    def answer(q, index):
+        measured = (grid.chart.low + grid.spacing * index)[None]
+        mode = controller.initial_mode(measured) if q is None else np.array([q])
+        u, after = controller.step(mode, measured)
+        return int(np.abs(lattice.levels - u).sum(axis=1).argmin()), modes.index(after[0])
+
+    moves = {}
+    for (row, q), node in product(enumerate((*modes, None)), range(lattice.nodes)):
+        if task.ending(grid.nodes[[node]])[0] != Outcome.RUNNING:
+            continue
+        at, found = np.unravel_index(node, grid.counts), set()
+        for shift in product(*[range(-w, w + 1) for w in window]):
+            index = np.where(periodic, np.add(at, shift) % grid.counts, np.add(at, shift))
+            level, mode = answer(q, tuple(int(k) for k in index))
+            found |= {(mode, place) for place in ends(node, level)}
+        moves[row, node] = found
+    return moves
+
+
+def twin_values(lattice, moves, rows):
+    """The game's value, layer by layer: what fails, or must have arrived, in k samples."""
+    value = np.full((rows, lattice.places), NEVER)
+    value[:, [*np.flatnonzero(lattice.failed), lattice.nodes + 1]] = LOST
+    value[:, [*np.flatnonzero(lattice.arrived), lattice.nodes]] = 0
+    for k in count(1):
+        lost = {s: LOST - k for s in moves if any(value[t] > NEVER for t in moves[s])}
+        won = {s: k for s in moves if all(value[t] < NEVER for t in moves[s])}
+        new = {s: v for s, v in (lost | won).items() if value[s] == NEVER}
+        if not new:
+            return value
+        for state, found in new.items():
+            value[state] = found
+
+
+def renamed(controller):
+    """The same hybrid controller with other numbers for its modes."""
+    number = {0: 2, 1: 5}
+    return HybridController(
+        controller.task,
+        {number[q]: policy for q, policy in controller.policies.items()},
+        {number[q]: flow for q, flow in controller.flow_sets.items()},
+    )
+
+
+# Cells 0.05 m wide: at half speed the vehicle ends between two nodes. Cells 0.1 m wide: always.
+TWINS = [
+    ("vehicle", (61, 31), sign_policy, (0.0, 0.05)),
+    ("vehicle", (61, 31), sign_policy, (0.0, 0.1)),
+    ("vehicle", (61, 31), lambda task: renamed(ideal_controller(task, 0.2)), (0.0, 0.1)),
+    ("vehicle", (61, 61), lambda task: ideal_controller(task, 0.07), (0.0, 0.1)),
+    ("vehicle", (61, 21), sign_policy, (0.15, 0.15)),
+    ("vehicle", (31, 31), lambda task: ideal_controller(task, 0.07), (0.1, 0.1)),
+    ("unit_circle", (300,), circle_policy, (0.0,)),
+    ("unit_circle", (300,), circle_policy, (0.2,)),
+    ("unit_circle", (300,), homing_policy, (0.1,)),
+    ("unit_circle", (300,), lambda task: renamed(circle_controller(task, 0.3)), (0.1,)),
+    ("unit_circle", (300,), lambda task: homing_controller(task, 0.1), (0.2,)),
+]
+
+
+@pytest.mark.parametrize(("name", "counts", "controller", "bound"), TWINS)
+def test_the_game_is_its_slow_twin(vehicle, circle, name, counts, controller, bound):
+    task, bound = {"vehicle": vehicle, "unit_circle": circle}[name], np.array(bound)
+    lattice, loop = Lattice.of(task, Grid(task.chart, counts)), controller(task)
+    loop = loop if isinstance(loop, HybridController) else PolicyController(loop)
+    plain = twin_moves(lattice, loop, bound)
+    moves = noisy_moves(Answers.of(lattice, loop, bound), bound)
+    assert moves.rows == len(loop.modes) + 1
+    value = solve(moves)
+    np.testing.assert_array_equal(value, twin_values(lattice, plain, moves.rows))
+    assert len(np.unique(value)) > 10
+    targets = np.split(moves.target, moves.counts.cumsum()[:-1])
+    for state, target in zip(moves.state[::7], targets[::7], strict=True):
+        found = {divmod(int(t), lattice.places) for t in target}
+        assert found == plain[divmod(int(state), lattice.places)]
+
+
+def test_answers_for_more_noise_serve_for_less(vehicle):
+    lattice = Lattice.of(vehicle, Grid.with_cells(vehicle.chart, 60))
+    loop, bound = ideal_controller(vehicle, 0.07), np.array([0.0, 0.1])
+    tight, wide = (Answers.of(lattice, loop, most) for most in (bound, np.array([0.2, 0.4])))
+    np.testing.assert_array_equal(solve(noisy_moves(tight, bound)), solve(noisy_moves(wide, bound)))
+
+
+def test_a_controller_that_goes_to_a_mode_it_does_not_have_is_refused(vehicle):
+    class Lost(PolicyController):
+        def step(self, q, measured):
+            return self.policy.act(measured), q + 3
+
+    lattice = Lattice.of(vehicle, Grid.with_cells(vehicle.chart, 60))
+    with pytest.raises(BadInput, match=r"went to mode 3, it has \(0,\)"):
+        Answers.of(lattice, Lost(sign_policy(vehicle)), np.zeros(2))
+
+
+# ---- vehicle: planted controllers
+
+OFF = 0.004  # lines run between the nodes, where the plant's rounding errors do not matter
+
+
+def sign_rule(task):
+    return PolicyController(sign_policy(task, lambda x: OFF + 0 * x))
+
+
+@pytest.fixture(scope="module")
+def on_vehicle(vehicle):
+    controllers = {
+        "left": PolicyController(one_way_policy(vehicle, 1.0)),
+        "right": PolicyController(one_way_policy(vehicle, -1.0)),
+        "sign": PolicyController(sign_policy(vehicle)),
+        "sign off": sign_rule(vehicle),
+        "ideal": ideal_controller(vehicle, 0.2 + OFF, 0.95 + OFF),
+        "narrow": ideal_controller(vehicle, 0.05 + OFF, 0.95 + OFF),
+    }
+    grid = Grid.with_cells(vehicle.chart, 240)
+    game = Game(vehicle, halves(vehicle), controllers, 0.2, grid=grid)
+    return game, controllers
+
+
+def own(game, name, eps):
+    """The value (N,) of nodes where the controller picks its start mode."""
+    return game.value(name, eps)[-1, :-2]
+
+
+@pytest.mark.parametrize("eps", [0.0, 0.05, 0.1])
+@pytest.mark.parametrize(("name", "side"), [("left", 1), ("right", -1)])
+def test_one_way_wins_the_starts_whose_way_is_open(on_vehicle, name, side, eps):
+    game, _ = on_vehicle
+    won = own(game, name, eps) < NEVER
+    x, y = game.lattice.grid.nodes.T
+    room, cell = LAST_CHANCE - x + side * y, game.lattice.grid.cell
+    assert won[game.starts & (room > cell)].all()
+    assert not won[game.starts & (room < -cell)].any()
+    open_ = game.limit.samples[0 if side > 0 else 1] < NEVER
+    np.testing.assert_array_equal(won[game.starts], open_[game.starts])
+
+
+def test_one_way_grazes_under_noise_as_large_as_its_clearance(on_vehicle):
+    # It stops turning where it measures y = 0.9 m, and touches the pillar at 0.751 m.
+    game, _ = on_vehicle
+    start = game.lattice.grid.nearest(np.array([[0.0, 0.5]]))[0]
+    assert own(game, "left", 0.1375)[start] < NEVER
+    assert own(game, "left", 0.15)[start] > NEVER
+
+
+@pytest.mark.parametrize("eps", [0.05, 0.075, 0.1])
+def test_the_sign_rule_loses_where_noise_hides_the_sign_and_nowhere_else(on_vehicle, eps):
+    # It can be held in -eps <= y < eps until no way is open, from wherever it comes.
+    game, _ = on_vehicle
+    y = game.lattice.grid.nodes[:, 1]
+    region = game.starts & game.winnable(eps)
+    hidden = (y > -eps - 1e-6) & (y < eps - 1e-6)
+    lost = own(game, "sign", eps) >= NEVER
+    np.testing.assert_array_equal(lost[region], hidden[region])
+    assert lost[game.starts & hidden].all()
+
+
+def test_noise_of_less_than_half_a_sample_s_way_cannot_hold_the_sign_rule(on_vehicle):
+    game, _ = on_vehicle
+    for eps, wins in ((0.025, True), (0.0375, False)):
+        region = game.starts & game.winnable(eps)
+        assert (own(game, "sign", eps)[region] < NEVER).all() == wins
+
+
+def test_hysteresis_wins_all_that_can_be_won_with_its_own_start_mode(on_vehicle):
+    game, _ = on_vehicle
+    region = game.starts & game.winnable(0.1)
+    assert (own(game, "ideal", 0.1)[region] < NEVER).all()
+
+
+def test_hysteresis_loses_from_the_wrong_start_mode_where_noise_hides_it(on_vehicle):
+    # Mode 1 (right) does not let go of y in (0, overlap + eps), and has no room left there.
+    game, _ = on_vehicle
+    value, at = game.value("ideal", 0.1), game.lattice.grid.nearest(np.array([[0.4, 0.2]]))[0]
+    assert value[0, at] < NEVER
+    assert value[-1, at] < NEVER
+    assert value[1, at] > NEVER
+    assert (
+        game.value("ideal", 0.0)[1, game.lattice.grid.nearest(np.array([[0.4, 0.25]]))[0]] < NEVER
+    )
+
+
+def test_every_start_of_the_vehicle_is_won_or_lost(on_vehicle):
+    # x = 3 m comes some day, and with it the end.
+    game, controllers = on_vehicle
+    for name in controllers:
+        assert not (game.value(name, 0.1) == NEVER)[:, np.append(game.starts, [True] * 2)].any()
+        assert not lasting(game.moves(name, 0.1)).any()
+
+
+def test_it_wins_no_more_under_more_noise(on_vehicle):
+    game, controllers = on_vehicle
+    for name in controllers:
+        values = [game.value(name, eps) for eps in (0.0, 0.05, 0.1, 0.2)]
+        for less, more in pairwise(values):
+            assert (less <= more).all()
+
+
+# ---- vehicle: the same in MuJoCo
+
+
+def some(nodes, mask, n=150):
+    """At most n of the nodes of a mask, at random: their numbers, and the points."""
+    at = np.random.default_rng(0).permutation(np.flatnonzero(mask))[:n]
+    assert len(at) > 20
+    return at, nodes[at]
+
+
+@pytest.mark.parametrize(
+    ("name", "q0", "eps"),
+    [
+        ("sign off", None, 0.1),
+        ("sign off", None, 0.05),
+        ("ideal", 0, 0.1),
+        ("ideal", 1, 0.05),
+        ("narrow", None, 0.1),
+        ("left", None, 0.1),
+    ],
+)
+def test_the_worst_signal_crashes_lost_starts_in_the_sample_foreseen(
+    vehicle, on_vehicle, name, q0, eps
+):
+    game, controllers = on_vehicle
+    value = game.value(name, eps)[-1 if q0 is None else q0, :-2]
+    at, z0 = some(game.lattice.grid.nodes, game.starts & (value > NEVER))
+    signal = worst_signal(game, name, controllers[name], z0, eps, q0)
+    assert np.abs(signal.values).max(initial=0.0) <= eps + 1e-12
+    assert not signal.values[..., 0].any(), "x is measured without noise"
+    arcs = simulate(vehicle, controllers[name], z0, noise=signal, q0=q0)
+    assert {arc.outcome for arc in arcs} == {"crashed"}
+    samples = [round(arc.t[-1] / vehicle.dt) for arc in arcs]
+    np.testing.assert_array_equal(samples, LOST - value[at])
+
+
+def arrivals(task, arcs):
+    """The samples after which arcs have first arrived."""
+    first = [np.argmax(task.verdict(arc.z) == Outcome.REACHED) for arc in arcs]
+    return np.array([round(arc.t[k] / task.dt) for arc, k in zip(arcs, first, strict=True)])
+
+
+@pytest.mark.parametrize("kind", ["worst", "uniform", "alternating", "adversarial"])
+@pytest.mark.parametrize("name", ["sign off", "ideal"])
+def test_no_noise_makes_a_won_start_of_the_vehicle_fail(vehicle, on_vehicle, name, kind):
+    game, controllers = on_vehicle
+    eps = 0.1
+    value = own(game, name, eps)
+    at, z0 = some(game.lattice.grid.nodes, game.starts & (value < NEVER), 200)
+    noise = game.worst_noise(name, eps) if kind == "worst" else Noise(kind, eps)
+    arcs = simulate(vehicle, controllers[name], z0, noise=noise)
+    assert {arc.outcome for arc in arcs} == {"reached"}
+    np.testing.assert_array_equal(arrivals(vehicle, arcs), value[at])
+
+
+# ---- unit circle: planted controllers
+
+
+def play(circle, controllers, cells=EXACT):
+    return Game(circle, halves(circle), controllers, 0.3, grid=Grid.with_cells(circle.chart, cells))
+
+
+@pytest.fixture(scope="module")
+def on_circle(circle):
+    controllers = {
+        "sign": PolicyController(circle_policy(circle, PI + 0.003)),
+        "hysteresis": circle_controller(circle, 0.4 + 0.003),
+        "homing": homing_controller(circle, 0.4 + 0.003),
+    }
+    return play(circle, controllers), controllers
+
+
+@pytest.mark.parametrize("eps", [0.05, 0.1, 0.2])
+def test_the_sign_rule_is_trapped_where_noise_hides_the_sign_and_nowhere_else(on_circle, eps):
+    game, _ = on_circle
+    value, theta = own(game, "sign", eps), game.lattice.grid.nodes[:, 0]
+    off, cell = np.abs(theta - PI - 0.003), game.lattice.grid.cell
+    assert (value[off < eps - cell] == NEVER).all()
+    assert (value[off > eps + cell] < NEVER).all()
+
+
+@pytest.mark.parametrize("eps", [0.0, 0.1, 0.2])
+def test_hysteresis_arrives_on_the_circle_in_the_time_foreseen(on_circle, eps):
+    # The longest way: in the wrong mode where noise hides that it is wrong, round to the band's near edge.
+    game, _ = on_circle
+    value = game.value("hysteresis", eps)[:, :-2]
+    assert (value < NEVER).all()
+    assert value[:-1].max() == pytest.approx((PI + 0.403 + eps - 0.3) / 0.05, abs=2)
+    assert value[-1].max() == pytest.approx((PI + eps - 0.3) / 0.05, abs=2)
+
+
+def test_values_converge_as_the_lattice_gets_finer(circle):
+    band, late = [], []
+    for cells in (720, 1500, 3000):
+        controllers = {"sign": PolicyController(circle_policy(circle))}
+        game = play(circle, controllers | {"hysteresis": circle_controller(circle)}, cells)
+        trapped = (own(game, "sign", 0.1) == NEVER).mean() * 2 * PI
+        band.append(abs(trapped - 0.2))
+        assert band[-1] <= 2 * game.lattice.grid.cell, "one at either edge"
+        worst = game.value("hysteresis", 0.1)[:-1, :-2].max()
+        late.append(worst - (PI + 0.4 + 0.1 - 0.3) / 0.05)
+    assert band[0] > band[1] > band[2]
+    assert late[0] > late[1] > late[2] > 0, "it errs to the adversary's side"
+    assert late[2] < 0.4 * late[0]
+
+
+# ---- unit circle: for ever
+
+
+@pytest.mark.parametrize("eps", [0.0, 0.05, 0.1])
+def test_a_deadbeat_policy_is_held_within_the_noise(circle, eps):
+    lattice = Lattice.of(circle, Grid.with_cells(circle.chart, EXACT))
+    loop, bound = PolicyController(homing_policy(circle)), np.array([eps])
+    near = circle.miss(lattice.grid.nodes) < 1
+    held = lasting(noisy_moves(Answers.of(lattice, loop, bound), bound), near)
+    cell = lattice.grid.cell
+    assert eps - cell <= circle.miss(lattice.grid.nodes[held]).max() <= eps + 2 * cell
+
+
+@pytest.mark.parametrize("dead", [0.1, 0.3])
+def test_a_policy_with_a_dead_zone_is_held_at_its_edge_and_the_noise(circle, dead):
+    eps = 0.1
+    lattice = Lattice.of(circle, Grid.with_cells(circle.chart, EXACT))
+    loop, bound = PolicyController(homing_policy(circle, dead)), np.array([eps])
+    near = circle.miss(lattice.grid.nodes) < 1
+    held = lasting(noisy_moves(Answers.of(lattice, loop, bound), bound), near)
+    reach = circle.miss(lattice.grid.nodes[held]).max()
+    assert reach == pytest.approx(dead + eps, abs=2 * lattice.grid.cell)
+
+
+def test_runs_are_not_held_where_they_never_come(circle):
+    # At the far side noise can hold a memoryless policy; runs from near the set-point never get there.
+    lattice = Lattice.of(circle, Grid.with_cells(circle.chart, EXACT))
+    loop, bound = PolicyController(homing_policy(circle)), np.array([0.1])
+    moves = noisy_moves(Answers.of(lattice, loop, bound), bound)
+    miss = circle.miss(lattice.grid.nodes)
+    assert miss[lasting(moves)].max() == pytest.approx(PI, abs=lattice.grid.cell)
+    assert miss[lasting(moves, miss > 3)].max() == pytest.approx(PI, abs=lattice.grid.cell)
+    assert miss[lasting(moves, miss < 3)].max() < 0.2
+
+
+# ---- unit circle: the same in MuJoCo
+
+
+def test_the_worst_signal_keeps_trapped_starts_from_arriving(circle, on_circle):
+    game, controllers = on_circle
+    eps = 12 * game.lattice.grid.cell
+    at = np.flatnonzero(own(game, "sign", eps) == NEVER)
+    z0 = game.lattice.grid.nodes[at]
+    signal = worst_signal(game, "sign", controllers["sign"], z0, eps)
+    assert len(signal.values) == circle.max_steps
+    assert np.abs(signal.values).max() <= eps + 1e-9
+    arcs = simulate(circle, controllers["sign"], z0, noise=signal)
+    assert {arc.outcome for arc in arcs} == {"stalled"}
+    assert max(np.abs(arc.z - PI).max() for arc in arcs) < 0.2
+
+
+@pytest.mark.parametrize("kind", ["worst", "uniform", "alternating", "adversarial"])
+@pytest.mark.parametrize("name", ["sign", "hysteresis"])
+def test_no_noise_makes_a_won_start_of_the_circle_late(circle, on_circle, name, kind):
+    game, controllers = on_circle
+    eps = 12 * game.lattice.grid.cell
+    value = own(game, name, eps)
+    at, z0 = some(game.lattice.grid.nodes, value < NEVER, 200)
+    noise = game.worst_noise(name, eps) if kind == "worst" else Noise(kind, eps)
+    arcs = simulate(circle, controllers[name], z0, noise=noise)
+    assert all(circle.arrived(arc.z).any() for arc in arcs)
+    assert (arrivals(circle, arcs) <= value[at]).all()
+    if kind == "worst":
+        np.testing.assert_array_equal(arrivals(circle, arcs), value[at])
+
+
+def test_modes_started_by_hand_arrive_when_the_game_says(circle, on_circle):
+    game, controllers = on_circle
+    eps = 12 * game.lattice.grid.cell
+    value = game.value("hysteresis", eps)[0, :-2]
+    at, z0 = some(game.lattice.grid.nodes, value > 40)
+    noise = game.worst_noise("hysteresis", eps)
+    arcs = simulate(circle, controllers["hysteresis"], z0, noise=noise, q0=0)
+    np.testing.assert_array_equal(arrivals(circle, arcs), value[at])

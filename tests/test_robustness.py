@@ -1,0 +1,424 @@
+"""Scores, margins and maps of the worst-case game, episodes in bulk, and the files they go into."""
+
+import numpy as np
+import pytest
+from planted import (
+    circle_controller,
+    circle_policy,
+    decisions,
+    halves,
+    homing_controller,
+    ideal_controller,
+    one_way_policy,
+    sign_policy,
+)
+
+from hyrl_mj import (
+    BadArtifact,
+    BadInput,
+    Noise,
+    artifacts,
+    closed_loop,
+    lattice,
+    robustness,
+    simulate,
+)
+from hyrl_mj.controllers import PolicyController
+from hyrl_mj.robustness import (
+    BEATEN,
+    LIMIT,
+    OVER,
+    UNWINNABLE,
+    WON,
+    WON_FROM_SOME,
+    Game,
+    episodes,
+    examine,
+    worst_signal,
+)
+from hyrl_mj.sets import Grid
+
+PI = np.pi
+# On 754 nodes full speed leads from node to node on the circle.
+EXACT = 754
+
+
+@pytest.fixture(scope="module")
+def on_vehicle(vehicle):
+    controllers = {
+        "left": PolicyController(one_way_policy(vehicle)),
+        "sign": PolicyController(sign_policy(vehicle)),
+        # The sets end between the nodes, where the plant's rounding errors do not matter.
+        "narrow": ideal_controller(vehicle, 0.104, clear=1.004),
+        "ideal": ideal_controller(vehicle, 0.154, clear=1.004),
+        "grazing": ideal_controller(vehicle, 0.204, clear=0.904),
+    }
+    grid = Grid.with_cells(vehicle.chart, 240)
+    return Game(vehicle, halves(vehicle), controllers, 0.2, grid=grid), controllers
+
+
+@pytest.fixture(scope="module")
+def on_circle(circle):
+    controllers = {
+        "sign": PolicyController(circle_policy(circle)),
+        "hysteresis": circle_controller(circle, 0.4),
+        "homing": homing_controller(circle, 0.4),
+    }
+    grid = Grid.with_cells(circle.chart, EXACT)
+    return Game(circle, halves(circle), controllers, 0.3, grid=grid), controllers
+
+
+# ---- scores
+
+
+@pytest.mark.parametrize("eps", [0.05, 0.1])
+def test_the_sign_rule_s_share_is_what_lies_outside_the_noise(on_vehicle, eps):
+    game, _ = on_vehicle
+    score, y = game.score("sign", eps), game.lattice.grid.nodes[:, 1]
+    region = game.starts & game.winnable(eps)
+    assert score.winnable == region.sum() / game.starts.sum()
+    hidden = (y[region] > -eps - 1e-6) & (y[region] < eps - 1e-6)
+    assert score.won == score.won_any == 1 - hidden.mean()
+    assert 0 < score.won < 1
+
+
+def test_the_ideal_rule_wins_everything_but_the_wrong_start_mode(on_vehicle):
+    score = on_vehicle[0].score("ideal", 0.1)
+    assert score.won == 1.0
+    assert 0.9 < score.won_any < 1.0
+    assert score.time == score.time_any == pytest.approx(3.0)
+    assert score.excursion is None, "every run is over some day"
+
+
+def test_the_circle_s_times_are_those_of_the_longest_way(on_circle):
+    score = on_circle[0].score("hysteresis", 0.1)
+    assert score.won == score.won_any == score.winnable == 1.0
+    assert score.time == pytest.approx(PI + 0.1 - 0.3, abs=0.1)
+    assert score.time_any == pytest.approx(PI + 0.4 + 0.1 - 0.3, abs=0.1)
+
+
+@pytest.mark.parametrize("eps", [0.0, 0.1, 0.2])
+def test_the_excursion_of_homing_is_the_noise(on_circle, eps):
+    game, _ = on_circle
+    cell = game.lattice.grid.cell
+    assert eps - cell <= game.score("homing", eps).excursion <= eps + 2 * cell
+
+
+def test_the_excursion_of_a_trapped_policy_is_the_far_side(on_circle):
+    game, _ = on_circle
+    assert game.score("sign", 0.1).excursion == pytest.approx(PI, abs=game.lattice.grid.cell)
+    assert game.score("sign", 0.1).won == pytest.approx(1 - 0.2 / (2 * PI), abs=2e-3)
+
+
+def test_noise_on_all_coordinates_wins_no_less(vehicle, on_vehicle):
+    _, controllers = on_vehicle
+    across, everywhere = (
+        Game(vehicle, halves(vehicle), controllers, 0.1, flag, Grid.with_cells(vehicle.chart, 120))
+        for flag in (False, True)
+    )
+    np.testing.assert_array_equal(across.bound(0.1), [0.0, 0.1])
+    np.testing.assert_array_equal(everywhere.bound(0.1), [0.1, 0.1])
+    for name in ("sign", "ideal"):
+        assert (everywhere.value(name, 0.1) >= across.value(name, 0.1)).all()
+    slanted = {"slanted": PolicyController(sign_policy(vehicle, lambda x: x - 0.3))}
+    across, everywhere = (
+        Game(vehicle, halves(vehicle), slanted, 0.1, flag, Grid.with_cells(vehicle.chart, 120))
+        for flag in (False, True)
+    )
+    assert everywhere.score("slanted", 0.1).won < across.score("slanted", 0.1).won
+
+
+def test_noise_beyond_what_was_prepared_is_refused(on_vehicle):
+    game, _ = on_vehicle
+    with pytest.raises(BadInput, match=r"noise 0.25 is beyond the largest that was prepared, 0.2"):
+        game.score("sign", 0.25)
+
+
+def test_a_game_under_noise_that_hides_everything_is_refused(vehicle):
+    with pytest.raises(BadInput, match=r"noise bound 1.5 hides the whole state space of vehicle"):
+        Game(vehicle, halves(vehicle, 60), {}, 1.5)
+
+
+# ---- margins
+
+
+@pytest.mark.parametrize("name", ["narrow", "ideal", "grazing"])
+def test_the_margin_of_the_ideal_rule_is_its_overlap_or_its_clearance(on_vehicle, name):
+    # Beyond its overlap noise turns a run back that has no room left; the pillar is at 0.751 m.
+    overlap, clear = {
+        "narrow": (0.104, 1.004),
+        "ideal": (0.154, 1.004),
+        "grazing": (0.204, 0.904),
+    }[name]
+    game, _ = on_vehicle
+    known = min(overlap, clear - 0.751)
+    assert game.margin(name) == pytest.approx(known, abs=game.lattice.grid.cell)
+
+
+def test_the_margin_of_the_sign_rule_is_half_of_a_sample_s_way(on_vehicle, on_circle):
+    for game, _ in (on_vehicle, on_circle):
+        assert game.margin("sign") == pytest.approx(0.025, abs=game.lattice.grid.cell)
+
+
+def test_there_is_no_margin_where_starts_are_lost_without_noise(on_vehicle):
+    assert on_vehicle[0].margin("left") is None
+
+
+def test_the_margin_is_no_larger_than_what_was_prepared(on_circle):
+    game, _ = on_circle
+    assert game.margin("hysteresis") == pytest.approx(0.3, abs=game.lattice.grid.cell)
+    assert game.margin("hysteresis") <= 0.3
+
+
+# ---- maps
+
+
+def test_the_map_s_classes_are_those_of_the_starts(vehicle, on_vehicle):
+    game, _ = on_vehicle
+
+    def classes(name, points):
+        return game.map(name, 0.1)[game.lattice.grid.nearest(np.array(points))].tolist()
+
+    # Far out, on the axis, within reach of the wrong mode, too late for any, and in the pillar.
+    points = [[0.0, 0.8], [0.0, 0.0], [0.4, 0.15], [0.6, 0.0], [1.5, 0.0]]
+    assert classes("sign", points) == [WON, BEATEN, WON, UNWINNABLE, OVER]
+    assert classes("ideal", points) == [WON, WON, WON_FROM_SOME, UNWINNABLE, OVER]
+    np.testing.assert_array_equal(game.map("sign", 0.1) == OVER, ~game.lattice.running)
+
+
+# ---- worst signals
+
+
+def test_the_worst_signal_of_several_starts_is_that_of_each_alone(vehicle, on_vehicle):
+    game, controllers = on_vehicle
+    z0 = np.array([[0.0, 0.05], [0.3, -0.05], [0.4, 0.0]])
+    together = worst_signal(game, "sign", controllers["sign"], z0, 0.1)
+    for i in range(len(z0)):
+        alone = worst_signal(game, "sign", controllers["sign"], z0[i : i + 1], 0.1)
+        np.testing.assert_array_equal(together.values[: len(alone.values), i], alone.values[:, 0])
+        assert not together.values[len(alone.values) :, i].any(), "none after the end"
+
+
+def test_a_start_between_the_nodes_is_led_into_the_pillar_too(vehicle, on_vehicle):
+    game, controllers = on_vehicle
+    x = np.random.default_rng(0).uniform(0.0, 0.4, 50)
+    z0 = np.stack([x, np.full_like(x, 0.025)], axis=-1)
+    signal = worst_signal(game, "sign", controllers["sign"], z0, 0.1)
+    assert np.abs(signal.values).max() <= 0.1 + 1e-12
+    assert {arc.outcome for arc in simulate(vehicle, controllers["sign"], z0)} == {"reached"}
+    arcs = simulate(vehicle, controllers["sign"], z0, noise=signal)
+    assert {arc.outcome for arc in arcs} == {"crashed"}
+
+
+# ---- episodes
+
+
+def record(records, controller, region, noise=None):
+    found = [
+        r
+        for r in records
+        if r["controller"] == controller and r["region"] == region and noise in (None, r["noise"])
+    ]
+    assert len(found) == 1
+    return found[0]
+
+
+@pytest.fixture(scope="module")
+def bulk(vehicle, on_vehicle):
+    """Episodes of the sign rule and of the ideal one, under every kind of noise."""
+    game, controllers = on_vehicle
+    noises = tuple(Noise(k, 0.1) for k in ("uniform", "alternating", "adversarial"))
+    return episodes(
+        vehicle,
+        decisions(vehicle),
+        {name: controllers[name] for name in ("sign", "ideal")},
+        noises,
+        600,
+        winnable=(game.lattice.grid, game.winnable(0.1)),
+    )
+
+
+def test_the_counts_add_up(bulk):
+    for noise in ("uniform", "alternating", "adversarial"):
+        for name in ("sign", "ideal"):
+            mine = [r for r in bulk if (r["noise"], r["controller"]) == (noise, name)]
+            assert {r["region"] for r in mine} == {"near M*", "elsewhere", "not winnable"}
+            assert sum(r["episodes"] for r in mine) == 600
+            for r in mine:
+                assert sum(r["outcomes"].values()) == r["episodes"]
+                assert r["reached"] == r["outcomes"].get("reached", 0) / r["episodes"]
+                assert 0 <= r["interval"][0] <= r["reached"] <= r["interval"][1] <= 1
+
+
+def test_the_regions_hold_the_same_starts_for_all(bulk):
+    for region in ("near M*", "elsewhere", "not winnable"):
+        assert len({r["episodes"] for r in bulk if r["region"] == region}) == 1
+
+
+def test_starts_near_the_critical_set_are_those_within_twice_the_noise(vehicle, on_vehicle):
+    # Starts are uniform in 0 <= x <= 0.5, |y| <= 1, and M* runs along the axis up to x = 0.45.
+    left = {"left": on_vehicle[1]["left"]}
+    for eps in (0.05, 0.1):
+        records = episodes(vehicle, decisions(vehicle), left, (Noise("uniform", eps),), 2000)
+        assert {r["region"] for r in records} == {"near M*", "elsewhere"}
+        near = record(records, "left", "near M*")["episodes"] / 2000
+        assert near == pytest.approx(2 * eps, abs=0.03)
+
+
+def test_the_ideal_rule_reaches_the_set_point_from_all_winnable_starts(bulk):
+    for r in bulk:
+        if r["controller"] == "ideal" and r["region"] != "not winnable":
+            assert set(r["outcomes"]) == {"reached"}
+            assert r["interval"][1] == 1.0
+
+
+def test_adversarial_noise_is_worse_than_chance(bulk):
+    for region in ("near M*", "elsewhere"):
+        adversarial, uniform = (record(bulk, "sign", region, k) for k in ("adversarial", "uniform"))
+        assert adversarial["reached"] <= uniform["reached"]
+    near = record(bulk, "sign", "near M*", "adversarial")
+    assert near["interval"][1] < record(bulk, "sign", "near M*", "uniform")["interval"][0]
+
+
+def test_no_noise_is_worse_than_the_worst(bulk, on_vehicle):
+    # The share of starts in the band that the game calls lost bounds what episodes lose near M*.
+    won = on_vehicle[0].score("sign", 0.1).won
+    for kind in ("uniform", "alternating", "adversarial"):
+        mine = [record(bulk, "sign", region, kind) for region in ("near M*", "elsewhere")]
+        lost = sum(r["episodes"] - r["outcomes"]["reached"] for r in mine)
+        assert lost / sum(r["episodes"] for r in mine) <= 1 - won + 0.02
+
+
+def test_the_same_seed_gives_the_same_counts(vehicle, on_vehicle):
+    sign = {"sign": on_vehicle[1]["sign"]}
+
+    def counts(seed):
+        noises = (Noise("uniform", 0.2),)
+        return episodes(vehicle, decisions(vehicle), sign, noises, 300, seed=seed)
+
+    assert counts(3) == counts(3)
+    assert counts(3) != counts(4)
+
+
+def test_episodes_in_batches_are_as_many(vehicle, on_vehicle, monkeypatch):
+    monkeypatch.setattr(robustness, "BATCH", 100)
+    sign, noises = {"sign": on_vehicle[1]["sign"]}, (Noise("uniform", 0.1),)
+    records = episodes(vehicle, decisions(vehicle), sign, noises, 250)
+    assert sum(r["episodes"] for r in records) == 250
+    first = episodes(vehicle, decisions(vehicle), sign, noises, 100)
+    for region in ("near M*", "elsewhere"):
+        here, before = record(records, "sign", region), record(first, "sign", region)
+        assert 1.5 * before["episodes"] < here["episodes"] < 5 * before["episodes"]
+
+
+@pytest.mark.parametrize(
+    ("noise", "count", "message"),
+    [
+        (Noise("uniform", 0.1), 0, "0 episodes cannot be simulated"),
+        (Noise("uniform", 0.1), -5, "-5 episodes cannot be simulated"),
+        (Noise("uniform", 1.5), 10, "noise bound 1.5 hides the whole state space of vehicle"),
+    ],
+)
+def test_episodes_that_make_no_sense_are_refused(vehicle, on_vehicle, noise, count, message):
+    sign = {"sign": on_vehicle[1]["sign"]}
+    with pytest.raises(BadInput, match=message):
+        episodes(vehicle, decisions(vehicle), sign, (noise,), count)
+
+
+@pytest.mark.parametrize("kind", ["uniform", "alternating", "adversarial"])
+def test_noise_everywhere_acts_on_every_column(vehicle, kind):
+    # A line at which the way is decided that runs askew, so that both columns matter.
+    loop = PolicyController(sign_policy(vehicle, lambda x: x - 0.3))
+    z0 = vehicle.starts(300, np.random.default_rng(0))
+    for everywhere, columns in ((False, [False, True]), (True, [True, True])):
+        noise = Noise(kind, 0.1, everywhere)
+        rollout = closed_loop(vehicle, loop, z0, noise=noise, steps=1, record=True)
+        n = rollout.measured[0] - rollout.path[0]
+        assert np.abs(n).max() <= 0.1 + 1e-12
+        assert (np.abs(n).max(axis=0) > 0.05).tolist() == columns
+
+
+# ---- the whole examination
+
+
+@pytest.fixture(scope="module")
+def coarse():
+    """Lattices so coarse that an examination takes no time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lattice, "CELLS", {1: EXACT, 2: 120})
+        patch.setattr(robustness, "CURVE_CELLS", 60)
+        yield
+
+
+@pytest.fixture(scope="module", params=["vehicle", "unit_circle"])
+def examined(request, coarse, vehicle, circle, on_vehicle, on_circle):
+    task, (_, controllers) = {
+        "vehicle": (vehicle, on_vehicle),
+        "unit_circle": (circle, on_circle),
+    }[request.param]
+    named = {"policy": controllers["sign"], "hyrl": controllers[list(controllers)[-1]]}
+    content, maps = examine(task, decisions(task), halves(task), named, (0.05, 0.1))
+    return task, named, content, maps
+
+
+def test_an_examination_holds_what_the_game_says(coarse, examined):
+    task, named, content, maps = examined
+    game = Game(task, halves(task), named)
+    for name in (*named, LIMIT):
+        assert content["scores"][name] == [vars(game.score(name, eps)) for eps in (0.05, 0.1)]
+    for name in named:
+        assert content["margin"][name] == game.margin(name)
+        np.testing.assert_array_equal(maps[f"map_{name}"], game.map(name, 0.1))
+    assert tuple(maps["grid_counts"]) == game.lattice.grid.counts
+    assert maps["eps"] == 0.1
+
+
+def test_the_curve_starts_at_no_noise_and_only_falls_for_the_policy(examined):
+    _, _, content, _ = examined
+    curve = content["curve"]
+    assert curve["eps"][0] == 0
+    for name in ("policy", "hyrl", LIMIT):
+        assert len(curve[name]["won"]) == len(curve["eps"]) == len(curve["winnable"])
+        assert curve[name]["won"][0] == 1.0
+    assert curve["policy"]["won"][-1] < 0.95
+    assert curve[LIMIT]["won"] == [1.0] * len(curve["eps"])
+
+
+def test_the_profile_says_how_much_noise_each_point_of_the_critical_set_bears(examined):
+    task, _, content, _ = examined
+    profile, points = content["profile"], decisions(task).points
+    assert profile["points"] == points[task.may_start(points)].tolist()
+    for name in ("policy", "hyrl", LIMIT):
+        assert len(profile[name]) == len(profile["points"])
+    # The sign rule can be held on the very line by noise of one sample's way, and by no less.
+    assert set(profile["policy"]) <= {0.0375, 0.05}
+    assert min(profile["hyrl"]) >= 0.1
+    assert set(profile[LIMIT]) == {content["curve"]["eps"][-1]}
+
+
+def test_an_examination_survives_being_written(examined, tmp_path):
+    _, _, content, _ = examined
+    robustness.save(tmp_path / "robustness.json", content)
+    assert robustness.load(tmp_path / "robustness.json") == content
+
+
+# ---- files
+
+
+@pytest.mark.parametrize("share", [0, 0.3, 0.9])
+def test_a_truncated_file_is_refused(tmp_path, bulk, share):
+    path = tmp_path / "robustness.json"
+    robustness.save(path, {"episodes": bulk})
+    text = path.read_bytes()
+    path.write_bytes(text[: int(share * len(text))])
+    with pytest.raises(BadArtifact, match=r"robustness.json cannot be read"):
+        robustness.load(path)
+
+
+def test_a_missing_file_and_one_of_another_kind_are_refused(tmp_path):
+    path = tmp_path / "robustness.json"
+    with pytest.raises(BadArtifact, match="there is no file"):
+        robustness.load(path)
+    artifacts.write_json(path, {}, kind="settings")
+    with pytest.raises(BadArtifact, match="it holds 'settings', not 'robustness'"):
+        robustness.load(path)
