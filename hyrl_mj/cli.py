@@ -138,7 +138,7 @@ def robustness(
     run_dir: RunDir,
     eps: float | None = None,
     episodes: int | None = None,
-    noise: str = "uniform,alternating,adversarial",
+    noise: str | None = None,
     all_coordinates: bool = False,
     seed: int = 0,
 ) -> None:
@@ -151,18 +151,21 @@ def robustness(
         eps: bound of the noise in chart units; by default the run's.
         episodes: noisy episodes to simulate for each kind of noise and controller; by default none where
             the worst case can be played exactly, on charts of one or two dimensions.
-        noise: kinds of noise in the episodes, separated by commas: uniform, alternating, adversarial.
+        noise: kinds of noise in the episodes, separated by commas; by default
+            uniform,alternating,adversarial.
         all_coordinates: noise on every coordinate of the measurement, not only on those the task calls
             noisy.
         seed: of starts and noise of the episodes.
     """
     run = pipeline.load_run(run_dir)
-    kinds = [kind.strip() for kind in noise.split(",")]
+    kinds = [] if noise is None else [kind.strip() for kind in noise.split(",")]
     for kind in kinds:
         if kind not in KINDS:
             raise unknown("noise", kind, KINDS)
     if episodes is None:
         Lattice.check(run.task)
+        if kinds:
+            raise BadInput("--noise is that of the episodes: say how many, as in --episodes 100000")
     pipeline.examine_run(run, eps, kinds, episodes, all_coordinates, seed)
     print_robustness(pipeline.load_run(run_dir))
     print(f"pictures in {run.path / 'figures'}")

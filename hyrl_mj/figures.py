@@ -28,7 +28,7 @@ DPI = 200  # [pixels/inch]
 WIDTH, PAD = 7.8, 0.1  # [inches] of a picture, and of the margin around it
 COLUMNS = 2  # panels beside each other
 INK, PAPER, PALE = "#232830", "#ffffff", "#8b919b"
-# As MAP_CLASSES: told apart by colour-blind people, and by their lightness alone.
+# As MAP_CLASSES: told apart by colour-blind people, too.
 CLASS_COLOURS = ("#7cc0e8", "#f2c530", "#d55e00", "#5c2a6b", "#dcdee2")
 SENTENCES = dict(enumerate(MAP_CLASSES)) | {
     UNWINNABLE: "not winnable, whatever the controller",

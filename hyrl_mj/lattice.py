@@ -12,10 +12,9 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.mjcf import model_name
 from hyrl_mj.progress import Progress
 from hyrl_mj.sets import Grid
+from hyrl_mj.settings import LATTICE
 from hyrl_mj.tasks.base import Outcome, Task
 
-# Cells along the longest side of the chart, by its dimension.
-CELLS = {1: 12_000, 2: 480}
 # A sample that ends this close to a node, in cells, ends on it.
 ON_NODE = 1e-3
 
@@ -70,7 +69,7 @@ class Lattice:
     def check(task: Task) -> None:
         """Raise `BadInput` unless the worst case can be played on a lattice of this task's chart."""
         d = task.chart.dimension
-        if d not in CELLS:
+        if d not in LATTICE:
             raise BadInput(
                 f"the exact game takes a chart of 1 or 2 dimensions, that of {task.name} has {d}: "
                 "use noisy episodes instead (hyrl-mj robustness RUN --episodes N --noise adversarial)"
@@ -103,7 +102,7 @@ class Lattice:
             BadInput: the plant's state is more than the chart, or the chart has three dimensions.
         """
         Lattice.check(task)
-        grid = grid or Grid.with_cells(task.chart, CELLS[task.chart.dimension])
+        grid = grid or Grid.with_cells(task.chart, LATTICE[task.chart.dimension])
         nodes = grid.nodes
         plant = task.plant(len(nodes))
         plant.set_state(task.qpos(nodes))

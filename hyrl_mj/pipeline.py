@@ -271,7 +271,9 @@ def examine_run(
     winnable = None
     if exact:
         bounds = tuple(dict.fromkeys((0.0, eps / 2, eps)))
-        game, maps = examine(task, critical, run.partition, loops, bounds, everywhere)
+        game, maps = examine(
+            task, critical, run.partition, loops, bounds, everywhere, run.settings.lattice
+        )
         grid = Grid.from_counts(task.chart, maps["grid_counts"])
         winnable = grid, np.isin(maps["map_hyrl"], (WON, WON_FROM_SOME, BEATEN))
         content["game"] = game

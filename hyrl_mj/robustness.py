@@ -23,6 +23,7 @@ from hyrl_mj.noise import Noise, Recorded
 from hyrl_mj.partition import Partition
 from hyrl_mj.progress import Progress
 from hyrl_mj.sets import Grid
+from hyrl_mj.settings import LATTICE
 from hyrl_mj.simulation import Rollout, closed_loop
 from hyrl_mj.tasks.base import Outcome, Task
 
@@ -31,8 +32,6 @@ LIMIT = "limit"
 # Noise bounds of the curve, and the largest one that is looked at [chart units].
 CURVE = tuple(round(0.0125 * k, 4) for k in range(25))
 LARGEST = CURVE[-1]
-# Cells of the lattice in the plane on which the curve is played; the scores take a finer one.
-CURVE_CELLS = 240
 # Classes of the maps.
 WON, WON_FROM_SOME, BEATEN, UNWINNABLE, OVER = range(5)
 MAP_CLASSES = (
@@ -216,6 +215,7 @@ def examine(
     controllers: Mapping[str, Controller],
     bounds: tuple[float, ...],
     everywhere: bool = False,
+    cells: int | None = None,
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Play the game: scores at some noise bounds, margins, the curve over all bounds, and the maps.
 
@@ -226,6 +226,8 @@ def examine(
         controllers: by name.
         bounds: noise bounds of the scores; the maps are drawn for the last.
         everywhere: whether noise acts on all coordinates.
+        cells: of the lattice along the longest side of the chart, by default the finest. In the plane the
+            curve is played on one of half as many.
 
     Returns:
         What goes into `robustness.json`, and the arrays of the maps.
@@ -233,9 +235,12 @@ def examine(
     for eps in bounds:
         task.check_noise(eps, everywhere)
     names = [*controllers, LIMIT]
+    Lattice.check(task)
+    cells = cells or LATTICE[task.chart.dimension]
+    grids = Grid.with_cells(task.chart, cells), Grid.with_cells(task.chart, cells // 2)
     plane = task.chart.dimension == 2
     progress = Progress("worst-case game", len(bounds) + len(CURVE) + 2, "noise bounds")
-    fine = Game(task, partition, controllers, max(*bounds, LARGEST), everywhere)
+    fine = Game(task, partition, controllers, max(*bounds, LARGEST), everywhere, grids[0])
     scores: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
     for k, eps in enumerate(bounds):
         for name in names:
@@ -244,8 +249,9 @@ def examine(
     margins = {name: fine.margin(name) for name in controllers}
     progress.update(len(bounds) + 1)
     maps = {f"map_{name}": fine.map(name, bounds[-1]) for name in controllers}
-    grid = Grid.with_cells(task.chart, CURVE_CELLS) if plane else None
-    coarse = Game(task, partition, controllers, LARGEST, everywhere, grid) if plane else fine
+    coarse = fine
+    if plane:
+        coarse = Game(task, partition, controllers, LARGEST, everywhere, grids[1])
     along = critical.points[task.may_start(critical.points)]
     at = coarse.lattice.grid.nearest(along)
     curve: dict[str, Any] = {"eps": list(CURVE), "winnable": []}

@@ -68,6 +68,7 @@ class Settings:
         stage6: training of each mode's policy (stage 6).
         cells: grid cells along the longest side of the chart; cells are square in chart units.
         rods: grid points along the longest side from which the search for critical points starts.
+        lattice: cells along the longest side for the worst-case game.
         resolution: length of the last rods, as a share of the first.
     """
 
@@ -80,6 +81,7 @@ class Settings:
     stage6: Training
     cells: int
     rods: int
+    lattice: int
     resolution: float = 1 / 32
 
     def __post_init__(self) -> None:
@@ -209,6 +211,9 @@ _TRAINING: dict[str, dict[str, tuple[Training, Training]]] = {
 # Grid points along the longest side of the chart, by its dimension: search of M*, and sets.
 _RODS = {1: 120, 2: 120, 3: 24}
 _CELLS = {1: 2880, 2: 240, 3: 48}
+# Cells along the longest side of the lattice on which the worst-case game is played; a smoke run takes less.
+LATTICE = {1: 12_000, 2: 480}
+_LATTICE_SMOKE = {1: 1_200, 2: 120}
 
 
 def preset(
@@ -247,4 +252,5 @@ def preset(
         stage6=stage6,
         cells=_CELLS[min(dimension, 3)],
         rods=_RODS[min(dimension, 3)],
+        lattice=(_LATTICE_SMOKE if name == "smoke" else LATTICE).get(dimension, 0),
     )

@@ -128,6 +128,20 @@ def test_a_single_node_of_a_ring_is_seen(tmp_path):
     assert (found[:, 1] > 200).sum() > 20, "beside what is in the legend"
 
 
+def test_the_critical_set_lies_at_its_angle(tmp_path, coarse):
+    arrays, pictures = map_of(CIRCLE, ["hyrl"], lambda z: WON + 0 * z[:, 0]), []
+    for critical in (critical_of(), critical_of((0.75 * np.pi,))):
+        path = tmp_path / "map.png"
+        figures.robustness_map(CIRCLE, content_of(["hyrl"]), arrays, critical, path)
+        pictures.append(np.asarray(Image.open(path).convert("RGB"))[::-1].astype(int))
+    changed = np.argwhere(np.abs(pictures[1] - pictures[0]).max(axis=-1) > 100)[:, ::-1]
+    ring, changed = (
+        found[found[:, 1] > 100] for found in (where(path, figures.CLASS_COLOURS[WON]), changed)
+    )
+    x, y = np.median(changed, axis=0) - (ring.min(axis=0) + ring.max(axis=0)) / 2
+    assert np.arctan2(y, x) == pytest.approx(0.75 * np.pi, abs=0.05)
+
+
 def test_curves_and_a_third_controller(tmp_path, coarse):
     names, path = ("policy", "hyrl", "median filter"), tmp_path / "curve.png"
     figures.robustness_curve(VEHICLE, content_of(names), path)

@@ -135,12 +135,12 @@ def test_everything_is_winnable_on_the_circle(on_circle, eps):
 
 
 def test_the_planted_parts_are_those_of_stage_3(vehicle, on_vehicle):
-    partition = make_partition(vehicle, sign_policy(vehicle), decisions(vehicle), 120)
+    partition = make_partition(vehicle, sign_policy(vehicle), decisions(vehicle), 60)
     limit = Limit.of(on_vehicle.lattice, partition)
     for eps in (0.0, 0.1):
         bound = on_vehicle.bound(eps)
         off = limit.winnable(bound) != on_vehicle.winnable(eps)
-        assert off[on_vehicle.starts].mean() < 0.01
+        assert off[on_vehicle.starts].mean() < 0.02
 
 
 def test_a_single_part_leaves_nothing_to_decide(vehicle):
@@ -166,13 +166,12 @@ def test_without_noise_the_limit_wins_from_every_start_mode(game):
     assert game.score(LIMIT, 0.0).won_any == 1.0
 
 
-@pytest.mark.parametrize("eps", BOUNDS)
+@pytest.mark.parametrize("eps", [0.05, 0.1])
 def test_no_planted_controller_beats_the_limit(game, eps):
     limit = game.score(LIMIT, eps)
     for name in game.answers:
         score, value = game.score(name, eps), game.value(name, eps)[:, :-2]
         assert score.won_any <= limit.won_any
         assert (value[-1] < NEVER)[game.starts].mean() <= limit.winnable + 1e-12
-        if game.task.name == "unit_circle":
-            # Noise may make a controller arrive early, but never the latest start.
-            assert score.won < 1 or score.time >= limit.time
+        # Noise may bring a run early, but not the latest of all.
+        assert score.won < 1 or score.time >= limit.time
