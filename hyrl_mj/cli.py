@@ -121,12 +121,14 @@ def simulate_run(
     game = None
     if noise == "worst":
         game = Game(run.task, run.partition, loops, max(bound, LARGEST))
+    arcs = {}
     for name, loop in loops.items():
         mode = q0 if name == "hyrl" else None
         signal: AnyNoise = (
             worst_signal(game, name, loop, z0[None], bound, mode) if game else Noise(noise, bound)
         )
-        arc = simulate(run.task, loop, z0, signal, mode, horizon, seed)
+        arcs[name] = simulate(run.task, loop, z0, signal, mode, horizon, seed, name=name)
+    for name, arc in arcs.items():
         assert isinstance(arc, HybridArc)
         arc.save(run.path / "arcs" / f"latest_{name}.npz")
         end = run.task.chart.format(arc.z[-1])

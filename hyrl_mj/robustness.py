@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest
 
 from hyrl_mj import artifacts
 from hyrl_mj.controllers import Controller
@@ -377,6 +376,8 @@ def _regions(
 
 
 def _record(noise: Noise, name: str, region: str, counts: np.ndarray) -> dict[str, Any]:
+    from scipy.stats import binomtest  # slow to import, and seldom needed
+
     reached, total = int(counts[Outcome.REACHED]), int(counts.sum())
     interval = binomtest(reached, total).proportion_ci(0.95, method="wilson")
     return {

@@ -56,7 +56,8 @@ def test_run_ends_with_a_table_and_leaves_every_artifact(finished):
         assert words in said
     names = ["config.json", "policy.safetensors", "policy.json", "critical_set.npz"]
     names += ["partition.npz", "extended_sets.npz", "mode_0.safetensors", "mode_1.safetensors"]
-    names += ["arcs/start0_policy.npz", "arcs/critical_hyrl_q1.npz"]
+    names += ["arcs/start0_policy.npz", "arcs/critical_hyrl_q1.npz", "robustness.json"]
+    names += ["figures/robustness_map.png", "figures/robustness_curve.png"]
     assert [n for n in names if not (path / n).is_file()] == []
     assert not list(path.rglob("*.partial*"))
 
@@ -113,7 +114,7 @@ def test_a_run_without_a_critical_set_has_one_mode_and_leaves_nothing_of_two(cop
     left = {p.name for p in [*copied.glob("mode_*"), *(copied / "arcs").iterdir()]}
     assert not {n for n in left if "critical" in n or "1." in n.replace("start1", "")}
     assert (
-        call("run", "unit_circle", "--preset", "smoke", "--out", copied).stdout.count("done") == 7
+        call("run", "unit_circle", "--preset", "smoke", "--out", copied).stdout.count("done") == 8
     )
 
 
@@ -122,6 +123,37 @@ def test_simulate_prints_both_ends(finished):
     assert done.returncode == 0, done.stderr
     assert "policy " in done.stdout
     assert "hyrl " in done.stdout
+
+
+def test_robustness_prints_the_worst_case_and_the_episodes(copied):
+    done = call("robustness", copied, "--episodes", "300", "--noise", "uniform,adversarial")
+    assert done.returncode == 0, done.stderr
+    for words in ("exact game", "limit", "HyRL: ", "uniform 0.1", "adversarial 0.1"):
+        assert words in done.stdout
+    content = hyrl_mj.load_run(copied).robustness
+    assert [score["eps"] for score in content["game"]["scores"]["hyrl"]] == [0.0, 0.05, 0.1]
+    kinds = {(r["noise"], r["controller"]) for r in content["episodes"]}
+    assert kinds == {(n, c) for n in ("uniform", "adversarial") for c in ("policy", "hyrl")}
+
+
+def test_an_interrupted_robustness_run_leaves_the_last_one(copied, monkeypatch):
+    before = contents(copied)
+
+    def interrupted(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pipeline, "episodes", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.examine_run(hyrl_mj.load_run(copied), eps=0.2, count=10)
+    assert contents(copied) == before
+
+
+def test_simulate_finds_the_worst_noise(copied):
+    done = call("simulate", copied, "--start", "3.1416", "--noise", "worst", "--eps", "0.1")
+    assert done.returncode == 0, done.stderr
+    arc = hyrl_mj.HybridArc.load(copied / "arcs" / "latest_policy.npz")
+    assert (arc.noise, arc.outcome) == ("worst", "stalled")
+    assert abs(arc.measured[:-1] - arc.z[:-1]).max() <= 0.1 + 1e-9
 
 
 def test_list_and_help():
@@ -141,6 +173,7 @@ def test_list_and_help():
         (["run", "vehicle", "--noise", "nan"], ["nan", ">= 0"]),
         (["run", "vehicle", "--noise", "much"], ["--noise", "'much'"]),
         (["run", "vehicle", "--horizon", "0"], ["horizon 0", "> 0"]),
+        (["run", "vehicle", "--noise", "1.5"], ["1.5 hides the whole state space", "below 1.5 m"]),
         (["run", "vehicle", "--seed", "-1"], ["seed -1", "from 0 to"]),
         (["run", "vehicle", "--seed", "5000000000"], ["seed 5000000000", "from 0 to"]),
         (["traim"], ["traim", "critical-set"]),
@@ -163,6 +196,13 @@ def test_bad_input_before_anything_is_made(arguments, parts, tmp_path, monkeypat
         (["simulate", "--start", "1", "--eps", "-1"], ["-1", ">= 0"]),
         (["simulate", "--start", "1", "--horizon", "0"], ["horizon 0", "> 0"]),
         (["simulate", "--q0", "1"], ["--start"]),
+        (["simulate", "--start", "1", "--eps", "4"], ["4 hides the whole", "below 3.14 rad"]),
+        (["simulate", "--start", "1", "--eps", "4", "--noise", "worst"], ["4 hides the whole"]),
+        (["robustness", "--eps", "4"], ["4 hides the whole", "below 3.14 rad"]),
+        (["robustness", "--eps", "nan"], ["nan", "finite"]),
+        (["robustness", "--episodes", "0"], ["0 episodes", "at least 1"]),
+        (["robustness", "--episodes", "9", "--noise", "white"], ["'white'", "adversarial"]),
+        (["robustness", "--noise", "uniform"], ["--episodes"]),
         (["extended-sets", "--horizon", "0"], ["horizon 0", "> 0"]),
         pytest.param(["replay", "--camera", "top"], ["'top'", "overhead, chase"], marks=needs_gl),
         (["replay", "--out", "film.gif"], ["film.gif", ".mp4"]),

@@ -145,3 +145,55 @@ def test_a_single_mode_keeps_everything(vehicle):
 def test_the_distance_to_the_critical_set_goes_the_short_way(circle, on_circle):
     distance = distance_to(circle, on_circle.critical, np.array([[0.0], [PI + 1], [7 * PI - 1]]))
     np.testing.assert_allclose(distance, [PI, 1.0, 1.0], atol=2e-3)
+
+
+# ---- sized to the noise
+
+
+@pytest.fixture(scope="module")
+def sized(on_vehicle):
+    return {noise: on_vehicle.extend(None, noise) for noise in (0.0, 0.1, 0.2)}
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1, 0.2])
+@pytest.mark.parametrize("x", [0.0, 0.1, 0.2, 0.3])
+def test_the_overlap_is_twice_the_noise_and_a_sample_where_there_is_room(
+    sized, on_vehicle, noise, x
+):
+    cell = on_vehicle.partition.grid.cell
+    ideal = max(noise, min(2 * noise + 0.05, LAST_CHANCE - x - noise))
+    assert overlap(sized[noise], x) == pytest.approx(ideal, abs=cell)
+
+
+def test_the_horizon_is_as_long_as_it_takes(sized, on_circle):
+    assert sized[0.1].horizon == pytest.approx(0.25)
+    assert on_circle.extend(None, 0.1).horizon == pytest.approx(0.25)
+    assert on_circle.extend(None, 0.2).horizon == pytest.approx(0.45)
+
+
+def test_where_the_overlap_cannot_be_wide_enough_the_run_says_so(sized, vehicle):
+    narrow, room = sized[0.1].narrow, sized[0.1].room
+    cell = sized[0.1].sets[0].grid.cell
+    # From the axis there is room for 2 eps up to here, and none from the last chance on.
+    assert narrow[:, 0].min() == pytest.approx(LAST_CHANCE - 0.2, abs=3 * cell)
+    assert narrow[:, 0].max() == pytest.approx(LAST_CHANCE, abs=2 * cell)
+    np.testing.assert_allclose(room, LAST_CHANCE - narrow[:, 0], atol=2 * cell)
+    sentence = sized[0.1].sentence(vehicle)
+    assert "no overlap can be wide enough for noise 0.1 at x 0." in sentence
+    assert "no overlap" not in sized[0.0].sentence(vehicle)
+
+
+def test_the_sets_on_the_circle_have_room_everywhere(on_circle, circle):
+    sets = on_circle.extend(None, 0.1)
+    assert not len(sets.narrow)
+    theta = np.linspace(0.5, 2 * PI - 0.5, 20_000)
+    reach = theta[sets.sets[0].contains(theta[:, None])].max()
+    assert reach == pytest.approx(PI + 0.25, abs=2 * sets.sets[0].grid.cell)
+
+
+def test_sized_sets_survive_being_written(sized, vehicle, tmp_path):
+    sized[0.1].save(tmp_path / "sets.npz")
+    back = type(sized[0.1]).load(tmp_path / "sets.npz", vehicle)
+    np.testing.assert_array_equal(back.narrow, sized[0.1].narrow)
+    np.testing.assert_array_equal(back.room, sized[0.1].room)
+    assert back.horizon == sized[0.1].horizon

@@ -401,6 +401,24 @@ def test_runs_are_not_held_where_they_never_come(circle):
     assert miss[lasting(moves, miss < 3)].max() < 0.2
 
 
+def test_runs_are_held_where_they_come_in_the_end(circle):
+    lattice = Lattice.of(circle, Grid.with_cells(circle.chart, EXACT))
+    loop, bound = PolicyController(homing_policy(circle)), np.array([0.1])
+    moves = noisy_moves(Answers.of(lattice, loop, bound), bound)
+    miss = circle.miss(lattice.grid.nodes)
+    from_afar = lasting(moves, (miss > 1) & (miss < 3))
+    np.testing.assert_array_equal(from_afar, lasting(moves, miss < 1))
+    assert from_afar.any()
+
+
+def test_a_run_that_swings_for_ever_is_held_at_both_ends(circle):
+    lattice = Lattice.of(circle, Grid.with_cells(circle.chart, EXACT))
+    loop, bound = PolicyController(circle_policy(circle)), np.zeros(1)
+    moves = noisy_moves(Answers.of(lattice, loop, bound), bound)
+    start = np.arange(EXACT) == 3  # 0.025 rad: one sample from there to the other side, and back
+    assert np.flatnonzero(lasting(moves, start)).tolist() == [3, EXACT - 3]
+
+
 # ---- unit circle: the same in MuJoCo
 
 

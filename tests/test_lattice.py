@@ -11,7 +11,7 @@ import hyrl_mj
 from hyrl_mj.errors import BadInput
 from hyrl_mj.lattice import Lattice
 from hyrl_mj.sets import Grid
-from hyrl_mj.tasks import Outcome
+from hyrl_mj.tasks import Chart, Outcome
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +82,15 @@ def test_between_nodes_a_sample_leads_to_those_around_its_end(lattices):
     np.testing.assert_allclose(np.abs(offset[half, :, 1]), 0.025, atol=1e-6)
     np.testing.assert_allclose(offset[half].sum(axis=1), 0, atol=1e-6)
     assert half.any()
+
+
+def test_leaving_the_chart_is_a_failure(vehicle):
+    alley = hyrl_mj.get_task("vehicle")
+    alley.chart = Chart(("x", "y"), ("m", "m"), (0.0, -1.0), (3.0, 1.0), (False, False))
+    lattice = Lattice.of(alley, Grid.with_cells(alley.chart, 60))
+    left, straight = (lattice.after[k, 0, lattice.grid.nearest([[0.5, 1.0]])[0]] for k in (-1, 2))
+    assert left == lattice.nodes + 1
+    np.testing.assert_allclose(lattice.grid.nodes[straight], [0.55, 1.0])
 
 
 # ---- unit circle: between nodes, all the way round

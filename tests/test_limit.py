@@ -166,6 +166,20 @@ def test_without_noise_the_limit_wins_from_every_start_mode(game):
     assert game.score(LIMIT, 0.0).won_any == 1.0
 
 
+@pytest.mark.parametrize("eps", [0.05, 0.1, 0.2])
+def test_with_room_for_the_noise_the_limit_holds_the_way_that_it_has_picked(on_circle, eps):
+    moves, places = on_circle.moves(LIMIT, eps), on_circle.lattice.places
+    going = np.append(~on_circle.lattice.arrived, [False, False])
+    origin = np.repeat(moves.state, moves.counts)
+    came = np.zeros(moves.rows * places, dtype=bool)
+    came[-places:] = going  # not started yet
+    for _ in range(80):
+        came[moves.target[came[origin] & going[origin % places]]] = True
+    jumps = (origin // places != moves.target // places) & (origin < (moves.rows - 1) * places)
+    assert jumps.any()
+    assert not (jumps & came[origin] & going[origin % places]).any()
+
+
 @pytest.mark.parametrize("eps", [0.05, 0.1])
 def test_no_planted_controller_beats_the_limit(game, eps):
     limit = game.score(LIMIT, eps)

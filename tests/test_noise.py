@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from planted import sign_policy
 
-from hyrl_mj import BadInput, Noise
+from hyrl_mj import BadInput, Noise, Outcome, Recorded
+from hyrl_mj.simulation import PolicyController, closed_loop
 
 
 def signal(noise, seed=0, n=1000, columns=2):
@@ -66,3 +68,54 @@ def test_an_unknown_kind_lists_the_known():
 def test_a_misspelt_kind_gets_a_hint():
     with pytest.raises(BadInput, match=r"Did you mean 'alternating'\?"):
         Noise("alternate", 0.1)
+
+
+# ---- signals that are given, and noise that looks at the loop
+
+
+def test_a_recorded_signal_is_repeated_and_then_over():
+    values = np.arange(12.0).reshape(3, 2, 2)
+    signal, rng = Recorded(values), np.random.default_rng(0)
+    for k in range(3):
+        np.testing.assert_array_equal(signal.sample(np.full(2, k), 2, rng), values[k])
+    np.testing.assert_array_equal(signal.sample(np.full(2, 3), 2, rng), np.zeros((2, 2)))
+    assert signal.bound == 11.0
+
+
+def test_a_recorded_signal_of_other_runs_is_refused():
+    with pytest.raises(BadInput, match="does not fit 3 simulations"):
+        Recorded(np.zeros((3, 2, 2))).sample(np.zeros(3, dtype=int), 2, np.random.default_rng(0))
+
+
+def test_adversarial_noise_is_no_signal_of_its_own():
+    with pytest.raises(BadInput, match="adversarial noise needs a controller"):
+        Noise("adversarial", 0.1).sample(np.zeros(1, dtype=int), 1, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("bound", [1.5, 100.0])
+def test_noise_that_hides_the_whole_chart_is_refused(vehicle, bound):
+    with pytest.raises(BadInput, match=r"hides the whole state space of vehicle: .* below 1\.5 m"):
+        vehicle.check_noise(bound)
+    assert vehicle.check_noise(1.4) == 1.4
+
+
+def test_adversarial_noise_leads_to_the_greater_danger(vehicle):
+    """Just off the axis the sign rule would steer away; noise towards the axis keeps it there."""
+    policy, z0 = sign_policy(vehicle), np.array([[0.0, 0.02], [0.0, -0.02], [0.0, 0.9]])
+    loop = PolicyController(policy)
+    rollout = closed_loop(vehicle, loop, z0, noise=Noise("adversarial", 0.1))
+    assert [Outcome(o).label for o in rollout.outcome] == ["crashed", "crashed", "reached"]
+    quiet = closed_loop(vehicle, loop, z0)
+    assert (quiet.outcome == Outcome.REACHED).all()
+
+
+def test_adversarial_noise_keeps_to_its_bound_and_columns(vehicle):
+    z0 = np.random.default_rng(0).uniform([0, -1], [0.5, 1], (50, 2))
+    # A side that depends on both coordinates.
+    loop = PolicyController(sign_policy(vehicle, line=lambda x: x - 0.25))
+    for everywhere in (False, True):
+        noise = Noise("adversarial", 0.1, everywhere)
+        rollout = closed_loop(vehicle, loop, z0, noise=noise, steps=5, record=True)
+        added = rollout.measured - rollout.path[:-1]
+        assert np.abs(added).max() == pytest.approx(0.1)
+        assert (np.abs(added[..., 0]).max() > 0) == everywhere

@@ -19,7 +19,6 @@ from hyrl_mj import (
     Noise,
     artifacts,
     closed_loop,
-    lattice,
     robustness,
     simulate,
 )
@@ -300,15 +299,18 @@ def test_the_same_seed_gives_the_same_counts(vehicle, on_vehicle):
     assert counts(3) != counts(4)
 
 
-def test_episodes_in_batches_are_as_many(vehicle, on_vehicle, monkeypatch):
+def test_batches_add_up_and_none_is_the_same(vehicle, on_vehicle, monkeypatch):
     monkeypatch.setattr(robustness, "BATCH", 100)
     sign, noises = {"sign": on_vehicle[1]["sign"]}, (Noise("uniform", 0.1),)
-    records = episodes(vehicle, decisions(vehicle), sign, noises, 250)
-    assert sum(r["episodes"] for r in records) == 250
-    first = episodes(vehicle, decisions(vehicle), sign, noises, 100)
-    for region in ("near M*", "elsewhere"):
-        here, before = record(records, "sign", region), record(first, "sign", region)
-        assert 1.5 * before["episodes"] < here["episodes"] < 5 * before["episodes"]
+
+    def near(count):
+        records = episodes(vehicle, decisions(vehicle), sign, noises, count)
+        assert sum(r["episodes"] for r in records) == count
+        return record(records, "sign", "near M*")["episodes"]
+
+    one, two, more = (near(count) for count in (100, 200, 250))
+    assert one < two < more
+    assert two != 2 * one
 
 
 @pytest.mark.parametrize(
@@ -341,36 +343,33 @@ def test_noise_everywhere_acts_on_every_column(vehicle, kind):
 # ---- the whole examination
 
 
-@pytest.fixture(scope="module")
-def coarse():
-    """Lattices so coarse that an examination takes no time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lattice, "CELLS", {1: EXACT, 2: 120})
-        patch.setattr(robustness, "CURVE_CELLS", 60)
-        yield
+CELLS = {"vehicle": 120, "unit_circle": EXACT}
 
 
-@pytest.fixture(scope="module", params=["vehicle", "unit_circle"])
-def examined(request, coarse, vehicle, circle, on_vehicle, on_circle):
+@pytest.fixture(scope="module", params=CELLS)
+def examined(request, vehicle, circle, on_vehicle, on_circle):
     task, (_, controllers) = {
         "vehicle": (vehicle, on_vehicle),
         "unit_circle": (circle, on_circle),
     }[request.param]
     named = {"policy": controllers["sign"], "hyrl": controllers[list(controllers)[-1]]}
-    content, maps = examine(task, decisions(task), halves(task), named, (0.05, 0.1))
+    cells = CELLS[request.param]
+    content, maps = examine(task, decisions(task), halves(task), named, (0.05, 0.1), cells=cells)
     return task, named, content, maps
 
 
-def test_an_examination_holds_what_the_game_says(coarse, examined):
+def test_an_examination_holds_what_the_game_says(examined):
     task, named, content, maps = examined
-    game = Game(task, halves(task), named)
+    grid = Grid.with_cells(task.chart, CELLS[task.name])
+    game = Game(task, halves(task), named, grid=grid)
     for name in (*named, LIMIT):
         assert content["scores"][name] == [vars(game.score(name, eps)) for eps in (0.05, 0.1)]
     for name in named:
         assert content["margin"][name] == game.margin(name)
         np.testing.assert_array_equal(maps[f"map_{name}"], game.map(name, 0.1))
-    assert tuple(maps["grid_counts"]) == game.lattice.grid.counts
+    assert tuple(maps["grid_counts"]) == grid.counts
     assert maps["eps"] == 0.1
+    assert content["lattice"]["spacing"] == grid.spacing.tolist()
 
 
 def test_the_curve_starts_at_no_noise_and_only_falls_for_the_policy(examined):

@@ -234,3 +234,33 @@ def test_distances_that_are_no_numbers_are_refused(circle):
     grid = Grid.with_cells(circle.chart, 20)
     with pytest.raises(BadInput, match="finite"):
         GridSet(grid, np.full(20, np.nan))
+
+
+# ---- boxes, for noise
+
+
+def test_a_box_dilates_along_its_sides_only():
+    grid = Grid.with_cells(PLANE, 120)
+    square = GridSet.from_mask(grid, (np.abs(grid.nodes) <= 0.25 + 1e-9).all(axis=1))
+    wide = square.dilated_by_box(np.array([0.0, 0.2]))
+    inside = (np.abs(grid.nodes[:, 0]) <= 0.25 + 1e-9) & (np.abs(grid.nodes[:, 1]) <= 0.45 + 1e-9)
+    np.testing.assert_array_equal(wide.mask, inside)
+    np.testing.assert_array_equal(wide.eroded_by_box(np.array([0.0, 0.2])).mask, square.mask)
+    assert square.dilated_by_box(np.zeros(2)) is square
+
+
+def test_a_box_goes_round_a_periodic_coordinate():
+    grid = Grid.with_cells(RING, 360)
+    half = np.array([0.3])
+    arc_set = GridSet.from_mask(grid, arc(grid.nodes) <= 0)
+    theta = RING.difference(grid.nodes, np.array([0.2]))[:, 0]
+    np.testing.assert_array_equal(
+        arc_set.dilated_by_box(half).mask, np.abs(theta) <= 0.8 + 0.3 - grid.cell / 8
+    )
+
+
+def test_what_lies_off_the_chart_does_not_erode():
+    grid = Grid.with_cells(LINE, 100)
+    whole = GridSet.from_mask(grid, grid.nodes[:, 0] >= 0)
+    eroded = whole.eroded_by_box(np.array([0.2]))
+    np.testing.assert_array_equal(eroded.mask, grid.nodes[:, 0] >= 0.2 - 1e-9)
