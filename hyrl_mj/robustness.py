@@ -13,12 +13,12 @@ import numpy as np
 from hyrl_mj import artifacts
 from hyrl_mj.controllers import Controller
 from hyrl_mj.critical_set import CriticalSet
-from hyrl_mj.errors import BadInput
+from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.extended_sets import distance_to
 from hyrl_mj.game import NEVER, Answers, Moves, WorstNoise, lasting, noisy_moves, solve
 from hyrl_mj.lattice import Lattice
 from hyrl_mj.limit import Limit
-from hyrl_mj.noise import Noise, Recorded
+from hyrl_mj.noise import Noise, Recorded, check_seed
 from hyrl_mj.partition import Partition
 from hyrl_mj.progress import Progress
 from hyrl_mj.sets import Grid
@@ -112,6 +112,9 @@ class Game:
 
     def moves(self, name: str, eps: float) -> Moves:
         """The adversary's moves against a controller, or against the limit."""
+        if name not in (*self.answers, LIMIT):
+            raise unknown("controller", name, (*self.answers, LIMIT))
+        self.task.check_noise(eps, self.everywhere)
         if eps > self.largest + 1e-9:
             raise BadInput(
                 f"noise {eps:g} is beyond the largest that was prepared, {self.largest:g}"
@@ -196,6 +199,8 @@ def worst_signal(
     noise = game.worst_noise(name, eps)
     modes = None if q0 is None else np.full(len(z0), q0)
     rollout = closed_loop(game.task, controller, z0, noise=noise, q0=modes, record=True)
+    if not len(rollout.measured):  # all runs are over where they start
+        return Recorded(np.zeros((1, len(z0), game.task.measurement_columns)), kind="worst")
     true = _true_measurements(game.task, rollout)
     values = np.where(np.isnan(rollout.u).any(axis=-1)[..., None], 0.0, rollout.measured - true)
     return Recorded(values, kind="worst")
@@ -329,6 +334,7 @@ def episodes(
     Raises:
         BadInput: no episodes, or a noise bound that hides the state space.
     """
+    check_seed(seed)
     if count < 1:
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
     for noise in noises:

@@ -231,7 +231,9 @@ def within_reach(mask: np.ndarray, window: np.ndarray, periodic: tuple[bool, ...
     found = mask.astype(np.uint8)
     for axis, (w, wraps) in enumerate(zip(window, periodic, strict=True)):
         if w:
-            size, mode = min(2 * w + 1, mask.shape[axis]), "wrap" if wraps else "constant"
+            n = mask.shape[axis]
+            size = min(2 * w + 1, n) if wraps else 2 * min(int(w), n - 1) + 1
+            mode = "wrap" if wraps else "constant"
             found = ndimage.maximum_filter1d(found, size, axis, mode=mode)
     return found.astype(bool)
 

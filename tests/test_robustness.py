@@ -421,3 +421,12 @@ def test_a_missing_file_and_one_of_another_kind_are_refused(tmp_path):
     artifacts.write_json(path, {}, kind="settings")
     with pytest.raises(BadArtifact, match="it holds 'settings', not 'robustness'"):
         robustness.load(path)
+
+
+def test_a_game_refuses_what_it_does_not_know(on_vehicle):
+    game = next(part for part in on_vehicle if isinstance(part, Game))
+    with pytest.raises(BadInput, match="unknown controller 'mine'"):
+        game.score("mine", 0.1)
+    for eps in (-0.1, float("nan")):
+        with pytest.raises(BadInput, match="finite number >= 0"):
+            game.score("limit", eps)

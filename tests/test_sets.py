@@ -259,6 +259,13 @@ def test_a_box_goes_round_a_periodic_coordinate():
     )
 
 
+def test_a_box_may_be_wider_than_half_the_chart():
+    grid = Grid.with_cells(LINE, 10)
+    corner = GridSet.from_mask(grid, grid.nodes[:, 0] <= -1 + 1e-9)
+    wide = corner.dilated_by_box(np.array([1.6]))
+    np.testing.assert_array_equal(wide.mask, grid.nodes[:, 0] <= 0.6 + 1e-9)
+
+
 def test_what_lies_off_the_chart_does_not_erode():
     grid = Grid.with_cells(LINE, 100)
     whole = GridSet.from_mask(grid, grid.nodes[:, 0] >= 0)
