@@ -238,7 +238,9 @@ def test_a_partition_comes_back(tmp_path, vehicle, grid_set):
 
 
 def test_extended_sets_come_back(tmp_path, vehicle, grid_set):
-    sets = ExtendedSets((0, 1), (grid_set, ~grid_set), (grid_set.mask, ~grid_set.mask), 0.3, 0.1)
+    masks = grid_set.mask, ~grid_set.mask
+    narrow, room = np.array([[0.3, 0.0]]), np.array([0.1])
+    sets = ExtendedSets((0, 1), (grid_set, ~grid_set), masks, 0.3, 0.1, narrow, room)
     sets.save(tmp_path / "e.npz")
     back = ExtendedSets.load(tmp_path / "e.npz", vehicle)
     assert (back.modes, back.horizon, back.noise) == ((0, 1), 0.3, 0.1)
@@ -252,7 +254,8 @@ def test_sets_of_another_task_are_refused(tmp_path, circle, grid_set):
     Partition((0,), (grid_set,), grid_set.mask).save(tmp_path / "p.npz")
     with pytest.raises(BadArtifact, match=r"p\.npz"):
         Partition.load(tmp_path / "p.npz", circle)
-    ExtendedSets((0,), (grid_set,), (grid_set.mask,), 0.3, 0.1).save(tmp_path / "e.npz")
+    nowhere = np.empty((0, 2)), np.empty(0)
+    ExtendedSets((0,), (grid_set,), (grid_set.mask,), 0.3, 0.1, *nowhere).save(tmp_path / "e.npz")
     with pytest.raises(BadArtifact, match=r"e\.npz"):
         ExtendedSets.load(tmp_path / "e.npz", circle)
 
