@@ -75,10 +75,10 @@ def train(
     model = build(task, settings, seed, noise=noise, domain=domain, start_from=start_from)
     if log_dir is not None:
         model.set_logger(configure(str(log_dir / "tensorboard"), ["tensorboard"]))
-    watch = _Watch(
-        settings, judge or _Episodes(task, noise or Noise(), domain, settings.gamma), log_dir, label
-    )
-    watch.from_the_start = judge is not None
+    # An untrained policy can be lucky in a few episodes; a judge's verdict stands at any time.
+    settled = settings.samples // 2 if judge is None else 0
+    judge = judge or _Episodes(task, noise or Noise(), domain, settings.gamma)
+    watch = _Watch(settings.samples, judge, settled, log_dir, label)
     with single_threaded():
         model.learn(settings.samples, callback=watch, log_interval=LOG_INTERVAL[settings.algorithm])
     watch.close()
@@ -204,14 +204,13 @@ class _Episodes:
 class _Watch(BaseCallback):
     """Progress bar, checkpoints at intervals, and the best policy."""
 
-    def __init__(self, settings: Training, judge: Judge, log_dir: Path | None, label: str):
+    def __init__(self, samples: int, judge: Judge, settled: int, log_dir: Path | None, label: str):
         super().__init__()
         self.best: MlpPolicy | None = None
         self.best_score: Score = (-np.inf,)
-        self.from_the_start = False
-        self._samples, self._judge, self._log_dir = settings.samples, judge, log_dir
-        self._next = self._interval = max(settings.samples // CHECKPOINTS, 1)
-        self._progress = Progress(label, settings.samples, "samples")
+        self._judge, self._settled, self._log_dir = judge, settled, log_dir
+        self._next = self._interval = max(samples // CHECKPOINTS, 1)
+        self._progress = Progress(label, samples, "samples")
 
     def _on_step(self) -> bool:
         self._progress.update(self.num_timesteps)
@@ -232,8 +231,7 @@ class _Watch(BaseCallback):
         policy = export(self.model, self.training_env.core.task)
         if self._log_dir is not None:
             policy.save(self._log_dir / "checkpoint.safetensors")
-        # An untrained policy can be lucky in a few episodes.
-        if self.from_the_start or self.num_timesteps >= self._samples // 2:
+        if self.num_timesteps >= self._settled:
             score = self._judge(policy)
             for i, value in enumerate(score):
                 self.logger.record(f"eval/score_{i}", value)
