@@ -10,7 +10,7 @@ import numpy as np
 from hyrl_mj.controllers import Controller
 from hyrl_mj.noise import Noise
 from hyrl_mj.plant import Plant
-from hyrl_mj.tasks.base import Outcome, Task
+from hyrl_mj.tasks.base import Task
 
 # Modes of runs that have not started yet: their controller picks one from the first measurement.
 NOT_STARTED = -1
@@ -66,9 +66,8 @@ class Lookahead:
             u, _ = self.controller.step(mode, measured)
             ahead.set_state(qpos, qvel)
             ahead.step(u)
-            ending = self.task.ending(ahead.measurement)
-            failed = (ending != Outcome.RUNNING) & (ending != Outcome.REACHED)
-            danger = np.where(failed, np.inf, self.task.danger(ahead.measurement))
+            after = ahead.measurement
+            danger = np.where(self.task.failed(after), np.inf, self.task.danger(after))
             better = danger > worst
             worst, chosen[better] = np.where(better, danger, worst), candidate
         return chosen

@@ -8,6 +8,7 @@ latest, or that it never arrives.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -104,25 +105,34 @@ class Moves:
     counts: np.ndarray
     target: np.ndarray
 
+    @staticmethod
+    def gather(
+        lattice: Lattice, rows: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]
+    ) -> Moves:
+        """From each row's nodes (m,) ascending, next modes (m,) and places (m, C) that they lead to."""
+        state, counts, target = [], [], []
+        for row, (node, mode, ends) in enumerate(rows):
+            target.append((ends + (mode * lattice.places)[:, None]).ravel())
+            found = np.bincount(node, minlength=lattice.nodes) * ends.shape[1]
+            state.append(np.flatnonzero(found) + row * lattice.places)
+            counts.append(found[found > 0])
+        return Moves(lattice, len(state), *map(np.concatenate, (state, counts, target)))
+
 
 def noisy_moves(answers: Answers, bound: np.ndarray) -> Moves:
     """The moves that noise within bounds (d,) gives the adversary against a controller."""
     lattice, modes = answers.lattice, len(answers.modes)
     window, periodic = nodes_within(lattice, bound), lattice.grid.chart.periodic
-    state, counts, target = [], [], []
-    for row, letters in enumerate(answers.letter):
+    rows = []
+    for letters in answers.letter:
         used = np.unique(letters)
         possible = [within_reach(letters == x, window, periodic)[answers.middle] for x in used]
         node, which = np.nonzero(
             np.stack(possible, axis=-1).reshape(lattice.nodes, -1) & lattice.running[:, None]
         )
         level, mode = np.divmod(used[which], modes)
-        ends = lattice.after[level, :, node]  # (moves, corners)
-        target.append((ends + (mode * lattice.places)[:, None]).ravel())
-        found = np.bincount(node, minlength=lattice.nodes) * ends.shape[1]
-        state.append(np.flatnonzero(found) + row * lattice.places)
-        counts.append(found[found > 0])
-    return Moves(lattice, modes + 1, *map(np.concatenate, (state, counts, target)))
+        rows.append((node, mode, lattice.after[level, :, node]))
+    return Moves.gather(lattice, rows)
 
 
 def solve(moves: Moves) -> np.ndarray:

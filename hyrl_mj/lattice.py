@@ -162,8 +162,7 @@ class Lattice:
 
 def _over(task: Task, measurement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Which states (n, p) end an episode: (n,) bool without success, (n,) bool with it."""
-    ending = task.ending(measurement)
-    return (ending != Outcome.RUNNING) & (ending != Outcome.REACHED), ending == Outcome.REACHED
+    return task.failed(measurement), task.ending(measurement) == Outcome.REACHED
 
 
 def _ended(task: Task, measurement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

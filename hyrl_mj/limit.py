@@ -88,16 +88,12 @@ class Limit:
             roomy = ~self._reach(self.samples[i] >= NEVER, bound)
             flows = self._reach(part, 2 * bound + noisy) & roomy | self._reach(part, bound)
             goes.append(np.where(flows, i, side))
-        state, counts, target = [], [], []
-        for row, goal in enumerate([*goes, side]):
+        rows = []
+        for goal in (*goes, side):
             possible = np.stack([self._reach(goal == i, bound) for i in range(modes)], axis=-1)
             node, mode = np.nonzero(possible & lattice.running[:, None])
-            end = lattice.after[self.level[mode, node], 0, node]
-            target.append(end + mode * lattice.places)
-            found = np.bincount(node, minlength=lattice.nodes)
-            state.append(np.flatnonzero(found) + row * lattice.places)
-            counts.append(found[found > 0])
-        return Moves(lattice, modes + 1, *map(np.concatenate, (state, counts, target)))
+            rows.append((node, mode, lattice.after[self.level[mode, node], :1, node]))
+        return Moves.gather(lattice, rows)
 
     def _reach(self, mask: np.ndarray, bound: np.ndarray) -> np.ndarray:
         """The nodes (N,) bool from which noise within bounds (d,) can show a node of the mask."""

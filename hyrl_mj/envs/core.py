@@ -174,7 +174,6 @@ def cautious_reward(task: Task, measured: np.ndarray, caution: np.ndarray) -> np
     worst = np.full(len(measured), np.inf)
     for signs in product(*[shares if c else (0.0,) for c in caution]):
         state = measured + signs * caution
-        ending = task.ending(state)
-        failed = (ending != Outcome.RUNNING) & (ending != Outcome.REACHED)
-        worst = np.minimum(worst, np.where(failed, task.worst_reward, task.reward(state)))
+        reward = np.where(task.failed(state), task.worst_reward, task.reward(state))
+        worst = np.minimum(worst, reward)
     return worst

@@ -263,6 +263,11 @@ class Task(ABC):
     def ending(self, measurement: np.ndarray) -> np.ndarray:
         """`Outcome` (n,) int of states that end an episode, RUNNING where it goes on."""
 
+    def failed(self, measurement: np.ndarray) -> np.ndarray:
+        """(n,) bool, states that end an episode without success."""
+        ending = self.ending(measurement)
+        return np.asarray((ending != Outcome.RUNNING) & (ending != Outcome.REACHED))
+
     @abstractmethod
     def verdict(self, measurement: np.ndarray) -> np.ndarray:
         """`Outcome` (n,) int of episodes that still ran when their time was up."""
