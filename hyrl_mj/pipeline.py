@@ -18,6 +18,7 @@ from hyrl_mj.extended_sets import extend
 from hyrl_mj.lattice import Lattice
 from hyrl_mj.noise import KINDS, Noise
 from hyrl_mj.partition import make_partition
+from hyrl_mj.policies import MlpPolicy
 from hyrl_mj.robustness import BEATEN, WON, WON_FROM_SOME, episodes, examine, save
 from hyrl_mj.run_directory import Run, load_run, open_or_create, write_config
 from hyrl_mj.sets import Grid
@@ -73,10 +74,18 @@ def retrain_stage(run: Run, say: Say) -> None:
 
     s, sets = run.settings, run.extended_sets
     logs = run.path / "logs"
-    policies = {
-        q: retrain(run.task, run.policy, sets, q, s.stage6, s.seed, logs / f"mode_{q}")
-        for q in sets.modes
-    }
+    policies: dict[int, MlpPolicy] = {}
+    for q in sets.modes:
+        policies[q] = retrain(
+            run.task,
+            run.policy,
+            sets,
+            q,
+            s.stage6,
+            s.seed,
+            [*policies.values()],
+            logs / f"mode_{q}",
+        )
     for q, policy in policies.items():
         policy.save(run.path / f"mode_{q}.safetensors")
     remove_others(run.path.glob("mode_*"), mode_paths(run))

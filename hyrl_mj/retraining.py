@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
+from hyrl_mj import symmetry
+from hyrl_mj.controllers import PolicyController
 from hyrl_mj.envs.core import Domain
 from hyrl_mj.extended_sets import ExtendedSets
 from hyrl_mj.game import LOST, NEVER, Answers, Moves, lasting, noisy_moves, solve
@@ -14,7 +17,6 @@ from hyrl_mj.limit import fewest_samples
 from hyrl_mj.noise import Noise
 from hyrl_mj.policies import MlpPolicy
 from hyrl_mj.settings import Training
-from hyrl_mj.simulation import PolicyController, closed_loop
 from hyrl_mj.tasks.base import Outcome, Task
 from hyrl_mj.training import Score, train
 
@@ -26,8 +28,6 @@ TASK_SHARE = 0.7
 URGENCY = -1.5
 # The latest arrival may be this share behind the fewest samples there are.
 ALLOWED_DELAY = 0.03
-# About so many episodes without noise are judged by where they end.
-EPISODES = 2000
 
 
 def retrain(
@@ -37,6 +37,7 @@ def retrain(
     mode: int,
     settings: Training,
     seed: int,
+    others: Iterable[MlpPolicy] = (),
     log_dir: Path | None = None,
 ) -> MlpPolicy:
     """Train the policy of one mode (paper, Step 6).
@@ -52,12 +53,17 @@ def retrain(
         mode: the mode to train.
         settings: how to train.
         seed: of everything random; each mode and attempt derives its own from it.
+        others: policies of other modes: if the mirror image of one is good enough here, it is taken.
         log_dir: where logs and checkpoints go.
 
     Returns:
-        The best policy of all attempts.
+        The best policy of all attempts, or the first mirror image that will do.
     """
     ground = ModeGround(task, extended, mode)
+    if ground.lattice and task.mirror is not None:
+        for image in (symmetry.mirrored(other) for other in others):
+            if ground(image) >= ground.enough:
+                return image
     best: tuple[Score, MlpPolicy] | None = None
     for attempt in range(settings.attempts):
         found = train(
@@ -147,8 +153,8 @@ class ModeGround:
         how far off they end without noise.
         """
         assert self.lattice is not None
-        loop = PolicyController(policy)
-        moves = noisy_moves(Answers.of(self.lattice, loop, self.noise), self.noise)
+        answers = Answers.of(self.lattice, PolicyController(policy), self.noise)
+        moves = noisy_moves(answers, self.noise)
         value = solve(moves)[0, :-2]
         self.lost = np.flatnonzero(self.wanted & (value >= NEVER))
         samples = np.where(value > NEVER, LOST - value, self.task.max_steps)[self.lost]
@@ -157,15 +163,19 @@ class ModeGround:
         if len(self.lost):
             return -len(self.lost) / len(self.nodes), -np.inf
         delay = value[self.nodes].max() / max(self.fewest, 1) - 1
-        return 0.0, -float(
-            max(delay / ALLOWED_DELAY, self._miss(loop, moves) / self.task.precision)
-        )
+        miss = self._miss(answers, moves)
+        return 0.0, -float(max(delay / ALLOWED_DELAY, miss / self.task.precision))
 
-    def _miss(self, loop: PolicyController, moves: Moves) -> float:
+    def _miss(self, answers: Answers, moves: Moves) -> float:
         assert self.lattice is not None
+        grid, after = self.lattice.grid, self.lattice.after
         still = lasting(moves, self.wanted)
         if still.any():
-            return float(self.task.miss(self.grid.nodes[still]).max() - self.noise.max())
-        chosen = self.early[:: max(len(self.early) // EPISODES, 1)]
-        rollout = closed_loop(self.task, loop, self.grid.nodes[chosen], quiet=True)
-        return float(self.task.miss(rollout.path[-1]).max())
+            return float(self.task.miss(grid.nodes[still]).max() - self.noise.max())
+        # The last node of each run without noise; a controller of one mode answers with levels alone.
+        level = answers.letter[0][answers.middle].ravel()
+        last = self.early
+        for _ in range(self.task.max_steps):
+            place = after[level[last], 0, last]
+            last = np.where(place < self.lattice.nodes, place, last)
+        return float(self.task.miss(grid.nodes[last]).max())

@@ -1,4 +1,4 @@
-"""Networks that respect a task's mirror symmetry while they learn.
+"""A task's mirror symmetry: networks that respect it while they learn, and policies seen in the mirror.
 
 The rewards of HyRL's problems are symmetric with respect to a hyperplane (paper, Section IV-B), and at
 the start the two ways past an obstacle differ by a thousandth of the return: less than the error of a
@@ -9,6 +9,7 @@ the first with the mirrored second. The result is a plain network of twice the w
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ import torch
 from torch import nn
 from torch.nn.utils import parametrize
 
+from hyrl_mj.policies import MlpPolicy
 from hyrl_mj.tasks.base import Task
 
 
@@ -28,11 +30,7 @@ def impose(policy: Any, task: Task) -> None:
     """
     assert task.mirror is not None
     signs = torch.tensor(task.mirror.observation, dtype=torch.float32)
-    turn = torch.tensor(task.mirror.inputs, dtype=torch.float32).diag()
-    if task.input_levels is not None:
-        mirrored = task.input_levels * task.mirror.inputs
-        pairs = np.abs(task.input_levels[:, None] - mirrored[None]).sum(axis=-1).argmin(axis=1)
-        turn = torch.eye(len(pairs))[pairs]
+    turn = torch.tensor(_turn(task), dtype=torch.float32)
     values = hasattr(policy, "q_net")
     if values:
         for network in (policy.q_net.q_net, policy.q_net_target.q_net):
@@ -57,6 +55,32 @@ def plain_state(policy: nn.Module) -> dict[str, torch.Tensor]:
         if "parametrizations" not in name:
             state.setdefault(name, tensor)
     return state
+
+
+def mirrored(policy: MlpPolicy) -> MlpPolicy:
+    """The policy that does at a mirrored observation what this one does at the observation, mirrored."""
+    task = policy.task
+    assert task.mirror is not None
+    signs, turn = np.array(task.mirror.observation), _turn(task)
+    values = [f"{net}.{2 * len(policy.hidden)}" for net in ("q_net.q_net", "q_net_target.q_net")]
+    weights = {}
+    for name, weight in policy.weights.items():
+        if name.endswith(".0.weight"):
+            weight = weight * signs
+        if name.rpartition(".")[0] in ("action_net", *values):
+            weight = turn @ weight
+        weights[name] = weight.astype(np.float32)
+    return replace(policy, weights=weights)
+
+
+def _turn(task: Task) -> np.ndarray:
+    """(k, k) matrix that mirrors a network's outputs: inputs, or preferences of the levels."""
+    assert task.mirror is not None
+    if task.input_levels is None:
+        return np.diag(task.mirror.inputs)
+    images = task.input_levels * task.mirror.inputs
+    pairs = np.abs(task.input_levels[:, None] - images[None]).sum(axis=-1).argmin(axis=1)
+    return np.eye(len(pairs))[pairs]
 
 
 def _tie(layers: list[nn.Module], signs: torch.Tensor, turn: torch.Tensor) -> None:
