@@ -13,13 +13,14 @@ from threadpoolctl import threadpool_limits
 from hyrl_mj import artifacts
 from hyrl_mj.controllers import Controller, PolicyController
 from hyrl_mj.critical_set import find_critical_set
+from hyrl_mj.episodes import episodes
 from hyrl_mj.errors import BadArtifact, BadInput, NoRenderer, unknown
 from hyrl_mj.extended_sets import extend
 from hyrl_mj.lattice import Lattice
 from hyrl_mj.noise import KINDS, Noise
 from hyrl_mj.partition import make_partition
 from hyrl_mj.policies import MlpPolicy
-from hyrl_mj.robustness import BEATEN, WON, WON_FROM_SOME, episodes, examine, save
+from hyrl_mj.robustness import BEATEN, WON, WON_FROM_SOME, examine, save
 from hyrl_mj.run_directory import Run, load_run, open_or_create, write_config
 from hyrl_mj.sets import Grid
 from hyrl_mj.settings import preset

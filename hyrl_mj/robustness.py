@@ -1,4 +1,4 @@
-"""How much measurement noise a controller survives: worst-case scores, margins, and episodes in bulk."""
+"""How much measurement noise a controller survives: worst-case scores, margins and maps."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ from hyrl_mj import artifacts
 from hyrl_mj.controllers import Controller
 from hyrl_mj.critical_set import CriticalSet
 from hyrl_mj.errors import BadInput, unknown
-from hyrl_mj.extended_sets import distance_to
 from hyrl_mj.game import NEVER, Answers, Moves, WorstNoise, lasting, noisy_moves, solve
 from hyrl_mj.lattice import Lattice
 from hyrl_mj.limit import Limit
-from hyrl_mj.noise import Noise, Recorded, check_seed
+from hyrl_mj.noise import Recorded
 from hyrl_mj.partition import Partition
 from hyrl_mj.progress import Progress
 from hyrl_mj.sets import Grid
 from hyrl_mj.settings import LATTICE
 from hyrl_mj.simulation import Rollout, closed_loop
-from hyrl_mj.tasks.base import Outcome, Task
+from hyrl_mj.tasks.base import Task
 
 # The controller that nothing can beat, beside those that are examined.
 LIMIT = "limit"
@@ -42,8 +41,6 @@ MAP_CLASSES = (
 )
 # About so many episodes without noise tell how far off the set-point they end.
 QUIET_EPISODES = 4000
-# Episodes that are simulated together: memory does not grow with their number.
-BATCH = 32_768
 
 
 @dataclass(frozen=True)
@@ -303,100 +300,6 @@ def examine(
     }
     arrays = {"grid_counts": np.array(fine.lattice.grid.counts), "eps": np.array(bounds[-1])}
     return content, arrays | maps
-
-
-def episodes(
-    task: Task,
-    critical: CriticalSet,
-    controllers: Mapping[str, Controller],
-    noises: tuple[Noise, ...],
-    count: int,
-    seed: int = 0,
-    winnable: tuple[Grid, np.ndarray] | None = None,
-) -> list[dict[str, Any]]:
-    """Noisy episodes in bulk: outcomes by noise, controller and start region.
-
-    All controllers meet the same starts; signals that do not look at the loop are the same, too.
-
-    Args:
-        task: what is played, from its start distribution.
-        critical: M*; starts within twice the noise bound of it are a region of their own.
-        controllers: by name.
-        noises: kinds and bounds.
-        count: episodes for each noise and controller.
-        seed: of starts and noise.
-        winnable: a grid and which of its nodes can be won; starts that cannot are a region of their own.
-
-    Returns:
-        One record for each noise, controller and region: how many episodes had each outcome, and the
-        share that reached the set-point with its 95% interval (Wilson).
-
-    Raises:
-        BadInput: no episodes, or a noise bound that hides the state space.
-    """
-    check_seed(seed)
-    if count < 1:
-        raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
-    for noise in noises:
-        task.check_noise(noise.bound, noise.everywhere)
-    progress = Progress("noisy episodes", count * len(noises) * len(controllers), "episodes")
-    records, done = [], 0
-    for noise in noises:
-        for name, controller in controllers.items():
-            counts: dict[str, np.ndarray] = {}
-            for first in range(0, count, BATCH):
-                n = min(BATCH, count - first)
-                draw, signal = np.random.SeedSequence([seed, first]).generate_state(2)
-                z0 = task.starts(n, np.random.default_rng(draw))
-                rollout = closed_loop(
-                    task, controller, z0, noise=noise, seed=int(signal), quiet=True
-                )
-                for region, inside in _regions(task, critical, noise.bound, winnable, z0).items():
-                    counts.setdefault(region, np.zeros(len(Outcome), dtype=int))
-                    counts[region] += np.bincount(rollout.outcome[inside], minlength=len(Outcome))
-                done += n
-                progress.update(done)
-            records += [
-                _record(noise, name, region, found)
-                for region, found in counts.items()
-                if found.any()
-            ]
-    progress.close()
-    return records
-
-
-def _regions(
-    task: Task,
-    critical: CriticalSet,
-    bound: float,
-    winnable: tuple[Grid, np.ndarray] | None,
-    z0: np.ndarray,
-) -> dict[str, np.ndarray]:
-    """The start regions: which of the starts (n, d) lie in each, (n,) bool."""
-    near = distance_to(task, critical, z0) <= 2 * bound
-    if winnable is None:
-        return {"near M*": near, "elsewhere": ~near}
-    grid, can = winnable
-    open_ = can[grid.nearest(z0)]
-    return {"near M*": near & open_, "elsewhere": ~near & open_, "not winnable": ~open_}
-
-
-def _record(noise: Noise, name: str, region: str, counts: np.ndarray) -> dict[str, Any]:
-    from scipy.stats import binomtest  # slow to import, and seldom needed
-
-    reached, total = int(counts[Outcome.REACHED]), int(counts.sum())
-    interval = binomtest(reached, total).proportion_ci(0.95, method="wilson")
-    return {
-        "noise": noise.kind,
-        "eps": noise.bound,
-        "everywhere": noise.everywhere,
-        "controller": name,
-        "region": region,
-        "episodes": total,
-        "outcomes": {Outcome(i).label: int(c) for i, c in enumerate(counts) if c},
-        "reached": reached / total,
-        "interval": [float(interval.low), float(interval.high)],
-    }
 
 
 def save(path: Path, content: Mapping[str, Any]) -> None:

@@ -19,7 +19,7 @@ ORDER = (
     "errors", "progress", "mjcf", "plant", "noise", "tasks", "settings", "artifacts", "policies",
     "controllers", "adversary", "rendering", "envs", "simulation", "symmetry", "training", "sets",
     "lattice", "game", "critical_set", "partition", "limit", "extended_sets", "retraining", "hybrid",
-    "robustness", "run_directory", "figures", "replay", "doctor", "pipeline", "tables", "cli",
+    "robustness", "episodes", "run_directory", "figures", "replay", "doctor", "pipeline", "tables", "cli",
 )  # fmt: skip
 
 

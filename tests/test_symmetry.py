@@ -93,3 +93,18 @@ def test_a_plain_network_is_not_mirrored(task):
     policy = build(task, settings, seed=1).policy
     with pytest.raises(AssertionError, match="not close"):
         assert_mirrored(task, policy)
+
+
+def test_a_policy_in_the_mirror_does_the_mirrored_thing(task):
+    settings = replace(preset(task, "smoke").stage1, symmetric=False)
+    for algorithm in ("ppo", "dqn") if task.levels else ("ppo",):
+        options = settings.options if algorithm == settings.algorithm else {}
+        built = build(task, replace(settings, algorithm=algorithm, options=options), seed=1)
+        policy = export(built, task)
+        image = symmetry.mirrored(policy)
+        o = observations(task).numpy()
+        turned = policy.inputs(o * task.mirror.observation) * task.mirror.inputs
+        assert np.abs(turned - policy.inputs(o)).max() > 1e-3, "it is symmetric anyway"
+        np.testing.assert_allclose(image.inputs(o), turned, atol=1e-6)
+        for name, weight in symmetry.mirrored(image).weights.items():
+            np.testing.assert_array_equal(weight, policy.weights[name], err_msg=name)

@@ -1,0 +1,153 @@
+"""Noisy episodes in bulk: counts, regions and intervals, with controllers whose worst case is known."""
+
+import numpy as np
+import pytest
+from planted import decisions, halves, ideal_controller, one_way_policy, sign_policy
+
+from hyrl_mj import BadInput, Noise, closed_loop
+from hyrl_mj import episodes as bulk
+from hyrl_mj.controllers import PolicyController
+from hyrl_mj.episodes import episodes
+from hyrl_mj.robustness import Game
+from hyrl_mj.sets import Grid
+
+
+@pytest.fixture(scope="module")
+def on_vehicle(vehicle):
+    controllers = {
+        "left": PolicyController(one_way_policy(vehicle)),
+        "sign": PolicyController(sign_policy(vehicle)),
+        "ideal": ideal_controller(vehicle, 0.154, clear=1.004),
+    }
+    grid = Grid.with_cells(vehicle.chart, 240)
+    return Game(vehicle, halves(vehicle), controllers, 0.2, grid=grid), controllers
+
+
+def record(records, controller, region, noise=None):
+    found = [
+        r
+        for r in records
+        if r["controller"] == controller and r["region"] == region and noise in (None, r["noise"])
+    ]
+    assert len(found) == 1
+    return found[0]
+
+
+@pytest.fixture(scope="module")
+def records(vehicle, on_vehicle):
+    """Episodes of the sign rule and of the ideal one, under every kind of noise."""
+    game, controllers = on_vehicle
+    noises = tuple(Noise(k, 0.1) for k in ("uniform", "alternating", "adversarial"))
+    return episodes(
+        vehicle,
+        decisions(vehicle),
+        {name: controllers[name] for name in ("sign", "ideal")},
+        noises,
+        600,
+        winnable=(game.lattice.grid, game.winnable(0.1)),
+    )
+
+
+def test_the_counts_add_up(records):
+    for noise in ("uniform", "alternating", "adversarial"):
+        for name in ("sign", "ideal"):
+            mine = [r for r in records if (r["noise"], r["controller"]) == (noise, name)]
+            assert {r["region"] for r in mine} == {"near M*", "elsewhere", "not winnable"}
+            assert sum(r["episodes"] for r in mine) == 600
+            for r in mine:
+                assert sum(r["outcomes"].values()) == r["episodes"]
+                assert r["reached"] == r["outcomes"].get("reached", 0) / r["episodes"]
+                assert 0 <= r["interval"][0] <= r["reached"] <= r["interval"][1] <= 1
+
+
+def test_the_regions_hold_the_same_starts_for_all(records):
+    for region in ("near M*", "elsewhere", "not winnable"):
+        assert len({r["episodes"] for r in records if r["region"] == region}) == 1
+
+
+def test_starts_near_the_critical_set_are_those_within_twice_the_noise(vehicle, on_vehicle):
+    # Starts are uniform in 0 <= x <= 0.5, |y| <= 1, and M* runs along the axis up to x = 0.45.
+    left = {"left": on_vehicle[1]["left"]}
+    for eps in (0.05, 0.1):
+        records = episodes(vehicle, decisions(vehicle), left, (Noise("uniform", eps),), 2000)
+        assert {r["region"] for r in records} == {"near M*", "elsewhere"}
+        near = record(records, "left", "near M*")["episodes"] / 2000
+        assert near == pytest.approx(2 * eps, abs=0.03)
+
+
+def test_the_ideal_rule_reaches_the_set_point_from_all_winnable_starts(records):
+    for r in records:
+        if r["controller"] == "ideal" and r["region"] != "not winnable":
+            assert set(r["outcomes"]) == {"reached"}
+            assert r["interval"][1] == 1.0
+
+
+def test_adversarial_noise_is_worse_than_chance(records):
+    for region in ("near M*", "elsewhere"):
+        adversarial, uniform = (
+            record(records, "sign", region, k) for k in ("adversarial", "uniform")
+        )
+        assert adversarial["reached"] <= uniform["reached"]
+    near = record(records, "sign", "near M*", "adversarial")
+    assert near["interval"][1] < record(records, "sign", "near M*", "uniform")["interval"][0]
+
+
+def test_no_noise_is_worse_than_the_worst(records, on_vehicle):
+    # The share of starts in the band that the game calls lost bounds what episodes lose near M*.
+    won = on_vehicle[0].score("sign", 0.1).won
+    for kind in ("uniform", "alternating", "adversarial"):
+        mine = [record(records, "sign", region, kind) for region in ("near M*", "elsewhere")]
+        lost = sum(r["episodes"] - r["outcomes"]["reached"] for r in mine)
+        assert lost / sum(r["episodes"] for r in mine) <= 1 - won + 0.02
+
+
+def test_the_same_seed_gives_the_same_counts(vehicle, on_vehicle):
+    sign = {"sign": on_vehicle[1]["sign"]}
+
+    def counts(seed):
+        noises = (Noise("uniform", 0.2),)
+        return episodes(vehicle, decisions(vehicle), sign, noises, 300, seed=seed)
+
+    assert counts(3) == counts(3)
+    assert counts(3) != counts(4)
+
+
+def test_batches_add_up_and_none_is_the_same(vehicle, on_vehicle, monkeypatch):
+    monkeypatch.setattr(bulk, "BATCH", 100)
+    sign, noises = {"sign": on_vehicle[1]["sign"]}, (Noise("uniform", 0.1),)
+
+    def near(count):
+        records = episodes(vehicle, decisions(vehicle), sign, noises, count)
+        assert sum(r["episodes"] for r in records) == count
+        return record(records, "sign", "near M*")["episodes"]
+
+    one, two, more = (near(count) for count in (100, 200, 250))
+    assert one < two < more
+    assert two != 2 * one
+
+
+@pytest.mark.parametrize(
+    ("noise", "count", "message"),
+    [
+        (Noise("uniform", 0.1), 0, "0 episodes cannot be simulated"),
+        (Noise("uniform", 0.1), -5, "-5 episodes cannot be simulated"),
+        (Noise("uniform", 1.5), 10, "noise bound 1.5 hides the whole state space of vehicle"),
+    ],
+)
+def test_episodes_that_make_no_sense_are_refused(vehicle, on_vehicle, noise, count, message):
+    sign = {"sign": on_vehicle[1]["sign"]}
+    with pytest.raises(BadInput, match=message):
+        episodes(vehicle, decisions(vehicle), sign, (noise,), count)
+
+
+@pytest.mark.parametrize("kind", ["uniform", "alternating", "adversarial"])
+def test_noise_everywhere_acts_on_every_column(vehicle, kind):
+    # A line at which the way is decided that runs askew, so that both columns matter.
+    loop = PolicyController(sign_policy(vehicle, lambda x: x - 0.3))
+    z0 = vehicle.starts(300, np.random.default_rng(0))
+    for everywhere, columns in ((False, [False, True]), (True, [True, True])):
+        noise = Noise(kind, 0.1, everywhere)
+        rollout = closed_loop(vehicle, loop, z0, noise=noise, steps=1, record=True)
+        n = rollout.measured[0] - rollout.path[0]
+        assert np.abs(n).max() <= 0.1 + 1e-12
+        assert (np.abs(n).max(axis=0) > 0.05).tolist() == columns

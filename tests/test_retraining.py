@@ -1,0 +1,147 @@
+"""Stage 6: where a mode is trained, how its policies are judged, and when one is good enough."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from planted import ideal_controller, one_way_policy
+
+from hyrl_mj import closed_loop, symmetry, training
+from hyrl_mj.controllers import PolicyController
+from hyrl_mj.envs.core import cautious_reward
+from hyrl_mj.extended_sets import ExtendedSets
+from hyrl_mj.retraining import ModeGround, retrain
+from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.settings import preset
+
+# ---- where modes are trained
+
+
+@pytest.fixture(scope="module")
+def vehicle_sets(vehicle):
+    grid = Grid.with_cells(vehicle.chart, 60)
+    ideal = ideal_controller(vehicle, 0.15)
+    sets = tuple(GridSet(grid, ideal.flow_set(q).signed_distance(grid.nodes)) for q in (0, 1))
+    winning = tuple(grid.nodes[:, 0] < 0.4 for _ in sets)
+    return ExtendedSets((0, 1), sets, winning, 0.3, 0.1, np.empty((0, 2)), np.empty(0))
+
+
+def test_mode_starts_cover_the_set_with_room_for_the_noise(vehicle, vehicle_sets):
+    domain = ModeGround(vehicle, vehicle_sets, 0).domain(gamma=0.9)
+    z = domain.starts(5000, np.random.default_rng(0))
+    cell = vehicle_sets.sets[0].grid.cell
+    assert vehicle.chart.contains(z).all()
+    assert -0.25 - cell <= z[:, 1].min() <= -0.2
+    assert z[:, 1].max() > 1.4
+    assert z[:, 0].max() <= 0.4 + cell
+    again = domain.starts(5000, np.random.default_rng(0))
+    np.testing.assert_array_equal(z, again)
+
+
+def test_a_mode_that_leaves_its_set_pays_for_ever(vehicle, circle, vehicle_sets):
+    domain = ModeGround(vehicle, vehicle_sets, 1).domain(gamma=0.9)
+    inside = domain.contains(np.array([[0.1, 0.22], [0.1, 0.28], [0.1, -1.0]]))
+    np.testing.assert_array_equal(inside, [True, False, True])
+    assert domain.exit_reward == 0.0
+    grid = Grid.with_cells(circle.chart, 60)
+    whole = GridSet.from_mask(grid, np.ones(60, dtype=bool))
+    sets = ExtendedSets((0,), (whole,), (whole.mask,), 0.5, 0.1, np.empty((0, 1)), np.empty(0))
+    assert ModeGround(circle, sets, 0).domain(gamma=0.9).exit_reward == pytest.approx(-10.0)
+
+
+# ---- the judge of stage 6
+
+
+def test_a_cautious_reward_is_the_least_around(vehicle):
+    rng = np.random.default_rng(0)
+    measured = rng.uniform([0.1, -1.3], [2.9, 1.3], (200, 2))
+    worst = cautious_reward(vehicle, measured, np.array([0.0, 0.1]))
+    for shift in (-0.1, -0.05, 0.0, 0.05, 0.1):
+        state = measured + np.array([0.0, shift])
+        crashed = vehicle.clearance(state) <= 1e-3
+        assert (worst <= np.where(crashed, 0.0, vehicle.reward(state)) + 1e-12).all()
+    np.testing.assert_array_equal(
+        cautious_reward(vehicle, measured, np.zeros(2)),
+        np.where(vehicle.clearance(measured) <= 1e-3, 0.0, vehicle.reward(measured)),
+    )
+    # Within the noise of the pillar there is nothing to earn.
+    assert cautious_reward(vehicle, np.array([[1.5, 0.84]]), np.array([0.0, 0.1]))[0] == 0.0
+
+
+@pytest.fixture(scope="module")
+def left(vehicle):
+    """The ground of the vehicle's mode 0 with ideal sets, where they can be won."""
+    grid = Grid.with_cells(vehicle.chart, 120)
+    ideal = ideal_controller(vehicle, 0.15)
+    sets = tuple(GridSet(grid, ideal.flow_set(q).signed_distance(grid.nodes)) for q in (0, 1))
+    open_ = grid.nodes[:, 1] > -(0.4 - grid.nodes[:, 0])
+    found = ExtendedSets((0, 1), sets, (open_, ~open_), 0.3, 0.1, np.empty((0, 2)), np.empty(0))
+    return ModeGround(vehicle, found, 0)
+
+
+def test_the_judge_prefers_a_policy_that_loses_nothing(vehicle, left):
+    wide = left(one_way_policy(vehicle, 1.0, clear=1.0))
+    assert wide[0] == 0.0
+    assert not len(left.lost)
+    grazing = left(one_way_policy(vehicle, 1.0, clear=0.8))
+    wrong = left(one_way_policy(vehicle, -1.0))
+    assert wrong < grazing < wide
+    assert len(left.lost)
+
+
+def test_where_runs_end_is_judged_as_they_are_simulated(vehicle, left):
+    for clear in (1.01, 1.06, 1.11):
+        policy = one_way_policy(vehicle, 1.0, clear)
+        starts = left.grid.nodes[left.early]
+        ends = closed_loop(vehicle, PolicyController(policy), starts).path[-1]
+        miss = -left(policy)[1] * vehicle.precision
+        assert miss == pytest.approx(vehicle.miss(ends).max(), abs=1e-6)
+
+
+def test_a_policy_that_ends_far_off_is_not_good_enough(vehicle, left):
+    # It passes the pillar and then goes straight on, a metre off the set-point.
+    score = left(one_way_policy(vehicle, 1.0, clear=1.0))
+    assert score < left.enough
+    assert -score[1] * vehicle.precision >= 1.0
+
+
+def test_training_goes_on_where_the_game_is_lost(vehicle, left):
+    left(one_way_policy(vehicle, 1.0, clear=0.8))
+    rng = np.random.default_rng(0)
+    z = left.starts(4000, rng)
+    lost = np.isin(left.grid.nearest(z), left.lost)
+    left(one_way_policy(vehicle, 1.0, clear=1.0))
+    elsewhere = np.isin(left.grid.nearest(left.starts(4000, rng)), left.nodes)
+    assert lost.mean() > 0.15
+    assert elsewhere.all()
+
+
+# ---- the mirror image of another mode's policy
+
+
+@pytest.fixture
+def quick(vehicle):
+    return replace(preset(vehicle, "smoke").stage6, samples=4_096)
+
+
+def untrained(vehicle, quick):
+    return training.export(training.build(vehicle, quick, seed=0), vehicle)
+
+
+def test_a_mirror_image_that_will_do_is_taken(vehicle, vehicle_sets, quick, monkeypatch):
+    other = untrained(vehicle, quick)
+    image = symmetry.mirrored(other)
+    monkeypatch.setattr(ModeGround, "__call__", lambda ground, policy: (0.0, -0.5))
+    found = retrain(vehicle, other, vehicle_sets, 1, quick, seed=0, others=[other])
+    for name, weight in image.weights.items():
+        np.testing.assert_array_equal(found.weights[name], weight)
+
+
+def test_one_that_will_not_do_is_not_taken(vehicle, vehicle_sets, quick):
+    # An untrained policy drives into the pillar.
+    other = untrained(vehicle, quick)
+    assert ModeGround(vehicle, vehicle_sets, 1)(symmetry.mirrored(other)) < (0.0, -1.0)
+    alone = retrain(vehicle, other, vehicle_sets, 1, quick, seed=0)
+    found = retrain(vehicle, other, vehicle_sets, 1, quick, seed=0, others=[other])
+    for name, weight in alone.weights.items():
+        np.testing.assert_array_equal(found.weights[name], weight)
