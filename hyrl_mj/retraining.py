@@ -172,10 +172,15 @@ class ModeGround:
         still = lasting(moves, self.wanted)
         if still.any():
             return float(self.task.miss(grid.nodes[still]).max() - self.noise.max())
-        # The last node of each run without noise; a controller of one mode answers with levels alone.
+        # Without noise, down to the last nodes on the chart; the sample after these ends most runs.
+        # A controller of one mode answers with levels alone.
         level = answers.letter[0][answers.middle].ravel()
         last = self.early
         for _ in range(self.task.max_steps):
             place = after[level[last], 0, last]
-            last = np.where(place < self.lattice.nodes, place, last)
-        return float(self.task.miss(grid.nodes[last]).max())
+            last = np.unique(np.where(place < self.lattice.nodes, place, last))
+        plant = self.task.plant(len(last))
+        plant.set_state(self.task.qpos(grid.nodes[last]))
+        plant.step(self.lattice.levels[level[last]])
+        ends = np.vstack([grid.nodes[last], self.task.z(plant.measurement)])
+        return float(self.task.miss(ends).max())

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planted import ideal_controller, one_way_policy
+from planted import ChartPolicy, ideal_controller, one_way_policy
 
 from hyrl_mj import closed_loop, symmetry, training
 from hyrl_mj.controllers import PolicyController
@@ -90,8 +90,11 @@ def test_the_judge_prefers_a_policy_that_loses_nothing(vehicle, left):
 
 
 def test_where_runs_end_is_judged_as_they_are_simulated(vehicle, left):
-    for clear in (1.01, 1.06, 1.11):
-        policy = one_way_policy(vehicle, 1.0, clear)
+    wide = one_way_policy(vehicle, 1.0, clear=1.01)
+    # Runs from between two samples' ways end half a sample behind the set-point.
+    late = one_way_policy(vehicle, 1.0, clear=1.11)
+    swerving = ChartPolicy(vehicle, lambda z: np.where(z[:, :1] > 2.96, late.rule(z), wide.rule(z)))
+    for policy in (wide, one_way_policy(vehicle, 1.0, clear=1.06), swerving):
         starts = left.grid.nodes[left.early]
         ends = closed_loop(vehicle, PolicyController(policy), starts).path[-1]
         miss = -left(policy)[1] * vehicle.precision
