@@ -11,12 +11,11 @@ from typing import Annotated
 import tyro
 
 from hyrl_mj import pipeline, progress
-from hyrl_mj.controllers import Controller, PolicyController
+from hyrl_mj.arcs import noisy_arcs, replay_floor, replay_shows
 from hyrl_mj.errors import BadInput, HyrlError, unknown
 from hyrl_mj.lattice import Lattice
-from hyrl_mj.noise import KINDS, Noise
-from hyrl_mj.robustness import LARGEST, Game, worst_signal
-from hyrl_mj.simulation import AnyNoise, HybridArc, simulate
+from hyrl_mj.noise import KINDS
+from hyrl_mj.replay import render_replay
 from hyrl_mj.tables import print_robustness, print_summary
 from hyrl_mj.tasks.base import get_task, task_names
 
@@ -110,27 +109,10 @@ def simulate_run(
             raise BadInput("--q0, --noise, --eps, --horizon and --seed need a --start")
         print_summary(pipeline.run_stage(run, "simulate"))
         return
-    if noise not in (*KINDS, "worst"):
-        raise unknown("noise", noise, (*KINDS, "worst"))
-    bound = run.task.check_noise(run.settings.noise if eps is None else eps)
-    z0 = run.task.check_state([start])[0]
-    loops: dict[str, Controller] = {
-        "policy": PolicyController(run.policy),
-        "hyrl": run.controller,
-    }
-    game = None
-    if noise == "worst":
-        game = Game(run.task, run.partition, loops, max(bound, LARGEST))
-    arcs = {}
-    for name, loop in loops.items():
-        mode = q0 if name == "hyrl" else None
-        signal: AnyNoise = (
-            worst_signal(game, name, loop, z0[None], bound, mode) if game else Noise(noise, bound)
-        )
-        arcs[name] = simulate(run.task, loop, z0, signal, mode, horizon, seed, name=name)
-    for name, arc in arcs.items():
-        assert isinstance(arc, HybridArc)
-        arc.save(run.path / "arcs" / f"latest_{name}.npz")
+    z0 = run.task.check_state([start])
+    found = noisy_arcs(run, z0, noise, eps, (q0,), horizon, seed)
+    for name, (arc,) in zip(("policy", "hyrl"), found.values(), strict=True):
+        arc.save(run.latest_path(name))
         end = run.task.chart.format(arc.z[-1])
         print(f"{name:7} {arc.outcome:14} t = {arc.t[-1]:.2f} s, {arc.j[-1]} jumps, {end}")
     print(f"saved as {run.path / 'arcs'}/latest_*.npz")
@@ -176,26 +158,47 @@ def robustness(
 def replay(
     run_dir: RunDir,
     out: Path | None = None,
-    size: str = "640x480",
-    fps: int = 40,
+    starts: str = "critical",
+    noise: str | None = None,
+    eps: float | None = None,
+    layout: str = "side-by-side",
     camera: str = "overhead",
+    size: str = "1280x720",
+    fps: int = 30,
+    slow_motion: float = 1.0,
 ) -> None:
-    """Render policy and hybrid controller side by side, from the start on the critical set.
+    """Render policy and hybrid controller under the same noise, as a video or a picture.
 
     Args:
         run_dir: a run directory.
-        out: the mp4 to write; by default replay.mp4 in the run directory.
-        size: width x height of one panel in pixels.
+        out: the mp4 or gif to write, with its last frame as a png of the same name, or a png alone; by
+            default replay.mp4 in the run directory.
+        starts: critical (the start on the critical set, once for each start mode), paper (all of the
+            paper's at once), or latest (what `hyrl-mj simulate --start` simulated last).
+        noise: simulate anew under this noise: none, uniform, alternating, adversarial (the most dangerous
+            one sample ahead), or worst (of the exact game, for each controller); by default the arcs of
+            the run, under alternating noise.
+        eps: bound of the noise in chart units; by default the run's.
+        layout: side-by-side, or overlay (both in one scene).
+        camera: a camera of the MJCF: overhead, chase or three_quarter.
+        size: width x height of the video in pixels.
         fps: frames per second.
-        camera: a camera of the MJCF: overhead or chase.
+        slow_motion: how many times slower the video is around jumps.
     """
-    from hyrl_mj.replay import render_replay
-
     run = pipeline.load_run(run_dir)
     out = out or run.path / "replay.mp4"
-    pairs = pipeline.critical_pairs(run)
-    render_replay(run.task, pairs, out, size=parse_size(size), fps=fps, camera=camera)
-    print(f"video at {out}")
+    render_replay(
+        run.task,
+        replay_shows(run, starts, noise, eps),
+        out,
+        floor=replay_floor(run),
+        size=parse_size(size),
+        fps=fps,
+        camera=camera,
+        layout=layout,
+        slow_motion=slow_motion,
+    )
+    print(f"{'picture' if out.suffix == '.png' else 'video'} at {out}")
 
 
 def parse_size(text: str) -> tuple[int, int]:

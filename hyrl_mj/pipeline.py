@@ -11,6 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from hyrl_mj import artifacts
+from hyrl_mj.arcs import replay_arcs, replay_floor, replay_shows
 from hyrl_mj.controllers import Controller, PolicyController
 from hyrl_mj.critical_set import find_critical_set
 from hyrl_mj.episodes import episodes
@@ -20,11 +21,17 @@ from hyrl_mj.lattice import Lattice
 from hyrl_mj.noise import KINDS, Noise
 from hyrl_mj.partition import make_partition
 from hyrl_mj.policies import MlpPolicy
-from hyrl_mj.robustness import BEATEN, WON, WON_FROM_SOME, examine, save
+from hyrl_mj.robustness import (
+    BEATEN,
+    WON,
+    WON_FROM_SOME,
+    examine,
+    save,
+)
 from hyrl_mj.run_directory import Run, load_run, open_or_create, write_config
 from hyrl_mj.sets import Grid
 from hyrl_mj.settings import preset
-from hyrl_mj.simulation import HybridArc, simulate
+from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks.base import get_task
 
 Say = Callable[[str], None]
@@ -132,7 +139,7 @@ def replay_stage(run: Run, say: Say) -> None:
     from hyrl_mj.replay import render_replay
 
     try:
-        render_replay(run.task, critical_pairs(run), run.path / "replay.mp4")
+        render_replay(run.task, replay_shows(run), run.path / "replay.mp4", floor=replay_floor(run))
         say(f"video at {run.path / 'replay.mp4'}")
     except NoRenderer as error:
         say(f"no video: {error}")
@@ -312,45 +319,3 @@ def robustness_sentence(content: Mapping[str, Any]) -> str:
         f"worst case at noise {hyrl['eps']:g}: the policy wins {100 * policy['won']:.2f}% of the winnable "
         f"starts, HyRL {100 * hyrl['won']:.2f}%, from every q0 {100 * hyrl['won_any']:.2f}%"
     )
-
-
-def critical_start(run: Run) -> np.ndarray | None:
-    """The point (d,) of M* that is nearest to the replay starts, or None if M* is empty."""
-    points = run.critical_set.points
-    if not len(points):
-        return None
-    centre = np.mean(run.task.replay_starts, axis=0)
-    return points[np.linalg.norm(run.task.chart.difference(points, centre), axis=1).argmin()]
-
-
-def replay_arcs(run: Run) -> dict[tuple[str, str], HybridArc]:
-    """The paper's replays (Section V), with a start on M* of our own added, by start and controller.
-
-    All controllers meet the same noise: alternating, with the run's bound.
-    """
-    starts: list[Sequence[float] | np.ndarray] = list(run.task.replay_starts)
-    names = [f"start{i}" for i in range(len(starts))]
-    critical = critical_start(run)
-    if critical is not None:
-        starts, names = [*starts, critical], [*names, "critical"]
-    z0 = np.array(starts, dtype=float)
-    noise = Noise("alternating", run.settings.noise)
-    s, horizon = run.settings, run.task.replay_time
-    found = {"policy": simulate(run.task, run.policy, z0, noise, horizon=horizon, seed=s.seed)}
-    for q in run.controller.modes:
-        loop = simulate(run.task, run.controller, z0, noise, q, horizon, s.seed)
-        found[f"hyrl_q{q}"] = loop
-    arcs: dict[tuple[str, str], HybridArc] = {}
-    for who, several in found.items():
-        assert isinstance(several, list)
-        arcs |= {(name, who): arc for name, arc in zip(names, several, strict=True)}
-    return arcs
-
-
-def critical_pairs(run: Run) -> list[tuple[HybridArc, HybridArc]]:
-    """Stage-1 policy and hybrid controller from the same start, on M* if there is one, for each mode."""
-    paths = run.arc_paths()
-    start = "critical" if ("critical", "policy") in paths else "start0"
-    policy = HybridArc.load(paths[start, "policy"])
-    modes = run.extended_sets.modes
-    return [(policy, HybridArc.load(paths[start, f"hyrl_q{q}"])) for q in modes]

@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from copy import copy
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -20,71 +22,173 @@ FFMPEG_CURE = (
 )
 
 
-class _Renderer(mujoco.Renderer):
-    # Where its constructor fails early its destructor still asks for these.
-    _gl_context = None
-    _mjr_context = None
+# The widest and highest picture [pixels].
+LARGEST = 4096
+# How a video is encoded, by the end of its name: an H.264 that browsers play, or a GIF.
+ENCODERS: dict[str, dict[str, Any]] = {
+    ".mp4": {"codec": "h264", "crf": 20, "ffmpeg_args": "-preset veryfast -movflags +faststart"},
+    ".gif": {"codec": "gif"},
+}
+GEOMS = 10_000
+
+# Left, top, right and bottom of a part of a picture [pixels], the last two excluded.
+Box = tuple[int, int, int, int]
 
 
 class SceneRenderer:
     """Draws states of one model from its named cameras.
+
+    A camera's field of view is that of the picture's shorter side: what a square picture shows is seen
+    in one of any shape.
 
     Args:
         model: the compiled model.
         width, height: of the picture [pixels].
 
     Raises:
-        BadInput: the picture is larger than the MJCF allows.
+        BadInput: a size that no picture can have.
         NoRenderer: there is no GL library; the message says which to install.
     """
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int):
-        largest = (int(model.vis.global_.offwidth), int(model.vis.global_.offheight))
-        if not (0 < width <= largest[0] and 0 < height <= largest[1]):
-            raise BadInput(
-                f"a picture of {width} x {height} pixels cannot be drawn: model "
-                f"{mjcf.model_name(model)} allows 1 x 1 to {largest[0]} x {largest[1]}"
-            )
-        self._data = mujoco.MjData(model)
-        self._model = model
+        check_size(width, height)
+        # Compiled models are shared, and the size of the buffer is one of their settings.
+        self.model = copy(model)
+        self.model.vis.global_.offwidth, self.model.vis.global_.offheight = width, height
+        self.width, self.height = width, height
+        self.data = mujoco.MjData(self.model)
+        self.scene = mujoco.MjvScene(self.model, maxgeom=GEOMS)
+        self._options, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
         try:
-            self._renderer = _Renderer(model, height, width)
+            self._gl = mujoco.GLContext(width, height)
+            self._gl.make_current()
+            self._context = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100)
         # Each GL backend fails in its own way: ImportError, AttributeError, RuntimeError, ...
         except Exception as error:
             raise _no_gl(error) from error
-
-    @property
-    def scene(self) -> mujoco.MjvScene:
-        """The scene of the next picture, to add marks to between `place` and `draw`."""
-        return self._renderer.scene
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
 
     def place(self, qpos: np.ndarray, camera: str) -> None:
-        """Put the robot into a position (nq,) and choose a camera."""
-        mjcf.object_id(self._model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
-        self._data.qpos[:] = qpos
-        mujoco.mj_forward(self._model, self._data)
-        self._renderer.update_scene(self._data, camera)
+        """Put the robot into a position (nq,) and look at it from a camera."""
+        self.clear()
+        self.look(qpos, camera)
+        self.add_robot(qpos)
+
+    def clear(self) -> None:
+        """Leave in the scene what never moves."""
+        static = mujoco.mjtCatBit.mjCAT_STATIC.value
+        mujoco.mj_forward(self.model, self.data)
+        mujoco.mjv_updateScene(
+            self.model, self.data, self._options, None, self._camera, static, self.scene
+        )
+
+    def look(self, qpos: np.ndarray, camera: str) -> None:
+        """Look from a camera, which may follow the robot in its position (nq,)."""
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._camera.fixedcamid = mjcf.object_id(self.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
+        self._move(qpos)
+        mujoco.mjv_updateCamera(self.model, self.data, self._camera, self.scene)
+        mujoco.mjv_makeLights(self.model, self.data, self.scene)
+        for view in self.scene.camera:
+            wider = max(self.height / self.width, 1.0)
+            view.frustum_bottom *= wider
+            view.frustum_top *= wider
+            view.frustum_width = (
+                (view.frustum_top - view.frustum_bottom) / 2 * self.width / self.height
+            )
+
+    def add_robot(self, qpos: np.ndarray) -> range:
+        """Add what moves to the scene, in a position (nq,).
+
+        Returns:
+            The numbers of its geoms in the scene.
+        """
+        self._move(qpos)
+        first, moving = self.scene.ngeom, mujoco.mjtCatBit.mjCAT_DYNAMIC.value
+        mujoco.mjv_addGeoms(
+            self.model, self.data, self._options, mujoco.MjvPerturb(), moving, self.scene
+        )
+        return range(first, self.scene.ngeom)
 
     def draw(self) -> np.ndarray:
         """The picture: (height, width, 3) uint8."""
+        picture = np.empty((self.height, self.width, 3), dtype=np.uint8)
+        self.redraw(picture, (0, 0, self.width, self.height))
+        return picture
+
+    def redraw(self, picture: np.ndarray, box: Box) -> None:
+        """Draw a part of the picture (height, width, 3) anew; the rest stays as it is.
+
+        A software rasteriser takes time for each pixel. This is exact: the camera's frustum is cut to
+        the box, and nothing else is different.
+        """
+        left, top, right, bottom = box
+        kept = [
+            (v.frustum_center, v.frustum_width, v.frustum_bottom, v.frustum_top)
+            for v in self.scene.camera
+        ]
+        for view, (centre, half, low, high) in zip(self.scene.camera, kept, strict=True):
+            x, y = 2 * half / self.width, (high - low) / self.height  # of one pixel
+            view.frustum_center = centre - half + x * (left + right) / 2
+            view.frustum_width = x * (right - left) / 2
+            view.frustum_bottom, view.frustum_top = high - y * bottom, high - y * top
+        part = mujoco.MjrRect(0, 0, right - left, bottom - top)
+        pixels = np.empty((part.height, part.width, 3), dtype=np.uint8)
         try:
-            return self._renderer.render()
+            self._gl.make_current()
+            mujoco.mjr_render(part, self.scene, self._context)
+            mujoco.mjr_readPixels(pixels, None, part, self._context)
         except mujoco.FatalError as error:
             raise _no_gl(error) from error
+        picture[top:bottom, left:right] = pixels[::-1]  # GL counts rows from below
+        for view, values in zip(self.scene.camera, kept, strict=True):
+            view.frustum_center, view.frustum_width, view.frustum_bottom, view.frustum_top = values
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where points (n, 3) [m] are seen.
+
+        Returns:
+            (n, 2) column and row in the picture [pixels], and (n,) pixels that a metre has there.
+        """
+        eyes, view = self.scene.camera, self.scene.camera[0]
+        offset = points - (eyes[0].pos + eyes[1].pos) / 2  # the middle of a stereo pair
+        depth = offset @ view.forward
+        shrink = np.ones(len(points)) if view.orthographic else view.frustum_near / depth
+        scale = self.height / (view.frustum_top - view.frustum_bottom)
+        across = shrink * (offset @ np.cross(view.forward, view.up)) - view.frustum_center
+        along = view.frustum_top - shrink * (offset @ view.up)
+        pixels = np.stack([self.width / 2 + scale * across, scale * along], axis=-1)
+        return pixels, scale * shrink
 
     def close(self) -> None:
         """Give the GL context back."""
-        self._renderer.close()
+        self._gl.make_current()
+        self._context.free()
+        self._gl.free()
+
+    def _move(self, qpos: np.ndarray) -> None:
+        self.data.qpos[:] = qpos
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+
+
+def check_size(width: int, height: int) -> None:
+    """Raise `BadInput` unless a picture can have this size [pixels]."""
+    if not (0 < width <= LARGEST and 0 < height <= LARGEST):
+        raise BadInput(
+            f"a picture of {width} x {height} pixels cannot be drawn: give 1 x 1 to "
+            f"{LARGEST} x {LARGEST}"
+        )
 
 
 @contextmanager
 def video(
     path: Path, width: int, height: int, fps: float
 ) -> Iterator[Callable[[np.ndarray], None]]:
-    """Write an H.264 video, whole or not at all.
+    """Write a video, whole or not at all.
 
     Args:
-        path: where to, an mp4.
+        path: where to; an mp4 or a gif, by its name.
         width, height: of the frames [pixels], even.
         fps: frames a second.
 
@@ -102,7 +206,7 @@ def video(
         with (
             artifacts.replacing(path) as temporary,
             mediapy.VideoWriter(
-                temporary, (height, width), fps=fps, crf=20, ffmpeg_args="-movflags +faststart"
+                temporary, (height, width), fps=fps, **ENCODERS[path.suffix]
             ) as writer,
         ):
             yield writer.add_image

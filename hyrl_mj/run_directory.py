@@ -88,6 +88,10 @@ class Run:
         """The replays by start ("start0", ..., "critical") and controller ("policy", "hyrl_q0", ...)."""
         return {key: HybridArc.load(path) for key, path in self.arc_paths().items()}
 
+    def latest_path(self, controller: str) -> Path:
+        """The file of the latest simulation from a start of the user's."""
+        return self.path / "arcs" / f"latest_{controller}.npz"
+
     def _of_task(self, policy: MlpPolicy) -> MlpPolicy:
         if policy.task.name != self.settings.task:
             raise BadArtifact(
