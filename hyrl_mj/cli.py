@@ -16,6 +16,7 @@ from hyrl_mj.errors import BadInput, HyrlError, unknown
 from hyrl_mj.lattice import Lattice
 from hyrl_mj.noise import KINDS
 from hyrl_mj.replay import render_replay
+from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tables import print_robustness, print_summary
 from hyrl_mj.tasks.base import get_task, task_names
 
@@ -201,6 +202,24 @@ def replay(
     print(f"{'picture' if out.suffix == '.png' else 'video'} at {out}")
 
 
+def view(run_dir: RunDir, arc: str = "critical_hyrl_q0", port: int = 0) -> None:
+    """Replay an arc in MuJoCo's viewer, or in a browser where there is no display.
+
+    Args:
+        run_dir: a run directory.
+        arc: the name of a file in its folder arcs.
+        port: of the web viewer, which only this machine can reach; by default the first free one from
+            8080 on.
+    """
+    from hyrl_mj.viewing import view
+
+    run = pipeline.load_run(run_dir)
+    paths = {path.stem: path for path in sorted((run.path / "arcs").glob("*.npz"))}
+    if arc not in paths:
+        raise unknown("arc", arc, paths)
+    view(run.task, HybridArc.load(paths[arc]), port)
+
+
 def parse_size(text: str) -> tuple[int, int]:
     """Width and height [pixels] from a text like 640x480."""
     parts = text.lower().split("x")
@@ -230,6 +249,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "robustness": robustness,
     "simulate": simulate_run,
     "replay": replay,
+    "view": view,
     "doctor": doctor,
 }
 

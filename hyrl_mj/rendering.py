@@ -68,6 +68,14 @@ class SceneRenderer:
             raise _no_gl(error) from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
 
+    @property
+    def device(self) -> str:
+        """What GL draws with, by the driver's name for it."""
+        from OpenGL import GL  # chooses its platform when it is imported
+
+        self._gl.make_current()
+        return str(GL.glGetString(GL.GL_RENDERER).decode())
+
     def place(self, qpos: np.ndarray, camera: str) -> None:
         """Put the robot into a position (nq,) and look at it from a camera."""
         self.clear()

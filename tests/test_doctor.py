@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import imageio_ffmpeg
 import pytest
+from gl import needs_gl
 
 from hyrl_mj import doctor
 
@@ -11,7 +12,7 @@ from hyrl_mj import doctor
 @pytest.fixture
 def healthy(monkeypatch):
     """A machine that renders and encodes, whatever this one can do."""
-    monkeypatch.setattr(doctor, "_rendering_problem", lambda: None)
+    monkeypatch.setattr(doctor, "_rendering", lambda: ("a rasteriser", None))
     monkeypatch.setattr(doctor, "_encoding_problem", lambda: None)
 
 
@@ -20,6 +21,7 @@ def test_versions_without_importing(healthy):
     text = "\n".join(lines)
     assert well, text
     assert "cure" not in text
+    assert "a rasteriser" in text
     for name in ("python", *doctor.DISTRIBUTIONS):
         assert any(line.startswith(name + " ") for line in lines)
 
@@ -36,7 +38,7 @@ def test_no_gl(monkeypatch):
     monkeypatch.setattr(doctor, "_encoding_problem", lambda: None)
     lines, well = doctor.report()
     assert not well
-    (line,) = [line for line in lines if line.startswith("one picture")]
+    (line,) = [line for line in lines if line.startswith("rendering")]
     assert "FAILED" in line
     assert line.count(doctor.GL_CURE) == 1
 
@@ -46,9 +48,9 @@ def test_no_gl(monkeypatch):
     [("import os; os.abort()", "SIGABRT"), ("import time; time.sleep(60)", "within")],
 )
 def test_a_gl_driver_that_crashes_or_hangs(monkeypatch, code, says):
-    monkeypatch.setattr(doctor, "_ONE_FRAME", code)
+    monkeypatch.setattr(doctor, "_FRAMES", code)
     monkeypatch.setattr(doctor, "RENDER_TIMEOUT", 2.0)
-    problem = doctor._rendering_problem()
+    _, problem = doctor._rendering()
     assert problem is not None
     assert says in problem
     assert doctor.GL_CURE in problem
@@ -60,3 +62,13 @@ def test_ffmpeg(monkeypatch, tmp_path):
     problem = doctor._encoding_problem()
     assert problem is not None
     assert "pip install" in problem
+
+
+@needs_gl
+def test_it_says_what_renders_and_how_fast():
+    device, problem = doctor._rendering()
+    assert problem is None
+    name, speed = device.rsplit(", ", 1)
+    assert name
+    assert float(speed.split()[0]) > 0
+    assert speed.endswith("full frames/s at 640 x 480")

@@ -19,7 +19,7 @@ ORDER = (
     "errors", "progress", "mjcf", "plant", "noise", "tasks", "settings", "artifacts", "policies",
     "controllers", "adversary", "rendering", "envs", "simulation", "symmetry", "training", "sets",
     "lattice", "game", "critical_set", "partition", "limit", "extended_sets", "retraining", "hybrid",
-    "robustness", "episodes", "run_directory", "figures", "replay", "arcs", "doctor", "pipeline",
+    "robustness", "episodes", "run_directory", "figures", "replay", "viewing", "arcs", "doctor", "pipeline",
     "tables", "cli",
 )  # fmt: skip
 
