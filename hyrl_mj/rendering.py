@@ -127,8 +127,8 @@ class SceneRenderer:
     def redraw(self, picture: np.ndarray, box: Box) -> None:
         """Draw a part of the picture (height, width, 3) anew; the rest stays as it is.
 
-        A software rasteriser takes time for each pixel. This is exact: the camera's frustum is cut to
-        the box, and nothing else is different.
+        A software rasteriser takes time for each pixel. The camera's frustum is cut to the box, and
+        nothing else is different.
         """
         left, top, right, bottom = box
         kept = [

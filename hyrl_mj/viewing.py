@@ -80,8 +80,8 @@ def _web(
 
     def serve(endpoint: Any) -> None:
         with (
-            mock.patch.object(web_server, "bind_public_socket", lambda *_: socket),
-            mock.patch.object(web_viewer, "_print_url_banner", lambda *_: None),
+            mock.patch.object(web_server, "bind_public_socket", return_value=socket),
+            mock.patch.object(web_viewer, "_print_url_banner"),
         ):
             viewer = web_viewer.WebViewer(
                 viewer_protocol.ViewerConfig(gfx="web"), endpoint, model=model

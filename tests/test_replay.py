@@ -1,10 +1,8 @@
-"""The replay: what is in the video, and what is left when it cannot be made."""
+"""The replay: what is in its pictures, frame by frame, and what is left when it cannot be made."""
 
 from __future__ import annotations
 
-import os
 import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,47 +10,73 @@ import numpy as np
 import pytest
 from gl import needs_gl
 from PIL import Image
+from planted import circle_controller, circle_policy, decisions, halves
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, HybridArc, HybridController, Noise, NoRenderer
-from hyrl_mj.rendering import SceneRenderer
-from hyrl_mj.replay import HOLD, MODE_COLOURS, POLICY_COLOUR, Layout, Track, render_replay
+from hyrl_mj.extended_sets import ExtendedSets
+from hyrl_mj.replay import Show, render_replay
+from hyrl_mj.replay.captions import Group, Layout
+from hyrl_mj.replay.marks import (
+    BAD,
+    CRITICAL,
+    GOOD,
+    MODE_COLOURS,
+    OPEN,
+    OVERLAP,
+    POLICY_COLOUR,
+    Floor,
+    Tracker,
+)
+from hyrl_mj.replay.panel import Panel, Track
+from hyrl_mj.replay.timeline import AROUND, HOLD, frame_times
 from hyrl_mj.sets import Grid, GridSet
 
-SIZE, FPS = (160, 120), 20
+SIZE, FPS = (480, 240), 20
 TASK = hyrl_mj.get_task("vehicle")
+NOISE = Noise("alternating", 0.1)
 
 
 class Steer:
-    """Left of the line `until`, steer at one rate [m/s]; then straight on."""
+    """Left of the line `until`, steer at one rate [m/s]; then straight on, and at last `home`."""
 
-    def __init__(self, rate: float, until: float = 1.0):
-        self.rate, self.until = rate, until
+    def __init__(self, rate: float, until: float = 1.0, home: float = 0.0):
+        self.rate, self.until, self.home = rate, until, home
 
     def act(self, measured: np.ndarray) -> np.ndarray:
-        return np.where(measured[:, :1] < self.until, self.rate, 0.0)
+        x = measured[:, :1]
+        return np.where(x < self.until, self.rate, np.where(x < 1.85, 0.0, self.home))
 
 
-def jumping_arc(z0: tuple[float, float], q0: int) -> HybridArc:
+def jumping_arc(q0: int = 1, noise: Noise | None = None, home: float = -1.0) -> HybridArc:
     """The pillar is passed on the left after a jump to mode 0 at y = 0.1."""
     grid = Grid.with_cells(TASK.chart, 60)
     y = grid.nodes[:, 1]
     sets = {0: GridSet(grid, -0.3 - y), 1: GridSet(grid, y - 0.1)}
-    controller = HybridController(TASK, {0: Steer(1.0, 1.2), 1: Steer(0.5)}, sets)
-    arc = hyrl_mj.simulate(TASK, controller, np.array(z0), q0=q0)
+    controller = HybridController(TASK, {0: Steer(1.0, 1.2, home), 1: Steer(0.5)}, sets)
+    arc = hyrl_mj.simulate(TASK, controller, np.zeros(2), noise=noise, q0=q0)
     assert isinstance(arc, HybridArc)
     return arc
 
 
 @pytest.fixture(scope="module")
-def pair() -> tuple[HybridArc, HybridArc]:
-    crash = hyrl_mj.simulate(TASK, Steer(0.0), np.zeros(2), noise=Noise("alternating", 0.1))
-    assert isinstance(crash, HybridArc)
-    arc = jumping_arc((0.0, 0.0), q0=1)
-    assert crash.outcome == "crashed"
-    assert arc.outcome == "reached"
-    assert arc.j[-1] == 1
-    return crash, arc
+def crash() -> HybridArc:
+    arc = hyrl_mj.simulate(TASK, Steer(0.0), np.zeros(2), noise=NOISE)
+    assert isinstance(arc, HybridArc)
+    assert arc.outcome == "crashed"
+    return arc
+
+
+@pytest.fixture(scope="module")
+def jump() -> HybridArc:
+    arc = jumping_arc()
+    assert (arc.outcome, arc.j[-1]) == ("reached", 1)
+    return arc
+
+
+@pytest.fixture(scope="module")
+def show(crash, jump) -> Show:
+    return Show([crash], [jump])
 
 
 def frames_of(path: Path) -> np.ndarray:
@@ -63,95 +87,299 @@ def frames_of(path: Path) -> np.ndarray:
     raw = subprocess.run(
         [*command, "-f", "rawvideo", "-pix_fmt", "rgb24", "-"], capture_output=True, check=True
     )
-    return np.frombuffer(raw.stdout, np.uint8).reshape(-1, SIZE[1], 2 * SIZE[0], 3)
+    return np.frombuffer(raw.stdout, np.uint8).reshape(-1, SIZE[1], SIZE[0], 3)
 
 
-def count(picture: np.ndarray, colour: tuple[int, int, int]) -> int:
-    """Pixels of nearly that colour."""
-    return int((np.abs(picture.astype(int) - colour).max(axis=-1) < 24).sum())
+def near(picture: np.ndarray, colour: tuple[int, int, int], within: int = 24) -> np.ndarray:
+    """Which pixels have nearly that colour."""
+    return np.abs(picture.astype(int) - colour).max(axis=-1) < within
+
+
+def coarse(picture: np.ndarray) -> np.ndarray:
+    """Means of blocks of 16 x 16 pixels of the scene: a poster's edges and letters are smoother."""
+    scene = picture[16:-16]
+    rows, columns = scene.shape[0] // 16, scene.shape[1] // 16
+    return scene.reshape(rows, 16, columns, 16, 3).mean(axis=(1, 3))
+
+
+def drawn(tracks, t, size=(320, 320), camera="overhead", floor=None, before=()):
+    """A panel's picture at time t [s], drawn at earlier times before; and where points are in it."""
+    panel, picture = Panel(TASK, tracks, *size, camera, floor), np.zeros((*size[::-1], 3), np.uint8)
+    for moment in (*before, t):
+        panel.draw(moment, picture)
+    renderer = panel._renderer
+    panel.close()
+    return picture, lambda points: renderer.project(np.atleast_2d(points))[0].round().astype(int)
+
+
+# ---- the video
 
 
 @needs_gl
-def test_the_video_plays_both_arcs_in_real_time(tmp_path, pair):
+def test_the_video_plays_both_arcs_in_real_time(tmp_path, show):
     path = tmp_path / "replay.mp4"
-    render_replay(TASK, [pair, pair], path, size=SIZE, fps=FPS)
+    render_replay(TASK, [show, show], path, size=SIZE, fps=FPS)
     frames = frames_of(path)
-    longest = max(arc.t[-1] for arc in pair)
-    assert len(frames) == 2 * (round(longest * FPS) + 1 + round(HOLD * FPS))
-    left, right = frames[:, :, : SIZE[0]], frames[:, :, SIZE[0] :]
-    crash, middle = round(pair[0].t[-1] * FPS), round(longest * FPS / 2)
-    moved = np.abs(np.diff(right[: round(longest * FPS)].astype(int), axis=0)).max(axis=(1, 2, 3))
+    (policy,), (hybrid,) = show.policy, show.hybrid
+    longest = round(max(policy.t[-1], hybrid.t[-1]) * FPS)
+    assert len(frames) == 2 * (longest + 1 + round(HOLD * FPS))
+    assert (frames.reshape(len(frames), -1).std(axis=1) > 10).all(), "no frame is blank"
+    left, right = frames[:, :, : SIZE[0] // 2], frames[:, :, SIZE[0] // 2 :]
+    crash = round(policy.t[-1] * FPS)
+    moved = np.abs(np.diff(right[:longest].astype(int), axis=0)).max(axis=(1, 2, 3))
     assert (moved > 40).all(), "the robot moves in every frame"
     # After its crash the left panel stays as it is, but for what the codec does to it.
-    assert np.abs(left[crash + 1].astype(int) - left[middle]).mean() < 1
-    poster = np.asarray(Image.open(path.with_suffix(".png")))
-    assert np.abs(poster.astype(int) - frames[len(frames) // 2 - 1]).mean() < 4
+    assert np.abs(left[crash + 1].astype(int) - left[longest // 2]).mean() < 1
+    scenes = slice(30, -30)
+    for k in range(crash + 1, longest):
+        assert np.abs(left[k, scenes].astype(int) - right[k, scenes]).max() > 60
+    poster = coarse(np.asarray(Image.open(path.with_suffix(".png"))))
+    assert np.abs(poster - coarse(frames[len(frames) // 2 - 1])).max() < 12
     assert sorted(p.name for p in tmp_path.iterdir()) == ["replay.mp4", "replay.png"]
 
 
 @needs_gl
-def test_the_path_has_the_colours_of_its_modes(pair):
-    renderer = SceneRenderer(TASK.model, 320, 240)
-    alone, joined = Track(TASK, pair[0], "", modes=False), Track(TASK, pair[1], "", modes=True)
-    without_jump = Track(TASK, replace(pair[1], j=0 * pair[1].j), "", modes=True)
-    start = joined.picture(renderer, 0.0, "overhead")
-    policy, hybrid, unmarked = (
-        track.picture(renderer, track.end, "overhead") for track in (alone, joined, without_jump)
-    )
-    renderer.close()
-    for colour in MODE_COLOURS[:2]:
-        assert count(start, colour) == 0
-        assert count(policy, colour) == 0
-        assert count(hybrid, colour) > 20
-    assert count(policy, POLICY_COLOUR) > count(start, POLICY_COLOUR) + 20
-    marked = np.argwhere(np.abs(hybrid.astype(int) - unmarked).max(axis=-1) > 24)
-    assert len(marked) > 20
-    assert np.ptp(marked, axis=0).max() < 16, "the jump is marked, in one place"
+def test_around_a_jump_it_is_slower(tmp_path, show):
+    path = tmp_path / "replay.mp4"
+    render_replay(TASK, [show], path, size=SIZE, fps=FPS, slow_motion=3)
+    (arc,) = show.hybrid
+    at = arc.t[np.flatnonzero(np.diff(arc.j))[0]]
+    slow = min(at, AROUND) + AROUND
+    assert len(frames_of(path)) == int(np.ceil((arc.t[-1] + 2 * slow) * FPS)) + 1 + HOLD * FPS
 
 
 @needs_gl
-def test_between_samples_the_robot_is_between_its_places(pair):
-    track, z = Track(TASK, pair[1], "", modes=True), pair[1].z
-    row = pair[1].at(0.1)
-    np.testing.assert_allclose(track._at(0.125, track._qpos), (z[row] + z[row + 1]) / 2, atol=1e-9)
+def test_a_gif_has_as_many_frames_and_a_picture_is_the_last(tmp_path, show):
+    render_replay(TASK, [show], tmp_path / "replay.gif", size=SIZE, fps=FPS)
+    with Image.open(tmp_path / "replay.gif") as film:
+        assert (film.n_frames, film.size) == (round(3.0 * FPS) + 1 + round(HOLD * FPS), SIZE)
+        film.seek(film.n_frames - 1)
+        last = coarse(np.asarray(film.convert("RGB")))
+    render_replay(TASK, [show], tmp_path / "alone.png", size=SIZE, fps=FPS)
+    alone = coarse(np.asarray(Image.open(tmp_path / "alone.png")))
+    assert np.abs(alone - last).max() < 12
+    names = sorted(p.name for p in tmp_path.iterdir())
+    assert names == ["alone.png", "replay.gif", "replay.png"]
+
+
+@needs_gl
+def test_an_overlay_has_both_paths_in_one_scene(tmp_path, show):
+    render_replay(TASK, [show], tmp_path / "one.png", size=(640, 480), layout="overlay")
+    picture = np.asarray(Image.open(tmp_path / "one.png"))
+    for colour in (POLICY_COLOUR, *MODE_COLOURS[:2], GOOD, BAD):
+        assert near(picture, colour).sum() > 8
+    # One arena, in the middle: the pillar's centre is seen once.
+    pillar = near(picture[262], (168, 175, 188), within=16)
+    assert 150 < pillar.sum()
+    assert np.ptp(np.flatnonzero(pillar)) < 210
+
+
+# ---- the scene
+
+
+@needs_gl
+def test_the_path_has_the_colours_of_its_modes(crash, jump):
+    picture, pixel = drawn([Track(TASK, jump)], 3.0)
+    track = Track(TASK, jump)
+    (row,) = track.jumps
+    middles = (track.points[1:] + track.points[:-1]) / 2
+    for points, colour in ((middles[2 : row - 2], 1), (middles[row + 3 : row + 20], 0)):
+        column, line = pixel(points).T
+        assert near(picture[line, column], MODE_COLOURS[colour]).all()
+    column, line = pixel(track.points[row])[0]
+    assert near(picture[line, column], (255, 255, 255)), "the jump is marked"
+    start, _ = drawn([track], 0.0)
+    policy, _ = drawn([Track(TASK, crash)], 3.0)
+    for colour in MODE_COLOURS[:2]:
+        assert not near(start, colour).any()
+        assert not near(policy, colour).any()
+    assert near(policy, POLICY_COLOUR).sum() > near(start, POLICY_COLOUR).sum() + 20
+    column, line = pixel(Track(TASK, crash).points[-1])[0]
+    assert near(policy[line - 3 : line + 4, column - 3 : column + 4], BAD).sum() > 5, "its end, too"
+
+
+@needs_gl
+@pytest.mark.parametrize("camera", ["overhead", "chase", "three_quarter"])
+def test_frames_do_not_depend_on_those_before(crash, jump, camera):
+    tracks = [Track(TASK, arc) for arc in (jump, crash)]
+    at_once, _ = drawn(tracks, 1.53, camera=camera)
+    by_and_by, _ = drawn(tracks, 1.53, camera=camera, before=np.arange(0.0, 1.5, 0.07))
+    # Now and then a sample on an edge is rounded to the other side.
+    differ = np.abs(at_once.astype(int) - by_and_by).max(axis=-1) > 2
+    assert differ.sum() <= 20
+
+
+@needs_gl
+def test_the_measured_robot_is_a_ghost_within_the_bound():
+    arc = jumping_arc(q0=0, noise=NOISE)
+    track, quiet = Track(TASK, arc), Track(TASK, replace(arc, bound=0.0))
+    t = 0.52
+    noisy, pixel = drawn([track], t, size=(640, 640))
+    plain, _ = drawn([quiet], t, size=(640, 640))
+    rows, columns = np.nonzero(np.abs(noisy.astype(int) - plain).max(axis=-1) > 12)
+    here = track.point(t)
+    assert arc.measured[arc.at(t), 1] > arc.z[arc.at(t), 1]
+    reach = pixel(here + np.array([[-0.28, 0.2, 0], [0.05, -0.15, 0]]))
+    assert reach[0, 0] <= columns.min() <= columns.max() <= reach[1, 0]
+    assert reach[0, 1] <= rows.min() <= rows.max() <= reach[1, 1]
+    (line,) = track.bounds(t)
+    np.testing.assert_allclose(line[[0, -1], 1], here[1] + np.array([-0.1, 0.1]), atol=1e-9)
+    for end in line[[0, -1]]:
+        column, row = pixel(0.9 * end + 0.1 * here)[0]
+        assert np.abs(noisy[row, column].astype(int) - plain[row, column]).max() > 12
+    np.testing.assert_array_equal(drawn([track], 3.0)[0], drawn([quiet], 3.0)[0])
+
+
+def test_the_bound_of_an_angle_is_an_arc(circle):
+    arc = hyrl_mj.simulate(circle, circle_policy(circle), np.array([2.0]), noise=NOISE, horizon=1.0)
+    (line,) = Track(circle, arc).bounds(0.0)
+    np.testing.assert_allclose(np.linalg.norm(line[:, :2], axis=1), 1.0, atol=1e-9)
+    angle = np.arctan2(line[:, 1], line[:, 0])
+    np.testing.assert_allclose(angle[[0, 4, 8]], [1.9, 2.0, 2.1], atol=1e-9)
+
+
+@needs_gl
+def test_critical_set_and_overlap_lie_on_the_floor(jump):
+    grid = Grid.with_cells(TASK.chart, 120)
+    x, y = grid.nodes.T
+    sets = tuple(GridSet(grid, side * y - 0.2) for side in (-1, 1))
+    won = np.ones(len(x), dtype=bool)
+    none = (np.empty((0, 2)), np.empty(0))
+    extended = ExtendedSets((0, 1), sets, (won, won), 0.3, 0.1, *none)
+    floor = Floor.of(TASK, decisions(TASK), halves(TASK, 120), extended)
+    picture, pixel = drawn([Track(TASK, jump)], 0.0, size=(640, 640), floor=floor)
+    plain, _ = drawn([Track(TASK, jump)], 0.0, size=(640, 640))
+    for point, colour in (
+        ([0.2, -0.15, 0], OVERLAP),
+        ([0.62, 0.15, 0], OVERLAP),
+        ([0.4, 0.0, 0], CRITICAL),
+    ):
+        column, row = pixel(point)[0]
+        assert near(picture[row, column], colour, within=12)
+    # Beside the pillar and behind it the ways have joined: nothing to see.
+    for point in ([0.2, 0.25, 0], [2.5, 0.0, 0]):
+        column, row = pixel(point)[0]
+        np.testing.assert_array_equal(picture[row, column], plain[row, column])
+
+
+def test_the_overlap_of_the_circle_is_around_its_critical_point(circle):
+    grid = Grid.with_cells(circle.chart, 600)
+    controller = circle_controller(circle, overlap=0.4)
+    sets = tuple(GridSet(grid, controller.flow_set(q).signed_distance(grid.nodes)) for q in (0, 1))
+    won = np.ones(len(grid.nodes), dtype=bool)
+    extended = ExtendedSets((0, 1), sets, (won, won), 0.5, 0.1, np.empty((0, 1)), np.empty(0))
+    floor = Floor.of(circle, decisions(circle), halves(circle, 600), extended)
+    angles = np.arctan2(floor.strips[..., 1], -floor.strips[..., 0])
+    assert np.abs(angles).max() == pytest.approx(0.4, abs=0.011)
+    lengths = np.linalg.norm(floor.strips[:, 0] - floor.strips[:, 1], axis=1)
+    assert lengths.sum() == pytest.approx(0.8, abs=0.02)
+    np.testing.assert_allclose(floor.critical[:, :2], [[-1, 0]], atol=1e-9)
+
+
+def test_between_samples_the_robot_is_between_its_places(jump):
+    track, z = Track(TASK, jump), jump.z
+    row = jump.at(0.1)
+    np.testing.assert_allclose(track.qpos(0.125), (z[row] + z[row + 1]) / 2, atol=1e-9)
     # The tracked site is the vehicle itself.
-    np.testing.assert_allclose(track._points[:, :2], z, atol=1e-9)
+    np.testing.assert_allclose(track.points[:, :2], z, atol=1e-9)
+    np.testing.assert_allclose(Tracker(TASK).of_z(z), track.points, atol=1e-6)
 
 
-def test_captions_lie_outside_the_scene(pair):
+# ---- time and captions
+
+
+def test_frames_show_equal_steps_of_time_to_the_end_and_hold_it():
+    times = frame_times(2.0, 10)
+    assert len(times) == 21 + 10
+    np.testing.assert_allclose(times[:21], np.arange(21) / 10, atol=1e-12)
+    assert set(times[20:]) == {2.0}
+
+
+def test_time_goes_slowly_around_jumps_and_only_there():
+    times = frame_times(3.0, 20, jumps=[1.0, 1.2, 2.9], slow_motion=4)
+    steps = np.diff(times[: -round(HOLD * 20)])
+    assert len(times) == np.ceil((3.0 + 3 * (0.7 + 0.35)) * 20) + 1 + HOLD * 20
+    for step, t in zip(steps, times, strict=False):
+        inside = (t >= 0.75 and t + step <= 1.45) or t >= 2.65
+        outside = t + step <= 0.75 or (t >= 1.45 and t + step <= 2.65)
+        if inside and t + step < 3.0:
+            assert step == pytest.approx(0.05 / 4)
+        if outside:
+            assert step == pytest.approx(0.05)
+    np.testing.assert_array_equal(frame_times(3.0, 20, [1.0]), frame_times(3.0, 20))
+
+
+def test_captions_tell_mode_and_outcome(jump):
     layout = Layout(640, 480)
-    scene = np.full((layout.scene_height, 640, 3), 7, dtype=np.uint8)
-    track = Track(TASK, pair[1], "HyRL", modes=True)
-    early, late = (layout.panel(scene, track, t) for t in (0.0, track.end))
-    inside = slice(layout.bar, -layout.bar)
-    assert (late[inside, :-1] == 7).all()
+    group = [Group("HyRL", [Track(TASK, jump)])]
+    early, late = (layout.below(group, t) for t in (0.0, 3.0))
     # Mode 1 at first, mode 0 after the jump; the outcome appears only at the end.
-    assert count(early, MODE_COLOURS[1]) > 200
-    assert count(late, MODE_COLOURS[0]) > 200
-    assert count(late, (0, 125, 85)) > 200 > count(early, (0, 125, 85))
+    for picture, mode in ((early, 1), (late, 0)):
+        assert near(picture, MODE_COLOURS[mode]).sum() > 200
+        assert near(picture, MODE_COLOURS[1 - mode]).sum() == 0
+    assert near(late, GOOD).sum() > 200 > near(early, GOOD).sum()
+    assert early.shape == late.shape == (layout.bar, 640, 3)
 
 
-def test_states_of_another_model_are_refused(tmp_path, pair):
-    wrong = replace(pair[1], state=pair[1].state[:, :-1])
+def test_who_crosses_the_line_elsewhere_has_not_arrived():
+    arc = jumping_arc(home=0.0)
+    assert arc.outcome == "reached"
+    caption = Layout(640, 480).below([Group("HyRL", [Track(TASK, arc)])], 3.0)
+    assert near(caption, GOOD).sum() == 0
+    assert near(caption, OPEN).sum() > 200
+
+
+def test_captions_of_several_arcs_count_outcomes(crash, jump):
+    layout = Layout(640, 480)
+    group = [Group("both", [Track(TASK, arc) for arc in (crash, jump)])]
+    colours = [
+        [bool(near(layout.below(group, t), c).sum() > 200) for c in (BAD, GOOD)]
+        for t in (0.0, 1.5, 3.0)
+    ]
+    assert colours == [[False, False], [True, False], [True, True]]
+
+
+# ---- what cannot be played
+
+
+def test_arcs_of_other_tasks_and_models_are_refused(tmp_path, show, circle):
+    (policy,), (hybrid,) = show.policy, show.hybrid
+    wrong = replace(hybrid, state=hybrid.state[:, :-1])
     with pytest.raises(BadArtifact, match="simulate it again"):
-        render_replay(TASK, [(pair[0], wrong)], tmp_path / "replay.mp4", size=SIZE)
+        render_replay(TASK, [Show([policy], [wrong])], tmp_path / "replay.mp4", size=SIZE)
+    with pytest.raises(BadArtifact, match="an arc of vehicle cannot be replayed"):
+        render_replay(circle, [show], tmp_path / "replay.mp4", size=SIZE)
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("size", [(161, 120), (0, 0), (160, 4000)])
-def test_impossible_sizes_are_refused(tmp_path, pair, size):
-    with pytest.raises(BadInput, match="pixels"):
-        render_replay(TASK, [pair], tmp_path / "replay.mp4", size=size)
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("a.mp4", {"size": (481, 160)}, "481 x 160 pixels cannot be drawn: give even numbers"),
+        ("a.mp4", {"size": (0, 0)}, "0 x 0 pixels"),
+        ("a.mp4", {"size": (100_000, 100_000)}, "to 2048 x 2048"),
+        ("a.mp4", {"fps": 0}, "no video has 0 frames a second: give 1 to 240"),
+        ("a.mp4", {"slow_motion": 0.5}, "slow motion 0.5 cannot be played: give 1"),
+        ("a.mp4", {"slow_motion": float("nan")}, "slow motion nan"),
+        ("a.mp4", {"layout": "tiled"}, "unknown layout 'tiled'.*side-by-side, overlay"),
+        ("a.mp4", {"camera": "top"}, "'top'.*overhead, three_quarter, chase"),
+        ("a.avi", {}, "a.avi is no replay: give a name that ends in one of .mp4, .gif, .png"),
+    ],
+)
+def test_impossible_wishes_are_refused(tmp_path, show, name, options, message):
+    with pytest.raises(BadInput, match=message):
+        render_replay(TASK, [show], tmp_path / name, **{"size": SIZE, **options})
+    assert not list(tmp_path.iterdir())
 
 
 def test_nothing_to_replay(tmp_path):
-    with pytest.raises(BadInput, match="at least one pair"):
+    with pytest.raises(BadInput, match="at least one show"):
         render_replay(TASK, [], tmp_path / "replay.mp4")
 
 
 @needs_gl
 @pytest.mark.parametrize("ffmpeg", ["missing", "fails"])
-def test_nothing_is_left_behind_when_ffmpeg_fails(tmp_path, pair, monkeypatch, ffmpeg):
+def test_nothing_is_left_behind_when_ffmpeg_fails(tmp_path, show, monkeypatch, ffmpeg):
     out = tmp_path / "out"
     if ffmpeg == "fails":
         fake = tmp_path / "ffmpeg"
@@ -165,27 +393,6 @@ def test_nothing_is_left_behind_when_ffmpeg_fails(tmp_path, pair, monkeypatch, f
             raise RuntimeError("No ffmpeg exe could be found")
 
         monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", nowhere)
-    with pytest.raises(NoRenderer, match="reinstall imageio-ffmpeg"):
-        render_replay(TASK, [pair], out / "replay.mp4", size=SIZE, fps=FPS)
+    with pytest.raises(NoRenderer, match="reinstall the encoder"):
+        render_replay(TASK, [show], out / "replay.mp4", size=SIZE, fps=FPS)
     assert not out.exists() or not list(out.iterdir())
-
-
-def test_without_gl_one_message_says_what_to_install():
-    code = (
-        "import hyrl_mj\n"
-        "from hyrl_mj.rendering import SceneRenderer\n"
-        "try: SceneRenderer(hyrl_mj.get_task('vehicle').model, 64, 48)\n"
-        "except hyrl_mj.NoRenderer as error: print(error)\n"
-    )
-    child = subprocess.run(
-        [sys.executable, "-c", code],
-        env={**os.environ, "MUJOCO_GL": "disable"},
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=60,
-    )
-    assert "MUJOCO_GL='disable'" in child.stdout
-    assert "apt-get install libegl1 libgl1-mesa-dri" in child.stdout
-    assert child.stdout.count("\n") == 1
-    assert "Traceback" not in child.stderr

@@ -24,7 +24,7 @@ from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks.base import Task
 
 FASTEST, SLOWEST_MOTION = 240, 100  # frames/s, and times slower than real time
-SMALLEST = (160, 120)  # [pixels] of a panel, for captions that can be read
+SMALLEST = (240, 160)  # [pixels] of a panel, for captions that can be read
 LAYOUTS = ("side-by-side", "overlay")
 FORMATS = (*ENCODERS, ".png")
 # A poster is drawn so many times larger and then reduced, for smooth edges.
@@ -105,7 +105,7 @@ def render_replay(
                     done += 1
                     progress.update(done)
     last = screens[0].times(fps, slow_motion)[-1:]
-    (large,) = screens[0].frames((FINER * size[0], FINER * size[1]), last)
+    (large,) = screens[0].frames(size, last, FINER)
     with artifacts.replacing(poster) as temporary:
         Image.fromarray(large).resize(size, Image.Resampling.LANCZOS).save(temporary)
 
@@ -144,14 +144,18 @@ class _Screen:
         jumps = [track.arc.t[row] for track in self._all for row in track.jumps]
         return frame_times(end, fps, jumps, slow_motion)
 
-    def frames(self, size: tuple[int, int], times: np.ndarray) -> Iterator[np.ndarray]:
-        """The frames (height, width, 3) at times [s]; each is valid until the next."""
-        frame = np.empty((size[1], size[0], 3), dtype=np.uint8)
-        edges = np.linspace(0, size[0], len(self._panels) + 1).astype(int)
+    def frames(
+        self, size: tuple[int, int], times: np.ndarray, finer: int = 1
+    ) -> Iterator[np.ndarray]:
+        """The frames (height, width, 3) at times [s], `finer` times the size; each valid until the next."""
+        frame = np.empty((finer * size[1], finer * size[0], 3), dtype=np.uint8)
+        edges = finer * np.linspace(0, size[0], len(self._panels) + 1).astype(int)
         with ExitStack() as stack:
             views = []
             for left, right, panel in zip(edges, edges[1:], self._panels, strict=False):
-                view = _View(self._task, frame[:, left:right], *panel, self._camera, self._floor)
+                layout = Layout(right - left, len(frame), finer)
+                part = frame[:, left:right]
+                view = _View(self._task, layout, part, *panel, self._camera, self._floor)
                 views.append(stack.enter_context(closing(view)))
             for t in times:
                 for ready in [view.draw(t) for view in views]:
@@ -168,13 +172,13 @@ class _View:
     def __init__(
         self,
         task: Task,
+        layout: Layout,
         part: np.ndarray,
         title: str,
         groups: Sequence[Group],
         camera: str,
         floor: Floor | None,
     ):
-        layout = Layout(part.shape[1], part.shape[0])
         tracks = [track for group in groups for track in group.tracks]
         self._layout, self._groups = layout, groups
         self._scene, self._below = part[layout.bar : -layout.bar], part[-layout.bar :]

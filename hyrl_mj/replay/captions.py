@@ -15,12 +15,14 @@ from hyrl_mj.replay.panel import Track
 from hyrl_mj.simulation import HybridArc
 
 EDGE = (205, 208, 213)
+SMALLEST_TEXT = 8  # [pixels]
 OUTCOMES: dict[str, tuple[str, RGB]] = {
-    "reached": ("reached the set-point", GOOD),
+    "reached": ("arrived", GOOD),
     "crashed": ("crashed", BAD),
     "out_of_bounds": ("left the arena", BAD),
     "stalled": ("stalled", BAD),
     "running": ("not there yet", OPEN),
+    "missed": ("ended off the goal", OPEN),
 }
 
 
@@ -43,15 +45,18 @@ class Layout:
 
     Attributes:
         width, height: of the panel [pixels].
+        finer: how many times larger it is drawn than it will be seen.
     """
 
     width: int
     height: int
+    finer: int = 1
 
     @cached_property
     def text(self) -> int:
         """Height of the letters [pixels]."""
-        return max(8, min(self.width // 32, self.height // 30))
+        seen = min(self.width / 32, self.height / 30) / self.finer
+        return max(SMALLEST_TEXT, int(seen)) * self.finer
 
     @property
     def bar(self) -> int:
@@ -99,12 +104,12 @@ class Layout:
             line.words(f"j = {arc.j[row]}", INK, room="j = 00")
             line.badge(f"q = {track.task.mode_name(int(arc.q[row]))}", track.colour(row))
         if t >= track.end:
-            line.badge(*OUTCOMES.get(arc.outcome, (arc.outcome, OPEN)))
+            line.badge(*OUTCOMES[_outcome(track)])
 
     def _several(self, line: _Line, tracks: Sequence[Track], t: float) -> None:
-        over = Counter(track.arc.outcome for track in tracks if t >= track.end)
+        over = Counter(_outcome(track) for track in tracks if t >= track.end)
         for outcome, number in sorted(over.items()):
-            words, colour = OUTCOMES.get(outcome, (outcome, OPEN))
+            words, colour = OUTCOMES[outcome]
             line.badge(f"{number} of {len(tracks)} {words}", colour)
 
 
@@ -150,3 +155,11 @@ def _noise(arc: HybridArc) -> str:
     if arc.noise == "none" or arc.bound == 0:
         return "no noise"
     return f"{arc.noise} noise, eps = {arc.bound:g}"
+
+
+def _outcome(track: Track) -> str:
+    """The outcome of an arc; who crosses the finishing line elsewhere than at the set-point misses it."""
+    reached = track.arc.outcome == "reached"
+    return (
+        "missed" if reached and not track.task.arrived(track.arc.z[-1:])[0] else track.arc.outcome
+    )
