@@ -60,7 +60,7 @@ class SceneRenderer:
         self.scene = mujoco.MjvScene(self.model, maxgeom=GEOMS)
         self._options, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
         try:
-            self._gl = mujoco.GLContext(width, height)
+            self._gl = _gl_context(width, height)
             self._gl.make_current()
             self._context = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100)
         # Each GL backend fails in its own way: ImportError, AttributeError, RuntimeError, ...
@@ -220,6 +220,16 @@ def video(
             yield writer.add_image
     except (ImportError, OSError, RuntimeError) as error:
         raise NoRenderer(f"no video at {path} ({_short(error)}): {FFMPEG_CURE}") from error
+
+
+def _gl_context(width: int, height: int) -> Any:
+    """A GL context of the backend that was chosen."""
+    if not os.environ.get("MUJOCO_GL") and not mjcf.has_display():
+        # MuJoCo was imported before this package, and would open a window.
+        from mujoco.egl import GLContext
+
+        return GLContext(width, height)
+    return mujoco.GLContext(width, height)
 
 
 def _no_gl(error: Exception) -> NoRenderer:

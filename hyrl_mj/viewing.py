@@ -73,6 +73,7 @@ def _web(
     try:
         # The viewer would listen to the whole network, without a password, and has no setting for that.
         socket = web_server.bind_public_socket(LOOPBACK, port)
+        socket.listen()  # who comes early waits
     except (OSError, OverflowError, RuntimeError) as error:
         raise BadInput(
             f"port {port} cannot be used ({error}): give a free one, 1024 to 65535"

@@ -1,17 +1,23 @@
 """The command line: what people type, and what they are told when it is wrong."""
 
 import os
+import re
 import shutil
+import signal
+import socket
 import subprocess
 import sys
+import urllib.request
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from gl import needs_gl
+from PIL import Image
 
 import hyrl_mj
 from hyrl_mj import cli, pipeline
+from hyrl_mj.mjcf import has_display
 
 
 def call(*arguments):
@@ -118,6 +124,62 @@ def test_a_run_without_a_critical_set_has_one_mode_and_leaves_nothing_of_two(cop
     )
 
 
+@needs_gl
+def test_what_was_simulated_is_replayed_and_so_are_the_paper_s_starts_anew(copied):
+    start = ("--start", "3.0", "--q0", "1", "--noise", "worst", "--horizon", "0.5")
+    assert call("simulate", copied, *start).returncode == 0
+    before = contents(copied)
+    for name, options in (
+        ("latest.png", ["--starts", "latest"]),
+        ("paper.png", ["--starts", "paper", "--noise", "adversarial", "--eps", "0.05"]),
+    ):
+        done = call("replay", copied, "--out", copied / name, "--size", "640x320", *options)
+        assert done.returncode == 0, done.stderr
+        assert f"picture at {copied / name}" in done.stdout
+        with Image.open(copied / name) as picture:
+            assert picture.size == (640, 320)
+    assert set(contents(copied)) - set(before) == {copied / "latest.png", copied / "paper.png"}
+
+
+def test_without_a_latest_simulation_there_is_nothing_to_replay(copied):
+    for left in (copied / "arcs").glob("latest_*"):
+        left.unlink()
+    done = call("replay", copied, "--starts", "latest")
+    assert_one_sentence(done, "latest_policy.npz", "run the stage")
+
+
+@needs_gl
+def test_a_video_that_cannot_be_written_leaves_nothing(copied):
+    (copied / "file").write_text("mine")
+    before = contents(copied)
+    done = call("replay", copied, "--out", copied / "file" / "replay.mp4", "--size", "640x320")
+    assert done.returncode in (1, 2)
+    assert "Traceback" not in done.stderr
+    assert str(copied / "file") in done.stderr
+    assert contents(copied) == before
+
+
+@pytest.mark.skipif(has_display(), reason="a window would open")
+def test_the_web_viewer_is_for_this_machine_only(finished):
+    command = [sys.executable, "-m", "hyrl_mj.cli", "view", str(finished[0])]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as child:
+        try:
+            said = child.stdout.readline()
+            address = re.search(r"http://127.0.0.1:(\d+)/", said)
+            assert address, said
+            with urllib.request.urlopen(address[0], timeout=20) as page:
+                assert "<html" in page.read().decode().lower()
+            # Who listens to the whole network is found at every address of this machine.
+            with pytest.raises(ConnectionRefusedError):
+                socket.create_connection(("127.0.0.2", int(address[1])), timeout=5)
+        finally:
+            child.send_signal(signal.SIGINT)
+        assert child.wait(timeout=20) == 130
+        assert "Traceback" not in child.stderr.read()
+
+
 def test_simulate_prints_both_ends(finished):
     done = call("simulate", finished[0], "--start", "3.0", "--q0", "1", "--noise", "uniform")
     assert done.returncode == 0, done.stderr
@@ -204,12 +266,20 @@ def test_bad_input_before_anything_is_made(arguments, parts, tmp_path, monkeypat
         (["robustness", "--episodes", "9", "--noise", "white"], ["'white'", "adversarial"]),
         (["robustness", "--noise", "uniform"], ["--episodes"]),
         (["extended-sets", "--horizon", "0"], ["horizon 0", "> 0"]),
-        pytest.param(["replay", "--camera", "top"], ["'top'", "overhead, chase"], marks=needs_gl),
-        (["replay", "--out", "film.gif"], ["film.gif", ".mp4"]),
+        (["replay", "--camera", "top"], ["'top'", "overhead, three_quarter, chase"]),
+        (["replay", "--out", "film.avi"], ["film.avi", ".mp4, .gif, .png"]),
+        (["replay", "--starts", "mine"], ["'mine'", "critical, paper, latest"]),
+        (["replay", "--starts", "latest", "--eps", "0.1"], ["--eps to simulate"]),
+        (["replay", "--noise", "white"], ["'white'", "worst"]),
+        (["replay", "--eps", "4"], ["4 hides the whole"]),
+        (["replay", "--layout", "tiled"], ["'tiled'", "overlay"]),
+        (["replay", "--slow-motion", "0"], ["slow motion 0", "real time"]),
+        (["view", "--arc", "mine"], ["'mine'", "critical_hyrl_q0"]),
+        (["view", "--port", "70000"], ["port 70000"]),
         (["simulate", "--start", "1", "--seed", "-1"], ["seed -1", "from 0 to"]),
         (["simulate", "--start", "1", "--horizon", "1e12"], ["horizon 1e+12", "3600"]),
         (["replay", "--size", "big"], ["'big'", "640x480"]),
-        (["replay", "--fps", "0"], ["at 0 frames a second"]),
+        (["replay", "--fps", "0"], ["0 frames a second"]),
     ],
 )
 def test_bad_input_leaves_the_run_as_it_was(arguments, parts, finished):

@@ -148,6 +148,26 @@ def test_without_gl_one_message_says_what_to_install(backend):
     assert "Traceback" not in child.stderr
 
 
+@needs_gl
+def test_who_imports_mujoco_first_gets_pictures_too():
+    code = (
+        "import mujoco, hyrl_mj\n"
+        "from hyrl_mj.rendering import SceneRenderer\n"
+        "renderer = SceneRenderer(hyrl_mj.get_task('vehicle').model, 64, 48)\n"
+        "renderer.place([0, 0], 'overhead')\n"
+        "print(renderer.draw().std() > 5)\n"
+    )
+    hidden = ("MUJOCO_GL", "PYOPENGL_PLATFORM")
+    child = subprocess.run(
+        [sys.executable, "-c", code],
+        env={k: v for k, v in os.environ.items() if k not in hidden},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert child.stdout == "True\n", child.stderr
+
+
 def test_where_one_backend_is_missing_the_next_is_tried(tmp_path):
     """Stands in for MuJoCo, whose import fails with EGL and goes well with OSMesa."""
     fake = tmp_path / "mujoco"

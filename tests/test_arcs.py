@@ -1,0 +1,82 @@
+"""Which starts are simulated under which noise, and what a replay shows of them."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from planted import decisions, halves, ideal_controller, sign_policy
+
+from hyrl_mj import BadInput
+from hyrl_mj.arcs import noisy_arcs, replay_arcs, replay_shows, replay_starts
+
+
+@pytest.fixture(scope="module")
+def run(vehicle):
+    """A run of the vehicle with planted controllers, as far as arcs are concerned."""
+    return SimpleNamespace(
+        task=vehicle,
+        settings=SimpleNamespace(noise=0.1, seed=0),
+        policy=sign_policy(vehicle),
+        controller=ideal_controller(vehicle, clear=1.004),
+        critical_set=decisions(vehicle),
+        partition=halves(vehicle),
+        extended_sets=SimpleNamespace(modes=(0, 1)),
+    )
+
+
+def test_the_starts_are_the_paper_s_and_one_on_the_critical_set(run):
+    starts = replay_starts(run)
+    assert list(starts) == ["start0", "start1", "start2", "start3", "start4", "critical"]
+    np.testing.assert_array_equal([*starts.values()][:5], run.task.replay_starts)
+    np.testing.assert_allclose(starts["critical"], [0, 0])
+
+
+def test_all_controllers_meet_the_noise_that_was_asked_for(run):
+    z0 = np.array([[0.0, 0.05], [0.0, -0.3]])
+    arcs = noisy_arcs(run, z0, "uniform", 0.07, (0, 1), seed=5)
+    assert list(arcs) == ["policy", "hyrl_q0", "hyrl_q1"]
+    noise = [(arc.measured - arc.z)[:15, 1] for several in arcs.values() for arc in several]
+    for other in noise[2::2]:
+        np.testing.assert_allclose(other, noise[0], atol=1e-9)
+    assert 0.02 < np.abs(noise[0]).max() <= 0.07 + 1e-9
+    assert {arc.bound for several in arcs.values() for arc in several} == {0.07}
+    assert [arc.q[0] for arc in arcs["hyrl_q1"]] == [1, 1]
+    chosen = noisy_arcs(run, z0, "none")["hyrl"]
+    assert [arc.q[0] for arc in chosen] == [0, 1]
+
+
+def test_the_worst_noise_is_each_controller_s_own(run):
+    arcs = noisy_arcs(run, np.array([[0.1, 0.05]]), "worst", None, (0, 1))
+    (policy,) = arcs["policy"]
+    assert (policy.outcome, policy.noise, policy.bound) == ("crashed", "worst", 0.1)
+    for q in (0, 1):
+        (arc,) = arcs[f"hyrl_q{q}"]
+        assert arc.outcome == "reached"
+        assert not np.allclose(arc.measured[5:12] - arc.z[5:12], (policy.measured - policy.z)[5:12])
+
+
+def test_shows_are_one_for_each_mode_or_all_of_the_paper_s_at_once(run):
+    arcs = replay_arcs(run)
+    assert len(arcs) == 6 * 3
+    shows = replay_shows(run, "critical", "none")
+    assert [show.hybrid[0].q[0] for show in shows] == [0, 1]
+    assert all(len(show.policy) == len(show.hybrid) == 1 for show in shows)
+    (paper,) = replay_shows(run, "paper", "alternating")
+    assert (len(paper.policy), len(paper.hybrid)) == (5, 10)
+    starts = np.array([arc.z[0] for arc in paper.hybrid])
+    np.testing.assert_allclose(starts, np.repeat(run.task.replay_starts, 2, axis=0))
+    np.testing.assert_array_equal(paper.policy[3].z, arcs["start3", "policy"].z)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("mine",), "unknown starts 'mine'"),
+        (("paper", "white"), "unknown noise 'white'.*worst"),
+        (("paper", "uniform", 2.0), "hides the whole state space"),
+        (("latest", "uniform"), "the latest simulation has its noise"),
+    ],
+)
+def test_what_cannot_be_shown(run, arguments, message):
+    with pytest.raises(BadInput, match=message):
+        replay_shows(run, *arguments)
