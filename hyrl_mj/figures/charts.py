@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Wedge
 from matplotlib.ticker import FuncFormatter, MultipleLocator
+from scipy.ndimage import gaussian_filter
 
-from hyrl_mj.figures.style import CASING, GREY, INK, PAPER, PALE, angle, axis_label
+from hyrl_mj.figures.style import CASING, GREEN, GREY, INK, PALE, PAPER, angle, axis_label
 from hyrl_mj.partition import Partition
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.tasks.base import Task
@@ -20,8 +20,11 @@ from hyrl_mj.tasks.base import Task
 # Radii of a ring, its ticks, their labels, and the edge of its panel.
 OUTER, INNER, TICK, LABEL, EDGE = 1.0, 0.7, 1.05, 1.18, 1.25
 # Cells along the longest side on which it is asked where runs are over.
-OVER_CELLS = 240
+OVER_CELLS, OVER_BLUR = 240, 1.5
+# Periods to either side that may be seen over time.
+TURNS = 9
 
+# By their words in the legend.
 Artists = dict[str, Artist]
 
 
@@ -56,17 +59,20 @@ def plane(panel: Axes, task: Task) -> Artists:
     panel.set(xlabel=axis_label(task, 0), ylabel=axis_label(task, 1))
     for coordinate, axis in enumerate((panel.xaxis, panel.yaxis)):
         angles_on(axis, task, coordinate)
+    found: Artists = {}
     grid = Grid.with_cells(task.chart, OVER_CELLS)
-    plant = task.plant(len(grid.nodes))
-    plant.set_state(task.qpos(grid.nodes))
-    over = task.failed(plant.measurement)
-    region(panel, GridSet.from_mask(grid, over), GREY, PALE, zorder=2.2)
-    return {"obstacle, or out of bounds": patch(GREY, PALE)} if over.any() else {}
+    over = task.failed(measured_at(task, grid.nodes)).reshape(grid.counts)
+    if over.any():
+        # Cells are no steps of an outline; half of the blurred mask is where it runs.
+        blurred = gaussian_filter(over.astype(float), OVER_BLUR, mode="nearest")
+        region(panel, GridSet(grid, 0.5 - blurred.ravel()), GREY, PALE, zorder=2.2)
+        found["obstacle, or out of bounds"] = patch(GREY, PALE)
+    if task.set_point is not None:
+        found |= cross(panel, *task.set_point)
+    return found
 
 
-def region(
-    panel: Axes, members: GridSet, face: str, edge: str | None = None, **looks: Any
-) -> None:
+def region(panel: Axes, members: GridSet, face: str, edge: str | None = None, **looks: Any) -> None:
     """Fill a set in a plane, and draw its outline if it has a colour."""
     grid, inside = members.grid, members.mask
     x, y = grid.nodes.reshape(*grid.counts, 2).transpose(2, 1, 0)
@@ -82,16 +88,6 @@ def patch(face: str, edge: str = INK) -> Patch:
     return Patch(facecolor=face, edgecolor=edge, linewidth=0.8)
 
 
-def way(panel: Axes, task: Task, z: np.ndarray, **looks: Any) -> Line2D:
-    """Draw a path (K, 2) in a plane; where it comes round a period the line is broken."""
-    z = task.chart.wrap(z)
-    half = np.where(task.chart.periodic, np.subtract(task.chart.high, task.chart.low) / 2, np.inf)
-    rows = np.flatnonzero((np.abs(np.diff(z, axis=0)) > half).any(axis=1)) + 1
-    x, y = np.insert(z, rows, np.nan, axis=0).T
-    (line,) = panel.plot(x, y, **looks)
-    return line
-
-
 # ---- rings
 
 
@@ -104,7 +100,9 @@ def ring(panel: Axes, task: Task, radii: Sequence[float], words: str = "") -> No
     for quarter in low + period * np.arange(4) / 4:
         at = np.array(on_ring(task, quarter))
         panel.plot(*np.outer(at, (OUTER, TICK)), color=INK, linewidth=0.8)
-        panel.text(*LABEL * at, value_text(task, quarter), ha="center", va="center")
+        panel.text(
+            at[0] * LABEL, at[1] * LABEL, value_text(task, quarter), ha="center", va="center"
+        )
     panel.text(0, 0, axis_label(task, 0) + words, ha="center", va="center")
     panel.set(xlim=(-EDGE, EDGE), ylim=(-EDGE, EDGE), aspect="equal", anchor="S")
     panel.set_axis_off()
@@ -125,7 +123,7 @@ def arcs(
     panel: Axes,
     task: Task,
     classes: np.ndarray,
-    colours: Sequence[Any],
+    colours: Sequence[Any] | np.ndarray,
     outer: float = OUTER,
     inner: float = INNER,
 ) -> None:
@@ -158,14 +156,50 @@ def arcs(
 # ---- what is drawn on both
 
 
-def dots(panel: Axes, x: np.ndarray, y: np.ndarray, colour: str = INK) -> Artists:
-    """Mark the points of M* (n,), (n,); returns as `plane`."""
-    if not len(x):
+def measured_at(task: Task, z: np.ndarray) -> np.ndarray:
+    """What is measured (n, p) at chart points (n, d), without noise."""
+    plant = task.plant(len(z))
+    plant.set_state(task.qpos(z))
+    return plant.measurement
+
+
+def cross(panel: Axes, x: float, y: float) -> Artists:
+    """Mark the set-point; returns as `plane`."""
+    looks: dict[str, Any] = {
+        "color": GREEN,
+        "markersize": 11,
+        "markeredgewidth": 2.5,
+        "linestyle": "none",
+    }
+    (drawn,) = panel.plot([x], [y], marker="+", clip_on=False, zorder=5, **looks)
+    return {"set-point": drawn}
+
+
+def set_point_lines(panel: Axes, task: Task, coordinate: int) -> Artists:
+    """Draw the set-point in a panel of a coordinate over time, round every period; returns as `plane`."""
+    if task.set_point is None:
         return {}
+    low, high = panel.get_ylim()
+    period = task.chart.high[coordinate] - task.chart.low[coordinate]
+    turns = np.arange(-TURNS, TURNS + 1) if task.chart.periodic[coordinate] else np.zeros(1)
+    heights = task.set_point[coordinate] + period * turns
+    found: Artists = {}
+    for height in heights[(heights >= low) & (heights <= high)]:
+        found["set-point"] = panel.axhline(
+            height, color=GREEN, linewidth=1.2, linestyle="--", zorder=1
+        )
+    return found
+
+
+def dots(panel: Axes, points: np.ndarray, colour: str = INK) -> Artists:
+    """Mark the points of M* where they lie in the panel (n, 2); returns as `plane`."""
+    if not len(points):
+        return {}
+    x, y = points.T
     # All the paper first: where points lie close together they make one line.
     for fill, size in ((PAPER, 5.0), (colour, 3.6)):
         (found,) = panel.plot(
-            x, y, "o", markersize=size, color=fill, markeredgewidth=0, clip_on=False, zorder=4
+            x, y, "o", markersize=size, color=fill, markeredgewidth=0, clip_on=False, zorder=3.5
         )
     return {"critical set M*": found}
 
@@ -175,9 +209,11 @@ def spokes(
 ) -> Artists:
     """Mark points (n,) of M* on a ring by lines from radius `start` to `end`; returns as `plane`."""
     x, y = on_ring(task, z)
-    for line, width in ((CASING[0][0], CASING[0][1]), (colour, CASING[1][1])):
-        panel.plot([start * x, end * x], [start * y, end * y], color=line, linewidth=width, zorder=3)
-    return dots(panel, start * x, start * y, colour)
+    for line, (_, width) in zip((PAPER, colour), CASING, strict=True):
+        panel.plot(
+            [start * x, end * x], [start * y, end * y], color=line, linewidth=width, zorder=3
+        )
+    return dots(panel, np.stack([start * x, start * y], axis=1), colour)
 
 
 def classes_of(partition: Partition) -> np.ndarray:

@@ -205,7 +205,7 @@ def _box(
         )
         panel.add_patch(box)
     z = critical.points
-    points = dots(panel, z[:, 0], np.full(len(z), 0.5) if flat else z[:, 1])
+    points = dots(panel, np.hstack([z, np.full_like(z, 0.5)]) if flat else z)
     return {"start region": box} | points
 
 

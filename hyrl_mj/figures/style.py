@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib import style
@@ -24,6 +25,7 @@ INK, PAPER, PALE = "#232830", "#ffffff", "#8b919b"
 GREY = "#dcdee2"
 # Of the stage-1 policy, and of what is bad: as in the replay.
 POLICY_COLOUR, RED, PALE_RED = "#2d323c", "#be2823", "#f4c9c7"
+GREEN = "#007d55"  # of the set-point
 # Blue, vermilion, purple and sky blue of Okabe and Ito, as in the replay, and the same hues as tints.
 MODE_COLOURS = ("#0072b2", "#d55e00", "#aa4499", "#56b4e9")
 MODE_TINTS = ("#d6e8f3", "#fbe4d3", "#f1dcee", "#e1f2fb")
@@ -63,7 +65,7 @@ def drawing(path: Path, size: tuple[float, float]) -> Iterator[Figure]:
             artifacts.replacing(path.with_suffix(".pdf")) as pdf,
         ):
             # Panels of a fixed aspect leave room, which is cut off.
-            cut = {"dpi": DPI, "bbox_inches": "tight", "pad_inches": PAD}
+            cut: dict[str, Any] = {"dpi": DPI, "bbox_inches": "tight", "pad_inches": PAD}
             figure.savefig(png, format="png", **cut)
             # Without the date the same picture is the same file.
             figure.savefig(pdf, format="pdf", metadata={"CreationDate": None}, **cut)
@@ -106,10 +108,10 @@ def noisy(task: Task, everywhere: bool = False) -> tuple[str, str]:
     return " and ".join(names), ", ".join(dict.fromkeys(units))
 
 
-def noise_label(task: Task, eps: float) -> str:
-    """The paper's noise for people: "alternating noise on y, eps = 0.1 m"."""
+def noise_label(task: Task, kind: str, eps: float) -> str:
+    """Noise for people: "alternating noise on y, eps = 0.1 m"."""
     where, unit = noisy(task)
-    return f"alternating noise on {where}, eps = {eps:g} {unit}"
+    return f"{kind} noise on {where}, eps = {eps:g} {unit}"
 
 
 def axis_label(task: Task, axis: int) -> str:
