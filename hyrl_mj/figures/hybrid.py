@@ -116,7 +116,7 @@ def runs(task: Task, found: Mapping[tuple[str, str], HybridArc], path: Path) -> 
                 for start in starts:
                     for who in (loop, "policy"):
                         draw = policy_way if who == "policy" else hybrid_way
-                        width = 1.0 if who == "policy" else 2.6
+                        width = 1.0 if who == "policy" else 2.0
                         arc = found[start, who]
                         ways |= draw(panel, task, view, arc, linewidth=width)
                         marks |= ends(panel, view, arc)
@@ -197,6 +197,8 @@ def _enlarge(
     near.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), title="around M*")
     box = Rectangle(low, *(high - low), fill=False, edgecolor=INK, linestyle=":", zorder=3)
     whole.add_patch(box)
+    for drawn in near.lines:
+        drawn.set_clip_on(True)  # a mark off this panel is not shown beside it
     # Of M*'s points the one in the middle: where the room that noise takes is drawn.
     middle = critical.points[np.argsort(critical.points.sum(axis=1))[len(critical.points) // 2]]
     axis = int(np.argmax(task.noise_in_chart(1.0)))
@@ -209,8 +211,8 @@ def _enlarge(
         "markersize": 9,
         "marker": "_|"[axis == 0],
     }
-    (drawn,) = near.plot(*room, zorder=4, **looks)
-    return {f"2 eps = {2 * sets.noise:g} {task.chart.units[axis]}": drawn}
+    (room_taken,) = near.plot(*room, zorder=4, **looks)
+    return {f"2 eps = {2 * sets.noise:g} {task.chart.units[axis]}": room_taken}
 
 
 # ---- runs

@@ -226,7 +226,7 @@ def _spirals(
     seconds = task.replay_time
     tints = [MODE_TINTS[i % len(MODE_TINTS)] for i in range(len(partition.modes))]
     arcs(panel, task, classes_of(partition), [*tints, None], OUTER, CORE)
-    ring(panel, task, (OUTER, CORE), f"\ntime goes outward,\n0 to {seconds:g} s")
+    ring(panel, task, (OUTER, CORE), f",\ntime outward:\n0 to {seconds:g} s")
     found: Artists = {
         f"only in the part $M_{mode}$": patch(tint)
         for mode, tint in zip(partition.modes, tints, strict=True)
