@@ -133,11 +133,13 @@ def figures_stage(run: Run, say: Say) -> None:
 
     task, critical, folder = run.task, run.critical_set, run.path / "figures"
     policy, eps, seed = run.policy, run.settings.noise, run.settings.seed
-    noisy, _ = critical_pairs(run)[0]
-    figures.overview(task, policy, critical, run.partition, noisy, folder / "overview.png")
+    # All is read before anything is written.
+    arcs, partition, sets = run.arcs(), run.partition, run.extended_sets
+    noisy = arcs.get(("critical", "policy"), arcs["start0", "policy"])
+    figures.overview(task, policy, critical, partition, noisy, folder / "overview.png")
     figures.policy_map(task, policy, critical, eps, seed, folder / "policy.png")
-    figures.extended_sets_map(task, critical, run.extended_sets, folder / "extended_sets.png")
-    figures.runs(task, run.arcs(), folder / "runs.png")
+    figures.extended_sets_map(task, critical, sets, folder / "extended_sets.png")
+    figures.runs(task, arcs, folder / "runs.png")
     say(f"{', '.join(figures.names(task))} in {folder}, as PNG and PDF")
 
 
