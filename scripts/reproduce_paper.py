@@ -32,8 +32,8 @@ FATES = {
 # Where ours differs on purpose.
 SIZED = "sized to the noise *"
 FOOTNOTE = (
-    "* The extended sets overlap as far as the noise asks for. The paper's sets: "
-    "hyrl-mj run unit_circle --horizon 0.5, hyrl-mj run vehicle --horizon 0.3, into other run directories."
+    "* The extended sets overlap as far as the noise asks for. With the paper's T instead: "
+    "hyrl-mj run unit_circle --horizon 0.5, and vehicle --horizon 0.3, each into another --out."
 )
 
 
