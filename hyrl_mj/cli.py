@@ -40,7 +40,7 @@ def run(
     horizon: float | None = None,
     out: Path | None = None,
 ) -> None:
-    """Run all stages: train, find the critical set, extend, retrain, simulate, render.
+    """Run all stages: train, find the critical set, extend, retrain, simulate, draw, render.
 
     A run directory that is there already is resumed: only what is missing is done.
 
@@ -129,7 +129,7 @@ def robustness(
 ) -> None:
     """Find out what measurement noise can do: worst-case game, margins, and episodes in bulk.
 
-    Writes robustness.json, figures/robustness_map.png and figures/robustness_curve.png.
+    Writes robustness.json, and figures/robustness_map and robustness_curve as PNG and PDF.
 
     Args:
         run_dir: a run directory.
@@ -248,6 +248,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "retrain": stage_command("retrain", "Run stage 6 again: train the policy of each mode."),
     "robustness": robustness,
     "simulate": simulate_run,
+    "figures": stage_command("figures", "Draw the paper's figures of a run again, as PNG and PDF."),
     "replay": replay,
     "view": view,
     "doctor": doctor,

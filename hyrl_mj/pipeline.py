@@ -134,6 +134,30 @@ def replay_sentence(run: Run, arcs: Mapping[tuple[str, str], HybridArc]) -> str:
     return f"HyRL reaches the set-point from {sum(reached)} of {len(hyrl)} of the paper's starts"
 
 
+def figures_stage(run: Run, say: Say) -> None:
+    """Draw the paper's figures of this run; those that make no sense for its chart are left out."""
+    from hyrl_mj import figures
+
+    task, critical, folder = run.task, run.critical_set, run.path / "figures"
+    policy, eps, seed = run.policy, run.settings.noise, run.settings.seed
+    # All is read before anything is written.
+    arcs, partition, sets = run.arcs(), run.partition, run.extended_sets
+    noisy = arcs.get(("critical", "policy"), arcs["start0", "policy"])
+    figures.overview(task, policy, critical, partition, noisy, folder / "overview.png")
+    figures.policy_map(task, policy, critical, eps, seed, folder / "policy.png")
+    figures.extended_sets_map(task, critical, sets, folder / "extended_sets.png")
+    figures.runs(task, arcs, folder / "runs.png")
+    say(f"{', '.join(figures.names(task))} in {folder}, as PNG and PDF")
+
+
+def figure_paths(run: Run) -> list[Path]:
+    """The files that `figures_stage` writes."""
+    from hyrl_mj import figures
+
+    folder = run.path / "figures"
+    return [folder / f"{n}{suffix}" for n in figures.names(run.task) for suffix in (".png", ".pdf")]
+
+
 def replay_stage(run: Run, say: Say) -> None:
     """Render the replay of the start on M*; without GL or ffmpeg say why, and go on."""
     from hyrl_mj.replay import render_replay
@@ -166,6 +190,7 @@ STAGES = (
     Stage("retrain", retrain_stage, mode_paths),
     Stage("robustness", robustness_stage, _files("robustness.json")),
     Stage("simulate", simulate_stage, lambda run: list(run.arc_paths().values())),
+    Stage("figures", figures_stage, figure_paths),
     Stage("replay", replay_stage, _files("replay.mp4")),
 )
 

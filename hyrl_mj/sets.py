@@ -204,6 +204,20 @@ class GridSet:
         """(N,) bool, the nodes in the set."""
         return self.values <= 0
 
+    def pieces(self) -> list[tuple[float, float]]:
+        """First and last node of each piece of a set in one dimension.
+
+        A piece that holds the seam of a periodic coordinate ends at a smaller value than it begins.
+        """
+        inside, nodes = self.mask, self.grid.nodes[:, 0]
+        before, after = np.roll(inside, 1), np.roll(inside, -1)
+        if inside.all() or not self.grid.chart.periodic[0]:
+            before[0] = after[-1] = False
+        begins, ends = np.flatnonzero(inside & ~before), np.flatnonzero(inside & ~after)
+        if len(ends) and ends[0] < begins[0]:
+            ends = np.roll(ends, -1)
+        return [(float(nodes[a]), float(nodes[b])) for a, b in zip(begins, ends, strict=True)]
+
     @cached_property
     def _nearest_inside(self) -> np.ndarray:
         """(N,) flat index of the inner node that is nearest to each node."""

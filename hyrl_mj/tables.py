@@ -108,13 +108,8 @@ def extent(run: Run, mode: int) -> str:
         return "extended set everything"
     if chart.dimension > 1 or not chart.periodic[0]:
         return f"extended set {100 * inside.mean():.1f}% of the chart"
-    angles = members.grid.nodes[:, 0] / np.pi
-    starts = np.flatnonzero(inside & ~np.roll(inside, 1))
-    ends = np.flatnonzero(inside & ~np.roll(inside, -1))
-    # An arc that crosses the seam ends before the first start.
-    ends = np.roll(ends, -1) if len(ends) and ends[0] < starts[0] else ends
-    arcs = [f"{angles[a]:.3f} pi to {angles[b]:.3f} pi" for a, b in zip(starts, ends, strict=True)]
-    return f"extended set {', '.join(arcs)}"
+    pieces = [f"{a / np.pi:.3f} pi to {b / np.pi:.3f} pi" for a, b in members.pieces()]
+    return f"extended set {', '.join(pieces)}"
 
 
 def _cell(run: Run, arc: HybridArc) -> str:

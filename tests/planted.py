@@ -211,6 +211,8 @@ class Cube(Task):
     chart = Chart(("a", "b", "c"), ("m",) * 3, (-1.0,) * 3, (1.0,) * 3, (False,) * 3)
     inputs = ("va", "vb", "vc")
     noisy = (True,) * 3
+    mode_names = ("up", "down")
+    algorithm = "ppo"
     max_steps = 12
     horizon = 0.3
 

@@ -1,203 +1,411 @@
-"""The pictures of the worst-case game: what is in them, and what is left when they cannot be drawn."""
+"""The paper's figures: what is in them, by matplotlib's own objects, and what is written."""
 
 from __future__ import annotations
 
-import matplotlib
+import re
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
-from matplotlib.colors import to_rgb
+from figure_parts import EPS, arcs_of, policy_of, sets_of, where
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
-from PIL import Image
+from matplotlib.patches import Wedge
+from matplotlib.path import Path as Outline
+from planted import Cube, decisions, halves, plane_policy
 
 import hyrl_mj
-from hyrl_mj import figures
-from hyrl_mj.robustness import BEATEN, CURVE, MAP_CLASSES, UNWINNABLE, WON, WON_FROM_SOME
-from hyrl_mj.sets import Grid
+from hyrl_mj import HybridController, Outcome, figures, replay, simulate
+from hyrl_mj.figures import charts, paths, style
+from hyrl_mj.sets import Everything
 
 CIRCLE, VEHICLE = hyrl_mj.get_task("unit_circle"), hyrl_mj.get_task("vehicle")
-EPS = 0.1
-HYRL = figures.CURVE_COLOURS[1]
+ARCS = {task.name: arcs_of(task) for task in (CIRCLE, VEHICLE)}
+TASKS = pytest.mark.parametrize("task", [CIRCLE, VEHICLE], ids=lambda task: task.name)
+NONE = hyrl_mj.CriticalSet(np.empty((0, 2)), np.zeros(0, dtype=int), 0.01, 0.1)
 
 
 @pytest.fixture
-def coarse(monkeypatch):
-    """Pictures with a quarter of the pixels, which are drawn faster."""
-    monkeypatch.setattr(figures, "DPI", 100)
+def drawn(monkeypatch):
+    """The figures that would have been written, instead of their files."""
+    found = []
+
+    def keep(self, path, **_):
+        found.append(self)
+        Path(path).touch()
+
+    monkeypatch.setattr(Figure, "savefig", keep)
+    return found
 
 
-def share(won, won_any, excursion=None):
-    return {"eps": EPS, "won": won, "won_any": won_any, "excursion": excursion}
+def draw_overview(task, path, critical=None):
+    noisy = ARCS[task.name]["critical", "policy"]
+    critical = critical or decisions(task)
+    figures.overview(task, policy_of(task), critical, halves(task), noisy, path)
 
 
-def content_of(names, excursion=None, margin=0.05):
-    """What `examine` returns, for controllers that lose more and more."""
-    eps = np.array(CURVE)
-    fall = {name: np.clip(1.2 - 4 * eps, 0, 1) for name in names}
-    curves = {
-        name: {"won": won, "won_any": won if name == "policy" else 0.9 * won, "time_any": 3 * won}
-        for name, won in fall.items()
-    }
-    full = {"won": np.ones(len(eps)), "won_any": 1 - 0.3 * eps, "time_any": np.full(len(eps), 3.0)}
-    return {
-        "everywhere": False,
-        "scores": {n: [share(0.8, 0.72, excursion)] for n in names} | {"limit": [share(1.0, 1.0)]},
-        "margin": dict.fromkeys(names, margin),
-        "curve": {"eps": eps, "winnable": 1 - 0.2 * eps, "limit": full} | curves,
-    }
+def draw_policy(task, path, critical=None):
+    figures.policy_map(task, policy_of(task), critical or decisions(task), EPS, 0, path)
 
 
-def map_of(task, names, rule, cells=40):
-    """The arrays of `examine`; the classes (N,) are a rule of the nodes (N, d)."""
-    grid = Grid.with_cells(task.chart, cells)
-    classes = np.asarray(rule(grid.nodes), dtype=np.int8)
-    maps = {f"map_{name}": classes for name in names}
-    return {"grid_counts": np.array(grid.counts), "eps": np.array(EPS), **maps}
+def draw_sets(task, path, critical=None):
+    figures.extended_sets_map(task, critical or decisions(task), sets_of(task), path)
 
 
-def critical_of(*points):
-    d = len(points[0]) if points else 1
-    z = np.array(points, dtype=float).reshape(-1, d)
-    return hyrl_mj.CriticalSet(z, np.zeros(len(z), dtype=int), 0.01, 0.1)
+def draw_runs(task, path, critical=None):
+    figures.runs(task, ARCS[task.name], path)
 
 
-def where(path, colour):
-    """The pixels (k, 2) that have just this colour: from the left, and from below."""
-    picture = np.asarray(Image.open(path).convert("RGB"))
-    found = (picture == np.round(255 * np.array(to_rgb(colour))).astype(int)).all(axis=-1)
-    return np.argwhere(found[::-1])[:, ::-1]
+DRAW = {
+    "overview": draw_overview,
+    "policy": draw_policy,
+    "extended_sets": draw_sets,
+    "runs": draw_runs,
+}
+FIGURES = pytest.mark.parametrize("name", DRAW)
 
 
-def size_of(path):
-    """Width and height [pixels] of what is a PNG."""
-    with Image.open(path) as image:
-        assert image.format == "PNG"
-        return image.size
+def lines_of(panel, colour, style="-"):
+    """The data (N, 2) of the lines of a colour in a panel."""
+    return [
+        np.transpose(line.get_data())
+        for line in panel.lines
+        if to_hex(line.get_color()) == colour and line.get_linestyle() == style
+    ]
 
 
-@pytest.mark.parametrize("task", [CIRCLE, VEHICLE], ids=lambda task: task.name)
-def test_each_class_that_occurs_has_its_colour(tmp_path, task):
-    occurring = (WON, WON_FROM_SOME, BEATEN)
-    path, names = tmp_path / "figures" / "map.png", ("policy", "hyrl")
-    arrays = map_of(task, names, lambda z: np.arange(len(z)) % 40 // 14)
-    critical = critical_of(task.replay_starts[2])
-    figures.robustness_map(task, content_of(names), arrays, critical, path)
-    for k, colour in enumerate(figures.CLASS_COLOURS):
-        assert (len(where(path, colour)) > 1000) == (k in occurring), MAP_CLASSES[k]
-    width, height = size_of(path)
-    assert 1200 < width <= 1600
-    assert 800 < height < 1600
-    assert [p.name for p in path.parent.iterdir()] == ["map.png"]
+def marks_of(panel, marker, colour):
+    """Where (k, 2) there are markers of a shape and colour in a panel."""
+    found = [
+        np.transpose(line.get_data())
+        for line in panel.lines
+        if line.get_marker() == marker and to_hex(line.get_color()) == colour
+    ]
+    return np.concatenate(found) if found else np.empty((0, 2))
 
 
-def test_a_map_is_drawn_the_right_way_round(tmp_path, coarse):
-    path = tmp_path / "map.png"
-
-    def upper_left(z):
-        return np.where((z[:, 0] < 1.0) & (z[:, 1] > 0.5), BEATEN, UNWINNABLE)
-
-    arrays = map_of(VEHICLE, ["hyrl"], upper_left)
-    figures.robustness_map(VEHICLE, content_of(["hyrl"]), arrays, critical_of((0.0, 0.0)), path)
-    corner, rest = (where(path, figures.CLASS_COLOURS[k]) for k in (BEATEN, UNWINNABLE))
-    right, up = np.median(corner, axis=0) - np.median(rest, axis=0)
-    assert right < -50
-    assert up > 50
+def filled(panel, colour):
+    """The outlines of all fields of a colour in a panel."""
+    return [
+        outline
+        for part in panel.collections
+        for outline in part.get_paths()
+        if len(part.get_facecolor()) and to_hex(part.get_facecolor()[0]) == colour
+    ]
 
 
-def test_arcs_of_a_ring_lie_at_their_angle(tmp_path, coarse):
-    path = tmp_path / "map.png"
-
-    def through_the_end_of_the_period(z):
-        return np.where(np.cos(z[:, 0] - 0.25) > 0.9, BEATEN, UNWINNABLE)
-
-    arrays = map_of(CIRCLE, ["hyrl"], through_the_end_of_the_period, cells=360)
-    figures.robustness_map(CIRCLE, content_of(["hyrl"]), arrays, critical_of(), path)
-    ring = where(path, figures.CLASS_COLOURS[UNWINNABLE])
-    # The ring without its legend: the other arc lies to the right, a little above the centre.
-    ring = ring[ring[:, 1] > 100]
-    centre = ring[:, 0].min() + np.ptp(ring[:, 1]) / 2, (ring[:, 1].min() + ring[:, 1].max()) / 2
-    found = where(path, figures.CLASS_COLOURS[BEATEN])
-    x, y = np.median(found[found[:, 1] > 100], axis=0) - centre
-    assert np.arctan2(y, x) == pytest.approx(0.25, abs=0.05)
+def inside(outlines: list[Outline], *points):
+    """Whether points lie in the outlines; in an even number of them is outside."""
+    loops = [loop for outline in outlines for loop in outline.to_polygons()]
+    return [bool(sum(Outline(loop).contains_point(p) for loop in loops) % 2) for p in points]
 
 
-def test_a_single_node_of_a_ring_is_seen(tmp_path):
-    path = tmp_path / "map.png"
-    arrays = map_of(CIRCLE, ["hyrl"], lambda z: (np.arange(len(z)) == 700) * BEATEN, cells=6000)
-    figures.robustness_map(CIRCLE, content_of(["hyrl"]), arrays, critical_of(), path)
-    found = where(path, figures.CLASS_COLOURS[BEATEN])
-    assert (found[:, 1] > 200).sum() > 20, "beside what is in the legend"
+# ---- all of them
 
 
-def test_the_critical_set_lies_at_its_angle(tmp_path, coarse):
-    arrays, pictures = map_of(CIRCLE, ["hyrl"], lambda z: WON + 0 * z[:, 0]), []
-    for critical in (critical_of(), critical_of((0.75 * np.pi,))):
-        path = tmp_path / "map.png"
-        figures.robustness_map(CIRCLE, content_of(["hyrl"]), arrays, critical, path)
-        pictures.append(np.asarray(Image.open(path).convert("RGB"))[::-1].astype(int))
-    changed = np.argwhere(np.abs(pictures[1] - pictures[0]).max(axis=-1) > 100)[:, ::-1]
-    ring, changed = (
-        found[found[:, 1] > 100] for found in (where(path, figures.CLASS_COLOURS[WON]), changed)
-    )
-    x, y = np.median(changed, axis=0) - (ring.min(axis=0) + ring.max(axis=0)) / 2
-    assert np.arctan2(y, x) == pytest.approx(0.75 * np.pi, abs=0.05)
+@TASKS
+@FIGURES
+def test_it_is_written_as_png_and_as_pdf_of_one_page(tmp_path, monkeypatch, task, name):
+    monkeypatch.setattr(style, "DPI", 80)
+    path = tmp_path / "figures" / f"{name}.png"
+    DRAW[name](task, path)
+    assert sorted(p.name for p in path.parent.iterdir()) == [f"{name}.pdf", f"{name}.png"]
+    pdf = path.with_suffix(".pdf").read_bytes()
+    assert pdf.startswith(b"%PDF")
+    assert len(re.findall(rb"/Type /Page\b", pdf)) == 1
+    for mode in (0, 1):
+        colour = style.MODE_COLOURS[mode]
+        if name == "extended_sets" and task is VEHICLE:
+            colour = style.MODE_TINTS[mode]
+        assert len(where(path, colour)) > 20, "each mode is there in its colour"
+    first = path.with_suffix(".pdf").read_bytes()
+    DRAW[name](task, path)
+    assert path.with_suffix(".pdf").read_bytes() == first, "the same picture is the same file"
 
 
-def test_curves_and_a_third_controller(tmp_path, coarse):
-    names, path = ("policy", "hyrl", "median filter"), tmp_path / "curve.png"
-    figures.robustness_curve(VEHICLE, content_of(names), path)
-    for colour in (*figures.CURVE_COLOURS[:3], figures.LIMIT_COLOUR, figures.PALE):
-        assert len(where(path, colour)) > 100
-    arrays = map_of(VEHICLE, names, lambda z: np.zeros(len(z)), cells=8)
-    critical = critical_of((0.0, 0.0))
-    figures.robustness_map(VEHICLE, content_of(names), arrays, critical, tmp_path / "map.png")
-    assert size_of(tmp_path / "map.png")[1] > size_of(path)[1]
+@TASKS
+@FIGURES
+def test_its_axes_have_labels_with_units_and_its_legend_hides_nothing(tmp_path, drawn, task, name):
+    DRAW[name](task, tmp_path / "p.png")
+    figure = drawn[0]
+    assert style.task_title(task) in figure.get_suptitle()
+    assert figure.legends
+    assert not any(panel.get_legend() for panel in figure.axes)
+    figure.draw_without_rendering()
+    unit = re.compile(r"\[(m|s|rad|m/s|rad/s)\]")
+    for panel in figure.axes:
+        labels = [panel.get_xlabel(), panel.get_ylabel()] + [t.get_text() for t in panel.texts]
+        beside = panel.axison and name == "runs" and panel is not figure.axes[0]
+        bar = panel.get_label() == "<colorbar>"
+        wanted = 1 if beside or bar or not panel.axison else 2
+        assert sum(bool(unit.search(label)) for label in labels) >= wanted, labels
+    box = figure.legends[0].get_window_extent()
+    panels = [panel.get_window_extent() for panel in figure.axes]
+    assert not any(box.overlaps(panel) for panel in panels)
 
 
-def test_times_are_drawn_where_runs_last_for_ever(tmp_path, coarse):
-    one, two = tmp_path / "one.png", tmp_path / "two.png"
-    figures.robustness_curve(CIRCLE, content_of(["hyrl"]), one)
-    figures.robustness_curve(CIRCLE, content_of(["hyrl"], excursion=0.1, margin=None), two)
-    assert size_of(two)[1] > size_of(one)[1] + 100
-    assert size_of(two)[0] <= 800
-    assert len(where(two, HYRL)) > len(where(one, HYRL))
+@TASKS
+@FIGURES
+def test_a_run_without_a_critical_set_is_drawn(tmp_path, drawn, task, name):
+    points = np.empty((0, task.chart.dimension))
+    DRAW[name](task, tmp_path / "p.png", replace(NONE, points=points))
+    assert len(drawn) == 2
+    words = [text.get_text() for text in drawn[0].legends[0].get_texts()]
+    assert "critical set M*" not in words
 
 
-@pytest.mark.parametrize("fails", ["on its way", "while it is written"])
-def test_nothing_is_left_behind_when_drawing_fails(tmp_path, monkeypatch, fails):
-    def half(self, path, **_):
-        path.write_bytes(b"\x89PNG")
-        raise OSError("no space left on device")
+@pytest.mark.parametrize("fails", [1, 2])
+def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch, fails):
+    written = []
 
-    path, content = tmp_path / "curve.png", content_of(["hyrl"])
-    path.write_bytes(b"an older picture")
-    if fails == "on its way":
-        del content["curve"]["hyrl"]
-    else:
-        monkeypatch.setattr(Figure, "savefig", half)
-    with pytest.raises((OSError, KeyError)):
-        figures.robustness_curve(VEHICLE, content, path)
-    assert path.read_bytes() == b"an older picture"
-    assert list(tmp_path.iterdir()) == [path]
+    def savefig(self, path, **_):
+        written.append(path)
+        Path(path).write_bytes(b"half")
+        if len(written) == fails:
+            raise OSError("no space left on device")
 
-
-def test_the_users_own_style_is_neither_used_nor_changed(tmp_path, coarse):
-    names = ["hyrl"]
-    figures.robustness_curve(VEHICLE, content_of(names), tmp_path / "plain.png")
-    with matplotlib.rc_context({"figure.facecolor": "black", "font.size": 30}):
-        before = dict(matplotlib.rcParams)
-        figures.robustness_curve(VEHICLE, content_of(names), tmp_path / "styled.png")
-        assert dict(matplotlib.rcParams) == before
-    assert (tmp_path / "plain.png").read_bytes() == (tmp_path / "styled.png").read_bytes()
+    monkeypatch.setattr(Figure, "savefig", savefig)
+    with pytest.raises(OSError, match="no space"):
+        draw_runs(CIRCLE, tmp_path / "runs.png")
+    assert len(written) == fails
+    assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("share", "words"),
-    [(1.0, "100%"), (0.99999, ">99.9%"), (0.128, "12.8%"), (1e-5, "<0.1%"), (0.0, "0%")],
-)
-def test_only_what_is_everything_is_called_so(share, words):
-    assert figures._percent(share) == words
+def test_every_picture_has_a_caption():
+    assert set(figures.CAPTIONS) == {*DRAW, "robustness_map", "robustness_curve"}
+    assert figures.names(VEHICLE) == figures.names(CIRCLE) == tuple(DRAW)
+    assert all(caption.endswith(".") for caption in figures.CAPTIONS.values())
 
 
-def test_angles_are_multiples_of_pi():
-    angles = np.pi * np.array([-1, -0.5, 0, 0.5, 1, 1.5, 2])
-    assert [figures._angle(x) for x in angles] == ["-π", "-π/2", "0", "π/2", "π", "3π/2", "2π"]
+def test_colours_are_those_of_the_replay():
+    as_hex = [to_hex(np.array(rgb) / 255) for rgb in replay.MODE_COLOURS]
+    assert as_hex == list(style.MODE_COLOURS)
+    assert to_hex(np.array(replay.POLICY_COLOUR) / 255) == style.POLICY_COLOUR
+    assert to_hex(np.array(replay.BAD) / 255) == style.RED
+    for tint, colour in zip(style.MODE_TINTS, style.MODE_COLOURS, strict=True):
+        hue = np.subtract(1, to_rgb(tint)) / np.subtract(1, to_rgb(colour))
+        assert np.ptp(hue) < 0.1, "a tint is the colour with white"
+
+
+# ---- overview
+
+
+def test_overview_of_a_plane(tmp_path, drawn):
+    draw_overview(VEHICLE, tmp_path / "p.png")
+    panel, noisy = drawn[0].axes[0], ARCS["vehicle"]["critical", "policy"]
+    for mode, side in ((0, 1), (1, -1)):
+        ways = lines_of(panel, style.MODE_COLOURS[mode])
+        assert len(ways) == 6
+        assert all((side * way[way[:, 0] > 1.2][:, 1] > 0.75).all() for way in ways)
+        assert inside(filled(panel, style.MODE_TINTS[mode]), (0.5, side), (0.5, -side)) == [
+            True,
+            False,
+        ]
+    (path,) = [way for way in lines_of(panel, style.POLICY_COLOUR) if len(way) == len(noisy.z)]
+    np.testing.assert_allclose(path, noisy.z, atol=1e-9)
+    np.testing.assert_allclose(marks_of(panel, "x", style.RED), noisy.z[-1:])
+    np.testing.assert_allclose(marks_of(panel, "+", style.GREEN), [VEHICLE.set_point])
+    np.testing.assert_allclose(marks_of(panel, "o", style.INK), decisions(VEHICLE).points)
+    np.testing.assert_allclose(marks_of(panel, ".", style.RED), noisy.measured[:-1])
+
+
+def test_the_band_is_all_that_can_be_observed(tmp_path, drawn):
+    draw_overview(VEHICLE, tmp_path / "p.png")
+    band = filled(drawn[0].axes[0], style.PALE_RED)
+    z = ARCS["vehicle"]["critical", "policy"].z
+    for y, held in ((-1.02, False), (-0.98, True), (0.0, True), (0.98, True), (1.02, False)):
+        shift = np.array([0.0, y * EPS])
+        middle = (z[1:] + z[:-1]) / 2 + shift
+        assert all(any(part.contains_point(p) for part in band) == held for p in middle)
+
+
+def test_overview_of_a_ring(tmp_path, drawn):
+    draw_overview(CIRCLE, tmp_path / "p.png")
+    panel, noisy = drawn[0].axes[0], ARCS["unit_circle"]["critical", "policy"]
+    for mode, side in ((0, 1), (1, -1)):
+        ways = lines_of(panel, style.MODE_COLOURS[mode])
+        assert ways
+        assert all((side * way[:, 1] > -0.02).all() for way in ways)
+        assert all(np.isclose(np.linalg.norm(way[0]), paths.CORE) for way in ways)
+    (spiral,) = [way for way in lines_of(panel, style.POLICY_COLOUR) if len(way) == len(noisy.z)]
+    radius = paths.CORE + (1 - paths.CORE) * noisy.t / CIRCLE.replay_time
+    np.testing.assert_allclose(np.linalg.norm(spiral, axis=1), radius)
+    np.testing.assert_allclose(spiral[:, 0] / radius, np.cos(noisy.z[:, 0]), atol=1e-12)
+    np.testing.assert_allclose(marks_of(panel, "x", style.RED), [[-1, 0]], atol=0.02)
+    np.testing.assert_allclose(marks_of(panel, "+", style.GREEN), [[1, 0]], atol=1e-9)
+
+
+# ---- policy
+
+
+def test_policy_of_a_plane(tmp_path, drawn):
+    draw_policy(VEHICLE, tmp_path / "p.png")
+    image, beside, bar = drawn[0].axes
+    values = np.asarray(image.images[0].get_array())
+    height = np.linspace(-1.5, 1.5, len(values))
+    assert (values[(height > 0.02) & (height < 0.88)] == 1).all()
+    assert (values[(height < -0.02) & (height > -0.88)] == -1).all()
+    assert (values[height > 0.92] == 0).all()
+    np.testing.assert_allclose(bar.get_yticks(), [-1, -0.5, 0, 0.5, 1])
+    assert bar.get_ylabel() == "lateral velocity [m/s]"
+    np.testing.assert_allclose(marks_of(image, "o", style.RED), decisions(VEHICLE).points)
+    starts = marks_of(beside, "o", to_hex("C0"))
+    del starts
+    circles = [line for line in beside.lines if line.get_marker() == "o"]
+    found = sorted(tuple(np.ravel(line.get_data())) for line in circles)
+    assert found == sorted(VEHICLE.policy_starts)
+    assert len(marks_of(beside, "x", style.RED)) == 1
+    assert len(marks_of(beside, "x", style.INK)) == 2
+    ((*_, last),) = lines_of(beside, style.POLICY_COLOUR)
+    assert VEHICLE.clearance(last) == 0
+
+
+def test_policy_of_a_ring(tmp_path, drawn):
+    draw_policy(CIRCLE, tmp_path / "p.png")
+    ring, beside, bar = drawn[0].axes
+    low, high = (to_hex(bar.collections[-1].cmap(x)) for x in (0.0, 1.0))
+    wedges = [patch for patch in ring.patches if isinstance(patch, Wedge)]
+    for angle, colour in ((90, low), (179, low), (181, high), (270, high)):
+        at = [w for w in wedges if (angle - w.theta1) % 360 < (w.theta2 - w.theta1) % 360.001]
+        assert [to_hex(w.get_facecolor()) for w in at] == [colour]
+    assert bar.get_ylabel() == "turn rate [rad/s]"
+    (spoke,) = lines_of(ring, style.RED)
+    assert (spoke[:, 0] < 0).all()
+    np.testing.assert_allclose(spoke[:, 1], 0, atol=1e-9)
+    ends = [line.get_xdata()[0] for line in beside.lines if line.get_marker() == "x"]
+    assert ends == [pytest.approx(4.0)] * 3
+    np.testing.assert_allclose(marks_of(beside, "x", style.RED), [[4, np.pi]], atol=EPS)
+
+
+def test_the_papers_starts_of_the_policy():
+    angles = np.array(CIRCLE.policy_starts)[:, 0]
+    points = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    np.testing.assert_allclose(points, [(-0.81, 0.59), (-0.95, -0.31), (-1, 0)], atol=5e-3)
+    assert set(VEHICLE.policy_starts) == {(0.0, 0.15), (0.0, 0.0), (0.0, -0.15)}
+
+
+# ---- extended sets
+
+
+def test_extended_sets_of_a_plane(tmp_path, drawn):
+    draw_sets(VEHICLE, tmp_path / "p.png")
+    whole, near = drawn[0].axes
+    shared = filled(whole, figures.hybrid.SHARED)
+    at = ((0.3, 0.0), (0.3, 0.18), (0.3, -0.18), (0.3, 0.22), (0.3, -0.22), (2.5, 1.0))
+    assert inside(shared, *at) == [True, True, True, False, False, True]
+    for mode, side in ((0, 1), (1, -1)):
+        tint = filled(whole, style.MODE_TINTS[mode])
+        assert inside(tint, (0.3, 0.5 * side), (0.3, -0.5 * side)) == [True, False]
+    (room,) = lines_of(near, style.RED)
+    assert np.ptp(room[:, 1]) == pytest.approx(2 * EPS)
+    assert near.get_ylim() == pytest.approx((-0.4, 0.4))
+
+
+def test_extended_sets_of_a_ring_have_their_ends_in_multiples_of_pi(tmp_path, drawn):
+    draw_sets(CIRCLE, tmp_path / "p.png")
+    (panel,) = drawn[0].axes
+    ends = {t.get_text(): t for t in panel.texts if t.get_text().count(".")}
+    expected = [sets_of(CIRCLE).sets[q].pieces()[0] for q in (0, 1)]
+    for mode, values in enumerate(expected):
+        for value in values:
+            text = ends.pop(f"{value / np.pi:.2f}π")
+            assert to_hex(text.get_color()) == style.MODE_COLOURS[mode]
+            x, y = text.get_position()
+            assert np.arctan2(y, x) % (2 * np.pi) == pytest.approx(value)
+    assert not ends
+    (far,) = [w for w in panel.patches
+              if isinstance(w, Wedge) and to_hex(w.get_facecolor()) == style.MODE_COLOURS[0]]  # fmt: skip
+    assert far.theta2 % 360 == pytest.approx(np.degrees(np.pi + 0.2), abs=1.5)
+
+
+# ---- runs
+
+
+def test_runs_in_a_plane(tmp_path, drawn):
+    draw_runs(VEHICLE, tmp_path / "p.png")
+    arcs, panels = ARCS["vehicle"], drawn[0].axes
+    assert [panel.get_title() for panel in panels] == [
+        "started in q0 = 0 (left)",
+        "started in q0 = 1 (right)",
+    ]
+    for q, panel in enumerate(panels):
+        expected = [arcs[f"start{i}", "policy"].z for i in range(5)]
+        found = lines_of(panel, style.POLICY_COLOUR)
+        assert len(found) == 5, "the run from M* is none of the paper's"
+        for way, z in zip(found, expected, strict=True):
+            np.testing.assert_allclose(way, z)
+        assert lines_of(panel, style.MODE_COLOURS[q])
+        crashed = sum(arcs[f"start{i}", "policy"].outcome == "crashed" for i in range(5))
+        assert len(marks_of(panel, "x", style.RED)) == crashed > 0
+        jumps = [arcs[f"start{i}", f"hyrl_q{q}"].j[-1] for i in range(5)]
+        assert len(marks_of(panel, "D", style.INK)) == sum(jumps)
+
+
+def test_jumps_over_time_are_marked_and_change_the_colour(tmp_path, drawn):
+    draw_runs(CIRCLE, tmp_path / "p.png")
+    arcs, panel = ARCS["unit_circle"], drawn[0].axes[0]
+    rows = [(arc, np.flatnonzero(np.diff(arc.j)))
+            for (start, who), arc in arcs.items() if who == "hyrl_q0" and start != "critical"]  # fmt: skip
+    expected = [(arc.t[k], arc.z[k, 0]) for arc, at in rows for k in at]
+    assert expected
+    np.testing.assert_allclose(marks_of(panel, "D", style.INK), expected)
+    assert min(way[0, 1] for way in lines_of(panel, style.MODE_COLOURS[1])) > np.pi
+    assert panel.get_ylabel() == "theta [rad]"
+    heights = {float(np.ravel(way[:, 1])[0]) for way in lines_of(panel, style.GREEN, "--")}
+    assert heights == {0.0, 2 * np.pi}
+
+
+# ---- charts of other kinds
+
+
+def test_of_three_dimensions_only_the_runs_over_time_are_drawn(tmp_path, drawn):
+    cube, path = Cube(lambda z: z[:, 0]), tmp_path / "p.png"
+    policy = plane_policy(cube, np.array([[1.0, 0.0, 0.0]]), np.sign)
+    loop = HybridController(cube, {0: policy, 1: policy}, {0: Everything(), 1: Everything()})
+    starts = np.array([[0.1, 0.2, -0.3]])
+    arcs = {("start0", "policy"): simulate(cube, policy, starts)[0]}
+    for q in (0, 1):
+        arcs["start0", f"hyrl_q{q}"] = simulate(cube, loop, starts, q0=q)[0]
+    none = replace(NONE, points=np.empty((0, 3)))
+    figures.overview(cube, policy, none, None, arcs["start0", "policy"], path)
+    figures.policy_map(cube, policy, none, EPS, 0, path)
+    figures.extended_sets_map(cube, none, None, path)
+    assert not drawn
+    assert figures.names(cube) == ("runs",)
+    figures.runs(cube, arcs, path)
+    panels = np.reshape(drawn[0].axes, (3, 2))
+    assert [panel.get_ylabel() for panel in panels[:, 0]] == ["a [m]", "b [m]", "c [m]"]
+    for row, coordinate in zip(panels, range(3), strict=True):
+        for panel in row:
+            (way,) = lines_of(panel, style.POLICY_COLOUR)
+            np.testing.assert_allclose(way[:, 1], arcs["start0", "policy"].z[:, coordinate])
+
+
+def test_an_obstacle_of_any_shape_is_drawn_where_runs_end(tmp_path, drawn):
+    class Walled(type(VEHICLE)):
+        def ending(self, measurement):
+            x, y = measurement.T
+            wall = (abs(x - 1) < 0.2) & (y > 0.5)
+            return np.where(wall, Outcome.CRASHED, Outcome.RUNNING)
+
+    draw_runs(Walled(), tmp_path / "p.png")
+    over = filled(drawn[0].axes[0], style.GREY)
+    at = ((1.0, 1.0), (1.0, 0.4), (1.17, 1.4), (1.23, 1.4), (1.5, 0.0))
+    assert inside(over, *at) == [True, False, True, False, False]
+
+
+def test_a_path_round_a_period_is_broken_at_the_seam():
+    class Torus(type(VEHICLE)):
+        chart = hyrl_mj.Chart(("a", "b"), ("rad",) * 2, (0.0,) * 2, (2 * np.pi,) * 2, (True, False))
+
+    view = paths.plane_view(Torus())
+    z = np.stack([np.linspace(5, 8, 31), np.full(31, 1.0)], axis=1)
+    with style.style.context("default"):
+        panel = Figure().subplots()
+        x, y = paths.line(panel, view, np.arange(31), z).get_data()
+    assert np.isnan(x).sum() == 1
+    assert np.nanmax(np.abs(np.diff(x))) < 0.2
+    assert np.nanmax(x) < 2 * np.pi
+    assert (y[~np.isnan(y)] == 1).all()
+    assert not charts.is_ring(Torus())

@@ -271,3 +271,17 @@ def test_what_lies_off_the_chart_does_not_erode():
     whole = GridSet.from_mask(grid, grid.nodes[:, 0] >= 0)
     eroded = whole.eroded_by_box(np.array([0.2]))
     np.testing.assert_array_equal(eroded.mask, grid.nodes[:, 0] >= 0.2 - 1e-9)
+
+
+def test_pieces_of_a_set_in_one_dimension():
+    ring, row = Grid(RING, (8,)), Grid(Chart(("x",), ("m",), (0.0,), (9.0,), (False,)), (10,))
+    eighth = PI / 4
+
+    def pieces(grid, *inside):
+        mask = np.isin(np.arange(len(grid.nodes)), inside)
+        return GridSet.from_mask(grid, mask).pieces()
+
+    assert pieces(ring, 7, 0, 1, 4) == [(4 * eighth, 4 * eighth), (7 * eighth, eighth)]
+    assert pieces(ring, *range(8)) == [(0.0, 7 * eighth)]
+    assert pieces(ring) == pieces(row) == []
+    assert pieces(row, 0, 1, 4, 8, 9) == [(0.0, 1.0), (4.0, 4.0), (8.0, 9.0)]

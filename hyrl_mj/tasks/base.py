@@ -120,6 +120,8 @@ class Task(ABC):
     chart: Chart
     #: names of the actuators that the policy drives
     inputs: tuple[str, ...]
+    #: their units; none of them where it is left empty
+    input_units: tuple[str, ...] = ()
     #: None for a continuous input; else the number of equally spaced levels of each single input
     levels: int | None = None
     #: columns of the measurement that noise acts on
@@ -138,6 +140,8 @@ class Task(ABC):
     #: the paper's replay starts (k, d), and how long they are watched [s]
     replay_starts: tuple[tuple[float, ...], ...]
     replay_time: float
+    #: the starts (k, d) of the paper's picture of the policy, by default the replay starts
+    policy_starts: tuple[tuple[float, ...], ...] = ()
     #: what the runs of each mode do, in the order of the modes
     mode_names: tuple[str, ...]
     #: SB3 algorithm that trains it: "ppo" or "dqn"
@@ -168,6 +172,11 @@ class Task(ABC):
         """The inputs of a discrete task, (levels, m), else None."""
         low, high = self.input_limits
         return None if self.levels is None else np.linspace(low, high, self.levels)
+
+    @cached_property
+    def set_point(self) -> np.ndarray | None:
+        """Where it is to go, a chart point (d,), if that is a single one."""
+        return None
 
     @property
     def measurement_columns(self) -> int:

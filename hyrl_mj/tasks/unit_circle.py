@@ -20,7 +20,7 @@ class UnitCircle(Task):
     env_id = "hyrl_mj/UnitCircle-v0"
     description = "turn a pointer to the set-point, clockwise or counter-clockwise (PPO)"
     chart = Chart(("theta",), ("rad",), (0.0,), (2 * PI,), (True,))
-    inputs = ("turn_rate",)
+    inputs, input_units = ("turn_rate",), ("rad/s",)
     noisy = (True,)
     max_steps = 150
     horizon = 0.5
@@ -29,20 +29,24 @@ class UnitCircle(Task):
     precision = 0.015
     replay_starts = tuple((factor * PI,) for factor in (0.75, 0.9, 1.0, 1.1, 1.25))
     replay_time = 4.0
+    policy_starts = tuple(
+        (float(np.arctan2(y, x)) % (2 * PI),)
+        for x, y in ((-0.81, 0.59), (-0.95, -0.31), (-1.0, 0.0))
+    )
     mode_names = ("clockwise", "counter-clockwise")
     algorithm = "ppo"
     mirror = Mirror((1, -1), (-1,))
     observation_low, observation_high = (-1.0, -1.0), (1.0, 1.0)
 
     @cached_property
-    def set_point(self) -> float:
-        """Angle of the set-point [rad]."""
+    def set_point(self) -> np.ndarray:
+        """Angle of the set-point (1,) [rad]."""
         x, y, _ = mjcf.site_pos(self.model, "set_point")
-        return float(np.arctan2(y, x))
+        return np.arctan2([y], [x])
 
     def error(self, theta: np.ndarray) -> np.ndarray:
         """Angle from the set-point in [-pi, pi]: (n,) [rad]."""
-        return self.chart.difference(theta, np.array([self.set_point]))[:, 0]
+        return self.chart.difference(theta, self.set_point)[:, 0]
 
     def observation(self, measured: np.ndarray) -> np.ndarray:
         return np.hstack([np.cos(measured), np.sin(measured)])

@@ -19,7 +19,7 @@ class Vehicle(Task):
     name = "vehicle"
     env_id = "hyrl_mj/ObstacleAvoidance-v0"
     description = "drive past a pillar on its left or on its right (DQN)"
-    inputs = ("lateral_velocity",)
+    inputs, input_units = ("lateral_velocity",), ("m/s",)
     levels = 5
     noisy = (False, True)
     max_steps = 60
@@ -29,6 +29,7 @@ class Vehicle(Task):
     precision = 0.04
     replay_starts = ((0.0, -0.15), (0.0, -0.055), (0.0, 0.0), (0.0, 0.055), (0.0, 0.15))
     replay_time = 3.0
+    policy_starts = replay_starts[::2]
     mode_names = ("left", "right")
     algorithm = "dqn"
     mirror = Mirror((1, 1, -1), (-1,))

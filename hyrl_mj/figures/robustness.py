@@ -2,32 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from fractions import Fraction
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import style
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
-from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Patch, Rectangle, Wedge
+from matplotlib.patches import Rectangle, Wedge
 
-from hyrl_mj import artifacts
 from hyrl_mj.critical_set import CriticalSet
+from hyrl_mj.figures.charts import INNER, OUTER, TICK, arcs, dots, is_ring, patch, ring, spokes
+from hyrl_mj.figures.style import (
+    CASING,
+    COLUMNS,
+    INK,
+    PALE,
+    PAPER,
+    WIDTH,
+    axis_label,
+    drawing,
+    head,
+    legend,
+    noisy,
+    percent,
+)
 from hyrl_mj.robustness import LIMIT, MAP_CLASSES, OVER, UNWINNABLE
 from hyrl_mj.sets import Grid
 from hyrl_mj.tasks.base import Task
 
-DPI = 200  # [pixels/inch]
-WIDTH, PAD = 7.8, 0.1  # [inches] of a picture, and of the margin around it
-COLUMNS = 2  # panels beside each other
-INK, PAPER, PALE = "#232830", "#ffffff", "#8b919b"
 # As MAP_CLASSES: told apart by colour-blind people, too.
 CLASS_COLOURS = ("#7cc0e8", "#f2c530", "#d55e00", "#5c2a6b", "#dcdee2")
 SENTENCES = dict(enumerate(MAP_CLASSES)) | {
@@ -43,22 +48,8 @@ MARKERS = "osD^"
 MARK_EVERY = 6
 # Rows of the marks of margins, above the curves [%].
 TOP, ROW = 105, 5
-# Width of lines over a map, the paper around the ink first.
-CASING = ((PAPER, 2.8), (INK, 1.4))
-# Radii of a ring, its ticks and their labels; the dots of M* lie inside, where they hide no class.
-OUTER, INNER, CRITICAL, TICK, LABEL, EDGE = 1.0, 0.7, 0.6, 1.05, 1.18, 1.25
-STYLE = {
-    "font.size": 10,
-    "axes.titlesize": 10,
-    "axes.edgecolor": INK,
-    "axes.linewidth": 0.8,
-    "text.color": INK,
-    "axes.labelcolor": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "legend.frameon": False,
-    "legend.fontsize": 9.5,
-}
+# Radius of the dots of M*: inside the ring, where they hide no class.
+CRITICAL = 0.6
 
 
 def robustness_map(
@@ -68,7 +59,7 @@ def robustness_map(
     critical: CriticalSet,
     path: Path,
 ) -> None:
-    """Write a PNG with a panel for each controller: what becomes of runs from each state.
+    """Write a picture (PNG and PDF) with a panel for each controller: what becomes of runs from each state.
 
     Args:
         task: what was played; its chart has two coordinates, or one.
@@ -76,46 +67,35 @@ def robustness_map(
         arrays: of `examine`: `map_<controller>` (N,) int, an index into `MAP_CLASSES` for each node of
             the grid of `grid_counts` (d,) nodes, and the noise bound `eps` that they hold for.
         critical: M*, drawn over it.
-        path: of the picture.
+        path: of the PNG.
     """
     names, grid = _controllers(content), Grid.from_counts(task.chart, arrays["grid_counts"])
     rows = -(-len(names) // COLUMNS)
     columns = min(len(names), COLUMNS)
-    ring = task.chart.dimension == 1 and task.chart.periodic[0]
-    with _figure(path, (WIDTH, 1.6 + rows * _panel_height(task, ring))) as figure:
-        where, unit = _noisy(task, content["everywhere"])
-        figure.suptitle(
-            f"{_title(task)}: the worst noise on {where} up to eps = {arrays['eps']:g} {unit}",
-            fontsize=12,
-            fontweight="bold",
-        )
+    with drawing(path, (WIDTH, 1.6 + rows * _panel_height(task))) as figure:
+        where, unit = noisy(task, content["everywhere"])
+        head(figure, task, f"the worst noise on {where} up to eps = {arrays['eps']:g} {unit}")
         panels = figure.subplots(rows, columns, squeeze=False).ravel()
         found: dict[str, Artist] = {}
         for panel, name in zip(panels, names, strict=False):
-            draw = _ring if ring else _box
+            draw = _ring if is_ring(task) else _box
             found |= draw(panel, task, grid, arrays[f"map_{name}"], critical)
             _head(panel, name, max(content["scores"][name], key=lambda score: score["eps"]))
         for panel in panels[len(names) :]:
             panel.set_axis_off()
         classes = np.unique(np.concatenate([arrays[f"map_{name}"] for name in names]))
-        handles = {
-            SENTENCES[k]: Patch(facecolor=CLASS_COLOURS[k], edgecolor=INK, linewidth=0.5)
-            for k in classes
-        } | found
-        figure.legend(
-            list(handles.values()), list(handles), loc="outside lower center", ncols=COLUMNS
-        )
+        legend(figure, {SENTENCES[k]: patch(CLASS_COLOURS[k]) for k in classes} | found)
 
 
 def robustness_curve(task: Task, content: Mapping[str, Any], path: Path) -> None:
-    """Write a PNG of what each controller wins against the noise bound.
+    """Write a picture (PNG and PDF) of what each controller wins against the noise bound.
 
     Where runs last for ever, a panel below has the worst time to arrival.
 
     Args:
         task: what was played.
         content: of `examine`.
-        path: of the picture.
+        path: of the PNG.
     """
     names, curve = _controllers(content), content["curve"]
     eps, scores = np.array(curve["eps"]), content["scores"]
@@ -124,12 +104,10 @@ def robustness_curve(task: Task, content: Mapping[str, Any], path: Path) -> None
     # A controller has its colour whoever else is in the picture.
     known = list(dict.fromkeys([*TITLES, *names]))
     numbers = {name: known.index(name) for name in names}
-    where, unit = _noisy(task, content["everywhere"])
+    where, unit = noisy(task, content["everywhere"])
     heights = (3.6, 2.0) if lasting else (3.6,)
-    with _figure(path, (WIDTH, 2.0 + sum(heights))) as figure:
-        figure.suptitle(
-            f"{_title(task)}: what is won against the worst noise", fontsize=12, fontweight="bold"
-        )
+    with drawing(path, (WIDTH, 2.0 + sum(heights))) as figure:
+        head(figure, task, "what is won against the worst noise")
         panels = figure.subplots(
             len(heights), 1, sharex=True, squeeze=False, height_ratios=heights
         ).ravel()
@@ -160,26 +138,7 @@ def robustness_curve(task: Task, content: Mapping[str, Any], path: Path) -> None
             textcoords="offset points",
             ha="center",
         )
-        figure.legend(
-            list(handles.values()),
-            list(handles),
-            loc="outside lower center",
-            ncols=COLUMNS,
-            handlelength=3.2,
-        )
-
-
-@contextmanager
-def _figure(path: Path, size: tuple[float, float]) -> Iterator[Figure]:
-    """A figure of a size [inches], written to `path` when the block ends well."""
-    # The user's own matplotlibrc must not change what is drawn here.
-    with style.context(["default", STYLE]):
-        layout = ConstrainedLayoutEngine(compress=True, h_pad=PAD, w_pad=PAD)
-        figure = Figure(figsize=size, layout=layout)
-        yield figure
-        with artifacts.replacing(path) as temporary:
-            # Panels of a fixed aspect leave room, which is cut off.
-            figure.savefig(temporary, format="png", dpi=DPI, bbox_inches="tight", pad_inches=PAD)
+        legend(figure, handles, handlelength=3.2)
 
 
 # ---- words
@@ -189,42 +148,12 @@ def _controllers(content: Mapping[str, Any]) -> list[str]:
     return [name for name in content["scores"] if name != LIMIT]
 
 
-def _title(task: Task) -> str:
-    return task.name.replace("_", " ").capitalize()
-
-
-def _noisy(task: Task, everywhere: bool) -> tuple[str, str]:
-    """The chart coordinates that noise acts on, and their unit: "x and y", "m"."""
-    hit = task.noise_in_chart(1.0, everywhere) > 0
-    names = [name for name, h in zip(task.chart.names, hit, strict=True) if h]
-    units = [unit for unit, h in zip(task.chart.units, hit, strict=True) if h]
-    return " and ".join(names), ", ".join(dict.fromkeys(units))
-
-
-def _axis_label(task: Task, axis: int) -> str:
-    return f"{task.chart.names[axis]} [{task.chart.units[axis]}]"
-
-
-def _percent(share: float) -> str:
-    """A share in percent; only what is everything is called 100%, and only nothing 0%."""
-    if 0 < share < 1:
-        return "<0.1%" if share < 5e-4 else ">99.9%" if share >= 0.9995 else f"{100 * share:.1f}%"
-    return f"{100 * share:.0f}%"
-
-
-def _angle(value: float) -> str:
-    """An angle in multiples of pi: "3π/2"."""
-    turns = Fraction(value / np.pi).limit_denominator(12)
-    number = {0: "0", 1: "π", -1: "-π"}.get(turns.numerator, f"{turns.numerator}π")
-    return number if turns.denominator == 1 else f"{number}/{turns.denominator}"
-
-
 # ---- maps
 
 
-def _panel_height(task: Task, ring: bool) -> float:
+def _panel_height(task: Task) -> float:
     """Height [inches] that a panel takes with its title and labels."""
-    if ring:
+    if is_ring(task):
         return 4.1
     sides = np.subtract(task.chart.high, task.chart.low)
     return 1.1 + (float(3.2 * sides[1] / sides[0]) if len(sides) == 2 else 0.5)
@@ -232,7 +161,7 @@ def _panel_height(task: Task, ring: bool) -> float:
 
 def _head(panel: Axes, name: str, score: Mapping[str, Any]) -> None:
     """Write the controller and what it wins over its panel."""
-    won, won_any = _percent(score["won"]), _percent(score["won_any"])
+    won, won_any = percent(score["won"]), percent(score["won_any"])
     panel.set_title(TITLES.get(name, name), fontsize=11, fontweight="bold", pad=36)
     panel.annotate(
         f"{won} of the winnable starts won,\n"
@@ -267,8 +196,8 @@ def _box(
         interpolation="nearest",
         aspect=0.12 * (high[0] - low[0]) if flat else "equal",
     )
-    panel.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel=_axis_label(task, 0))
-    panel.set(yticks=[]) if flat else panel.set(ylabel=_axis_label(task, 1))
+    panel.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel=axis_label(task, 0))
+    panel.set(yticks=[]) if flat else panel.set(ylabel=axis_label(task, 1))
     sides = end[0] - start[0], end[1] - start[1]
     for colour, width in CASING:
         box = Rectangle(
@@ -276,7 +205,7 @@ def _box(
         )
         panel.add_patch(box)
     z = critical.points
-    points = _points(panel, z[:, 0], np.full(len(z), 0.5) if flat else z[:, 1])
+    points = dots(panel, np.hstack([z, np.full_like(z, 0.5)]) if flat else z)
     return {"start region": box} | points
 
 
@@ -289,66 +218,16 @@ def _ring(
     panel: Axes, task: Task, grid: Grid, classes: np.ndarray, critical: CriticalSet
 ) -> dict[str, Artist]:
     """Draw a map over a periodic coordinate as arcs of a ring; returns as `_box`."""
-    low, period = task.chart.low[0], task.chart.high[0] - task.chart.low[0]
-    step = 360 / len(classes)  # [degrees] from node to node
-    origin = 360 * low / period
-    # Arcs begin half-way between nodes of different classes; one class all round has no beginning.
-    begins = np.flatnonzero(classes != np.roll(classes, 1))
-    ends = np.append(begins[1:], begins[:1] + len(classes))
-    if not len(begins):
-        begins, ends = np.array([0]), np.array([len(classes)])
-    # The shortest arcs last, with an edge: those of a single node are seen, too.
-    for arc in np.argsort(begins - ends):
-        theta = origin + step * (begins[arc] - 0.5), origin + step * (ends[arc] - 0.5)
-        colour = CLASS_COLOURS[classes[begins[arc]]]
-        panel.add_patch(
-            Wedge((0, 0), OUTER, *theta, width=OUTER - INNER, color=colour, linewidth=0.8)
-        )
-    for radius in (OUTER, INNER):
-        panel.add_patch(Circle((0, 0), radius, fill=False, edgecolor=INK, linewidth=0.8))
-    # Quarters of the period, as hours on a clock face.
-    for quarter in low + period * np.arange(4) / 4:
-        at = np.array(_on_ring(task, quarter))
-        panel.plot(*np.outer(at, (OUTER, TICK)), color=INK, linewidth=0.8)
-        text = _angle(quarter) if task.chart.units[0] == "rad" else f"{quarter:g}"
-        panel.text(LABEL * at[0], LABEL * at[1], text, ha="center", va="center")
-    panel.text(0, 0, _axis_label(task, 0), ha="center", va="center")
-    panel.set(xlim=(-EDGE, EDGE), ylim=(-EDGE, EDGE), aspect="equal", anchor="S")
-    panel.set_axis_off()
+    arcs(panel, task, classes, CLASS_COLOURS)
+    ring(panel, task, (OUTER, INNER))
     found: dict[str, Artist] = {}
+    period = task.chart.high[0] - task.chart.low[0]
     first, last = (360 * corner[0] / period for corner in (task.start_low, task.start_high))
-    if last - first < 360 - step:
+    if last - first < 360 - 360 / len(classes):
         found["start region"] = panel.add_patch(
             Wedge((0, 0), TICK, first, last, width=0.03, color=INK, linewidth=0)
         )
-    x, y = _on_ring(task, critical.points[:, 0])
-    for colour, width in CASING:
-        panel.plot(
-            [CRITICAL * x, OUTER * x],
-            [CRITICAL * y, OUTER * y],
-            color=colour,
-            linewidth=width,
-            zorder=3,
-        )
-    return found | _points(panel, CRITICAL * x, CRITICAL * y)
-
-
-def _on_ring(task: Task, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where values (n,) of a periodic coordinate lie on the unit circle: (n,), (n,)."""
-    angle = 2 * np.pi * np.asarray(z) / (task.chart.high[0] - task.chart.low[0])
-    return np.cos(angle), np.sin(angle)
-
-
-def _points(panel: Axes, x: np.ndarray, y: np.ndarray) -> dict[str, Artist]:
-    """Mark the points of M* (n,), (n,); returns as `_box`."""
-    if not len(x):
-        return {}
-    # All the paper first: where points lie close together they make one line.
-    for colour, size in ((PAPER, 5.0), (INK, 3.6)):
-        (dots,) = panel.plot(
-            x, y, "o", markersize=size, color=colour, markeredgewidth=0, clip_on=False, zorder=4
-        )
-    return {"critical set M*": dots}
+    return found | spokes(panel, task, critical.points[:, 0], CRITICAL, OUTER)
 
 
 # ---- curves

@@ -1,0 +1,139 @@
+"""What all pictures have in common: colours, sizes, words, and how they are written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import style
+from matplotlib.artist import Artist
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+from hyrl_mj import artifacts
+from hyrl_mj.tasks.base import Task
+
+DPI = 200  # [pixels/inch]
+WIDTH, PAD = 7.8, 0.1  # [inches] of a picture, and of the margin around it
+COLUMNS = 2  # panels beside each other, and columns of a legend
+INK, PAPER, PALE = "#232830", "#ffffff", "#8b919b"
+# States at which a run is over.
+GREY = "#dcdee2"
+# Of the stage-1 policy, and of what is bad: as in the replay.
+POLICY_COLOUR, RED, PALE_RED = "#2d323c", "#be2823", "#f4c9c7"
+GREEN = "#007d55"  # of the set-point
+# Blue, vermilion, purple and sky blue of Okabe and Ito, as in the replay, and the same hues as tints.
+MODE_COLOURS = ("#0072b2", "#d55e00", "#aa4499", "#56b4e9")
+MODE_TINTS = ("#d6e8f3", "#fbe4d3", "#f1dcee", "#e1f2fb")
+# Width of lines over a map, the paper around the ink first.
+CASING = ((PAPER, 2.8), (INK, 1.4))
+STYLE = {
+    "font.size": 10,
+    "axes.titlesize": 10,
+    "axes.edgecolor": INK,
+    "axes.linewidth": 0.8,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "legend.frameon": False,
+    "legend.fontsize": 9.5,
+    # Letters in a PDF stay letters, which can be searched and edited.
+    "pdf.fonttype": 42,
+}
+
+
+@contextmanager
+def drawing(path: Path, size: tuple[float, float]) -> Iterator[Figure]:
+    """A figure of a size [inches], written as PNG and PDF when the block ends well, or not at all.
+
+    Args:
+        path: of the PNG; the PDF has the same name.
+        size: width and height, with what is cut off in the end.
+    """
+    # The user's own matplotlibrc must not change what is drawn here.
+    with style.context(["default", STYLE]):
+        layout = ConstrainedLayoutEngine(compress=True, h_pad=PAD, w_pad=PAD)
+        figure = Figure(figsize=size, layout=layout)
+        yield figure
+        with (
+            artifacts.replacing(path.with_suffix(".png")) as png,
+            artifacts.replacing(path.with_suffix(".pdf")) as pdf,
+        ):
+            # Panels of a fixed aspect leave room, which is cut off.
+            cut: dict[str, Any] = {"dpi": DPI, "bbox_inches": "tight", "pad_inches": PAD}
+            figure.savefig(png, format="png", **cut)
+            # Without the date the same picture is the same file.
+            figure.savefig(pdf, format="pdf", metadata={"CreationDate": None}, **cut)
+
+
+def head(figure: Figure, task: Task, words: str) -> None:
+    """Write the title over a figure."""
+    figure.suptitle(f"{task_title(task)}: {words}", fontsize=12, fontweight="bold")
+
+
+def legend(figure: Figure, handles: Mapping[str, Artist], handlelength: float = 2.0) -> None:
+    """Write the legend below a figure, where it hides nothing."""
+    figure.legend(
+        list(handles.values()),
+        list(handles),
+        loc="outside lower center",
+        ncols=COLUMNS,
+        handlelength=handlelength,
+    )
+
+
+# ---- words
+
+
+def task_title(task: Task) -> str:
+    """The task for people: "Unit circle"."""
+    return task.name.replace("_", " ").capitalize()
+
+
+def policy_title(task: Task) -> str:
+    """The stage-1 policy for people: "RL policy (PPO)"."""
+    return f"RL policy ({task.algorithm.upper()})"
+
+
+def noisy(task: Task, everywhere: bool = False) -> tuple[str, str]:
+    """The chart coordinates that noise acts on, and their unit: "x and y", "m"."""
+    hit = task.noise_in_chart(1.0, everywhere) > 0
+    names = [name for name, h in zip(task.chart.names, hit, strict=True) if h]
+    units = [unit for unit, h in zip(task.chart.units, hit, strict=True) if h]
+    return " and ".join(names), ", ".join(dict.fromkeys(units))
+
+
+def noise_label(task: Task, kind: str, eps: float) -> str:
+    """Noise for people: "alternating noise on y, eps = 0.1 m"."""
+    where, unit = noisy(task)
+    return f"{kind} noise on {where}, eps = {eps:g} {unit}"
+
+
+def axis_label(task: Task, axis: int) -> str:
+    """A coordinate of the chart with its unit: "x [m]"."""
+    return f"{task.chart.names[axis]} [{task.chart.units[axis]}]"
+
+
+def input_label(task: Task, i: int) -> str:
+    """An input with its unit: "turn rate [rad/s]"."""
+    unit = f" [{task.input_units[i]}]" if task.input_units else ""
+    return task.inputs[i].replace("_", " ") + unit
+
+
+def percent(share: float) -> str:
+    """A share in percent; only what is everything is called 100%, and only nothing 0%."""
+    if 0 < share < 1:
+        return "<0.1%" if share < 5e-4 else ">99.9%" if share >= 0.9995 else f"{100 * share:.1f}%"
+    return f"{100 * share:.0f}%"
+
+
+def angle(value: float) -> str:
+    """An angle in multiples of pi: "3π/2"."""
+    turns = Fraction(value / np.pi).limit_denominator(12)
+    number = {0: "0", 1: "π", -1: "-π"}.get(turns.numerator, f"{turns.numerator}π")
+    return number if turns.denominator == 1 else f"{number}/{turns.denominator}"

@@ -1,0 +1,244 @@
+#!/usr/bin/env python
+"""The paper's figures, and its numbers beside ours: from finished runs, training what is missing.
+
+    python scripts/reproduce_paper.py                            # runs/unit_circle, runs/vehicle
+    python scripts/reproduce_paper.py --circle RUN --vehicle RUN --out DIR
+
+Figures are written as PNG and PDF. What stands under "ours" is computed from the runs.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import hyrl_mj
+from hyrl_mj import figures, progress
+from hyrl_mj.errors import BadInput
+from hyrl_mj.noise import Noise
+
+# A line of the table: the quantity, the paper's value, ours, and a note.
+Line = tuple[str, str, str, str]
+FATES = {
+    "crashed": "crashes",
+    "stalled": "stalls",
+    "out_of_bounds": "leaves the arena",
+    "running": "not there yet",
+}
+# Where ours differs on purpose.
+SIZED = "sized to the noise *"
+FOOTNOTE = (
+    "* The extended sets overlap as far as the noise asks for. With the paper's T instead: "
+    "hyrl-mj run unit_circle --horizon 0.5, and vehicle --horizon 0.3, each into another --out."
+)
+
+
+def opened(path: Path, task: str) -> hyrl_mj.Run:
+    """The finished run of a task at a path: resumed with its own settings, or made with the defaults.
+
+    Raises:
+        BadInput: it is a run of another task, or has no critical set.
+    """
+    given = {}
+    if (path / "config.json").is_file():
+        s = hyrl_mj.load_run(path).settings
+        if s.task != task:
+            raise BadInput(f"{path} is a run of {s.task}: give one of {task}")
+        given = {"noise": s.noise, "seed": s.seed, "preset_name": s.preset, "horizon": s.horizon}
+    run = hyrl_mj.run(task, out=path, say=lambda text: print(f"{path}: {text}"), **given)
+    if len(run.extended_sets.modes) < 2 or not len(run.critical_set.points):
+        raise BadInput(f"{path} has no critical set to show: give a run with another seed")
+    return run
+
+
+def draw(circle: hyrl_mj.Run, vehicle: hyrl_mj.Run, folder: Path) -> None:
+    """Write the paper's six figures."""
+    figures.overview(
+        vehicle.task, vehicle.policy, vehicle.critical_set, vehicle.partition,
+        vehicle.arcs()["critical", "policy"], folder / "fig1_intro.png",
+    )  # fmt: skip
+    for run, name in ((circle, "fig2_ppo_circle"), (vehicle, "fig3_dqn_vehicle")):
+        figures.policy_map(
+            run.task, run.policy, run.critical_set, run.settings.noise, run.settings.seed,
+            folder / f"{name}.png",
+        )  # fmt: skip
+    for run, name in ((circle, "circle"), (vehicle, "vehicle")):
+        path = folder / f"fig4_extended_sets_{name}.png"
+        figures.extended_sets_map(run.task, run.critical_set, run.extended_sets, path)
+    figures.runs(circle.task, circle.arcs(), folder / "fig5_hyrl_circle.png")
+    figures.runs(vehicle.task, vehicle.arcs(), folder / "fig6_hyrl_vehicle.png")
+
+
+# ---- our values
+
+
+def fate(run: hyrl_mj.Run, arc: hyrl_mj.HybridArc) -> str:
+    """What becomes of a run: "arrives, left", "stalls", ..."""
+    if arc.outcome != "reached":
+        return FATES[arc.outcome]
+    if not run.task.arrived(arc.z[-1:])[0]:
+        return f"ends {run.task.miss(arc.z[-1:])[0]:.2g} off the set-point"
+    return f"arrives, {run.task.mode_names[run.task.direction(arc.z[:, None])[0]]}"
+
+
+def point(z: np.ndarray) -> str:
+    """A start (d,), angles in multiples of pi."""
+    return f"{z[0] / np.pi:.2f}π" if len(z) == 1 else f"({', '.join(f'{x:g}' for x in z)})"
+
+
+def intervals(members: hyrl_mj.sets.GridSet) -> str:
+    """The pieces of a set of angles, in multiples of pi."""
+    return ", ".join(f"[{a / np.pi:.3f}π, {b / np.pi:.3f}π]" for a, b in members.pieces())
+
+
+def overlap(run: hyrl_mj.Run) -> np.ndarray:
+    """How wide the overlap of the extended sets is at each point of M* (N,), along what noise acts on."""
+    points, both = run.critical_set.points, run.extended_sets.sets[0] & run.extended_sets.sets[1]
+    direction = (run.task.noise_in_chart(1.0) > 0).astype(float)
+    step = both.grid.cell / 4
+    steps = np.arange(
+        np.ceil(np.subtract(run.task.chart.high, run.task.chart.low).max() / 2 / step)
+    )
+    width = np.zeros(len(points))
+    for sign in (1, -1):
+        z = points[:, None] + (sign * step * steps)[:, None] * direction
+        inside = both.contains(z.reshape(-1, z.shape[-1])).reshape(len(points), -1)
+        width += step * np.where(inside.all(axis=1), len(steps), inside.argmin(axis=1))
+    return width
+
+
+def training(run: hyrl_mj.Run) -> tuple[str, str]:
+    """Samples of stage 6 against stage 1, and what is other than in the paper."""
+    first, then = run.settings.stage1, run.settings.stage6
+    ours = f"{then.samples:,} a mode ({then.algorithm.upper()}), stage 1 {first.samples:,}"
+    return ours, "" if then.warm_start else "ours starts afresh, and trains under noise"
+
+
+# ---- the table
+
+
+def common(run: hyrl_mj.Run, horizon: str, width: str, least: float) -> Iterator[Line]:
+    """What the paper says of both problems; the width of its overlap is at `least` so much."""
+    unit = run.task.chart.units[0]
+    sets, sized = run.extended_sets, run.settings.horizon is None
+    yield "noise bound eps", f"0.1 {unit}", f"{run.settings.noise:g} {unit}", ""
+    yield "horizon T (step 5)", horizon, f"{sets.horizon:.3g} s", SIZED if sized else ""
+    at = np.linalg.norm(run.critical_set.points - run.arcs()["critical", "policy"].z[0], axis=1)
+    here, narrowest = overlap(run)[at.argmin()], overlap(run).min()
+    note = SIZED if sized and here < least else ""
+    yield "overlap at the replay starts", width, f"{here:.3f} {unit}", note
+    yield "overlap where it is narrowest", "> eps", f"{narrowest:.3f} {unit}", ""
+    yield ("cost of step 6 in samples", "at most that of step 1", *training(run))
+
+
+def alone(run: hyrl_mj.Run, said: tuple[str, ...]) -> Iterator[Line]:
+    """The stage-1 policy from the starts of Section III, and of Section V where the text tells."""
+    task, noise = run.task, Noise("alternating", run.settings.noise)
+    name, seed = task.algorithm.upper(), run.settings.seed
+    starts = np.array(task.policy_starts)
+    arcs = hyrl_mj.simulate(task, run.policy, starts, noise, horizon=task.replay_time, seed=seed)
+    for paper, arc in zip(said, arcs, strict=True):
+        yield f"{name} from {point(arc.z[0])}", paper, fate(run, arc), ""
+
+
+def hybrid(run: hyrl_mj.Run, decided: tuple[int, ...]) -> Iterator[Line]:
+    """The ten replays of Section V; the way is told for the starts that are `decided` by q0."""
+    arcs = run.arcs()
+    for q in run.controller.modes:
+        for i in range(len(run.task.replay_starts)):
+            arc = arcs[f"start{i}", f"hyrl_q{q}"]
+            paper = f"arrives, {run.task.mode_names[q]}" if i in decided else "arrives"
+            ours, jumps = fate(run, arc), arc.t[np.flatnonzero(np.diff(arc.j))]
+            note = ""
+            if not ours.startswith(paper) and len(jumps):
+                note = f"q jumps at t = {', '.join(f'{t:g}' for t in jumps)} s"
+                note += f": {SIZED}" if run.settings.horizon is None else ""
+            yield f"HyRL from {point(arc.z[0])}, q0 = {q}", paper, ours, note
+
+
+def circle_lines(run: hyrl_mj.Run) -> Iterator[Line]:
+    """Example 1."""
+    task, sets, parts = run.task, run.extended_sets, run.partition.parts
+    z = np.linspace(0, 2 * np.pi, 10_001)[:, None]
+    reward = task.reward(z)
+    low, high = (limit[0] for limit in task.input_limits)
+    yield (
+        "set-point",
+        "(1, 0)",
+        f"({np.cos(task.set_point[0]):g}, {np.sin(task.set_point[0]):g})",
+        "",
+    )
+    yield "input u", "[-1, 1] rad/s", f"[{low:g}, {high:g}] rad/s", ""
+    yield "reward R", "[-1, 0]", f"[{reward.min():.3g}, {abs(reward.max()):.3g}]", ""
+    yield "R(x, y) - R(x, -y)", "0", f"{abs(reward - reward[::-1]).max():.1g}", ""
+    where = ", ".join(f"{theta / np.pi:.4f}π" for theta in run.critical_set.points[:, 0])
+    yield "M*", "π", where, ""
+    shared = all(part.contains(task.set_point[None])[0] for part in parts)
+    both = "our parts share the set-point, too" if shared else ""
+    yield "M_0", "[0, π]", intervals(parts[0]), both
+    yield "M_1", "[π, 2π)", intervals(parts[1]), both
+    note = SIZED if run.settings.horizon is None else ""
+    yield "M_ext_0", "[0, 1.13π]", intervals(sets.sets[0]), note
+    yield "M_ext_1", "[0.87π, 2π)", intervals(sets.sets[1]), note
+    yield from common(run, "0.5 s", "> 0.2π = 0.628 rad", 0.2 * np.pi)
+    yield "runs are watched for", "4 s", f"{run.arcs()['start0', 'policy'].t[-1]:g} s", ""
+    yield from alone(run, ("arrives, clockwise", "arrives, counter-clockwise", "stalls"))
+    yield from hybrid(run, (1, 3))
+
+
+def vehicle_lines(run: hyrl_mj.Run) -> Iterator[Line]:
+    """Example 2."""
+    task, points = run.task, run.critical_set.points
+    (x0, y0), (x1, y1) = task.chart.low, task.chart.high
+    z = run.partition.grid.nodes
+    uneven = abs(task.reward(z) - task.reward(z * [1, -1])).max()
+    levels = ", ".join(f"{u:g}" for u in task.input_levels[:, 0])
+    yield "set-point", "(3, 0)", "({:g}, {:g})".format(*task.set_point), ""
+    yield "input u", "-1, -0.5, 0, 0.5, 1 m/s", f"{levels} m/s", ""
+    yield "arena", "[0, 3] x [-1.5, 1.5]", f"[{x0:g}, {x1:g}] x [{y0:g}, {y1:g}]", ""
+    yield "R(x, y) - R(x, -y)", "0", f"{uneven:.1g}", ""
+    ours = f"x {points[:, 0].min():.2f} to {points[:, 0].max():.2f}, |y| <= {abs(points[:, 1]).max():.4f}"
+    yield "M*", "around (0.4, 0)", ours, ""
+    yield from common(run, "not told (0.3 s in its code)", ">= 0.11 m", 0.11)
+    yield "runs are watched for", "to the set-point", f"{task.replay_time:g} s", ""
+    yield from alone(run, ("arrives, right", "crashes", "arrives, left"))
+    yield from hybrid(run, (1, 3))
+
+
+def main() -> None:
+    """Draw, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--circle", type=Path, default=Path("runs/unit_circle"), metavar="RUN")
+    parser.add_argument("--vehicle", type=Path, default=Path("runs/vehicle"), metavar="RUN")
+    parser.add_argument("--out", type=Path, default=Path("runs/paper"), metavar="DIR")
+    options = parser.parse_args()
+    progress.enabled = sys.stderr.isatty()
+    circle = opened(options.circle, "unit_circle")
+    vehicle = opened(options.vehicle, "vehicle")
+    draw(circle, vehicle, options.out)
+    table = Table(title="The paper's values and ours", caption=FOOTNOTE)
+    for heading in ("quantity", "paper", "ours", "note"):
+        table.add_column(heading)
+    for title, lines in (
+        ("unit circle", circle_lines(circle)),
+        ("vehicle", vehicle_lines(vehicle)),
+    ):
+        table.add_section()
+        table.add_row(f"[bold]{title}")
+        for line in lines:
+            # Square brackets are intervals, not rich's markup.
+            table.add_row(*(cell.replace("[", r"\[") for cell in line))
+    Console(width=None if sys.stdout.isatty() else 150).print(table)
+    print(f"figures in {options.out}")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except hyrl_mj.HyrlError as error:
+        print(error, file=sys.stderr)
+        sys.exit(error.exit_status)

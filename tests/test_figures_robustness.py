@@ -1,0 +1,189 @@
+"""The pictures of the worst-case game: what is in them, and what is left when they cannot be drawn."""
+
+from __future__ import annotations
+
+import matplotlib
+import numpy as np
+import pytest
+from figure_parts import EPS, size_of, where
+from matplotlib.figure import Figure
+from PIL import Image
+
+import hyrl_mj
+from hyrl_mj import figures
+from hyrl_mj.figures import robustness, style
+from hyrl_mj.robustness import BEATEN, CURVE, MAP_CLASSES, UNWINNABLE, WON, WON_FROM_SOME
+from hyrl_mj.sets import Grid
+
+CIRCLE, VEHICLE = hyrl_mj.get_task("unit_circle"), hyrl_mj.get_task("vehicle")
+HYRL = robustness.CURVE_COLOURS[1]
+
+
+@pytest.fixture
+def coarse(monkeypatch):
+    """Pictures with a quarter of the pixels, which are drawn faster."""
+    monkeypatch.setattr(style, "DPI", 100)
+
+
+def share(won, won_any, excursion=None):
+    return {"eps": EPS, "won": won, "won_any": won_any, "excursion": excursion}
+
+
+def content_of(names, excursion=None, margin=0.05):
+    """What `examine` returns, for controllers that lose more and more."""
+    eps = np.array(CURVE)
+    fall = {name: np.clip(1.2 - 4 * eps, 0, 1) for name in names}
+    curves = {
+        name: {"won": won, "won_any": won if name == "policy" else 0.9 * won, "time_any": 3 * won}
+        for name, won in fall.items()
+    }
+    full = {"won": np.ones(len(eps)), "won_any": 1 - 0.3 * eps, "time_any": np.full(len(eps), 3.0)}
+    return {
+        "everywhere": False,
+        "scores": {n: [share(0.8, 0.72, excursion)] for n in names} | {"limit": [share(1.0, 1.0)]},
+        "margin": dict.fromkeys(names, margin),
+        "curve": {"eps": eps, "winnable": 1 - 0.2 * eps, "limit": full} | curves,
+    }
+
+
+def map_of(task, names, rule, cells=40):
+    """The arrays of `examine`; the classes (N,) are a rule of the nodes (N, d)."""
+    grid = Grid.with_cells(task.chart, cells)
+    classes = np.asarray(rule(grid.nodes), dtype=np.int8)
+    maps = {f"map_{name}": classes for name in names}
+    return {"grid_counts": np.array(grid.counts), "eps": np.array(EPS), **maps}
+
+
+def critical_of(*points):
+    d = len(points[0]) if points else 1
+    z = np.array(points, dtype=float).reshape(-1, d)
+    return hyrl_mj.CriticalSet(z, np.zeros(len(z), dtype=int), 0.01, 0.1)
+
+
+@pytest.mark.parametrize("task", [CIRCLE, VEHICLE], ids=lambda task: task.name)
+def test_each_class_that_occurs_has_its_colour(tmp_path, task):
+    occurring = (WON, WON_FROM_SOME, BEATEN)
+    path, names = tmp_path / "figures" / "map.png", ("policy", "hyrl")
+    arrays = map_of(task, names, lambda z: np.arange(len(z)) % 40 // 14)
+    critical = critical_of(task.replay_starts[2])
+    figures.robustness_map(task, content_of(names), arrays, critical, path)
+    for k, colour in enumerate(robustness.CLASS_COLOURS):
+        assert (len(where(path, colour)) > 1000) == (k in occurring), MAP_CLASSES[k]
+    width, height = size_of(path)
+    assert 1200 < width <= 1600
+    assert 800 < height < 1600
+    assert sorted(p.name for p in path.parent.iterdir()) == ["map.pdf", "map.png"]
+
+
+def test_a_map_is_drawn_the_right_way_round(tmp_path, coarse):
+    path = tmp_path / "map.png"
+
+    def upper_left(z):
+        return np.where((z[:, 0] < 1.0) & (z[:, 1] > 0.5), BEATEN, UNWINNABLE)
+
+    arrays = map_of(VEHICLE, ["hyrl"], upper_left)
+    figures.robustness_map(VEHICLE, content_of(["hyrl"]), arrays, critical_of((0.0, 0.0)), path)
+    corner, rest = (where(path, robustness.CLASS_COLOURS[k]) for k in (BEATEN, UNWINNABLE))
+    right, up = np.median(corner, axis=0) - np.median(rest, axis=0)
+    assert right < -50
+    assert up > 50
+
+
+def test_arcs_of_a_ring_lie_at_their_angle(tmp_path, coarse):
+    path = tmp_path / "map.png"
+
+    def through_the_end_of_the_period(z):
+        return np.where(np.cos(z[:, 0] - 0.25) > 0.9, BEATEN, UNWINNABLE)
+
+    arrays = map_of(CIRCLE, ["hyrl"], through_the_end_of_the_period, cells=360)
+    figures.robustness_map(CIRCLE, content_of(["hyrl"]), arrays, critical_of(), path)
+    ring = where(path, robustness.CLASS_COLOURS[UNWINNABLE])
+    # The ring without its legend: the other arc lies to the right, a little above the centre.
+    ring = ring[ring[:, 1] > 100]
+    centre = ring[:, 0].min() + np.ptp(ring[:, 1]) / 2, (ring[:, 1].min() + ring[:, 1].max()) / 2
+    found = where(path, robustness.CLASS_COLOURS[BEATEN])
+    x, y = np.median(found[found[:, 1] > 100], axis=0) - centre
+    assert np.arctan2(y, x) == pytest.approx(0.25, abs=0.05)
+
+
+def test_a_single_node_of_a_ring_is_seen(tmp_path):
+    path = tmp_path / "map.png"
+    arrays = map_of(CIRCLE, ["hyrl"], lambda z: (np.arange(len(z)) == 700) * BEATEN, cells=6000)
+    figures.robustness_map(CIRCLE, content_of(["hyrl"]), arrays, critical_of(), path)
+    found = where(path, robustness.CLASS_COLOURS[BEATEN])
+    assert (found[:, 1] > 200).sum() > 20, "beside what is in the legend"
+
+
+def test_the_critical_set_lies_at_its_angle(tmp_path, coarse):
+    arrays, pictures = map_of(CIRCLE, ["hyrl"], lambda z: WON + 0 * z[:, 0]), []
+    for critical in (critical_of(), critical_of((0.75 * np.pi,))):
+        path = tmp_path / "map.png"
+        figures.robustness_map(CIRCLE, content_of(["hyrl"]), arrays, critical, path)
+        pictures.append(np.asarray(Image.open(path).convert("RGB"))[::-1].astype(int))
+    changed = np.argwhere(np.abs(pictures[1] - pictures[0]).max(axis=-1) > 100)[:, ::-1]
+    ring, changed = (
+        found[found[:, 1] > 100] for found in (where(path, robustness.CLASS_COLOURS[WON]), changed)
+    )
+    x, y = np.median(changed, axis=0) - (ring.min(axis=0) + ring.max(axis=0)) / 2
+    assert np.arctan2(y, x) == pytest.approx(0.75 * np.pi, abs=0.05)
+
+
+def test_curves_and_a_third_controller(tmp_path, coarse):
+    names, path = ("policy", "hyrl", "median filter"), tmp_path / "curve.png"
+    figures.robustness_curve(VEHICLE, content_of(names), path)
+    for colour in (*robustness.CURVE_COLOURS[:3], robustness.LIMIT_COLOUR, robustness.PALE):
+        assert len(where(path, colour)) > 100
+    arrays = map_of(VEHICLE, names, lambda z: np.zeros(len(z)), cells=8)
+    critical = critical_of((0.0, 0.0))
+    figures.robustness_map(VEHICLE, content_of(names), arrays, critical, tmp_path / "map.png")
+    assert size_of(tmp_path / "map.png")[1] > size_of(path)[1]
+
+
+def test_times_are_drawn_where_runs_last_for_ever(tmp_path, coarse):
+    one, two = tmp_path / "one.png", tmp_path / "two.png"
+    figures.robustness_curve(CIRCLE, content_of(["hyrl"]), one)
+    figures.robustness_curve(CIRCLE, content_of(["hyrl"], excursion=0.1, margin=None), two)
+    assert size_of(two)[1] > size_of(one)[1] + 100
+    assert size_of(two)[0] <= 800
+    assert len(where(two, HYRL)) > len(where(one, HYRL))
+
+
+@pytest.mark.parametrize("fails", ["on its way", "while it is written"])
+def test_nothing_is_left_behind_when_drawing_fails(tmp_path, monkeypatch, fails):
+    def half(self, path, **_):
+        path.write_bytes(b"\x89PNG")
+        raise OSError("no space left on device")
+
+    path, content = tmp_path / "curve.png", content_of(["hyrl"])
+    path.write_bytes(b"an older picture")
+    if fails == "on its way":
+        del content["curve"]["hyrl"]
+    else:
+        monkeypatch.setattr(Figure, "savefig", half)
+    with pytest.raises((OSError, KeyError)):
+        figures.robustness_curve(VEHICLE, content, path)
+    assert path.read_bytes() == b"an older picture"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_users_own_style_is_neither_used_nor_changed(tmp_path, coarse):
+    names = ["hyrl"]
+    figures.robustness_curve(VEHICLE, content_of(names), tmp_path / "plain.png")
+    with matplotlib.rc_context({"figure.facecolor": "black", "font.size": 30}):
+        before = dict(matplotlib.rcParams)
+        figures.robustness_curve(VEHICLE, content_of(names), tmp_path / "styled.png")
+        assert dict(matplotlib.rcParams) == before
+    assert (tmp_path / "plain.png").read_bytes() == (tmp_path / "styled.png").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("share", "words"),
+    [(1.0, "100%"), (0.99999, ">99.9%"), (0.128, "12.8%"), (1e-5, "<0.1%"), (0.0, "0%")],
+)
+def test_only_what_is_everything_is_called_so(share, words):
+    assert style.percent(share) == words
+
+
+def test_angles_are_multiples_of_pi():
+    angles = np.pi * np.array([-1, -0.5, 0, 0.5, 1, 1.5, 2])
+    assert [style.angle(x) for x in angles] == ["-π", "-π/2", "0", "π/2", "π", "3π/2", "2π"]
