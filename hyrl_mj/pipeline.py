@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from hyrl_mj.run_directory import Run, load_run, open_or_create, write_config
 from hyrl_mj.sets import Grid
 from hyrl_mj.settings import preset
 from hyrl_mj.simulation import HybridArc, simulate
+from hyrl_mj.tables import replay_sentence, robustness_sentence
 from hyrl_mj.tasks.base import get_task
 
 Say = Callable[[str], None]
@@ -120,13 +121,6 @@ def simulate_stage(run: Run, say: Say) -> None:
     say(f"{len(arcs)} arcs; {replay_sentence(run, arcs)}")
 
 
-def replay_sentence(run: Run, arcs: Mapping[tuple[str, str], HybridArc]) -> str:
-    """From how many of the paper's starts the hybrid controller reaches the set-point, for people."""
-    hyrl = [arc for (start, who), arc in arcs.items() if start != "critical" and who != "policy"]
-    reached = [arc.outcome == "reached" and run.task.arrived(arc.z[-1:])[0] for arc in hyrl]
-    return f"HyRL reaches the set-point from {sum(reached)} of {len(hyrl)} of the paper's starts"
-
-
 def replay_stage(run: Run, say: Say) -> None:
     """Render the replay of the start on M*; without GL or ffmpeg say why, and go on."""
     from hyrl_mj.replay import render_replay
@@ -136,6 +130,15 @@ def replay_stage(run: Run, say: Say) -> None:
         say(f"video at {run.path / 'replay.mp4'}")
     except NoRenderer as error:
         say(f"no video: {error}")
+
+
+def report_stage(run: Run, say: Say) -> None:
+    """Write the report of all that there is."""
+    from hyrl_mj.report import write_report
+
+    path = run.path / "report.html"
+    write_report(run, path)
+    say(f"page at {path}")
 
 
 @dataclass(frozen=True)
@@ -160,6 +163,7 @@ STAGES = (
     Stage("robustness", robustness_stage, _files("robustness.json")),
     Stage("simulate", simulate_stage, lambda run: list(run.arc_paths().values())),
     Stage("replay", replay_stage, _files("replay.mp4")),
+    Stage("report", report_stage, _files("report.html")),
 )
 
 
@@ -277,7 +281,8 @@ def examine_run(
         "policy": PolicyController(run.policy),
         "hyrl": run.controller,
     }
-    content: dict[str, Any] = {"eps": eps, "everywhere": everywhere, "game": None, "episodes": []}
+    content: dict[str, Any] = {"eps": eps, "everywhere": everywhere, "game": None}
+    content |= {"episodes": [], "seed": seed}
     winnable = None
     if exact:
         bounds = tuple(dict.fromkeys((0.0, eps / 2, eps)))
@@ -297,21 +302,6 @@ def examine_run(
     save(run.path / "robustness.json", content)
     say(robustness_sentence(content))
     return content
-
-
-def robustness_sentence(content: Mapping[str, Any]) -> str:
-    """The most important figures, for people."""
-    if content["game"] is None:
-        worst = {
-            who: min(r["reached"] for r in content["episodes"] if r["controller"] == who)
-            for who in ("policy", "hyrl")
-        }
-        return ", ".join(f"{who} reaches in {100 * x:.1f}% or more" for who, x in worst.items())
-    policy, hyrl = (content["game"]["scores"][who][-1] for who in ("policy", "hyrl"))
-    return (
-        f"worst case at noise {hyrl['eps']:g}: the policy wins {100 * policy['won']:.2f}% of the winnable "
-        f"starts, HyRL {100 * hyrl['won']:.2f}%, from every q0 {100 * hyrl['won_any']:.2f}%"
-    )
 
 
 def critical_start(run: Run) -> np.ndarray | None:

@@ -19,7 +19,8 @@ ORDER = (
     "errors", "progress", "mjcf", "plant", "noise", "tasks", "settings", "artifacts", "policies",
     "controllers", "adversary", "rendering", "envs", "simulation", "symmetry", "training", "sets",
     "lattice", "game", "critical_set", "partition", "limit", "extended_sets", "retraining", "hybrid",
-    "robustness", "episodes", "run_directory", "figures", "replay", "doctor", "pipeline", "tables", "cli",
+    "robustness", "episodes", "run_directory", "tables", "figures", "replay", "doctor", "report",
+    "pipeline", "summary", "cli",
 )  # fmt: skip
 
 
