@@ -36,12 +36,12 @@ class Ending:
 
     @property
     def details(self) -> str:
-        """When and where it ended, after how many jumps."""
+        """When it ended, and after how many jumps."""
         jumps = "1 jump" if self.jumps == 1 else f"{self.jumps} jumps"
-        return f"{self.time:.2f} s, {jumps}, {self.end}"
+        return f"{self.time:.2f} s, {jumps}"
 
     def __str__(self) -> str:
-        return f"{self.outcome} {self.details}"
+        return f"{self.outcome} {self.details}, {self.end}"
 
 
 @dataclass(frozen=True)
