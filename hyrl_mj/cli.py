@@ -17,7 +17,7 @@ from hyrl_mj.lattice import Lattice
 from hyrl_mj.noise import KINDS
 from hyrl_mj.replay import render_replay
 from hyrl_mj.simulation import HybridArc
-from hyrl_mj.tables import print_robustness, print_summary
+from hyrl_mj.summary import print_robustness, print_summary
 from hyrl_mj.tasks.base import get_task, task_names
 
 Positional = tyro.conf.Positional
@@ -40,7 +40,7 @@ def run(
     horizon: float | None = None,
     out: Path | None = None,
 ) -> None:
-    """Run all stages: train, find the critical set, extend, retrain, simulate, draw, render.
+    """Run all stages: train, find the critical set, extend, retrain, simulate, draw, render, report.
 
     A run directory that is there already is resumed: only what is missing is done.
 
@@ -228,6 +228,23 @@ def parse_size(text: str) -> tuple[int, int]:
     return int(parts[0]), int(parts[1])
 
 
+def report(run_dir: RunDir, out: Path | None = None) -> None:
+    """Write one page with all that a run has found: video, figures, tables, settings, how to repeat it.
+
+    The page opens in any browser, without a network, and can be printed.
+
+    Args:
+        run_dir: a run directory.
+        out: the html to write; by default report.html in the run directory.
+    """
+    from hyrl_mj.report import write_report
+
+    run = pipeline.load_run(run_dir)
+    out = out or run.path / "report.html"
+    write_report(run, out)
+    print(f"page at {out}")
+
+
 def doctor() -> None:
     """Tell whether this machine can train, render and encode video, and what to do where it cannot."""
     from hyrl_mj.doctor import report
@@ -251,6 +268,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "figures": stage_command("figures", "Draw the paper's figures of a run again, as PNG and PDF."),
     "replay": replay,
     "view": view,
+    "report": report,
     "doctor": doctor,
 }
 

@@ -59,7 +59,8 @@ class CriticalSet:
             for name, unit, a, b in zip(task.chart.names, task.chart.units, low, high, strict=True)
         )
         pieces = "1 piece" if self.pieces == 1 else f"{self.pieces} pieces"
-        return f"critical set of {pieces}, {len(self.points)} points, {ranges}"
+        points = "1 point" if len(self.points) == 1 else f"{len(self.points)} points"
+        return f"critical set of {pieces}, {points}, {ranges}"
 
     def save(self, path: Path) -> None:
         """Write it as npz."""

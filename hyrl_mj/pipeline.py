@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from hyrl_mj.robustness import (
 from hyrl_mj.run_directory import Run, load_run, open_or_create, write_config
 from hyrl_mj.sets import Grid
 from hyrl_mj.settings import preset
-from hyrl_mj.simulation import HybridArc
+from hyrl_mj.tables import replay_sentence, robustness_sentence
 from hyrl_mj.tasks.base import get_task
 
 Say = Callable[[str], None]
@@ -127,13 +127,6 @@ def simulate_stage(run: Run, say: Say) -> None:
     say(f"{len(arcs)} arcs; {replay_sentence(run, arcs)}")
 
 
-def replay_sentence(run: Run, arcs: Mapping[tuple[str, str], HybridArc]) -> str:
-    """From how many of the paper's starts the hybrid controller reaches the set-point, for people."""
-    hyrl = [arc for (start, who), arc in arcs.items() if start != "critical" and who != "policy"]
-    reached = [arc.outcome == "reached" and run.task.arrived(arc.z[-1:])[0] for arc in hyrl]
-    return f"HyRL reaches the set-point from {sum(reached)} of {len(hyrl)} of the paper's starts"
-
-
 def figures_stage(run: Run, say: Say) -> None:
     """Draw the paper's figures of this run; those that make no sense for its chart are left out."""
     from hyrl_mj import figures
@@ -169,6 +162,15 @@ def replay_stage(run: Run, say: Say) -> None:
         say(f"no video: {error}")
 
 
+def report_stage(run: Run, say: Say) -> None:
+    """Write the report of all that there is."""
+    from hyrl_mj.report import write_report
+
+    path = run.path / "report.html"
+    write_report(run, path)
+    say(f"page at {path}")
+
+
 @dataclass(frozen=True)
 class Stage:
     """One step of the pipeline: its function, and the files that tell that it has been done."""
@@ -192,6 +194,7 @@ STAGES = (
     Stage("simulate", simulate_stage, lambda run: list(run.arc_paths().values())),
     Stage("figures", figures_stage, figure_paths),
     Stage("replay", replay_stage, _files("replay.mp4")),
+    Stage("report", report_stage, _files("report.html")),
 )
 
 
@@ -309,7 +312,8 @@ def examine_run(
         "policy": PolicyController(run.policy),
         "hyrl": run.controller,
     }
-    content: dict[str, Any] = {"eps": eps, "everywhere": everywhere, "game": None, "episodes": []}
+    content: dict[str, Any] = {"eps": eps, "everywhere": everywhere, "game": None}
+    content |= {"episodes": [], "seed": seed}
     winnable = None
     if exact:
         bounds = tuple(dict.fromkeys((0.0, eps / 2, eps)))
@@ -329,18 +333,3 @@ def examine_run(
     save(run.path / "robustness.json", content)
     say(robustness_sentence(content))
     return content
-
-
-def robustness_sentence(content: Mapping[str, Any]) -> str:
-    """The most important figures, for people."""
-    if content["game"] is None:
-        worst = {
-            who: min(r["reached"] for r in content["episodes"] if r["controller"] == who)
-            for who in ("policy", "hyrl")
-        }
-        return ", ".join(f"{who} reaches in {100 * x:.1f}% or more" for who, x in worst.items())
-    policy, hyrl = (content["game"]["scores"][who][-1] for who in ("policy", "hyrl"))
-    return (
-        f"worst case at noise {hyrl['eps']:g}: the policy wins {100 * policy['won']:.2f}% of the winnable "
-        f"starts, HyRL {100 * hyrl['won']:.2f}%, from every q0 {100 * hyrl['won_any']:.2f}%"
-    )

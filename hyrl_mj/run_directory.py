@@ -77,6 +77,14 @@ class Run:
         """What `robustness.json` holds."""
         return robustness.load(self.path / "robustness.json")
 
+    @cached_property
+    def versions(self) -> dict[str, str]:
+        """The versions of Python and packages that it was begun with."""
+        config = self.path / "config.json"
+        content = artifacts.read_json(config, kind="run")
+        with artifacts.reading(config):
+            return dict(content["versions"])
+
     def arc_paths(self) -> dict[tuple[str, str], Path]:
         """The files of the replays by start ("start0", ..., "critical") and controller."""
         starts = [f"start{i}" for i in range(len(self.task.replay_starts))]

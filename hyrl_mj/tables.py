@@ -1,103 +1,196 @@
-"""The summary table that ends a run."""
+"""What a run has found, in rows and sentences for people: the terminal and the report show them."""
 
 from __future__ import annotations
 
-import numpy as np
-from rich.console import Console
-from rich.table import Table
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
-from hyrl_mj.pipeline import replay_sentence
+import numpy as np
+
+from hyrl_mj.robustness import LIMIT
 from hyrl_mj.run_directory import Run
 from hyrl_mj.simulation import HybridArc
+from hyrl_mj.tasks.base import Task
+
+NAMES = {"policy": "RL policy", "hyrl": "HyRL", LIMIT: "limit"}
 
 
-def print_summary(run: Run) -> None:
-    """Print how policy and hybrid controller did from the replay starts, under the same noise."""
-    arcs = run.arcs()
-    modes = run.extended_sets.modes
+@dataclass(frozen=True)
+class Ending:
+    """How a replay ended.
+
+    Attributes:
+        outcome: of the arc.
+        time: when it ended [s].
+        jumps: how often the mode changed.
+        end: the last chart point.
+        success: whether it ended at the set-point.
+    """
+
+    outcome: str
+    time: float
+    jumps: int
+    end: str
+    success: bool
+
+    @property
+    def details(self) -> str:
+        """When it ended, and after how many jumps."""
+        jumps = "1 jump" if self.jumps == 1 else f"{self.jumps} jumps"
+        return f"{self.time:.2f} s, {jumps}"
+
+    def __str__(self) -> str:
+        return f"{self.outcome} {self.details}, {self.end}"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows under headings.
+
+    Attributes:
+        title: over the table.
+        headings: one a column.
+        rows: the cells.
+    """
+
+    title: str
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str | Ending]]
+
+
+Arcs = Mapping[tuple[str, str], HybridArc]
+
+
+# ---- replays
+
+
+def replay_table(run: Run, arcs: Arcs) -> Table:
+    """How policy and hybrid controller did from the replay starts, under the same noise."""
+    task = run.task
     columns = {"policy": f"policy ({run.policy.algorithm.upper()})"}
-    columns |= {f"hyrl_q{q}": f"HyRL, q0 = {q}" for q in modes}
-    units = dict.fromkeys(run.task.chart.units)
-    noise = f"alternating noise {run.settings.noise:g}"
-    table = Table(title=f"{run.task.name}: {noise}, seed {run.settings.seed}")
-    table.add_column(f"start ({', '.join(run.task.chart.names)}) in {', '.join(units)}")
-    for heading in columns.values():
-        table.add_column(heading)
+    columns |= {f"hyrl_q{q}": f"HyRL, q0 = {task.mode_name(q)}" for q in run.extended_sets.modes}
+    units = ", ".join(dict.fromkeys(task.chart.units))
+    rows: list[list[str | Ending]] = []
     for start in dict.fromkeys(start for start, _ in arcs):
-        point = _point(run, arcs[start, "policy"].z[0])
-        cells = [_cell(run, arcs[start, who]) for who in columns]
-        table.add_row(f"{point} on M*" if start == "critical" else point, *cells)
-    _console().print(table)
-    print(run.critical_set.sentence(run.task))
-    for q in modes:
-        print(f"mode {run.task.mode_name(q)}: {extent(run, q)}")
-    print(replay_sentence(run, arcs))
-    print_robustness(run)
-    video = run.path / "replay.mp4"
-    print(f"run directory {run.path}" + (f", video {video}" if video.is_file() else ", no video"))
+        point = _point(arcs[start, "policy"].z[0])
+        endings = [_ending(task, arcs[start, who]) for who in columns]
+        rows.append([f"{point} on M*" if start == "critical" else point, *endings])
+    return Table(
+        f"{task.name}: alternating noise {run.settings.noise:g}, seed {run.settings.seed}",
+        [f"start ({', '.join(task.chart.names)}) in {units}", *columns.values()],
+        rows,
+    )
 
 
-def print_robustness(run: Run) -> None:
-    """Print the scores of the worst-case game and the counts of the noisy episodes."""
-    content, task = run.robustness, run.task
-    if content["game"] is not None:
-        scores = content["game"]["scores"]
-        lasting = scores["hyrl"][0]["excursion"] is not None
-        table = Table(title=f"{task.name}: worst case over all noise signals, exact game")
-        for heading in ("noise", "start region", "policy", "HyRL", "HyRL, any q0", "limit, any q0"):
-            table.add_column(heading)
-        if lasting:
-            for heading in ("worst time", "any q0", "excursion"):
-                table.add_column(heading)
-        for policy, hyrl, limit in zip(
-            *(scores[k] for k in ("policy", "hyrl", "limit")), strict=True
-        ):
-            shares = [policy["won"], hyrl["won"], hyrl["won_any"], limit["won_any"]]
-            row = [f"{hyrl['eps']:g}", f"{_percent(hyrl['winnable'])} winnable"]
-            row += [f"{_percent(share)} won" for share in shares]
+def _ending(task: Task, arc: HybridArc) -> Ending:
+    end, success = _point(task.chart.wrap(arc.z[-1:])[0]), arrives(task, arc)
+    outcome = arc.outcome.replace("_", " ")
+    return Ending(outcome, float(arc.t[-1]), int(arc.j[-1]), end, success)
+
+
+def arrives(task: Task, arc: HybridArc) -> bool:
+    """Whether an arc ends well, and close to the set-point."""
+    return arc.outcome == "reached" and bool(task.arrived(arc.z[-1:])[0])
+
+
+def arrivals(run: Run, arcs: Arcs, policy: bool) -> tuple[int, int]:
+    """How many of the paper's replays arrive, and of how many: those of the policy, or of HyRL."""
+    ours = [
+        arrives(run.task, arc)
+        for (start, who), arc in arcs.items()
+        if start != "critical" and (who == "policy") == policy
+    ]
+    return sum(ours), len(ours)
+
+
+def replay_sentence(run: Run, arcs: Arcs) -> str:
+    """From how many of the paper's starts the hybrid controller reaches the set-point, for people."""
+    reached, total = arrivals(run, arcs, policy=False)
+    return f"HyRL reaches the set-point from {reached} of {total} of the paper's starts"
+
+
+# ---- robustness
+
+
+def score_table(task: Task, content: Mapping[str, Any]) -> Table:
+    """The scores of the worst-case game: a row for each noise bound and controller."""
+    game = content["game"]
+    scores = game["scores"]
+    lasting = scores["hyrl"][0]["excursion"] is not None
+    where, unit = task.noise_on(content["everywhere"])
+    headings = [f"noise on {where} [{unit}]", "winnable starts", "controller"]
+    headings += ["won, own q0", "won, any q0"]
+    if lasting:
+        headings += ["latest arrival, own q0", "latest, any q0", f"excursion [{unit}]"]
+    rows = []
+    for level in zip(*scores.values(), strict=True):
+        for who, score in zip(scores, level, strict=True):
+            row = [f"{score['eps']:g}", percent(score["winnable"]), NAMES[who]]
+            row += [percent(score["won"]), percent(score["won_any"])]
             if lasting:
                 row += [
-                    f"{hyrl['time']:.2f} s",
-                    f"{hyrl['time_any']:.2f} s",
-                    f"{hyrl['excursion']:.3f}",
+                    _seconds(score["time"], score["won"]),
+                    _seconds(score["time_any"], score["won_any"]),
+                    "-" if who == LIMIT else f"{score['excursion']:.3f}",
                 ]
-            table.add_row(*row)
-        _console().print(table)
-        margins = content["game"]["margin"]
-        for who, label in (("policy", "policy"), ("hyrl", "HyRL")):
-            known = margins[who] is not None
-            print(
-                f"{label}: "
-                + (
-                    f"the whole winnable start region is won up to noise {margins[who]:.4g}"
-                    if known
-                    else "not all winnable starts are won even without noise"
-                )
-            )
-    if content["episodes"]:
-        table = Table(title=f"{task.name}: noisy episodes")
-        for heading in ("noise", "controller", "starts", "episodes", "reached", "95%", "outcomes"):
-            table.add_column(heading)
-        for r in content["episodes"]:
-            low, high = r["interval"]
-            table.add_row(
-                f"{r['noise']} {r['eps']:g}", r["controller"], r["region"], f"{r['episodes']:,}",
-                _percent(r["reached"]), f"{_percent(low)} - {_percent(high)}",
-                ", ".join(f"{k} {v:,}" for k, v in r["outcomes"].items()),
-            )  # fmt: skip
-        _console().print(table)
+            rows.append(row)
+    return Table(f"{task.name}: worst case over all noise signals, exact game", headings, rows)
 
 
-def _percent(share: float) -> str:
-    """A share in percent; only what is everything is called 100%."""
-    text = f"{100 * share:.2f}"
-    return f"{'>99.99' if text == '100.00' and share < 1 else text}%"
+def margin_table(task: Task, content: Mapping[str, Any]) -> Table:
+    """Up to which noise all is won, and how far off runs end without any: a row for each controller."""
+    game = content["game"]
+    _, unit = task.noise_on(content["everywhere"])
+    units = ", ".join(dict.fromkeys(task.chart.units))
+    off = f"off the set-point at most, no noise [{units}]"
+    return Table(
+        f"{task.name}: margins",
+        ["controller", "all winnable starts are won up to noise", off],
+        [
+            [NAMES[who], margin_text(margin, unit), f"{game['miss_without_noise'][who]:.3f}"]
+            for who, margin in game["margin"].items()
+        ],
+    )
 
 
-def _console() -> Console:
-    # Off a terminal rich assumes 80 columns, which would cut the cells.
-    console = Console()
-    return Console(width=None if console.is_terminal else 150)
+def margin_text(margin: float | None, unit: str) -> str:
+    """A margin for people; without one not even without noise all is won."""
+    return "none" if margin is None else f"{margin:.3g} {unit}"
+
+
+def episode_table(task: Task, content: Mapping[str, Any]) -> Table:
+    """The counts of the noisy episodes: a row for each noise, controller and start region."""
+    _, unit = task.noise_on(content["everywhere"])
+    rows = []
+    for r in content["episodes"]:
+        low, high = r["interval"]
+        outcomes = ", ".join(f"{k.replace('_', ' ')} {v:,}" for k, v in r["outcomes"].items())
+        row = [f"{r['noise']} {r['eps']:g} {unit}", NAMES[r["controller"]], r["region"]]
+        row += [f"{r['episodes']:,}", percent(r["reached"]), f"{percent(low)} - {percent(high)}"]
+        rows.append([*row, outcomes])
+    headings = ("noise", "controller", "starts", "episodes", "reached", "95%", "outcomes")
+    return Table(f"{task.name}: noisy episodes", headings, rows)
+
+
+def robustness_sentence(content: Mapping[str, Any]) -> str:
+    """The most important figures, for people."""
+    if content["game"] is None:
+        worst = {
+            who: min(r["reached"] for r in content["episodes"] if r["controller"] == who)
+            for who in ("policy", "hyrl")
+        }
+        return ", ".join(
+            f"{NAMES[who]} reaches in {percent(x)} or more" for who, x in worst.items()
+        )
+    policy, hyrl = (content["game"]["scores"][who][-1] for who in ("policy", "hyrl"))
+    return (
+        f"worst case at noise {hyrl['eps']:g}: the policy wins {percent(policy['won'])} of the winnable "
+        f"starts, HyRL {percent(hyrl['won'])}, from every q0 {percent(hyrl['won_any'])}"
+    )
+
+
+# ---- sets
 
 
 def extent(run: Run, mode: int) -> str:
@@ -112,10 +205,19 @@ def extent(run: Run, mode: int) -> str:
     return f"extended set {', '.join(pieces)}"
 
 
-def _cell(run: Run, arc: HybridArc) -> str:
-    return f"{arc.outcome} {arc.t[-1]:.1f} s {_point(run, run.task.chart.wrap(arc.z[-1:])[0])}"
-
-
-def _point(run: Run, z: np.ndarray) -> str:
+def _point(z: np.ndarray) -> str:
     """A chart point (d,), to a thousandth."""
     return f"({', '.join(f'{v + 0.0:.3f}' for v in np.round(z, 3))})"
+
+
+def percent(share: float) -> str:
+    """A share in percent; only what is everything is called 100%, and only nothing 0%."""
+    if share in (0, 1):
+        return f"{100 * share:.0f}%"
+    text = f"{100 * share:.2f}%"
+    return {"100.00%": ">99.99%", "0.00%": "<0.01%"}.get(text, text)
+
+
+def _seconds(time: float, won: float) -> str:
+    """A worst time to arrival; where nothing is won there is none."""
+    return f"{time:.2f} s" if won else "-"

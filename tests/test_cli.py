@@ -65,8 +65,10 @@ def test_run_ends_with_a_table_and_leaves_every_artifact(finished):
     names += ["partition.npz", "extended_sets.npz", "mode_0.safetensors", "mode_1.safetensors"]
     names += ["arcs/start0_policy.npz", "arcs/critical_hyrl_q1.npz", "robustness.json"]
     names += [f"figures/{name}{suffix}" for name in CAPTIONS for suffix in (".png", ".pdf")]
+    names += ["report.html"]
     assert [n for n in names if not (path / n).is_file()] == []
     assert not list(path.rglob("*.partial*"))
+    assert f"report {path / 'report.html'}" in said
 
 
 @needs_gl
@@ -198,7 +200,7 @@ def test_simulate_prints_both_ends(finished):
 def test_robustness_prints_the_worst_case_and_the_episodes(copied):
     done = call("robustness", copied, "--episodes", "300", "--noise", "uniform,adversarial")
     assert done.returncode == 0, done.stderr
-    for words in ("exact game", "limit", "HyRL: ", "uniform 0.1", "adversarial 0.1"):
+    for words in ("exact game", "limit", "margins", "uniform 0.1", "adversarial 0.1"):
         assert words in done.stdout
     content = hyrl_mj.load_run(copied).robustness
     assert [score["eps"] for score in content["game"]["scores"]["hyrl"]] == [0.0, 0.05, 0.1]
@@ -284,6 +286,8 @@ def test_bad_input_before_anything_is_made(arguments, parts, tmp_path, monkeypat
         (["replay", "--slow-motion", "0"], ["slow motion 0", "real time"]),
         (["view", "--arc", "mine"], ["'mine'", "critical_hyrl_q0"]),
         (["view", "--port", "70000"], ["port 70000"]),
+        (["report", "--out", "page.pdf"], ["page.pdf", ".html"]),
+        (["report", "--out", "/dev/null/page.html"], ["/dev/null/page.html", "choose another"]),
         (["simulate", "--start", "1", "--seed", "-1"], ["seed -1", "from 0 to"]),
         (["simulate", "--start", "1", "--horizon", "1e12"], ["horizon 1e+12", "3600"]),
         (["replay", "--size", "big"], ["'big'", "640x480"]),
@@ -300,6 +304,7 @@ def test_bad_input_leaves_the_run_as_it_was(arguments, parts, finished):
 def test_a_folder_that_is_no_run(tmp_path):
     (tmp_path / "file.txt").write_text("mine")
     assert_one_sentence(call("simulate", tmp_path), "not a run directory")
+    assert_one_sentence(call("report", tmp_path), "not a run directory")
     assert_one_sentence(call("run", "vehicle", "--out", tmp_path), "choose another --out")
     assert (tmp_path / "file.txt").read_text() == "mine"
 
@@ -319,6 +324,8 @@ def test_other_settings_do_not_overwrite_a_run(finished):
         ("mode_1.safetensors", "simulate"),
         ("arcs/critical_policy.npz", "replay"),
         ("arcs/start1_hyrl_q0.npz", "figures"),
+        ("robustness.json", "report"),
+        ("figures/robustness_map.png", "report"),
         ("config.json", "train"),
     ],
 )

@@ -16,7 +16,7 @@ from matplotlib.path import Path as Outline
 from planted import Cube, decisions, halves, plane_policy
 
 import hyrl_mj
-from hyrl_mj import HybridController, Outcome, figures, replay, simulate
+from hyrl_mj import HybridController, Outcome, figures, simulate
 from hyrl_mj.figures import charts, paths, style
 from hyrl_mj.sets import Everything
 
@@ -178,14 +178,10 @@ def test_every_picture_has_a_caption():
     assert all(caption.endswith(".") for caption in figures.CAPTIONS.values())
 
 
-def test_colours_are_those_of_the_replay():
-    as_hex = [to_hex(np.array(rgb) / 255) for rgb in replay.MODE_COLOURS]
-    assert as_hex == list(style.MODE_COLOURS)
-    assert to_hex(np.array(replay.POLICY_COLOUR) / 255) == style.POLICY_COLOUR
-    assert to_hex(np.array(replay.BAD) / 255) == style.RED
+def test_tints_are_the_colours_with_white():
     for tint, colour in zip(style.MODE_TINTS, style.MODE_COLOURS, strict=True):
         hue = np.subtract(1, to_rgb(tint)) / np.subtract(1, to_rgb(colour))
-        assert np.ptp(hue) < 0.1, "a tint is the colour with white"
+        assert np.ptp(hue) < 0.1
 
 
 # ---- overview

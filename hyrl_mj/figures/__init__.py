@@ -3,7 +3,7 @@
 from hyrl_mj.figures.charts import drawable
 from hyrl_mj.figures.hybrid import extended_sets_map, runs
 from hyrl_mj.figures.policy import overview, policy_map
-from hyrl_mj.figures.robustness import robustness_curve, robustness_map
+from hyrl_mj.figures.robustness import CLASS_COLOURS, robustness_curve, robustness_map
 from hyrl_mj.tasks.base import Task
 
 # What the picture of each name shows, in the order in which they tell the story.
@@ -41,6 +41,7 @@ def names(task: Task) -> tuple[str, ...]:
 
 __all__ = [
     "CAPTIONS",
+    "CLASS_COLOURS",
     "extended_sets_map",
     "names",
     "overview",

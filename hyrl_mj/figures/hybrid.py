@@ -40,7 +40,6 @@ from hyrl_mj.figures.style import (
     head,
     legend,
     noise_label,
-    noisy,
     policy_title,
 )
 from hyrl_mj.sets import GridSet
@@ -66,7 +65,7 @@ def extended_sets_map(task: Task, critical: CriticalSet, sets: ExtendedSets, pat
     """
     if not drawable(task):
         return
-    unit = noisy(task)[1]
+    unit = task.noise_on()[1]
     with drawing(path, (WIDTH, 5.6)) as figure:
         head(
             figure,

@@ -26,7 +26,6 @@ from hyrl_mj.figures.style import (
     drawing,
     head,
     legend,
-    noisy,
     percent,
 )
 from hyrl_mj.robustness import LIMIT, MAP_CLASSES, OVER, UNWINNABLE
@@ -73,7 +72,7 @@ def robustness_map(
     rows = -(-len(names) // COLUMNS)
     columns = min(len(names), COLUMNS)
     with drawing(path, (WIDTH, 1.6 + rows * _panel_height(task))) as figure:
-        where, unit = noisy(task, content["everywhere"])
+        where, unit = task.noise_on(content["everywhere"])
         head(figure, task, f"the worst noise on {where} up to eps = {arrays['eps']:g} {unit}")
         panels = figure.subplots(rows, columns, squeeze=False).ravel()
         found: dict[str, Artist] = {}
@@ -104,7 +103,7 @@ def robustness_curve(task: Task, content: Mapping[str, Any], path: Path) -> None
     # A controller has its colour whoever else is in the picture.
     known = list(dict.fromkeys([*TITLES, *names]))
     numbers = {name: known.index(name) for name in names}
-    where, unit = noisy(task, content["everywhere"])
+    where, unit = task.noise_on(content["everywhere"])
     heights = (3.6, 2.0) if lasting else (3.6,)
     with drawing(path, (WIDTH, 2.0 + sum(heights))) as figure:
         head(figure, task, "what is won against the worst noise")

@@ -14,20 +14,19 @@ from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from hyrl_mj import artifacts
+from hyrl_mj import artifacts, colours
 from hyrl_mj.tasks.base import Task
 
 DPI = 200  # [pixels/inch]
 WIDTH, PAD = 7.8, 0.1  # [inches] of a picture, and of the margin around it
 COLUMNS = 2  # panels beside each other, and columns of a legend
-INK, PAPER, PALE = "#232830", "#ffffff", "#8b919b"
+INK, PAPER, PALE = colours.INK, colours.WHITE, "#8b919b"
 # States at which a run is over.
 GREY = "#dcdee2"
-# Of the stage-1 policy, and of what is bad: as in the replay.
-POLICY_COLOUR, RED, PALE_RED = "#2d323c", "#be2823", "#f4c9c7"
-GREEN = "#007d55"  # of the set-point
-# Blue, vermilion, purple and sky blue of Okabe and Ito, as in the replay, and the same hues as tints.
-MODE_COLOURS = ("#0072b2", "#d55e00", "#aa4499", "#56b4e9")
+POLICY_COLOUR, RED, PALE_RED = colours.POLICY, colours.BAD, "#f4c9c7"
+GREEN = colours.GOOD  # of the set-point
+# The same hues as tints.
+MODE_COLOURS = colours.MODES
 MODE_TINTS = ("#d6e8f3", "#fbe4d3", "#f1dcee", "#e1f2fb")
 # Width of lines over a map, the paper around the ink first.
 CASING = ((PAPER, 2.8), (INK, 1.4))
@@ -100,17 +99,9 @@ def policy_title(task: Task) -> str:
     return f"RL policy ({task.algorithm.upper()})"
 
 
-def noisy(task: Task, everywhere: bool = False) -> tuple[str, str]:
-    """The chart coordinates that noise acts on, and their unit: "x and y", "m"."""
-    hit = task.noise_in_chart(1.0, everywhere) > 0
-    names = [name for name, h in zip(task.chart.names, hit, strict=True) if h]
-    units = [unit for unit, h in zip(task.chart.units, hit, strict=True) if h]
-    return " and ".join(names), ", ".join(dict.fromkeys(units))
-
-
 def noise_label(task: Task, kind: str, eps: float) -> str:
     """Noise for people: "alternating noise on y, eps = 0.1 m"."""
-    where, unit = noisy(task)
+    where, unit = task.noise_on()
     return f"{kind} noise on {where}, eps = {eps:g} {unit}"
 
 

@@ -10,7 +10,8 @@ from functools import cached_property
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from hyrl_mj.replay.marks import BAD, GOOD, INK, OPEN, PAPER, RGB, WHITE
+from hyrl_mj.colours import RGB
+from hyrl_mj.replay.marks import BAD, GOOD, INK, OPEN, PAPER, WHITE
 from hyrl_mj.replay.panel import Track
 from hyrl_mj.simulation import HybridArc
 

@@ -9,18 +9,17 @@ import mujoco
 import numpy as np
 from scipy import ndimage
 
-from hyrl_mj import mjcf
+from hyrl_mj import colours, mjcf
+from hyrl_mj.colours import RGB, rgb
 from hyrl_mj.critical_set import CriticalSet
 from hyrl_mj.extended_sets import ExtendedSets
 from hyrl_mj.partition import Partition
 from hyrl_mj.tasks.base import Task
 
-RGB = tuple[int, int, int]
-# Blue, vermilion, purple and sky blue of Okabe and Ito: told apart by colour-blind people too.
-MODE_COLOURS: tuple[RGB, ...] = ((0, 114, 178), (213, 94, 0), (170, 68, 153), (86, 180, 233))
-POLICY_COLOUR: RGB = (45, 50, 60)
-INK, PAPER, WHITE = (35, 40, 48), (246, 247, 249), (255, 255, 255)
-GOOD, BAD, OPEN = (0, 125, 85), (190, 40, 35), (110, 116, 126)
+MODE_COLOURS = tuple(map(rgb, colours.MODES))
+POLICY_COLOUR, INK, WHITE = map(rgb, (colours.POLICY, colours.INK, colours.WHITE))
+GOOD, BAD = rgb(colours.GOOD), rgb(colours.BAD)
+PAPER, OPEN = (246, 247, 249), (110, 116, 126)
 OVERLAP, CRITICAL, BOUND = (203, 196, 233), (205, 30, 45), (120, 95, 200)
 
 # The site of the MJCF whose path is drawn.

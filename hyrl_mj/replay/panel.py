@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from hyrl_mj import mjcf
+from hyrl_mj.colours import RGB
 from hyrl_mj.errors import BadArtifact
 from hyrl_mj.rendering import Box, SceneRenderer
 from hyrl_mj.replay import marks
@@ -67,7 +68,7 @@ class Track:
         """Rows right after a jump."""
         return np.flatnonzero(np.diff(self.arc.j) > 0) + 1
 
-    def colour(self, row: int) -> marks.RGB:
+    def colour(self, row: int) -> RGB:
         """The colour of the path from a row on."""
         colours = marks.MODE_COLOURS
         return colours[self.arc.q[row] % len(colours)] if self.modes else marks.POLICY_COLOUR

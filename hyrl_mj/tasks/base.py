@@ -308,6 +308,13 @@ class Task(ABC):
         d = self.chart.dimension
         return bound * (np.ones(d) if everywhere else np.array(self.noisy[:d], dtype=float))
 
+    def noise_on(self, everywhere: bool = False) -> tuple[str, str]:
+        """The chart coordinates that noise acts on, and their unit, for people: "x and y", "m"."""
+        hit = self.noise_in_chart(1.0, everywhere) > 0
+        names = [name for name, h in zip(self.chart.names, hit, strict=True) if h]
+        units = [unit for unit, h in zip(self.chart.units, hit, strict=True) if h]
+        return " and ".join(names), ", ".join(dict.fromkeys(units))
+
     def check_noise(self, bound: float, everywhere: bool = False) -> float:
         """The noise bound itself, if measurements still tell something about this task.
 

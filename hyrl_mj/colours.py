@@ -1,0 +1,15 @@
+"""The colours of pictures and videos; those of the modes are told apart by colour-blind people, too."""
+
+RGB = tuple[int, int, int]
+
+INK, WHITE = "#232830", "#ffffff"
+# Blue, vermilion, purple and sky blue of Okabe and Ito.
+MODES = ("#0072b2", "#d55e00", "#aa4499", "#56b4e9")
+POLICY = "#2d323c"  # the stage-1 policy
+GOOD, BAD = "#007d55", "#be2823"
+
+
+def rgb(colour: str) -> RGB:
+    """Red, green and blue, 0 to 255, of a colour like "#0072b2"."""
+    red, green, blue = bytes.fromhex(colour[1:])
+    return red, green, blue

@@ -1,0 +1,507 @@
+"""The report: what is in the page, what is said of what is missing, and how it looks."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import re
+import shutil
+import time
+from base64 import b64decode
+from dataclasses import replace
+from html import escape
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import chromium, needs_chromium
+from PIL import Image
+from planted import Cube, decisions, halves
+
+from hyrl_mj import BadArtifact, BadInput, MlpPolicy, load_run, pipeline
+from hyrl_mj.critical_set import CriticalSet
+from hyrl_mj.extended_sets import ExtendedSets
+from hyrl_mj.figures import CLASS_COLOURS
+from hyrl_mj.partition import Partition
+from hyrl_mj.rendering import video
+from hyrl_mj.report import render, write_report
+from hyrl_mj.run_directory import Run, write_config
+from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.settings import preset
+from hyrl_mj.tasks import base
+
+MAGENTA, GREEN = (230, 20, 200), (20, 200, 60)
+POSTER = (642, 240)  # [pixels], like no other picture
+VOID = {"meta", "img", "br", "link", "input", "hr", "source"}
+
+
+# ---- a planted run
+
+
+def linear(task, bias):
+    """A policy without hidden layers that turns or steers away from the critical set, and drifts."""
+    if task.algorithm == "ppo":
+        k = len(task.observation_low)
+        weight = -np.eye(len(task.inputs), k, k - len(task.inputs))
+        names, values = "action_net", (weight, np.full(len(weight), bias))
+    else:
+        levels = task.input_levels[:, 0]
+        names = "q_net.q_net.0"
+        values = np.outer(levels, [0, 0, 1]), bias * levels
+    weights = {
+        f"{names}.{part}": value.astype(np.float32)
+        for part, value in zip(("weight", "bias"), values, strict=True)
+    }
+    return MlpPolicy(task, task.algorithm, "relu", weights)
+
+
+def plant(path, task, critical, partition, slack=0.2):
+    """All but what noise can do, the replays and the video."""
+    run = Run(path, preset(task, "smoke"))
+    write_config(run)
+    linear(task, 0.0).save(path / "policy.safetensors")
+    critical.save(path / "critical_set.npz")
+    partition.save(path / "partition.npz")
+    grid = partition.grid
+    ExtendedSets(
+        partition.modes,
+        tuple(GridSet(grid, part.values - slack) for part in partition.parts),
+        tuple(np.ones(len(grid.nodes), dtype=bool) for _ in partition.parts),
+        0.3, 0.1, np.empty((0, task.chart.dimension)), np.empty(0),
+    ).save(path / "extended_sets.npz")  # fmt: skip
+    for q in partition.modes:
+        linear(task, 0.3 - 0.6 * q).save(path / f"mode_{q}.safetensors")
+    return load_run(path)
+
+
+def film(path):
+    """A replay and its poster: magenta on the left, green on the right."""
+    frame = np.full((POSTER[1], POSTER[0], 3), MAGENTA, dtype=np.uint8)
+    frame[:, POSTER[0] // 2 :] = GREEN
+    with video(path / "replay.mp4", *POSTER, 10) as add:
+        for _ in range(5):
+            add(frame)
+    Image.fromarray(frame).save(path / "replay.png")
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """A run of each problem, by name."""
+    paths = {}
+    for name in ("unit_circle", "vehicle"):
+        paths[name] = path = tmp_path_factory.mktemp("runs") / name
+        task = base.get_task(name)
+        run = plant(path, task, decisions(task), halves(task, 60))
+        pipeline.run_stage(run, "simulate", say=str)
+        pipeline.examine_run(run, kinds=["uniform"], count=200, say=str)
+        film(path)
+    return paths
+
+
+@pytest.fixture(params=("unit_circle", "vehicle"))
+def finished(request, runs):
+    return runs[request.param]
+
+
+@pytest.fixture
+def copied(finished, tmp_path):
+    """A copy of it, to be damaged."""
+    return shutil.copytree(finished, tmp_path / finished.name)
+
+
+class Page(HTMLParser):
+    """A page, taken apart: elements with their attributes, text, tables, entries of lists."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.elements, self.texts, self.tables, self.numbers = [], [], {}, []
+        self._open = []
+        self.feed(text)
+        assert self._open == [], "every element is closed"
+        self.text = " ".join(" ".join(self.texts).split())
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self._open.append(tag)
+        if tag == "table":
+            self.rows = self.tables[self.last_caption] = []
+        if tag == "dt":
+            self.numbers.append("")
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+
+    def handle_endtag(self, tag):
+        assert self._open.pop() == tag
+
+    def handle_data(self, data):
+        if "style" in self._open:
+            return
+        self.texts.append(data)
+        if {"dt", "dd"} & set(self._open):
+            self.numbers[-1] += data
+        if {"td", "th"} & set(self._open):
+            self.rows[-1][-1] += data
+        elif self._open and self._open[-1] == "p":
+            self.last_caption = data
+
+    def all(self, tag):
+        return [attributes for name, attributes in self.elements if name == tag]
+
+    def table(self, words):
+        """The rows of the table under a caption with these words, as dicts."""
+        (rows,) = [rows for caption, rows in self.tables.items() if words in caption]
+        return [dict(zip(rows[0], row, strict=True)) for row in rows[1:]]
+
+
+def page_of(path):
+    return Page(render(load_run(path)))
+
+
+def data(uri, kind):
+    head, content = uri.split(",", 1)
+    assert head == f"data:{kind};base64"
+    return b64decode(content, validate=True)
+
+
+# ---- what is in the page
+
+
+def test_the_page_needs_nothing_but_itself(finished):
+    text = render(load_run(finished))
+    page = Page(text)
+    assert not page.all("script")
+    for _, attributes in page.elements:
+        assert not [name for name in attributes if name.startswith("on")]
+        for name in {"src", "href", "poster", "srcset", "data"} & attributes.keys():
+            assert attributes[name].startswith("data:")
+    assert "http" not in re.sub(r"base64,[^\"]*", "", text).replace("http-equiv", "")
+    assert not re.search(r"url\(|@import", text)
+
+
+def test_it_is_a_proper_document(finished):
+    text = render(load_run(finished))
+    page = Page(text)
+    assert text.startswith("<!DOCTYPE html>")
+    assert page.all("html") == [{"lang": "en"}]
+    assert len(page.all("title")) == len(page.all("h1")) == len(page.all("main")) == 1
+    names = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
+    assert len(names) == len(set(names))
+    labelled = [a["aria-labelledby"] for _, a in page.elements if "aria-labelledby" in a]
+    assert labelled
+    assert set(labelled) <= set(names)
+    assert {"name": "viewport", "content": "width=device-width, initial-scale=1"} in page.all(
+        "meta"
+    )
+
+
+def test_pictures_and_video_are_the_files(finished):
+    page = page_of(finished)
+    pictures = {attributes["alt"]: attributes for attributes in page.all("img")}
+    assert all(pictures)
+    found = {}
+    for alt, attributes in pictures.items():
+        found[alt] = data(attributes["src"], "image/png")
+        image = Image.open(io.BytesIO(found[alt]))
+        image.load()
+        assert (int(attributes["width"]), int(attributes["height"])) == image.size
+    files = [finished / "figures" / f"robustness_{name}.png" for name in ("map", "curve")]
+    poster = (finished / "replay.png").read_bytes()
+    assert list(found.values()) == [poster, *(path.read_bytes() for path in files)]
+    (film,) = page.all("video")
+    assert data(film["src"], "video/mp4") == (finished / "replay.mp4").read_bytes()
+    assert data(film["poster"], "image/png") == poster
+    assert len(page.all("figcaption")) == 3
+
+
+def test_the_scores_are_those_of_the_game(copied):
+    content, rng = json.loads((copied / "robustness.json").read_text()), np.random.default_rng(0)
+    # Numbers of which no two are the same.
+    for score in (score for scores in content["game"]["scores"].values() for score in scores):
+        numbers = {key: rng.random() for key in score if key != "eps" and score[key] is not None}
+        score.update(numbers)
+    (copied / "robustness.json").write_text(json.dumps(content))
+    page, run = page_of(copied), load_run(copied)
+    game = run.robustness["game"]
+    for who in ("policy", "hyrl"):
+        assert f"{100 * game['scores'][who][-1]['won']:.2f}%" in page.numbers[0]
+        assert f"{100 * game['scores'][who][-1]['won_any']:.2f}%" in page.numbers[1]
+    rows = page.table("Worst case")
+    names = {"policy": "RL policy", "hyrl": "HyRL", "limit": "limit"}
+    for who, name in names.items():
+        for score in game["scores"][who]:
+            (row,) = [
+                row
+                for row in rows
+                if row["controller"] == name and float(next(iter(row.values()))) == score["eps"]
+            ]
+            shares = {"winnable starts": "winnable", "won, own q0": "won", "won, any q0": "won_any"}
+            for heading, key in shares.items():
+                shown = float(row[heading].strip("<>%"))
+                assert shown == pytest.approx(100 * score[key], abs=0.0101)
+            if score["excursion"] is not None:
+                assert row["latest arrival, own q0"] == f"{score['time']:.2f} s"
+                assert row["latest, any q0"] == f"{score['time_any']:.2f} s"
+            if score["excursion"] is not None and who != "limit":
+                assert float(row["excursion [rad]"]) == pytest.approx(score["excursion"], abs=1e-3)
+    for row, (who, margin) in zip(page.table("Margins"), game["margin"].items(), strict=True):
+        assert row["controller"] == names[who]
+        shown = row["all winnable starts are won up to noise"]
+        unit = run.task.chart.units[0]
+        assert shown == ("none" if margin is None else f"{margin:.3g} {unit}")
+        (off,) = [float(cell) for heading, cell in row.items() if "no noise" in heading]
+        assert off == pytest.approx(game["miss_without_noise"][who], abs=1e-3)
+
+
+def test_episodes_and_replays_are_those_of_the_run(finished):
+    page, run = page_of(finished), load_run(finished)
+    for row, record in zip(page.table("episodes"), run.robustness["episodes"], strict=True):
+        assert row["episodes"] == f"{record['episodes']:,}"
+        assert row["noise"].startswith("uniform 0.1 ")
+        reached = float(row["reached"].strip("<>%"))
+        assert reached == pytest.approx(100 * record["reached"], abs=0.0101)
+    rows = page.table("How the replays ended")
+    assert len(rows) == 6
+    for row, (_, arcs) in zip(rows, by_start(run).items(), strict=True):
+        assert len(row) == 1 + len(arcs) == 4
+        for cell, arc in zip(list(row.values())[1:], arcs, strict=True):
+            assert cell.split()[0] == arc.outcome.split("_")[0]
+            assert f"{arc.t[-1]:.2f} s" in cell
+            assert f"{arc.j[-1]} jump" in cell
+
+
+def by_start(run):
+    found = {}
+    for (start, _), arc in run.arcs().items():
+        found.setdefault(start, []).append(arc)
+    return found
+
+
+def test_settings_versions_and_the_command_are_told(finished):
+    page, run = page_of(finished), load_run(finished)
+    config = json.loads((finished / "config.json").read_text())
+    rows = dict(tuple(row) for row in page.tables["Versions"])
+    assert rows == config["versions"]
+    rows = dict(tuple(row) for row in page.tables["Settings"])
+    assert rows["seed"] == "0"
+    assert rows["noise"] == f"0.1 {run.task.chart.units[0]}"
+    training = {name: cells for name, *cells in page.tables["Training"]}
+    stages = (run.settings.stage1, run.settings.stage6)
+    assert training["gamma"] == [str(stage.gamma) for stage in stages]
+    assert f"hyrl-mj run {finished.name} --noise 0.1 --seed 0 --preset smoke" in page.text
+    assert "--episodes 200 --noise uniform --seed 0" in page.text
+    assert run.critical_set.sentence(run.task) in page.text
+
+
+def test_the_command_tells_what_is_not_the_default(copied):
+    run = load_run(copied)
+    settings = replace(run.settings, noise=0.05, seed=7, horizon=0.4)
+    changed = Run(copied, settings)
+    write_config(changed)
+    text = page_of(copied).text
+    assert f"run {copied.name} --noise 0.05 --seed 7 --preset smoke --horizon 0.4" in text
+    assert "--eps 0.1" in text, "it was examined with another bound"
+    assert "differ in" not in text
+    write_config(Run(copied, replace(settings, cells=99)))
+    assert "differ in: cells." in page_of(copied).text
+
+
+def test_the_same_artifacts_give_the_same_bytes_in_good_time(copied):
+    began = time.perf_counter()
+    write_report(load_run(copied), copied / "report.html")
+    assert time.perf_counter() - began < 3
+    first = (copied / "report.html").read_bytes()
+    elsewhere = shutil.copytree(copied, copied.parent / "other" / copied.name)
+    write_report(load_run(elsewhere), elsewhere / "again.html")
+    assert (elsewhere / "again.html").read_bytes() == first
+
+
+def test_odd_characters_are_escaped(finished, tmp_path):
+    name = '<b>odd & "run"<script>\'\udcff'
+    path = shutil.copytree(finished, tmp_path / name)
+    write_report(load_run(path), path / "report.html")
+    page = Page((path / "report.html").read_text(encoding="utf-8"))
+    assert '<b>odd & "run"<script>\'\N{REPLACEMENT CHARACTER}' in page.text
+    assert not page.all("script")
+
+
+# ---- what is missing
+
+
+@pytest.mark.parametrize(
+    ("lost", "words"),
+    [
+        (["replay.mp4", "replay.png"], "There is no video of the replay"),
+        (["replay.png"], "There is no video of the replay"),
+        (["robustness.json"], "It has not been examined yet"),
+        (["figures/robustness_map.png", "figures/robustness_curve.png"], "There are no figures"),
+        (["arcs/start1_hyrl_q0.npz"], "The replays have not been simulated"),
+    ],
+)
+def test_what_is_missing_is_said_in_its_place(lost, words, copied):
+    assert words not in page_of(copied).text
+    for name in lost:
+        (copied / name).unlink()
+    assert words in page_of(copied).text
+
+
+def test_a_bare_controller_is_enough(copied):
+    for name in ("arcs", "figures"):
+        shutil.rmtree(copied / name)
+    for name in ("robustness.json", "robustness.npz", "replay.mp4", "replay.png"):
+        (copied / name).unlink()
+    page = page_of(copied)
+    assert not page.all("img") + page.all("video")
+    assert page.text.count("hyrl-mj robustness RUN") == 2
+
+
+def test_no_critical_set_is_said(copied):
+    run = load_run(copied)
+    d = run.task.chart.dimension
+    none = replace(run.critical_set, points=np.empty((0, d)), component=np.zeros(0, dtype=int))
+    none.save(copied / "critical_set.npz")
+    page = page_of(copied)
+    assert "no critical set found at this resolution" in page.text
+    assert "on the critical set" not in page.text
+    assert len(page.table("How the replays ended")) == 5
+
+
+class Rover(Cube):
+    """A task with a chart of three dimensions, which has all that a run needs."""
+
+    name, algorithm, mode_names = "cube", "ppo", ("up", "down")
+    max_steps, replay_time = 6, 0.3
+    start_low, start_high = (-0.5,) * 3, (0.5,) * 3
+    observation_low, observation_high = (-1.0,) * 3, (1.0,) * 3
+    replay_starts = ((0.1, 0.0, 0.0), (-0.2, 0.1, 0.0))
+
+    def __init__(self):
+        super().__init__(lambda z: z[:, 0])
+
+
+def test_in_three_dimensions_episodes_stand_in_for_the_game(tmp_path, monkeypatch):
+    monkeypatch.setitem(base._REGISTRY, "cube", Rover)
+    task, path = Rover(), tmp_path / "cube"
+    grid = Grid.with_cells(task.chart, 6)
+    up = grid.nodes[:, 0] >= 0
+    parts = tuple(GridSet.from_mask(grid, part) for part in (up, ~up))
+    critical = CriticalSet(np.zeros((1, 3)), np.zeros(1, dtype=int), resolution=0.1, spacing=0.3)
+    run = plant(path, task, critical, Partition((0, 1), parts, np.ones(len(grid.nodes), bool)))
+    pipeline.run_stage(run, "simulate", say=str)
+    pipeline.examine_run(run, count=50, say=str)
+    page = page_of(path)
+    assert "The chart of this task has 3, its plant 3: noisy episodes stand in for it" in page.text
+    assert len(page.table("episodes")) == len(run.robustness["episodes"])
+    assert "winnable" not in page.text
+
+
+# ---- what goes wrong
+
+
+def contents(path):
+    return {p: p.read_bytes() for p in sorted(path.rglob("*")) if p.is_file()}
+
+
+@pytest.mark.parametrize("name", ["mode_0.safetensors", "critical_set.npz", "partition.npz"])
+def test_an_unfinished_run_is_refused(name, copied):
+    (copied / name).unlink()
+    before = contents(copied)
+    with pytest.raises(BadArtifact, match=re.escape(f"{copied / name}")):
+        write_report(load_run(copied), copied / "report.html")
+    assert contents(copied) == before
+
+
+def test_a_failed_write_leaves_the_last_report(copied, monkeypatch):
+    (copied / "report.html").write_text("the last one")
+    (copied / "taken.html").mkdir()
+    before = contents(copied)
+    run = load_run(copied)
+    with pytest.raises(BadInput, match=r"taken.html cannot be written"):
+        write_report(run, copied / "taken.html")
+    with pytest.raises(BadInput, match=r"page.pdf is not: give a name that ends in .html"):
+        write_report(run, copied / "page.pdf")
+    write = Path.write_text
+
+    def full(path, text, **options):
+        write(path, text[:100], **options)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(BadInput, match="No space left on device"):
+        write_report(run, copied / "report.html")
+    assert contents(copied) == before
+
+
+# ---- how it looks
+
+PROBE = """<script>
+const inside = e => e.parentElement.closest(".scroll, pre");
+const wide = [...document.body.querySelectorAll("*")].filter(
+  e => !inside(e) && e.getBoundingClientRect().right > innerWidth + 0.5);
+parent.document.body.dataset["at" + innerWidth] = JSON.stringify(
+  {page: document.documentElement.scrollWidth, wide: wide.map(e => e.tagName),
+   boxes: [...document.querySelectorAll(".scroll")].filter(e => e.scrollWidth > e.clientWidth).length});
+</script>"""
+
+
+@pytest.fixture(scope="module")
+def written(runs):
+    write_report(load_run(runs["vehicle"]), runs["vehicle"] / "report.html")
+    return runs["vehicle"] / "report.html"
+
+
+def count(picture, colour):
+    """Pixels of nearly that colour."""
+    return int((np.abs(picture.astype(int) - colour).max(axis=-1) < 12).sum())
+
+
+@needs_chromium
+def test_nothing_is_wider_than_the_window(written, tmp_path):
+    text = re.sub(r"<meta http-equiv=[^>]*>", "", written.read_text(encoding="utf-8"))
+    inner = escape(text.replace("</body>", f"{PROBE}</body>"))
+    # The browser's own window cannot be as narrow as a telephone, a frame can.
+    frames = [
+        f'<iframe style="border:0;width:{width}px;height:800px" srcdoc="{inner}"></iframe>'
+        for width in (360, 1280)
+    ]
+    probed = tmp_path / "probed.html"
+    probed.write_text(f"<!DOCTYPE html><body>{''.join(frames)}</body>", encoding="utf-8")
+    dom = chromium(probed, tmp_path / "profile", 1800, 1000, "--dump-dom")
+    (body,) = Page(dom).all("body")
+    for width in (360, 1280):
+        found = json.loads(body[f"data-at{width}"])
+        assert found["page"] <= width
+        assert found["wide"] == []
+        assert (found["boxes"] > 0) == (width == 360), "wide tables scroll inside themselves"
+
+
+@needs_chromium
+@pytest.mark.parametrize(("width", "height"), [(360, 3600), (1280, 2400)])
+def test_the_figures_are_seen(written, tmp_path, width, height):
+    shot = tmp_path / "shot.png"
+    chromium(written, tmp_path / "profile", width, height, f"--screenshot={shot}")
+    picture = np.asarray(Image.open(shot).convert("RGB"))
+    assert picture.shape == (height, width, 3)
+    # The poster is more than half as wide as the window; the controls of the video hide some of it.
+    area = (width / 2) ** 2 * POSTER[1] / POSTER[0]
+    assert count(picture, MAGENTA) > area / 8
+    assert count(picture, GREEN) > area / 8
+    classes = [tuple(bytes.fromhex(colour[1:])) for colour in CLASS_COLOURS]
+    assert sum(count(picture, colour) for colour in classes) > area / 4
+
+
+@needs_chromium
+def test_on_paper_the_video_is_its_poster(written, tmp_path):
+    paper = tmp_path / "paper.pdf"
+    chromium(written, tmp_path / "profile", 1280, 6000, f"--print-to-pdf={paper}")
+    content = paper.read_bytes()
+    assert content.startswith(b"%PDF")
+    sizes = set(re.findall(rb"/Width (\d+)\s*/Height (\d+)", content))
+    figures = [Image.open(p).size for p in (written.parent / "figures").glob("*.png")]
+    assert len(figures) == 2
+    for width, height in (POSTER, *figures):
+        assert (b"%d" % width, b"%d" % height) in sizes
