@@ -17,9 +17,9 @@ from hyrl_mj.training import build, export
 PACKAGE = Path(hyrl_mj.__file__).parent
 ORDER = (
     "errors", "progress", "colours", "mjcf", "plant", "noise", "tasks", "settings", "artifacts",
-    "policies",    "controllers", "adversary", "rendering", "envs", "simulation", "symmetry", "training", "sets",
-    "lattice", "game", "critical_set", "partition", "limit", "extended_sets", "retraining", "hybrid",
-    "robustness", "episodes", "run_directory", "tables", "figures", "replay", "viewing", "arcs",
+    "policies", "controllers", "adversary", "rendering", "envs", "simulation", "symmetry", "training",
+    "sets", "lattice", "game", "critical_set", "partition", "limit", "extended_sets", "retraining",
+    "hybrid", "robustness", "episodes", "run_directory", "tables", "figures", "replay", "viewing", "arcs",
     "doctor", "report", "pipeline", "summary", "cli",
 )  # fmt: skip
 
