@@ -63,18 +63,18 @@ class Limit:
         sides = depth <= depth.min(axis=0) + ON_BOUNDARY
         return Limit(lattice, parts, sides, samples, level, hop)
 
+    def held(self, bound: np.ndarray) -> np.ndarray:
+        """The most samples until arrival of "pick the side of the first measurement, then hold it".
+
+        Returns:
+            (N,) int, `NEVER` where noise within bounds (d,) can show a side whose way is closed.
+        """
+        shown = np.stack([self._reach(side, bound) for side in self.sides])
+        return np.asarray(np.where(shown, self.samples, 0).max(axis=0))
+
     def winnable(self, bound: np.ndarray) -> np.ndarray:
-        """Where "pick the side of the first measurement, then hold it" always wins: (N,) bool."""
-        wins = self.samples < NEVER
-        return np.asarray(
-            np.all(
-                [
-                    won | ~self._reach(side, bound)
-                    for won, side in zip(wins, self.sides, strict=True)
-                ],
-                axis=0,
-            )
-        )
+        """Where picking a side by the first measurement and holding it always wins: (N,) bool."""
+        return self.held(bound) < NEVER
 
     def moves(self, bound: np.ndarray) -> Moves:
         """The adversary's moves against the limit under noise within bounds (d,).

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import copy
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -54,13 +55,15 @@ class SceneRenderer:
         check_size(width, height)
         # Compiled models are shared, and the size of the buffer is one of their settings.
         self.model = copy(model)
-        self.model.vis.global_.offwidth, self.model.vis.global_.offheight = width, height
+        # Half a picture at twice the size may be a pixel larger.
+        shape = self.model.vis.global_
+        shape.offwidth, shape.offheight = width + 1, height + 1
         self.width, self.height = width, height
         self.data = mujoco.MjData(self.model)
         self.scene = mujoco.MjvScene(self.model, maxgeom=GEOMS)
         self._options, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
         try:
-            self._gl = _gl_context(width, height)
+            self._gl = _gl_context(width + 1, height + 1)
             self._gl.make_current()
             self._context = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100)
         # Each GL backend fails in its own way: ImportError, AttributeError, RuntimeError, ...
@@ -118,17 +121,27 @@ class SceneRenderer:
         )
         return range(first, self.scene.ngeom)
 
-    def draw(self) -> np.ndarray:
-        """The picture: (height, width, 3) uint8."""
-        picture = np.empty((self.height, self.width, 3), dtype=np.uint8)
-        self.redraw(picture, (0, 0, self.width, self.height))
+    def draw(self, finer: int = 1) -> np.ndarray:
+        """The picture: (height, width, 3) uint8, or `finer` times larger, drawn in as many parts."""
+        picture = np.empty((finer * self.height, finer * self.width, 3), dtype=np.uint8)
+        columns, rows = (
+            np.linspace(0, side, finer + 1).astype(int) for side in (self.width, self.height)
+        )
+        for left, right in pairwise(columns):
+            for top, bottom in pairwise(rows):
+                self.redraw(picture, (left, top, right, bottom), finer)
         return picture
 
-    def redraw(self, picture: np.ndarray, box: Box) -> None:
+    def redraw(self, picture: np.ndarray, box: Box, finer: int = 1) -> None:
         """Draw a part of the picture (height, width, 3) anew; the rest stays as it is.
 
         A software rasteriser takes time for each pixel. The camera's frustum is cut to the box, and
         nothing else is different.
+
+        Args:
+            picture: to draw into, `finer` times larger than this renderer's.
+            box: the part, in this renderer's pixels; in the picture it is no larger than `width` x `height`.
+            finer: how many pixels of the picture, across, are one of this renderer's.
         """
         left, top, right, bottom = box
         kept = [
@@ -140,7 +153,7 @@ class SceneRenderer:
             view.frustum_center = centre - half + x * (left + right) / 2
             view.frustum_width = x * (right - left) / 2
             view.frustum_bottom, view.frustum_top = high - y * bottom, high - y * top
-        part = mujoco.MjrRect(0, 0, right - left, bottom - top)
+        part = mujoco.MjrRect(0, 0, finer * (right - left), finer * (bottom - top))
         pixels = np.empty((part.height, part.width, 3), dtype=np.uint8)
         try:
             self._gl.make_current()
@@ -148,7 +161,8 @@ class SceneRenderer:
             mujoco.mjr_readPixels(pixels, None, part, self._context)
         except mujoco.FatalError as error:
             raise _no_gl(error) from error
-        picture[top:bottom, left:right] = pixels[::-1]  # GL counts rows from below
+        rows, columns = (slice(finer * a, finer * b) for a, b in ((top, bottom), (left, right)))
+        picture[rows, columns] = pixels[::-1]  # GL counts rows from below
         for view, values in zip(self.scene.camera, kept, strict=True):
             view.frustum_center, view.frustum_width, view.frustum_bottom, view.frustum_top = values
 

@@ -121,7 +121,7 @@ class Game:
 
     def value(self, name: str, eps: float) -> np.ndarray:
         """The game's value (modes + 1, places), the last row for runs that have not started."""
-        return solve(self.moves(name, eps))
+        return self._value(name, self.moves(name, eps), eps)
 
     def winnable(self, eps: float) -> np.ndarray:
         """(N,) bool, the nodes from which a way picked by the first measurement can be held."""
@@ -130,7 +130,7 @@ class Game:
     def score(self, name: str, eps: float) -> Score:
         """The score of a controller, or of the limit."""
         moves = self.moves(name, eps)
-        value = solve(moves)[:, :-2]
+        value = self._value(name, moves, eps)[:, :-2]
         region = self.starts & self.winnable(eps)
         own, worst = value[-1, region], value[:-1, region].max(axis=0, initial=0)
         still = lasting(moves) & ~self.lattice.failed
@@ -144,6 +144,12 @@ class Game:
             time_any=float(worst[worst < NEVER].max(initial=0) * dt),
             excursion=float(self.task.miss(nodes[still]).max()) if still.any() else None,
         )
+
+    def _value(self, name: str, moves: Moves, eps: float) -> np.ndarray:
+        value = solve(moves)
+        if name == LIMIT:  # by its first measurement it picks a mode and holds it
+            value[-1, :-2] = self.limit.held(self.bound(eps))
+        return value
 
     def map(self, name: str, eps: float) -> np.ndarray:
         """The class (N,) of every node, an index into `MAP_CLASSES`."""

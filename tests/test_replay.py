@@ -6,6 +6,7 @@ import subprocess
 from dataclasses import replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 from gl import needs_gl
@@ -27,6 +28,7 @@ from hyrl_mj.replay.marks import (
     POLICY_COLOUR,
     Floor,
     Tracker,
+    bar,
 )
 from hyrl_mj.replay.panel import Panel, Track
 from hyrl_mj.replay.timeline import AROUND, HOLD, frame_times
@@ -235,7 +237,7 @@ def test_the_bound_of_an_angle_is_an_arc(circle):
     (line,) = Track(circle, arc).bounds(0.0)
     np.testing.assert_allclose(np.linalg.norm(line[:, :2], axis=1), 1.0, atol=1e-9)
     angle = np.arctan2(line[:, 1], line[:, 0])
-    np.testing.assert_allclose(angle[[0, 4, 8]], [1.9, 2.0, 2.1], atol=1e-9)
+    np.testing.assert_allclose(angle[[0, 2, 4]], [1.9, 2.0, 2.1], atol=1e-9)
 
 
 @needs_gl
@@ -283,6 +285,20 @@ def test_between_samples_the_robot_is_between_its_places(jump):
     # The tracked site is the vehicle itself.
     np.testing.assert_allclose(track.points[:, :2], z, atol=1e-9)
     np.testing.assert_allclose(Tracker(TASK).of_z(z), track.points, atol=1e-6)
+
+
+@pytest.mark.parametrize("end", [(1, 0, 0), (-0.3, 0.4, 0), (0.2, 0.1, -0.5), (0, 0, 0.7)])
+def test_a_bar_lies_between_its_ends_with_its_flat_side_up(end):
+    scene = mujoco.MjvScene(TASK.model, maxgeom=5)
+    start, end = np.array([0.3, -0.2, 0.1]), np.array([0.3, -0.2, 0.1]) + end
+    bar(scene, start, end, (1, 2, 3), width=0.05, height=0.0)
+    geom = scene.geoms[0]
+    axes = np.array(geom.mat).reshape(3, 3)
+    np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(axes[:, 0] * geom.size[0] * 2, end - start, atol=1e-6)
+    np.testing.assert_allclose(geom.pos, (start + end) / 2, atol=1e-6)
+    assert axes[2, 1] == 0
+    assert axes[2, 2] >= 0
 
 
 # ---- time and captions
@@ -357,7 +373,7 @@ def test_arcs_of_other_tasks_and_models_are_refused(tmp_path, show, circle):
     [
         ("a.mp4", {"size": (481, 160)}, "481 x 160 pixels cannot be drawn: give even numbers"),
         ("a.mp4", {"size": (0, 0)}, "0 x 0 pixels"),
-        ("a.mp4", {"size": (100_000, 100_000)}, "to 2048 x 2048"),
+        ("a.mp4", {"size": (100_000, 100_000)}, "to 4096 x 4096"),
         ("a.mp4", {"fps": 0}, "no video has 0 frames a second: give 1 to 240"),
         ("a.mp4", {"slow_motion": 0.5}, "slow motion 0.5 cannot be played: give 1"),
         ("a.mp4", {"slow_motion": float("nan")}, "slow motion nan"),

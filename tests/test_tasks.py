@@ -20,7 +20,9 @@ def test_both_tasks_are_registered():
 
 
 def test_it_has_its_named_parts(task):
-    assert {"overhead", "chase"} <= set(mjcf.names(task.model, mujoco.mjtObj.mjOBJ_CAMERA))
+    assert {"overhead", "chase", "three_quarter"} <= set(
+        mjcf.names(task.model, mujoco.mjtObj.mjOBJ_CAMERA)
+    )
     assert set(task.inputs) <= set(mjcf.names(task.model, mujoco.mjtObj.mjOBJ_ACTUATOR))
     sensors = mjcf.names(task.model, mujoco.mjtObj.mjOBJ_SENSOR)
     assert len(sensors) == task.measurement_columns

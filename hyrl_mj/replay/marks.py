@@ -58,10 +58,11 @@ def bar(
     length = float(np.linalg.norm(end - start))
     if length < 1e-9:
         return
-    along = (end - start) / length
-    across = np.cross(UP if abs(along @ UP) < 0.99 else (1.0, 0.0, 0.0), along)
-    across /= np.linalg.norm(across)
-    axes = np.column_stack([along, across, np.cross(along, across)])
+    x, y, z = (end - start) / length
+    flat = np.hypot(x, y)
+    cos, sin = (x / flat, y / flat) if flat > 1e-6 else (1.0, 0.0)
+    # Along it, across it on the level, and what is left: NumPy's cross product takes longer than all of it.
+    axes = np.array([[x, -sin, -cos * z], [y, cos, -sin * z], [z, 0.0, flat]])
     size = (length / 2 + reach, width / 2, THICKNESS / 2)
     middle = (start + end) / 2 + height * UP
     _add(scene, mujoco.mjtGeom.mjGEOM_BOX, size, middle, axes, colour, alpha)

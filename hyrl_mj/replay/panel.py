@@ -20,7 +20,7 @@ from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks.base import Task
 
 PATH_WIDTH, START_RADIUS, JUMP_RADIUS, CROSS = 0.032, 0.035, 0.055, 0.075  # [m]
-BOUND_WIDTH, BOUND_PIECES = 0.05, 8
+BOUND_WIDTH, BOUND_PIECES = 0.05, 4
 BOUND_ALPHA, GHOST_ALPHA = 0.45, 0.35
 # By which what is drawn anew is larger than what has moved [pixels].
 MARGIN = 3
@@ -171,6 +171,10 @@ class Panel:
                     self._again(picture, box, drawn.box)
         for drawn, now, box in zip(self._drawn, times, boxes, strict=True):
             drawn.t, drawn.box = now, box
+
+    def fine(self, finer: int) -> np.ndarray:
+        """The picture of the last call, `finer` times larger."""
+        return self._renderer.draw(finer)
 
     def close(self) -> None:
         """Give the GL context back."""
