@@ -233,7 +233,7 @@ def video(
         ):
             yield writer.add_image
     except (ImportError, OSError, RuntimeError) as error:
-        raise NoRenderer(f"no video at {path} ({_short(error)}): {FFMPEG_CURE}") from error
+        raise NoRenderer(f"{path} cannot be encoded ({_short(error)}): {FFMPEG_CURE}") from error
 
 
 def _gl_context(width: int, height: int) -> Any:
