@@ -12,7 +12,7 @@ from hyrl_mj.noise import KINDS, Noise
 from hyrl_mj.replay import Floor, Show
 from hyrl_mj.robustness import LARGEST, Game, worst_signal
 from hyrl_mj.run_directory import Run
-from hyrl_mj.simulation import AnyNoise, HybridArc, simulate
+from hyrl_mj.simulation import AnyNoise, HybridArc, samples, simulate
 
 # What a replay plays.
 STARTS = ("critical", "paper", "latest")
@@ -64,12 +64,15 @@ def noisy_arcs(
         "policy": PolicyController(run.policy),
         "hyrl": run.controller,
     }
+    steps = None if horizon is None else samples(task, horizon)
     game = Game(task, run.partition, loops, max(bound, LARGEST)) if noise == WORST else None
     found = {}
     for name, loop in loops.items():
         for q0 in q0s if name == "hyrl" else (None,):
             signal: AnyNoise = (
-                worst_signal(game, name, loop, z0, bound, q0) if game else Noise(noise, bound)
+                worst_signal(game, name, loop, z0, bound, q0, steps)
+                if game
+                else Noise(noise, bound)
             )
             arcs = simulate(task, loop, z0, signal, q0, horizon, seed, name=name)
             assert isinstance(arcs, list)

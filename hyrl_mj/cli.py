@@ -21,6 +21,8 @@ from hyrl_mj.summary import print_robustness, print_summary
 from hyrl_mj.tasks.base import get_task, task_names
 
 Positional = tyro.conf.Positional
+# Starts, noise, its bound, layout and slow motion of the replay that a run makes.
+REPLAY = ("critical", None, None, "side-by-side", 1.0)
 RunDir = Annotated[Path, Positional, tyro.conf.arg(metavar="RUN", help="a run directory")]
 
 
@@ -172,8 +174,8 @@ def replay(
 
     Args:
         run_dir: a run directory.
-        out: the mp4 or gif to write, with its last frame as a png of the same name, or a png alone; by
-            default replay.mp4 in the run directory.
+        out: the mp4 or gif to write, with its last frame as a png of the same name, or a png alone; the
+            run's own replay goes to replay.mp4 in the run directory by default.
         starts: critical (the start on the critical set, once for each start mode), paper (all of the
             paper's at once), or latest (what `hyrl-mj simulate --start` simulated last).
         noise: simulate anew under this noise: none, uniform, alternating, adversarial (the most dangerous
@@ -187,6 +189,9 @@ def replay(
         slow_motion: how many times slower the video is around jumps.
     """
     run = pipeline.load_run(run_dir)
+    if out is None and (starts, noise, eps, layout, slow_motion) != REPLAY:
+        # The report says of replay.mp4 what a run puts there.
+        raise BadInput("another replay than that of the run needs an --out, as in --out mine.mp4")
     out = out or run.path / "replay.mp4"
     render_replay(
         run.task,

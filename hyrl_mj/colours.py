@@ -6,6 +6,7 @@ INK, WHITE = "#232830", "#ffffff"
 # Blue, vermilion, purple and sky blue of Okabe and Ito.
 MODES = ("#0072b2", "#d55e00", "#aa4499", "#56b4e9")
 POLICY = "#2d323c"  # the stage-1 policy
+OVERLAP = "#c9b8d8"  # of the extended sets
 GOOD, BAD = "#007d55", "#be2823"
 
 

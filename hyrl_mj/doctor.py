@@ -28,6 +28,8 @@ DISTRIBUTIONS = (
     "mediapy",
     "imageio-ffmpeg",
     "pillow",
+    "matplotlib",
+    "jinja2",
 )
 RENDER_TIMEOUT = 60.0  # [s]
 

@@ -66,17 +66,14 @@ class Recorded:
 
     Attributes:
         values: (K, n, p) noise of n simulations, in the unit of the measurement.
+        bound: the bound that it keeps.
         kind: its name.
     """
 
     values: np.ndarray
+    bound: float
     kind: str = "recorded"
     everywhere: bool = True
-
-    @property
-    def bound(self) -> float:
-        """The largest magnitude in it."""
-        return float(np.abs(self.values).max(initial=0.0))
 
     def sample(self, k: np.ndarray, columns: int, rng: np.random.Generator) -> np.ndarray:
         """As `Noise.sample`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import copy
@@ -30,7 +31,7 @@ ENCODERS: dict[str, dict[str, Any]] = {
     ".mp4": {"codec": "h264", "crf": 20, "ffmpeg_args": "-preset veryfast -movflags +faststart"},
     ".gif": {"codec": "gif"},
 }
-GEOMS = 10_000
+GEOMS = 2_000  # that a scene has room for, by default
 
 # Left, top, right and bottom of a part of a picture [pixels], the last two excluded.
 Box = tuple[int, int, int, int]
@@ -45,13 +46,14 @@ class SceneRenderer:
     Args:
         model: the compiled model.
         width, height: of the picture [pixels].
+        geoms: how many the scene has room for.
 
     Raises:
         BadInput: a size that no picture can have.
         NoRenderer: there is no GL library; the message says which to install.
     """
 
-    def __init__(self, model: mujoco.MjModel, width: int, height: int):
+    def __init__(self, model: mujoco.MjModel, width: int, height: int, geoms: int = GEOMS):
         check_size(width, height)
         # Compiled models are shared, and the size of the buffer is one of their settings.
         self.model = copy(model)
@@ -60,14 +62,17 @@ class SceneRenderer:
         shape.offwidth, shape.offheight = width + 1, height + 1
         self.width, self.height = width, height
         self.data = mujoco.MjData(self.model)
-        self.scene = mujoco.MjvScene(self.model, maxgeom=GEOMS)
+        self.scene = mujoco.MjvScene(self.model, maxgeom=geoms)
         self._options, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
+        self._gl: Any = None
         try:
             self._gl = _gl_context(width + 1, height + 1)
             self._gl.make_current()
             self._context = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100)
         # Each GL backend fails in its own way: ImportError, AttributeError, RuntimeError, ...
         except Exception as error:
+            if self._gl is not None:
+                self._gl.free()
             raise _no_gl(error) from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
 
@@ -122,7 +127,7 @@ class SceneRenderer:
         return range(first, self.scene.ngeom)
 
     def draw(self, finer: int = 1) -> np.ndarray:
-        """The picture: (height, width, 3) uint8, or `finer` times larger, drawn in as many parts."""
+        """The picture: (height, width, 3) uint8, or twice as large with `finer` 2, drawn in four parts."""
         picture = np.empty((finer * self.height, finer * self.width, 3), dtype=np.uint8)
         columns, rows = (
             np.linspace(0, side, finer + 1).astype(int) for side in (self.width, self.height)
@@ -237,12 +242,16 @@ def video(
 
 
 def _gl_context(width: int, height: int) -> Any:
-    """A GL context of the backend that was chosen."""
-    if not os.environ.get("MUJOCO_GL") and not mjcf.has_display():
-        # MuJoCo was imported before this package, and would open a window.
-        from mujoco.egl import GLContext
+    """A GL context off the screen: of the backend that was chosen, else EGL if there is one."""
+    if not os.environ.get("MUJOCO_GL") and sys.platform.startswith("linux"):
+        # There is a display, or MuJoCo was imported before this package. Its own choice opens windows,
+        # which only the main thread may.
+        try:
+            from mujoco.egl import GLContext
 
-        return GLContext(width, height)
+            return GLContext(width, height)
+        except Exception:  # whatever EGL lacks: the other way may go
+            pass
     return mujoco.GLContext(width, height)
 
 

@@ -24,7 +24,9 @@ from hyrl_mj.tables import (
     Table,
     arrivals,
     episode_table,
+    excursion_text,
     extent,
+    lasts,
     margin_table,
     margin_text,
     percent,
@@ -234,8 +236,8 @@ def _game_numbers(run: Run, robustness: Mapping[str, Any]) -> list[Number]:
             f"the margin: worst noise on {where}",
         ),
     ]
-    if hyrl["excursion"] is not None:
-        off, ours = (f"{score['excursion']:.3f} {unit}" for score in (policy, hyrl))
+    if lasts(game):
+        off, ours = (f"{excursion_text(score['excursion'])} {unit}" for score in (policy, hyrl))
         found.append(Number("kept off the set-point for ever, at most", off, ours, noise))
     return found
 

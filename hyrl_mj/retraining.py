@@ -151,6 +151,8 @@ class ModeGround:
         The delay is that of the latest arrival behind the fewest samples there are. The miss is how far
         off the set-point the noise can keep a run for ever, beyond the noise bound itself; where runs end,
         how far off they end without noise.
+
+        Starts are drawn from what the latest policy has lost.
         """
         assert self.lattice is not None
         answers = Answers.of(self.lattice, PolicyController(policy), self.noise)

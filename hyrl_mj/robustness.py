@@ -193,20 +193,29 @@ def _share(won: np.ndarray) -> float:
 
 
 def worst_signal(
-    game: Game, name: str, controller: Controller, z0: np.ndarray, eps: float, q0: int | None = None
+    game: Game,
+    name: str,
+    controller: Controller,
+    z0: np.ndarray,
+    eps: float,
+    q0: int | None = None,
+    steps: int | None = None,
 ) -> Recorded:
     """The worst noise signal against a controller from starts (n, d), sample by sample.
 
-    `simulate` with it from the same starts gives the runs that the game foresees.
+    `simulate` with it from the same starts gives the runs that the game foresees. It lasts for a number of
+    steps, by default until the task's time is up.
     """
     noise = game.worst_noise(name, eps)
     modes = None if q0 is None else np.full(len(z0), q0)
-    rollout = closed_loop(game.task, controller, z0, noise=noise, q0=modes, record=True)
+    rollout = closed_loop(
+        game.task, controller, z0, noise=noise, q0=modes, steps=steps, record=True
+    )
     if not len(rollout.measured):  # all runs are over where they start
-        return Recorded(np.zeros((1, len(z0), game.task.measurement_columns)), kind="worst")
+        return Recorded(np.zeros((1, len(z0), game.task.measurement_columns)), eps, kind="worst")
     true = _true_measurements(game.task, rollout)
     values = np.where(np.isnan(rollout.u).any(axis=-1)[..., None], 0.0, rollout.measured - true)
-    return Recorded(values, kind="worst")
+    return Recorded(values, eps, kind="worst")
 
 
 def _true_measurements(task: Task, rollout: Rollout) -> np.ndarray:

@@ -190,6 +190,10 @@ class HybridArc:
     noise: str
     bound: float
 
+    def arrives(self, task: Task) -> bool:
+        """Whether it reached the set-point; who crosses the finishing line elsewhere has not."""
+        return self.outcome == "reached" and bool(task.arrived(self.z[-1:])[0])
+
     def at(self, t: float) -> int:
         """The last row at or before a time [s]."""
         return int(np.searchsorted(self.t, t + 1e-9, side="right") - 1)
@@ -250,7 +254,7 @@ def simulate(
         )
     if isinstance(noise, Noise):
         task.check_noise(noise.bound, noise.everywhere)
-    steps = None if horizon is None else _steps(task, horizon)
+    steps = None if horizon is None else samples(task, horizon)
     loop = PolicyController(controller) if isinstance(controller, Policy) else controller
     if q0 is not None:
         q0 = np.asarray(q0)
@@ -270,7 +274,12 @@ def simulate(
     return arcs[0] if single else arcs
 
 
-def _steps(task: Task, horizon: float) -> int:
+def samples(task: Task, horizon: float) -> int:
+    """How many samples a time [s] takes.
+
+    Raises:
+        BadInput: it is not positive, or longer than an hour.
+    """
     if not (math.isfinite(horizon) and 0 < horizon <= LONGEST):
         raise BadInput(
             f"horizon {horizon:g} s cannot be used: give a time > 0 and <= {LONGEST:g} s"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import rich.table
 from rich.console import Console
+from rich.text import Text
 
 from hyrl_mj.run_directory import Run
 from hyrl_mj.tables import (
@@ -45,9 +46,9 @@ def _print(table: Table) -> None:
     """Print a table, every cell whole."""
     drawn = rich.table.Table(title=table.title)
     for heading in table.headings:
-        drawn.add_column(rich.table.Text(heading))
+        drawn.add_column(Text(heading))
     for row in table.rows:
-        drawn.add_row(*(rich.table.Text(str(cell)) for cell in row))
+        drawn.add_row(*(Text(str(cell)) for cell in row))
     # Off a terminal rich assumes 80 columns, which would cut the cells.
     console = Console()
     Console(width=None if console.is_terminal else 160).print(drawn)

@@ -84,20 +84,15 @@ def replay_table(run: Run, arcs: Arcs) -> Table:
 
 
 def _ending(task: Task, arc: HybridArc) -> Ending:
-    end, success = _point(task.chart.wrap(arc.z[-1:])[0]), arrives(task, arc)
+    end, success = _point(task.chart.wrap(arc.z[-1:])[0]), arc.arrives(task)
     outcome = arc.outcome.replace("_", " ")
     return Ending(outcome, float(arc.t[-1]), int(arc.j[-1]), end, success)
-
-
-def arrives(task: Task, arc: HybridArc) -> bool:
-    """Whether an arc ends well, and close to the set-point."""
-    return arc.outcome == "reached" and bool(task.arrived(arc.z[-1:])[0])
 
 
 def arrivals(run: Run, arcs: Arcs, policy: bool) -> tuple[int, int]:
     """How many of the paper's replays arrive, and of how many: those of the policy, or of HyRL."""
     ours = [
-        arrives(run.task, arc)
+        arc.arrives(run.task)
         for (start, who), arc in arcs.items()
         if start != "critical" and (who == "policy") == policy
     ]
@@ -117,7 +112,7 @@ def score_table(task: Task, content: Mapping[str, Any]) -> Table:
     """The scores of the worst-case game: a row for each noise bound and controller."""
     game = content["game"]
     scores = game["scores"]
-    lasting = scores["hyrl"][0]["excursion"] is not None
+    lasting = lasts(game)
     where, unit = task.noise_on(content["everywhere"])
     headings = [f"noise on {where} [{unit}]", "winnable starts", "controller"]
     headings += ["won, own q0", "won, any q0"]
@@ -132,7 +127,7 @@ def score_table(task: Task, content: Mapping[str, Any]) -> Table:
                 row += [
                     _seconds(score["time"], score["won"]),
                     _seconds(score["time_any"], score["won_any"]),
-                    "-" if who == LIMIT else f"{score['excursion']:.3f}",
+                    excursion_text(None if who == LIMIT else score["excursion"]),
                 ]
             rows.append(row)
     return Table(f"{task.name}: worst case over all noise signals, exact game", headings, rows)
@@ -152,6 +147,18 @@ def margin_table(task: Task, content: Mapping[str, Any]) -> Table:
             for who, margin in game["margin"].items()
         ],
     )
+
+
+def lasts(game: Mapping[str, Any]) -> bool:
+    """Whether some run goes on for ever, so that times and excursions tell something."""
+    return any(
+        score["excursion"] is not None for level in game["scores"].values() for score in level
+    )
+
+
+def excursion_text(excursion: float | None) -> str:
+    """How far off the set-point noise keeps a run; none where every run is over some day."""
+    return "-" if excursion is None else f"{excursion:.3f}"
 
 
 def margin_text(margin: float | None, unit: str) -> str:
@@ -201,7 +208,8 @@ def extent(run: Run, mode: int) -> str:
         return "extended set everything"
     if chart.dimension > 1 or not chart.periodic[0]:
         return f"extended set {100 * inside.mean():.1f}% of the chart"
-    pieces = [f"{a / np.pi:.3f} pi to {b / np.pi:.3f} pi" for a, b in members.pieces()]
+    scale, unit = (np.pi, " pi") if chart.units[0] == "rad" else (1.0, f" {chart.units[0]}")
+    pieces = [f"{a / scale:.3f}{unit} to {b / scale:.3f}{unit}" for a, b in members.pieces()]
     return f"extended set {', '.join(pieces)}"
 
 

@@ -55,7 +55,10 @@ def view(task: Task, arc: HybridArc, port: int = 0, say: Say = print) -> None:
 def _window(model: mujoco.MjModel, data: mujoco.MjData) -> AbstractContextManager[Any]:
     from mujoco import viewer
 
-    return viewer.launch_passive(model, data)
+    try:
+        return viewer.launch_passive(model, data)
+    except RuntimeError as error:  # on macOS, outside of mjpython
+        raise BadInput(f"MuJoCo's viewer cannot be opened: {error}") from error
 
 
 def _web(

@@ -99,12 +99,12 @@ def replay_figures(folder: Path) -> Iterator[Figure]:
             render_replay(task, [show], folder / "r.mp4", size=size, fps=fps, camera=camera)
             return seconds * fps + 1
 
-        def plain(size=size, camera=camera) -> int:
+        def plain(size=size, fps=fps, camera=camera) -> int:
             model = _default_quality(task.model, *size)
-            data, frames = mujoco.MjData(model), 20
+            data, frames = mujoco.MjData(model), seconds * fps + 1
             with closing(mujoco.Renderer(model, size[1], size[0])) as renderer:
                 for k in range(frames):
-                    data.qpos[:] = arc.z[k]
+                    data.qpos[:] = arc.z[k % len(arc.z)]
                     mujoco.mj_forward(model, data)
                     renderer.update_scene(data, camera)
                     renderer.render()

@@ -80,7 +80,7 @@ def fate(run: hyrl_mj.Run, arc: hyrl_mj.HybridArc) -> str:
     """What becomes of a run: "arrives, left", "stalls", ..."""
     if arc.outcome != "reached":
         return FATES[arc.outcome]
-    if not run.task.arrived(arc.z[-1:])[0]:
+    if not arc.arrives(run.task):
         return f"ends {run.task.miss(arc.z[-1:])[0]:.2g} off the set-point"
     return f"arrives, {run.task.mode_names[run.task.direction(arc.z[:, None])[0]]}"
 

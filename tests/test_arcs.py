@@ -55,6 +55,12 @@ def test_the_worst_noise_is_each_controller_s_own(run):
         assert not np.allclose(arc.measured[5:12] - arc.z[5:12], (policy.measured - policy.z)[5:12])
 
 
+def test_the_worst_noise_lasts_as_long_as_the_run_and_keeps_the_bound_that_was_asked_for(run):
+    (arc,) = noisy_arcs(run, np.array([[0.0, 0.3]]), "worst", 0.13, horizon=1.5)["hyrl"]
+    assert (arc.bound, len(arc.t)) == (0.13, 31)
+    assert (np.abs(arc.measured - arc.z)[:-1, 1] > 0.1).all()
+
+
 def test_shows_are_one_for_each_mode_or_all_of_the_paper_s_at_once(run):
     arcs = replay_arcs(run)
     assert len(arcs) == 6 * 3

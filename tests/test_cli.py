@@ -154,7 +154,7 @@ def test_what_was_simulated_is_replayed_and_so_are_the_paper_s_starts_anew(copie
 def test_without_a_latest_simulation_there_is_nothing_to_replay(copied):
     for left in (copied / "arcs").glob("latest_*"):
         left.unlink()
-    done = call("replay", copied, "--starts", "latest")
+    done = call("replay", copied, "--starts", "latest", "--out", "x.mp4")
     assert_one_sentence(done, "latest_policy.npz", "run the stage")
 
 
@@ -278,12 +278,13 @@ def test_bad_input_before_anything_is_made(arguments, parts, tmp_path, monkeypat
         (["extended-sets", "--horizon", "0"], ["horizon 0", "> 0"]),
         (["replay", "--camera", "top"], ["'top'", "overhead, three_quarter, chase"]),
         (["replay", "--out", "film.avi"], ["film.avi", ".mp4, .gif, .png"]),
-        (["replay", "--starts", "mine"], ["'mine'", "critical, paper, latest"]),
-        (["replay", "--starts", "latest", "--eps", "0.1"], ["--eps to simulate"]),
-        (["replay", "--noise", "white"], ["'white'", "worst"]),
-        (["replay", "--eps", "4"], ["4 hides the whole"]),
-        (["replay", "--layout", "tiled"], ["'tiled'", "overlay"]),
-        (["replay", "--slow-motion", "0"], ["slow motion 0", "real time"]),
+        (["replay", "--starts", "mine", "--out", "x.mp4"], ["'mine'", "critical, paper, latest"]),
+        (["replay", "--starts", "latest", "--eps", "0.1", "--out", "x.mp4"], ["--eps to simulate"]),
+        (["replay", "--noise", "white", "--out", "x.mp4"], ["'white'", "worst"]),
+        (["replay", "--layout", "overlay"], ["needs an --out"]),
+        (["replay", "--eps", "4", "--out", "x.mp4"], ["4 hides the whole"]),
+        (["replay", "--layout", "tiled", "--out", "x.mp4"], ["'tiled'", "overlay"]),
+        (["replay", "--slow-motion", "0", "--out", "x.mp4"], ["slow motion 0", "real time"]),
         (["view", "--arc", "mine"], ["'mine'", "critical_hyrl_q0"]),
         (["view", "--port", "70000"], ["port 70000"]),
         (["report", "--out", "page.pdf"], ["page.pdf", ".html"]),

@@ -115,9 +115,9 @@ def test_it_is_written_as_png_and_as_pdf_of_one_page(tmp_path, monkeypatch, task
     assert pdf.startswith(b"%PDF")
     assert len(re.findall(rb"/Type /Page\b", pdf)) == 1
     for mode in (0, 1):
-        colour = style.MODE_COLOURS[mode]
+        colour = style.mode_colour(mode)
         if name == "extended_sets" and task is VEHICLE:
-            colour = style.MODE_TINTS[mode]
+            colour = style.mode_tint(mode)
         assert len(where(path, colour)) > 20, "each mode is there in its colour"
     first = path.with_suffix(".pdf").read_bytes()
     DRAW[name](task, path)
@@ -179,7 +179,7 @@ def test_every_picture_has_a_caption():
 
 
 def test_tints_are_the_colours_with_white():
-    for tint, colour in zip(style.MODE_TINTS, style.MODE_COLOURS, strict=True):
+    for tint, colour in ((style.mode_tint(i), style.mode_colour(i)) for i in range(4)):
         hue = np.subtract(1, to_rgb(tint)) / np.subtract(1, to_rgb(colour))
         assert np.ptp(hue) < 0.1
 
@@ -191,10 +191,10 @@ def test_overview_of_a_plane(tmp_path, drawn):
     draw_overview(VEHICLE, tmp_path / "p.png")
     panel, noisy = drawn[0].axes[0], ARCS["vehicle"]["critical", "policy"]
     for mode, side in ((0, 1), (1, -1)):
-        ways = lines_of(panel, style.MODE_COLOURS[mode])
+        ways = lines_of(panel, style.mode_colour(mode))
         assert len(ways) == 6
         assert all((side * way[way[:, 0] > 1.2][:, 1] > 0.75).all() for way in ways)
-        assert inside(filled(panel, style.MODE_TINTS[mode]), (0.5, side), (0.5, -side)) == [
+        assert inside(filled(panel, style.mode_tint(mode)), (0.5, side), (0.5, -side)) == [
             True,
             False,
         ]
@@ -220,7 +220,7 @@ def test_overview_of_a_ring(tmp_path, drawn):
     draw_overview(CIRCLE, tmp_path / "p.png")
     panel, noisy = drawn[0].axes[0], ARCS["unit_circle"]["critical", "policy"]
     for mode, side in ((0, 1), (1, -1)):
-        ways = lines_of(panel, style.MODE_COLOURS[mode])
+        ways = lines_of(panel, style.mode_colour(mode))
         assert ways
         assert all((side * way[:, 1] > -0.02).all() for way in ways)
         assert all(np.isclose(np.linalg.norm(way[0]), paths.CORE) for way in ways)
@@ -246,13 +246,12 @@ def test_policy_of_a_plane(tmp_path, drawn):
     np.testing.assert_allclose(bar.get_yticks(), [-1, -0.5, 0, 0.5, 1])
     assert bar.get_ylabel() == "lateral velocity [m/s]"
     np.testing.assert_allclose(marks_of(image, "o", style.RED), decisions(VEHICLE).points)
-    starts = marks_of(beside, "o", to_hex("C0"))
-    del starts
     circles = [line for line in beside.lines if line.get_marker() == "o"]
     found = sorted(tuple(np.ravel(line.get_data())) for line in circles)
     assert found == sorted(VEHICLE.policy_starts)
     assert len(marks_of(beside, "x", style.RED)) == 1
-    assert len(marks_of(beside, "x", style.INK)) == 2
+    # The planted policy passes the pillar and goes straight on.
+    assert len(marks_of(beside, "x", style.PALE)) == 2
     ((*_, last),) = lines_of(beside, style.POLICY_COLOUR)
     assert VEHICLE.clearance(last) == 0
 
@@ -291,7 +290,7 @@ def test_extended_sets_of_a_plane(tmp_path, drawn):
     at = ((0.3, 0.0), (0.3, 0.18), (0.3, -0.18), (0.3, 0.22), (0.3, -0.22), (2.5, 1.0))
     assert inside(shared, *at) == [True, True, True, False, False, True]
     for mode, side in ((0, 1), (1, -1)):
-        tint = filled(whole, style.MODE_TINTS[mode])
+        tint = filled(whole, style.mode_tint(mode))
         assert inside(tint, (0.3, 0.5 * side), (0.3, -0.5 * side)) == [True, False]
     (room,) = lines_of(near, style.RED)
     assert np.ptp(room[:, 1]) == pytest.approx(2 * EPS)
@@ -306,12 +305,12 @@ def test_extended_sets_of_a_ring_have_their_ends_in_multiples_of_pi(tmp_path, dr
     for mode, values in enumerate(expected):
         for value in values:
             text = ends.pop(f"{value / np.pi:.2f}π")
-            assert to_hex(text.get_color()) == style.MODE_COLOURS[mode]
+            assert to_hex(text.get_color()) == style.mode_colour(mode)
             x, y = text.get_position()
             assert np.arctan2(y, x) % (2 * np.pi) == pytest.approx(value)
     assert not ends
     (far,) = [w for w in panel.patches
-              if isinstance(w, Wedge) and to_hex(w.get_facecolor()) == style.MODE_COLOURS[0]]  # fmt: skip
+              if isinstance(w, Wedge) and to_hex(w.get_facecolor()) == style.mode_colour(0)]  # fmt: skip
     assert far.theta2 % 360 == pytest.approx(np.degrees(np.pi + 0.2), abs=1.5)
 
 
@@ -331,7 +330,7 @@ def test_runs_in_a_plane(tmp_path, drawn):
         assert len(found) == 5, "the run from M* is none of the paper's"
         for way, z in zip(found, expected, strict=True):
             np.testing.assert_allclose(way, z)
-        assert lines_of(panel, style.MODE_COLOURS[q])
+        assert lines_of(panel, style.mode_colour(q))
         crashed = sum(arcs[f"start{i}", "policy"].outcome == "crashed" for i in range(5))
         assert len(marks_of(panel, "x", style.RED)) == crashed > 0
         jumps = [arcs[f"start{i}", f"hyrl_q{q}"].j[-1] for i in range(5)]
@@ -346,7 +345,7 @@ def test_jumps_over_time_are_marked_and_change_the_colour(tmp_path, drawn):
     expected = [(arc.t[k], arc.z[k, 0]) for arc, at in rows for k in at]
     assert expected
     np.testing.assert_allclose(marks_of(panel, "D", style.INK), expected)
-    assert min(way[0, 1] for way in lines_of(panel, style.MODE_COLOURS[1])) > np.pi
+    assert min(way[0, 1] for way in lines_of(panel, style.mode_colour(1))) > np.pi
     assert panel.get_ylabel() == "theta [rad]"
     heights = {float(np.ravel(way[:, 1])[0]) for way in lines_of(panel, style.GREEN, "--")}
     assert heights == {0.0, 2 * np.pi}

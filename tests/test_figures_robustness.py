@@ -176,14 +176,6 @@ def test_the_users_own_style_is_neither_used_nor_changed(tmp_path, coarse):
     assert (tmp_path / "plain.png").read_bytes() == (tmp_path / "styled.png").read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("share", "words"),
-    [(1.0, "100%"), (0.99999, ">99.9%"), (0.128, "12.8%"), (1e-5, "<0.1%"), (0.0, "0%")],
-)
-def test_only_what_is_everything_is_called_so(share, words):
-    assert style.percent(share) == words
-
-
 def test_angles_are_multiples_of_pi():
     angles = np.pi * np.array([-1, -0.5, 0, 0.5, 1, 1.5, 2])
     assert [style.angle(x) for x in angles] == ["-π", "-π/2", "0", "π/2", "π", "3π/2", "2π"]

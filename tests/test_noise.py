@@ -75,16 +75,17 @@ def test_a_misspelt_kind_gets_a_hint():
 
 def test_a_recorded_signal_is_repeated_and_then_over():
     values = np.arange(12.0).reshape(3, 2, 2)
-    signal, rng = Recorded(values), np.random.default_rng(0)
+    signal, rng = Recorded(values, 11.0), np.random.default_rng(0)
     for k in range(3):
         np.testing.assert_array_equal(signal.sample(np.full(2, k), 2, rng), values[k])
     np.testing.assert_array_equal(signal.sample(np.full(2, 3), 2, rng), np.zeros((2, 2)))
-    assert signal.bound == 11.0
 
 
 def test_a_recorded_signal_of_other_runs_is_refused():
     with pytest.raises(BadInput, match="does not fit 3 simulations"):
-        Recorded(np.zeros((3, 2, 2))).sample(np.zeros(3, dtype=int), 2, np.random.default_rng(0))
+        Recorded(np.zeros((3, 2, 2)), 0.0).sample(
+            np.zeros(3, dtype=int), 2, np.random.default_rng(0)
+        )
 
 
 def test_adversarial_noise_is_no_signal_of_its_own():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from planted import circle_controller, circle_policy, decisions, halves
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, HybridArc, HybridController, Noise, NoRenderer
 from hyrl_mj.extended_sets import ExtendedSets
+from hyrl_mj.mjcf import models_dir
 from hyrl_mj.replay import Show, render_replay
 from hyrl_mj.replay.captions import Group, Layout
 from hyrl_mj.replay.marks import (
@@ -212,6 +214,35 @@ def test_frames_do_not_depend_on_those_before(crash, jump, camera):
 
 
 @needs_gl
+def test_nothing_is_left_where_a_capsule_was(jump):
+    """It is longer than its numbers tell."""
+    spec = mujoco.MjSpec.from_file(str(models_dir() / "vehicle.xml"))
+    spec.body("vehicle").add_geom(
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+        size=[0.05, 0.4, 0],
+        rgba=[0.8, 0.1, 0.1, 1],
+        quat=[1, 0, 1, 0],
+        pos=[0, 0, 0.3],
+        mass=0,
+    )
+    task = copy(TASK)
+    task.model = spec.compile()
+    track = Track(task, jump)
+    pictures = []
+    for before in ((), np.arange(0.0, 1.5, 0.3)):
+        panel, picture = (
+            Panel(task, [track], 640, 640, "overhead"),
+            np.zeros((640, 640, 3), np.uint8),
+        )
+        for moment in (*before, 1.53):
+            panel.draw(moment, picture)
+        panel.close()
+        pictures.append(picture.astype(int))
+    assert near(pictures[0], (204, 26, 26), 90).sum() > 500
+    assert (np.abs(pictures[0] - pictures[1]).max(axis=-1) > 2).sum() <= 20
+
+
+@needs_gl
 def test_the_measured_robot_is_a_ghost_within_the_bound():
     arc = jumping_arc(q0=0, noise=NOISE)
     track, quiet = Track(TASK, arc), Track(TASK, replace(arc, bound=0.0))
@@ -388,9 +419,10 @@ def test_impossible_wishes_are_refused(tmp_path, show, name, options, message):
     assert not list(tmp_path.iterdir())
 
 
-def test_nothing_to_replay(tmp_path):
-    with pytest.raises(BadInput, match="at least one show"):
-        render_replay(TASK, [], tmp_path / "replay.mp4")
+def test_nothing_to_replay(tmp_path, crash):
+    for shows in ([], [Show([crash], [])], [Show([], [crash])]):
+        with pytest.raises(BadInput, match="give shows with arcs of both controllers"):
+            render_replay(TASK, shows, tmp_path / "replay.mp4")
 
 
 @needs_gl

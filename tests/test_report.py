@@ -7,7 +7,6 @@ import io
 import json
 import re
 import shutil
-import time
 from base64 import b64decode
 from dataclasses import replace
 from html import escape
@@ -310,10 +309,8 @@ def test_the_command_tells_what_is_not_the_default(copied):
     assert "differ in: cells." in page_of(copied).text
 
 
-def test_the_same_artifacts_give_the_same_bytes_in_good_time(copied):
-    began = time.perf_counter()
+def test_the_same_artifacts_give_the_same_bytes(copied):
     write_report(load_run(copied), copied / "report.html")
-    assert time.perf_counter() - began < 3
     first = (copied / "report.html").read_bytes()
     elsewhere = shutil.copytree(copied, copied.parent / "other" / copied.name)
     write_report(load_run(elsewhere), elsewhere / "again.html")

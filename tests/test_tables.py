@@ -7,7 +7,7 @@ import pytest
 
 import hyrl_mj
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.tables import extent
+from hyrl_mj.tables import extent, percent
 
 
 @pytest.mark.parametrize(
@@ -28,3 +28,11 @@ def test_extent_on_the_circle(inside, words):
     members = GridSet.from_mask(grid, inside(grid.nodes[:, 0] / np.pi))
     run = SimpleNamespace(task=task, extended_sets=SimpleNamespace(modes=(0,), sets=(members,)))
     assert extent(run, 0) == f"extended set {words}"
+
+
+@pytest.mark.parametrize(
+    ("share", "words"),
+    [(1.0, "100%"), (0.99999, ">99.99%"), (0.128, "12.80%"), (1e-5, "<0.01%"), (0.0, "0%")],
+)
+def test_only_what_is_everything_is_called_so(share, words):
+    assert percent(share) == words

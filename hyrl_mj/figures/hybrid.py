@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 
+from hyrl_mj import colours
 from hyrl_mj.critical_set import CriticalSet
 from hyrl_mj.extended_sets import ExtendedSets
 from hyrl_mj.figures.charts import (
@@ -31,14 +32,14 @@ from hyrl_mj.figures.charts import (
 from hyrl_mj.figures.paths import View, ends, hybrid_way, plane_view, policy_way, time_view
 from hyrl_mj.figures.style import (
     INK,
-    MODE_COLOURS,
-    MODE_TINTS,
     RED,
     WIDTH,
     axis_label,
     drawing,
     head,
     legend,
+    mode_colour,
+    mode_tint,
     noise_label,
     policy_title,
 )
@@ -47,7 +48,7 @@ from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks.base import Task
 
 # Of states that several extended sets hold.
-SHARED = "#c9b8d8"
+SHARED = colours.OVERLAP
 # Inner radius of the innermost ring, the gap between rings, and where the ends of a set are written.
 CORE, GAP, OUTSIDE, INSIDE = 0.6, 0.05, 1.14, 0.47
 # How far round M* the enlarged panel reaches, in noise bounds.
@@ -74,7 +75,7 @@ def extended_sets_map(task: Task, critical: CriticalSet, sets: ExtendedSets, pat
         )
         if is_ring(task):
             found = _set_rings(figure.subplots(), task, critical, sets)
-        elif len(critical.points):
+        elif len(critical.points) and sets.noise > 0:
             whole, near = figure.subplots(1, 2)
             found = _set_plane(whole, task, critical, sets)
             _set_plane(near, task, critical, sets)
@@ -118,7 +119,7 @@ def runs(task: Task, found: Mapping[tuple[str, str], HybridArc], path: Path) -> 
                         width = 1.0 if who == "policy" else 2.0
                         arc = found[start, who]
                         ways |= draw(panel, task, view, arc, linewidth=width)
-                        marks |= ends(panel, view, arc)
+                        marks |= ends(panel, task, view, arc)
                 if not flat:
                     shown |= set_point_lines(panel, task, coordinate)
         for panel, loop in zip(panels[0], loops, strict=True):
@@ -148,7 +149,7 @@ def _set_rings(panel: Axes, task: Task, critical: CriticalSet, sets: ExtendedSet
     found: Artists = {}
     width = (OUTER - CORE - GAP) / len(sets.sets)
     for i, (mode, members) in enumerate(zip(sets.modes, sets.sets, strict=True)):
-        outer, colour = OUTER - GAP - i * width, MODE_COLOURS[i % len(MODE_COLOURS)]
+        outer, colour = OUTER - GAP - i * width, mode_colour(mode)
         arcs(panel, task, members.mask.astype(int), (None, colour), outer, outer - width + GAP)
         found[_set_name(task, mode)] = patch(colour)
         # The first set's ends are written outside the rings, the others' inside, one below the other.
@@ -172,15 +173,15 @@ def _ends(panel: Axes, task: Task, members: GridSet, radius: float, colour: str)
 def _set_plane(panel: Axes, task: Task, critical: CriticalSet, sets: ExtendedSets) -> Artists:
     """Fill the sets in a plane, with outlines; returns as `plane`."""
     found: Artists = {}
-    colours = [(MODE_TINTS[i % 4], MODE_COLOURS[i % 4]) for i in range(len(sets.modes))]
-    for mode, members, (tint, colour) in zip(sets.modes, sets.sets, colours, strict=True):
+    looks = [(mode_tint(mode), mode_colour(mode)) for mode in sets.modes]
+    for mode, members, (tint, colour) in zip(sets.modes, sets.sets, looks, strict=True):
         region(panel, members, tint)
         found[_set_name(task, mode)] = patch(tint, colour)
     grid, shared = sets.sets[0].grid, _shared(sets)
     region(panel, GridSet.from_mask(grid, shared), SHARED)
     if shared.any():
         found["in several of them"] = patch(SHARED, SHARED)
-    for members, (_, colour) in zip(sets.sets, colours, strict=True):
+    for members, (_, colour) in zip(sets.sets, looks, strict=True):
         region(panel, members, "none", colour, zorder=2)
     found |= plane(panel, task)
     return found | dots(panel, critical.points)

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from hyrl_mj.figures.charts import Artists, on_ring
-from hyrl_mj.figures.style import INK, MODE_COLOURS, PALE, PAPER, POLICY_COLOUR, RED, policy_title
+from hyrl_mj.figures.style import INK, PALE, PAPER, POLICY_COLOUR, RED, mode_colour, policy_title
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks.base import Outcome, Task
 
@@ -72,20 +72,21 @@ def mark(panel: Axes, view: View, arc: HybridArc, row: int, shape: Any, **looks:
     return drawn
 
 
-def ends(panel: Axes, view: View, arc: HybridArc) -> Artists:
-    """Mark where a run starts and ends; an end that is no success is red.
+def ends(panel: Axes, task: Task, view: View, arc: HybridArc) -> Artists:
+    """Mark where a run starts and ends; an end in failure is red.
 
     Returns:
         What the legend needs.
     """
     start = mark(panel, view, arc, 0, "o", markerfacecolor=PAPER, markeredgecolor=INK)
-    return {"start": start} | end(panel, view, arc)
+    return {"start": start} | end(panel, task, view, arc)
 
 
-def end(panel: Axes, view: View, arc: HybridArc) -> Artists:
-    """Mark where a run ends, in red if that is no success; returns as `ends`."""
-    words = ENDS.get(arc.outcome, f"end: {arc.outcome}") if failed(arc) else "end"
-    colour = RED if failed(arc) else INK
+def end(panel: Axes, task: Task, view: View, arc: HybridArc) -> Artists:
+    """Mark where a run ends, in red if it has failed; returns as `ends`."""
+    words, colour = ("end", INK) if arc.arrives(task) else ("end: off the set-point", PALE)
+    if failed(arc):
+        words, colour = ENDS.get(arc.outcome, f"end: {arc.outcome}"), RED
     return {words: mark(panel, view, arc, -1, "x", color=colour, markeredgewidth=2)}
 
 
@@ -109,7 +110,7 @@ def chosen_way(
         What the legend says of it, and the path.
     """
     mode = int(task.direction(arc.z[:, None])[0])
-    colour, words = MODE_COLOURS[mode % len(MODE_COLOURS)], f"way of mode {task.mode_name(mode)}"
+    colour, words = mode_colour(mode), f"way of mode {task.mode_name(mode)}"
     if failed(arc):
         colour, words = POLICY_COLOUR, "neither way"
     elif mode < 0:
@@ -123,7 +124,7 @@ def hybrid_way(panel: Axes, task: Task, view: View, arc: HybridArc, **looks: Any
     for j in range(arc.j[-1] + 1):
         rows = arc.j == j
         mode = int(arc.q[rows][0])
-        colour = MODE_COLOURS[mode % len(MODE_COLOURS)]
+        colour = mode_colour(mode)
         drawn = line(panel, view, arc.t[rows], arc.z[rows], color=colour, **looks)
         found[f"HyRL in mode {task.mode_name(mode)}"] = drawn
     for row in np.flatnonzero(np.diff(arc.j)).tolist():

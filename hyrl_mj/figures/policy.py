@@ -47,7 +47,6 @@ from hyrl_mj.figures.paths import (
 )
 from hyrl_mj.figures.style import (
     INK,
-    MODE_TINTS,
     PALE,
     PALE_RED,
     RED,
@@ -57,6 +56,7 @@ from hyrl_mj.figures.style import (
     head,
     input_label,
     legend,
+    mode_tint,
     noise_label,
 )
 from hyrl_mj.noise import Noise
@@ -138,7 +138,7 @@ def policy_map(
         for run in runs:
             words, drawn = chosen_way(beside, task, view, run, linewidth=2.0)
             ways[words] = drawn
-            marks |= ends(beside, view, run)
+            marks |= ends(beside, task, view, run)
         if is_ring(task):
             found |= set_point_lines(beside, task, 0)
         legend(figure, found | dict(sorted(ways.items())) | marks)
@@ -165,9 +165,12 @@ def _runs(panel: Axes, task: Task, policy: Policy, view: View) -> Artists:
         words, drawn = chosen_way(panel, task, view, run, linewidth=1.3, zorder=3)
         found[f"without noise: {words}"] = drawn
         row = len(run.t) // ARROW
-        tail, tip = view.points(run.t[row : row + 2], run.z[row : row + 2])
+        points = view.points(run.t[row : row + 2], run.z[row : row + 2])
+        if len(points) < 2 or (np.abs(points[1] - points[0]) > view.longest).any():
+            continue  # it is over where it starts, or goes round the seam just there
         looks = {"arrowstyle": "-|>", "color": drawn.get_color(), "shrinkA": 0, "shrinkB": 0}
-        panel.annotate("", tip, tail, arrowprops=looks | {"mutation_scale": 11}, zorder=3)
+        arrow = looks | {"mutation_scale": 11}
+        panel.annotate("", points[1], points[0], arrowprops=arrow, zorder=3)
     return dict(sorted(found.items()))
 
 
@@ -183,15 +186,18 @@ def _field(
     found: Artists = {}
     classes, grid = classes_of(partition), partition.grid
     for i, mode in enumerate(partition.modes):
-        region(panel, GridSet.from_mask(grid, classes == i), MODE_TINTS[i % len(MODE_TINTS)])
-        found[f"only in the part $M_{mode}$"] = patch(MODE_TINTS[i % len(MODE_TINTS)])
+        region(panel, GridSet.from_mask(grid, classes == i), mode_tint(mode))
+        found[f"only in the part $M_{mode}$"] = patch(mode_tint(mode))
     found |= plane(panel, task)
     view = plane_view(task)
     found |= _runs(panel, task, policy, view)
     eps = task.noise_in_chart(arc.bound)
     panel.add_collection(
         PolyCollection(
-            list(_band(task.chart.wrap(arc.z), eps)), color=PALE_RED, linewidth=0.3, zorder=2
+            list(_band(task.chart.wrap(arc.z), eps, view.longest)),
+            color=PALE_RED,
+            linewidth=0.3,
+            zorder=2,
         )
     )
     found |= _noisy_run(panel, task, view, arc)
@@ -202,12 +208,14 @@ def _field(
     return found | dots(panel, critical.points)
 
 
-def _band(z: np.ndarray, eps: np.ndarray) -> np.ndarray:
+def _band(z: np.ndarray, eps: np.ndarray, longest: np.ndarray) -> np.ndarray:
     """Quadrilaterals (k, 4, 2) that cover a path (K, 2) and all within +-eps (2,) of it.
 
-    A box that moves straight on sweeps over itself and what its two diagonals sweep over.
+    A box that moves straight on sweeps over itself and what its two diagonals sweep over. Steps that are
+    longer than `longest` go round the seam of a periodic chart.
     """
-    a, b = z[:-1], z[1:]
+    steps = (np.abs(np.diff(z, axis=0)) <= longest).all(axis=1)
+    a, b = z[:-1][steps], z[1:][steps]
     corners = [np.array(signs) * eps for signs in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
     boxes = np.stack([z + corner for corner in corners], axis=1)
     swept = [np.stack([a - c, a + c, b + c, b - c], axis=1) for c in corners[:2]]
@@ -224,7 +232,7 @@ def _spirals(
 ) -> Artists:
     """Draw the overview of a ring, time going outward; returns as `plane`."""
     seconds = task.replay_time
-    tints = [MODE_TINTS[i % len(MODE_TINTS)] for i in range(len(partition.modes))]
+    tints = [mode_tint(mode) for mode in partition.modes]
     arcs(panel, task, classes_of(partition), [*tints, None], OUTER, CORE)
     ring(panel, task, (OUTER, CORE), f",\ntime outward:\n0 to {seconds:g} s")
     found: Artists = {
@@ -250,7 +258,7 @@ def _noisy_run(panel: Axes, task: Task, view: View, arc: HybridArc) -> Artists:
     measured = task.z(arc.measured[:-1])
     looks = {"linestyle": "none", "marker": ".", "color": RED, "markersize": 4, "zorder": 4.5}
     found["what it observes"] = line(panel, view, arc.t[:-1], measured, **looks)
-    return found | end(panel, view, arc)
+    return found | end(panel, task, view, arc)
 
 
 # ---- policy map

@@ -18,29 +18,31 @@ from hyrl_mj.figures.charts import INNER, OUTER, TICK, arcs, dots, is_ring, patc
 from hyrl_mj.figures.style import (
     CASING,
     COLUMNS,
+    GREY,
     INK,
     PALE,
     PAPER,
+    POLICY_COLOUR,
     WIDTH,
     axis_label,
     drawing,
     head,
     legend,
-    percent,
+    mode_colour,
 )
 from hyrl_mj.robustness import LIMIT, MAP_CLASSES, OVER, UNWINNABLE
 from hyrl_mj.sets import Grid
+from hyrl_mj.tables import NAMES, lasts, percent
 from hyrl_mj.tasks.base import Task
 
 # As MAP_CLASSES: told apart by colour-blind people, too.
-CLASS_COLOURS = ("#7cc0e8", "#f2c530", "#d55e00", "#5c2a6b", "#dcdee2")
+CLASS_COLOURS = ("#7cc0e8", "#f2c530", mode_colour(1), "#5c2a6b", GREY)
 SENTENCES = dict(enumerate(MAP_CLASSES)) | {
     UNWINNABLE: "not winnable, whatever the controller",
     OVER: "over: obstacle, or the run has ended",
 }
-TITLES = {"policy": "RL policy", "hyrl": "HyRL"}
 # Of the curves: ink as the policy's path in the replay, then blue, purple and vermilion.
-CURVE_COLOURS = ("#2d323c", "#0072b2", "#aa4499", "#d55e00")
+CURVE_COLOURS = (POLICY_COLOUR, *(mode_colour(i) for i in (0, 2, 1)))
 LIMIT_COLOUR = "#a9dcc9"
 MARKERS = "osD^"
 # Nodes of a curve from one marker to the next.
@@ -99,9 +101,9 @@ def robustness_curve(task: Task, content: Mapping[str, Any], path: Path) -> None
     names, curve = _controllers(content), content["curve"]
     eps, scores = np.array(curve["eps"]), content["scores"]
     run_eps = max(score["eps"] for score in scores[names[0]])
-    lasting = any(score["excursion"] is not None for name in names for score in scores[name])
+    lasting = lasts(content)
     # A controller has its colour whoever else is in the picture.
-    known = list(dict.fromkeys([*TITLES, *names]))
+    known = list(dict.fromkeys(["policy", "hyrl", *names]))
     numbers = {name: known.index(name) for name in names}
     where, unit = task.noise_on(content["everywhere"])
     heights = (3.6, 2.0) if lasting else (3.6,)
@@ -161,7 +163,7 @@ def _panel_height(task: Task) -> float:
 def _head(panel: Axes, name: str, score: Mapping[str, Any]) -> None:
     """Write the controller and what it wins over its panel."""
     won, won_any = percent(score["won"]), percent(score["won_any"])
-    panel.set_title(TITLES.get(name, name), fontsize=11, fontweight="bold", pad=36)
+    panel.set_title(NAMES.get(name, name), fontsize=11, fontweight="bold", pad=36)
     panel.annotate(
         f"{won} of the winnable starts won,\n"
         + ("from every start mode" if won == won_any else f"{won_any} from every start mode"),
@@ -255,7 +257,7 @@ def _won(
 ) -> dict[str, Artist]:
     """Draw what a controller wins; returns as `_limit`."""
     won, won_any = 100 * np.array(curve["won"]), 100 * np.array(curve["won_any"])
-    title, looks = TITLES.get(name, name), _looks(number)
+    title, looks = NAMES.get(name, name), _looks(number)
     (line,) = panel.plot(eps, won, **looks)
     if _same(curve):
         return {title: line}
@@ -309,7 +311,7 @@ def _margins(
     found: dict[str, Artist] = {}
     panel.set_ylim(-3, TOP + ROW * len(numbers))
     for row, (name, number) in enumerate(numbers.items()):
-        margin, title = margins[name], TITLES.get(name, name)
+        margin, title = margins[name], NAMES.get(name, name)
         if margin is None:
             found[f"margin of {title}: none"] = Line2D([], [], linestyle="none")
             continue

@@ -25,9 +25,8 @@ INK, PAPER, PALE = colours.INK, colours.WHITE, "#8b919b"
 GREY = "#dcdee2"
 POLICY_COLOUR, RED, PALE_RED = colours.POLICY, colours.BAD, "#f4c9c7"
 GREEN = colours.GOOD  # of the set-point
-# The same hues as tints.
-MODE_COLOURS = colours.MODES
-MODE_TINTS = ("#d6e8f3", "#fbe4d3", "#f1dcee", "#e1f2fb")
+# The hues of the modes as tints.
+_TINTS = ("#d6e8f3", "#fbe4d3", "#f1dcee", "#e1f2fb")
 # Width of lines over a map, the paper around the ink first.
 CASING = ((PAPER, 2.8), (INK, 1.4))
 STYLE = {
@@ -44,6 +43,16 @@ STYLE = {
     # Letters in a PDF stay letters, which can be searched and edited.
     "pdf.fonttype": 42,
 }
+
+
+def mode_colour(mode: int) -> str:
+    """The colour of a mode, as in the replay."""
+    return colours.MODES[mode % len(colours.MODES)]
+
+
+def mode_tint(mode: int) -> str:
+    """The same hue, for fields."""
+    return _TINTS[mode % len(_TINTS)]
 
 
 @contextmanager
@@ -114,13 +123,6 @@ def input_label(task: Task, i: int) -> str:
     """An input with its unit: "turn rate [rad/s]"."""
     unit = f" [{task.input_units[i]}]" if task.input_units else ""
     return task.inputs[i].replace("_", " ") + unit
-
-
-def percent(share: float) -> str:
-    """A share in percent; only what is everything is called 100%, and only nothing 0%."""
-    if 0 < share < 1:
-        return "<0.1%" if share < 5e-4 else ">99.9%" if share >= 0.9995 else f"{100 * share:.1f}%"
-    return f"{100 * share:.0f}%"
 
 
 def angle(value: float) -> str:

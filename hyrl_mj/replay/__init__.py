@@ -73,8 +73,8 @@ def render_replay(
     """
     if path.suffix not in FORMATS:
         raise BadInput(f"{path} is no replay: give a name that ends in one of {', '.join(FORMATS)}")
-    if not shows:
-        raise BadInput("there is nothing to replay: give at least one show")
+    if not shows or not all(show.policy and show.hybrid for show in shows):
+        raise BadInput("there is nothing to replay: give shows with arcs of both controllers")
     if layout not in LAYOUTS:
         raise unknown("layout", layout, LAYOUTS)
     if not 1 <= fps <= FASTEST:

@@ -160,7 +160,5 @@ def _noise(arc: HybridArc) -> str:
 
 def _outcome(track: Track) -> str:
     """The outcome of an arc; who crosses the finishing line elsewhere than at the set-point misses it."""
-    reached = track.arc.outcome == "reached"
-    return (
-        "missed" if reached and not track.task.arrived(track.arc.z[-1:])[0] else track.arc.outcome
-    )
+    arc = track.arc
+    return "missed" if arc.outcome == "reached" and not arc.arrives(track.task) else arc.outcome

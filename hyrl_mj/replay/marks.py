@@ -20,7 +20,7 @@ MODE_COLOURS = tuple(map(rgb, colours.MODES))
 POLICY_COLOUR, INK, WHITE = map(rgb, (colours.POLICY, colours.INK, colours.WHITE))
 GOOD, BAD = rgb(colours.GOOD), rgb(colours.BAD)
 PAPER, OPEN = (246, 247, 249), (110, 116, 126)
-OVERLAP, CRITICAL, BOUND = (203, 196, 233), (205, 30, 45), (120, 95, 200)
+OVERLAP, CRITICAL, BOUND = rgb(colours.OVERLAP), (205, 30, 45), (120, 95, 200)
 
 # The site of the MJCF whose path is drawn.
 TRACKED = "tracked"

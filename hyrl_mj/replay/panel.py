@@ -13,7 +13,7 @@ import numpy as np
 from hyrl_mj import mjcf
 from hyrl_mj.colours import RGB
 from hyrl_mj.errors import BadArtifact
-from hyrl_mj.rendering import Box, SceneRenderer
+from hyrl_mj.rendering import GEOMS, Box, SceneRenderer
 from hyrl_mj.replay import marks
 from hyrl_mj.replay.marks import Floor, Tracker
 from hyrl_mj.simulation import HybridArc
@@ -60,7 +60,9 @@ class Track:
         for i, state in enumerate(arc.state):
             mujoco.mj_setState(model, data, state, kind)
             self._qpos[i] = data.qpos
-        self._measured = task.qpos(task.z(arc.measured))
+        # Noise moves what the chart tells of a position, and leaves the rest as it is.
+        noise = task.qpos(task.z(arc.measured)) - task.qpos(arc.z)
+        self._measured = self._qpos + noise
         self.points = self._tracker.of_qpos(self._qpos)
 
     @cached_property
@@ -88,13 +90,12 @@ class Track:
 
     def bounds(self, t: float) -> list[np.ndarray]:
         """For each noisy coordinate, points (k, 3) [m] from where to where it may be measured."""
-        z = self._at(t, self.arc.z)
+        z, qpos = self._at(t, self.arc.z), self.qpos(t)
         noise = self.task.noise_in_chart(self.arc.bound)
         share = np.linspace(-1, 1, BOUND_PIECES + 1)[:, None]
-        return [
-            self._tracker.of_z(z + share * noise * (np.arange(len(z)) == i))
-            for i in np.flatnonzero(noise)
-        ]
+        lines = [z + share * noise * (np.arange(len(z)) == i) for i in np.flatnonzero(noise)]
+        shifts = [self.task.qpos(line) - self.task.qpos(z[None]) for line in lines]
+        return [self._tracker.of_qpos(qpos + shift) for shift in shifts]
 
     def _at(self, t: float, values: np.ndarray) -> np.ndarray:
         """Values at the rows (N, c), interpolated at time t: (c,)."""
@@ -139,8 +140,11 @@ class Panel:
     ):
         self._tracks, self._camera = tracks, camera
         found = mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
-        self._rests = task.model.cam_bodyid[found] == 0
-        self._renderer = SceneRenderer(task.model, width, height)
+        fixed = task.model.cam_mode[found] == mujoco.mjtCamLight.mjCAMLIGHT_FIXED
+        self._rests = fixed and task.model.cam_bodyid[found] == 0
+        # A bar for each row, and what else there is, with room to spare.
+        geoms = sum(len(track.arc.t) for track in tracks) + GEOMS * (1 + len(tracks))
+        self._renderer = SceneRenderer(task.model, width, height, geoms)
         self._renderer.clear()
         scene = self._renderer.scene
         if floor:
@@ -243,8 +247,14 @@ class Panel:
                 )
         geoms = scene.geoms[first : scene.ngeom]
         points = np.vstack([passed, *[geom.pos for geom in geoms]])
-        radii = [np.linalg.norm(geom.size) for geom in geoms]
+        radii = [self._radius(geom) for geom in geoms]
         return self._box(points, np.array([JUMP_RADIUS] * len(passed) + radii))
+
+    def _radius(self, geom: mujoco.MjvGeom) -> float:
+        """Of a ball around a geom [m]."""
+        if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
+            return float(self._renderer.model.geom_rbound[geom.objid])
+        return float(np.linalg.norm(geom.size))
 
     def _box(self, points: np.ndarray, radii: np.ndarray) -> Box:
         """The part of the picture in which balls around points (n, 3) are seen."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, closing
 
 import numpy as np
 
@@ -99,10 +100,12 @@ class Stage:
     ):
         self._frame = np.empty((size[1], size[0], 3), dtype=np.uint8)
         parts = np.array_split(self._frame, len(panels), axis=1)
-        self._views = [
-            _View(task, part, title, groups, camera, floor)
-            for part, (title, groups) in zip(parts, panels, strict=True)
-        ]
+        self._views: list[_View] = []
+        with ExitStack() as stack:
+            for part, (title, groups) in zip(parts, panels, strict=True):
+                view = _View(task, part, title, groups, camera, floor)
+                self._views.append(stack.enter_context(closing(view)))
+            self._open = stack.pop_all()
 
     def draw(self, t: float) -> np.ndarray:
         """The frame (height, width, 3) at time t [s], valid until the next."""
@@ -116,8 +119,7 @@ class Stage:
 
     def close(self) -> None:
         """Give the GL contexts back."""
-        for view in self._views:
-            view.close()
+        self._open.close()
 
 
 class _View:
@@ -153,9 +155,9 @@ class _View:
 
     def close(self) -> None:
         """Give the GL context back, in the thread that has it."""
-        if self._panel.exception() is None:
-            self._thread.submit(self._panel.result().close).result()
-        self._thread.shutdown()
+        with self._thread:
+            if self._panel.exception() is None:
+                self._thread.submit(self._panel.result().close).result()
 
     def _draw(self, t: float) -> None:
         bar = self._layout.bar
