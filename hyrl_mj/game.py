@@ -20,10 +20,13 @@ from hyrl_mj.lattice import Lattice
 from hyrl_mj.plant import Plant
 from hyrl_mj.sets import within_reach
 
+# How far beside a node its answer has to be the same, in cells.
+BESIDE = 1e-4
 # Values, the worse for the controller the greater: k < NEVER means "arrives after k samples at the latest",
 # LOST - k "fails after k samples".
 NEVER = 1 << 20
 LOST = 1 << 21
+FIRST = 1 << 22  # above all of them
 
 
 @dataclass(frozen=True)
@@ -37,12 +40,15 @@ class Answers:
         modes: the controller's modes.
         pad: (d,) nodes by which the measured nodes reach beyond the lattice on either side.
         letter: (Q + 1, measured nodes...) int, level * Q + number of the next mode.
+        firm: (Q + 1, measured nodes...) bool, whether the answer is the same right beside the node. Where it
+            is not, rounding decides what a measurement there provokes.
     """
 
     lattice: Lattice
     modes: tuple[int, ...]
     pad: np.ndarray
     letter: np.ndarray
+    firm: np.ndarray
 
     @staticmethod
     def of(lattice: Lattice, controller: Controller, bound: np.ndarray) -> Answers:
@@ -63,23 +69,44 @@ class Answers:
             for low, step, n, k in zip(grid.chart.low, grid.spacing, grid.counts, pad, strict=True)
         ]
         measured = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-        flat = measured.reshape(-1, len(axes))
-        rows = []
-        for q in (*modes, None):
-            mode = controller.initial_mode(flat) if q is None else np.full(len(flat), q)
-            u, after = controller.step(mode, flat)
+
+        def ask(q: int | None, points: np.ndarray) -> np.ndarray:
+            mode = controller.initial_mode(points) if q is None else np.full(len(points), q)
+            u, after = controller.step(mode, points)
             unknown = ~np.isin(after, modes)
             if unknown.any():
                 raise BadInput(f"the controller went to mode {after[unknown][0]}, it has {modes}")
-            letter = lattice.level_of(u) * len(modes) + np.searchsorted(modes, after)
-            rows.append(letter.reshape(measured.shape[:-1]))
-        return Answers(lattice, modes, pad, np.stack(rows))
+            return lattice.level_of(u) * len(modes) + np.searchsorted(modes, after)
+
+        letters, firm = [], []
+        beside = BESIDE * grid.spacing * np.eye(len(axes))[bound > 0]
+        for q in (*modes, None):
+            letter = ask(q, measured.reshape(-1, len(axes))).reshape(measured.shape[:-1])
+            sure = np.ones(letter.shape, dtype=bool)
+            at = np.nonzero(_borders(letter, grid.chart.periodic))
+            if len(at[0]) and len(beside):
+                others = [ask(q, measured[at] + side) for side in (*beside, *-beside)]
+                sure[at] = (np.array(others) == letter[at]).all(axis=0)
+            letters.append(letter)
+            firm.append(sure)
+        return Answers(lattice, modes, pad, np.stack(letters), np.stack(firm))
 
     @property
     def middle(self) -> tuple[slice, ...]:
         """Where the lattice lies among the measured nodes."""
         counts = self.lattice.grid.counts
         return tuple(slice(k, k + n) for k, n in zip(self.pad, counts, strict=True))
+
+
+def _borders(letter: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
+    """The nodes (n, ...) bool with another letter next to them."""
+    found = np.zeros(letter.shape, dtype=bool)
+    for axis, round_ in enumerate(periodic):
+        differs = np.diff(letter, axis=axis, append=letter.take([0], axis=axis)) != 0
+        if not round_:
+            differs[(slice(None),) * axis + (-1,)] = False
+        found |= differs | np.roll(differs, 1, axis=axis)
+    return found
 
 
 def nodes_within(lattice: Lattice, bound: np.ndarray) -> np.ndarray:
@@ -119,14 +146,22 @@ class Moves:
         return Moves(lattice, len(state), *map(np.concatenate, (state, counts, target)))
 
 
-def noisy_moves(answers: Answers, bound: np.ndarray) -> Moves:
-    """The moves that noise within bounds (d,) gives the adversary against a controller."""
+def noisy_moves(answers: Answers, bound: np.ndarray, firm: bool = False) -> Moves:
+    """The moves that noise within bounds (d,) gives the adversary against a controller.
+
+    With `firm` those that noise reaches only by a measurement on the very border of two answers are left
+    out; without noise a controller answers in any case.
+    """
     lattice, modes = answers.lattice, len(answers.modes)
     window, periodic = nodes_within(lattice, bound), lattice.grid.chart.periodic
     rows = []
-    for letters in answers.letter:
+    for letters, sure in zip(answers.letter, answers.firm, strict=True):
         used = np.unique(letters)
-        possible = [within_reach(letters == x, window, periodic)[answers.middle] for x in used]
+        possible = [
+            within_reach((letters == x) & (sure | (not firm)), window, periodic) | (letters == x)
+            for x in used
+        ]
+        possible = [mask[answers.middle] for mask in possible]
         node, which = np.nonzero(
             np.stack(possible, axis=-1).reshape(lattice.nodes, -1) & lattice.running[:, None]
         )
@@ -195,17 +230,25 @@ def lasting(moves: Moves, start: np.ndarray | None = None) -> np.ndarray:
 class WorstNoise:
     """The noise of the game's adversary, for use in simulations (an `Adversary`).
 
+    Where it can, it wins without measurements on the very border of two answers, from where rounding errors
+    of the plant could let a run escape.
+
     Args:
         answers: of the controller that it works against.
         bound: (d,) bounds of the noise.
-        value: of the game, from `solve`.
+
+    Attributes:
+        value: (modes + 1, places) int of the game that it plays.
     """
 
     kind = "worst"
 
-    def __init__(self, answers: Answers, bound: np.ndarray, value: np.ndarray):
+    def __init__(self, answers: Answers, bound: np.ndarray):
         self.bound = float(bound.max(initial=0.0))
-        self._answers, self._bound, self._value = answers, bound, value
+        self._answers, self._bound = answers, bound
+        self._any = solve(noisy_moves(answers, bound))
+        self._firm = solve(noisy_moves(answers, bound, firm=True))
+        self.value = np.where(self._firm >= NEVER, self._firm, self._any)
         window = nodes_within(answers.lattice, bound)
         shifts = np.stack(
             np.meshgrid(*[np.arange(-w, w + 1) for w in window], indexing="ij"), axis=-1
@@ -228,7 +271,10 @@ class WorstNoise:
                 grid.chart.periodic, (at + shift) % grid.counts, at + shift + answers.pad
             )
             level, mode = np.divmod(answers.letter[(row, *node.T)], len(modes))
-            value = self._value[mode[:, None], lattice.after[level, :, place]].max(axis=1)
+            ends = mode[:, None], lattice.after[level, :, place]
+            value, sure = self._any[ends].max(axis=1), self._firm[ends].max(axis=1)
+            counts = answers.firm[(row, *node.T)] | (shift == 0).all()
+            value = np.where(counts & (sure >= NEVER), FIRST + sure, value)
             better = value > worst
             worst = np.where(better, value, worst)
             chosen[better] = (at + shift)[better]

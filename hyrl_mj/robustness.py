@@ -185,7 +185,7 @@ class Game:
 
     def worst_noise(self, name: str, eps: float) -> WorstNoise:
         """The adversary's noise, to simulate with."""
-        return WorstNoise(self.answers[name], self.bound(eps), self.value(name, eps))
+        return WorstNoise(self.answers[name], self.bound(eps))
 
 
 def _share(won: np.ndarray) -> float:
