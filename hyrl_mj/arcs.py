@@ -123,7 +123,7 @@ def replay_shows(
             raise BadInput(
                 "the latest simulation has its noise: give --noise and --eps to simulate"
             )
-        latest = {who: [HybridArc.load(run.latest_path(who))] for who in ("policy", "hyrl")}
+        latest = {who: [run.arc(run.latest_path(who))] for who in ("policy", "hyrl")}
         return [Show(latest["policy"], latest["hyrl"])]
     anew = noise is not None or eps is not None
     arcs = replay_arcs(run, noise or "alternating", eps) if anew else run.arcs()

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from safetensors.numpy import load_file, save
 
-from hyrl_mj.errors import BadArtifact
+from hyrl_mj.errors import BadArtifact, BadInput
 
 # Raised whenever a file of an older version can no longer be read.
 VERSION = 1
@@ -19,14 +19,27 @@ VERSION = 1
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a temporary path beside `path`; rename it to `path` when the block ends well."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Give a temporary path beside `path`; rename it to `path` when the block ends well.
+
+    Raises:
+        BadInput: it cannot be written.
+    """
     temporary = path.with_name(f".{path.stem}.partial{path.suffix}")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.touch()
         yield temporary
         temporary.replace(path)
+    except BrokenPipeError:  # a program that writes it has died
+        raise
+    except OSError as error:
+        raise BadInput(
+            f"{path} cannot be written ({error.strerror or error}): give a place that can be written "
+            "and has room"
+        ) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 @contextmanager

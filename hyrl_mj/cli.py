@@ -16,7 +16,6 @@ from hyrl_mj.errors import BadInput, HyrlError, unknown
 from hyrl_mj.lattice import Lattice
 from hyrl_mj.noise import KINDS
 from hyrl_mj.replay import render_replay
-from hyrl_mj.simulation import HybridArc
 from hyrl_mj.summary import print_robustness, print_summary
 from hyrl_mj.tasks.base import get_task, task_names
 
@@ -184,7 +183,7 @@ def replay(
         eps: bound of the noise in chart units; by default the run's.
         layout: side-by-side, or overlay (both in one scene).
         camera: a camera of the MJCF: overhead, chase or three_quarter.
-        size: width x height of the video in pixels.
+        size: width x height of the video in pixels, even numbers, at least 480x160 side by side.
         fps: frames per second.
         slow_motion: how many times slower the video is around jumps.
     """
@@ -222,13 +221,13 @@ def view(run_dir: RunDir, arc: str = "critical_hyrl_q0", port: int = 0) -> None:
     paths = {path.stem: path for path in sorted((run.path / "arcs").glob("*.npz"))}
     if arc not in paths:
         raise unknown("arc", arc, paths)
-    view(run.task, HybridArc.load(paths[arc]), port)
+    view(run.task, run.arc(paths[arc]), port)
 
 
 def parse_size(text: str) -> tuple[int, int]:
     """Width and height [pixels] from a text like 640x480."""
     parts = text.lower().split("x")
-    if len(parts) != 2 or not all(p.isdecimal() for p in parts) or not all(map(int, parts)):
+    if len(parts) != 2 or not all(p.isdecimal() for p in parts):
         raise BadInput(f"size {text!r} cannot be used: give WIDTHxHEIGHT in pixels, as 640x480")
     return int(parts[0]), int(parts[1])
 

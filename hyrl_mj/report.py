@@ -97,13 +97,8 @@ def write_report(run: Run, path: Path) -> None:
     if path.suffix != ".html":
         raise BadInput(f"a report is an html, {path} is not: give a name that ends in .html")
     page = render(run)
-    try:
-        with artifacts.replacing(path) as temporary:
-            temporary.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise BadInput(
-            f"{path} cannot be written ({error.strerror}): choose another --out"
-        ) from error
+    with artifacts.replacing(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
 
 
 def render(run: Run) -> str:

@@ -94,7 +94,21 @@ class Run:
 
     def arcs(self) -> dict[tuple[str, str], HybridArc]:
         """The replays by start ("start0", ..., "critical") and controller ("policy", "hyrl_q0", ...)."""
-        return {key: HybridArc.load(path) for key, path in self.arc_paths().items()}
+        return {key: self.arc(path) for key, path in self.arc_paths().items()}
+
+    def arc(self, path: Path) -> HybridArc:
+        """An arc of this run's task.
+
+        Raises:
+            BadArtifact: it is of another task, or damaged.
+        """
+        found = HybridArc.load(path)
+        if found.task != self.settings.task:
+            raise BadArtifact(
+                f"{path} is an arc of {found.task}, {self.path} a run of {self.settings.task}: "
+                "simulate it again"
+            )
+        return found
 
     def latest_path(self, controller: str) -> Path:
         """The file of the latest simulation from a start of the user's."""

@@ -85,7 +85,7 @@ def replay_table(run: Run, arcs: Arcs) -> Table:
 
 def _ending(task: Task, arc: HybridArc) -> Ending:
     end, success = _point(task.chart.wrap(arc.z[-1:])[0]), arc.arrives(task)
-    outcome = arc.outcome.replace("_", " ")
+    outcome = arc.outcome.replace("_", " ") if success or arc.outcome != "reached" else "missed"
     return Ending(outcome, float(arc.t[-1]), int(arc.j[-1]), end, success)
 
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from planted import decisions, halves, ideal_controller, sign_policy
 
-from hyrl_mj import BadInput
+from hyrl_mj import BadArtifact, BadInput, Run
 from hyrl_mj.arcs import noisy_arcs, replay_arcs, replay_shows, replay_starts
+from hyrl_mj.settings import preset
 
 
 @pytest.fixture(scope="module")
@@ -86,3 +87,12 @@ def test_shows_are_one_for_each_mode_or_all_of_the_paper_s_at_once(run):
 def test_what_cannot_be_shown(run, arguments, message):
     with pytest.raises(BadInput, match=message):
         replay_shows(run, *arguments)
+
+
+def test_an_arc_of_another_task_is_refused(run, circle, tmp_path):
+    (arc,) = noisy_arcs(run, np.array([[0.0, 0.3]]), "none")["policy"]
+    arc.save(tmp_path / "mine.npz")
+    with pytest.raises(
+        BadArtifact, match=r"mine.npz is an arc of vehicle, .* a run of unit_circle"
+    ):
+        Run(tmp_path, preset(circle, "smoke")).arc(tmp_path / "mine.npz")

@@ -288,7 +288,10 @@ def test_bad_input_before_anything_is_made(arguments, parts, tmp_path, monkeypat
         (["view", "--arc", "mine"], ["'mine'", "critical_hyrl_q0"]),
         (["view", "--port", "70000"], ["port 70000"]),
         (["report", "--out", "page.pdf"], ["page.pdf", ".html"]),
-        (["report", "--out", "/dev/null/page.html"], ["/dev/null/page.html", "choose another"]),
+        (
+            ["report", "--out", "/dev/null/page.html"],
+            ["/dev/null/page.html", "a place that can be written"],
+        ),
         (["simulate", "--start", "1", "--seed", "-1"], ["seed -1", "from 0 to"]),
         (["simulate", "--start", "1", "--horizon", "1e12"], ["horizon 1e+12", "3600"]),
         (["replay", "--size", "big"], ["'big'", "640x480"]),

@@ -16,11 +16,13 @@ from planted import (
 from hyrl_mj import (
     BadArtifact,
     BadInput,
+    Noise,
     artifacts,
     robustness,
     simulate,
 )
 from hyrl_mj.controllers import PolicyController
+from hyrl_mj.game import NEVER
 from hyrl_mj.robustness import (
     BEATEN,
     LIMIT,
@@ -204,6 +206,33 @@ def test_a_start_between_the_nodes_is_led_into_the_pillar_too(vehicle, on_vehicl
     assert {arc.outcome for arc in simulate(vehicle, controllers["sign"], z0)} == {"reached"}
     arcs = simulate(vehicle, controllers["sign"], z0, noise=signal)
     assert {arc.outcome for arc in arcs} == {"crashed"}
+
+
+def test_no_milder_noise_crashes_what_the_worst_does_not(vehicle, on_vehicle):
+    """Rounding errors of the plant do not let a run escape, although the rule is torn on the axis."""
+    game, controllers = on_vehicle
+    x, y = np.meshgrid(np.arange(0, 0.31, 0.05), np.linspace(-0.0875, 0.0875, 8))
+    z0 = np.stack([x.ravel(), y.ravel()], axis=-1)
+    signals = [
+        Noise("alternating", 0.1),
+        Noise("adversarial", 0.1),
+        worst_signal(game, "sign", controllers["sign"], z0, 0.1),
+    ]
+    *milder, worst = (
+        [arc.outcome == "crashed" for arc in simulate(vehicle, controllers["sign"], z0, noise=s)]
+        for s in signals
+    )
+    assert not (np.any(milder, axis=0) & ~np.array(worst)).any()
+    lost = game.value("sign", 0.1)[-1][game.lattice.grid.nearest(z0)] > NEVER
+    np.testing.assert_array_equal(worst, lost)
+
+
+def test_an_answer_is_firm_unless_it_changes_right_beside_the_node(on_vehicle):
+    answers = on_vehicle[0].answers["sign"]
+    y = on_vehicle[0].lattice.grid.spacing[1] * np.arange(-answers.pad[1], answers.firm.shape[2])
+    torn = np.unique(np.nonzero(~answers.firm)[2])
+    # Where the sides part, and where the pillar is passed and it goes straight on.
+    assert set(np.round(y[torn] - 1.5, 4)) == {-0.9, 0.0, 0.9}
 
 
 # ---- the whole examination
