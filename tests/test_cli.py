@@ -171,23 +171,29 @@ def test_a_video_that_cannot_be_written_leaves_nothing(copied):
 
 @pytest.mark.skipif(has_display(), reason="a window would open")
 def test_the_web_viewer_is_for_this_machine_only(finished):
-    command = [sys.executable, "-m", "hyrl_mj.cli", "view", str(finished[0])]
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as child:
-        try:
-            said = child.stdout.readline()
-            address = re.search(r"http://127.0.0.1:(\d+)/", said)
-            assert address, said
-            with urllib.request.urlopen(address[0], timeout=20) as page:
-                assert "<html" in page.read().decode().lower()
-            # Who listens to the whole network is found at every address of this machine.
-            with pytest.raises(ConnectionRefusedError):
-                socket.create_connection(("127.0.0.2", int(address[1])), timeout=5)
-        finally:
-            child.send_signal(signal.SIGINT)
-        assert child.wait(timeout=20) == 130
-        assert "Traceback" not in child.stderr.read()
+    child = subprocess.Popen(
+        [sys.executable, "-m", "hyrl_mj.cli", "view", str(finished[0])],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # Who runs in the background is deaf to Ctrl+C, and so would be its children.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    try:
+        said = child.stdout.readline()
+        address = re.search(r"http://127.0.0.1:(\d+)/", said)
+        assert address, said
+        with urllib.request.urlopen(address[0], timeout=20) as page:
+            assert "<html" in page.read().decode().lower()
+        # Who listens to the whole network is found at every address of this machine.
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(("127.0.0.2", int(address[1])), timeout=5)
+        child.send_signal(signal.SIGINT)
+        _, complaints = child.communicate(timeout=30)
+    finally:
+        child.kill()
+    assert child.returncode == 130
+    assert "Traceback" not in complaints
 
 
 def test_simulate_prints_both_ends(finished):
