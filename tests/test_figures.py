@@ -16,7 +16,7 @@ from matplotlib.path import Path as Outline
 from planted import Cube, decisions, halves, plane_policy
 
 import hyrl_mj
-from hyrl_mj import HybridController, Outcome, figures, simulate
+from hyrl_mj import BadInput, HybridController, Outcome, figures, simulate
 from hyrl_mj.figures import charts, paths, style
 from hyrl_mj.sets import Everything
 
@@ -166,7 +166,7 @@ def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch, fails):
             raise OSError("no space left on device")
 
     monkeypatch.setattr(Figure, "savefig", savefig)
-    with pytest.raises(OSError, match="no space"):
+    with pytest.raises(BadInput, match=r"cannot be written \(no space"):
         draw_runs(CIRCLE, tmp_path / "runs.png")
     assert len(written) == fails
     assert list(tmp_path.iterdir()) == []
