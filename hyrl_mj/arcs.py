@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hyrl_mj.controllers import Controller, PolicyController
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.noise import KINDS, Noise
 from hyrl_mj.replay import Floor, Show
@@ -60,14 +59,10 @@ def noisy_arcs(
         raise unknown("noise", noise, NOISES)
     task = run.task
     bound = task.check_noise(run.settings.noise if eps is None else eps)
-    loops: dict[str, Controller] = {
-        "policy": PolicyController(run.policy),
-        "hyrl": run.controller,
-    }
     steps = None if horizon is None else samples(task, horizon)
-    game = Game(task, run.partition, loops, max(bound, LARGEST)) if noise == WORST else None
+    game = Game(task, run.partition, run.loops, max(bound, LARGEST)) if noise == WORST else None
     found = {}
-    for name, loop in loops.items():
+    for name, loop in run.loops.items():
         for q0 in q0s if name == "hyrl" else (None,):
             signal: AnyNoise = (
                 worst_signal(game, name, loop, z0, bound, q0, steps)

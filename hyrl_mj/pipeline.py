@@ -12,7 +12,6 @@ from threadpoolctl import threadpool_limits
 
 from hyrl_mj import artifacts
 from hyrl_mj.arcs import replay_arcs, replay_floor, replay_shows
-from hyrl_mj.controllers import Controller, PolicyController
 from hyrl_mj.critical_set import find_critical_set
 from hyrl_mj.episodes import episodes
 from hyrl_mj.errors import BadArtifact, BadInput, NoRenderer, unknown
@@ -21,6 +20,7 @@ from hyrl_mj.lattice import Lattice
 from hyrl_mj.noise import KINDS, Noise
 from hyrl_mj.partition import make_partition
 from hyrl_mj.policies import MlpPolicy
+from hyrl_mj.replay import render_replay
 from hyrl_mj.robustness import (
     BEATEN,
     WON,
@@ -153,8 +153,6 @@ def figure_paths(run: Run) -> list[Path]:
 
 def replay_stage(run: Run, say: Say) -> None:
     """Render the replay of the start on M*; without GL or ffmpeg say why, and go on."""
-    from hyrl_mj.replay import render_replay
-
     try:
         render_replay(run.task, replay_shows(run), run.path / "replay.mp4", floor=replay_floor(run))
         say(f"video at {run.path / 'replay.mp4'}")
@@ -308,10 +306,7 @@ def examine_run(
     if count is not None and count < 1:
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
     noises = tuple(Noise(kind, eps, everywhere) for kind in kinds or KINDS[1:])
-    loops: dict[str, Controller] = {
-        "policy": PolicyController(run.policy),
-        "hyrl": run.controller,
-    }
+    loops = run.loops
     content: dict[str, Any] = {"eps": eps, "everywhere": everywhere, "game": None}
     content |= {"episodes": [], "seed": seed}
     winnable = None

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hyrl_mj import artifacts, robustness
+from hyrl_mj.controllers import Controller, PolicyController
 from hyrl_mj.critical_set import CriticalSet
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.extended_sets import ExtendedSets
@@ -71,6 +72,11 @@ class Run:
         return HybridController(
             self.task, policies, dict(zip(extended.modes, extended.sets, strict=True))
         )
+
+    @cached_property
+    def loops(self) -> dict[str, Controller]:
+        """What is examined: the policy alone, and the hybrid controller."""
+        return {"policy": PolicyController(self.policy), "hyrl": self.controller}
 
     @cached_property
     def robustness(self) -> dict[str, Any]:

@@ -8,17 +8,19 @@ from planted import decisions, halves, ideal_controller, sign_policy
 
 from hyrl_mj import BadArtifact, BadInput, Run
 from hyrl_mj.arcs import noisy_arcs, replay_arcs, replay_shows, replay_starts
+from hyrl_mj.controllers import PolicyController
 from hyrl_mj.settings import preset
 
 
 @pytest.fixture(scope="module")
 def run(vehicle):
     """A run of the vehicle with planted controllers, as far as arcs are concerned."""
+    policy, controller = sign_policy(vehicle), ideal_controller(vehicle, clear=1.004)
     return SimpleNamespace(
         task=vehicle,
         settings=SimpleNamespace(noise=0.1, seed=0),
-        policy=sign_policy(vehicle),
-        controller=ideal_controller(vehicle, clear=1.004),
+        controller=controller,
+        loops={"policy": PolicyController(policy), "hyrl": controller},
         critical_set=decisions(vehicle),
         partition=halves(vehicle),
         extended_sets=SimpleNamespace(modes=(0, 1)),
