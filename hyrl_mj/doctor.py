@@ -49,7 +49,7 @@ try:
     while perf_counter() < began + 0.5:
         renderer.draw()
         frames += 1
-    print(f"{renderer.device}, {frames / (perf_counter() - began):.0f} full frames/s at 640 x 480")
+    print(f"{renderer.canvas.device}, {frames / (perf_counter() - began):.0f} full frames/s at 640 x 480")
     renderer.close()
 except HyrlError as error:
     raise SystemExit(str(error))

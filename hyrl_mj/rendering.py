@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from copy import copy
 from itertools import pairwise
@@ -32,38 +33,32 @@ ENCODERS: dict[str, dict[str, Any]] = {
     ".gif": {"codec": "gif"},
 }
 GEOMS = 2_000  # that a scene has room for, by default
+# A geom that is a label without a text is not drawn.
+HIDDEN = mujoco.mjtGeom.mjGEOM_LABEL
 
 # Left, top, right and bottom of a part of a picture [pixels], the last two excluded.
 Box = tuple[int, int, int, int]
 
 
-class SceneRenderer:
-    """Draws states of one model from its named cameras.
-
-    A camera's field of view is that of the picture's shorter side: what a square picture shows is seen
-    in one of any shape.
+class Canvas:
+    """A GL context off the screen, for pictures of one model. It belongs to the thread that made it.
 
     Args:
         model: the compiled model.
-        width, height: of the picture [pixels].
-        geoms: how many the scene has room for.
+        width, height: of the largest picture [pixels].
 
     Raises:
         BadInput: a size that no picture can have.
         NoRenderer: there is no GL library; the message says which to install.
     """
 
-    def __init__(self, model: mujoco.MjModel, width: int, height: int, geoms: int = GEOMS):
+    def __init__(self, model: mujoco.MjModel, width: int, height: int):
         check_size(width, height)
         # Compiled models are shared, and the size of the buffer is one of their settings.
         self.model = copy(model)
         # Half a picture at twice the size may be a pixel larger.
         shape = self.model.vis.global_
         shape.offwidth, shape.offheight = width + 1, height + 1
-        self.width, self.height = width, height
-        self.data = mujoco.MjData(self.model)
-        self.scene = mujoco.MjvScene(self.model, maxgeom=geoms)
-        self._options, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
         self._gl: Any = None
         try:
             self._gl = _gl_context(width + 1, height + 1)
@@ -84,6 +79,60 @@ class SceneRenderer:
         self._gl.make_current()
         return str(GL.glGetString(GL.GL_RENDERER).decode())
 
+    def draw(self, scene: mujoco.MjvScene, width: int, height: int) -> np.ndarray:
+        """The scene as its camera sees it: (height, width, 3) uint8."""
+        part = mujoco.MjrRect(0, 0, width, height)
+        pixels = np.empty((height, width, 3), dtype=np.uint8)
+        try:
+            self._gl.make_current()
+            mujoco.mjr_render(part, scene, self._context)
+            mujoco.mjr_readPixels(pixels, None, part, self._context)
+        except mujoco.FatalError as error:
+            raise _no_gl(error) from error
+        return pixels[::-1]  # GL counts rows from below
+
+    def close(self) -> None:
+        """Give the GL context back."""
+        self._gl.make_current()
+        self._context.free()
+        self._gl.free()
+
+
+class SceneRenderer:
+    """Draws states of one model from its named cameras.
+
+    A camera's field of view is that of the picture's shorter side: what a square picture shows is seen
+    in one of any shape.
+
+    Args:
+        model: the compiled model.
+        width, height: of the picture [pixels].
+        geoms: how many the scene has room for.
+        canvas: to draw on, of this model and no smaller; its own without one. A GL context takes a tenth
+            of a second.
+
+    Raises:
+        BadInput: a size that no picture can have.
+        NoRenderer: there is no GL library; the message says which to install.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        width: int,
+        height: int,
+        geoms: int = GEOMS,
+        canvas: Canvas | None = None,
+    ):
+        self._own, self.canvas = canvas is None, canvas or Canvas(model, width, height)
+        self.model, self.width, self.height = model, width, height
+        self.data = mujoco.MjData(self.model)
+        self.scene = mujoco.MjvScene(self.model, maxgeom=geoms)
+        self._options, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
+        # Of the geoms that stay: their kinds, balls around them, and which are not hidden.
+        self._kinds: list[int] = []
+        self._balls, self._shown = np.empty((0, 4)), np.empty(0, dtype=bool)
+
     def place(self, qpos: np.ndarray, camera: str) -> None:
         """Put the robot into a position (nq,) and look at it from a camera."""
         self.clear()
@@ -97,6 +146,29 @@ class SceneRenderer:
         mujoco.mjv_updateScene(
             self.model, self.data, self._options, None, self._camera, static, self.scene
         )
+        self._kinds, self._balls, self._shown = [], self._balls[:0], self._shown[:0]
+        self.keep()
+
+    def keep(self) -> None:
+        """Let what is in the scene now stay there, as it is."""
+        more = self.scene.geoms[len(self._kinds) : self.scene.ngeom]
+        if more:
+            self._kinds += [geom.type for geom in more]
+            balls = [[*geom.pos, self.reach(geom)] for geom in more]
+            self._balls = np.vstack([self._balls, balls])
+            self._shown = np.append(self._shown, np.ones(len(more), dtype=bool))
+
+    def drop(self) -> None:
+        """Take out of the scene what came after the last `keep`."""
+        self.scene.ngeom = len(self._kinds)
+
+    def reach(self, geom: mujoco.MjvGeom) -> float:
+        """Radius [m] of a ball around a geom of the scene; that of a plane is infinite."""
+        if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
+            return np.inf
+        if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
+            return float(self.model.geom_rbound[geom.objid])
+        return float(np.linalg.norm(geom.size))
 
     def look(self, qpos: np.ndarray, camera: str) -> None:
         """Look from a camera, which may follow the robot in its position (nq,)."""
@@ -148,6 +220,7 @@ class SceneRenderer:
             box: the part, in this renderer's pixels; in the picture it is no larger than `width` x `height`.
             finer: how many pixels of the picture, across, are one of this renderer's.
         """
+        self._hide_outside(box)
         left, top, right, bottom = box
         kept = [
             (v.frustum_center, v.frustum_width, v.frustum_bottom, v.frustum_top)
@@ -158,16 +231,10 @@ class SceneRenderer:
             view.frustum_center = centre - half + x * (left + right) / 2
             view.frustum_width = x * (right - left) / 2
             view.frustum_bottom, view.frustum_top = high - y * bottom, high - y * top
-        part = mujoco.MjrRect(0, 0, finer * (right - left), finer * (bottom - top))
-        pixels = np.empty((part.height, part.width, 3), dtype=np.uint8)
-        try:
-            self._gl.make_current()
-            mujoco.mjr_render(part, self.scene, self._context)
-            mujoco.mjr_readPixels(pixels, None, part, self._context)
-        except mujoco.FatalError as error:
-            raise _no_gl(error) from error
         rows, columns = (slice(finer * a, finer * b) for a, b in ((top, bottom), (left, right)))
-        picture[rows, columns] = pixels[::-1]  # GL counts rows from below
+        picture[rows, columns] = self.canvas.draw(
+            self.scene, finer * (right - left), finer * (bottom - top)
+        )
         for view, values in zip(self.scene.camera, kept, strict=True):
             view.frustum_center, view.frustum_width, view.frustum_bottom, view.frustum_top = values
 
@@ -188,10 +255,20 @@ class SceneRenderer:
         return pixels, scale * shrink
 
     def close(self) -> None:
-        """Give the GL context back."""
-        self._gl.make_current()
-        self._context.free()
-        self._gl.free()
+        """Give the GL context back, if it is its own."""
+        if self._own:
+            self.canvas.close()
+
+    def _hide_outside(self, box: Box) -> None:
+        """Leave out what stays and is not seen in a box: GL takes longer for it than for small boxes."""
+        left, top, right, bottom = box
+        pixels, scale = self.project(self._balls[:, :3])
+        radius = self._balls[:, 3] * scale + 1
+        low, high = pixels - radius[:, None], pixels + radius[:, None]
+        seen = (low < [right, bottom]).all(axis=1) & (high > [left, top]).all(axis=1)
+        for k in np.flatnonzero(seen != self._shown):
+            self.scene.geoms[k].type = self._kinds[k] if seen[k] else HIDDEN
+        self._shown = seen
 
     def _move(self, qpos: np.ndarray) -> None:
         self.data.qpos[:] = qpos
@@ -235,8 +312,18 @@ def video(
             mediapy.VideoWriter(
                 temporary, (height, width), fps=fps, **ENCODERS[path.suffix]
             ) as writer,
+            ThreadPoolExecutor(1) as thread,
         ):
-            yield writer.add_image
+            # One frame goes to the encoder while the next is drawn.
+            sent: Future[None] = thread.submit(lambda: None)
+
+            def add(frame: np.ndarray) -> None:
+                nonlocal sent
+                sent.result()
+                sent = thread.submit(writer.add_image, frame.copy())
+
+            yield add
+            sent.result()
     except (ImportError, OSError, RuntimeError) as error:
         raise NoRenderer(f"{path} cannot be encoded ({_short(error)}): {FFMPEG_CURE}") from error
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from itertools import pairwise
 
 import mujoco
 import numpy as np
@@ -77,8 +78,12 @@ def test_a_part_that_is_drawn_anew_is_that_of_the_whole(task, camera):
     renderer = SceneRenderer(task.model, 320, 240)
     renderer.place(np.array(POSITIONS[task.name]), camera)
     whole, parts = renderer.draw(), np.zeros((240, 320, 3), dtype=np.uint8)
-    for box in ((0, 0, 101, 240), (101, 0, 320, 77), (101, 77, 320, 240)):
-        renderer.redraw(parts, box)
+    hidden = []
+    for left, right in pairwise((0, 43, 101, 160, 230, 320)):
+        for top, bottom in pairwise((0, 50, 77, 160, 240)):
+            renderer.redraw(parts, (left, top, right, bottom))
+            hidden.append((~renderer._shown).sum())
+    assert max(hidden) > 0
     again = renderer.draw()
     renderer.close()
     np.testing.assert_array_equal(whole, again)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+from contextlib import closing
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, HybridArc, HybridController, Noise, NoRenderer
 from hyrl_mj.extended_sets import ExtendedSets
 from hyrl_mj.mjcf import models_dir
+from hyrl_mj.rendering import Canvas
 from hyrl_mj.replay import Show, render_replay
 from hyrl_mj.replay.captions import Group, Layout
 from hyrl_mj.replay.marks import (
@@ -108,11 +110,12 @@ def coarse(picture: np.ndarray) -> np.ndarray:
 
 def drawn(tracks, t, size=(320, 320), camera="overhead", floor=None, before=()):
     """A panel's picture at time t [s], drawn at earlier times before; and where points are in it."""
-    panel, picture = Panel(TASK, tracks, *size, camera, floor), np.zeros((*size[::-1], 3), np.uint8)
-    for moment in (*before, t):
-        panel.draw(moment, picture)
+    picture = np.zeros((*size[::-1], 3), np.uint8)
+    with closing(Canvas(TASK.model, *size)) as canvas:
+        panel = Panel(TASK, tracks, canvas, *size, camera, floor)
+        for moment in (*before, t):
+            panel.draw(moment, picture)
     renderer = panel._renderer
-    panel.close()
     return picture, lambda points: renderer.project(np.atleast_2d(points))[0].round().astype(int)
 
 
@@ -230,13 +233,11 @@ def test_nothing_is_left_where_a_capsule_was(jump):
     track = Track(task, jump)
     pictures = []
     for before in ((), np.arange(0.0, 1.5, 0.3)):
-        panel, picture = (
-            Panel(task, [track], 640, 640, "overhead"),
-            np.zeros((640, 640, 3), np.uint8),
-        )
-        for moment in (*before, 1.53):
-            panel.draw(moment, picture)
-        panel.close()
+        picture = np.zeros((640, 640, 3), np.uint8)
+        with closing(Canvas(task.model, 640, 640)) as canvas:
+            panel = Panel(task, [track], canvas, 640, 640, "overhead")
+            for moment in (*before, 1.53):
+                panel.draw(moment, picture)
         pictures.append(picture.astype(int))
     assert near(pictures[0], (204, 26, 26), 90).sum() > 500
     assert (np.abs(pictures[0] - pictures[1]).max(axis=-1) > 2).sum() <= 20

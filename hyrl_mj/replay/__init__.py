@@ -88,13 +88,14 @@ def render_replay(
     for screen in screens:
         screen.check(size)
     if path.suffix not in ENCODERS:
-        with closing(screens[0].open(size)) as stage:
+        with closing(screens[0].canvas(size)) as canvas:
+            stage = screens[0].open(size, canvas)
             stage.draw(screens[0].end)
             large = stage.fine(FINER)
     else:
         large = _film(screens, path, size, fps, slow_motion)
     with artifacts.replacing(path.with_suffix(".png")) as temporary:
-        Image.fromarray(large).resize(size, Image.Resampling.LANCZOS).save(temporary)
+        Image.fromarray(large).reduce(FINER).save(temporary)
 
 
 def _film(
@@ -105,15 +106,16 @@ def _film(
     done, large = 0, None
     with (
         closing(Progress("rendering", sum(map(len, times)), "frames")) as progress,
+        closing(screens[0].canvas(size)) as canvas,
         video(path, *size, fps) as add,
     ):
         for screen, when in zip(screens, times, strict=True):
-            with closing(screen.open(size)) as stage:
-                for t in when:
-                    add(stage.draw(t))
-                    done += 1
-                    progress.update(done)
-                if large is None:
-                    large = stage.fine(FINER)
+            stage = screen.open(size, canvas)
+            for t in when:
+                add(stage.draw(t))
+                done += 1
+                progress.update(done)
+            if large is None:
+                large = stage.fine(FINER)
     assert large is not None
     return large

@@ -13,7 +13,7 @@ import numpy as np
 from hyrl_mj import mjcf
 from hyrl_mj.colours import RGB
 from hyrl_mj.errors import BadArtifact
-from hyrl_mj.rendering import GEOMS, Box, SceneRenderer
+from hyrl_mj.rendering import GEOMS, Box, Canvas, SceneRenderer
 from hyrl_mj.replay import marks
 from hyrl_mj.replay.marks import Floor, Tracker
 from hyrl_mj.simulation import HybridArc
@@ -124,6 +124,7 @@ class Panel:
     Args:
         task: what the tracks are of.
         tracks: with their robots.
+        canvas: to draw on.
         width, height: of the picture [pixels].
         camera: a camera of the MJCF; one on the robot follows that of the first track.
         floor: what lies on the floor.
@@ -133,6 +134,7 @@ class Panel:
         self,
         task: Task,
         tracks: Sequence[Track],
+        canvas: Canvas,
         width: int,
         height: int,
         camera: str,
@@ -144,14 +146,14 @@ class Panel:
         self._rests = fixed and task.model.cam_bodyid[found] == 0
         # A bar for each row, and what else there is, with room to spare.
         geoms = sum(len(track.arc.t) for track in tracks) + GEOMS * (1 + len(tracks))
-        self._renderer = SceneRenderer(task.model, width, height, geoms)
+        self._renderer = SceneRenderer(task.model, width, height, geoms, canvas)
         self._renderer.clear()
         scene = self._renderer.scene
         if floor:
             floor.draw(scene)
         for track in tracks:
             marks.disc(scene, track.points[0], START_RADIUS, marks.ON_TOP, marks.INK)
-        self._kept = scene.ngeom
+        self._renderer.keep()
         self._drawn = [_Drawn() for _ in tracks]
 
     def draw(self, t: float, picture: np.ndarray) -> None:
@@ -162,9 +164,9 @@ class Panel:
         moved = [now > drawn.t for now, drawn in zip(times, self._drawn, strict=True)]
         if not any(moved):
             return
-        renderer.scene.ngeom = self._kept
+        renderer.drop()
         passed = [self._path(*each) for each in zip(self._tracks, self._drawn, times, strict=True)]
-        self._kept = renderer.scene.ngeom
+        renderer.keep()
         renderer.look(self._tracks[0].qpos(times[0]), self._camera)
         boxes = [self._robot(*each) for each in zip(self._tracks, times, passed, strict=True)]
         if fresh or not self._rests:
@@ -179,10 +181,6 @@ class Panel:
     def fine(self, finer: int) -> np.ndarray:
         """The picture of the last call, `finer` times larger."""
         return self._renderer.draw(finer)
-
-    def close(self) -> None:
-        """Give the GL context back."""
-        self._renderer.close()
 
     def _path(self, track: Track, drawn: _Drawn, t: float) -> np.ndarray:
         """Add to the scene what has been driven to the last sample; its points (k, 3)."""
@@ -247,14 +245,8 @@ class Panel:
                 )
         geoms = scene.geoms[first : scene.ngeom]
         points = np.vstack([passed, *[geom.pos for geom in geoms]])
-        radii = [self._radius(geom) for geom in geoms]
+        radii = [renderer.reach(geom) for geom in geoms]
         return self._box(points, np.array([JUMP_RADIUS] * len(passed) + radii))
-
-    def _radius(self, geom: mujoco.MjvGeom) -> float:
-        """Of a ball around a geom [m]."""
-        if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
-            return float(self._renderer.model.geom_rbound[geom.objid])
-        return float(np.linalg.norm(geom.size))
 
     def _box(self, points: np.ndarray, radii: np.ndarray) -> Box:
         """The part of the picture in which balls around points (n, 3) are seen."""

@@ -1,15 +1,14 @@
-"""What is seen at a time: panels side by side or one for all, each drawn in a thread of its own."""
+"""What is seen at a time: panels side by side or one for all, drawn on one canvas."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, closing
+from dataclasses import dataclass
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.rendering import LARGEST
+from hyrl_mj.rendering import LARGEST, Canvas
 from hyrl_mj.replay.captions import Group, Layout
 from hyrl_mj.replay.marks import Floor
 from hyrl_mj.replay.panel import Panel, Track
@@ -77,96 +76,68 @@ class Screen:
                 f"{least[0]} x {least[1]} to {LARGEST} x {LARGEST}"
             )
 
-    def open(self, size: tuple[int, int]) -> Stage:
+    def canvas(self, size: tuple[int, int]) -> Canvas:
+        """What it can be drawn on, in so many pixels. Close it in the end."""
+        layout = self._layout(size)
+        return Canvas(self._task.model, layout.width, layout.scene_height)
+
+    def open(self, size: tuple[int, int], canvas: Canvas) -> Stage:
         """Get ready to draw it, in so many pixels."""
-        return Stage(self._task, self._panels, self._camera, self._floor, size)
+        layout, frame = self._layout(size), np.empty((size[1], size[0], 3), dtype=np.uint8)
+        parts = np.split(frame, len(self._panels), axis=1)
+        views = []
+        for part, (title, groups) in zip(parts, self._panels, strict=True):
+            tracks = [track for group in groups for track in group.tracks]
+            at = (layout.width, layout.scene_height, self._camera, self._floor)
+            views.append(_View(part, layout, title, groups, Panel(self._task, tracks, canvas, *at)))
+        return Stage(frame, views)
+
+    def _layout(self, size: tuple[int, int]) -> Layout:
+        return Layout(size[0] // len(self._panels), size[1])
 
 
+@dataclass(frozen=True)
 class Stage:
-    """A screen that is being drawn, at times that never go back. Close it in the end.
+    """A screen that is being drawn, at times that never go back."""
 
-    Args:
-        task, panels, camera, floor: as in `Screen`.
-        size: width and height [pixels].
-    """
-
-    def __init__(
-        self,
-        task: Task,
-        panels: Sequence[tuple[str, Sequence[Group]]],
-        camera: str,
-        floor: Floor | None,
-        size: tuple[int, int],
-    ):
-        self._frame = np.empty((size[1], size[0], 3), dtype=np.uint8)
-        parts = np.array_split(self._frame, len(panels), axis=1)
-        self._views: list[_View] = []
-        with ExitStack() as stack:
-            for part, (title, groups) in zip(parts, panels, strict=True):
-                view = _View(task, part, title, groups, camera, floor)
-                self._views.append(stack.enter_context(closing(view)))
-            self._open = stack.pop_all()
+    _frame: np.ndarray
+    _views: Sequence[_View]
 
     def draw(self, t: float) -> np.ndarray:
         """The frame (height, width, 3) at time t [s], valid until the next."""
-        for ready in [view.draw(t) for view in self._views]:
-            ready.result()
+        for view in self._views:
+            view.draw(t)
         return self._frame
 
     def fine(self, finer: int) -> np.ndarray:
         """The frame that was drawn last, `finer` times larger."""
-        return np.hstack([ready.result() for ready in [v.fine(finer) for v in self._views]])
-
-    def close(self) -> None:
-        """Give the GL contexts back."""
-        self._open.close()
+        return np.hstack([view.fine(finer) for view in self._views])
 
 
 class _View:
-    """A panel with its captions, drawn into its part of the frame (height, width, 3).
-
-    In a thread of its own: a GL context belongs to one, and panels are drawn at the same time.
-    """
+    """A panel with its captions, drawn into its part of the frame (height, width, 3)."""
 
     def __init__(
-        self,
-        task: Task,
-        part: np.ndarray,
-        title: str,
-        groups: Sequence[Group],
-        camera: str,
-        floor: Floor | None,
+        self, part: np.ndarray, layout: Layout, title: str, groups: Sequence[Group], panel: Panel
     ):
-        tracks = [track for group in groups for track in group.tracks]
-        self._layout = layout = Layout(part.shape[1], part.shape[0])
-        self._title, self._groups, self._part, self._t = title, groups, part, 0.0
-        part[: layout.bar] = layout.above(title, tracks[0].arc)
-        self._thread = ThreadPoolExecutor(1)
-        size = layout.width, layout.scene_height
-        self._panel = self._thread.submit(Panel, task, tracks, *size, camera, floor)
+        self._part, self._layout, self._panel = part, layout, panel
+        self._title, self._groups, self._t = title, groups, -1.0
+        part[: layout.bar] = self._above(layout)
 
-    def draw(self, t: float) -> Future[None]:
-        """Start to draw the panel at time t [s]."""
-        return self._thread.submit(self._draw, t)
-
-    def fine(self, finer: int) -> Future[np.ndarray]:
-        """Start to draw it again, `finer` times larger."""
-        return self._thread.submit(self._fine, finer)
-
-    def close(self) -> None:
-        """Give the GL context back, in the thread that has it."""
-        with self._thread:
-            if self._panel.exception() is None:
-                self._thread.submit(self._panel.result().close).result()
-
-    def _draw(self, t: float) -> None:
+    def draw(self, t: float) -> None:
+        """Bring it to time t [s]."""
+        if t == self._t:
+            return
         bar = self._layout.bar
-        self._panel.result().draw(t, self._part[bar:-bar])
+        self._panel.draw(t, self._part[bar:-bar])
         self._part[-bar:] = self._layout.below(self._groups, t)
         self._t = t
 
-    def _fine(self, finer: int) -> np.ndarray:
+    def fine(self, finer: int) -> np.ndarray:
+        """It as it was drawn last, `finer` times larger."""
         layout = Layout(finer * self._layout.width, finer * self._layout.height, finer)
-        above = layout.above(self._title, self._groups[0].tracks[0].arc)
-        scene = self._panel.result().fine(finer)
-        return np.vstack([above, scene, layout.below(self._groups, self._t)])
+        scene = self._panel.fine(finer)
+        return np.vstack([self._above(layout), scene, layout.below(self._groups, self._t)])
+
+    def _above(self, layout: Layout) -> np.ndarray:
+        return layout.above(self._title, self._groups[0].tracks[0].arc)
