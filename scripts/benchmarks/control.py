@@ -1,0 +1,64 @@
+"""What a controller costs at run time, and what the package costs before it does anything."""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from benchmarks import Figure
+from benchmarks.runs import Runs, child
+from hyrl_mj import Run
+from hyrl_mj.training import build
+
+MANY, REPEATS = 100_000, 2_000
+
+
+def figures(runs: Runs) -> Iterator[Figure]:
+    """One state, many states; import and help."""
+    for name in ("vehicle", "unit_circle"):
+        run = runs.load(name)
+        against = "SB3's predict on one observation"
+        target = ">= 2x, <= 40 us"
+        one, other = _step(run, 1, REPEATS), _predict(run)
+        yield Figure(f"controller.step, {name}, one state", "us", against, target, one, other)
+        many = _step(run, MANY, 1)
+        yield Figure(f"controller.step, {name}, {MANY:,} states", "ms", "", "<= 100 ms", many)
+    ours, other = _python("import hyrl_mj"), _python("import mujoco, gymnasium")
+    target = "<= 1.3x the time, ratio >= 0.77"
+    yield Figure("import hyrl_mj", "s", "import mujoco, gymnasium", target, ours, other, least=0.0)
+    show = _python("from hyrl_mj.cli import main; main()", "--help")
+    yield Figure("hyrl-mj --help", "s", "", "<= 0.5 s", show, least=0.0)
+
+
+def _step(run: Run, n: int, repeats: int) -> Callable[[], int]:
+    task, controller, rng = run.task, run.controller, np.random.default_rng(0)
+    z = rng.uniform(task.chart.low, task.chart.high, (n, task.chart.dimension))
+    plant = task.plant(n)
+    plant.set_state(task.qpos(z))
+    measured, q = plant.measurement, rng.choice(controller.modes, n)
+
+    def work() -> int:
+        for _ in range(repeats):
+            controller.step(q, measured)
+        return repeats
+
+    return work
+
+
+def _predict(run: Run) -> Callable[[], int]:
+    model = build(run.task, run.settings.stage1, 0, start_from=run.policy)
+    observation = model.observation_space.sample()
+
+    def work() -> int:
+        for _ in range(REPEATS):
+            model.predict(observation, deterministic=True)
+        return REPEATS
+
+    return work
+
+
+def _python(code: str, *arguments: str) -> Callable[[], int]:
+    def work() -> int:
+        child(["-c", code, *arguments])
+        return 1
+
+    return work

@@ -1,0 +1,96 @@
+"""How time and memory grow with the number of simulations, rods and episodes.
+
+Each size runs in a process of its own, so that its peak memory is its own:
+
+    python scripts/benchmarks/growth.py simulations 4096
+"""
+
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+SIZES = {
+    "simulations": (1, 16, 256, 4_096, 65_536),
+    "rods": (10, 20, 40, 80, 160),
+    "episodes": (10_000, 30_000, 100_000, 300_000),
+}
+LABELS = {
+    "simulations": "simulations side by side, 100 samples",
+    "rods": "rods of the first level",
+    "episodes": "robustness episodes",
+}
+
+
+def measure(kind: str, size: int, run: Path) -> tuple[float, float]:
+    """Seconds and peak memory [MB] of one size, in this process."""
+    import hyrl_mj
+
+    task = hyrl_mj.get_task("vehicle")
+    if kind == "simulations":
+        from hyrl_mj.envs.core import BatchedEnv
+
+        env = BatchedEnv(task, size)
+        env.seed(0)
+        env.reset()
+        u = np.zeros((size, 1))
+        began = time.perf_counter()
+        for _ in range(100):
+            done = np.flatnonzero(env.step(u).done)
+            if len(done):
+                env.reset(done)
+    elif kind == "rods":
+        policy = hyrl_mj.load_run(run).policy
+        began = time.perf_counter()
+        hyrl_mj.find_critical_set(task, policy, size, 1 / 32)
+    else:
+        from hyrl_mj.episodes import episodes
+        from hyrl_mj.noise import Noise
+
+        found = hyrl_mj.load_run(run)
+        began = time.perf_counter()
+        loops = {"HyRL": found.controller}
+        episodes(task, loops, found.critical_set, [Noise("uniform", 0.1)], size)
+    took = time.perf_counter() - began
+    return took, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def plot(run: Path, path: Path) -> None:
+    """Measure all sizes, and draw them."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(2, len(SIZES), figsize=(11, 6), sharex="col", layout="constrained")
+    for column, (kind, sizes) in enumerate(SIZES.items()):
+        found = np.array([_child(kind, size, run) for size in sizes])
+        work = np.square(sizes) * 2 if kind == "rods" else np.array(sizes)
+        for row, (label, values) in enumerate(
+            zip(("time [s]", "memory [MB]"), found.T, strict=True)
+        ):
+            axis = axes[row, column]
+            axis.loglog(work, values, "o-", label="measured")
+            if row == 0:
+                line = values[-1] * work / work[-1]
+                axis.loglog(work, line, "--", color="0.6", label="linear")
+                axis.legend()
+            axis.set_ylabel(label)
+            axis.grid(alpha=0.3)
+        axes[1, column].set_ylim(100, 10_000)
+        axes[1, column].set_xlabel(LABELS[kind])
+    figure.savefig(path, dpi=120)
+
+
+def _child(kind: str, size: int, run: Path) -> tuple[float, ...]:
+    print(f"growth: {size} {kind} ...", file=sys.stderr, flush=True)
+    command = [sys.executable, __file__, kind, str(size), str(run)]
+    answer = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    return tuple(map(float, answer.split()))
+
+
+if __name__ == "__main__":
+    print(*measure(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3])))

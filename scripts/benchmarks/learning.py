@@ -1,0 +1,100 @@
+"""Stage 1 until the policy is good, against SB3 on one environment with the paper's settings."""
+
+from collections.abc import Callable, Iterator
+from itertools import count
+
+import gymnasium
+from quality import circle_return, vehicle_share
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+
+import hyrl_mj
+from benchmarks import Figure
+from benchmarks.runs import Runs
+from hyrl_mj.policies import MlpPolicy
+from hyrl_mj.settings import preset
+from hyrl_mj.tasks.base import Task
+from hyrl_mj.training import ALGORITHMS, Score, export, single_threaded, train
+
+# How good a policy has to be: the mean return from pi +- 0.2 rad; the share of winnable starts passed.
+GOOD: dict[str, tuple[Callable[[Task, MlpPolicy], float], float, str]] = {
+    "unit_circle": (circle_return, -30.5, ">= 15x"),
+    "vehicle": (vehicle_share, 0.995, ">= 3x"),
+}
+# Samples of the single environment between two looks at its policy.
+INTERVAL = 5_000
+
+
+def figures(runs: Runs) -> Iterator[Figure]:
+    """Both problems; every training with a seed of its own."""
+    for name, (quality, enough, target) in GOOD.items():
+        task = hyrl_mj.get_task(name)
+        yield Figure(
+            f"stage 1, {name}, to the paper's quality",
+            "s",
+            "SB3 on one environment, the paper's settings",
+            target,
+            _ours(task, quality, enough),
+            _paper(task, quality, enough),
+            least=0.0,
+            slow=True,
+        )
+
+
+class _Quality:
+    """Judges a policy by its quality, as `train` asks for it."""
+
+    def __init__(self, task: Task, quality: Callable[[Task, MlpPolicy], float], enough: float):
+        self._task, self._quality, self.enough = task, quality, (enough,)
+
+    def __call__(self, policy: MlpPolicy) -> Score:
+        return (self._quality(self._task, policy),)
+
+
+def _ours(task: Task, quality: Callable[[Task, MlpPolicy], float], enough: float):
+    seeds = count()
+
+    def work() -> int:
+        judge = _Quality(task, quality, enough)
+        found = train(task, preset(task).stage1, next(seeds), judge=judge)
+        if judge(found) < judge.enough:
+            raise SystemExit(f"{task.name}: stage 1 did not reach {enough}")
+        return 1
+
+    return work
+
+
+def _paper(task: Task, quality: Callable[[Task, MlpPolicy], float], enough: float):
+    seeds = count()
+
+    def work() -> int:
+        settings = preset(task, "paper").stage1
+        model = ALGORITHMS[settings.algorithm](
+            "MlpPolicy",
+            gymnasium.make(task.env_id),
+            seed=next(seeds),
+            device="cpu",
+            gamma=settings.gamma,
+            learning_rate=settings.learning_rate,
+            policy_kwargs={"net_arch": list(settings.hidden)},
+            **settings.options,
+        )
+        with single_threaded():
+            model.learn(settings.samples, callback=_Until(task, _Quality(task, quality, enough)))
+        return 1
+
+    return work
+
+
+class _Until(BaseCallback):
+    """Ends a training once the policy is good enough."""
+
+    def __init__(self, task: Task, judge: _Quality):
+        super().__init__()
+        self._task, self._judge = task, judge
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps % INTERVAL:
+            return True
+        model: BaseAlgorithm = self.model
+        return self._judge(export(model, self._task)) < self._judge.enough

@@ -1,0 +1,45 @@
+"""The finished runs that the figures are about, made when they are first asked for."""
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import hyrl_mj
+from hyrl_mj import Run
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Where they lie, and the preset that they are made with."""
+
+    folder: Path
+    preset: str
+
+    def path(self, task: str, seed: int = 0) -> Path:
+        """Of a finished run."""
+        path = self.folder / f"{task}_{seed}"
+        if not path.exists():
+            self.make(task, seed, path)
+        return path
+
+    def load(self, task: str) -> Run:
+        """A finished run."""
+        return hyrl_mj.load_run(self.path(task))
+
+    def make(self, task: str, seed: int, path: Path) -> float:
+        """Run the command; its peak memory [MB]."""
+        command = ["-m", "hyrl_mj.cli", "run", task, "--preset", self.preset, "--seed", str(seed)]
+        return child([*command, "--out", str(path)])
+
+
+def child(arguments: list[str]) -> float:
+    """Run Python in a process of its own, without its output; its peak memory [MB]."""
+    process = subprocess.Popen(
+        [sys.executable, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    _, status, usage = os.wait4(process.pid, 0)
+    if status:
+        raise SystemExit(f"python {' '.join(arguments)} failed")
+    return usage.ru_maxrss / 1024

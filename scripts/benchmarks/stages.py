@@ -1,0 +1,135 @@
+"""Critical set and extended sets, against the same starts one at a time."""
+
+from collections.abc import Iterator
+from itertools import product
+from typing import Any
+from unittest import mock
+
+import mujoco
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from benchmarks import Figure
+from benchmarks.runs import Runs
+from hyrl_mj import Run, Task, extend, extended_sets, find_critical_set
+from hyrl_mj.critical_set import PARTING, SAMPLES
+from hyrl_mj.tasks.base import Outcome
+from hyrl_mj.training import build
+
+RODS, RESOLUTION = 30, 1 / 32
+# One start in so many is run one at a time: all of them would take minutes.
+SHARE = 25
+
+
+def figures(runs: Runs) -> Iterator[Figure]:
+    """The search for M*, and the extended sets of both problems."""
+    run = runs.load("vehicle")
+    search = _OneRod(run)
+    yield Figure(
+        f"critical set, vehicle, {RODS} x {RODS} rods, all levels",
+        "ms",
+        "rod by rod, SB3's predict",
+        ">= 50x",
+        lambda: len([find_critical_set(run.task, run.policy, RODS, RESOLUTION)]),
+        search.all,
+    )
+    for name in ("vehicle", "unit_circle"):
+        yield _extension(runs.load(name))
+
+
+def _extension(run: Run) -> Figure:
+    task, settings = run.task, run.settings
+    args = (task, run.policy, run.critical_set, run.partition, settings.noise)
+    calls: list[tuple[Any, np.ndarray, dict[str, Any]]] = []
+    batched = extended_sets.closed_loop
+
+    def noted(task: Task, controller: Any, z0: np.ndarray, **options: Any) -> Any:
+        calls.append((controller.policy, z0, options))
+        return batched(task, controller, z0, **options)
+
+    with mock.patch.object(extended_sets, "closed_loop", noted):
+        extend(*args)
+    starts = sum(len(z0) for _, z0, _ in calls)
+
+    def ours() -> int:
+        extend(*args)
+        return starts
+
+    def plain() -> int:
+        done = 0
+        for policy, z0, options in calls:
+            limit = options.get("steps") or task.max_steps
+            for z in z0[::SHARE]:
+                _one_start(task, policy, z, limit, backward=options.get("backward", False))
+                done += 1
+        return done
+
+    against = "the same policies, one start at a time"
+    return Figure(f"extended sets, {task.name}", "starts/s", against, ">= 50x", ours, plain)
+
+
+def _one_start(task: Task, policy: Any, z: np.ndarray, steps: int, backward: bool) -> np.ndarray:
+    """One closed loop, as a script would write it; the path (k, d)."""
+    model, data = task.model, mujoco.MjData(task.model)
+    if model.nkey:
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+    held = data.ctrl.copy()
+    data.qpos[:] = task.qpos(z[None])[0]
+    mujoco.mj_forward(model, data)
+    path = [data.sensordata.copy()]
+    drives = [model.actuator(name).id for name in task.inputs]
+    for _ in range(steps):
+        u = policy.act(path[-1][None])[0]
+        data.ctrl[:] = held
+        data.ctrl[drives] = u
+        if backward:
+            data.ctrl *= -1
+        mujoco.mj_step(model, data)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_sensorPos(model, data)
+        path.append(data.sensordata.copy())
+        if not backward and task.ending(path[-1][None])[0] != Outcome.RUNNING:
+            break
+    return np.array(path)
+
+
+class _OneRod:
+    """The paper's search (Algorithm 1): rod by rod, its ends one after the other, with SB3's predict."""
+
+    def __init__(self, run: Run):
+        self._task, self._levels = run.task, run.task.input_levels
+        self._model: BaseAlgorithm = build(run.task, run.settings.stage1, 0, start_from=run.policy)
+
+    def act(self, measured: np.ndarray) -> np.ndarray:
+        """As a policy, one measurement (1, p) at a time."""
+        observation = self._task.observation(measured)[0].astype(np.float32)
+        action, _ = self._model.predict(observation, deterministic=True)
+        return self._levels[action][None]
+
+    def all(self) -> int:
+        """Search the whole chart."""
+        chart = self._task.chart
+        sides = np.subtract(chart.high, chart.low)
+        cell = sides.max() / RODS
+        axes = [
+            np.arange(low + cell / 2, high, cell)
+            for low, high in zip(chart.low, chart.high, strict=True)
+        ]
+        found = []
+        for point in product(*axes):
+            for axis in np.eye(len(sides)):
+                self._search(np.array(point), axis, cell, RESOLUTION * cell, found)
+        return 1
+
+    def _search(self, centre, axis, length, least, found) -> None:
+        ends = [centre - axis * length / 2, centre + axis * length / 2]
+        paths = [_one_start(self._task, self, end, SAMPLES, backward=False) for end in ends]
+        moves = [path[-1] - path[0] for path in paths]
+        apart = np.linalg.norm(moves[1] - moves[0])
+        if apart <= PARTING * sum(np.linalg.norm(move) for move in moves):
+            return
+        if length <= least:
+            found.append(centre)
+            return
+        for half in (-0.25, 0.25):
+            self._search(centre + half * length * axis, axis, length / 2, least, found)
