@@ -1,7 +1,7 @@
 """Speed as ratios: two ways of doing the same thing, timed alternately in one run.
 
     python scripts/benchmark.py              # median, least and greatest ratio of 5 pairs each
-    python scripts/benchmark.py --quick      # one pair of what takes seconds, on runs of preset smoke
+    python scripts/benchmark.py --quick      # one pair each of what takes seconds, on runs of preset smoke
     python scripts/benchmark.py --only replay engine --json benchmark.json
     python scripts/benchmark.py --only control --growth growth.png
 
@@ -67,14 +67,16 @@ def table(results: list[Measured]) -> Table:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="in two minutes, to see roughly")
+    parser.add_argument("--quick", action="store_true", help="one pair each, no training")
     parser.add_argument("--only", nargs="+", choices=GROUPS, default=list(GROUPS))
+    parser.add_argument("--runs", type=Path, help="keep the finished runs here, for the next time")
     parser.add_argument("--json", type=Path, help="also write the results here")
     parser.add_argument("--growth", type=Path, help="draw time and memory against size here")
     options = parser.parse_args()
     results = []
     with tempfile.TemporaryDirectory() as folder:
-        runs = Runs(Path(folder), "smoke" if options.quick else "fast")
+        preset = "smoke" if options.quick and not options.runs else "fast"
+        runs = Runs(options.runs or Path(folder), preset)
         for group in options.only:
             for figure in GROUPS[group](runs):
                 if figure.slow and options.quick:

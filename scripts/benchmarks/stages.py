@@ -1,6 +1,7 @@
 """Critical set and extended sets, against the same starts one at a time."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import product
 from typing import Any
 from unittest import mock
@@ -13,6 +14,7 @@ from benchmarks import Figure
 from benchmarks.runs import Runs
 from hyrl_mj import Run, Task, extend, extended_sets, find_critical_set
 from hyrl_mj.critical_set import PARTING, SAMPLES
+from hyrl_mj.partition import PartPolicy
 from hyrl_mj.tasks.base import Outcome
 from hyrl_mj.training import build
 
@@ -50,6 +52,7 @@ def _extension(run: Run) -> Figure:
     with mock.patch.object(extended_sets, "closed_loop", noted):
         extend(*args)
     starts = sum(len(z0) for _, z0, _ in calls)
+    predict = _Predict(run)
 
     def ours() -> int:
         extend(*args)
@@ -57,14 +60,15 @@ def _extension(run: Run) -> Figure:
 
     def plain() -> int:
         done = 0
-        for policy, z0, options in calls:
+        for pi, z0, options in calls:
+            policy = replace(pi, policy=predict) if isinstance(pi, PartPolicy) else predict
             limit = options.get("steps") or task.max_steps
             for z in z0[::SHARE]:
                 _one_start(task, policy, z, limit, backward=options.get("backward", False))
                 done += 1
         return done
 
-    against = "the same policies, one start at a time"
+    against = "start by start, SB3's predict"
     return Figure(f"extended sets, {task.name}", "starts/s", against, ">= 50x", ours, plain)
 
 
@@ -93,18 +97,26 @@ def _one_start(task: Task, policy: Any, z: np.ndarray, steps: int, backward: boo
     return np.array(path)
 
 
-class _OneRod:
-    """The paper's search (Algorithm 1): rod by rod, its ends one after the other, with SB3's predict."""
+class _Predict:
+    """The stage-1 policy by SB3's predict."""
 
     def __init__(self, run: Run):
-        self._task, self._levels = run.task, run.task.input_levels
+        self._task = run.task
         self._model: BaseAlgorithm = build(run.task, run.settings.stage1, 0, start_from=run.policy)
 
     def act(self, measured: np.ndarray) -> np.ndarray:
-        """As a policy, one measurement (1, p) at a time."""
+        """Of one measurement (1, p)."""
         observation = self._task.observation(measured)[0].astype(np.float32)
         action, _ = self._model.predict(observation, deterministic=True)
-        return self._levels[action][None]
+        levels = self._task.input_levels
+        return (action if levels is None else levels[action])[None]
+
+
+class _OneRod:
+    """The paper's search (Algorithm 1): rod by rod, its ends one after the other."""
+
+    def __init__(self, run: Run):
+        self._task, self._predict = run.task, _Predict(run)
 
     def all(self) -> int:
         """Search the whole chart."""
@@ -123,7 +135,9 @@ class _OneRod:
 
     def _search(self, centre, axis, length, least, found) -> None:
         ends = [centre - axis * length / 2, centre + axis * length / 2]
-        paths = [_one_start(self._task, self, end, SAMPLES, backward=False) for end in ends]
+        paths = [
+            _one_start(self._task, self._predict, end, SAMPLES, backward=False) for end in ends
+        ]
         moves = [path[-1] - path[0] for path in paths]
         apart = np.linalg.norm(moves[1] - moves[0])
         if apart <= PARTING * sum(np.linalg.norm(move) for move in moves):
