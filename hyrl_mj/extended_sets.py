@@ -150,13 +150,15 @@ def extend(
         for wins, part in zip(winning, parts, strict=True)
     ]
     # Only M* is to be covered; parts that meet again elsewhere, at the set-point, have nothing to decide.
-    around = distance_to(task, critical, grid.nodes) <= float(np.linalg.norm(2 * eps + hop))
+    off = distance_to(task, critical, grid.nodes)
+    around = off <= float(np.linalg.norm(2 * eps + hop))
+    starts = [grid.nodes[part.mask & (off <= near)] for part in parts]
     reached = list(parts)
     steps = [max(round(horizon / task.dt), 1)] if horizon else range(1, _longest(task) + 1)
     for k in steps if len(parts) > 1 else ():
         reached = [
-            part | backward_reach(task, pi, critical, part, near, k)
-            for pi, part in zip(pis, parts, strict=True)
+            part | backward_reach(task, pi, part, nodes, k)
+            for pi, part, nodes in zip(pis, parts, starts, strict=True)
         ]
         goals = [
             (w & r).mask & ~p.mask & around for w, r, p in zip(wanted, roomy, parts, strict=True)
@@ -211,11 +213,10 @@ def room_along(
 
 
 def backward_reach(
-    task: Task, pi: PartPolicy, critical: CriticalSet, part: GridSet, near: float, steps: int
+    task: Task, pi: PartPolicy, part: GridSet, nodes: np.ndarray, steps: int
 ) -> GridSet:
-    """X_i: what the backward closed loop reaches outside M_i from the neighbourhood of M*."""
+    """X_i: what the backward closed loop reaches outside M_i from nodes (k, d), those near M*."""
     grid = part.grid
-    nodes = grid.nodes[part.mask & (distance_to(task, critical, grid.nodes) <= near)]
     visited = np.zeros(len(grid.nodes), dtype=bool)
     if len(nodes):
         loop = PolicyController(pi)
