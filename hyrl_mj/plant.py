@@ -42,12 +42,18 @@ class Plant:
         self._batch = Batch(self.model, n, threads)
         self._initial = self._batch.state[0].copy()
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
-        self._ctrl, self._sensors = self._batch.bind("ctrl"), self._batch.bind("sensordata")
+        self._ctrl = self._batch.bind("ctrl")
+        # Sensors of joints are read from the state; for others MuJoCo has to compute them after each step.
+        self._joints = joint_columns(self.model)
+        self._stage = mujoco.mjtStage.mjSTAGE_NONE
+        if self._joints is None:
+            self._sensors = self._batch.bind("sensordata")
+            self._stage = mujoco.mjtStage(int(self.model.sensor_needstage.max()))
 
     @property
     def measurement(self) -> np.ndarray:
         """What the sensors give now, without noise: (n, p), a copy."""
-        return self._sensors.copy()
+        return self._sensors.copy() if self._joints is None else self._batch.state[:, self._joints]
 
     @property
     def qpos(self) -> np.ndarray:
@@ -85,7 +91,8 @@ class Plant:
         self._batch.state[rows] = self._initial  # time, activations and warm starts, too
         self._qpos[rows], self._qvel[rows] = qpos, qvel
         self._ctrl[rows] = self._held
-        self._batch.forward(ids, mujoco.mjtStage.mjSTAGE_POS)
+        if self._joints is None:
+            self._batch.forward(ids, self._stage)
 
     def step(self, u: np.ndarray, ids: np.ndarray | None = None) -> None:
         """Advance the copies `ids` (all by default) by one sample under the inputs u.
@@ -138,7 +145,7 @@ class Plant:
     def _advance(self, ctrl: np.ndarray, ids: np.ndarray | None) -> None:
         rows = slice(None) if ids is None else ids
         self._ctrl[rows] = ctrl
-        self._batch.step(ids, self.substeps, mujoco.mjtStage.mjSTAGE_POS)
+        self._batch.step(ids, self.substeps, self._stage)
         # What MuJoCo itself calls bad: not a number, infinite, or beyond mjMAXVAL.
         for name, values in (("qpos", self._qpos), ("qvel", self._qvel)):
             bad = ~(np.abs(values) <= mujoco.mjMAXVAL)
@@ -162,6 +169,23 @@ def input_limits(model: mujoco.MjModel, inputs: Sequence[str]) -> tuple[np.ndarr
             raise BadInput(f"actuator {name} needs a ctrlrange in the MJCF: its input limits")
     low, high = model.actuator_ctrlrange[columns].T
     return low.copy(), high.copy()
+
+
+def joint_columns(model: mujoco.MjModel) -> np.ndarray | None:
+    """Where a state (mjSTATE_INTEGRATION) has what the sensors measure: (p,) columns.
+
+    None unless each sensor is the position or velocity of a joint, as it is: only those are in the state.
+    """
+    kind, joint = model.sensor_type, model.sensor_objid
+    of_pos = kind == mujoco.mjtSensor.mjSENS_JOINTPOS
+    of_vel = kind == mujoco.mjtSensor.mjSENS_JOINTVEL
+    settings = (model.sensor_cutoff, model.sensor_delay, model.sensor_interval)
+    if not (of_pos | of_vel).all() or any(values.any() for values in settings):
+        return None
+    # The state begins with time, qpos and qvel.
+    qpos = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_TIME)
+    qvel = qpos + model.nq
+    return np.where(of_pos, qpos + model.jnt_qposadr[joint], qvel + model.jnt_dofadr[joint])
 
 
 def _checked(

@@ -7,7 +7,7 @@ from planted import euler, random_inputs, random_states
 
 from hyrl_mj import mjcf
 from hyrl_mj.errors import BadInput, SimulationDiverged
-from hyrl_mj.plant import Plant
+from hyrl_mj.plant import Plant, joint_columns
 from hyrl_mj.tasks.vehicle import Vehicle
 
 PAIRS = 10_000
@@ -62,6 +62,54 @@ def test_the_number_of_threads_changes_no_bit(task):
             plant.step(random_inputs(task, 300, rng))
         states.append(plant.state)
     np.testing.assert_array_equal(*states)
+
+
+PENDULUM = """
+<mujoco model="pendulum">
+  <option timestep="0.01"/>
+  <custom><numeric name="sample_time" data="0.02"/></custom>
+  <worldbody>
+    <body>
+      <freejoint name="free"/>
+      <geom size="0.1" mass="1"/>
+      <body pos="0.3 0 0">
+        <joint name="hinge" axis="0 1 0"/>
+        <geom name="bob" size="0.05" pos="0.3 0 0" mass="0.2"/>
+        <site name="tip" pos="0.3 0 0"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="hinge" ctrlrange="-1 1"/></actuator>
+  <sensor>SENSORS</sensor>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    ("sensors", "read_from_the_state"),
+    [
+        ('<jointpos joint="hinge"/><jointvel joint="hinge"/>', True),
+        ('<jointvel joint="hinge"/>', True),
+        ('<jointpos joint="hinge" cutoff="0.01"/>', False),
+        ('<jointpos joint="hinge"/><framepos objtype="site" objname="tip"/>', False),
+        ('<framelinvel objtype="site" objname="tip"/><jointvel joint="hinge"/>', False),
+        ('<accelerometer site="tip"/>', False),
+    ],
+)
+def test_the_measurement_is_what_the_sensors_give_now(sensors, read_from_the_state):
+    model = mujoco.MjModel.from_xml_string(PENDULUM.replace("SENSORS", sensors))
+    assert (joint_columns(model) is not None) == read_from_the_state
+    plant, data = Plant(model, ("push",), 3), mujoco.MjData(model)
+    qpos = np.tile([0, 0, 0, 1, 0, 0, 0, 0.4], (3, 1))
+    plant.set_state(qpos, np.random.default_rng(0).normal(size=(3, 7)))
+    rows = np.array([0, 2])
+    for u in (None, 0.3, -0.7):
+        if u is not None:
+            plant.step(np.full((2, 1), u), rows)
+        for state, measured in zip(plant.state, plant.measurement, strict=True):
+            mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+            mujoco.mj_forward(model, data)
+            np.testing.assert_array_equal(measured, data.sensordata)
 
 
 def test_only_the_addressed_copies_move(vehicle):
