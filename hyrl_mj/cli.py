@@ -11,11 +11,9 @@ from typing import Annotated
 import tyro
 
 from hyrl_mj import pipeline, progress
-from hyrl_mj.arcs import noisy_arcs, replay_floor, replay_shows
 from hyrl_mj.errors import BadInput, HyrlError, unknown
 from hyrl_mj.lattice import Lattice
 from hyrl_mj.noise import KINDS
-from hyrl_mj.replay import render_replay
 from hyrl_mj.summary import print_robustness, print_summary
 from hyrl_mj.tasks.base import get_task, task_names
 
@@ -105,6 +103,8 @@ def simulate_run(
         horizon: time to simulate in s; by default the task's.
         seed: of the noise.
     """
+    from hyrl_mj.arcs import noisy_arcs
+
     run = pipeline.load_run(run_dir)
     if start is None:
         if (q0, noise, eps, horizon, seed) != (None, "alternating", None, None, 0):
@@ -187,6 +187,9 @@ def replay(
         fps: frames per second.
         slow_motion: how many times slower the video is around jumps.
     """
+    from hyrl_mj.arcs import replay_floor, replay_shows
+    from hyrl_mj.replay import render_replay
+
     run = pipeline.load_run(run_dir)
     if out is None and (starts, noise, eps, layout, slow_motion) != REPLAY:
         # The report says of replay.mp4 what a run puts there.

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from hyrl_mj import artifacts
 from hyrl_mj.policies import Policy
@@ -167,6 +166,8 @@ def _differ(task: Task, policy: Policy, a: np.ndarray, b: np.ndarray) -> np.ndar
 
 def _pieces(task: Task, points: np.ndarray, reach: float) -> np.ndarray:
     """Number the pieces of a point set that are farther apart than `reach`: (N,) int."""
+    from scipy.sparse.csgraph import connected_components  # slow to import
+
     if not len(points):
         return np.zeros(0, dtype=int)
     tree = task.chart.tree(points)

@@ -11,7 +11,6 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from hyrl_mj import artifacts
-from hyrl_mj.arcs import replay_arcs, replay_floor, replay_shows
 from hyrl_mj.critical_set import find_critical_set
 from hyrl_mj.episodes import episodes
 from hyrl_mj.errors import BadArtifact, BadInput, NoRenderer, unknown
@@ -20,7 +19,6 @@ from hyrl_mj.lattice import Lattice
 from hyrl_mj.noise import KINDS, Noise
 from hyrl_mj.partition import make_partition
 from hyrl_mj.policies import MlpPolicy
-from hyrl_mj.replay import render_replay
 from hyrl_mj.robustness import (
     BEATEN,
     WON,
@@ -119,6 +117,8 @@ def remove_others(found: Iterable[Path], wanted: Iterable[Path]) -> None:
 
 def simulate_stage(run: Run, say: Say) -> None:
     """Simulate the paper's replay starts, and one on M*, under the paper's noise."""
+    from hyrl_mj.arcs import replay_arcs
+
     arcs, paths = replay_arcs(run), run.arc_paths()
     for key, arc in arcs.items():
         arc.save(paths[key])
@@ -153,6 +153,9 @@ def figure_paths(run: Run) -> list[Path]:
 
 def replay_stage(run: Run, say: Say) -> None:
     """Render the replay of the start on M*; without GL or ffmpeg say why, and go on."""
+    from hyrl_mj.arcs import replay_floor, replay_shows
+    from hyrl_mj.replay import render_replay
+
     try:
         render_replay(run.task, replay_shows(run), run.path / "replay.mp4", floor=replay_floor(run))
         say(f"video at {run.path / 'replay.mp4'}")

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
-from mujoco.batch import Batch
 
 from hyrl_mj import mjcf
 from hyrl_mj.errors import BadInput, SimulationDiverged
@@ -28,6 +27,8 @@ class Plant:
     """
 
     def __init__(self, model: mujoco.MjModel, inputs: Sequence[str], n: int, threads: int = 0):
+        from mujoco.batch import Batch  # slow to import
+
         actuator = mujoco.mjtObj.mjOBJ_ACTUATOR
         self.n = n
         self.model = copy.copy(model)

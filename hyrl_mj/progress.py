@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from tqdm import tqdm
-
 
 class Progress:
     """A bar that appears once the work has lasted half a second.
@@ -15,6 +13,8 @@ class Progress:
     """
 
     def __init__(self, label: str, total: int, unit: str):
+        from tqdm import tqdm  # slow to import
+
         self._bar = tqdm(
             desc=label,
             total=total,

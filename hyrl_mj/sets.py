@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from scipy import ndimage
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.tasks.base import Chart
@@ -152,6 +151,8 @@ class GridSet:
     @staticmethod
     def from_mask(grid: Grid, inside: np.ndarray) -> GridSet:
         """The set whose nodes are `inside` (N,) bool; its boundary runs half-way between nodes."""
+        from scipy import ndimage  # slow to import
+
         inside = inside.reshape(grid.counts)
         if inside.all() or not inside.any():
             far = float(np.linalg.norm(np.subtract(grid.chart.high, grid.chart.low)))
@@ -221,6 +222,8 @@ class GridSet:
     @cached_property
     def _nearest_inside(self) -> np.ndarray:
         """(N,) flat index of the inner node that is nearest to each node."""
+        from scipy import ndimage
+
         grid, inside = self.grid, self.mask.reshape(self.grid.counts)
         wide, middle = _unrolled(grid, inside)
         at = ndimage.distance_transform_edt(
@@ -242,6 +245,8 @@ class GridSet:
 
 def within_reach(mask: np.ndarray, window: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
     """Whether some node of a mask lies within so many nodes (d,) along each axis: bool, of its shape."""
+    from scipy import ndimage
+
     found = mask.astype(np.uint8)
     for axis, (w, wraps) in enumerate(zip(window, periodic, strict=True)):
         if w:

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import rich.table
-from rich.console import Console
-from rich.text import Text
-
 from hyrl_mj.run_directory import Run
 from hyrl_mj.tables import (
     Table,
@@ -44,6 +40,10 @@ def print_robustness(run: Run) -> None:
 
 def _print(table: Table) -> None:
     """Print a table, every cell whole."""
+    import rich.table  # slow to import, and --help does not need it
+    from rich.console import Console
+    from rich.text import Text
+
     drawn = rich.table.Table(title=table.title)
     for heading in table.headings:
         drawn.add_column(Text(heading))

@@ -115,10 +115,31 @@ def test_a_saved_policy_works_without_torch(task, tmp_path):
     np.testing.assert_allclose(np.load(tmp_path / "u.npy"), policy.act(states), atol=1e-6)
 
 
-def test_importing_loads_neither_training_nor_video():
-    heavy = {"torch", "stable_baselines3", "mediapy", "imageio_ffmpeg", "matplotlib"}
-    out = run_without(set(), f"import hyrl_mj; print(sorted({heavy} & set(sys.modules)))")
-    assert out.strip() == "[]"
+# Slow to import, and seldom needed.
+HEAVY = {
+    "PIL", "hyrl_mj.rendering", "hyrl_mj.replay", "imageio_ffmpeg", "jinja2", "matplotlib", "mediapy",
+    "mujoco.batch", "rich", "scipy", "stable_baselines3", "tensorboard", "torch", "tqdm",
+}  # fmt: skip
+HELP = """
+import sys
+from hyrl_mj import cli
+
+sys.argv = ["hyrl-mj", "--help"]
+try:
+    cli.main()
+except SystemExit:
+    print()
+"""
+
+
+@pytest.mark.parametrize(
+    ("code", "heavy"),
+    [("import hyrl_mj", HEAVY | {"tyro"}), (HELP, HEAVY)],
+    ids=["import", "help"],
+)
+def test_nothing_heavy_is_loaded_before_it_is_needed(code, heavy):
+    out = run_without(set(), f"{code}\nimport sys; print(sorted({heavy} & set(sys.modules)))")
+    assert out.splitlines()[-1] == "[]"
 
 
 def test_public_names_are_there():

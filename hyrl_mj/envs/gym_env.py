@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -13,8 +13,10 @@ from gymnasium.vector.utils import batch_space
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.errors import BadInput
 from hyrl_mj.noise import Noise
-from hyrl_mj.rendering import SceneRenderer
 from hyrl_mj.tasks.base import Outcome, Task, get_task, task_names
+
+if TYPE_CHECKING:
+    from hyrl_mj.rendering import SceneRenderer
 
 
 def observation_space(task: Task) -> spaces.Box:
@@ -92,6 +94,8 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         if self.render_mode is None:
             return None
         if self._renderer is None:
+            from hyrl_mj.rendering import SceneRenderer
+
             self._renderer = SceneRenderer(self.core.task.model, *self._size)
         self._renderer.place(self.core.plant.qpos[0], self._camera)
         return self._renderer.draw()

@@ -6,16 +6,19 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
 
 from hyrl_mj import mjcf
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.noise import check_bound
 from hyrl_mj.plant import Plant, input_limits
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 
 class Outcome(IntEnum):
@@ -74,6 +77,8 @@ class Chart:
 
     def tree(self, points: np.ndarray) -> cKDTree:
         """A search tree of points (n, d) that knows of the periods; ask it with `in_box` points."""
+        from scipy.spatial import cKDTree  # slow to import
+
         # Coordinates that are not periodic get a box so large that its other side is never near.
         period = np.subtract(self.high, self.low)
         return cKDTree(self.in_box(points), boxsize=np.where(self.periodic, period, 1e6 * period))
