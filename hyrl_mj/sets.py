@@ -124,7 +124,8 @@ class Grid:
         """Multilinear interpolation (n,) of values at the nodes (N,) at points (n, d)."""
         index = self.index(z).T[:, None]
         below = index.astype(int)
-        weights = np.abs(1 - self._corners - (index - below)).prod(axis=0)
+        share = index - below
+        weights = np.where(self._corners, share, 1 - share).prod(axis=0)
         # Above the last node of an axis lies nothing: "wrap" finds the first one, with a weight of 0.
         nodes = np.ravel_multi_index(tuple(below + self._corners), self.counts, mode="wrap")
         # One corner after the other: NumPy's sum of one point is not to the bit that of many.
