@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -41,14 +42,14 @@ class HybridController:
                 f"{sorted(self.flow_sets)}: give one of each for every mode"
             )
 
-    @property
+    @cached_property
     def modes(self) -> tuple[int, ...]:
         """The modes, in ascending order."""
         return tuple(sorted(self.policies))
 
     def flow_set(self, q: int) -> StateSet:
         """C_q, where mode q flows."""
-        self._check_modes(np.array([q]))
+        self._rows(np.array([q]))
         return self.flow_sets[q]
 
     def jump_set(self, q: int) -> StateSet:
@@ -65,7 +66,7 @@ class HybridController:
             (n,) int modes.
         """
         z = self.task.z(self.task.check_measurement(measured))
-        return np.array(self.modes)[self._distances(z).argmin(axis=0)]
+        return self._deepest(self.modes, z)
 
     def step(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """One sample: jump where z lies in D_q, then u = pi_q(measured).
@@ -86,30 +87,38 @@ class HybridController:
             raise BadInput(
                 f"{len(measured)} measurements need q of shape ({len(measured)},), got {q.shape}"
             )
-        self._check_modes(q)
         q_next = self._jump(q, self.task.z(measured))
         u = np.empty((len(measured), len(self.task.inputs)))
-        for mode, policy in self.policies.items():
-            rows = q_next == mode
-            if rows.any():
-                u[rows] = policy.act(measured[rows])
+        for mode, rows in self._rows(q_next).items():
+            u[rows] = self.policies[mode].act(measured[rows])
         return u, q_next
 
     def _jump(self, q: np.ndarray, z: np.ndarray) -> np.ndarray:
         """The modes (n,) after the jumps that z (n, d) calls for."""
-        if len(self.modes) == 1:
-            return q.copy()
-        distances = self._distances(z)
-        row, column = np.searchsorted(self.modes, q), np.arange(len(q))
-        jumps = distances[row, column] > ON_EDGE
-        distances[row, column] = np.inf
-        return np.where(jumps, np.array(self.modes)[distances.argmin(axis=0)], q)
+        rows_of = self._rows(q)
+        q_next = q.astype(int)
+        for mode, rows in rows_of.items():
+            jumps = rows[self.flow_sets[mode].signed_distance(z[rows]) > ON_EDGE]
+            others = [other for other in self.modes if other != mode]
+            if len(others) == 1:
+                q_next[jumps] = others[0]
+            elif others:
+                q_next[jumps] = self._deepest(others, z[jumps])
+        return q_next
 
-    def _distances(self, z: np.ndarray) -> np.ndarray:
-        """Signed distance of z (n, d) to every flow set: (modes, n)."""
-        return np.stack([self.flow_sets[q].signed_distance(z) for q in self.modes])
+    def _deepest(self, modes: Sequence[int], z: np.ndarray) -> np.ndarray:
+        """That of the modes (n,) whose flow set holds z (n, d) most deeply."""
+        distances = [self.flow_sets[q].signed_distance(z) for q in modes]
+        return np.array(modes)[np.argmin(distances, axis=0)]
 
-    def _check_modes(self, q: np.ndarray) -> None:
-        wrong = ~np.isin(q, self.modes)
-        if wrong.any():
-            raise BadInput(f"mode {q[wrong][0]} is unknown: choose one of {self.modes}")
+    def _rows(self, q: np.ndarray) -> dict[int, np.ndarray]:
+        """The rows of q (n,) in each mode that has any.
+
+        Raises:
+            BadInput: a mode is unknown.
+        """
+        rows = {mode: (q == mode).nonzero()[0] for mode in self.modes}
+        if sum(len(r) for r in rows.values()) < len(q):
+            wrong = q[~np.isin(q, self.modes)]
+            raise BadInput(f"mode {wrong[0]} is unknown: choose one of {self.modes}")
+        return {mode: r for mode, r in rows.items() if len(r)}

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadArtifact
@@ -23,6 +24,9 @@ def relu(x: np.ndarray) -> np.ndarray:
 ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"relu": relu, "tanh": np.tanh}
 # Rows that go through a network at a time: the hidden layers then stay in the processor's cache.
 CHUNK = 4096
+# The last bits of a matrix product depend on the threads that share it, and threads that wait for a
+# busy core take ten times as long as one: batches have a single one.
+BLAS = ThreadpoolController()
 
 
 @runtime_checkable
@@ -109,10 +113,11 @@ class MlpPolicy:
         """The network's last layer for observations (n, k): action values or preferences of a
         discrete task's levels, else the mean input."""
         observation = observation.astype(np.float32)
-        if len(observation) <= CHUNK:
+        if len(observation) <= 1:
             return self._forward(observation)
         parts = range(0, len(observation), CHUNK)
-        return np.concatenate([self._forward(observation[i : i + CHUNK]) for i in parts])
+        with BLAS.limit(limits=1, user_api="blas"):
+            return np.concatenate([self._forward(observation[i : i + CHUNK]) for i in parts])
 
     def _forward(self, x: np.ndarray) -> np.ndarray:
         activate = ACTIVATIONS[self.activation]

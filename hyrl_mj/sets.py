@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Protocol
 
 import numpy as np
@@ -63,8 +63,7 @@ class Grid:
     @staticmethod
     def with_cells(chart: Chart, cells: int) -> Grid:
         """A grid with square cells (in chart units), `cells` of them along the longest side."""
-        sides = np.subtract(chart.high, chart.low)
-        number = np.maximum(np.round(cells * sides / sides.max()).astype(int), 2)
+        number = np.maximum(np.round(cells * chart.sides / chart.sides.max()).astype(int), 2)
         return Grid(chart, tuple(int(k) for k in number + ~np.array(chart.periodic)))
 
     @staticmethod
@@ -84,7 +83,7 @@ class Grid:
     def spacing(self) -> np.ndarray:
         """Distance between nodes along each coordinate (d,)."""
         gaps = np.array(self.counts) - ~np.array(self.chart.periodic)
-        return np.subtract(self.chart.high, self.chart.low) / gaps
+        return self.chart.sides / gaps
 
     @property
     def cell(self) -> float:
@@ -100,31 +99,36 @@ class Grid:
         ]
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
 
+    @cached_property
+    def _last(self) -> np.ndarray:
+        """Greatest fractional index along each coordinate (d,); a circle has no last node."""
+        return np.where(self.chart.periodic, np.inf, np.array(self.counts) - 1)
+
     def index(self, z: np.ndarray) -> np.ndarray:
         """Fractional indices (n, d) of points, kept on the grid."""
-        index = (self.chart.wrap(z) - self.chart.low) / self.spacing
-        return np.where(self.chart.periodic, index, np.clip(index, 0, np.array(self.counts) - 1))
+        index = (self.chart.wrap(z) - self.chart.origin) / self.spacing
+        return np.minimum(np.maximum(index, 0), self._last)
 
     def nearest(self, z: np.ndarray) -> np.ndarray:
         """Flat indices (n,) of the nodes nearest to points (n, d)."""
         index = np.round(self.index(z)).astype(int) % self.counts
         return np.ravel_multi_index(tuple(index.T), self.counts)
 
+    @cached_property
+    def _corners(self) -> np.ndarray:
+        """The corners of a cell (d, 2**d, 1): 0 is below, 1 above; the last coordinate runs fastest."""
+        return np.indices((2,) * len(self.counts)).reshape(len(self.counts), -1, 1)
+
     def interpolate(self, values: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Multilinear interpolation (n,) of values at the nodes (N,) at points (n, d)."""
-        index = self.index(z)
-        below = np.floor(index).astype(int)
+        index = self.index(z).T[:, None]
+        below = index.astype(int)
         share = index - below
-        result = np.zeros(len(index))
-        for corner in np.ndindex(*(2,) * len(self.counts)):
-            weight = np.where(corner, share, 1 - share).prod(axis=1)
-            at = np.where(
-                self.chart.periodic,
-                (below + corner) % self.counts,
-                np.minimum(below + corner, np.array(self.counts) - 1),
-            )
-            result += weight * values[np.ravel_multi_index(tuple(at.T), self.counts)]
-        return result
+        weights = np.where(self._corners, share, 1 - share).prod(axis=0)
+        # Above the last node of an axis lies nothing: "wrap" finds the first one, with a weight of 0.
+        nodes = np.ravel_multi_index(tuple(below + self._corners), self.counts, mode="wrap")
+        # One corner after the other: NumPy's sum of one point is not to the bit that of many.
+        return reduce(np.add, weights * values[nodes])
 
 
 @dataclass(frozen=True)
@@ -155,7 +159,7 @@ class GridSet:
 
         inside = inside.reshape(grid.counts)
         if inside.all() or not inside.any():
-            far = float(np.linalg.norm(np.subtract(grid.chart.high, grid.chart.low)))
+            far = float(np.linalg.norm(grid.chart.sides))
             return GridSet(grid, np.full(inside.size, -far if inside.all() else far))
         wide, middle = _unrolled(grid, inside)
         outward = ndimage.distance_transform_edt(~wide, sampling=grid.spacing)[middle]

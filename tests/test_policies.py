@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from planted import random_states
+from threadpoolctl import threadpool_limits
 
 from hyrl_mj import BadArtifact, BadInput, MlpPolicy, artifacts
 from hyrl_mj.settings import preset
@@ -46,6 +47,17 @@ def test_a_batch_gives_what_its_rows_give(task, policy):
     singles = np.concatenate([policy.act(measured[i : i + 1]) for i in range(0, 9000, 500)])
     np.testing.assert_allclose(singles, batch[::500], atol=1e-6)
     assert policy.act(measured[:0]).shape == (0, 1)
+
+
+@pytest.mark.parametrize("rows", [1, 60, 2501, 9000])
+def test_threads_change_no_bit(task, model, rows):
+    policy = export(model, task)
+    observation = task.observation(random_states(task, rows, np.random.default_rng(0)))
+    outputs = []
+    for threads in (1, 2):
+        with threadpool_limits(threads, user_api="blas"):
+            outputs.append(policy.outputs(observation))
+    np.testing.assert_array_equal(*outputs)
 
 
 def test_inputs_stay_inside_the_limits(task, model):

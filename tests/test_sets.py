@@ -12,6 +12,10 @@ RING = Chart(("theta",), ("rad",), (0.0,), (2 * PI,), (True,))
 PLANE = Chart(("x", "y"), ("m", "m"), (-1.0, -1.0), (2.0, 1.0), (False, False))
 TUBE = Chart(("theta", "y"), ("rad", "m"), (0.0, -1.0), (2 * PI, 1.0), (True, False))
 
+SLAB = Chart(
+    ("x", "y", "theta"), ("m",) * 3, (-1.0, 0.0, -PI), (1.0, 3.0, PI), (False, False, True)
+)
+
 
 def interval(z):
     return np.maximum(-0.5 - z[:, 0], z[:, 0] - 0.3)
@@ -183,6 +187,21 @@ def test_interpolation_is_exact_for_linear_functions():
     np.testing.assert_allclose(grid.interpolate(values, z), z @ slopes + 1, atol=1e-9)
     outside = np.array([[9.0, 0.0], [0.0, -9.0]])
     np.testing.assert_allclose(grid.interpolate(values, outside), [5.0, 4.0], atol=1e-9)
+
+
+def test_interpolation_is_that_of_each_coordinate_in_turn():
+    grid = Grid(SLAB, (4, 5, 6))
+    values = np.random.default_rng(0).normal(size=120)
+    table, z = values.reshape(grid.counts), points(SLAB, 500)
+    for i, (x, y, theta) in enumerate(z):
+        along_x = [np.interp(x, np.linspace(-1, 1, 4), line) for line in table.reshape(4, -1).T]
+        along_y = [
+            np.interp(y, np.linspace(0, 3, 5), line) for line in np.reshape(along_x, (5, 6)).T
+        ]
+        exact = np.interp(theta, np.linspace(-PI, PI, 7), [*along_y, along_y[0]])
+        one = grid.interpolate(values, z[i : i + 1])
+        np.testing.assert_allclose(one, exact, atol=1e-12)
+        assert one == grid.interpolate(values, z)[i], "one point gives what it gives among many"
 
 
 def test_the_nearest_node_is_the_nearest(case):

@@ -57,18 +57,29 @@ class Chart:
     def dimension(self) -> int:
         return len(self.names)
 
+    @cached_property
+    def origin(self) -> np.ndarray:
+        """The lower ends (d,), as an array."""
+        return np.array(self.low)
+
+    @cached_property
+    def sides(self) -> np.ndarray:
+        """Length of the charted box along each coordinate (d,)."""
+        return np.subtract(self.high, self.low)
+
     def wrap(self, z: np.ndarray) -> np.ndarray:
-        """The same points (n, d), periodic coordinates brought into [low, high)."""
-        low, period = np.array(self.low), np.subtract(self.high, self.low)
-        turned = np.mod(z - low, period)
+        """The same points (n, d), periodic coordinates brought into [low, high); z itself without any."""
+        if not any(self.periodic):
+            return z
+        turned = np.mod(z - self.origin, self.sides)
         # The remainder of a tiny negative number rounds up to the period itself.
-        turned = np.where(turned < period, turned, 0.0)
-        return np.where(self.periodic, low + turned, z)
+        turned = np.where(turned < self.sides, turned, 0.0)
+        return np.where(self.periodic, self.origin + turned, z)
 
     def difference(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """a - b (n, d), the short way round in periodic coordinates."""
-        delta, period = np.subtract(a, b), np.subtract(self.high, self.low)
-        return np.where(self.periodic, delta - period * np.round(delta / period), delta)
+        delta = np.subtract(a, b)
+        return np.where(self.periodic, delta - self.sides * np.round(delta / self.sides), delta)
 
     def contains(self, z: np.ndarray) -> np.ndarray:
         """Whether points (n, d) lie in the charted box: (n,) bool."""
@@ -80,13 +91,12 @@ class Chart:
         from scipy.spatial import cKDTree  # slow to import
 
         # Coordinates that are not periodic get a box so large that its other side is never near.
-        period = np.subtract(self.high, self.low)
-        return cKDTree(self.in_box(points), boxsize=np.where(self.periodic, period, 1e6 * period))
+        size = np.where(self.periodic, self.sides, 1e6 * self.sides)
+        return cKDTree(self.in_box(points), boxsize=size)
 
     def in_box(self, z: np.ndarray) -> np.ndarray:
         """Points (n, d) in the coordinates of `tree`: never negative."""
-        shift = np.where(self.periodic, 0.0, 1e3 * np.subtract(self.high, self.low))
-        return self.wrap(z) - self.low + shift
+        return self.wrap(z) - self.origin + np.where(self.periodic, 0.0, 1e3 * self.sides)
 
     def format(self, z: np.ndarray) -> str:
         """One point (d,) for people: "x = 0.1 m, y = -0.2 m"."""
@@ -327,9 +337,8 @@ class Task(ABC):
             BadInput: it is not a number >= 0, or so large that it hides the whole chart.
         """
         check_bound(bound)
-        sides = np.subtract(self.chart.high, self.chart.low)
         hit = self.noise_in_chart(1.0, everywhere) > 0
-        limit = float(sides[hit].min() / 2) if hit.any() else np.inf
+        limit = float(self.chart.sides[hit].min() / 2) if hit.any() else np.inf
         if bound >= limit:
             raise BadInput(
                 f"noise bound {bound:g} hides the whole state space of {self.name}: "

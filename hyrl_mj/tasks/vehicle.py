@@ -79,7 +79,8 @@ class Vehicle(Task):
 
     def observation(self, measured: np.ndarray) -> np.ndarray:
         y = measured[:, 1]
-        return np.stack([self.clearance(measured), self.distance_to_go(measured), y], axis=-1)
+        columns = np.array([self.clearance(measured), self.distance_to_go(measured), y])
+        return columns.T.copy()
 
     def reward(self, measurement: np.ndarray) -> np.ndarray:
         d_o = self.clearance(measurement)
