@@ -118,7 +118,7 @@ class HybridController:
             BadInput: a mode is unknown.
         """
         rows = {mode: (q == mode).nonzero()[0] for mode in self.modes}
-        if sum(len(r) for r in rows.values()) < len(q):
+        if sum(map(len, rows.values())) < len(q):
             wrong = q[~np.isin(q, self.modes)]
             raise BadInput(f"mode {wrong[0]} is unknown: choose one of {self.modes}")
         return {mode: r for mode, r in rows.items() if len(r)}

@@ -124,7 +124,7 @@ class Grid:
         index = self.index(z).T[:, None]
         below = index.astype(int)
         share = index - below
-        weights = np.where(self._corners, share, 1 - share).prod(axis=0)
+        weights = reduce(np.multiply, np.where(self._corners, share, 1 - share))
         # Above the last node of an axis lies nothing: "wrap" finds the first one, with a weight of 0.
         nodes = np.ravel_multi_index(tuple(below + self._corners), self.counts, mode="wrap")
         # One corner after the other: NumPy's sum of one point is not to the bit that of many.
