@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -258,11 +260,11 @@ def examine(
     progress = Progress("worst-case game", len(bounds) + len(CURVE) + 2, "noise bounds")
     fine = Game(task, partition, controllers, max(*bounds, LARGEST), everywhere, grids[0])
     scores: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
-    for k, eps in enumerate(bounds):
-        for name in names:
-            scores[name].append(vars(fine.score(name, eps)))
-        progress.update(k + 1)
-    margins = {name: fine.margin(name) for name in controllers}
+    games = [(name, eps) for eps in bounds for name in names]
+    for k, ((name, _), score) in enumerate(zip(games, together(fine.score, games), strict=True)):
+        scores[name].append(vars(score))
+        progress.update((k + 1) // len(names))
+    margins = dict(zip(controllers, together(fine.margin, zip(controllers)), strict=True))
     progress.update(len(bounds) + 1)
     maps = {f"map_{name}": fine.map(name, bounds[-1]) for name in controllers}
     coarse = fine
@@ -274,11 +276,12 @@ def examine(
     curve |= {name: {"won": [], "won_any": [], "time_any": []} for name in names}
     holds = {name: np.ones(len(along), dtype=bool) for name in names}
     profile = {name: np.full(len(along), np.nan) for name in names}
+    values = together(coarse.value, [(name, eps) for eps in CURVE for name in names])
     for k, eps in enumerate(CURVE):
         region = coarse.starts & coarse.winnable(eps)
         curve["winnable"].append(float(region.sum() / max(coarse.starts.sum(), 1)))
         for name in names:
-            value = coarse.value(name, eps)[:, :-2]
+            value = next(values)[:, :-2]
             own, worst = value[-1], value[:-1].max(axis=0)
             curve[name]["won"].append(_share(own[region] < NEVER))
             curve[name]["won_any"].append(_share(worst[region] < NEVER))
@@ -315,6 +318,12 @@ def examine(
     }
     arrays = {"grid_counts": np.array(fine.lattice.grid.counts), "eps": np.array(bounds[-1])}
     return content, arrays | maps
+
+
+def together(work: Callable[..., Any], calls: Iterable[tuple[Any, ...]]) -> Iterator[Any]:
+    """The results of calls, in their order, worked out in threads: NumPy lets others work meanwhile."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        yield from pool.map(lambda call: work(*call), calls)
 
 
 def save(path: Path, content: Mapping[str, Any]) -> None:
