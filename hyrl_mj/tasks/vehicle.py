@@ -14,6 +14,12 @@ LANE = 0.2  # [m] from the set-point, across
 ON_THE_LINE = 1e-6  # [m] the error that sixty samples of the kinematic actuator add up to
 
 
+def distance(z: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Distance (n,) of points (n, 2) to one (2,): NumPy's norm along short rows takes several times as long."""
+    x, y = (z - point).T
+    return np.sqrt(x * x + y * y)
+
+
 @register
 class Vehicle(Task):
     name = "vehicle"
@@ -71,11 +77,11 @@ class Vehicle(Task):
 
     def clearance(self, z: np.ndarray) -> np.ndarray:
         """Distance to the obstacle's surface, d_o: (n,) [m]."""
-        return np.maximum(np.linalg.norm(z - self.obstacle, axis=-1) - self.radius, 0.0)
+        return np.maximum(distance(z, self.obstacle) - self.radius, 0.0)
 
     def distance_to_go(self, z: np.ndarray) -> np.ndarray:
         """Distance to the set-point, d_g: (n,) [m]."""
-        return np.linalg.norm(z - self.set_point, axis=-1)
+        return distance(z, self.set_point)
 
     def observation(self, measured: np.ndarray) -> np.ndarray:
         y = measured[:, 1]

@@ -16,7 +16,7 @@ import numpy as np
 SIZES = {
     "simulations": (1, 16, 256, 4_096, 65_536),
     "rods": (10, 20, 40, 80, 160),
-    "episodes": (10_000, 30_000, 100_000, 300_000),
+    "episodes": (1_000, 10_000, 100_000, 1_000_000),
 }
 LABELS = {
     "simulations": "simulations side by side, 100 samples",
@@ -53,7 +53,7 @@ def measure(kind: str, size: int, run: Path) -> tuple[float, float]:
         found = hyrl_mj.load_run(run)
         began = time.perf_counter()
         loops = {"HyRL": found.controller}
-        episodes(task, loops, found.critical_set, [Noise("uniform", 0.1)], size)
+        episodes(task, found.critical_set, loops, (Noise("uniform", 0.1),), size)
     took = time.perf_counter() - began
     return took, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
@@ -66,22 +66,17 @@ def plot(run: Path, path: Path) -> None:
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(2, len(SIZES), figsize=(11, 6), sharex="col", layout="constrained")
-    for column, (kind, sizes) in enumerate(SIZES.items()):
-        found = np.array([_child(kind, size, run) for size in sizes])
-        work = np.square(sizes) * 2 if kind == "rods" else np.array(sizes)
-        for row, (label, values) in enumerate(
-            zip(("time [s]", "memory [MB]"), found.T, strict=True)
-        ):
-            axis = axes[row, column]
-            axis.loglog(work, values, "o-", label="measured")
-            if row == 0:
-                line = values[-1] * work / work[-1]
-                axis.loglog(work, line, "--", color="0.6", label="linear")
-                axis.legend()
-            axis.set_ylabel(label)
+    for (above, below), (kind, sizes) in zip(axes.T, SIZES.items(), strict=True):
+        time_, memory = np.array([_child(kind, size, run) for size in sizes]).T
+        work = 2 * np.square(sizes) if kind == "rods" else np.array(sizes)
+        above.loglog(work, time_, "o-", label="measured")
+        above.loglog(work, time_[-1] * work / work[-1], "--", color="0.6", label="linear")
+        above.set_ylabel("time [s]")
+        above.legend()
+        below.plot(work, memory, "o-")
+        below.set(xlabel=LABELS[kind], ylabel="peak memory [MB]", ylim=(0, 400))
+        for axis in (above, below):
             axis.grid(alpha=0.3)
-        axes[1, column].set_ylim(100, 10_000)
-        axes[1, column].set_xlabel(LABELS[kind])
     figure.savefig(path, dpi=120)
 
 
