@@ -15,9 +15,10 @@ ON_THE_LINE = 1e-6  # [m] the error that sixty samples of the kinematic actuator
 
 
 def distance(z: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Distance (n,) of points (n, 2) to one (2,): NumPy's norm along short rows takes several times as long."""
-    x, y = (z - point).T
-    return np.sqrt(x * x + y * y)
+    """Distance (n,) of points (n, 2) to one (2,). NumPy's norm takes several times as long."""
+    away = z - point
+    x, y = away[..., 0], away[..., 1]
+    return np.asarray(np.sqrt(x * x + y * y))
 
 
 @register
