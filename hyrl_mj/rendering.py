@@ -256,6 +256,28 @@ class SceneRenderer:
         pixels = np.stack([self.width / 2 + scale * across, scale * along], axis=-1)
         return pixels, scale * shrink
 
+    def extent(self, points: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where balls around points (n, 3) with radii (n,) [m] may be seen.
+
+        Returns:
+            (n, 2) least and (n, 2) greatest column and row [pixels], a pixel wider than need be; everywhere
+            for a ball that reaches to the camera.
+        """
+        eyes, view = self.scene.camera, self.scene.camera[0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pixels, scale = self.project(points)
+            reach = (radii * scale)[:, None]
+            near = np.zeros(len(points), dtype=bool)
+            if not view.orthographic:
+                # What is nearer than the middle is seen larger, and farther off the axis.
+                depth = (points - (eyes[0].pos + eyes[1].pos) / 2) @ view.forward
+                off = np.abs(pixels - [self.width / 2, self.height / 2])
+                reach = (radii / (depth - radii))[:, None] * ((scale * depth)[:, None] + off)
+                near = depth <= radii
+            low, high = pixels - reach - 1, pixels + reach + 1
+        low[near], high[near] = -np.inf, np.inf
+        return low, high
+
     def close(self) -> None:
         """Give the GL context back, if it is its own."""
         if self._own:
@@ -264,10 +286,8 @@ class SceneRenderer:
     def _hide_outside(self, box: Box) -> None:
         """Leave out what stays and is not seen in a box: GL takes longer for it than for small boxes."""
         left, top, right, bottom = box
-        pixels, scale = self.project(self._balls[:, :3])
-        radius = self._balls[:, 3] * scale + 1
-        low, high = pixels - radius[:, None], pixels + radius[:, None]
-        seen = (low < [right, bottom]).all(axis=1) & (high > [left, top]).all(axis=1)
+        low, high = self.extent(self._balls[:, :3], self._balls[:, 3])
+        seen = np.asarray((low < [right, bottom]) & (high > [left, top])).all(axis=1)
         for k in np.flatnonzero(seen != self._shown):
             self.scene.geoms[k].type = self._kinds[k] if seen[k] else HIDDEN
         self._shown = seen

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -43,6 +42,9 @@ MAP_CLASSES = (
 )
 # About so many episodes without noise tell how far off the set-point they end.
 QUIET_EPISODES = 4000
+
+# Games that are played at a time; each takes tens of megabytes.
+THREADS = 4
 
 
 @dataclass(frozen=True)
@@ -322,7 +324,7 @@ def examine(
 
 def together(work: Callable[..., Any], calls: Iterable[tuple[Any, ...]]) -> Iterator[Any]:
     """The results of calls, in their order, worked out in threads: NumPy lets others work meanwhile."""
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(THREADS) as pool:
         yield from pool.map(lambda call: work(*call), calls)
 
 

@@ -94,6 +94,44 @@ def test_a_part_that_is_drawn_anew_is_that_of_the_whole(task, camera):
 
 
 @needs_gl
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+def test_what_reaches_past_the_camera_is_not_left_out(projection):
+    """Long walls whose middles lie beside or behind the camera, and a ball right before it."""
+    model = mujoco.MjModel.from_xml_string(
+        f"""
+        <mujoco>
+          <visual><global fovy="60"/></visual>
+          <worldbody>
+            <light pos="0 0 3"/>
+            <camera name="eye" projection="{projection}" fovy="{60 if projection == "perspective" else 3}"
+              pos="0 0 1" xyaxes="0 -1 0 0.3 0 1"/>
+            <geom type="box" size="6 0.1 0.4" pos="-3 1 0.4" rgba="0.9 0.2 0.1 1"/>
+            <geom type="box" size="4 0.1 0.4" pos="0.2 -1 0.4" rgba="0.1 0.8 0.2 1"/>
+            <geom type="sphere" size="0.3" pos="0.7 0.25 0.8" rgba="0.1 0.2 0.9 1"/>
+          </worldbody>
+        </mujoco>
+        """
+    )
+    renderer = SceneRenderer(model, 160, 120)
+    renderer.place(np.zeros(0), "eye")
+    parts, whole = np.zeros((2, 120, 160, 3), dtype=np.uint8)
+    for left, right in pairwise((0, 30, 64, 101, 160)):
+        for top, bottom in pairwise((0, 25, 70, 120)):
+            renderer.redraw(parts, (left, top, right, bottom))
+    renderer._hide_outside = lambda box: None
+    renderer._shown[:] = True
+    for geom, kind in zip(renderer.scene.geoms, renderer._kinds, strict=False):
+        geom.type = kind
+    renderer.redraw(whole, (0, 0, 160, 120))
+    renderer.close()
+    red, green, blue = whole.reshape(-1, 3).astype(int).T
+    assert (red > green + blue).any()
+    assert (green > red + blue).any()
+    assert (blue > red + green).any()
+    assert (np.abs(parts.astype(int) - whole).max(axis=-1) > 1).sum() <= 5
+
+
+@needs_gl
 def test_several_robots_are_in_one_scene(vehicle):
     renderer = SceneRenderer(vehicle.model, 320, 240)
     renderer.place(np.array([0.2, 1.0]), "overhead")

@@ -23,7 +23,7 @@ PATH_WIDTH, START_RADIUS, JUMP_RADIUS, CROSS = 0.032, 0.035, 0.055, 0.075  # [m]
 BOUND_WIDTH, BOUND_PIECES = 0.05, 4
 BOUND_ALPHA, GHOST_ALPHA = 0.45, 0.35
 # By which what is drawn anew is larger than what has moved [pixels].
-MARGIN = 3
+MARGIN = 2
 FAILED = ("crashed", "out_of_bounds", "stalled")
 
 
@@ -251,11 +251,10 @@ class Panel:
     def _box(self, points: np.ndarray, radii: np.ndarray) -> Box:
         """The part of the picture in which balls around points (n, 3) are seen."""
         renderer = self._renderer
-        pixels, scale = renderer.project(points)
-        reach = (radii * scale + MARGIN)[:, None]
+        low, high = renderer.extent(points, radii)
         size = (renderer.width, renderer.height)
-        left, top = np.floor((pixels - reach).min(axis=0)).clip(0, size).astype(int)
-        right, bottom = np.ceil((pixels + reach).max(axis=0)).clip(0, size).astype(int)
+        left, top = np.floor(low.min(axis=0) - MARGIN).clip(0, size).astype(int)
+        right, bottom = np.ceil(high.max(axis=0) + MARGIN).clip(0, size).astype(int)
         return left, top, right, bottom
 
     def _again(self, picture: np.ndarray, now: Box, before: Box) -> None:
