@@ -287,7 +287,7 @@ class SceneRenderer:
         """Leave out what stays and is not seen in a box: GL takes longer for it than for small boxes."""
         left, top, right, bottom = box
         low, high = self.extent(self._balls[:, :3], self._balls[:, 3])
-        seen = np.asarray((low < [right, bottom]) & (high > [left, top])).all(axis=1)
+        seen = np.asarray(((low < [right, bottom]) & (high > [left, top])).all(axis=1))
         for k in np.flatnonzero(seen != self._shown):
             self.scene.geoms[k].type = self._kinds[k] if seen[k] else HIDDEN
         self._shown = seen

@@ -51,7 +51,7 @@ class Figure:
     ours: Callable[[], int]
     other: Callable[[], int] | None = None
     memory: Callable[[], float] | None = None
-    least: float = 1.0
+    least: float = 0.5
     slow: bool = False
 
     def measure(self, pairs: int) -> Measured:
