@@ -13,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
+from hyrl_mj.encoding import video
 from hyrl_mj.errors import NoRenderer
-from hyrl_mj.rendering import GL_CURE, video
+from hyrl_mj.rendering import GL_CURE
 
 # Distributions whose versions matter; not imported for it, since torch takes seconds.
 DISTRIBUTIONS = (

@@ -34,3 +34,9 @@ def unknown(what: str, given: object, allowed: Iterable[str]) -> BadInput:
     close = get_close_matches(str(given), names, n=1)
     hint = f" Did you mean {close[0]!r}?" if close else ""
     return BadInput(f"unknown {what} {given!r}: choose one of {', '.join(names)}.{hint}")
+
+
+def brief(error: Exception) -> str:
+    """The kind of an error and the beginning of what it says, in one line."""
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text if len(text) <= 160 else text[:157] + '...'}"

@@ -1,39 +1,23 @@
-"""Off-screen pictures of a model and videos of them, with one clear message where that fails."""
+"""Off-screen pictures of a model, with one clear message where that fails."""
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from copy import copy
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from hyrl_mj import artifacts, mjcf
-from hyrl_mj.errors import BadInput, NoRenderer
+from hyrl_mj import mjcf
+from hyrl_mj.errors import BadInput, NoRenderer, brief
 
 GL_CURE = "on Debian or Ubuntu: apt-get install libegl1 libgl1-mesa-dri, and set MUJOCO_GL=egl"
-FFMPEG_CURE = (
-    "check that the disk is writable and has room, and reinstall the encoder: "
-    "pip install --force-reinstall imageio-ffmpeg"
-)
-
 
 # The widest and highest picture [pixels].
 LARGEST = 4096
-# How a video is encoded, by the end of its name: an H.264 that browsers play, or a GIF. More threads than
-# this only take time from the drawing.
-H264 = "-preset veryfast -threads 2 -sws_flags fast_bilinear -movflags +faststart"
-ENCODERS: dict[str, dict[str, Any]] = {
-    ".mp4": {"codec": "h264", "crf": 20, "ffmpeg_args": H264},
-    ".gif": {"codec": "gif"},
-}
 GEOMS = 2_000  # that a scene has room for, by default
 # A geom that is a label without a text is not drawn.
 HIDDEN = mujoco.mjtGeom.mjGEOM_LABEL
@@ -307,49 +291,6 @@ def check_size(width: int, height: int) -> None:
         )
 
 
-@contextmanager
-def video(
-    path: Path, width: int, height: int, fps: float
-) -> Iterator[Callable[[np.ndarray], None]]:
-    """Write a video, whole or not at all.
-
-    Args:
-        path: where to; an mp4 or a gif, by its name.
-        width, height: of the frames [pixels], even.
-        fps: frames a second.
-
-    Yields:
-        A function that appends one frame (height, width, 3) uint8.
-
-    Raises:
-        NoRenderer: ffmpeg is missing or failed; the message says how to mend it.
-    """
-    try:
-        import imageio_ffmpeg
-        import mediapy
-
-        mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
-        with (
-            artifacts.replacing(path) as temporary,
-            mediapy.VideoWriter(
-                temporary, (height, width), fps=fps, **ENCODERS[path.suffix]
-            ) as writer,
-            ThreadPoolExecutor(1) as thread,
-        ):
-            # One frame goes to the encoder while the next is drawn.
-            sent: Future[None] = thread.submit(lambda: None)
-
-            def add(frame: np.ndarray) -> None:
-                nonlocal sent
-                sent.result()
-                sent = thread.submit(writer.add_image, frame.copy())
-
-            yield add
-            sent.result()
-    except (ImportError, OSError, RuntimeError) as error:
-        raise NoRenderer(f"{path} cannot be encoded ({_short(error)}): {FFMPEG_CURE}") from error
-
-
 def _gl_context(width: int, height: int) -> Any:
     """A GL context off the screen: of the backend that was chosen, else EGL if there is one."""
     if not os.environ.get("MUJOCO_GL") and sys.platform.startswith("linux"):
@@ -366,13 +307,7 @@ def _gl_context(width: int, height: int) -> Any:
 
 def _no_gl(error: Exception) -> NoRenderer:
     backend = os.environ.get("MUJOCO_GL", "")
-    cause = mjcf.GL_PROBLEM or _short(error)
+    cause = mjcf.GL_PROBLEM or brief(error)
     return NoRenderer(
         f"off-screen rendering failed with MUJOCO_GL={backend!r} ({cause}): {GL_CURE}"
     )
-
-
-def _short(error: Exception) -> str:
-    """The kind of an error and the beginning of what it says, in one line."""
-    text = " ".join(str(error).split())
-    return f"{type(error).__name__}: {text if len(text) <= 160 else text[:157] + '...'}"

@@ -21,10 +21,10 @@ from planted import Cube, decisions, halves
 
 from hyrl_mj import BadArtifact, BadInput, MlpPolicy, load_run, pipeline
 from hyrl_mj.critical_set import CriticalSet
+from hyrl_mj.encoding import video
 from hyrl_mj.extended_sets import ExtendedSets
 from hyrl_mj.figures import CLASS_COLOURS
 from hyrl_mj.partition import Partition
-from hyrl_mj.rendering import video
 from hyrl_mj.report import render, write_report
 from hyrl_mj.run_directory import Run, write_config
 from hyrl_mj.sets import Grid, GridSet

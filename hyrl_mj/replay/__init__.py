@@ -12,9 +12,9 @@ import numpy as np
 from PIL import Image
 
 from hyrl_mj import artifacts, mjcf
+from hyrl_mj.encoding import ENCODERS, video
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.progress import Progress
-from hyrl_mj.rendering import ENCODERS, video
 from hyrl_mj.replay.marks import Floor
 from hyrl_mj.replay.screen import LAYOUTS, Screen
 from hyrl_mj.replay.timeline import frame_times
