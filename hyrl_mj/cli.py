@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import os
 import sys
 from collections.abc import Callable
@@ -283,6 +285,8 @@ COMMANDS: dict[str, Callable[..., None]] = {
 def main() -> None:
     """The console script `hyrl-mj`."""
     progress.enabled = sys.stderr.isatty()
+    # Python would look for garbage among torch's modules for most of a second before it ends.
+    atexit.register(gc.freeze)
     try:
         tyro.extras.subcommand_cli_from_dict(
             COMMANDS,

@@ -29,7 +29,7 @@ class Training:
         anneal: whether it falls linearly to (almost) zero.
         gamma: discount factor.
         symmetric: whether the network is made to respect the task's mirror symmetry, if it has one.
-            It then has twice the width.
+            Its weights then serve twice, and the policy has twice the width.
         warm_start: whether training goes on from the weights of stage 1 (stage 6 only). A Gaussian
             policy that has made up its mind does not try the other way any more: PPO starts afresh.
         episode: samples until an episode is truncated, by default the task's; shorter ones see more of
@@ -116,7 +116,7 @@ class Settings:
 # Stage 1 of each preset, by algorithm.
 _DQN_FAST = Training(
     algorithm="dqn",
-    samples=200_000,
+    samples=150_000,
     envs=64,
     hidden=(64, 64),
     activation="relu",

@@ -2,58 +2,59 @@
 
 The rewards of HyRL's problems are symmetric with respect to a hyperplane (paper, Section IV-B), and at
 the start the two ways past an obstacle differ by a thousandth of the return: less than the error of a
-freely trained network, which then decides at an arbitrary place. Here every layer holds two copies of
-the same weights, one that looks at the observation o and one at its mirror image S o; the output averages
-the first with the mirrored second. The result is a plain network of twice the width.
+freely trained network, which then decides at an arbitrary place. Here a network f sees the observation o
+and its mirror image S o in one batch, and answers with the mean of f(o) and the mirrored f(S o). That is a
+plain network of twice the width, whose two halves have the same weights.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from torch import nn
-from torch.nn.utils import parametrize
 
 from hyrl_mj.policies import MlpPolicy
 from hyrl_mj.tasks.base import Task
 
 
 def impose(policy: Any, task: Task) -> None:
-    """Tie the weights of an SB3 MLP policy (PPO or DQN) so that it respects `task.mirror`.
+    """Make the networks of an SB3 MLP policy (PPO or DQN) respect `task.mirror`.
 
     Args:
-        policy: an SB3 policy whose hidden layers have even width.
+        policy: an SB3 policy; its weights stay, and so do their names.
         task: a task with a mirror symmetry.
     """
     assert task.mirror is not None
     signs = torch.tensor(task.mirror.observation, dtype=torch.float32)
-    turn = torch.tensor(_turn(task), dtype=torch.float32)
-    values = hasattr(policy, "q_net")
-    if values:
-        for network in (policy.q_net.q_net, policy.q_net_target.q_net):
-            _tie([*network], signs, turn)
-    else:
-        _tie([*policy.mlp_extractor.policy_net, policy.action_net], signs, turn)
-        _tie([*policy.mlp_extractor.value_net, policy.value_net], signs, torch.eye(1))
-    rate = policy.optimizer.param_groups[0]["lr"]
-    trained = policy.q_net if values else policy
-    policy.optimizer = policy.optimizer_class(
-        trained.parameters(), lr=rate, **policy.optimizer_kwargs
-    )
+    for names, turn in _networks(policy, task):
+        first, last = policy.get_submodule(names[0]), policy.get_submodule(names[-1])
+        first.register_forward_pre_hook(partial(_see_both, signs))
+        last.register_forward_hook(partial(_average, turn))
+    policy.symmetric = True
 
 
-def plain_state(policy: nn.Module) -> dict[str, torch.Tensor]:
-    """The state dict of a policy with the tied weights written out."""
-    state: dict[str, torch.Tensor] = {}
-    for name, module in policy.named_modules():
-        if isinstance(module, nn.Linear):
-            state |= {f"{name}.weight": module.weight, f"{name}.bias": module.bias}
-    for name, tensor in policy.state_dict().items():
-        if "parametrizations" not in name:
-            state.setdefault(name, tensor)
+def plain_state(policy: Any, task: Task) -> dict[str, torch.Tensor]:
+    """The state dict of an SB3 policy as a plain network; of twice the width if it was made symmetric."""
+    state: dict[str, torch.Tensor] = policy.state_dict()
+    if not getattr(policy, "symmetric", False):
+        return state
+    assert task.mirror is not None
+    signs = torch.tensor(task.mirror.observation, dtype=torch.float32)
+    for names, turn in _networks(policy, task):
+        for name in names:
+            weight, bias = state[f"{name}.weight"], state[f"{name}.bias"]
+            if name == names[0]:
+                wide, bias = torch.cat([weight, weight * signs]), bias.repeat(2)
+            elif name == names[-1]:
+                wide = torch.cat([weight, turn @ weight], dim=1) / 2
+                bias = (bias + turn @ bias) / 2
+            else:
+                wide, bias = torch.block_diag(weight, weight), bias.repeat(2)
+            state[f"{name}.weight"], state[f"{name}.bias"] = wide, bias
     return state
 
 
@@ -83,76 +84,29 @@ def _turn(task: Task) -> np.ndarray:
     return np.eye(len(pairs))[pairs]
 
 
-def _tie(layers: list[nn.Module], signs: torch.Tensor, turn: torch.Tensor) -> None:
-    """Tie the linear layers of one network from observation to output."""
-    linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
-    first, *middle, last = linear
-    parametrize.register_parametrization(first, "weight", _First(signs))
-    for layer in middle:
-        parametrize.register_parametrization(layer, "weight", _Middle())
-    for layer in (first, *middle):
-        parametrize.register_parametrization(layer, "bias", _Twice())
-    parametrize.register_parametrization(last, "weight", _Last(turn))
-    parametrize.register_parametrization(last, "bias", _Average(turn))
+def _networks(policy: Any, task: Task) -> list[tuple[list[str], torch.Tensor]]:
+    """Of each network: the names of its linear layers, in order, and what the mirror does to its output."""
+    linear = [name for name, layer in policy.named_modules() if isinstance(layer, nn.Linear)]
+    turn = torch.tensor(_turn(task), dtype=torch.float32)
+    parts: dict[tuple[str, ...], torch.Tensor]
+    if hasattr(policy, "q_net"):
+        parts = {("q_net.",): turn, ("q_net_target.",): turn}
+    else:
+        parts = {
+            ("mlp_extractor.policy_net", "action_net"): turn,
+            ("mlp_extractor.value_net", "value_net"): torch.eye(1),
+        }
+    return [([n for n in linear if n.startswith(part)], turn) for part, turn in parts.items()]
 
 
-class _First(nn.Module):
-    """(h, o) -> (2 h, o): the first half sees o, the second S o."""
-
-    def __init__(self, signs: torch.Tensor):
-        super().__init__()
-        self._signs = signs
-
-    def forward(self, half: torch.Tensor) -> torch.Tensor:
-        return torch.cat([half, half * self._signs])
-
-    def right_inverse(self, whole: torch.Tensor) -> torch.Tensor:
-        return whole[: len(whole) // 2].clone()
+def _see_both(signs: torch.Tensor, layer: nn.Module, given: tuple[torch.Tensor]) -> torch.Tensor:
+    """(n, k) observations -> (2 n, k): they and their mirror images."""
+    return torch.cat([given[0], given[0] * signs])
 
 
-class _Middle(nn.Module):
-    """(h, g) -> (2 h, 2 g): each half goes on by itself."""
-
-    def forward(self, half: torch.Tensor) -> torch.Tensor:
-        return torch.block_diag(half, half)
-
-    def right_inverse(self, whole: torch.Tensor) -> torch.Tensor:
-        return whole[: whole.shape[0] // 2, : whole.shape[1] // 2].clone()
-
-
-class _Twice(nn.Module):
-    """(h,) -> (2 h,)."""
-
-    def forward(self, half: torch.Tensor) -> torch.Tensor:
-        return torch.cat([half, half])
-
-    def right_inverse(self, whole: torch.Tensor) -> torch.Tensor:
-        return whole[: len(whole) // 2].clone()
-
-
-class _Last(nn.Module):
-    """(k, h) -> (k, 2 h): the mean of the first half's output and the second's, mirrored."""
-
-    def __init__(self, turn: torch.Tensor):
-        super().__init__()
-        self._turn = turn
-
-    def forward(self, half: torch.Tensor) -> torch.Tensor:
-        return torch.cat([half, self._turn @ half], dim=1) / 2
-
-    def right_inverse(self, whole: torch.Tensor) -> torch.Tensor:
-        return whole[:, : whole.shape[1] // 2].clone()
-
-
-class _Average(nn.Module):
-    """(k,) -> (k,): the mean of a bias and its mirror image."""
-
-    def __init__(self, turn: torch.Tensor):
-        super().__init__()
-        self._turn = turn
-
-    def forward(self, bias: torch.Tensor) -> torch.Tensor:
-        return (bias + self._turn @ bias) / 2
-
-    def right_inverse(self, whole: torch.Tensor) -> torch.Tensor:
-        return whole.clone()
+def _average(
+    turn: torch.Tensor, layer: nn.Module, given: tuple[torch.Tensor], output: torch.Tensor
+) -> torch.Tensor:
+    """(2 n, k) outputs -> (n, k): the mean of the first half and the second, mirrored."""
+    straight, image = output.chunk(2)
+    return (straight + image @ turn.T) / 2

@@ -100,9 +100,6 @@ def build(
         raise unknown("algorithm", settings.algorithm, ALGORITHMS)
     hidden = settings.hidden if start_from is None else start_from.hidden
     activation = settings.activation if start_from is None else start_from.activation
-    mirrored = settings.symmetric and start_from is None and task.mirror is not None
-    if mirrored:
-        hidden = tuple(2 * width for width in hidden)
     rate = settings.learning_rate
     env = BatchedEnv(task, settings.envs, noise=noise, domain=domain, max_steps=settings.episode)
     model = ALGORITHMS[settings.algorithm](
@@ -118,14 +115,14 @@ def build(
     if start_from is not None:
         state = {name: torch.as_tensor(np.array(w)) for name, w in start_from.weights.items()}
         model.policy.load_state_dict(state)
-    if mirrored:
+    if settings.symmetric and start_from is None and task.mirror is not None:
         symmetry.impose(model.policy, task)
     return model
 
 
 def export(model: BaseAlgorithm, task: Task) -> MlpPolicy:
     """The policy that an SB3 algorithm has learned so far, as a plain network."""
-    state = symmetry.plain_state(model.policy)
+    state = symmetry.plain_state(model.policy, task)
     weights = {name: tensor.detach().cpu().numpy().copy() for name, tensor in state.items()}
     activation = next(n for n, a in ACTIVATIONS.items() if a is model.policy.activation_fn)
     algorithm = next(name for name, kind in ALGORITHMS.items() if isinstance(model, kind))

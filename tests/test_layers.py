@@ -18,8 +18,8 @@ PACKAGE = Path(hyrl_mj.__file__).parent
 ORDER = (
     "errors", "progress", "colours", "mjcf", "plant", "noise", "tasks", "settings", "artifacts",
     "policies", "controllers", "adversary", "rendering", "encoding", "envs", "simulation",
-    "symmetry", "training",
-    "sets", "lattice", "game", "critical_set", "partition", "limit", "extended_sets", "retraining",
+    "symmetry", "training", "sets", "lattice", "game", "critical_set", "partition", "limit",
+    "extended_sets", "retraining",
     "hybrid", "robustness", "episodes", "run_directory", "tables", "figures", "replay", "viewing", "arcs",
     "doctor", "report", "pipeline", "summary", "cli",
 )  # fmt: skip
@@ -119,7 +119,8 @@ def test_a_saved_policy_works_without_torch(task, tmp_path):
 # Slow to import, and seldom needed.
 HEAVY = {
     "PIL", "hyrl_mj.encoding", "hyrl_mj.rendering", "hyrl_mj.replay", "imageio_ffmpeg", "jinja2",
-    "matplotlib", "mediapy", "mujoco.batch", "rich", "scipy", "stable_baselines3", "tensorboard", "torch", "tqdm",
+    "matplotlib", "mediapy", "mujoco.batch", "rich", "scipy",
+    "stable_baselines3", "tensorboard", "torch", "tqdm",
 }  # fmt: skip
 HELP = """
 import sys
