@@ -15,6 +15,7 @@ from hyrl_mj.tasks.base import Task
 
 # A point this close to the edge of a flow set is on it [chart units].
 ON_EDGE = 1e-9
+Rows = np.ndarray | slice
 
 
 @dataclass(frozen=True)
@@ -87,36 +88,42 @@ class HybridController:
             raise BadInput(
                 f"{len(measured)} measurements need q of shape ({len(measured)},), got {q.shape}"
             )
-        q_next = self._jump(q, self.task.z(measured))
-        u = np.empty((len(measured), len(self.task.inputs)))
-        for mode, rows in self._rows(q_next).items():
-            u[rows] = self.policies[mode].act(measured[rows])
-        return u, q_next
-
-    def _jump(self, q: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """The modes (n,) after the jumps that z (n, d) calls for."""
         rows_of = self._rows(q)
-        q_next = q.astype(int)
+        q_next = self._jump(q, self.task.z(measured), rows_of)
+        if q_next is not q:
+            rows_of = self._rows(q_next)
+        u = np.empty((len(measured), len(self.task.inputs)))
         for mode, rows in rows_of.items():
-            jumps = rows[self.flow_sets[mode].signed_distance(z[rows]) > ON_EDGE]
+            u[rows] = self.policies[mode].act(measured[rows])
+        return u, q_next.astype(int)
+
+    def _jump(self, q: np.ndarray, z: np.ndarray, rows_of: dict[int, Rows]) -> np.ndarray:
+        """The modes (n,) after the jumps that z (n, d) calls for; q itself if it calls for none."""
+        q_next = q
+        for mode, rows in rows_of.items():
+            jumps = self.flow_sets[mode].signed_distance(z[rows]) > ON_EDGE
             others = [other for other in self.modes if other != mode]
-            if len(others) == 1:
-                q_next[jumps] = others[0]
-            elif others:
-                q_next[jumps] = self._deepest(others, z[jumps])
+            if others and jumps.any():
+                q_next = q.copy() if q_next is q else q_next
+                jumping = np.arange(len(q))[rows][jumps]
+                q_next[jumping] = self._deepest(others, z[jumping])
         return q_next
 
     def _deepest(self, modes: Sequence[int], z: np.ndarray) -> np.ndarray:
         """That of the modes (n,) whose flow set holds z (n, d) most deeply."""
+        if len(modes) == 1:
+            return np.full(len(z), modes[0])
         distances = [self.flow_sets[q].signed_distance(z) for q in modes]
         return np.array(modes)[np.argmin(distances, axis=0)]
 
-    def _rows(self, q: np.ndarray) -> dict[int, np.ndarray]:
+    def _rows(self, q: np.ndarray) -> dict[int, Rows]:
         """The rows of q (n,) in each mode that has any.
 
         Raises:
             BadInput: a mode is unknown.
         """
+        if len(q) == 1 and q[0] in self.modes:
+            return {int(q[0]): slice(None)}  # without a copy
         rows = {mode: (q == mode).nonzero()[0] for mode in self.modes}
         if sum(map(len, rows.values())) < len(q):
             wrong = q[~np.isin(q, self.modes)]
