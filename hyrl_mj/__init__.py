@@ -9,7 +9,7 @@ from hyrl_mj import mjcf as _mjcf  # first: it chooses the GL backend before muj
 from hyrl_mj.controllers import Controller
 from hyrl_mj.critical_set import CriticalSet, find_critical_set
 from hyrl_mj.envs.gym_env import register_envs
-from hyrl_mj.errors import BadArtifact, BadInput, HyrlError, NoRenderer, SimulationDiverged
+from hyrl_mj.errors import BadArtifact, BadInput, HyrlError, NoRenderer
 from hyrl_mj.extended_sets import ExtendedSets, extend
 from hyrl_mj.hybrid import HybridController
 from hyrl_mj.noise import Noise, Recorded
@@ -45,7 +45,6 @@ __all__ = [
     "Run",
     "Score",
     "Settings",
-    "SimulationDiverged",
     "StateSet",
     "Task",
     "closed_loop",

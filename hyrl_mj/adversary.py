@@ -67,7 +67,8 @@ class Lookahead:
             ahead.set_state(qpos, qvel)
             ahead.step(u)
             after = ahead.measurement
-            danger = np.where(self.task.failed(after), np.inf, self.task.danger(after))
+            failed = self.task.failed(after) | ahead.unstable
+            danger = np.where(failed, np.inf, self.task.danger(after))
             better = danger > worst
             worst, chosen[better] = np.where(better, danger, worst), candidate
         return chosen

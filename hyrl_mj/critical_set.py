@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from hyrl_mj import artifacts
+from hyrl_mj.errors import unknown
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import PolicyController, closed_loop
 from hyrl_mj.tasks.base import Task
 
+METHODS = ("rods", "outcome")
 # Samples that the two ends of a rod run: long enough to part, too short to come round an obstacle.
 SAMPLES = 5
 # The ends part when they grow apart by this share of the way that both went: displacements of equal
@@ -91,23 +93,47 @@ class CriticalSet:
             )
 
 
-def find_critical_set(task: Task, policy: Policy, cells: int, resolution: float) -> CriticalSet:
-    """Search for M* with rods: two starts a small distance apart along one chart axis.
+def find_critical_set(
+    task: Task, policy: Policy, cells: int, resolution: float, method: str = "rods"
+) -> CriticalSet:
+    """Search for M*.
 
-    Both ends of a rod run the closed loop for a few samples. If they part, the rod is cut in two
-    halves, and so on down to the resolution; the centres of the last rods that part are critical if
-    the closed loop goes different ways from their ends for good. All rods of a level are one batch.
+    With `rods` (paper, Step 2), two starts a small distance apart along one chart axis: both ends of a
+    rod run the closed loop for a few samples. If they part, the rod is cut in two halves, and so on down
+    to the resolution; the centres of the last rods that part are critical if the closed loop goes
+    different ways from their ends for good.
+
+    By `outcome`, neighbouring nodes of a grid from which the closed loop goes different ways: the way
+    from the middle between them tells in which half to look on, down to the resolution. That takes
+    whole runs, and finds a decision that shows late: of a plant with inertia, say.
+
+    All runs of a level are one batch.
 
     Args:
         task: gives chart, plant, and the direction of a run.
         policy: closes the loop.
         cells: grid points along the longest side of the chart from which the search starts.
         resolution: length of the last rods, as a share of the first.
+        method: "rods" or "outcome".
 
     Returns:
         The critical set; it may be empty.
+
+    Raises:
+        BadInput: an unknown method.
     """
-    grid = Grid.with_cells(task.chart, cells)
+    if method not in METHODS:
+        raise unknown("method", method, METHODS)
+    grid, d = Grid.with_cells(task.chart, cells), task.chart.dimension
+    found = (_by_rods if method == "rods" else _by_outcome)(task, policy, grid, resolution)
+    points = np.unique(task.chart.wrap(found), axis=0) if len(found) else np.empty((0, d))
+    return CriticalSet(
+        points, _pieces(task, points, LINK * grid.cell), resolution * grid.cell, grid.cell
+    )
+
+
+def _by_rods(task: Task, policy: Policy, grid: Grid, resolution: float) -> np.ndarray:
+    """Centres (N, d) of the last rods that part."""
     d = task.chart.dimension
     centre = np.repeat(grid.nodes, d, axis=0)
     axis = np.tile(np.arange(d), len(grid.nodes))
@@ -121,11 +147,52 @@ def find_critical_set(task: Task, policy: Policy, cells: int, resolution: float)
         offset[np.arange(len(centre)), axis] = length / 4
         centre = np.vstack([centre - offset, centre + offset])
         axis, length = np.tile(axis, 2), np.tile(length / 2, 2)
-    centre = centre[_differ(task, policy, *_ends(task, centre, axis, length))]
-    points = np.unique(task.chart.wrap(centre), axis=0) if len(centre) else np.empty((0, d))
-    return CriticalSet(
-        points, _pieces(task, points, LINK * grid.cell), resolution * grid.cell, grid.cell
-    )
+    return centre[_differ(task, policy, *_ends(task, centre, axis, length))]
+
+
+def _by_outcome(task: Task, policy: Policy, grid: Grid, resolution: float) -> np.ndarray:
+    """Middles (N, d) between starts so close together whose runs go different ways."""
+
+    def ways(z: np.ndarray) -> np.ndarray:
+        if not len(z):
+            return np.zeros(0, dtype=int)
+        return task.direction(closed_loop(task, PolicyController(policy), z).path)
+
+    at_node = ways(grid.nodes)
+    first, second = grid.neighbours()
+    pair = (at_node[first] != at_node[second]) & (at_node[first] >= 0) & (at_node[second] >= 0)
+    first, second = first[pair], second[pair]
+    a, way_a, way_b = grid.nodes[first], at_node[first], at_node[second]
+    b = a + task.chart.difference(grid.nodes[second], a)
+    length = grid.cell
+    while len(a) and length > resolution * grid.cell * (1 + 1e-9):
+        middle = (a + b) / 2
+        way = ways(middle)
+        near_a = (way == way_a)[:, None]
+        a, b = np.where(near_a, middle, a), np.where(near_a, b, middle)
+        way_b = np.where(near_a[:, 0], way_b, way)
+        # In the middle there may be nothing to decide.
+        going, length = way >= 0, length / 2
+        a, b, way_a, way_b = a[going], b[going], way_a[going], way_b[going]
+    return ((a + b) / 2)[_go_apart(task, policy, a, b, grid.cell)]
+
+
+def _go_apart(task: Task, policy: Policy, a: np.ndarray, b: np.ndarray, far: float) -> np.ndarray:
+    """Whether runs from a and b (n, d) get as far as that apart while both last: (n,) bool.
+
+    Two runs that a pillar stops on either side of its middle go nowhere different, and neither do two
+    that dither around the same point, a sample to and a sample fro.
+    """
+    n = len(a)
+    if not n:
+        return np.zeros(0, dtype=bool)
+    rollout = closed_loop(task, PolicyController(policy), np.vstack([a, b]))
+    moved = rollout.path - rollout.path[0]
+    apart = np.linalg.norm(moved[:, :n] - moved[:, n:], axis=2)
+    last = np.minimum(rollout.length[:n], rollout.length[n:])
+    apart[np.arange(len(apart))[:, None] > last] = 0.0
+    hop = np.linalg.norm(np.diff(rollout.path, axis=0), axis=2).max(axis=0)
+    return np.asarray(apart.max(axis=0) > far + hop[:n] + hop[n:])
 
 
 def _ends(

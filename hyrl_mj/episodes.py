@@ -65,7 +65,7 @@ def episodes(
                 draw, signal = np.random.SeedSequence([seed, first]).generate_state(2)
                 z0 = task.starts(n, np.random.default_rng(draw))
                 rollout = closed_loop(
-                    task, controller, z0, noise=noise, seed=int(signal), quiet=True
+                    task, controller, z0, noise=noise, seed=int(signal), quiet=True, vary=True
                 )
                 for region, inside in _regions(task, critical, noise.bound, winnable, z0).items():
                     counts.setdefault(region, np.zeros(len(Outcome), dtype=int))

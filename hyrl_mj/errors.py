@@ -20,10 +20,6 @@ class BadArtifact(BadInput):
     """A file that is missing, truncated, of another version, or not what its name says."""
 
 
-class SimulationDiverged(HyrlError):
-    """MuJoCo gave up on a simulation: its state is not finite any more."""
-
-
 class NoRenderer(HyrlError):
     """Off-screen rendering or video encoding is not possible on this machine."""
 

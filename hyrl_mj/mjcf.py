@@ -76,11 +76,6 @@ def load(path: Path) -> mujoco.MjModel:
         raise BadInput(f"MuJoCo cannot compile {path}: {error}") from error
 
 
-def load_task_model(name: str) -> mujoco.MjModel:
-    """The compiled model `models/<name>.xml` of a task."""
-    return load(models_dir() / f"{name}.xml")
-
-
 def object_id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
     """The id of a named object.
 
@@ -100,6 +95,7 @@ def names(model: mujoco.MjModel, kind: mujoco.mjtObj) -> list[str]:
         mujoco.mjtObj.mjOBJ_ACTUATOR: model.nu,
         mujoco.mjtObj.mjOBJ_CAMERA: model.ncam,
         mujoco.mjtObj.mjOBJ_GEOM: model.ngeom,
+        mujoco.mjtObj.mjOBJ_NUMERIC: model.nnumeric,
         mujoco.mjtObj.mjOBJ_SENSOR: model.nsensor,
         mujoco.mjtObj.mjOBJ_SITE: model.nsite,
     }[kind]
@@ -129,6 +125,21 @@ def geom_pos(model: mujoco.MjModel, name: str) -> np.ndarray:
 def geom_size(model: mujoco.MjModel, name: str) -> np.ndarray:
     """Sizes of a geom, for a cylinder (radius, half height, 0): (3,) [m]."""
     return model.geom_size[object_id(model, mujoco.mjtObj.mjOBJ_GEOM, name)].copy()
+
+
+def numeric(model: mujoco.MjModel, name: str, size: int) -> np.ndarray:
+    """The values (size,) of a custom numeric.
+
+    Raises:
+        BadInput: the model has no such numeric, or one of another size.
+    """
+    index = object_id(model, mujoco.mjtObj.mjOBJ_NUMERIC, name)
+    first, found = model.numeric_adr[index], model.numeric_size[index]
+    if found != size:
+        raise BadInput(
+            f"numeric {name} of model {model_name(model)} has {found} value(s): give it {size}"
+        )
+    return np.array(model.numeric_data[first : first + size])
 
 
 def sample_time(model: mujoco.MjModel) -> float:

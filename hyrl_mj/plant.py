@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
 
 from hyrl_mj import mjcf
-from hyrl_mj.errors import BadInput, SimulationDiverged
+from hyrl_mj.errors import BadInput
 
+# What the sensors give (n, sensors) -> the measurement (n, p).
+Measure = Callable[[np.ndarray], np.ndarray]
+# Inputs (n, m), positions (n, nq), velocities (n, nv) -> controls of all actuators (n, nu).
+Control = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 # A float32 policy may overshoot an input limit by a rounding error; more than this is a mistake.
 INPUT_TOLERANCE = 1e-6
 
@@ -24,23 +28,35 @@ class Plant:
             others hold the control of the model's first keyframe, or zero.
         n: number of copies.
         threads: threads of the physics, 0 for all cores. The result does not depend on it.
+        measure: makes the measurement of what the sensors give; by default it is just that.
+        control: an inner loop that makes the controls of all actuators out of u, at every physics step
+            and from the true state. `inputs` are then names of MJCF numerics that hold their limits.
     """
 
-    def __init__(self, model: mujoco.MjModel, inputs: Sequence[str], n: int, threads: int = 0):
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        inputs: Sequence[str],
+        n: int,
+        threads: int = 0,
+        *,
+        measure: Measure = lambda given: given,
+        control: Control | None = None,
+    ):
         from mujoco.batch import Batch  # slow to import
 
-        actuator = mujoco.mjtObj.mjOBJ_ACTUATOR
-        self.n = n
+        self.n, self._measure, self._control = n, measure, control
         self.model = copy.copy(model)
         # A bad state has to stay visible: MuJoCo would reset it and only count a warning. Inputs are
         # checked here, and clamping them would be in the way of running backward.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
         self.substeps = max(round(mjcf.sample_time(model) / model.opt.timestep), 1)
-        self.columns = [mjcf.object_id(model, actuator, name) for name in inputs]
-        self.low, self.high = input_limits(model, inputs)
+        self.low, self.high = input_limits(model, inputs, of_actuators=control is None)
+        self._columns = [] if control else actuator_columns(model, inputs)
         self._held = model.key_ctrl[0].copy() if model.nkey else np.zeros(model.nu)
         self._batch = Batch(self.model, n, threads)
+        self._unstable = np.zeros(n, dtype=bool)
         self._initial = self._batch.state[0].copy()
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._ctrl = self._batch.bind("ctrl")
@@ -53,8 +69,17 @@ class Plant:
 
     @property
     def measurement(self) -> np.ndarray:
-        """What the sensors give now, without noise: (n, p), a copy."""
-        return self._sensors.copy() if self._joints is None else self._batch.state[:, self._joints]
+        """What is measured now, without noise: (n, p), a copy."""
+        given = self._sensors.copy() if self._joints is None else self._batch.state[:, self._joints]
+        return self._measure(given)
+
+    @property
+    def unstable(self) -> np.ndarray:
+        """(n,) bool, copies whose simulation left the finite numbers since they were put into a state.
+
+        They stand in the model's initial state; the others do not notice.
+        """
+        return self._unstable.copy()
 
     @property
     def qpos(self) -> np.ndarray:
@@ -92,6 +117,7 @@ class Plant:
         self._batch.state[rows] = self._initial  # time, activations and warm starts, too
         self._qpos[rows], self._qvel[rows] = qpos, qvel
         self._ctrl[rows] = self._held
+        self._unstable[rows] = False
         if self._joints is None:
             self._batch.forward(ids, self._stage)
 
@@ -104,9 +130,13 @@ class Plant:
 
         Raises:
             BadInput: a wrong shape, a value that is not finite, or one outside the input limits.
-            SimulationDiverged: a copy left the finite numbers.
         """
-        self._advance(self._controls(u, ids), ids)
+        u, rows = self._inputs(u, ids), slice(None) if ids is None else ids
+        if self._control is None:
+            self._advance(self._controls(u), ids, self.substeps)
+            return
+        for _ in range(self.substeps):
+            self._advance(self._control(u, self._qpos[rows], self._qvel[rows]), ids, 1)
 
     def step_backward(self, u: np.ndarray, ids: np.ndarray | None = None) -> None:
         """Undo `step`: one sample of x' = -f(x, u), for plants with kinematic actuators only.
@@ -119,19 +149,22 @@ class Plant:
                 f"the plant {mjcf.model_name(self.model)} cannot be run backward: that takes a "
                 "velocity actuator with kv >= 1e6 on every degree of freedom, one to one"
             )
-        self._advance(-self._controls(u, ids), ids)
+        self._advance(-self._controls(self._inputs(u, ids)), ids, self.substeps)
 
     @property
     def invertible(self) -> bool:
         """Whether each degree of freedom simply follows its own velocity actuator."""
         model = self.model
+        if self._control is not None:
+            return False
         driven = sorted(model.actuator_trnid[:, 0])
         follows = -model.actuator_biasprm[:, 2] >= 1e6
         return bool(model.nq == model.nv and driven == list(range(model.njnt)) and follows.all())
 
-    def _controls(self, u: np.ndarray, ids: np.ndarray | None) -> np.ndarray:
+    def _inputs(self, u: np.ndarray, ids: np.ndarray | None) -> np.ndarray:
+        """Inputs (k, m), checked, inside their limits to the last bit."""
         count = self.n if ids is None else len(ids)
-        u = _checked("input", u, (count, len(self.columns)), ids)
+        u = _checked("input", u, (count, len(self.low)), ids)
         wrong = (u < self.low - INPUT_TOLERANCE) | (u > self.high + INPUT_TOLERANCE)
         if wrong.any():
             row, column = np.argwhere(wrong)[0]
@@ -139,32 +172,58 @@ class Plant:
                 f"input {u[row, column]:g} of simulation {row if ids is None else ids[row]} is "
                 f"outside the limits [{self.low[column]:g}, {self.high[column]:g}] of the MJCF"
             )
-        ctrl = np.tile(self._held, (count, 1))
-        ctrl[:, self.columns] = np.clip(u, self.low, self.high)
+        return np.clip(u, self.low, self.high)
+
+    def _controls(self, u: np.ndarray) -> np.ndarray:
+        """Controls of all actuators (k, nu) for inputs (k, m)."""
+        ctrl = np.tile(self._held, (len(u), 1))
+        ctrl[:, self._columns] = u
         return ctrl
 
-    def _advance(self, ctrl: np.ndarray, ids: np.ndarray | None) -> None:
+    def _advance(self, ctrl: np.ndarray, ids: np.ndarray | None, substeps: int) -> None:
         rows = slice(None) if ids is None else ids
         self._ctrl[rows] = ctrl
-        self._batch.step(ids, self.substeps, self._stage)
+        self._batch.step(ids, substeps, self._stage)
         # What MuJoCo itself calls bad: not a number, infinite, or beyond mjMAXVAL.
-        for name, values in (("qpos", self._qpos), ("qvel", self._qvel)):
-            bad = ~(np.abs(values) <= mujoco.mjMAXVAL)
-            if bad.any():
-                row, column = np.argwhere(bad)[0]
-                raise SimulationDiverged(
-                    f"simulation {row} of {self.n} of {mjcf.model_name(self.model)} diverged: "
-                    f"{name}[{column}] is {values[row, column]:g}; try a smaller timestep in the MJCF"
-                )
+        for values in (self._qpos, self._qvel):
+            good = np.abs(values) <= mujoco.mjMAXVAL
+            if not good.all():
+                self._give_up(np.flatnonzero(~good.all(axis=1)))
+
+    def _give_up(self, ids: np.ndarray) -> None:
+        """Put copies that cannot go on into the initial state, and remember that they could not."""
+        self._unstable[ids] = True
+        self._batch.state[ids] = self._initial
+        if self._joints is None:
+            self._batch.forward(ids, self._stage)
 
 
-def input_limits(model: mujoco.MjModel, inputs: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper limits (m,), (m,) of the named actuators, from their `ctrlrange`.
+def actuator_columns(model: mujoco.MjModel, names: Sequence[str]) -> list[int]:
+    """The ids of the named actuators.
 
     Raises:
-        BadInput: the model has no such actuator, or it has no limits.
+        BadInput: the model has no such actuator; the message lists those it has.
     """
-    columns = [mjcf.object_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in inputs]
+    return [mjcf.object_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in names]
+
+
+def input_limits(
+    model: mujoco.MjModel, inputs: Sequence[str], of_actuators: bool = True
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper limits (m,), (m,) of the inputs, from the MJCF.
+
+    Args:
+        model: the compiled model.
+        inputs: names of actuators with a `ctrlrange`, or of custom numerics with two values.
+        of_actuators: which of the two.
+
+    Raises:
+        BadInput: the model has no such actuator or numeric, or it gives no limits.
+    """
+    if not of_actuators:
+        ranges = np.array([mjcf.numeric(model, name, 2) for name in inputs])
+        return ranges[:, 0], ranges[:, 1]
+    columns = actuator_columns(model, inputs)
     for name, column in zip(inputs, columns, strict=True):
         if not model.actuator_ctrllimited[column]:
             raise BadInput(f"actuator {name} needs a ctrlrange in the MJCF: its input limits")

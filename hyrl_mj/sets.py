@@ -114,6 +114,17 @@ class Grid:
         index = np.round(self.index(z)).astype(int) % self.counts
         return np.ravel_multi_index(tuple(index.T), self.counts)
 
+    def neighbours(self) -> tuple[np.ndarray, np.ndarray]:
+        """All pairs of nodes next to each other along a coordinate: flat indices (k,), (k,)."""
+        index = np.arange(int(np.prod(self.counts))).reshape(self.counts)
+        pairs = []
+        for axis, periodic in enumerate(self.chart.periodic):
+            after = np.roll(index, -1, axis)
+            kept = slice(None) if periodic else slice(-1)
+            pairs.append([np.moveaxis(i, axis, 0)[kept].ravel() for i in (index, after)])
+        first, second = np.concatenate(pairs, axis=1)
+        return first, second
+
     @cached_property
     def _corners(self) -> np.ndarray:
         """The corners of a cell (d, 2**d, 1): 0 is below, 1 above; the last coordinate runs fastest."""

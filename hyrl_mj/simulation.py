@@ -66,6 +66,7 @@ def closed_loop(
     backward: bool = False,
     record: bool = False,
     quiet: bool = False,
+    vary: bool = False,
     label: str = "simulating",
 ) -> Rollout:
     """Run the closed loop from many starts at once.
@@ -81,16 +82,17 @@ def closed_loop(
         backward: run x' = -f(x, u) instead; runs then have no end but the last step.
         record: whether modes, measurements, inputs and states are kept.
         quiet: show no progress bar, because the caller has one.
+        vary: whether coordinates that the chart does not hold are drawn, too, as in training.
         label: what the progress bar says.
     """
     noise = noise or Noise()
     limit = task.max_steps if steps is None else steps
     n, rng, plant = len(z0), np.random.default_rng(seed), task.plant(len(z0))
-    plant.set_state(task.qpos(z0))
+    plant.set_state(*task.state(z0, np.random.default_rng([seed, 1]) if vary else None))
     measurement = plant.measurement
     q = np.full(n, NOT_STARTED) if q0 is None else np.asarray(q0, dtype=int).copy()
     disturb = _disturbance(task, controller, noise, n, rng)
-    outcome = np.full(n, Outcome.RUNNING) if backward else task.ending(measurement)
+    outcome = np.full(n, Outcome.RUNNING) if backward else task.outcome(measurement, plant.unstable)
     length = np.zeros(n, dtype=int)
     path = np.empty((limit + 1, n, task.chart.dimension))
     path[0] = task.z(measurement)
@@ -114,7 +116,7 @@ def closed_loop(
         path[k + 1] = task.z(measurement)
         length[active] = k + 1
         if not backward:
-            outcome[active] = task.ending(measurement[active])
+            outcome[active] = task.outcome(measurement[active], plant.unstable[active])
         if record:
             for name, value in (
                 ("before", before),

@@ -172,7 +172,7 @@ def ideal_controller(task, overlap=0.15, clear=0.9):
     )
 
 
-# ---- a task with a chart of three dimensions
+# ---- a task with a chart of three or four dimensions
 
 CUBE = """
 <mujoco model="cube">
@@ -181,19 +181,15 @@ CUBE = """
   </option>
   <worldbody>
     <body>
-      <joint name="a" type="slide" axis="1 0 0"/>
-      <joint name="b" type="slide" axis="0 1 0"/>
-      <joint name="c" type="slide" axis="0 0 1"/>
+      JOINTS
       <geom type="sphere" size="0.1" mass="1"/>
     </body>
   </worldbody>
   <actuator>
-    <velocity name="va" joint="a" kv="1e9" ctrlrange="-1 1"/>
-    <velocity name="vb" joint="b" kv="1e9" ctrlrange="-1 1"/>
-    <velocity name="vc" joint="c" kv="1e9" ctrlrange="-1 1"/>
+    ACTUATORS
   </actuator>
   <sensor>
-    <jointpos joint="a"/> <jointpos joint="b"/> <jointpos joint="c"/>
+    SENSORS
   </sensor>
 </mujoco>
 """
@@ -203,22 +199,33 @@ class Cube(Task):
     """A point that moves at will in a cube; runs differ by whether a level rises or falls.
 
     Args:
-        level: chart points (n, 3) -> (n,).
+        level: chart points (n, d) -> (n,).
+        d: its dimension, at most 4.
     """
 
     name = "cube"
     description = "planted"
-    chart = Chart(("a", "b", "c"), ("m",) * 3, (-1.0,) * 3, (1.0,) * 3, (False,) * 3)
-    inputs = ("va", "vb", "vc")
-    noisy = (True,) * 3
     mode_names = ("up", "down")
     algorithm = "ppo"
     max_steps = 12
     horizon = 0.3
 
-    def __init__(self, level):
-        self.level = level
-        self.model = mujoco.MjModel.from_xml_string(CUBE)
+    def __init__(self, level, d=3):
+        self.level, self.noisy, names = level, (True,) * d, "abce"[:d]
+        self.chart = Chart(tuple(names), ("m",) * d, (-1.0,) * d, (1.0,) * d, (False,) * d)
+        self.inputs = tuple(f"v{name}" for name in names)
+        axes = ("1 0 0", "0 1 0", "0 0 1", "1 1 1")
+        joint = '<joint name="{}" type="slide" axis="{}"/>'
+        velocity = '<velocity name="v{0}" joint="{0}" kv="1e9" ctrlrange="-1 1"/>'
+        parts = {
+            "JOINTS": [joint.format(name, axis) for name, axis in zip(names, axes, strict=False)],
+            "ACTUATORS": [velocity.format(name) for name in names],
+            "SENSORS": [f'<jointpos joint="{name}"/>' for name in names],
+        }
+        xml = CUBE
+        for key, lines in parts.items():
+            xml = xml.replace(key, "".join(lines))
+        self.model = mujoco.MjModel.from_xml_string(xml)
 
     def observation(self, measured):
         return measured
@@ -239,7 +246,7 @@ class Cube(Task):
         return np.zeros(len(z))
 
     def starts(self, n, rng):
-        return rng.uniform(-1, 1, (n, 3))
+        return rng.uniform(-1, 1, (n, self.chart.dimension))
 
     def direction(self, path):
         return np.where(self.level(path[-1]) > self.level(path[0]), 0, 1)

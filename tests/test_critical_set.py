@@ -1,4 +1,6 @@
-"""The search finds planted critical sets in one, two and three dimensions, and nothing else."""
+"""Both searches find planted critical sets in one to four dimensions, and nothing else."""
+
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,11 +15,18 @@ from planted import (
     two_way_circle_policy,
 )
 
-from hyrl_mj import CriticalSet, find_critical_set
+from hyrl_mj import BadInput, CriticalSet, find_critical_set
+from hyrl_mj.critical_set import METHODS
 
 PI = np.pi
 NORMAL = np.array([2.0, -1.0, 2.0]) / 3
 RESOLUTION = 1 / 32
+
+
+@pytest.fixture(params=METHODS)
+def search(request):
+    """`find_critical_set` by each method."""
+    return partial(find_critical_set, method=request.param)
 
 
 def heights(z):
@@ -32,36 +41,36 @@ def radii(z):
 
 
 @pytest.mark.parametrize("angle", [1.0, 2.345, PI, 4.4])
-def test_a_critical_angle_on_the_circle(circle, angle):
-    critical = find_critical_set(circle, circle_policy(circle, angle), 120, RESOLUTION)
+def test_a_critical_angle_on_the_circle(search, circle, angle):
+    critical = search(circle, circle_policy(circle, angle), 120, RESOLUTION)
     assert critical.pieces == 1
     assert np.abs(critical.points - angle).max() <= critical.resolution
     assert critical.resolution == pytest.approx(2 * PI / 120 / 32)
 
 
-def test_a_finer_resolution_gives_a_smaller_error(circle):
+def test_a_finer_resolution_gives_a_smaller_error(search, circle):
     angles, shares = (2.345, 3.3, 3.9), (1 / 2, 1 / 16, 1 / 128)
     errors = np.zeros((len(angles), len(shares)))
     for (i, j), _ in np.ndenumerate(errors):
-        found = find_critical_set(circle, circle_policy(circle, angles[i]), 60, shares[j])
+        found = search(circle, circle_policy(circle, angles[i]), 60, shares[j])
         errors[i, j] = np.abs(found.points - angles[i]).max()
     coarse, middle, fine = errors.max(axis=0)
     assert middle < coarse / 4
     assert fine < middle / 4
 
 
-def test_two_critical_angles_are_two_pieces(circle):
+def test_two_critical_angles_are_two_pieces(search, circle):
     policy = two_way_circle_policy(circle, 2.0, 3.0, 4.0)
-    critical = find_critical_set(circle, policy, 120, RESOLUTION)
+    critical = search(circle, policy, 120, RESOLUTION)
     assert critical.pieces == 2
     angles = sorted(critical.points[critical.component == k].mean() for k in range(2))
     assert angles == pytest.approx([2.0, 4.0], abs=critical.resolution)
     assert critical.sentence(circle).startswith("critical set of 2 pieces")
 
 
-def test_a_continuous_policy_has_one_too(circle):
+def test_a_continuous_policy_has_one_too(search, circle):
     policy = ChartPolicy(circle, lambda z: np.tanh(20 * (circle.chart.wrap(z) - PI)))
-    critical = find_critical_set(circle, policy, 120, RESOLUTION)
+    critical = search(circle, policy, 120, RESOLUTION)
     assert critical.pieces == 1
     assert np.abs(critical.points - PI).max() <= 2 * critical.resolution
 
@@ -69,8 +78,8 @@ def test_a_continuous_policy_has_one_too(circle):
 # ---- two dimensions
 
 
-def test_a_critical_line_before_the_obstacle(vehicle):
-    critical = find_critical_set(vehicle, sign_policy(vehicle), 60, RESOLUTION)
+def test_a_critical_line_before_the_obstacle(search, vehicle):
+    critical = search(vehicle, sign_policy(vehicle), 60, RESOLUTION)
     x, y = critical.points.T
     assert np.abs(y).max() <= critical.resolution
     assert critical.pieces == 1
@@ -79,13 +88,13 @@ def test_a_critical_line_before_the_obstacle(vehicle):
     assert 0.4 <= x.max() <= 0.8
 
 
-def test_a_slanted_critical_line(vehicle):
+def test_a_slanted_critical_line(search, vehicle):
     def line(x):
         return 0.1 - 0.4 * x
 
     errors = []
     for share in (1 / 2, 1 / 16):
-        critical = find_critical_set(vehicle, sign_policy(vehicle, line), 60, share)
+        critical = search(vehicle, sign_policy(vehicle, line), 60, share)
         assert critical.pieces == 1
         errors.append(np.abs(critical.points[:, 1] - line(critical.points[:, 0])).max())
         assert errors[-1] <= critical.resolution
@@ -96,30 +105,30 @@ def test_a_slanted_critical_line(vehicle):
 
 
 @pytest.mark.parametrize("share", [1 / 2, 1 / 8])
-def test_a_critical_plane(share):
+def test_a_critical_plane(search, share):
     cube = Cube(heights)
     policy = plane_policy(cube, NORMAL, lambda s: np.where(s >= 0.2, 1.0, -1.0))
-    critical = find_critical_set(cube, policy, 10, share)
+    critical = search(cube, policy, 10, share)
     assert critical.pieces == 1
     assert len(critical.points) > 100
     assert np.abs(heights(critical.points) - 0.2).max() <= share * critical.spacing
 
 
-def test_a_critical_sphere():
+def test_a_critical_sphere(search):
     cube = Cube(radii)
     errors = []
     for share in (1 / 2, 1 / 8):
-        critical = find_critical_set(cube, sphere_policy(cube, 0.6), 10, share)
+        critical = search(cube, sphere_policy(cube, 0.6), 10, share)
         assert critical.pieces == 1
         errors.append(np.abs(radii(critical.points) - 0.6).max())
         assert errors[-1] <= share * critical.spacing
     assert errors[1] < errors[0] / 2
 
 
-def test_two_critical_planes_are_two_pieces():
+def test_two_critical_planes_are_two_pieces(search):
     cube = Cube(heights)
     policy = plane_policy(cube, NORMAL, lambda s: np.sign(s) * np.where(np.abs(s) < 0.6, -1.0, 1.0))
-    critical = find_critical_set(cube, policy, 12, 1 / 4)
+    critical = search(cube, policy, 12, 1 / 4)
     assert critical.pieces == 2
     for k in range(2):
         s = heights(critical.points[critical.component == k])
@@ -127,34 +136,75 @@ def test_two_critical_planes_are_two_pieces():
         assert len(set(np.sign(s))) == 1
 
 
+# ---- four dimensions
+
+
+def test_a_critical_sphere_in_four_dimensions(search):
+    ball = Cube(radii, 4)
+    errors = []
+    for cells, share in ((4, 1 / 2), (4, 1 / 8), (8, 1 / 8)):
+        critical = search(ball, sphere_policy(ball, 0.8), cells, share)
+        assert critical.pieces == 1
+        errors.append(np.abs(radii(critical.points) - 0.8).max())
+        assert errors[-1] <= critical.resolution
+    assert errors[1] < errors[0] / 2
+    assert errors[2] < errors[1]
+
+
+# ---- both searches
+
+
+def test_both_agree_on_the_papers_problems(task):
+    policy = sign_policy(task) if task.name == "vehicle" else circle_policy(task, 3.0)
+    rods, outcome = (find_critical_set(task, policy, 60, RESOLUTION, m) for m in METHODS)
+    assert rods.pieces == outcome.pieces == 1
+    both = rods.resolution / 2 + outcome.resolution / 2
+    off = [
+        np.abs(found.points[:, -1] - (0 if task.name == "vehicle" else 3))
+        for found in (rods, outcome)
+    ]
+    assert max(off[0].max(), off[1].max()) <= both
+    low, high = np.array(
+        [[f.points.min(axis=0), f.points.max(axis=0)] for f in (rods, outcome)]
+    ).swapaxes(0, 1)
+    assert np.abs(np.diff(low, axis=0)).max() <= both
+    # Where M* ends before the obstacle, the last point is one of the grid's.
+    assert np.abs(np.diff(high, axis=0)).max() <= rods.spacing
+
+
+def test_an_unknown_method_is_refused(circle):
+    with pytest.raises(BadInput, match=r"'guess'.*rods, outcome"):
+        find_critical_set(circle, circle_policy(circle), 60, RESOLUTION, "guess")
+
+
 # ---- where there is none
 
 
-def test_one_way_policies_have_none(circle, vehicle):
+def test_one_way_policies_have_none(search, circle, vehicle):
     clockwise = ChartPolicy(circle, lambda z: np.full((len(z), 1), -1.0))
-    none = find_critical_set(circle, clockwise, 120, RESOLUTION)
+    none = search(circle, clockwise, 120, RESOLUTION)
     assert (len(none.points), none.pieces) == (0, 0)
     assert "no critical set found at this resolution" in none.sentence(circle)
     assert none.points.shape == (0, 1)
     for side in (-1.0, 1.0):
         policy = one_way_policy(vehicle, side)
-        assert find_critical_set(vehicle, policy, 60, RESOLUTION).pieces == 0
+        assert search(vehicle, policy, 60, RESOLUTION).pieces == 0
 
 
 @pytest.mark.parametrize("u", [-1.0, -0.5, 0.0, 1.0])
-def test_the_edge_between_crash_and_no_crash_is_not_critical(vehicle, u):
+def test_the_edge_between_crash_and_no_crash_is_not_critical(search, vehicle, u):
     constant = ChartPolicy(vehicle, lambda z: np.full((len(z), 1), u))
-    assert find_critical_set(vehicle, constant, 60, RESOLUTION).pieces == 0
+    assert search(vehicle, constant, 60, RESOLUTION).pieces == 0
 
 
-def test_a_set_point_is_not_critical(circle):
+def test_a_set_point_is_not_critical(search, circle):
     target = 3.0
     policy = ChartPolicy(circle, lambda z: np.where(circle.chart.wrap(z) < target, 1.0, -1.0))
-    critical = find_critical_set(circle, policy, 120, RESOLUTION)
+    critical = search(circle, policy, 120, RESOLUTION)
     assert (np.abs(critical.points - target) > 0.2).all()
     cube = Cube(radii)
     home = ChartPolicy(cube, lambda z: np.clip(-5 * z, -1, 1))
-    assert find_critical_set(cube, home, 10, 1 / 8).pieces == 0
+    assert search(cube, home, 10, 1 / 8).pieces == 0
 
 
 def test_an_empty_result_can_be_saved(circle, tmp_path):

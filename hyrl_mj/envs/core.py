@@ -105,7 +105,7 @@ class BatchedEnv:
         if z is None:
             draw = self.task.starts if self.domain is None else self.domain.starts
             z = draw(len(ids), self._rng)
-        self.plant.set_state(self.task.qpos(z), ids=ids)
+        self.plant.set_state(*self.task.state(z, self._rng), ids=ids)
         self._samples[ids] = 0
         return self.task.observation(self._measure(ids)).astype(np.float32)
 
@@ -118,9 +118,10 @@ class BatchedEnv:
         self.plant.step(u)
         self._samples += 1
         measurement = self.plant.measurement
-        outcome = self.task.ending(measurement)
+        outcome = self.task.outcome(measurement, self.plant.unstable)
         terminated = outcome != Outcome.RUNNING
         reward = self.task.reward(measurement)
+        reward[self.plant.unstable] = self.task.worst_reward
         measured = self._measure(self._everyone)
         if self.domain is not None:
             if self.domain.caution is not None:

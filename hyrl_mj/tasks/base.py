@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -29,6 +31,7 @@ class Outcome(IntEnum):
     CRASHED = 2
     OUT_OF_BOUNDS = 3
     STALLED = 4
+    UNSTABLE = 5
 
     @property
     def label(self) -> str:
@@ -170,7 +173,14 @@ class Task(ABC):
     @cached_property
     def model(self) -> mujoco.MjModel:
         """The compiled MJCF (shared: do not write to it)."""
-        return mjcf.load_task_model(self.name)
+        return mjcf.load(self.model_path)
+
+    @property
+    def model_path(self) -> Path:
+        """Its MJCF: `<name>.xml` beside the file that defines the task, else in `models`."""
+        beside = Path(inspect.getfile(type(self))).with_name(f"{self.name}.xml")
+        inside = mjcf.models_dir() / beside.name
+        return inside if inside.is_file() and not beside.is_file() else beside
 
     @cached_property
     def dt(self) -> float:
@@ -180,7 +190,7 @@ class Task(ABC):
     @cached_property
     def input_limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper limit of the inputs (m,), (m,), from the MJCF."""
-        return input_limits(self.model, self.inputs)
+        return input_limits(self.model, self.inputs, of_actuators=not self.has_inner_loop)
 
     @cached_property
     def input_levels(self) -> np.ndarray | None:
@@ -205,7 +215,8 @@ class Task(ABC):
 
     def plant(self, n: int, threads: int = 0) -> Plant:
         """n copies of the robot."""
-        return Plant(self.model, self.inputs, n, threads)
+        control = self.control if self.has_inner_loop else None
+        return Plant(self.model, self.inputs, n, threads, measure=self.measure, control=control)
 
     def check_state(self, z: ArrayLike) -> np.ndarray:
         """Chart points as a float array (n, d).
@@ -263,9 +274,47 @@ class Task(ABC):
             )
         return measured
 
+    def measure(self, sensors: np.ndarray) -> np.ndarray:
+        """The measurement (n, p) of what the sensors give (n, sensors), by default just that."""
+        return sensors
+
+    def control(self, u: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        """An inner loop, at the rate of the physics and from the true state.
+
+        A task that has one gives names of MJCF numerics as `inputs`; they hold the limits.
+
+        Args:
+            u: (n, m) inputs of the policy.
+            qpos, qvel: (n, nq), (n, nv) positions and velocities.
+
+        Returns:
+            (n, nu) controls of all actuators.
+        """
+        raise NotImplementedError
+
+    @property
+    def has_inner_loop(self) -> bool:
+        """Whether `control` is there, between the policy and the actuators."""
+        return type(self).control is not Task.control
+
+    def state(
+        self, z: np.ndarray, rng: np.random.Generator | None = None
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """The full state that belongs to chart points, by default these as positions, at rest.
+
+        Args:
+            z: (n, d) chart points.
+            rng: draws the coordinates that the chart does not hold, as a start distribution would have
+                them; without it they have their usual values.
+
+        Returns:
+            qpos (n, nq) and qvel (n, nv), None at rest.
+        """
+        return z, None
+
     def qpos(self, z: np.ndarray) -> np.ndarray:
         """The full position (n, nq) that belongs to chart points z (n, d)."""
-        return z
+        return self.state(z)[0]
 
     def z(self, measured: np.ndarray) -> np.ndarray:
         """Chart points (n, d) of measurements (n, p)."""
@@ -286,6 +335,10 @@ class Task(ABC):
     @abstractmethod
     def ending(self, measurement: np.ndarray) -> np.ndarray:
         """`Outcome` (n,) int of states that end an episode, RUNNING where it goes on."""
+
+    def outcome(self, measurement: np.ndarray, unstable: np.ndarray) -> np.ndarray:
+        """`Outcome` (n,) int of measurements (n, p), UNSTABLE where the simulation broke down (n,)."""
+        return np.where(unstable, Outcome.UNSTABLE, self.ending(measurement))
 
     def failed(self, measurement: np.ndarray) -> np.ndarray:
         """(n,) bool, states that end an episode without success."""
