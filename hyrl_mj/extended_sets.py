@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -118,7 +119,8 @@ def extend(
     """Extend the parts over M*.
 
     X_i are the states that x' = -f(x, pi_i(x)) reaches outside M_i within the horizon, from the
-    neighbourhood of M*. They are trimmed to where mode i still succeeds, with room for the noise, and
+    neighbourhood of M*; for a plant that cannot be run backward, those outside M_i that pi_i brings into
+    M_i within the horizon. They are trimmed to where mode i still succeeds, with room for the noise, and
     every part is widened by the noise bound, so that a wrong measurement does not flip the mode back:
 
         M_ext_i = ((M_i u X_i) n (W_i eroded by eps)) u (M_i dilated by eps)
@@ -152,14 +154,17 @@ def extend(
     # Only M* is to be covered; parts that meet again elsewhere, at the set-point, have nothing to decide.
     off = distance_to(task, critical, grid.nodes)
     around = off <= float(np.linalg.norm(2 * eps + hop))
-    starts = [grid.nodes[part.mask & (off <= near)] for part in parts]
     reached = list(parts)
+    if len(parts) > 1:
+        reach = [
+            backward_reach(task, pi, part, part.mask & (off <= near))
+            if task.plant(1).invertible
+            else forward_reach(task, pi, part, part.mask & (off <= near), part.dilated(radius).mask)
+            for pi, part in zip(pis, parts, strict=True)
+        ]
     steps = [max(round(horizon / task.dt), 1)] if horizon else range(1, _longest(task) + 1)
     for k in steps if len(parts) > 1 else ():
-        reached = [
-            part | backward_reach(task, pi, part, nodes, k)
-            for pi, part, nodes in zip(pis, parts, starts, strict=True)
-        ]
+        reached = [part | within(k) for part, within in zip(parts, reach, strict=True)]
         goals = [
             (w & r).mask & ~p.mask & around for w, r, p in zip(wanted, roomy, parts, strict=True)
         ]
@@ -213,20 +218,58 @@ def room_along(
 
 
 def backward_reach(
-    task: Task, pi: PartPolicy, part: GridSet, nodes: np.ndarray, steps: int
-) -> GridSet:
-    """X_i: what the backward closed loop reaches outside M_i from nodes (k, d), those near M*."""
+    task: Task, pi: PartPolicy, part: GridSet, rim: np.ndarray
+) -> Callable[[int], GridSet]:
+    """M_i u X_i by the number of samples.
+
+    Args:
+        task: gives the plant.
+        pi: pi_i.
+        part: M_i.
+        rim: (N,) bool, its nodes near M*, from where the closed loop is run backward.
+    """
+    grid, gap = part.grid, GAP_CELLS * part.grid.cell
+    nodes = grid.nodes[rim]
+
+    def within(steps: int) -> GridSet:
+        visited = np.zeros(len(grid.nodes), dtype=bool)
+        if len(nodes):
+            loop = PolicyController(pi)
+            path = closed_loop(task, loop, nodes, steps=steps, backward=True, label="backward").path
+            z = between_samples(path, grid)
+            visited[grid.nearest(z[task.chart.contains(z)])] = True
+        # Close the gaps between samples, together with the part that they leave.
+        wide = GridSet.from_mask(grid, visited | part.mask).dilated(gap)
+        return GridSet.from_mask(grid, wide.mask).eroded(gap)
+
+    return within
+
+
+def forward_reach(
+    task: Task, pi: PartPolicy, part: GridSet, rim: np.ndarray, asked: np.ndarray
+) -> Callable[[int], GridSet]:
+    """M_i u X_i by the number of samples, for plants that cannot be run backward.
+
+    Args:
+        task: gives the plant.
+        pi: pi_i.
+        part: M_i.
+        rim: (N,) bool, its nodes near M*; X_i are those that the closed loop brings there.
+        asked: (N,) bool, the nodes that may come to lie in the extended set.
+    """
     grid = part.grid
-    visited = np.zeros(len(grid.nodes), dtype=bool)
-    if len(nodes):
-        loop = PolicyController(pi)
-        path = closed_loop(task, loop, nodes, steps=steps, backward=True, label="backward").path
-        z = between_samples(path, grid)
-        visited[grid.nearest(z[task.chart.contains(z)])] = True
-    # Close the gaps between samples, together with the part that they leave.
-    gap = GAP_CELLS * grid.cell
-    wide = GridSet.from_mask(grid, visited | part.mask).dilated(gap)
-    return GridSet.from_mask(grid, wide.mask).eroded(gap)
+    outside = np.flatnonzero(asked & ~part.mask)
+    arrival = np.full(len(grid.nodes), np.inf)
+    if len(outside):
+        rollout = closed_loop(
+            task, PolicyController(pi), grid.nodes[outside], steps=_longest(task), label="forward"
+        )
+        under_way = np.ones(len(outside), dtype=bool)
+        for k, z in enumerate(rollout.path[1:], 1):
+            enters = under_way & part.contains(z)
+            arrival[outside[enters & rim[grid.nearest(z)]]] = k
+            under_way &= ~enters
+    return lambda steps: GridSet.from_mask(grid, part.mask | (arrival <= steps))
 
 
 def between_samples(path: np.ndarray, grid: Grid) -> np.ndarray:

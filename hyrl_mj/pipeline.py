@@ -54,7 +54,7 @@ def train_stage(run: Run, say: Say) -> None:
 def critical_set_stage(run: Run, say: Say) -> None:
     """Stage 2: find the critical set."""
     s = run.settings
-    critical = find_critical_set(run.task, run.policy, s.rods, s.resolution)
+    critical = find_critical_set(run.task, run.policy, s.rods, s.resolution, s.search)
     critical.save(run.path / "critical_set.npz")
     say(critical.sentence(run.task))
 

@@ -70,6 +70,7 @@ class Settings:
         rods: grid points along the longest side from which the search for critical points starts.
         lattice: cells along the longest side for the worst-case game.
         resolution: length of the last rods, as a share of the first.
+        search: how critical points are searched for, by "rods" or "outcome".
     """
 
     task: str
@@ -83,6 +84,7 @@ class Settings:
     rods: int
     lattice: int
     resolution: float = 1 / 32
+    search: str = "rods"
 
     def __post_init__(self) -> None:
         check_bound(self.noise)
@@ -251,6 +253,7 @@ def preset(
         stage1=stage1,
         stage6=stage6,
         cells=_CELLS[min(dimension, 3)],
+        search=task.search,
         rods=_RODS[min(dimension, 3)],
         lattice=(_LATTICE_SMOKE if name == "smoke" else LATTICE).get(dimension, 0),
     )

@@ -6,6 +6,7 @@ from planted import circle_policy, one_way_policy, sign_policy
 
 from hyrl_mj import extend, find_critical_set, make_partition
 from hyrl_mj.extended_sets import distance_to
+from hyrl_mj.plant import Plant
 
 PI = np.pi
 # From the axis an obstacle of radius 0.75 at x = 1.5 can be passed only if x <= this.
@@ -197,3 +198,25 @@ def test_sized_sets_survive_being_written(sized, vehicle, tmp_path):
     np.testing.assert_array_equal(back.narrow, sized[0.1].narrow)
     np.testing.assert_array_equal(back.room, sized[0.1].room)
     assert back.horizon == sized[0.1].horizon
+
+
+# ---- plants that cannot be run backward
+
+
+@pytest.mark.parametrize(("noise", "horizon"), [(0.1, None), (0.1, 0.3), (0.0, 0.2)])
+def test_forward_runs_give_the_sets_that_backward_ones_give(
+    on_circle, on_vehicle, monkeypatch, noise, horizon
+):
+    for case in (on_circle, on_vehicle):
+        backward = case.extend(horizon, noise)
+        with monkeypatch.context() as patch:
+            patch.setattr(Plant, "invertible", False)
+            forward = case.extend(horizon, noise)
+        assert forward.horizon == pytest.approx(backward.horizon, abs=0.05)
+        grid, hop = case.partition.grid, 0.05 * np.sqrt(2)
+        for a, b in zip(forward.sets, backward.sets, strict=True):
+            assert (a.mask != case.partition.parts[0].mask).any()
+            # An edge is known to a sample and the cells that close the gaps.
+            slack = hop + 2 * grid.cell
+            assert a.dilated(slack).mask[b.mask].all()
+            assert b.dilated(slack).mask[a.mask].all()

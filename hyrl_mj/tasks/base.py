@@ -162,6 +162,8 @@ class Task(ABC):
     policy_starts: tuple[tuple[float, ...], ...] = ()
     #: what the runs of each mode do, in the order of the modes
     mode_names: tuple[str, ...]
+    #: how its critical set is searched for: by "rods" or by "outcome"; see `find_critical_set`
+    search: str = "outcome"
     #: SB3 algorithm that trains it: "ppo" or "dqn"
     algorithm: str
     #: the hyperplane with respect to which its reward is symmetric, if any (paper, Section IV-B)

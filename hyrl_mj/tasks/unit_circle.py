@@ -34,6 +34,7 @@ class UnitCircle(Task):
         for x, y in ((-0.81, 0.59), (-0.95, -0.31), (-1.0, 0.0))
     )
     mode_names = ("clockwise", "counter-clockwise")
+    search = "rods"
     algorithm = "ppo"
     mirror = Mirror((1, -1), (-1,))
     observation_low, observation_high = (-1.0, -1.0), (1.0, 1.0)

@@ -38,6 +38,7 @@ class Vehicle(Task):
     replay_time = 3.0
     policy_starts = replay_starts[::2]
     mode_names = ("left", "right")
+    search = "rods"
     algorithm = "dqn"
     mirror = Mirror((1, 1, -1), (-1,))
 
