@@ -8,7 +8,6 @@ Importing this package needs neither torch nor a GL library.
 from hyrl_mj import mjcf as _mjcf  # first: it chooses the GL backend before mujoco is imported
 from hyrl_mj.controllers import Controller
 from hyrl_mj.critical_set import CriticalSet, find_critical_set
-from hyrl_mj.envs.gym_env import register_envs
 from hyrl_mj.errors import BadArtifact, BadInput, HyrlError, NoRenderer
 from hyrl_mj.extended_sets import ExtendedSets, extend
 from hyrl_mj.hybrid import HybridController
@@ -21,7 +20,7 @@ from hyrl_mj.run_directory import Run, load_run
 from hyrl_mj.sets import StateSet
 from hyrl_mj.settings import Settings
 from hyrl_mj.simulation import HybridArc, closed_loop, simulate
-from hyrl_mj.tasks import Chart, Outcome, Task, get_task, register, task_names
+from hyrl_mj.tasks import Chart, Mirror, Outcome, Task, get_task, register, task_names
 
 __version__ = "0.1.0"
 __all__ = [
@@ -35,6 +34,7 @@ __all__ = [
     "HybridArc",
     "HybridController",
     "HyrlError",
+    "Mirror",
     "MlpPolicy",
     "NoRenderer",
     "Noise",
@@ -59,5 +59,4 @@ __all__ = [
     "task_names",
 ]
 
-register_envs()
 del _mjcf

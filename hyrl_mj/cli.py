@@ -17,7 +17,7 @@ from hyrl_mj.errors import BadInput, HyrlError, unknown
 from hyrl_mj.lattice import Lattice
 from hyrl_mj.noise import KINDS
 from hyrl_mj.summary import print_robustness, print_summary
-from hyrl_mj.tasks.base import get_task, task_names
+from hyrl_mj.tasks.registry import get_task, task_names
 
 Positional = tyro.conf.Positional
 # Starts, noise, its bound, layout and slow motion of the replay that a run makes.

@@ -30,7 +30,8 @@ from hyrl_mj.run_directory import Run, load_run, open_or_create, write_config
 from hyrl_mj.sets import Grid
 from hyrl_mj.settings import preset
 from hyrl_mj.tables import replay_sentence, robustness_sentence
-from hyrl_mj.tasks.base import get_task
+from hyrl_mj.tasks.checks import check_task
+from hyrl_mj.tasks.registry import get_task
 
 Say = Callable[[str], None]
 # Noisy episodes of a run whose worst case cannot be played exactly.
@@ -227,7 +228,7 @@ def done(run: Run, index: int) -> bool:
 
 
 def run(
-    task: str,
+    task: str | Path,
     *,
     noise: float = 0.1,
     seed: int = 0,
@@ -239,7 +240,7 @@ def run(
     """Run all stages, or those that are missing from the run directory.
 
     Args:
-        task: its name.
+        task: its name, or the Python file that defines it.
         noise: bound eps of the measurement noise to survive, in chart units.
         seed: of everything random.
         preset_name: "fast", "paper" or "smoke".
@@ -250,8 +251,9 @@ def run(
     Raises:
         BadInput: a value that cannot be used.
     """
-    settings = preset(get_task(task), preset_name, noise=noise, seed=seed, horizon=horizon)
-    current = open_or_create(out or Path("runs") / task, settings)
+    found = check_task(get_task(task))
+    settings = preset(found, preset_name, noise=noise, seed=seed, horizon=horizon)
+    current = open_or_create(out or Path("runs") / found.name, settings)
     for index, stage in enumerate(STAGES):
         if done(current, index):
             say(f"{stage.name}: done before")

@@ -13,7 +13,8 @@ from threadpoolctl import ThreadpoolController
 
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadArtifact
-from hyrl_mj.tasks.base import Task, get_task
+from hyrl_mj.tasks.base import Task
+from hyrl_mj.tasks.registry import get_task
 
 
 def relu(x: np.ndarray) -> np.ndarray:

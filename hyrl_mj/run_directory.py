@@ -19,7 +19,8 @@ from hyrl_mj.partition import Partition
 from hyrl_mj.policies import MlpPolicy
 from hyrl_mj.settings import Settings
 from hyrl_mj.simulation import HybridArc
-from hyrl_mj.tasks.base import Task, get_task
+from hyrl_mj.tasks.base import Task
+from hyrl_mj.tasks.registry import get_task
 
 PACKAGES = ("mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "mediapy")
 
@@ -44,7 +45,7 @@ class Run:
     @cached_property
     def policy(self) -> MlpPolicy:
         """The policy of stage 1."""
-        return self._of_task(MlpPolicy.load(self.path / "policy.safetensors"))
+        return self._load_policy("policy.safetensors")
 
     @cached_property
     def critical_set(self) -> CriticalSet:
@@ -65,10 +66,7 @@ class Run:
     def controller(self) -> HybridController:
         """The hybrid controller, of stage 7."""
         extended = self.extended_sets
-        policies = {
-            q: self._of_task(MlpPolicy.load(self.path / f"mode_{q}.safetensors"))
-            for q in extended.modes
-        }
+        policies = {q: self._load_policy(f"mode_{q}.safetensors") for q in extended.modes}
         return HybridController(
             self.task, policies, dict(zip(extended.modes, extended.sets, strict=True))
         )
@@ -109,9 +107,9 @@ class Run:
             BadArtifact: it is of another task, or damaged.
         """
         found = HybridArc.load(path)
-        if found.task != self.settings.task:
+        if found.task != self.task.name:
             raise BadArtifact(
-                f"{path} is an arc of {found.task}, {self.path} a run of {self.settings.task}: "
+                f"{path} is an arc of {found.task}, {self.path} a run of {self.task.name}: "
                 "simulate it again"
             )
         return found
@@ -120,10 +118,12 @@ class Run:
         """The file of the latest simulation from a start of the user's."""
         return self.path / "arcs" / f"latest_{controller}.npz"
 
-    def _of_task(self, policy: MlpPolicy) -> MlpPolicy:
-        if policy.task.name != self.settings.task:
+    def _load_policy(self, name: str) -> MlpPolicy:
+        task = self.task  # first: a task of the user's is known by its name once its file is loaded
+        policy = MlpPolicy.load(self.path / name)
+        if policy.task.name != task.name:
             raise BadArtifact(
-                f"{self.path} is a run of {self.settings.task}, but holds a policy for "
+                f"{self.path} is a run of {task.name}, but holds a policy for "
                 f"{policy.task.name}: run the stage that writes it again"
             )
         return policy

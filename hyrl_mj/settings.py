@@ -59,7 +59,7 @@ class Settings:
     """All settings of a run; `config.json` holds them.
 
     Attributes:
-        task: its name.
+        task: its name, or the file that defines it.
         preset: the name of the preset that the others started from.
         seed: of everything random.
         noise: bound eps of the measurement noise that the controller has to survive.
@@ -245,7 +245,7 @@ def preset(
     task.check_noise(noise)
     dimension = task.chart.dimension
     return Settings(
-        task=task.name,
+        task=task.reference,
         preset=name,
         seed=seed,
         noise=noise,

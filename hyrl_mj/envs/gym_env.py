@@ -13,7 +13,8 @@ from gymnasium.vector.utils import batch_space
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.errors import BadInput
 from hyrl_mj.noise import Noise
-from hyrl_mj.tasks.base import Outcome, Task, get_task, task_names
+from hyrl_mj.tasks.base import Outcome, Task
+from hyrl_mj.tasks.registry import get_task
 
 if TYPE_CHECKING:
     from hyrl_mj.rendering import SceneRenderer
@@ -172,20 +173,6 @@ class TaskVectorEnv(VectorEnv):
             observation[ended] = self.core.reset(ended)
         infos |= {"z": self.core.z}
         return observation, result.reward, result.terminated, result.truncated, infos
-
-
-def register_envs() -> None:
-    """Make every task known to `gymnasium.make` and `gymnasium.make_vec`."""
-    for name in task_names():
-        task = get_task(name)
-        if task.env_id not in gym.registry:
-            gym.register(
-                id=task.env_id,
-                entry_point="hyrl_mj.envs.gym_env:TaskEnv",
-                vector_entry_point="hyrl_mj.envs.gym_env:TaskVectorEnv",
-                kwargs={"task": name},
-                max_episode_steps=task.max_steps,
-            )
 
 
 def _label(outcome: int) -> str:

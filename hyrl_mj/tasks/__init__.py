@@ -1,10 +1,12 @@
 """The robots: one file each, named as its MJCF."""
 
 from hyrl_mj.tasks import unit_circle, vehicle
-from hyrl_mj.tasks.base import Chart, Outcome, Task, get_task, register, task_names
+from hyrl_mj.tasks.base import Chart, Mirror, Outcome, Task
+from hyrl_mj.tasks.registry import get_task, register, task_names
 
 __all__ = [
     "Chart",
+    "Mirror",
     "Outcome",
     "Task",
     "get_task",

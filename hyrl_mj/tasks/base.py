@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hyrl_mj import mjcf
-from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.errors import BadInput
 from hyrl_mj.noise import check_bound
 from hyrl_mj.plant import Plant, input_limits
 
@@ -130,8 +130,10 @@ class Task(ABC):
 
     #: the task's name, also that of its MJCF `models/<name>.xml`
     name: str
-    #: the id under which Gymnasium knows it
+    #: the id under which Gymnasium knows it, by default `hyrl_mj/<class>-v0`
     env_id: str
+    #: the file that it was loaded from, if it is not part of an installed package
+    source: Path | None = None
     #: one line for `hyrl-mj list`
     description: str
     #: coordinates of the critical set and of all sets
@@ -176,6 +178,11 @@ class Task(ABC):
     def model(self) -> mujoco.MjModel:
         """The compiled MJCF (shared: do not write to it)."""
         return mjcf.load(self.model_path)
+
+    @property
+    def reference(self) -> str:
+        """What `get_task` finds it by in another process: its name, or the file that defines it."""
+        return self.name if self.source is None else str(self.source)
 
     @property
     def model_path(self) -> Path:
@@ -411,28 +418,3 @@ class Task(ABC):
         Returns:
             (n,) int: the mode whose way the run went, -1 where there was nothing to decide.
         """
-
-
-_REGISTRY: dict[str, type[Task]] = {}
-
-
-def register(task: type[Task]) -> type[Task]:
-    """Class decorator: make a task known by its name."""
-    _REGISTRY[task.name] = task
-    return task
-
-
-def task_names() -> list[str]:
-    """The names of all tasks."""
-    return sorted(_REGISTRY)
-
-
-def get_task(name: str) -> Task:
-    """The task of that name.
-
-    Raises:
-        BadInput: there is none; the message lists those there are.
-    """
-    if name not in _REGISTRY:
-        raise unknown("task", name, task_names())
-    return _REGISTRY[name]()

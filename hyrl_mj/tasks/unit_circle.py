@@ -7,7 +7,8 @@ from functools import cached_property
 import numpy as np
 
 from hyrl_mj import mjcf
-from hyrl_mj.tasks.base import Chart, Mirror, Outcome, Task, register
+from hyrl_mj.tasks.base import Chart, Mirror, Outcome, Task
+from hyrl_mj.tasks.registry import register
 
 PI = np.pi
 # The pointer has arrived when it is this close to the set-point [rad].

@@ -1,0 +1,137 @@
+"""Whether a task is whole and consistent, found out before anything is trained."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from hyrl_mj import mjcf
+from hyrl_mj.errors import BadInput
+from hyrl_mj.tasks.base import Outcome, Task
+
+REQUIRED = (
+    "chart", "inputs", "noisy", "max_steps", "horizon", "worst_reward", "start_low", "start_high",
+    "replay_starts", "replay_time", "mode_names", "algorithm", "observation_low", "observation_high",
+)  # fmt: skip
+# Starts that are tried, and the samples of each under random inputs.
+STARTS, SAMPLES = 64, 20
+# How closely the measurement of a chart point's full state has to give the chart point back.
+ROUND_TRIP = 1e-6
+
+
+def check_task(task: Task) -> Task:
+    """The task itself, if it can be trained.
+
+    Raises:
+        BadInput: it cannot; the message names the file, what is wrong in it, and what is right.
+    """
+    where = task.source or task.name
+    try:
+        _check_parts(task)
+        _check_model(task)
+        _check_starts(task)
+        _check_episode(task)
+    except BadInput as error:
+        raise BadInput(f"the task of {where} cannot be used: {error}") from error
+    return task
+
+
+def _check_parts(task: Task) -> None:
+    missing = [name for name in REQUIRED if not hasattr(task, name)]
+    if missing:
+        raise BadInput(f"it has no {', '.join(missing)}: add what is missing")
+    chart, d = task.chart, task.chart.dimension
+    for name in ("units", "low", "high", "periodic"):
+        if len(getattr(chart, name)) != d:
+            raise BadInput(
+                f"its chart has {d} name(s) and {len(getattr(chart, name))} value(s) of {name}: give {d}"
+            )
+    if not (np.isfinite(chart.sides).all() and (chart.sides > 0).all()):
+        raise BadInput("its chart has a side that is not positive: give low < high, both finite")
+    for name in ("start_low", "start_high"):
+        if len(getattr(task, name)) != d:
+            raise BadInput(f"{name} has {len(getattr(task, name))} value(s): its chart takes {d}")
+    if wrong := [start for start in task.replay_starts if len(start) != d]:
+        raise BadInput(f"replay start {wrong[0]} has {len(wrong[0])} value(s): its chart takes {d}")
+
+
+def _check_model(task: Task) -> None:
+    model, path = task.model, task.model_path
+    if not model.nu:
+        raise BadInput(f"{path.name} has no actuators: give the policy at least one to drive")
+    _ = task.input_limits
+    for kind, name in (
+        (mujoco.mjtObj.mjOBJ_SITE, "tracked"),
+        (mujoco.mjtObj.mjOBJ_CAMERA, "overhead"),
+    ):
+        mjcf.object_id(model, kind, name)  # the replay takes them
+    steps = task.dt / model.opt.timestep
+    if abs(steps - round(steps)) > 1e-6 or steps < 0.5:
+        raise BadInput(
+            f"its sample time {task.dt:g} s is no multiple of the physics step "
+            f"{model.opt.timestep:g} s in {path.name}: change one of them"
+        )
+
+
+def _check_starts(task: Task) -> None:
+    d, p = task.chart.dimension, task.measurement_columns
+    z = task.starts(STARTS, np.random.default_rng(0))
+    if z.shape != (STARTS, d):
+        raise BadInput(f"starts({STARTS}) has shape {z.shape}: its chart takes {(STARTS, d)}")
+    if not task.chart.contains(z).all():
+        outside = task.chart.format(z[~task.chart.contains(z)][0])
+        raise BadInput(f"it starts outside its chart, at {outside}: change one of them")
+    plant = task.plant(STARTS)
+    plant.set_state(*task.state(z, np.random.default_rng(1)))
+    measurement = plant.measurement
+    if measurement.shape != (STARTS, p):
+        raise BadInput(
+            f"it measures {measurement.shape[1]} column(s), and `noisy` has {p}: make them as many"
+        )
+    back = task.z(measurement)
+    if back.shape != z.shape:
+        raise BadInput(f"z() gives {back.shape[1:]} values a measurement: its chart takes {d}")
+    off = np.abs(task.chart.difference(back, z)).max(axis=1)
+    if off.max() > ROUND_TRIP:
+        worst = int(off.argmax())
+        raise BadInput(
+            f"state() and z() do not belong together: {task.chart.format(z[worst])} is measured as "
+            f"{task.chart.format(back[worst])}"
+        )
+    over = task.ending(measurement) != Outcome.RUNNING
+    if over.any():
+        first = int(over.argmax())
+        label = Outcome(task.ending(measurement)[first]).label
+        raise BadInput(
+            f"{over.sum()} of {STARTS} starts are over before they begin: {task.chart.format(z[first])} "
+            f"is {label}; start elsewhere, or change ending()"
+        )
+
+
+def _check_episode(task: Task) -> None:
+    rng, plant = np.random.default_rng(0), task.plant(STARTS)
+    plant.set_state(*task.state(task.starts(STARTS, rng), rng))
+    low, high = np.array(task.observation_low), np.array(task.observation_high)
+    for sample in range(SAMPLES):
+        measurement = plant.measurement
+        running = task.outcome(measurement, plant.unstable) == Outcome.RUNNING
+        observation = task.observation(measurement[running])
+        if observation.shape[1:] != low.shape or low.shape != high.shape:
+            raise BadInput(
+                f"an observation has {observation.shape[1]} values, observation_low {len(low)} and "
+                f"observation_high {len(high)}: make them as many"
+            )
+        outside = ~((observation >= low) & (observation <= high))
+        if outside.any():
+            row, column = np.argwhere(outside)[0]
+            raise BadInput(
+                f"observation[{column}] is {observation[row, column]:g} after {sample} samples, and "
+                f"its bounds are {low[column]:g} and {high[column]:g}: widen them"
+            )
+        reward = task.reward(measurement)
+        if reward.shape != (STARTS,) or not np.isfinite(reward[running]).all():
+            raise BadInput(
+                f"reward() of {STARTS} measurements must be {STARTS} finite numbers, it has shape "
+                f"{reward.shape} and values like {reward.ravel()[0]:g}"
+            )
+        plant.step(rng.uniform(*task.input_limits, (STARTS, len(task.inputs))))

@@ -1,0 +1,141 @@
+"""Where tasks come from: this package, other installed packages, and files of the user's."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from types import ModuleType
+
+import gymnasium as gym
+
+from hyrl_mj.errors import BadInput, brief, unknown
+from hyrl_mj.tasks.base import Task
+
+# The group of entry points under which an installed package offers tasks: name = "its_module".
+GROUP = "hyrl_mj.tasks"
+_REGISTRY: dict[str, type[Task]] = {}
+_FILES: dict[Path, type[Task]] = {}
+
+
+def register(task: type[Task]) -> type[Task]:
+    """Class decorator: make a task known by its name, to Gymnasium by its `env_id`."""
+    if "env_id" not in vars(task):
+        task.env_id = f"hyrl_mj/{task.__name__}-v0"
+    _REGISTRY[task.name] = task
+    gym.registry.pop(task.env_id, None)  # a file may be loaded again
+    gym.register(
+        id=task.env_id,
+        entry_point="hyrl_mj.envs.gym_env:TaskEnv",
+        vector_entry_point="hyrl_mj.envs.gym_env:TaskVectorEnv",
+        kwargs={"task": task.name},
+        max_episode_steps=task.max_steps,
+    )
+    return task
+
+
+def task_names() -> list[str]:
+    """The names of all tasks of this package and of other installed ones."""
+    return sorted(_REGISTRY.keys() | _offered().keys())
+
+
+def get_task(name: str | Path) -> Task:
+    """A task by its name, or by the Python file that defines it.
+
+    The file is run, as any Python file is that you import. It defines one subclass of `Task`, and its
+    MJCF lies beside it: `<name>.xml`.
+
+    Raises:
+        BadInput: there is no such task, or its file cannot be used; the message says why.
+    """
+    if str(name).endswith(".py"):
+        return _instance(_from_file(Path(name)), str(name))
+    name = str(name)
+    offered = {} if name in _REGISTRY else _offered()
+    if name in offered:
+        try:
+            found = offered[name].load()
+        except Exception as error:  # whatever a foreign module raises
+            raise BadInput(
+                f"the task {name} of {offered[name].value} cannot be imported ({brief(error)}): mend "
+                "or uninstall the package that offers it"
+            ) from error
+        if isinstance(found, type) and found not in _REGISTRY.values():
+            register(found)
+    if name not in _REGISTRY:
+        raise unknown("task", name, [*task_names(), "or a file my_robot.py"])
+    return _instance(_REGISTRY[name], name)
+
+
+def _offered() -> dict[str, EntryPoint]:
+    return {entry.name: entry for entry in entry_points(group=GROUP)}
+
+
+def _instance(task: type[Task], what: str) -> Task:
+    try:
+        return task()
+    except TypeError as error:  # methods that a task must have are missing
+        raise BadInput(f"the task of {what} is not finished: {error}") from error
+
+
+def _from_file(path: Path) -> type[Task]:
+    path = path.resolve()
+    if path not in _FILES:
+        if not path.is_file():
+            raise BadInput(
+                f"there is no task file {path}: hyrl-mj new-task {path.stem} writes one to start from"
+            )
+        module = _run(path)
+        found = [
+            value
+            for value in vars(module).values()
+            if isinstance(value, type)
+            and issubclass(value, Task)
+            and value.__module__ == module.__name__
+            and hasattr(value, "name")
+        ]
+        if len(found) != 1:
+            names = ", ".join(task.__name__ for task in found) or "none"
+            raise BadInput(
+                f"{path} must define one task, a subclass of hyrl_mj.Task with a name: it has {names}"
+            )
+        (task,) = found
+        task.source = path
+        if _REGISTRY.get(task.name, task).source != path:
+            raise BadInput(
+                f"{path} defines a task {task.name}, and there is another of that name: rename it"
+            )
+        _FILES[path] = register(task)
+    return _FILES[path]
+
+
+def _run(path: Path) -> ModuleType:
+    """Import a file as a module of its own; like a script's, its folder can be imported from."""
+    name = f"hyrl_mj_task_{path.stem}_{len(_FILES)}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    sys.path.insert(0, str(path.parent))
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:  # whatever the user's file raises
+        del sys.modules[name]
+        raise BadInput(f"{path} cannot be imported: {brief(error)}{_line(error, path)}") from error
+    finally:
+        sys.path.remove(str(path.parent))
+    return module
+
+
+def _line(error: BaseException, path: Path) -> str:
+    """Where in a file an error came from: ", line 7"; nothing if it did not."""
+    if isinstance(error, SyntaxError):
+        return ""  # it says so itself
+    lines, trace = [], error.__traceback__
+    while trace is not None:
+        if trace.tb_frame.f_code.co_filename == str(path):
+            lines.append(trace.tb_lineno)
+        trace = trace.tb_next
+    return f", line {lines[-1]}" if lines else ""
