@@ -32,6 +32,24 @@ def list_tasks() -> None:
         print(f"{name:14} {task.env_id:30} {task.description}")
 
 
+def new_task(
+    name: Annotated[str, Positional, tyro.conf.arg(metavar="NAME")],
+    /,
+    folder: Path = Path(),
+) -> None:
+    """Write a task of your own to start from: NAME.py, NAME.xml and test_NAME.py.
+
+    Args:
+        name: of the task and its files: letters, digits and _.
+        folder: where to.
+    """
+    from hyrl_mj.new_task import write_task
+
+    paths = write_task(name, folder)
+    print(f"wrote {', '.join(map(str, paths))}")
+    print(f"try them with pytest {paths[-1]}, then hyrl-mj run {paths[0]}")
+
+
 def run(
     task: Annotated[str, Positional, tyro.conf.arg(metavar="TASK")],
     /,
@@ -46,7 +64,7 @@ def run(
     A run directory that is there already is resumed: only what is missing is done.
 
     Args:
-        task: a task, see `hyrl-mj list`.
+        task: a task, see `hyrl-mj list`, or a Python file that defines one, see `hyrl-mj new-task`.
         noise: bound of the measurement noise to survive, in rad (unit_circle) or m (vehicle).
         seed: of everything random.
         preset: fast, paper (the paper's training, ten minutes), or smoke (seconds).
@@ -266,6 +284,7 @@ def doctor() -> None:
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "list": list_tasks,
+    "new-task": new_task,
     "run": run,
     "train": stage_command("train", "Run stage 1 again: train the policy."),
     "critical-set": stage_command("critical-set", "Run stage 2 again: find the critical set."),

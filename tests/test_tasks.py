@@ -3,11 +3,11 @@
 import mujoco
 import numpy as np
 import pytest
-from planted import random_inputs, random_states
+from planted import random_states
 
 import hyrl_mj
 from hyrl_mj import BadInput, Outcome, mjcf
-from hyrl_mj.envs.gym_env import observation_space
+from hyrl_mj.task_tests import *  # noqa: F403
 
 PI = np.pi
 
@@ -44,66 +44,10 @@ def test_its_descriptions_fit_its_dimensions(task):
     assert len(task.mode_names) == 2
 
 
-def test_its_starts_lie_in_the_chart(task):
-    z = task.starts(5000, np.random.default_rng(0))
-    assert z.shape == (5000, task.chart.dimension)
-    assert task.chart.contains(z).all()
-    np.testing.assert_array_equal(task.check_state(z), z)
-    np.testing.assert_array_equal(task.starts(5000, np.random.default_rng(0)), z)
-
-
-def test_an_episode_stays_finite_and_its_observations_in_their_space(task):
-    rng, space = np.random.default_rng(0), observation_space(task)
-    plant = task.plant(32)
-    plant.set_state(task.qpos(random_states(task, 32, rng)))
-    for _ in range(task.max_steps):
-        plant.step(random_inputs(task, 32, rng))
-        running = task.ending(plant.measurement) == Outcome.RUNNING
-        observation = task.observation(plant.measurement[running]).astype(np.float32)
-        assert all(space.contains(o) for o in observation)
-        assert np.isfinite(task.reward(plant.measurement)).all()
-        assert (task.reward(plant.measurement[running]) >= task.worst_reward).all()
-
-
-def test_episodes_repeat_bit_for_bit(task):
-    def episode():
-        rng = np.random.default_rng(5)
-        plant = task.plant(8)
-        plant.set_state(task.qpos(task.starts(8, rng)))
-        for _ in range(task.max_steps):
-            plant.step(random_inputs(task, 8, rng))
-        return plant.state
-
-    np.testing.assert_array_equal(episode(), episode())
-
-
-def test_what_the_plant_returns_is_not_its_memory(task):
-    plant = task.plant(2)
-    plant.set_state(task.qpos(np.array(task.replay_starts[:2])))
-    returned = [plant.measurement, plant.qpos, plant.state, task.z(plant.measurement)]
-    kept = [values.copy() for values in returned]
-    plant.step(np.ones((2, len(task.inputs))))
-    for values, copy in zip(returned, kept, strict=True):
-        np.testing.assert_array_equal(values, copy)
-    after = plant.state
-    for values in (plant.measurement, plant.qpos, plant.state):
-        values[:] = 7.0
-    np.testing.assert_array_equal(plant.state, after)
-
-
 def test_a_plant_does_not_write_to_the_shared_model(task):
     before = task.model.opt.disableflags
     task.plant(1)
     assert task.model.opt.disableflags == before
-
-
-def test_chart_and_position_belong_together(task):
-    z = random_states(task, 100, np.random.default_rng(0))
-    plant = task.plant(100)
-    plant.set_state(task.qpos(z))
-    np.testing.assert_allclose(task.z(plant.measurement), z, atol=1e-12)
-    other = random_states(task, 100, np.random.default_rng(1))
-    np.testing.assert_allclose(task.z(task.with_z(plant.measurement, other)), other, atol=1e-12)
 
 
 def test_its_mirror_image_earns_the_same_reward(task):
@@ -113,24 +57,6 @@ def test_its_mirror_image_earns_the_same_reward(task):
     np.testing.assert_array_equal(task.ending(image), task.ending(z))
     signs = np.array(task.mirror.observation)
     np.testing.assert_allclose(task.observation(image), task.observation(z) * signs, atol=1e-12)
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_state_that_is_not_finite_is_refused(task, value):
-    z = np.array(task.replay_starts[:3], dtype=float)
-    z[1, -1] = value
-    with pytest.raises(BadInput, match="state 1") as caught:
-        task.check_state(z)
-    assert str(value) in str(caught.value)
-
-
-ILL_SHAPED = [np.zeros((2, 5)), np.zeros((2, 2, 2)), [], "here", [[0.0], [0.0, 1.0]]]
-
-
-@pytest.mark.parametrize("z", ILL_SHAPED)
-def test_a_state_of_the_wrong_shape_names_the_coordinates(task, z):
-    with pytest.raises(BadInput, match=task.name):
-        task.check_state(z)
 
 
 def test_bad_measurements_are_refused(task):

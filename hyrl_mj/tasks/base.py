@@ -157,6 +157,8 @@ class Task(ABC):
     start_high: tuple[float, ...]
     #: how far off the set-point a policy may be because of itself, not of noise [chart units]
     precision: float = np.inf
+    #: how far from the set-point counts as there [chart units]
+    close: float = 0.2
     #: the paper's replay starts (k, d), and how long they are watched [s]
     replay_starts: tuple[tuple[float, ...], ...]
     replay_time: float
@@ -354,17 +356,19 @@ class Task(ABC):
         ending = self.ending(measurement)
         return np.asarray((ending != Outcome.RUNNING) & (ending != Outcome.REACHED))
 
-    @abstractmethod
     def verdict(self, measurement: np.ndarray) -> np.ndarray:
         """`Outcome` (n,) int of episodes that still ran when their time was up."""
+        return np.where(self.arrived(self.z(measurement)), Outcome.REACHED, Outcome.STALLED)
 
-    @abstractmethod
     def arrived(self, z: np.ndarray) -> np.ndarray:
         """Whether chart points (n, d) at the end of an episode are close to the set-point: (n,) bool."""
+        return self.miss(z) <= self.close
 
-    @abstractmethod
     def miss(self, z: np.ndarray) -> np.ndarray:
         """How far chart points (n, d) at the end of an episode are off the set-point: (n,), chart units."""
+        if self.set_point is None:
+            raise BadInput(f"{self.name} has no set_point: give it one, or a miss() of its own")
+        return np.asarray(np.linalg.norm(self.chart.difference(z, self.set_point), axis=1))
 
     def danger(self, measurement: np.ndarray) -> np.ndarray:
         """How dangerous states are, the greater the worse: (n,). What adversarial noise works towards."""
@@ -408,13 +412,34 @@ class Task(ABC):
             )
         return float(bound)
 
-    @abstractmethod
     def direction(self, path: np.ndarray) -> np.ndarray:
-        """Which way runs went.
+        """Which way runs went, by default on which side of the geom "obstacle" they passed.
+
+        The first two coordinates of the chart are then where the robot is in the plane.
 
         Args:
             path: (K + 1, n, d) chart points over time, not wrapped; a run that ended stays put.
 
         Returns:
-            (n,) int: the mode whose way the run went, -1 where there was nothing to decide.
+            (n,) int: the mode whose way the run went, -1 where there was nothing to decide; by default 0
+            for the left and 1 for the right side.
         """
+        return passing_side(path[..., :2], mjcf.geom_pos(self.model, "obstacle")[:2])
+
+
+def passing_side(path: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """On which side runs pass an obstacle, as seen on the way from their start to where they are nearest.
+
+    Args:
+        path: (K + 1, n, 2) points in the plane over time; a run that ended stays put.
+        centre: (2,) of the obstacle.
+
+    Returns:
+        (n,) int: 0 on its left, 1 on its right, -1 for runs that only leave it behind.
+    """
+    nearest = np.linalg.norm(path - centre, axis=2).argmin(axis=0)
+    way = path[nearest, np.arange(path.shape[1])] - path[0]
+    to_centre = centre - path[0]
+    # The obstacle lies to the right of who passes on the left.
+    right = way[:, 0] * to_centre[:, 1] - way[:, 1] * to_centre[:, 0] > 0
+    return np.where(nearest == 0, -1, right.astype(int))

@@ -1,0 +1,44 @@
+"""A task to start from: one Python file, one MJCF, and the tests that every task must pass."""
+
+from __future__ import annotations
+
+import keyword
+from pathlib import Path
+
+from hyrl_mj import artifacts
+from hyrl_mj.errors import BadInput
+from hyrl_mj.tasks.registry import task_names
+
+TEMPLATES = Path(__file__).parent / "templates" / "task"
+
+
+def write_task(name: str, folder: Path) -> list[Path]:
+    """Write `<name>.py`, `<name>.xml` and `test_<name>.py` into a folder; nothing is overwritten.
+
+    Returns:
+        The files.
+
+    Raises:
+        BadInput: the name cannot be one of a Python file, it is taken, or a file is there already.
+    """
+    if not name.isidentifier() or keyword.iskeyword(name):
+        raise BadInput(
+            f"{name!r} cannot be the name of a task: give letters, digits and _, as my_robot"
+        )
+    if name in task_names():
+        raise BadInput(f"there is a task {name} already: choose another name")
+    title = "".join(part.capitalize() for part in name.split("_"))
+    texts = {
+        folder / path.name.replace("my_robot", name): path.read_text()
+        .replace("my_robot", name)
+        .replace("MyRobot", title)
+        for path in sorted(TEMPLATES.iterdir())
+        if path.is_file()
+    }
+    if there := [path for path in texts if path.exists()]:
+        raise BadInput(f"{there[0]} is there already: choose another name, or another folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    for path, text in texts.items():
+        with artifacts.replacing(path) as temporary:
+            temporary.write_text(text)
+    return list(texts)

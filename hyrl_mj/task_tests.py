@@ -1,0 +1,110 @@
+"""What every task must do: import it into a test file that has a fixture `task`, and run pytest there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hyrl_mj.controllers import PolicyController
+from hyrl_mj.envs.gym_env import observation_space
+from hyrl_mj.errors import BadInput
+from hyrl_mj.simulation import closed_loop
+from hyrl_mj.tasks import Outcome, Task
+from hyrl_mj.tasks.checks import check_task
+
+
+def random_inputs(task: Task, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Inputs (n, m) all over the input limits."""
+    low, high = task.input_limits
+    return rng.uniform(low, high, (n, len(low)))
+
+
+def test_it_can_be_trained(task: Task) -> None:
+    assert check_task(task) is task
+
+
+def test_its_starts_lie_in_the_chart_and_repeat(task: Task) -> None:
+    z = task.starts(2000, np.random.default_rng(0))
+    assert z.shape == (2000, task.chart.dimension)
+    np.testing.assert_array_equal(task.check_state(z), z)
+    np.testing.assert_array_equal(task.starts(2000, np.random.default_rng(0)), z)
+
+
+def test_an_episode_stays_finite_and_its_observations_in_their_space(task: Task) -> None:
+    rng, space, plant = np.random.default_rng(0), observation_space(task), task.plant(32)
+    plant.set_state(*task.state(task.starts(32, rng), rng))
+    for _ in range(task.max_steps):
+        plant.step(random_inputs(task, 32, rng))
+        outcome = task.outcome(plant.measurement, plant.unstable)
+        running = plant.measurement[outcome == Outcome.RUNNING]
+        assert all(space.contains(o) for o in task.observation(running).astype(np.float32))
+        assert np.isfinite(task.reward(plant.measurement)).all()
+        assert (task.reward(running) >= task.worst_reward).all(), "worse than worst_reward"
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_episodes_repeat_bit_for_bit_at_any_number_of_threads(task: Task, threads: int) -> None:
+    def episode(threads: int) -> np.ndarray:
+        rng, plant = np.random.default_rng(5), task.plant(8, threads)
+        plant.set_state(*task.state(task.starts(8, rng), rng))
+        for _ in range(min(task.max_steps, 20)):
+            plant.step(random_inputs(task, 8, rng))
+        return plant.state
+
+    np.testing.assert_array_equal(episode(threads), episode(1))
+
+
+def test_what_the_plant_returns_is_not_its_memory(task: Task) -> None:
+    plant = task.plant(2)
+    plant.set_state(*task.state(task.starts(2, np.random.default_rng(0))))
+    returned = [plant.measurement, plant.qpos, plant.state, task.z(plant.measurement)]
+    kept = [values.copy() for values in returned]
+    plant.step(np.tile(task.input_limits[1], (2, 1)))
+    for values, copy in zip(returned, kept, strict=True):
+        np.testing.assert_array_equal(values, copy)
+    after = plant.state
+    for values in (plant.measurement, plant.qpos, plant.state):
+        values[:] = 7.0
+    np.testing.assert_array_equal(plant.state, after)
+
+
+def test_chart_and_state_belong_together(task: Task) -> None:
+    rng = np.random.default_rng(0)
+    z, other = (
+        rng.uniform(task.chart.low, task.chart.high, (100, task.chart.dimension)) for _ in range(2)
+    )
+    plant = task.plant(100)
+    plant.set_state(*task.state(z))
+    np.testing.assert_allclose(task.z(plant.measurement), z, atol=1e-9)
+    np.testing.assert_allclose(task.z(task.with_z(plant.measurement, other)), other, atol=1e-9)
+
+
+def test_the_ways_that_runs_go_are_its_modes(task: Task) -> None:
+    class Straight:
+        def act(self, measured: np.ndarray) -> np.ndarray:
+            return np.tile(np.mean(task.input_limits, axis=0), (len(measured), 1))
+
+    z = task.starts(200, np.random.default_rng(0))
+    way = task.direction(closed_loop(task, PolicyController(Straight()), z, quiet=True).path)
+    assert way.shape == (200,)
+    assert set(way) <= {-1, *range(len(task.mode_names))}
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_what_is_not_finite_is_refused(task: Task, value: float) -> None:
+    z = np.array(task.replay_starts, dtype=float)
+    z[-1, -1] = value
+    with pytest.raises(BadInput, match=f"state {len(z) - 1}"):
+        task.check_state(z)
+    measured = np.full((2, task.measurement_columns), value)
+    with pytest.raises(BadInput, match=r"measurement\[0, 0\]"):
+        task.check_measurement(measured)
+
+
+ILL_SHAPED = [np.zeros((2, 9)), np.zeros((2, 2, 2)), [], "here", [[0.0], [0.0, 1.0]]]
+
+
+@pytest.mark.parametrize("z", ILL_SHAPED)
+def test_a_state_of_the_wrong_shape_names_the_task(task: Task, z: object) -> None:
+    with pytest.raises(BadInput, match=task.name):
+        task.check_state(z)  # type: ignore[arg-type]

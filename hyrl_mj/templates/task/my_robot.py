@@ -1,0 +1,69 @@
+"""A puck that glides past a pillar, on its left or on its right.
+
+hyrl-mj run my_robot.py
+pytest test_my_robot.py
+"""
+
+import numpy as np
+
+import hyrl_mj
+from hyrl_mj import Chart, Mirror, Outcome, mjcf
+
+WALL = 1.4  # [m] to either side
+
+
+@hyrl_mj.register
+class MyRobot(hyrl_mj.Task):
+    name = "my_robot"
+    description = "glide past a pillar on its left or on its right"
+    # Where the decision falls: the critical set and all other sets are found in these coordinates.
+    chart = Chart(("x", "y"), ("m", "m"), (0.0, -1.5), (3.2, 1.5), (False, False))
+    inputs, input_units = ("lateral",), ("m/s",)
+    noisy = (False, True, False, False)  # of the measurement: x, y, vy, touching
+    max_steps, horizon = 70, 0.3
+    worst_reward = 0.0  # a crash must not be a way out of a bad reward
+    start_low, start_high = (0.0, -0.8), (0.3, 0.8)
+    replay_starts = ((0.0, -0.15), (0.0, 0.0), (0.0, 0.15))
+    replay_time = 3.2
+    mode_names = ("left", "right")
+    algorithm = "ppo"
+    # Mirrored observations call for mirrored inputs.
+    mirror = Mirror(observation=(1, -1, -1), inputs=(-1,))
+    observation_low, observation_high = (-1.0, -3.0, -3.0), (5.0, 3.0, 3.0)
+    set_point = np.array([3.0, 0.0])
+    close = 0.3  # [m] from the set-point is there
+
+    def state(self, z, rng=None):
+        """It drives at full speed; how fast it drifts aside the chart does not say."""
+        drift = np.zeros(len(z)) if rng is None else rng.uniform(-0.2, 0.2, len(z))
+        return z, np.stack([np.ones(len(z)), drift], axis=1)
+
+    def z(self, measured):
+        return measured[:, :2]
+
+    def with_z(self, measured, z):
+        return np.hstack([z, measured[:, 2:]])
+
+    def observation(self, measured):
+        return measured[:, :3]
+
+    def clearance(self, measured):
+        """How far the puck is from the pillar: (n,) [m]."""
+        centre = mjcf.geom_pos(self.model, "obstacle")[:2]
+        radii = mjcf.geom_size(self.model, "obstacle")[0] + mjcf.geom_size(self.model, "puck")[0]
+        return np.maximum(np.linalg.norm(measured[:, :2] - centre, axis=1) - radii, 0.0)
+
+    def reward(self, measured):
+        close = np.maximum(1 - self.clearance(measured) / 0.2, 0.0)
+        return np.where(self.failed(measured), 0.0, 3 - np.abs(measured[:, 1]) - close)
+
+    def ending(self, measured):
+        ends = np.full(len(measured), Outcome.RUNNING)
+        ends[measured[:, 0] >= self.set_point[0]] = Outcome.REACHED
+        ends[np.abs(measured[:, 1]) >= WALL] = Outcome.OUT_OF_BOUNDS
+        touching = (measured[:, 3] > 0) | (self.clearance(measured) <= 0)
+        ends[touching] = Outcome.CRASHED
+        return ends
+
+    def miss(self, z):
+        return np.abs(z[:, 1])
