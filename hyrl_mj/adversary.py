@@ -48,27 +48,36 @@ class Lookahead:
 
     def __init__(self, task: Task, controller: Controller, noise: Noise):
         self.task, self.controller, self.bound = task, controller, noise.bound
-        acts = np.ones(len(task.noisy), dtype=bool) if noise.everywhere else np.array(task.noisy)
-        shares = (0.0, -1.0, 1.0, -0.5, 0.5) if acts.sum() <= 2 else (0.0, -1.0, 1.0)
+        acts = noise.acts_on(task.noisy)
+        shares = (0.0, -1.0, 1.0, -0.5, 0.5) if np.count_nonzero(acts) <= 2 else (0.0, -1.0, 1.0)
         choices = product(*[shares if hit else (0.0,) for hit in acts])
-        self._candidates = noise.bound * np.array(list(choices))
+        self._candidates = noise.bound * np.array(list(choices)) * acts
         self._ahead: Plant | None = None
 
     def choose(self, plant: Plant, q: np.ndarray) -> np.ndarray:
         """As `Adversary.choose`. Among equals no noise is preferred, then the largest."""
         ahead = self._ahead = self._ahead or self.task.plant(plant.n)
         true, qpos, qvel = plant.measurement, plant.qpos, plant.qvel
-        worst = np.full(plant.n, -np.inf)
-        chosen = np.zeros_like(true)
-        for candidate in self._candidates:
-            measured = true + candidate
-            mode = np.where(q == NOT_STARTED, self.controller.initial_mode(measured), q)
-            u, _ = self.controller.step(mode, measured)
-            ahead.set_state(qpos, qvel)
-            ahead.step(u)
-            after = ahead.measurement
-            failed = self.task.failed(after) | ahead.unstable
+        inputs = np.stack([self._answer(true + candidate, q) for candidate in self._candidates])
+        # Where all candidates get the same answer there is nothing to choose, and each answer is tried once.
+        split = (inputs != inputs[0]).any(axis=(0, 2))
+        worst, chosen = np.full(plant.n, -np.inf), np.zeros_like(true)
+        for i, candidate in enumerate(self._candidates):
+            tried = (inputs[:i] == inputs[i]).all(axis=2).any(axis=0)
+            rows = np.flatnonzero(split & ~tried)
+            if not len(rows):
+                continue
+            ahead.set_state(qpos[rows], qvel[rows], rows)
+            ahead.step(inputs[i, rows], rows)
+            after = ahead.measurement[rows]
+            failed = self.task.failed(after) | ahead.unstable[rows]
             danger = np.where(failed, np.inf, self.task.danger(after))
-            better = danger > worst
-            worst, chosen[better] = np.where(better, danger, worst), candidate
+            better = rows[danger > worst[rows]]
+            worst[rows] = np.maximum(worst[rows], danger)
+            chosen[better] = candidate
         return chosen
+
+    def _answer(self, measured: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """What the controller answers (n, m) to measurements (n, p) in modes q (n,)."""
+        mode = np.where(q == NOT_STARTED, self.controller.initial_mode(measured), q)
+        return self.controller.step(mode, measured)[0]

@@ -65,7 +65,7 @@ def run(
 
     Args:
         task: a task, see `hyrl-mj list`, or a Python file that defines one, see `hyrl-mj new-task`.
-        noise: bound of the measurement noise to survive, in rad (unit_circle) or m (vehicle).
+        noise: bound of the measurement noise to survive, in the units of the chart.
         seed: of everything random.
         preset: fast, paper (the paper's training, ten minutes), or smoke (seconds).
         horizon: horizon T of the backward propagation in s; by default the extended sets are sized to the
@@ -115,7 +115,7 @@ def simulate_run(
 
     Args:
         run_dir: a run directory.
-        start: start in chart coordinates: theta in rad (unit_circle), or x y in m (vehicle).
+        start: start in chart coordinates, as x y in m (vehicle) or theta in rad (unit_circle).
         q0: start mode; by default the controller picks it from the first measurement.
         noise: none, uniform, alternating, adversarial (the most dangerous one sample ahead), or worst (the
             signal with which the exact game is lost, or arrival is latest).
@@ -146,6 +146,7 @@ def robustness(
     episodes: int | None = None,
     noise: str | None = None,
     all_coordinates: bool = False,
+    near_critical: bool = False,
     seed: int = 0,
 ) -> None:
     """Find out what measurement noise can do: worst-case game, margins, and episodes in bulk.
@@ -161,6 +162,7 @@ def robustness(
             uniform,alternating,adversarial.
         all_coordinates: noise on every coordinate of the measurement, not only on those the task calls
             noisy.
+        near_critical: all episodes start within twice the bound of the critical set.
         seed: of starts and noise of the episodes.
     """
     run = pipeline.load_run(run_dir)
@@ -170,9 +172,10 @@ def robustness(
             raise unknown("noise", kind, KINDS)
     if episodes is None:
         Lattice.check(run.task)
-        if kinds:
-            raise BadInput("--noise is that of the episodes: say how many, as in --episodes 100000")
-    pipeline.examine_run(run, eps, kinds, episodes, all_coordinates, seed)
+        if kinds or near_critical:
+            option = "--noise" if kinds else "--near-critical"
+            raise BadInput(f"{option} is about the episodes: say how many, as in --episodes 100000")
+    pipeline.examine_run(run, eps, kinds, episodes, all_coordinates, seed, near_critical)
     print_robustness(pipeline.load_run(run_dir))
     print(f"pictures in {run.path / 'figures'}")
 

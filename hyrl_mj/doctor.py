@@ -39,9 +39,9 @@ _FRAMES = """
 from time import perf_counter
 from hyrl_mj.errors import HyrlError
 from hyrl_mj.rendering import SceneRenderer
-from hyrl_mj.tasks import get_task, task_names
+from hyrl_mj.tasks import get_task
 try:
-    model = get_task(task_names()[0]).model
+    model = get_task("vehicle").model
     renderer = SceneRenderer(model, 640, 480)
     renderer.place(model.qpos0, "overhead")
     if renderer.draw().std() == 0:

@@ -19,6 +19,8 @@ from hyrl_mj.tasks.base import Outcome, Task
 
 # Episodes that are simulated together: memory does not grow with their number.
 BATCH = 32_768
+# After so many starts, none of which lies near M*, there are none.
+RARE = 100_000
 
 
 def episodes(
@@ -29,6 +31,7 @@ def episodes(
     count: int,
     seed: int = 0,
     winnable: tuple[Grid, np.ndarray] | None = None,
+    near: bool = False,
 ) -> list[dict[str, Any]]:
     """Noisy episodes in bulk: outcomes by noise, controller and start region.
 
@@ -42,13 +45,14 @@ def episodes(
         count: episodes for each noise and controller.
         seed: of starts and noise.
         winnable: a grid and which of its nodes can be won; starts that cannot are a region of their own.
+        near: whether all episodes start within twice the noise bound of M*.
 
     Returns:
         One record for each noise, controller and region: how many episodes had each outcome, and the
         share that reached the set-point with its 95% interval (Wilson).
 
     Raises:
-        BadInput: no episodes, or a noise bound that hides the state space.
+        BadInput: no episodes, a noise bound that hides the state space, or no starts near M*.
     """
     check_seed(seed)
     if count < 1:
@@ -63,7 +67,7 @@ def episodes(
             for first in range(0, count, BATCH):
                 n = min(BATCH, count - first)
                 draw, signal = np.random.SeedSequence([seed, first]).generate_state(2)
-                z0 = task.starts(n, np.random.default_rng(draw))
+                z0 = _starts(task, critical, noise, n, np.random.default_rng(draw), near)
                 rollout = closed_loop(
                     task, controller, z0, noise=noise, seed=int(signal), quiet=True, vary=True
                 )
@@ -81,6 +85,36 @@ def episodes(
     return records
 
 
+def _starts(
+    task: Task,
+    critical: CriticalSet,
+    noise: Noise,
+    n: int,
+    rng: np.random.Generator,
+    near: bool,
+) -> np.ndarray:
+    """n starts (n, d) from the task's distribution; if asked for, of those near M*."""
+    z = task.starts(n, rng)
+    if not near:
+        return z
+    kept, drawn = np.empty((0, z.shape[1])), 0
+    while len(kept) < n:
+        kept = np.vstack([kept, z[_near(task, critical, noise.bound, z)]])
+        drawn += n
+        if not len(kept) and drawn >= RARE:
+            raise BadInput(
+                f"of {drawn:,} starts of {task.name} none lies within {2 * noise.bound:g} of its critical "
+                "set: leave --near-critical out, or start elsewhere"
+            )
+        z = task.starts(n, rng)
+    return kept[:n]
+
+
+def _near(task: Task, critical: CriticalSet, bound: float, z: np.ndarray) -> np.ndarray:
+    """Whether starts (n, d) lie within twice the noise bound of M*: (n,) bool."""
+    return np.asarray(distance_to(task, critical, z) <= 2 * bound)
+
+
 def _regions(
     task: Task,
     critical: CriticalSet,
@@ -89,7 +123,7 @@ def _regions(
     z0: np.ndarray,
 ) -> dict[str, np.ndarray]:
     """The start regions: which of the starts (n, d) lie in each, (n,) bool."""
-    near = distance_to(task, critical, z0) <= 2 * bound
+    near = _near(task, critical, bound, z0)
     if winnable is None:
         return {"near M*": near, "elsewhere": ~near}
     grid, can = winnable

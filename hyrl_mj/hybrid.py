@@ -102,8 +102,8 @@ class HybridController:
         q_next = q
         for mode, rows in rows_of.items():
             jumps = self.flow_sets[mode].signed_distance(z[rows]) > ON_EDGE
-            others = [other for other in self.modes if other != mode]
-            if others and jumps.any():
+            if len(self.modes) > 1 and np.count_nonzero(jumps):
+                others = [other for other in self.modes if other != mode]
                 q_next = q.copy() if q_next is q else q_next
                 jumping = np.arange(len(q))[rows][jumps]
                 q_next[jumping] = self._deepest(others, z[jumping])

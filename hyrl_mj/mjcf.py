@@ -73,7 +73,8 @@ def load(path: Path) -> mujoco.MjModel:
     try:
         return mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
-        raise BadInput(f"MuJoCo cannot compile {path}: {error}") from error
+        said = " ".join(str(error).split())
+        raise BadInput(f"MuJoCo cannot compile {path}: {said}") from error
 
 
 def object_id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:

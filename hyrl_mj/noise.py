@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Integral, Real
 
@@ -35,6 +36,10 @@ class Noise:
         if self.kind not in KINDS:
             raise unknown("noise", self.kind, KINDS)
         check_bound(self.bound)
+
+    def acts_on(self, noisy: Sequence[float]) -> np.ndarray:
+        """How much of the bound acts on each column (p,) of a measurement: the task's shares, or all."""
+        return np.ones(len(noisy)) if self.everywhere else np.array(noisy, dtype=float)
 
     def sample(self, k: np.ndarray, columns: int, rng: np.random.Generator) -> np.ndarray:
         """A signal of its own for n simulations at their samples k.
@@ -74,6 +79,10 @@ class Recorded:
     bound: float
     kind: str = "recorded"
     everywhere: bool = True
+
+    def acts_on(self, noisy: Sequence[float]) -> np.ndarray:
+        """As `Noise.acts_on`."""
+        return np.ones(len(noisy))
 
     def sample(self, k: np.ndarray, columns: int, rng: np.random.Generator) -> np.ndarray:
         """As `Noise.sample`."""

@@ -278,6 +278,7 @@ def examine_run(
     count: int | None = None,
     everywhere: bool = False,
     seed: int = 0,
+    near: bool = False,
     say: Say = print,
 ) -> dict[str, Any]:
     """Examine policy and hybrid controller under noise, and write `robustness.json` with its pictures.
@@ -292,6 +293,7 @@ def examine_run(
         count: number of episodes for each kind and controller.
         everywhere: whether noise acts on all columns of the measurement.
         seed: of starts and noise of the episodes.
+        near: whether the episodes all start near M*.
         say: told the result in a line.
 
     Returns:
@@ -324,7 +326,7 @@ def examine_run(
         winnable = grid, np.isin(maps["map_hyrl"], (WON, WON_FROM_SOME, BEATEN))
         content["game"] = game
     if count is not None:
-        content["episodes"] = episodes(task, critical, loops, noises, count, seed, winnable)
+        content["episodes"] = episodes(task, critical, loops, noises, count, seed, winnable, near)
     if exact:
         folder = run.path / "figures"
         figures.robustness_map(task, game, maps, critical, folder / "robustness_map.png")

@@ -30,7 +30,8 @@ class Plant:
         threads: threads of the physics, 0 for all cores. The result does not depend on it.
         measure: makes the measurement of what the sensors give; by default it is just that.
         control: an inner loop that makes the controls of all actuators out of u, at every physics step
-            and from the true state. `inputs` are then names of MJCF numerics that hold their limits.
+            and from the true state; they are kept inside each actuator's ctrlrange. `inputs` are then
+            names of MJCF numerics that hold their limits.
     """
 
     def __init__(
@@ -54,6 +55,9 @@ class Plant:
         self.substeps = max(round(mjcf.sample_time(model) / model.opt.timestep), 1)
         self.low, self.high = input_limits(model, inputs, of_actuators=control is None)
         self._columns = [] if control else actuator_columns(model, inputs)
+        limited = model.actuator_ctrllimited.astype(bool)[:, None]
+        ranges = np.where(limited, model.actuator_ctrlrange, [-np.inf, np.inf])
+        self._ctrl_low, self._ctrl_high = ranges.T
         self._held = model.key_ctrl[0].copy() if model.nkey else np.zeros(model.nu)
         self._batch = Batch(self.model, n, threads)
         self._unstable = np.zeros(n, dtype=bool)
@@ -136,7 +140,8 @@ class Plant:
             self._advance(self._controls(u), ids, self.substeps)
             return
         for _ in range(self.substeps):
-            self._advance(self._control(u, self._qpos[rows], self._qvel[rows]), ids, 1)
+            ctrl = self._control(u, self._qpos[rows], self._qvel[rows])
+            self._advance(np.clip(ctrl, self._ctrl_low, self._ctrl_high), ids, 1)
 
     def step_backward(self, u: np.ndarray, ids: np.ndarray | None = None) -> None:
         """Undo `step`: one sample of x' = -f(x, u), for plants with kinematic actuators only.

@@ -124,8 +124,12 @@ class MlpPolicy:
         activate = ACTIVATIONS[self.activation]
         *hidden, last = self._network  # type: ignore[attr-defined]
         for weight, bias in hidden:
-            x = activate(x @ weight.T + bias)
-        return x @ last[0].T + last[1]
+            x = x @ weight.T
+            x += bias
+            x = activate(x)
+        x = x @ last[0].T
+        x += last[1]
+        return x
 
     def save(self, path: Path) -> None:
         """Write `path` (safetensors) and its description beside it (JSON)."""

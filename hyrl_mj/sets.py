@@ -202,8 +202,8 @@ class GridSet:
         return GridSet(self.grid, self.values + by)
 
     def dilated_by_box(self, half: np.ndarray) -> GridSet:
-        """All points z + n with z in the set and |n_i| <= half_i (d,), to whole nodes."""
-        window = np.round(half / self.grid.spacing).astype(int)
+        """All points z + n with z in the set and |n_i| <= half_i (d,), and up to the next nodes."""
+        window = np.ceil(half / self.grid.spacing - 1e-6).astype(int)
         if not window.any():
             return self
         shape, periodic = self.grid.counts, self.grid.chart.periodic

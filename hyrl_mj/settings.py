@@ -211,8 +211,11 @@ _TRAINING: dict[str, dict[str, tuple[Training, Training]]] = {
     },
 }
 # Grid points along the longest side of the chart, by its dimension: search of M*, and sets.
-_RODS = {1: 120, 2: 120, 3: 24}
-_CELLS = {1: 2880, 2: 240, 3: 48}
+_RODS = {1: 120, 2: 120, 3: 24, 4: 8}
+_CELLS = {1: 2880, 2: 240, 3: 48, 4: 16}
+# Coarser ones where every sample takes a physics engine's work: plants with dynamics.
+_RODS_DYNAMIC = {1: 120, 2: 40, 3: 16, 4: 8}
+_CELLS_DYNAMIC = {1: 720, 2: 96, 3: 30, 4: 12}
 # Cells along the longest side of the lattice on which the worst-case game is played; a smoke run takes less.
 LATTICE = {1: 12_000, 2: 480}
 _LATTICE_SMOKE = {1: 1_200, 2: 120}
@@ -244,6 +247,8 @@ def preset(
     stage1, stage6 = _TRAINING[task.algorithm][name]
     task.check_noise(noise)
     dimension = task.chart.dimension
+    kinematic = task.plant(1).invertible
+    cells, rods = (_CELLS, _RODS) if kinematic else (_CELLS_DYNAMIC, _RODS_DYNAMIC)
     return Settings(
         task=task.reference,
         preset=name,
@@ -252,8 +257,8 @@ def preset(
         horizon=task.horizon if horizon is None and name == "paper" else horizon,
         stage1=stage1,
         stage6=stage6,
-        cells=_CELLS[min(dimension, 3)],
+        cells=cells[min(dimension, 4)],
         search=task.search,
-        rods=_RODS[min(dimension, 3)],
+        rods=rods[min(dimension, 4)],
         lattice=(_LATTICE_SMOKE if name == "smoke" else LATTICE).get(dimension, 0),
     )

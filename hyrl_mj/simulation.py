@@ -151,7 +151,7 @@ def _disturbance(
         return lambda k, plant, q: adversary.choose(plant, q)
     signal = noise
     columns = task.measurement_columns
-    acts = np.ones(columns) if signal.everywhere else np.array(task.noisy, dtype=float)
+    acts = signal.acts_on(task.noisy)
     return lambda k, plant, q: signal.sample(np.full(n, k), columns, rng) * acts
 
 

@@ -161,8 +161,7 @@ class BatchedEnv:
         """Noisy measurements (k, p) of the rows `ids`."""
         true = self.plant.measurement[ids]
         noise = self.noise.sample(self._samples[ids], true.shape[1], self._rng)
-        acts = np.ones(true.shape[1]) if self.noise.everywhere else np.array(self.task.noisy)
-        return np.asarray(true + noise * acts)
+        return np.asarray(true + noise * self.noise.acts_on(self.task.noisy))
 
 
 def cautious_reward(task: Task, measured: np.ndarray, caution: np.ndarray) -> np.ndarray:

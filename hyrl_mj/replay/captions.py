@@ -22,6 +22,7 @@ OUTCOMES: dict[str, tuple[str, RGB]] = {
     "crashed": ("crashed", BAD),
     "out_of_bounds": ("left the arena", BAD),
     "stalled": ("stalled", BAD),
+    "unstable": ("simulation broke down", BAD),
     "running": ("not there yet", OPEN),
     "missed": ("ended off the goal", OPEN),
 }

@@ -24,7 +24,7 @@ BOUND_WIDTH, BOUND_PIECES = 0.05, 4
 BOUND_ALPHA, GHOST_ALPHA = 0.45, 0.35
 # By which what is drawn anew is larger than what has moved [pixels].
 MARGIN = 2
-FAILED = ("crashed", "out_of_bounds", "stalled")
+FAILED = ("crashed", "out_of_bounds", "stalled", "unstable")
 
 
 class Track:

@@ -1,6 +1,8 @@
-"""The robots: one file each, named as its MJCF."""
+"""The robots: one file each, named as its MJCF. A file that lies here is a task of the package."""
 
-from hyrl_mj.tasks import unit_circle, vehicle
+from importlib import import_module
+from pkgutil import iter_modules
+
 from hyrl_mj.tasks.base import Chart, Mirror, Outcome, Task, passing_side
 from hyrl_mj.tasks.registry import get_task, register, task_names
 
@@ -13,6 +15,7 @@ __all__ = [
     "passing_side",
     "register",
     "task_names",
-    "unit_circle",
-    "vehicle",
 ]
+
+for _module in iter_modules(__path__, f"{__name__}."):
+    import_module(_module.name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import sys
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -20,7 +21,17 @@ _FILES: dict[Path, type[Task]] = {}
 
 
 def register(task: type[Task]) -> type[Task]:
-    """Class decorator: make a task known by its name, to Gymnasium by its `env_id`."""
+    """Class decorator: make a task known by its name, to Gymnasium by its `env_id`.
+
+    Raises:
+        BadInput: another file has a task of that name.
+    """
+    where = inspect.getfile(task)
+    if task.name in _REGISTRY and inspect.getfile(_REGISTRY[task.name]) != where:
+        raise BadInput(
+            f"{where} defines a task {task.name}, and so does {inspect.getfile(_REGISTRY[task.name])}: "
+            "rename one of them"
+        )
     if "env_id" not in vars(task):
         task.env_id = f"hyrl_mj/{task.__name__}-v0"
     _REGISTRY[task.name] = task
@@ -30,7 +41,7 @@ def register(task: type[Task]) -> type[Task]:
         entry_point="hyrl_mj.envs.gym_env:TaskEnv",
         vector_entry_point="hyrl_mj.envs.gym_env:TaskVectorEnv",
         kwargs={"task": task.name},
-        max_episode_steps=task.max_steps,
+        max_episode_steps=getattr(task, "max_steps", None),  # `check_task` says what is missing
     )
     return task
 
@@ -102,10 +113,6 @@ def _from_file(path: Path) -> type[Task]:
             )
         (task,) = found
         task.source = path
-        if _REGISTRY.get(task.name, task).source != path:
-            raise BadInput(
-                f"{path} defines a task {task.name}, and there is another of that name: rename it"
-            )
         _FILES[path] = register(task)
     return _FILES[path]
 
@@ -121,6 +128,9 @@ def _run(path: Path) -> ModuleType:
     sys.path.insert(0, str(path.parent))
     try:
         spec.loader.exec_module(module)
+    except BadInput:
+        del sys.modules[name]
+        raise
     except Exception as error:  # whatever the user's file raises
         del sys.modules[name]
         raise BadInput(f"{path} cannot be imported: {brief(error)}{_line(error, path)}") from error

@@ -87,9 +87,11 @@ class Vehicle(Task):
         return distance(z, self.set_point)
 
     def observation(self, measured: np.ndarray) -> np.ndarray:
-        y = measured[:, 1]
-        columns = np.array([self.clearance(measured), self.distance_to_go(measured), y])
-        return columns.T.copy()
+        seen = np.empty((len(measured), 3))
+        seen[:, 0] = self.clearance(measured)
+        seen[:, 1] = self.distance_to_go(measured)
+        seen[:, 2] = measured[:, 1]
+        return seen
 
     def reward(self, measurement: np.ndarray) -> np.ndarray:
         d_o = self.clearance(measurement)

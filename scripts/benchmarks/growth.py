@@ -5,13 +5,16 @@ Each size runs in a process of its own, so that its peak memory is its own:
     python scripts/benchmarks/growth.py simulations 4096
 """
 
-import resource
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.runs import peak_memory
 
 SIZES = {
     "simulations": (1, 16, 256, 4_096, 65_536),
@@ -55,7 +58,7 @@ def measure(kind: str, size: int, run: Path) -> tuple[float, float]:
         loops = {"HyRL": found.controller}
         episodes(task, found.critical_set, loops, (Noise("uniform", 0.1),), size)
     took = time.perf_counter() - began
-    return took, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return took, peak_memory()
 
 
 def plot(run: Path, path: Path) -> None:
@@ -74,7 +77,8 @@ def plot(run: Path, path: Path) -> None:
         above.set_ylabel("time [s]")
         above.legend()
         below.plot(work, memory, "o-")
-        below.set(xlabel=LABELS[kind], ylabel="peak memory [MB]", ylim=(0, 400))
+        below.set(xlabel=LABELS[kind], ylabel="peak memory [MB]")
+        below.set_ylim(0, 1.2 * max(memory))
         for axis in (above, below):
             axis.grid(alpha=0.3)
     figure.savefig(path, dpi=120)

@@ -1,8 +1,8 @@
 """The finished runs that the figures are about, made when they are first asked for."""
 
-import os
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,7 +39,22 @@ def child(arguments: list[str]) -> float:
     process = subprocess.Popen(
         [sys.executable, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
-    _, status, usage = os.wait4(process.pid, 0)
-    if status:
+    peak = 0.0
+    while process.poll() is None:
+        peak = max(peak, peak_memory(process.pid))
+        time.sleep(0.02)
+    if process.returncode:
         raise SystemExit(f"python {' '.join(arguments)} failed")
-    return usage.ru_maxrss / 1024
+    return peak
+
+
+def peak_memory(pid: int | str = "self") -> float:
+    """The most that a process has had in memory so far [MB], on Linux.
+
+    `ru_maxrss` would say that of the process that started it, if that is more.
+    """
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+        return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
+    except (OSError, StopIteration):  # it has just ended, or there is no such file here
+        return 0.0

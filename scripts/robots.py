@@ -1,0 +1,138 @@
+"""The robots with dynamics, put to the test: trains what is missing, and prints one table.
+
+    python scripts/robots.py                                # rover and quadrotor, seeds 0 to 2
+    python scripts/robots.py --tasks rover --seeds 0 --episodes 1000
+
+Episodes start near the critical set. An expert rule, which knows which side to take, says from which starts a
+controller has to survive without noise. Exit status 1 if some figure misses its target.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from benchmarks.runs import child
+from rich.console import Console
+from rich.table import Table
+
+import hyrl_mj
+from hyrl_mj import progress
+from hyrl_mj.controllers import Controller, PolicyController
+from hyrl_mj.episodes import episodes
+from hyrl_mj.simulation import closed_loop
+
+KINDS = ("alternating", "adversarial")
+# Starts for the comparison with the expert.
+STARTS = 2_000
+
+
+@dataclass(frozen=True)
+class Expert:
+    """Passes the pillar on a given side with room to spare, then goes for the set-point.
+
+    Attributes:
+        task: the rover or the quadrotor.
+        side: 1 for the left, -1 for the right.
+    """
+
+    task: hyrl_mj.Task
+    side: int
+
+    def act(self, measured: np.ndarray) -> np.ndarray:
+        """Inputs (n, m) for measurements (n, p)."""
+        x, y = measured[:, 0], measured[:, 1]
+        centre = self.task.obstacle
+        gap = self.task.clearance(np.array([[centre[0], centre[1], *measured[0, 2:]]]))[0]
+        before = x < centre[0] - 0.2 * gap
+        goal_y = np.where(before, self.side * (0.25 - gap), self.task.set_point[1])
+        if self.task.name == "quadrotor":
+            wanted = 3 * (goal_y - y)
+        else:
+            bearing = np.clip(1.5 * np.arctan2(goal_y - y, 0.5), -1.2, 1.2)
+            wanted = 4 * (bearing - measured[:, 2])
+        return np.clip(wanted[:, None], *self.task.input_limits)
+
+
+def crashes_without_noise(run: hyrl_mj.Run) -> dict[str, int]:
+    """How often each controller fails from starts that the expert survives on one side."""
+    task = run.task
+    z = task.starts(STARTS, np.random.default_rng(0))
+    survived = np.zeros(STARTS, dtype=bool)
+    for side in (1, -1):
+        survived |= reached(task, PolicyController(Expert(task, side)), z)
+    if not survived.any():
+        raise SystemExit(f"{task.name}: the expert survives from nowhere")
+    found = {name: ~reached(task, loop, z) & survived for name, loop in run.loops.items()}
+    return {name: int(failed.sum()) for name, failed in found.items()}
+
+
+def reached(task: hyrl_mj.Task, loop: Controller, z: np.ndarray) -> np.ndarray:
+    """Whether runs from starts (n, d) reach the end: (n,) bool."""
+    return closed_loop(task, loop, z, quiet=True).outcome == hyrl_mj.Outcome.REACHED
+
+
+def measure(name: str, seed: int, count: int, folder: Path) -> list[str]:
+    """One row of the table; figures that miss their target end in "!"."""
+    out, began = folder / f"{name}_{seed}", time.monotonic()
+    done_before = (out / "report.html").is_file()
+    memory = child(["-m", "hyrl_mj.cli", "run", name, "--seed", str(seed), "--out", str(out)])
+    took = time.monotonic() - began
+    run = hyrl_mj.load_run(out)
+    noises = tuple(hyrl_mj.Noise(kind, run.settings.noise) for kind in KINDS)
+    records = episodes(run.task, run.critical_set, run.loops, noises, count, near=True)
+    row = [name, str(seed)]
+    for loop in run.loops:
+        for kind in KINDS:
+            (found,) = (r for r in records if (r["controller"], r["noise"]) == (loop, kind))
+            failed = found["episodes"] - found["outcomes"].get("reached", 0)
+            share = failed / found["episodes"]
+            good = share >= 0.2 if loop == "policy" else failed == 0
+            shown = f"{share:.1%}" if loop == "policy" else f"{failed} of {found['episodes']}"
+            row.append(shown if good else f"{shown} !")
+    quiet = crashes_without_noise(run)
+    row += [f"{n}" if n == 0 else f"{n} !" for n in quiet.values()]
+    fits = took <= 480 and memory <= 2048
+    row.append("-" if done_before else f"{took:.0f} s, {memory:.0f} MB{'' if fits else ' !'}")
+    return row
+
+
+def main() -> int:
+    """Run and print; 1 if a target is missed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    robots = ("rover", "quadrotor")
+    parser.add_argument("--tasks", nargs="+", default=list(robots), choices=robots)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--episodes", type=int, default=10_000)
+    parser.add_argument("--out", type=Path, default=Path("runs/robots"))
+    options = parser.parse_args()
+    progress.enabled = sys.stderr.isatty()
+    table = Table(title=f"failures near M*, {options.episodes:,} episodes for each kind of noise")
+    headings = ["robot", "seed"]
+    for loop, target in (("RL policy", ">= 20%"), ("HyRL", "0")):
+        headings += [f"{loop}, {kind}\n{target}" for kind in KINDS]
+    headings += [f"{loop}, no noise\n0" for loop in ("RL policy", "HyRL")]
+    for heading in (*headings, "run\n<= 480 s, 2048 MB"):
+        table.add_column(heading)
+    missed = 0
+    for name in options.tasks:
+        for seed in options.seeds:
+            row = measure(name, seed, options.episodes, options.out)
+            missed += sum(cell.endswith("!") for cell in row)
+            table.add_row(*row)
+            print(f"{name} seed {seed}: {', '.join(row[2:])}", file=sys.stderr, flush=True)
+    Console(width=None if sys.stdout.isatty() else 160).print(table)
+    print(f"{missed} figures miss their target" if missed else "every figure meets its target")
+    return int(missed > 0)
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except hyrl_mj.HyrlError as error:
+        print(error, file=sys.stderr)
+        sys.exit(error.exit_status)

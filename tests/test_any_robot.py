@@ -1,0 +1,290 @@
+"""Robots that the package has never seen: brought as a file, or by another installed package."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gl import needs_gl
+
+import hyrl_mj
+from hyrl_mj.new_task import TEMPLATES, write_task
+from hyrl_mj.tasks.checks import check_task
+
+# ---- a point mass in space with a pillar: a chart of three dimensions, two inputs, contacts
+
+WASP_XML = """
+<mujoco model="wasp">
+  <option timestep="0.01" integrator="implicitfast" gravity="0 0 0"/>
+  <custom><numeric name="sample_time" data="0.05"/></custom>
+  <visual><quality shadowsize="0"/></visual>
+  <worldbody>
+    <light directional="true" dir="0.2 0.2 -1" castshadow="false"/>
+    <geom name="ground" type="plane" size="6 6 0.1" contype="0" conaffinity="0"/>
+    <geom name="obstacle" type="cylinder" pos="1.4 0 0.6" size="0.4 0.6"/>
+    <site name="set_point" pos="2.6 0 0.5"/>
+    <camera name="overhead" projection="orthographic" fovy="3" pos="1.3 0 4" xyaxes="1 0 0 0 1 0"/>
+    <body name="wasp">
+      <joint name="x" type="slide" axis="1 0 0"/>
+      <joint name="y" type="slide" axis="0 1 0"/>
+      <joint name="z" type="slide" axis="0 0 1"/>
+      <geom name="body" size="0.08" mass="0.5" rgba="0.9 0.7 0.1 1"/>
+      <site name="tracked"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <velocity name="ahead" joint="x" kv="10"/>
+    <velocity name="aside" joint="y" kv="8" ctrlrange="-1.5 1.5"/>
+    <velocity name="aloft" joint="z" kv="8" ctrlrange="-0.5 0.5"/>
+  </actuator>
+  <sensor>
+    <jointpos joint="x"/> <jointpos joint="y"/> <jointpos joint="z"/>
+    <contact geom1="body" geom2="obstacle" data="found"/>
+  </sensor>
+  <keyframe><key ctrl="1 0 0"/></keyframe>
+</mujoco>
+"""
+
+WASP_PY = """
+import numpy as np
+
+import hyrl_mj
+from hyrl_mj import Chart, Mirror, Outcome, mjcf
+
+
+class Wasp(hyrl_mj.Task):
+    name = "wasp"
+    description = "a point mass in space"
+    chart = Chart(
+        ("x", "y", "z"), ("m",) * 3, (0.0, -1.2, 0.2), (2.8, 1.2, 0.8), (False,) * 3
+    )
+    inputs = ("aside", "aloft")
+    noisy = (False, True, False, False)
+    max_steps, horizon, worst_reward = 60, 0.3, 0.0
+    start_low, start_high = (0.0, -0.5, 0.3), (0.2, 0.5, 0.7)
+    replay_starts, replay_time = ((0.0, 0.05, 0.5), (0.0, -0.05, 0.5)), 3.0
+    mode_names = ("left", "right")
+    algorithm = "ppo"
+    mirror = Mirror((1, -1, 1), (-1, 1))
+    observation_low, observation_high = (-1.0, -3.0, -2.0), (5.0, 3.0, 3.0)
+    set_point = np.array([2.6, 0.0, 0.5])
+    close = 0.6
+
+    def state(self, z, rng=None):
+        return z, np.tile([1.0, 0.0, 0.0], (len(z), 1))
+
+    def z(self, measured):
+        return measured[:, :3]
+
+    def with_z(self, measured, z):
+        return np.hstack([z, measured[:, 3:]])
+
+    def observation(self, measured):
+        return measured[:, :3]
+
+    def clearance(self, measured):
+        centre = mjcf.geom_pos(self.model, "obstacle")[:2]
+        return np.linalg.norm(measured[:, :2] - centre, axis=1) - 0.48
+
+    def reward(self, measured):
+        near = np.clip(1 - self.clearance(measured) / 0.2, 0, 1)
+        off = np.abs(measured[:, 1]) + np.abs(measured[:, 2] - 0.5)
+        return np.where(self.failed(measured), 0.0, 3 - np.minimum(off, 2) - near)
+
+    def ending(self, measured):
+        ends = np.full(len(measured), Outcome.RUNNING)
+        ends[measured[:, 0] >= 2.6] = Outcome.REACHED
+        ends[np.abs(measured[:, 1]) >= 1.2] = Outcome.OUT_OF_BOUNDS
+        ends[(measured[:, 3] > 0) | (self.clearance(measured) <= 0)] = Outcome.CRASHED
+        return ends
+"""
+
+
+@pytest.fixture(scope="module")
+def wasp(tmp_path_factory):
+    """The file of a task, in a folder of its own."""
+    folder = tmp_path_factory.mktemp("robots")
+    (folder / "wasp.xml").write_text(WASP_XML)
+    (folder / "wasp.py").write_text(WASP_PY)
+    return folder / "wasp.py"
+
+
+def command(*arguments, cwd, path=()):
+    """Run `hyrl-mj` in a folder."""
+    package = str(Path(hyrl_mj.__file__).parents[1])
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([package, *map(str, path)])}
+    code = "from hyrl_mj.cli import main; main()"
+    return subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        cwd=cwd, env=env, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
+@needs_gl
+def test_a_robot_from_its_own_folder_goes_through_the_whole_pipeline(wasp, tmp_path):
+    assert len(WASP_PY.strip().splitlines()) <= 90
+    done = command("run", os.path.relpath(wasp, tmp_path), "--preset", "smoke", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    out = tmp_path / "runs" / "wasp"
+    assert (out / "replay.mp4").stat().st_size > 10_000
+    assert (out / "report.html").is_file()
+    records = json.loads((out / "robustness.json").read_text())["episodes"]
+    assert {r["controller"] for r in records} == {"policy", "hyrl"}
+    # It is found again, from anywhere.
+    again = command("replay", out, "--starts", "paper", "--out", "v.png", cwd=out.parent)
+    assert again.returncode == 0, again.stderr
+    assert (out.parent / "v.png").is_file()
+
+
+def test_its_critical_set_is_found_and_its_parts_are_the_two_sides(wasp):
+    task = check_task(hyrl_mj.get_task(wasp))
+
+    class Sides:
+        def act(self, measured):
+            side = np.where(measured[:, 1] >= 0.1, 1.5, -1.5)
+            aside = np.where(np.abs(measured[:, 1]) < 0.8, side, 0.0)
+            return np.stack([aside, np.zeros(len(measured))], axis=1)
+
+    critical = hyrl_mj.find_critical_set(task, Sides(), 20, 1 / 16, "outcome")
+    assert critical.pieces == 1
+    assert np.abs(critical.points[:, 1] - 0.1).max() <= critical.resolution
+    partition = hyrl_mj.make_partition(task, Sides(), critical, 20)
+    assert partition.modes == (0, 1)
+    before = np.array([[0.1, 0.4, 0.5], [0.1, -0.4, 0.5]])
+    assert [part.contains(before).tolist() for part in partition.parts] == [
+        [True, False],
+        [False, True],
+    ]
+
+
+def test_gymnasium_knows_it(wasp):
+    task = hyrl_mj.get_task(wasp)
+    env = gymnasium.make("hyrl_mj/Wasp-v0")
+    observation, info = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    assert task.chart.contains(info["z"])
+    assert hyrl_mj.get_task("wasp").reference == str(wasp)
+
+
+def test_an_installed_package_can_offer_tasks(wasp, tmp_path):
+    described = tmp_path / "site" / "wasps-1.0.dist-info"
+    described.mkdir(parents=True)
+    (described / "METADATA").write_text("Metadata-Version: 2.1\nName: wasps\nVersion: 1.0\n")
+    (described / "entry_points.txt").write_text("[hyrl_mj.tasks]\nwasp = wasp:Wasp\n")
+    listed = command("list", cwd=tmp_path, path=[described.parent, wasp.parent])
+    assert listed.returncode == 0, listed.stderr
+    assert re.search(r"^wasp +hyrl_mj/Wasp-v0 +a point mass in space$", listed.stdout, re.M)
+    broken = command("list", cwd=tmp_path, path=[described.parent])
+    assert broken.returncode == 2
+    assert "the task wasp of wasp:Wasp cannot be imported" in broken.stderr
+    assert "Traceback" not in broken.stderr
+
+
+# ---- a task to start from
+
+
+def test_a_new_task_passes_its_own_tests(tmp_path):
+    written = command("new-task", "sledge_2", "--folder", "mine", cwd=tmp_path)
+    assert written.returncode == 0, written.stderr
+    folder = tmp_path / "mine"
+    assert {p.name for p in folder.iterdir()} == {"sledge_2.py", "sledge_2.xml", "test_sledge_2.py"}
+    ran = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_sledge_2.py"],
+        cwd=folder, capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": str(Path(hyrl_mj.__file__).parents[1])},
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stdout
+    assert int(re.search(r"(\d+) passed", ran.stdout).group(1)) > 10
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [("2fast", "letters, digits"), ("class", "letters, digits"), ("vehicle", "already")],
+)
+def test_a_name_that_cannot_be_one_is_refused(tmp_path, name, says):
+    done = command("new-task", name, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert says in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_nothing_is_overwritten(tmp_path):
+    (tmp_path / "mine.xml").write_text("precious")
+    with pytest.raises(hyrl_mj.BadInput, match=r"mine\.xml is there already"):
+        write_task("mine", tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.xml"]
+
+
+# ---- what is wrong is said before any training
+
+PY, XML = "my_robot.py", "my_robot.xml"
+MISTAKES = {
+    "a tag that is not closed": (XML, "</worldbody>", "", r"my_robot\.xml: .*[Ll]ine.*\d+"),
+    "an unknown attribute": (XML, 'kv="12"', 'kw="12"', r"my_robot\.xml: .*kw.*line \d+"),
+    "no MJCF": (XML, None, None, r"no MJCF model at .*my_robot\.xml"),
+    "no task file": (PY, None, None, r"no task file .*my_robot\.py.*new-task my_robot"),
+    "an import that fails": (PY, "import numpy", "import nunpy", r"'nunpy', line \d+"),
+    "no Python": (PY, "class MyRobot", "clas MyRobot", r"SyntaxError.*my_robot\.py, line \d+"),
+    "an error of its own": (PY, "WALL = 1.4", "WALL = 1 / 0", r"ZeroDivisionError.*line \d+"),
+    "no task": (PY, "(hyrl_mj.Task)", "", r"must define one task.*none"),
+    "a name that is taken": (
+        PY, 'name = "my_robot"', 'name = "vehicle"', r"and so does .*vehicle\.py: rename",
+    ),
+    "a part is missing": (PY, "max_steps, horizon = 70, 0.3", "", r"no max_steps, horizon"),
+    "a method is missing": (PY, "def ending", "def finish", r"not finished.*ending"),
+    "no actuators": (
+        XML, '<actuator>.*</actuator>| ctrl="1 0"', "", r"my_robot\.xml has no actuators",
+    ),
+    "an actuator of another name": (XML, 'name="lateral"', 'name="side"', r"'lateral'.*side"),
+    "a limit is missing": (XML, ' ctrlrange="-1 1"', "", r"lateral needs a ctrlrange"),
+    "a chart of the wrong dimension": (PY, r'\("m", "m"\)', '("m",)', r"2 name.*1 value.*units"),
+    "a z of the wrong dimension": (
+        PY, r":, :2\]\n\n    def with", ":, :1]\n\n    def with", r"z\(\) gives .*1",
+    ),
+    "starts of the wrong dimension": (PY, r"\(0\.0, -0\.8\)", "(0.0,)", r"start_low has 1 value"),
+    "a measurement of the wrong size": (
+        PY, "noisy = .*\n", "noisy = (True,)\n", r"measures 4.*`noisy` has 1",
+    ),
+    "an observation outside its space": (
+        PY, r"\(5\.0, 3\.0, 3\.0\)", "(0.1, 3.0, 3.0)", r"observation\[0\] is .*0\.1: widen",
+    ),
+    "a start that has crashed": (
+        XML, 'pos="1.6 0 0.1"', 'pos="0.2 0 0.1"', r"starts are over before they begin: x = .*crashed",
+    ),
+    "a start outside the chart": (PY, r"\(0\.3, 0\.8\)", "(0.3, 1.8)", r"starts outside its chart"),
+    "a sample time that does not fit": (
+        XML, 'data="0.05"', 'data="0.045"', r"0\.045 s is no multiple of the physics step 0\.01 s",
+    ),
+    "a state that is not the chart's": (
+        PY, "return z, np.stack", "return 1.01 * z, np.stack", r"state\(\) and z\(\) do not belong",
+    ),
+    "nothing to track": (XML, 'name="tracked"', 'name="followed"', r"'tracked'.*followed"),
+    "no camera": (XML, 'name="overhead"', 'name="above"', r"'overhead'.*above"),
+    "a reward that is one number": (
+        PY, r"return np\.where\(self\.failed.*\n", "return np.zeros(1)\n", r"reward\(\)",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_one_sentence_before_any_training(tmp_path, mistake):
+    file, old, new, says = MISTAKES[mistake]
+    for name in (PY, XML):
+        text = (TEMPLATES / name).read_text()
+        if name == file and old is not None:
+            changed = re.sub(old, new, text, flags=re.DOTALL if "<" in old else 0)
+            assert changed != text
+            text = changed
+        if name != file or old is not None:
+            (tmp_path / name).write_text(text)
+    done = command("run", PY, "--preset", "smoke", cwd=tmp_path)
+    assert done.returncode == 2, done.stderr
+    assert re.search(says, done.stderr, re.DOTALL), done.stderr
+    assert "Traceback" not in done.stderr
+    assert "my_robot" in done.stderr
+    assert not (tmp_path / "runs").exists()
