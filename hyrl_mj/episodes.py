@@ -18,7 +18,7 @@ from hyrl_mj.simulation import closed_loop
 from hyrl_mj.tasks.base import Outcome, Task
 
 # Episodes that are simulated together: memory does not grow with their number.
-BATCH = 32_768
+BATCH = 4_096
 # After so many starts, none of which lies near M*, there are none.
 RARE = 100_000
 
