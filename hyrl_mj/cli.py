@@ -28,8 +28,11 @@ RunDir = Annotated[Path, Positional, tyro.conf.arg(metavar="RUN", help="a run di
 def list_tasks() -> None:
     """List the tasks."""
     for name in task_names():
-        task = get_task(name)
-        print(f"{name:14} {task.env_id:30} {task.description}")
+        try:
+            task = get_task(name)
+            print(f"{name:14} {task.env_id:30} {task.description}")
+        except BadInput as error:  # of another package
+            print(f"{name:14} {error}")
 
 
 def new_task(

@@ -11,10 +11,9 @@ from hyrl_mj import artifacts
 from hyrl_mj.errors import unknown
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import Grid
-from hyrl_mj.simulation import PolicyController, closed_loop
-from hyrl_mj.tasks.base import Task
+from hyrl_mj.simulation import PolicyController, closed_loop, ways
+from hyrl_mj.tasks.base import SEARCHES, Task
 
-METHODS = ("rods", "outcome")
 # Samples that the two ends of a rod run: long enough to part, too short to come round an obstacle.
 SAMPLES = 5
 # The ends part when they grow apart by this share of the way that both went: displacements of equal
@@ -49,7 +48,7 @@ class CriticalSet:
         """The result for people."""
         if not len(self.points):
             return (
-                f"no critical set found at this resolution (grid {self.spacing:.3g}, rods down to "
+                f"no critical set found at this resolution (grid {self.spacing:.3g}, pairs down to "
                 f"{self.resolution:.3g} {task.chart.units[0]})"
             )
         low, high = self.points.min(axis=0), self.points.max(axis=0)
@@ -122,8 +121,8 @@ def find_critical_set(
     Raises:
         BadInput: an unknown method.
     """
-    if method not in METHODS:
-        raise unknown("method", method, METHODS)
+    if method not in SEARCHES:
+        raise unknown("method", method, SEARCHES)
     grid, d = Grid.with_cells(task.chart, cells), task.chart.dimension
     found = (_by_rods if method == "rods" else _by_outcome)(task, policy, grid, resolution)
     points = np.unique(task.chart.wrap(found), axis=0) if len(found) else np.empty((0, d))
@@ -153,12 +152,12 @@ def _by_rods(task: Task, policy: Policy, grid: Grid, resolution: float) -> np.nd
 def _by_outcome(task: Task, policy: Policy, grid: Grid, resolution: float) -> np.ndarray:
     """Middles (N, d) between starts so close together whose runs go different ways."""
 
-    def ways(z: np.ndarray) -> np.ndarray:
+    def way_from(z: np.ndarray) -> np.ndarray:
         if not len(z):
             return np.zeros(0, dtype=int)
-        return task.direction(closed_loop(task, PolicyController(policy), z).path)
+        return ways(task, closed_loop(task, PolicyController(policy), z))
 
-    at_node = ways(grid.nodes)
+    at_node = way_from(grid.nodes)
     first, second = grid.neighbours()
     pair = (at_node[first] != at_node[second]) & (at_node[first] >= 0) & (at_node[second] >= 0)
     first, second = first[pair], second[pair]
@@ -167,7 +166,7 @@ def _by_outcome(task: Task, policy: Policy, grid: Grid, resolution: float) -> np
     length = grid.cell
     while len(a) and length > resolution * grid.cell * (1 + 1e-9):
         middle = (a + b) / 2
-        way = ways(middle)
+        way = way_from(middle)
         near_a = (way == way_a)[:, None]
         a, b = np.where(near_a, middle, a), np.where(near_a, b, middle)
         way_b = np.where(near_a[:, 0], way_b, way)
@@ -227,7 +226,7 @@ def _differ(task: Task, policy: Policy, a: np.ndarray, b: np.ndarray) -> np.ndar
     if not n:
         return np.zeros(0, dtype=bool)
     rollout = closed_loop(task, PolicyController(policy), np.vstack([a, b]))
-    way = task.direction(rollout.path)
+    way = ways(task, rollout)
     return (way[:n] != way[n:]) & (way[:n] >= 0) & (way[n:] >= 0)
 
 

@@ -97,6 +97,10 @@ def _starts(
     z = task.starts(n, rng)
     if not near:
         return z
+    if not len(critical.points):
+        raise BadInput(
+            "no critical set was found, so nothing starts near it: leave --near-critical out"
+        )
     kept, drawn = np.empty((0, z.shape[1])), 0
     while len(kept) < n:
         kept = np.vstack([kept, z[_near(task, critical, noise.bound, z)]])

@@ -32,7 +32,7 @@ def unknown(what: str, given: object, allowed: Iterable[str]) -> BadInput:
     return BadInput(f"unknown {what} {given!r}: choose one of {', '.join(names)}.{hint}")
 
 
-def brief(error: Exception) -> str:
+def brief(error: BaseException) -> str:
     """The kind of an error and the beginning of what it says, in one line."""
     text = " ".join(str(error).split())
     return f"{type(error).__name__}: {text if len(text) <= 160 else text[:157] + '...'}"

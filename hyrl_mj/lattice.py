@@ -105,7 +105,7 @@ class Lattice:
         grid = grid or Grid.with_cells(task.chart, LATTICE[task.chart.dimension])
         nodes = grid.nodes
         plant = task.plant(len(nodes))
-        plant.set_state(task.qpos(nodes))
+        plant.set_state(*task.state(nodes))
         failed, arrived = _ended(task, plant.measurement)
         alive = np.flatnonzero(task.ending(plant.measurement) == Outcome.RUNNING)
         levels = _levels(task, grid, nodes[alive])
@@ -115,7 +115,7 @@ class Lattice:
         good = np.zeros_like(bad)
         progress = Progress("tabulating the plant", len(levels), "inputs")
         for a, level in enumerate(levels):
-            plant.set_state(task.qpos(nodes[alive]))
+            plant.set_state(*task.state(nodes[alive]))
             plant.step(np.tile(level, (len(alive), 1)))
             measurement = plant.measurement
             ends[a] = nodes
@@ -183,7 +183,7 @@ def _levels(task: Task, grid: Grid, nodes: np.ndarray) -> np.ndarray:
             u = (low + high) / 2
             u[i] = value
             plant = task.plant(1)
-            plant.set_state(task.qpos(nodes[:1]))
+            plant.set_state(*task.state(nodes[:1]))
             plant.step(u[None])
             ends.append(task.z(plant.measurement)[0])
         cells = np.abs((ends[1] - ends[0]) / grid.spacing).max()

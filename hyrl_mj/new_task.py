@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import keyword
+import re
+from importlib.util import find_spec
 from pathlib import Path
 
 from hyrl_mj import artifacts
@@ -21,15 +23,16 @@ def write_task(name: str, folder: Path) -> list[Path]:
     Raises:
         BadInput: the name cannot be one of a Python file, it is taken, or a file is there already.
     """
-    if not name.isidentifier() or keyword.iskeyword(name):
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or keyword.iskeyword(name):
         raise BadInput(
-            f"{name!r} cannot be the name of a task: give letters, digits and _, as my_robot"
+            f"{name!r} cannot be the name of a task: give lower-case letters, digits and _, as my_robot"
         )
-    if name in task_names():
-        raise BadInput(f"there is a task {name} already: choose another name")
+    if name in task_names() or find_spec(name) is not None:
+        what = "task" if name in task_names() else "Python package"
+        raise BadInput(f"there is a {what} {name} already: choose another name")
     title = "".join(part.capitalize() for part in name.split("_"))
     texts = {
-        folder / path.name.replace("my_robot", name): path.read_text()
+        folder / path.name.replace("my_robot", name): path.read_text(encoding="utf-8")
         .replace("my_robot", name)
         .replace("MyRobot", title)
         for path in sorted(TEMPLATES.iterdir())
@@ -40,5 +43,5 @@ def write_task(name: str, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     for path, text in texts.items():
         with artifacts.replacing(path) as temporary:
-            temporary.write_text(text)
+            temporary.write_text(text, encoding="utf-8")
     return list(texts)

@@ -11,7 +11,7 @@ from hyrl_mj import artifacts
 from hyrl_mj.critical_set import CriticalSet
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.simulation import PolicyController, closed_loop
+from hyrl_mj.simulation import PolicyController, closed_loop, ways
 from hyrl_mj.tasks.base import Outcome, Task
 
 
@@ -89,7 +89,7 @@ def make_partition(task: Task, policy: Policy, critical: CriticalSet, cells: int
     grid = Grid.with_cells(task.chart, cells)
     rollout = closed_loop(task, PolicyController(policy), grid.nodes, label="partition")
     succeeds = rollout.outcome == Outcome.REACHED
-    way = task.direction(rollout.path)
+    way = ways(task, rollout)
     if not len(critical.points):
         way = np.full_like(way, -1)
     modes = tuple(int(q) for q in np.unique(way[way >= 0])) or (0,)

@@ -223,6 +223,9 @@ def done(run: Run, index: int) -> bool:
         return False
     if not all(path.is_file() for paths in outputs for path in paths):
         return False
+    source = run.task.source
+    if source is not None:  # a robot of the user's that was changed is trained again
+        outputs = [[source, run.task.model_path], *outputs]
     times = [[path.stat().st_mtime_ns for path in paths] for paths in outputs]
     return min(times[-1]) >= max((t for earlier in times[:-1] for t in earlier), default=0)
 

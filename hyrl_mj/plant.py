@@ -81,7 +81,7 @@ class Plant:
     def unstable(self) -> np.ndarray:
         """(n,) bool, copies whose simulation left the finite numbers since they were put into a state.
 
-        They stand in the model's initial state; the others do not notice.
+        They were put back into the model's initial state; the others do not notice.
         """
         return self._unstable.copy()
 
@@ -141,6 +141,7 @@ class Plant:
             return
         for _ in range(self.substeps):
             ctrl = self._control(u, self._qpos[rows], self._qvel[rows])
+            ctrl = _checked("control", ctrl, (len(u), self.model.nu), ids)
             self._advance(np.clip(ctrl, self._ctrl_low, self._ctrl_high), ids, 1)
 
     def step_backward(self, u: np.ndarray, ids: np.ndarray | None = None) -> None:

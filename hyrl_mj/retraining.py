@@ -111,7 +111,7 @@ class ModeGround:
             self.lattice = Lattice.of(task, self.grid)
         within = self.within.mask
         plant = task.plant(len(self.grid.nodes))
-        plant.set_state(task.qpos(self.grid.nodes))
+        plant.set_state(*task.state(self.grid.nodes))
         alive = task.ending(plant.measurement) == Outcome.RUNNING
         # If the stage-1 policy never succeeds here, training may still find a way.
         wins = extended.winning[index]
@@ -182,7 +182,7 @@ class ModeGround:
             place = after[level[last], 0, last]
             last = np.unique(np.where(place < self.lattice.nodes, place, last))
         plant = self.task.plant(len(last))
-        plant.set_state(self.task.qpos(grid.nodes[last]))
+        plant.set_state(*self.task.state(grid.nodes[last]))
         plant.step(self.lattice.levels[level[last]])
         ends = np.vstack([grid.nodes[last], self.task.z(plant.measurement)])
         return float(self.task.miss(ends).max())

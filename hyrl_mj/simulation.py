@@ -112,11 +112,12 @@ def closed_loop(
         before, u = q.copy(), np.full((n, len(task.inputs)), np.nan)
         u[active], q[active] = controller.step(q[active], measured[active])
         (plant.step_backward if backward else plant.step)(u[active], active)
-        measurement = plant.measurement
+        measurement, last, lost = plant.measurement, measurement, plant.unstable
+        measurement[lost] = last[lost]  # where it was before it broke down
         path[k + 1] = task.z(measurement)
         length[active] = k + 1
         if not backward:
-            outcome[active] = task.outcome(measurement[active], plant.unstable[active])
+            outcome[active] = task.outcome(measurement[active], lost[active])
         if record:
             for name, value in (
                 ("before", before),
@@ -125,7 +126,7 @@ def closed_loop(
                 ("u", u),
             ):
                 kept[name].append(value)
-            states.append(plant.state)
+            states.append(np.where(lost[:, None], states[-1], plant.state))
         if progress:
             progress.update(k + 1)
     if progress:
@@ -138,6 +139,11 @@ def closed_loop(
     arrays |= {k: arrays[k].astype(int) for k in ("before", "q")}
     path = path[: length.max() + 1]
     return Rollout(path, length, outcome, first_mode, **arrays, state=np.array(states))
+
+
+def ways(task: Task, rollout: Rollout) -> np.ndarray:
+    """Which way each run went, (n,) int as `Task.direction`; -1 for one that broke down."""
+    return np.where(rollout.outcome == Outcome.UNSTABLE, -1, task.direction(rollout.path))
 
 
 def _disturbance(

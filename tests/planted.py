@@ -19,12 +19,6 @@ def euler(task, z, u):
     return z + velocity * 0.05
 
 
-def random_inputs(task, n, rng):
-    """Inputs (n, m) all over the input limits."""
-    low, high = task.input_limits
-    return rng.uniform(low, high, (n, len(low)))
-
-
 def random_states(task, n, rng):
     """Chart points (n, d) all over the chart."""
     return rng.uniform(task.chart.low, task.chart.high, (n, task.chart.dimension))

@@ -13,7 +13,11 @@ import pytest
 from gl import needs_gl
 
 import hyrl_mj
+from hyrl_mj import Outcome
+from hyrl_mj.controllers import PolicyController
+from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.new_task import TEMPLATES, write_task
+from hyrl_mj.simulation import ways
 from hyrl_mj.tasks.checks import check_task
 
 # ---- a point mass in space with a pillar: a chart of three dimensions, two inputs, contacts
@@ -54,6 +58,9 @@ WASP_PY = """
 import numpy as np
 
 import hyrl_mj
+from hyrl_mj import Outcome
+from hyrl_mj.controllers import PolicyController
+from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj import Chart, Mirror, Outcome, mjcf
 
 
@@ -180,9 +187,13 @@ def test_an_installed_package_can_offer_tasks(wasp, tmp_path):
     assert listed.returncode == 0, listed.stderr
     assert re.search(r"^wasp +hyrl_mj/Wasp-v0 +a point mass in space$", listed.stdout, re.M)
     broken = command("list", cwd=tmp_path, path=[described.parent])
-    assert broken.returncode == 2
-    assert "the task wasp of wasp:Wasp cannot be imported" in broken.stderr
+    assert broken.returncode == 0
+    assert "the task wasp of wasp:Wasp cannot be imported" in broken.stdout
+    assert "vehicle" in broken.stdout
     assert "Traceback" not in broken.stderr
+    run = command("run", "wasp", cwd=tmp_path, path=[described.parent])
+    assert run.returncode == 2
+    assert "the task wasp of wasp:Wasp cannot be imported" in run.stderr
 
 
 # ---- a task to start from
@@ -204,7 +215,13 @@ def test_a_new_task_passes_its_own_tests(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "says"),
-    [("2fast", "letters, digits"), ("class", "letters, digits"), ("vehicle", "already")],
+    [
+        ("2fast", "letters, digits"),
+        ("class", "letters, digits"),
+        ("_", "letters, digits"),
+        ("vehicle", "a task vehicle already"),
+        ("numpy", "a Python package numpy already"),
+    ],
 )
 def test_a_name_that_cannot_be_one_is_refused(tmp_path, name, says):
     done = command("new-task", name, cwd=tmp_path)
@@ -268,6 +285,23 @@ MISTAKES = {
     "a reward that is one number": (
         PY, r"return np\.where\(self\.failed.*\n", "return np.zeros(1)\n", r"reward\(\)",
     ),
+    "an error in a method": (
+        PY, r"close = np\.maximum", "close = np.maximal", r"AttributeError.*'maximal', line \d+",
+    ),
+    "a flat observation": (
+        PY, r"return measured\[:, :3\]", "return measured[:, 0]", r"observation\(\) gives shape",
+    ),
+    "starts the wrong way round": (PY, r"\(0\.0, -0\.8\)", "(0.0, 1.0)", r"start_low is greater"),
+    "an unknown algorithm": (PY, '"ppo"', '"sac"', r"algorithm 'sac'.*ppo, dqn"),
+    "dqn without levels": (PY, '"ppo"', '"dqn"', r"dqn needs levels"),
+    "a mirror of the wrong length": (
+        PY, r"\(1, -1, -1\)", "(1, -1)", r"mirror\.observation is \(1, -1\): give 3",
+    ),
+    "a set-point of the wrong dimension": (
+        PY, r"\[3\.0, 0\.0\]", "[3.0]", r"set_point has shape \(1,\)",
+    ),
+    "one mode": (PY, r'\("left", "right"\)', '("left",)', r"mode_names"),
+    "a replay start outside": (PY, r"\(0\.0, 0\.15\)\)", "(0.0, 9.0))", r"y = 9 m.*outside"),
 }  # fmt: skip
 
 
@@ -288,3 +322,38 @@ def test_a_mistake_is_one_sentence_before_any_training(tmp_path, mistake):
     assert "Traceback" not in done.stderr
     assert "my_robot" in done.stderr
     assert not (tmp_path / "runs").exists()
+
+
+# ---- a simulation that breaks down
+
+
+def test_a_simulation_that_breaks_down_ends_its_episode_alone(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its log into the working directory
+    rocket = '<motor name="aside" joint="y" gear="1e15" ctrlrange="-1.5 1.5"/>'
+    xml = re.sub('<velocity name="aside".*?/>', rocket, WASP_XML).replace("wasp", "rocket_wasp")
+    (tmp_path / "rocket_wasp.xml").write_text(xml)
+    text = WASP_PY.replace('"wasp"', '"rocket_wasp"').replace("class Wasp", "class RocketWasp")
+    (tmp_path / "rocket_wasp.py").write_text(text)
+    task = hyrl_mj.get_task(tmp_path / "rocket_wasp.py")
+
+    class Push:
+        def act(self, measured):
+            aside = np.where(measured[:, 1] > 0.55, 1.5, 0.0)
+            return np.stack([aside, np.zeros(len(measured))], axis=1)
+
+    z0 = np.array([[0.0, y, 0.5] for y in (0.5, 0.6, -0.55)])
+    rollout = hyrl_mj.closed_loop(task, PolicyController(Push()), z0)
+    assert rollout.outcome.tolist() == [Outcome.REACHED, Outcome.UNSTABLE, Outcome.REACHED]
+    assert rollout.length[1] == 1
+    np.testing.assert_array_equal(rollout.path[1:, 1], rollout.path[:-1, 1])
+    assert ways(task, rollout).tolist() == [0, -1, 1]
+    calm = hyrl_mj.closed_loop(task, PolicyController(Push()), z0[[0, 2]])
+    np.testing.assert_array_equal(rollout.path[:, [0, 2]], calm.path)
+
+    env = BatchedEnv(task, 3)
+    env.reset(z=z0)
+    result = env.step(Push().act(env.plant.measurement))
+    assert [Outcome(o).label for o in result.outcome] == ["running", "unstable", "running"]
+    assert result.terminated.tolist() == [False, True, False]
+    assert result.reward[1] == task.worst_reward
+    assert np.isfinite(result.observation).all()

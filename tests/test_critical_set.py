@@ -16,14 +16,14 @@ from planted import (
 )
 
 from hyrl_mj import BadInput, CriticalSet, find_critical_set
-from hyrl_mj.critical_set import METHODS
+from hyrl_mj.tasks.base import SEARCHES
 
 PI = np.pi
 NORMAL = np.array([2.0, -1.0, 2.0]) / 3
 RESOLUTION = 1 / 32
 
 
-@pytest.fixture(params=METHODS)
+@pytest.fixture(params=SEARCHES)
 def search(request):
     """`find_critical_set` by each method."""
     return partial(find_critical_set, method=request.param)
@@ -156,7 +156,7 @@ def test_a_critical_sphere_in_four_dimensions(search):
 
 def test_both_agree_on_the_papers_problems(task):
     policy = sign_policy(task) if task.name == "vehicle" else circle_policy(task, 3.0)
-    rods, outcome = (find_critical_set(task, policy, 60, RESOLUTION, m) for m in METHODS)
+    rods, outcome = (find_critical_set(task, policy, 60, RESOLUTION, m) for m in SEARCHES)
     assert rods.pieces == outcome.pieces == 1
     both = rods.resolution / 2 + outcome.resolution / 2
     off = [

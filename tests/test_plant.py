@@ -3,11 +3,12 @@
 import mujoco
 import numpy as np
 import pytest
-from planted import euler, random_inputs, random_states
+from planted import euler, random_states
 
 from hyrl_mj import mjcf
 from hyrl_mj.errors import BadInput
 from hyrl_mj.plant import Plant, joint_columns
+from hyrl_mj.task_tests import random_inputs
 from hyrl_mj.tasks.vehicle import Vehicle
 
 PAIRS = 10_000

@@ -159,7 +159,7 @@ def arcs(
 def measured_at(task: Task, z: np.ndarray) -> np.ndarray:
     """What is measured (n, p) at chart points (n, d), without noise."""
     plant = task.plant(len(z))
-    plant.set_state(task.qpos(z))
+    plant.set_state(*task.state(z))
     return plant.measurement
 
 

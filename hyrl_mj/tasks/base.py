@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import IntEnum
@@ -21,6 +20,10 @@ from hyrl_mj.plant import Plant, input_limits
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
+
+
+# How a critical set can be searched for.
+SEARCHES = ("rods", "outcome")
 
 
 class Outcome(IntEnum):
@@ -135,7 +138,7 @@ class Task(ABC):
     #: the file that it was loaded from, if it is not part of an installed package
     source: Path | None = None
     #: one line for `hyrl-mj list`
-    description: str
+    description: str = ""
     #: coordinates of the critical set and of all sets
     chart: Chart
     #: names of the actuators that the policy drives
@@ -189,10 +192,9 @@ class Task(ABC):
 
     @property
     def model_path(self) -> Path:
-        """Its MJCF: `<name>.xml` beside the file that defines the task, else in `models`."""
-        beside = Path(inspect.getfile(type(self))).with_name(f"{self.name}.xml")
-        inside = mjcf.models_dir() / beside.name
-        return inside if inside.is_file() and not beside.is_file() else beside
+        """Its MJCF, `<name>.xml`: beside the user's file that defines the task, else in `models`."""
+        inside = mjcf.models_dir() / f"{self.name}.xml"
+        return inside if self.source is None else self.source.with_name(inside.name)
 
     @cached_property
     def dt(self) -> float:
@@ -406,12 +408,13 @@ class Task(ABC):
             BadInput: it is not a number >= 0, or so large that it hides the whole chart.
         """
         check_bound(bound)
-        hit = self.noise_in_chart(1.0, everywhere) > 0
-        limit = float(self.chart.sides[hit].min() / 2) if hit.any() else np.inf
-        if bound >= limit:
+        share = self.noise_in_chart(1.0, everywhere)
+        with np.errstate(divide="ignore"):
+            limits = self.chart.sides / (2 * share)
+        if bound >= limits.min():
             raise BadInput(
                 f"noise bound {bound:g} hides the whole state space of {self.name}: "
-                f"give one below {limit:.3g} {self.chart.units[int(np.argmax(hit))]}"
+                f"give one below {limits.min():.3g} {self.chart.units[int(limits.argmin())]}"
             )
         return float(bound)
 

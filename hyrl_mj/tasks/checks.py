@@ -6,9 +6,11 @@ import mujoco
 import numpy as np
 
 from hyrl_mj import mjcf
-from hyrl_mj.errors import BadInput
-from hyrl_mj.tasks.base import Outcome, Task
+from hyrl_mj.errors import BadInput, brief, unknown
+from hyrl_mj.tasks.base import SEARCHES, Outcome, Task
+from hyrl_mj.tasks.registry import line_in
 
+ALGORITHMS = ("ppo", "dqn")
 REQUIRED = (
     "chart", "inputs", "noisy", "max_steps", "horizon", "worst_reward", "start_low", "start_high",
     "replay_starts", "replay_time", "mode_names", "algorithm", "observation_low", "observation_high",
@@ -28,11 +30,15 @@ def check_task(task: Task) -> Task:
     where = task.source or task.name
     try:
         _check_parts(task)
+        _check_training(task)
         _check_model(task)
         _check_starts(task)
         _check_episode(task)
     except BadInput as error:
         raise BadInput(f"the task of {where} cannot be used: {error}") from error
+    except Exception as error:  # whatever its own methods raise
+        line = line_in(error, task.source)
+        raise BadInput(f"the task of {where} cannot be used: {brief(error)}{line}") from error
     return task
 
 
@@ -51,8 +57,42 @@ def _check_parts(task: Task) -> None:
     for name in ("start_low", "start_high"):
         if len(getattr(task, name)) != d:
             raise BadInput(f"{name} has {len(getattr(task, name))} value(s): its chart takes {d}")
-    if wrong := [start for start in task.replay_starts if len(start) != d]:
-        raise BadInput(f"replay start {wrong[0]} has {len(wrong[0])} value(s): its chart takes {d}")
+    if np.greater(task.start_low, task.start_high).any():
+        raise BadInput("start_low is greater than start_high: exchange them")
+    if task.set_point is not None and np.shape(task.set_point) != (d,):
+        raise BadInput(f"set_point has shape {np.shape(task.set_point)}: its chart takes {(d,)}")
+    for start in task.replay_starts:
+        task.check_state(start)
+    if not np.isfinite(task.noisy).all() or min(task.noisy) < 0:
+        raise BadInput(f"noisy is {task.noisy}: give shares of the noise bound, 0 or more")
+    if len(task.mode_names) < 2:
+        raise BadInput(
+            f"mode_names is {task.mode_names!r}: name the ways that runs can go, two or more"
+        )
+
+
+def _check_training(task: Task) -> None:
+    if task.algorithm not in ALGORITHMS:
+        raise unknown("algorithm", task.algorithm, ALGORITHMS)
+    if task.search not in SEARCHES:
+        raise unknown("search", task.search, SEARCHES)
+    if not task.inputs:
+        raise BadInput("inputs is empty: name the actuators that the policy drives")
+    if task.levels is None and task.algorithm == "dqn":
+        raise BadInput("dqn needs levels of the input: give levels = 5, say, or algorithm = 'ppo'")
+    if task.levels is not None and (task.levels < 2 or len(task.inputs) > 1):
+        raise BadInput(
+            f"{task.levels} levels of {len(task.inputs)} input(s) cannot be used: give 2 or more of a "
+            "single input, or none"
+        )
+    if task.mirror is not None:
+        for name, wanted in (
+            ("observation", len(task.observation_low)),
+            ("inputs", len(task.inputs)),
+        ):
+            signs = getattr(task.mirror, name)
+            if len(signs) != wanted or not set(signs) <= {-1, 1}:
+                raise BadInput(f"mirror.{name} is {signs}: give {wanted} values, each 1 or -1")
 
 
 def _check_model(task: Task) -> None:
@@ -91,6 +131,9 @@ def _check_starts(task: Task) -> None:
     back = task.z(measurement)
     if back.shape != z.shape:
         raise BadInput(f"z() gives {back.shape[1:]} values a measurement: its chart takes {d}")
+    moved = task.with_z(measurement, z[::-1])
+    if moved.shape != measurement.shape or task.z(moved).shape != z.shape:
+        raise BadInput(f"with_z() gives shape {moved.shape}: it is to be {measurement.shape}")
     off = np.abs(task.chart.difference(back, z)).max(axis=1)
     if off.max() > ROUND_TRIP:
         worst = int(off.argmax())
@@ -112,14 +155,15 @@ def _check_episode(task: Task) -> None:
     rng, plant = np.random.default_rng(0), task.plant(STARTS)
     plant.set_state(*task.state(task.starts(STARTS, rng), rng))
     low, high = np.array(task.observation_low), np.array(task.observation_high)
+    path = [task.z(plant.measurement)]
     for sample in range(SAMPLES):
         measurement = plant.measurement
         running = task.outcome(measurement, plant.unstable) == Outcome.RUNNING
         observation = task.observation(measurement[running])
         if observation.shape[1:] != low.shape or low.shape != high.shape:
             raise BadInput(
-                f"an observation has {observation.shape[1]} values, observation_low {len(low)} and "
-                f"observation_high {len(high)}: make them as many"
+                f"observation() gives shape {observation.shape} for {running.sum()} measurements, "
+                f"observation_low has {len(low)} values and observation_high {len(high)}: make them as many"
             )
         outside = ~((observation >= low) & (observation <= high))
         if outside.any():
@@ -128,10 +172,27 @@ def _check_episode(task: Task) -> None:
                 f"observation[{column}] is {observation[row, column]:g} after {sample} samples, and "
                 f"its bounds are {low[column]:g} and {high[column]:g}: widen them"
             )
-        reward = task.reward(measurement)
+        reward = np.asarray(task.reward(measurement))
         if reward.shape != (STARTS,) or not np.isfinite(reward[running]).all():
             raise BadInput(
                 f"reward() of {STARTS} measurements must be {STARTS} finite numbers, it has shape "
                 f"{reward.shape} and values like {reward.ravel()[0]:g}"
             )
         plant.step(rng.uniform(*task.input_limits, (STARTS, len(task.inputs))))
+        path.append(task.z(plant.measurement))
+    for name, found in (
+        ("direction", task.direction(np.array(path))),
+        ("miss", task.miss(path[-1])),
+        ("arrived", task.arrived(path[-1])),
+        ("danger", task.danger(plant.measurement)),
+        ("verdict", task.verdict(plant.measurement)),
+    ):
+        if np.shape(found) != (STARTS,):
+            raise BadInput(
+                f"{name}() of {STARTS} runs has shape {np.shape(found)}: it is to be ({STARTS},)"
+            )
+    ways = set(np.unique(task.direction(np.array(path))).tolist())
+    if not ways <= {-1, *range(len(task.mode_names))}:
+        raise BadInput(
+            f"direction() gives {sorted(ways)}: give -1 or the number of one of the mode_names"
+        )

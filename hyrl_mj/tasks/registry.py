@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import inspect
 import sys
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -14,8 +13,9 @@ import gymnasium as gym
 from hyrl_mj.errors import BadInput, brief, unknown
 from hyrl_mj.tasks.base import Task
 
-# The group of entry points under which an installed package offers tasks: name = "its_module".
+# The group of entry points under which an installed package offers tasks: name = "its.module:Class".
 GROUP = "hyrl_mj.tasks"
+PACKAGE = Path(__file__).resolve().parents[1]
 _REGISTRY: dict[str, type[Task]] = {}
 _FILES: dict[Path, type[Task]] = {}
 
@@ -26,16 +26,23 @@ def register(task: type[Task]) -> type[Task]:
     Raises:
         BadInput: another file has a task of that name.
     """
-    where = inspect.getfile(task)
-    if task.name in _REGISTRY and inspect.getfile(_REGISTRY[task.name]) != where:
+    here, other = _file(task), _REGISTRY.get(task.name)
+    if other is not None and _file(other) != here:
         raise BadInput(
-            f"{where} defines a task {task.name}, and so does {inspect.getfile(_REGISTRY[task.name])}: "
-            "rename one of them"
+            f"{here} defines a task {task.name}, and so does {_file(other)}: rename one of them"
         )
+    if here is not None and PACKAGE not in here.parents:
+        task.source = here
     if "env_id" not in vars(task):
         task.env_id = f"hyrl_mj/{task.__name__}-v0"
+    taken = gym.registry.pop(task.env_id, None)  # by this class, if its decorator has been here
+    if taken is not None and taken.kwargs.get("task") != task.name:
+        gym.registry[task.env_id] = taken
+        raise BadInput(
+            f"{here} defines an environment {task.env_id}, and there is another: rename the class, or give "
+            "it an env_id"
+        )
     _REGISTRY[task.name] = task
-    gym.registry.pop(task.env_id, None)  # a file may be loaded again
     gym.register(
         id=task.env_id,
         entry_point="hyrl_mj.envs.gym_env:TaskEnv",
@@ -63,17 +70,8 @@ def get_task(name: str | Path) -> Task:
     if str(name).endswith(".py"):
         return _instance(_from_file(Path(name)), str(name))
     name = str(name)
-    offered = {} if name in _REGISTRY else _offered()
-    if name in offered:
-        try:
-            found = offered[name].load()
-        except Exception as error:  # whatever a foreign module raises
-            raise BadInput(
-                f"the task {name} of {offered[name].value} cannot be imported ({brief(error)}): mend "
-                "or uninstall the package that offers it"
-            ) from error
-        if isinstance(found, type) and found not in _REGISTRY.values():
-            register(found)
+    if name not in _REGISTRY and name in (offered := _offered()):
+        _from_entry_point(offered[name])
     if name not in _REGISTRY:
         raise unknown("task", name, [*task_names(), "or a file my_robot.py"])
     return _instance(_REGISTRY[name], name)
@@ -88,6 +86,29 @@ def _instance(task: type[Task], what: str) -> Task:
         return task()
     except TypeError as error:  # methods that a task must have are missing
         raise BadInput(f"the task of {what} is not finished: {error}") from error
+
+
+def _file(task: type[Task]) -> Path | None:
+    """Where a task is defined; None in an interactive session."""
+    file = getattr(sys.modules.get(task.__module__), "__file__", None)
+    return None if file is None else Path(file).resolve()
+
+
+def _from_entry_point(entry: EntryPoint) -> None:
+    try:
+        found = entry.load()
+    except (Exception, SystemExit) as error:  # whatever a foreign module raises
+        raise BadInput(
+            f"the task {entry.name} of {entry.value} cannot be imported ({brief(error)}): mend or "
+            "uninstall the package that offers it"
+        ) from error
+    if not (isinstance(found, type) and issubclass(found, Task)) or found.name != entry.name:
+        raise BadInput(
+            f"the entry point {entry.name} = {entry.value} offers no task of that name: give a subclass "
+            f"of hyrl_mj.Task with name = {entry.name!r}, as its.module:Class"
+        )
+    register(found)
+    found.source = None  # it is found by its name
 
 
 def _from_file(path: Path) -> type[Task]:
@@ -111,9 +132,7 @@ def _from_file(path: Path) -> type[Task]:
             raise BadInput(
                 f"{path} must define one task, a subclass of hyrl_mj.Task with a name: it has {names}"
             )
-        (task,) = found
-        task.source = path
-        _FILES[path] = register(task)
+        _FILES[path] = register(found[0])
     return _FILES[path]
 
 
@@ -131,15 +150,17 @@ def _run(path: Path) -> ModuleType:
     except BadInput:
         del sys.modules[name]
         raise
-    except Exception as error:  # whatever the user's file raises
+    except (Exception, SystemExit) as error:  # whatever the user's file raises
         del sys.modules[name]
-        raise BadInput(f"{path} cannot be imported: {brief(error)}{_line(error, path)}") from error
+        raise BadInput(
+            f"{path} cannot be imported: {brief(error)}{line_in(error, path)}"
+        ) from error
     finally:
         sys.path.remove(str(path.parent))
     return module
 
 
-def _line(error: BaseException, path: Path) -> str:
+def line_in(error: BaseException, path: Path | None) -> str:
     """Where in a file an error came from: ", line 7"; nothing if it did not."""
     if isinstance(error, SyntaxError):
         return ""  # it says so itself
