@@ -29,7 +29,7 @@ from hyrl_mj.report import render, write_report
 from hyrl_mj.run_directory import Run, write_config
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.settings import preset
-from hyrl_mj.tasks import base
+from hyrl_mj.tasks import registry
 
 MAGENTA, GREEN = (230, 20, 200), (20, 200, 60)
 POSTER = (642, 240)  # [pixels], like no other picture
@@ -91,7 +91,7 @@ def runs(tmp_path_factory):
     paths = {}
     for name in ("unit_circle", "vehicle"):
         paths[name] = path = tmp_path_factory.mktemp("runs") / name
-        task = base.get_task(name)
+        task = registry.get_task(name)
         run = plant(path, task, decisions(task), halves(task, 60))
         pipeline.run_stage(run, "simulate", say=str)
         pipeline.examine_run(run, kinds=["uniform"], count=200, say=str)
@@ -381,7 +381,7 @@ class Rover(Cube):
 
 
 def test_in_three_dimensions_episodes_stand_in_for_the_game(tmp_path, monkeypatch):
-    monkeypatch.setitem(base._REGISTRY, "cube", Rover)
+    monkeypatch.setitem(registry._REGISTRY, "cube", Rover)
     task, path = Rover(), tmp_path / "cube"
     grid = Grid.with_cells(task.chart, 6)
     up = grid.nodes[:, 0] >= 0
