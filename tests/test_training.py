@@ -58,7 +58,7 @@ def test_ppo_learns_the_circle_with_the_smoke_preset(circle):
 
 
 def test_dqn_learns_the_vehicle_with_some_more_samples(vehicle):
-    settings = replace(preset(vehicle, "smoke").stage1, samples=40_000)
+    settings = replace(preset(vehicle, "smoke").stage1, samples=60_000)
     policy = training.train(vehicle, settings, seed=0)
     assert training.evaluate(vehicle, policy, Noise())[1] > 85
 
