@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.tasks.base import Chart
+from hyrl_mj.tasks.chart import Chart
 
 
 class StateSet(Protocol):

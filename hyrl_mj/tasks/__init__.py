@@ -3,7 +3,8 @@
 from importlib import import_module
 from pkgutil import iter_modules
 
-from hyrl_mj.tasks.base import Chart, Mirror, Outcome, Task, passing_side
+from hyrl_mj.tasks.base import Mirror, Outcome, Task, passing_side
+from hyrl_mj.tasks.chart import Chart
 from hyrl_mj.tasks.registry import get_task, register, task_names
 
 __all__ = [

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -17,10 +16,7 @@ from hyrl_mj import mjcf
 from hyrl_mj.errors import BadInput
 from hyrl_mj.noise import check_bound
 from hyrl_mj.plant import Plant, input_limits
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
-
+from hyrl_mj.tasks.chart import Chart
 
 # How a critical set can be searched for.
 SEARCHES = ("rods", "outcome")
@@ -40,75 +36,6 @@ class Outcome(IntEnum):
     def label(self) -> str:
         """The name for people and for `info`: "reached", "crashed", ..."""
         return self.name.lower()
-
-
-@dataclass(frozen=True)
-class Chart:
-    """The coordinates z in which the critical set and all sets live.
-
-    Attributes:
-        names: one a coordinate.
-        units: one a coordinate.
-        low, high: (d,) ends of the charted box; for a periodic coordinate one period.
-        periodic: (d,) whether a coordinate lives on a circle.
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    periodic: tuple[bool, ...]
-
-    @property
-    def dimension(self) -> int:
-        return len(self.names)
-
-    @cached_property
-    def origin(self) -> np.ndarray:
-        """The lower ends (d,), as an array."""
-        return np.array(self.low)
-
-    @cached_property
-    def sides(self) -> np.ndarray:
-        """Length of the charted box along each coordinate (d,)."""
-        return np.subtract(self.high, self.low)
-
-    def wrap(self, z: np.ndarray) -> np.ndarray:
-        """The same points (n, d), periodic coordinates brought into [low, high); z itself without any."""
-        if not any(self.periodic):
-            return z
-        turned = np.mod(z - self.origin, self.sides)
-        # The remainder of a tiny negative number rounds up to the period itself.
-        turned = np.where(turned < self.sides, turned, 0.0)
-        return np.where(self.periodic, self.origin + turned, z)
-
-    def difference(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """a - b (n, d), the short way round in periodic coordinates."""
-        delta = np.subtract(a, b)
-        return np.where(self.periodic, delta - self.sides * np.round(delta / self.sides), delta)
-
-    def contains(self, z: np.ndarray) -> np.ndarray:
-        """Whether points (n, d) lie in the charted box: (n,) bool."""
-        inside = (z >= self.low) & (z <= self.high)
-        return np.asarray((inside | self.periodic).all(axis=-1))
-
-    def tree(self, points: np.ndarray) -> cKDTree:
-        """A search tree of points (n, d) that knows of the periods; ask it with `in_box` points."""
-        from scipy.spatial import cKDTree  # slow to import
-
-        # Coordinates that are not periodic get a box so large that its other side is never near.
-        size = np.where(self.periodic, self.sides, 1e6 * self.sides)
-        return cKDTree(self.in_box(points), boxsize=size)
-
-    def in_box(self, z: np.ndarray) -> np.ndarray:
-        """Points (n, d) in the coordinates of `tree`: never negative."""
-        return self.wrap(z) - self.origin + np.where(self.periodic, 0.0, 1e3 * self.sides)
-
-    def format(self, z: np.ndarray) -> str:
-        """One point (d,) for people: "x = 0.1 m, y = -0.2 m"."""
-        return ", ".join(
-            f"{n} = {v:.4g} {u}" for n, v, u in zip(self.names, z, self.units, strict=True)
-        )
 
 
 @dataclass(frozen=True)
@@ -295,7 +222,7 @@ class Task(ABC):
         return sensors
 
     def control(self, u: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        """An inner loop, at the rate of the physics and from the true state.
+        """An inner loop, at the rate of the physics and from the true state; by default there is none.
 
         A task that has one gives names of MJCF numerics as `inputs`; they hold the limits.
 
@@ -306,7 +233,7 @@ class Task(ABC):
         Returns:
             (n, nu) controls of all actuators.
         """
-        raise NotImplementedError
+        return u
 
     @property
     def has_inner_loop(self) -> bool:
