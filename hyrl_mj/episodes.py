@@ -61,6 +61,8 @@ def episodes(
         task.check_noise(noise.bound, noise.everywhere)
     progress = Progress("noisy episodes", count * len(noises) * len(controllers), "episodes")
     records, done = [], 0
+    # New ones for each batch would leave more and more holes in the memory.
+    plants = {n: task.plant(n) for n in {min(BATCH, count), count % BATCH} - {0}}
     for noise in noises:
         for name, controller in controllers.items():
             counts: dict[str, np.ndarray] = {}
@@ -69,7 +71,14 @@ def episodes(
                 draw, signal = np.random.SeedSequence([seed, first]).generate_state(2)
                 z0 = _starts(task, critical, noise, n, np.random.default_rng(draw), near)
                 rollout = closed_loop(
-                    task, controller, z0, noise=noise, seed=int(signal), quiet=True, vary=True
+                    task,
+                    controller,
+                    z0,
+                    noise=noise,
+                    seed=int(signal),
+                    quiet=True,
+                    vary=True,
+                    plant=plants[n],
                 )
                 for region, inside in _regions(task, critical, noise.bound, winnable, z0).items():
                     counts.setdefault(region, np.zeros(len(Outcome), dtype=int))

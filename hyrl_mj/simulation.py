@@ -67,6 +67,7 @@ def closed_loop(
     record: bool = False,
     quiet: bool = False,
     vary: bool = False,
+    plant: Plant | None = None,
     label: str = "simulating",
 ) -> Rollout:
     """Run the closed loop from many starts at once.
@@ -83,11 +84,13 @@ def closed_loop(
         record: whether modes, measurements, inputs and states are kept.
         quiet: show no progress bar, because the caller has one.
         vary: whether coordinates that the chart does not hold are drawn, too, as in training.
+        plant: n copies of the task's robot to use again; by default new ones.
         label: what the progress bar says.
     """
     noise = noise or Noise()
     limit = task.max_steps if steps is None else steps
-    n, rng, plant = len(z0), np.random.default_rng(seed), task.plant(len(z0))
+    n, rng = len(z0), np.random.default_rng(seed)
+    plant = plant or task.plant(n)
     plant.set_state(*task.state(z0, np.random.default_rng([seed, 1]) if vary else None))
     measurement = plant.measurement
     q = np.full(n, NOT_STARTED) if q0 is None else np.asarray(q0, dtype=int).copy()
