@@ -118,10 +118,11 @@ class BatchedEnv:
         self.plant.step(u)
         self._samples += 1
         measurement = self.plant.measurement
-        outcome = self.task.outcome(measurement, self.plant.unstable)
+        unstable = self.plant.unstable
+        outcome = self.task.outcome(measurement, unstable)
         terminated = outcome != Outcome.RUNNING
         reward = self.task.reward(measurement)
-        reward[self.plant.unstable] = self.task.worst_reward
+        reward[unstable] = self.task.worst_reward
         measured = self._measure(self._everyone)
         if self.domain is not None:
             if self.domain.caution is not None:

@@ -102,7 +102,7 @@ class CartPole(Task):
     chart = Chart(("cart", "pole"), ("m", "rad"), (-2.4, -0.3), (2.4, 0.3), (False, False))
     inputs = ("push",)
     noisy = (True, True, True, True)
-    max_steps = 200
+    max_steps, worst_reward = 200, 0.0
     start_low, start_high = (-0.05, -0.05), (0.05, 0.05)
     observation_low, observation_high = (-10.0,) * 4, (10.0,) * 4
 
