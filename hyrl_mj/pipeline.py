@@ -34,8 +34,8 @@ from hyrl_mj.tasks.checks import check_task
 from hyrl_mj.tasks.registry import get_task
 
 Say = Callable[[str], None]
-# Noisy episodes of a run whose worst case cannot be played exactly.
-EPISODES = 10_000
+# Noisy episodes of a run whose worst case cannot be played exactly, and of one that only shows that all runs.
+EPISODES, EPISODES_SMOKE = 10_000, 200
 
 
 # ---- the stages: each reads the artifacts of those before it and writes its own
@@ -312,7 +312,7 @@ def examine_run(
     task.check_noise(eps, everywhere)
     exact = Lattice.possible(task)
     if count is None and not exact:
-        count = EPISODES
+        count = EPISODES_SMOKE if run.settings.preset == "smoke" else EPISODES
     if count is not None and count < 1:
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
     noises = tuple(Noise(kind, eps, everywhere) for kind in kinds or KINDS[1:])
