@@ -178,6 +178,15 @@ def test_gymnasium_knows_it(wasp):
     assert hyrl_mj.get_task("wasp").reference == str(wasp)
 
 
+USE_INSTALLED = """
+from hyrl_mj import get_task
+from hyrl_mj.tasks.checks import check_task
+
+task = check_task(get_task("wasp"))
+print(task.reference, task.model_path)
+"""
+
+
 def test_an_installed_package_can_offer_tasks(wasp, tmp_path):
     described = tmp_path / "site" / "wasps-1.0.dist-info"
     described.mkdir(parents=True)
@@ -186,6 +195,14 @@ def test_an_installed_package_can_offer_tasks(wasp, tmp_path):
     listed = command("list", cwd=tmp_path, path=[described.parent, wasp.parent])
     assert listed.returncode == 0, listed.stderr
     assert re.search(r"^wasp +hyrl_mj/Wasp-v0 +a point mass in space$", listed.stdout, re.M)
+    used = subprocess.run(
+        [sys.executable, "-c", USE_INSTALLED], capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(
+            [str(Path(hyrl_mj.__file__).parents[1]), str(described.parent), str(wasp.parent)]
+        )},
+    )  # fmt: skip
+    assert used.returncode == 0, used.stderr
+    assert used.stdout.split() == ["wasp", str(wasp.with_suffix(".xml"))]
     broken = command("list", cwd=tmp_path, path=[described.parent])
     assert broken.returncode == 0
     assert "the task wasp of wasp:Wasp cannot be imported" in broken.stdout

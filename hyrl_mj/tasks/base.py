@@ -62,8 +62,10 @@ class Task(ABC):
     name: str
     #: the id under which Gymnasium knows it, by default `hyrl_mj/<class>-v0`
     env_id: str
-    #: the file that it was loaded from, if it is not part of an installed package
+    #: the file that defines it, if that is not one of this package
     source: Path | None = None
+    #: whether another installed package offers it: its name finds it then
+    installed: bool = False
     #: one line for `hyrl-mj list`
     description: str = ""
     #: coordinates of the critical set and of all sets
@@ -115,7 +117,7 @@ class Task(ABC):
     @property
     def reference(self) -> str:
         """What `get_task` finds it by in another process: its name, or the file that defines it."""
-        return self.name if self.source is None else str(self.source)
+        return self.name if self.source is None or self.installed else str(self.source)
 
     @property
     def model_path(self) -> Path:

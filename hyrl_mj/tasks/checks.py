@@ -180,8 +180,9 @@ def _check_episode(task: Task) -> None:
             )
         plant.step(rng.uniform(*task.input_limits, (STARTS, len(task.inputs))))
         path.append(task.z(plant.measurement))
+    way = task.direction(np.array(path))
     for name, found in (
-        ("direction", task.direction(np.array(path))),
+        ("direction", way),
         ("miss", task.miss(path[-1])),
         ("arrived", task.arrived(path[-1])),
         ("danger", task.danger(plant.measurement)),
@@ -191,7 +192,7 @@ def _check_episode(task: Task) -> None:
             raise BadInput(
                 f"{name}() of {STARTS} runs has shape {np.shape(found)}: it is to be ({STARTS},)"
             )
-    ways = set(np.unique(task.direction(np.array(path))).tolist())
+    ways = set(np.unique(way).tolist())
     if not ways <= {-1, *range(len(task.mode_names))}:
         raise BadInput(
             f"direction() gives {sorted(ways)}: give -1 or the number of one of the mode_names"

@@ -108,7 +108,7 @@ def _from_entry_point(entry: EntryPoint) -> None:
             f"of hyrl_mj.Task with name = {entry.name!r}, as its.module:Class"
         )
     register(found)
-    found.source = None  # it is found by its name
+    found.installed = True
 
 
 def _from_file(path: Path) -> type[Task]:
