@@ -10,10 +10,12 @@ import numpy as np
 from hyrl_mj.controllers import Controller
 from hyrl_mj.noise import Noise
 from hyrl_mj.plant import Plant
-from hyrl_mj.tasks.base import Task
+from hyrl_mj.tasks.base import Outcome, Task
 
 # Modes of runs that have not started yet: their controller picks one from the first measurement.
 NOT_STARTED = -1
+# How many samples a plant with inertia is followed to see what an input leads to.
+AHEAD = 8
 
 
 class Adversary(Protocol):
@@ -35,7 +37,10 @@ class Adversary(Protocol):
 
 
 class Lookahead:
-    """The noise that leads to the greatest danger one sample later, by the task's own measure of it.
+    """The noise that leads into the greatest danger, by the task's own measure of it.
+
+    A kinematic plant is looked at one sample later. With inertia one sample shows little: the closed loop
+    is followed for `AHEAD` of them, the first with the noise that is tried and the rest without any.
 
     Args:
         task: measures the danger.
@@ -53,31 +58,50 @@ class Lookahead:
         choices = product(*[shares if hit else (0.0,) for hit in acts])
         self._candidates = noise.bound * np.array(list(choices)) * acts
         self._ahead: Plant | None = None
+        self.samples = 1 if task.kinematic else AHEAD
 
     def choose(self, plant: Plant, q: np.ndarray) -> np.ndarray:
         """As `Adversary.choose`. Among equals no noise is preferred, then the largest."""
         ahead = self._ahead = self._ahead or self.task.plant(plant.n)
         true, qpos, qvel = plant.measurement, plant.qpos, plant.qvel
-        inputs = np.stack([self._answer(true + candidate, q) for candidate in self._candidates])
+        answers = [np.column_stack(self._act(true + c, q)) for c in self._candidates]
+        answer = np.stack(answers)
         # Where all candidates get the same answer there is nothing to choose, and each answer is tried once.
-        split = (inputs != inputs[0]).any(axis=(0, 2))
+        running = self.task.outcome(true, plant.unstable) == Outcome.RUNNING
+        split = (answer != answer[0]).any(axis=(0, 2)) & running
         worst, chosen = np.full(plant.n, -np.inf), np.zeros_like(true)
         for i, candidate in enumerate(self._candidates):
-            tried = (inputs[:i] == inputs[i]).all(axis=2).any(axis=0)
+            tried = (answer[:i] == answer[i]).all(axis=2).any(axis=0)
             rows = np.flatnonzero(split & ~tried)
             if not len(rows):
                 continue
             ahead.set_state(qpos[rows], qvel[rows], rows)
-            ahead.step(inputs[i, rows], rows)
-            after = ahead.measurement[rows]
-            failed = self.task.failed(after) | ahead.unstable[rows]
-            danger = np.where(failed, np.inf, self.task.danger(after))
+            danger = self._danger(ahead, rows, answer[i, rows])
             better = rows[danger > worst[rows]]
             worst[rows] = np.maximum(worst[rows], danger)
             chosen[better] = candidate
         return chosen
 
-    def _answer(self, measured: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """What the controller answers (n, m) to measurements (n, p) in modes q (n,)."""
+    def _danger(self, ahead: Plant, rows: np.ndarray, answer: np.ndarray) -> np.ndarray:
+        """The greatest danger (k,) of the simulations `rows` (k,) after answers (k, m + 1): inputs, mode."""
+        worst = np.full(len(rows), -np.inf)
+        under_way = np.arange(len(rows))
+        for _ in range(self.samples):
+            u, q = answer[:, :-1], answer[:, -1].astype(int)
+            ahead.step(u, rows)
+            after = ahead.measurement[rows]
+            outcome = self.task.outcome(after, ahead.unstable[rows])
+            goes_on = outcome == Outcome.RUNNING
+            failed = ~goes_on & (outcome != Outcome.REACHED)
+            danger = np.where(failed, np.inf, self.task.danger(after))
+            worst[under_way] = np.maximum(worst[under_way], danger)
+            rows, under_way = rows[goes_on], under_way[goes_on]
+            if not len(rows):
+                break
+            answer = np.column_stack(self._act(after[goes_on], q[goes_on]))
+        return worst
+
+    def _act(self, measured: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What the controller answers to measurements (n, p) in modes q (n,): inputs (n, m), modes (n,)."""
         mode = np.where(q == NOT_STARTED, self.controller.initial_mode(measured), q)
-        return self.controller.step(mode, measured)[0]
+        return self.controller.step(mode, measured)

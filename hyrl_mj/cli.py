@@ -120,7 +120,7 @@ def simulate_run(
         run_dir: a run directory.
         start: start in chart coordinates, as x y in m (vehicle) or theta in rad (unit_circle).
         q0: start mode; by default the controller picks it from the first measurement.
-        noise: none, uniform, alternating, adversarial (the most dangerous one sample ahead), or worst (the
+        noise: none, uniform, alternating, adversarial (the most dangerous one), or worst (the
             signal with which the exact game is lost, or arrival is latest).
         eps: bound of the noise in chart units; by default the run's.
         horizon: time to simulate in s; by default the task's.
@@ -204,8 +204,8 @@ def replay(
         starts: critical (the start on the critical set, once for each start mode), paper (all of the
             paper's at once), or latest (what `hyrl-mj simulate --start` simulated last).
         noise: simulate anew under this noise: none, uniform, alternating, adversarial (the most dangerous
-            one sample ahead), or worst (of the exact game, for each controller); by default the arcs of
-            the run, under alternating noise.
+            one), or worst (of the exact game, for each controller); by default the arcs of the run, under
+            alternating noise.
         eps: bound of the noise in chart units; by default the run's.
         layout: side-by-side, or overlay (both in one scene).
         camera: a camera of the MJCF: overhead, chase or three_quarter.

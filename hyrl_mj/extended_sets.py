@@ -158,7 +158,7 @@ def extend(
     if len(parts) > 1:
         reach = [
             backward_reach(task, pi, part, part.mask & (off <= near))
-            if task.plant(1).invertible
+            if task.kinematic
             else forward_reach(task, pi, part, part.mask & (off <= near), part.dilated(radius).mask)
             for pi, part in zip(pis, parts, strict=True)
         ]

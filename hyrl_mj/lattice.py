@@ -74,7 +74,7 @@ class Lattice:
                 f"the exact game takes a chart of 1 or 2 dimensions, that of {task.name} has {d}: "
                 "use noisy episodes instead (hyrl-mj robustness RUN --episodes N --noise adversarial)"
             )
-        if task.measurement_columns != d or task.model.nq != d or not task.plant(1).invertible:
+        if task.measurement_columns != d or task.model.nq != d or not task.kinematic:
             raise BadInput(
                 f"the exact game takes a plant that one sample maps from chart point to chart point, "
                 f"and {model_name(task.model)} has a larger state: use noisy episodes instead "

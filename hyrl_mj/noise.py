@@ -23,7 +23,7 @@ class Noise:
     Attributes:
         kind: "none"; "uniform", drawn anew at every sample from [-bound, bound]; "alternating", +bound,
             -bound, +bound, ... (the paper's); or "adversarial", at each sample the one that leads to
-            the greatest danger one sample later.
+            the greatest danger soon after.
         bound: largest magnitude eps >= 0, in the unit of the measurement.
         everywhere: whether it acts on every column of the measurement, not only on the task's noisy ones.
     """

@@ -35,7 +35,7 @@ from hyrl_mj.tasks.registry import get_task
 
 Say = Callable[[str], None]
 # Noisy episodes of a run whose worst case cannot be played exactly, and of one that only shows that all runs.
-EPISODES, EPISODES_SMOKE = 10_000, 200
+EPISODES, EPISODES_SMOKE = 1_000, 200
 
 
 # ---- the stages: each reads the artifacts of those before it and writes its own

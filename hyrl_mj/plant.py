@@ -139,10 +139,11 @@ class Plant:
         if self._control is None:
             self._advance(self._controls(u), ids, self.substeps)
             return
-        for _ in range(self.substeps):
+        for left in reversed(range(self.substeps)):
             ctrl = self._control(u, self._qpos[rows], self._qvel[rows])
             ctrl = _checked("control", ctrl, (len(u), self.model.nu), ids)
-            self._advance(np.clip(ctrl, self._ctrl_low, self._ctrl_high), ids, 1)
+            ctrl = np.clip(ctrl, self._ctrl_low, self._ctrl_high)
+            self._advance(ctrl, ids, 1, sense=not left)
 
     def step_backward(self, u: np.ndarray, ids: np.ndarray | None = None) -> None:
         """Undo `step`: one sample of x' = -f(x, u), for plants with kinematic actuators only.
@@ -186,10 +187,14 @@ class Plant:
         ctrl[:, self._columns] = u
         return ctrl
 
-    def _advance(self, ctrl: np.ndarray, ids: np.ndarray | None, substeps: int) -> None:
+    def _advance(
+        self, ctrl: np.ndarray, ids: np.ndarray | None, substeps: int, sense: bool = True
+    ) -> None:
         rows = slice(None) if ids is None else ids
         self._ctrl[rows] = ctrl
-        self._batch.step(ids, substeps, self._stage)
+        # What only sensors need is computed when somebody will look at them.
+        stage = self._stage if sense else mujoco.mjtStage.mjSTAGE_NONE
+        self._batch.step(ids, substeps, stage)
         # What MuJoCo itself calls bad: not a number, infinite, or beyond mjMAXVAL.
         for values in (self._qpos, self._qvel):
             good = np.abs(values) <= mujoco.mjMAXVAL

@@ -14,9 +14,11 @@ from hyrl_mj.extended_sets import ExtendedSets
 from hyrl_mj.game import LOST, NEVER, Answers, Moves, lasting, noisy_moves, solve
 from hyrl_mj.lattice import Lattice
 from hyrl_mj.limit import fewest_samples
-from hyrl_mj.noise import Noise
+from hyrl_mj.noise import KINDS, Noise
 from hyrl_mj.policies import MlpPolicy
+from hyrl_mj.sets import GridSet
 from hyrl_mj.settings import Training
+from hyrl_mj.simulation import closed_loop
 from hyrl_mj.tasks.base import Outcome, Task
 from hyrl_mj.training import Score, train
 
@@ -28,6 +30,8 @@ TASK_SHARE = 0.7
 URGENCY = -1.5
 # The latest arrival may be this share behind the fewest samples there are.
 ALLOWED_DELAY = 0.03
+# Episodes for each kind of noise that a policy is judged by where the worst case cannot be played.
+EPISODES = 512
 
 
 def retrain(
@@ -59,8 +63,8 @@ def retrain(
     Returns:
         The best policy of all attempts, or the first mirror image that will do.
     """
-    ground = ModeGround(task, extended, mode)
-    if ground.lattice and task.mirror is not None:
+    ground = (ByGame if Lattice.possible(task) else ByEpisodes)(task, extended, mode)
+    if task.mirror is not None:
         for image in (symmetry.mirrored(other) for other in others):
             if ground(image) >= ground.enough:
                 return image
@@ -70,16 +74,13 @@ def retrain(
             task,
             settings,
             seed=int(np.random.SeedSequence([seed, 1 + mode, attempt]).generate_state(1)[0]),
-            # Without a game to find the worst noise, chance has to do.
-            noise=Noise() if ground.lattice else Noise("uniform", extended.noise),
+            noise=ground.noise,
             domain=ground.domain(settings.gamma),
             start_from=policy if settings.warm_start else None,
-            judge=ground if ground.lattice else None,
+            judge=ground,
             log_dir=log_dir,
             label=f"mode {mode}" + (f", attempt {attempt + 1}" if attempt else ""),
         )
-        if not ground.lattice:
-            return found
         score = ground(found)
         if best is None or score > best[0]:
             best = score, found
@@ -90,7 +91,7 @@ def retrain(
 
 
 class ModeGround:
-    """Where one mode has to win: judges its policies there, and draws starts from it (a `Judge`).
+    """Where one mode has to win: draws starts from it, and tells its policies apart (a `Judge`).
 
     It is every state whose measurement can lie in M_ext_i and from which the mode can still succeed.
 
@@ -98,17 +99,22 @@ class ModeGround:
         task: what is to be learned.
         extended: M_ext_i and W_i.
         mode: the mode.
+
+    Attributes:
+        enough: the score of a policy that will do.
+        noise: on the measurements while the mode is trained.
+        bound: how far a measured chart point may be off, by coordinate (d,).
     """
+
+    enough: Score
+    noise: Noise
 
     def __init__(self, task: Task, extended: ExtendedSets, mode: int):
         self.task, self.extended = task, extended
-        self.noise = task.noise_in_chart(extended.noise)
+        self.bound = task.noise_in_chart(extended.noise)
         index = extended.modes.index(mode)
-        self.within = extended.sets[index].dilated_by_box(self.noise)
+        self.within = extended.sets[index].dilated_by_box(self.bound)
         self.grid = self.within.grid
-        self.lattice: Lattice | None = None
-        if Lattice.possible(task):
-            self.lattice = Lattice.of(task, self.grid)
         within = self.within.mask
         plant = task.plant(len(self.grid.nodes))
         plant.set_state(*task.state(self.grid.nodes))
@@ -120,12 +126,10 @@ class ModeGround:
         early = self.nodes[task.may_start(self.grid.nodes[self.nodes])]
         self.early = early if len(early) else self.nodes
         self.lost, self._weight = np.empty(0, dtype=int), np.empty(0)
-        self.enough: Score = (0.0, -1.0)
-        if self.lattice:
-            after = self.lattice.after
-            inside = np.append(within, [True, False])[after]
-            fewest, _ = fewest_samples(self.lattice, after, inside)
-            self.fewest = int(fewest[self.nodes][fewest[self.nodes] < NEVER].max(initial=0))
+
+    def __call__(self, policy: MlpPolicy) -> Score:
+        """The score of a policy. Starts are drawn from what the latest policy has lost."""
+        raise NotImplementedError
 
     def domain(self, gamma: float) -> Domain:
         """Where training goes on; leaving it counts as the worst reward for ever."""
@@ -141,39 +145,58 @@ class ModeGround:
         if len(self.lost):
             lost = rng.choice(self.lost, n, p=self._weight)
             at = np.where(rng.random(n) < LOST_SHARE, lost, at)
-        chart, d = self.task.chart, self.task.chart.dimension
+        return self._around(at, rng)
+
+    def _around(self, at: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Points (n, d) in the cells around nodes at (n,)."""
+        n, chart, d = len(at), self.task.chart, self.task.chart.dimension
         z = self.grid.nodes[at] + rng.uniform(-0.5, 0.5, (n, d)) * self.grid.spacing
         return np.where(chart.periodic, z, np.clip(z, chart.low, chart.high))
 
+    def _remember(self, lost: np.ndarray, weight: np.ndarray) -> None:
+        """Nodes (k,) that were lost, and how much of the training each is worth (k,)."""
+        self.lost, self._weight = lost, weight / max(weight.sum(), 1e-300)
+
+
+class ByGame(ModeGround):
+    """Judges by the worst-case game, which has to be won from every state.
+
+    Minus the share of states lost; minus delay or miss, whichever is more beyond what is allowed.
+
+    The delay is that of the latest arrival behind the fewest samples there are. The miss is how far
+    off the set-point the noise can keep a run for ever, beyond the noise bound itself; where runs end,
+    how far off they end without noise.
+    """
+
+    enough: Score = (0.0, -1.0)
+    noise = Noise()  # the game finds the worst
+
+    def __init__(self, task: Task, extended: ExtendedSets, mode: int):
+        super().__init__(task, extended, mode)
+        self.lattice = Lattice.of(task, self.grid)
+        after = self.lattice.after
+        inside = np.append(self.within.mask, [True, False])[after]
+        fewest, _ = fewest_samples(self.lattice, after, inside)
+        self.fewest = int(fewest[self.nodes][fewest[self.nodes] < NEVER].max(initial=0))
+
     def __call__(self, policy: MlpPolicy) -> Score:
-        """Minus the share of states lost; minus delay or miss, whichever is more beyond what is allowed.
-
-        The delay is that of the latest arrival behind the fewest samples there are. The miss is how far
-        off the set-point the noise can keep a run for ever, beyond the noise bound itself; where runs end,
-        how far off they end without noise.
-
-        Starts are drawn from what the latest policy has lost.
-        """
-        assert self.lattice is not None
-        answers = Answers.of(self.lattice, PolicyController(policy), self.noise)
-        moves = noisy_moves(answers, self.noise)
+        answers = Answers.of(self.lattice, PolicyController(policy), self.bound)
+        moves = noisy_moves(answers, self.bound)
         value = solve(moves)[0, :-2]
-        self.lost = np.flatnonzero(self.wanted & (value >= NEVER))
-        samples = np.where(value > NEVER, LOST - value, self.task.max_steps)[self.lost]
-        weight = np.maximum(samples, 1.0) ** URGENCY
-        self._weight = weight / weight.sum()
-        if len(self.lost):
-            return -len(self.lost) / len(self.nodes), -np.inf
+        lost = np.flatnonzero(self.wanted & (value >= NEVER))
+        samples = np.where(value > NEVER, LOST - value, self.task.max_steps)[lost]
+        self._remember(lost, np.maximum(samples, 1.0) ** URGENCY)
+        if len(lost):
+            return -len(lost) / len(self.nodes), -np.inf
         delay = value[self.nodes].max() / max(self.fewest, 1) - 1
         miss = self._miss(answers, moves)
         return 0.0, -float(max(delay / ALLOWED_DELAY, miss / self.task.precision))
 
     def _miss(self, answers: Answers, moves: Moves) -> float:
-        assert self.lattice is not None
         grid, after = self.lattice.grid, self.lattice.after
         still = lasting(moves, self.wanted)
         if still.any():
-            return float(self.task.miss(grid.nodes[still]).max() - self.noise.max())
+            return float(self.task.miss(grid.nodes[still]).max() - self.bound.max())
         # Without noise, down to the last nodes on the chart; the sample after these ends most runs.
         # A controller of one mode answers with levels alone.
         level = answers.letter[0][answers.middle].ravel()
@@ -186,3 +209,45 @@ class ModeGround:
         plant.step(self.lattice.levels[level[last]])
         ends = np.vstack([grid.nodes[last], self.task.z(plant.measurement)])
         return float(self.task.miss(ends).max())
+
+
+class ByEpisodes(ModeGround):
+    """Judges by noisy episodes, where the worst case cannot be played.
+
+    They start where the hybrid controller may pick the mode. The kinds of noise come in turn, the hardest
+    last: how many of them are survived by all episodes, and minus the share of those that the next one stops.
+
+    Attributes:
+        judged: (n, d) where they start.
+    """
+
+    enough: Score = (float(len(KINDS)), 0.0)
+
+    def __init__(self, task: Task, extended: ExtendedSets, mode: int):
+        super().__init__(task, extended, mode)
+        self.noise = Noise("uniform", extended.noise)
+        depth = np.stack([s.values for s in extended.sets])
+        deepest = GridSet.from_mask(self.grid, depth.argmin(axis=0) == extended.modes.index(mode))
+        picked = deepest.dilated_by_box(self.bound).mask[self.early]
+        rng = np.random.default_rng(0)
+        first = rng.choice(self.early[picked] if picked.any() else self.early, EPISODES)
+        self.judged = self._around(first, rng)
+        self._plant = task.plant(EPISODES)
+
+    def __call__(self, policy: MlpPolicy) -> Score:
+        loop = PolicyController(policy)
+        for survived, kind in enumerate(KINDS):
+            outcome = closed_loop(
+                self.task,
+                loop,
+                self.judged,
+                noise=Noise(kind, self.extended.noise),
+                plant=self._plant,
+                vary=True,
+                quiet=True,
+            ).outcome
+            lost = self.grid.nearest(self.judged[outcome != Outcome.REACHED])
+            self._remember(lost, np.ones(len(lost)))
+            if len(lost):
+                return float(survived), -len(lost) / EPISODES
+        return self.enough

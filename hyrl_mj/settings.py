@@ -247,8 +247,7 @@ def preset(
     stage1, stage6 = _TRAINING[task.algorithm][name]
     task.check_noise(noise)
     dimension = task.chart.dimension
-    kinematic = task.plant(1).invertible
-    cells, rods = (_CELLS, _RODS) if kinematic else (_CELLS_DYNAMIC, _RODS_DYNAMIC)
+    cells, rods = (_CELLS, _RODS) if task.kinematic else (_CELLS_DYNAMIC, _RODS_DYNAMIC)
     return Settings(
         task=task.reference,
         preset=name,

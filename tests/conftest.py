@@ -9,6 +9,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import pytest
 
 import hyrl_mj
+from hyrl_mj.new_task import write_task
 
 
 @pytest.fixture(scope="session")
@@ -25,3 +26,11 @@ def vehicle():
 def task(request):
     """Either of the paper's tasks."""
     return hyrl_mj.get_task(request.param)
+
+
+@pytest.fixture(scope="session")
+def puck(tmp_path_factory):
+    """A robot with inertia: what `hyrl-mj new-task` writes."""
+    folder = tmp_path_factory.mktemp("puck")
+    write_task("puck", folder)
+    return hyrl_mj.get_task(folder / "puck.py")

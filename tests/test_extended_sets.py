@@ -6,7 +6,6 @@ from planted import circle_policy, one_way_policy, sign_policy
 
 from hyrl_mj import extend, find_critical_set, make_partition
 from hyrl_mj.extended_sets import distance_to
-from hyrl_mj.plant import Plant
 
 PI = np.pi
 # From the axis an obstacle of radius 0.75 at x = 1.5 can be passed only if x <= this.
@@ -210,7 +209,7 @@ def test_forward_runs_give_the_sets_that_backward_ones_give(
     for case in (on_circle, on_vehicle):
         backward = case.extend(horizon, noise)
         with monkeypatch.context() as patch:
-            patch.setattr(Plant, "invertible", False)
+            patch.setattr(case.task, "kinematic", False)
             forward = case.extend(horizon, noise)
         assert forward.horizon == pytest.approx(backward.horizon, abs=0.05)
         grid, hop = case.partition.grid, 0.05 * np.sqrt(2)

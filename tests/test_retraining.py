@@ -10,7 +10,7 @@ from hyrl_mj import closed_loop, symmetry, training
 from hyrl_mj.controllers import PolicyController
 from hyrl_mj.envs.core import cautious_reward
 from hyrl_mj.extended_sets import ExtendedSets
-from hyrl_mj.retraining import ModeGround, retrain
+from hyrl_mj.retraining import EPISODES, ByEpisodes, ByGame, retrain
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.settings import preset
 
@@ -27,7 +27,7 @@ def vehicle_sets(vehicle):
 
 
 def test_mode_starts_cover_the_set_with_room_for_the_noise(vehicle, vehicle_sets):
-    domain = ModeGround(vehicle, vehicle_sets, 0).domain(gamma=0.9)
+    domain = ByGame(vehicle, vehicle_sets, 0).domain(gamma=0.9)
     z = domain.starts(5000, np.random.default_rng(0))
     cell = vehicle_sets.sets[0].grid.cell
     assert vehicle.chart.contains(z).all()
@@ -39,14 +39,14 @@ def test_mode_starts_cover_the_set_with_room_for_the_noise(vehicle, vehicle_sets
 
 
 def test_a_mode_that_leaves_its_set_pays_for_ever(vehicle, circle, vehicle_sets):
-    domain = ModeGround(vehicle, vehicle_sets, 1).domain(gamma=0.9)
+    domain = ByGame(vehicle, vehicle_sets, 1).domain(gamma=0.9)
     inside = domain.contains(np.array([[0.1, 0.22], [0.1, 0.28], [0.1, -1.0]]))
     np.testing.assert_array_equal(inside, [True, False, True])
     assert domain.exit_reward == 0.0
     grid = Grid.with_cells(circle.chart, 60)
     whole = GridSet.from_mask(grid, np.ones(60, dtype=bool))
     sets = ExtendedSets((0,), (whole,), (whole.mask,), 0.5, 0.1, np.empty((0, 1)), np.empty(0))
-    assert ModeGround(circle, sets, 0).domain(gamma=0.9).exit_reward == pytest.approx(-10.0)
+    assert ByGame(circle, sets, 0).domain(gamma=0.9).exit_reward == pytest.approx(-10.0)
 
 
 # ---- the judge of stage 6
@@ -76,7 +76,7 @@ def left(vehicle):
     sets = tuple(GridSet(grid, ideal.flow_set(q).signed_distance(grid.nodes)) for q in (0, 1))
     open_ = grid.nodes[:, 1] > -(0.4 - grid.nodes[:, 0])
     found = ExtendedSets((0, 1), sets, (open_, ~open_), 0.3, 0.1, np.empty((0, 2)), np.empty(0))
-    return ModeGround(vehicle, found, 0)
+    return ByGame(vehicle, found, 0)
 
 
 def test_the_judge_prefers_a_policy_that_loses_nothing(vehicle, left):
@@ -134,7 +134,7 @@ def untrained(vehicle, quick):
 def test_a_mirror_image_that_will_do_is_taken(vehicle, vehicle_sets, quick, monkeypatch):
     other = untrained(vehicle, quick)
     image = symmetry.mirrored(other)
-    monkeypatch.setattr(ModeGround, "__call__", lambda ground, policy: (0.0, -0.5))
+    monkeypatch.setattr(ByGame, "__call__", lambda ground, policy: (0.0, -0.5))
     found = retrain(vehicle, other, vehicle_sets, 1, quick, seed=0, others=[other])
     for name, weight in image.weights.items():
         np.testing.assert_array_equal(found.weights[name], weight)
@@ -143,8 +143,51 @@ def test_a_mirror_image_that_will_do_is_taken(vehicle, vehicle_sets, quick, monk
 def test_one_that_will_not_do_is_not_taken(vehicle, vehicle_sets, quick):
     # An untrained policy drives into the pillar.
     other = untrained(vehicle, quick)
-    assert ModeGround(vehicle, vehicle_sets, 1)(symmetry.mirrored(other)) < (0.0, -1.0)
+    assert ByGame(vehicle, vehicle_sets, 1)(symmetry.mirrored(other)) < (0.0, -1.0)
     alone = retrain(vehicle, other, vehicle_sets, 1, quick, seed=0)
     found = retrain(vehicle, other, vehicle_sets, 1, quick, seed=0, others=[other])
     for name, weight in alone.weights.items():
+        np.testing.assert_array_equal(found.weights[name], weight)
+
+
+# ---- where the worst case cannot be played
+
+
+@pytest.fixture(scope="module")
+def puck_sets(puck):
+    grid = Grid.with_cells(puck.chart, 60)
+    sets = tuple(GridSet(grid, -s * grid.nodes[:, 1] - 0.25) for s in (1.0, -1.0))
+    winning = tuple(s * grid.nodes[:, 1] > -0.4 for s in (1.0, -1.0))
+    return ExtendedSets((0, 1), sets, winning, 0.3, 0.1, np.empty((0, 2)), np.empty(0))
+
+
+def test_episodes_tell_policies_apart(puck, puck_sets):
+    ground = ByEpisodes(puck, puck_sets, 0)
+    wrong = ground(one_way_policy(puck, -1.0))
+    assert wrong[0] == 0
+    assert len(ground.lost) == round(-wrong[1] * EPISODES) > 0
+    # As close as it gets without noise, but not with it.
+    grazing = ground(one_way_policy(puck, 1.0, clear=0.6))
+    good = ground(one_way_policy(puck, 1.0))
+    assert wrong < grazing < good == ground.enough
+    assert grazing[0] == 3, "chance does not find it, the adversary does"
+    assert not len(ground.lost)
+
+
+def test_they_start_where_the_mode_may_be_picked(puck, puck_sets):
+    for mode, side in ((0, 1.0), (1, -1.0)):
+        ground = ByEpisodes(puck, puck_sets, mode)
+        cell = ground.grid.cell
+        y = side * ground.judged[:, 1]
+        assert -0.1 - 2 * cell <= y.min() < 0.0
+        assert y.max() > 0.6
+        assert puck.may_start(ground.grid.nodes[ground.grid.nearest(ground.judged)]).all()
+
+
+def test_a_mirror_image_is_taken_there_too(puck, puck_sets, monkeypatch):
+    settings = replace(preset(puck, "smoke").stage6, samples=4_096)
+    other = training.export(training.build(puck, settings, seed=0), puck)
+    monkeypatch.setattr(ByEpisodes, "__call__", lambda ground, policy: ground.enough)
+    found = retrain(puck, other, puck_sets, 1, settings, seed=0, others=[other])
+    for name, weight in symmetry.mirrored(other).weights.items():
         np.testing.assert_array_equal(found.weights[name], weight)

@@ -161,6 +161,11 @@ class Task(ABC):
         control = self.control if self.has_inner_loop else None
         return Plant(self.model, self.inputs, n, threads, measure=self.measure, control=control)
 
+    @cached_property
+    def kinematic(self) -> bool:
+        """Whether the robot simply follows its inputs, so that it can be run backward."""
+        return self.plant(1).invertible
+
     def check_state(self, z: ArrayLike) -> np.ndarray:
         """Chart points as a float array (n, d).
 

@@ -57,6 +57,10 @@ class MyRobot(hyrl_mj.Task):
         close = np.maximum(1 - self.clearance(measured) / 0.2, 0.0)
         return np.where(self.failed(measured), 0.0, 3 - np.abs(measured[:, 1]) - close)
 
+    def danger(self, measured):
+        """What adversarial noise works towards; a crash is always worst."""
+        return -self.clearance(measured)
+
     def ending(self, measured):
         ends = np.full(len(measured), Outcome.RUNNING)
         ends[measured[:, 0] >= self.set_point[0]] = Outcome.REACHED
