@@ -133,5 +133,11 @@ def replay_shows(
 
 
 def replay_floor(run: Run) -> Floor:
-    """What a replay shows on the floor."""
-    return Floor.of(run.task, run.critical_set, run.partition, run.extended_sets)
+    """What a replay shows on the floor; of a chart of more than two dimensions a section."""
+    section = run.section
+    return Floor.of(
+        section.task,
+        run.critical_section,
+        section.partition(run.partition),
+        section.extended_sets(run.extended_sets),
+    )

@@ -124,7 +124,10 @@ def find_critical_set(
     if method not in SEARCHES:
         raise unknown("method", method, SEARCHES)
     grid, d = Grid.with_cells(task.chart, cells), task.chart.dimension
-    found = (_by_rods if method == "rods" else _by_outcome)(task, policy, grid, resolution)
+    if method == "rods":
+        found = _by_rods(task, policy, grid, resolution)
+    else:
+        found = critical_points(task, policy, grid.nodes, grid.neighbours(), grid.cell, resolution)
     points = np.unique(task.chart.wrap(found), axis=0) if len(found) else np.empty((0, d))
     return CriticalSet(
         points, _pieces(task, points, LINK * grid.cell), resolution * grid.cell, grid.cell
@@ -149,22 +152,36 @@ def _by_rods(task: Task, policy: Policy, grid: Grid, resolution: float) -> np.nd
     return centre[_differ(task, policy, *_ends(task, centre, axis, length))]
 
 
-def _by_outcome(task: Task, policy: Policy, grid: Grid, resolution: float) -> np.ndarray:
-    """Middles (N, d) between starts so close together whose runs go different ways."""
+def critical_points(
+    task: Task,
+    policy: Policy,
+    nodes: np.ndarray,
+    neighbours: tuple[np.ndarray, np.ndarray],
+    cell: float,
+    resolution: float,
+) -> np.ndarray:
+    """The search by outcome: middles (N, d) between close starts whose runs go different ways.
+
+    Args:
+        task, policy, resolution: as in `find_critical_set`.
+        nodes: (n, d) starts.
+        neighbours: (k,), (k,) pairs of starts that lie next to each other.
+        cell: the greatest distance between such two.
+    """
 
     def way_from(z: np.ndarray) -> np.ndarray:
         if not len(z):
             return np.zeros(0, dtype=int)
         return ways(task, closed_loop(task, PolicyController(policy), z))
 
-    at_node = way_from(grid.nodes)
-    first, second = grid.neighbours()
+    at_node = way_from(nodes)
+    first, second = neighbours
     pair = (at_node[first] != at_node[second]) & (at_node[first] >= 0) & (at_node[second] >= 0)
     first, second = first[pair], second[pair]
-    a, way_a, way_b = grid.nodes[first], at_node[first], at_node[second]
-    b = a + task.chart.difference(grid.nodes[second], a)
-    length = grid.cell
-    while len(a) and length > resolution * grid.cell * (1 + 1e-9):
+    a, way_a, way_b = nodes[first], at_node[first], at_node[second]
+    b = a + task.chart.difference(nodes[second], a)
+    length = cell
+    while len(a) and length > resolution * cell * (1 + 1e-9):
         middle = (a + b) / 2
         way = way_from(middle)
         near_a = (way == way_a)[:, None]
@@ -173,7 +190,7 @@ def _by_outcome(task: Task, policy: Policy, grid: Grid, resolution: float) -> np
         # In the middle there may be nothing to decide.
         going, length = way >= 0, length / 2
         a, b, way_a, way_b = a[going], b[going], way_a[going], way_b[going]
-    return ((a + b) / 2)[_go_apart(task, policy, a, b, grid.cell)]
+    return ((a + b) / 2)[_go_apart(task, policy, a, b, cell)]
 
 
 def _go_apart(task: Task, policy: Policy, a: np.ndarray, b: np.ndarray, far: float) -> np.ndarray:

@@ -132,15 +132,16 @@ def figures_stage(run: Run, say: Say) -> None:
     """Draw the paper's figures of this run; those that make no sense for its chart are left out."""
     from hyrl_mj import figures
 
-    task, critical, folder = run.task, run.critical_set, run.path / "figures"
-    policy, eps, seed = run.policy, run.settings.noise, run.settings.seed
+    section, folder = run.section, run.path / "figures"
+    task, policy, eps, seed = section.task, run.policy, run.settings.noise, run.settings.seed
     # All is read before anything is written.
-    arcs, partition, sets = run.arcs(), run.partition, run.extended_sets
-    noisy = arcs.get(("critical", "policy"), arcs["start0", "policy"])
+    arcs, critical = run.arcs(), run.critical_section
+    partition, sets = section.partition(run.partition), section.extended_sets(run.extended_sets)
+    noisy = section.arc(arcs.get(("critical", "policy"), arcs["start0", "policy"]))
     figures.overview(task, policy, critical, partition, noisy, folder / "overview.png")
     figures.policy_map(task, policy, critical, eps, seed, folder / "policy.png")
     figures.extended_sets_map(task, critical, sets, folder / "extended_sets.png")
-    figures.runs(task, arcs, folder / "runs.png")
+    figures.runs(run.task, arcs, folder / "runs.png")
     say(f"{', '.join(figures.names(task))} in {folder}, as PNG and PDF")
 
 

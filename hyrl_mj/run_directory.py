@@ -17,12 +17,15 @@ from hyrl_mj.extended_sets import ExtendedSets
 from hyrl_mj.hybrid import HybridController
 from hyrl_mj.partition import Partition
 from hyrl_mj.policies import MlpPolicy
+from hyrl_mj.section import Section
 from hyrl_mj.settings import Settings
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.registry import get_task
 
 PACKAGES = ("mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "mediapy")
+# Grid points along the longest side from which critical points of a section are searched for.
+SECTION_CELLS = 40
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,18 @@ class Run:
     def extended_sets(self) -> ExtendedSets:
         """The extended sets M_ext_i, of stage 5."""
         return ExtendedSets.load(self.path / "extended_sets.npz", self.task)
+
+    @cached_property
+    def section(self) -> Section:
+        """What is drawn of a chart of more than two dimensions."""
+        return Section.of(self.task)
+
+    @cached_property
+    def critical_section(self) -> CriticalSet:
+        """M* in the section."""
+        s = self.settings
+        cells = max(s.rods, SECTION_CELLS)
+        return self.section.critical_set(self.critical_set, self.policy, cells, s.resolution)
 
     @cached_property
     def controller(self) -> HybridController:

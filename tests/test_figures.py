@@ -17,8 +17,11 @@ from planted import Cube, decisions, halves, plane_policy
 
 import hyrl_mj
 from hyrl_mj import BadInput, HybridController, Outcome, figures, simulate
+from hyrl_mj.extended_sets import ExtendedSets
 from hyrl_mj.figures import charts, paths, style
-from hyrl_mj.sets import Everything
+from hyrl_mj.partition import Partition
+from hyrl_mj.section import Section
+from hyrl_mj.sets import Everything, Grid, GridSet
 
 CIRCLE, VEHICLE = hyrl_mj.get_task("unit_circle"), hyrl_mj.get_task("vehicle")
 ARCS = {task.name: arcs_of(task) for task in (CIRCLE, VEHICLE)}
@@ -354,20 +357,36 @@ def test_jumps_over_time_are_marked_and_change_the_colour(tmp_path, drawn):
 # ---- charts of other kinds
 
 
-def test_of_three_dimensions_only_the_runs_over_time_are_drawn(tmp_path, drawn):
-    cube, path = Cube(lambda z: z[:, 0]), tmp_path / "p.png"
+class Cut(Cube):
+    """A chart of three dimensions, drawn at c = -0.3."""
+
+    replay_starts, replay_time = ((0.1, 0.2, -0.3),), 0.3
+    start_low, start_high = (-0.5,) * 3, (0.5,) * 3
+
+
+def test_of_three_dimensions_a_section_is_drawn_and_the_runs_over_time(tmp_path, drawn):
+    cube, path = Cut(lambda z: z[:, 0]), tmp_path / "p.png"
     policy = plane_policy(cube, np.array([[1.0, 0.0, 0.0]]), np.sign)
     loop = HybridController(cube, {0: policy, 1: policy}, {0: Everything(), 1: Everything()})
     starts = np.array([[0.1, 0.2, -0.3]])
     arcs = {("start0", "policy"): simulate(cube, policy, starts)[0]}
     for q in (0, 1):
         arcs["start0", f"hyrl_q{q}"] = simulate(cube, loop, starts, q0=q)[0]
-    none = replace(NONE, points=np.empty((0, 3)))
-    figures.overview(cube, policy, none, None, arcs["start0", "policy"], path)
-    figures.policy_map(cube, policy, none, EPS, 0, path)
-    figures.extended_sets_map(cube, none, None, path)
-    assert not drawn
-    assert figures.names(cube) == ("runs",)
+    section = Section.of(cube)
+    grid = Grid.with_cells(section.task.chart, 20)
+    half = GridSet(grid, grid.nodes[:, 0])
+    partition = Partition((0, 1), (half, ~half), half.mask)
+    sets = ExtendedSets((0, 1), (half, ~half), (), 0.3, EPS, np.empty((0, 2)), np.empty(0))
+    arc = section.arc(arcs["start0", "policy"])
+    figures.overview(section.task, policy, NONE, partition, arc, path)
+    figures.policy_map(section.task, policy, NONE, EPS, 0, path)
+    figures.extended_sets_map(section.task, NONE, sets, path)
+    assert len({id(figure) for figure in drawn}) == 3
+    for figure in drawn:
+        assert figure.get_suptitle().startswith("Cube at c = -0.3 m: ")
+        assert (figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()) == ("a [m]", "b [m]")
+    drawn.clear()
+    assert figures.names(cube) == ("overview", "policy", "extended_sets", "runs")
     figures.runs(cube, arcs, path)
     panels = np.reshape(drawn[0].axes, (3, 2))
     assert [panel.get_ylabel() for panel in panels[:, 0]] == ["a [m]", "b [m]", "c [m]"]

@@ -19,7 +19,7 @@ ORDER = (
     "errors", "progress", "colours", "mjcf", "plant", "noise", "tasks", "settings", "artifacts",
     "policies", "controllers", "adversary", "rendering", "encoding", "envs", "simulation",
     "task_tests", "symmetry", "training", "sets", "lattice", "game", "critical_set", "partition", "limit",
-    "extended_sets", "retraining",
+    "extended_sets", "section", "retraining",
     "hybrid", "robustness", "episodes", "run_directory", "tables", "figures", "replay", "viewing", "arcs",
     "doctor", "report", "pipeline", "summary", "new_task", "cli",
 )  # fmt: skip

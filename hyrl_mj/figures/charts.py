@@ -34,8 +34,8 @@ def is_ring(task: Task) -> bool:
 
 
 def drawable(task: Task) -> bool:
-    """Whether the whole chart can be shown as a plane or a ring."""
-    return is_ring(task) or task.chart.dimension == 2
+    """Whether the chart, or a section of it, can be shown as a plane or a ring."""
+    return is_ring(task) or task.chart.dimension > 1
 
 
 def angles_on(axis: Any, task: Task, coordinate: int) -> None:

@@ -81,7 +81,8 @@ def drawing(path: Path, size: tuple[float, float]) -> Iterator[Figure]:
 
 def head(figure: Figure, task: Task, words: str) -> None:
     """Write the title over a figure."""
-    figure.suptitle(f"{task_title(task)}: {words}", fontsize=12, fontweight="bold")
+    where = f" at {task.chart.section}" if task.chart.section else ""
+    figure.suptitle(f"{task_title(task)}{where}: {words}", fontsize=12, fontweight="bold")
 
 
 def legend(figure: Figure, handles: Mapping[str, Artist], handlelength: float = 2.0) -> None:

@@ -27,6 +27,7 @@ TRACKED = "tracked"
 # Heights above the tracked site [m], from the floor up: what lies higher is seen.
 ON_FLOOR, ON_SETS, ON_BOUND, ON_PATH, ON_TOP = -0.006, -0.004, -0.002, 0.0, 0.006
 THICKNESS = 0.004  # [m]
+FLYING = 0.3  # whose tracked site is so far above the floor flies [m]
 CRITICAL_RADIUS, OVERLAP_WIDTH = 0.02, 0.16  # [m]
 # Cells of a strip of the overlap: short enough to follow a bent coordinate.
 STRIP = 16
@@ -141,22 +142,18 @@ class Floor:
     def of(
         task: Task, critical: CriticalSet, partition: Partition, extended: ExtendedSets
     ) -> Floor:
-        """Of the results of the stages.
-
-        On a chart of more than two dimensions the overlap has no place on the floor and is left out.
-        """
+        """Of the results of the stages, on a chart of one or two dimensions."""
         tracker, strips, widths = Tracker(task), [], []
         half = extended.sets[0].grid.spacing / 2
         for ends in _strips(critical, partition, extended):
             middle = ends.mean(axis=0)
             side = middle + np.where(np.arange(len(half)) == 0, half, 0.0)
-            points = tracker.of_z(np.vstack([ends, middle, side]))
+            points = on_floor(task, tracker.of_z(np.vstack([ends, middle, side])))
             strips.append(points[:2])
             across = 2 * float(np.linalg.norm(points[3] - points[2]))
             widths.append(OVERLAP_WIDTH if len(half) == 1 else across)
-        return Floor(
-            tracker.of_z(critical.points), np.reshape(strips, (-1, 2, 3)), np.array(widths)
-        )
+        points = on_floor(task, tracker.of_z(critical.points))
+        return Floor(points, np.reshape(strips, (-1, 2, 3)), np.array(widths))
 
     def draw(self, scene: mujoco.MjvScene) -> None:
         """Add it to a scene."""
@@ -167,6 +164,17 @@ class Floor:
             disc(scene, point, CRITICAL_RADIUS, ON_SETS, CRITICAL)
 
 
+def on_floor(task: Task, points: np.ndarray) -> np.ndarray:
+    """Where a robot casts its shadow when it is at points (n, 3) [m], if it flies; else these points."""
+    floor = mujoco.mj_name2id(task.model, mujoco.mjtObj.mjOBJ_GEOM, "floor")
+    if floor < 0:
+        return points
+    ground = task.model.geom_pos[floor, 2]
+    flies = points[:, 2] > ground + FLYING
+    height = np.where(flies, ground - 2 * ON_FLOOR, points[:, 2])
+    return np.column_stack([points[:, :2], height])
+
+
 def _strips(
     critical: CriticalSet, partition: Partition, extended: ExtendedSets
 ) -> Iterator[np.ndarray]:
@@ -175,7 +183,7 @@ def _strips(
     Where the ways have joined again all sets overlap, and there is nothing to see.
     """
     grid = extended.sets[0].grid
-    if grid.chart.dimension > 2 or not len(critical.points):
+    if not len(critical.points):
         return
     joined = np.sum([part.contains(grid.nodes) for part in partition.parts], axis=0) > 1
     # How deep a state lies in the second of the sets that hold it, negative inside.

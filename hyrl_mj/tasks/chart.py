@@ -21,6 +21,7 @@ class Chart:
         units: one a coordinate.
         low, high: (d,) ends of the charted box; for a periodic coordinate one period.
         periodic: (d,) whether a coordinate lives on a circle.
+        section: of a chart that is cut out of a larger one, where: "heading = 0 rad".
     """
 
     names: tuple[str, ...]
@@ -28,6 +29,7 @@ class Chart:
     low: tuple[float, ...]
     high: tuple[float, ...]
     periodic: tuple[bool, ...]
+    section: str = ""
 
     @property
     def dimension(self) -> int:
