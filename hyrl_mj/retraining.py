@@ -126,9 +126,16 @@ class ModeGround:
         early = self.nodes[task.may_start(self.grid.nodes[self.nodes])]
         self.early = early if len(early) else self.nodes
         self.lost, self._weight = np.empty(0, dtype=int), np.empty(0)
+        self._latest: tuple[MlpPolicy, Score] | None = None
 
     def __call__(self, policy: MlpPolicy) -> Score:
         """The score of a policy. Starts are drawn from what the latest policy has lost."""
+        if self._latest is None or self._latest[0] is not policy:
+            self._latest = policy, self.score(policy)
+        return self._latest[1]
+
+    def score(self, policy: MlpPolicy) -> Score:
+        """What `__call__` gives for a policy that was not just asked about."""
         raise NotImplementedError
 
     def domain(self, gamma: float) -> Domain:
@@ -179,7 +186,7 @@ class ByGame(ModeGround):
         fewest, _ = fewest_samples(self.lattice, after, inside)
         self.fewest = int(fewest[self.nodes][fewest[self.nodes] < NEVER].max(initial=0))
 
-    def __call__(self, policy: MlpPolicy) -> Score:
+    def score(self, policy: MlpPolicy) -> Score:
         answers = Answers.of(self.lattice, PolicyController(policy), self.bound)
         moves = noisy_moves(answers, self.bound)
         value = solve(moves)[0, :-2]
@@ -215,7 +222,7 @@ class ByEpisodes(ModeGround):
     """Judges by noisy episodes, where the worst case cannot be played.
 
     They start where the hybrid controller may pick the mode. The kinds of noise come in turn, the hardest
-    last: how many of them are survived by all episodes, and minus the share of those that the next one stops.
+    last: under how many of them all episodes arrive, and minus the share of those that the next one stops.
 
     Attributes:
         judged: (n, d) where they start.
@@ -234,10 +241,10 @@ class ByEpisodes(ModeGround):
         self.judged = self._around(first, rng)
         self._plant = task.plant(EPISODES)
 
-    def __call__(self, policy: MlpPolicy) -> Score:
+    def score(self, policy: MlpPolicy) -> Score:
         loop = PolicyController(policy)
         for survived, kind in enumerate(KINDS):
-            outcome = closed_loop(
+            run = closed_loop(
                 self.task,
                 loop,
                 self.judged,
@@ -245,8 +252,9 @@ class ByEpisodes(ModeGround):
                 plant=self._plant,
                 vary=True,
                 quiet=True,
-            ).outcome
-            lost = self.grid.nearest(self.judged[outcome != Outcome.REACHED])
+            )
+            arrived = (run.outcome == Outcome.REACHED) & self.task.arrived(run.path[-1])
+            lost = self.grid.nearest(self.judged[~arrived])
             self._remember(lost, np.ones(len(lost)))
             if len(lost):
                 return float(survived), -len(lost) / EPISODES
