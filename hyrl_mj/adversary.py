@@ -16,6 +16,8 @@ from hyrl_mj.tasks.base import Outcome, Task
 NOT_STARTED = -1
 # How many samples a plant with inertia is followed to see what an input leads to.
 AHEAD = 8
+# Simulations that are looked ahead of together.
+AT_ONCE = 2_048
 
 
 class Adversary(Protocol):
@@ -62,30 +64,31 @@ class Lookahead:
 
     def choose(self, plant: Plant, q: np.ndarray) -> np.ndarray:
         """As `Adversary.choose`. Among equals no noise is preferred, then the largest."""
-        ahead = self._ahead = self._ahead or self.task.plant(plant.n)
-        true, qpos, qvel = plant.measurement, plant.qpos, plant.qvel
-        answers = [np.column_stack(self._act(true + c, q)) for c in self._candidates]
-        answer = np.stack(answers)
+        true, chosen = plant.measurement, np.zeros_like(plant.measurement)
+        running = np.flatnonzero(self.task.outcome(true, plant.unstable) == Outcome.RUNNING)
+        answer = np.stack(
+            [np.column_stack(self._act(true[running] + c, q[running])) for c in self._candidates]
+        )
         # Where all candidates get the same answer there is nothing to choose, and each answer is tried once.
-        running = self.task.outcome(true, plant.unstable) == Outcome.RUNNING
-        split = (answer != answer[0]).any(axis=(0, 2)) & running
-        worst, chosen = np.full(plant.n, -np.inf), np.zeros_like(true)
-        for i, candidate in enumerate(self._candidates):
-            tried = (answer[:i] == answer[i]).all(axis=2).any(axis=0)
-            rows = np.flatnonzero(split & ~tried)
-            if not len(rows):
-                continue
-            ahead.set_state(qpos[rows], qvel[rows], rows)
-            danger = self._danger(ahead, rows, answer[i, rows])
-            better = rows[danger > worst[rows]]
-            worst[rows] = np.maximum(worst[rows], danger)
-            chosen[better] = candidate
+        split = (answer != answer[0]).any(axis=(0, 2))
+        tried = [(answer[:i] == answer[i]).all(axis=2).any(axis=0) for i in range(len(answer))]
+        candidate, at = np.nonzero(split & ~np.stack(tried))
+        qpos, qvel = plant.qpos[running[at]], plant.qvel[running[at]]
+        danger = np.full(answer.shape[:2], -np.inf)
+        for first in range(0, len(at), AT_ONCE):
+            these = slice(first, first + AT_ONCE)
+            danger[candidate[these], at[these]] = self._danger(
+                qpos[these], qvel[these], answer[candidate[these], at[these]]
+            )
+        chosen[running] = self._candidates[danger.argmax(axis=0)]
         return chosen
 
-    def _danger(self, ahead: Plant, rows: np.ndarray, answer: np.ndarray) -> np.ndarray:
-        """The greatest danger (k,) of the simulations `rows` (k,) after answers (k, m + 1): inputs, mode."""
-        worst = np.full(len(rows), -np.inf)
-        under_way = np.arange(len(rows))
+    def _danger(self, qpos: np.ndarray, qvel: np.ndarray, answer: np.ndarray) -> np.ndarray:
+        """The greatest danger (k,) that follows on answers (k, m + 1), inputs and mode, in k states."""
+        ahead = self._ahead = self._ahead or self.task.plant(AT_ONCE)
+        rows = np.arange(len(answer))
+        worst = np.full(len(answer), -np.inf)
+        ahead.set_state(qpos, qvel, rows)
         for _ in range(self.samples):
             u, q = answer[:, :-1], answer[:, -1].astype(int)
             ahead.step(u, rows)
@@ -94,8 +97,8 @@ class Lookahead:
             goes_on = outcome == Outcome.RUNNING
             failed = ~goes_on & (outcome != Outcome.REACHED)
             danger = np.where(failed, np.inf, self.task.danger(after))
-            worst[under_way] = np.maximum(worst[under_way], danger)
-            rows, under_way = rows[goes_on], under_way[goes_on]
+            worst[rows] = np.maximum(worst[rows], danger)
+            rows = rows[goes_on]
             if not len(rows):
                 break
             answer = np.column_stack(self._act(after[goes_on], q[goes_on]))
