@@ -15,7 +15,7 @@ from hyrl_mj.tasks.base import Outcome, Task
 # Modes of runs that have not started yet: their controller picks one from the first measurement.
 NOT_STARTED = -1
 # How many samples a plant with inertia is followed to see what an input leads to.
-AHEAD = 8
+AHEAD = 6
 # Simulations that are looked ahead of together.
 AT_ONCE = 2_048
 
