@@ -1,0 +1,171 @@
+"""A quadrotor: fly past a pillar at speed, on its left or on its right, to a gate behind it."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from hyrl_mj import mjcf
+from hyrl_mj.tasks.base import Mirror, Outcome, Task
+from hyrl_mj.tasks.chart import Chart
+from hyrl_mj.tasks.registry import register
+
+# Inner loop: how fast velocity, height, tilt and its rate follow [1/s, 1/s, 1/s^2, 1/s].
+VELOCITY, HEIGHT, TILT, RATE = 4.0, 2.0, 225.0, 24.0
+# The steepest tilt that the inner loop asks for, as sideways over upward acceleration.
+STEEPEST = 0.6
+# How close to the pillar it begins to matter [m]; the fastest drift to the side that the sets hold [m/s].
+NEAR, FASTEST = 0.3, 1.2
+# Tilt to the side that starts have at most [rad].
+START_TILT = 0.05
+
+
+@register
+class Quadrotor(Task):
+    name = "quadrotor"
+    description = "fly past a pillar on its left or on its right (DQN)"
+    inputs, input_units = ("lateral_velocity",), ("m/s",)
+    levels = 5
+    # Of the measurement: x, y, velocity to the side, tilt to the side, touching pillar or floor.
+    noisy = (1.0, 1.0, 0.0, 0.0, 0.0)
+    max_steps = 80
+    horizon = 0.5
+    worst_reward = 0.0
+    start_low, start_high = (0.0, -0.7, -0.3), (0.3, 0.7, 0.3)
+    replay_starts = tuple((0.0, y, 0.0) for y in (-0.15, -0.055, 0.0, 0.055, 0.15))
+    replay_time = 3.4
+    mode_names = ("left", "right")
+    algorithm = "dqn"
+    mirror = Mirror((1, -1, -1, -1), (-1,))
+    close = 0.4
+    observation_low = (-5.0, -4.0, -6.0, -1.0)
+    observation_high = (5.0, 4.0, 6.0, 1.0)
+
+    @cached_property
+    def chart(self) -> Chart:  # type: ignore[override]
+        centre, half = mjcf.site_pos(self.model, "arena"), mjcf.site_size(self.model, "arena")
+        low, high = (centre - half)[:2], (centre + half)[:2]
+        return Chart(
+            ("x", "y", "drift"),
+            ("m", "m", "m/s"),
+            (*low, -FASTEST),
+            (*high, FASTEST),
+            (False, False, False),
+        )
+
+    @cached_property
+    def set_point(self) -> np.ndarray:
+        """The middle of the gate, without a drift to the side (3,) [m, m, m/s]."""
+        return np.append(mjcf.site_pos(self.model, "set_point")[:2], 0.0)
+
+    @cached_property
+    def obstacle(self) -> np.ndarray:
+        """Centre of the pillar (2,) [m]."""
+        return mjcf.geom_pos(self.model, "obstacle")[:2]
+
+    @cached_property
+    def cruise(self) -> tuple[float, float]:
+        """Speed ahead [m/s] and height [m] that the inner loop keeps."""
+        speed, height = (mjcf.numeric(self.model, name, 1)[0] for name in ("speed", "height"))
+        return float(speed), float(height)
+
+    @cached_property
+    def mixer(self) -> np.ndarray:
+        """(4, 4): from thrust [N] and torques about the body's axes [Nm] to the thrust of each rotor."""
+        gear = self.model.actuator_gear
+        arm = self.model.site_pos[self.model.actuator_trnid[:, 0]]
+        # A rotor at (x, y) with thrust f turns the body by (y f, -x f) about its x and y axis.
+        return np.linalg.inv(np.stack([gear[:, 2], arm[:, 1], -arm[:, 0], gear[:, 5]]))
+
+    def measure(self, sensors: np.ndarray) -> np.ndarray:
+        return sensors[:, [0, 1, 4, 7, 9]]
+
+    def control(self, u: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        """Velocity, then tilt, then the rotors (n, 4) [N]."""
+        body = self.model.body("quadrotor")
+        (speed, height), gravity = self.cruise, -self.model.opt.gravity[2]
+        axes = rotation(qpos[:, 3:7])
+        climb = HEIGHT * (height - qpos[:, 2])
+        wanted = np.column_stack([np.full(len(u), speed), u[:, 0], climb]) - qvel[:, :3]
+        push = VELOCITY * wanted + [0.0, 0.0, gravity]
+        push[:, 2] = np.clip(push[:, 2], 0.5 * gravity, 1.3 * gravity)
+        sideways = np.linalg.norm(push[:, :2], axis=1)
+        room = STEEPEST * push[:, 2]
+        push[:, :2] *= np.minimum(1.0, room / np.maximum(sideways, 1e-9))[:, None]
+        up = axes[:, :, 2]
+        thrust = body.mass * (push * up).sum(axis=1)
+        # The turn from the body's up to where it shall push, and back to yaw 0, in the body's axes.
+        goal = push / np.linalg.norm(push, axis=1, keepdims=True)
+        turn = np.einsum("nji,nj->ni", axes, np.cross(up, goal))
+        turn[:, 2] = -np.arctan2(axes[:, 1, 0], axes[:, 0, 0])
+        torque = body.inertia * (TILT * turn - RATE * qvel[:, 3:6])
+        return self.share_out(thrust, torque)
+
+    def share_out(self, thrust: np.ndarray, torque: np.ndarray) -> np.ndarray:
+        """Thrusts (n, 4) of the rotors [N], inside their limits, for a thrust (n,) and torques (n, 3) [Nm].
+
+        Where not all can be had, keeping its attitude comes before keeping its height.
+        """
+        most = self.model.actuator_ctrlrange[0, 1]
+        turning = torque @ self.mixer[:, 1:].T
+        spread = turning.max(axis=1) - turning.min(axis=1)
+        turning *= np.minimum(1.0, most / np.maximum(spread, 1e-9))[:, None]
+        even = thrust * self.mixer[0, 0]
+        even = np.clip(even, -turning.min(axis=1), most - turning.max(axis=1))
+        return even[:, None] + turning
+
+    def state(
+        self, z: np.ndarray, rng: np.random.Generator | None = None
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        tilt = np.zeros(len(z)) if rng is None else rng.uniform(-1, 1, len(z)) * START_TILT
+        speed, height = self.cruise
+        qpos, qvel = np.zeros((len(z), 7)), np.zeros((len(z), 6))
+        qpos[:, :2], qpos[:, 2] = z[:, :2], height
+        qpos[:, 3], qpos[:, 4] = np.cos(tilt / 2), np.sin(tilt / 2)
+        qvel[:, 0], qvel[:, 1] = speed, z[:, 2]
+        return qpos, qvel
+
+    def z(self, measured: np.ndarray) -> np.ndarray:
+        return measured[:, :3]
+
+    def with_z(self, measured: np.ndarray, z: np.ndarray) -> np.ndarray:
+        return np.hstack([z, measured[:, 3:]])
+
+    def observation(self, measured: np.ndarray) -> np.ndarray:
+        return np.hstack([self.obstacle[0] - measured[:, :1], measured[:, 1:4]])
+
+    def clearance(self, measured: np.ndarray) -> np.ndarray:
+        """Distance of the hull from the pillar: (n,) [m]."""
+        radii = sum(mjcf.geom_size(self.model, name)[0] for name in ("obstacle", "hull"))
+        return np.asarray(np.linalg.norm(measured[:, :2] - self.obstacle, axis=1) - radii)
+
+    def reward(self, measurement: np.ndarray) -> np.ndarray:
+        near = np.clip(1 - self.clearance(measurement) / NEAR, 0.0, 1.0)
+        reward = np.maximum(3 - np.abs(measurement[:, 1]) - near, 0.0)
+        return np.where(self.failed(measurement), 0.0, reward)
+
+    def ending(self, measurement: np.ndarray) -> np.ndarray:
+        x, y, _, _, touching = measurement.T
+        ends = np.full(len(measurement), Outcome.RUNNING)
+        ends[x >= self.set_point[0]] = Outcome.REACHED
+        ends[np.abs(y) >= self.chart.high[1]] = Outcome.OUT_OF_BOUNDS
+        ends[(touching > 0) | (self.clearance(measurement) <= 0)] = Outcome.CRASHED
+        return ends
+
+    def miss(self, z: np.ndarray) -> np.ndarray:
+        return np.abs(z[:, 1] - self.set_point[1])
+
+    def danger(self, measurement: np.ndarray) -> np.ndarray:
+        return -self.clearance(measurement)
+
+
+def rotation(quaternion: np.ndarray) -> np.ndarray:
+    """Rotation matrices (n, 3, 3) of unit quaternions (n, 4): columns are the body's axes."""
+    w, x, y, z = quaternion.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)

@@ -1,0 +1,125 @@
+"""The quadrotor flies as its rotors let it, and decides in time or crashes."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hyrl_mj
+from hyrl_mj import Outcome
+from hyrl_mj.controllers import PolicyController
+from hyrl_mj.simulation import closed_loop
+from hyrl_mj.tasks.quadrotor import rotation
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "scripts"))
+
+from robots import Expert
+
+
+@pytest.fixture(scope="module")
+def quadrotor():
+    return hyrl_mj.get_task("quadrotor")
+
+
+class Constant:
+    """One input for ever."""
+
+    def __init__(self, u):
+        self.u = u
+
+    def act(self, measured):
+        return np.full((len(measured), 1), self.u)
+
+
+def fly(task, policy, z0, steps=None):
+    return closed_loop(task, PolicyController(policy), np.array(z0), steps=steps, quiet=True)
+
+
+def test_a_rotation_is_that_of_mujoco(quadrotor):
+    import mujoco
+
+    quaternions = np.random.default_rng(0).normal(size=(20, 4))
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    for quaternion, matrix in zip(quaternions, rotation(quaternions), strict=True):
+        expected = np.empty(9)
+        mujoco.mju_quat2Mat(expected, quaternion)
+        np.testing.assert_allclose(matrix, expected.reshape(3, 3), atol=1e-12)
+
+
+def test_it_keeps_speed_and_height(quadrotor):
+    plant = quadrotor.plant(1)
+    plant.set_state(*quadrotor.state(np.array([[0.0, 1.2, 0.0]])))
+    for _ in range(40):
+        plant.step(np.zeros((1, 1)))
+    speed, height = quadrotor.cruise
+    assert plant.qpos[0, 2] == pytest.approx(height, abs=0.02)
+    assert plant.qvel[0, 0] == pytest.approx(speed, abs=0.02)
+    assert plant.measurement[0, 1] == pytest.approx(1.2, abs=1e-3)
+
+
+@pytest.mark.parametrize("u", [-1.0, -0.5, 1.0])
+def test_its_lateral_velocity_follows_after_a_while(quadrotor, u):
+    path = fly(quadrotor, Constant(u), [[0.0, -u / 2, 0.0]], steps=20).path[:, 0, 1]
+    velocity = np.diff(path) / 0.05
+    assert abs(velocity[0]) < 0.2 * abs(u)
+    assert velocity[-1] == pytest.approx(u, rel=0.15)
+
+
+def test_its_start_states_drift_as_the_chart_says(quadrotor):
+    z = quadrotor.starts(30, np.random.default_rng(0))
+    plant = quadrotor.plant(len(z))
+    plant.set_state(*quadrotor.state(z, np.random.default_rng(1)))
+    np.testing.assert_allclose(plant.measurement[:, :3], z, atol=1e-12)
+    tilt = plant.measurement[:, 3]
+    assert 0.02 < np.abs(tilt).max() <= 0.051
+
+
+def test_its_thrust_has_limits(quadrotor):
+    low, high = quadrotor.model.actuator_ctrlrange.T
+    rng = np.random.default_rng(0)
+    thrust, torque = rng.uniform(0, 12, 500), rng.normal(size=(500, 3)) * [0.3, 0.3, 0.02]
+    shared = quadrotor.share_out(thrust, torque)
+    assert (shared >= low - 1e-9).all()
+    assert (shared <= high + 1e-9).all()
+    wanted = np.column_stack([thrust, torque]) @ quadrotor.mixer.T
+    within = ((wanted >= low) & (wanted <= high)).all(axis=1)
+    assert 20 < within.sum() < 480
+    np.testing.assert_allclose(shared[within], wanted[within])
+    # In flight they are met: full thrust on one side while it rolls.
+    plant = quadrotor.plant(1)
+    plant.set_state(*quadrotor.state(np.zeros((1, 3))))
+    plant.step(np.array([[1.0]]))
+    asked = [quadrotor.control(np.array([[u]]), plant.qpos, plant.qvel) for u in (1.0, -1.0)]
+    assert max(a.max() for a in asked) == pytest.approx(high[0])
+
+
+def test_its_mixer_gives_the_torques_that_are_asked_for(quadrotor):
+    wanted = np.array([8.0, 0.1, -0.2, 0.03])
+    thrust = quadrotor.mixer @ wanted
+    arms = [
+        quadrotor.model.site(n).pos
+        for n in ("front_left", "back_left", "back_right", "front_right")
+    ]
+    torque = sum(np.cross(arm, [0, 0, f]) for arm, f in zip(arms, thrust, strict=True))
+    twist = thrust @ quadrotor.model.actuator_gear[:, 5]
+    np.testing.assert_allclose([thrust.sum(), *torque[:2], twist], wanted, atol=1e-12)
+
+
+def test_its_mirror_image_flies_the_mirrored_way(quadrotor):
+    z = quadrotor.starts(20, np.random.default_rng(0))
+    runs = [fly(quadrotor, Constant(u), z * [1, s, s], 15) for u, s in ((0.9, 1), (-0.9, -1))]
+    np.testing.assert_allclose(runs[0].path, runs[1].path * [1, -1, -1], atol=1e-6)
+
+
+def test_who_decides_late_crashes(quadrotor):
+    starts = [[x, 0.0, 0.0] for x in (0.0, 0.3, 1.7)]
+    for side in (1, -1):
+        outcome = fly(quadrotor, Expert(quadrotor, side), starts).outcome
+        assert outcome.tolist() == [Outcome.REACHED, Outcome.REACHED, Outcome.CRASHED]
+
+
+def test_an_expert_survives_from_every_start(quadrotor):
+    z = quadrotor.starts(300, np.random.default_rng(0))
+    won = [fly(quadrotor, Expert(quadrotor, s), z).outcome == Outcome.REACHED for s in (1, -1)]
+    assert np.any(won, axis=0).all()

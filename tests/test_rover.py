@@ -1,0 +1,119 @@
+"""The rover rolls on its wheels as its MJCF says, and decides in time or crashes."""
+
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+import hyrl_mj
+from hyrl_mj import Outcome
+from hyrl_mj.controllers import PolicyController
+from hyrl_mj.simulation import closed_loop
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "scripts"))
+
+from robots import Expert
+
+
+@pytest.fixture(scope="module")
+def rover():
+    return hyrl_mj.get_task("rover")
+
+
+class Constant:
+    """One input for ever."""
+
+    def __init__(self, u):
+        self.u = u
+
+    def act(self, measured):
+        return np.full((len(measured), 1), self.u)
+
+
+def drive(task, policy, z0, steps=None):
+    return closed_loop(task, PolicyController(policy), np.array(z0), steps=steps, quiet=True)
+
+
+def test_it_stands_on_two_wheels_and_a_caster(rover):
+    model, data = rover.model, mujoco.MjData(rover.model)
+    qpos, _ = rover.state(np.zeros((1, 3)))
+    data.qpos[:] = qpos[0]
+    for _ in range(200):
+        mujoco.mj_step(model, data)
+    floor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "floor")
+    touching = {model.geom(g).name for c in data.contact for g in c.geom if g != floor}
+    assert touching == {"left_tyre", "right_tyre", "caster"}
+    assert np.abs(data.qvel).max() < 0.02
+    weight = model.body_mass.sum() * 9.81
+    forces = np.zeros((data.ncon, 6))
+    for i, force in enumerate(forces):
+        mujoco.mj_contactForce(model, data, i, force)
+    assert forces[:, 0].sum() == pytest.approx(weight, rel=0.02)
+
+
+def test_it_drives_straight_at_its_speed(rover):
+    path = drive(rover, Constant(0.0), [[0.0, 1.0, 0.0]], steps=40).path[:, 0]
+    assert path[-1, 0] == pytest.approx(2.0, abs=0.1)
+    np.testing.assert_allclose(path[:, 1:], [[1.0, 0.0]] * len(path), atol=5e-3)
+
+
+@pytest.mark.parametrize("u", [-1.2, -0.6, 0.6, 1.2])
+def test_it_turns_at_the_rate_that_is_asked_for(rover, u):
+    heading = drive(rover, Constant(u), [[0.0, 0.0, 0.0]], steps=10).path[:, 0, 2]
+    assert (heading[10] - heading[4]) / 0.3 == pytest.approx(u, rel=0.15)
+    # It takes a while: what has inertia does not jump.
+    assert abs(heading[1]) < 0.8 * abs(u) * 0.05
+
+
+def test_its_mirror_image_drives_the_mirrored_way(rover):
+    rng = np.random.default_rng(0)
+    z = rover.starts(20, rng)
+    runs = [drive(rover, Constant(u), z * [1, s, s], 15) for u, s in ((1.1, 1), (-1.1, -1))]
+    np.testing.assert_allclose(runs[0].path, runs[1].path * [1, -1, -1], atol=1e-4)
+
+
+def test_what_touches_the_pillar_has_crashed(rover):
+    rollout = drive(rover, Constant(0.0), [[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    assert rollout.outcome.tolist() == [Outcome.CRASHED, Outcome.REACHED]
+    plant = rover.plant(1)
+    plant.set_state(*rover.state(np.array([[1.5, 0.0, 0.0]])))
+    while rover.ending(plant.measurement) == Outcome.RUNNING:
+        plant.step(np.zeros((1, 1)))
+    x = plant.measurement[0, 0]
+    assert x == pytest.approx(2.3 - 0.45 - 0.16 + 0.035, abs=0.06)
+
+
+def test_who_decides_late_crashes(rover):
+    starts = [[x, 0.0, 0.0] for x in (0.0, 0.3, 1.4)]
+    for side in (1, -1):
+        outcome = drive(rover, Expert(rover, side), starts).outcome
+        assert outcome.tolist() == [Outcome.REACHED, Outcome.REACHED, Outcome.CRASHED]
+
+
+def test_an_expert_survives_from_every_start(rover):
+    z = rover.starts(300, np.random.default_rng(0))
+    survived = [drive(rover, Expert(rover, s), z).outcome == Outcome.REACHED for s in (1, -1)]
+    assert np.any(survived, axis=0).all()
+
+
+def test_its_start_states_move_at_the_speed_of_its_wheels(rover):
+    _, qvel = rover.state(np.array([[0.1, 0.2, 0.3]]), np.random.default_rng(0))
+    speed = np.hypot(*qvel[0, :2])
+    assert speed == pytest.approx(rover.speed)
+    radius, half, _ = rover.wheels
+    left, right = qvel[0, 6:]
+    assert (left + right) / 2 * radius == pytest.approx(speed)
+    assert (right - left) * radius / (2 * half) == pytest.approx(qvel[0, 5])
+    assert qvel[0, 5] != 0
+
+
+def test_a_detour_earns_less_than_the_goal(rover):
+    at = rover.set_point[0]
+    measured = np.zeros((3, 5))
+    measured[:, 0], measured[2, 1] = (at, at - 0.5, at), 0.8
+    goal, on_the_way, off = rover.reward(measured)
+    # To drive on for ever is worth 1 / (1 - 0.9) samples' reward to the policies of the modes.
+    assert goal > on_the_way / (1 - 0.9)
+    assert off < goal
