@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
+from hyrl_mj.errors import BadInput
 from hyrl_mj.policies import Policy
 
 
@@ -42,3 +44,20 @@ class PolicyController:
 
     def step(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self.policy.act(measured), q
+
+
+def as_controller(loop: Controller | Policy) -> Controller:
+    """A controller itself, or a policy in the shape of one."""
+    return PolicyController(loop) if isinstance(loop, Policy) else loop
+
+
+def check_modes(q: np.ndarray, modes: Sequence[int]) -> np.ndarray:
+    """Modes (n,) themselves, if all of them are among `modes`.
+
+    Raises:
+        BadInput: one is not.
+    """
+    unknown = q[~np.isin(q, modes)]
+    if len(unknown):
+        raise BadInput(f"mode {unknown[0]} is unknown: choose one of {tuple(modes)}")
+    return q

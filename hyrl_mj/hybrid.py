@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from hyrl_mj.controllers import check_modes
 from hyrl_mj.errors import BadInput
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import Complement, StateSet
@@ -126,6 +127,5 @@ class HybridController:
             return {int(q[0]): slice(None)}  # without a copy
         rows = {mode: (q == mode).nonzero()[0] for mode in self.modes}
         if sum(map(len, rows.values())) < len(q):
-            wrong = q[~np.isin(q, self.modes)]
-            raise BadInput(f"mode {wrong[0]} is unknown: choose one of {self.modes}")
+            check_modes(q, self.modes)
         return {mode: r for mode, r in rows.items() if len(r)}

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from hyrl_mj import artifacts
 from hyrl_mj.adversary import NOT_STARTED, Adversary, Lookahead
-from hyrl_mj.controllers import Controller, PolicyController
+from hyrl_mj.controllers import Controller, PolicyController, as_controller, check_modes
 from hyrl_mj.errors import BadInput
 from hyrl_mj.noise import Noise, Recorded, check_seed
 from hyrl_mj.plant import Plant
@@ -266,17 +266,14 @@ def simulate(
     if isinstance(noise, Noise):
         task.check_noise(noise.bound, noise.everywhere)
     steps = None if horizon is None else samples(task, horizon)
-    loop = PolicyController(controller) if isinstance(controller, Policy) else controller
+    loop = as_controller(controller)
     if q0 is not None:
         q0 = np.asarray(q0)
         if q0.shape not in ((), (len(starts),)):
             raise BadInput(
                 f"{len(starts)} starts need one q0 or {len(starts)}, got shape {q0.shape}"
             )
-        q0 = np.broadcast_to(q0, len(starts))
-        unknown = q0[~np.isin(q0, loop.modes)]
-        if len(unknown):
-            raise BadInput(f"mode {unknown[0]} is unknown: choose one of {loop.modes}")
+        q0 = check_modes(np.broadcast_to(q0, len(starts)), loop.modes)
     rollout = closed_loop(
         task, loop, starts, noise=noise, q0=q0, steps=steps, seed=seed, record=True
     )
