@@ -277,6 +277,31 @@ def test_sb3_is_told_that_time_was_up(circle):
     assert not done.any()
 
 
+def test_sb3_starts_where_its_options_say_once(task):
+    env, z = TaskVecEnv(BatchedEnv(task, 2)), np.array(task.replay_starts[:2])
+    env.seed(0)
+
+    def first_seen(z):
+        return task.observation(z).astype(np.float32)
+
+    env.set_options([{"z": start} for start in z])
+    np.testing.assert_array_equal(env.reset(), first_seen(z))
+    assert not np.array_equal(env.reset(), first_seen(z))
+    env.set_options({"z": z[0]})
+    np.testing.assert_array_equal(env.reset(), first_seen(z[[0, 0]]))
+
+
+def test_starts_that_do_not_fit_are_refused(vehicle):
+    env = TaskVecEnv(BatchedEnv(vehicle, 2))
+    for options in ([{"z": [0.0, 0.1]}, {}], {"z": [0.0]}, {"z": [9.0, 0.0]}):
+        env.set_options(options)
+        with pytest.raises(BadInput, match="vehicle"):
+            env.reset()
+    env.set_options([{"z": [0.0, 0.1]}] * 3)
+    with pytest.raises(BadInput, match=r"2 episode\(s\) need as many starts, got 3"):
+        env.reset()
+
+
 # ---- noise and domain
 
 

@@ -100,11 +100,16 @@ class BatchedEnv:
 
         Returns:
             (k, o) float32, their first observations.
+
+        Raises:
+            BadInput: another number of starts than of rows.
         """
         ids = self._everyone if ids is None else ids
         if z is None:
             draw = self.task.starts if self.domain is None else self.domain.starts
             z = draw(len(ids), self._rng)
+        if len(z) != len(ids):
+            raise BadInput(f"{len(ids)} episode(s) need as many starts, got {len(z)}")
         self.plant.set_state(*self.task.state(z, self._rng), ids=ids)
         self._samples[ids] = 0
         return self.task.observation(self._measure(ids)).astype(np.float32)

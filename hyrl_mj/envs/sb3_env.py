@@ -29,9 +29,12 @@ class TaskVecEnv(VecEnv):
         return [seed] * self.num_envs
 
     def reset(self) -> np.ndarray:
-        """Start all episodes."""
+        """Start all episodes, at chart points if `set_options([{"z": z}, ...])` gave one to each."""
+        given = [options.get("z") for options in self._options]
+        self._reset_options()
+        z = None if all(point is None for point in given) else self.core.task.check_state(given)
         self._returns[:], self._lengths[:] = 0, 0
-        return self.core.reset()
+        return self.core.reset(z=z)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions for `step_wait`."""
