@@ -79,6 +79,19 @@ def test_chart_and_state_belong_together(task: Task) -> None:
     np.testing.assert_allclose(task.z(task.with_z(plant.measurement, other)), other, atol=1e-9)
 
 
+def test_an_observation_leads_back_to_its_measurement(task: Task) -> None:
+    if type(task).measured is Task.measured:
+        pytest.skip("the task has no measured(observation)")
+    rng, plant = np.random.default_rng(0), task.plant(500)
+    z = rng.uniform(task.chart.low, task.chart.high, (500, task.chart.dimension))
+    plant.set_state(*task.state(z, rng))
+    seen = task.observation(plant.measurement).astype(np.float32).astype(float)
+    measured = task.measured(seen)
+    off = task.chart.difference(task.z(measured), task.z(plant.measurement))
+    assert (np.abs(off) <= 1e-5 * task.chart.sides).all(), "not where the chart says"
+    np.testing.assert_allclose(task.observation(measured), seen, rtol=1e-5, atol=1e-5)
+
+
 def test_the_ways_that_runs_go_are_its_modes(task: Task) -> None:
     class Straight:
         def act(self, measured: np.ndarray) -> np.ndarray:

@@ -278,6 +278,19 @@ class Task(ABC):
     def observation(self, measured: np.ndarray) -> np.ndarray:
         """What the network is fed: (n, k)."""
 
+    def measured(self, observation: np.ndarray) -> np.ndarray:
+        """Measurements (n, p) of observations (n, k): `observation` undone, if a task can do that.
+
+        Columns that neither the chart nor the networks read may hold any value.
+
+        Raises:
+            BadInput: the task does not say how.
+        """
+        raise BadInput(
+            f"{self.name} does not say which measurement an observation belongs to: "
+            "give it a measured(observation)"
+        )
+
     @abstractmethod
     def reward(self, measurement: np.ndarray) -> np.ndarray:
         """Reward (n,) of the true state after the step."""

@@ -54,6 +54,10 @@ class UnitCircle(Task):
     def observation(self, measured: np.ndarray) -> np.ndarray:
         return np.hstack([np.cos(measured), np.sin(measured)])
 
+    def measured(self, observation: np.ndarray) -> np.ndarray:
+        cosine, sine = observation[:, :1], observation[:, 1:]
+        return self.chart.wrap(np.arctan2(sine, cosine))
+
     def reward(self, measurement: np.ndarray) -> np.ndarray:
         return -np.abs(self.error(measurement)) / PI
 

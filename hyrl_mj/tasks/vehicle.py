@@ -94,6 +94,17 @@ class Vehicle(Task):
         seen[:, 2] = measured[:, 1]
         return seen
 
+    def measured(self, observation: np.ndarray) -> np.ndarray:
+        d_o, d_g, y = observation.T
+        (x_o, y_o), (x_g, y_g) = self.obstacle, self.set_point
+        # The squared distances along x from obstacle and set-point.
+        to_obstacle = (d_o + self.radius) ** 2 - (y - y_o) ** 2
+        to_go = d_g**2 - (y - y_g) ** 2
+        x = (x_o + x_g) / 2 + (to_obstacle - to_go) / (2 * (x_g - x_o))
+        # Inside the obstacle, where noise may put it, the clearance is 0 and tells nothing.
+        inside = x_g - np.sqrt(np.maximum(to_go, 0.0))
+        return np.stack([np.where(d_o > 0, x, inside), y], axis=1)
+
     def reward(self, measurement: np.ndarray) -> np.ndarray:
         d_o = self.clearance(measurement)
         barrier = (d_o - 1.5) ** 2 - np.log(np.maximum(d_o, 1e-6))
