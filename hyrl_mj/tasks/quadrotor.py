@@ -135,6 +135,10 @@ class Quadrotor(Task):
     def observation(self, measured: np.ndarray) -> np.ndarray:
         return np.hstack([self.obstacle[0] - measured[:, :1], measured[:, 1:4]])
 
+    def measured(self, observation: np.ndarray) -> np.ndarray:
+        unseen = np.zeros((len(observation), 1))
+        return np.hstack([self.obstacle[0] - observation[:, :1], observation[:, 1:], unseen])
+
     def clearance(self, measured: np.ndarray) -> np.ndarray:
         """Distance of the hull from the pillar: (n,) [m]."""
         radii = sum(mjcf.geom_size(self.model, name)[0] for name in ("obstacle", "hull"))

@@ -108,6 +108,10 @@ class Rover(Task):
         ahead = self.obstacle[0] - measured[:, :1]
         return np.hstack([ahead, measured[:, 1:3]])
 
+    def measured(self, observation: np.ndarray) -> np.ndarray:
+        unseen = np.zeros((len(observation), 2))
+        return np.hstack([self.obstacle[0] - observation[:, :1], observation[:, 1:], unseen])
+
     def clearance(self, measured: np.ndarray) -> np.ndarray:
         """How far the bumper's middle is from touching the pillar: (n,) [m]."""
         bumper = mjcf.geom_pos(self.model, "bumper")[0]
