@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import load_file, save
 
-from hyrl_mj.errors import BadArtifact, BadInput
+from hyrl_mj.errors import BadArtifact, BadInput, brief
 
 # Raised whenever a file of an older version can no longer be read.
 VERSION = 1
@@ -43,10 +43,17 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """Turn whatever a damaged file makes its reader raise into one clear sentence."""
+def reading(path: Path, remedy: str = "") -> Iterator[None]:
+    """Turn whatever a damaged file makes its reader raise into one clear sentence.
+
+    Args:
+        path: the file.
+        remedy: what to do about it; by default to run the stage that writes it.
+    """
     if not path.is_file():
-        raise BadArtifact(f"there is no file {path}: run the stage that writes it first")
+        raise BadArtifact(
+            f"there is no file {path}: {remedy or 'run the stage that writes it first'}"
+        )
     try:
         yield
     except BadArtifact as error:
@@ -54,8 +61,8 @@ def reading(path: Path) -> Iterator[None]:
     # The readers of damaged files raise whatever the damage leads them to.
     except Exception as error:
         raise BadArtifact(
-            f"{path} cannot be read ({type(error).__name__}: {error}): it is truncated or not what "
-            "its name says; run the stage that writes it again"
+            f"{path} cannot be read ({brief(error)}): it is truncated or not what its name says; "
+            f"{remedy or 'run the stage that writes it again'}"
         ) from error
 
 

@@ -19,16 +19,16 @@ from torch import nn
 from hyrl_mj import symmetry
 from hyrl_mj.envs.core import BatchedEnv, Domain
 from hyrl_mj.envs.sb3_env import TaskVecEnv
-from hyrl_mj.errors import unknown
+from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.noise import SIGNALS, Noise
-from hyrl_mj.policies import MlpPolicy
+from hyrl_mj.policies import TORCH_NAMES, MlpPolicy
 from hyrl_mj.progress import Progress
 from hyrl_mj.settings import Training
 from hyrl_mj.tasks.base import Outcome, Task
 
 Score = tuple[float, ...]
 ALGORITHMS: dict[str, type[PPO] | type[DQN]] = {"ppo": PPO, "dqn": DQN}
-ACTIVATIONS = {"relu": nn.ReLU, "tanh": nn.Tanh}
+ACTIVATIONS = {name: getattr(nn, torch_name) for name, torch_name in TORCH_NAMES.items()}
 # How often TensorBoard gets a point: PPO counts rollouts, DQN episodes.
 LOG_INTERVAL = {"ppo": 1, "dqn": 100}
 # The learning rate falls to this share of its first value, not to zero: the last samples count too.
@@ -95,7 +95,11 @@ def build(
     domain: Domain | None = None,
     start_from: MlpPolicy | None = None,
 ) -> BaseAlgorithm:
-    """The SB3 algorithm that `train` runs, ready to learn."""
+    """The SB3 algorithm that `train` runs, ready to learn.
+
+    Raises:
+        BadInput: an unknown algorithm, or a policy to start from whose networks are those of another one.
+    """
     if settings.algorithm not in ALGORITHMS:
         raise unknown("algorithm", settings.algorithm, ALGORITHMS)
     hidden = settings.hidden if start_from is None else start_from.hidden
@@ -114,7 +118,13 @@ def build(
     )
     if start_from is not None:
         state = {name: torch.as_tensor(np.array(w)) for name, w in start_from.weights.items()}
-        model.policy.load_state_dict(state)
+        try:
+            model.policy.load_state_dict(state)
+        except RuntimeError as error:
+            raise BadInput(
+                f"training with {settings.algorithm} cannot go on from this {start_from.algorithm} "
+                "policy, whose networks are other ones: start afresh"
+            ) from error
     if settings.symmetric and start_from is None and task.mirror is not None:
         symmetry.impose(model.policy, task)
     return model

@@ -113,8 +113,8 @@ def test_a_truncated_policy_is_named(policy, tmp_path, ending):
         ({"version": 2}, "version 2"),
         ({"kind": "critical set"}, "'critical set', not 'policy'"),
         ({"task": "humanoid"}, "unknown task 'humanoid'"),
-        ({"algorithm": "sac"}, "'sac'"),
-        ({"activation": "gelu"}, "'gelu'"),
+        ({"algorithm": "trpo"}, "'trpo'"),
+        ({"activation": "softplus"}, "'softplus'"),
     ],
 )
 def test_a_description_that_does_not_fit_is_named(policy, tmp_path, change, message):
@@ -136,8 +136,11 @@ def test_a_description_without_a_task_is_named(policy, tmp_path):
 
 def test_the_network_of_another_task_is_refused(circle, vehicle, tmp_path):
     policy = export(build(circle, preset(circle, "smoke").stage1, seed=0), circle)
-    with pytest.raises(BadArtifact, match=r"takes 2 and gives 1 numbers.* vehicle needs 3 and 5"):
+    with pytest.raises(BadArtifact, match=r"continuous inputs.* vehicle takes one of 5 discrete"):
         MlpPolicy(vehicle, "ppo", "tanh", policy.weights)
+    plain = {name: weight for name, weight in policy.weights.items() if name != "log_std"}
+    with pytest.raises(BadArtifact, match=r"takes 2 and gives 1 numbers.* vehicle needs 3 and 5"):
+        MlpPolicy(vehicle, "ppo", "tanh", plain)
     with pytest.raises(BadArtifact, match="holds no network of a dqn policy"):
         MlpPolicy(vehicle, "dqn", "relu", policy.weights)
 

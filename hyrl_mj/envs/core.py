@@ -151,17 +151,9 @@ class BatchedEnv:
 
     def inputs(self, actions: np.ndarray) -> np.ndarray:
         """Inputs (n, m) in the plant's units for actions: levels (n,) int, or inputs (n, m) to clip."""
-        levels = self.task.input_levels
-        if levels is None:
+        if self.task.input_levels is None:
             return np.clip(np.asarray(actions, dtype=float), *self.task.input_limits)
-        actions = np.asarray(actions)
-        whole = np.issubdtype(actions.dtype, np.integer)
-        if not whole or (actions < 0).any() or (actions >= len(levels)).any():
-            raise BadInput(
-                f"action {actions!r} cannot be used: {self.task.name} takes integers from 0 to "
-                f"{len(levels) - 1}"
-            )
-        return levels[actions]
+        return self.task.at_levels(actions)
 
     def _measure(self, ids: np.ndarray) -> np.ndarray:
         """Noisy measurements (k, p) of the rows `ids`."""

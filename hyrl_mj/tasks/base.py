@@ -141,6 +141,23 @@ class Task(ABC):
         low, high = self.input_limits
         return None if self.levels is None else np.linspace(low, high, self.levels)
 
+    def at_levels(self, actions: np.ndarray) -> np.ndarray:
+        """Inputs (n, m) of a discrete task for the numbers of its levels (n,) int.
+
+        Raises:
+            BadInput: a number that is not an integer, or not of a level.
+        """
+        levels, actions = self.input_levels, np.asarray(actions)
+        assert levels is not None
+        whole = np.issubdtype(actions.dtype, np.integer)
+        wrong = actions if not whole else actions[(actions < 0) | (actions >= len(levels))]
+        if wrong.size:
+            raise BadInput(
+                f"action {wrong.flat[0]} cannot be used: {self.name} takes integers from 0 to "
+                f"{len(levels) - 1}"
+            )
+        return levels[actions]
+
     @cached_property
     def set_point(self) -> np.ndarray | None:
         """Where it is to go, a chart point (d,), if that is a single one."""
