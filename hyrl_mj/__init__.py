@@ -6,6 +6,7 @@ Importing this package needs neither torch nor a GL library.
 """
 
 from hyrl_mj import mjcf as _mjcf  # first: it chooses the GL backend before mujoco is imported
+from hyrl_mj.agents import from_callable, load_agent
 from hyrl_mj.controllers import Controller
 from hyrl_mj.critical_set import CriticalSet, find_critical_set
 from hyrl_mj.errors import BadArtifact, BadInput, HyrlError, NoRenderer
@@ -50,7 +51,9 @@ __all__ = [
     "closed_loop",
     "extend",
     "find_critical_set",
+    "from_callable",
     "get_task",
+    "load_agent",
     "load_run",
     "make_partition",
     "register",

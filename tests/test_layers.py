@@ -17,7 +17,7 @@ from hyrl_mj.training import build, export
 PACKAGE = Path(hyrl_mj.__file__).parent
 ORDER = (
     "errors", "progress", "colours", "mjcf", "plant", "noise", "tasks", "settings", "artifacts",
-    "policies", "controllers", "adversary", "rendering", "encoding", "envs", "simulation",
+    "policies", "agents", "controllers", "adversary", "rendering", "encoding", "envs", "simulation",
     "task_tests", "symmetry", "training", "sets", "lattice", "game", "critical_set", "partition", "limit",
     "extended_sets", "section", "retraining",
     "hybrid", "robustness", "episodes", "run_directory", "tables", "figures", "replay", "viewing", "arcs",
