@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -227,7 +228,8 @@ def _tensors(content: bytes) -> dict[str, np.ndarray]:
     try:
         if size > LARGEST:
             raise BadArtifact("its policy.pth is too large for an MLP policy")
-        state = torch.load(io.BytesIO(content), weights_only=True, map_location="cpu")
+        with warnings.catch_warnings(action="ignore"):  # of odd pickles, which are refused anyway
+            state = torch.load(io.BytesIO(content), weights_only=True, map_location="cpu")
     except UnpicklingError as error:
         # torch's own sentence recommends to load it unsafely.
         raise BadArtifact(
