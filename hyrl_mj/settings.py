@@ -24,7 +24,7 @@ class Training:
         samples: environment samples in all.
         envs: episodes side by side.
         hidden: widths of the hidden layers.
-        activation: "relu" or "tanh".
+        activation: between the layers, one of `hyrl_mj.policies.ACTIVATIONS`.
         learning_rate: at the start.
         anneal: whether it falls linearly to (almost) zero.
         gamma: discount factor.

@@ -343,6 +343,15 @@ def test_what_is_no_agent_is_named(agent, circle, tmp_path):
         load_agent(rewritten(agent, policy_pth=None), circle)
 
 
+@pytest.mark.parametrize("algorithm", [PPO, SAC])
+def test_an_agent_with_state_dependent_exploration_is_refused(algorithm, circle, tmp_path):
+    options = {"buffer_size": 10} if algorithm is SAC else {}
+    env = TaskVecEnv(BatchedEnv(circle, 1))
+    model = algorithm("MlpPolicy", env, device="cpu", use_sde=True, **options)
+    with pytest.raises(BadArtifact, match="use_sde"):
+        load_agent(saved(model, tmp_path), circle)
+
+
 def add(name):
     return lambda state: {**state, name: torch.zeros(2, 2)}
 
@@ -355,7 +364,6 @@ def add(name):
         (add("features_extractor.extractors.image.cnn.0.weight"), "observations are a dict"),
         (add("features_extractor.layer.weight"), "features extractor of its own"),
         (add("lstm_actor.weight_ih_l0"), "recurrent policy"),
-        (add("log_std"), "use_sde"),
         (add("mlp_extractor.policy_net.1.weight"), "no linear layer with a bias"),
         (lambda state: {"encoder.weight": torch.zeros(2, 2)}, r"its tensors \(encoder.weight\)"),
         (lambda state: {n: t for n, t in state.items() if n != "action_net.bias"}, "with a bias"),
