@@ -10,6 +10,7 @@ from hyrl_mj.agents import from_callable, load_agent
 from hyrl_mj.controllers import Controller
 from hyrl_mj.critical_set import CriticalSet, find_critical_set
 from hyrl_mj.errors import BadArtifact, BadInput, HyrlError, NoRenderer
+from hyrl_mj.export import export_numpy, export_onnx
 from hyrl_mj.extended_sets import ExtendedSets, extend
 from hyrl_mj.hybrid import HybridController
 from hyrl_mj.noise import Noise, Recorded
@@ -49,6 +50,8 @@ __all__ = [
     "StateSet",
     "Task",
     "closed_loop",
+    "export_numpy",
+    "export_onnx",
     "extend",
     "find_critical_set",
     "from_callable",

@@ -278,6 +278,21 @@ def report(run_dir: RunDir, out: Path | None = None) -> None:
     print(f"page at {out}")
 
 
+def export(run_dir: RunDir, to: str, out: Path) -> None:
+    """Write the hybrid controller of a run so that it works without hyrl_mj.
+
+    Args:
+        run_dir: a run directory.
+        to: onnx (one file, q and measured in, u and q_next out; -1 as the first q), or numpy (a folder
+            with controller.py and controller.npz, which need NumPy alone).
+        out: the file or the folder to write.
+    """
+    from hyrl_mj.export import export
+
+    export(pipeline.load_run(run_dir).controller, to, out)
+    print(f"controller at {out}")
+
+
 def doctor() -> None:
     """Tell whether this machine can train, render and encode video, and what to do where it cannot."""
     from hyrl_mj.doctor import report
@@ -303,6 +318,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "replay": replay,
     "view": view,
     "report": report,
+    "export": export,
     "doctor": doctor,
 }
 

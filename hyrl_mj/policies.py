@@ -217,7 +217,19 @@ class MlpPolicy(ObservationPolicy):
     @property
     def hidden(self) -> tuple[int, ...]:
         """Widths of the hidden layers."""
-        return tuple(len(bias) for _, bias in self._network[:-1])  # type: ignore[attr-defined]
+        return tuple(len(bias) for _, bias in self.layers[:-1])
+
+    @property
+    def layers(self) -> list[Layer]:
+        """Weight (outputs, inputs) and bias (outputs,) of each layer, from observation to output."""
+        return self._network  # type: ignore[attr-defined]
+
+    @property
+    def output(self) -> str:
+        """What the last layer gives: the value of each "level", or the input, to "clip" or "squash" to its limits."""
+        if self._levels is not None:
+            return "level"
+        return "squash" if self._layout.squashed else "clip"
 
     def inputs(self, observation: np.ndarray) -> np.ndarray:
         """Inputs (n, m) in the plant's units for observations (n, k)."""
@@ -266,7 +278,7 @@ class MlpPolicy(ObservationPolicy):
     def outputs(self, observation: np.ndarray) -> np.ndarray:
         """The network's last layer for observations (n, k): action values or preferences of a
         discrete task's levels, else the mean input, before it is squashed if it is."""
-        return self._run(observation, self._network[-1])  # type: ignore[attr-defined]
+        return self._run(observation, self.layers[-1])
 
     def _run(self, observation: np.ndarray, last: Layer) -> np.ndarray:
         """What `last` gives on top of the hidden layers, for observations (n, k)."""
@@ -279,7 +291,7 @@ class MlpPolicy(ObservationPolicy):
 
     def _forward(self, x: np.ndarray, last: Layer) -> np.ndarray:
         activate = ACTIVATIONS[self.activation]
-        for weight, bias in self._network[:-1]:  # type: ignore[attr-defined]
+        for weight, bias in self.layers[:-1]:
             x = x @ weight.T
             x += bias
             x = activate(x)

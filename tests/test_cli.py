@@ -226,6 +226,14 @@ def test_an_interrupted_robustness_run_leaves_the_last_one(copied, monkeypatch):
     assert contents(copied) == before
 
 
+@pytest.mark.parametrize(("form", "out"), [("onnx", "circle.onnx"), ("numpy", "circle")])
+def test_export_writes_the_controller(form, out, finished, tmp_path):
+    done = call("export", finished[0], "--to", form, "--out", tmp_path / out)
+    assert done.returncode == 0, done.stderr
+    assert str(tmp_path / out) in done.stdout
+    assert (tmp_path / out).exists()
+
+
 def test_simulate_finds_the_worst_noise(copied):
     done = call("simulate", copied, "--start", "3.1416", "--noise", "worst", "--eps", "0.1")
     assert done.returncode == 0, done.stderr
@@ -298,6 +306,9 @@ def test_bad_input_before_anything_is_made(arguments, parts, tmp_path, monkeypat
             ["report", "--out", "/dev/null/page.html"],
             ["/dev/null/page.html", "a place that can be written"],
         ),
+        (["export", "--to", "tflite", "--out", "x"], ["'tflite'", "onnx, numpy"]),
+        (["export", "--to", "numpy", "--out", "/dev/null/x"], ["a place that can be written"]),
+        (["export", "--to", "onnx", "--out", "/dev/null/x"], ["a place that can be written"]),
         (["simulate", "--start", "1", "--seed", "-1"], ["seed -1", "from 0 to"]),
         (["simulate", "--start", "1", "--horizon", "1e12"], ["horizon 1e+12", "3600"]),
         (["replay", "--size", "big"], ["'big'", "640x480"]),

@@ -19,8 +19,8 @@ ORDER = (
     "errors", "progress", "colours", "mjcf", "plant", "noise", "tasks", "settings", "artifacts",
     "policies", "agents", "controllers", "adversary", "rendering", "encoding", "envs", "simulation",
     "task_tests", "symmetry", "training", "sets", "lattice", "game", "critical_set", "partition", "limit",
-    "extended_sets", "section", "retraining",
-    "hybrid", "robustness", "episodes", "run_directory", "tables", "figures", "replay", "viewing", "arcs",
+    "extended_sets", "section", "retraining", "hybrid", "export",
+    "robustness", "episodes", "run_directory", "tables", "figures", "replay", "viewing", "arcs",
     "doctor", "report", "pipeline", "summary", "new_task", "cli",
 )  # fmt: skip
 

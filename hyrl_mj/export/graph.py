@@ -1,0 +1,260 @@
+"""Writes what code does as an ONNX graph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import onnx
+from onnx import helper, numpy_helper
+
+from hyrl_mj.export.tracing import BATCH, COMPARISONS, Operation, Program
+
+# Those of the oldest onnxruntime that is asked for, and older ones read.
+OPSET, IR_VERSION = 18, 8
+# Operations that ONNX has under another name.
+ELEMENTWISE = {
+    "absolute": "Abs", "negative": "Neg", "sign": "Sign", "sqrt": "Sqrt", "exp": "Exp", "log": "Log",
+    "sin": "Sin", "cos": "Cos", "tanh": "Tanh", "floor": "Floor", "ceil": "Ceil", "rint": "Round",
+    "isnan": "IsNaN", "logical_not": "Not",
+    "add": "Add", "subtract": "Sub", "multiply": "Mul", "divide": "Div", "power": "Pow",
+    "maximum": "Max", "minimum": "Min", "matmul": "MatMul",
+    "greater": "Greater", "greater_equal": "GreaterOrEqual", "less": "Less",
+    "less_equal": "LessOrEqual", "equal": "Equal",
+    "logical_and": "And", "logical_or": "Or", "logical_xor": "Xor",
+}  # fmt: skip
+REDUCED = {"sum": "ReduceSum", "prod": "ReduceProd", "max": "ReduceMax", "min": "ReduceMin"}
+
+
+def write_graph(
+    program: Program, outputs: Sequence[str], name: str, metadata: Mapping[str, str]
+) -> onnx.ModelProto:
+    """The model that does what a program does, on batches of any size.
+
+    Args:
+        program: its inputs and outputs have one row for each of the batch.
+        outputs: names of its outputs.
+        name: of the graph.
+        metadata: is kept with the model.
+    """
+    graph = _Graph(program)
+    for operation in program.operations():
+        graph.names[id(operation)] = graph.lower(operation)
+    for output, operation in zip(outputs, program.outputs, strict=True):
+        graph.nodes.append(helper.make_node("Identity", [graph.get(operation)], [output]))
+    model = helper.make_model(
+        helper.make_graph(
+            graph.nodes,
+            name,
+            [_described(o.operands[0], o) for o in program.inputs],
+            [_described(n, o) for n, o in zip(outputs, program.outputs, strict=True)],
+            [numpy_helper.from_array(a, key) for key, a in graph.constants.values()],
+        ),
+        opset_imports=[helper.make_opsetid("", OPSET)],
+        ir_version=IR_VERSION,
+        producer_name="hyrl_mj",
+    )
+    helper.set_model_props(model, dict(metadata))
+    onnx.checker.check_model(model)
+    return model
+
+
+def _described(name: str, operation: Operation) -> onnx.ValueInfoProto:
+    kind = helper.np_dtype_to_tensor_dtype(operation.value.dtype)
+    return helper.make_tensor_value_info(name, kind, ["n", *operation.value.shape[1:]])
+
+
+class _Graph:
+    """A graph in the making: nodes, constants, and what the result of each operation is called."""
+
+    def __init__(self, program: Program) -> None:
+        self.batch = program.inputs[0]
+        self.names = {id(o): o.operands[0] for o in program.inputs}
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: dict[tuple[Any, ...], tuple[str, np.ndarray]] = {}
+
+    def node(self, kind: str, *inputs: str, **attributes: Any) -> str:
+        """Add a node; the name of what it gives."""
+        result = f"{kind.lower()}_{len(self.nodes)}"
+        self.nodes.append(helper.make_node(kind, list(inputs), [result], **attributes))
+        return result
+
+    def constant(self, value: Any, dtype: Any) -> str:
+        """The name of a constant."""
+        array = np.ascontiguousarray(np.asarray(value, dtype)).reshape(np.shape(value))
+        key = (array.dtype.name, array.shape, array.tobytes())
+        return self.constants.setdefault(key, (f"constant_{len(self.constants)}", array))[0]
+
+    def get(self, operand: Any, dtype: Any = None) -> str:
+        """The name of an operand, of this type."""
+        if not isinstance(operand, Operation):
+            return self.constant(operand, np.asarray(operand).dtype if dtype is None else dtype)
+        name = self.names[id(operand)]
+        same = dtype is None or dtype == operand.value.dtype
+        return name if same else self.cast(name, dtype)
+
+    def cast(self, name: str, dtype: Any) -> str:
+        return self.node("Cast", name, to=helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))
+
+    def shape(self, shape: tuple[int, ...]) -> str:
+        """The name of a shape that has the size of the batch where the program had `BATCH`."""
+        rows = self.node("Shape", self.get(self.batch), start=0, end=1)
+        parts = [rows if size == BATCH else self.constant([size], np.int64) for size in shape]
+        return self.node("Concat", *parts, axis=0)
+
+    def lower(self, operation: Operation) -> str:
+        """Add what an operation takes; the name of its result."""
+        name, options, dtype = operation.name, operation.options, operation.value.dtype
+        operands = operation.operands
+        if name in LOWERED:
+            return LOWERED[name](self, operation)
+        if name in ELEMENTWISE:
+            kind = common(operands) if name in COMPARISONS or dtype.kind == "b" else dtype
+            return self.node(ELEMENTWISE[name], *(self.get(o, kind) for o in operands))
+        if name in REDUCED:
+            axes = self.constant(options["axis"], np.int64)
+            x = self.get(operands[0], dtype)
+            return self.node(REDUCED[name], x, axes, keepdims=int(options["keepdims"]))
+        raise NotImplementedError(name)
+
+
+def common(operands: Sequence[Any]) -> np.dtype:
+    """The type in which NumPy compares operands."""
+    return np.result_type(*(o.value if isinstance(o, Operation) else o for o in operands))
+
+
+def _getitem(g: _Graph, o: Operation) -> str:
+    result, axis = g.get(o.operands[0]), 0
+    sizes = iter(o.operands[0].value.shape)
+    for item in o.options["item"]:
+        if item is None:
+            result = g.node("Unsqueeze", result, g.constant([axis], np.int64))
+        else:
+            size = next(sizes)
+            if item != slice(None) if isinstance(item, slice) else True:
+                picked = g.constant(np.arange(size)[item], np.int64)
+                result = g.node("Gather", result, picked, axis=axis)
+        axis += not isinstance(item, int)
+    return result
+
+
+def _any_or_all(kind: str) -> Callable[[_Graph, Operation], str]:
+    def lower(g: _Graph, o: Operation) -> str:
+        x = g.cast(g.get(o.operands[0], bool), np.int32)
+        axes = g.constant(o.options["axis"], np.int64)
+        return g.cast(g.node(kind, x, axes, keepdims=int(o.options["keepdims"])), bool)
+
+    return lower
+
+
+def _arg(kind: str) -> Callable[[_Graph, Operation], str]:
+    def lower(g: _Graph, o: Operation) -> str:
+        axis, keepdims = o.options["axis"], int(o.options["keepdims"])
+        return g.node(kind, g.get(o.operands[0]), axis=axis, keepdims=keepdims)
+
+    return lower
+
+
+def _where(g: _Graph, o: Operation) -> str:
+    condition, *values = o.operands
+    return g.node("Where", g.get(condition, bool), *(g.get(v, o.value.dtype) for v in values))
+
+
+def _concatenate(g: _Graph, o: Operation) -> str:
+    parts = (g.get(part, o.value.dtype) for part in o.operands)
+    return g.node("Concat", *parts, axis=o.options["axis"])
+
+
+def _full(g: _Graph, o: Operation) -> str:
+    return g.node("Expand", g.get(o.operands[0], o.value.dtype), g.shape(o.options["shape"]))
+
+
+def _take(g: _Graph, o: Operation) -> str:
+    array, indices = o.operands
+    return g.node("Gather", g.get(array), g.get(indices, np.int64), axis=o.options["axis"])
+
+
+def _isfinite(g: _Graph, o: Operation) -> str:
+    x = g.get(o.operands[0], common([o.operands[0], np.float32(0)]))
+    kind = common([o.operands[0], np.float32(0)])
+    return g.node("Less", g.node("Abs", x), g.constant(np.inf, kind))
+
+
+def _remainder(g: _Graph, o: Operation) -> str:
+    dtype = o.value.dtype
+    x, y = (g.get(operand, dtype) for operand in o.operands)
+    if dtype.kind == "i":
+        return g.node("Mod", x, y)
+    # Of numbers that are not whole ONNX has the remainder of C, with the sign of x; NumPy's has that of y.
+    zero, rest = g.constant(0, dtype), g.node("Mod", x, y, fmod=1)
+    other_sign = g.node("Less", g.node("Mul", g.node("Sign", rest), g.node("Sign", y)), zero)
+    return g.node("Where", other_sign, g.node("Add", rest, y), rest)
+
+
+def _arctan2(g: _Graph, y: str, x: str, dtype: np.dtype) -> str:
+    """The angle of points, of which onnxruntime knows the arctan in float32 alone.
+
+    That is a first guess, off by some 1e-7 rad. Turned back by it, a point lies so close to the x axis that
+    the tangent of what is left is its angle.
+    """
+    zero, pi = g.constant(0, dtype), g.constant(np.pi, dtype)
+    # By |x|: a zero of x has a sign, too, which must not turn that of y.
+    slope = g.cast(g.node("Div", y, g.node("Abs", x)), np.float32)
+    ahead = g.cast(g.node("Atan", slope), dtype)
+    half_turn = g.node("Where", g.node("Less", y, zero), g.node("Neg", pi), pi)
+    behind = g.node("Sub", half_turn, ahead)
+    guess = g.node("Where", g.node("Less", x, zero), behind, ahead)
+    cos, sin = g.node("Cos", guess), g.node("Sin", guess)
+    across = g.node("Sub", g.node("Mul", y, cos), g.node("Mul", x, sin))
+    along = g.node("Add", g.node("Mul", x, cos), g.node("Mul", y, sin))
+    angle = g.node("Add", guess, g.node("Div", across, along))
+    origin = g.node("And", g.node("Equal", x, zero), g.node("Equal", y, zero))
+    return g.node("Where", origin, zero, angle)
+
+
+def _angle(g: _Graph, o: Operation) -> str:
+    """arctan2(y, x), arctan(s) = arctan2(s, 1), and the like."""
+    dtype = o.value.dtype
+    first, *second = (g.get(operand, dtype) for operand in o.operands)
+    if second:
+        return _arctan2(g, first, second[0], dtype)
+    one = g.constant(1, dtype)
+    if o.name == "arctan":
+        y, x = first, one
+    else:
+        product = g.node("Mul", g.node("Sub", one, first), g.node("Add", one, first))
+        rest = g.node("Sqrt", product)
+        y, x = (first, rest) if o.name == "arcsin" else (rest, first)
+    return _arctan2(g, y, x, dtype)
+
+
+def _tan(g: _Graph, o: Operation) -> str:
+    x = g.get(o.operands[0], o.value.dtype)
+    return g.node("Div", g.node("Sin", x), g.node("Cos", x))
+
+
+LOWERED: dict[str, Callable[[_Graph, Operation], str]] = {
+    "getitem": _getitem,
+    "astype": lambda g, o: g.get(o.operands[0], o.value.dtype),
+    "reshape": lambda g, o: g.node("Reshape", g.get(o.operands[0]), g.shape(o.options["shape"])),
+    "transpose": lambda g, o: g.node("Transpose", g.get(o.operands[0]), perm=o.options["axes"]),
+    "not_equal": lambda g, o: g.node(
+        "Not", g.node("Equal", *(g.get(x, common(o.operands)) for x in o.operands))
+    ),
+    "any": _any_or_all("ReduceMax"),
+    "all": _any_or_all("ReduceMin"),
+    "argmax": _arg("ArgMax"),
+    "argmin": _arg("ArgMin"),
+    "where": _where,
+    "concatenate": _concatenate,
+    "full": _full,
+    "take": _take,
+    "isfinite": _isfinite,
+    "remainder": _remainder,
+    "tan": _tan,
+    "arctan2": _angle,
+    "arctan": _angle,
+    "arcsin": _angle,
+    "arccos": _angle,
+}

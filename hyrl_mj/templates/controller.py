@@ -1,0 +1,146 @@
+"""The hybrid controller of a task, for NumPy alone; written by hyrl-mj export.
+
+It needs the file controller.npz beside it. One sample of the loop:
+
+    q = initial_mode(measured)      # once, from the first measurement
+    u, q = step(q, measured)        # jump if the mode's flow set is left, then act
+
+Both take batches; one robot is a batch of one, measured of shape (1, p).
+"""
+
+import numpy as np
+
+with np.load(__file__.rpartition(".")[0] + ".npz", allow_pickle=False) as file:
+    ARRAYS = {name: file[name] for name in file.files}
+
+MODES = ARRAYS["modes"]
+LOW, SIDES, PERIODIC = (ARRAYS[f"chart_{name}"] for name in ("low", "sides", "periodic"))
+# What stands for "in no mode yet".
+NO_MODE = -1
+
+# ---- the task: this part is written anew for each one
+TASK = "name"
+SAMPLE_TIME = 0.05  # [s]
+MEASUREMENT_COLUMNS = 1
+INPUTS = ("name [unit]",)
+# Of the network of each mode: what is between its layers, and what the last one gives: the value of each
+# "level" of the input, or the input itself, to "clip" or to "squash" (by tanh) to its limits.
+ACTIVATIONS = (np.tanh,)
+OUTPUTS = ("clip",)
+
+
+def chart_point(measured):
+    """Chart points (n, d) of measurements (n, p)."""
+    return measured
+
+
+def observation(measured):
+    """What the networks are fed (n, k) for measurements (n, p)."""
+    return measured
+
+
+# ---- the controller
+
+
+def step(q, measured):
+    """One sample: jump where the mode's flow set is left, then act.
+
+    Args:
+        q: (n,) int modes.
+        measured: (n, p) measurements.
+
+    Returns:
+        u (n, m), inputs in the plant's units; q_next (n,) int, the modes after the jumps.
+
+    Raises:
+        ValueError: wrong shapes, values that are not finite, or unknown modes.
+    """
+    q, measured = np.asarray(q), checked(measured)
+    if q.shape != (len(measured),):
+        raise ValueError(f"{len(measured)} measurements need as many modes, got shape {q.shape}")
+    if not np.isin(q, MODES).all():
+        raise ValueError(f"modes {q} are unknown: choose from {MODES}")
+    return answer(q.astype(np.int64), measured)
+
+
+def initial_mode(measured):
+    """The modes (n,) whose flow sets hold the first measurements (n, p) most deeply."""
+    measured = checked(measured)
+    return answer(np.full(len(measured), NO_MODE), measured)[1]
+
+
+def checked(measured):
+    """Measurements as a float array (n, p)."""
+    measured = np.asarray(measured, dtype=np.float64)
+    if measured.ndim != 2 or measured.shape[1] != MEASUREMENT_COLUMNS:
+        raise ValueError(
+            f"a measurement has shape (n, {MEASUREMENT_COLUMNS}), got {measured.shape}"
+        )
+    if not np.isfinite(measured).all():
+        raise ValueError("a measurement is not finite")
+    return measured
+
+
+def answer(q, measured):
+    """`step` without branches: all modes are computed, and then chosen from.
+
+    A q that is no mode begins in the mode whose flow set holds the measurement most deeply. Where a
+    measurement is not finite, q stays and u is NaN.
+    """
+    z, seen, modes = chart_point(measured), observation(measured), range(len(MODES))
+    distances = np.stack([signed_distance(z, k) for k in modes], axis=1)
+    active = q[:, None] == MODES
+    flows = (active & (distances <= ARRAYS["on_edge"])).any(axis=1)
+    deepest = np.take(MODES, np.where(active, np.inf, distances).argmin(axis=1))
+    finite = np.isfinite(measured).all(axis=1)
+    q_next = np.where(finite & ~flows, deepest, q)
+    u = np.nan
+    for k in modes:
+        u = np.where((finite & (q_next == MODES[k]))[:, None], inputs(network(seen, k), k), u)
+    return u, q_next
+
+
+def signed_distance(z, k):
+    """Distance (n,) of chart points (n, d) to the edge of a flow set, negative inside.
+
+    It is given at the nodes of a grid, and interpolated in between.
+    """
+    counts, spacing = ARRAYS[f"counts_{k}"], ARRAYS[f"spacing_{k}"]
+    last = np.where(PERIODIC, np.inf, counts - 1)
+    index = np.minimum(np.maximum((wrapped(z) - LOW) / spacing, 0), last)
+    below = np.floor(index)
+    share, first = index - below, below.astype(np.int64)
+    strides = np.append(np.cumprod(counts[:0:-1])[::-1], 1)
+    distance = 0.0
+    for corner in np.ndindex(*[2] * len(counts)):
+        weight = np.where(np.array(corner, dtype=bool), share, 1 - share).prod(axis=1)
+        # Above the last node of an axis lies nothing: the first one is taken, with a weight of 0.
+        node = ((first + np.array(corner)) % counts * strides).sum(axis=1)
+        distance = distance + weight * np.take(ARRAYS[f"distances_{k}"], node)
+    return distance
+
+
+def wrapped(z):
+    """The same chart points, periodic coordinates brought into their period."""
+    turned = np.mod(z - LOW, SIDES)
+    # The remainder of a tiny negative number rounds up to the period itself.
+    turned = np.where(turned < SIDES, turned, 0.0)
+    return np.where(PERIODIC, LOW + turned, z)
+
+
+def network(seen, k):
+    """The last layer of a mode's network for observations."""
+    x, last = seen.astype(np.float32), ARRAYS[f"layers_{k}"] - 1
+    for i in range(last):
+        x = ACTIVATIONS[k](x @ ARRAYS[f"weight_{k}_{i}"].T + ARRAYS[f"bias_{k}_{i}"])
+    return x @ ARRAYS[f"weight_{k}_{last}"].T + ARRAYS[f"bias_{k}_{last}"]
+
+
+def inputs(output, k):
+    """Inputs (n, m) in the plant's units for the last layer of a mode's network."""
+    if OUTPUTS[k] == "level":
+        return np.take(ARRAYS["levels"], output.argmax(axis=1), axis=0)
+    u, low, high = output.astype(np.float64), ARRAYS["input_low"], ARRAYS["input_high"]
+    if OUTPUTS[k] == "squash":
+        u = low + (np.tanh(u) + 1) / 2 * (high - low)
+    return np.minimum(np.maximum(u, low), high)

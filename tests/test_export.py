@@ -1,0 +1,439 @@
+"""A controller that is taken away does what it did at home."""
+
+import re
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+from planted import AnalyticSet, Cube, ideal_controller, random_states
+
+import hyrl_mj
+from hyrl_mj import BadInput, HybridController, MlpPolicy, export_numpy, export_onnx
+from hyrl_mj.export import export
+from hyrl_mj.export.graph import write_graph
+from hyrl_mj.export.source import write_function
+from hyrl_mj.export.tracing import BATCH, trace
+from hyrl_mj.policies import ACTIVATIONS
+from hyrl_mj.sets import Everything, Grid, GridSet
+
+RNG = np.random.default_rng
+
+
+def network(task, seed=0, activation="relu", kind=MlpPolicy):
+    """A network with random weights, large enough that it answers differently from place to place."""
+    rng, outputs = RNG(abs(seed)), task.levels or len(task.inputs)
+    sizes = [(32, len(task.observation_low)), (32, 32), (outputs, 32)]
+    names = ("q_net.q_net.0.", "q_net.q_net.2.", "q_net.q_net.4.") if task.levels else (
+        "mlp_extractor.policy_net.0.", "mlp_extractor.policy_net.2.", "action_net.",
+    )  # fmt: skip
+    weights = {}
+    for name, size in zip(names, sizes, strict=True):
+        weights[f"{name}weight"] = rng.normal(size=size).astype(np.float32) / np.sqrt(size[1])
+        weights[f"{name}bias"] = rng.normal(size=size[0]).astype(np.float32)
+    return kind(task, "dqn" if task.levels else "ppo", activation, weights)
+
+
+def smooth_set(task, k, modes):
+    """A set whose edge winds through the chart; `modes` of them overlap and cover it."""
+    grid = Grid.with_cells(task.chart, 60)
+    angle = (2 * np.pi * (grid.nodes - task.chart.origin) / task.chart.sides).sum(axis=1)
+    return GridSet(grid, -np.cos(angle - 2 * np.pi * k / modes) - 0.2)
+
+
+def planted(task, modes=(0, 1), **options):
+    """A controller with random networks."""
+    return HybridController(
+        task,
+        {q: network(task, seed=q, **options) for q in modes},
+        {q: smooth_set(task, k, len(modes)) for k, q in enumerate(modes)},
+    )
+
+
+def as_numpy(controller, folder):
+    path, _ = export_numpy(controller, folder)
+    space = {"__file__": str(path)}
+    exec(compile(path.read_text(), path, "exec"), space)
+    return space["step"], space["initial_mode"]
+
+
+def as_onnx(controller, folder):
+    path = export_onnx(controller, folder / "controller.onnx")
+    session = onnxruntime.InferenceSession(path)
+
+    def step(q, measured):
+        return session.run(None, {"q": q, "measured": measured})
+
+    return step, lambda measured: step(np.full(len(measured), -1), measured)[1]
+
+
+@pytest.fixture(params=(as_numpy, as_onnx), ids=("numpy", "onnx"))
+def taken(request, tmp_path):
+    """Exports a controller: its step and initial_mode."""
+    return lambda controller: request.param(controller, tmp_path)
+
+
+def assert_same(controller, taken, measured, tolerance=1e-6):
+    step, initial_mode = taken
+    q = RNG(1).choice(controller.modes, len(measured))
+    (u, after), (u_there, after_there) = controller.step(q, measured), step(q, measured)
+    assert u_there.dtype == np.float64
+    assert after_there.dtype == np.int64
+    np.testing.assert_array_equal(after_there, after)
+    np.testing.assert_allclose(u_there, u, rtol=0, atol=tolerance)
+    np.testing.assert_array_equal(initial_mode(measured), controller.initial_mode(measured))
+    return u, q, after
+
+
+# ---- agreement
+
+
+def test_it_agrees_on_ten_thousand_states(task, taken):
+    controller = planted(task)
+    # Beyond the ends of the chart, too, and for the circle any winding.
+    measured = random_states(task, 10_000, RNG(0)) * 1.5 - 0.25 * task.chart.sides
+    u, q, after = assert_same(controller, taken(controller), measured)
+    assert 0.05 < (q != after).mean() < 0.95
+    assert len(np.unique(u)) > 2
+
+
+@pytest.mark.parametrize("n", [1, 7])
+def test_batches_of_any_size(n, task, taken):
+    controller = planted(task)
+    assert_same(controller, taken(controller), random_states(task, n, RNG(2)))
+
+
+def test_three_modes_jump_to_the_deepest(circle, taken):
+    controller = planted(circle, modes=(1, 4, 7))
+    _, q, after = assert_same(controller, taken(controller), random_states(circle, 2000, RNG(0)))
+    assert {(a, b) for a, b in zip(q, after, strict=True) if a != b} == {
+        (a, b) for a in (1, 4, 7) for b in (1, 4, 7) if a != b
+    }
+
+
+def test_on_the_edge_it_flows(vehicle, taken):
+    grid = Grid(vehicle.chart, (2, 2))
+    ramp = GridSet(grid, grid.nodes[:, 1].copy())  # its edge is y = 0, to the bit at the middle
+    controller = HybridController(
+        vehicle, {q: network(vehicle, q) for q in (0, 1)}, {0: ramp, 1: ~ramp}
+    )
+    near = np.array([0.0, 5e-10, -5e-10, 2e-9, -2e-9])
+    measured = np.column_stack([np.ones(5), near])
+    step, _ = taken(controller)
+    for q in (0, 1):
+        modes = np.full(5, q)
+        np.testing.assert_array_equal(step(modes, measured)[1], controller.step(modes, measured)[1])
+
+
+@pytest.mark.parametrize("d", [3, 4])
+def test_charts_of_more_dimensions(d, taken):
+    cube = Cube(lambda z: z[:, 0], d)
+    cube.observation_low, cube.observation_high = (-1.0,) * d, (1.0,) * d
+    grid = Grid.with_cells(cube.chart, 6)
+    held = [GridSet(grid, RNG(k).normal(size=len(grid.nodes)) - 0.3) for k in (0, 1)]
+    controller = HybridController(
+        cube, {q: network(cube, q) for q in (0, 1)}, dict(enumerate(held))
+    )
+    assert_same(controller, taken(controller), random_states(cube, 2000, RNG(0)) * 1.2)
+
+
+def test_one_mode_without_an_edge(circle, taken):
+    controller = HybridController(circle, {0: network(circle)}, {0: Everything()})
+    assert_same(controller, taken(controller), random_states(circle, 100, RNG(0)))
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_activations(activation, circle, taken):
+    controller = planted(circle, activation=activation)
+    assert_same(controller, taken(controller), random_states(circle, 500, RNG(0)), 1e-5)
+
+
+class Squashed(MlpPolicy):
+    """Its output goes through tanh and is stretched to the limits."""
+
+    @property
+    def output(self):
+        return "squash"
+
+    def inputs(self, observation):
+        low, high = self.task.input_limits
+        return low + (np.tanh(self.outputs(observation).astype(float)) + 1) / 2 * (high - low)
+
+
+def test_an_output_that_is_squashed(circle, taken):
+    controller = planted(circle, kind=Squashed)
+    u, _, _ = assert_same(controller, taken(controller), random_states(circle, 2000, RNG(0)))
+    assert (np.abs(u) < 1).mean() > 0.5
+
+
+def test_a_task_of_the_user_s(puck, taken):
+    controller = planted(puck)
+    measured = RNG(0).uniform(-1, 1, (2000, puck.measurement_columns))
+    assert_same(controller, taken(controller), measured)
+
+
+# ---- what it says to bad values
+
+
+def test_the_folder_refuses_what_the_controller_refuses(vehicle, tmp_path):
+    step, initial_mode = as_numpy(planted(vehicle), tmp_path)
+    with pytest.raises(ValueError, match="not finite"):
+        step(np.array([0]), np.array([[np.nan, 0.0]]))
+    with pytest.raises(ValueError, match=r"modes \[3\] are unknown"):
+        step(np.array([3]), np.zeros((1, 2)))
+    with pytest.raises(ValueError, match="as many modes"):
+        step(np.array([0, 1]), np.zeros((1, 2)))
+    with pytest.raises(ValueError, match=r"shape \(n, 2\)"):
+        initial_mode(np.zeros(2))
+
+
+def test_the_graph_answers_what_is_not_finite_with_nan(task, tmp_path):
+    step, _ = as_onnx(planted(task), tmp_path)
+    measured = random_states(task, 3, RNG(0))
+    measured[:2, -1] = np.nan, np.inf
+    u, after = step(np.array([0, 1, 0]), measured)
+    assert np.isnan(u).all(axis=1).tolist() == [True, True, False]
+    assert after[:2].tolist() == [0, 1]
+
+
+def test_the_graph_says_what_it_is_of(vehicle, tmp_path):
+    path = export_onnx(planted(vehicle), tmp_path / "vehicle.onnx")
+    session = onnxruntime.InferenceSession(path)
+    assert session.get_modelmeta().custom_metadata_map == {
+        "task": "vehicle", "modes": "0, 1", "inputs": "lateral_velocity [m/s]", "sample_time": "0.05"
+    }  # fmt: skip
+    assert [(i.name, i.shape) for i in session.get_inputs()] == [
+        ("q", ["n"]), ("measured", ["n", 2])
+    ]  # fmt: skip
+
+
+ALONE = """
+import sys
+from importlib.abc import MetaPathFinder
+import numpy as np
+
+class Refuse(MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] not in {"controller", "numpy", *sys.stdlib_module_names}:
+            raise ImportError(name + " is not here")
+
+sys.meta_path.insert(0, Refuse())
+import controller
+measured = np.load("measured.npy")
+q = controller.initial_mode(measured)
+np.savez("answer.npz", *controller.step(1 - q, measured))
+"""
+
+
+def test_the_folder_needs_numpy_alone(vehicle, tmp_path):
+    controller = planted(vehicle)
+    written = export_numpy(controller, tmp_path / "folder")
+    measured = random_states(vehicle, 50, RNG(0))
+    np.save(tmp_path / "folder" / "measured.npy", measured)
+    done = subprocess.run(
+        [sys.executable, "-c", ALONE],
+        cwd=tmp_path / "folder",
+        env={},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
+    imports = re.findall(r"^\s*(?:from|import) .*", written[0].read_text(), re.MULTILINE)
+    assert imports == ["import numpy as np"]
+    q = 1 - controller.initial_mode(measured)
+    with np.load(tmp_path / "folder" / "answer.npz") as answer:
+        for there, here in zip(answer.values(), controller.step(q, measured), strict=True):
+            np.testing.assert_allclose(there, here, atol=1e-6)
+
+
+def test_the_examples_of_the_readme_run(vehicle, tmp_path, monkeypatch):
+    text = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    section = text.split("## Take it away")[1].split("\n## ")[0]
+    examples = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
+    assert len(examples) == 2
+    controller = planted(vehicle)
+    export_onnx(controller, tmp_path / "vehicle.onnx")
+    export_numpy(controller, tmp_path / "vehicle_controller")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(time, "sleep", lambda seconds: None)
+    ends = []
+    for example in examples:
+        space = {}
+        exec(example, space)
+        ends.append(space["measured"])
+    np.testing.assert_allclose(ends[0], ends[1])
+    assert ends[0][0, 0] == pytest.approx(3.0)
+
+
+# ---- refusals
+
+
+def with_method(task, name, method):
+    """The same task with another method."""
+    return type(task.name, (type(task),), {name: lambda self, measured: method(measured)})()
+
+
+@pytest.mark.parametrize(
+    ("method", "said"),
+    [
+        (lambda x: np.hstack([np.cos(x), np.interp(x, [0, 7], [0, 1])]), r"uses np\.interp"),
+        (lambda x: np.hstack([x, x]) if x[0, 0] > 1 else np.hstack([x, -x]), "picks single rows"),
+        (lambda x: np.hstack([x, x]) if (x > 1).any(axis=1) else x, "branches on values"),
+        (lambda x: np.array([[np.cos(a), np.sin(a)] for a in x[:, 0]]), "loops over the rows"),
+        (lambda x: np.hstack([x, x - x.mean(axis=0)]), "each must stand for itself"),
+        (lambda x: np.hstack([x[x > 1][:, None], x]), "depends on values"),
+        (lambda x: np.hstack([x, np.linspace(0, 1, 9)[x.astype(int)]]), "plain numbers"),
+        (lambda x: np.zeros((len(x), 2)) + 1, "reference"),
+        (lambda x: np.hstack([x, x.spam]), r"uses \.spam"),
+        (lambda x: np.hstack([x, np.arange(len(x))[:, None] * x]), "does not do what"),
+    ],
+)  # fmt: skip
+def test_a_task_method_that_cannot_be_followed_is_named(method, said, circle, tmp_path):
+    task = with_method(circle, "observation", method)
+    if said == "reference":  # of constants alone: that is a fine observation
+        assert export_numpy(planted(task), tmp_path)
+        return
+    with pytest.raises(BadInput, match=said) as refused:
+        export_numpy(planted(task), tmp_path / "folder")
+    assert "observation" in str(refused.value)
+    assert not (tmp_path / "folder").exists()
+
+
+def test_policies_and_sets_of_other_kinds_are_refused(vehicle, circle, tmp_path):
+    with pytest.raises(BadInput, match="policy of mode 0 is a ChartPolicy"):
+        export_numpy(
+            replace(ideal_controller(vehicle), flow_sets=planted(vehicle).flow_sets), tmp_path
+        )
+    anywhere = dict.fromkeys((0, 1), AnalyticSet(lambda z: z[:, 0]))
+    with pytest.raises(BadInput, match="flow set of mode 0 is a AnalyticSet"):
+        export_onnx(replace(planted(vehicle), flow_sets=anywhere), tmp_path / "x.onnx")
+    foreign = replace(planted(vehicle), policies=planted(circle).policies)
+    with pytest.raises(BadInput, match="for unit_circle, not vehicle"):
+        export_numpy(foreign, tmp_path)
+    with pytest.raises(BadInput, match=r"modes \(-1, 0\)"):
+        export_numpy(planted(vehicle, modes=(-1, 0)), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_bad_forms_and_places(circle, tmp_path):
+    controller = planted(circle)
+    with pytest.raises(BadInput, match="onnx, numpy"):
+        export(controller, "tflite", tmp_path / "x")
+    (tmp_path / "file").write_text("mine")
+    for form in ("onnx", "numpy"):
+        with pytest.raises(BadInput, match="a place that can be written"):
+            export(controller, form, tmp_path / "file" / "x")
+    with pytest.raises(BadInput, match="a place that can be written"):
+        export(controller, "onnx", tmp_path)
+    (tmp_path / "controller.py").write_text("mine")
+    with pytest.raises(BadInput, match="no exported controller"):
+        export(controller, "numpy", tmp_path)
+    assert (tmp_path / "controller.py").read_text() == "mine"
+    assert {p.name for p in tmp_path.iterdir()} == {"file", "controller.py"}
+
+
+def test_without_onnx_it_says_what_to_install(circle, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(BadInput, match=re.escape('pip install "hyrl-mj[onnx]"')):
+        export_onnx(planted(circle), tmp_path / "x.onnx")
+
+
+# ---- the vocabulary
+
+UNARY = (
+    "abs", "negative", "sign", "exp", "sin", "cos", "tan", "arctan", "tanh", "floor", "ceil", "rint",
+    "isnan", "isfinite", "fabs", "square", "reciprocal", "radians", "deg2rad", "degrees", "rad2deg",
+    "exp2", "expm1", "sinh", "cosh", "trunc", "positive",
+)  # fmt: skip
+BINARY = (
+    "add", "subtract", "multiply", "divide", "remainder", "maximum", "minimum", "arctan2", "hypot",
+    "fmax", "fmin", "logaddexp", "greater", "less_equal", "not_equal",
+)  # fmt: skip
+
+
+def assigned(x):
+    made = np.empty((len(x), 4), dtype=float)
+    made[:, [3, 1]] = x[:, :2]
+    made[..., 0] = x[:, 2]
+    made[:, 2] = 7
+    made[x[:, 0] > 0, 1] = 5
+    made[made < -1] = -1
+    made[:, :2] *= 2
+    return made
+
+
+def by_parts(x):
+    a, b, c = x.T
+    made = np.array([a, b * c, np.where(a > b, a, c)]).T
+    made += 1
+    return np.asarray(made)
+
+
+WHOLE = {
+    **{name: lambda x, name=name: getattr(np, name)(x) for name in UNARY},
+    **{name: lambda x, name=name: getattr(np, name)(x[:, :2], x[:, 1:]) for name in BINARY},
+    "by numbers": lambda x: (2 * x - 1) ** 2 / 3 % 0.7,
+    "negative divisor": lambda x: np.mod(x, -0.3),
+    "whole numbers": lambda x: (x * 10).astype(int) % 3 + np.ones(3, dtype=np.int32),
+    "single precision": lambda x: x.astype(np.float32) * 3 + 1,
+    "arcsin": lambda x: np.arcsin(np.clip(x, -1, 1)),
+    "arccos": lambda x: np.arccos(x.clip(-1, 1)),
+    "arctan2 at the axes": lambda x: np.arctan2(np.rint(x) + 0.0, np.rint(x[:, ::-1]) + 0.0),
+    "arctan2 near -0": lambda x: np.arctan2(np.rint(x) + 0.5, np.rint(x[:, ::-1])),
+    "log": lambda x: np.log(np.abs(x)) + np.log1p(x * x) + np.log2(x * x) + np.log10(x * x),
+    "sqrt and power": lambda x: np.sqrt(np.abs(x)) + np.power(np.abs(x), 0.3),
+    "bools": lambda x: ((x > 0) & (x < 1) | ~(x < -1)) ^ (x[:, :1] == 0),
+    "reductions": lambda x: np.stack(
+        [x.sum(axis=1), x.prod(axis=-1), x.max(axis=1), np.min(x, axis=1), np.mean(x, axis=1)], axis=1
+    ),
+    "any and all": lambda x: np.column_stack([(x > 1).any(axis=1), np.all(x > -1, axis=1)]),
+    "argmax": lambda x: np.argmax(x, axis=1) - x.argmin(axis=1),
+    "norm": lambda x: x / np.linalg.norm(x, axis=1, keepdims=True),
+    "norm of rows": lambda x: np.linalg.norm(x[:, :2], axis=1),
+    "shapes": lambda x: np.reshape(x, (len(x), 3, 1)).transpose(0, 2, 1).reshape(-1, 3)[:, ::2],
+    "axes": lambda x: np.squeeze(np.swapaxes(np.expand_dims(x, 1), 1, 2), axis=2),
+    "stacks": lambda x: np.hstack([np.vstack([x.T, x.T]).T, np.zeros((len(x), 2)), np.ones_like(x)]),
+    "full": lambda x: np.full((len(x), 2), 0.5) + np.full_like(x[:, :2], 2) + np.zeros_like(x[:, 1:]),
+    "indices": lambda x: np.concatenate([x[:, [2, 0]], x[:, -1:], x[:, 1][:, None]], axis=1),
+    "mask of columns": lambda x: x[:, np.array([True, False, True])],
+    "take": lambda x: np.take(np.linspace(0, 1, 50), np.clip(x * 9 + 20, 0, 49).astype(int)),
+    "matrix": lambda x: x @ np.arange(6.0).reshape(3, 2) + np.dot(x, np.eye(3)[:, :2]),
+    "select": lambda x: np.select([x > 1, x > 0], [x, x * x], default=-1.0),
+    "differences": lambda x: np.diff(x, axis=1) + np.round(x[:, :2], 1),
+    "large constants": lambda x: x[:, :1] * np.linspace(0, 1, 40),
+    "strong scalars": lambda x: x.astype(np.float32) * np.float64(0.1) + np.where(x > 1, np.inf, 0),
+    "assigned": assigned,
+    "by parts": by_parts,
+    "itself": lambda x: x.copy(),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_operations_survive_both_forms(name):
+    program = trace(WHOLE[name], {"x": RNG(0).normal(size=(BATCH, 3))}, name)
+    arrays = {}
+    lines = write_function("f", "It does something.", program, arrays)
+    space = {"np": np, "ARRAYS": arrays}
+    exec("\n".join(lines), space)
+    model = write_graph(program, ("y",), "f", {})
+    session = onnxruntime.InferenceSession(model.SerializeToString())
+    for n in (1, 5, 300):
+        x = 2 * RNG(n).normal(size=(n, 3))
+        wanted = WHOLE[name](x)
+        for given in (space["f"](x), session.run(None, {"x": x})[0]):
+            assert given.dtype == wanted.dtype
+            np.testing.assert_allclose(given, wanted, rtol=1e-12, atol=1e-14)
+
+
+def test_numpy_is_itself_again_after_a_trace():
+    before = dict(vars(np))
+    with pytest.raises(BadInput):
+        trace(lambda x: np.interp(x, [0, 1], [0, 1]), {"x": np.zeros((BATCH, 1))}, "f")
+    assert all(vars(np)[name] is value for name, value in before.items())
+    assert hyrl_mj.export_onnx is export_onnx
