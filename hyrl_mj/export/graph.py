@@ -16,7 +16,7 @@ OPSET, IR_VERSION = 18, 8
 # Operations that ONNX has under another name.
 ELEMENTWISE = {
     "absolute": "Abs", "negative": "Neg", "sign": "Sign", "sqrt": "Sqrt", "exp": "Exp", "log": "Log",
-    "sin": "Sin", "cos": "Cos", "tanh": "Tanh", "floor": "Floor", "ceil": "Ceil", "rint": "Round",
+    "sin": "Sin", "tanh": "Tanh", "floor": "Floor", "ceil": "Ceil", "rint": "Round",
     "isnan": "IsNaN", "logical_not": "Not",
     "add": "Add", "subtract": "Sub", "multiply": "Mul", "divide": "Div", "power": "Pow",
     "maximum": "Max", "minimum": "Min", "matmul": "MatMul",
@@ -24,7 +24,7 @@ ELEMENTWISE = {
     "less_equal": "LessOrEqual", "equal": "Equal",
     "logical_and": "And", "logical_or": "Or", "logical_xor": "Xor",
 }  # fmt: skip
-REDUCED = {"sum": "ReduceSum", "prod": "ReduceProd", "max": "ReduceMax", "min": "ReduceMin"}
+REDUCED = {"sum": "ReduceSum", "max": "ReduceMax", "min": "ReduceMin"}
 
 
 def write_graph(
@@ -42,7 +42,9 @@ def write_graph(
     for operation in program.operations():
         graph.names[id(operation)] = graph.lower(operation)
     for output, operation in zip(outputs, program.outputs, strict=True):
-        graph.nodes.append(helper.make_node("Identity", [graph.get(operation)], [output]))
+        graph.nodes.append(
+            helper.make_node("Identity", [graph.get(operation)], [output], name=output)
+        )
     model = helper.make_model(
         helper.make_graph(
             graph.nodes,
@@ -77,7 +79,8 @@ class _Graph:
     def node(self, kind: str, *inputs: str, **attributes: Any) -> str:
         """Add a node; the name of what it gives."""
         result = f"{kind.lower()}_{len(self.nodes)}"
-        self.nodes.append(helper.make_node(kind, list(inputs), [result], **attributes))
+        # With a name: older versions of onnxruntime take nodes without one for the same node.
+        self.nodes.append(helper.make_node(kind, list(inputs), [result], name=result, **attributes))
         return result
 
     def constant(self, value: Any, dtype: Any) -> str:
@@ -192,6 +195,13 @@ def _remainder(g: _Graph, o: Operation) -> str:
     return g.node("Where", other_sign, g.node("Add", rest, y), rest)
 
 
+def _cos(g: _Graph, x: str, dtype: np.dtype) -> str:
+    """cos(x) = 1 - 2 sin(x / 2)^2: older versions of onnxruntime have no cosine in float64."""
+    half, one, two = (g.constant(number, dtype) for number in (0.5, 1, 2))
+    sin = g.node("Sin", g.node("Mul", x, half))
+    return g.node("Sub", one, g.node("Mul", two, g.node("Mul", sin, sin)))
+
+
 def _arctan2(g: _Graph, y: str, x: str, dtype: np.dtype) -> str:
     """The angle of points, of which onnxruntime knows the arctan in float32 alone.
 
@@ -205,7 +215,7 @@ def _arctan2(g: _Graph, y: str, x: str, dtype: np.dtype) -> str:
     half_turn = g.node("Where", g.node("Less", y, zero), g.node("Neg", pi), pi)
     behind = g.node("Sub", half_turn, ahead)
     guess = g.node("Where", g.node("Less", x, zero), behind, ahead)
-    cos, sin = g.node("Cos", guess), g.node("Sin", guess)
+    cos, sin = _cos(g, guess, dtype), g.node("Sin", guess)
     across = g.node("Sub", g.node("Mul", y, cos), g.node("Mul", x, sin))
     along = g.node("Add", g.node("Mul", x, cos), g.node("Mul", y, sin))
     angle = g.node("Add", guess, g.node("Div", across, along))
@@ -231,7 +241,7 @@ def _angle(g: _Graph, o: Operation) -> str:
 
 def _tan(g: _Graph, o: Operation) -> str:
     x = g.get(o.operands[0], o.value.dtype)
-    return g.node("Div", g.node("Sin", x), g.node("Cos", x))
+    return g.node("Div", g.node("Sin", x), _cos(g, x, o.value.dtype))
 
 
 LOWERED: dict[str, Callable[[_Graph, Operation], str]] = {
@@ -252,6 +262,7 @@ LOWERED: dict[str, Callable[[_Graph, Operation], str]] = {
     "take": _take,
     "isfinite": _isfinite,
     "remainder": _remainder,
+    "cos": lambda g, o: _cos(g, g.get(o.operands[0], o.value.dtype), o.value.dtype),
     "tan": _tan,
     "arctan2": _angle,
     "arctan": _angle,

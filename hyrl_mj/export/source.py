@@ -59,9 +59,9 @@ def _expression(operation: Operation, write: Any) -> str:
     if name == "getitem":
         return f"{operands[0]}[{_listed(map(_index, options['item']))}]"
     if name == "astype":
-        return f"{operands[0]}.astype(np.{options['dtype']})"
+        return f"{operands[0]}.astype(np.{_name(options['dtype'])})"
     if name == "full":
-        return f"np.full({_shape(options['shape'])}, {operands[0]}, dtype=np.{options['dtype']})"
+        return f"np.full({_shape(options['shape'])}, {operands[0]}, dtype=np.{_name(options['dtype'])})"
     if name == "reshape":
         return f"np.reshape({operands[0]}, {_shape(options['shape'])})"
     if name == "concatenate":
@@ -108,5 +108,7 @@ def literal(x: Any) -> str:
     return repr(int(x) if isinstance(x, int) and not isinstance(x, bool) else x)
 
 
-def _name(dtype: np.dtype) -> str:
-    return "bool_" if dtype.kind == "b" else dtype.name
+def _name(dtype: str | np.dtype) -> str:
+    """What NumPy calls a type, in versions 1 and 2."""
+    name = np.dtype(dtype).name
+    return "bool_" if name == "bool" else name

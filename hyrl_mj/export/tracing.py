@@ -32,7 +32,7 @@ BINARY = (
     "matmul", "logical_and", "logical_or", "logical_xor",
 )  # fmt: skip
 UFUNCS = {*UNARY, *COMPARISONS, *BINARY}
-REDUCTIONS = ("sum", "prod", "max", "min", "any", "all", "argmax", "argmin")
+REDUCTIONS = ("sum", "max", "min", "any", "all", "argmax", "argmin")
 # What `Operation.name` can be beside a ufunc: functions of NumPy, and two methods of its arrays.
 FUNCTIONS = (
     {*REDUCTIONS, "where", "concatenate", "reshape", "transpose", "take", "full"}
@@ -129,6 +129,8 @@ def _evaluate(name: str, values: Sequence[Any], options: Mapping[str, Any]) -> A
         return values[0][options["item"]]
     if name == "astype":
         return values[0].astype(options["dtype"])
+    if name == "reshape":  # its argument changed its name in NumPy 2
+        return values[0].reshape(options["shape"])
     if name == "concatenate":
         return np.concatenate(values, **options)
     if name == "full":
@@ -304,6 +306,18 @@ def _reduce(name: str, x: Any, axis: Any = None, keepdims: bool = False) -> Trac
     return apply(name, x, axis=axes, keepdims=bool(keepdims))
 
 
+def _prod(x: Any, axis: Any = None, keepdims: bool = False) -> Any:
+    """One factor after the other: older versions of onnxruntime have no product in float64."""
+    if np.ndim(axis) or (axis is None and x.ndim > 1):
+        raise Untraceable("uses np.prod other than along one axis")
+    axis = (axis or 0) % x.ndim
+    if x.shape[axis] == BATCH:
+        raise Untraceable("uses np.prod over the rows of a batch: each must stand for itself")
+    factors = [np.take(x, np.array([i]), axis=axis) for i in range(x.shape[axis])]
+    product = reduce(np.multiply, factors)
+    return product if keepdims else np.squeeze(product, axis=axis)
+
+
 def _mean(x: Any, axis: Any = None, keepdims: bool = False) -> Any:
     total = np.sum(x, axis=axis, keepdims=keepdims)
     return total * float(np.prod(total.shape) / np.prod(x.shape))
@@ -419,6 +433,7 @@ COMPOSED: dict[Any, Callable[..., Any]] = {
     np.amax: partial(_reduce, "max"),
     np.amin: partial(_reduce, "min"),
     np.mean: _mean,
+    np.prod: _prod,
     np.linalg.norm: _norm,
     np.reshape: _reshape,
     np.ravel: lambda x: _reshape(x, -1),
