@@ -289,6 +289,7 @@ def with_method(task, name, method):
         (lambda x: np.hstack([x, x - x.mean(axis=0)]), "each must stand for itself"),
         (lambda x: np.hstack([x[x > 1][:, None], x]), "depends on values"),
         (lambda x: np.hstack([x, np.linspace(0, 1, 9)[x.astype(int)]]), "plain numbers"),
+        (lambda x: np.hstack([x, x.sum(axis=1, dtype=float)[:, None]]), r"np\.sum with arguments"),
         (lambda x: np.hstack([x, x.spam]), r"uses \.spam"),
         (lambda x: np.hstack([x, np.arange(len(x))[:, None] * x]), "does not do what"),
     ],

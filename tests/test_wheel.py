@@ -51,7 +51,8 @@ def test_the_wheel_holds_package_models_and_licence(wheel):
     models = {"unit_circle.xml", "vehicle.xml", "common/scene.xml"}
     assert {f"hyrl_mj/models/{name}" for name in models} <= names
     assert {"hyrl_mj/py.typed", "hyrl_mj/cli.py", "hyrl_mj/tasks/vehicle.py"} <= names
-    assert {"hyrl_mj/templates/report.html", "hyrl_mj/templates/report.css"} <= names
+    templates = {"report.html", "report.css", "controller.py"}
+    assert {f"hyrl_mj/templates/{name}" for name in templates} <= names
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert not any(name.startswith(("tests/", "scripts/", "models/")) for name in names)
 

@@ -7,6 +7,7 @@ another kind, so that `np.cos(x)`, `x[:, 0]` or `a @ x` come here. What is kept 
 
 from __future__ import annotations
 
+import inspect
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -185,7 +186,7 @@ class Traced(NDArrayOperatorsMixin):
         function = getattr(np, {"flatten": "ravel"}.get(name, name), None)
         if function not in COMPOSED:
             raise Untraceable(f"uses .{name} of an array, which has no exported form")
-        return partial(COMPOSED[function], self)
+        return partial(_compose, function, self)
 
     # ---- what would lose the trace
 
@@ -219,7 +220,7 @@ class Traced(NDArrayOperatorsMixin):
         if function not in COMPOSED:
             name = f"{function.__module__}.{function.__name__}".replace("numpy", "np", 1)
             raise Untraceable(f"uses {name}, which has no exported form")
-        return COMPOSED[function](*args, **kwargs)
+        return _compose(function, *args, **kwargs)
 
     def __getitem__(self, index: Any) -> Traced:
         item = _item(index, self.shape)
@@ -294,6 +295,18 @@ def _item(index: Any, shape: tuple[int, ...]) -> tuple[Any, ...]:
 # ---- functions, put together from the vocabulary
 
 Axis = int | None
+
+
+def _compose(function: Any, *args: Any, **kwargs: Any) -> Any:
+    """Do a function of NumPy as `COMPOSED` says."""
+    composed = COMPOSED[function]
+    try:
+        inspect.signature(composed).bind(*args, **kwargs)
+    except TypeError:
+        raise Untraceable(
+            f"uses np.{function.__name__} with arguments that have no exported form"
+        ) from None
+    return composed(*args, **kwargs)
 
 
 def _reduce(name: str, x: Any, axis: Any = None, keepdims: bool = False) -> Traced:
@@ -451,7 +464,7 @@ COMPOSED: dict[Any, Callable[..., Any]] = {
     np.where: _where,
     np.select: _select,
     np.diff: _diff,
-    np.dot: np.matmul,
+    np.dot: lambda x, y: x @ y,
     np.zeros_like: partial(_full_like, 0),
     np.empty_like: partial(_full_like, 0),
     np.ones_like: partial(_full_like, 1),
@@ -511,7 +524,8 @@ def _bools(*operands: Any) -> tuple[Any, ...]:
 def _patched() -> Iterator[None]:
     """Let np.empty((len(x), 3)), np.array([x, y]), np.take(table, x) and the like come here, too.
 
-    NumPy does not look at what these are given.
+    NumPy does not look at what these are given. Meanwhile they are others for the whole process, but do the
+    same for all that is not followed.
     """
 
     def filling(original: Any) -> Any:
