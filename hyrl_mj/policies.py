@@ -226,7 +226,7 @@ class MlpPolicy(ObservationPolicy):
 
     @property
     def output(self) -> str:
-        """What the last layer gives: the value of each "level", or the input, to "clip" or "squash" to its limits."""
+        """What the last layer gives: the value of each "level", or the input, to "clip" or to "squash"."""
         if self._levels is not None:
             return "level"
         return "squash" if self._layout.squashed else "clip"
