@@ -33,6 +33,7 @@ from hyrl_mj.replay.marks import (
     Floor,
     Tracker,
     bar,
+    disc,
 )
 from hyrl_mj.replay.panel import Panel, Track
 from hyrl_mj.replay.timeline import AROUND, HOLD, frame_times
@@ -270,6 +271,14 @@ def test_the_bound_of_an_angle_is_an_arc(circle):
     np.testing.assert_allclose(np.linalg.norm(line[:, :2], axis=1), 1.0, atol=1e-9)
     angle = np.arctan2(line[:, 1], line[:, 0])
     np.testing.assert_allclose(angle[[0, 2, 4]], [1.9, 2.0, 2.1], atol=1e-9)
+
+
+def test_a_mark_is_no_geom_of_the_model_that_was_drawn_in_its_place():
+    scene = mujoco.MjvScene(TASK.model, 3)
+    scene.geoms[0].objtype, scene.geoms[0].objid = mujoco.mjtObj.mjOBJ_GEOM, 99
+    disc(scene, np.zeros(3), 0.1, 0.0, (1, 2, 3))
+    assert scene.ngeom == 1
+    assert scene.geoms[0].objtype == mujoco.mjtObj.mjOBJ_UNKNOWN
 
 
 @needs_gl

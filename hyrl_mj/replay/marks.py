@@ -91,6 +91,8 @@ def _add(
         geom = scene.geoms[scene.ngeom]
         rgba = np.array([*colour, 255 * alpha], dtype=np.float32) / 255
         mujoco.mjv_initGeom(geom, kind, np.array(size), pos, axes.ravel(), rgba)
+        # MuJoCo leaves in it which geom of the model was drawn in this place before.
+        geom.objtype, geom.objid = mujoco.mjtObj.mjOBJ_UNKNOWN, -1
         geom.specular = 0  # marks keep the colours of the captions
         geom.transparent = int(alpha < 1)
         scene.ngeom += 1
