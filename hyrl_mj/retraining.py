@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -90,7 +91,7 @@ def retrain(
     return best[1]
 
 
-class ModeGround:
+class ModeGround(ABC):
     """Where one mode has to win: draws starts from it, and tells its policies apart (a `Judge`).
 
     It is every state whose measurement can lie in M_ext_i and from which the mode can still succeed.
@@ -134,9 +135,9 @@ class ModeGround:
             self._latest = policy, self.score(policy)
         return self._latest[1]
 
+    @abstractmethod
     def score(self, policy: MlpPolicy) -> Score:
         """What `__call__` gives for a policy that was not just asked about."""
-        raise NotImplementedError
 
     def domain(self, gamma: float) -> Domain:
         """Where training goes on; leaving it counts as the worst reward for ever."""
