@@ -111,9 +111,10 @@ def test_its_start_states_move_at_the_speed_of_its_wheels(rover):
 
 def test_a_detour_earns_less_than_the_goal(rover):
     at = rover.set_point[0]
-    measured = np.zeros((3, 5))
-    measured[:, 0], measured[2, 1] = (at, at - 0.5, at), 0.8
-    goal, on_the_way, off = rover.reward(measured)
-    # To drive on for ever is worth 1 / (1 - 0.9) samples' reward to the policies of the modes.
-    assert goal > on_the_way / (1 - 0.9)
+    measured = np.zeros((4, 5))
+    measured[:, 0] = at, at - 0.5, at - 0.5, at
+    measured[2, 2], measured[3, 1] = 0.8, 0.8
+    goal, ahead, turned, off = rover.reward(measured)
+    # What to go on for ever is worth to the policies of the modes, whose discount factor is 0.9.
+    assert goal >= ahead / (1 - 0.9) - 1e-9 > turned / (1 - 0.9)
     assert off < goal

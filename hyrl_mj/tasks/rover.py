@@ -13,8 +13,8 @@ from hyrl_mj.tasks.registry import register
 
 # The heading that still counts as on the way [rad], and how close to the pillar it begins to matter [m].
 ASTRAY, NEAR = 1.4, 0.25
-# Samples' reward that there is for reaching the goal.
-FINISH = 20
+# Samples' reward that there is for reaching the goal, and what a heading costs on the way [1/rad].
+FINISH, HEADING_COST = 10, 0.1
 # Rate of turn that starts have at most [rad/s].
 START_RATE = 0.3
 
@@ -122,7 +122,8 @@ class Rover(Task):
 
     def reward(self, measurement: np.ndarray) -> np.ndarray:
         near = np.clip(1 - self.clearance(measurement) / NEAR, 0.0, 1.0)
-        reward = np.maximum(3 - np.abs(measurement[:, 1]) - near, 0.0)
+        off = np.abs(measurement[:, 1]) + HEADING_COST * np.abs(measurement[:, 2])
+        reward = np.maximum(3 - off - near, 0.0)
         # The goal is worth as much as driving on, or the rover would take its time on detours.
         reward = np.where(measurement[:, 0] >= self.set_point[0], FINISH * reward, reward)
         return np.where(self.failed(measurement), 0.0, reward)
