@@ -13,8 +13,8 @@ from hyrl_mj.tasks.registry import register
 
 # The heading that still counts as on the way [rad], and how close to the pillar it begins to matter [m].
 ASTRAY, NEAR = 1.4, 0.25
-# Samples' reward that there is for reaching the goal, and what a heading costs on the way [1/rad].
-FINISH, HEADING_COST = 10, 0.1
+# What counts at the goal, in samples' reward; off the middle before the pillar [1/m]; and a heading [1/rad2].
+FINISH, BEFORE, TURNED = 10, 0.5, 0.15
 # Rate of turn that starts have at most [rad/s].
 START_RATE = 0.3
 
@@ -121,11 +121,13 @@ class Rover(Task):
         return np.asarray(np.linalg.norm(middle - self.obstacle, axis=1) - radii)
 
     def reward(self, measurement: np.ndarray) -> np.ndarray:
+        x, y, heading = measurement[:, :3].T
         near = np.clip(1 - self.clearance(measurement) / NEAR, 0.0, 1.0)
-        off = np.abs(measurement[:, 1]) + HEADING_COST * np.abs(measurement[:, 2])
+        # Before the pillar the middle is worth less: it would call for crossing it, and then deciding.
+        off = np.abs(y) * np.where(x < self.obstacle[0], BEFORE, 1.0) + TURNED * heading**2
         reward = np.maximum(3 - off - near, 0.0)
-        # The goal is worth as much as driving on, or the rover would take its time on detours.
-        reward = np.where(measurement[:, 0] >= self.set_point[0], FINISH * reward, reward)
+        # Enough that driving on in detours does not pay.
+        reward = np.where(x >= self.set_point[0], FINISH * reward, reward)
         return np.where(self.failed(measurement), 0.0, reward)
 
     def ending(self, measurement: np.ndarray) -> np.ndarray:
