@@ -15,7 +15,7 @@ from hyrl_mj.extended_sets import ExtendedSets, extend
 from hyrl_mj.hybrid import HybridController
 from hyrl_mj.noise import Noise, Recorded
 from hyrl_mj.partition import Partition, make_partition
-from hyrl_mj.pipeline import run
+from hyrl_mj.pipeline import diagnose, robustify, run
 from hyrl_mj.policies import MlpPolicy, Policy
 from hyrl_mj.robustness import Game, Score
 from hyrl_mj.run_directory import Run, load_run
@@ -50,6 +50,7 @@ __all__ = [
     "StateSet",
     "Task",
     "closed_loop",
+    "diagnose",
     "export_numpy",
     "export_onnx",
     "extend",
@@ -60,6 +61,7 @@ __all__ = [
     "load_run",
     "make_partition",
     "register",
+    "robustify",
     "run",
     "simulate",
     "task_names",

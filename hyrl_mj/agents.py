@@ -32,7 +32,7 @@ from hyrl_mj.policies import (
 )
 from hyrl_mj.tasks.base import Task
 
-REMEDY = "give the zip that SB3's model.save wrote, or an .onnx file"
+REMEDY = "give the zip that SB3's model.save wrote, an .onnx file, or a policy.safetensors of a run"
 # What unpacks to more [bytes] is no MLP policy: the largest of them take a few megabytes.
 LARGEST = 2**28
 # What parts of tensor names say about agents that are not plain MLPs on a vector.
@@ -152,7 +152,7 @@ def load_agent(
     stochastic: bool = False,
     seed: int = 0,
 ) -> ObservationPolicy:
-    """A trained agent as a policy: an SB3 zip or an `.onnx` file.
+    """A trained agent as a policy: an SB3 zip, an `.onnx` file, or a `.safetensors` file of ours.
 
     Zips are those that `model.save` writes for PPO, A2C, DQN, SAC, TD3 and DDPG with an MLP policy, by
     SB3 1.x too. Nothing in them is executed, and all but `policy.pth` may be missing. The agent has to
@@ -162,6 +162,8 @@ def load_agent(
 
     An ONNX model has one input, observations (n, k) float32, and as its first output inputs (n, m) in the
     plant's units; for a discrete task preferences (n, levels) or integers (n,).
+
+    A `.safetensors` file is what `MlpPolicy.save` wrote, with its description beside it.
 
     Args:
         path: the file.
@@ -173,7 +175,7 @@ def load_agent(
         seed: of these draws.
 
     Returns:
-        An `MlpPolicy` or `SampledPolicy` for a zip, a `FunctionPolicy` for an `.onnx` file.
+        A `FunctionPolicy` for an `.onnx` file, else an `MlpPolicy` or `SampledPolicy`.
 
     Raises:
         BadInput: an unknown activation, a bad seed, a policy that has nothing to draw from.
@@ -187,10 +189,23 @@ def load_agent(
         if stochastic or activation is not None:
             raise BadInput("an .onnx file acts as it is: give neither an activation nor stochastic")
         return _from_onnx(path, task)
-    with artifacts.reading(path, REMEDY):
-        weights, about = _read_zip(path)
-        policy = _from_tensors(weights, about, task, activation)
+    if path.suffix == ".safetensors":
+        policy = _from_safetensors(path, task, activation)
+    else:
+        with artifacts.reading(path, REMEDY):
+            weights, about = _read_zip(path)
+            policy = _from_tensors(weights, about, task, activation)
     return SampledPolicy(policy, np.random.default_rng(seed)) if stochastic else policy
+
+
+def _from_safetensors(path: Path, task: Task, activation: str | None) -> MlpPolicy:
+    """The policy that `MlpPolicy.save` wrote."""
+    policy = MlpPolicy.load(path)
+    if policy.task.name != task.name:
+        raise BadArtifact(f"{path} is a policy for {policy.task.name}: {task.name} needs its own")
+    if activation not in (None, policy.activation):
+        raise BadArtifact(f"{path} has activation {policy.activation!r}: leave the activation out")
+    return policy
 
 
 # ---- SB3

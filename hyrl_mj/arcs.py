@@ -60,7 +60,9 @@ def noisy_arcs(
     task = run.task
     bound = task.check_noise(run.settings.noise if eps is None else eps)
     steps = None if horizon is None else samples(task, horizon)
-    game = Game(task, run.partition, run.loops, max(bound, LARGEST)) if noise == WORST else None
+    if noise == WORST:
+        run.check_exact()
+    game = Game(task, run.split, run.loops, max(bound, LARGEST)) if noise == WORST else None
     found = {}
     for name, loop in run.loops.items():
         for q0 in q0s if name == "hyrl" else (None,):
@@ -132,12 +134,12 @@ def replay_shows(
     return [Show([arcs[name, "policy"]], [arcs[name, mode]]) for mode in modes]
 
 
-def replay_floor(run: Run) -> Floor:
+def replay_floor(run: Run, overlap: bool = True) -> Floor:
     """What a replay shows on the floor; of a chart of more than two dimensions a section."""
     section = run.section
     return Floor.of(
         section.task,
         run.critical_section,
-        section.partition(run.partition),
-        section.extended_sets(run.extended_sets),
+        section.partition(run.split if overlap else run.partition),
+        section.extended_sets(run.extended_sets) if overlap else None,
     )

@@ -14,7 +14,6 @@ import tyro
 
 from hyrl_mj import pipeline, progress
 from hyrl_mj.errors import BadInput, HyrlError, unknown
-from hyrl_mj.lattice import Lattice
 from hyrl_mj.noise import KINDS
 from hyrl_mj.summary import print_robustness, print_summary
 from hyrl_mj.tasks.registry import get_task, task_names
@@ -79,6 +78,99 @@ def run(
         task, noise=noise, seed=seed, preset_name=preset, horizon=horizon, out=out
     )
     print_summary(result)
+
+
+AgentFile = Annotated[
+    Path,
+    tyro.conf.arg(
+        metavar="FILE",
+        help="a .zip that SB3's model.save wrote, an .onnx file, or a .safetensors file",
+    ),
+]
+
+
+def robustify(
+    task: Annotated[str, Positional, tyro.conf.arg(metavar="TASK")],
+    /,
+    policy: AgentFile,
+    activation: str | None = None,
+    stochastic: bool = False,
+    noise: float = 0.1,
+    seed: int = 0,
+    preset: str = "fast",
+    horizon: float | None = None,
+    out: Path | None = None,
+) -> None:
+    """Make an agent robust that was trained elsewhere: all stages but the first.
+
+    A run directory that is there already is resumed: only what is missing is done.
+
+    Args:
+        task: a task, see `hyrl-mj list`, or a Python file that defines one.
+        policy: the agent.
+        activation: between its layers, for a zip that does not say; by default SB3's.
+        stochastic: the agent draws its inputs, as it did while it learned (PPO, A2C, SAC); noisy episodes
+            then stand in for the exact game.
+        noise: bound of the measurement noise to survive, in the units of the chart.
+        seed: of everything random.
+        preset: fast, paper, or smoke, as for `hyrl-mj run`.
+        horizon: horizon T of the backward propagation in s; by default the extended sets are sized to the
+            noise.
+        out: the run directory; by default runs/TASK_robust.
+    """
+    result = pipeline.robustify(
+        task,
+        policy,
+        activation=activation,
+        stochastic=stochastic,
+        noise=noise,
+        seed=seed,
+        preset_name=preset,
+        horizon=horizon,
+        out=out,
+    )
+    print_summary(result)
+
+
+def diagnose(
+    task: Annotated[str, Positional, tyro.conf.arg(metavar="TASK")],
+    /,
+    policy: AgentFile,
+    activation: str | None = None,
+    stochastic: bool = False,
+    noise: float = 0.1,
+    seed: int = 0,
+    preset: str = "fast",
+    horizon: float | None = None,
+    out: Path | None = None,
+) -> None:
+    """Find out what noise can do to an agent: critical set, losses, margin, a run that it loses, pictures.
+
+    Nothing is trained. `hyrl-mj robustify` with the same options goes on in the same run directory.
+
+    Args:
+        task: a task, see `hyrl-mj list`, or a Python file that defines one.
+        policy: the agent.
+        activation: between its layers, for a zip that does not say; by default SB3's.
+        stochastic: the agent draws its inputs, as it did while it learned (PPO, A2C, SAC); noisy episodes
+            then stand in for the exact game.
+        noise: bound of the measurement noise, in the units of the chart.
+        seed: of everything random.
+        preset: fast, paper or smoke: how finely it is looked at, and how `hyrl-mj robustify` goes on.
+        horizon: of `hyrl-mj robustify`, which goes on with it.
+        out: the run directory; by default runs/TASK_robust.
+    """
+    pipeline.diagnose(
+        task,
+        policy,
+        activation=activation,
+        stochastic=stochastic,
+        noise=noise,
+        seed=seed,
+        preset_name=preset,
+        horizon=horizon,
+        out=out,
+    )
 
 
 def stage_command(name: str, help_text: str) -> Callable[..., None]:
@@ -174,7 +266,7 @@ def robustness(
         if kind not in KINDS:
             raise unknown("noise", kind, KINDS)
     if episodes is None:
-        Lattice.check(run.task)
+        run.check_exact()
         if kinds or near_critical:
             option = "--noise" if kinds else "--near-critical"
             raise BadInput(f"{option} is about the episodes: say how many, as in --episodes 100000")
@@ -307,6 +399,8 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "list": list_tasks,
     "new-task": new_task,
     "run": run,
+    "robustify": robustify,
+    "diagnose": diagnose,
     "train": stage_command("train", "Run stage 1 again: train the policy."),
     "critical-set": stage_command("critical-set", "Run stage 2 again: find the critical set."),
     "partition": stage_command("partition", "Run stage 3 again: partition the chart."),

@@ -10,6 +10,8 @@ import numpy as np
 
 from hyrl_mj import artifacts
 from hyrl_mj.critical_set import CriticalSet
+from hyrl_mj.game import NEVER
+from hyrl_mj.limit import Limit
 from hyrl_mj.partition import Partition, PartPolicy, part_policies
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import Grid, GridSet
@@ -34,7 +36,7 @@ class ExtendedSets:
         modes: the modes.
         sets: M_ext_i, in the same order.
         winning: W_i as (N,) bool over the grid's nodes: where pi_i reaches its goal.
-        horizon: time T of the backward propagation [s].
+        horizon: time T of the backward propagation [s]; 0 if there was none.
         noise: bound eps of the measurement noise that the sets are made for.
         narrow: (K, d) points of M* at which a mode has less room than the noise asks for.
         room: (K,) the room there is, across, in chart units; 2 eps are asked for.
@@ -54,10 +56,8 @@ class ExtendedSets:
             return "one mode, its set is everything"
         both = self.sets[0] & self.sets[1]
         share = both.mask.mean()
-        text = (
-            f"{len(self.sets)} extended sets, T = {self.horizon:.2g} s, "
-            f"the first two share {100 * share:.1f}% of the chart"
-        )
+        reach = f"T = {self.horizon:.2g} s" if self.horizon else "as far as the ways are open"
+        text = f"{len(self.sets)} extended sets, {reach}, the first two share {100 * share:.1f}% of the chart"
         if not len(self.narrow):
             return text
         low, high, chart = self.narrow.min(axis=0), self.narrow.max(axis=0), task.chart
@@ -115,6 +115,7 @@ def extend(
     partition: Partition,
     noise: float,
     horizon: float | None = None,
+    ways: Limit | None = None,
 ) -> ExtendedSets:
     """Extend the parts over M*.
 
@@ -135,18 +136,25 @@ def extend(
         noise: bound eps of the measurement noise.
         horizon: time T of the backward propagation [s]. By default the shortest with which every set
             reaches 2 eps and one sample over M*, where its mode still succeeds, and then no farther.
+        ways: which way is open from where. An agent need not know how to go on its way from beyond the
+            place where it decides otherwise; with `ways` W_i is where way i is open, for the mode will be
+            trained to go it, and without a horizon every set reaches 2 eps and one sample over the
+            boundary of its part there.
     """
     grid, parts = partition.grid, partition.parts
     eps, hop = task.noise_in_chart(noise), longest_hop(task, policy, grid)
-    near = max(noise, NEIGHBOURHOOD_CELLS * grid.cell, float(np.linalg.norm(hop)))
+    near = neighbourhood(grid, noise, hop)
     pis = part_policies(task, policy, partition, near)
     wanted = [part.dilated_by_box(2 * eps + hop * (task.noise_in_chart(1.0) > 0)) for part in parts]
     # W_i, asked for wherever a set may come to lie.
     radius = 3 * noise + near + (0.0 if horizon is None else horizon / task.dt * near)
-    winning = tuple(
-        part_wins(task, pi, partition, part, part.dilated(radius))
-        for pi, part in zip(pis, parts, strict=True)
-    )
+    if ways is None:
+        winning = tuple(
+            part_wins(task, pi, partition, part, part.dilated(radius))
+            for pi, part in zip(pis, parts, strict=True)
+        )
+    else:
+        winning = open_ways(ways, grid)
     roomy = [
         GridSet.from_mask(grid, wins | ~part.dilated(radius).mask).eroded_by_box(eps)
         for wins, part in zip(winning, parts, strict=True)
@@ -155,7 +163,8 @@ def extend(
     off = distance_to(task, critical, grid.nodes)
     around = off <= float(np.linalg.norm(2 * eps + hop))
     reached = list(parts)
-    if len(parts) > 1:
+    running = len(parts) > 1 and (ways is None or horizon is not None)
+    if running:
         reach = [
             backward_reach(task, pi, part, part.mask & (off <= near))
             if task.kinematic
@@ -163,7 +172,7 @@ def extend(
             for pi, part in zip(pis, parts, strict=True)
         ]
     steps = [max(round(horizon / task.dt), 1)] if horizon else range(1, _longest(task) + 1)
-    for k in steps if len(parts) > 1 else ():
+    for k in steps if running else ():
         reached = [part | within(k) for part, within in zip(parts, reach, strict=True)]
         goals = [
             (w & r).mask & ~p.mask & around for w, r, p in zip(wanted, roomy, parts, strict=True)
@@ -172,14 +181,66 @@ def extend(
         if min(filled, default=1.0) >= FILLED:
             break
     if horizon is None:
-        reached = [r & w for r, w in zip(reached, wanted, strict=True)]
+        reached = [r & w for r, w in zip(reached, wanted, strict=True)] if running else wanted
     sets = tuple(
         (r & room) | part.dilated_by_box(eps)
         for r, room, part in zip(reached, roomy, parts, strict=True)
     )
     narrow, room = room_along(task, critical, partition, winning, eps)
-    taken = horizon or (k * task.dt if len(parts) > 1 else 0.0)
+    taken = horizon or (k * task.dt if running else 0.0)
     return ExtendedSets(partition.modes, sets, winning, taken, noise, narrow, room)
+
+
+def open_ways(ways: Limit, grid: Grid) -> tuple[np.ndarray, ...]:
+    """Where on a grid each mode's way is open: (N,) bool."""
+    at = ways.lattice.grid.nearest(grid.nodes)
+    return tuple(samples[at] < NEVER for samples in ways.samples)
+
+
+def with_room(
+    task: Task, policy: Policy, partition: Partition, ways: Limit, noise: float
+) -> Partition:
+    """The parts, changed where the policy goes a way that is about to close while another is not.
+
+    Who drives towards the obstacle's middle and decides at the last moment leaves no room for an overlap.
+    So a state with less room for its way than 2 eps and one sample belongs to the mode whose way has the
+    most. Where every way has that room, or none, the policy's own decision stands.
+
+    Args:
+        task: gives the noisy coordinates.
+        policy: the agent.
+        partition: M_i, by the way that it goes.
+        ways: which way is open from where.
+        noise: bound eps of the measurement noise.
+    """
+    grid = partition.grid
+    if len(partition.parts) < 2:
+        return partition
+    hop = longest_hop(task, policy, grid) * (task.noise_in_chart(1.0) > 0)
+    wanted = float((2 * task.noise_in_chart(noise) + hop).max())
+    room = -np.stack([GridSet.from_mask(grid, open_).values for open_ in open_ways(ways, grid)])
+    masks = np.stack([part.mask for part in partition.parts])
+    own = np.where(masks, room, -np.inf).max(axis=0)
+    best = room.argmax(axis=0)
+    moved = (masks.sum(axis=0) == 1) & (own < wanted) & (room.max(axis=0) > np.maximum(own, 0))
+    parts = tuple(
+        GridSet.from_mask(grid, np.where(moved, best == i, mask)) for i, mask in enumerate(masks)
+    )
+    return Partition(partition.modes, parts, partition.succeeds)
+
+
+def boundary(partition: Partition) -> np.ndarray:
+    """Points (N, d) between neighbouring nodes of which no part holds both."""
+    grid = partition.grid
+    first, second = grid.neighbours()
+    together = np.any([part.mask[first] & part.mask[second] for part in partition.parts], axis=0)
+    a, b = grid.nodes[first[~together]], grid.nodes[second[~together]]
+    return np.asarray(a + grid.chart.difference(b, a) / 2)
+
+
+def neighbourhood(grid: Grid, noise: float, hop: np.ndarray) -> float:
+    """The distance from M* that counts as near it: the noise, some cells, and a sample's way (d,)."""
+    return max(noise, NEIGHBOURHOOD_CELLS * grid.cell, float(np.linalg.norm(hop)))
 
 
 def _longest(task: Task) -> int:

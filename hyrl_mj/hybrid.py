@@ -31,11 +31,13 @@ class HybridController:
         task: gives the chart and checks measurements.
         policies: the policy of each mode.
         flow_sets: C_q of each mode.
+        starts: a set for each mode by which the start mode is picked; by default the flow sets.
     """
 
     task: Task
     policies: Mapping[int, Policy]
     flow_sets: Mapping[int, StateSet]
+    starts: Mapping[int, StateSet] | None = None
 
     def __post_init__(self) -> None:
         if set(self.policies) != set(self.flow_sets) or not self.policies:
@@ -59,7 +61,7 @@ class HybridController:
         return Complement(self.flow_set(q))
 
     def initial_mode(self, measured: np.ndarray) -> np.ndarray:
-        """The mode whose flow set holds the first measurement most deeply.
+        """The mode whose flow set, or start set, holds the first measurement most deeply.
 
         Args:
             measured: (n, p) measurements.
@@ -68,7 +70,7 @@ class HybridController:
             (n,) int modes.
         """
         z = self.task.z(self.task.check_measurement(measured))
-        return self._deepest(self.modes, z)
+        return self._deepest(self.modes, z, self.starts)
 
     def step(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """One sample: jump where z lies in D_q, then u = pi_q(measured).
@@ -110,11 +112,13 @@ class HybridController:
                 q_next[jumping] = self._deepest(others, z[jumping])
         return q_next
 
-    def _deepest(self, modes: Sequence[int], z: np.ndarray) -> np.ndarray:
-        """That of the modes (n,) whose flow set holds z (n, d) most deeply."""
+    def _deepest(
+        self, modes: Sequence[int], z: np.ndarray, sets: Mapping[int, StateSet] | None = None
+    ) -> np.ndarray:
+        """That of the modes (n,) whose set, by default its flow set, holds z (n, d) most deeply."""
         if len(modes) == 1:
             return np.full(len(z), modes[0])
-        distances = [self.flow_sets[q].signed_distance(z) for q in modes]
+        distances = [(sets or self.flow_sets)[q].signed_distance(z) for q in modes]
         return np.array(modes)[np.argmin(distances, axis=0)]
 
     def _rows(self, q: np.ndarray) -> dict[int, Rows]:

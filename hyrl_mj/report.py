@@ -16,9 +16,10 @@ from PIL import Image
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadInput
 from hyrl_mj.figures import CAPTIONS, CLASS_COLOURS
+from hyrl_mj.policies import MlpPolicy
 from hyrl_mj.robustness import LIMIT, MAP_CLASSES
 from hyrl_mj.run_directory import Run
-from hyrl_mj.settings import Settings, Training, preset
+from hyrl_mj.settings import Agent, Settings, Training, preset
 from hyrl_mj.tables import (
     Arcs,
     Table,
@@ -35,6 +36,7 @@ from hyrl_mj.tables import (
     robustness_sentence,
     score_table,
 )
+from hyrl_mj.tasks.registry import get_task
 
 # What the classes of the maps mean, in the order of MAP_CLASSES.
 MEANINGS = (
@@ -107,25 +109,13 @@ def render(run: Run) -> str:
     robustness = run.robustness if (run.path / "robustness.json").is_file() else None
     arcs = run.arcs() if all(path.is_file() for path in run.arc_paths().values()) else None
     game = robustness["game"] if robustness else None
-    environment = Environment(
-        loader=PackageLoader("hyrl_mj"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("report.html").render(
-        # A name that is no Unicode must not keep the page from being written.
-        name=os.fsencode(run.path.resolve().name).decode("utf-8", "replace"),
-        title=task.name.replace("_", " ").capitalize(),
-        task=task,
-        settings=run.settings,
+    return fill(
+        "report.html",
+        run,
         modes=[task.mode_name(q) for q in modes],
-        critical=run.critical_set,
-        unit=task.noise_on()[1],
         worst=task.noise_on(bool(robustness and robustness["everywhere"])),
-        video=_video(run),
-        pictures=_pictures(run),
+        video=film(run.path / "replay.mp4"),
+        pictures=pictures(run.path / "figures"),
         robustness=robustness,
         game=game,
         arcs=arcs,
@@ -140,7 +130,30 @@ def render(run: Run) -> str:
         commands=_commands(run.settings, robustness),
         changed=_changed(run),
         classes=list(zip(MAP_CLASSES, CLASS_COLOURS, MEANINGS, strict=True)),
+    )
+
+
+def fill(template: str, run: Run, **values: Any) -> str:
+    """A page from its template, with what every page of a run says."""
+    environment = Environment(
+        loader=PackageLoader("hyrl_mj"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(
+        # A name that is no Unicode must not keep the page from being written.
+        name=os.fsencode(run.path.resolve().name).decode("utf-8", "replace"),
+        title=run.task.name.replace("_", " ").capitalize(),
+        task=run.task,
+        settings=run.settings,
+        agent=run.agent,
+        exact=run.exact,
+        critical=run.critical_set,
+        unit=run.task.noise_on()[1],
         percent=percent,
+        **values,
     )
 
 
@@ -157,17 +170,17 @@ def _tables(run: Run, robustness: Mapping[str, Any] | None) -> dict[str, Table |
 # ---- pictures
 
 
-def _video(run: Run) -> dict[str, Any] | None:
-    """The replay and its poster."""
-    film, poster = run.path / "replay.mp4", run.path / "replay.png"
-    if not (film.is_file() and poster.is_file()):
+def film(path: Path) -> dict[str, Any] | None:
+    """A replay and its poster, if both are there."""
+    poster = path.with_suffix(".png")
+    if not (path.is_file() and poster.is_file()):
         return None
-    return {"data": _data(film, "video/mp4"), "poster": _picture(poster, "replay")}
+    return {"data": _data(path, "video/mp4"), "poster": _picture(poster, "replay")}
 
 
-def _pictures(run: Run) -> list[Picture]:
+def pictures(folder: Path) -> list[Picture]:
     """The figures that are there."""
-    paths = {name: run.path / "figures" / f"{name}.png" for name in CAPTIONS}
+    paths = {name: folder / f"{name}.png" for name in CAPTIONS}
     return [
         _picture(path, name.replace("_", " "), CAPTIONS[name])
         for name, path in paths.items()
@@ -268,14 +281,16 @@ def _stages(
 ) -> list[tuple[str, str]]:
     """What each stage has found, in a sentence."""
     task, s, modes = run.task, run.settings, run.extended_sets.modes
-    size = sum(weight.size for weight in run.policy.weights.values())
     reach = "; ".join(f"mode {task.mode_name(q)}: {extent(run, q)}" for q in modes)
     each = f"up to {s.stage6.attempts} times " if s.stage6.attempts > 1 else ""
+    if isinstance(s.stage1, Agent):
+        first = f"none: {s.stage1} was given"
+    else:
+        assert isinstance(run.policy, MlpPolicy)
+        size = sum(weight.size for weight in run.policy.weights.values())
+        first = f"{s.stage1.algorithm.upper()}, {s.stage1.samples:,} samples, no noise: {size:,} weights"
     return [
-        (
-            "train",
-            f"{s.stage1.algorithm.upper()}, {s.stage1.samples:,} samples, no noise: {size:,} weights",
-        ),
+        ("train", first),
         ("critical-set", run.critical_set.sentence(task)),
         ("partition", run.partition.sentence(task)),
         ("extended-sets", f"{run.extended_sets.sentence(task)}; {reach}"),
@@ -294,13 +309,16 @@ def _settings(settings: Settings) -> list[tuple[str, str]]:
     return [
         (_words(name), _value(value))
         for name, value in vars(settings).items()
-        if not isinstance(value, Training)
+        if not isinstance(value, Training | Agent)
     ]
 
 
 def _training(settings: Settings) -> list[tuple[str, str, str]]:
-    """The settings of the trainings of stages 1 and 6, side by side."""
-    first, sixth = (vars(t) | t.options for t in (settings.stage1, settings.stage6))
+    """The settings of the trainings of stages 1 and 6, side by side; an agent has its own."""
+    first, sixth = (
+        vars(stage) | (stage.options if isinstance(stage, Training) else {})
+        for stage in (settings.stage1, settings.stage6)
+    )
     return [
         (
             _words(name),
@@ -328,16 +346,31 @@ def _value(value: object) -> str:
 def _commands(settings: Settings, robustness: Mapping[str, Any] | None) -> list[str]:
     """What to type to repeat the run, and the examination if it was another than the run's own."""
     s = settings
-    first = ["hyrl-mj", "run", s.task, "--noise", f"{s.noise}", "--seed", f"{s.seed}"]
-    first += ["--preset", s.preset]
-    if s.horizon is not None:
-        first += ["--horizon", f"{s.horizon}"]
-    commands = [shlex.join(first)]
+    commands = [beginning(settings)]
     if robustness and (
         robustness["episodes"] or robustness["everywhere"] or robustness["eps"] != s.noise
     ):
         commands.append(_examination(robustness))
     return commands
+
+
+def beginning(settings: Settings, out: Path | None = None) -> str:
+    """What begins such a run, or goes on with it: a command, or a call where the agent is no file."""
+    s, agent = settings, settings.stage1 if isinstance(settings.stage1, Agent) else None
+    if agent and not agent.source:
+        rest = "" if s.horizon is None else f", horizon={s.horizon}"
+        rest += "" if out is None else f", out={str(out)!r}"
+        return (
+            f"hyrl_mj.robustify({s.task!r}, policy, noise={s.noise}, seed={s.seed}, "
+            f"preset_name={s.preset!r}{rest})"
+        )
+    words = ["hyrl-mj", *(["robustify", s.task, *agent.options] if agent else ["run", s.task])]
+    words += ["--noise", f"{s.noise}", "--seed", f"{s.seed}", "--preset", s.preset]
+    if s.horizon is not None:
+        words += ["--horizon", f"{s.horizon}"]
+    if out is not None:
+        words += ["--out", f"{out}"]
+    return shlex.join(words)
 
 
 def _examination(robustness: Mapping[str, Any]) -> str:
@@ -357,5 +390,12 @@ def _examination(robustness: Mapping[str, Any]) -> str:
 def _changed(run: Run) -> list[str]:
     """Settings that the command would not give again: those of a preset of another version."""
     s = run.settings
-    again = preset(run.task, s.preset, noise=s.noise, seed=s.seed, horizon=s.horizon).to_json()
+    again = preset(
+        get_task(s.task),
+        s.preset,
+        noise=s.noise,
+        seed=s.seed,
+        horizon=s.horizon,
+        agent=run.agent,
+    ).to_json()
     return [_words(name) for name, value in s.to_json().items() if value != again[name]]

@@ -11,17 +11,18 @@ import numpy as np
 from hyrl_mj import symmetry
 from hyrl_mj.controllers import PolicyController
 from hyrl_mj.envs.core import Domain
-from hyrl_mj.extended_sets import ExtendedSets
+from hyrl_mj.extended_sets import ExtendedSets, longest_hop, neighbourhood
 from hyrl_mj.game import LOST, NEVER, Answers, Moves, lasting, noisy_moves, solve
 from hyrl_mj.lattice import Lattice
 from hyrl_mj.limit import fewest_samples
 from hyrl_mj.noise import KINDS, Noise
-from hyrl_mj.policies import MlpPolicy
+from hyrl_mj.partition import Partition, part_policies
+from hyrl_mj.policies import ACTOR_CRITIC, LAYOUTS, MlpPolicy, Policy
 from hyrl_mj.sets import GridSet
 from hyrl_mj.settings import Training
 from hyrl_mj.simulation import closed_loop
 from hyrl_mj.tasks.base import Outcome, Task
-from hyrl_mj.training import Score, train
+from hyrl_mj.training import Score, distil, fits, train
 
 # Of the starts of training episodes this share is where the game is lost, if it is; of the others this
 # share comes from where the task starts, the rest from all over the mode's domain.
@@ -38,13 +39,14 @@ EPISODES, TOGETHER = 256, 64
 
 def retrain(
     task: Task,
-    policy: MlpPolicy,
+    policy: Policy,
     extended: ExtendedSets,
     mode: int,
     settings: Training,
     seed: int,
     others: Iterable[MlpPolicy] = (),
     log_dir: Path | None = None,
+    partition: Partition | None = None,
 ) -> MlpPolicy:
     """Train the policy of one mode (paper, Step 6).
 
@@ -54,16 +56,18 @@ def retrain(
 
     Args:
         task: what to learn.
-        policy: the stage-1 policy; with `settings.warm_start` training goes on from its weights.
+        policy: the stage-1 policy; with `settings.warm_start` the first attempt goes on from it.
         extended: M_ext_i and W_i, from stage 5.
         mode: the mode to train.
         settings: how to train.
         seed: of everything random; each mode and attempt derives its own from it.
         others: policies of other modes: if the mirror image of one is good enough here, it is taken.
         log_dir: where logs and checkpoints go.
+        partition: M_i, from stage 3, for a warm start with PPO.
 
     Returns:
-        The best policy of all attempts, or the first mirror image that will do.
+        The best policy of all attempts and the one that they went on from, or the first mirror image that
+        will do.
     """
     ground = (ByGame if Lattice.possible(task) else ByEpisodes)(task, extended, mode)
     if task.mirror is not None:
@@ -72,13 +76,21 @@ def retrain(
                 return image
     best: tuple[Score, MlpPolicy] | None = None
     for attempt in range(settings.attempts):
+        draw = int(np.random.SeedSequence([seed, 1 + mode, attempt]).generate_state(1)[0])
+        warm = None
+        if settings.warm_start and not attempt:
+            warm = warm_start(task, policy, extended, mode, settings, draw, ground, partition)
+        if warm is not None:
+            best = ground(warm), warm
+            if best[0] >= ground.enough:
+                return warm
         found = train(
             task,
             settings,
-            seed=int(np.random.SeedSequence([seed, 1 + mode, attempt]).generate_state(1)[0]),
+            seed=draw,
             noise=ground.noise,
             domain=ground.domain(settings.gamma),
-            start_from=policy if settings.warm_start else None,
+            start_from=warm,
             judge=ground,
             log_dir=log_dir,
             label=f"mode {mode}" + (f", attempt {attempt + 1}" if attempt else ""),
@@ -90,6 +102,31 @@ def retrain(
             break
     assert best is not None
     return best[1]
+
+
+def warm_start(
+    task: Task,
+    policy: Policy,
+    extended: ExtendedSets,
+    mode: int,
+    settings: Training,
+    seed: int,
+    ground: ModeGround,
+    partition: Partition | None,
+) -> MlpPolicy | None:
+    """What the first attempt goes on from; None if it has to start afresh.
+
+    PPO and A2C go on from pi_i, what the policy does on M_i, continued over the boundary (paper, Step 4),
+    distilled into their network. The policy's own weights would bring its decision along, which they do not
+    let go of. Others go on from the weights, if these fit.
+    """
+    if partition is None or LAYOUTS[settings.algorithm] is not ACTOR_CRITIC:
+        if isinstance(policy, MlpPolicy) and fits(task, settings, policy):
+            return policy
+        return None
+    near = neighbourhood(partition.grid, extended.noise, longest_hop(task, policy, partition.grid))
+    part = part_policies(task, policy, partition, near)[partition.modes.index(mode)]
+    return distil(task, part, ground.starts, settings, seed)
 
 
 class ModeGround(ABC):

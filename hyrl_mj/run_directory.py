@@ -10,15 +10,18 @@ from pathlib import Path
 from typing import Any
 
 from hyrl_mj import artifacts, robustness
+from hyrl_mj.agents import SampledPolicy
 from hyrl_mj.controllers import Controller, PolicyController
 from hyrl_mj.critical_set import CriticalSet
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.extended_sets import ExtendedSets
+from hyrl_mj.given import FUNCTION, ONNX, AnyPolicy, opened
 from hyrl_mj.hybrid import HybridController
+from hyrl_mj.lattice import Lattice
 from hyrl_mj.partition import Partition
-from hyrl_mj.policies import MlpPolicy
+from hyrl_mj.policies import MlpPolicy, Policy
 from hyrl_mj.section import Section
-from hyrl_mj.settings import Settings
+from hyrl_mj.settings import Agent, Settings
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.registry import get_task
@@ -35,20 +38,60 @@ class Run:
     Attributes:
         path: the directory.
         settings: how it was made.
+        function: the agent that it is about, if that is a function, which no file holds.
     """
 
     path: Path
     settings: Settings
+    function: AnyPolicy | None = None
 
     @cached_property
     def task(self) -> Task:
         """The task."""
-        return get_task(self.settings.task)
+        task = get_task(self.settings.task)
+        if self.agent is not None:
+            task.algorithm = self.agent.algorithm  # pictures call the policy by it
+        return task
+
+    @property
+    def agent(self) -> Agent | None:
+        """The agent that was given in the place of stage 1, if one was."""
+        stage1 = self.settings.stage1
+        return stage1 if isinstance(stage1, Agent) else None
 
     @cached_property
-    def policy(self) -> MlpPolicy:
-        """The policy of stage 1."""
-        return self._load_policy("policy.safetensors")
+    def policy(self) -> Policy:
+        """The policy of stage 1, or the agent."""
+        if self.agent is None:
+            return self._load_policy("policy.safetensors")
+        return opened(self.path, self.agent, self.task, self.settings.seed, self.function)
+
+    @property
+    def steady(self) -> Policy:
+        """The policy at its mean or mode, where it is sampled: the stages take a function."""
+        policy = self.policy
+        return policy.policy if isinstance(policy, SampledPolicy) else policy
+
+    @property
+    def exact(self) -> bool:
+        """Whether the worst case can be played: it takes a lattice, and a policy that does not draw."""
+        return Lattice.possible(self.task) and not (self.agent and self.agent.stochastic)
+
+    def check_exact(self) -> None:
+        """Raise `BadInput` unless `exact`."""
+        Lattice.check(self.task)
+        if not self.exact:
+            raise BadInput(
+                "the exact game takes a function of the measurement, and this policy draws its inputs: use "
+                "noisy episodes instead (hyrl-mj robustness RUN --episodes N --noise adversarial)"
+            )
+
+    @property
+    def policy_files(self) -> list[Path]:
+        """The files that hold the policy of stage 1, or the agent."""
+        special = {ONNX: ["policy.onnx"], FUNCTION: ["policy.json"]}
+        network = ["policy.safetensors", "policy.json"]
+        return [self.path / n for n in special.get(self.settings.stage1.algorithm, network)]
 
     @cached_property
     def critical_set(self) -> CriticalSet:
@@ -59,6 +102,21 @@ class Run:
     def partition(self) -> Partition:
         """The parts M_i, of stage 3."""
         return Partition.load(self.path / "partition.npz", self.task)
+
+    @cached_property
+    def split(self) -> Partition:
+        """The parts that are extended: M_i, for an agent changed where they leave no room."""
+        return self.partition if self.agent is None else Partition.load(self.split_path, self.task)
+
+    @property
+    def split_path(self) -> Path:
+        """The file of `split`, if it has one of its own."""
+        return self.path / "split.npz"
+
+    @property
+    def set_files(self) -> list[Path]:
+        """The files of stage 5."""
+        return [self.path / "extended_sets.npz", *[self.split_path] * (self.agent is not None)]
 
     @cached_property
     def extended_sets(self) -> ExtendedSets:
@@ -75,16 +133,20 @@ class Run:
         """M* in the section."""
         s = self.settings
         cells = max(s.rods, SECTION_CELLS)
-        return self.section.critical_set(self.critical_set, self.policy, cells, s.resolution)
+        return self.section.critical_set(self.critical_set, self.steady, cells, s.resolution)
 
     @cached_property
     def controller(self) -> HybridController:
         """The hybrid controller, of stage 7."""
         extended = self.extended_sets
         policies = {q: self._load_policy(f"mode_{q}.safetensors") for q in extended.modes}
-        return HybridController(
-            self.task, policies, dict(zip(extended.modes, extended.sets, strict=True))
-        )
+        flow_sets = dict(zip(extended.modes, extended.sets, strict=True))
+        starts = None
+        if (
+            self.agent is not None
+        ):  # its sets reach differently far to either side of where it decides
+            starts = dict(zip(self.split.modes, self.split.parts, strict=True))
+        return HybridController(self.task, policies, flow_sets, starts)
 
     @cached_property
     def loops(self) -> dict[str, Controller]:
@@ -144,8 +206,12 @@ class Run:
         return policy
 
 
-def load_run(path: str | Path) -> Run:
+def load_run(path: str | Path, policy: AnyPolicy | None = None) -> Run:
     """Open a run directory.
+
+    Args:
+        path: the directory.
+        policy: the function that the run is about, if it is about one: no file holds it.
 
     Raises:
         BadArtifact: it is not one.
@@ -159,7 +225,7 @@ def load_run(path: str | Path) -> Run:
         )
     content = artifacts.read_json(config, kind="run")
     with artifacts.reading(config):
-        return Run(path, Settings.from_json(content["settings"]))
+        return Run(path, Settings.from_json(content["settings"]), policy)
 
 
 def write_config(run: Run) -> None:
@@ -169,24 +235,40 @@ def write_config(run: Run) -> None:
     artifacts.write_json(run.path / "config.json", content, kind="run")
 
 
-def open_or_create(path: str | Path, settings: Settings) -> Run:
+def _differing(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
+    """The settings that differ, in words."""
+    found = []
+    for name in (name for name in new if old[name] != new[name]):
+        what = old[name], new[name]
+        if not isinstance(new[name], dict):
+            found.append(f"{name}: {what[0]} there, {what[1]} asked for")
+        elif not any("sha256" in stage for stage in what):
+            found.append(name)
+        elif old[name] | {"source": ""} != new[name] | {"source": ""}:
+            found.append(f"policy: {_policy(what[0])} there, {_policy(what[1])} asked for")
+    return found
+
+
+def _policy(stage1: dict[str, Any]) -> str:
+    """Stage 1 for people."""
+    if "sha256" not in stage1:
+        return f"{stage1['algorithm']} to be trained"
+    return f"{Agent(**stage1)} of sha256 {stage1['sha256'][:8]}"
+
+
+def open_or_create(path: str | Path, settings: Settings, policy: AnyPolicy | None = None) -> Run:
     """The run directory at `path` with these settings, made if it is not there yet.
+
+    `policy` is as in `load_run`.
 
     Raises:
         BadInput: there is a run with other settings; the message names them.
     """
     path = Path(path)
     if (path / "config.json").exists():
-        run = load_run(path)
+        run = load_run(path, policy)
         if run.settings != settings:
-            old, new = run.settings.to_json(), settings.to_json()
-            differing = [
-                f"{name}: {old[name]} there, {new[name]} asked for"
-                if not isinstance(new[name], dict)
-                else name
-                for name in new
-                if old[name] != new[name]
-            ]
+            differing = _differing(run.settings.to_json(), settings.to_json())
             raise BadInput(
                 f"{path} holds a run with other settings ({'; '.join(differing)}): "
                 "choose another --out, give the same settings, or remove it"
@@ -194,6 +276,6 @@ def open_or_create(path: str | Path, settings: Settings) -> Run:
         return run
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise BadInput(f"{path} is there and is not a run directory: choose another --out")
-    run = Run(path, settings)
+    run = Run(path, settings, policy)
     write_config(run)
     return run

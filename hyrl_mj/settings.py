@@ -30,8 +30,9 @@ class Training:
         gamma: discount factor.
         symmetric: whether the network is made to respect the task's mirror symmetry, if it has one.
             Its weights then serve twice, and the policy has twice the width.
-        warm_start: whether training goes on from the weights of stage 1 (stage 6 only). A Gaussian
-            policy that has made up its mind does not try the other way any more: PPO starts afresh.
+        warm_start: whether the first attempt goes on from the policy of stage 1 (stage 6 only): DQN from
+            its weights, PPO from what it does on the mode's part, distilled. A Gaussian policy that has
+            made up its mind does not try the other way any more.
         episode: samples until an episode is truncated, by default the task's; shorter ones see more of
             the starts.
         attempts: how often training starts again, with another seed, until its policy is good enough
@@ -55,6 +56,39 @@ class Training:
 
 
 @dataclass(frozen=True)
+class Agent:
+    """A policy that is given, in the place of one that stage 1 trains.
+
+    Attributes:
+        algorithm: of SB3 that trained it; "onnx" for a model in that format, "function" for code.
+        source: the file that it came from, as it was given; "" for an object of Python's. Two agents that
+            differ in nothing else are the same.
+        sha256: of what it is: a network's tensors, a model's file, a function's answers.
+        activation: between a network's layers, else None.
+        stochastic: whether it draws its inputs, as it did while it learned.
+    """
+
+    algorithm: str
+    source: str = field(compare=False)
+    sha256: str
+    activation: str | None = None
+    stochastic: bool = False
+
+    def __str__(self) -> str:
+        """It for people: "agent.zip (DQN, sampled)"."""
+        drawn = ", sampled" if self.stochastic else ""
+        return f"{self.source or 'an agent of Python code'} ({self.algorithm.upper()}{drawn})"
+
+    @property
+    def options(self) -> list[str]:
+        """How the command line is told of it."""
+        options = ["--policy", self.source]
+        if self.activation is not None:
+            options += ["--activation", self.activation]
+        return options + ["--stochastic"] * self.stochastic
+
+
+@dataclass(frozen=True)
 class Settings:
     """All settings of a run; `config.json` holds them.
 
@@ -64,7 +98,7 @@ class Settings:
         seed: of everything random.
         noise: bound eps of the measurement noise that the controller has to survive.
         horizon: time T of the backward propagation [s]; None to size the sets to the noise.
-        stage1: training of the first policy (stage 1).
+        stage1: training of the first policy (stage 1), or the agent that is given instead.
         stage6: training of each mode's policy (stage 6).
         cells: grid cells along the longest side of the chart; cells are square in chart units.
         rods: grid points along the longest side from which the search for critical points starts.
@@ -78,7 +112,7 @@ class Settings:
     seed: int
     noise: float
     horizon: float | None
-    stage1: Training
+    stage1: Training | Agent
     stage6: Training
     cells: int
     rods: int
@@ -106,13 +140,17 @@ class Settings:
             BadArtifact: a setting is missing or unknown.
         """
         try:
-            stages = {
-                name: Training(**{**content[name], "hidden": tuple(content[name]["hidden"])})
-                for name in ("stage1", "stage6")
-            }
+            stages = {name: _stage(content[name]) for name in ("stage1", "stage6")}
             return Settings(**{**content, **stages})
         except (KeyError, TypeError) as error:
             raise BadArtifact(f"its settings are not those of this version ({error})") from error
+
+
+def _stage(content: dict[str, Any]) -> Training | Agent:
+    """A training or an agent, from what `to_json` makes of it."""
+    if "sha256" in content:
+        return Agent(**content)
+    return Training(**{**content, "hidden": tuple(content["hidden"])})
 
 
 # Stage 1 of each preset, by algorithm.
@@ -228,6 +266,7 @@ def preset(
     noise: float = 0.1,
     seed: int = 0,
     horizon: float | None = None,
+    agent: Agent | None = None,
 ) -> Settings:
     """The settings of a preset.
 
@@ -238,6 +277,7 @@ def preset(
         seed: of everything random.
         horizon: time T of the backward propagation [s]; by default the sets are sized to the noise, and
             preset "paper" takes the paper's T.
+        agent: takes the place of stage 1; the modes then go on from it.
 
     Raises:
         BadInput: an unknown preset, or a value that cannot be used.
@@ -254,10 +294,11 @@ def preset(
         seed=seed,
         noise=noise,
         horizon=task.horizon if horizon is None and name == "paper" else horizon,
-        stage1=stage1,
-        stage6=stage6,
+        stage1=agent or stage1,
+        stage6=replace(stage6, warm_start=True) if agent else stage6,
         cells=cells[min(dimension, 4)],
-        search=task.search,
+        # Whose agent goes straight on for some samples before it decides has a part of M* that rods miss.
+        search="outcome" if agent else task.search,
         rods=rods[min(dimension, 4)],
         lattice=(_LATTICE_SMOKE if name == "smoke" else LATTICE).get(dimension, 0),
     )

@@ -71,7 +71,8 @@ def extended_sets_map(task: Task, critical: CriticalSet, sets: ExtendedSets, pat
         head(
             figure,
             task,
-            f"extended sets for noise up to eps = {sets.noise:g} {unit}, T = {sets.horizon:.2g} s",
+            f"extended sets for noise up to eps = {sets.noise:g} {unit}"
+            + (f", T = {sets.horizon:.2g} s" if sets.horizon else ""),
         )
         if is_ring(task):
             found = _set_rings(figure.subplots(), task, critical, sets)

@@ -33,11 +33,11 @@ class Show:
 
     Attributes:
         policy: arcs of the stage-1 policy.
-        hybrid: arcs of the hybrid controller.
+        hybrid: arcs of the hybrid controller; none to show the policy alone.
     """
 
     policy: Sequence[HybridArc]
-    hybrid: Sequence[HybridArc]
+    hybrid: Sequence[HybridArc] = ()
 
 
 def render_replay(
@@ -73,8 +73,8 @@ def render_replay(
     """
     if path.suffix not in FORMATS:
         raise BadInput(f"{path} is no replay: give a name that ends in one of {', '.join(FORMATS)}")
-    if not shows or not all(show.policy and show.hybrid for show in shows):
-        raise BadInput("there is nothing to replay: give shows with arcs of both controllers")
+    if not shows or not all(show.policy for show in shows):
+        raise BadInput("there is nothing to replay: give shows with arcs of the policy")
     if layout not in LAYOUTS:
         raise unknown("layout", layout, LAYOUTS)
     if not 1 <= fps <= FASTEST:

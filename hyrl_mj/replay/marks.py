@@ -142,12 +142,12 @@ class Floor:
 
     @staticmethod
     def of(
-        task: Task, critical: CriticalSet, partition: Partition, extended: ExtendedSets
+        task: Task, critical: CriticalSet, partition: Partition, extended: ExtendedSets | None
     ) -> Floor:
-        """Of the results of the stages, on a chart of one or two dimensions."""
+        """Of the results of the stages, on a chart of one or two dimensions; no sets, no overlap."""
         tracker, strips, widths = Tracker(task), [], []
-        half = extended.sets[0].grid.spacing / 2
-        for ends in _strips(critical, partition, extended):
+        half = partition.grid.spacing / 2
+        for ends in _strips(critical, partition, extended) if extended else ():
             middle = ends.mean(axis=0)
             side = middle + np.where(np.arange(len(half)) == 0, half, 0.0)
             points = on_floor(task, tracker.of_z(np.vstack([ends, middle, side])))

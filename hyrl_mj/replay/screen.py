@@ -24,7 +24,8 @@ class Screen:
 
     Args:
         task: what the arcs are of.
-        policy, hybrid: arcs of the stage-1 policy, and of the hybrid controller.
+        policy, hybrid: arcs of the stage-1 policy, and of the hybrid controller; without these the policy
+            is alone.
         layout: one of `LAYOUTS`.
         camera: a camera of the MJCF.
         floor: what lies on the floor.
@@ -41,12 +42,13 @@ class Screen:
     ):
         self._task, self._camera, self._floor = task, camera, floor
         learned = Group(f"RL policy ({task.algorithm.upper()})", [Track(task, a) for a in policy])
+        if not hybrid:
+            self._panels: list[tuple[str, list[Group]]] = [(learned.name, [learned])]
+            return
         joined = Group("HyRL", [Track(task, arc) for arc in hybrid])
         started = {int(arc.q[0]) for arc in hybrid}
         where = "each mode" if len(started) > 1 else f"q = {task.mode_name(*started)}"
-        self._panels: list[tuple[str, list[Group]]] = [
-            (f"{learned.name} and {joined.name}", [learned, joined])
-        ]
+        self._panels = [(f"{learned.name} and {joined.name}", [learned, joined])]
         if layout == "side-by-side":
             self._panels = [
                 (learned.name, [learned]),
