@@ -271,7 +271,7 @@ def _from_tensors(
 ) -> MlpPolicy:
     """The policy of an SB3 agent whose tensors and metadata have been read."""
     _check_plain(weights, about)
-    algorithm = _algorithm(weights, about)
+    algorithm = infer_algorithm(weights, about)
     if LAYOUTS[algorithm] is ACTOR_CRITIC:
         check_kind(task, levels="log_std" not in weights)
     wrong = [name for name, weight in weights.items() if not np.isfinite(weight).all()]
@@ -296,7 +296,7 @@ def _check_plain(weights: Mapping[str, np.ndarray], about: Mapping[str, Any]) ->
         raise BadArtifact("it was trained with use_sde: train it without, or export it to .onnx")
 
 
-def _algorithm(weights: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> str:
+def infer_algorithm(weights: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> str:
     """Which SB3 algorithm trained an agent; "ppo" for A2C, too, where there is no metadata."""
     if any(name.startswith("q_net.q_net.") for name in weights):
         return "dqn"

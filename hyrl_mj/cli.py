@@ -58,6 +58,7 @@ def run(
     noise: float = 0.1,
     seed: int = 0,
     preset: str = "fast",
+    algorithm: str | None = None,
     horizon: float | None = None,
     out: Path | None = None,
 ) -> None:
@@ -70,12 +71,20 @@ def run(
         noise: bound of the measurement noise to survive, in the units of the chart.
         seed: of everything random.
         preset: fast, paper (the paper's training, ten minutes), or smoke (seconds).
+        algorithm: trains stage 1: ppo, a2c, dqn, sac, td3, ddpg, or module:Class of another one of SB3's
+            kind, as sb3_contrib:TQC; by default the task's.
         horizon: horizon T of the backward propagation in s; by default the extended sets are sized to the
             noise. The paper has 0.5 (unit_circle) and 0.3 (vehicle).
         out: the run directory; by default runs/TASK.
     """
     result = pipeline.run(
-        task, noise=noise, seed=seed, preset_name=preset, horizon=horizon, out=out
+        task,
+        noise=noise,
+        seed=seed,
+        preset_name=preset,
+        algorithm=algorithm,
+        horizon=horizon,
+        out=out,
     )
     print_summary(result)
 

@@ -11,6 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from hyrl_mj import artifacts
+from hyrl_mj.algorithms import ALGORITHMS
 from hyrl_mj.controllers import Controller, PolicyController
 from hyrl_mj.critical_set import find_critical_set
 from hyrl_mj.episodes import episodes
@@ -31,7 +32,7 @@ from hyrl_mj.robustness import (
 )
 from hyrl_mj.run_directory import Run, load_run, open_or_create, write_config
 from hyrl_mj.sets import Grid
-from hyrl_mj.settings import Agent, preset
+from hyrl_mj.settings import Agent, Training, preset
 from hyrl_mj.tables import replay_sentence, robustness_sentence
 from hyrl_mj.tasks.checks import check_task
 from hyrl_mj.tasks.registry import get_task
@@ -281,6 +282,7 @@ def run(
     noise: float = 0.1,
     seed: int = 0,
     preset_name: str = "fast",
+    algorithm: str | None = None,
     out: str | Path | None = None,
     horizon: float | None = None,
     say: Say = print,
@@ -292,6 +294,8 @@ def run(
         noise: bound eps of the measurement noise to survive, in chart units.
         seed: of everything random.
         preset_name: "fast", "paper" or "smoke".
+        algorithm: of stage 1, "ppo", "a2c", "dqn", "sac", "td3" or "ddpg", or as `module:Class` another one
+            of SB3's kind; by default the task's.
         out: the run directory, by default `runs/<task>`.
         horizon: time T of the backward propagation [s]; by default the sets are sized to the noise.
         say: told a line about each stage.
@@ -300,7 +304,13 @@ def run(
         BadInput: a value that cannot be used.
     """
     found = check_task(get_task(task))
+    found.algorithm = algorithm or found.algorithm
     settings = preset(found, preset_name, noise=noise, seed=seed, horizon=horizon)
+    if found.algorithm not in ALGORITHMS:
+        from hyrl_mj.training import check_foreign
+
+        assert isinstance(settings.stage1, Training)
+        check_foreign(found, settings.stage1)
     return _run_all(open_or_create(out or Path("runs") / found.name, settings), say)
 
 

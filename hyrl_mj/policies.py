@@ -13,6 +13,7 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from hyrl_mj import artifacts
+from hyrl_mj.algorithms import ALGORITHMS
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.registry import get_task
@@ -85,7 +86,6 @@ class Layout:
     Attributes:
         parts: beginnings of the names of its tensors, from the observation to the output.
         activation: SB3's default between the layers.
-        levels: whether it chooses among the levels of a discrete task; None if it may be either.
         squashed: whether the output goes through tanh and is stretched to the task's input limits;
             otherwise it is clipped to them.
         log_std: the tensor, or the layer beside the last one, with the logarithm of the spread that it
@@ -94,7 +94,6 @@ class Layout:
 
     parts: tuple[str, ...]
     activation: str
-    levels: bool | None = None
     squashed: bool = False
     log_std: str | None = None
 
@@ -105,15 +104,14 @@ ACTOR_CRITIC = Layout(
     "tanh",
     log_std="log_std",
 )
-DETERMINISTIC = Layout(("actor.mu.",), "relu", levels=False, squashed=True)
+DETERMINISTIC = Layout(("actor.mu.",), "relu", squashed=True)
 LAYOUTS = {
     "ppo": ACTOR_CRITIC,
     "a2c": ACTOR_CRITIC,
-    "dqn": Layout(("q_net.q_net.",), "relu", levels=True),
+    "dqn": Layout(("q_net.q_net.",), "relu"),
     "sac": Layout(
         ("actor.latent_pi.", "actor.mu."),
         "relu",
-        levels=False,
         squashed=True,
         log_std="actor.log_std",
     ),
@@ -180,7 +178,7 @@ class MlpPolicy(ObservationPolicy):
 
     def __post_init__(self) -> None:
         layers = _layers(self.weights, self.algorithm)
-        levels = self._layout.levels
+        levels = ALGORITHMS[self.algorithm]
         if levels is None and "log_std" in self.weights:
             levels = False
         if levels is not None:

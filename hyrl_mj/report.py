@@ -288,7 +288,7 @@ def _stages(
     else:
         assert isinstance(run.policy, MlpPolicy)
         size = sum(weight.size for weight in run.policy.weights.values())
-        first = f"{s.stage1.algorithm.upper()}, {s.stage1.samples:,} samples, no noise: {size:,} weights"
+        first = f"{s.stage1.title}, {s.stage1.samples:,} samples, no noise: {size:,} weights"
     return [
         ("train", first),
         ("critical-set", run.critical_set.sentence(task)),
@@ -296,7 +296,7 @@ def _stages(
         ("extended-sets", f"{run.extended_sets.sentence(task)}; {reach}"),
         (
             "retrain",
-            f"a policy for each of {len(modes)} modes: {s.stage6.algorithm.upper()}, "
+            f"a policy for each of {len(modes)} modes: {s.stage6.title}, "
             f"{each}{s.stage6.samples:,} samples",
         ),
         ("robustness", "not done" if robustness is None else robustness_sentence(robustness)),
@@ -366,6 +366,8 @@ def beginning(settings: Settings, out: Path | None = None) -> str:
         )
     words = ["hyrl-mj", *(["robustify", s.task, *agent.options] if agent else ["run", s.task])]
     words += ["--noise", f"{s.noise}", "--seed", f"{s.seed}", "--preset", s.preset]
+    if not agent and s.stage1.algorithm != get_task(s.task).algorithm:
+        words += ["--algorithm", s.stage1.algorithm]
     if s.horizon is not None:
         words += ["--horizon", f"{s.horizon}"]
     if out is not None:
@@ -391,11 +393,6 @@ def _changed(run: Run) -> list[str]:
     """Settings that the command would not give again: those of a preset of another version."""
     s = run.settings
     again = preset(
-        get_task(s.task),
-        s.preset,
-        noise=s.noise,
-        seed=s.seed,
-        horizon=s.horizon,
-        agent=run.agent,
+        run.task, s.preset, noise=s.noise, seed=s.seed, horizon=s.horizon, agent=run.agent
     ).to_json()
     return [_words(name) for name, value in s.to_json().items() if value != again[name]]

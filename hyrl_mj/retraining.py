@@ -10,6 +10,7 @@ import numpy as np
 
 from hyrl_mj import symmetry
 from hyrl_mj.controllers import PolicyController
+from hyrl_mj.distillation import distil, fits
 from hyrl_mj.envs.core import Domain
 from hyrl_mj.extended_sets import ExtendedSets, longest_hop, neighbourhood
 from hyrl_mj.game import LOST, NEVER, Answers, Moves, lasting, noisy_moves, solve
@@ -22,7 +23,7 @@ from hyrl_mj.sets import GridSet
 from hyrl_mj.settings import Training
 from hyrl_mj.simulation import closed_loop
 from hyrl_mj.tasks.base import Outcome, Task
-from hyrl_mj.training import Score, distil, fits, train
+from hyrl_mj.training import Score, train
 
 # Of the starts of training episodes this share is where the game is lost, if it is; of the others this
 # share comes from where the task starts, the rest from all over the mode's domain.

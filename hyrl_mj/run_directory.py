@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
@@ -21,7 +22,7 @@ from hyrl_mj.lattice import Lattice
 from hyrl_mj.partition import Partition
 from hyrl_mj.policies import MlpPolicy, Policy
 from hyrl_mj.section import Section
-from hyrl_mj.settings import Agent, Settings
+from hyrl_mj.settings import Agent, Settings, Training
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.registry import get_task
@@ -47,10 +48,9 @@ class Run:
 
     @cached_property
     def task(self) -> Task:
-        """The task."""
+        """The task, with the algorithm that trained it here: pictures call the policy by it."""
         task = get_task(self.settings.task)
-        if self.agent is not None:
-            task.algorithm = self.agent.algorithm  # pictures call the policy by it
+        task.algorithm = self.settings.stage1.algorithm
         return task
 
     @property
@@ -235,25 +235,27 @@ def write_config(run: Run) -> None:
     artifacts.write_json(run.path / "config.json", content, kind="run")
 
 
-def _differing(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    """The settings that differ, in words."""
-    found = []
-    for name in (name for name in new if old[name] != new[name]):
-        what = old[name], new[name]
-        if not isinstance(new[name], dict):
-            found.append(f"{name}: {what[0]} there, {what[1]} asked for")
-        elif not any("sha256" in stage for stage in what):
-            found.append(name)
-        elif old[name] | {"source": ""} != new[name] | {"source": ""}:
-            found.append(f"policy: {_policy(what[0])} there, {_policy(what[1])} asked for")
-    return found
+def _differing(old: Settings, new: Settings) -> Iterator[str]:
+    """The settings that differ, for people."""
+    for name, there in vars(old).items():
+        asked = getattr(new, name)
+        if there == asked:
+            continue
+        if not isinstance(there, Training | Agent):
+            yield f"{name}: {there} there, {asked} asked for"
+        elif Agent in (type(there), type(asked)):
+            yield f"policy: {_policy(there)} there, {_policy(asked)} asked for"
+        elif there.algorithm != asked.algorithm:
+            yield f"{name} algorithm: {there.algorithm} there, {asked.algorithm} asked for"
+        else:
+            yield name
 
 
-def _policy(stage1: dict[str, Any]) -> str:
+def _policy(stage1: Training | Agent) -> str:
     """Stage 1 for people."""
-    if "sha256" not in stage1:
-        return f"{stage1['algorithm']} to be trained"
-    return f"{Agent(**stage1)} of sha256 {stage1['sha256'][:8]}"
+    if isinstance(stage1, Agent):
+        return f"{stage1} of sha256 {stage1.sha256[:8]}"
+    return f"{stage1.title} to be trained"
 
 
 def open_or_create(path: str | Path, settings: Settings, policy: AnyPolicy | None = None) -> Run:
@@ -268,9 +270,9 @@ def open_or_create(path: str | Path, settings: Settings, policy: AnyPolicy | Non
     if (path / "config.json").exists():
         run = load_run(path, policy)
         if run.settings != settings:
-            differing = _differing(run.settings.to_json(), settings.to_json())
+            differing = "; ".join(_differing(run.settings, settings))
             raise BadInput(
-                f"{path} holds a run with other settings ({'; '.join(differing)}): "
+                f"{path} holds a run with other settings ({differing}): "
                 "choose another --out, give the same settings, or remove it"
             )
         return run

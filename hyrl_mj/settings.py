@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from numbers import Real
 from typing import Any
 
+from hyrl_mj.algorithms import accepted, algorithm_title, check_algorithm, relative
 from hyrl_mj.errors import BadArtifact, BadInput, unknown
 from hyrl_mj.noise import check_bound, check_seed
 from hyrl_mj.tasks.base import Task
@@ -20,7 +21,7 @@ class Training:
     """How SB3 trains one policy.
 
     Attributes:
-        algorithm: of SB3, "ppo" or "dqn".
+        algorithm: one of `hyrl_mj.algorithms.ALGORITHMS`, or `module:Class` of another one.
         samples: environment samples in all.
         envs: episodes side by side.
         hidden: widths of the hidden layers.
@@ -37,6 +38,8 @@ class Training:
             the starts.
         attempts: how often training starts again, with another seed, until its policy is good enough
             (stage 6 only); the best is kept.
+        action_noise: standard deviation of the noise with which TD3 and DDPG try other inputs, which are
+            stretched to lie between -1 and 1.
         options: further keywords of the SB3 algorithm.
     """
 
@@ -52,7 +55,13 @@ class Training:
     warm_start: bool = False
     episode: int | None = None
     attempts: int = 1
+    action_noise: float = 0.0
     options: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def title(self) -> str:
+        """The algorithm for people: "PPO"."""
+        return algorithm_title(self.algorithm)
 
 
 @dataclass(frozen=True)
@@ -77,7 +86,12 @@ class Agent:
     def __str__(self) -> str:
         """It for people: "agent.zip (DQN, sampled)"."""
         drawn = ", sampled" if self.stochastic else ""
-        return f"{self.source or 'an agent of Python code'} ({self.algorithm.upper()}{drawn})"
+        return f"{self.source or 'an agent of Python code'} ({self.title}{drawn})"
+
+    @property
+    def title(self) -> str:
+        """What it is for people: "DQN", "ONNX", "FUNCTION"."""
+        return algorithm_title(self.algorithm)
 
     @property
     def options(self) -> list[str]:
@@ -153,8 +167,58 @@ def _stage(content: dict[str, Any]) -> Training | Agent:
     return Training(**{**content, "hidden": tuple(content["hidden"])})
 
 
-# Stage 1 of each preset, by algorithm.
-_DQN_FAST = Training(
+# Stage 1 of preset fast, by algorithm: of tasks with continuous inputs, and of those with levels.
+# Short episodes: the decision falls in their first second.
+_PPO = Training(
+    algorithm="ppo",
+    samples=160_000,
+    envs=128,
+    hidden=(64, 64),
+    activation="tanh",
+    learning_rate=3e-3,
+    anneal=True,
+    gamma=0.98,
+    symmetric=True,
+    episode=20,
+    options={"n_steps": 32, "batch_size": 1024, "n_epochs": 8},
+)
+_A2C = replace(
+    _PPO,
+    algorithm="a2c",
+    options={"n_steps": 16, "normalize_advantage": True, "use_rms_prop": False},
+)
+# A gradient step takes milliseconds, a sample hardly anything: many samples to each.
+_SAC = replace(
+    _PPO,
+    algorithm="sac",
+    samples=48_000,
+    envs=32,
+    activation="relu",
+    gamma=0.95,
+    options={
+        "buffer_size": 100_000,
+        "learning_starts": 1_000,
+        "batch_size": 256,
+        "train_freq": 1,
+        "gradient_steps": 1,
+        "tau": 0.02,
+        "ent_coef": 0.02,
+    },
+)
+_TD3 = replace(
+    _SAC,
+    algorithm="td3",
+    action_noise=0.3,
+    options={name: value for name, value in _SAC.options.items() if name != "ent_coef"},
+)
+_CONTINUOUS = {
+    "ppo": _PPO,
+    "a2c": _A2C,
+    "sac": _SAC,
+    "td3": _TD3,
+    "ddpg": replace(_TD3, algorithm="ddpg"),
+}
+_DQN = Training(
     algorithm="dqn",
     samples=150_000,
     envs=64,
@@ -177,20 +241,27 @@ _DQN_FAST = Training(
         "exploration_final_eps": 0.05,
     },
 )
-# Short episodes: the decision falls in their first second.
-_PPO_FAST = Training(
-    algorithm="ppo",
-    samples=160_000,
-    envs=128,
-    hidden=(64, 64),
-    activation="tanh",
-    learning_rate=3e-3,
-    anneal=True,
-    gamma=0.98,
-    symmetric=True,
-    episode=20,
-    options={"n_steps": 32, "batch_size": 1024, "n_epochs": 8},
+_PPO_LEVELS = replace(
+    _PPO,
+    samples=200_000,
+    activation="relu",
+    gamma=0.9664,
+    episode=None,
+    options={**_PPO.options, "ent_coef": 0.02, "gae_lambda": 0.95},
 )
+_LEVELS = {
+    "ppo": _PPO_LEVELS,
+    "a2c": replace(
+        _PPO_LEVELS,
+        algorithm="a2c",
+        samples=300_000,
+        envs=32,
+        gamma=0.95,
+        options={**_A2C.options, "n_steps": 8, "ent_coef": 0.01, "gae_lambda": 0.9},
+    ),
+    "dqn": _DQN,
+}
+# What the paper trained with.
 _PAPER = Training(
     algorithm="dqn",
     samples=1_000_000,
@@ -202,10 +273,21 @@ _PAPER = Training(
     gamma=0.9664,
     symmetric=False,
 )
-# Stage 6. The modes of a discrete task are trained by PPO, too: the ways differ by less than the error of
-# a freely trained value function, and a policy that is learned directly does not depend on it.
+_PAPERS = {"ppo": replace(_PAPER, algorithm="ppo"), "dqn": _PAPER}
+# Samples of preset smoke.
+_SMOKE = {
+    "ppo": 24_576,
+    "a2c": 65_536,
+    "dqn": 10_000,
+    "sac": 12_000,
+    "td3": 12_000,
+    "ddpg": 12_000,
+}
+# Stage 6, whatever stage 1 was trained with. The modes of a discrete task are trained by PPO, too: the ways
+# differ by less than the error of a freely trained value function, and a policy that is learned directly
+# does not depend on it.
 _MODES_CONTINUOUS = replace(
-    _PPO_FAST,
+    _PPO,
     samples=320_000,
     activation="relu",
     gamma=0.95,
@@ -218,36 +300,18 @@ _MODES_DISCRETE = replace(
     samples=400_000,
     gamma=0.9,
     episode=None,
-    options={**_PPO_FAST.options, "ent_coef": 0.003, "gae_lambda": 0.9},
+    options={**_PPO.options, "ent_coef": 0.003, "gae_lambda": 0.9},
 )
-_TRAINING: dict[str, dict[str, tuple[Training, Training]]] = {
-    "dqn": {
-        "fast": (_DQN_FAST, _MODES_DISCRETE),
-        "paper": (_PAPER, replace(_PAPER, samples=300_000, warm_start=True)),
-        "smoke": (
-            replace(_DQN_FAST, samples=10_000),
-            replace(_MODES_DISCRETE, samples=8_192, attempts=1),
-        ),
-    },
-    "ppo": {
-        "fast": (_PPO_FAST, _MODES_CONTINUOUS),
-        "paper": (
-            replace(_PAPER, algorithm="ppo"),
-            replace(
-                _PAPER,
-                algorithm="ppo",
-                samples=100_000,
-                hidden=(112, 112),
-                learning_rate=3.45e-4,
-                gamma=0.9637,
-            ),
-        ),
-        "smoke": (
-            replace(_PPO_FAST, samples=24_576),
-            replace(_MODES_CONTINUOUS, samples=8_192, attempts=1),
-        ),
-    },
-}
+_MODES_PAPER_CONTINUOUS = replace(
+    _PAPER,
+    algorithm="ppo",
+    samples=100_000,
+    hidden=(112, 112),
+    learning_rate=3.45e-4,
+    gamma=0.9637,
+)
+_MODES_PAPER_DISCRETE = replace(_PAPER, samples=300_000, warm_start=True)
+_SMOKE_MODES = 8_192
 # Grid points along the longest side of the chart, by its dimension: search of M*, and sets.
 _RODS = {1: 120, 2: 120, 3: 24, 4: 8}
 _CELLS = {1: 2880, 2: 240, 3: 48, 4: 16}
@@ -271,7 +335,7 @@ def preset(
     """The settings of a preset.
 
     Args:
-        task: what they are for.
+        task: what they are for; `task.algorithm` trains stage 1.
         name: "fast", "paper" (the paper's training), or "smoke" (seconds, to see that all runs).
         noise: bound eps of the measurement noise that the controller has to survive.
         seed: of everything random.
@@ -284,7 +348,8 @@ def preset(
     """
     if name not in PRESETS:
         raise unknown("preset", name, PRESETS)
-    stage1, stage6 = _TRAINING[task.algorithm][name]
+    stage1 = agent or _stage1(task, name)
+    stage6 = _stage6(task, name, stage1.algorithm)
     task.check_noise(noise)
     dimension = task.chart.dimension
     cells, rods = (_CELLS, _RODS) if task.kinematic else (_CELLS_DYNAMIC, _RODS_DYNAMIC)
@@ -294,7 +359,7 @@ def preset(
         seed=seed,
         noise=noise,
         horizon=task.horizon if horizon is None and name == "paper" else horizon,
-        stage1=agent or stage1,
+        stage1=stage1,
         stage6=replace(stage6, warm_start=True) if agent else stage6,
         cells=cells[min(dimension, 4)],
         # Whose agent goes straight on for some samples before it decides has a part of M* that rods miss.
@@ -302,3 +367,33 @@ def preset(
         rods=rods[min(dimension, 4)],
         lattice=(_LATTICE_SMOKE if name == "smoke" else LATTICE).get(dimension, 0),
     )
+
+
+def _stage1(task: Task, name: str) -> Training:
+    """Stage 1 of a preset, with the task's algorithm."""
+    check_algorithm(task.algorithm, task.name, task.levels)
+    known = relative(task.algorithm, task.levels)
+    if name == "paper":
+        if known not in _PAPERS:
+            raise BadInput(
+                f"preset 'paper' has no {task.algorithm}, the paper trained with {' and '.join(_PAPERS)}: "
+                "choose preset fast or smoke"
+            )
+        found = _PAPERS[known]
+    else:
+        found = (_CONTINUOUS if task.levels is None else _LEVELS)[known]
+    if name == "smoke":
+        found = replace(found, samples=_SMOKE[known])
+    if known == task.algorithm:
+        return found
+    options = accepted(task.algorithm, found.options)
+    return replace(found, algorithm=task.algorithm, options=options)
+
+
+def _stage6(task: Task, name: str, algorithm: str) -> Training:
+    """Stage 6 of a preset, after stage 1 with an algorithm."""
+    if name == "paper":
+        found = _MODES_PAPER_CONTINUOUS if task.levels is None else _MODES_PAPER_DISCRETE
+        return replace(found, warm_start=found.warm_start and found.algorithm == algorithm)
+    found = _MODES_CONTINUOUS if task.levels is None else _MODES_DISCRETE
+    return replace(found, samples=_SMOKE_MODES, attempts=1) if name == "smoke" else found

@@ -20,20 +20,24 @@ from torch import nn
 from hyrl_mj.policies import MlpPolicy
 from hyrl_mj.tasks.base import Task
 
+# What the mirror does to what a network sees, (k,) signs, and to what it says, a (m, m) matrix.
+Signs = torch.Tensor | None
+Turn = torch.Tensor | None
+
 
 def impose(policy: Any, task: Task) -> None:
-    """Make the networks of an SB3 MLP policy (PPO or DQN) respect `task.mirror`.
+    """Make the networks of an SB3 MLP policy respect `task.mirror`: actors, critics and their targets.
 
     Args:
         policy: an SB3 policy; its weights stay, and so do their names.
         task: a task with a mirror symmetry.
     """
-    assert task.mirror is not None
-    signs = torch.tensor(task.mirror.observation, dtype=torch.float32)
-    for names, turn in _networks(policy, task):
-        first, last = policy.get_submodule(names[0]), policy.get_submodule(names[-1])
-        first.register_forward_pre_hook(partial(_see_both, signs))
-        last.register_forward_hook(partial(_average, turn))
+    for name, (signs, turn) in _layers(policy, task).items():
+        layer = policy.get_submodule(name)
+        if signs is not None:
+            layer.register_forward_pre_hook(partial(_see_both, signs))
+        if turn is not None:
+            layer.register_forward_hook(partial(_average, turn))
     policy.symmetric = True
 
 
@@ -42,19 +46,16 @@ def plain_state(policy: Any, task: Task) -> dict[str, torch.Tensor]:
     state: dict[str, torch.Tensor] = policy.state_dict()
     if not getattr(policy, "symmetric", False):
         return state
-    assert task.mirror is not None
-    signs = torch.tensor(task.mirror.observation, dtype=torch.float32)
-    for names, turn in _networks(policy, task):
-        for name in names:
-            weight, bias = state[f"{name}.weight"], state[f"{name}.bias"]
-            if name == names[0]:
-                wide, bias = torch.cat([weight, weight * signs]), bias.repeat(2)
-            elif name == names[-1]:
-                wide = torch.cat([weight, turn @ weight], dim=1) / 2
-                bias = (bias + turn @ bias) / 2
-            else:
-                wide, bias = torch.block_diag(weight, weight), bias.repeat(2)
-            state[f"{name}.weight"], state[f"{name}.bias"] = wide, bias
+    for name, (signs, turn) in _layers(policy, task).items():
+        weight, bias = state[f"{name}.weight"], state[f"{name}.bias"]
+        if signs is not None:
+            wide, bias = torch.cat([weight, weight * signs]), bias.repeat(2)
+        elif turn is not None:
+            wide = torch.cat([weight, turn @ weight], dim=1) / 2
+            bias = (bias + turn @ bias) / 2
+        else:
+            wide, bias = torch.block_diag(weight, weight), bias.repeat(2)
+        state[f"{name}.weight"], state[f"{name}.bias"] = wide, bias
     return state
 
 
@@ -84,19 +85,35 @@ def _turn(task: Task) -> np.ndarray:
     return np.eye(len(pairs))[pairs]
 
 
-def _networks(policy: Any, task: Task) -> list[tuple[list[str], torch.Tensor]]:
-    """Of each network: the names of its linear layers, in order, and what the mirror does to its output."""
-    linear = [name for name, layer in policy.named_modules() if isinstance(layer, nn.Linear)]
+def _layers(policy: Any, task: Task) -> dict[str, tuple[Signs, Turn]]:
+    """Of each linear layer by name: how the mirror turns what its network sees, if it is the first one, and
+    what its network says, if it is the last one."""
+    assert task.mirror is not None
+    seen = torch.tensor(task.mirror.observation, dtype=torch.float32)
+    # Critics see the inputs, too, stretched to lie between -1 and 1.
+    seen_by_critic = torch.tensor(task.mirror.observation + task.mirror.inputs, dtype=torch.float32)
     turn = torch.tensor(_turn(task), dtype=torch.float32)
-    parts: dict[tuple[str, ...], torch.Tensor]
-    if hasattr(policy, "q_net"):
-        parts = {("q_net.",): turn, ("q_net_target.",): turn}
-    else:
-        parts = {
-            ("mlp_extractor.policy_net", "action_net"): turn,
-            ("mlp_extractor.value_net", "value_net"): torch.eye(1),
-        }
-    return [([n for n in linear if n.startswith(part)], turn) for part, turn in parts.items()]
+    linear = {n: layer for n, layer in policy.named_modules() if isinstance(layer, nn.Linear)}
+    critics = {n.rpartition(".")[0] + "." for n in linear if n.startswith("critic")}
+    found: dict[str, tuple[Signs, Turn]] = {}
+    for parts, signs, says in (
+        (("q_net.",), seen, turn),
+        (("q_net_target.",), seen, turn),
+        (("mlp_extractor.policy_net.", "action_net"), seen, turn),
+        (("mlp_extractor.value_net.", "value_net"), seen, None),
+        (("actor.latent_pi.", "actor.mu"), seen, turn),
+        (("actor.log_std",), None, None),  # beside the mean, on the same hidden layers
+        (("actor_target.",), seen, turn),
+        *(((critic,), seen_by_critic, None) for critic in critics),
+    ):
+        names = [name for name in linear if name.startswith(parts)]
+        for name in names:
+            same = torch.eye(linear[name].out_features) if says is None else says
+            found[name] = (
+                signs if name == names[0] else None,
+                same if name == names[-1] else None,
+            )
+    return found
 
 
 def _see_both(signs: torch.Tensor, layer: nn.Module, given: tuple[torch.Tensor]) -> torch.Tensor:

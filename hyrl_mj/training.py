@@ -2,44 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 import torch
-from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from threadpoolctl import threadpool_limits
 from torch import nn
 
 from hyrl_mj import symmetry
+from hyrl_mj.agents import infer_algorithm
+from hyrl_mj.algorithms import ALGORITHMS, algorithm_class, check_algorithm
 from hyrl_mj.envs.core import BatchedEnv, Domain
 from hyrl_mj.envs.sb3_env import TaskVecEnv
-from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.errors import BadInput, brief
 from hyrl_mj.noise import SIGNALS, Noise
-from hyrl_mj.policies import LAYOUTS, TORCH_NAMES, MlpPolicy, Policy
+from hyrl_mj.policies import TORCH_NAMES, MlpPolicy
 from hyrl_mj.progress import Progress
 from hyrl_mj.settings import Training
 from hyrl_mj.tasks.base import Outcome, Task
 
 Score = tuple[float, ...]
-# Draws n chart points (n, d).
-Starts = Callable[[int, np.random.Generator], np.ndarray]
-ALGORITHMS: dict[str, type[PPO] | type[DQN]] = {"ppo": PPO, "dqn": DQN}
 ACTIVATIONS = {name: getattr(nn, torch_name) for name, torch_name in TORCH_NAMES.items()}
-# How often TensorBoard gets a point: PPO counts rollouts, DQN episodes.
-LOG_INTERVAL = {"ppo": 1, "dqn": 100}
+# How often TensorBoard gets a point: algorithms on their own policy count rollouts, the others episodes.
+LOG_ROLLOUTS, LOG_EPISODES = 1, 100
 # The learning rate falls to this share of its first value, not to zero: the last samples count too.
 FINAL_RATE = 0.02
 # How often the policy is checkpointed and judged; on how many episodes.
 CHECKPOINTS = 32
 EPISODES = 256
-# States at which a policy is copied, and the steps and batches of the regression.
-DISTILLED, DISTILLING, BATCH = 16_384, 1_500, 512
+# Observations by which a foreign policy is compared with the plain network of its weights, and how far the
+# weights are moved before that.
+CHECKED, MOVED = 64, 0.05
 
 
 def train(
@@ -82,9 +83,10 @@ def train(
     # An untrained policy can be lucky in a few episodes; a judge's verdict stands at any time.
     settled = settings.samples // 2 if judge is None else 0
     judge = judge or _Episodes(task, noise or Noise(), domain, settings.gamma)
+    interval = LOG_ROLLOUTS if isinstance(model, OnPolicyAlgorithm) else LOG_EPISODES
     watch = _Watch(settings.samples, judge, settled, log_dir, label)
     with single_threaded():
-        model.learn(settings.samples, callback=watch, log_interval=LOG_INTERVAL[settings.algorithm])
+        model.learn(settings.samples, callback=watch, log_interval=interval)
     watch.close()
     assert watch.best is not None
     return watch.best
@@ -104,13 +106,16 @@ def build(
     Raises:
         BadInput: an unknown algorithm, or a policy to start from whose networks are those of another one.
     """
-    if settings.algorithm not in ALGORITHMS:
-        raise unknown("algorithm", settings.algorithm, ALGORITHMS)
+    check_algorithm(settings.algorithm, task.name, task.levels)
     hidden = settings.hidden if start_from is None else start_from.hidden
     activation = settings.activation if start_from is None else start_from.activation
     rate = settings.learning_rate
     env = BatchedEnv(task, settings.envs, noise=noise, domain=domain, max_steps=settings.episode)
-    model = ALGORITHMS[settings.algorithm](
+    options = dict(settings.options)
+    if settings.action_noise:
+        m = len(task.inputs)
+        options["action_noise"] = NormalActionNoise(np.zeros(m), np.full(m, settings.action_noise))
+    model = algorithm_class(settings.algorithm)(
         "MlpPolicy",
         TaskVecEnv(env),
         seed=seed,
@@ -118,7 +123,7 @@ def build(
         gamma=settings.gamma,
         learning_rate=(lambda left: rate * max(left, FINAL_RATE)) if settings.anneal else rate,
         policy_kwargs={"net_arch": list(hidden), "activation_fn": ACTIVATIONS[activation]},
-        **settings.options,
+        **options,
     )
     if start_from is not None:
         state = {name: torch.as_tensor(np.array(w)) for name, w in start_from.weights.items()}
@@ -134,57 +139,35 @@ def build(
     return model
 
 
-def fits(task: Task, settings: Training, policy: MlpPolicy) -> bool:
-    """Whether training can go on from a policy's weights."""
-    try:
-        build(task, settings, 0, start_from=policy)
-    except BadInput:
-        return False
-    return True
+def check_foreign(task: Task, settings: Training) -> None:
+    """Build an algorithm of somebody else's and ask its policy, before anything is trained.
 
-
-def distil(task: Task, policy: Policy, starts: Starts, settings: Training, seed: int) -> MlpPolicy:
-    """A network that answers as a policy does, by regression: what PPO and A2C can go on from.
-
-    Args:
-        task: gives observations and inputs.
-        policy: the one to copy, which may be any.
-        starts: draws the chart points (n, d) at which it is copied.
-        settings: of the training that goes on from there: network and algorithm.
-        seed: of weights and points.
-
-    Returns:
-        A policy of `settings.algorithm`, whose value function and spread are untrained.
+    Raises:
+        BadInput: it cannot be built with these settings, or its policy does not do what a plain network
+            with its weights does.
     """
-    model = build(task, settings, seed)
-    rng = np.random.default_rng(seed)
-    plant = task.plant(DISTILLED)
-    plant.set_state(*task.state(starts(DISTILLED, rng), rng))
-    measured = plant.measurement
-    seen = torch.as_tensor(task.observation(measured).astype(np.float32))
-    inputs, levels = policy.act(measured), task.input_levels
-    if levels is None:
-        wanted = torch.as_tensor(inputs.astype(np.float32))
-    else:
-        off = np.abs(inputs[:, None] - levels).sum(axis=2)
-        wanted = torch.as_tensor(off.argmin(axis=1))
-    acting = [
-        weights
-        for name, weights in model.policy.named_parameters()
-        if name.startswith(LAYOUTS[settings.algorithm].parts)
-    ]
-    optimizer = torch.optim.Adam(acting, lr=settings.learning_rate)
-    progress = Progress("distilling the agent", DISTILLING, "steps")
-    with single_threaded():
-        for step in range(DISTILLING):
-            rows = torch.as_tensor(rng.integers(DISTILLED, size=BATCH))
-            _, likelihood, _ = model.policy.evaluate_actions(seen[rows], wanted[rows])
-            optimizer.zero_grad()
-            (-likelihood.mean()).backward()
-            optimizer.step()
-            progress.update(step + 1)
-    progress.close()
-    return export(model, task)
+    name = settings.algorithm
+    try:
+        model = build(task, settings, seed=0)
+    except Exception as error:  # whatever a foreign class raises
+        raise BadInput(f"{name} cannot train {task.name}: {brief(error)}") from error
+    # Layers that do nothing at first, as those that normalise, are seen once all weights have changed.
+    generator = torch.Generator().manual_seed(0)
+    for tensor in model.policy.state_dict().values():
+        if tensor.is_floating_point():
+            tensor += MOVED * torch.rand(tensor.shape, generator=generator)
+    plain = f"the policy of {name} cannot be used, only plain multilayer perceptrons can"
+    try:
+        policy = export(model, task)
+    except Exception as error:
+        raise BadInput(f"{plain}: {brief(error)}") from error
+    core = BatchedEnv(task, CHECKED)
+    core.seed(0)
+    observation = core.reset()
+    actions, _ = model.predict(observation, deterministic=True)
+    off = np.abs(core.inputs(actions) - policy.inputs(observation)).max()
+    if off > 1e-4 * np.ptp(task.input_limits):
+        raise BadInput(f"{plain}: what it answers is not what its weights say")
 
 
 def export(model: BaseAlgorithm, task: Task) -> MlpPolicy:
@@ -192,8 +175,8 @@ def export(model: BaseAlgorithm, task: Task) -> MlpPolicy:
     state = symmetry.plain_state(model.policy, task)
     weights = {name: tensor.detach().cpu().numpy().copy() for name, tensor in state.items()}
     activation = next(n for n, a in ACTIVATIONS.items() if a is model.policy.activation_fn)
-    algorithm = next(name for name, kind in ALGORITHMS.items() if isinstance(model, kind))
-    return MlpPolicy(task, algorithm, activation, weights)
+    own = (name for name in ALGORITHMS if type(model) is algorithm_class(name))
+    return MlpPolicy(task, next(own, "") or infer_algorithm(weights, {}), activation, weights)
 
 
 @contextmanager

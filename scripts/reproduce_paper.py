@@ -18,6 +18,7 @@ from rich.table import Table
 
 import hyrl_mj
 from hyrl_mj import figures, progress
+from hyrl_mj.algorithms import algorithm_title
 from hyrl_mj.errors import BadInput
 from hyrl_mj.noise import Noise
 
@@ -114,7 +115,7 @@ def overlap(run: hyrl_mj.Run) -> np.ndarray:
 def training(run: hyrl_mj.Run) -> tuple[str, str]:
     """Samples of stage 6 against stage 1, and what is other than in the paper."""
     first, then = run.settings.stage1, run.settings.stage6
-    ours = f"{then.samples:,} a mode ({then.algorithm.upper()}), stage 1 {first.samples:,}"
+    ours = f"{then.samples:,} a mode ({then.title}), stage 1 {first.samples:,}"
     return ours, "" if then.warm_start else "ours starts afresh, and trains under noise"
 
 
@@ -138,7 +139,7 @@ def common(run: hyrl_mj.Run, horizon: str, width: str, least: float) -> Iterator
 def alone(run: hyrl_mj.Run, said: tuple[str, ...]) -> Iterator[Line]:
     """The stage-1 policy from the starts of Section III, and of Section V where the text tells."""
     task, noise = run.task, Noise("alternating", run.settings.noise)
-    name, seed = task.algorithm.upper(), run.settings.seed
+    name, seed = algorithm_title(task.algorithm), run.settings.seed
     starts = np.array(task.policy_starts)
     arcs = hyrl_mj.simulate(task, run.policy, starts, noise, horizon=task.replay_time, seed=seed)
     for paper, arc in zip(said, arcs, strict=True):

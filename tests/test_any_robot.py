@@ -309,7 +309,7 @@ MISTAKES = {
         PY, r"return measured\[:, :3\]", "return measured[:, 0]", r"observation\(\) gives shape",
     ),
     "starts the wrong way round": (PY, r"\(0\.0, -0\.8\)", "(0.0, 1.0)", r"start_low is greater"),
-    "an unknown algorithm": (PY, '"ppo"', '"sac"', r"algorithm 'sac'.*ppo, dqn"),
+    "an unknown algorithm": (PY, '"ppo"', '"sarsa"', r"algorithm 'sarsa'.*ppo, a2c"),
     "dqn without levels": (PY, '"ppo"', '"dqn"', r"dqn needs levels"),
     "a mirror of the wrong length": (
         PY, r"\(1, -1, -1\)", "(1, -1)", r"mirror\.observation is \(1, -1\): give 3",

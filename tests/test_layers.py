@@ -16,10 +16,10 @@ from hyrl_mj.training import build, export
 
 PACKAGE = Path(hyrl_mj.__file__).parent
 ORDER = (
-    "errors", "progress", "colours", "mjcf", "plant", "noise", "tasks", "settings", "artifacts",
+    "errors", "progress", "colours", "algorithms", "mjcf", "plant", "noise", "tasks", "settings", "artifacts",
     "policies", "agents", "given", "controllers", "adversary", "rendering", "encoding", "envs", "simulation",
-    "task_tests", "symmetry", "training", "sets", "lattice", "game", "critical_set", "partition", "limit",
-    "extended_sets", "section", "retraining", "hybrid", "export",
+    "task_tests", "symmetry", "training", "distillation", "sets", "lattice", "game", "critical_set",
+    "partition", "limit", "extended_sets", "section", "retraining", "hybrid", "export",
     "robustness", "episodes", "run_directory", "tables", "figures", "replay", "viewing", "arcs",
     "doctor", "report", "diagnosis", "pipeline", "summary", "new_task", "cli",
 )  # fmt: skip

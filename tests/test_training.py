@@ -129,8 +129,8 @@ def test_it_goes_on_from_a_policy(task):
 
 
 def test_an_unknown_algorithm_lists_the_known(vehicle):
-    settings = replace(preset(vehicle, "smoke").stage1, algorithm="sac")
-    with pytest.raises(BadInput, match="unknown algorithm 'sac': choose one of ppo, dqn"):
+    settings = replace(preset(vehicle, "smoke").stage1, algorithm="sarsa")
+    with pytest.raises(BadInput, match="unknown algorithm 'sarsa': choose one of ppo, a2c, dqn"):
         training.build(vehicle, settings, 0)
 
 

@@ -11,6 +11,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import BoundaryNorm, Colormap, ListedColormap, Normalize
 
+from hyrl_mj.algorithms import algorithm_title
 from hyrl_mj.critical_set import CriticalSet
 from hyrl_mj.figures.charts import (
     INNER,
@@ -96,7 +97,9 @@ def overview(
     if not drawable(task):
         return
     with drawing(path, (WIDTH, 7.6)) as figure:
-        head(figure, task, f"the {task.algorithm.upper()} policy, and where noise leads it")
+        head(
+            figure, task, f"the {algorithm_title(task.algorithm)} policy, and where noise leads it"
+        )
         panel = figure.subplots()
         panel.set_title(noise_label(task, arc.noise, arc.bound))
         found = _spirals if is_ring(task) else _field
@@ -123,7 +126,7 @@ def policy_map(
     runs = simulate(task, policy, np.array(starts), noise, horizon=task.replay_time, seed=seed)
     assert isinstance(runs, list)
     with drawing(path, (WIDTH, 5.2)) as figure:
-        head(figure, task, f"the {task.algorithm.upper()} policy")
+        head(figure, task, f"the {algorithm_title(task.algorithm)} policy")
         *maps, beside = figure.subplots(1, len(task.inputs) + 1)
         found: Artists = {}
         for i, panel in enumerate(maps):

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from hyrl_mj import artifacts, colours
+from hyrl_mj.algorithms import algorithm_title
 from hyrl_mj.tasks.base import Task
 
 DPI = 200  # [pixels/inch]
@@ -106,7 +107,7 @@ def task_title(task: Task) -> str:
 
 def policy_title(task: Task) -> str:
     """The stage-1 policy for people: "RL policy (PPO)"."""
-    return f"RL policy ({task.algorithm.upper()})"
+    return f"RL policy ({algorithm_title(task.algorithm)})"
 
 
 def noise_label(task: Task, kind: str, eps: float) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hyrl_mj.algorithms import algorithm_title
 from hyrl_mj.errors import BadInput
 from hyrl_mj.rendering import LARGEST, Canvas
 from hyrl_mj.replay.captions import Group, Layout
@@ -41,7 +42,9 @@ class Screen:
         floor: Floor | None,
     ):
         self._task, self._camera, self._floor = task, camera, floor
-        learned = Group(f"RL policy ({task.algorithm.upper()})", [Track(task, a) for a in policy])
+        learned = Group(
+            f"RL policy ({algorithm_title(task.algorithm)})", [Track(task, a) for a in policy]
+        )
         if not hybrid:
             self._panels: list[tuple[str, list[Group]]] = [(learned.name, [learned])]
             return

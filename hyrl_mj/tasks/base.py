@@ -101,7 +101,7 @@ class Task(ABC):
     mode_names: tuple[str, ...]
     #: how its critical set is searched for: by "rods" or by "outcome"; see `find_critical_set`
     search: str = "outcome"
-    #: SB3 algorithm that trains it: "ppo" or "dqn"
+    #: what trains it by default: an algorithm of SB3, as "ppo", or "module:Class"
     algorithm: str
     #: the hyperplane with respect to which its reward is symmetric, if any (paper, Section IV-B)
     mirror: Mirror | None = None

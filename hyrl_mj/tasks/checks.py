@@ -6,11 +6,11 @@ import mujoco
 import numpy as np
 
 from hyrl_mj import mjcf
+from hyrl_mj.algorithms import check_algorithm
 from hyrl_mj.errors import BadInput, brief, unknown
 from hyrl_mj.tasks.base import SEARCHES, Outcome, Task
 from hyrl_mj.tasks.registry import line_in
 
-ALGORITHMS = ("ppo", "dqn")
 REQUIRED = (
     "chart", "inputs", "noisy", "max_steps", "horizon", "worst_reward", "start_low", "start_high",
     "replay_starts", "replay_time", "mode_names", "algorithm", "observation_low", "observation_high",
@@ -72,19 +72,16 @@ def _check_parts(task: Task) -> None:
 
 
 def _check_training(task: Task) -> None:
-    if task.algorithm not in ALGORITHMS:
-        raise unknown("algorithm", task.algorithm, ALGORITHMS)
     if task.search not in SEARCHES:
         raise unknown("search", task.search, SEARCHES)
     if not task.inputs:
         raise BadInput("inputs is empty: name the actuators that the policy drives")
-    if task.levels is None and task.algorithm == "dqn":
-        raise BadInput("dqn needs levels of the input: give levels = 5, say, or algorithm = 'ppo'")
     if task.levels is not None and (task.levels < 2 or len(task.inputs) > 1):
         raise BadInput(
             f"{task.levels} levels of {len(task.inputs)} input(s) cannot be used: give 2 or more of a "
             "single input, or none"
         )
+    check_algorithm(task.algorithm, task.name, task.levels)
     if task.mirror is not None:
         for name, wanted in (
             ("observation", len(task.observation_low)),

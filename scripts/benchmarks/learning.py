@@ -14,10 +14,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 import hyrl_mj
 from benchmarks import Figure
 from benchmarks.runs import Runs
+from hyrl_mj.algorithms import algorithm_class
 from hyrl_mj.policies import MlpPolicy
 from hyrl_mj.settings import preset
 from hyrl_mj.tasks.base import Task
-from hyrl_mj.training import ALGORITHMS, Score, export, single_threaded, train
+from hyrl_mj.training import Score, export, single_threaded, train
 
 # How good a policy has to be: the mean return from pi +- 0.2 rad; the share of winnable starts passed.
 GOOD: dict[str, tuple[Callable[[Task, MlpPolicy], float], float, str]] = {
@@ -73,7 +74,7 @@ def _paper(task: Task, quality: Callable[[Task, MlpPolicy], float], enough: floa
 
     def work() -> int:
         settings = preset(task, "paper").stage1
-        model = ALGORITHMS[settings.algorithm](
+        model = algorithm_class(settings.algorithm)(
             "MlpPolicy",
             gymnasium.make(task.env_id),
             seed=next(seeds),

@@ -1,0 +1,343 @@
+"""Every algorithm trains, gives a plain network and a whole run; what cannot be used is refused first."""
+
+import json
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import hyrl_mj
+from hyrl_mj import BadInput, cli
+from hyrl_mj.algorithms import ALGORITHMS, algorithm_class, algorithm_title, check_algorithm
+from hyrl_mj.envs.core import BatchedEnv
+from hyrl_mj.settings import PRESETS, preset
+from hyrl_mj.training import build, check_foreign, evaluate, export, single_threaded, train
+
+# What can have the inputs of which task.
+CAN = [
+    (name, task)
+    for name, discrete in ALGORITHMS.items()
+    for task, levels in (("unit_circle", False), ("vehicle", True))
+    if discrete in (None, levels)
+]
+# Samples after which every network has been updated.
+FEW = {"ppo": 8_192, "a2c": 8_192, "dqn": 4_000, "sac": 2_000, "td3": 2_000, "ddpg": 2_000}
+# A module of the user's with algorithms of all kinds.
+MODULE = '''
+import torch
+from gymnasium.spaces import Box
+from stable_baselines3 import DQN, PPO, SAC, TD3
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
+
+
+class Derived(PPO):
+    """PPO under another name."""
+
+
+class Any(PPO):
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+
+
+class Fewer(PPO):
+    def __init__(self, policy, env, learning_rate=1e-3, gamma=0.9, seed=None, device="cpu",
+                 policy_kwargs=None, n_steps=8):
+        super().__init__(policy, env, learning_rate, n_steps, gamma=gamma, seed=seed, device=device,
+                         policy_kwargs=policy_kwargs, batch_size=64)
+
+
+class Similar(OffPolicyAlgorithm):
+    """SAC that is not derived from it."""
+    policy_aliases = SAC.policy_aliases
+
+    def __init__(self, policy, env, learning_rate, buffer_size, learning_starts, batch_size, tau,
+                 gamma, train_freq, gradient_steps, ent_coef, policy_kwargs, seed, device):
+        super().__init__(policy, env, learning_rate, buffer_size, learning_starts, batch_size, tau,
+                         gamma, train_freq, gradient_steps, policy_kwargs=policy_kwargs, seed=seed,
+                         device=device, supported_action_spaces=(Box,), support_multi_env=True)
+        self.ent_coef_tensor = torch.tensor(ent_coef)
+        self._setup_model()
+
+    def _setup_model(self):
+        super()._setup_model()
+        self.actor, self.critic = self.policy.actor, self.policy.critic
+        self.critic_target = self.policy.critic_target
+
+    def train(self, gradient_steps, batch_size):
+        self.ent_coef_optimizer = self.log_ent_coef = None
+        self.target_update_interval = 1
+        self.batch_norm_stats = self.batch_norm_stats_target = []
+        SAC.train(self, gradient_steps, batch_size)
+
+
+class DerivedTD3(TD3):
+    pass
+
+
+class DerivedDQN(DQN):
+    pass
+
+
+class Broken(PPO):
+    def __init__(self, *args, **kwargs):
+        raise RuntimeError("not today")
+
+
+class Other(ActorCriticPolicy):
+    def _get_action_dist_from_latent(self, latent_pi):
+        return super()._get_action_dist_from_latent(1 - latent_pi)
+
+
+class Twisted(PPO):
+    policy_aliases = {"MlpPolicy": Other}
+
+
+class Normalised(ActorCriticPolicy):
+    def _build(self, lr_schedule):
+        super()._build(lr_schedule)
+        layers = list(self.mlp_extractor.policy_net)
+        layers[3] = torch.nn.Sequential(torch.nn.BatchNorm1d(64), layers[3])
+        self.mlp_extractor.policy_net = torch.nn.Sequential(*layers)
+
+
+class Norm(PPO):
+    policy_aliases = {"MlpPolicy": Normalised}
+
+
+class Blind(ActorCriticPolicy):
+    def _build(self, lr_schedule):
+        super()._build(lr_schedule)
+        self.action_net = torch.nn.Sequential(self.action_net)
+
+
+class Renamed(PPO):
+    policy_aliases = {"MlpPolicy": Blind}
+
+
+NOT_A_CLASS = 3
+'''
+
+
+@pytest.fixture(scope="module")
+def mine(tmp_path_factory):
+    """The name of a module with algorithms, which can be imported."""
+    folder = tmp_path_factory.mktemp("mine")
+    (folder / "my_algorithms.py").write_text(MODULE)
+    (folder / "my_broken_module.py").write_text("import nowhere_to_be_found\n")
+    sys.path.insert(0, str(folder))
+    yield "my_algorithms"
+    sys.path.remove(str(folder))
+
+
+def task_with(name, algorithm):
+    """A task, and what is to train it."""
+    task = hyrl_mj.get_task(name)
+    task.algorithm = algorithm
+    return task
+
+
+def quick(task, known):
+    return replace(preset(task, "smoke").stage1, samples=FEW[known])
+
+
+# ---- the algorithms of SB3
+
+
+@pytest.mark.parametrize(("algorithm", "name"), CAN)
+def test_it_trains_a_policy_that_answers_as_sb3_does(algorithm, name):
+    task = task_with(name, algorithm)
+    settings = quick(task, algorithm)
+    model = build(task, settings, seed=0)
+    before = export(model, task)
+    with single_threaded():
+        model.learn(settings.samples)
+    policy = export(model, task)
+    assert policy.algorithm == algorithm
+    core = BatchedEnv(task, 500)
+    core.seed(1)
+    observation = core.reset()
+    assert np.abs(policy.outputs(observation) - before.outputs(observation)).max() > 1e-3
+    actions, _ = model.predict(observation, deterministic=True)
+    np.testing.assert_allclose(policy.inputs(observation), core.inputs(actions), atol=1e-5)
+
+
+@pytest.mark.parametrize(("algorithm", "name"), [c for c in CAN if c[0] not in ("ppo", "dqn")])
+def test_the_seed_fixes_the_policy(algorithm, name):
+    task = task_with(name, algorithm)
+    first, again, other = (train(task, quick(task, algorithm), seed).weights for seed in (4, 4, 5))
+    assert first.keys() == again.keys()
+    assert all(np.array_equal(first[name], again[name]) for name in first)
+    assert any(not np.array_equal(first[name], other[name]) for name in first)
+
+
+@pytest.mark.parametrize(("algorithm", "name"), CAN)
+def test_actors_and_critics_respect_the_mirror(algorithm, name):
+    task = task_with(name, algorithm)
+    settings = quick(task, algorithm)
+    model = build(task, settings, seed=0)
+    with single_threaded():
+        model.learn(settings.samples)
+    policy, rng = export(model, task), np.random.default_rng(0)
+    o = rng.uniform(task.observation_low, task.observation_high, (200, len(task.observation_low)))
+    there = policy.inputs(o * task.mirror.observation) * task.mirror.inputs
+    close = np.abs(there - policy.inputs(o)).max(axis=1) < 1e-4
+    assert close.mean() > 0.99, "levels that are worth the same are chosen by their order"
+    for part in ("critic", "critic_target"):
+        if hasattr(model, part):
+            a = rng.uniform(-1, 1, (200, len(task.inputs)))
+            straight = values(getattr(model, part), o, a)
+            turned = o * task.mirror.observation, a * task.mirror.inputs
+            np.testing.assert_allclose(
+                values(getattr(model, part), *turned), straight, rtol=1e-4, atol=1e-4
+            )
+
+
+def values(critic, o, a):
+    """What all networks of an SB3 critic say, (critics, n)."""
+    import torch
+
+    with torch.no_grad():
+        return np.hstack(
+            [v.numpy() for v in critic(torch.tensor(o).float(), torch.tensor(a).float())]
+        )
+
+
+@pytest.mark.parametrize("algorithm", ["a2c", "sac", "td3", "ddpg"])
+def test_the_smoke_preset_learns_the_circle(algorithm):
+    task = task_with("unit_circle", algorithm)
+    settings = preset(task, "smoke").stage1
+    before = evaluate(task, export(build(task, settings, 0), task), hyrl_mj.Noise())[1]
+    assert evaluate(task, train(task, settings, 0), hyrl_mj.Noise())[1] > before + 10
+
+
+def test_every_preset_has_every_algorithm_or_says_so():
+    for algorithm, name in CAN:
+        task = task_with(name, algorithm)
+        for which in PRESETS:
+            if which == "paper" and algorithm not in ("ppo", "dqn"):
+                with pytest.raises(BadInput, match=f"'paper' has no {algorithm}"):
+                    preset(task, which)
+                continue
+            settings = preset(task, which)
+            assert settings.stage1.algorithm == algorithm
+            own = preset(hyrl_mj.get_task(name), which)
+            if which != "paper":
+                assert settings.stage6 == own.stage6
+            build(task, settings.stage1, 0)
+
+
+def test_a_mode_goes_on_only_from_a_policy_of_its_own_algorithm(vehicle):
+    assert preset(vehicle, "paper").stage6.warm_start
+    assert not preset(task_with("vehicle", "ppo"), "paper").stage6.warm_start
+
+
+# ---- refusals
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "task", "says"),
+    [
+        ("dqn", "unit_circle", "dqn needs levels of the input, unit_circle has none: choose one of ppo"),
+        ("sac", "vehicle", "sac takes no levels of the input, vehicle has 5: choose one of ppo, a2c, dqn"),
+        ("td3", "vehicle", "td3 takes no levels"),
+        ("ddpg", "vehicle", "ddpg takes no levels"),
+        ("DQN", "vehicle", "unknown algorithm 'DQN'"),
+        ("tqc", "unit_circle", "unknown algorithm 'tqc'"),
+        ("nowhere_at_all:PPO", "unit_circle", "nowhere_at_all:PPO cannot be imported: ModuleNotFound"),
+        ("my_broken_module:PPO", "unit_circle", "cannot be imported: ModuleNotFound"),
+        ("my_algorithms:Nothing", "unit_circle", "cannot be imported: AttributeError"),
+        ("my_algorithms:", "unit_circle", "cannot be imported"),
+        (":PPO", "unit_circle", "cannot be imported: ValueError"),
+        ("my_algorithms:NOT_A_CLASS", "unit_circle", "is no algorithm of SB3's kind"),
+        ("pathlib:Path", "unit_circle", "is no algorithm of SB3's kind"),
+        ("my_algorithms:Broken", "unit_circle", "cannot train unit_circle: RuntimeError: not today"),
+        ("my_algorithms:DerivedDQN", "unit_circle", "DerivedDQN needs levels of the input"),
+        ("my_algorithms:DerivedTD3", "vehicle", "DerivedTD3 takes no levels of the input"),
+        ("my_algorithms:Similar", "vehicle", "cannot train vehicle"),
+        ("my_algorithms:Twisted", "unit_circle", "what it answers is not what its weights say"),
+        ("my_algorithms:Norm", "unit_circle", "only plain multilayer perceptrons can"),
+        ("my_algorithms:Renamed", "unit_circle", "only plain multilayer perceptrons can"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_used_is_one_sentence_before_any_training(
+    algorithm, task, says, mine, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(sys, "argv", ["hyrl-mj", "run", task, "--algorithm", algorithm])
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    said = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert says in said
+    assert said.count("\n") == 1
+    assert not any(tmp_path.iterdir()), "nothing may be left behind"
+
+
+# ---- algorithms from elsewhere
+
+
+@pytest.mark.parametrize(
+    ("kind", "task", "known"),
+    [
+        ("Derived", "unit_circle", "ppo"),
+        ("Any", "unit_circle", "ppo"),
+        ("Fewer", "vehicle", "ppo"),
+        ("Similar", "unit_circle", "sac"),
+        ("DerivedTD3", "unit_circle", "td3"),
+        ("DerivedDQN", "vehicle", "dqn"),
+    ],
+)
+def test_a_class_of_the_users_trains_with_the_settings_of_its_relative(kind, task, known, mine):
+    name = f"{mine}:{kind}"
+    task = task_with(task, name)
+    settings = quick(task, known)
+    assert settings.algorithm == name
+    assert algorithm_title(name) == kind.upper()
+    ours = preset(task_with(task.name, known), "smoke").stage1
+    assert settings.options.items() <= ours.options.items()
+    assert set(settings.options) == ({"n_steps"} if kind == "Fewer" else set(ours.options))
+    check_foreign(task, settings)
+    assert train(task, settings, 0).algorithm == known
+
+
+def test_a_module_in_the_current_folder_is_found(tmp_path, monkeypatch):
+    (tmp_path / "beside_me.py").write_text("from stable_baselines3 import A2C as Mine\n")
+    monkeypatch.chdir(tmp_path)
+    before = list(sys.path)
+    check_algorithm("beside_me:Mine", "any", None)
+    assert algorithm_class("beside_me:Mine").__name__ == "A2C"
+    assert sys.path == before
+
+
+# ---- whole runs
+
+
+def test_a_whole_run_names_its_algorithm_and_keeps_to_it(tmp_path, monkeypatch, capsys):
+    out = tmp_path / "run"
+
+    def hyrl(*arguments):
+        monkeypatch.setattr(sys, "argv", ["hyrl-mj", *map(str, arguments)])
+        cli.main()
+        return capsys.readouterr().out
+
+    whole = ("run", "unit_circle", "--preset", "smoke", "--out", out)
+    said = hyrl(*whole, "--algorithm", "td3")
+    assert "policy (TD3)" in said
+    settings = json.loads((out / "config.json").read_text())["settings"]
+    assert settings["stage1"]["algorithm"] == "td3"
+    assert settings["stage6"]["algorithm"] == "ppo"
+    page = (out / "report.html").read_text()
+    assert "TD3, 12,000 samples" in page
+    assert "--algorithm td3" in page
+    run = hyrl_mj.load_run(out)
+    assert run.task.algorithm == run.policy.algorithm == "td3"
+    assert hyrl_mj.get_task("unit_circle").algorithm == "ppo", "only the run's own task is changed"
+    assert "train: done before" in hyrl(*whole, "--algorithm", "td3")
+    for others in ((), ("--algorithm", "sac")):
+        with pytest.raises(SystemExit) as ended:
+            hyrl(*whole, *others)
+        assert ended.value.code == 2
+        asked = others[-1] if others else "ppo"
+        assert f"stage1 algorithm: td3 there, {asked} asked for" in capsys.readouterr().err
