@@ -45,6 +45,11 @@ class HybridController:
                 f"policies of modes {sorted(self.policies)} do not fit flow sets of modes "
                 f"{sorted(self.flow_sets)}: give one of each for every mode"
             )
+        if self.starts is not None and set(self.starts) != set(self.policies):
+            raise BadInput(
+                f"start sets of modes {sorted(self.starts)} do not fit modes {sorted(self.policies)}: give "
+                "one for every mode, or none"
+            )
 
     @cached_property
     def modes(self) -> tuple[int, ...]:

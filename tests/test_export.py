@@ -115,6 +115,17 @@ def test_three_modes_jump_to_the_deepest(circle, taken):
     }
 
 
+def test_it_begins_by_start_sets_where_there_are_some(vehicle, taken):
+    controller = planted(vehicle)
+    coarse = Grid.with_cells(vehicle.chart, 10)
+    upper = GridSet(coarse, 0.3 - coarse.nodes[:, 1])
+    controller = replace(controller, starts={0: upper, 1: ~upper})
+    measured = random_states(vehicle, 2000, RNG(0))
+    assert_same(controller, taken(controller), measured)
+    by_flow = replace(controller, starts=None).initial_mode(measured)
+    assert 0.05 < (controller.initial_mode(measured) != by_flow).mean() < 0.95
+
+
 def test_on_the_edge_it_flows(vehicle, taken):
     grid = Grid(vehicle.chart, (2, 2))
     ramp = GridSet(grid, grid.nodes[:, 1].copy())  # its edge is y = 0, to the bit at the middle

@@ -148,7 +148,7 @@ def _write(controller: HybridController, folder: Path) -> tuple[Path, Path]:
 
 
 def _arrays(controller: HybridController) -> dict[str, np.ndarray]:
-    """What the template reads of modes, chart, inputs, flow sets and networks."""
+    """What the template reads of modes, chart, inputs, sets and networks."""
     task, chart = controller.task, controller.task.chart
     if min(controller.modes) < 0:
         raise BadInput(f"modes {controller.modes} cannot be exported: -1 stands for no mode yet")
@@ -165,10 +165,14 @@ def _arrays(controller: HybridController) -> dict[str, np.ndarray]:
     if task.input_levels is not None:
         arrays["levels"] = task.input_levels
     for k, q in enumerate(controller.modes):
-        held = _grid_set(controller.flow_sets[q], task, q)
-        arrays[f"counts_{k}"] = np.array(held.grid.counts, dtype=np.int64)
-        arrays[f"spacing_{k}"] = held.grid.spacing
-        arrays[f"distances_{k}"] = held.values
+        sets = {"flow": controller.flow_sets[q]}
+        if controller.starts is not None:
+            sets["start"] = controller.starts[q]
+        for kind, held in sets.items():
+            on_grid = _grid_set(held, task, f"{kind} set of mode {q}")
+            arrays[f"{kind}_{k}"] = on_grid.values
+            arrays[f"{kind}_{k}_counts"] = np.array(on_grid.grid.counts, dtype=np.int64)
+            arrays[f"{kind}_{k}_spacing"] = on_grid.grid.spacing
         layers = _policy(controller, q).layers
         arrays[f"layers_{k}"] = np.array(len(layers))
         for i, (weight, bias) in enumerate(layers):
@@ -176,15 +180,15 @@ def _arrays(controller: HybridController) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _grid_set(held: StateSet, task: Task, q: int) -> GridSet:
-    """A flow set on a grid."""
+def _grid_set(held: StateSet, task: Task, what: str) -> GridSet:
+    """A set on a grid."""
     if isinstance(held, GridSet) and held.grid.chart == task.chart:
         return held
     if isinstance(held, Everything):
         grid = Grid(task.chart, (2,) * task.chart.dimension)
         return GridSet(grid, np.full(2**task.chart.dimension, DEEPEST))
     raise BadInput(
-        f"the flow set of mode {q} is a {type(held).__name__}: only a GridSet on the chart of "
+        f"the {what} is a {type(held).__name__}: only a GridSet on the chart of "
         f"{task.name}, or Everything, can be exported"
     )
 

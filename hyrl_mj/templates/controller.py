@@ -64,7 +64,7 @@ def step(q, measured):
 
 
 def initial_mode(measured):
-    """The modes (n,) whose flow sets hold the first measurements (n, p) most deeply."""
+    """The modes (n,) whose flow sets, or start sets, hold the first measurements (n, p) most deeply."""
     measured = checked(measured)
     return answer(np.full(len(measured), NO_MODE), measured)[1]
 
@@ -84,14 +84,17 @@ def checked(measured):
 def answer(q, measured):
     """`step` without branches: all modes are computed, and then chosen from.
 
-    A q that is no mode begins in the mode whose flow set holds the measurement most deeply. Where a
+    A q that is no mode begins in the mode whose start set holds the measurement most deeply. Where a
     measurement is not finite, q stays and u is NaN.
     """
     z, seen, modes = chart_point(measured), observation(measured), range(len(MODES))
-    distances = np.stack([signed_distance(z, k) for k in modes], axis=1)
+    flow = distances(z, "flow")
     active = q[:, None] == MODES
-    flows = (active & (distances <= ARRAYS["on_edge"])).any(axis=1)
-    deepest = np.take(MODES, np.where(active, np.inf, distances).argmin(axis=1))
+    flows = (active & (flow <= ARRAYS["on_edge"])).any(axis=1)
+    depth = np.where(active, np.inf, flow)
+    if "start_0" in ARRAYS:  # without start sets the flow sets tell
+        depth = np.where(active.any(axis=1, keepdims=True), depth, distances(z, "start"))
+    deepest = np.take(MODES, depth.argmin(axis=1))
     finite = np.isfinite(measured).all(axis=1)
     q_next = np.where(finite & ~flows, deepest, q)
     u = np.nan
@@ -100,12 +103,17 @@ def answer(q, measured):
     return u, q_next
 
 
-def signed_distance(z, k):
-    """Distance (n,) of chart points (n, d) to the edge of a flow set, negative inside.
+def distances(z, kind):
+    """Distances (n, modes) of chart points (n, d) to the edges of all modes' sets of a kind."""
+    return np.stack([signed_distance(z, f"{kind}_{k}") for k in range(len(MODES))], axis=1)
+
+
+def signed_distance(z, name):
+    """Distance (n,) of chart points (n, d) to the edge of a set, negative inside.
 
     It is given at the nodes of a grid, and interpolated in between.
     """
-    counts, spacing = ARRAYS[f"counts_{k}"], ARRAYS[f"spacing_{k}"]
+    counts, spacing = ARRAYS[f"{name}_counts"], ARRAYS[f"{name}_spacing"]
     last = np.where(PERIODIC, np.inf, counts - 1)
     index = np.minimum(np.maximum((wrapped(z) - LOW) / spacing, 0), last)
     below = np.floor(index)
@@ -116,7 +124,7 @@ def signed_distance(z, k):
         weight = np.where(np.array(corner, dtype=bool), share, 1 - share).prod(axis=1)
         # Above the last node of an axis lies nothing: the first one is taken, with a weight of 0.
         node = ((first + np.array(corner)) % counts * strides).sum(axis=1)
-        distance = distance + weight * np.take(ARRAYS[f"distances_{k}"], node)
+        distance = distance + weight * np.take(ARRAYS[name], node)
     return distance
 
 
