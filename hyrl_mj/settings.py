@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 from numbers import Real
 from typing import Any
 
+import numpy as np
+
 from hyrl_mj.algorithms import accepted, algorithm_title, check_algorithm, relative
 from hyrl_mj.errors import BadArtifact, BadInput, unknown
 from hyrl_mj.noise import check_bound, check_seed
@@ -168,7 +170,7 @@ def _stage(content: dict[str, Any]) -> Training | Agent:
 
 
 # Stage 1 of preset fast, by algorithm: of tasks with continuous inputs, and of those with levels.
-# Short episodes: the decision falls in their first second.
+# Short episodes, for tasks that start all over the chart: the decision falls in their first second.
 _PPO = Training(
     algorithm="ppo",
     samples=160_000,
@@ -384,6 +386,8 @@ def _stage1(task: Task, name: str) -> Training:
         found = (_CONTINUOUS if task.levels is None else _LEVELS)[known]
     if name == "smoke":
         found = replace(found, samples=_SMOKE[known])
+    if np.any(np.subtract(task.start_high, task.start_low) < task.chart.sides - 1e-9):
+        found = replace(found, episode=None)  # what lies behind the starts has to be driven to
     if known == task.algorithm:
         return found
     options = accepted(task.algorithm, found.options)

@@ -341,3 +341,9 @@ def test_a_whole_run_names_its_algorithm_and_keeps_to_it(tmp_path, monkeypatch, 
         assert ended.value.code == 2
         asked = others[-1] if others else "ppo"
         assert f"stage1 algorithm: td3 there, {asked} asked for" in capsys.readouterr().err
+
+
+def test_short_episodes_are_for_tasks_that_start_everywhere(circle, monkeypatch):
+    assert preset(circle).stage1.episode == 20
+    monkeypatch.setattr(circle, "start_high", (3.0,))
+    assert preset(circle).stage1.episode is None

@@ -309,8 +309,8 @@ MISTAKES = {
         PY, r"return measured\[:, :3\]", "return measured[:, 0]", r"observation\(\) gives shape",
     ),
     "starts the wrong way round": (PY, r"\(0\.0, -0\.8\)", "(0.0, 1.0)", r"start_low is greater"),
-    "an unknown algorithm": (PY, '"ppo"', '"sarsa"', r"algorithm 'sarsa'.*ppo, a2c"),
-    "dqn without levels": (PY, '"ppo"', '"dqn"', r"dqn needs levels"),
+    "an unknown algorithm": (PY, '"dqn"', '"sarsa"', r"algorithm 'sarsa'.*ppo, a2c"),
+    "dqn without levels": (PY, "levels, algorithm = 5,", "algorithm =", r"dqn needs levels"),
     "a mirror of the wrong length": (
         PY, r"\(1, -1, -1\)", "(1, -1)", r"mirror\.observation is \(1, -1\): give 3",
     ),

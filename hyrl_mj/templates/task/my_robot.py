@@ -26,7 +26,7 @@ class MyRobot(hyrl_mj.Task):
     replay_starts = ((0.0, -0.15), (0.0, 0.0), (0.0, 0.15))
     replay_time = 3.2
     mode_names = ("left", "right")
-    algorithm = "ppo"
+    levels, algorithm = 5, "dqn"
     # Mirrored observations call for mirrored inputs.
     mirror = Mirror(observation=(1, -1, -1), inputs=(-1,))
     observation_low, observation_high = (-1.0, -3.0, -3.0), (5.0, 3.0, 3.0)
