@@ -3,7 +3,7 @@
     python scripts/plain_dqn.py agent.zip --seed 0
     hyrl-mj robustify vehicle --policy agent.zip
 
-Two minutes. Its networks respect no symmetry; SB3's `EvalCallback` keeps the policy with the best return.
+Half a minute. Its networks respect no symmetry; SB3's `EvalCallback` keeps the policy with the best return.
 """
 
 from __future__ import annotations
