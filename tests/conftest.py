@@ -30,7 +30,12 @@ def task(request):
 
 @pytest.fixture(scope="session")
 def puck(tmp_path_factory):
-    """A robot with inertia: what `hyrl-mj new-task` writes."""
+    """A robot with inertia: what `hyrl-mj new-task` writes, with continuous inputs."""
     folder = tmp_path_factory.mktemp("puck")
     write_task("puck", folder)
-    return hyrl_mj.get_task(folder / "puck.py")
+    path = folder / "puck.py"
+    text = path.read_text()
+    continuous = text.replace('levels, algorithm = 5, "dqn"', 'algorithm = "ppo"')
+    assert continuous != text
+    path.write_text(continuous)
+    return hyrl_mj.get_task(path)
