@@ -10,8 +10,8 @@ from hyrl_mj.tasks.base import Task
 CAPTIONS = {
     "overview": (
         "Where the stage-1 policy goes without noise, in the colour of the mode whose way it is, and "
-        "where it goes under measurement noise from a start on the critical set M*. The red field is "
-        "all that it can observe along that path."
+        "where measurement noise leads it from one start. The red field is all that it can observe along "
+        "that path."
     ),
     "policy": (
         "The input that the stage-1 policy gives at each measurement, with the critical set M* in red, "
