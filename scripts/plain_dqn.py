@@ -50,8 +50,10 @@ def main() -> None:
         policy_kwargs={"net_arch": [64, 64]},
     )
     best = options.out.parent / f".{options.out.stem}"
+    judged = TaskVecEnv(BatchedEnv(task, 64))
+    judged.seed(options.seed)
     watch = EvalCallback(
-        TaskVecEnv(BatchedEnv(task, 64)),
+        judged,
         n_eval_episodes=256,
         eval_freq=options.samples // 64 // 40,
         best_model_save_path=str(best),
