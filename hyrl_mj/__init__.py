@@ -6,23 +6,26 @@ Importing this package needs neither torch nor a GL library.
 """
 
 from hyrl_mj import mjcf as _mjcf  # first: it chooses the GL backend before mujoco is imported
-from hyrl_mj.agents import from_callable, load_agent
-from hyrl_mj.controllers import Controller
-from hyrl_mj.critical_set import CriticalSet, find_critical_set
+from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadArtifact, BadInput, HyrlError, NoRenderer
 from hyrl_mj.export import export_numpy, export_onnx
-from hyrl_mj.extended_sets import ExtendedSets, extend
-from hyrl_mj.hybrid import HybridController
-from hyrl_mj.noise import Noise, Recorded
-from hyrl_mj.partition import Partition, make_partition
+from hyrl_mj.game import Game, Score
+from hyrl_mj.learning import Settings
 from hyrl_mj.pipeline import diagnose, robustify, run
-from hyrl_mj.policies import MlpPolicy, Policy
-from hyrl_mj.robustness import Game, Score
+from hyrl_mj.policies import Controller, MlpPolicy, Policy, from_callable, load_agent
 from hyrl_mj.run_directory import Run, load_run
 from hyrl_mj.sets import StateSet
-from hyrl_mj.settings import Settings
-from hyrl_mj.simulation import HybridArc, closed_loop, simulate
-from hyrl_mj.tasks import Chart, Mirror, Outcome, Task, get_task, register, task_names
+from hyrl_mj.simulation import HybridArc, Noise, Recorded, closed_loop, simulate
+from hyrl_mj.stages import (
+    CriticalSet,
+    ExtendedSets,
+    HybridController,
+    Partition,
+    extend,
+    find_critical_set,
+    make_partition,
+)
+from hyrl_mj.tasks import Mirror, Outcome, Task, get_task, register, task_names
 
 __version__ = "0.1.0"
 __all__ = [

@@ -14,9 +14,10 @@ import tyro
 
 from hyrl_mj import pipeline, progress
 from hyrl_mj.errors import BadInput, HyrlError, unknown
-from hyrl_mj.noise import KINDS
-from hyrl_mj.summary import print_robustness, print_summary
-from hyrl_mj.tasks.registry import get_task, task_names
+from hyrl_mj.run_directory import load_run
+from hyrl_mj.simulation import KINDS
+from hyrl_mj.tasks import get_task, task_names
+from hyrl_mj.viz import print_robustness, print_summary
 
 Positional = tyro.conf.Positional
 # Starts, noise, its bound, layout and slow motion of the replay that a run makes.
@@ -45,7 +46,7 @@ def new_task(
         name: of the task and its files: letters, digits and _.
         folder: where to.
     """
-    from hyrl_mj.new_task import write_task
+    from hyrl_mj.tasks import write_task
 
     paths = write_task(name, folder)
     print(f"wrote {', '.join(map(str, paths))}")
@@ -186,7 +187,7 @@ def stage_command(name: str, help_text: str) -> Callable[..., None]:
     """The subcommand that runs one stage again from what is on disk."""
 
     def command(run_dir: RunDir) -> None:
-        pipeline.run_stage(pipeline.load_run(run_dir), name)
+        pipeline.run_stage(load_run(run_dir), name)
 
     command.__doc__ = help_text
     return command
@@ -199,7 +200,7 @@ def extended_sets(run_dir: RunDir, horizon: float | None = None) -> None:
         run_dir: a run directory.
         horizon: a new horizon T of the backward propagation in s.
     """
-    run = pipeline.load_run(run_dir)
+    run = load_run(run_dir)
     if horizon is None:
         pipeline.run_stage(run, "extended-sets")
     else:
@@ -227,9 +228,9 @@ def simulate_run(
         horizon: time to simulate in s; by default the task's.
         seed: of the noise.
     """
-    from hyrl_mj.arcs import noisy_arcs
+    from hyrl_mj.viz.arcs import noisy_arcs
 
-    run = pipeline.load_run(run_dir)
+    run = load_run(run_dir)
     if start is None:
         if (q0, noise, eps, horizon, seed) != (None, "alternating", None, None, 0):
             raise BadInput("--q0, --noise, --eps, --horizon and --seed need a --start")
@@ -269,7 +270,7 @@ def robustness(
         near_critical: all episodes start within twice the bound of the critical set.
         seed: of starts and noise of the episodes.
     """
-    run = pipeline.load_run(run_dir)
+    run = load_run(run_dir)
     kinds = [] if noise is None else [kind.strip() for kind in noise.split(",")]
     for kind in kinds:
         if kind not in KINDS:
@@ -280,7 +281,7 @@ def robustness(
             option = "--noise" if kinds else "--near-critical"
             raise BadInput(f"{option} is about the episodes: say how many, as in --episodes 100000")
     pipeline.examine_run(run, eps, kinds, episodes, all_coordinates, seed, near_critical)
-    print_robustness(pipeline.load_run(run_dir))
+    print_robustness(load_run(run_dir))
     print(f"pictures in {run.path / 'figures'}")
 
 
@@ -314,10 +315,10 @@ def replay(
         fps: frames per second.
         slow_motion: how many times slower the video is around jumps.
     """
-    from hyrl_mj.arcs import replay_floor, replay_shows
-    from hyrl_mj.replay import render_replay
+    from hyrl_mj.viz.arcs import replay_floor, replay_shows
+    from hyrl_mj.viz.replay import render_replay
 
-    run = pipeline.load_run(run_dir)
+    run = load_run(run_dir)
     if out is None and (starts, noise, eps, layout, slow_motion) != REPLAY:
         # The report says of replay.mp4 what a run puts there.
         raise BadInput("another replay than that of the run needs an --out, as in --out mine.mp4")
@@ -345,9 +346,9 @@ def view(run_dir: RunDir, arc: str = "critical_hyrl_q0", port: int = 0) -> None:
         port: of the web viewer, which only this machine can reach; by default the first free one from
             8080 on.
     """
-    from hyrl_mj.viewing import view
+    from hyrl_mj.viz.viewing import view
 
-    run = pipeline.load_run(run_dir)
+    run = load_run(run_dir)
     paths = {path.stem: path for path in sorted((run.path / "arcs").glob("*.npz"))}
     if arc not in paths:
         raise unknown("arc", arc, paths)
@@ -371,9 +372,9 @@ def report(run_dir: RunDir, out: Path | None = None) -> None:
         run_dir: a run directory.
         out: the html to write; by default report.html in the run directory.
     """
-    from hyrl_mj.report import write_report
+    from hyrl_mj.viz.report import write_report
 
-    run = pipeline.load_run(run_dir)
+    run = load_run(run_dir)
     out = out or run.path / "report.html"
     write_report(run, out)
     print(f"page at {out}")
@@ -390,7 +391,7 @@ def export(run_dir: RunDir, to: str, out: Path) -> None:
     """
     from hyrl_mj.export import export
 
-    export(pipeline.load_run(run_dir).controller, to, out)
+    export(load_run(run_dir).controller, to, out)
     print(f"controller at {out}")
 
 

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hyrl_mj.encoding import video
 from hyrl_mj.errors import NoRenderer
 from hyrl_mj.rendering import GL_CURE
+from hyrl_mj.viz.encoding import video
 
 # Distributions whose versions matter; not imported for it, since torch takes seconds.
 DISTRIBUTIONS = (

@@ -1,7 +1,9 @@
 """What can go wrong, in sentences for people: what was given, what is allowed, how to mend it."""
 
+import math
 from collections.abc import Iterable
 from difflib import get_close_matches
+from numbers import Integral, Real
 
 
 class HyrlError(Exception):
@@ -36,3 +38,25 @@ def brief(error: BaseException) -> str:
     """The kind of an error and the beginning of what it says, in one line."""
     text = " ".join(str(error).split())
     return f"{type(error).__name__}: {text if len(text) <= 160 else text[:157] + '...'}"
+
+
+def check_seed(seed: int) -> int:
+    """The seed itself, if it is one.
+
+    Raises:
+        BadInput: it is not an integer from 0 to 2**32 - 1, what NumPy, torch and SB3 all take.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= seed < 2**32:
+        raise BadInput(f"seed {seed!r} cannot be used: give an integer from 0 to 4294967295")
+    return int(seed)
+
+
+def check_bound(bound: float) -> float:
+    """The noise bound itself, if it is one.
+
+    Raises:
+        BadInput: it is negative, infinite or not a number.
+    """
+    if not (isinstance(bound, Real) and math.isfinite(bound) and bound >= 0):
+        raise BadInput(f"noise bound {bound!r} cannot be used: give a finite number >= 0")
+    return float(bound)

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+# Is told each line of text that a person may read while work goes on.
+Say = Callable[[str], None]
+
 
 class Progress:
     """A bar that appears once the work has lasted half a second.

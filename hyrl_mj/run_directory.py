@@ -10,26 +10,28 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from hyrl_mj import artifacts, robustness
-from hyrl_mj.agents import SampledPolicy
-from hyrl_mj.controllers import Controller, PolicyController
-from hyrl_mj.critical_set import CriticalSet
+from hyrl_mj import artifacts
 from hyrl_mj.errors import BadArtifact, BadInput
-from hyrl_mj.extended_sets import ExtendedSets
-from hyrl_mj.given import FUNCTION, ONNX, AnyPolicy, opened
-from hyrl_mj.hybrid import HybridController
-from hyrl_mj.lattice import Lattice
-from hyrl_mj.partition import Partition
-from hyrl_mj.policies import MlpPolicy, Policy
-from hyrl_mj.section import Section
-from hyrl_mj.settings import Agent, Settings, Training
+from hyrl_mj.game import Lattice
+from hyrl_mj.game import scores as robustness
+from hyrl_mj.learning import Settings, Training
+from hyrl_mj.policies import (
+    FUNCTION,
+    ONNX,
+    Agent,
+    AnyPolicy,
+    Controller,
+    MlpPolicy,
+    Policy,
+    PolicyController,
+    SampledPolicy,
+    opened,
+)
 from hyrl_mj.simulation import HybridArc
-from hyrl_mj.tasks.base import Task
-from hyrl_mj.tasks.registry import get_task
+from hyrl_mj.stages import CriticalSet, ExtendedSets, HybridController, Partition
+from hyrl_mj.tasks import Task, get_task
 
 PACKAGES = ("mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "mediapy")
-# Grid points along the longest side from which critical points of a section are searched for.
-SECTION_CELLS = 40
 
 
 @dataclass(frozen=True)
@@ -122,18 +124,6 @@ class Run:
     def extended_sets(self) -> ExtendedSets:
         """The extended sets M_ext_i, of stage 5."""
         return ExtendedSets.load(self.path / "extended_sets.npz", self.task)
-
-    @cached_property
-    def section(self) -> Section:
-        """What is drawn of a chart of more than two dimensions."""
-        return Section.of(self.task)
-
-    @cached_property
-    def critical_section(self) -> CriticalSet:
-        """M* in the section."""
-        s = self.settings
-        cells = max(s.rods, SECTION_CELLS)
-        return self.section.critical_set(self.critical_set, self.steady, cells, s.resolution)
 
     @cached_property
     def controller(self) -> HybridController:

@@ -8,8 +8,8 @@ from typing import Protocol
 
 import numpy as np
 
+from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput
-from hyrl_mj.tasks.chart import Chart
 
 
 class StateSet(Protocol):

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hyrl_mj.controllers import PolicyController
-from hyrl_mj.envs.gym_env import observation_space
+from hyrl_mj.envs import observation_space
 from hyrl_mj.errors import BadInput
+from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import closed_loop
-from hyrl_mj.tasks import Outcome, Task
-from hyrl_mj.tasks.checks import check_task
+from hyrl_mj.tasks import Outcome, Task, check_task
 
 
 def random_inputs(task: Task, n: int, rng: np.random.Generator) -> np.ndarray:

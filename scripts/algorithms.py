@@ -17,9 +17,9 @@ from rich.table import Table
 
 import hyrl_mj
 from hyrl_mj import progress
-from hyrl_mj.algorithms import ALGORITHMS, algorithm_title
-from hyrl_mj.pipeline import run
-from hyrl_mj.tables import arrivals, percent
+from hyrl_mj.pipeline.runs import run
+from hyrl_mj.policies import ALGORITHMS, algorithm_title
+from hyrl_mj.viz.tables import arrivals, percent
 
 PAPER = ("unit_circle", "vehicle")
 HEADINGS = (

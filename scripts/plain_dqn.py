@@ -16,7 +16,7 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.callbacks import EvalCallback
 
 import hyrl_mj
-from hyrl_mj.envs.core import BatchedEnv
+from hyrl_mj.envs import BatchedEnv
 from hyrl_mj.envs.sb3_env import TaskVecEnv
 
 SAMPLES = 300_000

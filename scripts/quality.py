@@ -12,9 +12,10 @@ import sys
 import numpy as np
 
 import hyrl_mj
-from hyrl_mj.envs.core import BatchedEnv
-from hyrl_mj.pipeline import replay_sentence
-from hyrl_mj.simulation import PolicyController, closed_loop
+from hyrl_mj.envs import BatchedEnv
+from hyrl_mj.policies import PolicyController
+from hyrl_mj.simulation import closed_loop
+from hyrl_mj.viz import replay_sentence
 
 
 def circle_return(task: hyrl_mj.Task, policy: hyrl_mj.MlpPolicy, starts: int = 10_000) -> float:

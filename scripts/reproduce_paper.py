@@ -17,10 +17,11 @@ from rich.console import Console
 from rich.table import Table
 
 import hyrl_mj
-from hyrl_mj import figures, progress
-from hyrl_mj.algorithms import algorithm_title
+from hyrl_mj import progress
 from hyrl_mj.errors import BadInput
-from hyrl_mj.noise import Noise
+from hyrl_mj.policies import algorithm_title
+from hyrl_mj.simulation import Noise
+from hyrl_mj.viz import figures
 
 # A line of the table: the quantity, the paper's value, ours, and a note.
 Line = tuple[str, str, str, str]

@@ -22,9 +22,9 @@ from rich.table import Table
 
 import hyrl_mj
 from hyrl_mj import progress
-from hyrl_mj.controllers import Controller, PolicyController
-from hyrl_mj.episodes import episodes
+from hyrl_mj.policies import Controller, PolicyController
 from hyrl_mj.simulation import closed_loop
+from hyrl_mj.stages import noisy_episodes
 
 KINDS = ("alternating", "adversarial")
 # Starts for the comparison with the expert.
@@ -89,7 +89,9 @@ def measure(name: str, seed: int, count: int, folder: Path) -> list[str]:
     row = [name, str(seed)]
     for loop, controller in run.loops.items():
         n = min(count, SHARE) if loop == "policy" else count
-        for found in episodes(run.task, run.critical_set, {loop: controller}, noises, n, near=True):
+        for found in noisy_episodes(
+            run.task, run.critical_set, {loop: controller}, noises, n, near=True
+        ):
             failed = found["episodes"] - found["outcomes"].get("reached", 0)
             share = failed / found["episodes"]
             good = share >= 0.2 if loop == "policy" else failed == 0

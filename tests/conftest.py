@@ -9,7 +9,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import pytest
 
 import hyrl_mj
-from hyrl_mj.new_task import write_task
+from hyrl_mj.tasks.scaffold import write_task
 
 
 @pytest.fixture(scope="session")

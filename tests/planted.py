@@ -6,11 +6,12 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from hyrl_mj.critical_set import CriticalSet
-from hyrl_mj.hybrid import HybridController
-from hyrl_mj.partition import Partition
+from hyrl_mj.chart import Chart
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.tasks import Chart, Outcome, Task
+from hyrl_mj.stages.critical_set import CriticalSet
+from hyrl_mj.stages.hybrid import HybridController
+from hyrl_mj.stages.partition import Partition
+from hyrl_mj.tasks import Outcome, Task
 
 
 def euler(task, z, u):

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from planted import sign_policy
 
-from hyrl_mj import Noise, Outcome, adversary
-from hyrl_mj.adversary import NOT_STARTED, Lookahead
-from hyrl_mj.controllers import PolicyController
-from hyrl_mj.simulation import closed_loop
+from hyrl_mj import Noise, Outcome
+from hyrl_mj.policies.controllers import PolicyController
+from hyrl_mj.simulation import lookahead as adversary
+from hyrl_mj.simulation.lookahead import NOT_STARTED, Lookahead
+from hyrl_mj.simulation.rollout import closed_loop
 
 EPS = 0.1
 

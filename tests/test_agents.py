@@ -17,13 +17,13 @@ from torch import nn
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, MlpPolicy, from_callable, load_agent
-from hyrl_mj.agents import SampledPolicy
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.envs.sb3_env import TaskVecEnv
-from hyrl_mj.policies import ACTIVATIONS, TORCH_NAMES
-from hyrl_mj.settings import preset
+from hyrl_mj.learning.presets import preset
+from hyrl_mj.learning.training import build
+from hyrl_mj.policies.activations import ACTIVATIONS, TORCH_NAMES
+from hyrl_mj.policies.mlp import SampledPolicy
 from hyrl_mj.tasks.unit_circle import UnitCircle
-from hyrl_mj.training import build
 
 OFF_POLICY = (DQN, SAC, TD3, DDPG)
 DEFAULT = {PPO: "tanh", A2C: "tanh", DQN: "relu", SAC: "relu", TD3: "relu", DDPG: "relu"}

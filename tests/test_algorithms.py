@@ -9,10 +9,15 @@ import pytest
 
 import hyrl_mj
 from hyrl_mj import BadInput, cli
-from hyrl_mj.algorithms import ALGORITHMS, algorithm_class, algorithm_title, check_algorithm
 from hyrl_mj.envs.core import BatchedEnv
-from hyrl_mj.settings import PRESETS, preset
-from hyrl_mj.training import build, check_foreign, evaluate, export, single_threaded, train
+from hyrl_mj.learning.presets import PRESETS, preset
+from hyrl_mj.learning.training import build, check_foreign, evaluate, export, single_threaded, train
+from hyrl_mj.policies.algorithms import (
+    ALGORITHMS,
+    algorithm_class,
+    algorithm_title,
+    check_algorithm,
+)
 
 # What can have the inputs of which task.
 CAN = [

@@ -14,11 +14,11 @@ from gl import needs_gl
 
 import hyrl_mj
 from hyrl_mj import Outcome
-from hyrl_mj.controllers import PolicyController
 from hyrl_mj.envs.core import BatchedEnv
-from hyrl_mj.new_task import TEMPLATES, write_task
-from hyrl_mj.simulation import ways
+from hyrl_mj.policies.controllers import PolicyController
+from hyrl_mj.simulation.rollout import ways
 from hyrl_mj.tasks.checks import check_task
+from hyrl_mj.tasks.scaffold import TEMPLATES, write_task
 
 # ---- a point mass in space with a pillar: a chart of three dimensions, two inputs, contacts
 
@@ -59,7 +59,7 @@ import numpy as np
 
 import hyrl_mj
 from hyrl_mj import Outcome
-from hyrl_mj.controllers import PolicyController
+from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj import Chart, Mirror, Outcome, mjcf
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from hyrl_mj import BadArtifact, CriticalSet, artifacts
-from hyrl_mj.extended_sets import ExtendedSets
-from hyrl_mj.partition import Partition
 from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.stages.extended_sets import ExtendedSets
+from hyrl_mj.stages.partition import Partition
 
 ARRAYS = {"a": np.arange(500.0).reshape(50, 10), "name": np.array("word"), "flag": np.array([True])}
 CONTENT = {"x": 1.5, "items": [1, 2, 3]}

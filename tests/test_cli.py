@@ -16,9 +16,10 @@ from gl import needs_gl
 from PIL import Image
 
 import hyrl_mj
-from hyrl_mj import cli, pipeline
-from hyrl_mj.figures import CAPTIONS
+from hyrl_mj import cli
 from hyrl_mj.mjcf import has_display
+from hyrl_mj.pipeline import steps as pipeline
+from hyrl_mj.viz.figures import CAPTIONS
 
 
 def call(*arguments):

@@ -5,11 +5,11 @@ import pytest
 from planted import decisions, halves, ideal_controller, one_way_policy, sign_policy
 
 from hyrl_mj import BadInput, Noise, closed_loop
-from hyrl_mj import episodes as bulk
-from hyrl_mj.controllers import PolicyController
-from hyrl_mj.episodes import episodes
-from hyrl_mj.robustness import Game
+from hyrl_mj.game.scores import Game
+from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid
+from hyrl_mj.stages import episodes as bulk
+from hyrl_mj.stages.episodes import noisy_episodes
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def records(vehicle, on_vehicle):
     """Episodes of the sign rule and of the ideal one, under every kind of noise."""
     game, controllers = on_vehicle
     noises = tuple(Noise(k, 0.1) for k in ("uniform", "alternating", "adversarial"))
-    return episodes(
+    return noisy_episodes(
         vehicle,
         decisions(vehicle),
         {name: controllers[name] for name in ("sign", "ideal")},
@@ -69,7 +69,7 @@ def test_starts_near_the_critical_set_are_those_within_twice_the_noise(vehicle, 
     # Starts are uniform in 0 <= x <= 0.5, |y| <= 1, and M* runs along the axis up to x = 0.45.
     left = {"left": on_vehicle[1]["left"]}
     for eps in (0.05, 0.1):
-        records = episodes(vehicle, decisions(vehicle), left, (Noise("uniform", eps),), 2000)
+        records = noisy_episodes(vehicle, decisions(vehicle), left, (Noise("uniform", eps),), 2000)
         assert {r["region"] for r in records} == {"near M*", "elsewhere"}
         near = record(records, "left", "near M*")["episodes"] / 2000
         assert near == pytest.approx(2 * eps, abs=0.03)
@@ -106,7 +106,7 @@ def test_the_same_seed_gives_the_same_counts(vehicle, on_vehicle):
 
     def counts(seed):
         noises = (Noise("uniform", 0.2),)
-        return episodes(vehicle, decisions(vehicle), sign, noises, 300, seed=seed)
+        return noisy_episodes(vehicle, decisions(vehicle), sign, noises, 300, seed=seed)
 
     assert counts(3) == counts(3)
     assert counts(3) != counts(4)
@@ -117,7 +117,7 @@ def test_batches_add_up_and_none_is_the_same(vehicle, on_vehicle, monkeypatch):
     sign, noises = {"sign": on_vehicle[1]["sign"]}, (Noise("uniform", 0.1),)
 
     def near(count):
-        records = episodes(vehicle, decisions(vehicle), sign, noises, count)
+        records = noisy_episodes(vehicle, decisions(vehicle), sign, noises, count)
         assert sum(r["episodes"] for r in records) == count
         return record(records, "sign", "near M*")["episodes"]
 
@@ -137,7 +137,7 @@ def test_batches_add_up_and_none_is_the_same(vehicle, on_vehicle, monkeypatch):
 def test_episodes_that_make_no_sense_are_refused(vehicle, on_vehicle, noise, count, message):
     sign = {"sign": on_vehicle[1]["sign"]}
     with pytest.raises(BadInput, match=message):
-        episodes(vehicle, decisions(vehicle), sign, (noise,), count)
+        noisy_episodes(vehicle, decisions(vehicle), sign, (noise,), count)
 
 
 @pytest.mark.parametrize("kind", ["uniform", "alternating", "adversarial"])

@@ -18,7 +18,7 @@ from hyrl_mj.export import export
 from hyrl_mj.export.graph import write_graph
 from hyrl_mj.export.source import write_function
 from hyrl_mj.export.tracing import BATCH, trace
-from hyrl_mj.policies import ACTIVATIONS
+from hyrl_mj.policies.activations import ACTIVATIONS
 from hyrl_mj.sets import Everything, Grid, GridSet
 
 RNG = np.random.default_rng

@@ -16,12 +16,13 @@ from matplotlib.path import Path as Outline
 from planted import Cube, decisions, halves, plane_policy
 
 import hyrl_mj
-from hyrl_mj import BadInput, HybridController, Outcome, figures, simulate
-from hyrl_mj.extended_sets import ExtendedSets
-from hyrl_mj.figures import charts, paths, style
-from hyrl_mj.partition import Partition
-from hyrl_mj.section import Section
+from hyrl_mj import BadInput, HybridController, Outcome, simulate
 from hyrl_mj.sets import Everything, Grid, GridSet
+from hyrl_mj.stages.extended_sets import ExtendedSets
+from hyrl_mj.stages.partition import Partition
+from hyrl_mj.viz import figures
+from hyrl_mj.viz.figures import charts, paths, style
+from hyrl_mj.viz.section import Section
 
 CIRCLE, VEHICLE = hyrl_mj.get_task("unit_circle"), hyrl_mj.get_task("vehicle")
 ARCS = {task.name: arcs_of(task) for task in (CIRCLE, VEHICLE)}

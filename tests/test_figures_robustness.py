@@ -10,10 +10,11 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import hyrl_mj
-from hyrl_mj import BadInput, figures
-from hyrl_mj.figures import robustness, style
-from hyrl_mj.robustness import BEATEN, CURVE, MAP_CLASSES, UNWINNABLE, WON, WON_FROM_SOME
+from hyrl_mj import BadInput
+from hyrl_mj.game.scores import BEATEN, CURVE, MAP_CLASSES, UNWINNABLE, WON, WON_FROM_SOME
 from hyrl_mj.sets import Grid
+from hyrl_mj.viz import figures
+from hyrl_mj.viz.figures import robustness, style
 
 CIRCLE, VEHICLE = hyrl_mj.get_task("unit_circle"), hyrl_mj.get_task("vehicle")
 HYRL = robustness.CURVE_COLOURS[1]

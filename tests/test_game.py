@@ -17,11 +17,11 @@ from planted import (
 )
 
 from hyrl_mj import HybridController, Noise, simulate
-from hyrl_mj.controllers import PolicyController
 from hyrl_mj.errors import BadInput
-from hyrl_mj.game import LOST, NEVER, Answers, lasting, noisy_moves, solve
-from hyrl_mj.lattice import ON_NODE, Lattice
-from hyrl_mj.robustness import Game, worst_signal
+from hyrl_mj.game.lattice import ON_NODE, Lattice
+from hyrl_mj.game.scores import Game, worst_signal
+from hyrl_mj.game.solver import LOST, NEVER, Answers, lasting, noisy_moves, solve
+from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid
 from hyrl_mj.tasks import Outcome
 

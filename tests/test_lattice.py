@@ -8,10 +8,11 @@ import pytest
 from planted import Cube
 
 import hyrl_mj
+from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput
-from hyrl_mj.lattice import Lattice
+from hyrl_mj.game.lattice import Lattice
 from hyrl_mj.sets import Grid
-from hyrl_mj.tasks import Chart, Outcome
+from hyrl_mj.tasks import Outcome
 
 
 @pytest.fixture(scope="module")

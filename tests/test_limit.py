@@ -15,11 +15,11 @@ from planted import (
 )
 
 from hyrl_mj import CriticalSet, make_partition
-from hyrl_mj.controllers import PolicyController
-from hyrl_mj.game import NEVER, solve
-from hyrl_mj.lattice import Lattice
-from hyrl_mj.limit import Limit
-from hyrl_mj.robustness import LIMIT, Game
+from hyrl_mj.game.lattice import Lattice
+from hyrl_mj.game.limit import Limit
+from hyrl_mj.game.scores import LIMIT, Game
+from hyrl_mj.game.solver import NEVER, solve
+from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid
 
 PI = np.pi

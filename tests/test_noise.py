@@ -5,7 +5,8 @@ import pytest
 from planted import sign_policy
 
 from hyrl_mj import BadInput, Noise, Outcome, Recorded
-from hyrl_mj.simulation import PolicyController, closed_loop
+from hyrl_mj.policies.controllers import PolicyController
+from hyrl_mj.simulation.rollout import closed_loop
 
 
 def signal(noise, seed=0, n=1000, columns=2):

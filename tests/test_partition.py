@@ -5,7 +5,7 @@ import pytest
 from planted import ChartPolicy, circle_policy, one_way_policy, sign_policy
 
 from hyrl_mj import find_critical_set, make_partition
-from hyrl_mj.partition import part_policies
+from hyrl_mj.stages.partition import part_policies
 
 PI = np.pi
 

@@ -9,8 +9,8 @@ from planted import random_states
 from threadpoolctl import threadpool_limits
 
 from hyrl_mj import BadArtifact, BadInput, MlpPolicy, artifacts
-from hyrl_mj.settings import preset
-from hyrl_mj.training import build, export
+from hyrl_mj.learning.presets import preset
+from hyrl_mj.learning.training import build, export
 
 
 @pytest.fixture(scope="module", params=[True, False], ids=["mirrored", "plain"])

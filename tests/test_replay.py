@@ -17,12 +17,13 @@ from planted import circle_controller, circle_policy, decisions, halves
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, HybridArc, HybridController, Noise, NoRenderer
-from hyrl_mj.extended_sets import ExtendedSets
 from hyrl_mj.mjcf import models_dir
 from hyrl_mj.rendering import Canvas
-from hyrl_mj.replay import Show, render_replay
-from hyrl_mj.replay.captions import Group, Layout
-from hyrl_mj.replay.marks import (
+from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.stages.extended_sets import ExtendedSets
+from hyrl_mj.viz.replay import Show, render_replay
+from hyrl_mj.viz.replay.captions import Group, Layout
+from hyrl_mj.viz.replay.marks import (
     BAD,
     CRITICAL,
     GOOD,
@@ -35,9 +36,8 @@ from hyrl_mj.replay.marks import (
     bar,
     disc,
 )
-from hyrl_mj.replay.panel import Panel, Track
-from hyrl_mj.replay.timeline import AROUND, HOLD, frame_times
-from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.viz.replay.panel import Panel, Track
+from hyrl_mj.viz.replay.timeline import AROUND, HOLD, frame_times
 
 SIZE, FPS = (480, 240), 20
 TASK = hyrl_mj.get_task("vehicle")

@@ -19,17 +19,18 @@ from browser import chromium, needs_chromium
 from PIL import Image
 from planted import Cube, decisions, halves
 
-from hyrl_mj import BadArtifact, BadInput, MlpPolicy, load_run, pipeline
-from hyrl_mj.critical_set import CriticalSet
-from hyrl_mj.encoding import video
-from hyrl_mj.extended_sets import ExtendedSets
-from hyrl_mj.figures import CLASS_COLOURS
-from hyrl_mj.partition import Partition
-from hyrl_mj.report import render, write_report
+from hyrl_mj import BadArtifact, BadInput, MlpPolicy, load_run
+from hyrl_mj.learning.presets import preset
+from hyrl_mj.pipeline import steps as pipeline
 from hyrl_mj.run_directory import Run, write_config
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.settings import preset
+from hyrl_mj.stages.critical_set import CriticalSet
+from hyrl_mj.stages.extended_sets import ExtendedSets
+from hyrl_mj.stages.partition import Partition
 from hyrl_mj.tasks import registry
+from hyrl_mj.viz.encoding import video
+from hyrl_mj.viz.figures import CLASS_COLOURS
+from hyrl_mj.viz.report import render, write_report
 
 MAGENTA, GREEN = (230, 20, 200), (20, 200, 60)
 POSTER = (642, 240)  # [pixels], like no other picture

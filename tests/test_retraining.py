@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from planted import ChartPolicy, ideal_controller, one_way_policy
 
-from hyrl_mj import closed_loop, symmetry, training
-from hyrl_mj.controllers import PolicyController
+from hyrl_mj import closed_loop
 from hyrl_mj.envs.core import cautious_reward
-from hyrl_mj.extended_sets import ExtendedSets
-from hyrl_mj.retraining import TOGETHER, ByEpisodes, ByGame, retrain
+from hyrl_mj.learning import symmetry, training
+from hyrl_mj.learning.presets import preset
+from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.settings import preset
+from hyrl_mj.stages.extended_sets import ExtendedSets
+from hyrl_mj.stages.retraining import TOGETHER, ByEpisodes, ByGame, retrain
 
 # ---- where modes are trained
 

@@ -16,17 +16,20 @@ from stable_baselines3 import DQN, PPO
 from test_agents import onnx_file, rewritten, saved, untrained
 
 import hyrl_mj
-from hyrl_mj import BadInput, MlpPolicy, pipeline, training
+from hyrl_mj import BadInput, MlpPolicy
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.envs.sb3_env import TaskVecEnv
-from hyrl_mj.extended_sets import boundary, with_room
-from hyrl_mj.given import opened, take
-from hyrl_mj.lattice import Lattice
-from hyrl_mj.limit import Limit
-from hyrl_mj.partition import Partition
-from hyrl_mj.retraining import ByGame, retrain, warm_start
+from hyrl_mj.game.lattice import Lattice
+from hyrl_mj.game.limit import Limit
+from hyrl_mj.learning import training
+from hyrl_mj.learning.presets import preset
+from hyrl_mj.learning.settings import Settings
+from hyrl_mj.pipeline import steps as pipeline
+from hyrl_mj.policies.given import opened, take
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.settings import Settings, preset
+from hyrl_mj.stages.extended_sets import boundary, with_room
+from hyrl_mj.stages.partition import Partition
+from hyrl_mj.stages.retraining import ByGame, retrain, warm_start
 
 SMOKE = {"preset_name": "smoke", "say": str}
 
@@ -325,7 +328,7 @@ def test_dqn_goes_on_from_weights_that_fit_and_else_afresh(robust, vehicle):
 
 def test_a_start_that_will_do_is_not_trained(circle_run, monkeypatch):
     monkeypatch.setattr(ByGame, "score", lambda ground, policy: (0.0, -0.5))
-    monkeypatch.setattr("hyrl_mj.retraining.train", None)
+    monkeypatch.setattr("hyrl_mj.stages.retraining.train", None)
     run, settings = circle_run, circle_run.settings.stage6
     found = retrain(
         run.task, run.policy, run.extended_sets, 0, settings, 0, partition=run.partition

@@ -13,17 +13,9 @@ from planted import (
     sign_policy,
 )
 
-from hyrl_mj import (
-    BadArtifact,
-    BadInput,
-    Noise,
-    artifacts,
-    robustness,
-    simulate,
-)
-from hyrl_mj.controllers import PolicyController
-from hyrl_mj.game import NEVER
-from hyrl_mj.robustness import (
+from hyrl_mj import BadArtifact, BadInput, Noise, artifacts, simulate
+from hyrl_mj.game import scores as robustness
+from hyrl_mj.game.scores import (
     BEATEN,
     LIMIT,
     OVER,
@@ -34,6 +26,8 @@ from hyrl_mj.robustness import (
     examine,
     worst_signal,
 )
+from hyrl_mj.game.solver import NEVER
+from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid
 
 PI = np.pi

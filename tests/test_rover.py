@@ -9,8 +9,8 @@ import pytest
 
 import hyrl_mj
 from hyrl_mj import Outcome
-from hyrl_mj.controllers import PolicyController
-from hyrl_mj.simulation import closed_loop
+from hyrl_mj.policies.controllers import PolicyController
+from hyrl_mj.simulation.rollout import closed_loop
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "scripts"))
 

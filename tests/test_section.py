@@ -5,12 +5,12 @@ import pytest
 from planted import Cube, sphere_policy
 
 from hyrl_mj import closed_loop, find_critical_set
-from hyrl_mj.controllers import PolicyController
-from hyrl_mj.extended_sets import ExtendedSets
-from hyrl_mj.partition import Partition
-from hyrl_mj.replay.marks import on_floor
-from hyrl_mj.section import Section
+from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.stages.extended_sets import ExtendedSets
+from hyrl_mj.stages.partition import Partition
+from hyrl_mj.viz.replay.marks import on_floor
+from hyrl_mj.viz.section import Section
 
 HEIGHT, RADIUS = 0.3, 0.7
 ACROSS = np.sqrt(RADIUS**2 - HEIGHT**2)

@@ -13,7 +13,7 @@ from planted import (
 )
 
 from hyrl_mj import BadArtifact, BadInput, HybridArc, Noise, Outcome, closed_loop, simulate
-from hyrl_mj.simulation import PolicyController
+from hyrl_mj.policies.controllers import PolicyController
 
 ALTERNATING = Noise("alternating", 0.1)
 

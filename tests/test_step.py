@@ -8,9 +8,9 @@ import pytest
 from planted import ChartPolicy, random_states
 
 from hyrl_mj import HybridController
+from hyrl_mj.learning.presets import preset
+from hyrl_mj.learning.training import build, export
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.settings import preset
-from hyrl_mj.training import build, export
 
 LAYERS = {
     "dqn": ("q_net.q_net.0", "q_net.q_net.2", "q_net.q_net.4"),

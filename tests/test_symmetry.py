@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import nn
 
-from hyrl_mj import symmetry
-from hyrl_mj.settings import preset
-from hyrl_mj.training import build, export, single_threaded
+from hyrl_mj.learning import symmetry
+from hyrl_mj.learning.presets import preset
+from hyrl_mj.learning.training import build, export, single_threaded
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import pytest
 
 import hyrl_mj
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.tables import extent, percent
+from hyrl_mj.viz.tables import extent, percent
 
 
 @pytest.mark.parametrize(

@@ -1,1 +1,18 @@
-"""Environments: one batched core, and its faces for Gymnasium and Stable-Baselines3."""
+"""Environments: one batched core, and its interfaces for Gymnasium and Stable-Baselines3.
+
+The module `sb3_env` imports Stable-Baselines3, so it is imported only where it is needed.
+"""
+
+from hyrl_mj.envs.core import BatchedEnv, Domain
+from hyrl_mj.envs.gym_env import TaskEnv, TaskVectorEnv, observation_space
+from hyrl_mj.envs.sb3_policy import Sb3Policy
+
+__all__ = [
+    "BatchedEnv",
+    "Domain",
+    "Sb3Policy",
+    "TaskEnv",
+    "TaskVectorEnv",
+    "observation_space",
+    "sb3_env",
+]

@@ -9,8 +9,8 @@ from itertools import product
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.noise import Noise
-from hyrl_mj.tasks.base import Outcome, Task
+from hyrl_mj.simulation import Noise
+from hyrl_mj.tasks import Outcome, Task
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,8 @@ from gymnasium.vector.utils import batch_space
 
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.errors import BadInput
-from hyrl_mj.noise import Noise
-from hyrl_mj.tasks.base import Outcome, Task
-from hyrl_mj.tasks.registry import get_task
+from hyrl_mj.simulation import Noise
+from hyrl_mj.tasks import Outcome, Task, get_task
 
 if TYPE_CHECKING:
     from hyrl_mj.rendering import SceneRenderer

@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.envs.gym_env import action_space, observation_space
-from hyrl_mj.tasks.base import Outcome
+from hyrl_mj.tasks import Outcome
 
 
 class TaskVecEnv(VecEnv):

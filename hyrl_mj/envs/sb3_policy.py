@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hyrl_mj.controllers import Controller, as_controller, check_modes
 from hyrl_mj.errors import BadInput
-from hyrl_mj.policies import Policy
-from hyrl_mj.tasks.base import Task
+from hyrl_mj.policies import Controller, Policy, as_controller, check_modes
+from hyrl_mj.tasks import Task
 
 
 @dataclass(frozen=True)

@@ -19,13 +19,15 @@ from hyrl_mj import artifacts
 from hyrl_mj.errors import BadInput, brief, unknown
 from hyrl_mj.export.source import literal, write_function
 from hyrl_mj.export.tracing import BATCH, trace
-from hyrl_mj.hybrid import ON_EDGE, HybridController
 from hyrl_mj.policies import ACTIVATIONS, MlpPolicy
 from hyrl_mj.sets import Everything, Grid, GridSet, StateSet
-from hyrl_mj.tasks.base import Task
+from hyrl_mj.stages import ON_EDGE, HybridController
+from hyrl_mj.tasks import Task
 
 if TYPE_CHECKING:
     import onnx
+
+__all__ = ["export", "export_numpy", "export_onnx"]
 
 TEMPLATE = Path(__file__).parents[1] / "templates" / "controller.py"
 # Where the part of the template begins and ends that belongs to the task.

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hyrl_mj import mjcf
-from hyrl_mj.errors import BadInput
-from hyrl_mj.noise import check_bound
+from hyrl_mj.chart import Chart
+from hyrl_mj.errors import BadInput, check_bound
 from hyrl_mj.plant import Plant, input_limits
-from hyrl_mj.tasks.chart import Chart
 
 # How a critical set can be searched for.
 SEARCHES = ("rods", "outcome")

@@ -6,7 +6,6 @@ import mujoco
 import numpy as np
 
 from hyrl_mj import mjcf
-from hyrl_mj.algorithms import check_algorithm
 from hyrl_mj.errors import BadInput, brief, unknown
 from hyrl_mj.tasks.base import SEARCHES, Outcome, Task
 from hyrl_mj.tasks.registry import line_in
@@ -81,7 +80,6 @@ def _check_training(task: Task) -> None:
             f"{task.levels} levels of {len(task.inputs)} input(s) cannot be used: give 2 or more of a "
             "single input, or none"
         )
-    check_algorithm(task.algorithm, task.name, task.levels)
     if task.mirror is not None:
         for name, wanted in (
             ("observation", len(task.observation_low)),

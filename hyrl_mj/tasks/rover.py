@@ -7,8 +7,8 @@ from functools import cached_property
 import numpy as np
 
 from hyrl_mj import mjcf
+from hyrl_mj.chart import Chart
 from hyrl_mj.tasks.base import Mirror, Outcome, Task
-from hyrl_mj.tasks.chart import Chart
 from hyrl_mj.tasks.registry import register
 
 # The heading that still counts as on the way [rad], and how close to the pillar it begins to matter [m].

@@ -7,8 +7,8 @@ from functools import cached_property
 import numpy as np
 
 from hyrl_mj import mjcf
+from hyrl_mj.chart import Chart
 from hyrl_mj.tasks.base import Mirror, Outcome, Task
-from hyrl_mj.tasks.chart import Chart
 from hyrl_mj.tasks.registry import register
 
 CRASH_DISTANCE = 1e-3  # [m] from the obstacle's surface

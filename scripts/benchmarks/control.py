@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks import Figure
 from benchmarks.runs import Runs, child
 from hyrl_mj import Run
-from hyrl_mj.training import build
+from hyrl_mj.learning.training import build
 
 MANY, REPEATS = 100_000, 2_000
 

@@ -12,9 +12,8 @@ import hyrl_mj
 from benchmarks import Figure
 from benchmarks.runs import Runs
 from hyrl_mj import Chart, Outcome, Task
-from hyrl_mj.envs.core import BatchedEnv
-from hyrl_mj.noise import Noise
-from hyrl_mj.simulation import closed_loop
+from hyrl_mj.envs import BatchedEnv
+from hyrl_mj.simulation import Noise, closed_loop
 
 # Samples that a piece of work is.
 SAMPLES = 60

@@ -34,7 +34,7 @@ def measure(kind: str, size: int, run: Path) -> tuple[float, float]:
 
     task = hyrl_mj.get_task("vehicle")
     if kind == "simulations":
-        from hyrl_mj.envs.core import BatchedEnv
+        from hyrl_mj.envs import BatchedEnv
 
         env = BatchedEnv(task, size)
         env.seed(0)
@@ -50,13 +50,13 @@ def measure(kind: str, size: int, run: Path) -> tuple[float, float]:
         began = time.perf_counter()
         hyrl_mj.find_critical_set(task, policy, size, 1 / 32)
     else:
-        from hyrl_mj.episodes import episodes
-        from hyrl_mj.noise import Noise
+        from hyrl_mj.simulation import Noise
+        from hyrl_mj.stages import noisy_episodes
 
         found = hyrl_mj.load_run(run)
         began = time.perf_counter()
         loops = {"HyRL": found.controller}
-        episodes(task, found.critical_set, loops, (Noise("uniform", 0.1),), size)
+        noisy_episodes(task, found.critical_set, loops, (Noise("uniform", 0.1),), size)
     took = time.perf_counter() - began
     return took, peak_memory()
 

@@ -14,11 +14,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 import hyrl_mj
 from benchmarks import Figure
 from benchmarks.runs import Runs
-from hyrl_mj.algorithms import algorithm_class
-from hyrl_mj.policies import MlpPolicy
-from hyrl_mj.settings import preset
-from hyrl_mj.tasks.base import Task
-from hyrl_mj.training import Score, export, single_threaded, train
+from hyrl_mj.learning import preset
+from hyrl_mj.learning.training import Score, export, single_threaded, train
+from hyrl_mj.policies import MlpPolicy, algorithm_class
+from hyrl_mj.tasks import Task
 
 # How good a policy has to be: the mean return from pi +- 0.2 rad; the share of winnable starts passed.
 GOOD: dict[str, tuple[Callable[[Task, MlpPolicy], float], float, str]] = {

@@ -10,7 +10,7 @@ import numpy as np
 import hyrl_mj
 from benchmarks import Figure
 from benchmarks.runs import Runs
-from hyrl_mj.replay import Show, render_replay
+from hyrl_mj.viz.replay import Show, render_replay
 
 
 class _GoStraight:

@@ -12,11 +12,12 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from benchmarks import Figure
 from benchmarks.runs import Runs
-from hyrl_mj import Run, Task, extend, extended_sets, find_critical_set
-from hyrl_mj.critical_set import PARTING, SAMPLES
-from hyrl_mj.partition import PartPolicy
-from hyrl_mj.tasks.base import Outcome
-from hyrl_mj.training import build
+from hyrl_mj import Run, Task, extend, find_critical_set
+from hyrl_mj.learning.training import build
+from hyrl_mj.stages import extended_sets
+from hyrl_mj.stages.critical_set import PARTING, SAMPLES
+from hyrl_mj.stages.partition import PartPolicy
+from hyrl_mj.tasks import Outcome
 
 RODS, RESOLUTION = 30, 1 / 32
 # One start in so many is run one at a time: all of them would take minutes.

@@ -1,0 +1,208 @@
+"""A lattice of states and what one sample of the compiled plant makes of each of its nodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+
+from hyrl_mj.errors import BadInput
+from hyrl_mj.mjcf import model_name
+from hyrl_mj.progress import Progress
+from hyrl_mj.sets import Grid
+from hyrl_mj.tasks import Outcome, Task
+
+# Cells along the longest side of the game's lattice, by the dimension of the chart.
+LATTICE = {1: 12_000, 2: 480}
+# A sample that ends this close to a node, in cells, ends on it.
+ON_NODE = 1e-3
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """The plant's own transition, tabulated over nodes and input levels.
+
+    Two more places follow the N nodes: number N stands for "arrived", N + 1 for "failed". A sample that
+    ends between nodes leads to all nodes around its end, so that an adversary who may choose among them
+    can do whatever could have been done from there: the lattice errs to the adversary's side, by less
+    than a cell a sample.
+
+    Attributes:
+        task: gives the plant, and says what has arrived or failed.
+        grid: the nodes.
+        levels: (A, m) the inputs: a discrete task's own; of a continuous one as many as one sample can
+            tell apart on the grid.
+        after: (A, C, N) the places around the end of one sample, the nearest first.
+        arrived: (N,) bool, the nodes at which an episode that ended there would be a success.
+        failed: (N,) bool, the nodes at which an episode ends without success.
+    """
+
+    task: Task
+    grid: Grid
+    levels: np.ndarray
+    after: np.ndarray
+    arrived: np.ndarray
+    failed: np.ndarray
+
+    @property
+    def nodes(self) -> int:
+        """N, the number of nodes."""
+        return len(self.grid.nodes)
+
+    @property
+    def places(self) -> int:
+        """N + 2: the nodes, "arrived" and "failed"."""
+        return self.nodes + 2
+
+    @cached_property
+    def running(self) -> np.ndarray:
+        """(N,) bool, the nodes at which an episode goes on."""
+        return self.task.ending(self.grid.nodes) == Outcome.RUNNING
+
+    @cached_property
+    def exact(self) -> bool:
+        """Whether every sample leads from node to node."""
+        return self.after.shape[1] == 1
+
+    @staticmethod
+    def check(task: Task) -> None:
+        """Raise `BadInput` unless the worst case can be played on a lattice of this task's chart."""
+        d = task.chart.dimension
+        if d not in LATTICE:
+            raise BadInput(
+                f"the exact game takes a chart of 1 or 2 dimensions, that of {task.name} has {d}: "
+                "use noisy episodes instead (hyrl-mj robustness RUN --episodes N --noise adversarial)"
+            )
+        if task.measurement_columns != d or task.model.nq != d or not task.kinematic:
+            raise BadInput(
+                f"the exact game takes a plant that one sample maps from chart point to chart point, "
+                f"and {model_name(task.model)} has a larger state: use noisy episodes instead "
+                "(hyrl-mj robustness RUN --episodes N --noise adversarial)"
+            )
+
+    @staticmethod
+    def possible(task: Task) -> bool:
+        """Whether the game can be played on a lattice of this task."""
+        try:
+            Lattice.check(task)
+        except BadInput:
+            return False
+        return True
+
+    @staticmethod
+    def of(task: Task, grid: Grid | None = None) -> Lattice:
+        """The lattice of a task.
+
+        Args:
+            task: its chart is that of the lattice.
+            grid: the nodes; by default 12,000 cells along a line, 480 x 480 in the plane.
+
+        Raises:
+            BadInput: the plant's state is more than the chart, or the chart has three dimensions.
+        """
+        Lattice.check(task)
+        grid = grid or Grid.with_cells(task.chart, LATTICE[task.chart.dimension])
+        nodes = grid.nodes
+        plant = task.plant(len(nodes))
+        plant.set_state(*task.state(nodes))
+        failed, arrived = _ended(task, plant.measurement)
+        alive = np.flatnonzero(task.ending(plant.measurement) == Outcome.RUNNING)
+        levels = _levels(task, grid, nodes[alive])
+        plant = task.plant(len(alive))
+        ends = np.empty((len(levels), *nodes.shape))
+        bad = np.zeros((len(levels), len(nodes)), dtype=bool)
+        good = np.zeros_like(bad)
+        progress = Progress("tabulating the plant", len(levels), "inputs")
+        for a, level in enumerate(levels):
+            plant.set_state(*task.state(nodes[alive]))
+            plant.step(np.tile(level, (len(alive), 1)))
+            measurement = plant.measurement
+            ends[a] = nodes
+            ends[a, alive] = task.z(measurement)
+            bad[a, alive], good[a, alive] = _over(task, measurement)
+            progress.update(a + 1)
+        progress.close()
+        after = _around(grid, ends)
+        outside = ~task.chart.contains(ends)
+        # A state off the chart that has not come to its end is nowhere on the lattice.
+        after = np.where((bad | outside & ~good)[:, None], len(nodes) + 1, after)
+        after = np.where(good[:, None], len(nodes), after)
+        return Lattice(task, grid, levels, after.astype(np.int32), arrived, failed)
+
+    def level_of(self, u: np.ndarray) -> np.ndarray:
+        """The levels (n,) int nearest to inputs (n, m).
+
+        Raises:
+            BadInput: an input that is not finite, out of range, or not one of a discrete task's.
+        """
+        low, high = self.task.input_limits
+        if u.ndim != 2 or u.shape[1] != len(low):
+            raise BadInput(
+                f"a controller of {self.task.name} gives (n, {len(low)}) inputs, got {u.shape}"
+            )
+        wrong = ~((u >= low - 1e-6) & (u <= high + 1e-6)).all(axis=1)
+        if wrong.any():
+            raise BadInput(
+                f"the controller's input {u[wrong][0].tolist()} cannot be applied: the limits of "
+                f"{self.task.name} are {low.tolist()} to {high.tolist()}"
+            )
+        counts = [len(np.unique(column)) for column in self.levels.T]
+        steps = (np.array(counts) - 1) / (high - low)
+        index = np.clip(np.round((u - low) * steps), 0, np.array(counts) - 1).astype(int)
+        found = np.ravel_multi_index(tuple(index.T), tuple(counts))
+        off = np.abs(self.levels[found] - u).max(axis=1) > 1e-6
+        if self.task.levels is not None and off.any():
+            raise BadInput(
+                f"the controller's input {u[off][0].tolist()} is not one of the levels of "
+                f"{self.task.name}: {np.unique(self.levels).tolist()}"
+            )
+        return found
+
+
+def _over(task: Task, measurement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which states (n, p) end an episode: (n,) bool without success, (n,) bool with it."""
+    return task.failed(measurement), task.ending(measurement) == Outcome.REACHED
+
+
+def _ended(task: Task, measurement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As `_over`, with the verdict at states where the episode would run on."""
+    failed, reached = _over(task, measurement)
+    return failed, reached | ~failed & (task.verdict(measurement) == Outcome.REACHED)
+
+
+def _levels(task: Task, grid: Grid, nodes: np.ndarray) -> np.ndarray:
+    """The inputs (A, m) of the lattice: of a continuous task so many that neighbours lead a cell apart."""
+    if task.input_levels is not None:
+        return task.input_levels
+    low, high = task.input_limits
+    axes = []
+    for i in range(len(low)):
+        ends = []
+        for value in (low[i], high[i]):
+            u = (low + high) / 2
+            u[i] = value
+            plant = task.plant(1)
+            plant.set_state(*task.state(nodes[:1]))
+            plant.step(u[None])
+            ends.append(task.z(plant.measurement)[0])
+        cells = np.abs((ends[1] - ends[0]) / grid.spacing).max()
+        axes.append(np.linspace(low[i], high[i], int(np.ceil(cells)) + 1))
+    return np.array(list(product(*axes)))
+
+
+def _around(grid: Grid, ends: np.ndarray) -> np.ndarray:
+    """The nodes around points (A, N, d), the nearest first: (A, C, N) flat indices."""
+    index = (grid.chart.wrap(ends) - grid.chart.low) / grid.spacing
+    nearest = np.round(index)
+    other = nearest + np.where(np.abs(index - nearest) <= ON_NODE, 0, np.sign(index - nearest))
+    between = (other != nearest).any(axis=(0, 1))
+    corners = product(*[(0, 1) if b else (0,) for b in between])
+    counts = np.array(grid.counts)
+    found = []
+    for corner in corners:
+        at = np.where(corner, other, nearest).astype(int)
+        at = np.where(grid.chart.periodic, at % counts, np.clip(at, 0, counts - 1))
+        found.append(np.ravel_multi_index(tuple(np.moveaxis(at, -1, 0)), grid.counts))
+    return np.stack(found, axis=1)

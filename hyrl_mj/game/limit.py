@@ -1,0 +1,137 @@
+"""What any controller could win: the limit beside every score of the worst-case game.
+
+The limit is a controller that knows the true state to steer by, but has to decide the way by what it
+measures. It picks the side of the first measurement, and from there each way is taken as well as it can be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hyrl_mj.game.lattice import Lattice
+from hyrl_mj.game.solver import NEVER, Moves, nodes_within
+from hyrl_mj.sets import GridSet, within_reach
+
+# Parts whose depths differ by no more than this meet there [chart units].
+ON_BOUNDARY = 1e-9
+
+
+@dataclass(frozen=True)
+class Limit:
+    """How each way could be taken by somebody who knows the state.
+
+    Attributes:
+        lattice: of the states.
+        parts: (Q, N) bool, M_i at the nodes.
+        sides: (Q, N) bool, whether a measurement there calls for each mode; on the boundary, several.
+        samples: (Q, N) least number of samples until arrival by each mode's way, `NEVER` where it is
+            closed.
+        level: (Q, N) the input level that does it.
+        hop: (d,) longest way of one sample, along each coordinate.
+    """
+
+    lattice: Lattice
+    parts: np.ndarray
+    sides: np.ndarray
+    samples: np.ndarray
+    level: np.ndarray
+    hop: np.ndarray
+
+    @staticmethod
+    def of(lattice: Lattice, parts: Iterable[GridSet]) -> Limit:
+        """Find the ways on a lattice, by backward recursion over the best input.
+
+        A run goes mode i's way if it enters M_i and then stays there until it arrives; before that it may
+        pass through other parts, but not where several meet again.
+
+        Args:
+            lattice: the states.
+            parts: M_i of each mode, on one grid.
+        """
+        sets, nodes = tuple(parts), lattice.grid.nodes
+        at = sets[0].grid.nearest(nodes)
+        inside = np.stack([part.mask[at] for part in sets])
+        depth = np.stack([part.signed_distance(nodes) for part in sets])
+        samples, level = np.empty(inside.shape, dtype=int), np.empty(inside.shape, dtype=int)
+        after = lattice.after[:, :1]  # to the limit's side: the nearest node
+        for i, part in enumerate(inside):
+            # The two places behind the nodes: arrived is in every part, failed in none.
+            shared = np.append(part & np.delete(inside, i, axis=0).any(axis=0), [True, False])
+            allowed = np.where(part, np.append(part, [True, False])[after], ~shared[after])
+            samples[i], level[i] = fewest_samples(lattice, after, allowed)
+        ends = after[:, 0]
+        moved = lattice.grid.chart.difference(nodes[np.minimum(ends, lattice.nodes - 1)], nodes)
+        hop = np.abs(moved[ends < lattice.nodes]).max(axis=0)
+        sides = depth <= depth.min(axis=0) + ON_BOUNDARY
+        return Limit(lattice, inside, sides, samples, level, hop)
+
+    def held(self, bound: np.ndarray) -> np.ndarray:
+        """The most samples until arrival of "pick the side of the first measurement, then hold it".
+
+        Returns:
+            (N,) int, `NEVER` where noise within bounds (d,) can show a side whose way is closed.
+        """
+        shown = np.stack([self._reach(side, bound) for side in self.sides])
+        return np.asarray(np.where(shown, self.samples, 0).max(axis=0))
+
+    def winnable(self, bound: np.ndarray) -> np.ndarray:
+        """Where picking a side by the first measurement and holding it always wins: (N,) bool."""
+        return self.held(bound) < NEVER
+
+    def moves(self, bound: np.ndarray) -> Moves:
+        """The adversary's moves against the limit under noise within bounds (d,).
+
+        Its flow sets are those of stage 5, with the ways that are really open in place of W_i.
+        """
+        lattice, modes = self.lattice, len(self.parts)
+        noisy = np.where(bound > 0, self.hop, 0.0)
+        goes, side = [], self.sides.argmax(axis=0)
+        for i, part in enumerate(self.parts):
+            roomy = ~self._reach(self.samples[i] >= NEVER, bound)
+            flows = self._reach(part, 2 * bound + noisy) & roomy | self._reach(part, bound)
+            goes.append(np.where(flows, i, side))
+        rows = []
+        for goal in (*goes, side):
+            possible = np.stack([self._reach(goal == i, bound) for i in range(modes)], axis=-1)
+            node, mode = np.nonzero(possible & lattice.running[:, None])
+            rows.append((node, mode, lattice.after[self.level[mode, node], :1, node]))
+        return Moves.gather(lattice, rows)
+
+    def _reach(self, mask: np.ndarray, bound: np.ndarray) -> np.ndarray:
+        """The nodes (N,) bool from which noise within bounds (d,) can show a node of the mask."""
+        grid = self.lattice.grid
+        window = nodes_within(self.lattice, bound)
+        return within_reach(mask.reshape(grid.counts), window, grid.chart.periodic).ravel()
+
+
+def fewest_samples(
+    lattice: Lattice, after: np.ndarray, allowed: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The fewest samples until arrival without noise, over allowed transitions.
+
+    Args:
+        lattice: gives the places.
+        after: (A, C, N) where each level leads; of several places around its end the worst counts.
+        allowed: (A, C, N) bool.
+
+    Returns:
+        (N,) int, `NEVER` where there is no way, and (N,) int, the level to take.
+    """
+    samples = np.full(lattice.places, NEVER)
+    samples[:-2][lattice.arrived] = 0
+    samples[-2] = 0
+    level = np.zeros(lattice.nodes, dtype=int)
+    open_ = np.flatnonzero(lattice.running & ~lattice.arrived)
+    while len(open_):
+        found = np.where(allowed[..., open_], samples[after[..., open_]], NEVER).max(axis=1)
+        best = found.argmin(axis=0)
+        fewest = found[best, np.arange(len(open_))]
+        done = fewest < NEVER
+        if not done.any():
+            break
+        samples[open_[done]], level[open_[done]] = fewest[done] + 1, best[done]
+        open_ = open_[~done]
+    return samples[:-2], level

@@ -1,0 +1,283 @@
+"""The worst-case noise game: what no measurement noise within a bound can make the closed loop do.
+
+At every sample an adversary who knows everything picks the noise n, |n| <= eps, the controller answers the
+measurement z + n in its mode q, and the plant moves. Played backward on a lattice, the game has a value
+for each state (z, q): the samples after which the episode fails, or after which it has arrived at the
+latest, or that it never arrives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hyrl_mj.errors import BadInput
+from hyrl_mj.game.lattice import Lattice
+from hyrl_mj.plant import Plant
+from hyrl_mj.policies import Controller
+from hyrl_mj.sets import within_reach
+from hyrl_mj.simulation import NOT_STARTED
+
+# How far beside a node its answer has to be the same, in cells.
+BESIDE = 1e-4
+# Values, the worse for the controller the greater: k < NEVER means "arrives after k samples at the latest",
+# LOST - k "fails after k samples".
+NEVER = 1 << 20
+LOST = 1 << 21
+FIRST = 1 << 22  # above all of them
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What a controller answers at every node that can be measured, in every mode.
+
+    The last row is that of a run that has not started yet: there the controller picks its own mode.
+
+    Attributes:
+        lattice: of the true states.
+        modes: the controller's modes.
+        pad: (d,) nodes by which the measured nodes reach beyond the lattice on either side.
+        letter: (Q + 1, measured nodes...) int, level * Q + number of the next mode.
+        firm: (Q + 1, measured nodes...) bool, whether the answer is the same right beside the node. Where it
+            is not, rounding decides what a measurement there provokes.
+    """
+
+    lattice: Lattice
+    modes: tuple[int, ...]
+    pad: np.ndarray
+    letter: np.ndarray
+    firm: np.ndarray
+
+    @staticmethod
+    def of(lattice: Lattice, controller: Controller, bound: np.ndarray) -> Answers:
+        """Ask a controller.
+
+        Args:
+            lattice: of the true states.
+            controller: a pure function of mode and measurement.
+            bound: (d,) the largest noise bounds that will be played.
+
+        Raises:
+            BadInput: the controller answers with something that is no input or no mode of its own.
+        """
+        grid, modes = lattice.grid, controller.modes
+        pad = np.where(grid.chart.periodic, 0, nodes_within(lattice, bound))
+        axes = [
+            low + step * np.arange(-k, n + k)
+            for low, step, n, k in zip(grid.chart.low, grid.spacing, grid.counts, pad, strict=True)
+        ]
+        measured = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+
+        def ask(q: int | None, points: np.ndarray) -> np.ndarray:
+            mode = controller.initial_mode(points) if q is None else np.full(len(points), q)
+            u, after = controller.step(mode, points)
+            unknown = ~np.isin(after, modes)
+            if unknown.any():
+                raise BadInput(f"the controller went to mode {after[unknown][0]}, it has {modes}")
+            return lattice.level_of(u) * len(modes) + np.searchsorted(modes, after)
+
+        letters, firm = [], []
+        beside = BESIDE * grid.spacing * np.eye(len(axes))[bound > 0]
+        for q in (*modes, None):
+            letter = ask(q, measured.reshape(-1, len(axes))).reshape(measured.shape[:-1])
+            sure = np.ones(letter.shape, dtype=bool)
+            at = np.nonzero(_borders(letter, grid.chart.periodic))
+            if len(at[0]) and len(beside):
+                others = [ask(q, measured[at] + side) for side in (*beside, *-beside)]
+                sure[at] = (np.array(others) == letter[at]).all(axis=0)
+            letters.append(letter)
+            firm.append(sure)
+        return Answers(lattice, modes, pad, np.stack(letters), np.stack(firm))
+
+    @property
+    def middle(self) -> tuple[slice, ...]:
+        """Where the lattice lies among the measured nodes."""
+        counts = self.lattice.grid.counts
+        return tuple(slice(k, k + n) for k, n in zip(self.pad, counts, strict=True))
+
+
+def _borders(letter: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
+    """The nodes (n, ...) bool with another letter next to them."""
+    found = np.zeros(letter.shape, dtype=bool)
+    for axis, round_ in enumerate(periodic):
+        differs = np.diff(letter, axis=axis, append=letter.take([0], axis=axis)) != 0
+        if not round_:
+            differs[(slice(None),) * axis + (-1,)] = False
+        found |= differs | np.roll(differs, 1, axis=axis)
+    return found
+
+
+def nodes_within(lattice: Lattice, bound: np.ndarray) -> np.ndarray:
+    """How many nodes lie within noise bounds (d,) on either side: (d,) int."""
+    return np.floor(bound / lattice.grid.spacing + 1e-6).astype(int)
+
+
+@dataclass(frozen=True)
+class Moves:
+    """To which states each state can be led in one sample. States are numbered row * places + place.
+
+    Attributes:
+        lattice: gives the places.
+        rows: number of modes, and one for runs that have not started yet.
+        state: (S,) the states that have moves.
+        counts: (S,) how many each has.
+        target: (E,) where they lead.
+    """
+
+    lattice: Lattice
+    rows: int
+    state: np.ndarray
+    counts: np.ndarray
+    target: np.ndarray
+
+    @staticmethod
+    def gather(
+        lattice: Lattice, rows: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]
+    ) -> Moves:
+        """From each row's nodes (m,) ascending, next modes (m,) and places (m, C) that they lead to."""
+        state, counts, target = [], [], []
+        for row, (node, mode, ends) in enumerate(rows):
+            target.append((ends + (mode * lattice.places)[:, None]).ravel())
+            found = np.bincount(node, minlength=lattice.nodes) * ends.shape[1]
+            state.append(np.flatnonzero(found) + row * lattice.places)
+            counts.append(found[found > 0])
+        return Moves(lattice, len(state), *map(np.concatenate, (state, counts, target)))
+
+
+def noisy_moves(answers: Answers, bound: np.ndarray, firm: bool = False) -> Moves:
+    """The moves that noise within bounds (d,) gives the adversary against a controller.
+
+    With `firm` those that noise reaches only by a measurement on the very border of two answers are left
+    out; without noise a controller answers in any case.
+    """
+    lattice, modes = answers.lattice, len(answers.modes)
+    window, periodic = nodes_within(lattice, bound), lattice.grid.chart.periodic
+    rows = []
+    for letters, sure in zip(answers.letter, answers.firm, strict=True):
+        used = np.unique(letters)
+        possible = [
+            within_reach((letters == x) & (sure | (not firm)), window, periodic) | (letters == x)
+            for x in used
+        ]
+        possible = [mask[answers.middle] for mask in possible]
+        node, which = np.nonzero(
+            np.stack(possible, axis=-1).reshape(lattice.nodes, -1) & lattice.running[:, None]
+        )
+        level, mode = np.divmod(used[which], modes)
+        rows.append((node, mode, lattice.after[level, :, node]))
+    return Moves.gather(lattice, rows)
+
+
+def solve(moves: Moves) -> np.ndarray:
+    """The value of every state by backward recursion: (rows, places) int.
+
+    An episode is over where it arrives; all others that never fail or arrive are worth `NEVER`.
+    """
+    lattice = moves.lattice
+    value = np.full((moves.rows, lattice.places), NEVER, dtype=np.int32)
+    value[:, :-2][:, lattice.failed] = LOST
+    value[:, :-2][:, lattice.arrived] = 0
+    value[:, -2], value[:, -1] = 0, LOST
+    flat = value.ravel()
+    state, counts, target = moves.state, moves.counts, moves.target
+    while True:
+        undecided = flat[state] == NEVER
+        target = target[np.repeat(undecided, counts)]
+        state, counts = state[undecided], counts[undecided]
+        if not len(state):
+            return value
+        after = flat[target]
+        after += np.sign(NEVER - after)  # one sample more
+        found = np.maximum.reduceat(after, np.append(0, np.cumsum(counts)[:-1]))
+        if (found == NEVER).all():
+            return value
+        # Each state is decided once: at the earliest failure, or when all its moves have arrived.
+        flat[state] = found
+
+
+def lasting(moves: Moves, start: np.ndarray | None = None) -> np.ndarray:
+    """The nodes (N,) bool at which a run can still be after any number of samples, in some mode.
+
+    For a task that is over some day there are none.
+
+    Args:
+        moves: of the adversary.
+        start: (N,) bool, the nodes where runs start, in any mode; by default all.
+    """
+    lattice = moves.lattice
+    runs = np.zeros((moves.rows, lattice.places), dtype=bool)
+    runs.reshape(-1)[moves.state] = True
+    runs[-1] = False  # one sample later a run has started
+    alive = runs.copy()
+    if start is not None:
+        alive[:, :-2] &= start
+    grows = start is not None  # first to all that can be reached, then down to what remains
+    while True:
+        reached = np.zeros(runs.size, dtype=bool)
+        reached[moves.target[np.repeat(alive.reshape(-1)[moves.state], moves.counts)]] = True
+        after = reached.reshape(runs.shape) & runs
+        if grows:
+            after |= alive
+        if (after == alive).all():
+            if not grows:
+                return np.asarray(alive[:, :-2].any(axis=0))
+            grows = False
+        alive = after
+
+
+class WorstNoise:
+    """The noise of the game's adversary, for use in simulations (an `Adversary`).
+
+    Where it can, it wins without measurements on the very border of two answers, from where rounding errors
+    of the plant could let a run escape.
+
+    Args:
+        answers: of the controller that it works against.
+        bound: (d,) bounds of the noise.
+
+    Attributes:
+        value: (modes + 1, places) int of the game that it plays.
+    """
+
+    kind = "worst"
+
+    def __init__(self, answers: Answers, bound: np.ndarray):
+        self.bound = float(bound.max(initial=0.0))
+        self._answers, self._bound = answers, bound
+        self._any = solve(noisy_moves(answers, bound))
+        self._firm = solve(noisy_moves(answers, bound, firm=True))
+        self.value = np.where(self._firm >= NEVER, self._firm, self._any)
+        window = nodes_within(answers.lattice, bound)
+        shifts = np.stack(
+            np.meshgrid(*[np.arange(-w, w + 1) for w in window], indexing="ij"), axis=-1
+        ).reshape(-1, len(window))
+        # Among equals the largest noise, for what lies between the nodes.
+        self._shifts = shifts[np.argsort(-np.abs(shifts).sum(axis=1), kind="stable")]
+
+    def choose(self, plant: Plant, q: np.ndarray) -> np.ndarray:
+        """As `Adversary.choose`."""
+        answers, lattice = self._answers, self._answers.lattice
+        grid, modes = lattice.grid, answers.modes
+        true = plant.measurement
+        place = grid.nearest(true)
+        at = np.stack(np.unravel_index(place, grid.counts), axis=-1)
+        row = np.where(q == NOT_STARTED, len(modes), np.searchsorted(modes, q))
+        # Of the few letters that can be provoked the worst is wanted, so all shifts are looked at.
+        worst, chosen = np.full(len(true), -1), np.zeros_like(true)
+        for shift in self._shifts:
+            node = np.where(
+                grid.chart.periodic, (at + shift) % grid.counts, at + shift + answers.pad
+            )
+            level, mode = np.divmod(answers.letter[(row, *node.T)], len(modes))
+            ends = mode[:, None], lattice.after[level, :, place]
+            value, sure = self._any[ends].max(axis=1), self._firm[ends].max(axis=1)
+            counts = answers.firm[(row, *node.T)] | (shift == 0).all()
+            value = np.where(counts & (sure >= NEVER), FIRST + sure, value)
+            better = value > worst
+            worst = np.where(better, value, worst)
+            chosen[better] = (at + shift)[better]
+        measured = grid.chart.low + grid.spacing * chosen
+        noise = grid.chart.difference(measured, grid.chart.wrap(true))
+        return np.clip(noise, -self._bound, self._bound)

@@ -1,0 +1,247 @@
+"""The presets of a run's settings: fast, paper and smoke."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.game import LATTICE
+from hyrl_mj.learning.settings import Settings, Training
+from hyrl_mj.policies import Agent, accepted, check_algorithm, relative
+from hyrl_mj.tasks import Task
+
+PRESETS = ("fast", "paper", "smoke")
+
+# Stage 1 of preset fast, by algorithm: of tasks with continuous inputs, and of those with levels.
+# Short episodes, for tasks that start all over the chart: the decision falls in their first second.
+_PPO = Training(
+    algorithm="ppo",
+    samples=160_000,
+    envs=128,
+    hidden=(64, 64),
+    activation="tanh",
+    learning_rate=3e-3,
+    anneal=True,
+    gamma=0.98,
+    symmetric=True,
+    episode=20,
+    options={"n_steps": 32, "batch_size": 1024, "n_epochs": 8},
+)
+_A2C = replace(
+    _PPO,
+    algorithm="a2c",
+    options={"n_steps": 16, "normalize_advantage": True, "use_rms_prop": False},
+)
+# A gradient step takes milliseconds, a sample hardly anything: many samples to each.
+_SAC = replace(
+    _PPO,
+    algorithm="sac",
+    samples=48_000,
+    envs=32,
+    activation="relu",
+    gamma=0.95,
+    options={
+        "buffer_size": 100_000,
+        "learning_starts": 1_000,
+        "batch_size": 256,
+        "train_freq": 1,
+        "gradient_steps": 1,
+        "tau": 0.02,
+        "ent_coef": 0.02,
+    },
+)
+_TD3 = replace(
+    _SAC,
+    algorithm="td3",
+    action_noise=0.3,
+    options={name: value for name, value in _SAC.options.items() if name != "ent_coef"},
+)
+_CONTINUOUS = {
+    "ppo": _PPO,
+    "a2c": _A2C,
+    "sac": _SAC,
+    "td3": _TD3,
+    "ddpg": replace(_TD3, algorithm="ddpg"),
+}
+_DQN = Training(
+    algorithm="dqn",
+    samples=150_000,
+    envs=64,
+    hidden=(64, 64),
+    activation="relu",
+    learning_rate=1e-3,
+    anneal=True,
+    gamma=0.9664,
+    symmetric=True,
+    options={
+        "buffer_size": 200_000,
+        "learning_starts": 2_000,
+        "batch_size": 256,
+        "train_freq": 1,
+        "gradient_steps": 4,
+        "target_update_interval": 3_000,
+        "n_steps": 5,
+        "exploration_initial_eps": 1.0,
+        "exploration_fraction": 0.5,
+        "exploration_final_eps": 0.05,
+    },
+)
+_PPO_LEVELS = replace(
+    _PPO,
+    samples=200_000,
+    activation="relu",
+    gamma=0.9664,
+    episode=None,
+    options={**_PPO.options, "ent_coef": 0.02, "gae_lambda": 0.95},
+)
+_LEVELS = {
+    "ppo": _PPO_LEVELS,
+    "a2c": replace(
+        _PPO_LEVELS,
+        algorithm="a2c",
+        samples=300_000,
+        envs=32,
+        gamma=0.95,
+        options={**_A2C.options, "n_steps": 8, "ent_coef": 0.01, "gae_lambda": 0.9},
+    ),
+    "dqn": _DQN,
+}
+# What the paper trained with.
+_PAPER = Training(
+    algorithm="dqn",
+    samples=1_000_000,
+    envs=1,
+    hidden=(64, 64),
+    activation="relu",
+    learning_rate=1.946e-4,
+    anneal=False,
+    gamma=0.9664,
+    symmetric=False,
+)
+_PAPERS = {"ppo": replace(_PAPER, algorithm="ppo"), "dqn": _PAPER}
+# Samples of preset smoke.
+_SMOKE = {
+    "ppo": 24_576,
+    "a2c": 65_536,
+    "dqn": 10_000,
+    "sac": 12_000,
+    "td3": 12_000,
+    "ddpg": 12_000,
+}
+# Stage 6, whatever stage 1 was trained with. The modes of a discrete task are trained by PPO, too: the ways
+# differ by less than the error of a freely trained value function, and a policy that is learned directly
+# does not depend on it.
+_MODES_CONTINUOUS = replace(
+    _PPO,
+    samples=320_000,
+    activation="relu",
+    gamma=0.95,
+    symmetric=False,
+    episode=40,
+    attempts=3,
+)
+_MODES_DISCRETE = replace(
+    _MODES_CONTINUOUS,
+    samples=400_000,
+    gamma=0.9,
+    episode=None,
+    options={**_PPO.options, "ent_coef": 0.003, "gae_lambda": 0.9},
+)
+_MODES_PAPER_CONTINUOUS = replace(
+    _PAPER,
+    algorithm="ppo",
+    samples=100_000,
+    hidden=(112, 112),
+    learning_rate=3.45e-4,
+    gamma=0.9637,
+)
+_MODES_PAPER_DISCRETE = replace(_PAPER, samples=300_000, warm_start=True)
+_SMOKE_MODES = 8_192
+# Grid points along the longest side of the chart, by its dimension: search of M*, and sets.
+_RODS = {1: 120, 2: 120, 3: 24, 4: 8}
+_CELLS = {1: 2880, 2: 240, 3: 48, 4: 16}
+# Coarser ones where every sample takes a physics engine's work: plants with dynamics.
+_RODS_DYNAMIC = {1: 120, 2: 40, 3: 16, 4: 8}
+_CELLS_DYNAMIC = {1: 720, 2: 96, 3: 30, 4: 12}
+# Cells of the worst-case game's lattice in a smoke run.
+_LATTICE_SMOKE = {1: 1_200, 2: 120}
+
+
+def preset(
+    task: Task,
+    name: str = "fast",
+    *,
+    noise: float = 0.1,
+    seed: int = 0,
+    horizon: float | None = None,
+    agent: Agent | None = None,
+) -> Settings:
+    """The settings of a preset.
+
+    Args:
+        task: what they are for; `task.algorithm` trains stage 1.
+        name: "fast", "paper" (the paper's training), or "smoke" (seconds, to see that all runs).
+        noise: bound eps of the measurement noise that the controller has to survive.
+        seed: of everything random.
+        horizon: time T of the backward propagation [s]; by default the sets are sized to the noise, and
+            preset "paper" takes the paper's T.
+        agent: takes the place of stage 1; the modes then go on from it.
+
+    Raises:
+        BadInput: an unknown preset, or a value that cannot be used.
+    """
+    if name not in PRESETS:
+        raise unknown("preset", name, PRESETS)
+    stage1 = agent or _stage1(task, name)
+    stage6 = _stage6(task, name, stage1.algorithm)
+    task.check_noise(noise)
+    dimension = task.chart.dimension
+    cells, rods = (_CELLS, _RODS) if task.kinematic else (_CELLS_DYNAMIC, _RODS_DYNAMIC)
+    return Settings(
+        task=task.reference,
+        preset=name,
+        seed=seed,
+        noise=noise,
+        horizon=task.horizon if horizon is None and name == "paper" else horizon,
+        stage1=stage1,
+        stage6=replace(stage6, warm_start=True) if agent else stage6,
+        cells=cells[min(dimension, 4)],
+        # Whose agent goes straight on for some samples before it decides has a part of M* that rods miss.
+        search="outcome" if agent else task.search,
+        rods=rods[min(dimension, 4)],
+        lattice=(_LATTICE_SMOKE if name == "smoke" else LATTICE).get(dimension, 0),
+    )
+
+
+def _stage1(task: Task, name: str) -> Training:
+    """Stage 1 of a preset, with the task's algorithm."""
+    check_algorithm(task.algorithm, task.name, task.levels)
+    known = relative(task.algorithm, task.levels)
+    if name == "paper":
+        if known not in _PAPERS:
+            raise BadInput(
+                f"preset 'paper' has no {task.algorithm}, the paper trained with {' and '.join(_PAPERS)}: "
+                "choose preset fast or smoke"
+            )
+        found = _PAPERS[known]
+    else:
+        found = (_CONTINUOUS if task.levels is None else _LEVELS)[known]
+    if name == "smoke":
+        found = replace(found, samples=_SMOKE[known])
+    if np.any(np.subtract(task.start_high, task.start_low) < task.chart.sides - 1e-9):
+        found = replace(found, episode=None)  # what lies behind the starts has to be driven to
+    if known == task.algorithm:
+        return found
+    options = accepted(task.algorithm, found.options)
+    return replace(found, algorithm=task.algorithm, options=options)
+
+
+def _stage6(task: Task, name: str, algorithm: str) -> Training:
+    """Stage 6 of a preset, after stage 1 with an algorithm."""
+    if name == "paper":
+        found = _MODES_PAPER_CONTINUOUS if task.levels is None else _MODES_PAPER_DISCRETE
+        return replace(found, warm_start=found.warm_start and found.algorithm == algorithm)
+    found = _MODES_CONTINUOUS if task.levels is None else _MODES_DISCRETE
+    return replace(found, samples=_SMOKE_MODES, attempts=1) if name == "smoke" else found

@@ -1,0 +1,127 @@
+"""Every setting of a run, in frozen dataclasses with named presets."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from numbers import Real
+from typing import Any
+
+from hyrl_mj.errors import BadArtifact, BadInput, check_bound, check_seed
+from hyrl_mj.policies import Agent, algorithm_title
+
+PRESETS = ("fast", "paper", "smoke")
+
+
+@dataclass(frozen=True)
+class Training:
+    """How SB3 trains one policy.
+
+    Attributes:
+        algorithm: one of `hyrl_mj.policies.algorithms.ALGORITHMS`, or `module:Class` of another one.
+        samples: environment samples in all.
+        envs: episodes side by side.
+        hidden: widths of the hidden layers.
+        activation: between the layers, one of `hyrl_mj.policies.mlp.ACTIVATIONS`.
+        learning_rate: at the start.
+        anneal: whether it falls linearly to (almost) zero.
+        gamma: discount factor.
+        symmetric: whether the network is made to respect the task's mirror symmetry, if it has one.
+            Its weights then serve twice, and the policy has twice the width.
+        warm_start: whether the first attempt goes on from the policy of stage 1 (stage 6 only): DQN from
+            its weights, PPO from what it does on the mode's part, distilled. A Gaussian policy that has
+            made up its mind does not try the other way any more.
+        episode: samples until an episode is truncated, by default the task's; shorter ones see more of
+            the starts.
+        attempts: how often training starts again, with another seed, until its policy is good enough
+            (stage 6 only); the best is kept.
+        action_noise: standard deviation of the noise with which TD3 and DDPG try other inputs, which are
+            stretched to lie between -1 and 1.
+        options: further keywords of the SB3 algorithm.
+    """
+
+    algorithm: str
+    samples: int
+    envs: int
+    hidden: tuple[int, ...]
+    activation: str
+    learning_rate: float
+    anneal: bool
+    gamma: float
+    symmetric: bool
+    warm_start: bool = False
+    episode: int | None = None
+    attempts: int = 1
+    action_noise: float = 0.0
+    options: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def title(self) -> str:
+        """The algorithm for people: "PPO"."""
+        return algorithm_title(self.algorithm)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All settings of a run; `config.json` holds them.
+
+    Attributes:
+        task: its name, or the file that defines it.
+        preset: the name of the preset that the others started from.
+        seed: of everything random.
+        noise: bound eps of the measurement noise that the controller has to survive.
+        horizon: time T of the backward propagation [s]; None to size the sets to the noise.
+        stage1: training of the first policy (stage 1), or the agent that is given instead.
+        stage6: training of each mode's policy (stage 6).
+        cells: grid cells along the longest side of the chart; cells are square in chart units.
+        rods: grid points along the longest side from which the search for critical points starts.
+        lattice: cells along the longest side for the worst-case game.
+        resolution: length of the last rods, as a share of the first.
+        search: how critical points are searched for, by "rods" or "outcome".
+    """
+
+    task: str
+    preset: str
+    seed: int
+    noise: float
+    horizon: float | None
+    stage1: Training | Agent
+    stage6: Training
+    cells: int
+    rods: int
+    lattice: int
+    resolution: float = 1 / 32
+    search: str = "rods"
+
+    def __post_init__(self) -> None:
+        check_bound(self.noise)
+        if self.horizon is not None and not (
+            isinstance(self.horizon, Real) and math.isfinite(self.horizon) and self.horizon > 0
+        ):
+            raise BadInput(f"horizon {self.horizon!r} s cannot be used: give a finite time > 0")
+        check_seed(self.seed)
+
+    def to_json(self) -> dict[str, Any]:
+        """As nested dicts."""
+        return dataclasses.asdict(self)
+
+    @staticmethod
+    def from_json(content: dict[str, Any]) -> Settings:
+        """From nested dicts.
+
+        Raises:
+            BadArtifact: a setting is missing or unknown.
+        """
+        try:
+            stages = {name: _stage(content[name]) for name in ("stage1", "stage6")}
+            return Settings(**{**content, **stages})
+        except (KeyError, TypeError) as error:
+            raise BadArtifact(f"its settings are not those of this version ({error})") from error
+
+
+def _stage(content: dict[str, Any]) -> Training | Agent:
+    """A training or an agent, from what `to_json` makes of it."""
+    if "sha256" in content:
+        return Agent(**content)
+    return Training(**{**content, "hidden": tuple(content["hidden"])})

@@ -1,0 +1,291 @@
+"""Train a policy with SB3 on the batched environments (paper, Steps 1 and 6)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from threadpoolctl import threadpool_limits
+from torch import nn
+
+from hyrl_mj.envs import BatchedEnv, Domain
+from hyrl_mj.envs.sb3_env import TaskVecEnv
+from hyrl_mj.errors import BadInput, brief
+from hyrl_mj.learning import symmetry
+from hyrl_mj.learning.settings import Training
+from hyrl_mj.policies import (
+    ALGORITHMS,
+    TORCH_NAMES,
+    MlpPolicy,
+    algorithm_class,
+    check_algorithm,
+    infer_algorithm,
+)
+from hyrl_mj.progress import Progress
+from hyrl_mj.simulation import SIGNALS, Noise
+from hyrl_mj.tasks import Outcome, Task
+
+Score = tuple[float, ...]
+ACTIVATIONS = {name: getattr(nn, torch_name) for name, torch_name in TORCH_NAMES.items()}
+# How often TensorBoard gets a point: algorithms on their own policy count rollouts, the others episodes.
+LOG_ROLLOUTS, LOG_EPISODES = 1, 100
+# The learning rate falls to this share of its first value, not to zero: the last samples count too.
+FINAL_RATE = 0.02
+# How often the policy is checkpointed and judged; on how many episodes.
+CHECKPOINTS = 32
+EPISODES = 256
+# Observations by which a foreign policy is compared with the plain network of its weights, and how far the
+# weights are moved before that.
+CHECKED, MOVED = 64, 0.05
+
+
+def train(
+    task: Task,
+    settings: Training,
+    seed: int,
+    *,
+    noise: Noise | None = None,
+    domain: Domain | None = None,
+    start_from: MlpPolicy | None = None,
+    judge: Judge | None = None,
+    log_dir: Path | None = None,
+    label: str = "training",
+) -> MlpPolicy:
+    """Train one policy, and return the best that was met.
+
+    Training goes up and down; as with SB3's `EvalCallback`, the policy is judged at intervals. By default
+    that is done in the second half, on the same episodes every time: the best is the one that most often
+    ends at the set-point, and among equals the one with the highest return.
+
+    Args:
+        task: what to learn.
+        settings: how.
+        seed: of weights, exploration, starts and noise; the same seed gives the same policy on the
+            same machine, at any number of physics threads.
+        noise: measurement noise during training.
+        domain: restricts starts and episodes to a part of the state space.
+        start_from: a policy whose weights to go on from; its network replaces `settings.hidden`.
+        judge: scores policies instead, from the beginning, and ends the training early once one is good
+            enough.
+        log_dir: where TensorBoard logs and checkpoints go; none are written by default.
+        label: what the progress bar says.
+
+    Returns:
+        The best policy.
+    """
+    model = build(task, settings, seed, noise=noise, domain=domain, start_from=start_from)
+    if log_dir is not None:
+        model.set_logger(configure(str(log_dir / "tensorboard"), ["tensorboard"]))
+    # An untrained policy can be lucky in a few episodes; a judge's verdict stands at any time.
+    settled = settings.samples // 2 if judge is None else 0
+    judge = judge or _Episodes(task, noise or Noise(), domain, settings.gamma)
+    interval = LOG_ROLLOUTS if isinstance(model, OnPolicyAlgorithm) else LOG_EPISODES
+    watch = _Watch(settings.samples, judge, settled, log_dir, label)
+    with single_threaded():
+        model.learn(settings.samples, callback=watch, log_interval=interval)
+    watch.close()
+    assert watch.best is not None
+    return watch.best
+
+
+def build(
+    task: Task,
+    settings: Training,
+    seed: int,
+    *,
+    noise: Noise | None = None,
+    domain: Domain | None = None,
+    start_from: MlpPolicy | None = None,
+) -> BaseAlgorithm:
+    """The SB3 algorithm that `train` runs, ready to learn.
+
+    Raises:
+        BadInput: an unknown algorithm, or a policy to start from whose networks are those of another one.
+    """
+    check_algorithm(settings.algorithm, task.name, task.levels)
+    hidden = settings.hidden if start_from is None else start_from.hidden
+    activation = settings.activation if start_from is None else start_from.activation
+    rate = settings.learning_rate
+    env = BatchedEnv(task, settings.envs, noise=noise, domain=domain, max_steps=settings.episode)
+    options = dict(settings.options)
+    if settings.action_noise:
+        m = len(task.inputs)
+        options["action_noise"] = NormalActionNoise(np.zeros(m), np.full(m, settings.action_noise))
+    model = algorithm_class(settings.algorithm)(
+        "MlpPolicy",
+        TaskVecEnv(env),
+        seed=seed,
+        device="cpu",
+        gamma=settings.gamma,
+        learning_rate=(lambda left: rate * max(left, FINAL_RATE)) if settings.anneal else rate,
+        policy_kwargs={"net_arch": list(hidden), "activation_fn": ACTIVATIONS[activation]},
+        **options,
+    )
+    if start_from is not None:
+        state = {name: torch.as_tensor(np.array(w)) for name, w in start_from.weights.items()}
+        try:
+            model.policy.load_state_dict(state)
+        except RuntimeError as error:
+            raise BadInput(
+                f"training with {settings.algorithm} cannot go on from this {start_from.algorithm} "
+                "policy, whose networks are other ones: start afresh"
+            ) from error
+    if settings.symmetric and start_from is None and task.mirror is not None:
+        symmetry.impose(model.policy, task)
+    return model
+
+
+def check_foreign(task: Task, settings: Training) -> None:
+    """Build an algorithm of somebody else's and ask its policy, before anything is trained.
+
+    Raises:
+        BadInput: it cannot be built with these settings, or its policy does not do what a plain network
+            with its weights does.
+    """
+    name = settings.algorithm
+    try:
+        model = build(task, settings, seed=0)
+    except Exception as error:  # whatever a foreign class raises
+        raise BadInput(f"{name} cannot train {task.name}: {brief(error)}") from error
+    # Layers that do nothing at first, as those that normalise, are seen once all weights have changed.
+    generator = torch.Generator().manual_seed(0)
+    for tensor in model.policy.state_dict().values():
+        if tensor.is_floating_point():
+            tensor += MOVED * torch.rand(tensor.shape, generator=generator)
+    plain = f"the policy of {name} cannot be used, only plain multilayer perceptrons can"
+    try:
+        policy = export(model, task)
+    except Exception as error:
+        raise BadInput(f"{plain}: {brief(error)}") from error
+    core = BatchedEnv(task, CHECKED)
+    core.seed(0)
+    observation = core.reset()
+    actions, _ = model.predict(observation, deterministic=True)
+    off = np.abs(core.inputs(actions) - policy.inputs(observation)).max()
+    if off > 1e-4 * np.ptp(task.input_limits):
+        raise BadInput(f"{plain}: what it answers is not what its weights say")
+
+
+def export(model: BaseAlgorithm, task: Task) -> MlpPolicy:
+    """The policy that an SB3 algorithm has learned so far, as a plain network."""
+    state = symmetry.plain_state(model.policy, task)
+    weights = {name: tensor.detach().cpu().numpy().copy() for name, tensor in state.items()}
+    activation = next(n for n, a in ACTIVATIONS.items() if a is model.policy.activation_fn)
+    own = (name for name in ALGORITHMS if type(model) is algorithm_class(name))
+    return MlpPolicy(task, next(own, "") or infer_algorithm(weights, {}), activation, weights)
+
+
+@contextmanager
+def single_threaded() -> Iterator[None]:
+    """One thread for torch and BLAS: small networks are faster, and sums do not depend on the machine."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1, user_api="blas"):
+            yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def evaluate(
+    task: Task,
+    policy: MlpPolicy,
+    noise: Noise,
+    domain: Domain | None = None,
+    gamma: float = 1.0,
+    episodes: int = EPISODES,
+) -> tuple[float, float]:
+    """How a policy does in episodes from the start distribution, always the same ones.
+
+    Returns:
+        The share of episodes that end at the set-point, and the mean return, discounted by gamma.
+    """
+    env = BatchedEnv(task, episodes, noise=noise, domain=domain)
+    env.seed(0)
+    observation = env.reset()
+    returns, weight = np.zeros(episodes), np.ones(episodes)
+    success = np.zeros(episodes, dtype=bool)
+    while weight.any():
+        result = env.step(policy.inputs(observation))
+        returns += weight * result.reward
+        ended = result.done & (weight > 0)
+        success[ended] = (result.outcome == Outcome.REACHED)[ended] & task.arrived(env.z[ended])
+        weight *= gamma * ~result.done
+        observation = result.observation
+    return float(success.mean()), float(returns.mean())
+
+
+class Judge(Protocol):
+    """What tells good policies from bad ones.
+
+    Attributes:
+        enough: a score with which training may end.
+    """
+
+    enough: Score
+
+    def __call__(self, policy: MlpPolicy) -> Score:
+        """The score of a policy; scores are compared from left to right, the higher the better."""
+        ...
+
+
+class _Episodes:
+    """Judges by episodes without noise and with each kind of it."""
+
+    enough: Score = (np.inf,)
+
+    def __init__(self, task: Task, noise: Noise, domain: Domain | None, gamma: float):
+        self._task, self._domain, self._gamma = task, domain, gamma
+        self._noises = [Noise(k, noise.bound) for k in SIGNALS] if noise.bound else [Noise()]
+
+    def __call__(self, policy: MlpPolicy) -> Score:
+        found = [evaluate(self._task, policy, n, self._domain, self._gamma) for n in self._noises]
+        success, returns = np.mean(found, axis=0)
+        return float(success), float(returns)
+
+
+class _Watch(BaseCallback):
+    """Progress bar, checkpoints at intervals, and the best policy."""
+
+    def __init__(self, samples: int, judge: Judge, settled: int, log_dir: Path | None, label: str):
+        super().__init__()
+        self.best: MlpPolicy | None = None
+        self.best_score: Score = (-np.inf,)
+        self._judge, self._settled, self._log_dir = judge, settled, log_dir
+        self._next = self._interval = max(samples // CHECKPOINTS, 1)
+        self._progress = Progress(label, samples, "samples")
+
+    def _on_step(self) -> bool:
+        self._progress.update(self.num_timesteps)
+        if self.num_timesteps >= self._next:
+            self._next += self._interval
+            self._checkpoint()
+        return self.best_score < self._judge.enough
+
+    def _on_training_end(self) -> None:
+        if self.best_score < self._judge.enough:
+            self._checkpoint()
+
+    def close(self) -> None:
+        """Take the progress bar away."""
+        self._progress.close()
+
+    def _checkpoint(self) -> None:
+        policy = export(self.model, self.training_env.core.task)
+        if self._log_dir is not None:
+            policy.save(self._log_dir / "checkpoint.safetensors")
+        if self.num_timesteps >= self._settled:
+            score = self._judge(policy)
+            for i, value in enumerate(score):
+                self.logger.record(f"eval/score_{i}", value)
+            if score > self.best_score:
+                self.best_score, self.best = score, policy

@@ -1,0 +1,237 @@
+"""The stages in order: each fills its part of a run directory, from which any can start again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from threadpoolctl import threadpool_limits
+
+from hyrl_mj.errors import BadInput, NoRenderer, unknown
+from hyrl_mj.game import Lattice, Limit, save
+from hyrl_mj.pipeline.examination import draw_robustness, examine_loops, examine_run
+from hyrl_mj.policies import Agent, MlpPolicy, PolicyController
+from hyrl_mj.progress import Say
+from hyrl_mj.run_directory import Run, load_run
+from hyrl_mj.sets import Grid
+from hyrl_mj.stages import boundary, extend, find_critical_set, make_partition, with_room
+from hyrl_mj.viz import Section, critical_section, replay_sentence
+
+# ---- the stages: each reads the artifacts of those before it and writes its own
+
+
+def train_stage(run: Run, say: Say) -> None:
+    """Stage 1: train the policy."""
+    from hyrl_mj.learning.training import train
+
+    s = run.settings
+    if isinstance(s.stage1, Agent):
+        raise BadInput(
+            f"{run.path} is about an agent that was given, {s.stage1.source}: there is nothing to train; "
+            "hyrl-mj robustify with another --policy and another --out takes another one"
+        )
+    logs = run.path / "logs" / "stage1"
+    policy = train(run.task, s.stage1, s.seed, log_dir=logs, label="stage 1")
+    policy.save(run.path / "policy.safetensors")
+    say(f"policy of {sum(w.size for w in policy.weights.values())} weights")
+
+
+def critical_set_stage(run: Run, say: Say) -> None:
+    """Stage 2: find the critical set."""
+    s = run.settings
+    critical = find_critical_set(run.task, run.steady, s.rods, s.resolution, s.search)
+    critical.save(run.path / "critical_set.npz")
+    say(critical.sentence(run.task))
+
+
+def partition_stage(run: Run, say: Say) -> None:
+    """Stage 3: partition the chart."""
+    partition = make_partition(run.task, run.steady, run.critical_set, run.settings.cells)
+    partition.save(run.path / "partition.npz")
+    say(partition.sentence(run.task))
+
+
+def extended_sets_stage(run: Run, say: Say) -> None:
+    """Stages 4 and 5: extend the parts over the critical set."""
+    s, task = run.settings, run.task
+    critical, split, ways = run.critical_set, run.partition, None
+    if run.agent:
+        if Lattice.possible(task):
+            lattice = Lattice.of(task, Grid.with_cells(task.chart, s.lattice))
+            ways = Limit.of(lattice, split)
+            split = with_room(task, run.steady, split, ways, s.noise)
+            ways = Limit.of(lattice, split)
+            critical = replace(critical, points=boundary(split))
+        split.save(run.split_path)
+    sets = extend(task, run.steady, critical, split, s.noise, s.horizon, ways)
+    sets.save(run.path / "extended_sets.npz")
+    say(sets.sentence(task))
+
+
+def retrain_stage(run: Run, say: Say) -> None:
+    """Stages 6 and 7: train the policy of each mode."""
+    from hyrl_mj.stages.retraining import retrain
+
+    s, sets = run.settings, run.extended_sets
+    logs = run.path / "logs"
+    policies: dict[int, MlpPolicy] = {}
+    for q in sets.modes:
+        policies[q] = retrain(
+            run.task,
+            run.steady,
+            sets,
+            q,
+            s.stage6,
+            s.seed,
+            [*policies.values()],
+            logs / f"mode_{q}",
+            run.partition,
+        )
+    for q, policy in policies.items():
+        policy.save(run.path / f"mode_{q}.safetensors")
+    remove_others(run.path.glob("mode_*"), mode_paths(run))
+    say(f"policies of {len(policies)} modes")
+
+
+def robustness_stage(run: Run, say: Say) -> None:
+    """Find out what noise can do to the policy and to the hybrid controller."""
+    examine_run(run, say=say)
+
+
+def mode_paths(run: Run) -> list[Path]:
+    """The files of the mode policies."""
+    suffixes = (".safetensors", ".json")
+    return [run.path / f"mode_{q}{suffix}" for q in run.extended_sets.modes for suffix in suffixes]
+
+
+def remove_others(found: Iterable[Path], wanted: Iterable[Path]) -> None:
+    """Remove what an earlier run of a stage, with other modes or starts, has left."""
+    for path in set(found) - set(wanted):
+        path.unlink()
+
+
+def simulate_stage(run: Run, say: Say) -> None:
+    """Simulate the paper's replay starts, and one on M*, under the paper's noise."""
+    from hyrl_mj.viz.arcs import replay_arcs
+
+    arcs, paths = replay_arcs(run), run.arc_paths()
+    for key, arc in arcs.items():
+        arc.save(paths[key])
+    folder = run.path / "arcs"
+    remove_others(folder.glob("*.npz"), [*paths.values(), *folder.glob("latest_*.npz")])
+    say(f"{len(arcs)} arcs; {replay_sentence(run, arcs)}")
+
+
+def figures_stage(run: Run, say: Say) -> None:
+    """Draw the paper's figures of this run; those that make no sense for its chart are left out."""
+    from hyrl_mj.viz import figures
+
+    section, folder = Section.of(run.task), run.path / "figures"
+    task, policy, eps, seed = section.task, run.steady, run.settings.noise, run.settings.seed
+    # All is read before anything is written.
+    arcs, critical = run.arcs(), critical_section(run)
+    partition, sets = section.partition(run.partition), section.extended_sets(run.extended_sets)
+    noisy = section.arc(arcs.get(("critical", "policy"), arcs["start0", "policy"]))
+    figures.overview(task, policy, critical, partition, noisy, folder / "overview.png")
+    figures.policy_map(task, policy, critical, eps, seed, folder / "policy.png")
+    figures.extended_sets_map(task, critical, sets, folder / "extended_sets.png")
+    figures.runs(run.task, arcs, folder / "runs.png")
+    say(f"{', '.join(figures.names(task))} in {folder}, as PNG and PDF")
+
+
+def figure_paths(run: Run) -> list[Path]:
+    """The files that `figures_stage` writes."""
+    from hyrl_mj.viz import figures
+
+    folder = run.path / "figures"
+    return [folder / f"{n}{suffix}" for n in figures.names(run.task) for suffix in (".png", ".pdf")]
+
+
+def replay_stage(run: Run, say: Say) -> None:
+    """Render the replay of the start on M*; without GL or ffmpeg say why, and go on."""
+    from hyrl_mj.viz.arcs import replay_floor, replay_shows
+    from hyrl_mj.viz.replay import render_replay
+
+    try:
+        render_replay(run.task, replay_shows(run), run.path / "replay.mp4", floor=replay_floor(run))
+        say(f"video at {run.path / 'replay.mp4'}")
+    except NoRenderer as error:
+        say(f"no video: {error}")
+
+
+def report_stage(run: Run, say: Say) -> None:
+    """Write the report of all that there is."""
+    from hyrl_mj.viz.report import write_report
+
+    path = run.path / "report.html"
+    write_report(run, path)
+    say(f"page at {path}")
+
+
+def diagnose_stage(run: Run, say: Say) -> None:
+    """Find out what noise can do to the policy alone, draw it, and write it on a page."""
+    from hyrl_mj.viz import diagnosis, figures
+
+    section, folder = Section.of(run.task), run.path / diagnosis.FOLDER
+    eps, seed = run.settings.noise, run.settings.seed
+    content, maps = examine_loops(run, {"policy": PolicyController(run.policy)}, run.partition)
+    arc = diagnosis.worst_arc(run)
+    critical, partition = critical_section(run), section.partition(run.partition)
+    shown = section.arc(arc or diagnosis.usual_arc(run))
+    figures.overview(section.task, run.steady, critical, partition, shown, folder / "overview.png")
+    figures.policy_map(section.task, run.steady, critical, eps, seed, folder / "policy.png")
+    if maps is not None:
+        draw_robustness(run, content, maps, folder)
+    diagnosis.write_worst(run, arc, say)
+    save(folder / "robustness.json", content)
+    diagnosis.write_page(run, content, arc)
+    for sentence in diagnosis.sentences(run, content, arc):
+        say(sentence)
+    say(f"page at {run.path / diagnosis.PAGE}")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of the pipeline: its function, and the files that tell that it has been done."""
+
+    name: str
+    work: Callable[[Run, Say], None]
+    outputs: Callable[[Run], list[Path]]
+
+
+def _files(*names: str) -> Callable[[Run], list[Path]]:
+    return lambda run: [run.path / name for name in names]
+
+
+STAGES = (
+    Stage("train", train_stage, lambda run: run.policy_files),
+    Stage("critical-set", critical_set_stage, _files("critical_set.npz")),
+    Stage("partition", partition_stage, _files("partition.npz")),
+    Stage("extended-sets", extended_sets_stage, lambda run: run.set_files),
+    Stage("retrain", retrain_stage, mode_paths),
+    Stage("robustness", robustness_stage, _files("robustness.json")),
+    Stage("simulate", simulate_stage, lambda run: list(run.arc_paths().values())),
+    Stage("figures", figures_stage, figure_paths),
+    Stage("replay", replay_stage, _files("replay.mp4")),
+    Stage("report", report_stage, _files("report.html")),
+)
+
+
+# What `diagnose` does: the first stages, which `robustify` then need not do again, and a page.
+DIAGNOSIS = (*STAGES[:3], Stage("diagnose", diagnose_stage, _files("diagnosis.html")))
+
+
+def run_stage(run: Run, name: str, say: Say = print) -> Run:
+    """Run one stage from what is on disk; the run is returned anew, with its result.
+
+    Raises:
+        BadInput: there is no stage of that name.
+    """
+    stages = {stage.name: stage for stage in (*DIAGNOSIS, *STAGES)}
+    if name not in stages:
+        raise unknown("stage", name, stages)
+    # The physics has the cores; BLAS threads that wait for one of them only stall.
+    with threadpool_limits(1, user_api="blas"):
+        stages[name].work(run, lambda text: say(f"{name}: {text}"))
+    return load_run(run.path, run.function)

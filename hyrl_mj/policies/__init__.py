@@ -1,0 +1,50 @@
+"""Policies and controllers: what answers a measurement with an input.
+
+A policy is a network, a function or an ONNX model on the observation of a task; a controller adds a
+mode. Agents that were trained elsewhere are read here, and nothing in their files is executed.
+"""
+
+from hyrl_mj.policies.activations import ACTIVATIONS, TORCH_NAMES
+from hyrl_mj.policies.agents import load_agent
+from hyrl_mj.policies.algorithms import (
+    ALGORITHMS,
+    accepted,
+    algorithm_class,
+    algorithm_title,
+    check_algorithm,
+    relative,
+)
+from hyrl_mj.policies.controllers import Controller, PolicyController, as_controller, check_modes
+from hyrl_mj.policies.functions import from_callable
+from hyrl_mj.policies.given import FUNCTION, ONNX, Agent, AnyPolicy, opened, take
+from hyrl_mj.policies.mlp import ACTOR_CRITIC, LAYOUTS, MlpPolicy, Policy, SampledPolicy
+from hyrl_mj.policies.sb3_zip import infer_algorithm
+
+__all__ = [
+    "ACTIVATIONS",
+    "ACTOR_CRITIC",
+    "ALGORITHMS",
+    "FUNCTION",
+    "LAYOUTS",
+    "ONNX",
+    "TORCH_NAMES",
+    "Agent",
+    "AnyPolicy",
+    "Controller",
+    "MlpPolicy",
+    "Policy",
+    "PolicyController",
+    "SampledPolicy",
+    "accepted",
+    "algorithm_class",
+    "algorithm_title",
+    "as_controller",
+    "check_algorithm",
+    "check_modes",
+    "from_callable",
+    "infer_algorithm",
+    "load_agent",
+    "opened",
+    "relative",
+    "take",
+]

@@ -1,0 +1,340 @@
+"""Policies: from a measurement to an input, in NumPy alone."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from threadpoolctl import ThreadpoolController
+
+from hyrl_mj import artifacts
+from hyrl_mj.errors import BadArtifact, BadInput
+from hyrl_mj.policies.activations import ACTIVATIONS
+from hyrl_mj.policies.algorithms import ALGORITHMS
+from hyrl_mj.tasks import Task, get_task
+
+# A linear layer: weight (outputs, inputs) and bias (outputs,).
+Layer = tuple[np.ndarray, np.ndarray]
+# Rows that go through a network at a time: the hidden layers then stay in the processor's cache.
+CHUNK = 4096
+# The last bits of a matrix product depend on the threads that share it, and threads that wait for a
+# busy core take ten times as long as one: batches have a single one.
+BLAS = ThreadpoolController()
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where an SB3 policy keeps the network that acts, and what its output means.
+
+    Attributes:
+        parts: beginnings of the names of its tensors, from the observation to the output.
+        activation: SB3's default between the layers.
+        squashed: whether the output goes through tanh and is stretched to the task's input limits;
+            otherwise it is clipped to them.
+        log_std: the tensor, or the layer beside the last one, with the logarithm of the spread that it
+            has while it learns; None where nothing is drawn from a distribution.
+    """
+
+    parts: tuple[str, ...]
+    activation: str
+    squashed: bool = False
+    log_std: str | None = None
+
+
+# SB3 1.x had layers that policy and value function share.
+ACTOR_CRITIC = Layout(
+    ("mlp_extractor.shared_net.", "mlp_extractor.policy_net.", "action_net."),
+    "tanh",
+    log_std="log_std",
+)
+DETERMINISTIC = Layout(("actor.mu.",), "relu", squashed=True)
+LAYOUTS = {
+    "ppo": ACTOR_CRITIC,
+    "a2c": ACTOR_CRITIC,
+    "dqn": Layout(("q_net.q_net.",), "relu"),
+    "sac": Layout(
+        ("actor.latent_pi.", "actor.mu."),
+        "relu",
+        squashed=True,
+        log_std="actor.log_std",
+    ),
+    "td3": DETERMINISTIC,
+    "ddpg": DETERMINISTIC,
+}
+# How far SB3 lets a layer's log_std go.
+LOG_STD_RANGE = (-20, 2)
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """Anything that answers a measurement with an input."""
+
+    def act(self, measured: np.ndarray) -> np.ndarray:
+        """Inputs (n, m) in the plant's units for measurements (n, p)."""
+        ...
+
+
+class ObservationPolicy(ABC):
+    """A policy that sees a measurement only through its task's observation.
+
+    Attributes:
+        task: the task whose observation it reads and whose inputs it gives.
+    """
+
+    task: Task
+
+    def act(self, measured: np.ndarray) -> np.ndarray:
+        """Inputs for noisy measurements.
+
+        Args:
+            measured: (n, p), in the units of the measurement.
+
+        Returns:
+            (n, m) inputs in the plant's units, inside its limits.
+
+        Raises:
+            BadInput: a wrong shape, or a value that is not finite.
+        """
+        measured = self.task.check_measurement(measured)
+        return self.inputs(self.task.observation(measured))
+
+    @abstractmethod
+    def inputs(self, observation: np.ndarray) -> np.ndarray:
+        """Inputs (n, m) in the plant's units for observations (n, k)."""
+
+
+@dataclass(frozen=True)
+class MlpPolicy(ObservationPolicy):
+    """A multilayer perceptron on a task's observation; a trained SB3 policy at its mean or mode.
+
+    Attributes:
+        task: the task whose observation it reads and whose inputs it gives.
+        algorithm: the SB3 algorithm that trained it, one of `LAYOUTS`.
+        activation: what is between the layers, one of `ACTIVATIONS`.
+        weights: all tensors of the SB3 policy by name, critics included, so that training can go on.
+    """
+
+    task: Task
+    algorithm: str
+    activation: str
+    weights: Mapping[str, np.ndarray] = field(repr=False)
+
+    def __post_init__(self) -> None:
+        layers = _layers(self.weights, self.algorithm)
+        levels = ALGORITHMS[self.algorithm]
+        if levels is None and "log_std" in self.weights:
+            levels = False
+        if levels is not None:
+            check_kind(self.task, levels)
+        outputs = len(self.task.input_limits[0]) if self._levels is None else len(self._levels)
+        given = (layers[0][0].shape[1], layers[-1][0].shape[0])
+        wanted = (len(self.task.observation_low), outputs)
+        if given != wanted:
+            raise BadArtifact(
+                f"the network takes {given[0]} and gives {given[1]} numbers, "
+                f"the task {self.task.name} needs {wanted[0]} and {wanted[1]}"
+            )
+        for (_, bias), (weight, _) in pairwise(layers):
+            if weight.shape[1] != len(bias):
+                raise BadArtifact(
+                    f"a layer gives {len(bias)} numbers and the next takes {weight.shape[1]}"
+                )
+        if not all(np.isfinite(w).all() and np.isfinite(b).all() for w, b in layers):
+            raise BadArtifact("the network has weights that are not finite")
+        if self.activation not in ACTIVATIONS:
+            raise BadArtifact(
+                f"activation {self.activation!r} is unknown: choose one of {', '.join(ACTIVATIONS)}"
+            )
+        object.__setattr__(self, "_network", layers)
+
+    @property
+    def _levels(self) -> np.ndarray | None:
+        return self.task.input_levels
+
+    @property
+    def _layout(self) -> Layout:
+        return LAYOUTS[self.algorithm]
+
+    @property
+    def hidden(self) -> tuple[int, ...]:
+        """Widths of the hidden layers."""
+        return tuple(len(bias) for _, bias in self.layers[:-1])
+
+    @property
+    def layers(self) -> list[Layer]:
+        """Weight (outputs, inputs) and bias (outputs,) of each layer, from observation to output."""
+        return self._network  # type: ignore[attr-defined]
+
+    @property
+    def output(self) -> str:
+        """What the last layer gives: the value of each "level", or the input, to "clip" or to "squash"."""
+        if self._levels is not None:
+            return "level"
+        return "squash" if self._layout.squashed else "clip"
+
+    def inputs(self, observation: np.ndarray) -> np.ndarray:
+        """Inputs (n, m) in the plant's units for observations (n, k)."""
+        outputs = self.outputs(observation)
+        if self._levels is not None:
+            return self._levels[outputs.argmax(axis=1)]
+        return self._within_limits(outputs)
+
+    def sample(self, observation: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Inputs (n, m) for observations (n, k), drawn as the policy draws them while it learns.
+
+        Raises:
+            BadInput: a policy of DQN, TD3 or DDPG, which has no distribution to draw from.
+        """
+        if self._layout.log_std is None:
+            raise BadInput(
+                f"a {self.algorithm} policy has no distribution to draw from: use it as it is, "
+                "without stochastic"
+            )
+        outputs = self.outputs(observation)
+        if self._levels is not None:
+            # The greatest of preferences with Gumbel noise is a draw from their softmax.
+            return self._levels[(outputs + rng.gumbel(size=outputs.shape)).argmax(axis=1)]
+        spread = np.exp(self._log_std(observation))
+        return self._within_limits(outputs + spread * rng.standard_normal(outputs.shape))
+
+    def _log_std(self, observation: np.ndarray) -> np.ndarray:
+        """Logarithm of the Gaussian's standard deviation, (n, m) or (m,)."""
+        name = self._layout.log_std or ""
+        if name in self.weights:
+            return self.weights[name]
+        layer = _linear(self.weights, f"{name}.")
+        if not layer:
+            raise BadArtifact(
+                f"the {self.algorithm} policy has no log_std: it cannot be drawn from"
+            )
+        return np.clip(self._run(observation, layer[0]), *LOG_STD_RANGE)
+
+    def _within_limits(self, outputs: np.ndarray) -> np.ndarray:
+        """Inputs (n, m) of a continuous task for what the last layer gives (n, m)."""
+        u, (low, high) = outputs.astype(float), self.task.input_limits
+        if self._layout.squashed:
+            u = low + (np.tanh(u) + 1) / 2 * (high - low)
+        return np.clip(u, low, high)
+
+    def outputs(self, observation: np.ndarray) -> np.ndarray:
+        """The network's last layer for observations (n, k): action values or preferences of a
+        discrete task's levels, else the mean input, before it is squashed if it is."""
+        return self._run(observation, self.layers[-1])
+
+    def _run(self, observation: np.ndarray, last: Layer) -> np.ndarray:
+        """What `last` gives on top of the hidden layers, for observations (n, k)."""
+        observation = observation.astype(np.float32)
+        if len(observation) <= 1:
+            return self._forward(observation, last)
+        parts = range(0, len(observation), CHUNK)
+        with BLAS.limit(limits=1, user_api="blas"):
+            return np.concatenate([self._forward(observation[i : i + CHUNK], last) for i in parts])
+
+    def _forward(self, x: np.ndarray, last: Layer) -> np.ndarray:
+        activate = ACTIVATIONS[self.activation]
+        for weight, bias in self.layers[:-1]:
+            x = x @ weight.T
+            x += bias
+            x = activate(x)
+        x = x @ last[0].T
+        x += last[1]
+        return x
+
+    def save(self, path: Path) -> None:
+        """Write `path` (safetensors) and its description beside it (JSON)."""
+        artifacts.write_tensors(path, dict(self.weights))
+        artifacts.write_json(
+            path.with_suffix(".json"),
+            {"task": self.task.name, "algorithm": self.algorithm, "activation": self.activation},
+            kind="policy",
+        )
+
+    @staticmethod
+    def load(path: Path) -> MlpPolicy:
+        """Read what `save` wrote.
+
+        Raises:
+            BadArtifact: a file is missing, truncated, or not a policy of this version.
+        """
+        description = artifacts.read_json(path.with_suffix(".json"), kind="policy")
+        weights = artifacts.read_tensors(path)
+        with artifacts.reading(path):
+            return MlpPolicy(
+                task=get_task(description["task"]),
+                algorithm=description["algorithm"],
+                activation=description["activation"],
+                weights=weights,
+            )
+
+
+@dataclass(frozen=True)
+class SampledPolicy(ObservationPolicy):
+    """A trained policy that draws its inputs, as it did while it learned.
+
+    It is reproducible call by call only: the same seed and the same calls in the same order give the
+    same inputs, but the same measurement twice does not.
+
+    Attributes:
+        policy: gives the distributions.
+        rng: draws from them.
+    """
+
+    policy: MlpPolicy
+    rng: np.random.Generator
+
+    def __post_init__(self) -> None:
+        # What cannot be drawn from is refused now, and not in the middle of a run.
+        k = len(self.task.observation_low)
+        self.policy.sample(np.zeros((1, k)), np.random.default_rng(0))
+
+    @property
+    def task(self) -> Task:  # type: ignore[override]
+        return self.policy.task
+
+    def inputs(self, observation: np.ndarray) -> np.ndarray:
+        return self.policy.sample(observation, self.rng)
+
+
+def check_kind(task: Task, levels: bool) -> None:
+    """Raise `BadArtifact` where a network that chooses among levels, or does not, meets another task."""
+    if levels == (task.input_levels is not None):
+        return
+    gives = "chooses among discrete levels" if levels else "gives continuous inputs"
+    takes = "continuous inputs" if task.levels is None else f"one of {task.levels} discrete levels"
+    raise BadArtifact(f"the network {gives}, the task {task.name} takes {takes}")
+
+
+def _layers(weights: Mapping[str, np.ndarray], algorithm: str) -> list[Layer]:
+    """The (weight, bias) pairs from observation to output, found by SB3's names for them."""
+    if algorithm not in LAYOUTS:
+        raise BadArtifact(
+            f"a policy of algorithm {algorithm!r} is unknown here: choose one of {', '.join(LAYOUTS)}"
+        )
+    parts = [_linear(weights, part) for part in LAYOUTS[algorithm].parts]
+    if not parts[-1]:
+        raise BadArtifact(f"the file holds no network of a {algorithm} policy")
+    return [layer for part in parts for layer in part]
+
+
+def _linear(weights: Mapping[str, np.ndarray], prefix: str) -> list[Layer]:
+    """The linear layers whose names begin with `prefix`, in order."""
+    stems = {
+        name.removesuffix("weight")
+        for name in weights
+        if name.startswith(prefix) and name.endswith("weight")
+    }
+    layers = []
+    for stem in sorted(stems, key=lambda s: (len(s), s)):
+        weight, bias = weights[f"{stem}weight"], weights.get(f"{stem}bias")
+        if weight.ndim != 2 or bias is None or bias.shape != weight.shape[:1]:
+            raise BadArtifact(
+                f"{stem}weight belongs to no linear layer with a bias: only plain multilayer "
+                "perceptrons can be used"
+            )
+        layers.append((weight, bias))
+    return layers

@@ -1,0 +1,157 @@
+"""The closed loop of task, noise and controller, in bulk, and the hybrid arcs that it produces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hyrl_mj.plant import Plant
+from hyrl_mj.policies import Controller
+from hyrl_mj.progress import Progress
+from hyrl_mj.simulation.lookahead import NOT_STARTED, Adversary, Lookahead
+from hyrl_mj.simulation.noise import Noise, Recorded
+from hyrl_mj.tasks import Outcome, Task
+
+# What may disturb the measurement.
+AnyNoise = Noise | Recorded | Adversary
+# The longest time that `simulate` records [s]: an hour.
+LONGEST = 3600.0
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """n closed-loop runs over at most K samples. A run that ended stays where it ended.
+
+    Attributes:
+        path: (K + 1, n, d) true chart points at the samples, periodic coordinates unwrapped.
+        length: (n,) samples until the end of each run.
+        outcome: (n,) `Outcome`.
+        q0: (n,) modes at the start.
+        before: (K, n) modes at each sample before a jump, and
+        q: (K, n) after it. Recorded only on demand, like the following.
+        measured: (K, n, p) noisy measurements.
+        u: (K, n, m) inputs.
+        state: (K + 1, n, nstate) MuJoCo's states.
+    """
+
+    path: np.ndarray
+    length: np.ndarray
+    outcome: np.ndarray
+    q0: np.ndarray
+    before: np.ndarray
+    q: np.ndarray
+    measured: np.ndarray
+    u: np.ndarray
+    state: np.ndarray
+
+
+def closed_loop(
+    task: Task,
+    controller: Controller,
+    z0: np.ndarray,
+    *,
+    noise: AnyNoise | None = None,
+    q0: np.ndarray | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    backward: bool = False,
+    record: bool = False,
+    quiet: bool = False,
+    vary: bool = False,
+    plant: Plant | None = None,
+    label: str = "simulating",
+) -> Rollout:
+    """Run the closed loop from many starts at once.
+
+    Args:
+        task: the robot and its job.
+        controller: what closes the loop.
+        z0: (n, d) starts, chart points.
+        noise: on the measurement; none by default.
+        q0: (n,) start modes; by default the controller picks them from the first measurement.
+        steps: samples to run, by default until the task's time is up.
+        seed: of the noise; the same seed and n give the same signals whatever the controller.
+        backward: run x' = -f(x, u) instead; runs then have no end but the last step.
+        record: whether modes, measurements, inputs and states are kept.
+        quiet: show no progress bar, because the caller has one.
+        vary: whether coordinates that the chart does not hold are drawn, too, as in training.
+        plant: n copies of the task's robot to use again; by default new ones.
+        label: what the progress bar says.
+    """
+    noise = noise or Noise()
+    limit = task.max_steps if steps is None else steps
+    n, rng = len(z0), np.random.default_rng(seed)
+    plant = plant or task.plant(n)
+    plant.set_state(*task.state(z0, np.random.default_rng([seed, 1]) if vary else None))
+    measurement = plant.measurement
+    q = np.full(n, NOT_STARTED) if q0 is None else np.asarray(q0, dtype=int).copy()
+    disturb = _disturbance(task, controller, noise, n, rng)
+    outcome = np.full(n, Outcome.RUNNING) if backward else task.outcome(measurement, plant.unstable)
+    length = np.zeros(n, dtype=int)
+    path = np.empty((limit + 1, n, task.chart.dimension))
+    path[0] = task.z(measurement)
+    first_mode = q.copy()
+    kept: dict[str, list[np.ndarray]] = {name: [] for name in ("before", "q", "measured", "u")}
+    states = [plant.state] if record else []
+    progress = None if quiet else Progress(label, limit, "samples")
+    for k in range(limit):
+        active = np.flatnonzero(outcome == Outcome.RUNNING)
+        if not len(active):
+            break
+        signal = disturb(k, plant, q)
+        measured = measurement + signal
+        if k == 0 and q0 is None:
+            q[:] = controller.initial_mode(measured)
+            first_mode = q.copy()
+        before, u = q.copy(), np.full((n, len(task.inputs)), np.nan)
+        u[active], q[active] = controller.step(q[active], measured[active])
+        (plant.step_backward if backward else plant.step)(u[active], active)
+        measurement, last, lost = plant.measurement, measurement, plant.unstable
+        measurement[lost] = last[lost]  # where it was before it broke down
+        path[k + 1] = task.z(measurement)
+        length[active] = k + 1
+        if not backward:
+            outcome[active] = task.outcome(measurement[active], lost[active])
+        if record:
+            for name, value in (
+                ("before", before),
+                ("q", q.copy()),
+                ("measured", measured),
+                ("u", u),
+            ):
+                kept[name].append(value)
+            states.append(np.where(lost[:, None], states[-1], plant.state))
+        if progress:
+            progress.update(k + 1)
+    if progress:
+        progress.close()
+    if not backward:
+        late = outcome == Outcome.RUNNING
+        outcome[late] = task.verdict(measurement[late])
+    shapes = {"before": (), "q": (), "measured": (len(task.noisy),), "u": (len(task.inputs),)}
+    arrays = {k: np.array(values).reshape(-1, n, *shapes[k]) for k, values in kept.items()}
+    arrays |= {k: arrays[k].astype(int) for k in ("before", "q")}
+    path = path[: length.max() + 1]
+    return Rollout(path, length, outcome, first_mode, **arrays, state=np.array(states))
+
+
+def ways(task: Task, rollout: Rollout) -> np.ndarray:
+    """Which way each run went, (n,) int as `Task.direction`; -1 for one that broke down."""
+    return np.where(rollout.outcome == Outcome.UNSTABLE, -1, task.direction(rollout.path))
+
+
+def _disturbance(
+    task: Task, controller: Controller, noise: AnyNoise, n: int, rng: np.random.Generator
+) -> Callable[[int, Plant, np.ndarray], np.ndarray]:
+    """The noise (n, p) as a function of the sample's number, the plant and the modes."""
+    if isinstance(noise, Noise) and noise.kind == "adversarial":
+        noise = Lookahead(task, controller, noise)
+    if not isinstance(noise, Noise | Recorded):
+        adversary = noise
+        return lambda k, plant, q: adversary.choose(plant, q)
+    signal = noise
+    columns = task.measurement_columns
+    acts = signal.acts_on(task.noisy)
+    return lambda k, plant, q: signal.sample(np.full(n, k), columns, rng) * acts

@@ -1,0 +1,28 @@
+"""The stages of HyRL between training and examination (paper, Section IV): a function and a result for each.
+
+Stage 2 is `find_critical_set`, stage 3 `make_partition`, stages 4 and 5 `extend`, stage 6
+`retraining.retrain`, and stage 7 `HybridController`. The module `retraining` imports torch, so it
+is imported only where it is needed.
+"""
+
+from hyrl_mj.stages.critical_set import CriticalSet, critical_points, find_critical_set
+from hyrl_mj.stages.episodes import noisy_episodes
+from hyrl_mj.stages.extended_sets import ExtendedSets, boundary, extend, with_room
+from hyrl_mj.stages.hybrid import ON_EDGE, HybridController
+from hyrl_mj.stages.partition import Partition, make_partition
+
+__all__ = [
+    "ON_EDGE",
+    "CriticalSet",
+    "ExtendedSets",
+    "HybridController",
+    "Partition",
+    "boundary",
+    "critical_points",
+    "extend",
+    "find_critical_set",
+    "make_partition",
+    "noisy_episodes",
+    "retraining",
+    "with_room",
+]

@@ -1,0 +1,367 @@
+"""Stage 5: extend each part over the critical set, by running the closed loop backward."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hyrl_mj import artifacts
+from hyrl_mj.game import NEVER, Limit
+from hyrl_mj.policies import Policy, PolicyController
+from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.simulation import closed_loop
+from hyrl_mj.stages.critical_set import CriticalSet
+from hyrl_mj.stages.partition import Partition, PartPolicy, part_policies
+from hyrl_mj.tasks import Outcome, Task
+
+# The neighbourhood of M* is at least this many cells wide, and as wide as the loop goes in one sample.
+NEIGHBOURHOOD_CELLS = 4
+# Gaps between the samples of the backward runs that are closed, in cells.
+GAP_CELLS = 1.5
+# A horizon is long enough when the backward runs have filled this share of the overlap that is wanted.
+FILLED = 0.995
+# The longest horizon that is tried [s].
+LONGEST_HORIZON = 2.0
+
+
+@dataclass(frozen=True)
+class ExtendedSets:
+    """M_ext_i for each mode (paper, Step 5).
+
+    Attributes:
+        modes: the modes.
+        sets: M_ext_i, in the same order.
+        winning: W_i as (N,) bool over the grid's nodes: where pi_i reaches its goal.
+        horizon: time T of the backward propagation [s]; 0 if there was none.
+        noise: bound eps of the measurement noise that the sets are made for.
+        narrow: (K, d) points of M* at which a mode has less room than the noise asks for.
+        room: (K,) the room there is, across, in chart units; 2 eps are asked for.
+    """
+
+    modes: tuple[int, ...]
+    sets: tuple[GridSet, ...]
+    winning: tuple[np.ndarray, ...]
+    horizon: float
+    noise: float
+    narrow: np.ndarray
+    room: np.ndarray
+
+    def sentence(self, task: Task) -> str:
+        """How far the sets overlap, for people."""
+        if len(self.sets) < 2:
+            return "one mode, its set is everything"
+        both = self.sets[0] & self.sets[1]
+        share = both.mask.mean()
+        reach = f"T = {self.horizon:.2g} s" if self.horizon else "as far as the ways are open"
+        text = f"{len(self.sets)} extended sets, {reach}, the first two share {100 * share:.1f}% of the chart"
+        if not len(self.narrow):
+            return text
+        low, high, chart = self.narrow.min(axis=0), self.narrow.max(axis=0), task.chart
+        where = ", ".join(
+            f"{name} {a:.3g} to {b:.3g} {unit}" if b - a > 1e-3 else f"{name} {a:.3g} {unit}"
+            for name, unit, a, b in zip(chart.names, chart.units, low, high, strict=True)
+        )
+        return (
+            f"{text}; no overlap can be wide enough for noise {self.noise:g} at {where}: "
+            f"{2 * self.noise:g} of room are needed there and as little as {self.room.min():.2g} is left"
+        )
+
+    def save(self, path: Path) -> None:
+        """Write them as npz."""
+        artifacts.write_arrays(
+            path,
+            {
+                "modes": np.array(self.modes),
+                "grid_counts": np.array(self.sets[0].grid.counts),
+                "signed_distance": np.stack([s.values for s in self.sets]),
+                "winning": np.stack(self.winning),
+                "horizon": np.array(self.horizon),
+                "noise": np.array(self.noise),
+                "narrow": self.narrow,
+                "room": self.room,
+            },
+            kind="extended sets",
+        )
+
+    @staticmethod
+    def load(path: Path, task: Task) -> ExtendedSets:
+        """Read what `save` wrote.
+
+        Raises:
+            BadArtifact: the file is missing, truncated, or not the extended sets of this task.
+        """
+        arrays = artifacts.read_arrays(path, kind="extended sets")
+        with artifacts.reading(path):
+            grid = Grid.from_counts(task.chart, arrays["grid_counts"])
+            return ExtendedSets(
+                modes=tuple(int(q) for q in arrays["modes"]),
+                sets=tuple(GridSet(grid, values) for values in arrays["signed_distance"]),
+                winning=tuple(arrays["winning"]),
+                horizon=float(arrays["horizon"]),
+                noise=float(arrays["noise"]),
+                narrow=arrays["narrow"],
+                room=arrays["room"],
+            )
+
+
+def extend(
+    task: Task,
+    policy: Policy,
+    critical: CriticalSet,
+    partition: Partition,
+    noise: float,
+    horizon: float | None = None,
+    ways: Limit | None = None,
+) -> ExtendedSets:
+    """Extend the parts over M*.
+
+    X_i are the states that x' = -f(x, pi_i(x)) reaches outside M_i within the horizon, from the
+    neighbourhood of M*; for a plant that cannot be run backward, those outside M_i that pi_i brings into
+    M_i within the horizon. They are trimmed to where mode i still succeeds, with room for the noise, and
+    every part is widened by the noise bound, so that a wrong measurement does not flip the mode back:
+
+        M_ext_i = ((M_i u X_i) n (W_i eroded by eps)) u (M_i dilated by eps)
+
+    Erosion and dilation act along the coordinates that are measured with noise.
+
+    Args:
+        task: gives plant and chart.
+        policy: the stage-1 policy.
+        critical: M*, from stage 2.
+        partition: M_i, from stage 3.
+        noise: bound eps of the measurement noise.
+        horizon: time T of the backward propagation [s]. By default the shortest with which every set
+            reaches 2 eps and one sample over M*, where its mode still succeeds, and then no farther.
+        ways: which way is open from where. An agent need not know how to go on its way from beyond the
+            place where it decides otherwise; with `ways` W_i is where way i is open, for the mode will be
+            trained to go it, and without a horizon every set reaches 2 eps and one sample over the
+            boundary of its part there.
+    """
+    grid, parts = partition.grid, partition.parts
+    eps, hop = task.noise_in_chart(noise), longest_hop(task, policy, grid)
+    near = neighbourhood(grid, noise, hop)
+    pis = part_policies(task, policy, partition, near)
+    wanted = [part.dilated_by_box(2 * eps + hop * (task.noise_in_chart(1.0) > 0)) for part in parts]
+    # W_i, asked for wherever a set may come to lie.
+    radius = 3 * noise + near + (0.0 if horizon is None else horizon / task.dt * near)
+    if ways is None:
+        winning = tuple(
+            part_wins(task, pi, partition, part, part.dilated(radius))
+            for pi, part in zip(pis, parts, strict=True)
+        )
+    else:
+        winning = open_ways(ways, grid)
+    roomy = [
+        GridSet.from_mask(grid, wins | ~part.dilated(radius).mask).eroded_by_box(eps)
+        for wins, part in zip(winning, parts, strict=True)
+    ]
+    # Only M* is to be covered; parts that meet again elsewhere, at the set-point, have nothing to decide.
+    off = distance_to(task, critical, grid.nodes)
+    around = off <= float(np.linalg.norm(2 * eps + hop))
+    reached = list(parts)
+    running = len(parts) > 1 and (ways is None or horizon is not None)
+    if running:
+        reach = [
+            backward_reach(task, pi, part, part.mask & (off <= near))
+            if task.kinematic
+            else forward_reach(task, pi, part, part.mask & (off <= near), part.dilated(radius).mask)
+            for pi, part in zip(pis, parts, strict=True)
+        ]
+    steps = [max(round(horizon / task.dt), 1)] if horizon else range(1, _longest(task) + 1)
+    for k in steps if running else ():
+        reached = [part | within(k) for part, within in zip(parts, reach, strict=True)]
+        goals = [
+            (w & r).mask & ~p.mask & around for w, r, p in zip(wanted, roomy, parts, strict=True)
+        ]
+        filled = [r.mask[goal].mean() for r, goal in zip(reached, goals, strict=True) if goal.any()]
+        if min(filled, default=1.0) >= FILLED:
+            break
+    if horizon is None:
+        reached = [r & w for r, w in zip(reached, wanted, strict=True)] if running else wanted
+    sets = tuple(
+        (r & room) | part.dilated_by_box(eps)
+        for r, room, part in zip(reached, roomy, parts, strict=True)
+    )
+    narrow, room = room_along(task, critical, partition, winning, eps)
+    taken = horizon or (k * task.dt if running else 0.0)
+    return ExtendedSets(partition.modes, sets, winning, taken, noise, narrow, room)
+
+
+def open_ways(ways: Limit, grid: Grid) -> tuple[np.ndarray, ...]:
+    """Where on a grid each mode's way is open: (N,) bool."""
+    at = ways.lattice.grid.nearest(grid.nodes)
+    return tuple(samples[at] < NEVER for samples in ways.samples)
+
+
+def with_room(
+    task: Task, policy: Policy, partition: Partition, ways: Limit, noise: float
+) -> Partition:
+    """The parts, changed where the policy goes a way that is about to close while another is not.
+
+    Who drives towards the obstacle's middle and decides at the last moment leaves no room for an overlap.
+    So a state with less room for its way than 2 eps and one sample belongs to the mode whose way has the
+    most. Where every way has that room, or none, the policy's own decision stands.
+
+    Args:
+        task: gives the noisy coordinates.
+        policy: the agent.
+        partition: M_i, by the way that it goes.
+        ways: which way is open from where.
+        noise: bound eps of the measurement noise.
+    """
+    grid = partition.grid
+    if len(partition.parts) < 2:
+        return partition
+    hop = longest_hop(task, policy, grid) * (task.noise_in_chart(1.0) > 0)
+    wanted = float((2 * task.noise_in_chart(noise) + hop).max())
+    room = -np.stack([GridSet.from_mask(grid, open_).values for open_ in open_ways(ways, grid)])
+    masks = np.stack([part.mask for part in partition.parts])
+    own = np.where(masks, room, -np.inf).max(axis=0)
+    best = room.argmax(axis=0)
+    moved = (masks.sum(axis=0) == 1) & (own < wanted) & (room.max(axis=0) > np.maximum(own, 0))
+    parts = tuple(
+        GridSet.from_mask(grid, np.where(moved, best == i, mask)) for i, mask in enumerate(masks)
+    )
+    return Partition(partition.modes, parts, partition.succeeds)
+
+
+def boundary(partition: Partition) -> np.ndarray:
+    """Points (N, d) between neighbouring nodes of which no part holds both."""
+    grid = partition.grid
+    first, second = grid.neighbours()
+    together = np.any([part.mask[first] & part.mask[second] for part in partition.parts], axis=0)
+    a, b = grid.nodes[first[~together]], grid.nodes[second[~together]]
+    return np.asarray(a + grid.chart.difference(b, a) / 2)
+
+
+def neighbourhood(grid: Grid, noise: float, hop: np.ndarray) -> float:
+    """The distance from M* that counts as near it: the noise, some cells, and a sample's way (d,)."""
+    return max(noise, NEIGHBOURHOOD_CELLS * grid.cell, float(np.linalg.norm(hop)))
+
+
+def _longest(task: Task) -> int:
+    return round(LONGEST_HORIZON / task.dt)
+
+
+def room_along(
+    task: Task,
+    critical: CriticalSet,
+    partition: Partition,
+    winning: tuple[np.ndarray, ...],
+    eps: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where on M* some mode has less than 2 eps (d,) of room across M*, though a mode can win there.
+
+    Returns:
+        Points (K, d) of M*, and the room (K,) at each: how far to either side all modes still succeed.
+    """
+    grid, points = partition.grid, critical.points
+    shares = np.arange(0.0, 1.0 + 1e-9, 0.02)
+    reach = 2 * eps.max(initial=0.0)
+    if not len(points) or not reach or len(winning) < 2:
+        return np.empty((0, task.chart.dimension)), np.empty(0)
+    room = np.full(len(points), reach)
+    for direction in np.vstack([np.diag(2 * eps), -np.diag(2 * eps)]):
+        if not direction.any():
+            continue
+        line = grid.nearest((points[:, None] + shares[:, None] * direction).reshape(-1, len(eps)))
+        for wins in winning:
+            ok = wins[line].reshape(len(points), -1)
+            first = np.where(ok.all(axis=1), len(shares), ok.argmin(axis=1))
+            room = np.minimum(room, np.maximum(first - 1, 0) * 0.02 * reach)
+    someone = np.any([wins[grid.nearest(points)] for wins in winning], axis=0)
+    narrow = someone & (room < reach - grid.cell)
+    return points[narrow], room[narrow]
+
+
+def backward_reach(
+    task: Task, pi: PartPolicy, part: GridSet, rim: np.ndarray
+) -> Callable[[int], GridSet]:
+    """M_i u X_i by the number of samples.
+
+    Args:
+        task: gives the plant.
+        pi: pi_i.
+        part: M_i.
+        rim: (N,) bool, its nodes near M*, from where the closed loop is run backward.
+    """
+    grid, gap = part.grid, GAP_CELLS * part.grid.cell
+    nodes = grid.nodes[rim]
+
+    def within(steps: int) -> GridSet:
+        visited = np.zeros(len(grid.nodes), dtype=bool)
+        if len(nodes):
+            loop = PolicyController(pi)
+            path = closed_loop(task, loop, nodes, steps=steps, backward=True, label="backward").path
+            z = between_samples(path, grid)
+            visited[grid.nearest(z[task.chart.contains(z)])] = True
+        # Close the gaps between samples, together with the part that they leave.
+        wide = GridSet.from_mask(grid, visited | part.mask).dilated(gap)
+        return GridSet.from_mask(grid, wide.mask).eroded(gap)
+
+    return within
+
+
+def forward_reach(
+    task: Task, pi: PartPolicy, part: GridSet, rim: np.ndarray, asked: np.ndarray
+) -> Callable[[int], GridSet]:
+    """M_i u X_i by the number of samples, for plants that cannot be run backward.
+
+    Args:
+        task: gives the plant.
+        pi: pi_i.
+        part: M_i.
+        rim: (N,) bool, its nodes near M*; X_i are those that the closed loop brings there.
+        asked: (N,) bool, the nodes that may come to lie in the extended set.
+    """
+    grid = part.grid
+    outside = np.flatnonzero(asked & ~part.mask)
+    arrival = np.full(len(grid.nodes), np.inf)
+    if len(outside):
+        rollout = closed_loop(
+            task, PolicyController(pi), grid.nodes[outside], steps=_longest(task), label="forward"
+        )
+        under_way = np.ones(len(outside), dtype=bool)
+        for k, z in enumerate(rollout.path[1:], 1):
+            enters = under_way & part.contains(z)
+            arrival[outside[enters & rim[grid.nearest(z)]]] = k
+            under_way &= ~enters
+    return lambda steps: GridSet.from_mask(grid, part.mask | (arrival <= steps))
+
+
+def between_samples(path: np.ndarray, grid: Grid) -> np.ndarray:
+    """Points (N, d) along sampled paths (K + 1, n, d), so close that they miss no cell of the grid."""
+    hops = np.diff(path, axis=0)
+    count = max(int(np.ceil(np.abs(hops / grid.spacing).max(initial=0.0))), 1)
+    shares = np.arange(count)[:, None, None, None] / count
+    d = path.shape[-1]
+    return np.concatenate([(path[:-1] + shares * hops).reshape(-1, d), path[-1]])
+
+
+def longest_hop(task: Task, policy: Policy, grid: Grid) -> np.ndarray:
+    """The longest way (d,) that the closed loop goes in one sample along each coordinate."""
+    path = closed_loop(task, PolicyController(policy), grid.nodes, steps=1).path
+    return np.asarray(np.abs(path[-1] - path[0]).max(axis=0))
+
+
+def part_wins(
+    task: Task, pi: PartPolicy, partition: Partition, part: GridSet, asked: GridSet
+) -> np.ndarray:
+    """W_i: the nodes (N,) bool of `asked` from which pi_i reaches the goal."""
+    wins = partition.succeeds & part.mask
+    outside = np.flatnonzero(asked.mask & ~part.mask)
+    if len(outside):
+        loop = PolicyController(pi)
+        rollout = closed_loop(task, loop, part.grid.nodes[outside], label="extended sets")
+        wins[outside] = rollout.outcome == Outcome.REACHED
+    return wins
+
+
+def distance_to(task: Task, critical: CriticalSet, z: np.ndarray) -> np.ndarray:
+    """Distance (n,) of chart points (n, d) to M*, in chart units; infinite if M* is empty."""
+    if not len(critical.points):
+        return np.full(len(z), np.inf)
+    return task.chart.tree(critical.points).query(task.chart.in_box(z))[0]

@@ -1,0 +1,139 @@
+"""Stage 7: the hybrid system that joins the mode policies with hysteresis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from hyrl_mj.errors import BadInput
+from hyrl_mj.policies import Policy, check_modes
+from hyrl_mj.sets import Complement, StateSet
+from hyrl_mj.tasks import Task
+
+# A point this close to the edge of a flow set is on it [chart units].
+ON_EDGE = 1e-9
+Rows = np.ndarray | slice
+
+
+@dataclass(frozen=True)
+class HybridController:
+    """H = (C, F, D, G) with state (z, q) (paper, Step 7), sampled: a pure function, no hidden state.
+
+    In mode q the policy pi_q flows on C_q = M_ext_q. On D_q, the closure of the rest, q jumps, to the
+    other mode; with more than two, to the one whose flow set holds z most deeply. On the edge, where
+    both are allowed, it flows: noise of just the bound that the sets are made for does not flip it.
+
+    Attributes:
+        task: gives the chart and checks measurements.
+        policies: the policy of each mode.
+        flow_sets: C_q of each mode.
+        starts: a set for each mode by which the start mode is picked; by default the flow sets.
+    """
+
+    task: Task
+    policies: Mapping[int, Policy]
+    flow_sets: Mapping[int, StateSet]
+    starts: Mapping[int, StateSet] | None = None
+
+    def __post_init__(self) -> None:
+        if set(self.policies) != set(self.flow_sets) or not self.policies:
+            raise BadInput(
+                f"policies of modes {sorted(self.policies)} do not fit flow sets of modes "
+                f"{sorted(self.flow_sets)}: give one of each for every mode"
+            )
+        if self.starts is not None and set(self.starts) != set(self.policies):
+            raise BadInput(
+                f"start sets of modes {sorted(self.starts)} do not fit modes {sorted(self.policies)}: give "
+                "one for every mode, or none"
+            )
+
+    @cached_property
+    def modes(self) -> tuple[int, ...]:
+        """The modes, in ascending order."""
+        return tuple(sorted(self.policies))
+
+    def flow_set(self, q: int) -> StateSet:
+        """C_q, where mode q flows."""
+        self._rows(np.array([q]))
+        return self.flow_sets[q]
+
+    def jump_set(self, q: int) -> StateSet:
+        """D_q, where mode q jumps."""
+        return Complement(self.flow_set(q))
+
+    def initial_mode(self, measured: np.ndarray) -> np.ndarray:
+        """The mode whose flow set, or start set, holds the first measurement most deeply.
+
+        Args:
+            measured: (n, p) measurements.
+
+        Returns:
+            (n,) int modes.
+        """
+        z = self.task.z(self.task.check_measurement(measured))
+        return self._deepest(self.modes, z, self.starts)
+
+    def step(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """One sample: jump where z lies in D_q, then u = pi_q(measured).
+
+        Args:
+            q: (n,) int modes.
+            measured: (n, p) measurements.
+
+        Returns:
+            u (n, m), inputs in the plant's units; q_next (n,) int, the modes after the jumps.
+
+        Raises:
+            BadInput: wrong shapes, values that are not finite, or unknown modes.
+        """
+        measured = self.task.check_measurement(measured)
+        q = np.asarray(q)
+        if q.shape != (len(measured),):
+            raise BadInput(
+                f"{len(measured)} measurements need q of shape ({len(measured)},), got {q.shape}"
+            )
+        rows_of = self._rows(q)
+        q_next = self._jump(q, self.task.z(measured), rows_of)
+        if q_next is not q:
+            rows_of = self._rows(q_next)
+        u = np.empty((len(measured), len(self.task.inputs)))
+        for mode, rows in rows_of.items():
+            u[rows] = self.policies[mode].act(measured[rows])
+        return u, q_next.astype(int)
+
+    def _jump(self, q: np.ndarray, z: np.ndarray, rows_of: dict[int, Rows]) -> np.ndarray:
+        """The modes (n,) after the jumps that z (n, d) calls for; q itself if it calls for none."""
+        q_next = q
+        for mode, rows in rows_of.items():
+            jumps = self.flow_sets[mode].signed_distance(z[rows]) > ON_EDGE
+            if len(self.modes) > 1 and np.count_nonzero(jumps):
+                others = [other for other in self.modes if other != mode]
+                q_next = q.copy() if q_next is q else q_next
+                jumping = np.arange(len(q))[rows][jumps]
+                q_next[jumping] = self._deepest(others, z[jumping])
+        return q_next
+
+    def _deepest(
+        self, modes: Sequence[int], z: np.ndarray, sets: Mapping[int, StateSet] | None = None
+    ) -> np.ndarray:
+        """That of the modes (n,) whose set, by default its flow set, holds z (n, d) most deeply."""
+        if len(modes) == 1:
+            return np.full(len(z), modes[0])
+        distances = [(sets or self.flow_sets)[q].signed_distance(z) for q in modes]
+        return np.array(modes)[np.argmin(distances, axis=0)]
+
+    def _rows(self, q: np.ndarray) -> dict[int, Rows]:
+        """The rows of q (n,) in each mode that has any.
+
+        Raises:
+            BadInput: a mode is unknown.
+        """
+        if len(q) == 1 and q[0] in self.modes:
+            return {int(q[0]): slice(None)}  # without a copy
+        rows = {mode: (q == mode).nonzero()[0] for mode in self.modes}
+        if sum(map(len, rows.values())) < len(q):
+            check_modes(q, self.modes)
+        return {mode: r for mode, r in rows.items() if len(r)}

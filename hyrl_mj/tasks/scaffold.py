@@ -1,0 +1,47 @@
+"""A task to start from: one Python file, one MJCF, and the tests that every task must pass."""
+
+from __future__ import annotations
+
+import keyword
+import re
+from importlib.util import find_spec
+from pathlib import Path
+
+from hyrl_mj import artifacts
+from hyrl_mj.errors import BadInput
+from hyrl_mj.tasks.registry import task_names
+
+TEMPLATES = Path(__file__).parents[1] / "templates" / "task"
+
+
+def write_task(name: str, folder: Path) -> list[Path]:
+    """Write `<name>.py`, `<name>.xml` and `test_<name>.py` into a folder; nothing is overwritten.
+
+    Returns:
+        The files.
+
+    Raises:
+        BadInput: the name cannot be one of a Python file, it is taken, or a file is there already.
+    """
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or keyword.iskeyword(name):
+        raise BadInput(
+            f"{name!r} cannot be the name of a task: give lower-case letters, digits and _, as my_robot"
+        )
+    if name in task_names() or find_spec(name) is not None:
+        what = "task" if name in task_names() else "Python package"
+        raise BadInput(f"there is a {what} {name} already: choose another name")
+    title = "".join(part.capitalize() for part in name.split("_"))
+    texts = {
+        folder / path.name.replace("my_robot", name): path.read_text(encoding="utf-8")
+        .replace("my_robot", name)
+        .replace("MyRobot", title)
+        for path in sorted(TEMPLATES.iterdir())
+        if path.is_file()
+    }
+    if there := [path for path in texts if path.exists()]:
+        raise BadInput(f"{there[0]} is there already: choose another name, or another folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    for path, text in texts.items():
+        with artifacts.replacing(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    return list(texts)

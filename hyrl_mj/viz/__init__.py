@@ -1,0 +1,25 @@
+"""Pictures, videos, tables and pages of what a run has found.
+
+The modules `arcs`, `diagnosis`, `encoding`, `figures`, `replay`, `report` and `viewing` import
+matplotlib, Pillow or a GL library, so they are imported only where they are needed.
+"""
+
+from hyrl_mj.viz.section import Section, critical_section
+from hyrl_mj.viz.summary import print_robustness, print_summary
+from hyrl_mj.viz.tables import replay_sentence, robustness_sentence
+
+__all__ = [
+    "Section",
+    "arcs",
+    "critical_section",
+    "diagnosis",
+    "encoding",
+    "figures",
+    "print_robustness",
+    "print_summary",
+    "replay",
+    "replay_sentence",
+    "report",
+    "robustness_sentence",
+    "viewing",
+]

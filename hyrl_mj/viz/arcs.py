@@ -1,0 +1,145 @@
+"""The arcs of a run: which starts are simulated under which noise, and which of them a replay shows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.game import LARGEST, Game, worst_signal
+from hyrl_mj.run_directory import Run
+from hyrl_mj.simulation import KINDS, AnyNoise, HybridArc, Noise, samples, simulate
+from hyrl_mj.viz.replay import Floor, Show
+from hyrl_mj.viz.section import Section, critical_section
+
+# What a replay plays.
+STARTS = ("critical", "paper", "latest")
+# The noise of the exact game, beside the kinds that are defined without one.
+WORST = "worst"
+NOISES = (*KINDS, WORST)
+
+
+def critical_start(run: Run) -> np.ndarray | None:
+    """The point (d,) of M* that is nearest to the replay starts, or None if M* is empty."""
+    points = run.critical_set.points
+    if not len(points):
+        return None
+    centre = np.mean(run.task.replay_starts, axis=0)
+    return points[np.linalg.norm(run.task.chart.difference(points, centre), axis=1).argmin()]
+
+
+def noisy_arcs(
+    run: Run,
+    z0: np.ndarray,
+    noise: str,
+    eps: float | None = None,
+    q0s: Sequence[int | None] = (None,),
+    horizon: float | None = None,
+    seed: int = 0,
+) -> dict[str, list[HybridArc]]:
+    """Simulate policy and hybrid controller from starts (n, d) under the same noise.
+
+    Args:
+        run: with its mode policies.
+        z0: starts.
+        noise: none, uniform, alternating, adversarial, or worst (of the exact game, for each of them).
+        eps: bound of the noise, by default the run's.
+        q0s: start modes of the hybrid controller, None to let it pick.
+        horizon: time [s], by default the task's.
+        seed: of the noise.
+
+    Returns:
+        An arc for each start, of "policy" and of "hyrl_q0" and so on, or "hyrl" for its own choice.
+
+    Raises:
+        BadInput: a value that cannot be used, or a worst case that cannot be played exactly.
+    """
+    if noise not in NOISES:
+        raise unknown("noise", noise, NOISES)
+    task = run.task
+    bound = task.check_noise(run.settings.noise if eps is None else eps)
+    steps = None if horizon is None else samples(task, horizon)
+    if noise == WORST:
+        run.check_exact()
+    game = Game(task, run.split, run.loops, max(bound, LARGEST)) if noise == WORST else None
+    found = {}
+    for name, loop in run.loops.items():
+        for q0 in q0s if name == "hyrl" else (None,):
+            signal: AnyNoise = (
+                worst_signal(game, name, loop, z0, bound, q0, steps)
+                if game
+                else Noise(noise, bound)
+            )
+            arcs = simulate(task, loop, z0, signal, q0, horizon, seed, name=name)
+            assert isinstance(arcs, list)
+            found[name if q0 is None else f"{name}_q{q0}"] = arcs
+    return found
+
+
+def replay_starts(run: Run) -> dict[str, np.ndarray]:
+    """The paper's replay starts (Section V), with one on M* of our own added: (d,) by name."""
+    starts = {f"start{i}": np.array(z) for i, z in enumerate(run.task.replay_starts)}
+    critical = critical_start(run)
+    return starts if critical is None else starts | {"critical": critical}
+
+
+def replay_arcs(
+    run: Run, noise: str = "alternating", eps: float | None = None
+) -> dict[tuple[str, str], HybridArc]:
+    """The replays by start and controller, by default under the paper's noise with the run's bound."""
+    starts, s = replay_starts(run), run.settings
+    z0 = np.array([*starts.values()], dtype=float)
+    found = noisy_arcs(run, z0, noise, eps, run.controller.modes, run.task.replay_time, s.seed)
+    return {
+        (name, who): arc
+        for who, arcs in found.items()
+        for name, arc in zip(starts, arcs, strict=True)
+    }
+
+
+def replay_shows(
+    run: Run, starts: str = "critical", noise: str | None = None, eps: float | None = None
+) -> list[Show]:
+    """What a replay plays.
+
+    Args:
+        run: with its arcs.
+        starts: "critical" for the start on M*, once for each start mode; "paper" for all of the paper's
+            at once; "latest" for what `hyrl-mj simulate --start` left.
+        noise: simulates anew under this kind of noise, instead of the arcs on disk.
+        eps: its bound, by default the run's.
+
+    Raises:
+        BadInput: a value that cannot be used.
+    """
+    if starts not in STARTS:
+        raise unknown("starts", starts, STARTS)
+    if starts == "latest":
+        if noise is not None or eps is not None:
+            raise BadInput(
+                "the latest simulation has its noise: give --noise and --eps to simulate"
+            )
+        latest = {who: [run.arc(run.latest_path(who))] for who in ("policy", "hyrl")}
+        return [Show(latest["policy"], latest["hyrl"])]
+    anew = noise is not None or eps is not None
+    arcs = replay_arcs(run, noise or "alternating", eps) if anew else run.arcs()
+    names = [name for name, who in arcs if who == "policy"]
+    modes = [f"hyrl_q{q}" for q in run.extended_sets.modes]
+    if starts == "paper":
+        names = [name for name in names if name != "critical"]
+        policy = [arcs[name, "policy"] for name in names]
+        return [Show(policy, [arcs[name, mode] for name in names for mode in modes])]
+    name = "critical" if "critical" in names else names[0]
+    return [Show([arcs[name, "policy"]], [arcs[name, mode]]) for mode in modes]
+
+
+def replay_floor(run: Run, overlap: bool = True) -> Floor:
+    """What a replay shows on the floor; of a chart of more than two dimensions a section."""
+    section = Section.of(run.task)
+    return Floor.of(
+        section.task,
+        critical_section(run),
+        section.partition(run.split if overlap else run.partition),
+        section.extended_sets(run.extended_sets) if overlap else None,
+    )

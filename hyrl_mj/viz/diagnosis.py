@@ -1,0 +1,145 @@
+"""What noise can do to a policy alone: a start that it loses, how, and a page about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from hyrl_mj import artifacts
+from hyrl_mj.errors import NoRenderer
+from hyrl_mj.game import NEVER, Game, worst_signal
+from hyrl_mj.policies import PolicyController
+from hyrl_mj.run_directory import Run
+from hyrl_mj.sets import Grid
+from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, simulate
+from hyrl_mj.viz.arcs import critical_start, replay_floor
+from hyrl_mj.viz.replay import Show, render_replay
+from hyrl_mj.viz.report import beginning, fill, film, pictures
+from hyrl_mj.viz.tables import episode_table, margin_table, margin_text, percent, score_table
+
+# In the run directory: the page, and the folder with all that is on it.
+PAGE, FOLDER = "diagnosis.html", "diagnosis"
+# Lost starts that are simulated, the nearest to the middle of the replay starts first.
+TRIED = 64
+# Of the replay of the policy alone [pixels].
+SIZE = (960, 720)
+
+
+def worst_arc(run: Run) -> HybridArc | None:
+    """A start that the policy loses, with the noise signal that it loses to; None if none was found.
+
+    Where the game can be played the signal is that of its adversary; else it is adversarial noise, tried
+    from starts of the task's.
+    """
+    task, eps, loop = run.task, run.settings.noise, PolicyController(run.policy)
+    if run.exact:
+        grid = Grid.with_cells(task.chart, run.settings.lattice)
+        game = Game(task, run.partition, {"policy": loop}, eps, grid=grid)
+        own = game.value("policy", eps)[-1, :-2]
+        z0 = game.lattice.grid.nodes[game.starts & game.winnable(eps) & (own >= NEVER)]
+        off = np.linalg.norm(task.chart.difference(z0, _middle(run)), axis=1)
+        z0 = z0[np.argsort(off, kind="stable")[:TRIED]]
+        if not len(z0):
+            return None
+        noise: AnyNoise = worst_signal(game, "policy", loop, z0, eps)
+    else:
+        z0, noise = task.starts(TRIED, np.random.default_rng(0)), Noise("adversarial", eps)
+        critical = critical_start(run)
+        if critical is not None and task.may_start(critical[None])[0]:
+            z0 = np.vstack([critical, z0])
+    arcs = simulate(task, loop, z0, noise, name="policy")
+    assert isinstance(arcs, list)
+    return next((arc for arc in arcs if arc.outcome != "reached"), None)
+
+
+def usual_arc(run: Run) -> HybridArc:
+    """The policy under the paper's noise, from M* if there is one."""
+    start = critical_start(run)
+    task, noise = run.task, Noise("alternating", run.settings.noise)
+    z0 = task.replay_starts[0] if start is None else start
+    arc = simulate(task, run.policy, z0, noise, horizon=task.replay_time, seed=run.settings.seed)
+    assert isinstance(arc, HybridArc)
+    return arc
+
+
+def _middle(run: Run) -> np.ndarray:
+    """The middle of the replay starts (d,)."""
+    return np.asarray(np.mean(run.task.replay_starts, axis=0))
+
+
+def write_worst(run: Run, arc: HybridArc | None, say: Callable[[str], None]) -> None:
+    """Write the arc and its replay; what an earlier diagnosis has left of them goes."""
+    path = run.path / FOLDER / "worst.npz"
+    for suffix in (".npz", ".mp4", ".png"):
+        path.with_suffix(suffix).unlink(missing_ok=True)
+    if arc is None:
+        return
+    arc.save(path)
+    try:
+        floor = replay_floor(run, overlap=False)
+        render_replay(run.task, [Show([arc])], path.with_suffix(".mp4"), floor=floor, size=SIZE)
+    except NoRenderer as error:
+        say(f"no video: {error}")
+
+
+def sentences(run: Run, content: Mapping[str, Any], arc: HybridArc | None) -> list[str]:
+    """What was found, for people: the critical set, what is lost to noise, the margin, the worst run."""
+    eps, task = content["eps"], run.task
+    where, unit = task.noise_on(content["everywhere"])
+    found = [run.critical_set.sentence(task)]
+    noise = f"noise on {where} of up to {eps:g} {unit}"
+    if content["game"] is not None:
+        score = content["game"]["scores"]["policy"][-1]
+        margin = content["game"]["margin"]["policy"]
+        found.append(
+            f"the worst {noise} makes it lose {percent(1 - score['won'])} of the starts that can be won"
+        )
+        found.append(
+            "it does not win all of them even without noise"
+            if margin is None
+            else f"it wins all of them up to noise {margin_text(margin, unit)}"
+        )
+    else:
+        worst = min(content["episodes"], key=lambda record: record["reached"])
+        if run.agent and run.agent.stochastic:
+            found.append("it draws its inputs, so that noisy episodes stand in for the worst case")
+        found.append(
+            f"under {worst['noise']} {noise} it loses {percent(1 - worst['reached'])} of the episodes "
+            f"that start {worst['region']}"
+        )
+    if arc is None:
+        found.append(f"no start was found that {noise} makes it lose")
+    else:
+        start = task.chart.format(arc.z[0])
+        outcome = arc.outcome.replace("_", " ")
+        found.append(
+            f"from {start} it ends {outcome} after {arc.t[-1]:.2f} s, under {arc.noise} noise"
+        )
+    return found
+
+
+def write_page(run: Run, content: Mapping[str, Any], arc: HybridArc | None) -> None:
+    """Write the page.
+
+    Raises:
+        BadArtifact: a picture on it is damaged.
+        BadInput: it cannot be written.
+    """
+    task, folder, path = run.task, run.path / FOLDER, run.path / PAGE
+    game = content["game"] is not None
+    page = fill(
+        "diagnosis.html",
+        run,
+        sentences=sentences(run, content, arc),
+        arc=arc,
+        video=film(folder / "worst.mp4"),
+        pictures=pictures(folder),
+        scores=score_table(task, content) if game else None,
+        margins=margin_table(task, content) if game else None,
+        episodes=episode_table(task, content) if content["episodes"] else None,
+        command=beginning(run.settings, run.path),
+    )
+    with artifacts.replacing(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")

@@ -1,0 +1,222 @@
+"""Charts as panels: a plane, or the ring of a periodic coordinate, and what is drawn on them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.patches import Circle, Patch, Wedge
+from matplotlib.ticker import FuncFormatter, MultipleLocator
+from scipy.ndimage import gaussian_filter
+
+from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.stages import Partition
+from hyrl_mj.tasks import Task
+from hyrl_mj.viz.figures.style import CASING, GREEN, GREY, INK, PALE, PAPER, angle, axis_label
+
+# Radii of a ring, its ticks, their labels, and the edge of its panel.
+OUTER, INNER, TICK, LABEL, EDGE = 1.0, 0.7, 1.05, 1.18, 1.25
+# Cells along the longest side on which it is asked where runs are over.
+OVER_CELLS, OVER_BLUR = 240, 1.5
+# Periods to either side that may be seen over time.
+TURNS = 9
+
+# By their words in the legend.
+Artists = dict[str, Artist]
+
+
+def is_ring(task: Task) -> bool:
+    """Whether the chart is one periodic coordinate."""
+    return task.chart.periodic == (True,)
+
+
+def drawable(task: Task) -> bool:
+    """Whether the chart, or a section of it, can be shown as a plane or a ring."""
+    return is_ring(task) or task.chart.dimension > 1
+
+
+def angles_on(axis: Any, task: Task, coordinate: int) -> None:
+    """Write an axis in multiples of pi if its coordinate is a periodic angle."""
+    if task.chart.units[coordinate] == "rad" and task.chart.periodic[coordinate]:
+        axis.set_major_locator(MultipleLocator(np.pi / 2))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: angle(value)))
+
+
+# ---- planes
+
+
+def plane(panel: Axes, task: Task) -> Artists:
+    """Make a panel the plane of a chart, with the states at which runs are over.
+
+    Returns:
+        What the legend needs.
+    """
+    (left, bottom), (right, top) = task.chart.low, task.chart.high
+    panel.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
+    panel.set(xlabel=axis_label(task, 0), ylabel=axis_label(task, 1))
+    for coordinate, axis in enumerate((panel.xaxis, panel.yaxis)):
+        angles_on(axis, task, coordinate)
+    found: Artists = {}
+    grid = Grid.with_cells(task.chart, OVER_CELLS)
+    over = task.failed(measured_at(task, grid.nodes)).reshape(grid.counts)
+    if over.any():
+        # Cells are no steps of an outline; half of the blurred mask is where it runs.
+        blurred = gaussian_filter(over.astype(float), OVER_BLUR, mode="nearest")
+        region(panel, GridSet(grid, 0.5 - blurred.ravel()), GREY, PALE, zorder=2.2)
+        found["obstacle, or out of bounds"] = patch(GREY, PALE)
+    if task.set_point is not None:
+        found |= cross(panel, *task.set_point)
+    return found
+
+
+def region(panel: Axes, members: GridSet, face: str, edge: str | None = None, **looks: Any) -> None:
+    """Fill a set in a plane, and draw its outline if it has a colour."""
+    grid, inside = members.grid, members.mask
+    x, y = grid.nodes.reshape(*grid.counts, 2).transpose(2, 1, 0)
+    values = members.values.reshape(grid.counts).T
+    if inside.any():
+        panel.contourf(x, y, values, [values.min() - 1, 0], colors=[face], **looks)
+    if edge and inside.any() and not inside.all():
+        panel.contour(x, y, values, [0], colors=[edge], linewidths=1.2, **looks)
+
+
+def patch(face: str, edge: str = INK) -> Patch:
+    """A filled field for a legend."""
+    return Patch(facecolor=face, edgecolor=edge, linewidth=0.8)
+
+
+# ---- rings
+
+
+def ring(panel: Axes, task: Task, radii: Sequence[float], words: str = "") -> None:
+    """Make a panel the ring of a periodic coordinate: circles, a clock face, and words in its middle."""
+    low, period = task.chart.low[0], task.chart.high[0] - task.chart.low[0]
+    for radius in radii:
+        panel.add_patch(Circle((0, 0), radius, fill=False, edgecolor=INK, linewidth=0.8, zorder=3))
+    # Quarters of the period, as hours on a clock face.
+    for quarter in low + period * np.arange(4) / 4:
+        at = np.array(on_ring(task, quarter))
+        panel.plot(*np.outer(at, (OUTER, TICK)), color=INK, linewidth=0.8)
+        panel.text(
+            at[0] * LABEL, at[1] * LABEL, value_text(task, quarter), ha="center", va="center"
+        )
+    panel.text(0, 0, axis_label(task, 0) + words, ha="center", va="center")
+    panel.set(xlim=(-EDGE, EDGE), ylim=(-EDGE, EDGE), aspect="equal", anchor="S")
+    panel.set_axis_off()
+
+
+def value_text(task: Task, value: float) -> str:
+    """A value of a ring's coordinate for people: "π/2" or "45"."""
+    return angle(value) if task.chart.units[0] == "rad" else f"{value:g}"
+
+
+def on_ring(task: Task, z: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+    """Where values (n,) of a periodic coordinate lie on the unit circle: (n,), (n,)."""
+    turned = 2 * np.pi * np.asarray(z) / (task.chart.high[0] - task.chart.low[0])
+    return np.cos(turned), np.sin(turned)
+
+
+def arcs(
+    panel: Axes,
+    task: Task,
+    classes: np.ndarray,
+    colours: Sequence[Any] | np.ndarray,
+    outer: float = OUTER,
+    inner: float = INNER,
+) -> None:
+    """Draw classes (N,) int of equally spaced values of a periodic coordinate as arcs of a ring.
+
+    Args:
+        panel: to draw on.
+        task: has the coordinate.
+        classes: indices into the colours.
+        colours: of the classes; None leaves it free.
+        outer, inner: radii of the ring.
+    """
+    period = task.chart.high[0] - task.chart.low[0]
+    step, origin = 360 / len(classes), 360 * task.chart.low[0] / period  # [degrees]
+    # Arcs begin half-way between nodes of different classes; one class all round has no beginning.
+    begins = np.flatnonzero(classes != np.roll(classes, 1))
+    ends = np.append(begins[1:], begins[:1] + len(classes))
+    if not len(begins):
+        begins, ends = np.array([0]), np.array([len(classes)])
+    # The shortest arcs last, with an edge: those of a single node are seen, too.
+    for arc in np.argsort(begins - ends):
+        theta = origin + step * (begins[arc] - 0.5), origin + step * (ends[arc] - 0.5)
+        colour = colours[classes[begins[arc]]]
+        if colour is not None:
+            panel.add_patch(
+                Wedge((0, 0), outer, *theta, width=outer - inner, color=colour, linewidth=0.8)
+            )
+
+
+# ---- what is drawn on both
+
+
+def measured_at(task: Task, z: np.ndarray) -> np.ndarray:
+    """What is measured (n, p) at chart points (n, d), without noise."""
+    plant = task.plant(len(z))
+    plant.set_state(*task.state(z))
+    return plant.measurement
+
+
+def cross(panel: Axes, x: float, y: float) -> Artists:
+    """Mark the set-point; returns as `plane`."""
+    looks: dict[str, Any] = {
+        "color": GREEN,
+        "markersize": 11,
+        "markeredgewidth": 2.5,
+        "linestyle": "none",
+    }
+    (drawn,) = panel.plot([x], [y], marker="+", clip_on=False, zorder=5, **looks)
+    return {"set-point": drawn}
+
+
+def set_point_lines(panel: Axes, task: Task, coordinate: int) -> Artists:
+    """Draw the set-point in a panel of a coordinate over time, round every period; returns as `plane`."""
+    if task.set_point is None:
+        return {}
+    low, high = panel.get_ylim()
+    period = task.chart.high[coordinate] - task.chart.low[coordinate]
+    turns = np.arange(-TURNS, TURNS + 1) if task.chart.periodic[coordinate] else np.zeros(1)
+    heights = task.set_point[coordinate] + period * turns
+    found: Artists = {}
+    for height in heights[(heights >= low) & (heights <= high)]:
+        found["set-point"] = panel.axhline(
+            height, color=GREEN, linewidth=1.2, linestyle="--", zorder=1
+        )
+    return found
+
+
+def dots(panel: Axes, points: np.ndarray, colour: str = INK) -> Artists:
+    """Mark the points of M* where they lie in the panel (n, 2); returns as `plane`."""
+    if not len(points):
+        return {}
+    x, y = points.T
+    # All the paper first: where points lie close together they make one line.
+    for fill, size in ((PAPER, 5.0), (colour, 3.6)):
+        (found,) = panel.plot(
+            x, y, "o", markersize=size, color=fill, markeredgewidth=0, clip_on=False, zorder=3.5
+        )
+    return {"critical set M*": found}
+
+
+def spokes(
+    panel: Axes, task: Task, z: np.ndarray, start: float, end: float, colour: str = INK
+) -> Artists:
+    """Mark points (n,) of M* on a ring by lines from radius `start` to `end`; returns as `plane`."""
+    x, y = on_ring(task, z)
+    for line, (_, width) in zip((PAPER, colour), CASING, strict=True):
+        panel.plot(
+            [start * x, end * x], [start * y, end * y], color=line, linewidth=width, zorder=3
+        )
+    return dots(panel, np.stack([start * x, start * y], axis=1), colour)
+
+
+def classes_of(partition: Partition) -> np.ndarray:
+    """The part (N,) int that alone holds each node; the number of parts where there are several."""
+    held = np.stack([part.mask for part in partition.parts])
+    return np.where(held.sum(axis=0) == 1, held.argmax(axis=0), len(held))

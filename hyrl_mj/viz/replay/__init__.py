@@ -1,0 +1,121 @@
+"""The replay: stage-1 policy and hybrid controller under the same noise, as a video or a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from PIL import Image
+
+from hyrl_mj import artifacts, mjcf
+from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.progress import Progress
+from hyrl_mj.simulation import HybridArc
+from hyrl_mj.tasks import Task
+from hyrl_mj.viz.encoding import ENCODERS, video
+from hyrl_mj.viz.replay.marks import Floor
+from hyrl_mj.viz.replay.screen import LAYOUTS, Screen
+from hyrl_mj.viz.replay.timeline import frame_times
+
+FASTEST, SLOWEST_MOTION = 240, 100  # frames/s, and times slower than real time
+FORMATS = (*ENCODERS, ".png")
+# A poster is drawn so many times larger and then reduced, for smooth edges.
+FINER = 2
+
+
+@dataclass(frozen=True)
+class Show:
+    """What is played together.
+
+    Attributes:
+        policy: arcs of the stage-1 policy.
+        hybrid: arcs of the hybrid controller; none to show the policy alone.
+    """
+
+    policy: Sequence[HybridArc]
+    hybrid: Sequence[HybridArc] = ()
+
+
+def render_replay(
+    task: Task,
+    shows: Sequence[Show],
+    path: Path,
+    *,
+    floor: Floor | None = None,
+    size: tuple[int, int] = (1280, 720),
+    fps: int = 30,
+    camera: str = "overhead",
+    layout: str = "side-by-side",
+    slow_motion: float = 1.0,
+) -> None:
+    """Write a video that plays shows one after the other; its poster beside it, or that alone.
+
+    Args:
+        task: what the arcs are of; its MJCF has a site "tracked", whose path is drawn.
+        shows: what to play.
+        path: of the video, an mp4 or a gif, with the poster as a PNG of the same name; a png for the
+            poster alone, the end of the first show.
+        floor: what to draw on the floor.
+        size: width and height of the video [pixels], even.
+        fps: frames a second.
+        camera: a camera of the MJCF.
+        layout: "side-by-side", or "overlay" for one panel with both controllers.
+        slow_motion: how many times slower it is around jumps.
+
+    Raises:
+        BadArtifact: an arc is not of this task or its model.
+        BadInput: nothing to play, or a value that cannot be used.
+        NoRenderer: there is no GL library or no video encoder.
+    """
+    if path.suffix not in FORMATS:
+        raise BadInput(f"{path} is no replay: give a name that ends in one of {', '.join(FORMATS)}")
+    if not shows or not all(show.policy for show in shows):
+        raise BadInput("there is nothing to replay: give shows with arcs of the policy")
+    if layout not in LAYOUTS:
+        raise unknown("layout", layout, LAYOUTS)
+    if not 1 <= fps <= FASTEST:
+        raise BadInput(f"no video has {fps} frames a second: give 1 to {FASTEST}")
+    if not 1 <= slow_motion <= SLOWEST_MOTION:
+        raise BadInput(
+            f"slow motion {slow_motion:g} cannot be played: give 1 (real time) to {SLOWEST_MOTION}"
+        )
+    mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
+    screens = [Screen(task, show.policy, show.hybrid, layout, camera, floor) for show in shows]
+    for screen in screens:
+        screen.check(size)
+    if path.suffix not in ENCODERS:
+        with closing(screens[0].canvas(size)) as canvas:
+            stage = screens[0].open(size, canvas)
+            stage.draw(screens[0].end)
+            large = stage.fine(FINER)
+    else:
+        large = _film(screens, path, size, fps, slow_motion)
+    with artifacts.replacing(path.with_suffix(".png")) as temporary:
+        Image.fromarray(large).reduce(FINER).save(temporary)
+
+
+def _film(
+    screens: Sequence[Screen], path: Path, size: tuple[int, int], fps: int, slow_motion: float
+) -> np.ndarray:
+    """Write the video; returns the end of the first show, `FINER` times larger."""
+    times = [frame_times(screen.end, fps, screen.jumps, slow_motion) for screen in screens]
+    done, large = 0, None
+    with (
+        closing(Progress("rendering", sum(map(len, times)), "frames")) as progress,
+        closing(screens[0].canvas(size)) as canvas,
+        video(path, *size, fps) as add,
+    ):
+        for screen, when in zip(screens, times, strict=True):
+            stage = screen.open(size, canvas)
+            for t in when:
+                add(stage.draw(t))
+                done += 1
+                progress.update(done)
+            if large is None:
+                large = stage.fine(FINER)
+    assert large is not None
+    return large

@@ -1,0 +1,165 @@
+"""The captions of a panel: a bar above the scene and one below."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from hyrl_mj.simulation import HybridArc
+from hyrl_mj.viz.colours import RGB
+from hyrl_mj.viz.replay.marks import BAD, GOOD, INK, OPEN, PAPER, WHITE
+from hyrl_mj.viz.replay.panel import Track
+
+EDGE = (205, 208, 213)
+SMALLEST_TEXT = 8  # [pixels]
+OUTCOMES: dict[str, tuple[str, RGB]] = {
+    "reached": ("arrived", GOOD),
+    "crashed": ("crashed", BAD),
+    "out_of_bounds": ("left the arena", BAD),
+    "stalled": ("stalled", BAD),
+    "unstable": ("simulation broke down", BAD),
+    "running": ("not there yet", OPEN),
+    "missed": ("ended off the goal", OPEN),
+}
+
+
+@dataclass(frozen=True)
+class Group:
+    """Tracks of one controller.
+
+    Attributes:
+        name: of the controller, for people.
+        tracks: of its arcs.
+    """
+
+    name: str
+    tracks: Sequence[Track]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where a panel has its captions.
+
+    Attributes:
+        width, height: of the panel [pixels].
+        finer: how many times larger it is drawn than it will be seen.
+    """
+
+    width: int
+    height: int
+    finer: int = 1
+
+    @cached_property
+    def text(self) -> int:
+        """Height of the letters [pixels]."""
+        seen = min(self.width / 32, self.height / 30) / self.finer
+        return max(SMALLEST_TEXT, int(seen)) * self.finer
+
+    @property
+    def bar(self) -> int:
+        """Height of a bar [pixels]."""
+        return 2 * self.text
+
+    @property
+    def scene_height(self) -> int:
+        """Height that is left to the scene [pixels]."""
+        return self.height - 2 * self.bar
+
+    @cached_property
+    def fonts(self) -> tuple[ImageFont.FreeTypeFont, ImageFont.FreeTypeFont]:
+        """A font for titles, and a smaller one."""
+        large = ImageFont.load_default(size=self.text)
+        small = ImageFont.load_default(size=round(0.85 * self.text))
+        assert isinstance(large, ImageFont.FreeTypeFont)
+        assert isinstance(small, ImageFont.FreeTypeFont)
+        return large, small
+
+    def above(self, title: str, arc: HybridArc) -> np.ndarray:
+        """The bar with title and noise: (bar, width, 3)."""
+        line = _Line(self)
+        line.words(title, INK, large=True)
+        line.at_right(_noise(arc))
+        return line.pixels
+
+    def below(self, groups: Sequence[Group], t: float) -> np.ndarray:
+        """The bar with what is going on at time t [s]: (bar, width, 3)."""
+        line = _Line(self)
+        longest = max(track.end for group in groups for track in group.tracks)
+        line.words(f"t = {min(t, longest):.2f} s", INK, room="t = 00.00 s")
+        for group in groups:
+            if len(groups) > 1:
+                line.words(group.name, INK)
+            if len(group.tracks) == 1:
+                self._one(line, group.tracks[0], t)
+            else:
+                self._several(line, group.tracks, t)
+        return line.pixels
+
+    def _one(self, line: _Line, track: Track, t: float) -> None:
+        arc, row = track.arc, track.arc.at(t)
+        if track.modes:
+            line.words(f"j = {arc.j[row]}", INK, room="j = 00")
+            line.badge(f"q = {track.task.mode_name(int(arc.q[row]))}", track.colour(row))
+        if t >= track.end:
+            line.badge(*OUTCOMES[_outcome(track)])
+
+    def _several(self, line: _Line, tracks: Sequence[Track], t: float) -> None:
+        over = Counter(_outcome(track) for track in tracks if t >= track.end)
+        for outcome, number in sorted(over.items()):
+            words, colour = OUTCOMES[outcome]
+            line.badge(f"{number} of {len(tracks)} {words}", colour)
+
+
+class _Line:
+    """A bar that is written on from left to right."""
+
+    def __init__(self, layout: Layout):
+        self._large, self._small = layout.fonts
+        self._image = Image.new("RGB", (layout.width, layout.bar), PAPER)
+        self._draw = ImageDraw.Draw(self._image)
+        self._gap, self._middle = layout.text, layout.bar // 2
+        self._x = self._gap / 2
+        edge = layout.width - 1
+        self._draw.line([(edge, 0), (edge, layout.bar)], EDGE)
+
+    @property
+    def pixels(self) -> np.ndarray:
+        return np.asarray(self._image)
+
+    def words(self, words: str, colour: RGB, *, large: bool = False, room: str = "") -> None:
+        """Words that take at least as much room as others."""
+        font = self._large if large else self._small
+        self._draw.text((self._x, self._middle), words, colour, font, anchor="lm")
+        self._x += max(font.getlength(words), font.getlength(room)) + self._gap
+
+    def badge(self, words: str, colour: RGB) -> None:
+        """White words on a coloured plate."""
+        pad, half = self._gap / 3, 0.75 * self._gap
+        end = self._x + self._small.getlength(words) + 2 * pad
+        plate = (self._x, self._middle - half, end, self._middle + half)
+        self._draw.rectangle(plate, colour)
+        at = (self._x + pad, self._middle)
+        self._draw.text(at, words, WHITE, self._small, anchor="lm")
+        self._x = end + self._gap / 2
+
+    def at_right(self, words: str) -> None:
+        """Words at the right end."""
+        x = self._image.width - self._gap / 2
+        self._draw.text((x, self._middle), words, OPEN, self._small, anchor="rm")
+
+
+def _noise(arc: HybridArc) -> str:
+    if arc.noise == "none" or arc.bound == 0:
+        return "no noise"
+    return f"{arc.noise} noise, eps = {arc.bound:g}"
+
+
+def _outcome(track: Track) -> str:
+    """The outcome of an arc; who crosses the finishing line elsewhere than at the set-point misses it."""
+    arc = track.arc
+    return "missed" if arc.outcome == "reached" and not arc.arrives(track.task) else arc.outcome

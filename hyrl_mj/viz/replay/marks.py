@@ -1,0 +1,203 @@
+"""What a replay adds to the scene: flat bars and discs of one colour, and what the floor shows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from scipy import ndimage
+
+from hyrl_mj import mjcf
+from hyrl_mj.stages import CriticalSet, ExtendedSets, Partition
+from hyrl_mj.tasks import Task
+from hyrl_mj.viz import colours
+from hyrl_mj.viz.colours import RGB, rgb
+
+MODE_COLOURS = tuple(map(rgb, colours.MODES))
+POLICY_COLOUR, INK, WHITE = map(rgb, (colours.POLICY, colours.INK, colours.WHITE))
+GOOD, BAD = rgb(colours.GOOD), rgb(colours.BAD)
+PAPER, OPEN = (246, 247, 249), (110, 116, 126)
+OVERLAP, CRITICAL, BOUND = rgb(colours.OVERLAP), (205, 30, 45), (120, 95, 200)
+
+# The site of the MJCF whose path is drawn.
+TRACKED = "tracked"
+# Heights above the tracked site [m], from the floor up: what lies higher is seen.
+ON_FLOOR, ON_SETS, ON_BOUND, ON_PATH, ON_TOP = -0.006, -0.004, -0.002, 0.0, 0.006
+THICKNESS = 0.004  # [m]
+FLYING = 0.3  # whose tracked site is so far above the floor flies [m]
+CRITICAL_RADIUS, OVERLAP_WIDTH = 0.02, 0.16  # [m]
+# Cells of a strip of the overlap: short enough to follow a bent coordinate.
+STRIP = 16
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def bar(
+    scene: mujoco.MjvScene,
+    start: np.ndarray,
+    end: np.ndarray,
+    colour: RGB,
+    *,
+    width: float,
+    height: float,
+    reach: float = 0.0,
+    alpha: float = 1.0,
+) -> None:
+    """Add a flat bar, which is drawn several times faster than a capsule.
+
+    Args:
+        scene: to add it to.
+        start, end: (3,) points [m].
+        colour: of it.
+        width: across [m].
+        height: above the points [m].
+        reach: by which it goes on beyond either end [m].
+        alpha: opacity, 0 to 1.
+    """
+    length = float(np.linalg.norm(end - start))
+    if length < 1e-9:
+        return
+    x, y, z = (end - start) / length
+    flat = np.hypot(x, y)
+    cos, sin = (x / flat, y / flat) if flat > 1e-6 else (1.0, 0.0)
+    # Along it, across it on the level, and what is left: NumPy's cross product takes longer than all of it.
+    axes = np.array([[x, -sin, -cos * z], [y, cos, -sin * z], [z, 0.0, flat]])
+    size = (length / 2 + reach, width / 2, THICKNESS / 2)
+    middle = (start + end) / 2 + height * UP
+    _add(scene, mujoco.mjtGeom.mjGEOM_BOX, size, middle, axes, colour, alpha)
+
+
+def disc(
+    scene: mujoco.MjvScene, centre: np.ndarray, radius: float, height: float, colour: RGB
+) -> None:
+    """Add a flat disc around a point (3,), a height above it [m]."""
+    kind, size = mujoco.mjtGeom.mjGEOM_CYLINDER, (radius, THICKNESS / 2, 0.0)
+    _add(scene, kind, size, centre + height * UP, np.eye(3), colour, 1.0)
+
+
+def _add(
+    scene: mujoco.MjvScene,
+    kind: mujoco.mjtGeom,
+    size: tuple[float, float, float],
+    pos: np.ndarray,
+    axes: np.ndarray,
+    colour: RGB,
+    alpha: float,
+) -> None:
+    """Add a geom to the scene, unless a very long path has used up all there are."""
+    if scene.ngeom < scene.maxgeom:
+        geom = scene.geoms[scene.ngeom]
+        rgba = np.array([*colour, 255 * alpha], dtype=np.float32) / 255
+        mujoco.mjv_initGeom(geom, kind, np.array(size), pos, axes.ravel(), rgba)
+        # MuJoCo leaves in it which geom of the model was drawn in this place before.
+        geom.objtype, geom.objid = mujoco.mjtObj.mjOBJ_UNKNOWN, -1
+        geom.specular = 0  # marks keep the colours of the captions
+        geom.transparent = int(alpha < 1)
+        scene.ngeom += 1
+
+
+class Tracker:
+    """Where the tracked site of a task's robot is.
+
+    Args:
+        task: its MJCF has a site "tracked".
+
+    Raises:
+        BadInput: it has none.
+    """
+
+    def __init__(self, task: Task):
+        self._task, self._data = task, mujoco.MjData(task.model)
+        self._site = mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_SITE, TRACKED)
+
+    def of_qpos(self, qpos: np.ndarray) -> np.ndarray:
+        """Positions (n, nq) -> points (n, 3) [m]."""
+        points = np.empty((len(qpos), 3))
+        for point, position in zip(points, qpos, strict=True):
+            self._data.qpos[:] = position
+            mujoco.mj_kinematics(self._task.model, self._data)
+            point[:] = self._data.site_xpos[self._site]
+        return points
+
+    def of_z(self, z: np.ndarray) -> np.ndarray:
+        """Chart points (n, d) -> points (n, 3) [m]."""
+        return self.of_qpos(self._task.qpos(z))
+
+
+@dataclass(frozen=True)
+class Floor:
+    """What is known before a run and lies on the floor.
+
+    Attributes:
+        critical: (k, 3) points of M* [m].
+        strips: (s, 2, 3) ends of the strips that make up the overlap of the extended sets [m], and
+        widths: (s,) of each [m].
+    """
+
+    critical: np.ndarray
+    strips: np.ndarray
+    widths: np.ndarray
+
+    @staticmethod
+    def of(
+        task: Task, critical: CriticalSet, partition: Partition, extended: ExtendedSets | None
+    ) -> Floor:
+        """Of the results of the stages, on a chart of one or two dimensions; no sets, no overlap."""
+        tracker, strips, widths = Tracker(task), [], []
+        half = partition.grid.spacing / 2
+        for ends in _strips(critical, partition, extended) if extended else ():
+            middle = ends.mean(axis=0)
+            side = middle + np.where(np.arange(len(half)) == 0, half, 0.0)
+            points = on_floor(task, tracker.of_z(np.vstack([ends, middle, side])))
+            strips.append(points[:2])
+            across = 2 * float(np.linalg.norm(points[3] - points[2]))
+            widths.append(OVERLAP_WIDTH if len(half) == 1 else across)
+        points = on_floor(task, tracker.of_z(critical.points))
+        return Floor(points, np.reshape(strips, (-1, 2, 3)), np.array(widths))
+
+    def draw(self, scene: mujoco.MjvScene) -> None:
+        """Add it to a scene."""
+        for (start, end), width in zip(self.strips, self.widths, strict=True):
+            # A little longer than it is, so that no gap is seen where the strips turn.
+            bar(scene, start, end, OVERLAP, width=width, height=ON_FLOOR, reach=width / 50)
+        for point in self.critical:
+            disc(scene, point, CRITICAL_RADIUS, ON_SETS, CRITICAL)
+
+
+def on_floor(task: Task, points: np.ndarray) -> np.ndarray:
+    """Where a robot casts its shadow when it is at points (n, 3) [m], if it flies; else these points."""
+    floor = mujoco.mj_name2id(task.model, mujoco.mjtObj.mjOBJ_GEOM, "floor")
+    if floor < 0:
+        return points
+    ground = task.model.geom_pos[floor, 2]
+    flies = points[:, 2] > ground + FLYING
+    height = np.where(flies, ground - 2 * ON_FLOOR, points[:, 2])
+    return np.column_stack([points[:, :2], height])
+
+
+def _strips(
+    critical: CriticalSet, partition: Partition, extended: ExtendedSets
+) -> Iterator[np.ndarray]:
+    """The overlap at M* in strips along the chart's last coordinate: the ends (2, d) of each.
+
+    Where the ways have joined again all sets overlap, and there is nothing to see.
+    """
+    grid = extended.sets[0].grid
+    if not len(critical.points):
+        return
+    joined = np.sum([part.contains(grid.nodes) for part in partition.parts], axis=0) > 1
+    # How deep a state lies in the second of the sets that hold it, negative inside.
+    depth = np.sort([s.signed_distance(grid.nodes) for s in extended.sets], axis=0)[1]
+    overlap = ((depth <= 0) & ~joined).reshape(grid.counts)
+    pieces, _ = ndimage.label(overlap)
+    at_critical = np.unique(pieces.ravel()[grid.nearest(critical.points)])
+    overlap = np.isin(pieces, at_critical[at_critical > 0])
+    for row in np.arange(overlap.size).reshape(-1, grid.counts[-1]):
+        inside = row[overlap.ravel()[row]]
+        for run in np.split(inside, np.flatnonzero(np.diff(inside) > 1) + 1):
+            for piece in range(0, len(run), STRIP):
+                strip = run[piece : piece + STRIP]
+                ends = grid.nodes[strip[[0, -1]]]
+                ends[:, -1] += [-grid.spacing[-1] / 2, grid.spacing[-1] / 2]
+                yield ends

@@ -1,0 +1,265 @@
+"""One panel of a replay: the arcs of one or more controllers in one scene, frame by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import mujoco
+import numpy as np
+
+from hyrl_mj import mjcf
+from hyrl_mj.errors import BadArtifact
+from hyrl_mj.rendering import GEOMS, Box, Canvas, SceneRenderer
+from hyrl_mj.simulation import HybridArc
+from hyrl_mj.tasks import Task
+from hyrl_mj.viz.colours import RGB
+from hyrl_mj.viz.replay import marks
+from hyrl_mj.viz.replay.marks import Floor, Tracker
+
+PATH_WIDTH, START_RADIUS, JUMP_RADIUS, CROSS = 0.032, 0.035, 0.055, 0.075  # [m]
+BOUND_WIDTH, BOUND_PIECES = 0.05, 4
+BOUND_ALPHA, GHOST_ALPHA = 0.45, 0.35
+# By which what is drawn anew is larger than what has moved [pixels].
+MARGIN = 2
+FAILED = ("crashed", "out_of_bounds", "stalled", "unstable")
+
+
+class Track:
+    """An arc, ready to be drawn.
+
+    Args:
+        task: what it is of.
+        arc: the arc.
+
+    Raises:
+        BadArtifact: it is of another task, or its states are not of the task's model.
+    """
+
+    def __init__(self, task: Task, arc: HybridArc):
+        self.task, self.arc = task, arc
+        self.end = float(arc.t[-1])
+        self.modes = arc.controller != "policy"
+        if arc.task != task.name:
+            raise BadArtifact(
+                f"an arc of {arc.task} cannot be replayed in the scene of {task.name}"
+            )
+        model, data = task.model, mujoco.MjData(task.model)
+        kind = mujoco.mjtState.mjSTATE_INTEGRATION
+        width = mujoco.mj_stateSize(model, kind)
+        if arc.state.shape != (len(arc.t), width):
+            raise BadArtifact(
+                f"the states of an arc of {arc.task} have shape {arc.state.shape}, model "
+                f"{mjcf.model_name(model)} needs {(len(arc.t), width)}: simulate it again"
+            )
+        self._tracker = Tracker(task)
+        # Positions (N, nq) at each row of the arc, those that were measured, and (N, 3) of the site.
+        self._qpos = np.empty((len(arc.t), model.nq))
+        for i, state in enumerate(arc.state):
+            mujoco.mj_setState(model, data, state, kind)
+            self._qpos[i] = data.qpos
+        # Noise moves what the chart tells of a position, and leaves the rest as it is.
+        noise = task.qpos(task.z(arc.measured)) - task.qpos(arc.z)
+        self._measured = self._qpos + noise
+        self.points = self._tracker.of_qpos(self._qpos)
+
+    @cached_property
+    def jumps(self) -> np.ndarray:
+        """Rows right after a jump."""
+        return np.flatnonzero(np.diff(self.arc.j) > 0) + 1
+
+    def colour(self, row: int) -> RGB:
+        """The colour of the path from a row on."""
+        colours = marks.MODE_COLOURS
+        return colours[self.arc.q[row] % len(colours)] if self.modes else marks.POLICY_COLOUR
+
+    def qpos(self, t: float) -> np.ndarray:
+        """The robot's position (nq,) at time t [s], between samples interpolated."""
+        return self._at(t, self._qpos)
+
+    def point(self, t: float) -> np.ndarray:
+        """The tracked site (3,) [m] at time t [s]."""
+        return self._tracker.of_qpos(self.qpos(t)[None])[0]
+
+    def measured(self, t: float) -> np.ndarray | None:
+        """Where the robot was measured at the last sample (nq,); None where it was not."""
+        found = self._measured[self.arc.at(t)]
+        return found if np.isfinite(found).all() and self.arc.bound > 0 else None
+
+    def bounds(self, t: float) -> list[np.ndarray]:
+        """For each noisy coordinate, points (k, 3) [m] from where to where it may be measured."""
+        z, qpos = self._at(t, self.arc.z), self.qpos(t)
+        noise = self.task.noise_in_chart(self.arc.bound)
+        share = np.linspace(-1, 1, BOUND_PIECES + 1)[:, None]
+        lines = [z + share * noise * (np.arange(len(z)) == i) for i in np.flatnonzero(noise)]
+        shifts = [self.task.qpos(line) - self.task.qpos(z[None]) for line in lines]
+        return [self._tracker.of_qpos(qpos + shift) for shift in shifts]
+
+    def _at(self, t: float, values: np.ndarray) -> np.ndarray:
+        """Values at the rows (N, c), interpolated at time t: (c,)."""
+        row = self.arc.at(t)
+        if row + 1 == len(values):
+            return values[row]
+        share = (t - self.arc.t[row]) / (self.arc.t[row + 1] - self.arc.t[row])
+        return (1 - share) * values[row] + share * values[row + 1]
+
+
+@dataclass
+class _Drawn:
+    """How far a track has been drawn: to which row, at which time, and where in the picture."""
+
+    row: int = 0
+    t: float = -1.0
+    box: Box = (0, 0, 0, 0)
+
+
+class Panel:
+    """Draws tracks in one scene, at times that never go back.
+
+    What stays as it is is drawn once: paths stay in the scene, and while the camera rests only what has
+    moved is drawn anew.
+
+    Args:
+        task: what the tracks are of.
+        tracks: with their robots.
+        canvas: to draw on.
+        width, height: of the picture [pixels].
+        camera: a camera of the MJCF; one on the robot follows that of the first track.
+        floor: what lies on the floor.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        tracks: Sequence[Track],
+        canvas: Canvas,
+        width: int,
+        height: int,
+        camera: str,
+        floor: Floor | None = None,
+    ):
+        self._tracks, self._camera = tracks, camera
+        found = mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
+        fixed = task.model.cam_mode[found] == mujoco.mjtCamLight.mjCAMLIGHT_FIXED
+        self._rests = fixed and task.model.cam_bodyid[found] == 0
+        # A bar for each row, and what else there is, with room to spare.
+        geoms = sum(len(track.arc.t) for track in tracks) + GEOMS * (1 + len(tracks))
+        self._renderer = SceneRenderer(task.model, width, height, geoms, canvas)
+        self._renderer.clear()
+        scene = self._renderer.scene
+        if floor:
+            floor.draw(scene)
+        for track in tracks:
+            marks.disc(scene, track.points[0], START_RADIUS, marks.ON_TOP, marks.INK)
+        self._renderer.keep()
+        self._drawn = [_Drawn() for _ in tracks]
+
+    def draw(self, t: float, picture: np.ndarray) -> None:
+        """Bring the picture (height, width, 3) of the last call to time t [s]."""
+        renderer = self._renderer
+        times = [min(t, track.end) for track in self._tracks]
+        fresh = self._drawn[0].t < 0
+        moved = [now > drawn.t for now, drawn in zip(times, self._drawn, strict=True)]
+        if not any(moved):
+            return
+        renderer.drop()
+        passed = [self._path(*each) for each in zip(self._tracks, self._drawn, times, strict=True)]
+        renderer.keep()
+        renderer.look(self._tracks[0].qpos(times[0]), self._camera)
+        boxes = [self._robot(*each) for each in zip(self._tracks, times, passed, strict=True)]
+        if fresh or not self._rests:
+            renderer.redraw(picture, (0, 0, renderer.width, renderer.height))
+        else:
+            for box, drawn, is_moved in zip(boxes, self._drawn, moved, strict=True):
+                if is_moved:
+                    self._again(picture, box, drawn.box)
+        for drawn, now, box in zip(self._drawn, times, boxes, strict=True):
+            drawn.t, drawn.box = now, box
+
+    def fine(self, finer: int) -> np.ndarray:
+        """The picture of the last call, `finer` times larger."""
+        return self._renderer.draw(finer)
+
+    def _path(self, track: Track, drawn: _Drawn, t: float) -> np.ndarray:
+        """Add to the scene what has been driven to the last sample; its points (k, 3)."""
+        scene, last, first = self._renderer.scene, track.arc.at(t), drawn.row
+        for row in range(first, last):
+            self._segment(track, row, track.points[row + 1])
+        for row in track.jumps[(track.jumps > first) & (track.jumps <= last)]:
+            height = marks.ON_TOP + marks.THICKNESS
+            marks.disc(scene, track.points[row], JUMP_RADIUS, height, marks.INK)
+            above = height + marks.THICKNESS
+            marks.disc(scene, track.points[row], 0.6 * JUMP_RADIUS, above, marks.WHITE)
+        drawn.row = last
+        return track.points[first : last + 1]
+
+    def _segment(self, track: Track, row: int, end: np.ndarray) -> None:
+        # Where a path comes back in another mode the later one is drawn over the earlier. Square ends
+        # as long as half the width close the gaps at bends.
+        height = marks.ON_PATH + 2e-4 * (track.arc.j[row] % 20)
+        marks.bar(
+            self._renderer.scene,
+            track.points[row],
+            end,
+            track.colour(row),
+            width=PATH_WIDTH,
+            height=height,
+            reach=PATH_WIDTH / 2,
+        )
+
+    def _robot(self, track: Track, t: float, passed: np.ndarray) -> Box:
+        """Add the robot, its ghost and the noise bound to the scene; where all of it is seen."""
+        renderer, scene = self._renderer, self._renderer.scene
+        first, point = scene.ngeom, track.point(t)
+        self._segment(track, track.arc.at(t), point)
+        over = t >= track.end
+        if not over and track.arc.bound > 0:
+            for line in track.bounds(t):
+                for start, end in pairwise(line):
+                    marks.bar(
+                        scene,
+                        start,
+                        end,
+                        marks.BOUND,
+                        width=BOUND_WIDTH,
+                        height=marks.ON_BOUND,
+                        alpha=BOUND_ALPHA,
+                    )
+        renderer.add_robot(track.qpos(t))
+        ghost = track.measured(t)
+        if ghost is not None and not over:
+            for number in renderer.add_robot(ghost):
+                scene.geoms[number].rgba[3] = GHOST_ALPHA
+                scene.geoms[number].transparent = 1
+        if over and track.arc.outcome in FAILED:
+            for side in ((CROSS, CROSS, 0.0), (CROSS, -CROSS, 0.0)):
+                marks.bar(
+                    scene,
+                    point - side,
+                    point + side,
+                    marks.BAD,
+                    width=PATH_WIDTH,
+                    height=marks.ON_TOP + 0.18,
+                )
+        geoms = scene.geoms[first : scene.ngeom]
+        points = np.vstack([passed, *[geom.pos for geom in geoms]])
+        radii = [renderer.reach(geom) for geom in geoms]
+        return self._box(points, np.array([JUMP_RADIUS] * len(passed) + radii))
+
+    def _box(self, points: np.ndarray, radii: np.ndarray) -> Box:
+        """The part of the picture in which balls around points (n, 3) are seen."""
+        renderer = self._renderer
+        low, high = renderer.extent(points, radii)
+        size = (renderer.width, renderer.height)
+        left, top = np.floor(low.min(axis=0) - MARGIN).clip(0, size).astype(int)
+        right, bottom = np.ceil(high.max(axis=0) + MARGIN).clip(0, size).astype(int)
+        return left, top, right, bottom
+
+    def _again(self, picture: np.ndarray, now: Box, before: Box) -> None:
+        """Draw anew where something is or was."""
+        left, top = min(now[0], before[0]), min(now[1], before[1])
+        right, bottom = max(now[2], before[2]), max(now[3], before[3])
+        if left < right and top < bottom:
+            self._renderer.redraw(picture, (left, top, right, bottom))
