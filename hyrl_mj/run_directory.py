@@ -25,7 +25,7 @@ from hyrl_mj.policies import (
     Policy,
     PolicyController,
     SampledPolicy,
-    opened,
+    reopen_agent,
 )
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.stages import CriticalSet, ExtendedSets, HybridController, Partition
@@ -66,7 +66,7 @@ class Run:
         """The policy of stage 1, or the agent."""
         if self.agent is None:
             return self._load_policy("policy.safetensors")
-        return opened(self.path, self.agent, self.task, self.settings.seed, self.function)
+        return reopen_agent(self.path, self.agent, self.task, self.settings.seed, self.function)
 
     @property
     def steady(self) -> Policy:

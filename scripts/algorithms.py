@@ -31,7 +31,7 @@ HEADINGS = (
 def able(task: str) -> list[str]:
     """The algorithms of SB3 that can have the inputs of a task."""
     discrete = hyrl_mj.get_task(task).levels is not None
-    return [name for name, needs in ALGORITHMS.items() if needs in (None, discrete)]
+    return [name for name, algorithm in ALGORITHMS.items() if algorithm.takes(discrete)]
 
 
 def row(task: str, algorithm: str, seed: int, noise: float, out: Path) -> tuple[list[str], bool]:

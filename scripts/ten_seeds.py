@@ -12,12 +12,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from hyrl_mj.pipeline.runs import run
 from rich.console import Console
 from rich.table import Table
 
 import hyrl_mj
 from hyrl_mj import progress
+from hyrl_mj.pipeline.runs import run
 
 PAPER = ("unit_circle", "vehicle")
 # A figure of a run: its heading, how it is read from robustness.json, and what it must be.

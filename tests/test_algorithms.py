@@ -22,9 +22,9 @@ from hyrl_mj.policies.algorithms import (
 # What can have the inputs of which task.
 CAN = [
     (name, task)
-    for name, discrete in ALGORITHMS.items()
+    for name, algorithm in ALGORITHMS.items()
     for task, levels in (("unit_circle", False), ("vehicle", True))
-    if discrete in (None, levels)
+    if algorithm.takes(levels)
 ]
 # Samples after which every network has been updated.
 FEW = {"ppo": 8_192, "a2c": 8_192, "dqn": 4_000, "sac": 2_000, "td3": 2_000, "ddpg": 2_000}

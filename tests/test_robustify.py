@@ -25,7 +25,7 @@ from hyrl_mj.learning import training
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.learning.settings import Settings
 from hyrl_mj.pipeline import steps as pipeline
-from hyrl_mj.policies.given import opened, take
+from hyrl_mj.policies.external import read_agent, reopen_agent
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import boundary, with_room
 from hyrl_mj.stages.partition import Partition
@@ -172,7 +172,7 @@ def test_a_zip_without_any_pickled_member_is_the_same_agent(dqn, vehicle, tmp_pa
     with zipfile.ZipFile(bare) as file:
         others = [name for name in file.namelist() if name != "policy.pth"]
     rewritten(bare, **dict.fromkeys(others))
-    assert take(vehicle, bare).agent == take(vehicle, dqn).agent
+    assert read_agent(vehicle, bare).agent == read_agent(vehicle, dqn).agent
 
 
 def test_a_stage_works_on_the_agent(robust, tmp_path):
@@ -248,17 +248,17 @@ def test_what_a_policy_is_given_as_is_remembered(circle, tmp_path):
     ]
     measured = np.linspace(0, 6, 50)[:, None]
     for k, (policy, algorithm, stochastic) in enumerate(cases):
-        given = take(circle, policy)
+        given = read_agent(circle, policy)
         assert (given.agent.algorithm, given.agent.stochastic) == (algorithm, stochastic)
         folder = tmp_path / str(k)
         folder.mkdir()
         given.store(folder)
         again = given.policy if algorithm == "function" else None
-        found = opened(folder, given.agent, circle, 0, again)
+        found = reopen_agent(folder, given.agent, circle, 0, again)
         acts = found.policy.act if stochastic else found.act
         before = given.policy.policy.act if stochastic else given.policy.act
         np.testing.assert_array_equal(acts(measured), before(measured))
-    assert take(circle, network).agent == take(circle, tmp_path / "p.safetensors").agent
+    assert read_agent(circle, network).agent == read_agent(circle, tmp_path / "p.safetensors").agent
     settings = preset(circle, "smoke", agent=given.agent)
     assert Settings.from_json(json.loads(json.dumps(settings.to_json()))) == settings
 

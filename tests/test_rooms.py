@@ -26,7 +26,9 @@ ROOMS = sorted(path.parent.name for path in PACKAGE.glob("*/__init__.py"))
 def test_others_use_only_what_a_room_exports(room):
     door = importlib.import_module(f"hyrl_mj.{room}")
     assert door.__doc__, "the door says what the room is for"
-    assert [name for name in door.__all__ if not hasattr(door, name) and not is_module(room, name)] == []
+    assert [
+        name for name in door.__all__ if not hasattr(door, name) and not is_module(room, name)
+    ] == []
     inside = {door.__name__, *GRAPH.find_descendants(door.__name__)}
     for module in inside - {door.__name__}:
         for importer in GRAPH.find_modules_that_directly_import(module) - inside:

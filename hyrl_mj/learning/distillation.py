@@ -10,7 +10,7 @@ import torch
 from hyrl_mj.errors import BadInput
 from hyrl_mj.learning.settings import Training
 from hyrl_mj.learning.training import build, export, single_threaded
-from hyrl_mj.policies import LAYOUTS, MlpPolicy, Policy
+from hyrl_mj.policies import ALGORITHMS, MlpPolicy, Policy
 from hyrl_mj.progress import Progress
 from hyrl_mj.tasks import Task
 
@@ -57,7 +57,7 @@ def distil(task: Task, policy: Policy, starts: Starts, settings: Training, seed:
     acting = [
         weights
         for name, weights in model.policy.named_parameters()
-        if name.startswith(LAYOUTS[settings.algorithm].parts)
+        if name.startswith(ALGORITHMS[settings.algorithm].parts)
     ]
     optimizer = torch.optim.Adam(acting, lr=settings.learning_rate)
     progress = Progress("distilling the agent", DISTILLING, "steps")

@@ -10,7 +10,7 @@ from typing import Any
 from hyrl_mj.errors import BadArtifact
 from hyrl_mj.learning import Training, preset
 from hyrl_mj.pipeline.steps import DIAGNOSIS, STAGES, Stage, extended_sets_stage, run_stage
-from hyrl_mj.policies import ALGORITHMS, FUNCTION, AnyPolicy, take
+from hyrl_mj.policies import ALGORITHMS, FUNCTION, AnyPolicy, read_agent
 from hyrl_mj.progress import Say
 from hyrl_mj.run_directory import Run, load_run, open_or_create, write_config
 from hyrl_mj.tasks import check_task, get_task
@@ -156,12 +156,12 @@ def _with_agent(
     """The run directory of an agent, with the agent in it; `values` are those of `preset`."""
     found = check_task(get_task(task))
     preset(found, preset_name, **values)  # a wrong value is found before the agent is looked at
-    given = take(found, policy, activation, stochastic, values["seed"])
-    settings = preset(found, preset_name, **values, agent=given.agent)
-    function = given.policy if given.agent.algorithm == FUNCTION else None
+    external = read_agent(found, policy, activation, stochastic, values["seed"])
+    settings = preset(found, preset_name, **values, agent=external.agent)
+    function = external.policy if external.agent.algorithm == FUNCTION else None
     run = open_or_create(out or Path("runs") / f"{found.name}_robust", settings, function)
     if not done(run, 0):
-        given.store(run.path)
+        external.store(run.path)
     return run
 
 

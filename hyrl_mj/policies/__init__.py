@@ -15,17 +15,15 @@ from hyrl_mj.policies.algorithms import (
     relative,
 )
 from hyrl_mj.policies.controllers import Controller, PolicyController, as_controller, check_modes
+from hyrl_mj.policies.external import FUNCTION, ONNX, Agent, AnyPolicy, read_agent, reopen_agent
 from hyrl_mj.policies.functions import from_callable
-from hyrl_mj.policies.given import FUNCTION, ONNX, Agent, AnyPolicy, opened, take
-from hyrl_mj.policies.mlp import ACTOR_CRITIC, LAYOUTS, MlpPolicy, Policy, SampledPolicy
+from hyrl_mj.policies.mlp import MlpPolicy, Policy, SampledPolicy
 from hyrl_mj.policies.sb3_zip import infer_algorithm
 
 __all__ = [
     "ACTIVATIONS",
-    "ACTOR_CRITIC",
     "ALGORITHMS",
     "FUNCTION",
-    "LAYOUTS",
     "ONNX",
     "TORCH_NAMES",
     "Agent",
@@ -44,7 +42,7 @@ __all__ = [
     "from_callable",
     "infer_algorithm",
     "load_agent",
-    "opened",
+    "read_agent",
     "relative",
-    "take",
+    "reopen_agent",
 ]

@@ -6,6 +6,7 @@ import importlib
 import inspect
 import sys
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from hyrl_mj.errors import BadInput, brief, unknown
@@ -13,20 +14,64 @@ from hyrl_mj.errors import BadInput, brief, unknown
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-# Of SB3, and whether an algorithm needs levels of the input (True), needs that there are none (False), or
-# takes either (None).
-ALGORITHMS: dict[str, bool | None] = {
-    "ppo": None,
-    "a2c": None,
-    "dqn": True,
-    "sac": False,
-    "td3": False,
-    "ddpg": False,
+
+@dataclass(frozen=True)
+class Algorithm:
+    """An algorithm of SB3: the inputs that it can have, and how its policies are built.
+
+    Attributes:
+        levels: True if it needs levels of the input, False if it needs a continuous input, None if it takes
+            either.
+        parts: beginnings of the names of the tensors of the network that acts, from observation to output.
+        activation: SB3's default between the layers.
+        squashed: whether the output goes through tanh and is stretched to the task's input limits;
+            otherwise it is clipped to them.
+        log_std: the tensor, or the layer beside the last one, that holds the logarithm of the standard
+            deviation during training; None if nothing is drawn from a distribution.
+    """
+
+    levels: bool | None
+    parts: tuple[str, ...]
+    activation: str
+    squashed: bool = False
+    log_std: str | None = None
+
+    def takes(self, discrete: bool) -> bool:
+        """Whether it can have levels of the input (`discrete`), or a continuous input."""
+        return self.levels in (None, discrete)
+
+    @property
+    def is_actor_critic(self) -> bool:
+        """Whether its policy network is trained directly, beside a value function (PPO and A2C)."""
+        return self.parts == _ACTOR_CRITIC.parts
+
+
+# SB3 1.x had layers that policy and value function share.
+_ACTOR_CRITIC = Algorithm(
+    levels=None,
+    parts=("mlp_extractor.shared_net.", "mlp_extractor.policy_net.", "action_net."),
+    activation="tanh",
+    log_std="log_std",
+)
+_DETERMINISTIC = Algorithm(levels=False, parts=("actor.mu.",), activation="relu", squashed=True)
+ALGORITHMS = {
+    "ppo": _ACTOR_CRITIC,
+    "a2c": _ACTOR_CRITIC,
+    "dqn": Algorithm(levels=True, parts=("q_net.q_net.",), activation="relu"),
+    "sac": Algorithm(
+        levels=False,
+        parts=("actor.latent_pi.", "actor.mu."),
+        activation="relu",
+        squashed=True,
+        log_std="actor.log_std",
+    ),
+    "td3": _DETERMINISTIC,
+    "ddpg": _DETERMINISTIC,
 }
 
 
 def algorithm_title(name: str) -> str:
-    """An algorithm for people: "PPO"; "TQC" of "sb3_contrib:TQC"."""
+    """Returns the display name of an algorithm: "PPO", or "TQC" for "sb3_contrib:TQC"."""
     return name.rpartition(":")[2].upper()
 
 
@@ -41,12 +86,12 @@ def check_algorithm(name: str, task: str, levels: int | None) -> None:
     if ":" not in name and name not in ALGORITHMS:
         raise unknown("algorithm", name, [*ALGORITHMS, "or module:Class of another one"])
     discrete = levels is not None
-    if ALGORITHMS[relative(name, levels)] in (None, discrete):
+    if ALGORITHMS[relative(name, levels)].takes(discrete):
         return
     which = f"takes no levels of the input, {task} has {levels}"
     if not discrete:
         which = f"needs levels of the input, {task} has none"
-    able = [other for other, needs in ALGORITHMS.items() if needs in (None, discrete)]
+    able = [other for other, algorithm in ALGORITHMS.items() if algorithm.takes(discrete)]
     raise BadInput(f"{name} {which}: choose one of {', '.join(able)}")
 
 

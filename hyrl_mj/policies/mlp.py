@@ -15,7 +15,7 @@ from threadpoolctl import ThreadpoolController
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.policies.activations import ACTIVATIONS
-from hyrl_mj.policies.algorithms import ALGORITHMS
+from hyrl_mj.policies.algorithms import ALGORITHMS, Algorithm
 from hyrl_mj.tasks import Task, get_task
 
 # A linear layer: weight (outputs, inputs) and bias (outputs,).
@@ -27,45 +27,6 @@ CHUNK = 4096
 BLAS = ThreadpoolController()
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Where an SB3 policy keeps the network that acts, and what its output means.
-
-    Attributes:
-        parts: beginnings of the names of its tensors, from the observation to the output.
-        activation: SB3's default between the layers.
-        squashed: whether the output goes through tanh and is stretched to the task's input limits;
-            otherwise it is clipped to them.
-        log_std: the tensor, or the layer beside the last one, with the logarithm of the spread that it
-            has while it learns; None where nothing is drawn from a distribution.
-    """
-
-    parts: tuple[str, ...]
-    activation: str
-    squashed: bool = False
-    log_std: str | None = None
-
-
-# SB3 1.x had layers that policy and value function share.
-ACTOR_CRITIC = Layout(
-    ("mlp_extractor.shared_net.", "mlp_extractor.policy_net.", "action_net."),
-    "tanh",
-    log_std="log_std",
-)
-DETERMINISTIC = Layout(("actor.mu.",), "relu", squashed=True)
-LAYOUTS = {
-    "ppo": ACTOR_CRITIC,
-    "a2c": ACTOR_CRITIC,
-    "dqn": Layout(("q_net.q_net.",), "relu"),
-    "sac": Layout(
-        ("actor.latent_pi.", "actor.mu."),
-        "relu",
-        squashed=True,
-        log_std="actor.log_std",
-    ),
-    "td3": DETERMINISTIC,
-    "ddpg": DETERMINISTIC,
-}
 # How far SB3 lets a layer's log_std go.
 LOG_STD_RANGE = (-20, 2)
 
@@ -114,7 +75,7 @@ class MlpPolicy(ObservationPolicy):
 
     Attributes:
         task: the task whose observation it reads and whose inputs it gives.
-        algorithm: the SB3 algorithm that trained it, one of `LAYOUTS`.
+        algorithm: the SB3 algorithm that trained it, one of `ALGORITHMS`.
         activation: what is between the layers, one of `ACTIVATIONS`.
         weights: all tensors of the SB3 policy by name, critics included, so that training can go on.
     """
@@ -126,7 +87,7 @@ class MlpPolicy(ObservationPolicy):
 
     def __post_init__(self) -> None:
         layers = _layers(self.weights, self.algorithm)
-        levels = ALGORITHMS[self.algorithm]
+        levels = ALGORITHMS[self.algorithm].levels
         if levels is None and "log_std" in self.weights:
             levels = False
         if levels is not None:
@@ -157,8 +118,8 @@ class MlpPolicy(ObservationPolicy):
         return self.task.input_levels
 
     @property
-    def _layout(self) -> Layout:
-        return LAYOUTS[self.algorithm]
+    def _kind(self) -> Algorithm:
+        return ALGORITHMS[self.algorithm]
 
     @property
     def hidden(self) -> tuple[int, ...]:
@@ -175,7 +136,7 @@ class MlpPolicy(ObservationPolicy):
         """What the last layer gives: the value of each "level", or the input, to "clip" or to "squash"."""
         if self._levels is not None:
             return "level"
-        return "squash" if self._layout.squashed else "clip"
+        return "squash" if self._kind.squashed else "clip"
 
     def inputs(self, observation: np.ndarray) -> np.ndarray:
         """Inputs (n, m) in the plant's units for observations (n, k)."""
@@ -190,7 +151,7 @@ class MlpPolicy(ObservationPolicy):
         Raises:
             BadInput: a policy of DQN, TD3 or DDPG, which has no distribution to draw from.
         """
-        if self._layout.log_std is None:
+        if self._kind.log_std is None:
             raise BadInput(
                 f"a {self.algorithm} policy has no distribution to draw from: use it as it is, "
                 "without stochastic"
@@ -204,7 +165,7 @@ class MlpPolicy(ObservationPolicy):
 
     def _log_std(self, observation: np.ndarray) -> np.ndarray:
         """Logarithm of the Gaussian's standard deviation, (n, m) or (m,)."""
-        name = self._layout.log_std or ""
+        name = self._kind.log_std or ""
         if name in self.weights:
             return self.weights[name]
         layer = _linear(self.weights, f"{name}.")
@@ -217,7 +178,7 @@ class MlpPolicy(ObservationPolicy):
     def _within_limits(self, outputs: np.ndarray) -> np.ndarray:
         """Inputs (n, m) of a continuous task for what the last layer gives (n, m)."""
         u, (low, high) = outputs.astype(float), self.task.input_limits
-        if self._layout.squashed:
+        if self._kind.squashed:
             u = low + (np.tanh(u) + 1) / 2 * (high - low)
         return np.clip(u, low, high)
 
@@ -311,11 +272,11 @@ def check_kind(task: Task, levels: bool) -> None:
 
 def _layers(weights: Mapping[str, np.ndarray], algorithm: str) -> list[Layer]:
     """The (weight, bias) pairs from observation to output, found by SB3's names for them."""
-    if algorithm not in LAYOUTS:
+    if algorithm not in ALGORITHMS:
         raise BadArtifact(
-            f"a policy of algorithm {algorithm!r} is unknown here: choose one of {', '.join(LAYOUTS)}"
+            f"a policy of algorithm {algorithm!r} is unknown here: choose one of {', '.join(ALGORITHMS)}"
         )
-    parts = [_linear(weights, part) for part in LAYOUTS[algorithm].parts]
+    parts = [_linear(weights, part) for part in ALGORITHMS[algorithm].parts]
     if not parts[-1]:
         raise BadArtifact(f"the file holds no network of a {algorithm} policy")
     return [layer for part in parts for layer in part]

@@ -19,7 +19,8 @@ import numpy as np
 
 from hyrl_mj.errors import BadArtifact
 from hyrl_mj.policies.activations import ACTIVATIONS, TORCH_NAMES
-from hyrl_mj.policies.mlp import ACTOR_CRITIC, LAYOUTS, MlpPolicy, check_kind
+from hyrl_mj.policies.algorithms import ALGORITHMS
+from hyrl_mj.policies.mlp import MlpPolicy, check_kind
 from hyrl_mj.tasks import Task
 
 REMEDY = "give the zip that SB3's model.save wrote, an .onnx file, or a policy.safetensors of a run"
@@ -95,12 +96,12 @@ def from_tensors(
     """The policy of an SB3 agent whose tensors and metadata have been read."""
     _check_plain(weights, about)
     algorithm = infer_algorithm(weights, about)
-    if LAYOUTS[algorithm] is ACTOR_CRITIC:
+    if ALGORITHMS[algorithm].is_actor_critic:
         check_kind(task, levels="log_std" not in weights)
     wrong = [name for name, weight in weights.items() if not np.isfinite(weight).all()]
     if wrong:
         raise BadArtifact(f"its tensor {wrong[0]} has weights that are not finite")
-    activation = _activation(about, activation) or LAYOUTS[algorithm].activation
+    activation = _activation(about, activation) or ALGORITHMS[algorithm].activation
     return MlpPolicy(task, algorithm, activation, weights)
 
 
@@ -131,7 +132,7 @@ def infer_algorithm(weights: Mapping[str, np.ndarray], about: Mapping[str, Any])
         return "td3" if any(name.startswith("critic.qf1.") for name in weights) else "ddpg"
     some = ", ".join(list(weights)[:3]) or "none"
     raise BadArtifact(
-        f"its tensors ({some}) are of no MLP policy of {', '.join(LAYOUTS)}: {REMEDY}"
+        f"its tensors ({some}) are of no MLP policy of {', '.join(ALGORITHMS)}: {REMEDY}"
     )
 
 

@@ -23,7 +23,7 @@ from hyrl_mj.game import (
 from hyrl_mj.learning import Training, symmetry
 from hyrl_mj.learning.distillation import distil, fits
 from hyrl_mj.learning.training import Score, train
-from hyrl_mj.policies import ACTOR_CRITIC, LAYOUTS, MlpPolicy, Policy, PolicyController
+from hyrl_mj.policies import ALGORITHMS, MlpPolicy, Policy, PolicyController
 from hyrl_mj.sets import GridSet
 from hyrl_mj.simulation import KINDS, Noise, closed_loop
 from hyrl_mj.stages.extended_sets import ExtendedSets, longest_hop, neighbourhood
@@ -126,7 +126,7 @@ def warm_start(
     distilled into their network. The policy's own weights would bring its decision along, which they do not
     let go of. Others go on from the weights, if these fit.
     """
-    if partition is None or LAYOUTS[settings.algorithm] is not ACTOR_CRITIC:
+    if partition is None or not ALGORITHMS[settings.algorithm].is_actor_critic:
         if isinstance(policy, MlpPolicy) and fits(task, settings, policy):
             return policy
         return None

@@ -1,4 +1,4 @@
-"""The agent that a run makes robust: what it was given as, and how the run directory holds it."""
+"""An external agent, which a run makes robust: how it is read, described and stored."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from hyrl_mj.tasks import Task
 
 @dataclass(frozen=True)
 class Agent:
-    """A policy that is given, in the place of one that stage 1 trains.
+    """Describes an external agent, which takes the place of the policy that stage 1 trains.
 
     Attributes:
         algorithm: of SB3 that trained it; "onnx" for a model in that format, "function" for code.
@@ -39,35 +39,35 @@ class Agent:
     stochastic: bool = False
 
     def __str__(self) -> str:
-        """It for people: "agent.zip (DQN, sampled)"."""
+        """Returns a one-line description: "agent.zip (DQN, sampled)"."""
         drawn = ", sampled" if self.stochastic else ""
         return f"{self.source or 'an agent of Python code'} ({self.title}{drawn})"
 
     @property
     def title(self) -> str:
-        """What it is for people: "DQN", "ONNX", "FUNCTION"."""
+        """Returns its kind for display: "DQN", "ONNX" or "FUNCTION"."""
         return algorithm_title(self.algorithm)
 
     @property
     def options(self) -> list[str]:
-        """How the command line is told of it."""
+        """Returns the command-line options that describe it."""
         options = ["--policy", self.source]
         if self.activation is not None:
             options += ["--activation", self.activation]
         return options + ["--stochastic"] * self.stochastic
 
 
-# What an agent may be given as.
+# The ways in which an agent can be passed in.
 AnyPolicy = str | Path | Policy | Callable[[np.ndarray], Any]
-# Kinds of agents beside those that SB3 trains.
+# Kinds of agents besides those that SB3 trains.
 ONNX, FUNCTION = "onnx", "function"
-# Measurements at which a function is asked who it is, and the decimals of its answers that count.
-ASKED, DECIMALS = 256, 6
+# Number of measurements from which the fingerprint of a function is made, and decimals that count in it.
+PROBES, DECIMALS = 256, 6
 
 
 @dataclass(frozen=True)
-class Given:
-    """An agent, ready to act and to be stored.
+class ExternalAgent:
+    """An agent that was trained elsewhere, ready to act and to be stored.
 
     Attributes:
         policy: what acts.
@@ -92,13 +92,13 @@ class Given:
             artifacts.write_json(path / "policy.json", content, kind="policy")
 
 
-def take(
+def read_agent(
     task: Task,
     policy: AnyPolicy,
     activation: str | None = None,
     stochastic: bool = False,
     seed: int = 0,
-) -> Given:
+) -> ExternalAgent:
     """An agent as it is given.
 
     Args:
@@ -112,11 +112,11 @@ def take(
     """
     if isinstance(policy, str | Path):
         path = Path(policy)
-        found: Policy = load_agent(path, task, activation, stochastic, seed)
+        loaded: Policy = load_agent(path, task, activation, stochastic, seed)
         if path.suffix != ".onnx":
-            return _network(found, task, str(path))
+            return _network(loaded, task, str(path))
         model = path.read_bytes()
-        return Given(found, Agent(ONNX, str(path), sha256(model).hexdigest()), model)
+        return ExternalAgent(loaded, Agent(ONNX, str(path), sha256(model).hexdigest()), model)
     if activation is not None or stochastic:
         raise BadInput(
             "activation and stochastic are about the file of an agent: leave them out, and give a policy "
@@ -124,11 +124,13 @@ def take(
         )
     if isinstance(policy, MlpPolicy | SampledPolicy):
         return _network(policy, task)
-    found = policy if isinstance(policy, Policy) else from_callable(policy, task)
-    return Given(found, Agent(FUNCTION, "", _fingerprint(found, task)))
+    function = policy if isinstance(policy, Policy) else from_callable(policy, task)
+    return ExternalAgent(function, Agent(FUNCTION, "", _fingerprint(function, task)))
 
 
-def opened(path: Path, agent: Agent, task: Task, seed: int, policy: AnyPolicy | None) -> Policy:
+def reopen_agent(
+    path: Path, agent: Agent, task: Task, seed: int, policy: AnyPolicy | None
+) -> Policy:
     """The agent of a run directory.
 
     Args:
@@ -147,13 +149,13 @@ def opened(path: Path, agent: Agent, task: Task, seed: int, policy: AnyPolicy | 
                 f"{path} is about a function, which no file holds: open it in Python with "
                 "hyrl_mj.load_run(path, policy=...)"
             )
-        given = take(task, policy)
-        if given.agent != agent:
+        external = read_agent(task, policy)
+        if external.agent != agent:
             raise BadInput(
                 f"{path} is about a function that answers otherwise than the policy given now: give the "
                 "one that the run was made with"
             )
-        return given.policy
+        return external.policy
     if policy is not None:
         raise BadInput(f"{path} holds its own policy: open it without another one")
     if agent.algorithm == ONNX:
@@ -161,7 +163,7 @@ def opened(path: Path, agent: Agent, task: Task, seed: int, policy: AnyPolicy | 
     return load_agent(path / "policy.safetensors", task, stochastic=agent.stochastic, seed=seed)
 
 
-def _network(policy: Policy, task: Task, source: str = "") -> Given:
+def _network(policy: Policy, task: Task, source: str = "") -> ExternalAgent:
     """A trained network, which acts by its mean or mode, or is sampled."""
     stochastic = isinstance(policy, SampledPolicy)
     network = policy.policy if isinstance(policy, SampledPolicy) else policy
@@ -173,7 +175,7 @@ def _network(policy: Policy, task: Task, source: str = "") -> Given:
     digest = sha256()
     for name in sorted(network.weights):
         digest.update(name.encode() + np.ascontiguousarray(network.weights[name]).tobytes())
-    return Given(
+    return ExternalAgent(
         policy,
         Agent(network.algorithm, source, digest.hexdigest(), network.activation, stochastic),
     )
@@ -186,14 +188,14 @@ def _fingerprint(policy: Policy, task: Task) -> str:
         BadInput: the answers are no inputs, or others when it is asked again.
     """
     rng = np.random.default_rng(0)
-    plant = task.plant(ASKED)
-    plant.set_state(*task.state(task.starts(ASKED, rng), rng))
+    plant = task.plant(PROBES)
+    plant.set_state(*task.state(task.starts(PROBES, rng), rng))
     measured = plant.measurement
     first, again = (np.asarray(policy.act(measured)) for _ in range(2))
-    wanted = (ASKED, len(task.inputs))
+    wanted = (PROBES, len(task.inputs))
     if first.shape != wanted or not np.issubdtype(first.dtype, np.number):
         raise BadInput(
-            f"the policy gives {first.dtype} of shape {first.shape} for {ASKED} measurements, {task.name} "
+            f"the policy gives {first.dtype} of shape {first.shape} for {PROBES} measurements, {task.name} "
             f"takes inputs of shape {wanted}"
         )
     if not np.isfinite(first).all():
