@@ -5,7 +5,7 @@ import pytest
 from planted import circle_policy, one_way_policy, sign_policy
 
 from hyrl_mj import extend, find_critical_set, make_partition
-from hyrl_mj.stages.extended_sets import distance_to
+from hyrl_mj.stages.critical_set import distance_to
 
 PI = np.pi
 # From the axis an obstacle of radius 0.75 at x = 1.5 can be passed only if x <= this.

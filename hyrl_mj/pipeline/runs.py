@@ -14,6 +14,7 @@ from hyrl_mj.policies import ALGORITHMS, FUNCTION, AnyPolicy, read_agent
 from hyrl_mj.progress import Say
 from hyrl_mj.run_directory import Run, load_run, open_or_create, write_config
 from hyrl_mj.tasks import check_task, get_task
+from hyrl_mj.viz import beginning
 
 
 def done(run: Run, index: int, stages: Sequence[Stage] = STAGES) -> bool:
@@ -167,8 +168,6 @@ def _with_agent(
 
 def extend_again(run: Run, horizon: float, say: Say = print) -> Run:
     """Run stages 4 and 5 with another horizon T [s], and keep it in `config.json` if that went well."""
-    from hyrl_mj.viz.report import beginning
-
     changed = Run(run.path, replace(run.settings, horizon=horizon), run.function)
     extended_sets_stage(changed, lambda text: say(f"extended-sets: {text}"))
     write_config(changed)

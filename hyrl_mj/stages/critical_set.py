@@ -256,3 +256,10 @@ def _pieces(task: Task, points: np.ndarray, reach: float) -> np.ndarray:
     tree = task.chart.tree(points)
     near = tree.sparse_distance_matrix(tree, reach)
     return connected_components(near, directed=False)[1]
+
+
+def distance_to(task: Task, critical: CriticalSet, z: np.ndarray) -> np.ndarray:
+    """Distance (n,) of chart points (n, d) to M*, in chart units; infinite if M* is empty."""
+    if not len(critical.points):
+        return np.full(len(z), np.inf)
+    return task.chart.tree(critical.points).query(task.chart.in_box(z))[0]

@@ -12,8 +12,7 @@ from hyrl_mj.policies import Controller
 from hyrl_mj.progress import Progress
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import Noise, closed_loop
-from hyrl_mj.stages.critical_set import CriticalSet
-from hyrl_mj.stages.extended_sets import distance_to
+from hyrl_mj.stages.critical_set import CriticalSet, distance_to
 from hyrl_mj.tasks import Outcome, Task
 
 # Episodes that are simulated together: memory does not grow with their number.

@@ -26,8 +26,9 @@ from hyrl_mj.learning.training import Score, train
 from hyrl_mj.policies import ALGORITHMS, MlpPolicy, Policy, PolicyController
 from hyrl_mj.sets import GridSet
 from hyrl_mj.simulation import KINDS, Noise, closed_loop
-from hyrl_mj.stages.extended_sets import ExtendedSets, longest_hop, neighbourhood
+from hyrl_mj.stages.extended_sets import ExtendedSets, neighbourhood
 from hyrl_mj.stages.partition import Partition, part_policies
+from hyrl_mj.stages.reachability import longest_hop
 from hyrl_mj.tasks import Outcome, Task
 
 # Of the starts of training episodes this share is where the game is lost, if it is; of the others this

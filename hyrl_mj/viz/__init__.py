@@ -4,6 +4,7 @@ The modules `arcs`, `diagnosis`, `encoding`, `figures`, `replay`, `report` and `
 matplotlib, Pillow or a GL library, so they are imported only where they are needed.
 """
 
+from hyrl_mj.viz.commands import beginning
 from hyrl_mj.viz.section import Section, critical_section
 from hyrl_mj.viz.summary import print_robustness, print_summary
 from hyrl_mj.viz.tables import replay_sentence, robustness_sentence
@@ -11,6 +12,7 @@ from hyrl_mj.viz.tables import replay_sentence, robustness_sentence
 __all__ = [
     "Section",
     "arcs",
+    "beginning",
     "critical_section",
     "diagnosis",
     "encoding",

@@ -15,8 +15,9 @@ from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, simulate
 from hyrl_mj.viz.arcs import critical_start, replay_floor
+from hyrl_mj.viz.commands import beginning
+from hyrl_mj.viz.page import fill, film, pictures
 from hyrl_mj.viz.replay import Show, render_replay
-from hyrl_mj.viz.report import beginning, fill, film, pictures
 from hyrl_mj.viz.tables import episode_table, margin_table, margin_text, percent, score_table
 
 # In the run directory: the page, and the folder with all that is on it.

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import os
-import shlex
-from base64 import b64encode
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from PIL import Image
-
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadInput
 from hyrl_mj.game import LIMIT, MAP_CLASSES
-from hyrl_mj.learning import Settings, Training, preset
+from hyrl_mj.learning import Settings, Training
 from hyrl_mj.policies import Agent, MlpPolicy
 from hyrl_mj.run_directory import Run
-from hyrl_mj.tasks import get_task
-from hyrl_mj.viz.figures import CAPTIONS, CLASS_COLOURS
+from hyrl_mj.viz.commands import changed, commands
+from hyrl_mj.viz.figures import CLASS_COLOURS
+from hyrl_mj.viz.page import fill, film, pictures
 from hyrl_mj.viz.tables import (
     Arcs,
     Table,
@@ -47,24 +42,6 @@ MEANINGS = (
     "Decided by what is measured, neither way can be held against the worst noise.",
     "Nothing is left to be decided: an obstacle, the edge of the arena, or the goal.",
 )
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A PNG in the page.
-
-    Attributes:
-        name: for people.
-        data: the file as a data URI.
-        width, height: [pixels].
-        caption: what it shows.
-    """
-
-    name: str
-    data: str
-    width: int
-    height: int
-    caption: str = ""
 
 
 @dataclass(frozen=True)
@@ -127,33 +104,9 @@ def render(run: Run) -> str:
         table=_settings(run.settings),
         training=_training(run.settings),
         versions=run.versions,
-        commands=_commands(run.settings, robustness),
-        changed=_changed(run),
+        commands=commands(run.settings, robustness),
+        changed=changed(run),
         classes=list(zip(MAP_CLASSES, CLASS_COLOURS, MEANINGS, strict=True)),
-    )
-
-
-def fill(template: str, run: Run, **values: Any) -> str:
-    """A page from its template, with what every page of a run says."""
-    environment = Environment(
-        loader=PackageLoader("hyrl_mj"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template(template).render(
-        # A name that is no Unicode must not keep the page from being written.
-        name=os.fsencode(run.path.resolve().name).decode("utf-8", "replace"),
-        title=run.task.name.replace("_", " ").capitalize(),
-        task=run.task,
-        settings=run.settings,
-        agent=run.agent,
-        exact=run.exact,
-        critical=run.critical_set,
-        unit=run.task.noise_on()[1],
-        percent=percent,
-        **values,
     )
 
 
@@ -165,38 +118,6 @@ def _tables(run: Run, robustness: Mapping[str, Any] | None) -> dict[str, Table |
         "margins": margin_table(task, found) if found["game"] else None,
         "episodes": episode_table(task, found) if found["episodes"] else None,
     }
-
-
-# ---- pictures
-
-
-def film(path: Path) -> dict[str, Any] | None:
-    """A replay and its poster, if both are there."""
-    poster = path.with_suffix(".png")
-    if not (path.is_file() and poster.is_file()):
-        return None
-    return {"data": _data(path, "video/mp4"), "poster": _picture(poster, "replay")}
-
-
-def pictures(folder: Path) -> list[Picture]:
-    """The figures that are there."""
-    paths = {name: folder / f"{name}.png" for name in CAPTIONS}
-    return [
-        _picture(path, name.replace("_", " "), CAPTIONS[name])
-        for name, path in paths.items()
-        if path.is_file()
-    ]
-
-
-def _picture(path: Path, name: str, caption: str = "") -> Picture:
-    with artifacts.reading(path), Image.open(path, formats=("PNG",)) as image:
-        image.verify()
-        return Picture(name, _data(path, "image/png"), *image.size, caption)
-
-
-def _data(path: Path, kind: str) -> str:
-    """A file as a data URI."""
-    return f"data:{kind};base64,{b64encode(path.read_bytes()).decode()}"
 
 
 # ---- numbers
@@ -273,7 +194,7 @@ def _episode_numbers(robustness: Mapping[str, Any]) -> list[Number]:
     ]
 
 
-# ---- stages, settings, commands
+# ---- stages and settings
 
 
 def _stages(
@@ -341,58 +262,3 @@ def _value(value: object) -> str:
     if isinstance(value, tuple):
         return ", ".join(map(str, value))
     return "by default" if value is None else f"{value}"
-
-
-def _commands(settings: Settings, robustness: Mapping[str, Any] | None) -> list[str]:
-    """What to type to repeat the run, and the examination if it was another than the run's own."""
-    s = settings
-    commands = [beginning(settings)]
-    if robustness and (
-        robustness["episodes"] or robustness["everywhere"] or robustness["eps"] != s.noise
-    ):
-        commands.append(_examination(robustness))
-    return commands
-
-
-def beginning(settings: Settings, out: Path | None = None) -> str:
-    """What begins such a run, or goes on with it: a command, or a call where the agent is no file."""
-    s, agent = settings, settings.stage1 if isinstance(settings.stage1, Agent) else None
-    if agent and not agent.source:
-        rest = "" if s.horizon is None else f", horizon={s.horizon}"
-        rest += "" if out is None else f", out={str(out)!r}"
-        return (
-            f"hyrl_mj.robustify({s.task!r}, policy, noise={s.noise}, seed={s.seed}, "
-            f"preset_name={s.preset!r}{rest})"
-        )
-    words = ["hyrl-mj", *(["robustify", s.task, *agent.options] if agent else ["run", s.task])]
-    words += ["--noise", f"{s.noise}", "--seed", f"{s.seed}", "--preset", s.preset]
-    if not agent and s.stage1.algorithm != get_task(s.task).algorithm:
-        words += ["--algorithm", s.stage1.algorithm]
-    if s.horizon is not None:
-        words += ["--horizon", f"{s.horizon}"]
-    if out is not None:
-        words += ["--out", f"{out}"]
-    return shlex.join(words)
-
-
-def _examination(robustness: Mapping[str, Any]) -> str:
-    command = ["hyrl-mj", "robustness", "RUN", "--eps", f"{robustness['eps']}"]
-    if robustness["everywhere"]:
-        command.append("--all-coordinates")
-    records = robustness["episodes"]
-    if records:
-        kinds = list(dict.fromkeys(r["noise"] for r in records))
-        one = [r for r in records if (r["noise"], r["controller"]) == (kinds[0], "hyrl")]
-        command += ["--episodes", f"{sum(r['episodes'] for r in one)}", "--noise", ",".join(kinds)]
-        if "seed" in robustness:  # older files do not tell
-            command += ["--seed", f"{robustness['seed']}"]
-    return shlex.join(command)
-
-
-def _changed(run: Run) -> list[str]:
-    """Settings that the command would not give again: those of a preset of another version."""
-    s = run.settings
-    again = preset(
-        run.task, s.preset, noise=s.noise, seed=s.seed, horizon=s.horizon, agent=run.agent
-    ).to_json()
-    return [_words(name) for name, value in s.to_json().items() if value != again[name]]

@@ -14,7 +14,7 @@ from benchmarks import Figure
 from benchmarks.runs import Runs
 from hyrl_mj import Run, Task, extend, find_critical_set
 from hyrl_mj.learning.training import build
-from hyrl_mj.stages import extended_sets
+from hyrl_mj.stages import reachability
 from hyrl_mj.stages.critical_set import PARTING, SAMPLES
 from hyrl_mj.stages.partition import PartPolicy
 from hyrl_mj.tasks import Outcome
@@ -44,13 +44,13 @@ def _extension(run: Run) -> Figure:
     task, settings = run.task, run.settings
     args = (task, run.policy, run.critical_set, run.partition, settings.noise)
     calls: list[tuple[Any, np.ndarray, dict[str, Any]]] = []
-    batched = extended_sets.closed_loop
+    batched = reachability.closed_loop
 
     def noted(task: Task, controller: Any, z0: np.ndarray, **options: Any) -> Any:
         calls.append((controller.policy, z0, options))
         return batched(task, controller, z0, **options)
 
-    with mock.patch.object(extended_sets, "closed_loop", noted):
+    with mock.patch.object(reachability, "closed_loop", noted):
         extend(*args)
     starts = sum(len(z0) for _, z0, _ in calls)
     predict = _Predict(run)

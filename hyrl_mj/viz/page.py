@@ -1,0 +1,88 @@
+"""What the pages of a run share: templates, pictures and films, all inside one file."""
+
+from __future__ import annotations
+
+import os
+from base64 import b64encode
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from PIL import Image
+
+from hyrl_mj import artifacts
+from hyrl_mj.run_directory import Run
+from hyrl_mj.viz.figures import CAPTIONS
+from hyrl_mj.viz.tables import percent
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A PNG in the page.
+
+    Attributes:
+        name: for people.
+        data: the file as a data URI.
+        width, height: [pixels].
+        caption: what it shows.
+    """
+
+    name: str
+    data: str
+    width: int
+    height: int
+    caption: str = ""
+
+
+def fill(template: str, run: Run, **values: Any) -> str:
+    """A page from its template, with what every page of a run says."""
+    environment = Environment(
+        loader=PackageLoader("hyrl_mj"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(
+        # A name that is no Unicode must not keep the page from being written.
+        name=os.fsencode(run.path.resolve().name).decode("utf-8", "replace"),
+        title=run.task.name.replace("_", " ").capitalize(),
+        task=run.task,
+        settings=run.settings,
+        agent=run.agent,
+        exact=run.exact,
+        critical=run.critical_set,
+        unit=run.task.noise_on()[1],
+        percent=percent,
+        **values,
+    )
+
+
+def film(path: Path) -> dict[str, Any] | None:
+    """A replay and its poster, if both are there."""
+    poster = path.with_suffix(".png")
+    if not (path.is_file() and poster.is_file()):
+        return None
+    return {"data": _data(path, "video/mp4"), "poster": _picture(poster, "replay")}
+
+
+def pictures(folder: Path) -> list[Picture]:
+    """The figures that are there."""
+    paths = {name: folder / f"{name}.png" for name in CAPTIONS}
+    return [
+        _picture(path, name.replace("_", " "), CAPTIONS[name])
+        for name, path in paths.items()
+        if path.is_file()
+    ]
+
+
+def _picture(path: Path, name: str, caption: str = "") -> Picture:
+    with artifacts.reading(path), Image.open(path, formats=("PNG",)) as image:
+        image.verify()
+        return Picture(name, _data(path, "image/png"), *image.size, caption)
+
+
+def _data(path: Path, kind: str) -> str:
+    """A file as a data URI."""
+    return f"data:{kind};base64,{b64encode(path.read_bytes()).decode()}"
