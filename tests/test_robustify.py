@@ -29,7 +29,7 @@ from hyrl_mj.policies.external import read_agent, reopen_agent
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import boundary, with_room
 from hyrl_mj.stages.partition import Partition
-from hyrl_mj.stages.retraining import ByGame, retrain, warm_start
+from hyrl_mj.stages.retraining import ByGame, WarmStart, mode_ground, retrain
 
 SMOKE = {"preset_name": "smoke", "say": str}
 
@@ -307,8 +307,8 @@ def ground(circle_run):
 
 
 def start_of(run, policy, ground, **changed):
-    settings, sets = replace(run.settings.stage6, **changed), run.extended_sets
-    return warm_start(run.task, policy, sets, 0, settings, 0, ground, run.partition)
+    settings = replace(run.settings.stage6, **changed)
+    return WarmStart(policy, run.partition).policy_for(ground, settings, 0)
 
 
 def test_a_function_is_distilled_part_by_part(circle_run, ground):
@@ -321,18 +321,27 @@ def test_a_function_is_distilled_part_by_part(circle_run, ground):
 
 def test_dqn_goes_on_from_weights_that_fit_and_else_afresh(robust, vehicle):
     run = hyrl_mj.load_run(robust[0])
-    assert start_of(run, run.policy, None, algorithm="dqn", options={}) is run.policy
+    assert (
+        start_of(
+            run, run.policy, mode_ground(vehicle, run.extended_sets, 0), algorithm="dqn", options={}
+        )
+        is run.policy
+    )
     function = hyrl_mj.from_callable(lambda o: np.zeros(len(o), dtype=int), vehicle)
-    assert start_of(run, function, None, algorithm="dqn", options={}) is None
+    assert (
+        start_of(
+            run, function, mode_ground(vehicle, run.extended_sets, 0), algorithm="dqn", options={}
+        )
+        is None
+    )
 
 
 def test_a_start_that_will_do_is_not_trained(circle_run, monkeypatch):
     monkeypatch.setattr(ByGame, "score", lambda ground, policy: (0.0, -0.5))
     monkeypatch.setattr("hyrl_mj.stages.retraining.train", None)
     run, settings = circle_run, circle_run.settings.stage6
-    found = retrain(
-        run.task, run.policy, run.extended_sets, 0, settings, 0, partition=run.partition
-    )
+    warm_start = WarmStart(run.policy, run.partition)
+    found = retrain(mode_ground(run.task, run.extended_sets, 0), settings, 0, warm_start=warm_start)
     assert (found.act(np.linspace(0.5, 2.4, 50)[:, None]) < 0).all()
 
 

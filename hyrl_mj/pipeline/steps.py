@@ -71,22 +71,19 @@ def extended_sets_stage(run: Run, say: Say) -> None:
 
 def retrain_stage(run: Run, say: Say) -> None:
     """Stages 6 and 7: train the policy of each mode."""
-    from hyrl_mj.stages.retraining import retrain
+    from hyrl_mj.stages.retraining import WarmStart, mode_ground, retrain
 
     s, sets = run.settings, run.extended_sets
     logs = run.path / "logs"
     policies: dict[int, MlpPolicy] = {}
     for q in sets.modes:
         policies[q] = retrain(
-            run.task,
-            run.steady,
-            sets,
-            q,
+            mode_ground(run.task, sets, q),
             s.stage6,
             s.seed,
-            [*policies.values()],
-            logs / f"mode_{q}",
-            run.partition,
+            warm_start=WarmStart(run.steady, run.partition),
+            others=[*policies.values()],
+            log_dir=logs / f"mode_{q}",
         )
     for q, policy in policies.items():
         policy.save(run.path / f"mode_{q}.safetensors")

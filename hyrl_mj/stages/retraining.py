@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -44,16 +45,50 @@ ALLOWED_DELAY = 0.03
 EPISODES, TOGETHER = 256, 64
 
 
+@dataclass(frozen=True)
+class WarmStart:
+    """What the first attempt of stage 6 can go on from.
+
+    Attributes:
+        policy: the stage-1 policy, or the agent.
+        partition: M_i, from stage 3.
+    """
+
+    policy: Policy
+    partition: Partition
+
+    def policy_for(self, ground: ModeGround, settings: Training, seed: int) -> MlpPolicy | None:
+        """Returns the policy that training goes on from; None if it has to start afresh.
+
+        PPO and A2C go on from pi_i, what the policy does on M_i, continued over the boundary (paper, Step
+        4), distilled into their network. The policy's own weights would bring its decision along, which
+        they do not let go of. Other algorithms go on from the weights, if these fit.
+
+        Args:
+            ground: of the mode.
+            settings: of the training.
+            seed: of weights and points of the distillation.
+        """
+        task, policy, partition = ground.task, self.policy, self.partition
+        if not ALGORITHMS[settings.algorithm].is_actor_critic:
+            if isinstance(policy, MlpPolicy) and fits(task, settings, policy):
+                return policy
+            return None
+        hop = longest_hop(task, policy, partition.grid)
+        near = neighbourhood(partition.grid, ground.extended.noise, hop)
+        index = partition.modes.index(ground.mode)
+        part = part_policies(task, policy, partition, near)[index]
+        return distil(task, part, ground.starts, settings, seed)
+
+
 def retrain(
-    task: Task,
-    policy: Policy,
-    extended: ExtendedSets,
-    mode: int,
+    ground: ModeGround,
     settings: Training,
     seed: int,
+    *,
+    warm_start: WarmStart | None = None,
     others: Iterable[MlpPolicy] = (),
     log_dir: Path | None = None,
-    partition: Partition | None = None,
 ) -> MlpPolicy:
     """Train the policy of one mode (paper, Step 6).
 
@@ -62,21 +97,18 @@ def retrain(
     on where the worst-case game is lost.
 
     Args:
-        task: what to learn.
-        policy: the stage-1 policy; with `settings.warm_start` the first attempt goes on from it.
-        extended: M_ext_i and W_i, from stage 5.
-        mode: the mode to train.
+        ground: where the mode has to win, and the judge of its policies; see `mode_ground`.
         settings: how to train.
         seed: of everything random; each mode and attempt derives its own from it.
+        warm_start: what the first attempt goes on from, if `settings.warm_start` asks for it.
         others: policies of other modes: if the mirror image of one is good enough here, it is taken.
         log_dir: where logs and checkpoints go.
-        partition: M_i, from stage 3, for a warm start with PPO.
 
     Returns:
         The best policy of all attempts and the one that they went on from, or the first mirror image that
-        will do.
+        is good enough.
     """
-    ground = (ByGame if Lattice.possible(task) else ByEpisodes)(task, extended, mode)
+    task, mode = ground.task, ground.mode
     if task.mirror is not None:
         for image in (symmetry.mirrored(other) for other in others):
             if ground(image) >= ground.enough:
@@ -85,13 +117,13 @@ def retrain(
     for attempt in range(settings.attempts):
         draw = int(np.random.SeedSequence([seed, 1 + mode, attempt]).generate_state(1)[0])
         warm = None
-        if settings.warm_start and not attempt:
-            warm = warm_start(task, policy, extended, mode, settings, draw, ground, partition)
+        if warm_start is not None and settings.warm_start and not attempt:
+            warm = warm_start.policy_for(ground, settings, draw)
         if warm is not None:
             best = ground(warm), warm
             if best[0] >= ground.enough:
                 return warm
-        found = train(
+        trained = train(
             task,
             settings,
             seed=draw,
@@ -102,38 +134,18 @@ def retrain(
             log_dir=log_dir,
             label=f"mode {mode}" + (f", attempt {attempt + 1}" if attempt else ""),
         )
-        score = ground(found)
+        score = ground(trained)
         if best is None or score > best[0]:
-            best = score, found
+            best = score, trained
         if score >= ground.enough:
             break
     assert best is not None
     return best[1]
 
 
-def warm_start(
-    task: Task,
-    policy: Policy,
-    extended: ExtendedSets,
-    mode: int,
-    settings: Training,
-    seed: int,
-    ground: ModeGround,
-    partition: Partition | None,
-) -> MlpPolicy | None:
-    """What the first attempt goes on from; None if it has to start afresh.
-
-    PPO and A2C go on from pi_i, what the policy does on M_i, continued over the boundary (paper, Step 4),
-    distilled into their network. The policy's own weights would bring its decision along, which they do not
-    let go of. Others go on from the weights, if these fit.
-    """
-    if partition is None or not ALGORITHMS[settings.algorithm].is_actor_critic:
-        if isinstance(policy, MlpPolicy) and fits(task, settings, policy):
-            return policy
-        return None
-    near = neighbourhood(partition.grid, extended.noise, longest_hop(task, policy, partition.grid))
-    part = part_policies(task, policy, partition, near)[partition.modes.index(mode)]
-    return distil(task, part, ground.starts, settings, seed)
+def mode_ground(task: Task, extended: ExtendedSets, mode: int) -> ModeGround:
+    """The ground of a mode: judged by the worst-case game where it can be played, else by episodes."""
+    return (ByGame if Lattice.possible(task) else ByEpisodes)(task, extended, mode)
 
 
 class ModeGround(ABC):
@@ -156,7 +168,7 @@ class ModeGround(ABC):
     noise: Noise
 
     def __init__(self, task: Task, extended: ExtendedSets, mode: int):
-        self.task, self.extended = task, extended
+        self.task, self.extended, self.mode = task, extended, mode
         self.bound = task.noise_in_chart(extended.noise)
         index = extended.modes.index(mode)
         self.within = extended.sets[index].dilated_by_box(self.bound)
