@@ -1,4 +1,4 @@
-"""The doctor: what this machine has, what it lacks, and how to mend that."""
+"""`hyrl-mj doctor`: which libraries this machine has, what it lacks, and how to mend that."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from hyrl_mj.errors import NoRenderer
 from hyrl_mj.rendering import GL_CURE
 from hyrl_mj.viz.encoding import video
 
-# Distributions whose versions matter; not imported for it, since torch takes seconds.
+# Distributions whose versions matter. Read from their metadata: importing torch takes seconds.
 DISTRIBUTIONS = (
     "mujoco",
     "gymnasium",
@@ -34,7 +34,7 @@ DISTRIBUTIONS = (
 )
 RENDER_TIMEOUT = 60.0  # [s]
 
-# Draws for half a second; prints what draws and how often.
+# Draws for half a second; prints the name of the GL device and its frames per second.
 _FRAMES = """
 from time import perf_counter
 from hyrl_mj.errors import HyrlError
@@ -58,18 +58,12 @@ except HyrlError as error:
 
 
 def report() -> tuple[list[str], bool]:
-    """Examine this machine.
+    """Examines this machine.
 
     Returns:
-        Lines for people, with the cure for what is missing; whether all is well.
+        Lines to print, with the cure for what is missing; whether all is well.
     """
-    lines = [f"python             {platform.python_version()}"]
-    missing = []
-    for name in DISTRIBUTIONS:
-        version = _version(name)
-        lines.append(f"{name:<18} {version or 'MISSING'}")
-        if version is None:
-            missing.append(name)
+    lines, missing = versions()
     if missing:
         lines.append(f"cure: pip install {' '.join(missing)}")
     (device, picture), film = _rendering(), _encoding_problem()
@@ -82,6 +76,14 @@ def report() -> tuple[list[str], bool]:
     return lines, well
 
 
+def versions() -> tuple[list[str], list[str]]:
+    """Returns a line per distribution with its version, and the names of those that are missing."""
+    installed = {name: _version(name) for name in DISTRIBUTIONS}
+    lines = [f"{name:<18} {version or 'MISSING'}" for name, version in installed.items()]
+    missing = [name for name, version in installed.items() if version is None]
+    return [f"python             {platform.python_version()}", *lines], missing
+
+
 def _version(name: str) -> str | None:
     try:
         return metadata.version(name)
@@ -90,9 +92,10 @@ def _version(name: str) -> str | None:
 
 
 def _rendering() -> tuple[str, str | None]:
-    """What renders and how fast; why no picture can be rendered, and the cure, None if one can.
+    """Draws in a child process, because a broken GL driver may take its process down.
 
-    In a child process: a broken GL driver may take its process down.
+    Returns:
+        The GL device and its speed; why nothing can be drawn and the cure, or None if it can.
     """
     package = str(Path(__file__).resolve().parents[1])
     paths = os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH")]))
@@ -123,7 +126,7 @@ def _signal(number: int) -> str:
 
 
 def _encoding_problem() -> str | None:
-    """Why no video can be encoded, and the cure; None if one can."""
+    """Returns why no video can be encoded, and the cure; None if one can."""
     with tempfile.TemporaryDirectory() as folder:
         try:
             with video(Path(folder) / "trial.mp4", 64, 48, 10) as add:

@@ -1,6 +1,9 @@
-"""The doctor finds what is missing, and says how to mend it."""
+"""`hyrl-mj doctor` finds what is missing, and says how to mend it."""
 
 from __future__ import annotations
+
+import subprocess
+import sys
 
 import imageio_ffmpeg
 import pytest
@@ -16,14 +19,27 @@ def healthy(monkeypatch):
     monkeypatch.setattr(doctor, "_encoding_problem", lambda: None)
 
 
-def test_versions_without_importing(healthy):
+def test_versions_without_importing():
+    code = (
+        "import sys; from hyrl_mj import doctor; lines, missing = doctor.versions();"
+        "print(*lines, sep='\\n'); print('missing:', missing);"
+        "print('imported:', {'torch', 'stable_baselines3', 'mediapy', 'matplotlib'} & set(sys.modules))"
+    )
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    *lines, missing, imported = child.stdout.splitlines()
+    assert missing == "missing: []"
+    assert imported == "imported: set()"
+    assert [line.split()[0] for line in lines] == ["python", *doctor.DISTRIBUTIONS]
+    assert all(line.split()[1][0].isdigit() for line in lines)
+
+
+def test_a_healthy_machine(healthy):
     lines, well = doctor.report()
     text = "\n".join(lines)
     assert well, text
     assert "cure" not in text
     assert "a rasteriser" in text
-    for name in ("python", *doctor.DISTRIBUTIONS):
-        assert any(line.startswith(name + " ") for line in lines)
+    assert lines[: len(doctor.DISTRIBUTIONS) + 1] == doctor.versions()[0]
 
 
 def test_a_missing_distribution(healthy, monkeypatch):
