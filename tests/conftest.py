@@ -6,10 +6,17 @@ import os
 # ten times as long as none.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import hypothesis
 import pytest
 
 import hyrl_mj
 from hyrl_mj.tasks.scaffold import write_task
+
+# The same examples everywhere, whatever the speed of the machine.
+hypothesis.settings.register_profile(
+    "repeatable", derandomize=True, deadline=None, database=None, max_examples=50
+)
+hypothesis.settings.load_profile("repeatable")
 
 
 @pytest.fixture(scope="session")
@@ -39,3 +46,12 @@ def puck(tmp_path_factory):
     assert continuous != text
     path.write_text(continuous)
     return hyrl_mj.get_task(path)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item):
+    """In CI a skipped test has failed: everything that the tests need is installed there."""
+    report = yield
+    if "CI" in os.environ and report.skipped and not hasattr(report, "wasxfail"):
+        report.outcome, report.longrepr = "failed", f"skipped in CI: {report.longrepr}"
+    return report

@@ -504,7 +504,8 @@ def test_what_is_no_function_is_refused(circle):
 
 def onnx_file(folder, weight, bias, rows="n", integers=False, dtype=np.float32):
     """An ONNX file of a linear layer, (n, k) -> (n, m); with `integers` the number of the greatest."""
-    onnx = pytest.importorskip("onnx")
+    import onnx
+
     kind = onnx.helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
     nodes = [onnx.helper.make_node("Gemm", ["o", "w", "b"], ["linear"], transB=1)]
     given = onnx.helper.make_tensor_value_info("o", kind, [rows, weight.shape[1]])
@@ -524,7 +525,9 @@ def onnx_file(folder, weight, bias, rows="n", integers=False, dtype=np.float32):
 
 @pytest.fixture
 def runtime():
-    return pytest.importorskip("onnxruntime")
+    import onnxruntime
+
+    return onnxruntime
 
 
 @pytest.fixture

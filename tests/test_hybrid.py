@@ -2,8 +2,12 @@
 
 import numpy as np
 import pytest
+from drawn import points
+from hypothesis import given
+from hypothesis import strategies as st
 from planted import AnalyticSet, ChartPolicy, ideal_controller, random_states
 
+import hyrl_mj
 from hyrl_mj import BadInput, HybridController
 from hyrl_mj.sets import Everything
 
@@ -12,12 +16,17 @@ def constant(task, value):
     return ChartPolicy(task, lambda z: np.full((len(z), 1), value))
 
 
-@pytest.fixture
+def states_of(name):
+    """Measurements (n, d) of one of the paper's tasks, also beyond its chart."""
+    return points(hyrl_mj.get_task(name).chart)
+
+
+@pytest.fixture(scope="module")
 def two(vehicle):
     return ideal_controller(vehicle, overlap=0.2)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def three(circle):
     """Three modes around the circle, each centred on its own third, half-width 1.3 rad."""
     centres = {1: 0.0, 4: 2 * np.pi / 3, 7: 4 * np.pi / 3}
@@ -34,10 +43,10 @@ def three(circle):
 # ---- jumps
 
 
-def test_it_jumps_exactly_on_the_jump_set(two, vehicle):
-    z = random_states(vehicle, 2000, np.random.default_rng(0))
+@given(z=states_of("vehicle"))
+def test_it_jumps_exactly_on_the_jump_set(two, z):
     for q in two.modes:
-        modes = np.full(2000, q)
+        modes = np.full(len(z), q)
         _, after = two.step(modes, z)
         np.testing.assert_array_equal(after != modes, two.jump_set(q).contains(z))
 
@@ -93,11 +102,13 @@ def test_a_single_mode_never_jumps(vehicle):
         np.testing.assert_array_equal(controller.initial_mode(z), 0)
 
 
-def test_flow_and_jump_set_meet_on_the_boundary_only(two, vehicle):
-    z = random_states(vehicle, 1000, np.random.default_rng(0))
+@given(z=states_of("vehicle"))
+def test_flow_and_jump_set_meet_on_the_boundary_only(two, z):
     flow, jump = two.flow_set(0), two.jump_set(0)
-    np.testing.assert_array_equal(flow.signed_distance(z), -jump.signed_distance(z))
-    np.testing.assert_array_equal(flow.contains(z), ~jump.contains(z))
+    distance = flow.signed_distance(z)
+    np.testing.assert_array_equal(distance, -jump.signed_distance(z))
+    np.testing.assert_array_equal(flow.contains(z) & jump.contains(z), distance == 0)
+    assert (flow.contains(z) | jump.contains(z)).all()
 
 
 # ---- a pure function
@@ -117,15 +128,15 @@ def test_step_is_pure(two, vehicle):
     assert not np.shares_memory(first[1], q)
 
 
-def test_a_batch_gives_what_its_rows_give(three, circle):
-    z = random_states(circle, 300, np.random.default_rng(0))
-    q = np.array(three.modes)[np.arange(300) % 3]
+@given(z=states_of("unit_circle"), modes=st.lists(st.sampled_from([1, 4, 7]), min_size=8))
+def test_a_batch_gives_what_its_rows_give(three, z, modes):
+    q = np.array(modes[: len(z)])
     u, after = three.step(q, z)
-    for i in range(300):
+    assert u.shape == (len(z), 1)
+    assert after.dtype.kind == "i"
+    for i in range(len(z)):
         u_i, q_i = three.step(q[i : i + 1], z[i : i + 1])
         assert (u_i[0, 0], q_i[0]) == (u[i, 0], after[i])
-    assert u.shape == (300, 1)
-    assert after.dtype.kind == "i"
 
 
 def test_no_robots_are_no_problem(two):

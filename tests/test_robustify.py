@@ -224,7 +224,6 @@ def test_another_agent_does_not_overwrite_a_run(circle_run):
 
 
 def test_an_onnx_file_is_kept_in_the_run(circle, tmp_path):
-    pytest.importorskip("onnxruntime")
     path = onnx_file(tmp_path, np.array([[0.0, -9.0]]), np.zeros(1))
     run = hyrl_mj.diagnose("unit_circle", path, out=tmp_path / "run", **SMOKE)
     assert run.critical_set.points == pytest.approx(np.pi, abs=0.05)

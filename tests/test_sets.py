@@ -2,6 +2,10 @@
 
 import numpy as np
 import pytest
+from drawn import grid_sets
+from drawn import points as drawn_points
+from hypothesis import given
+from hypothesis import strategies as st
 
 from hyrl_mj import BadInput, Chart
 from hyrl_mj.sets import Complement, Everything, Grid, GridSet
@@ -105,15 +109,29 @@ def test_a_full_and_an_empty_set(case):
 # ---- algebra
 
 
-def test_union_intersection_complement():
-    left, right = on_grid(PLANE, disc, 90), on_grid(PLANE, lambda z: disc(z - [0.5, 0.0]), 90)
-    z = points(PLANE)
-    a, b = left.signed_distance(left.grid.nodes), right.signed_distance(right.grid.nodes)
+ANY_CHART = st.sampled_from([LINE, RING, PLANE, TUBE, SLAB])
+TWO_SETS = ANY_CHART.flatmap(lambda c: st.tuples(grid_sets(c, 2), drawn_points(c)))
+
+
+@given(TWO_SETS)
+def test_union_intersection_complement(case):
+    (left, right), _ = case
     nodes = left.grid.nodes
-    np.testing.assert_array_equal((left | right).contains(nodes), (a <= 0) | (b <= 0))
-    np.testing.assert_array_equal((left & right).contains(nodes), (a <= 0) & (b <= 0))
-    np.testing.assert_allclose((~left).signed_distance(z), -left.signed_distance(z))
-    np.testing.assert_allclose((~~left).values, left.values)
+    a, b = left.values <= 0, right.values <= 0
+    np.testing.assert_array_equal((left | right).mask, a | b)
+    np.testing.assert_array_equal((left & right).mask, a & b)
+    np.testing.assert_array_equal((~left).mask, ~a | (left.values == 0))
+    np.testing.assert_array_equal((~(left | right)).values, (~left & ~right).values)
+    np.testing.assert_allclose(left.signed_distance(nodes), left.values, atol=1e-12)
+
+
+@given(TWO_SETS)
+def test_between_nodes_a_union_is_no_smaller_and_an_intersection_no_larger(case):
+    (left, right), z = case
+    a, b = left.signed_distance(z), right.signed_distance(z)
+    assert ((left | right).signed_distance(z) <= np.minimum(a, b) + 1e-12).all()
+    assert ((left & right).signed_distance(z) >= np.maximum(a, b) - 1e-12).all()
+    np.testing.assert_allclose((~left).signed_distance(z), -a, atol=1e-12)
 
 
 def test_dilation_and_erosion_move_the_boundary_by_their_amount():
@@ -189,24 +207,36 @@ def test_interpolation_is_exact_for_linear_functions():
     np.testing.assert_allclose(grid.interpolate(values, outside), [5.0, 4.0], atol=1e-9)
 
 
-def test_interpolation_is_that_of_each_coordinate_in_turn():
-    grid = Grid(SLAB, (4, 5, 6))
-    values = np.random.default_rng(0).normal(size=120)
-    table, z = values.reshape(grid.counts), points(SLAB, 500)
-    for i, (x, y, theta) in enumerate(z):
-        along_x = [np.interp(x, np.linspace(-1, 1, 4), line) for line in table.reshape(4, -1).T]
-        along_y = [
-            np.interp(y, np.linspace(0, 3, 5), line) for line in np.reshape(along_x, (5, 6)).T
-        ]
-        exact = np.interp(theta, np.linspace(-PI, PI, 7), [*along_y, along_y[0]])
-        one = grid.interpolate(values, z[i : i + 1])
-        np.testing.assert_allclose(one, exact, atol=1e-12)
-        assert one == grid.interpolate(values, z)[i], "one point gives what it gives among many"
+def interpolated_in_turn(whole, point):
+    """The value of a set at one point (d,), by `np.interp` along one coordinate after the other."""
+    grid, table = whole.grid, whole.values.reshape(whole.grid.counts)
+    for i, x in enumerate(grid.chart.wrap(point[None])[0]):
+        if grid.chart.periodic[i]:
+            table = np.concatenate([table, table[:1]])
+        at = np.linspace(grid.chart.low[i], grid.chart.high[i], len(table))
+        table = np.apply_along_axis(lambda line, x=x, at=at: np.interp(x, at, line), 0, table)
+    return table
 
 
+@given(TWO_SETS)
+def test_interpolation_is_that_of_each_coordinate_in_turn(case):
+    (whole, _), z = case
+    exact = [interpolated_in_turn(whole, point) for point in z]
+    np.testing.assert_allclose(whole.signed_distance(z), exact, atol=1e-9)
+
+
+@given(TWO_SETS)
+def test_a_point_alone_gives_what_it_gives_among_many(case):
+    (whole, _), z = case
+    np.testing.assert_array_equal(
+        whole.signed_distance(z), [whole.signed_distance(point[None])[0] for point in z]
+    )
+
+
+@given(TWO_SETS)
 def test_the_nearest_node_is_the_nearest(case):
-    chart, _ = case
-    grid, z = Grid.with_cells(chart, 20), points(chart, 300)
+    (whole, _), z = case
+    chart, grid = whole.grid.chart, whole.grid
     distance = np.linalg.norm(chart.difference(z[:, None], grid.nodes[None]), axis=2)
     chosen = distance[np.arange(len(z)), grid.nearest(z)]
     np.testing.assert_allclose(chosen, distance.min(axis=1), atol=1e-9)
