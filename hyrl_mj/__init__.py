@@ -5,7 +5,7 @@ The stages, in the order of the data flow: `tasks`, `training`, `critical_set`, 
 Importing this package needs neither torch nor a GL library.
 """
 
-from hyrl_mj import mjcf as _mjcf  # first: it chooses the GL backend before mujoco is imported
+from hyrl_mj import gl as _gl  # first: it imports mujoco, with a GL backend that does not stop it
 from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadArtifact, BadInput, HyrlError, NoRenderer
 from hyrl_mj.export import export_numpy, export_onnx
@@ -70,4 +70,4 @@ __all__ = [
     "task_names",
 ]
 
-del _mjcf
+del _gl

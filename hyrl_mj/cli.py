@@ -340,6 +340,8 @@ def replay(
 def view(run_dir: RunDir, arc: str = "critical_hyrl_q0", port: int = 0) -> None:
     """Replay an arc in MuJoCo's viewer, or in a browser where there is no display.
 
+    The viewer for a browser takes pip install "hyrl-mj[view]". Ctrl+C ends it.
+
     Args:
         run_dir: a run directory.
         arc: the name of a file in its folder arcs.

@@ -1,57 +1,12 @@
 """Find and compile MJCF models; read their geometry, so that it is written down nowhere else."""
 
-import importlib
-import os
-import sys
 from functools import lru_cache
 from pathlib import Path
 
-# GL backends that need no screen, in the order in which they are tried.
-HEADLESS = ("egl", "osmesa")
+import mujoco
+import numpy as np
 
-
-def has_display() -> bool:
-    """Whether windows can be opened; elsewhere than on Linux they always can."""
-    shown = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    return bool(shown) or not sys.platform.startswith("linux")
-
-
-def import_mujoco() -> str:
-    """Import MuJoCo with a GL backend that does not stop it, and tell why there is none, if so.
-
-    MuJoCo reads `MUJOCO_GL` when it is first imported, and with a backend that is unknown or not
-    installed the import itself fails. Training and analysis need no GL, so they go on without it.
-    """
-    asked = os.environ.get("MUJOCO_GL", "")
-    backends = (asked,) if asked or has_display() or "mujoco" in sys.modules else HEADLESS
-    problems = []
-    for backend in backends:
-        if backend:
-            os.environ["MUJOCO_GL"] = backend
-        try:
-            importlib.import_module("mujoco")
-            return ""
-        # Each backend fails in its own way: RuntimeError, ImportError, AttributeError, ...
-        except Exception as error:
-            if not backend:
-                raise
-            problems.append(f"{backend}: {type(error).__name__}: {error}")
-        for name in [name for name in sys.modules if name.split(".")[0] in ("mujoco", "OpenGL")]:
-            del sys.modules[name]
-        os.environ.pop("PYOPENGL_PLATFORM", None)  # set by the backend that failed
-    os.environ["MUJOCO_GL"] = "disable"
-    importlib.import_module("mujoco")
-    os.environ["MUJOCO_GL"] = asked or HEADLESS[0]
-    return "; ".join(problems)
-
-
-# Why MuJoCo runs without GL although a backend was tried; empty if it does not.
-GL_PROBLEM = import_mujoco()
-
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
-
-from hyrl_mj.errors import BadInput, unknown  # noqa: E402
+from hyrl_mj.errors import BadInput, unknown
 
 
 def models_dir() -> Path:

@@ -13,6 +13,7 @@ import numpy as np
 
 from hyrl_mj import mjcf
 from hyrl_mj.errors import BadInput, NoRenderer, brief
+from hyrl_mj.gl import GL_PROBLEM
 
 GL_CURE = "on Debian or Ubuntu: apt-get install libegl1 libgl1-mesa-dri, and set MUJOCO_GL=egl"
 
@@ -307,7 +308,7 @@ def _gl_context(width: int, height: int) -> Any:
 
 def _no_gl(error: Exception) -> NoRenderer:
     backend = os.environ.get("MUJOCO_GL", "")
-    cause = mjcf.GL_PROBLEM or brief(error)
+    cause = GL_PROBLEM or brief(error)
     return NoRenderer(
         f"off-screen rendering failed with MUJOCO_GL={backend!r} ({cause}): {GL_CURE}"
     )

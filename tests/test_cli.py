@@ -17,7 +17,7 @@ from PIL import Image
 
 import hyrl_mj
 from hyrl_mj import cli
-from hyrl_mj.mjcf import has_display
+from hyrl_mj.gl import has_display
 from hyrl_mj.pipeline import steps as pipeline
 from hyrl_mj.viz.figures import CAPTIONS
 

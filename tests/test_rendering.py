@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from gl import needs_gl
 
-import hyrl_mj
 from hyrl_mj import BadInput
 from hyrl_mj.rendering import SceneRenderer
 
@@ -209,29 +208,3 @@ def test_who_imports_mujoco_first_gets_pictures_too():
         timeout=60,
     )
     assert child.stdout == "True\n", child.stderr
-
-
-def test_where_one_backend_is_missing_the_next_is_tried(tmp_path):
-    """Stands in for MuJoCo, whose import fails with EGL and goes well with OSMesa."""
-    fake = tmp_path / "mujoco"
-    fake.mkdir()
-    (fake / "__init__.py").write_text(
-        "import os\n"
-        "backend = os.environ['MUJOCO_GL']\n"
-        "if backend == 'egl':\n"
-        "    os.environ['PYOPENGL_PLATFORM'] = 'egl'\n"
-        "    raise AttributeError('no eglQueryString')\n"
-        "assert 'PYOPENGL_PLATFORM' not in os.environ\n"
-    )
-    source = (hyrl_mj.mjcf.models_dir().parent / "hyrl_mj" / "mjcf.py").read_text(encoding="utf-8")
-    code = source.split("import mujoco  # noqa")[0] + "\nprint(os.environ['MUJOCO_GL'], GL_PROBLEM)"
-    hidden = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY", "WAYLAND_DISPLAY", "PYTHONPATH")
-    environment = {k: v for k, v in os.environ.items() if k not in hidden}
-    child = subprocess.run(
-        [sys.executable, "-c", code],
-        env=environment | {"PYTHONPATH": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert child.stdout.split() == ["osmesa"], child.stderr

@@ -101,7 +101,7 @@ def test_a_saved_policy_works_without_torch(task, tmp_path):
 HEAVY = {
     "PIL", "hyrl_mj.viz.encoding", "hyrl_mj.rendering", "hyrl_mj.viz.replay", "imageio_ffmpeg", "jinja2",
     "matplotlib", "mediapy", "mujoco.batch", "rich", "scipy",
-    "stable_baselines3", "tensorboard", "torch", "tqdm",
+    "stable_baselines3", "tensorboard", "torch", "tqdm", "viser",
 }  # fmt: skip
 HELP = """
 import sys
@@ -128,11 +128,3 @@ def test_nothing_heavy_is_loaded_before_it_is_needed(code, heavy):
 def test_public_names_are_there():
     assert [name for name in hyrl_mj.__all__ if not hasattr(hyrl_mj, name)] == []
     assert (PACKAGE / "py.typed").is_file()
-
-
-def test_the_gl_backend_is_chosen_only_where_the_user_has_not():
-    code = "import hyrl_mj, os; print(os.environ.get('MUJOCO_GL'))"
-    headless = {"DISPLAY": "", "WAYLAND_DISPLAY": ""}
-    unset = "import os; os.environ.pop('MUJOCO_GL', None); "
-    assert run_without(set(), unset + code, **headless).strip() == "egl"
-    assert run_without(set(), code, MUJOCO_GL="disabled", **headless).strip() == "disabled"

@@ -1,0 +1,290 @@
+"""The viewers: how an arc is played, who can reach the page, and what is said where none opens."""
+
+import re
+import socket
+import sys
+import threading
+import urllib.request
+from contextlib import contextmanager
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from planted import ideal_controller
+
+import hyrl_mj
+from hyrl_mj import BadInput
+from hyrl_mj.viz import viewing
+from hyrl_mj.viz.replay.panel import Track
+
+
+@pytest.fixture(scope="module")
+def arc(vehicle):
+    """Half a second of the vehicle."""
+    return hyrl_mj.simulate(vehicle, ideal_controller(vehicle), [0.0, 0.05], horizon=0.5)
+
+
+# ---- the loop
+
+
+class Clock:
+    """Stands in for the module time: it goes on when somebody sleeps."""
+
+    def __init__(self):
+        self.now = 100.0
+        self.slept = []
+
+    def monotonic(self):
+        return self.now
+
+    def sleep(self, seconds):
+        self.slept.append(seconds)
+        self.now += seconds
+
+
+class Recorder:
+    """Stands in for a viewer: it keeps the data that it is shown, and takes some time over it."""
+
+    def __init__(self, data, clock, frames, takes=0.0):
+        self.data, self.clock, self.frames, self.takes = data, clock, frames, takes
+        self.t, self.qpos, self.seen = [], [], []
+
+    def is_running(self):
+        return len(self.t) < self.frames
+
+    def sync(self):
+        self.t.append(self.data.time)
+        self.qpos.append(self.data.qpos.copy())
+        self.seen.append(self.clock.now)
+        self.clock.now += self.takes
+
+
+@pytest.fixture
+def play(vehicle, arc, monkeypatch):
+    """A function that plays the arc for some frames, and tells what was shown when."""
+
+    def run(frames, takes=0.0):
+        clock, data = Clock(), mujoco.MjData(vehicle.model)
+        monkeypatch.setattr(viewing, "time", clock)
+        viewer = Recorder(data, clock, frames, takes)
+        viewing.play(Track(vehicle, arc), vehicle.model, data, viewer)
+        return viewer
+
+    return run
+
+
+def test_an_arc_is_played_at_sixty_hertz_held_at_its_end_and_begun_again(play, vehicle, arc):
+    frames = int(viewing.FPS * (arc.t[-1] + viewing.PAUSE)) + 20
+    viewer = play(frames)
+    t, qpos = np.array(viewer.t), np.array(viewer.qpos)
+    np.testing.assert_allclose(np.diff(viewer.seen), 1 / 60)
+    track = Track(vehicle, arc)
+    np.testing.assert_allclose(qpos, [track.qpos(min(at, track.end)) for at in t])
+    held = t >= track.end
+    assert held.sum() == pytest.approx(viewing.FPS * viewing.PAUSE, abs=1)
+    assert (qpos[held] == track.qpos(track.end)).all()
+    (again,) = np.flatnonzero(np.diff(t) < 0)
+    np.testing.assert_allclose(np.diff(t[: again + 1]), 1 / 60)
+    np.testing.assert_allclose(np.diff(t[again + 1 :]), 1 / 60)
+
+
+def test_the_time_that_a_viewer_takes_is_part_of_the_sixtieth(play):
+    np.testing.assert_allclose(np.diff(play(30, takes=0.01).seen), 1 / 60)
+
+
+def test_behind_a_slow_viewer_the_arc_stays_in_real_time(play):
+    viewer = play(5, takes=0.1)
+    np.testing.assert_allclose(viewer.t, [0.0, 0.1, 0.2, 0.3, 0.4], atol=1e-9)
+    assert viewer.clock.slept == [0.0] * 5
+
+
+def test_nothing_is_shown_when_the_viewer_is_closed(play):
+    assert play(0).t == []
+
+
+# ---- in a browser
+
+
+class Enough(Exception):
+    """Ends a viewer from inside, as Ctrl+C does."""
+
+
+@pytest.fixture
+def headless(monkeypatch):
+    monkeypatch.setattr(viewing, "has_display", lambda: False)
+
+
+def listeners(port):
+    """The addresses on which this machine listens to a port, as Linux writes them."""
+    rows = [
+        row.split()
+        for name in ("tcp", "tcp6")
+        if (table := Path("/proc/net") / name).exists()
+        for row in table.read_text().splitlines()[1:]
+    ]
+    local = [row[1].rsplit(":", 1) for row in rows if row[3] == "0A"]
+    return [address for address, number in local if int(number, 16) == port]
+
+
+def port_of(said):
+    """The port in the sentence that says where the page is."""
+    return int(re.search(r"http://127\.0\.0\.1:(\d+)/", said)[1])
+
+
+@contextmanager
+def taken_port():
+    """A port to which somebody else listens."""
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        yield other.getsockname()[1]
+
+
+def free_port():
+    with taken_port() as port:
+        return port
+
+
+def test_the_page_is_served_to_this_machine_alone(vehicle, arc, headless, capsys):
+    port, said = free_port(), []
+
+    def look(text):
+        said.append(text)
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=20) as page:
+            assert b"<html" in page.read().lower()
+        if sys.platform == "linux":
+            assert listeners(port) == ["0100007F"]
+        raise Enough
+
+    with pytest.raises(Enough):
+        viewing.view(vehicle, arc, port, look)
+    assert port_of(said[0]) == port
+    assert "only from this machine" in said[0]
+    assert capsys.readouterr().out == ""  # viser's own words are not ours
+    with pytest.raises(ConnectionRefusedError):  # and nobody listens any more
+        socket.create_connection(("127.0.0.1", port), timeout=5)
+
+
+def test_without_a_port_the_first_free_one_from_8080_on_is_taken(vehicle, arc, headless):
+    said = []
+
+    def end(text):
+        said.append(text)
+        raise Enough
+
+    try:
+        other = socket.create_server(("127.0.0.1", 8080))
+    except OSError:  # somebody has it
+        other = None
+    try:
+        with pytest.raises(Enough):
+            viewing.view(vehicle, arc, say=end)
+    finally:
+        if other is not None:
+            other.close()
+    assert 8080 < port_of(said[0]) < 8180
+
+
+def test_who_has_the_page_open_sees_the_robot_move(vehicle, arc, headless, monkeypatch):
+    viser = pytest.importorskip("viser")
+    from websockets.sync.client import connect
+
+    received = []
+    open_page = threading.Event()
+
+    def watch(address):
+        with connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None) as page:
+            try:
+                while True:  # first the scene, and then a long time nothing
+                    page.recv(timeout=1)
+            except TimeoutError:
+                open_page.set()
+            for _ in range(20):
+                received.append(page.recv(timeout=10))
+
+    def play(track, model, data, viewer):
+        assert viewer.is_running()
+        assert open_page.wait(30)
+        for frame in range(1, 1000):
+            viewing.show(track, model, data, frame / 100)
+            viewer.sync()
+            thread.join(0.02)
+            if not thread.is_alive():
+                return
+
+    def say(text):
+        nonlocal thread
+        thread = threading.Thread(target=watch, args=(f"ws://127.0.0.1:{port_of(text)}",))
+        thread.start()
+
+    thread = None
+    monkeypatch.setattr(viewing, "play", play)
+    viewing.view(vehicle, arc, say=say)
+    assert len(received) == 20
+
+
+def test_the_shared_model_stays_as_it_is(vehicle, arc, headless):
+    def end(text):
+        raise Enough
+
+    before = vehicle.model.vis.scale.framewidth, vehicle.model.vis.rgba.contactpoint.copy()
+    with pytest.raises(Enough):
+        viewing.view(vehicle, arc, say=end)
+    after = vehicle.model.vis.scale.framewidth, vehicle.model.vis.rgba.contactpoint
+    assert before[0] == after[0]
+    np.testing.assert_array_equal(before[1], after[1])
+
+
+@pytest.mark.parametrize("port", [70_000, 65_536, -1])
+def test_a_number_that_is_no_port_is_refused(port, vehicle, arc, headless):
+    with pytest.raises(BadInput, match=f"port {port} cannot be used .*1024 to 65535"):
+        viewing.view(vehicle, arc, port)
+
+
+def test_a_port_that_is_taken_is_refused(vehicle, arc, headless):
+    with taken_port() as port, pytest.raises(BadInput, match=f"port {port} cannot be used"):
+        viewing.view(vehicle, arc, port)
+
+
+@pytest.mark.parametrize("package", ["mjviser", "viser"])
+def test_without_the_extra_one_sentence_says_how_to_get_it(
+    package, vehicle, arc, headless, monkeypatch
+):
+    monkeypatch.setitem(sys.modules, package, None)
+    sentence = 'there is no display, .* pip install "hyrl-mj\\[view\\]", or .* hyrl-mj replay'
+    with pytest.raises(BadInput, match=sentence) as caught:
+        viewing.view(vehicle, arc)
+    assert "\n" not in str(caught.value)
+    assert caught.value.exit_status == 2
+
+
+# ---- in a window
+
+
+def test_with_a_display_mujoco_s_own_viewer_plays_it(vehicle, arc, monkeypatch):
+    played = []
+
+    @contextmanager
+    def launch_passive(model, data):
+        played.append(model)
+        yield "the window"
+
+    monkeypatch.setattr(viewing, "has_display", lambda: True)
+    monkeypatch.setitem(sys.modules, "mjviser", None)  # it is not asked for
+    monkeypatch.setattr("mujoco.viewer.launch_passive", launch_passive)
+    monkeypatch.setattr(viewing, "play", lambda *given: played.append(given[3]))
+    viewing.view(vehicle, arc)
+    model, viewer = played
+    assert viewer == "the window"
+    assert model is not vehicle.model
+
+
+def test_a_window_that_cannot_be_opened_is_one_sentence(vehicle, arc, monkeypatch):
+    def launch_passive(model, data):
+        raise RuntimeError("run it under mjpython")
+
+    monkeypatch.setattr(viewing, "has_display", lambda: True)
+    monkeypatch.setattr("mujoco.viewer.launch_passive", launch_passive)
+    with pytest.raises(
+        BadInput, match=r"cannot be opened \(run it under mjpython\): .* hyrl-mj replay"
+    ):
+        viewing.view(vehicle, arc)
