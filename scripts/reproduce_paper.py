@@ -19,7 +19,6 @@ from rich.table import Table
 import hyrl_mj
 from hyrl_mj import progress
 from hyrl_mj.errors import BadInput
-from hyrl_mj.policies import algorithm_title
 from hyrl_mj.simulation import Noise
 from hyrl_mj.viz import figures
 
@@ -30,6 +29,20 @@ FATES = {
     "stalled": "stalls",
     "out_of_bounds": "leaves the arena",
     "running": "not there yet",
+}
+# The paper's figures: our name of the figure, and the file, by task.
+PAPER = {
+    "unit_circle": {
+        "policy": "fig2_ppo_circle",
+        "extended_sets": "fig4_extended_sets_circle",
+        "runs": "fig5_hyrl_circle",
+    },
+    "vehicle": {
+        "overview": "fig1_intro",
+        "policy": "fig3_dqn_vehicle",
+        "extended_sets": "fig4_extended_sets_vehicle",
+        "runs": "fig6_hyrl_vehicle",
+    },
 }
 # Where ours differs on purpose.
 SIZED = "sized to the noise *"
@@ -58,21 +71,11 @@ def opened(path: Path, task: str) -> hyrl_mj.Run:
 
 
 def draw(circle: hyrl_mj.Run, vehicle: hyrl_mj.Run, folder: Path) -> None:
-    """Write the paper's six figures."""
-    figures.overview(
-        vehicle.task, vehicle.policy, vehicle.critical_set, vehicle.partition,
-        vehicle.arcs()["critical", "policy"], folder / "fig1_intro.png",
-    )  # fmt: skip
-    for run, name in ((circle, "fig2_ppo_circle"), (vehicle, "fig3_dqn_vehicle")):
-        figures.policy_map(
-            run.task, run.policy, run.critical_set, run.settings.noise, run.settings.seed,
-            folder / f"{name}.png",
-        )  # fmt: skip
-    for run, name in ((circle, "circle"), (vehicle, "vehicle")):
-        path = folder / f"fig4_extended_sets_{name}.png"
-        figures.extended_sets_map(run.task, run.critical_set, run.extended_sets, path)
-    figures.runs(circle.task, circle.arcs(), folder / "fig5_hyrl_circle.png")
-    figures.runs(vehicle.task, vehicle.arcs(), folder / "fig6_hyrl_vehicle.png")
+    """Write the paper's seven figures: one to six, of which the fourth has a part for each task."""
+    for run in (circle, vehicle):
+        shown = figures.shown_run(run)
+        for name, file in PAPER[run.task.name].items():
+            figures.FIGURES[name].draw(shown, folder / f"{file}.png")
 
 
 # ---- our values
@@ -140,7 +143,7 @@ def common(run: hyrl_mj.Run, horizon: str, width: str, least: float) -> Iterator
 def alone(run: hyrl_mj.Run, said: tuple[str, ...]) -> Iterator[Line]:
     """The stage-1 policy from the starts of Section III, and of Section V where the text tells."""
     task, noise = run.task, Noise("alternating", run.settings.noise)
-    name, seed = algorithm_title(task.algorithm), run.settings.seed
+    name, seed = run.settings.stage1.title, run.settings.seed
     starts = np.array(task.policy_starts)
     arcs = hyrl_mj.simulate(task, run.policy, starts, noise, horizon=task.replay_time, seed=seed)
     for paper, arc in zip(said, arcs, strict=True):

@@ -1,4 +1,4 @@
-"""What tests of figures look at: the pixels of a PNG, and planted artifacts to draw."""
+"""For tests of figures: the pixels of a PNG, and planted artifacts to draw."""
 
 import numpy as np
 from matplotlib.colors import to_rgb
@@ -13,26 +13,28 @@ from planted import (
 )
 
 from hyrl_mj import ExtendedSets, Noise, simulate
+from hyrl_mj.viz.arcs import overview_arcs, policy_start_arcs
+from hyrl_mj.viz.figures import ShownRun
 
 EPS = 0.1
 
 
 def where(path, colour):
-    """The pixels (k, 2) that have just this colour: from the left, and from below."""
+    """Returns the pixels (k, 2) of exactly this colour: columns from the left, rows from below."""
     picture = np.asarray(Image.open(path).convert("RGB"))
-    found = (picture == np.round(255 * np.array(to_rgb(colour))).astype(int)).all(axis=-1)
-    return np.argwhere(found[::-1])[:, ::-1]
+    same = (picture == np.round(255 * np.array(to_rgb(colour))).astype(int)).all(axis=-1)
+    return np.argwhere(same[::-1])[:, ::-1]
 
 
 def size_of(path):
-    """Width and height [pixels] of what is a PNG."""
+    """Returns width and height [pixels] of a PNG."""
     with Image.open(path) as image:
         assert image.format == "PNG"
         return image.size
 
 
 def policy_of(task):
-    """A stage-1 policy that decides where `decisions` says."""
+    """Returns a stage-1 policy whose critical set is `decisions`."""
     return homing_policy(task) if task.name == "unit_circle" else sign_policy(task)
 
 
@@ -41,7 +43,7 @@ def controller_of(task):
 
 
 def sets_of(task, reach=0.2):
-    """The parts, each reaching so far over M* as it would be by that much noise."""
+    """Returns the parts, each extended over M* by the noise bound `reach`."""
     parts = halves(task).parts
     sets = tuple(part.dilated_by_box(task.noise_in_chart(reach)) for part in parts)
     everywhere = np.ones(len(sets[0].values), dtype=bool)
@@ -50,13 +52,31 @@ def sets_of(task, reach=0.2):
 
 
 def arcs_of(task):
-    """The replays, and the policy's from M*, under the paper's noise."""
+    """Returns the replays, and those from M*, under the paper's noise."""
     noise, horizon = Noise("alternating", EPS), task.replay_time
     starts = [*task.replay_starts, decisions(task).points[0]]
     names = [*(f"start{i}" for i in range(5)), "critical"]
-    found = {}
+    arcs = {}
     for who, loop, q in (("policy", policy_of(task), None), ("hyrl_q0", controller_of(task), 0),
                          ("hyrl_q1", controller_of(task), 1)):  # fmt: skip
-        arcs = simulate(task, loop, np.array(starts, dtype=float), noise, q, horizon)
-        found |= {(name, who): arc for name, arc in zip(names, arcs, strict=True)}
-    return found
+        runs = simulate(task, loop, np.array(starts, dtype=float), noise, q, horizon)
+        arcs |= {(name, who): arc for name, arc in zip(names, runs, strict=True)}
+    return arcs
+
+
+def shown_of(task, arcs):
+    """Returns what the figures show of a planted run with these replays."""
+    policy = policy_of(task)
+    return ShownRun(
+        task,
+        "DQN",
+        policy,
+        decisions(task),
+        halves(task),
+        noisy=arcs["critical", "policy"],
+        noiseless=tuple(overview_arcs(task, policy)),
+        paper=tuple(policy_start_arcs(task, policy, EPS, 0)),
+        whole=task,
+        sets=sets_of(task),
+        replays=arcs,
+    )

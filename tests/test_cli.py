@@ -19,7 +19,7 @@ import hyrl_mj
 from hyrl_mj import cli
 from hyrl_mj.gl import has_display
 from hyrl_mj.pipeline import steps as pipeline
-from hyrl_mj.viz.figures import CAPTIONS
+from hyrl_mj.viz.figures import FIGURES
 
 
 def call(*arguments):
@@ -65,7 +65,7 @@ def test_run_ends_with_a_table_and_leaves_every_artifact(finished):
     names = ["config.json", "policy.safetensors", "policy.json", "critical_set.npz"]
     names += ["partition.npz", "extended_sets.npz", "mode_0.safetensors", "mode_1.safetensors"]
     names += ["arcs/start0_policy.npz", "arcs/critical_hyrl_q1.npz", "robustness.json"]
-    names += [f"figures/{name}{suffix}" for name in CAPTIONS for suffix in (".png", ".pdf")]
+    names += [f"figures/{name}{suffix}" for name in FIGURES for suffix in (".png", ".pdf")]
     names += ["report.html"]
     assert [n for n in names if not (path / n).is_file()] == []
     assert not list(path.rglob("*.partial*"))

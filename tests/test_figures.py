@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from figure_parts import EPS, arcs_of, policy_of, sets_of, where
+from figure_parts import EPS, arcs_of, sets_of, shown_of, where
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Wedge
 from matplotlib.path import Path as Outline
-from planted import Cube, decisions, halves, plane_policy
+from planted import Cube, decisions, plane_policy
 
 import hyrl_mj
 from hyrl_mj import BadInput, HybridController, Outcome, simulate
@@ -21,7 +21,9 @@ from hyrl_mj.sets import Everything, Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.viz import figures
-from hyrl_mj.viz.figures import charts, paths, style
+from hyrl_mj.viz.arcs import overview_arcs, policy_start_arcs
+from hyrl_mj.viz.figures import charts, extended_sets, paths, style
+from hyrl_mj.viz.page import pictures
 from hyrl_mj.viz.section import Section
 
 CIRCLE, VEHICLE = hyrl_mj.get_task("unit_circle"), hyrl_mj.get_task("vehicle")
@@ -30,44 +32,14 @@ TASKS = pytest.mark.parametrize("task", [CIRCLE, VEHICLE], ids=lambda task: task
 NONE = hyrl_mj.CriticalSet(np.empty((0, 2)), np.zeros(0, dtype=int), 0.01, 0.1)
 
 
-@pytest.fixture
-def drawn(monkeypatch):
-    """The figures that would have been written, instead of their files."""
-    found = []
-
-    def keep(self, path, **_):
-        found.append(self)
-        Path(path).touch()
-
-    monkeypatch.setattr(Figure, "savefig", keep)
-    return found
+SHOWN = {task.name: shown_of(task, ARCS[task.name]) for task in (CIRCLE, VEHICLE)}
+NAMES = figures.names(VEHICLE, figures.ShownRun)
+EVERY_FIGURE = pytest.mark.parametrize("name", NAMES)
 
 
-def draw_overview(task, path, critical=None):
-    noisy = ARCS[task.name]["critical", "policy"]
-    critical = critical or decisions(task)
-    figures.overview(task, policy_of(task), critical, halves(task), noisy, path)
-
-
-def draw_policy(task, path, critical=None):
-    figures.policy_map(task, policy_of(task), critical or decisions(task), EPS, 0, path)
-
-
-def draw_sets(task, path, critical=None):
-    figures.extended_sets_map(task, critical or decisions(task), sets_of(task), path)
-
-
-def draw_runs(task, path, critical=None):
-    figures.runs(task, ARCS[task.name], path)
-
-
-DRAW = {
-    "overview": draw_overview,
-    "policy": draw_policy,
-    "extended_sets": draw_sets,
-    "runs": draw_runs,
-}
-FIGURES = pytest.mark.parametrize("name", DRAW)
+def draw(name, task, path=None, /, **changes):
+    """Draws a figure of the planted run, with some of what it shows replaced."""
+    return figures.FIGURES[name].draw(replace(SHOWN[task.name], **changes), path)
 
 
 def lines_of(panel, colour, style="-"):
@@ -109,11 +81,11 @@ def inside(outlines: list[Outline], *points):
 
 
 @TASKS
-@FIGURES
+@EVERY_FIGURE
 def test_it_is_written_as_png_and_as_pdf_of_one_page(tmp_path, monkeypatch, task, name):
     monkeypatch.setattr(style, "DPI", 80)
     path = tmp_path / "figures" / f"{name}.png"
-    DRAW[name](task, path)
+    draw(name, task, path)
     assert sorted(p.name for p in path.parent.iterdir()) == [f"{name}.pdf", f"{name}.png"]
     pdf = path.with_suffix(".pdf").read_bytes()
     assert pdf.startswith(b"%PDF")
@@ -124,15 +96,14 @@ def test_it_is_written_as_png_and_as_pdf_of_one_page(tmp_path, monkeypatch, task
             colour = style.mode_tint(mode)
         assert len(where(path, colour)) > 20, "each mode is there in its colour"
     first = path.with_suffix(".pdf").read_bytes()
-    DRAW[name](task, path)
+    draw(name, task, path)
     assert path.with_suffix(".pdf").read_bytes() == first, "the same picture is the same file"
 
 
 @TASKS
-@FIGURES
-def test_its_axes_have_labels_with_units_and_its_legend_hides_nothing(tmp_path, drawn, task, name):
-    DRAW[name](task, tmp_path / "p.png")
-    figure = drawn[0]
+@EVERY_FIGURE
+def test_its_axes_have_labels_with_units_and_its_legend_hides_nothing(task, name):
+    figure = draw(name, task)
     assert style.task_title(task) in figure.get_suptitle()
     assert figure.legends
     assert not any(panel.get_legend() for panel in figure.axes)
@@ -150,12 +121,11 @@ def test_its_axes_have_labels_with_units_and_its_legend_hides_nothing(tmp_path, 
 
 
 @TASKS
-@FIGURES
-def test_a_run_without_a_critical_set_is_drawn(tmp_path, drawn, task, name):
+@EVERY_FIGURE
+def test_a_run_without_a_critical_set_is_drawn(task, name):
     points = np.empty((0, task.chart.dimension))
-    DRAW[name](task, tmp_path / "p.png", replace(NONE, points=points))
-    assert len(drawn) == 2
-    words = [text.get_text() for text in drawn[0].legends[0].get_texts()]
+    figure = draw(name, task, critical=replace(NONE, points=points))
+    words = [text.get_text() for text in figure.legends[0].get_texts()]
     assert "critical set M*" not in words
 
 
@@ -171,15 +141,52 @@ def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch, fails):
 
     monkeypatch.setattr(Figure, "savefig", savefig)
     with pytest.raises(BadInput, match=r"cannot be written \(no space"):
-        draw_runs(CIRCLE, tmp_path / "runs.png")
+        draw("runs", CIRCLE, tmp_path / "runs.png")
     assert len(written) == fails
     assert list(tmp_path.iterdir()) == []
 
 
-def test_every_picture_has_a_caption():
-    assert set(figures.CAPTIONS) == {*DRAW, "robustness_map", "robustness_curve"}
-    assert figures.names(VEHICLE) == figures.names(CIRCLE) == tuple(DRAW)
-    assert all(caption.endswith(".") for caption in figures.CAPTIONS.values())
+@TASKS
+@EVERY_FIGURE
+def test_without_a_path_nothing_is_written(tmp_path, monkeypatch, task, name):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(style.artifacts, "replacing", None)
+    assert isinstance(draw(name, task), Figure)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_every_figure_is_drawn_from_one_kind_of_value_and_has_a_caption():
+    kinds = figures.ShownPolicy, figures.ShownRun, figures.ShownGame
+    policy, run, game = (figures.names(VEHICLE, kind) for kind in kinds)
+    assert policy == ("overview", "policy")
+    assert run == NAMES == ("overview", "policy", "extended_sets", "runs")
+    assert game == ("robustness_map", "robustness_curve")
+    assert sorted([*run, *game]) == sorted(figures.FIGURES)
+    assert all(entry.caption.endswith(".") for entry in figures.FIGURES.values())
+
+
+def test_a_new_figure_is_an_entry(tmp_path, monkeypatch):
+    def draw_title(shown, path=None):
+        with style.drawing(path, (3, 1)) as figure:
+            style.head(figure, shown.task, shown.policy_title)
+        return figure
+
+    monkeypatch.setitem(
+        figures.FIGURES, "title", figures.Entry(draw_title, figures.ShownPolicy, "The title.")
+    )
+    assert figures.draw_all(SHOWN["vehicle"], tmp_path) == (*NAMES, "title")
+    assert {path.stem for path in tmp_path.iterdir()} == {*NAMES, "title"}
+    assert [picture.caption for picture in pictures(tmp_path)][-1] == "The title."
+
+
+def test_of_one_coordinate_that_is_not_periodic_only_the_runs_are_drawn():
+    class Line(type(CIRCLE)):
+        chart = hyrl_mj.Chart(("a",), ("m",), (0.0,), (1.0,), (False,))
+
+    assert figures.names(Line(), figures.ShownRun) == ("runs",)
+    for name in ("overview", "policy", "extended_sets"):
+        with pytest.raises(BadInput, match="one coordinate, a, which is not periodic"):
+            draw(name, CIRCLE, task=Line())
 
 
 def test_tints_are_the_colours_with_white():
@@ -191,9 +198,9 @@ def test_tints_are_the_colours_with_white():
 # ---- overview
 
 
-def test_overview_of_a_plane(tmp_path, drawn):
-    draw_overview(VEHICLE, tmp_path / "p.png")
-    panel, noisy = drawn[0].axes[0], ARCS["vehicle"]["critical", "policy"]
+def test_overview_of_a_plane():
+    figure = draw("overview", VEHICLE)
+    panel, noisy = figure.axes[0], ARCS["vehicle"]["critical", "policy"]
     for mode, side in ((0, 1), (1, -1)):
         ways = lines_of(panel, style.mode_colour(mode))
         assert len(ways) == 6
@@ -210,9 +217,9 @@ def test_overview_of_a_plane(tmp_path, drawn):
     np.testing.assert_allclose(marks_of(panel, ".", style.RED), noisy.measured[:-1])
 
 
-def test_the_band_is_all_that_can_be_observed(tmp_path, drawn):
-    draw_overview(VEHICLE, tmp_path / "p.png")
-    band = filled(drawn[0].axes[0], style.PALE_RED)
+def test_the_band_is_all_that_can_be_observed():
+    figure = draw("overview", VEHICLE)
+    band = filled(figure.axes[0], style.PALE_RED)
     z = ARCS["vehicle"]["critical", "policy"].z
     for y, held in ((-1.02, False), (-0.98, True), (0.0, True), (0.98, True), (1.02, False)):
         shift = np.array([0.0, y * EPS])
@@ -220,9 +227,9 @@ def test_the_band_is_all_that_can_be_observed(tmp_path, drawn):
         assert all(any(part.contains_point(p) for part in band) == held for p in middle)
 
 
-def test_overview_of_a_ring(tmp_path, drawn):
-    draw_overview(CIRCLE, tmp_path / "p.png")
-    panel, noisy = drawn[0].axes[0], ARCS["unit_circle"]["critical", "policy"]
+def test_overview_of_a_ring():
+    figure = draw("overview", CIRCLE)
+    panel, noisy = figure.axes[0], ARCS["unit_circle"]["critical", "policy"]
     for mode, side in ((0, 1), (1, -1)):
         ways = lines_of(panel, style.mode_colour(mode))
         assert ways
@@ -239,9 +246,9 @@ def test_overview_of_a_ring(tmp_path, drawn):
 # ---- policy
 
 
-def test_policy_of_a_plane(tmp_path, drawn):
-    draw_policy(VEHICLE, tmp_path / "p.png")
-    image, beside, bar = drawn[0].axes
+def test_policy_of_a_plane():
+    figure = draw("policy", VEHICLE)
+    image, beside, bar = figure.axes
     values = np.asarray(image.images[0].get_array())
     height = np.linspace(-1.5, 1.5, len(values))
     assert (values[(height > 0.02) & (height < 0.88)] == 1).all()
@@ -260,9 +267,9 @@ def test_policy_of_a_plane(tmp_path, drawn):
     assert VEHICLE.clearance(last) == 0
 
 
-def test_policy_of_a_ring(tmp_path, drawn):
-    draw_policy(CIRCLE, tmp_path / "p.png")
-    ring, beside, bar = drawn[0].axes
+def test_policy_of_a_ring():
+    figure = draw("policy", CIRCLE)
+    ring, beside, bar = figure.axes
     low, high = (to_hex(bar.collections[-1].cmap(x)) for x in (0.0, 1.0))
     wedges = [patch for patch in ring.patches if isinstance(patch, Wedge)]
     for angle, colour in ((90, low), (179, low), (181, high), (270, high)):
@@ -287,10 +294,10 @@ def test_the_papers_starts_of_the_policy():
 # ---- extended sets
 
 
-def test_extended_sets_of_a_plane(tmp_path, drawn):
-    draw_sets(VEHICLE, tmp_path / "p.png")
-    whole, near = drawn[0].axes
-    shared = filled(whole, figures.hybrid.SHARED)
+def test_extended_sets_of_a_plane():
+    figure = draw("extended_sets", VEHICLE)
+    whole, near = figure.axes
+    shared = filled(whole, extended_sets.SHARED)
     at = ((0.3, 0.0), (0.3, 0.18), (0.3, -0.18), (0.3, 0.22), (0.3, -0.22), (2.5, 1.0))
     assert inside(shared, *at) == [True, True, True, False, False, True]
     for mode, side in ((0, 1), (1, -1)):
@@ -301,9 +308,9 @@ def test_extended_sets_of_a_plane(tmp_path, drawn):
     assert near.get_ylim() == pytest.approx((-0.4, 0.4))
 
 
-def test_extended_sets_of_a_ring_have_their_ends_in_multiples_of_pi(tmp_path, drawn):
-    draw_sets(CIRCLE, tmp_path / "p.png")
-    (panel,) = drawn[0].axes
+def test_extended_sets_of_a_ring_have_their_ends_in_multiples_of_pi():
+    figure = draw("extended_sets", CIRCLE)
+    (panel,) = figure.axes
     ends = {t.get_text(): t for t in panel.texts if t.get_text().count(".")}
     expected = [sets_of(CIRCLE).sets[q].pieces()[0] for q in (0, 1)]
     for mode, values in enumerate(expected):
@@ -321,9 +328,9 @@ def test_extended_sets_of_a_ring_have_their_ends_in_multiples_of_pi(tmp_path, dr
 # ---- runs
 
 
-def test_runs_in_a_plane(tmp_path, drawn):
-    draw_runs(VEHICLE, tmp_path / "p.png")
-    arcs, panels = ARCS["vehicle"], drawn[0].axes
+def test_runs_in_a_plane():
+    figure = draw("runs", VEHICLE)
+    arcs, panels = ARCS["vehicle"], figure.axes
     assert [panel.get_title() for panel in panels] == [
         "started in q0 = 0 (left)",
         "started in q0 = 1 (right)",
@@ -341,9 +348,9 @@ def test_runs_in_a_plane(tmp_path, drawn):
         assert len(marks_of(panel, "D", style.INK)) == sum(jumps)
 
 
-def test_jumps_over_time_are_marked_and_change_the_colour(tmp_path, drawn):
-    draw_runs(CIRCLE, tmp_path / "p.png")
-    arcs, panel = ARCS["unit_circle"], drawn[0].axes[0]
+def test_jumps_over_time_are_marked_and_change_the_colour():
+    figure = draw("runs", CIRCLE)
+    arcs, panel = ARCS["unit_circle"], figure.axes[0]
     rows = [(arc, np.flatnonzero(np.diff(arc.j)))
             for (start, who), arc in arcs.items() if who == "hyrl_q0" and start != "critical"]  # fmt: skip
     expected = [(arc.t[k], arc.z[k, 0]) for arc, at in rows for k in at]
@@ -365,8 +372,8 @@ class Cut(Cube):
     start_low, start_high = (-0.5,) * 3, (0.5,) * 3
 
 
-def test_of_three_dimensions_a_section_is_drawn_and_the_runs_over_time(tmp_path, drawn):
-    cube, path = Cut(lambda z: z[:, 0]), tmp_path / "p.png"
+def test_of_three_dimensions_a_section_is_drawn_and_the_runs_over_time():
+    cube = Cut(lambda z: z[:, 0])
     policy = plane_policy(cube, np.array([[1.0, 0.0, 0.0]]), np.sign)
     loop = HybridController(cube, {0: policy, 1: policy}, {0: Everything(), 1: Everything()})
     starts = np.array([[0.1, 0.2, -0.3]])
@@ -376,20 +383,29 @@ def test_of_three_dimensions_a_section_is_drawn_and_the_runs_over_time(tmp_path,
     section = Section.of(cube)
     grid = Grid.with_cells(section.task.chart, 20)
     half = GridSet(grid, grid.nodes[:, 0])
-    partition = Partition((0, 1), (half, ~half), half.mask)
-    sets = ExtendedSets((0, 1), (half, ~half), (), 0.3, EPS, np.empty((0, 2)), np.empty(0))
-    arc = section.arc(arcs["start0", "policy"])
-    figures.overview(section.task, policy, NONE, partition, arc, path)
-    figures.policy_map(section.task, policy, NONE, EPS, 0, path)
-    figures.extended_sets_map(section.task, NONE, sets, path)
-    assert len({id(figure) for figure in drawn}) == 3
-    for figure in drawn:
+    shown = figures.ShownRun(
+        section.task,
+        "PPO",
+        policy,
+        NONE,
+        Partition((0, 1), (half, ~half), half.mask),
+        noisy=section.arc(arcs["start0", "policy"]),
+        noiseless=tuple(overview_arcs(section.task, policy)),
+        paper=tuple(policy_start_arcs(section.task, policy, EPS, 0)),
+        whole=cube,
+        sets=ExtendedSets((0, 1), (half, ~half), (), 0.3, EPS, np.empty((0, 2)), np.empty(0)),
+        replays=arcs,
+    )
+    assert figures.names(cube, figures.ShownRun) == NAMES
+    for draw_one in (
+        figures.draw_overview,
+        figures.draw_policy_map,
+        figures.draw_extended_sets,
+    ):
+        figure = draw_one(shown)
         assert figure.get_suptitle().startswith("Cube at c = -0.3 m: ")
         assert (figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()) == ("a [m]", "b [m]")
-    drawn.clear()
-    assert figures.names(cube) == ("overview", "policy", "extended_sets", "runs")
-    figures.runs(cube, arcs, path)
-    panels = np.reshape(drawn[0].axes, (3, 2))
+    panels = np.reshape(figures.draw_runs(shown).axes, (3, 2))
     assert [panel.get_ylabel() for panel in panels[:, 0]] == ["a [m]", "b [m]", "c [m]"]
     for row, coordinate in zip(panels, range(3), strict=True):
         for panel in row:
@@ -397,15 +413,15 @@ def test_of_three_dimensions_a_section_is_drawn_and_the_runs_over_time(tmp_path,
             np.testing.assert_allclose(way[:, 1], arcs["start0", "policy"].z[:, coordinate])
 
 
-def test_an_obstacle_of_any_shape_is_drawn_where_runs_end(tmp_path, drawn):
+def test_an_obstacle_of_any_shape_is_drawn_where_runs_end():
     class Walled(type(VEHICLE)):
         def ending(self, measurement):
             x, y = measurement.T
             wall = (abs(x - 1) < 0.2) & (y > 0.5)
             return np.where(wall, Outcome.CRASHED, Outcome.RUNNING)
 
-    draw_runs(Walled(), tmp_path / "p.png")
-    over = filled(drawn[0].axes[0], style.GREY)
+    figure = draw("runs", VEHICLE, whole=Walled())
+    over = filled(figure.axes[0], style.GREY)
     at = ((1.0, 1.0), (1.0, 0.4), (1.17, 1.4), (1.23, 1.4), (1.5, 0.0))
     assert inside(over, *at) == [True, False, True, False, False]
 

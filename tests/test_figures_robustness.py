@@ -14,10 +14,10 @@ from hyrl_mj import BadInput
 from hyrl_mj.game.scores import BEATEN, CURVE, MAP_CLASSES, UNWINNABLE, WON, WON_FROM_SOME
 from hyrl_mj.sets import Grid
 from hyrl_mj.viz import figures
-from hyrl_mj.viz.figures import robustness, style
+from hyrl_mj.viz.figures import robustness_curve, style
 
 CIRCLE, VEHICLE = hyrl_mj.get_task("unit_circle"), hyrl_mj.get_task("vehicle")
-HYRL = robustness.CURVE_COLOURS[1]
+HYRL = robustness_curve.CURVE_COLOURS[1]
 
 
 @pytest.fixture
@@ -61,14 +61,22 @@ def critical_of(*points):
     return hyrl_mj.CriticalSet(z, np.zeros(len(z), dtype=int), 0.01, 0.1)
 
 
+def draw_map(task, result, maps, critical, path=None):
+    return figures.draw_robustness_map(figures.ShownGame(task, critical, result, maps), path)
+
+
+def draw_curve(task, result, path=None):
+    return figures.draw_robustness_curve(figures.ShownGame(task, critical_of(), result, {}), path)
+
+
 @pytest.mark.parametrize("task", [CIRCLE, VEHICLE], ids=lambda task: task.name)
 def test_each_class_that_occurs_has_its_colour(tmp_path, task):
     occurring = (WON, WON_FROM_SOME, BEATEN)
     path, names = tmp_path / "figures" / "map.png", ("policy", "hyrl")
     arrays = map_of(task, names, lambda z: np.arange(len(z)) % 40 // 14)
     critical = critical_of(task.replay_starts[2])
-    figures.robustness_map(task, content_of(names), arrays, critical, path)
-    for k, colour in enumerate(robustness.CLASS_COLOURS):
+    draw_map(task, content_of(names), arrays, critical, path)
+    for k, colour in enumerate(figures.CLASS_COLOURS):
         assert (len(where(path, colour)) > 1000) == (k in occurring), MAP_CLASSES[k]
     width, height = size_of(path)
     assert 1200 < width <= 1600
@@ -83,8 +91,8 @@ def test_a_map_is_drawn_the_right_way_round(tmp_path, coarse):
         return np.where((z[:, 0] < 1.0) & (z[:, 1] > 0.5), BEATEN, UNWINNABLE)
 
     arrays = map_of(VEHICLE, ["hyrl"], upper_left)
-    figures.robustness_map(VEHICLE, content_of(["hyrl"]), arrays, critical_of((0.0, 0.0)), path)
-    corner, rest = (where(path, robustness.CLASS_COLOURS[k]) for k in (BEATEN, UNWINNABLE))
+    draw_map(VEHICLE, content_of(["hyrl"]), arrays, critical_of((0.0, 0.0)), path)
+    corner, rest = (where(path, figures.CLASS_COLOURS[k]) for k in (BEATEN, UNWINNABLE))
     right, up = np.median(corner, axis=0) - np.median(rest, axis=0)
     assert right < -50
     assert up > 50
@@ -97,12 +105,12 @@ def test_arcs_of_a_ring_lie_at_their_angle(tmp_path, coarse):
         return np.where(np.cos(z[:, 0] - 0.25) > 0.9, BEATEN, UNWINNABLE)
 
     arrays = map_of(CIRCLE, ["hyrl"], through_the_end_of_the_period, cells=360)
-    figures.robustness_map(CIRCLE, content_of(["hyrl"]), arrays, critical_of(), path)
-    ring = where(path, robustness.CLASS_COLOURS[UNWINNABLE])
+    draw_map(CIRCLE, content_of(["hyrl"]), arrays, critical_of(), path)
+    ring = where(path, figures.CLASS_COLOURS[UNWINNABLE])
     # The ring without its legend: the other arc lies to the right, a little above the centre.
     ring = ring[ring[:, 1] > 100]
     centre = ring[:, 0].min() + np.ptp(ring[:, 1]) / 2, (ring[:, 1].min() + ring[:, 1].max()) / 2
-    found = where(path, robustness.CLASS_COLOURS[BEATEN])
+    found = where(path, figures.CLASS_COLOURS[BEATEN])
     x, y = np.median(found[found[:, 1] > 100], axis=0) - centre
     assert np.arctan2(y, x) == pytest.approx(0.25, abs=0.05)
 
@@ -110,8 +118,8 @@ def test_arcs_of_a_ring_lie_at_their_angle(tmp_path, coarse):
 def test_a_single_node_of_a_ring_is_seen(tmp_path):
     path = tmp_path / "map.png"
     arrays = map_of(CIRCLE, ["hyrl"], lambda z: (np.arange(len(z)) == 700) * BEATEN, cells=6000)
-    figures.robustness_map(CIRCLE, content_of(["hyrl"]), arrays, critical_of(), path)
-    found = where(path, robustness.CLASS_COLOURS[BEATEN])
+    draw_map(CIRCLE, content_of(["hyrl"]), arrays, critical_of(), path)
+    found = where(path, figures.CLASS_COLOURS[BEATEN])
     assert (found[:, 1] > 200).sum() > 20, "beside what is in the legend"
 
 
@@ -119,11 +127,11 @@ def test_the_critical_set_lies_at_its_angle(tmp_path, coarse):
     arrays, pictures = map_of(CIRCLE, ["hyrl"], lambda z: WON + 0 * z[:, 0]), []
     for critical in (critical_of(), critical_of((0.75 * np.pi,))):
         path = tmp_path / "map.png"
-        figures.robustness_map(CIRCLE, content_of(["hyrl"]), arrays, critical, path)
+        draw_map(CIRCLE, content_of(["hyrl"]), arrays, critical, path)
         pictures.append(np.asarray(Image.open(path).convert("RGB"))[::-1].astype(int))
     changed = np.argwhere(np.abs(pictures[1] - pictures[0]).max(axis=-1) > 100)[:, ::-1]
     ring, changed = (
-        found[found[:, 1] > 100] for found in (where(path, robustness.CLASS_COLOURS[WON]), changed)
+        found[found[:, 1] > 100] for found in (where(path, figures.CLASS_COLOURS[WON]), changed)
     )
     x, y = np.median(changed, axis=0) - (ring.min(axis=0) + ring.max(axis=0)) / 2
     assert np.arctan2(y, x) == pytest.approx(0.75 * np.pi, abs=0.05)
@@ -131,19 +139,23 @@ def test_the_critical_set_lies_at_its_angle(tmp_path, coarse):
 
 def test_curves_and_a_third_controller(tmp_path, coarse):
     names, path = ("policy", "hyrl", "median filter"), tmp_path / "curve.png"
-    figures.robustness_curve(VEHICLE, content_of(names), path)
-    for colour in (*robustness.CURVE_COLOURS[:3], robustness.LIMIT_COLOUR, robustness.PALE):
+    draw_curve(VEHICLE, content_of(names), path)
+    for colour in (
+        *robustness_curve.CURVE_COLOURS[:3],
+        robustness_curve.LIMIT_COLOUR,
+        robustness_curve.PALE,
+    ):
         assert len(where(path, colour)) > 100
     arrays = map_of(VEHICLE, names, lambda z: np.zeros(len(z)), cells=8)
     critical = critical_of((0.0, 0.0))
-    figures.robustness_map(VEHICLE, content_of(names), arrays, critical, tmp_path / "map.png")
+    draw_map(VEHICLE, content_of(names), arrays, critical, tmp_path / "map.png")
     assert size_of(tmp_path / "map.png")[1] > size_of(path)[1]
 
 
 def test_times_are_drawn_where_runs_last_for_ever(tmp_path, coarse):
     one, two = tmp_path / "one.png", tmp_path / "two.png"
-    figures.robustness_curve(CIRCLE, content_of(["hyrl"]), one)
-    figures.robustness_curve(CIRCLE, content_of(["hyrl"], excursion=0.1, margin=None), two)
+    draw_curve(CIRCLE, content_of(["hyrl"]), one)
+    draw_curve(CIRCLE, content_of(["hyrl"], excursion=0.1, margin=None), two)
     assert size_of(two)[1] > size_of(one)[1] + 100
     assert size_of(two)[0] <= 800
     assert len(where(two, HYRL)) > len(where(one, HYRL))
@@ -162,17 +174,17 @@ def test_nothing_is_left_behind_when_drawing_fails(tmp_path, monkeypatch, fails)
     else:
         monkeypatch.setattr(Figure, "savefig", half)
     with pytest.raises((BadInput, KeyError)):
-        figures.robustness_curve(VEHICLE, content, path)
+        draw_curve(VEHICLE, content, path)
     assert path.read_bytes() == b"an older picture"
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_the_users_own_style_is_neither_used_nor_changed(tmp_path, coarse):
     names = ["hyrl"]
-    figures.robustness_curve(VEHICLE, content_of(names), tmp_path / "plain.png")
+    draw_curve(VEHICLE, content_of(names), tmp_path / "plain.png")
     with matplotlib.rc_context({"figure.facecolor": "black", "font.size": 30}):
         before = dict(matplotlib.rcParams)
-        figures.robustness_curve(VEHICLE, content_of(names), tmp_path / "styled.png")
+        draw_curve(VEHICLE, content_of(names), tmp_path / "styled.png")
         assert dict(matplotlib.rcParams) == before
     assert (tmp_path / "plain.png").read_bytes() == (tmp_path / "styled.png").read_bytes()
 

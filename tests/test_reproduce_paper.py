@@ -25,6 +25,7 @@ def planted_run(task, arcs=None, **settings):
         task=task,
         settings=preset(task, **settings),
         policy=policy_of(task),
+        steady=policy_of(task),
         controller=controller_of(task),
         critical_set=decisions(task),
         partition=halves(task),
@@ -85,10 +86,11 @@ def test_a_run_of_another_task_is_refused(tmp_path):
         script.opened(tmp_path, "unit_circle")
 
 
-def test_six_figures_are_written(tmp_path):
+def test_the_papers_seven_figures_are_written(tmp_path):
     circle, vehicle = (planted_run(hyrl_mj.get_task(t)) for t in ("unit_circle", "vehicle"))
     script.draw(circle, vehicle, tmp_path)
     names = {path.stem.partition("_")[0] for path in tmp_path.iterdir()}
     assert names == {f"fig{i}" for i in range(1, 7)}
+    assert len([*tmp_path.glob("*.png")]) == 7
     assert {path.suffix for path in tmp_path.iterdir()} == {".png", ".pdf"}
     assert np.all([path.with_suffix(".pdf").is_file() for path in tmp_path.glob("*.png")])

@@ -115,6 +115,5 @@ def draw_robustness(
     """Draw the map and the curve of the game."""
     from hyrl_mj.viz import figures
 
-    task, game = run.task, content["game"]
-    figures.robustness_map(task, game, maps, run.critical_set, folder / "robustness_map.png")
-    figures.robustness_curve(task, game, folder / "robustness_curve.png")
+    shown = figures.ShownGame(run.task, run.critical_set, content["game"], maps)
+    figures.draw_all(shown, folder)

@@ -16,7 +16,7 @@ from hyrl_mj.progress import Say
 from hyrl_mj.run_directory import Run, load_run
 from hyrl_mj.sets import Grid
 from hyrl_mj.stages import boundary, extend, find_critical_set, make_partition, with_room
-from hyrl_mj.viz import Section, critical_section, replay_sentence
+from hyrl_mj.viz import replay_sentence
 
 # ---- the stages: each reads the artifacts of those before it and writes its own
 
@@ -124,25 +124,18 @@ def figures_stage(run: Run, say: Say) -> None:
     """Draw the paper's figures of this run; those that make no sense for its chart are left out."""
     from hyrl_mj.viz import figures
 
-    section, folder = Section.of(run.task), run.path / "figures"
-    task, policy, eps, seed = section.task, run.steady, run.settings.noise, run.settings.seed
-    # All is read before anything is written.
-    arcs, critical = run.arcs(), critical_section(run)
-    partition, sets = section.partition(run.partition), section.extended_sets(run.extended_sets)
-    noisy = section.arc(arcs.get(("critical", "policy"), arcs["start0", "policy"]))
-    figures.overview(task, policy, critical, partition, noisy, folder / "overview.png")
-    figures.policy_map(task, policy, critical, eps, seed, folder / "policy.png")
-    figures.extended_sets_map(task, critical, sets, folder / "extended_sets.png")
-    figures.runs(run.task, arcs, folder / "runs.png")
-    say(f"{', '.join(figures.names(task))} in {folder}, as PNG and PDF")
+    folder = run.path / "figures"
+    # Everything is read before anything is written.
+    drawn = figures.draw_all(figures.shown_run(run), folder)
+    say(f"{', '.join(drawn)} in {folder}, as PNG and PDF")
 
 
 def figure_paths(run: Run) -> list[Path]:
     """The files that `figures_stage` writes."""
     from hyrl_mj.viz import figures
 
-    folder = run.path / "figures"
-    return [folder / f"{n}{suffix}" for n in figures.names(run.task) for suffix in (".png", ".pdf")]
+    folder, names = run.path / "figures", figures.names(run.task, figures.ShownRun)
+    return [folder / f"{name}{suffix}" for name in names for suffix in (".png", ".pdf")]
 
 
 def replay_stage(run: Run, say: Say) -> None:
@@ -170,14 +163,10 @@ def diagnose_stage(run: Run, say: Say) -> None:
     """Find out what noise can do to the policy alone, draw it, and write it on a page."""
     from hyrl_mj.viz import diagnosis, figures
 
-    section, folder = Section.of(run.task), run.path / diagnosis.FOLDER
-    eps, seed = run.settings.noise, run.settings.seed
+    folder = run.path / diagnosis.FOLDER
     content, maps = examine_loops(run, {"policy": PolicyController(run.policy)}, run.partition)
     arc = diagnosis.worst_arc(run)
-    critical, partition = critical_section(run), section.partition(run.partition)
-    shown = section.arc(arc or diagnosis.usual_arc(run))
-    figures.overview(section.task, run.steady, critical, partition, shown, folder / "overview.png")
-    figures.policy_map(section.task, run.steady, critical, eps, seed, folder / "policy.png")
+    figures.draw_all(figures.shown_policy(run, arc or diagnosis.usual_arc(run)), folder)
     if maps is not None:
         draw_robustness(run, content, maps, folder)
     diagnosis.write_worst(run, arc, say)

@@ -8,13 +8,17 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.game import LARGEST, Game, worst_signal
+from hyrl_mj.policies import Policy
 from hyrl_mj.run_directory import Run
 from hyrl_mj.simulation import KINDS, AnyNoise, HybridArc, Noise, samples, simulate
+from hyrl_mj.tasks import Task
 from hyrl_mj.viz.replay import Floor, Show
 from hyrl_mj.viz.section import Section, critical_section
 
 # What a replay plays.
 STARTS = ("critical", "paper", "latest")
+# Runs without noise in the overview: of an even number none starts in the middle.
+OVERVIEW_RUNS = 12
 # The noise of the exact game, beside the kinds that are defined without one.
 WORST = "worst"
 NOISES = (*KINDS, WORST)
@@ -143,3 +147,39 @@ def replay_floor(run: Run, overlap: bool = True) -> Floor:
         section.partition(run.split if overlap else run.partition),
         section.extended_sets(run.extended_sets) if overlap else None,
     )
+
+
+# ---- what the figures show
+
+
+def overview_arcs(task: Task, policy: Policy) -> list[HybridArc]:
+    """Simulates a policy without noise, from starts along the longest side of the start region.
+
+    The other coordinates of the starts are at their lower end.
+
+    Args:
+        task: may be a section's.
+        policy: of stage 1.
+    """
+    low, high = np.array(task.start_low), np.array(task.start_high)
+    starts, axis = np.tile(low, (OVERVIEW_RUNS, 1)), int(np.argmax(high - low))
+    shares = (np.arange(OVERVIEW_RUNS) + 0.5) / OVERVIEW_RUNS
+    starts[:, axis] = low[axis] + shares * (high - low)[axis]
+    arcs = simulate(task, policy, starts, horizon=task.replay_time)
+    assert isinstance(arcs, list)
+    return arcs
+
+
+def policy_start_arcs(task: Task, policy: Policy, eps: float, seed: int) -> list[HybridArc]:
+    """Simulates a policy from the paper's starts of it (Section III), under the paper's noise.
+
+    Args:
+        task: may be a section's.
+        policy: of stage 1.
+        eps: bound of the noise.
+        seed: of the noise.
+    """
+    starts, noise = np.array(task.policy_starts or task.replay_starts), Noise("alternating", eps)
+    arcs = simulate(task, policy, starts, noise, horizon=task.replay_time, seed=seed)
+    assert isinstance(arcs, list)
+    return arcs

@@ -13,7 +13,7 @@ from PIL import Image
 
 from hyrl_mj import artifacts
 from hyrl_mj.run_directory import Run
-from hyrl_mj.viz.figures import CAPTIONS
+from hyrl_mj.viz.figures import FIGURES
 from hyrl_mj.viz.tables import percent
 
 
@@ -68,10 +68,10 @@ def film(path: Path) -> dict[str, Any] | None:
 
 
 def pictures(folder: Path) -> list[Picture]:
-    """The figures that are there."""
-    paths = {name: folder / f"{name}.png" for name in CAPTIONS}
+    """Returns the figures that have been drawn into a folder."""
+    paths = {name: folder / f"{name}.png" for name in FIGURES}
     return [
-        _picture(path, name.replace("_", " "), CAPTIONS[name])
+        _picture(path, name.replace("_", " "), FIGURES[name].caption)
         for name, path in paths.items()
         if path.is_file()
     ]

@@ -1,52 +1,119 @@
-"""Pictures of a run, each a function from its artifacts to a PNG and a PDF."""
+"""Figures of a run, drawn from what its stages have found.
+
+Each function takes what it shows and returns a matplotlib `Figure`; given a path it also writes a PNG and
+a PDF. A new figure is a module here and an entry of `FIGURES`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
 
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.figures.charts import drawable
-from hyrl_mj.viz.figures.hybrid import extended_sets_map, runs
-from hyrl_mj.viz.figures.policy import overview, policy_map
-from hyrl_mj.viz.figures.robustness import CLASS_COLOURS, robustness_curve, robustness_map
+from hyrl_mj.viz.figures.extended_sets import draw_extended_sets
+from hyrl_mj.viz.figures.overview import draw_overview
+from hyrl_mj.viz.figures.policy_map import draw_policy_map
+from hyrl_mj.viz.figures.robustness_curve import draw_robustness_curve
+from hyrl_mj.viz.figures.robustness_map import CLASS_COLOURS, draw_robustness_map
+from hyrl_mj.viz.figures.runs import draw_runs
+from hyrl_mj.viz.figures.shown import ShownGame, ShownPolicy, ShownRun, shown_policy, shown_run
 
-# What the picture of each name shows, in the order in which they tell the story.
-CAPTIONS = {
-    "overview": (
+
+@dataclass(frozen=True)
+class Entry:
+    """A figure that stages draw and reports show.
+
+    Attributes:
+        draw: (shown, path or None) -> the figure.
+        shows: the type that `draw` takes; the stage that makes one draws the figure.
+        caption: one or two sentences for the report.
+        flat: whether the chart, or a section of it, must be a plane or a ring.
+    """
+
+    draw: Callable[[Any, Path | None], Figure]
+    shows: type[ShownPolicy | ShownGame]
+    caption: str
+    flat: bool = True
+
+
+# By the name of their files, in the order in which reports show them.
+FIGURES = {
+    "overview": Entry(
+        draw_overview,
+        ShownPolicy,
         "Where the stage-1 policy goes without noise, in the colour of the mode whose way it is, and "
         "where measurement noise leads it from one start. The red field is all that it can observe along "
-        "that path."
+        "that path.",
     ),
-    "policy": (
+    "policy": Entry(
+        draw_policy_map,
+        ShownPolicy,
         "The input that the stage-1 policy gives at each measurement, with the critical set M* in red, "
-        "and its runs from the paper's starts under measurement noise."
+        "and its runs from the paper's starts under measurement noise.",
     ),
-    "extended_sets": (
+    "extended_sets": Entry(
+        draw_extended_sets,
+        ShownRun,
         "The extended set of each mode, and where they overlap: the overlap over the critical set M* is "
-        "the hysteresis that is to keep noise from flipping the mode."
+        "the hysteresis that is to keep noise from flipping the mode.",
     ),
-    "robustness_map": (
-        "What becomes of runs from each state when an adversary picks the worst noise at every sample."
+    "robustness_map": Entry(
+        draw_robustness_map,
+        ShownGame,
+        "What becomes of runs from each state when an adversary picks the worst noise at every sample.",
+        flat=False,
     ),
-    "robustness_curve": (
-        "How much of the winnable start region is won against the worst noise, over its bound."
+    "robustness_curve": Entry(
+        draw_robustness_curve,
+        ShownGame,
+        "How much of the winnable start region is won against the worst noise, over its bound.",
+        flat=False,
     ),
-    "runs": (
+    "runs": Entry(
+        draw_runs,
+        ShownRun,
         "The hybrid controller and the stage-1 policy from the paper's starts under the same "
-        "measurement noise, for each start mode."
+        "measurement noise, for each start mode.",
+        flat=False,
     ),
 }
 
 
-def names(task: Task) -> tuple[str, ...]:
-    """The pictures of a run that need no worst-case game; some are left out where a chart cannot be shown."""
-    return ("overview", "policy", "extended_sets", "runs") if drawable(task) else ("runs",)
+def names(task: Task, shows: type[ShownPolicy | ShownGame]) -> tuple[str, ...]:
+    """Returns the names of the figures that a value of a type has, of those that the chart allows."""
+    return tuple(
+        name
+        for name, entry in FIGURES.items()
+        if issubclass(shows, entry.shows) and (drawable(task) or not entry.flat)
+    )
+
+
+def draw_all(shown: ShownPolicy | ShownGame, folder: Path) -> tuple[str, ...]:
+    """Writes every figure of a value into a folder, and returns their names."""
+    drawn = names(shown.task, type(shown))
+    for name in drawn:
+        FIGURES[name].draw(shown, folder / f"{name}.png")
+    return drawn
 
 
 __all__ = [
-    "CAPTIONS",
     "CLASS_COLOURS",
-    "extended_sets_map",
+    "FIGURES",
+    "Entry",
+    "ShownGame",
+    "ShownPolicy",
+    "ShownRun",
+    "draw_all",
+    "draw_extended_sets",
+    "draw_overview",
+    "draw_policy_map",
+    "draw_robustness_curve",
+    "draw_robustness_map",
+    "draw_runs",
     "names",
-    "overview",
-    "policy_map",
-    "robustness_curve",
-    "robustness_map",
-    "runs",
+    "shown_policy",
+    "shown_run",
 ]

@@ -12,6 +12,7 @@ from matplotlib.patches import Circle, Patch, Wedge
 from matplotlib.ticker import FuncFormatter, MultipleLocator
 from scipy.ndimage import gaussian_filter
 
+from hyrl_mj.errors import BadInput
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages import Partition
 from hyrl_mj.tasks import Task
@@ -36,6 +37,16 @@ def is_ring(task: Task) -> bool:
 def drawable(task: Task) -> bool:
     """Whether the chart, or a section of it, can be shown as a plane or a ring."""
     return is_ring(task) or task.chart.dimension > 1
+
+
+def check_drawable(task: Task) -> None:
+    """Raises `BadInput` unless `drawable`."""
+    if not drawable(task):
+        name = task.chart.names[0]
+        raise BadInput(
+            f"the chart of {task.name} has one coordinate, {name}, which is not periodic, so that there is "
+            "no plane and no ring to draw: draw its runs, which are shown over time"
+        )
 
 
 def angles_on(axis: Any, task: Task, coordinate: int) -> None:

@@ -20,7 +20,6 @@ from hyrl_mj.viz.figures.style import (
     POLICY_COLOUR,
     RED,
     mode_colour,
-    policy_title,
 )
 
 # Radius at which spirals begin; they end at 1.
@@ -103,10 +102,9 @@ def failed(arc: HybridArc) -> bool:
     return arc.outcome != Outcome.REACHED.label
 
 
-def policy_way(panel: Axes, task: Task, view: View, arc: HybridArc, **looks: Any) -> Artists:
-    """Draw a run of the stage-1 policy in ink; returns as `ends`."""
-    drawn = line(panel, view, arc.t, arc.z, color=POLICY_COLOUR, zorder=4, **looks)
-    return {policy_title(task): drawn}
+def policy_way(panel: Axes, view: View, arc: HybridArc, **looks: Any) -> Line2D:
+    """Draws a run of the stage-1 policy in ink."""
+    return line(panel, view, arc.t, arc.z, color=POLICY_COLOUR, zorder=4, **looks)
 
 
 def chosen_way(

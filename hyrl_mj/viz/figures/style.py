@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from hyrl_mj import artifacts
-from hyrl_mj.policies import algorithm_title
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz import colours
 
@@ -58,18 +57,20 @@ def mode_tint(mode: int) -> str:
 
 
 @contextmanager
-def drawing(path: Path, size: tuple[float, float]) -> Iterator[Figure]:
-    """A figure of a size [inches], written as PNG and PDF when the block ends well, or not at all.
+def drawing(path: Path | None, size: tuple[float, float]) -> Iterator[Figure]:
+    """Gives a figure to draw on, and writes it as PNG and PDF when the block ends without an error.
 
     Args:
-        path: of the PNG; the PDF has the same name.
-        size: width and height, with what is cut off in the end.
+        path: of the PNG; the PDF has the same name. With None nothing is written.
+        size: width and height [inches], before empty margins are cut off.
     """
-    # The user's own matplotlibrc must not change what is drawn here.
+    # The user's own matplotlibrc must not change the figure.
     with style.context(["default", STYLE]):
         layout = ConstrainedLayoutEngine(compress=True, h_pad=PAD, w_pad=PAD)
         figure = Figure(figsize=size, layout=layout)
         yield figure
+        if path is None:
+            return
         with (
             artifacts.replacing(path.with_suffix(".png")) as png,
             artifacts.replacing(path.with_suffix(".pdf")) as pdf,
@@ -104,11 +105,6 @@ def legend(figure: Figure, handles: Mapping[str, Artist], handlelength: float = 
 def task_title(task: Task) -> str:
     """The task for people: "Unit circle"."""
     return task.name.replace("_", " ").capitalize()
-
-
-def policy_title(task: Task) -> str:
-    """The stage-1 policy for people: "RL policy (PPO)"."""
-    return f"RL policy ({algorithm_title(task.algorithm)})"
 
 
 def noise_label(task: Task, kind: str, eps: float) -> str:

@@ -1,0 +1,171 @@
+"""The overview: which way the stage-1 policy goes without noise, and where noise leads it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+
+from hyrl_mj.sets import GridSet
+from hyrl_mj.viz.figures.charts import (
+    OUTER,
+    Artists,
+    arcs,
+    check_drawable,
+    classes_of,
+    cross,
+    dots,
+    is_ring,
+    on_ring,
+    patch,
+    plane,
+    region,
+    ring,
+    spokes,
+)
+from hyrl_mj.viz.figures.paths import (
+    CORE,
+    View,
+    chosen_way,
+    end,
+    line,
+    mark,
+    plane_view,
+    policy_way,
+    spiral_view,
+)
+from hyrl_mj.viz.figures.shown import ShownPolicy
+from hyrl_mj.viz.figures.style import (
+    INK,
+    PALE,
+    PALE_RED,
+    RED,
+    WIDTH,
+    drawing,
+    head,
+    legend,
+    mode_tint,
+    noise_label,
+)
+
+# An arrowhead shows the direction of a run after 1/ARROW of its samples.
+ARROW = 7
+
+
+def draw_overview(shown: ShownPolicy, path: Path | None = None) -> Figure:
+    """Draws the ways that the policy goes without noise, and a run that noise leads astray.
+
+    Args:
+        shown: has a chart that is a plane or a ring.
+        path: where the PNG and the PDF are written, if anywhere.
+
+    Returns:
+        The figure.
+
+    Raises:
+        BadInput: the chart is neither a plane nor a ring.
+    """
+    task, arc = shown.task, shown.noisy
+    check_drawable(task)
+    with drawing(path, (WIDTH, 7.6)) as figure:
+        head(figure, task, f"the {shown.algorithm} policy, and where noise leads it")
+        panel = figure.subplots()
+        panel.set_title(noise_label(task, arc.noise, arc.bound))
+        draw = _spirals if is_ring(task) else _field
+        legend(figure, draw(panel, shown))
+    return figure
+
+
+def _field(panel: Axes, shown: ShownPolicy) -> Artists:
+    """Draws the overview of a plane; returns the legend's entries."""
+    task, partition, arc = shown.task, shown.partition, shown.noisy
+    handles: Artists = {}
+    classes, grid = classes_of(partition), partition.grid
+    for i, mode in enumerate(partition.modes):
+        region(panel, GridSet.from_mask(grid, classes == i), mode_tint(mode))
+        handles[f"only in the part $M_{mode}$"] = patch(mode_tint(mode))
+    handles |= plane(panel, task)
+    view = plane_view(task)
+    handles |= _noiseless_runs(panel, shown, view)
+    eps = task.noise_in_chart(arc.bound)
+    panel.add_collection(
+        PolyCollection(
+            list(_band(task.chart.wrap(arc.z), eps, view.longest)),
+            color=PALE_RED,
+            linewidth=0.3,
+            zorder=2,
+        )
+    )
+    handles |= _noisy_run(panel, shown, view)
+    ahead = arc.z[-1] - arc.z[0]
+    pointing = (3, 0, float(np.degrees(np.arctan2(ahead[1], ahead[0]))) - 90)
+    looks = {"markersize": 13, "markerfacecolor": PALE, "markeredgecolor": INK}
+    handles["robot at its start"] = mark(panel, view, arc, 0, pointing, **looks)
+    return handles | dots(panel, shown.critical.points)
+
+
+def _band(z: np.ndarray, eps: np.ndarray, longest: np.ndarray) -> np.ndarray:
+    """Returns quadrilaterals (k, 4, 2) that cover a path (K, 2) and all points within +-eps (2,) of it.
+
+    A box that moves along a straight line covers itself and the area that its two diagonals sweep. Steps
+    longer than `longest` cross the seam of a periodic chart.
+    """
+    steps = (np.abs(np.diff(z, axis=0)) <= longest).all(axis=1)
+    a, b = z[:-1][steps], z[1:][steps]
+    corners = [np.array(signs) * eps for signs in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
+    boxes = np.stack([z + corner for corner in corners], axis=1)
+    swept = [np.stack([a - c, a + c, b + c, b - c], axis=1) for c in corners[:2]]
+    return np.concatenate([boxes, *swept])
+
+
+def _spirals(panel: Axes, shown: ShownPolicy) -> Artists:
+    """Draws the overview of a ring, where time goes outward; returns the legend's entries."""
+    task, partition, arc = shown.task, shown.partition, shown.noisy
+    seconds = task.replay_time
+    tints = [mode_tint(mode) for mode in partition.modes]
+    arcs(panel, task, classes_of(partition), [*tints, None], OUTER, CORE)
+    ring(panel, task, (OUTER, CORE), f",\ntime outward:\n0 to {seconds:g} s")
+    handles: Artists = {
+        f"only in the part $M_{mode}$": patch(tint)
+        for mode, tint in zip(partition.modes, tints, strict=True)
+    }
+    view = spiral_view(task, seconds)
+    handles |= _noiseless_runs(panel, shown, view)
+    eps = task.noise_in_chart(arc.bound)
+    rim = np.vstack([view.points(arc.t, arc.z - eps), view.points(arc.t, arc.z + eps)[::-1]])
+    panel.fill(*rim.T, color=PALE_RED, linewidth=0, zorder=2)
+    handles |= _noisy_run(panel, shown, view)
+    if task.set_point is not None:
+        handles |= cross(panel, *np.ravel(on_ring(task, task.set_point)))
+    return handles | spokes(panel, task, shown.critical.points[:, 0], CORE - 0.06, OUTER)
+
+
+def _noiseless_runs(panel: Axes, shown: ShownPolicy, view: View) -> Artists:
+    """Draws the runs without noise, with arrowheads; returns the legend's entries."""
+    handles: Artists = {}
+    for run in shown.noiseless:
+        way, drawn = chosen_way(panel, shown.task, view, run, linewidth=1.3, zorder=3)
+        handles[f"without noise: {way}"] = drawn
+        row = len(run.t) // ARROW
+        points = view.points(run.t[row : row + 2], run.z[row : row + 2])
+        if len(points) < 2 or (np.abs(points[1] - points[0]) > view.longest).any():
+            continue  # the run ends where it starts, or crosses the seam at this sample
+        looks = {"arrowstyle": "-|>", "color": drawn.get_color(), "shrinkA": 0, "shrinkB": 0}
+        arrow = looks | {"mutation_scale": 11}
+        panel.annotate("", points[1], points[0], arrowprops=arrow, zorder=3)
+    return dict(sorted(handles.items()))
+
+
+def _noisy_run(panel: Axes, shown: ShownPolicy, view: View) -> Artists:
+    """Draws the run under noise and what it measures; returns the legend's entries."""
+    task, arc = shown.task, shown.noisy
+    drawn = policy_way(panel, view, arc, linewidth=1.4)
+    handles: Artists = {f"{shown.policy_title}, with noise": drawn}
+    handles["what it can observe"] = patch(PALE_RED, PALE_RED)
+    measured = task.z(arc.measured[:-1])
+    looks = {"linestyle": "none", "marker": ".", "color": RED, "markersize": 4, "zorder": 4.5}
+    handles["what it observes"] = line(panel, view, arc.t[:-1], measured, **looks)
+    return handles | end(panel, task, view, arc)

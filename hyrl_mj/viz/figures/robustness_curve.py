@@ -1,0 +1,181 @@
+"""The robustness curve: how much each controller wins against the worst noise, over its bound."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from hyrl_mj.game import LIMIT
+from hyrl_mj.viz.figures.charts import Artists
+from hyrl_mj.viz.figures.shown import ShownGame
+from hyrl_mj.viz.figures.style import (
+    INK,
+    PALE,
+    PAPER,
+    POLICY_COLOUR,
+    WIDTH,
+    drawing,
+    head,
+    legend,
+    mode_colour,
+)
+from hyrl_mj.viz.tables import NAMES, lasts
+
+# Of the curves: ink as the policy's path in the replay, then blue, purple and vermilion.
+CURVE_COLOURS = (POLICY_COLOUR, *(mode_colour(i) for i in (0, 2, 1)))
+LIMIT_COLOUR = "#a9dcc9"
+MARKERS = "osD^"
+# Nodes of a curve from one marker to the next.
+MARK_EVERY = 6
+# Rows of the marks of margins, above the curves [%].
+TOP, ROW = 105, 5
+
+
+def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
+    """Draws what each controller wins against the noise bound.
+
+    Where runs last for ever, a second panel shows the worst time to arrival.
+
+    Args:
+        shown: the game.
+        path: where the PNG and the PDF are written, if anywhere.
+
+    Returns:
+        The figure.
+    """
+    task, result = shown.task, shown.result
+    curve, scores = result["curve"], result["scores"]
+    names = [name for name in scores if name != LIMIT]
+    eps = np.array(curve["eps"])
+    run_eps = max(score["eps"] for score in scores[names[0]])
+    lasting = lasts(result)
+    # A controller keeps its colour whichever others are in the figure.
+    known = list(dict.fromkeys(["policy", "hyrl", *names]))
+    numbers = {name: known.index(name) for name in names}
+    where, unit = task.noise_on(result["everywhere"])
+    heights = (3.6, 2.0) if lasting else (3.6,)
+    with drawing(path, (WIDTH, 2.0 + sum(heights))) as figure:
+        head(figure, task, "what is won against the worst noise")
+        panels = figure.subplots(
+            len(heights), 1, sharex=True, squeeze=False, height_ratios=heights
+        ).ravel()
+        shares = panels[0]
+        handles = _limit(shares, eps, curve[LIMIT])
+        for name, number in numbers.items():
+            handles |= _won(shares, number, name, eps, curve[name])
+        (line,) = shares.plot(eps, 100 * np.array(curve["winnable"]), color=PALE, linewidth=1)
+        handles["winnable share of the start region"] = line
+        handles |= _margins(shares, result["margin"], numbers, unit)
+        shares.set(ylabel="winnable starts that are won [%]", yticks=range(0, 101, 20))
+        if lasting:
+            for name, number in numbers.items():
+                _times(panels[1], number, eps, curve[name])
+            panels[1].set_ylabel("worst time to arrival,\nstarts that are won [s]")
+        for panel in panels:
+            panel.axvline(run_eps, color=INK, linewidth=1, linestyle=(0, (1, 2)), zorder=1)
+            panel.grid(color="#e6e8eb", linewidth=0.8)
+            panel.set_axisbelow(True)
+            panel.spines[["top", "right"]].set_visible(False)
+        right = max(eps[-1], run_eps)
+        panels[-1].set(xlabel=f"noise bound eps on {where} [{unit}]", xlim=(0, 1.01 * right))
+        shares.annotate(
+            f"this run: eps = {run_eps:g} {unit}",
+            (run_eps, 1),
+            xycoords=("data", "axes fraction"),
+            xytext=(0, 3),
+            textcoords="offset points",
+            ha="center",
+        )
+        legend(figure, handles, handlelength=3.2)
+    return figure
+
+
+def _limit(panel: Axes, eps: np.ndarray, curve: Mapping[str, Any]) -> Artists:
+    """Draws the limit of any controller, broad and pale, so that curves on it can be seen.
+
+    Returns:
+        The legend's entries.
+    """
+    looks: dict[str, Any] = {"color": LIMIT_COLOUR, "linewidth": 7, "solid_capstyle": "butt"}
+    (won,) = panel.plot(eps, 100 * np.array(curve["won"]), **looks)
+    if _same(curve):
+        return {"limit of any controller": won}
+    looks |= {"linestyle": (0, (1.2, 0.5)), "linewidth": 4}
+    (won_any,) = panel.plot(eps, 100 * np.array(curve["won_any"]), **looks)
+    return {
+        "limit of any controller, picks the start mode": won,
+        "limit of any controller, from every start mode": won_any,
+    }
+
+
+def _won(panel: Axes, number: int, name: str, eps: np.ndarray, curve: Mapping[str, Any]) -> Artists:
+    """Draws what a controller wins; returns the legend's entries."""
+    won, won_any = 100 * np.array(curve["won"]), 100 * np.array(curve["won_any"])
+    title, looks = NAMES.get(name, name), _looks(number)
+    (line,) = panel.plot(eps, won, **looks)
+    if _same(curve):
+        return {title: line}
+    (dashed,) = panel.plot(eps, won_any, **looks | _dashed(number))
+    return {f"{title}, picks the start mode": line, f"{title}, from every start mode": dashed}
+
+
+def _times(panel: Axes, number: int, eps: np.ndarray, curve: Mapping[str, Any]) -> None:
+    """Draws the worst time to arrival where anything is won."""
+    looks = _looks(number) | ({} if _same(curve) else _dashed(number))
+    won = np.array(curve["won_any"]) > 0
+    panel.plot(eps, np.where(won, curve["time_any"], np.nan), **looks)
+
+
+def _same(curve: Mapping[str, Any]) -> bool:
+    """Returns whether the start mode makes no difference."""
+    return bool(np.allclose(curve["won"], curve["won_any"], atol=1e-9))
+
+
+def _looks(number: int) -> dict[str, Any]:
+    """Returns the line style of a controller's curve.
+
+    Where curves coincide the first is thin and lies on thicker ones, and no marker hides another.
+    """
+    return {
+        "color": CURVE_COLOURS[number % len(CURVE_COLOURS)],
+        "linewidth": 1.5 + 1.3 * number,
+        "zorder": 3 + 1 / (1 + number),
+        "marker": MARKERS[number % len(MARKERS)],
+        "markersize": 6,
+        "clip_on": False,
+        "markevery": (2 * number % MARK_EVERY, MARK_EVERY),
+    }
+
+
+def _dashed(number: int) -> dict[str, Any]:
+    """Returns how the line style differs where the controller is started in every mode."""
+    return {
+        "linestyle": "--",
+        "linewidth": 1.5,
+        "markerfacecolor": PAPER,
+        "markeredgewidth": 1.5,
+        "markevery": ((2 * number + 1) % MARK_EVERY, MARK_EVERY),
+    }
+
+
+def _margins(
+    panel: Axes, margins: Mapping[str, float | None], numbers: Mapping[str, int], unit: str
+) -> Artists:
+    """Marks the margins above the curves, a row for each controller; returns the legend's entries."""
+    handles: Artists = {}
+    panel.set_ylim(-3, TOP + ROW * len(numbers))
+    for row, (name, number) in enumerate(numbers.items()):
+        margin, title = margins[name], NAMES.get(name, name)
+        if margin is None:
+            handles[f"margin of {title}: none"] = Line2D([], [], linestyle="none")
+            continue
+        looks = _looks(number) | {"marker": "v", "linestyle": "none", "markevery": None}
+        (mark,) = panel.plot([margin], [TOP + ROW * row], **looks)
+        handles[f"margin of {title}: all is won up to {margin:.3g} {unit}"] = mark
+    return handles

@@ -1,0 +1,110 @@
+"""What the figures show: the parts of a run, cut to the section of its chart that can be drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hyrl_mj.policies import Policy
+from hyrl_mj.run_directory import Run
+from hyrl_mj.simulation import HybridArc
+from hyrl_mj.stages import CriticalSet, ExtendedSets, Partition
+from hyrl_mj.tasks import Task
+from hyrl_mj.viz.arcs import overview_arcs, policy_start_arcs
+from hyrl_mj.viz.section import Section, critical_section
+
+
+@dataclass(frozen=True)
+class ShownPolicy:
+    """What the figures of a stage-1 policy show.
+
+    Attributes:
+        task: in the section.
+        algorithm: that trained the policy, "DQN".
+        policy: of stage 1, at its mean or mode where it is sampled.
+        critical: M*.
+        partition: the parts M_i.
+        noisy: a run under noise, from M* if there is one.
+        noiseless: runs from starts all along the start region.
+        paper: runs from the paper's starts of the policy, under the paper's noise.
+    """
+
+    task: Task
+    algorithm: str
+    policy: Policy
+    critical: CriticalSet
+    partition: Partition
+    noisy: HybridArc
+    noiseless: tuple[HybridArc, ...]
+    paper: tuple[HybridArc, ...]
+
+    @property
+    def policy_title(self) -> str:
+        """What legends call the policy: "RL policy (DQN)"."""
+        return f"RL policy ({self.algorithm})"
+
+
+@dataclass(frozen=True)
+class ShownRun(ShownPolicy):
+    """What the figures of a finished run show: its policy, and its hybrid controller.
+
+    Attributes:
+        whole: the task with all of its chart.
+        sets: M_ext_i.
+        replays: arcs on the whole chart by start ("start0", ..., "critical") and controller ("policy",
+            "hyrl_q0", ...), under the same noise.
+    """
+
+    whole: Task
+    sets: ExtendedSets
+    replays: Mapping[tuple[str, str], HybridArc]
+
+
+@dataclass(frozen=True)
+class ShownGame:
+    """What the figures of the worst-case game show.
+
+    Attributes:
+        task: what was played; its chart has two coordinates, or one.
+        critical: M*.
+        result: of `examine`.
+        maps: of `examine`: `map_<controller>` (N,) int, an index into `MAP_CLASSES` for each node of
+            the grid of `grid_counts` (d,) nodes, and the noise bound `eps` that they hold for.
+    """
+
+    task: Task
+    critical: CriticalSet
+    result: Mapping[str, Any]
+    maps: Mapping[str, np.ndarray]
+
+
+def shown_policy(run: Run, noisy: HybridArc) -> ShownPolicy:
+    """Returns what the figures of a run's policy show; simulates the arcs that no stage has left.
+
+    Args:
+        run: with its critical set and partition.
+        noisy: a run of the policy under noise, from M* if there is one.
+    """
+    section, s = Section.of(run.task), run.settings
+    return ShownPolicy(
+        section.task,
+        s.stage1.title,
+        run.steady,
+        critical_section(run),
+        section.partition(run.partition),
+        section.arc(noisy),
+        tuple(overview_arcs(section.task, run.steady)),
+        tuple(policy_start_arcs(section.task, run.steady, s.noise, s.seed)),
+    )
+
+
+def shown_run(run: Run) -> ShownRun:
+    """Returns what the figures of a run show; its replays have been simulated."""
+    arcs, section = run.arcs(), Section.of(run.task)
+    start = "critical" if ("critical", "policy") in arcs else "start0"
+    policy = shown_policy(run, arcs[start, "policy"])
+    sets = section.extended_sets(run.extended_sets)
+    return ShownRun(**vars(policy), whole=run.task, sets=sets, replays=arcs)
