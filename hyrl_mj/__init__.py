@@ -15,7 +15,18 @@ from hyrl_mj.pipeline import diagnose, robustify, run
 from hyrl_mj.policies import Controller, MlpPolicy, Policy, from_callable, load_agent
 from hyrl_mj.run_directory import Run, load_run
 from hyrl_mj.sets import StateSet
-from hyrl_mj.simulation import HybridArc, Noise, Recorded, closed_loop, simulate
+from hyrl_mj.simulation import (
+    HybridArc,
+    LoopSettings,
+    Noise,
+    Recorded,
+    Sample,
+    Signal,
+    closed_loop,
+    register_noise,
+    simulate,
+    simulate_batch,
+)
 from hyrl_mj.stages import (
     CriticalSet,
     ExtendedSets,
@@ -39,6 +50,7 @@ __all__ = [
     "HybridArc",
     "HybridController",
     "HyrlError",
+    "LoopSettings",
     "Mirror",
     "MlpPolicy",
     "NoRenderer",
@@ -48,8 +60,10 @@ __all__ = [
     "Policy",
     "Recorded",
     "Run",
+    "Sample",
     "Score",
     "Settings",
+    "Signal",
     "StateSet",
     "Task",
     "closed_loop",
@@ -64,9 +78,11 @@ __all__ = [
     "load_run",
     "make_partition",
     "register",
+    "register_noise",
     "robustify",
     "run",
     "simulate",
+    "simulate_batch",
     "task_names",
 ]
 

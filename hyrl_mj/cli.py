@@ -15,7 +15,6 @@ import tyro
 from hyrl_mj import pipeline, progress
 from hyrl_mj.errors import BadInput, HyrlError, unknown
 from hyrl_mj.run_directory import load_run
-from hyrl_mj.simulation import KINDS
 from hyrl_mj.tasks import get_task, task_names
 from hyrl_mj.viz import print_robustness, print_summary
 
@@ -272,9 +271,6 @@ def robustness(
     """
     run = load_run(run_dir)
     kinds = [] if noise is None else [kind.strip() for kind in noise.split(",")]
-    for kind in kinds:
-        if kind not in KINDS:
-            raise unknown("noise", kind, KINDS)
     if episodes is None:
         run.check_exact()
         if kinds or near_critical:

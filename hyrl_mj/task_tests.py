@@ -8,7 +8,7 @@ import pytest
 from hyrl_mj.envs import observation_space
 from hyrl_mj.errors import BadInput
 from hyrl_mj.policies import PolicyController
-from hyrl_mj.simulation import closed_loop
+from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import Outcome, Task, check_task
 
 
@@ -99,7 +99,8 @@ def test_the_ways_that_runs_go_are_its_modes(task: Task) -> None:
             return np.tile(np.mean(task.input_limits, axis=0), (len(measured), 1))
 
     z = task.starts(200, np.random.default_rng(0))
-    way = task.direction(closed_loop(task, PolicyController(Straight()), z, quiet=True).path)
+    loop, settings = PolicyController(Straight()), LoopSettings(quiet=True)
+    way = task.direction(closed_loop(task, loop, z, settings=settings).path)
     assert way.shape == (200,)
     assert set(way) <= {-1, *range(len(task.mode_names))}
 

@@ -23,8 +23,8 @@ from rich.table import Table
 import hyrl_mj
 from hyrl_mj import progress
 from hyrl_mj.policies import Controller, PolicyController
-from hyrl_mj.simulation import closed_loop
-from hyrl_mj.stages import noisy_episodes
+from hyrl_mj.simulation import LoopSettings, closed_loop
+from hyrl_mj.stages import Regions, noisy_episodes
 
 KINDS = ("alternating", "adversarial")
 # Starts for the comparison with the expert.
@@ -75,7 +75,8 @@ def crashes_without_noise(run: hyrl_mj.Run) -> dict[str, int]:
 
 def reached(task: hyrl_mj.Task, loop: Controller, z: np.ndarray) -> np.ndarray:
     """Whether runs from starts (n, d) reach the end: (n,) bool."""
-    return closed_loop(task, loop, z, quiet=True).outcome == hyrl_mj.Outcome.REACHED
+    rollout = closed_loop(task, loop, z, settings=LoopSettings(quiet=True))
+    return rollout.outcome == hyrl_mj.Outcome.REACHED
 
 
 def measure(name: str, seed: int, count: int, folder: Path) -> list[str]:
@@ -89,9 +90,8 @@ def measure(name: str, seed: int, count: int, folder: Path) -> list[str]:
     row = [name, str(seed)]
     for loop, controller in run.loops.items():
         n = min(count, SHARE) if loop == "policy" else count
-        for found in noisy_episodes(
-            run.task, run.critical_set, {loop: controller}, noises, n, near=True
-        ):
+        regions = Regions(run.critical_set, near=True)
+        for found in noisy_episodes(run.task, regions, {loop: controller}, noises, n):
             failed = found["episodes"] - found["outcomes"].get("reached", 0)
             share = failed / found["episodes"]
             good = share >= 0.2 if loop == "policy" else failed == 0

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from planted import decisions, halves, ideal_controller, one_way_policy, sign_policy
 
-from hyrl_mj import BadInput, Noise, closed_loop
+from hyrl_mj import BadInput, LoopSettings, Noise, closed_loop
 from hyrl_mj.game.scores import Game
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid
 from hyrl_mj.stages import episodes as bulk
-from hyrl_mj.stages.episodes import noisy_episodes
+from hyrl_mj.stages.episodes import Regions, noisy_episodes
 
 
 @pytest.fixture(scope="module")
@@ -40,11 +40,10 @@ def records(vehicle, on_vehicle):
     noises = tuple(Noise(k, 0.1) for k in ("uniform", "alternating", "adversarial"))
     return noisy_episodes(
         vehicle,
-        decisions(vehicle),
+        Regions(decisions(vehicle), (game.lattice.grid, game.winnable(0.1))),
         {name: controllers[name] for name in ("sign", "ideal")},
         noises,
         600,
-        winnable=(game.lattice.grid, game.winnable(0.1)),
     )
 
 
@@ -69,7 +68,9 @@ def test_starts_near_the_critical_set_are_those_within_twice_the_noise(vehicle, 
     # Starts are uniform in 0 <= x <= 0.5, |y| <= 1, and M* runs along the axis up to x = 0.45.
     left = {"left": on_vehicle[1]["left"]}
     for eps in (0.05, 0.1):
-        records = noisy_episodes(vehicle, decisions(vehicle), left, (Noise("uniform", eps),), 2000)
+        records = noisy_episodes(
+            vehicle, Regions(decisions(vehicle)), left, (Noise("uniform", eps),), 2000
+        )
         assert {r["region"] for r in records} == {"near M*", "elsewhere"}
         near = record(records, "left", "near M*")["episodes"] / 2000
         assert near == pytest.approx(2 * eps, abs=0.03)
@@ -106,7 +107,7 @@ def test_the_same_seed_gives_the_same_counts(vehicle, on_vehicle):
 
     def counts(seed):
         noises = (Noise("uniform", 0.2),)
-        return noisy_episodes(vehicle, decisions(vehicle), sign, noises, 300, seed=seed)
+        return noisy_episodes(vehicle, Regions(decisions(vehicle)), sign, noises, 300, seed=seed)
 
     assert counts(3) == counts(3)
     assert counts(3) != counts(4)
@@ -117,7 +118,7 @@ def test_batches_add_up_and_none_is_the_same(vehicle, on_vehicle, monkeypatch):
     sign, noises = {"sign": on_vehicle[1]["sign"]}, (Noise("uniform", 0.1),)
 
     def near(count):
-        records = noisy_episodes(vehicle, decisions(vehicle), sign, noises, count)
+        records = noisy_episodes(vehicle, Regions(decisions(vehicle)), sign, noises, count)
         assert sum(r["episodes"] for r in records) == count
         return record(records, "sign", "near M*")["episodes"]
 
@@ -137,7 +138,7 @@ def test_batches_add_up_and_none_is_the_same(vehicle, on_vehicle, monkeypatch):
 def test_episodes_that_make_no_sense_are_refused(vehicle, on_vehicle, noise, count, message):
     sign = {"sign": on_vehicle[1]["sign"]}
     with pytest.raises(BadInput, match=message):
-        noisy_episodes(vehicle, decisions(vehicle), sign, (noise,), count)
+        noisy_episodes(vehicle, Regions(decisions(vehicle)), sign, (noise,), count)
 
 
 @pytest.mark.parametrize("kind", ["uniform", "alternating", "adversarial"])
@@ -147,7 +148,7 @@ def test_noise_everywhere_acts_on_every_column(vehicle, kind):
     z0 = vehicle.starts(300, np.random.default_rng(0))
     for everywhere, columns in ((False, [False, True]), (True, [True, True])):
         noise = Noise(kind, 0.1, everywhere)
-        rollout = closed_loop(vehicle, loop, z0, noise=noise, steps=1, record=True)
+        rollout = closed_loop(vehicle, loop, z0, noise, settings=LoopSettings(steps=1, record=True))
         n = rollout.measured[0] - rollout.path[0]
         assert np.abs(n).max() <= 0.1 + 1e-12
         assert (np.abs(n).max(axis=0) > 0.05).tolist() == columns

@@ -9,7 +9,7 @@ import pytest
 import hyrl_mj
 from hyrl_mj import Outcome
 from hyrl_mj.policies.controllers import PolicyController
-from hyrl_mj.simulation.rollout import closed_loop
+from hyrl_mj.simulation.rollout import LoopSettings, closed_loop
 from hyrl_mj.tasks.quadrotor import rotation
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "scripts"))
@@ -33,7 +33,9 @@ class Constant:
 
 
 def fly(task, policy, z0, steps=None):
-    return closed_loop(task, PolicyController(policy), np.array(z0), steps=steps, quiet=True)
+    return closed_loop(
+        task, PolicyController(policy), np.array(z0), settings=LoopSettings(steps=steps, quiet=True)
+    )
 
 
 def test_a_rotation_is_that_of_mujoco(quadrotor):

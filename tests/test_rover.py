@@ -10,7 +10,7 @@ import pytest
 import hyrl_mj
 from hyrl_mj import Outcome
 from hyrl_mj.policies.controllers import PolicyController
-from hyrl_mj.simulation.rollout import closed_loop
+from hyrl_mj.simulation.rollout import LoopSettings, closed_loop
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "scripts"))
 
@@ -33,7 +33,9 @@ class Constant:
 
 
 def drive(task, policy, z0, steps=None):
-    return closed_loop(task, PolicyController(policy), np.array(z0), steps=steps, quiet=True)
+    return closed_loop(
+        task, PolicyController(policy), np.array(z0), settings=LoopSettings(steps=steps, quiet=True)
+    )
 
 
 def test_it_stands_on_two_wheels_and_a_caster(rover):

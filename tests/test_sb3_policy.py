@@ -14,7 +14,7 @@ from planted import (
 )
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from hyrl_mj import BadInput, Noise, closed_loop
+from hyrl_mj import BadInput, LoopSettings, Noise, closed_loop
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.envs.gym_env import action_space
 from hyrl_mj.envs.sb3_env import TaskVecEnv
@@ -42,7 +42,9 @@ def observed(task, measured):
 
 def simulated_returns(task, loop, z, noise, seed):
     """Returns and lengths (n,), (n,) of the project's own simulation."""
-    rollout = closed_loop(task, as_controller(loop), z, noise=noise, seed=seed, quiet=True)
+    rollout = closed_loop(
+        task, as_controller(loop), z, noise, seed=seed, settings=LoopSettings(quiet=True)
+    )
     rewards = np.array([task.reward(measurement) for measurement in rollout.path[1:]])
     played = np.arange(len(rewards))[:, None] < rollout.length
     return np.where(played, rewards, 0.0).sum(axis=0), rollout.length

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from planted import Cube, sphere_policy
 
-from hyrl_mj import closed_loop, find_critical_set
+from hyrl_mj import LoopSettings, closed_loop, find_critical_set
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
@@ -70,8 +70,8 @@ def test_its_critical_set_is_searched_for_in_the_plane(cube, section):
 def test_runs_in_it_are_those_of_the_whole_task(cube, section):
     z = np.array([[0.2, 0.1], [-0.5, 0.4]])
     loop = PolicyController(sphere_policy(cube, RADIUS))
-    seen = closed_loop(section.task, loop, z, steps=5)
-    whole = closed_loop(cube, loop, section.lift(z), steps=5)
+    seen = closed_loop(section.task, loop, z, settings=LoopSettings(steps=5))
+    whole = closed_loop(cube, loop, section.lift(z), settings=LoopSettings(steps=5))
     np.testing.assert_array_equal(seen.path, whole.path[..., :2])
     np.testing.assert_array_equal(seen.measured, whole.measured)
 

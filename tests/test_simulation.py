@@ -12,7 +12,16 @@ from planted import (
     sign_policy,
 )
 
-from hyrl_mj import BadArtifact, BadInput, HybridArc, Noise, Outcome, closed_loop, simulate
+from hyrl_mj import (
+    BadArtifact,
+    BadInput,
+    HybridArc,
+    LoopSettings,
+    Noise,
+    Outcome,
+    closed_loop,
+    simulate,
+)
 from hyrl_mj.policies.controllers import PolicyController
 
 ALTERNATING = Noise("alternating", 0.1)
@@ -79,7 +88,9 @@ def cases(circle, vehicle):
 def test_it_equals_the_formula_one_by_one(circle, vehicle):
     for task, controller, starts in cases(circle, vehicle):
         q0 = np.zeros(len(starts), dtype=int)
-        rollout = closed_loop(task, controller, starts, noise=ALTERNATING, q0=q0, record=True)
+        rollout = closed_loop(
+            task, controller, starts, ALTERNATING, q0=q0, settings=LoopSettings(record=True)
+        )
         for i, start in enumerate(starts):
             path, modes, outcome = formula_run(task, controller, start, 0, 0.1)
             end = rollout.length[i]
@@ -109,8 +120,10 @@ def test_a_run_that_ended_stays_where_it_ended(vehicle):
 def test_backward_undoes_forward(vehicle):
     loop = PolicyController(one_way_policy(vehicle, clear=9.0))
     starts = vehicle_starts(20)
-    forward = closed_loop(vehicle, loop, starts, steps=6)
-    back = closed_loop(vehicle, loop, forward.path[-1], steps=6, backward=True)
+    forward = closed_loop(vehicle, loop, starts, settings=LoopSettings(steps=6))
+    back = closed_loop(
+        vehicle, loop, forward.path[-1], settings=LoopSettings(steps=6, backward=True)
+    )
     np.testing.assert_allclose(back.path[-1], starts, atol=1e-6)
     assert (back.outcome == Outcome.RUNNING).all()
 

@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.simulation import Noise
+from hyrl_mj.simulation import NOT_STARTED, AnyNoise, Sample, signal_for
 from hyrl_mj.tasks import Outcome, Task
 
 
@@ -61,7 +61,8 @@ class BatchedEnv:
     Args:
         task: what is played.
         n: number of episodes side by side.
-        noise: measurement noise on the observations; reward and end see the true state.
+        noise: measurement noise on the observations, of a kind that needs no controller; reward and end
+            see the true state.
         domain: where episodes start and stay; by default the task's starts, and everywhere.
         max_steps: samples until truncation, by default the task's.
         threads: threads of the physics, 0 for all cores; the result does not depend on it.
@@ -72,7 +73,7 @@ class BatchedEnv:
         task: Task,
         n: int,
         *,
-        noise: Noise | None = None,
+        noise: AnyNoise | None = None,
         domain: Domain | None = None,
         max_steps: int | None = None,
         threads: int = 0,
@@ -80,16 +81,17 @@ class BatchedEnv:
         if n < 1:
             raise BadInput(f"{n} episodes side by side cannot be played: give at least 1")
         self.task, self.n, self.domain = task, n, domain
-        self.noise = noise or Noise()
+        self._noise = signal_for(noise, task, None)
         self.max_steps = max_steps or task.max_steps
         self.plant = task.plant(n, threads)
-        self._rng = np.random.default_rng()
         self._samples = np.zeros(n, dtype=int)
         self._everyone = np.arange(n)
+        self.seed(None)
 
     def seed(self, seed: int | None) -> None:
         """Restart the generator from which starts and noise are drawn."""
         self._rng = np.random.default_rng(seed)
+        self._noise.reset(self.n, self._rng)
 
     def reset(self, ids: np.ndarray | None = None, z: np.ndarray | None = None) -> np.ndarray:
         """Start new episodes in the rows `ids` (all by default).
@@ -156,10 +158,11 @@ class BatchedEnv:
         return self.task.at_levels(actions)
 
     def _measure(self, ids: np.ndarray) -> np.ndarray:
-        """Noisy measurements (k, p) of the rows `ids`."""
+        """Returns noisy measurements (k, p) of the rows `ids`."""
         true = self.plant.measurement[ids]
-        noise = self.noise.sample(self._samples[ids], true.shape[1], self._rng)
-        return np.asarray(true + noise * self.noise.acts_on(self.task.noisy))
+        modes = np.full(len(ids), NOT_STARTED)
+        now = Sample(ids, self._samples[ids], true, modes, self.plant)
+        return true + self._noise.sample(now)
 
 
 def cautious_reward(task: Task, measured: np.ndarray, caution: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.errors import BadInput
-from hyrl_mj.simulation import Noise
+from hyrl_mj.simulation import AnyNoise
 from hyrl_mj.tasks import Outcome, Task, get_task
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         self,
         task: str,
         *,
-        noise: Noise | None = None,
+        noise: AnyNoise | None = None,
         render_mode: str | None = None,
         camera: str = "overhead",
         width: int = 640,
@@ -128,7 +128,7 @@ class TaskVectorEnv(VectorEnv):
         task: str,
         num_envs: int = 1,
         *,
-        noise: Noise | None = None,
+        noise: AnyNoise | None = None,
         max_episode_steps: int | None = None,
         threads: int = 0,
     ):

@@ -19,7 +19,7 @@ from hyrl_mj.game.solver import NEVER, Answers, Moves, WorstNoise, lasting, nois
 from hyrl_mj.policies import Controller, Policy, as_controller
 from hyrl_mj.progress import Progress
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.simulation import Recorded, Rollout, closed_loop
+from hyrl_mj.simulation import LoopSettings, Recorded, Rollout, closed_loop
 from hyrl_mj.tasks import Task
 
 # The controller that nothing can beat, beside those that are examined.
@@ -211,9 +211,8 @@ def worst_signal(
     """
     noise = game.worst_noise(name, eps)
     modes = None if q0 is None else np.full(len(z0), q0)
-    rollout = closed_loop(
-        game.task, as_controller(controller), z0, noise=noise, q0=modes, steps=steps, record=True
-    )
+    loop, settings = as_controller(controller), LoopSettings(steps=steps, record=True)
+    rollout = closed_loop(game.task, loop, z0, noise, modes, settings=settings)
     if not len(rollout.measured):  # all runs are over where they start
         return Recorded(np.zeros((1, len(z0), game.task.measurement_columns)), eps, kind="worst")
     true = _true_measurements(game.task, rollout)
@@ -296,7 +295,7 @@ def examine(
     quiet_starts = coarse.lattice.grid.nodes[coarse.starts & coarse.winnable(0.0)]
     quiet_starts = quiet_starts[:: max(len(quiet_starts) // QUIET_EPISODES, 1)]
     ends = {
-        name: closed_loop(task, controller, quiet_starts, quiet=True)
+        name: closed_loop(task, controller, quiet_starts, settings=LoopSettings(quiet=True))
         for name, controller in controllers.items()
     }
     spacing = fine.lattice.grid.spacing.tolist()

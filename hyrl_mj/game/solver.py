@@ -10,15 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.game.lattice import Lattice
-from hyrl_mj.plant import Plant
 from hyrl_mj.policies import Controller
 from hyrl_mj.sets import within_reach
-from hyrl_mj.simulation import NOT_STARTED
+from hyrl_mj.simulation import NOT_STARTED, Sample, Signal, check_controller
+from hyrl_mj.tasks import Task
 
 # How far beside a node its answer has to be the same, in cells.
 BESIDE = 1e-4
@@ -227,8 +228,8 @@ def lasting(moves: Moves, start: np.ndarray | None = None) -> np.ndarray:
         alive = after
 
 
-class WorstNoise:
-    """The noise of the game's adversary, for use in simulations (an `Adversary`).
+class WorstNoise(Signal):
+    """The noise of the game's adversary, for use in simulations.
 
     Where it can, it wins without measurements on the very border of two answers, from where rounding errors
     of the plant could let a run escape.
@@ -256,11 +257,14 @@ class WorstNoise:
         # Among equals the largest noise, for what lies between the nodes.
         self._shifts = shifts[np.argsort(-np.abs(shifts).sum(axis=1), kind="stable")]
 
-    def choose(self, plant: Plant, q: np.ndarray) -> np.ndarray:
-        """As `Adversary.choose`."""
+    def against(self, task: Task, controller: Controller | None) -> Self:
+        check_controller(controller, self.kind)
+        return super().against(task, controller)
+
+    def sample(self, now: Sample) -> np.ndarray:
         answers, lattice = self._answers, self._answers.lattice
         grid, modes = lattice.grid, answers.modes
-        true = plant.measurement
+        true, q = now.measurement, now.q
         place = grid.nearest(true)
         at = np.stack(np.unravel_index(place, grid.counts), axis=-1)
         row = np.where(q == NOT_STARTED, len(modes), np.searchsorted(modes, q))

@@ -31,7 +31,7 @@ from hyrl_mj.policies import (
     infer_algorithm,
 )
 from hyrl_mj.progress import Progress
-from hyrl_mj.simulation import SIGNALS, Noise
+from hyrl_mj.simulation import Noise
 from hyrl_mj.tasks import Outcome, Task
 
 Score = tuple[float, ...]
@@ -43,6 +43,8 @@ FINAL_RATE = 0.02
 # How often the policy is checkpointed and judged; on how many episodes.
 CHECKPOINTS = 32
 EPISODES = 256
+# Under which kinds of noise a policy is judged, if it is to stand any.
+JUDGES = ("none", "uniform", "alternating")
 # Observations by which a foreign policy is compared with the plain network of its weights, and how far the
 # weights are moved before that.
 CHECKED, MOVED = 64, 0.05
@@ -245,7 +247,7 @@ class _Episodes:
 
     def __init__(self, task: Task, noise: Noise, domain: Domain | None, gamma: float):
         self._task, self._domain, self._gamma = task, domain, gamma
-        self._noises = [Noise(k, noise.bound) for k in SIGNALS] if noise.bound else [Noise()]
+        self._noises = [Noise(k, noise.bound) for k in JUDGES] if noise.bound else [Noise()]
 
     def __call__(self, policy: MlpPolicy) -> Score:
         found = [evaluate(self._task, policy, n, self._domain, self._gamma) for n in self._noises]

@@ -15,10 +15,12 @@ from hyrl_mj.policies import Controller
 from hyrl_mj.progress import Say
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import Grid
-from hyrl_mj.simulation import KINDS, Noise
-from hyrl_mj.stages import Partition, noisy_episodes
+from hyrl_mj.simulation import Noise
+from hyrl_mj.stages import Partition, Regions, noisy_episodes
 from hyrl_mj.viz import robustness_sentence
 
+# The kinds of noise in episodes, unless others are asked for.
+KINDS = ("uniform", "alternating", "adversarial")
 # Noisy episodes of a run whose worst case cannot be played exactly, and of one that only shows that all runs.
 EPISODES, EPISODES_SMOKE = 1_000, 200
 
@@ -41,7 +43,7 @@ def examine_run(
     Args:
         run: with its mode policies.
         eps: noise bound, by default the run's. The scores are for none, half of it, and it.
-        kinds: of the noise in episodes, by default all.
+        kinds: of the noise in episodes, by default `KINDS`.
         count: number of episodes for each kind and controller.
         everywhere: whether noise acts on all columns of the measurement.
         seed: of starts and noise of the episodes.
@@ -90,7 +92,7 @@ def examine_loops(
         count = EPISODES_SMOKE if run.settings.preset == "smoke" else EPISODES
     if count is not None and count < 1:
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
-    noises = tuple(Noise(kind, eps, everywhere) for kind in kinds or KINDS[1:])
+    noises = tuple(Noise(kind, eps, everywhere) for kind in kinds or KINDS)
     content: dict[str, Any] = {"eps": eps, "everywhere": everywhere, "game": None}
     content |= {"episodes": [], "seed": seed}
     winnable, maps = None, None
@@ -103,9 +105,8 @@ def examine_loops(
         last = maps[f"map_{[*loops][-1]}"]
         winnable = grid, np.isin(last, (WON, WON_FROM_SOME, BEATEN))
     if count is not None:
-        content["episodes"] = noisy_episodes(
-            task, critical, loops, noises, count, seed, winnable, near
-        )
+        regions = Regions(critical, winnable, near)
+        content["episodes"] = noisy_episodes(task, regions, loops, noises, count, seed)
     return content, maps
 
 

@@ -1,25 +1,43 @@
 """Simulation: the closed loop of plant, measurement noise and controller, in batches.
 
-`closed_loop` runs many episodes at once; `simulate` returns them as hybrid arcs. Each kind of
-measurement noise is a class of its own.
+`closed_loop` runs many episodes at once; `simulate` returns them as hybrid arcs. Each kind of measurement
+noise is a class of its own, a `Signal`, that `register_noise` makes known by its name.
 """
 
-from hyrl_mj.simulation.arc import HybridArc, samples, simulate
-from hyrl_mj.simulation.lookahead import NOT_STARTED
-from hyrl_mj.simulation.noise import KINDS, SIGNALS, Noise, Recorded
-from hyrl_mj.simulation.rollout import AnyNoise, Rollout, closed_loop, ways
+from hyrl_mj.simulation.arc import HybridArc, samples, simulate, simulate_batch
+from hyrl_mj.simulation.lookahead import Lookahead
+from hyrl_mj.simulation.noise import (
+    NOT_STARTED,
+    AnyNoise,
+    Noise,
+    Recorded,
+    Sample,
+    Signal,
+    check_controller,
+    noise_kinds,
+    register_noise,
+    signal_for,
+)
+from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop, ways
 
 __all__ = [
-    "KINDS",
     "NOT_STARTED",
-    "SIGNALS",
     "AnyNoise",
     "HybridArc",
+    "Lookahead",
+    "LoopSettings",
     "Noise",
     "Recorded",
     "Rollout",
+    "Sample",
+    "Signal",
+    "check_controller",
     "closed_loop",
+    "noise_kinds",
+    "register_noise",
     "samples",
+    "signal_for",
     "simulate",
+    "simulate_batch",
     "ways",
 ]

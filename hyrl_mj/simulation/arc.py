@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,9 +14,12 @@ from numpy.typing import ArrayLike
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadInput, check_seed
 from hyrl_mj.policies import Controller, Policy, PolicyController, as_controller, check_modes
-from hyrl_mj.simulation.noise import Noise, Recorded
-from hyrl_mj.simulation.rollout import AnyNoise, Rollout, closed_loop
-from hyrl_mj.tasks import Outcome, Task
+from hyrl_mj.simulation.noise import AnyNoise, Noise
+from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop
+from hyrl_mj.tasks import Outcome, Task, get_task, task_names
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # The longest time that `simulate` records [s]: an hour.
 LONGEST = 3600.0
@@ -30,7 +34,7 @@ class HybridArc:
 
     Attributes:
         task: name of the task.
-        controller: "policy" or "hyrl", or what the caller calls it.
+        controller: "policy" for a policy alone, else "hyrl".
         t: (N,) time [s].
         j: (N,) number of jumps so far.
         z: (N, d) true chart points, periodic coordinates unwrapped.
@@ -39,8 +43,8 @@ class HybridArc:
         u: (N, m) inputs applied from this row on; not a number where none is: in the last row, and
             in the first of the two rows of a jump.
         state: (N, nstate) MuJoCo's state (`mjSTATE_INTEGRATION`).
-        outcome: "reached", "crashed", "out_of_bounds"; if none of them came, the task's verdict at the
-            end: "reached" or "stalled" for a task of regulation, else "running".
+        outcome: label of an `Outcome`: the one that ended the run, or the task's verdict when its time was
+            up.
         noise: kind of the measurement noise.
         bound: its bound eps.
     """
@@ -58,12 +62,55 @@ class HybridArc:
     noise: str
     bound: float
 
+    def __repr__(self) -> str:
+        return f"HybridArc({self.task}, {self._summary})"
+
+    @property
+    def _summary(self) -> str:
+        jumps = int(self.j[-1])
+        noise = f"{self.noise} noise of {self.bound:g}" if self.bound else "no noise"
+        return (
+            f"{self.controller}: {self.outcome} after {self.t[-1]:.2f} s, "
+            f"{jumps} jump{'s' * (jumps != 1)}, {noise}"
+        )
+
+    def plot(self) -> Figure:
+        """Returns a figure of the chart coordinates over time, coloured by mode, jumps as dashed lines."""
+        from matplotlib.figure import Figure  # slow to import
+
+        dimension = self.z.shape[1]
+        figure = Figure(figsize=(6.4, 1.4 + 1.6 * dimension), layout="constrained")
+        panels = figure.subplots(dimension, sharex=True, squeeze=False)[:, 0]
+        figure.suptitle(f"{self.task}, {self._summary}", fontsize="medium")
+        jumps = np.flatnonzero(np.diff(self.j))
+        # Between two jumps the mode is the same.
+        stretches = np.split(np.arange(len(self.t)), jumps + 1)
+        for panel, label, z in zip(panels, self._axis_labels(), self.z.T, strict=True):
+            for rows in stretches:
+                mode = self.q[rows[0]]
+                panel.plot(self.t[rows], z[rows], color=f"C{mode}", label=f"mode {mode}")
+            for t in self.t[jumps]:
+                panel.axvline(t, color="0.6", linestyle="--", linewidth=0.8, zorder=0)
+            panel.set_ylabel(label)
+        panels[-1].set_xlabel("t [s]")
+        lines, labels = panels[0].get_legend_handles_labels()
+        by_label = dict(zip(labels, lines, strict=True))
+        panels[0].legend(by_label.values(), by_label)
+        return figure
+
+    def _axis_labels(self) -> list[str]:
+        """Returns "x [m]" for each coordinate, or "z[0]" where the task is not known here."""
+        d = self.z.shape[1]
+        if self.task in task_names() and (chart := get_task(self.task).chart).dimension == d:
+            return [f"{n} [{unit}]" for n, unit in zip(chart.names, chart.units, strict=True)]
+        return [f"z[{axis}]" for axis in range(d)]
+
     def arrives(self, task: Task) -> bool:
-        """Whether it reached the set-point; who crosses the finishing line elsewhere has not."""
+        """Returns whether it reached the set-point, not the finishing line elsewhere."""
         return self.outcome == "reached" and bool(task.arrived(self.z[-1:])[0])
 
     def at(self, t: float) -> int:
-        """The last row at or before a time [s]."""
+        """Returns the last row at or before a time [s]."""
         return int(np.searchsorted(self.t, t + 1e-9, side="right") - 1)
 
     def save(self, path: Path) -> None:
@@ -84,6 +131,31 @@ class HybridArc:
             return HybridArc(**{k: v.item() if v.ndim == 0 else v for k, v in values.items()})
 
 
+@overload
+def simulate(
+    task: Task,
+    controller: Controller | Policy,
+    z0: Sequence[float],
+    noise: AnyNoise | None = None,
+    q0: int | None = None,
+    horizon: float | None = None,
+    seed: int = 0,
+) -> HybridArc: ...
+
+
+@overload
+def simulate(
+    task: Task,
+    controller: Controller | Policy,
+    z0: Sequence[Sequence[float]],
+    noise: AnyNoise | None = None,
+    q0: int | np.ndarray | None = None,
+    horizon: float | None = None,
+    seed: int = 0,
+) -> list[HybridArc]: ...
+
+
+@overload
 def simulate(
     task: Task,
     controller: Controller | Policy,
@@ -92,37 +164,52 @@ def simulate(
     q0: int | np.ndarray | None = None,
     horizon: float | None = None,
     seed: int = 0,
-    name: str = "",
+) -> Any: ...
+
+
+def simulate(
+    task: Task,
+    controller: Controller | Policy,
+    z0: ArrayLike,
+    noise: AnyNoise | None = None,
+    q0: int | np.ndarray | None = None,
+    horizon: float | None = None,
+    seed: int = 0,
 ) -> HybridArc | list[HybridArc]:
     """Simulate the closed loop in MuJoCo.
 
     Args:
-        task: the robot and its job.
+        task: the robot and its problem.
         controller: a controller, or a policy.
         z0: one start (d,), or n starts (n, d), in the chart.
         noise: on the measurement; none by default.
         q0: the start mode, or one for each start; by default the controller picks it.
         horizon: time to simulate [s], by default the task's.
         seed: of the noise.
-        name: what the arcs call the controller; by default "policy" for a policy, else "hyrl".
 
     Returns:
         One arc for one start, a list of arcs for several.
 
     Raises:
-        BadInput: a start outside the chart, an unknown mode, modes that do not fit the starts, a bad
-            seed, or a horizon that is not positive.
+        BadInput: a start outside the chart, an unknown mode, modes that do not fit the starts, a noise or
+            a seed that cannot be used, or a horizon that is not positive.
     """
+    arcs = simulate_batch(task, controller, z0, noise, q0, horizon, seed)
+    return arcs[0] if np.ndim(z0) < 2 else arcs
+
+
+def simulate_batch(
+    task: Task,
+    controller: Controller | Policy,
+    z0: ArrayLike,
+    noise: AnyNoise | None = None,
+    q0: int | np.ndarray | None = None,
+    horizon: float | None = None,
+    seed: int = 0,
+) -> list[HybridArc]:
+    """Simulate the closed loop from n starts (n, d), or from one; as `simulate`, always with a list."""
     starts = task.check_state(z0)
-    single = np.ndim(z0) < 2
     check_seed(seed)
-    if not (noise is None or isinstance(noise, Noise | Recorded) or hasattr(noise, "choose")):
-        raise BadInput(
-            f'noise {noise!r} cannot be used: give a hyrl_mj.Noise("alternating", 0.1), say'
-        )
-    if isinstance(noise, Noise):
-        task.check_noise(noise.bound, noise.everywhere)
-    steps = None if horizon is None else samples(task, horizon)
     loop = as_controller(controller)
     if q0 is not None:
         q0 = np.asarray(q0)
@@ -131,16 +218,17 @@ def simulate(
                 f"{len(starts)} starts need one q0 or {len(starts)}, got shape {q0.shape}"
             )
         q0 = check_modes(np.broadcast_to(q0, len(starts)), loop.modes)
+    noise = Noise() if noise is None else noise
+    steps = None if horizon is None else samples(task, horizon)
     rollout = closed_loop(
-        task, loop, starts, noise=noise, q0=q0, steps=steps, seed=seed, record=True
+        task, loop, starts, noise, q0, seed, LoopSettings(steps=steps, record=True)
     )
-    name = name or ("policy" if isinstance(loop, PolicyController) else "hyrl")
-    arcs = [_arc(task, name, rollout, i, noise or Noise()) for i in range(len(starts))]
-    return arcs[0] if single else arcs
+    name = "policy" if isinstance(loop, PolicyController) else "hyrl"
+    return [_arc(task, name, rollout, i, noise) for i in range(len(starts))]
 
 
 def samples(task: Task, horizon: float) -> int:
-    """How many samples a time [s] takes.
+    """Returns how many samples a time [s] takes.
 
     Raises:
         BadInput: it is not positive, or longer than an hour.
@@ -153,7 +241,7 @@ def samples(task: Task, horizon: float) -> int:
 
 
 def _arc(task: Task, name: str, rollout: Rollout, i: int, noise: AnyNoise) -> HybridArc:
-    """Run i of a rollout as a hybrid arc."""
+    """Returns run i of a rollout as a hybrid arc."""
     end = rollout.length[i]
     before, after = rollout.before[:end, i], rollout.q[:end, i]
     jumped = before != after
@@ -182,5 +270,5 @@ def _arc(task: Task, name: str, rollout: Rollout, i: int, noise: AnyNoise) -> Hy
 
 
 def _ended(values: np.ndarray) -> np.ndarray:
-    """(K, c) with a last row that holds no numbers."""
+    """Returns values (K, c) with a row of NaN after them."""
     return np.vstack([values, np.full((1, values.shape[1]), np.nan)])

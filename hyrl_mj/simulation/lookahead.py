@@ -3,77 +3,68 @@
 from __future__ import annotations
 
 from itertools import product
-from typing import Protocol
+from typing import Self
 
 import numpy as np
 
 from hyrl_mj.plant import Plant
 from hyrl_mj.policies import Controller
-from hyrl_mj.simulation.noise import Noise
+from hyrl_mj.simulation.noise import NOT_STARTED, Sample, Signal, check_controller, register_noise
 from hyrl_mj.tasks import Outcome, Task
 
-# Modes of runs that have not started yet: their controller picks one from the first measurement.
-NOT_STARTED = -1
 # How many samples a plant with inertia is followed to see what an input leads to.
 AHEAD = 6
-# Simulations that are looked ahead of together.
+# Simulations that are followed side by side.
 AT_ONCE = 2_048
 
 
-class Adversary(Protocol):
-    """Measurement noise that is chosen anew at every sample, in view of the state and the mode."""
-
-    @property
-    def kind(self) -> str:
-        """Its name."""
-        ...
-
-    @property
-    def bound(self) -> float:
-        """The largest magnitude that it may have."""
-        ...
-
-    def choose(self, plant: Plant, q: np.ndarray) -> np.ndarray:
-        """The noise (n, p) for n simulations in modes q (n,), `NOT_STARTED` before the first sample."""
-        ...
-
-
-class Lookahead:
+@register_noise
+class Lookahead(Signal):
     """The noise that leads into the greatest danger, by the task's own measure of it.
 
     A kinematic plant is looked at one sample later. With inertia one sample shows little: the closed loop
     is followed for `AHEAD` of them, the first with the noise that is tried and the rest without any.
 
-    Args:
-        task: measures the danger.
-        controller: what the noise works against.
-        noise: its bound, and on which columns it acts. Of each of them both ends, the middle and zero are
-            tried; with more than two columns the ends and zero.
+    On each column that noise acts on, both ends of the bound, their halves and zero are tried; with more
+    than two such columns the ends and zero.
+
+    Attributes:
+        samples: how many samples the closed loop is followed.
     """
 
     kind = "adversarial"
+    task: Task
+    controller: Controller
+    samples: int
 
-    def __init__(self, task: Task, controller: Controller, noise: Noise):
-        self.task, self.controller, self.bound = task, controller, noise.bound
-        acts = noise.acts_on(task.noisy)
-        shares = (0.0, -1.0, 1.0, -0.5, 0.5) if np.count_nonzero(acts) <= 2 else (0.0, -1.0, 1.0)
-        choices = product(*[shares if hit else (0.0,) for hit in acts])
-        self._candidates = noise.bound * np.array(list(choices)) * acts
+    def __init__(self, bound: float, shares: np.ndarray):
+        super().__init__(bound, shares)
+        tried = (0.0, -1.0, 1.0, -0.5, 0.5) if np.count_nonzero(shares) <= 2 else (0.0, -1.0, 1.0)
+        choices = product(*[tried if share else (0.0,) for share in shares])
+        self._candidates = bound * np.array(list(choices)) * shares
         self._ahead: Plant | None = None
-        self.samples = 1 if task.kinematic else AHEAD
 
-    def choose(self, plant: Plant, q: np.ndarray) -> np.ndarray:
-        """As `Adversary.choose`. Among equals no noise is preferred, then the largest."""
-        true, chosen = plant.measurement, np.zeros_like(plant.measurement)
-        running = np.flatnonzero(self.task.outcome(true, plant.unstable) == Outcome.RUNNING)
+    def against(self, task: Task, controller: Controller | None) -> Self:
+        signal = super().against(task, controller)
+        signal.task, signal.controller = task, check_controller(controller, self.kind)
+        signal.samples = 1 if task.kinematic else AHEAD
+        return signal
+
+    def sample(self, now: Sample) -> np.ndarray:
+        """As `Signal.sample`. Among equals no noise is preferred, then the largest."""
+        true, chosen = now.measurement, np.zeros_like(now.measurement)
+        unstable = now.plant.unstable[now.rows]
+        running = np.flatnonzero(self.task.outcome(true, unstable) == Outcome.RUNNING)
+        q = now.q[running]
         answer = np.stack(
-            [np.column_stack(self._act(true[running] + c, q[running])) for c in self._candidates]
+            [np.column_stack(self._act(true[running] + c, q)) for c in self._candidates]
         )
         # Where all candidates get the same answer there is nothing to choose, and each answer is tried once.
         split = (answer != answer[0]).any(axis=(0, 2))
         tried = [(answer[:i] == answer[i]).all(axis=2).any(axis=0) for i in range(len(answer))]
         candidate, at = np.nonzero(split & ~np.stack(tried))
-        qpos, qvel = plant.qpos[running[at]], plant.qvel[running[at]]
+        rows = now.rows[running[at]]
+        qpos, qvel = now.plant.qpos[rows], now.plant.qvel[rows]
         danger = np.full(answer.shape[:2], -np.inf)
         for first in range(0, len(at), AT_ONCE):
             these = slice(first, first + AT_ONCE)
@@ -84,7 +75,7 @@ class Lookahead:
         return chosen
 
     def _danger(self, qpos: np.ndarray, qvel: np.ndarray, answer: np.ndarray) -> np.ndarray:
-        """The greatest danger (k,) that follows on answers (k, m + 1), inputs and mode, in k states."""
+        """Returns the greatest danger (k,) after answers (k, m + 1), inputs and mode, in k states."""
         ahead = self._ahead = self._ahead or self.task.plant(AT_ONCE)
         rows = np.arange(len(answer))
         worst = np.full(len(answer), -np.inf)
@@ -105,6 +96,6 @@ class Lookahead:
         return worst
 
     def _act(self, measured: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What the controller answers to measurements (n, p) in modes q (n,): inputs (n, m), modes (n,)."""
+        """Returns the controller's inputs (n, m) and modes (n,) for measurements (n, p) in modes (n,)."""
         mode = np.where(q == NOT_STARTED, self.controller.initial_mode(measured), q)
         return self.controller.step(mode, measured)

@@ -1,17 +1,189 @@
-"""Measurement noise: seeded signals, bounded by eps on the columns of the measurement that it hits."""
+"""Measurement noise: signals bounded by eps on the columns of the measurement that they act on.
+
+`Noise` names a kind and its bound; a `Signal` is what disturbs one closed loop. To add a kind, write a
+class like those below and register it where it is defined.
+"""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
+from typing import Self, TypeVar
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput, check_bound, unknown
+from hyrl_mj.plant import Plant
+from hyrl_mj.policies import Controller
+from hyrl_mj.tasks import Task
 
-# Those that are signals of their own, and those that look at the closed loop.
-SIGNALS = ("none", "uniform", "alternating")
-KINDS = (*SIGNALS, "adversarial")
+# The mode of a run whose controller has not picked one yet: it does so from the first measurement.
+NOT_STARTED = -1
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What a signal may know when it is sampled, for n of the simulations that it disturbs.
+
+    Attributes:
+        rows: (n,) int, which of the simulations.
+        k: (n,) int, the number of each one's sample. Where it is 0 a run begins anew: a signal with memory
+            starts over in these rows.
+        measurement: (n, p) true measurements.
+        q: (n,) int, modes; `NOT_STARTED` where none has been picked.
+        plant: all simulations.
+    """
+
+    rows: np.ndarray
+    k: np.ndarray
+    measurement: np.ndarray
+    q: np.ndarray
+    plant: Plant
+
+
+class Signal(ABC):
+    """Measurement noise on one closed loop.
+
+    Args:
+        bound: largest magnitude eps >= 0, in the unit of the measurement.
+        shares: (p,) how much of the bound acts on each column of the measurement.
+
+    Attributes:
+        kind: name of the kind.
+        rng: the generator that random noise is drawn from, after `reset`.
+    """
+
+    kind: str
+    rng: np.random.Generator
+
+    def __init__(self, bound: float, shares: np.ndarray):
+        self.bound, self.shares = bound, shares
+
+    def against(self, task: Task, controller: Controller | None) -> Self:
+        """Returns the signal for one closed loop: a copy, because loops do not share their memory.
+
+        Args:
+            task: the task.
+            controller: what closes the loop; None in an environment, where an agent does.
+
+        Raises:
+            BadInput: the signal works against a controller, and there is none; see `check_controller`.
+        """
+        return copy(self)
+
+    def reset(self, n: int, rng: np.random.Generator) -> None:
+        """Begin n simulations, with a generator to draw from; a signal with memory makes room for it."""
+        self.rng = rng
+
+    @abstractmethod
+    def sample(self, now: Sample) -> np.ndarray:
+        """Returns the noise (n, p) on the measurements of a sample, in their unit."""
+
+
+def check_controller(controller: Controller | None, kind: str) -> Controller:
+    """Returns the controller itself, if there is one that noise of this kind can work against.
+
+    Raises:
+        BadInput: there is none.
+    """
+    if controller is None:
+        raise BadInput(
+            f"{kind} noise needs a controller to act against: use simulate(), or another kind of noise here"
+        )
+    return controller
+
+
+AnySignal = TypeVar("AnySignal", bound=Signal)
+_KINDS: dict[str, type[Signal]] = {}
+
+
+def register_noise(signal: type[AnySignal]) -> type[AnySignal]:
+    """Make a class of signals known by its `kind`: a class decorator.
+
+    `Noise(kind, bound)` and `--noise KIND` find it then. It is built with a bound and the shares of the
+    columns, as `Signal`.
+
+    Raises:
+        BadInput: another class has that kind.
+    """
+    known = _KINDS.get(signal.kind, signal)
+    if (known.__module__, known.__qualname__) != (signal.__module__, signal.__qualname__):
+        raise BadInput(
+            f"{signal.__name__} cannot be registered: noise {signal.kind!r} is already "
+            f"{known.__module__}.{known.__qualname__}, so choose another kind"
+        )
+    _KINDS[signal.kind] = signal
+    return signal
+
+
+def noise_kinds() -> tuple[str, ...]:
+    """Returns the kinds of noise that are registered."""
+    return tuple(_KINDS)
+
+
+@register_noise
+class NoNoise(Signal):
+    """Exact measurements."""
+
+    kind = "none"
+
+    def sample(self, now: Sample) -> np.ndarray:
+        return np.zeros_like(now.measurement)
+
+
+@register_noise
+class Uniform(Signal):
+    """Noise drawn anew at every sample, uniformly between its bounds."""
+
+    kind = "uniform"
+
+    def sample(self, now: Sample) -> np.ndarray:
+        return self.rng.uniform(-self.bound, self.bound, now.measurement.shape) * self.shares
+
+
+@register_noise
+class Alternating(Signal):
+    """+bound, -bound, +bound, ...: the paper's noise."""
+
+    kind = "alternating"
+
+    def sample(self, now: Sample) -> np.ndarray:
+        return np.where(now.k % 2 == 0, self.bound, -self.bound)[:, None] * self.shares
+
+
+@dataclass(frozen=True)
+class Recorded(Signal):
+    """A noise signal that is given sample by sample; after its end there is none.
+
+    Attributes:
+        values: (K, n, p) noise on n simulations, in the unit of the measurement.
+        bound: the bound that it keeps.
+        kind: name of its kind.
+    """
+
+    values: np.ndarray
+    bound: float
+    kind: str = "recorded"
+
+    def reset(self, n: int, rng: np.random.Generator) -> None:
+        if self.values.shape[1] != n:
+            raise self._misfit(f"{n} simulations")
+
+    def sample(self, now: Sample) -> np.ndarray:
+        columns = now.measurement.shape[1]
+        if self.values.shape[2] != columns:
+            raise self._misfit(f"{columns} columns of measurement")
+        over = now.k >= len(self.values)
+        values = self.values[np.minimum(now.k, len(self.values) - 1), now.rows]
+        return np.where(over[:, None], 0.0, values)
+
+    def _misfit(self, what: str) -> BadInput:
+        return BadInput(
+            f"a recorded noise of shape {self.values.shape} does not fit {what}: "
+            "its shape is (samples, simulations, columns)"
+        )
 
 
 @dataclass(frozen=True)
@@ -20,8 +192,8 @@ class Noise:
 
     Attributes:
         kind: "none"; "uniform", drawn anew at every sample from [-bound, bound]; "alternating", +bound,
-            -bound, +bound, ... (the paper's); or "adversarial", at each sample the one that leads to
-            the greatest danger soon after.
+            -bound, +bound, ... (the paper's); "adversarial", at each sample the one that leads to the
+            greatest danger soon after; or another one that is registered.
         bound: largest magnitude eps >= 0, in the unit of the measurement.
         everywhere: whether it acts on every column of the measurement, not only on the task's noisy ones.
     """
@@ -31,64 +203,38 @@ class Noise:
     everywhere: bool = False
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise unknown("noise", self.kind, KINDS)
+        if self.kind not in _KINDS:
+            raise unknown("noise", self.kind, _KINDS)
         check_bound(self.bound)
 
-    def acts_on(self, noisy: Sequence[float]) -> np.ndarray:
-        """How much of the bound acts on each column (p,) of a measurement: the task's shares, or all."""
+    def shares(self, noisy: Sequence[float]) -> np.ndarray:
+        """Returns how much of the bound acts on each column (p,): the task's shares, or all of it."""
         return np.ones(len(noisy)) if self.everywhere else np.array(noisy, dtype=float)
 
-    def sample(self, k: np.ndarray, columns: int, rng: np.random.Generator) -> np.ndarray:
-        """A signal of its own for n simulations at their samples k.
-
-        Args:
-            k: (n,) int, the number of each simulation's sample.
-            columns: p, the number of columns of the measurement.
-            rng: the generator that random noise is drawn from.
-
-        Returns:
-            (n, p), in the unit of the measurement.
+    def against(self, task: Task, controller: Controller | None) -> Signal:
+        """Returns the signal of this kind for one closed loop, as `Signal.against`.
 
         Raises:
-            BadInput: the noise is adversarial, which takes a closed loop to look at.
+            BadInput: it needs a controller and there is none, or its bound hides the whole chart.
         """
-        if self.kind not in SIGNALS:
-            raise BadInput(f"{self.kind} noise needs a controller to act against: use simulate()")
-        shape = (len(k), columns)
-        if self.kind == "uniform":
-            return rng.uniform(-self.bound, self.bound, shape)
-        if self.kind == "alternating":
-            return np.broadcast_to(np.where(k % 2 == 0, self.bound, -self.bound)[:, None], shape)
-        return np.zeros(shape)
+        task.check_noise(self.bound, self.everywhere)
+        signal = _KINDS[self.kind](self.bound, self.shares(task.noisy))
+        return signal.against(task, controller)
 
 
-@dataclass(frozen=True)
-class Recorded:
-    """A noise signal that is given sample by sample; after its end there is none.
+# What may be given as the noise of a closed loop.
+AnyNoise = Noise | Signal
 
-    Attributes:
-        values: (K, n, p) noise of n simulations, in the unit of the measurement.
-        bound: the bound that it keeps.
-        kind: its name.
+
+def signal_for(noise: AnyNoise | None, task: Task, controller: Controller | None) -> Signal:
+    """Returns the signal for one closed loop, of no noise by default.
+
+    Raises:
+        BadInput: it is no noise, or cannot be used here.
     """
-
-    values: np.ndarray
-    bound: float
-    kind: str = "recorded"
-    everywhere: bool = True
-
-    def acts_on(self, noisy: Sequence[float]) -> np.ndarray:
-        """As `Noise.acts_on`."""
-        return np.ones(len(noisy))
-
-    def sample(self, k: np.ndarray, columns: int, rng: np.random.Generator) -> np.ndarray:
-        """As `Noise.sample`."""
-        if self.values.shape[1:] != (len(k), columns):
-            raise BadInput(
-                f"a recorded noise of shape {self.values.shape} does not fit {len(k)} simulations "
-                f"with {columns} columns of measurement"
-            )
-        over = k >= len(self.values)
-        values = self.values[np.minimum(k, len(self.values) - 1), np.arange(len(k))]
-        return np.where(over[:, None], 0.0, values)
+    noise = Noise() if noise is None else noise
+    if not isinstance(noise, AnyNoise):
+        raise BadInput(
+            f'noise {noise!r} cannot be used: give a hyrl_mj.Noise("alternating", 0.1), say'
+        )
+    return noise.against(task, controller)

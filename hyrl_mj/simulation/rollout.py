@@ -1,8 +1,7 @@
-"""The closed loop of task, noise and controller, in bulk, and the hybrid arcs that it produces."""
+"""The closed loop of task, noise and controller, for many starts at once."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,14 +9,31 @@ import numpy as np
 from hyrl_mj.plant import Plant
 from hyrl_mj.policies import Controller
 from hyrl_mj.progress import Progress
-from hyrl_mj.simulation.lookahead import NOT_STARTED, Adversary, Lookahead
-from hyrl_mj.simulation.noise import Noise, Recorded
+from hyrl_mj.simulation.noise import NOT_STARTED, AnyNoise, Sample, signal_for
 from hyrl_mj.tasks import Outcome, Task
 
-# What may disturb the measurement.
-AnyNoise = Noise | Recorded | Adversary
-# The longest time that `simulate` records [s]: an hour.
-LONGEST = 3600.0
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """How the closed loop is run.
+
+    Attributes:
+        steps: number of samples, by default until the task's time is up.
+        backward: run x' = -f(x, u) instead; such runs end with the last sample only.
+        record: whether modes, measurements, inputs and states are kept.
+        vary: whether coordinates that the chart does not hold are drawn, too, as in training.
+        plant: n copies of the task's robot to use again; by default new ones.
+        label: what the progress bar says.
+        quiet: show no progress bar, because the caller has one.
+    """
+
+    steps: int | None = None
+    backward: bool = False
+    record: bool = False
+    vary: bool = False
+    plant: Plant | None = None
+    label: str = "simulating"
+    quiet: bool = False
 
 
 @dataclass(frozen=True)
@@ -51,43 +67,36 @@ def closed_loop(
     task: Task,
     controller: Controller,
     z0: np.ndarray,
-    *,
     noise: AnyNoise | None = None,
     q0: np.ndarray | None = None,
-    steps: int | None = None,
     seed: int = 0,
-    backward: bool = False,
-    record: bool = False,
-    quiet: bool = False,
-    vary: bool = False,
-    plant: Plant | None = None,
-    label: str = "simulating",
+    settings: LoopSettings = LoopSettings(),
 ) -> Rollout:
     """Run the closed loop from many starts at once.
 
     Args:
-        task: the robot and its job.
+        task: the robot and its problem.
         controller: what closes the loop.
         z0: (n, d) starts, chart points.
         noise: on the measurement; none by default.
         q0: (n,) start modes; by default the controller picks them from the first measurement.
-        steps: samples to run, by default until the task's time is up.
         seed: of the noise; the same seed and n give the same signals whatever the controller.
-        backward: run x' = -f(x, u) instead; runs then have no end but the last step.
-        record: whether modes, measurements, inputs and states are kept.
-        quiet: show no progress bar, because the caller has one.
-        vary: whether coordinates that the chart does not hold are drawn, too, as in training.
-        plant: n copies of the task's robot to use again; by default new ones.
-        label: what the progress bar says.
+        settings: how long, which way, and what is kept.
+
+    Raises:
+        BadInput: the noise cannot be used.
     """
-    noise = noise or Noise()
-    limit = task.max_steps if steps is None else steps
+    limit = task.max_steps if settings.steps is None else settings.steps
+    backward, record = settings.backward, settings.record
     n, rng = len(z0), np.random.default_rng(seed)
-    plant = plant or task.plant(n)
-    plant.set_state(*task.state(z0, np.random.default_rng([seed, 1]) if vary else None))
+    everyone = np.arange(n)
+    plant = settings.plant or task.plant(n)
+    others = np.random.default_rng([seed, 1]) if settings.vary else None
+    plant.set_state(*task.state(z0, others))
+    signal = signal_for(noise, task, controller)
+    signal.reset(n, rng)
     measurement = plant.measurement
     q = np.full(n, NOT_STARTED) if q0 is None else np.asarray(q0, dtype=int).copy()
-    disturb = _disturbance(task, controller, noise, n, rng)
     outcome = np.full(n, Outcome.RUNNING) if backward else task.outcome(measurement, plant.unstable)
     length = np.zeros(n, dtype=int)
     path = np.empty((limit + 1, n, task.chart.dimension))
@@ -95,13 +104,13 @@ def closed_loop(
     first_mode = q.copy()
     kept: dict[str, list[np.ndarray]] = {name: [] for name in ("before", "q", "measured", "u")}
     states = [plant.state] if record else []
-    progress = None if quiet else Progress(label, limit, "samples")
+    progress = None if settings.quiet else Progress(settings.label, limit, "samples")
     for k in range(limit):
         active = np.flatnonzero(outcome == Outcome.RUNNING)
         if not len(active):
             break
-        signal = disturb(k, plant, q)
-        measured = measurement + signal
+        now = Sample(everyone, np.full(n, k), measurement, q, plant)
+        measured = measurement + signal.sample(now)
         if k == 0 and q0 is None:
             q[:] = controller.initial_mode(measured)
             first_mode = q.copy()
@@ -115,12 +124,8 @@ def closed_loop(
         if not backward:
             outcome[active] = task.outcome(measurement[active], lost[active])
         if record:
-            for name, value in (
-                ("before", before),
-                ("q", q.copy()),
-                ("measured", measured),
-                ("u", u),
-            ):
+            values = {"before": before, "q": q.copy(), "measured": measured, "u": u}
+            for name, value in values.items():
                 kept[name].append(value)
             states.append(np.where(lost[:, None], states[-1], plant.state))
         if progress:
@@ -138,20 +143,5 @@ def closed_loop(
 
 
 def ways(task: Task, rollout: Rollout) -> np.ndarray:
-    """Which way each run went, (n,) int as `Task.direction`; -1 for one that broke down."""
+    """Returns which way each run went, (n,) int as `Task.direction`; -1 for one that broke down."""
     return np.where(rollout.outcome == Outcome.UNSTABLE, -1, task.direction(rollout.path))
-
-
-def _disturbance(
-    task: Task, controller: Controller, noise: AnyNoise, n: int, rng: np.random.Generator
-) -> Callable[[int, Plant, np.ndarray], np.ndarray]:
-    """The noise (n, p) as a function of the sample's number, the plant and the modes."""
-    if isinstance(noise, Noise) and noise.kind == "adversarial":
-        noise = Lookahead(task, controller, noise)
-    if not isinstance(noise, Noise | Recorded):
-        adversary = noise
-        return lambda k, plant, q: adversary.choose(plant, q)
-    signal = noise
-    columns = task.measurement_columns
-    acts = signal.acts_on(task.noisy)
-    return lambda k, plant, q: signal.sample(np.full(n, k), columns, rng) * acts

@@ -6,7 +6,7 @@ is imported only where it is needed.
 """
 
 from hyrl_mj.stages.critical_set import CriticalSet, critical_points, find_critical_set
-from hyrl_mj.stages.episodes import noisy_episodes
+from hyrl_mj.stages.episodes import Regions, noisy_episodes
 from hyrl_mj.stages.extended_sets import ExtendedSets, boundary, extend, with_room
 from hyrl_mj.stages.hybrid import ON_EDGE, HybridController
 from hyrl_mj.stages.partition import Partition, make_partition
@@ -17,6 +17,7 @@ __all__ = [
     "ExtendedSets",
     "HybridController",
     "Partition",
+    "Regions",
     "boundary",
     "critical_points",
     "extend",

@@ -11,7 +11,7 @@ from hyrl_mj import artifacts
 from hyrl_mj.errors import unknown
 from hyrl_mj.policies import Policy, PolicyController
 from hyrl_mj.sets import Grid
-from hyrl_mj.simulation import closed_loop, ways
+from hyrl_mj.simulation import LoopSettings, closed_loop, ways
 from hyrl_mj.tasks import SEARCHES, Task
 
 # Samples that the two ends of a rod run: long enough to part, too short to come round an obstacle.
@@ -226,7 +226,8 @@ def _ends(
 def _part(task: Task, policy: Policy, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Whether the runs from a and b (n, d) part: (n,) bool."""
     n = len(a)
-    rollout = closed_loop(task, PolicyController(policy), np.vstack([a, b]), steps=SAMPLES)
+    loop, settings = PolicyController(policy), LoopSettings(steps=SAMPLES)
+    rollout = closed_loop(task, loop, np.vstack([a, b]), settings=settings)
     # A run that ends early, in a crash say, is compared with the other where both still ran.
     last = np.minimum(rollout.length[:n], rollout.length[n:])
     end = rollout.path[np.tile(last, 2), np.arange(2 * n)]

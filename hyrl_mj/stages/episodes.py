@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,25 +12,76 @@ from hyrl_mj.errors import BadInput, check_seed
 from hyrl_mj.policies import Controller
 from hyrl_mj.progress import Progress
 from hyrl_mj.sets import Grid
-from hyrl_mj.simulation import Noise, closed_loop
+from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
 from hyrl_mj.stages.critical_set import CriticalSet, distance_to
 from hyrl_mj.tasks import Outcome, Task
 
-# Episodes that are simulated together: memory does not grow with their number.
+# Episodes that are simulated side by side: memory does not grow with their number.
 BATCH = 4_096
 # After so many starts, none of which lies near M*, there are none.
 RARE = 100_000
 
 
+@dataclass(frozen=True)
+class Regions:
+    """Start regions of a task, by which noisy episodes are counted.
+
+    Attributes:
+        critical: M*; starts within twice the noise bound of it are a region of their own.
+        winnable: a grid and which of its nodes can be won; starts that cannot are a region of their own.
+        near: whether all episodes start within twice the noise bound of M*.
+    """
+
+    critical: CriticalSet
+    winnable: tuple[Grid, np.ndarray] | None = None
+    near: bool = False
+
+    def draw(self, task: Task, bound: float, n: int, rng: np.random.Generator) -> np.ndarray:
+        """Returns n starts (n, d) from the task's distribution, under noise up to a bound.
+
+        Raises:
+            BadInput: they are to lie near M*, and hardly any or none do.
+        """
+        z = task.starts(n, rng)
+        if not self.near:
+            return z
+        if not len(self.critical.points):
+            raise BadInput(
+                "no critical set was found, so nothing starts near it: leave --near-critical out"
+            )
+        kept, drawn = np.empty((0, z.shape[1])), 0
+        while len(kept) < n:
+            kept = np.vstack([kept, z[self._close(task, bound, z)]])
+            drawn += n
+            if not len(kept) and drawn >= RARE:
+                raise BadInput(
+                    f"of {drawn:,} starts of {task.name} none lies within {2 * bound:g} of its critical "
+                    "set: leave --near-critical out, or start elsewhere"
+                )
+            z = task.starts(n, rng)
+        return kept[:n]
+
+    def split(self, task: Task, bound: float, z0: np.ndarray) -> dict[str, np.ndarray]:
+        """Returns which of the starts (n, d) lie in each region, (n,) bool by its name."""
+        near = self._close(task, bound, z0)
+        if self.winnable is None:
+            return {"near M*": near, "elsewhere": ~near}
+        grid, can = self.winnable
+        open_ = can[grid.nearest(z0)]
+        return {"near M*": near & open_, "elsewhere": ~near & open_, "not winnable": ~open_}
+
+    def _close(self, task: Task, bound: float, z: np.ndarray) -> np.ndarray:
+        """Returns whether starts (n, d) lie within twice the noise bound of M*: (n,) bool."""
+        return np.asarray(distance_to(task, self.critical, z) <= 2 * bound)
+
+
 def noisy_episodes(
     task: Task,
-    critical: CriticalSet,
+    regions: Regions,
     controllers: Mapping[str, Controller],
-    noises: tuple[Noise, ...],
+    noises: Sequence[Noise],
     count: int,
     seed: int = 0,
-    winnable: tuple[Grid, np.ndarray] | None = None,
-    near: bool = False,
 ) -> list[dict[str, Any]]:
     """Noisy episodes in bulk: outcomes by noise, controller and start region.
 
@@ -37,13 +89,11 @@ def noisy_episodes(
 
     Args:
         task: what is played, from its start distribution.
-        critical: M*; starts within twice the noise bound of it are a region of their own.
+        regions: by which the starts are counted.
         controllers: by name.
         noises: kinds and bounds.
         count: episodes for each noise and controller.
         seed: of starts and noise.
-        winnable: a grid and which of its nodes can be won; starts that cannot are a region of their own.
-        near: whether all episodes start within twice the noise bound of M*.
 
     Returns:
         One record for each noise, controller and region: how many episodes had each outcome, and the
@@ -67,82 +117,27 @@ def noisy_episodes(
             for first in range(0, count, BATCH):
                 n = min(BATCH, count - first)
                 draw, signal = np.random.SeedSequence([seed, first]).generate_state(2)
-                z0 = _starts(task, critical, noise, n, np.random.default_rng(draw), near)
+                z0 = regions.draw(task, noise.bound, n, np.random.default_rng(draw))
+                settings = LoopSettings(vary=True, plant=plants[n], quiet=True)
                 rollout = closed_loop(
-                    task,
-                    controller,
-                    z0,
-                    noise=noise,
-                    seed=int(signal),
-                    quiet=True,
-                    vary=True,
-                    plant=plants[n],
+                    task, controller, z0, noise, seed=int(signal), settings=settings
                 )
-                for region, inside in _regions(task, critical, noise.bound, winnable, z0).items():
+                for region, inside in regions.split(task, noise.bound, z0).items():
                     counts.setdefault(region, np.zeros(len(Outcome), dtype=int))
                     counts[region] += np.bincount(rollout.outcome[inside], minlength=len(Outcome))
                 done += n
                 progress.update(done)
             records += [
-                _record(noise, name, region, found)
-                for region, found in counts.items()
-                if found.any()
+                _record(noise, name, region, outcomes)
+                for region, outcomes in counts.items()
+                if outcomes.any()
             ]
     progress.close()
     return records
 
 
-def _starts(
-    task: Task,
-    critical: CriticalSet,
-    noise: Noise,
-    n: int,
-    rng: np.random.Generator,
-    near: bool,
-) -> np.ndarray:
-    """n starts (n, d) from the task's distribution; if asked for, of those near M*."""
-    z = task.starts(n, rng)
-    if not near:
-        return z
-    if not len(critical.points):
-        raise BadInput(
-            "no critical set was found, so nothing starts near it: leave --near-critical out"
-        )
-    kept, drawn = np.empty((0, z.shape[1])), 0
-    while len(kept) < n:
-        kept = np.vstack([kept, z[_near(task, critical, noise.bound, z)]])
-        drawn += n
-        if not len(kept) and drawn >= RARE:
-            raise BadInput(
-                f"of {drawn:,} starts of {task.name} none lies within {2 * noise.bound:g} of its critical "
-                "set: leave --near-critical out, or start elsewhere"
-            )
-        z = task.starts(n, rng)
-    return kept[:n]
-
-
-def _near(task: Task, critical: CriticalSet, bound: float, z: np.ndarray) -> np.ndarray:
-    """Whether starts (n, d) lie within twice the noise bound of M*: (n,) bool."""
-    return np.asarray(distance_to(task, critical, z) <= 2 * bound)
-
-
-def _regions(
-    task: Task,
-    critical: CriticalSet,
-    bound: float,
-    winnable: tuple[Grid, np.ndarray] | None,
-    z0: np.ndarray,
-) -> dict[str, np.ndarray]:
-    """The start regions: which of the starts (n, d) lie in each, (n,) bool."""
-    near = _near(task, critical, bound, z0)
-    if winnable is None:
-        return {"near M*": near, "elsewhere": ~near}
-    grid, can = winnable
-    open_ = can[grid.nearest(z0)]
-    return {"near M*": near & open_, "elsewhere": ~near & open_, "not winnable": ~open_}
-
-
 def _record(noise: Noise, name: str, region: str, counts: np.ndarray) -> dict[str, Any]:
+    """Returns what the episodes (outcomes,) of a noise, controller and region came to."""
     from scipy.stats import binomtest  # slow to import, and seldom needed
 
     reached, total = int(counts[Outcome.REACHED]), int(counts.sum())

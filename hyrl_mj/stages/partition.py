@@ -11,7 +11,7 @@ import numpy as np
 from hyrl_mj import artifacts
 from hyrl_mj.policies import Policy, PolicyController
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.simulation import closed_loop, ways
+from hyrl_mj.simulation import LoopSettings, closed_loop, ways
 from hyrl_mj.stages.critical_set import CriticalSet
 from hyrl_mj.tasks import Outcome, Task
 
@@ -92,7 +92,8 @@ def make_partition(task: Task, policy: Policy, critical: CriticalSet, cells: int
         cells: cells of the grid along the longest side of the chart.
     """
     grid = Grid.with_cells(task.chart, cells)
-    rollout = closed_loop(task, PolicyController(policy), grid.nodes, label="partition")
+    loop, settings = PolicyController(policy), LoopSettings(label="partition")
+    rollout = closed_loop(task, loop, grid.nodes, settings=settings)
     succeeds = rollout.outcome == Outcome.REACHED
     way = ways(task, rollout)
     if not len(critical.points):

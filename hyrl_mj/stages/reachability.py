@@ -8,7 +8,7 @@ import numpy as np
 
 from hyrl_mj.policies import Policy, PolicyController
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.simulation import closed_loop
+from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.stages.partition import Partition, PartPolicy
 from hyrl_mj.tasks import Outcome, Task
 
@@ -25,8 +25,8 @@ def part_wins(
     wins = partition.succeeds & part.mask
     outside = np.flatnonzero(asked.mask & ~part.mask)
     if len(outside):
-        loop = PolicyController(pi)
-        rollout = closed_loop(task, loop, part.grid.nodes[outside], label="extended sets")
+        loop, settings = PolicyController(pi), LoopSettings(label="extended sets")
+        rollout = closed_loop(task, loop, part.grid.nodes[outside], settings=settings)
         wins[outside] = rollout.outcome == Outcome.REACHED
     return wins
 
@@ -48,8 +48,8 @@ def backward_reach(
     def within(steps: int) -> GridSet:
         visited = np.zeros(len(grid.nodes), dtype=bool)
         if len(nodes):
-            loop = PolicyController(pi)
-            path = closed_loop(task, loop, nodes, steps=steps, backward=True, label="backward").path
+            settings = LoopSettings(steps=steps, backward=True, label="backward")
+            path = closed_loop(task, PolicyController(pi), nodes, settings=settings).path
             z = between_samples(path, grid)
             visited[grid.nearest(z[task.chart.contains(z)])] = True
         # Close the gaps between samples, together with the part that they leave.
@@ -75,13 +75,11 @@ def forward_reach(
     outside = np.flatnonzero(asked & ~part.mask)
     arrival = np.full(len(grid.nodes), np.inf)
     if len(outside):
-        rollout = closed_loop(
-            task,
+        loop, settings = (
             PolicyController(pi),
-            grid.nodes[outside],
-            steps=longest_samples(task),
-            label="forward",
+            LoopSettings(steps=longest_samples(task), label="forward"),
         )
+        rollout = closed_loop(task, loop, grid.nodes[outside], settings=settings)
         under_way = np.ones(len(outside), dtype=bool)
         for k, z in enumerate(rollout.path[1:], 1):
             enters = under_way & part.contains(z)
@@ -101,7 +99,8 @@ def between_samples(path: np.ndarray, grid: Grid) -> np.ndarray:
 
 def longest_hop(task: Task, policy: Policy, grid: Grid) -> np.ndarray:
     """The longest way (d,) that the closed loop goes in one sample along each coordinate."""
-    path = closed_loop(task, PolicyController(policy), grid.nodes, steps=1).path
+    loop, settings = PolicyController(policy), LoopSettings(steps=1)
+    path = closed_loop(task, loop, grid.nodes, settings=settings).path
     return np.asarray(np.abs(path[-1] - path[0]).max(axis=0))
 
 

@@ -26,7 +26,7 @@ from hyrl_mj.learning.distillation import distil, fits
 from hyrl_mj.learning.training import Score, train
 from hyrl_mj.policies import ALGORITHMS, MlpPolicy, Policy, PolicyController
 from hyrl_mj.sets import GridSet
-from hyrl_mj.simulation import KINDS, Noise, closed_loop
+from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
 from hyrl_mj.stages.extended_sets import ExtendedSets, neighbourhood
 from hyrl_mj.stages.partition import Partition, part_policies
 from hyrl_mj.stages.reachability import longest_hop
@@ -40,6 +40,8 @@ TASK_SHARE = 0.7
 URGENCY = -1.5
 # The latest arrival may be this share behind the fewest samples there are.
 ALLOWED_DELAY = 0.03
+# The kinds of noise that a policy is judged by where the worst case cannot be played, the mildest first.
+JUDGES = ("none", "uniform", "alternating", "adversarial")
 # Episodes for each kind of noise that a policy is judged by where the worst case cannot be played, and how
 # many at a time: bad policies, which most are, need not be followed through all.
 EPISODES, TOGETHER = 256, 64
@@ -287,7 +289,7 @@ class ByEpisodes(ModeGround):
         judged: (n, d) where they start.
     """
 
-    enough: Score = (float(len(KINDS)), 0.0)
+    enough: Score = (float(len(JUDGES)), 0.0)
 
     def __init__(self, task: Task, extended: ExtendedSets, mode: int):
         super().__init__(task, extended, mode)
@@ -301,20 +303,15 @@ class ByEpisodes(ModeGround):
         self._plant = task.plant(TOGETHER)
 
     def score(self, policy: MlpPolicy) -> Score:
-        loop, bound = PolicyController(policy), self.extended.noise
-        for survived, kind in enumerate(KINDS):
+        loop, settings = (
+            PolicyController(policy),
+            LoopSettings(plant=self._plant, vary=True, quiet=True),
+        )
+        for survived, kind in enumerate(JUDGES):
             for done in range(0, EPISODES, TOGETHER):
                 starts = self.judged[done : done + TOGETHER]
-                run = closed_loop(
-                    self.task,
-                    loop,
-                    starts,
-                    noise=Noise(kind, bound),
-                    seed=done,
-                    plant=self._plant,
-                    vary=True,
-                    quiet=True,
-                )
+                noise = Noise(kind, self.extended.noise)
+                run = closed_loop(self.task, loop, starts, noise, seed=done, settings=settings)
                 won = run.outcome == Outcome.REACHED
                 if kind == "none":
                     won &= self.task.arrived(run.path[-1])

@@ -10,7 +10,7 @@ from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.game import LARGEST, Game, worst_signal
 from hyrl_mj.policies import Policy
 from hyrl_mj.run_directory import Run
-from hyrl_mj.simulation import KINDS, AnyNoise, HybridArc, Noise, samples, simulate
+from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, noise_kinds, samples, simulate_batch
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.replay import Floor, Show
 from hyrl_mj.viz.section import Section, critical_section
@@ -19,9 +19,8 @@ from hyrl_mj.viz.section import Section, critical_section
 STARTS = ("critical", "paper", "latest")
 # Runs without noise in the overview: of an even number none starts in the middle.
 OVERVIEW_RUNS = 12
-# The noise of the exact game, beside the kinds that are defined without one.
+# The noise of the exact game, beside the registered kinds, which do without one.
 WORST = "worst"
-NOISES = (*KINDS, WORST)
 
 
 def critical_start(run: Run) -> np.ndarray | None:
@@ -47,7 +46,7 @@ def noisy_arcs(
     Args:
         run: with its mode policies.
         z0: starts.
-        noise: none, uniform, alternating, adversarial, or worst (of the exact game, for each of them).
+        noise: a registered kind, or worst (of the exact game, for each of them).
         eps: bound of the noise, by default the run's.
         q0s: start modes of the hybrid controller, None to let it pick.
         horizon: time [s], by default the task's.
@@ -59,15 +58,15 @@ def noisy_arcs(
     Raises:
         BadInput: a value that cannot be used, or a worst case that cannot be played exactly.
     """
-    if noise not in NOISES:
-        raise unknown("noise", noise, NOISES)
-    task = run.task
+    task = run.task  # first: the file of a user's task may register noise
+    if noise not in (kinds := (*noise_kinds(), WORST)):
+        raise unknown("noise", noise, kinds)
     bound = task.check_noise(run.settings.noise if eps is None else eps)
     steps = None if horizon is None else samples(task, horizon)
     if noise == WORST:
         run.check_exact()
     game = Game(task, run.split, run.loops, max(bound, LARGEST)) if noise == WORST else None
-    found = {}
+    arcs = {}
     for name, loop in run.loops.items():
         for q0 in q0s if name == "hyrl" else (None,):
             signal: AnyNoise = (
@@ -75,10 +74,9 @@ def noisy_arcs(
                 if game
                 else Noise(noise, bound)
             )
-            arcs = simulate(task, loop, z0, signal, q0, horizon, seed, name=name)
-            assert isinstance(arcs, list)
-            found[name if q0 is None else f"{name}_q{q0}"] = arcs
-    return found
+            who = name if q0 is None else f"{name}_q{q0}"
+            arcs[who] = simulate_batch(task, loop, z0, signal, q0, horizon, seed)
+    return arcs
 
 
 def replay_starts(run: Run) -> dict[str, np.ndarray]:
@@ -165,9 +163,7 @@ def overview_arcs(task: Task, policy: Policy) -> list[HybridArc]:
     starts, axis = np.tile(low, (OVERVIEW_RUNS, 1)), int(np.argmax(high - low))
     shares = (np.arange(OVERVIEW_RUNS) + 0.5) / OVERVIEW_RUNS
     starts[:, axis] = low[axis] + shares * (high - low)[axis]
-    arcs = simulate(task, policy, starts, horizon=task.replay_time)
-    assert isinstance(arcs, list)
-    return arcs
+    return simulate_batch(task, policy, starts, horizon=task.replay_time)
 
 
 def policy_start_arcs(task: Task, policy: Policy, eps: float, seed: int) -> list[HybridArc]:
@@ -179,7 +175,5 @@ def policy_start_arcs(task: Task, policy: Policy, eps: float, seed: int) -> list
         eps: bound of the noise.
         seed: of the noise.
     """
-    starts, noise = np.array(task.policy_starts or task.replay_starts), Noise("alternating", eps)
-    arcs = simulate(task, policy, starts, noise, horizon=task.replay_time, seed=seed)
-    assert isinstance(arcs, list)
-    return arcs
+    starts, noise = task.policy_starts or task.replay_starts, Noise("alternating", eps)
+    return simulate_batch(task, policy, starts, noise, horizon=task.replay_time, seed=seed)

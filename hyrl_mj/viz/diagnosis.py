@@ -13,7 +13,7 @@ from hyrl_mj.game import NEVER, Game, worst_signal
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import Grid
-from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, simulate
+from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, simulate_batch
 from hyrl_mj.viz.arcs import critical_start, replay_floor
 from hyrl_mj.viz.commands import beginning
 from hyrl_mj.viz.page import fill, film, pictures
@@ -50,8 +50,7 @@ def worst_arc(run: Run) -> HybridArc | None:
         critical = critical_start(run)
         if critical is not None and task.may_start(critical[None])[0]:
             z0 = np.vstack([critical, z0])
-    arcs = simulate(task, loop, z0, noise, name="policy")
-    assert isinstance(arcs, list)
+    arcs = simulate_batch(task, loop, z0, noise)
     return next((arc for arc in arcs if arc.outcome != "reached"), None)
 
 
@@ -60,8 +59,8 @@ def usual_arc(run: Run) -> HybridArc:
     start = critical_start(run)
     task, noise = run.task, Noise("alternating", run.settings.noise)
     z0 = task.replay_starts[0] if start is None else start
-    arc = simulate(task, run.policy, z0, noise, horizon=task.replay_time, seed=run.settings.seed)
-    assert isinstance(arc, HybridArc)
+    seed, horizon = run.settings.seed, task.replay_time
+    (arc,) = simulate_batch(task, run.policy, z0, noise, horizon=horizon, seed=seed)
     return arc
 
 

@@ -13,7 +13,7 @@ from benchmarks import Figure
 from benchmarks.runs import Runs
 from hyrl_mj import Chart, Outcome, Task
 from hyrl_mj.envs import BatchedEnv
-from hyrl_mj.simulation import Noise, closed_loop
+from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
 
 # Samples that a piece of work is.
 SAMPLES = 60
@@ -88,7 +88,9 @@ def _closed_loop(runs: Runs) -> Callable[[], int]:
 
     def work() -> int:
         noise = Noise("uniform", 0.1)
-        rollout = closed_loop(run.task, run.controller, z0, noise=noise, quiet=True)
+        rollout = closed_loop(
+            run.task, run.controller, z0, noise, settings=LoopSettings(quiet=True)
+        )
         return int(rollout.length.sum())
 
     return work

@@ -51,12 +51,12 @@ def measure(kind: str, size: int, run: Path) -> tuple[float, float]:
         hyrl_mj.find_critical_set(task, policy, size, 1 / 32)
     else:
         from hyrl_mj.simulation import Noise
-        from hyrl_mj.stages import noisy_episodes
+        from hyrl_mj.stages import Regions, noisy_episodes
 
         found = hyrl_mj.load_run(run)
         began = time.perf_counter()
         loops = {"HyRL": found.controller}
-        noisy_episodes(task, found.critical_set, loops, (Noise("uniform", 0.1),), size)
+        noisy_episodes(task, Regions(found.critical_set), loops, (Noise("uniform", 0.1),), size)
     took = time.perf_counter() - began
     return took, peak_memory()
 

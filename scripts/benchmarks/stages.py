@@ -14,6 +14,7 @@ from benchmarks import Figure
 from benchmarks.runs import Runs
 from hyrl_mj import Run, Task, extend, find_critical_set
 from hyrl_mj.learning.training import build
+from hyrl_mj.simulation import LoopSettings
 from hyrl_mj.stages import reachability
 from hyrl_mj.stages.critical_set import PARTING, SAMPLES
 from hyrl_mj.stages.partition import PartPolicy
@@ -43,12 +44,12 @@ def figures(runs: Runs) -> Iterator[Figure]:
 def _extension(run: Run) -> Figure:
     task, settings = run.task, run.settings
     args = (task, run.policy, run.critical_set, run.partition, settings.noise)
-    calls: list[tuple[Any, np.ndarray, dict[str, Any]]] = []
+    calls: list[tuple[Any, np.ndarray, LoopSettings]] = []
     batched = reachability.closed_loop
 
-    def noted(task: Task, controller: Any, z0: np.ndarray, **options: Any) -> Any:
-        calls.append((controller.policy, z0, options))
-        return batched(task, controller, z0, **options)
+    def noted(task: Task, controller: Any, z0: np.ndarray, *, settings: LoopSettings) -> Any:
+        calls.append((controller.policy, z0, settings))
+        return batched(task, controller, z0, settings=settings)
 
     with mock.patch.object(reachability, "closed_loop", noted):
         extend(*args)
@@ -61,11 +62,11 @@ def _extension(run: Run) -> Figure:
 
     def plain() -> int:
         done = 0
-        for pi, z0, options in calls:
+        for pi, z0, settings in calls:
             policy = replace(pi, policy=predict) if isinstance(pi, PartPolicy) else predict
-            limit = options.get("steps") or task.max_steps
+            limit = settings.steps or task.max_steps
             for z in z0[::SHARE]:
-                _one_start(task, policy, z, limit, backward=options.get("backward", False))
+                _one_start(task, policy, z, limit, backward=settings.backward)
                 done += 1
         return done
 
