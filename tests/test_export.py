@@ -262,10 +262,9 @@ def test_the_folder_needs_numpy_alone(vehicle, tmp_path):
             np.testing.assert_allclose(there, here, atol=1e-6)
 
 
-def test_the_examples_of_the_readme_run(vehicle, tmp_path, monkeypatch):
-    text = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
-    section = text.split("## Take it away")[1].split("\n## ")[0]
-    examples = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
+def test_the_loops_of_the_manual_end_in_the_same_place(vehicle, tmp_path, monkeypatch):
+    text = (Path(__file__).parents[1] / "docs" / "export.md").read_text(encoding="utf-8")
+    examples = re.findall(r"```python\n(import time.*?)```", text, re.DOTALL)
     assert len(examples) == 2
     controller = planted(vehicle)
     export_onnx(controller, tmp_path / "vehicle.onnx")
