@@ -3,13 +3,17 @@
 import re
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import onnxruntime
 import pytest
+from numpy import empty
 from planted import AnalyticSet, Cube, ideal_controller, random_states
 
 import hyrl_mj
@@ -18,7 +22,7 @@ from hyrl_mj.export import export
 from hyrl_mj.export.graph import write_graph
 from hyrl_mj.export.source import write_function
 from hyrl_mj.export.tracing import BATCH, trace
-from hyrl_mj.policies.activations import ACTIVATIONS
+from hyrl_mj.policies import ACTIVATIONS
 from hyrl_mj.sets import Everything, Grid, GridSet
 
 RNG = np.random.default_rng
@@ -262,9 +266,10 @@ def test_the_folder_needs_numpy_alone(vehicle, tmp_path):
             np.testing.assert_allclose(there, here, atol=1e-6)
 
 
-def test_the_loops_of_the_manual_end_in_the_same_place(vehicle, tmp_path, monkeypatch):
-    text = (Path(__file__).parents[1] / "docs" / "export.md").read_text(encoding="utf-8")
-    examples = re.findall(r"```python\n(import time.*?)```", text, re.DOTALL)
+def test_both_loops_of_the_manual_drive_alike(vehicle, tmp_path, monkeypatch):
+    page = (Path(__file__).parents[1] / "docs" / "export.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    examples = [block for block in blocks if "while" in block or "for _ in range" in block]
     assert len(examples) == 2
     controller = planted(vehicle)
     export_onnx(controller, tmp_path / "vehicle.onnx")
@@ -447,6 +452,135 @@ def test_gelu_takes_the_error_function_of_scipy():
     wanted = x * special.erf(x / np.sqrt(np.float32(2)))
     assert space["f"](x).dtype == np.float32
     np.testing.assert_allclose(space["f"](x), wanted, rtol=0, atol=2e-6)
+
+
+# ---- code of many shapes, and NumPy as it is for everybody else
+
+
+def in_a_function(x):
+    made = empty((len(x), 2))
+    made[:, 0], made[:, 1] = x[:, 0], 1
+    return made
+
+
+def with_an_import_of_its_own(x):
+    import numpy
+    from numpy import zeros
+
+    made = zeros((len(x), 2))
+    made[:, 0] = numpy.asarray(x)[:, 0]
+    return made
+
+
+def with_a_function_in_it(x):
+    def halved(x, times):
+        return np.array([x[:, 0], x[:, 1]]).T if times == 0 else halved(x / 2, times - 1)
+
+    return halved(x, times=2)
+
+
+class Encoder:
+    scale = 3.0
+
+    def encode(self, x):
+        made = np.empty((len(x), 2))
+        made[:, 0] = self.offset + self.shifted(x[:, 0])
+        made[:, 1] = type(self).scale
+        return made
+
+    @property
+    def offset(self):
+        return float(np.zeros((BATCH, 1))[0, 0]) + type(self).scale
+
+    @staticmethod
+    def shifted(x):
+        return np.asarray(x + 1)
+
+    @classmethod
+    def twice(cls, x):
+        return np.array([x[:, 0], cls.scale * x[:, 1]]).T * 2
+
+
+class Further(Encoder):
+    scale = 5.0
+
+    def encode(self, x):
+        assert isinstance(self, Further)
+        return np.hstack([super().encode(x), self.twice(x), Encoder.encode(self, x)])
+
+
+SHAPES = {
+    "a function": in_a_function,
+    "an import": with_an_import_of_its_own,
+    "a function in a function": with_a_function_in_it,
+    "a partial function": lambda x: partial(in_a_function)(x),
+    "a function of another module": lambda x: in_another_module.columns(x),
+    "a method": Encoder().encode,
+    "an inherited method": Further().encode,
+    "a class method": Further.twice,
+}
+in_another_module = ModuleType("in_another_module")
+exec(
+    "import numpy as np\ndef columns(x): return np.array([x[:, 1], x[:, 0]]).T",
+    vars(in_another_module),
+)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_code_is_followed_into(shape):
+    program = trace(SHAPES[shape], {"x": RNG(0).normal(size=(BATCH, 2))}, shape)
+    arrays = {}
+    lines = write_function("f", "It does something.", program, arrays)
+    space = {"np": np, "ARRAYS": arrays}
+    exec("\n".join(lines), space)
+    x = RNG(1).normal(size=(5, 2))
+    np.testing.assert_allclose(space["f"](x), SHAPES[shape](x), rtol=1e-15)
+
+
+def test_methods_of_other_objects_run_as_they_are():
+    encoder, x = Encoder(), np.ones((BATCH, 2))
+    with pytest.raises(BadInput, match=r"np\.empty in methods of other objects"):
+        trace(lambda x: encoder.encode(x), {"x": x}, "f")
+    # What they make of plain arrays can be used.
+    assert trace(lambda x: x * encoder.encode(np.ones((1, 2))), {"x": x}, "f").operations()
+
+
+def made_arrays(task):
+    """What is plain everywhere else than in code that is being followed."""
+    x = np.zeros((BATCH, 2))
+    return [
+        x, np.empty((BATCH, 3)), np.ones(BATCH), np.full((BATCH, 2), 7.0), np.arange(BATCH),
+        np.array([x, x]), np.asarray(x), np.take(np.arange(9.0), np.zeros(BATCH, dtype=int)),
+        empty((BATCH, 1)), task.observation(x),
+    ]  # fmt: skip
+
+
+def test_other_threads_have_their_arrays_and_numpy_its_functions(vehicle):
+    """The code that is followed waits until another thread is done."""
+    before = dict(vars(np))
+    inside, done, made, changed = threading.Event(), threading.Event(), [], []
+
+    class Waiting(type(vehicle)):
+        def observation(self, measured):
+            seen = super().observation(measured)
+            numpy = sys.modules["numpy"]
+            changed.extend(name for name, value in before.items() if vars(numpy)[name] is not value)
+            inside.set()
+            assert done.wait(60)
+            return seen
+
+    def work():
+        inside.wait(60)
+        made.extend(made_arrays(vehicle))
+        done.set()
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    program = trace(Waiting().observation, {"measured": np.ones((BATCH, 2))}, "observation")
+    thread.join()
+    assert program.operations()
+    assert [type(array) for array in made] == [np.ndarray] * len(made_arrays(vehicle))
+    assert changed == []
 
 
 def test_numpy_is_itself_again_after_a_trace():

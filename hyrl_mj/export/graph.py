@@ -9,22 +9,14 @@ import numpy as np
 import onnx
 from onnx import helper, numpy_helper
 
-from hyrl_mj.export.tracing import BATCH, COMPARISONS, Operation, Program
+from hyrl_mj.export.traced_array import Operation, Program
+from hyrl_mj.export.vocabulary import BATCH, ELEMENTWISE
 
 # Those of the oldest onnxruntime that is asked for, and older ones read.
 OPSET, IR_VERSION = 18, 8
-# Operations that ONNX has under another name.
-ELEMENTWISE = {
-    "absolute": "Abs", "negative": "Neg", "sign": "Sign", "sqrt": "Sqrt", "exp": "Exp", "log": "Log",
-    "sin": "Sin", "tanh": "Tanh", "floor": "Floor", "ceil": "Ceil", "rint": "Round",
-    "isnan": "IsNaN", "logical_not": "Not",
-    "add": "Add", "subtract": "Sub", "multiply": "Mul", "divide": "Div", "power": "Pow",
-    "maximum": "Max", "minimum": "Min", "matmul": "MatMul",
-    "greater": "Greater", "greater_equal": "GreaterOrEqual", "less": "Less",
-    "less_equal": "LessOrEqual", "equal": "Equal",
-    "logical_and": "And", "logical_or": "Or", "logical_xor": "Xor",
+REDUCED = {
+    "sum": "ReduceSum", "max": "ReduceMax", "min": "ReduceMin", "any": "ReduceMax", "all": "ReduceMin",
 }  # fmt: skip
-REDUCED = {"sum": "ReduceSum", "max": "ReduceMax", "min": "ReduceMin"}
 
 
 def write_graph(
@@ -41,16 +33,14 @@ def write_graph(
     graph = _Graph(program)
     for operation in program.operations():
         graph.names[id(operation)] = graph.lower(operation)
-    for output, operation in zip(outputs, program.outputs, strict=True):
-        graph.nodes.append(
-            helper.make_node("Identity", [graph.get(operation)], [output], name=output)
-        )
+    results = list(zip(outputs, program.outputs, strict=True))
+    graph.nodes += [helper.make_node("Identity", [graph.get(o)], [n], name=n) for n, o in results]
     model = helper.make_model(
         helper.make_graph(
             graph.nodes,
             name,
             [_described(o.operands[0], o) for o in program.inputs],
-            [_described(n, o) for n, o in zip(outputs, program.outputs, strict=True)],
+            [_described(n, o) for n, o in results],
             [numpy_helper.from_array(a, key) for key, a in graph.constants.values()],
         ),
         opset_imports=[helper.make_opsetid("", OPSET)],
@@ -97,6 +87,10 @@ class _Graph:
         same = dtype is None or dtype == operand.value.dtype
         return name if same else self.cast(name, dtype)
 
+    def operands(self, operation: Operation, dtype: Any = None) -> list[str]:
+        """The names of all operands, of this type or that of the result."""
+        return [self.get(o, dtype or operation.value.dtype) for o in operation.operands]
+
     def cast(self, name: str, dtype: Any) -> str:
         return self.node("Cast", name, to=helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))
 
@@ -108,24 +102,19 @@ class _Graph:
 
     def lower(self, operation: Operation) -> str:
         """Add what an operation takes; the name of its result."""
-        name, options, dtype = operation.name, operation.options, operation.value.dtype
-        operands = operation.operands
-        if name in LOWERED:
-            return LOWERED[name](self, operation)
+        name, is_bool = operation.name, operation.value.dtype.kind == "b"
         if name in ELEMENTWISE:
-            kind = common(operands) if name in COMPARISONS or dtype.kind == "b" else dtype
-            return self.node(ELEMENTWISE[name], *(self.get(o, kind) for o in operands))
+            values = (o.value if isinstance(o, Operation) else o for o in operation.operands)
+            # NumPy compares numbers in the type that they have in common.
+            names = self.operands(operation, np.result_type(*values) if is_bool else None)
+            return self.node(ELEMENTWISE[name], *names)
         if name in REDUCED:
-            axes = self.constant(options["axis"], np.int64)
-            x = self.get(operands[0], dtype)
-            return self.node(REDUCED[name], x, axes, keepdims=int(options["keepdims"]))
-        # The tracer keeps nothing else; a name that is new there has to be written here, too.
-        raise NotImplementedError(name)
-
-
-def common(operands: Sequence[Any]) -> np.dtype:
-    """The type in which NumPy compares operands."""
-    return np.result_type(*(o.value if isinstance(o, Operation) else o for o in operands))
+            (x,), axes = self.operands(operation), operation.options["axis"]
+            x = self.cast(x, np.int32) if is_bool else x
+            keepdims = operation.options["keepdims"]
+            x = self.node(REDUCED[name], x, self.constant(axes, np.int64), keepdims=keepdims)
+            return self.cast(x, bool) if is_bool else x
+        return LOWERED[name](self, operation)
 
 
 def _getitem(g: _Graph, o: Operation) -> str:
@@ -143,51 +132,18 @@ def _getitem(g: _Graph, o: Operation) -> str:
     return result
 
 
-def _any_or_all(kind: str) -> Callable[[_Graph, Operation], str]:
-    def lower(g: _Graph, o: Operation) -> str:
-        x = g.cast(g.get(o.operands[0], bool), np.int32)
-        axes = g.constant(o.options["axis"], np.int64)
-        return g.cast(g.node(kind, x, axes, keepdims=int(o.options["keepdims"])), bool)
-
-    return lower
-
-
-def _arg(kind: str) -> Callable[[_Graph, Operation], str]:
-    def lower(g: _Graph, o: Operation) -> str:
-        axis, keepdims = o.options["axis"], int(o.options["keepdims"])
-        return g.node(kind, g.get(o.operands[0]), axis=axis, keepdims=keepdims)
-
-    return lower
-
-
 def _where(g: _Graph, o: Operation) -> str:
     condition, *values = o.operands
     return g.node("Where", g.get(condition, bool), *(g.get(v, o.value.dtype) for v in values))
 
 
-def _concatenate(g: _Graph, o: Operation) -> str:
-    parts = (g.get(part, o.value.dtype) for part in o.operands)
-    return g.node("Concat", *parts, axis=o.options["axis"])
-
-
-def _full(g: _Graph, o: Operation) -> str:
-    return g.node("Expand", g.get(o.operands[0], o.value.dtype), g.shape(o.options["shape"]))
-
-
 def _take(g: _Graph, o: Operation) -> str:
     array, indices = o.operands
-    return g.node("Gather", g.get(array), g.get(indices, np.int64), axis=o.options["axis"])
-
-
-def _isfinite(g: _Graph, o: Operation) -> str:
-    x = g.get(o.operands[0], common([o.operands[0], np.float32(0)]))
-    kind = common([o.operands[0], np.float32(0)])
-    return g.node("Less", g.node("Abs", x), g.constant(np.inf, kind))
+    return g.node("Gather", g.get(array), g.get(indices, np.int64), **o.options)
 
 
 def _remainder(g: _Graph, o: Operation) -> str:
-    dtype = o.value.dtype
-    x, y = (g.get(operand, dtype) for operand in o.operands)
+    dtype, (x, y) = o.value.dtype, g.operands(o)
     if dtype.kind == "i":
         return g.node("Mod", x, y)
     # Of numbers that are not whole ONNX has the remainder of C, with the sign of x; NumPy's has that of y.
@@ -203,12 +159,13 @@ def _cos(g: _Graph, x: str, dtype: np.dtype) -> str:
     return g.node("Sub", one, g.node("Mul", two, g.node("Mul", sin, sin)))
 
 
-def _arctan2(g: _Graph, y: str, x: str, dtype: np.dtype) -> str:
+def _arctan2(g: _Graph, o: Operation) -> str:
     """The angle of points, of which onnxruntime knows the arctan in float32 alone.
 
     That is a first guess, off by some 1e-7 rad. Turned back by it, a point lies so close to the x axis that
     the tangent of what is left is its angle.
     """
+    dtype, (y, x) = o.value.dtype, g.operands(o)
     zero, pi = g.constant(0, dtype), g.constant(np.pi, dtype)
     # By |x|: a zero of x has a sign, too, which must not turn that of y.
     slope = g.cast(g.node("Div", y, g.node("Abs", x)), np.float32)
@@ -224,49 +181,18 @@ def _arctan2(g: _Graph, y: str, x: str, dtype: np.dtype) -> str:
     return g.node("Where", origin, zero, angle)
 
 
-def _angle(g: _Graph, o: Operation) -> str:
-    """arctan2(y, x), arctan(s) = arctan2(s, 1), and the like."""
-    dtype = o.value.dtype
-    first, *second = (g.get(operand, dtype) for operand in o.operands)
-    if second:
-        return _arctan2(g, first, second[0], dtype)
-    one = g.constant(1, dtype)
-    if o.name == "arctan":
-        y, x = first, one
-    else:
-        product = g.node("Mul", g.node("Sub", one, first), g.node("Add", one, first))
-        rest = g.node("Sqrt", product)
-        y, x = (first, rest) if o.name == "arcsin" else (rest, first)
-    return _arctan2(g, y, x, dtype)
-
-
-def _tan(g: _Graph, o: Operation) -> str:
-    x = g.get(o.operands[0], o.value.dtype)
-    return g.node("Div", g.node("Sin", x), _cos(g, x, o.value.dtype))
-
-
 LOWERED: dict[str, Callable[[_Graph, Operation], str]] = {
     "getitem": _getitem,
     "astype": lambda g, o: g.get(o.operands[0], o.value.dtype),
     "reshape": lambda g, o: g.node("Reshape", g.get(o.operands[0]), g.shape(o.options["shape"])),
     "transpose": lambda g, o: g.node("Transpose", g.get(o.operands[0]), perm=o.options["axes"]),
-    "not_equal": lambda g, o: g.node(
-        "Not", g.node("Equal", *(g.get(x, common(o.operands)) for x in o.operands))
-    ),
-    "any": _any_or_all("ReduceMax"),
-    "all": _any_or_all("ReduceMin"),
-    "argmax": _arg("ArgMax"),
-    "argmin": _arg("ArgMin"),
+    "argmax": lambda g, o: g.node("ArgMax", g.get(o.operands[0]), **o.options),
+    "argmin": lambda g, o: g.node("ArgMin", g.get(o.operands[0]), **o.options),
     "where": _where,
-    "concatenate": _concatenate,
-    "full": _full,
+    "concatenate": lambda g, o: g.node("Concat", *g.operands(o), **o.options),
+    "full": lambda g, o: g.node("Expand", *g.operands(o), g.shape(o.options["shape"])),
     "take": _take,
-    "isfinite": _isfinite,
     "remainder": _remainder,
-    "cos": lambda g, o: _cos(g, g.get(o.operands[0], o.value.dtype), o.value.dtype),
-    "tan": _tan,
-    "arctan2": _angle,
-    "arctan": _angle,
-    "arcsin": _angle,
-    "arccos": _angle,
+    "cos": lambda g, o: _cos(g, g.operands(o)[0], o.value.dtype),
+    "arctan2": _arctan2,
 }

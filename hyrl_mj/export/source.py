@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 
-from hyrl_mj.export.tracing import BATCH, Operation, Program
+from hyrl_mj.export.traced_array import Operation, Program
+from hyrl_mj.export.vocabulary import BATCH
 
+_listed = ", ".join
 # Larger arrays are not written into the code.
 FEW = 16
-INFIX = {
-    "add": "+", "subtract": "-", "multiply": "*", "divide": "/", "power": "**", "matmul": "@",
-    "greater": ">", "greater_equal": ">=", "less": "<", "less_equal": "<=",
+# Operations that are not written as the call of a function of their name.
+WRITTEN = {
+    "add": "{} + {}", "subtract": "{} - {}", "multiply": "{} * {}", "divide": "{} / {}",
+    "power": "({}) ** {}", "matmul": "{} @ {}", "greater": "{} > {}", "greater_equal": "{} >= {}",
+    "less": "{} < {}", "less_equal": "{} <= {}", "getitem": "{}[{item}]",
+    "astype": "{}.astype({dtype})", "reshape": "np.reshape({}, {shape})",
+    "full": "np.full({shape}, {}, dtype={dtype})",
 }  # fmt: skip
 
 
@@ -41,40 +47,25 @@ def write_function(
             return f"ARRAYS[{key!r}]"
         return literal(x)
 
-    body = []
-    for number, operation in enumerate(program.operations()):
+    body, operations = [], program.operations()
+    if any(BATCH in operation.options.get("shape", ()) for operation in operations):
+        body.append(f"n = len({argument.operands[0]})")
+    for number, operation in enumerate(operations):
         body.append(f"v{number} = {_expression(operation, write)}")
         names[id(operation)] = f"v{number}"
-    if any("((n," in line or ", (n," in line for line in body):
-        body.insert(0, f"n = len({argument.operands[0]})")
     lines = [f'"""{sentence}"""', *body, f"return {names[id(result)]}"]
     return [f"def {name}({argument.operands[0]}):", *(f"    {line}" for line in lines)]
 
 
 def _expression(operation: Operation, write: Any) -> str:
-    name, options = operation.name, operation.options
+    name = operation.name
     operands = [write(o) for o in operation.operands]
-    if name in INFIX:
-        return f"{operands[0]} {INFIX[name]} {operands[1]}"
-    if name == "getitem":
-        return f"{operands[0]}[{_listed(map(_index, options['item']))}]"
-    if name == "astype":
-        return f"{operands[0]}.astype(np.{_name(options['dtype'])})"
-    if name == "full":
-        return f"np.full({_shape(options['shape'])}, {operands[0]}, dtype=np.{_name(options['dtype'])})"
-    if name == "reshape":
-        return f"np.reshape({operands[0]}, {_shape(options['shape'])})"
+    options = {k: OPTIONS.get(k, literal)(v) for k, v in operation.options.items()}
+    if name in WRITTEN:
+        return WRITTEN[name].format(*operands, **options)
     if name == "concatenate":
         operands = [f"[{_listed(operands)}]"]
-    return f"np.{name}({_listed([*operands, *(f'{k}={literal(v)}' for k, v in options.items())])})"
-
-
-def _listed(parts: Iterable[str]) -> str:
-    return ", ".join(parts)
-
-
-def _shape(shape: tuple[int, ...]) -> str:
-    return _tuple("n" if size == BATCH else str(size) for size in shape)
+    return f"np.{name}({_listed([*operands, *(f'{k}={v}' for k, v in options.items())])})"
 
 
 def _tuple(parts: Iterable[str]) -> str:
@@ -82,21 +73,21 @@ def _tuple(parts: Iterable[str]) -> str:
     return f"({_listed(parts)}{',' * (len(parts) == 1)})"
 
 
-def _index(item: Any) -> str:
-    if isinstance(item, slice):
-        parts = ["" if i is None else str(int(i)) for i in (item.start, item.stop, item.step)]
+def _index(entry: Any) -> str:
+    if isinstance(entry, slice):
+        parts = ["" if i is None else str(i) for i in (entry.start, entry.stop, entry.step)]
         return ":".join(parts if parts[2] else parts[:2])
-    return str(item.tolist()) if isinstance(item, np.ndarray) else str(item)
+    return str(entry.tolist() if isinstance(entry, np.ndarray) else entry)
 
 
 def literal(x: Any) -> str:
     """Python source of numbers, arrays, tuples, text and None that gives them back to the last bit."""
     if isinstance(x, np.ndarray):
         as_it_is = np.array(x.tolist()).dtype == x.dtype
-        dtype = "" if as_it_is else f", dtype=np.{_name(x.dtype)}"
+        dtype = "" if as_it_is else f", dtype={_dtype(x.dtype)}"
         return f"np.array({literal(x.tolist())}{dtype})"
     if isinstance(x, np.generic):
-        return f"np.{_name(x.dtype)}({literal(x.item())})"
+        return f"{_dtype(x.dtype)}({literal(x.item())})"
     if isinstance(x, list):
         return f"[{_listed(map(literal, x))}]"
     if isinstance(x, tuple):
@@ -108,7 +99,14 @@ def literal(x: Any) -> str:
     return repr(int(x) if isinstance(x, int) and not isinstance(x, bool) else x)
 
 
-def _name(dtype: str | np.dtype) -> str:
+def _dtype(dtype: str | np.dtype) -> str:
     """What NumPy calls a type, in versions 1 and 2."""
     name = np.dtype(dtype).name
-    return "bool_" if name == "bool" else name
+    return f"np.{'bool_' if name == 'bool' else name}"
+
+
+OPTIONS: dict[str, Callable[[Any], str]] = {
+    "item": lambda item: _listed(map(_index, item)),
+    "shape": lambda shape: _tuple("n" if size == BATCH else str(size) for size in shape),
+    "dtype": _dtype,
+}
