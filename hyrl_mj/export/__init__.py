@@ -6,7 +6,7 @@ operation: the NumPy form holds the operations as source, and the ONNX graph is 
 No library does this for NumPy code as it is:
 
 - torch.onnx.export(dynamo=True) over torch's NumPy layer (torch 2.13, onnxscript 0.7) exports 48 of the 73
-  functions in tests/test_export.py, and of the observations of four tasks only that of unit_circle. It refuses
+  functions in tests/test_export.py, and of four tasks only the observation of unit_circle. It refuses
   calls into MuJoCo, loses arrays of the task, turns Python numbers into float32, emits
   functions that onnxruntime lacks in float64 (arctan), and has no NumPy form.
 - Arrays of ndonnx 0.23 and onnx-array-api 0.3 do not take NumPy's functions.
