@@ -4,7 +4,7 @@
     python scripts/reproduce_paper.py                            # runs/unit_circle, runs/vehicle
     python scripts/reproduce_paper.py --circle RUN --vehicle RUN --out DIR
 
-Figures are written as PNG and PDF. What stands under "ours" is computed from the runs.
+Figures are written as PNG and PDF. The values under "ours" are computed from the runs.
 """
 
 import argparse
@@ -19,8 +19,8 @@ from rich.table import Table
 import hyrl_mj
 from hyrl_mj import progress
 from hyrl_mj.errors import BadInput
-from hyrl_mj.simulation import Noise
 from hyrl_mj.viz import figures
+from hyrl_mj.viz.arcs import policy_start_arcs
 
 # A line of the table: the quantity, the paper's value, ours, and a note.
 Line = tuple[str, str, str, str]
@@ -53,18 +53,18 @@ FOOTNOTE = (
 
 
 def opened(path: Path, task: str) -> hyrl_mj.Run:
-    """The finished run of a task at a path: resumed with its own settings, or made with the defaults.
+    """Returns the finished run of a task at a path: resumed with its own settings, or made with defaults.
 
     Raises:
         BadInput: it is a run of another task, or has no critical set.
     """
-    given = {}
+    settings = {}
     if (path / "config.json").is_file():
         s = hyrl_mj.load_run(path).settings
         if s.task != task:
             raise BadInput(f"{path} is a run of {s.task}: give one of {task}")
-        given = {"noise": s.noise, "seed": s.seed, "preset_name": s.preset, "horizon": s.horizon}
-    run = hyrl_mj.run(task, out=path, say=lambda text: print(f"{path}: {text}"), **given)
+        settings = {"noise": s.noise, "seed": s.seed, "preset_name": s.preset, "horizon": s.horizon}
+    run = hyrl_mj.run(task, out=path, say=lambda text: print(f"{path}: {text}"), **settings)
     if len(run.extended_sets.modes) < 2 or not len(run.critical_set.points):
         raise BadInput(f"{path} has no critical set to show: give a run with another seed")
     return run
@@ -82,7 +82,7 @@ def draw(circle: hyrl_mj.Run, vehicle: hyrl_mj.Run, folder: Path) -> None:
 
 
 def fate(run: hyrl_mj.Run, arc: hyrl_mj.HybridArc) -> str:
-    """What becomes of a run: "arrives, left", "stalls", ..."""
+    """Returns how a run ends: "arrives, left", "stalls", ..."""
     if arc.outcome != "reached":
         return FATES[arc.outcome]
     if not arc.arrives(run.task):
@@ -91,17 +91,17 @@ def fate(run: hyrl_mj.Run, arc: hyrl_mj.HybridArc) -> str:
 
 
 def point(z: np.ndarray) -> str:
-    """A start (d,), angles in multiples of pi."""
+    """Returns a start (d,) as text, angles in multiples of pi."""
     return f"{z[0] / np.pi:.2f}π" if len(z) == 1 else f"({', '.join(f'{x:g}' for x in z)})"
 
 
 def intervals(members: hyrl_mj.sets.GridSet) -> str:
-    """The pieces of a set of angles, in multiples of pi."""
+    """Returns the pieces of a set of angles as text, in multiples of pi."""
     return ", ".join(f"[{a / np.pi:.3f}π, {b / np.pi:.3f}π]" for a, b in members.pieces())
 
 
 def overlap(run: hyrl_mj.Run) -> np.ndarray:
-    """How wide the overlap of the extended sets is at each point of M* (N,), along what noise acts on."""
+    """Returns the width (N,) of the overlap at each point of M*, along the coordinates that noise acts on."""
     points, both = run.critical_set.points, run.extended_sets.sets[0] & run.extended_sets.sets[1]
     direction = (run.task.noise_in_chart(1.0) > 0).astype(float)
     step = both.grid.cell / 4
@@ -117,7 +117,7 @@ def overlap(run: hyrl_mj.Run) -> np.ndarray:
 
 
 def training(run: hyrl_mj.Run) -> tuple[str, str]:
-    """Samples of stage 6 against stage 1, and what is other than in the paper."""
+    """Returns the samples of stages 6 and 1 as text, and how this differs from the paper."""
     first, then = run.settings.stage1, run.settings.stage6
     ours = f"{then.samples:,} a mode ({then.title}), stage 1 {first.samples:,}"
     return ours, "" if then.warm_start else "ours starts afresh, and trains under noise"
@@ -127,7 +127,7 @@ def training(run: hyrl_mj.Run) -> tuple[str, str]:
 
 
 def common(run: hyrl_mj.Run, horizon: str, width: str, least: float) -> Iterator[Line]:
-    """What the paper says of both problems; the width of its overlap is at `least` so much."""
+    """Lines for both problems; the paper's overlap is at least `least` wide."""
     unit = run.task.chart.units[0]
     sets, sized = run.extended_sets, run.settings.horizon is None
     yield "noise bound eps", f"0.1 {unit}", f"{run.settings.noise:g} {unit}", ""
@@ -140,18 +140,16 @@ def common(run: hyrl_mj.Run, horizon: str, width: str, least: float) -> Iterator
     yield ("cost of step 6 in samples", "at most that of step 1", *training(run))
 
 
-def alone(run: hyrl_mj.Run, said: tuple[str, ...]) -> Iterator[Line]:
-    """The stage-1 policy from the starts of Section III, and of Section V where the text tells."""
-    task, noise = run.task, Noise("alternating", run.settings.noise)
-    name, seed = run.settings.stage1.title, run.settings.seed
-    starts = np.array(task.policy_starts)
-    arcs = hyrl_mj.simulate(task, run.policy, starts, noise, horizon=task.replay_time, seed=seed)
-    for paper, arc in zip(said, arcs, strict=True):
-        yield f"{name} from {point(arc.z[0])}", paper, fate(run, arc), ""
+def policy_alone(run: hyrl_mj.Run, paper_fates: tuple[str, ...]) -> Iterator[Line]:
+    """Lines for the stage-1 policy from the starts of Section III; `paper_fates` is what the paper says."""
+    s = run.settings
+    arcs = policy_start_arcs(run.task, run.policy, s.noise, s.seed)
+    for paper, arc in zip(paper_fates, arcs, strict=True):
+        yield f"{s.stage1.title} from {point(arc.z[0])}", paper, fate(run, arc), ""
 
 
 def hybrid(run: hyrl_mj.Run, decided: tuple[int, ...]) -> Iterator[Line]:
-    """The ten replays of Section V; the way is told for the starts that are `decided` by q0."""
+    """Lines for the ten replays of Section V; q0 decides the way from the starts `decided`."""
     arcs = run.arcs()
     for q in run.controller.modes:
         for i in range(len(run.task.replay_starts)):
@@ -191,7 +189,7 @@ def circle_lines(run: hyrl_mj.Run) -> Iterator[Line]:
     yield "M_ext_1", "[0.87π, 2π)", intervals(sets.sets[1]), note
     yield from common(run, "0.5 s", "> 0.2π = 0.628 rad", 0.2 * np.pi)
     yield "runs are watched for", "4 s", f"{run.arcs()['start0', 'policy'].t[-1]:g} s", ""
-    yield from alone(run, ("arrives, clockwise", "arrives, counter-clockwise", "stalls"))
+    yield from policy_alone(run, ("arrives, clockwise", "arrives, counter-clockwise", "stalls"))
     yield from hybrid(run, (1, 3))
 
 
@@ -210,12 +208,12 @@ def vehicle_lines(run: hyrl_mj.Run) -> Iterator[Line]:
     yield "M*", "around (0.4, 0)", ours, ""
     yield from common(run, "not told (0.3 s in its code)", ">= 0.11 m", 0.11)
     yield "runs are watched for", "to the set-point", f"{task.replay_time:g} s", ""
-    yield from alone(run, ("arrives, right", "crashes", "arrives, left"))
+    yield from policy_alone(run, ("arrives, right", "crashes", "arrives, left"))
     yield from hybrid(run, (1, 3))
 
 
 def main() -> None:
-    """Draw, and print the table."""
+    """Draw the figures, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--circle", type=Path, default=Path("runs/unit_circle"), metavar="RUN")
     parser.add_argument("--vehicle", type=Path, default=Path("runs/vehicle"), metavar="RUN")

@@ -161,6 +161,19 @@ def test_times_are_drawn_where_runs_last_for_ever(tmp_path, coarse):
     assert len(where(two, HYRL)) > len(where(one, HYRL))
 
 
+@pytest.mark.parametrize("task", [CIRCLE, VEHICLE], ids=lambda task: task.name)
+def test_without_a_path_the_figure_is_returned_and_nothing_is_written(tmp_path, monkeypatch, task):
+    monkeypatch.chdir(tmp_path)
+    names = ("policy", "hyrl")
+    maps = map_of(task, names, lambda z: np.zeros(len(z)), cells=8)
+    critical = critical_of(task.replay_starts[2])
+    assert len(draw_map(task, content_of(names), maps, critical).axes) == len(names)
+    assert "margin of HyRL" in str(
+        [text.get_text() for text in draw_curve(task, content_of(names)).legends[0].get_texts()]
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("fails", ["on its way", "while it is written"])
 def test_nothing_is_left_behind_when_drawing_fails(tmp_path, monkeypatch, fails):
     def half(self, path, **_):

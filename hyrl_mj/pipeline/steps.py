@@ -121,7 +121,7 @@ def simulate_stage(run: Run, say: Say) -> None:
 
 
 def figures_stage(run: Run, say: Say) -> None:
-    """Draw the paper's figures of this run; those that make no sense for its chart are left out."""
+    """Draw the figures of a run; those that its chart does not allow are left out."""
     from hyrl_mj.viz import figures
 
     folder = run.path / "figures"

@@ -1,4 +1,4 @@
-"""Charts as panels: a plane, or the ring of a periodic coordinate, and what is drawn on them."""
+"""Panels of a chart: a plane, or the ring of a periodic coordinate, and the marks on them."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from hyrl_mj.viz.figures.style import CASING, GREEN, GREY, INK, PALE, PAPER, ang
 
 # Radii of a ring, its ticks, their labels, and the edge of its panel.
 OUTER, INNER, TICK, LABEL, EDGE = 1.0, 0.7, 1.05, 1.18, 1.25
-# Cells along the longest side on which it is asked where runs are over.
+# Cells along the longest side of the grid that shows where runs are over, and its blur in cells.
 OVER_CELLS, OVER_BLUR = 240, 1.5
-# Periods to either side that may be seen over time.
+# Periods to either side at which the set-point is drawn over time.
 TURNS = 9
 
-# By their words in the legend.
+# Entries of a legend: the artist of each label.
 Artists = dict[str, Artist]
 
 
 def is_ring(task: Task) -> bool:
-    """Whether the chart is one periodic coordinate."""
+    """Returns whether the chart is one periodic coordinate."""
     return task.chart.periodic == (True,)
 
 
 def drawable(task: Task) -> bool:
-    """Whether the chart, or a section of it, can be shown as a plane or a ring."""
+    """Returns whether the chart, or a section of it, can be shown as a plane or a ring."""
     return is_ring(task) or task.chart.dimension > 1
 
 
@@ -50,7 +50,7 @@ def check_drawable(task: Task) -> None:
 
 
 def angles_on(axis: Any, task: Task, coordinate: int) -> None:
-    """Write an axis in multiples of pi if its coordinate is a periodic angle."""
+    """Labels an axis in multiples of pi if its coordinate is a periodic angle."""
     if task.chart.units[coordinate] == "rad" and task.chart.periodic[coordinate]:
         axis.set_major_locator(MultipleLocator(np.pi / 2))
         axis.set_major_formatter(FuncFormatter(lambda value, _: angle(value)))
@@ -60,31 +60,31 @@ def angles_on(axis: Any, task: Task, coordinate: int) -> None:
 
 
 def plane(panel: Axes, task: Task) -> Artists:
-    """Make a panel the plane of a chart, with the states at which runs are over.
+    """Makes a panel the plane of a chart, with the states at which runs are over.
 
     Returns:
-        What the legend needs.
+        The legend's entries.
     """
     (left, bottom), (right, top) = task.chart.low, task.chart.high
     panel.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
     panel.set(xlabel=axis_label(task, 0), ylabel=axis_label(task, 1))
     for coordinate, axis in enumerate((panel.xaxis, panel.yaxis)):
         angles_on(axis, task, coordinate)
-    found: Artists = {}
+    handles: Artists = {}
     grid = Grid.with_cells(task.chart, OVER_CELLS)
     over = task.failed(measured_at(task, grid.nodes)).reshape(grid.counts)
     if over.any():
-        # Cells are no steps of an outline; half of the blurred mask is where it runs.
+        # Blurred, the mask has a smooth outline where it is one half, without the steps of its cells.
         blurred = gaussian_filter(over.astype(float), OVER_BLUR, mode="nearest")
         region(panel, GridSet(grid, 0.5 - blurred.ravel()), GREY, PALE, zorder=2.2)
-        found["obstacle, or out of bounds"] = patch(GREY, PALE)
+        handles["obstacle, or out of bounds"] = patch(GREY, PALE)
     if task.set_point is not None:
-        found |= cross(panel, *task.set_point)
-    return found
+        handles |= cross(panel, *task.set_point)
+    return handles
 
 
 def region(panel: Axes, members: GridSet, face: str, edge: str | None = None, **looks: Any) -> None:
-    """Fill a set in a plane, and draw its outline if it has a colour."""
+    """Fills a set in a plane, and draws its outline if that has a colour."""
     grid, inside = members.grid, members.mask
     x, y = grid.nodes.reshape(*grid.counts, 2).transpose(2, 1, 0)
     values = members.values.reshape(grid.counts).T
@@ -95,15 +95,15 @@ def region(panel: Axes, members: GridSet, face: str, edge: str | None = None, **
 
 
 def patch(face: str, edge: str = INK) -> Patch:
-    """A filled field for a legend."""
+    """Returns a filled field for a legend."""
     return Patch(facecolor=face, edgecolor=edge, linewidth=0.8)
 
 
 # ---- rings
 
 
-def ring(panel: Axes, task: Task, radii: Sequence[float], words: str = "") -> None:
-    """Make a panel the ring of a periodic coordinate: circles, a clock face, and words in its middle."""
+def ring(panel: Axes, task: Task, radii: Sequence[float], note: str = "") -> None:
+    """Makes a panel the ring of a periodic coordinate: circles, a clock face, and its label with a note."""
     low, period = task.chart.low[0], task.chart.high[0] - task.chart.low[0]
     for radius in radii:
         panel.add_patch(Circle((0, 0), radius, fill=False, edgecolor=INK, linewidth=0.8, zorder=3))
@@ -114,18 +114,18 @@ def ring(panel: Axes, task: Task, radii: Sequence[float], words: str = "") -> No
         panel.text(
             at[0] * LABEL, at[1] * LABEL, value_text(task, quarter), ha="center", va="center"
         )
-    panel.text(0, 0, axis_label(task, 0) + words, ha="center", va="center")
+    panel.text(0, 0, axis_label(task, 0) + note, ha="center", va="center")
     panel.set(xlim=(-EDGE, EDGE), ylim=(-EDGE, EDGE), aspect="equal", anchor="S")
     panel.set_axis_off()
 
 
 def value_text(task: Task, value: float) -> str:
-    """A value of a ring's coordinate for people: "π/2" or "45"."""
+    """Returns the label of a value of a ring's coordinate: "π/2" or "45"."""
     return angle(value) if task.chart.units[0] == "rad" else f"{value:g}"
 
 
 def on_ring(task: Task, z: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """Where values (n,) of a periodic coordinate lie on the unit circle: (n,), (n,)."""
+    """Returns x (n,) and y (n,) on the unit circle of values (n,) of a periodic coordinate."""
     turned = 2 * np.pi * np.asarray(z) / (task.chart.high[0] - task.chart.low[0])
     return np.cos(turned), np.sin(turned)
 
@@ -138,13 +138,13 @@ def arcs(
     outer: float = OUTER,
     inner: float = INNER,
 ) -> None:
-    """Draw classes (N,) int of equally spaced values of a periodic coordinate as arcs of a ring.
+    """Draws classes (N,) int of equally spaced values of a periodic coordinate as arcs of a ring.
 
     Args:
         panel: to draw on.
         task: has the coordinate.
         classes: indices into the colours.
-        colours: of the classes; None leaves it free.
+        colours: of the classes; None leaves the ring blank.
         outer, inner: radii of the ring.
     """
     period = task.chart.high[0] - task.chart.low[0]
@@ -154,7 +154,7 @@ def arcs(
     ends = np.append(begins[1:], begins[:1] + len(classes))
     if not len(begins):
         begins, ends = np.array([0]), np.array([len(classes)])
-    # The shortest arcs last, with an edge: those of a single node are seen, too.
+    # The shortest arcs last, with an edge, so that even those of a single node can be seen.
     for arc in np.argsort(begins - ends):
         theta = origin + step * (begins[arc] - 0.5), origin + step * (ends[arc] - 0.5)
         colour = colours[classes[begins[arc]]]
@@ -164,18 +164,18 @@ def arcs(
             )
 
 
-# ---- what is drawn on both
+# ---- marks on planes and rings
 
 
 def measured_at(task: Task, z: np.ndarray) -> np.ndarray:
-    """What is measured (n, p) at chart points (n, d), without noise."""
+    """Returns the measurement (n, p) at chart points (n, d), without noise."""
     plant = task.plant(len(z))
     plant.set_state(*task.state(z))
     return plant.measurement
 
 
 def cross(panel: Axes, x: float, y: float) -> Artists:
-    """Mark the set-point; returns as `plane`."""
+    """Marks the set-point; returns the legend's entries."""
     looks: dict[str, Any] = {
         "color": GREEN,
         "markersize": 11,
@@ -187,38 +187,38 @@ def cross(panel: Axes, x: float, y: float) -> Artists:
 
 
 def set_point_lines(panel: Axes, task: Task, coordinate: int) -> Artists:
-    """Draw the set-point in a panel of a coordinate over time, round every period; returns as `plane`."""
+    """Draws the set-point in a panel over time, once a period; returns the legend's entries."""
     if task.set_point is None:
         return {}
     low, high = panel.get_ylim()
     period = task.chart.high[coordinate] - task.chart.low[coordinate]
     turns = np.arange(-TURNS, TURNS + 1) if task.chart.periodic[coordinate] else np.zeros(1)
     heights = task.set_point[coordinate] + period * turns
-    found: Artists = {}
+    handles: Artists = {}
     for height in heights[(heights >= low) & (heights <= high)]:
-        found["set-point"] = panel.axhline(
+        handles["set-point"] = panel.axhline(
             height, color=GREEN, linewidth=1.2, linestyle="--", zorder=1
         )
-    return found
+    return handles
 
 
 def dots(panel: Axes, points: np.ndarray, colour: str = INK) -> Artists:
-    """Mark the points of M* where they lie in the panel (n, 2); returns as `plane`."""
+    """Marks points (n, 2) of M*, given in the panel; returns the legend's entries."""
     if not len(points):
         return {}
     x, y = points.T
-    # All the paper first: where points lie close together they make one line.
+    # All white edges first, so that points close to each other merge into one line.
     for fill, size in ((PAPER, 5.0), (colour, 3.6)):
-        (found,) = panel.plot(
+        (drawn,) = panel.plot(
             x, y, "o", markersize=size, color=fill, markeredgewidth=0, clip_on=False, zorder=3.5
         )
-    return {"critical set M*": found}
+    return {"critical set M*": drawn}
 
 
 def spokes(
     panel: Axes, task: Task, z: np.ndarray, start: float, end: float, colour: str = INK
 ) -> Artists:
-    """Mark points (n,) of M* on a ring by lines from radius `start` to `end`; returns as `plane`."""
+    """Marks points (n,) of M* by lines from radius `start` to `end`; returns the legend's entries."""
     x, y = on_ring(task, z)
     for line, (_, width) in zip((PAPER, colour), CASING, strict=True):
         panel.plot(
@@ -228,6 +228,6 @@ def spokes(
 
 
 def classes_of(partition: Partition) -> np.ndarray:
-    """The part (N,) int that alone holds each node; the number of parts where there are several."""
+    """Returns the part (N,) int that alone holds each node, or the number of parts where several do."""
     held = np.stack([part.mask for part in partition.parts])
     return np.where(held.sum(axis=0) == 1, held.argmax(axis=0), len(held))

@@ -1,4 +1,4 @@
-"""What all pictures have in common: colours, sizes, words, and how they are written."""
+"""The style of all figures: colours, sizes, labels, and how the files are written."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from hyrl_mj.tasks import Task
 from hyrl_mj.viz import colours
 
 DPI = 200  # [pixels/inch]
-WIDTH, PAD = 7.8, 0.1  # [inches] of a picture, and of the margin around it
+WIDTH, PAD = 7.8, 0.1  # [inches] of a figure, and of the margin around it
 COLUMNS = 2  # panels beside each other, and columns of a legend
 INK, PAPER, PALE = colours.INK, colours.WHITE, "#8b919b"
 # States at which a run is over.
 GREY = "#dcdee2"
 POLICY_COLOUR, RED, PALE_RED = colours.POLICY, colours.BAD, "#f4c9c7"
 GREEN = colours.GOOD  # of the set-point
-# The hues of the modes as tints.
+# The colours of the modes, mixed with white.
 _TINTS = ("#d6e8f3", "#fbe4d3", "#f1dcee", "#e1f2fb")
-# Width of lines over a map, the paper around the ink first.
+# Colour and width of lines over a map: a white edge, then the line.
 CASING = ((PAPER, 2.8), (INK, 1.4))
 STYLE = {
     "font.size": 10,
@@ -41,18 +41,18 @@ STYLE = {
     "ytick.color": INK,
     "legend.frameon": False,
     "legend.fontsize": 9.5,
-    # Letters in a PDF stay letters, which can be searched and edited.
+    # Text in a PDF stays text, which can be searched and edited.
     "pdf.fonttype": 42,
 }
 
 
 def mode_colour(mode: int) -> str:
-    """The colour of a mode, as in the replay."""
+    """Returns the colour of a mode, as in the replay."""
     return colours.MODES[mode % len(colours.MODES)]
 
 
 def mode_tint(mode: int) -> str:
-    """The same hue, for fields."""
+    """Returns a pale shade of the colour of a mode, for areas."""
     return _TINTS[mode % len(_TINTS)]
 
 
@@ -75,21 +75,21 @@ def drawing(path: Path | None, size: tuple[float, float]) -> Iterator[Figure]:
             artifacts.replacing(path.with_suffix(".png")) as png,
             artifacts.replacing(path.with_suffix(".pdf")) as pdf,
         ):
-            # Panels of a fixed aspect leave room, which is cut off.
+            # Panels of a fixed aspect leave empty margins, which are cut off.
             cut: dict[str, Any] = {"dpi": DPI, "bbox_inches": "tight", "pad_inches": PAD}
             figure.savefig(png, format="png", **cut)
-            # Without the date the same picture is the same file.
+            # Without the date the same figure is the same file.
             figure.savefig(pdf, format="pdf", metadata={"CreationDate": None}, **cut)
 
 
-def head(figure: Figure, task: Task, words: str) -> None:
-    """Write the title over a figure."""
+def head(figure: Figure, task: Task, title: str) -> None:
+    """Writes the title above a figure."""
     where = f" at {task.chart.section}" if task.chart.section else ""
-    figure.suptitle(f"{task_title(task)}{where}: {words}", fontsize=12, fontweight="bold")
+    figure.suptitle(f"{task_title(task)}{where}: {title}", fontsize=12, fontweight="bold")
 
 
 def legend(figure: Figure, handles: Mapping[str, Artist], handlelength: float = 2.0) -> None:
-    """Write the legend below a figure, where it hides nothing."""
+    """Writes the legend below a figure, where it hides nothing."""
     figure.legend(
         list(handles.values()),
         list(handles),
@@ -99,33 +99,33 @@ def legend(figure: Figure, handles: Mapping[str, Artist], handlelength: float = 
     )
 
 
-# ---- words
+# ---- labels
 
 
 def task_title(task: Task) -> str:
-    """The task for people: "Unit circle"."""
+    """Returns the title of a task: "Unit circle"."""
     return task.name.replace("_", " ").capitalize()
 
 
 def noise_label(task: Task, kind: str, eps: float) -> str:
-    """Noise for people: "alternating noise on y, eps = 0.1 m"."""
+    """Returns the label of a noise: "alternating noise on y, eps = 0.1 m"."""
     where, unit = task.noise_on()
     return f"{kind} noise on {where}, eps = {eps:g} {unit}"
 
 
 def axis_label(task: Task, axis: int) -> str:
-    """A coordinate of the chart with its unit: "x [m]"."""
+    """Returns a coordinate of the chart with its unit: "x [m]"."""
     return f"{task.chart.names[axis]} [{task.chart.units[axis]}]"
 
 
 def input_label(task: Task, i: int) -> str:
-    """An input with its unit: "turn rate [rad/s]"."""
+    """Returns an input with its unit: "turn rate [rad/s]"."""
     unit = f" [{task.input_units[i]}]" if task.input_units else ""
     return task.inputs[i].replace("_", " ") + unit
 
 
 def angle(value: float) -> str:
-    """An angle in multiples of pi: "3π/2"."""
+    """Returns an angle in multiples of pi: "3π/2"."""
     turns = Fraction(value / np.pi).limit_denominator(12)
     number = {0: "0", 1: "π", -1: "-π"}.get(turns.numerator, f"{turns.numerator}π")
     return number if turns.denominator == 1 else f"{number}/{turns.denominator}"
