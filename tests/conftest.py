@@ -48,6 +48,27 @@ def puck(tmp_path_factory):
     return hyrl_mj.get_task(path)
 
 
+@pytest.fixture(scope="session")
+def planted_circle(tmp_path_factory):
+    """A run of the circle whose policies are planted and whose other stages ran; and what was said.
+
+    As on a machine that cannot draw: there is no video.
+    """
+    from planted import decisions, halves
+    from test_report import plant
+
+    def no_renderer(*arguments, **options):
+        raise hyrl_mj.NoRenderer("no GL library here")
+
+    task, said = hyrl_mj.get_task("unit_circle"), []
+    path = tmp_path_factory.mktemp("planted") / "unit_circle"
+    plant(path, task, decisions(task), halves(task))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hyrl_mj.viz.replay.render_replay", no_renderer)
+        run = hyrl_mj.run("unit_circle", preset_name="smoke", out=path, say=said.append)
+    return run, said
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item):
     """In CI a skipped test has failed: everything that the tests need is installed there."""

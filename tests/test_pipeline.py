@@ -1,0 +1,161 @@
+"""The pipeline does what is missing from a run directory, and one stage again where it is told to."""
+
+import os
+import shutil
+
+import numpy as np
+import pytest
+from planted import circle_policy
+
+import hyrl_mj
+from hyrl_mj import BadInput
+from hyrl_mj.pipeline import examine_run, extend_again, run_stage
+from hyrl_mj.pipeline.runs import done
+from hyrl_mj.pipeline.steps import STAGES
+
+NAMES = [stage.name for stage in STAGES]
+
+
+@pytest.fixture
+def run(planted_circle, tmp_path):
+    """A copy of the planted run, to be changed."""
+    return hyrl_mj.load_run(shutil.copytree(planted_circle[0].path, tmp_path / "run"))
+
+
+def contents(path):
+    return {p.relative_to(path): p.read_bytes() for p in sorted(path.rglob("*")) if p.is_file()}
+
+
+def stages_done(run):
+    return [name for i, name in enumerate(NAMES) if done(run, i)]
+
+
+# ---- whole runs
+
+
+def test_a_run_goes_on_where_it_was_left(planted_circle):
+    run, said = planted_circle
+    stages = [line.partition(":")[0] for line in said]
+    assert list(dict.fromkeys(stages)) == NAMES
+    assert said[:5] == [f"{name}: done before" for name in NAMES[:5]]
+    assert not any("done before" in line for line in said[5:])
+    assert "replay: no video: no GL library here" in said
+    assert said[-1] == f"report: page at {run.path / 'report.html'}"
+
+
+def test_what_the_stages_leave(planted_circle):
+    run, _ = planted_circle
+    arcs = {f"arcs/{s}_{who}.npz" for s, who in run.arcs()}
+    left = {str(name) for name in contents(run.path)}
+    assert arcs <= left
+    assert {"robustness.json", "robustness.npz", "figures/overview.pdf", "report.html"} <= left
+    assert not [name for name in left if "partial" in name or name.startswith("replay")]
+
+
+def test_what_cannot_be_drawn_is_tried_again(planted_circle):
+    assert stages_done(planted_circle[0]) == NAMES[: NAMES.index("replay")]
+
+
+@pytest.mark.parametrize("name", ["policy.safetensors", "critical_set.npz", "extended_sets.npz"])
+def test_a_newer_result_makes_those_after_it_out_of_date(run, name):
+    stage = {"policy": "train", "critical_set": "critical-set", "extended_sets": "extended-sets"}
+    os.utime(run.path / name)
+    assert stages_done(run) == NAMES[: NAMES.index(stage[name.split(".")[0]]) + 1]
+
+
+def test_a_missing_result_makes_its_stage_undone(run):
+    (run.path / "mode_1.safetensors").unlink()
+    assert stages_done(run) == NAMES[: NAMES.index("retrain")]
+
+
+# ---- one stage
+
+
+def test_an_unknown_stage_lists_the_known(run):
+    with pytest.raises(BadInput, match=r"'simulat'.*Did you mean 'simulate'"):
+        run_stage(run, "simulat")
+
+
+def test_arcs_of_other_starts_go_and_the_user_s_own_stay(run):
+    folder, said = run.path / "arcs", []
+    before = contents(folder)
+    for name in ("start9_policy.npz", "critical_hyrl_q7.npz", "latest_policy.npz"):
+        shutil.copy(folder / "start0_policy.npz", folder / name)
+    run_stage(run, "simulate", say=said.append)
+    after = {path.name for path in folder.iterdir()}
+    assert after == {path.name for path in before} | {"latest_policy.npz"}
+    assert said == [f"simulate: {len(before)} arcs; {said[0].partition('; ')[2]}"]
+
+
+def test_the_same_stage_gives_the_same_again(run):
+    before = {key: arc.z for key, arc in run.arcs().items()}
+    again = run_stage(run, "simulate", say=str)
+    for key, arc in again.arcs().items():
+        np.testing.assert_array_equal(arc.z, before[key])
+
+
+def test_the_critical_set_and_the_parts_are_those_of_the_policy(run):
+    again = run_stage(run_stage(run, "critical-set", say=str), "partition", say=str)
+    assert np.abs(again.critical_set.points - np.pi).max() < 0.01
+    assert again.partition.parts[0].contains(np.array([[2.0], [4.0]])).tolist() == [True, False]
+    assert stages_done(again) == NAMES[:3]
+
+
+def test_an_agent_of_others_is_not_trained(circle, tmp_path):
+    said = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hyrl_mj.pipeline.runs.DIAGNOSIS", STAGES[:2])
+        run = hyrl_mj.diagnose(
+            "unit_circle",
+            circle_policy(circle, critical=2.5),
+            out=tmp_path / "run",
+            preset_name="smoke",
+            say=said.append,
+        )
+    assert said[0].startswith("train: none, ")
+    assert np.abs(run.critical_set.points - 2.5).max() < 0.01
+    with pytest.raises(BadInput, match="there is nothing to train"):
+        run_stage(run, "train")
+
+
+# ---- with other values
+
+
+def test_another_horizon_is_kept_and_what_follows_is_out_of_date(run):
+    said = []
+    again = extend_again(run, 0.2, say=said.append)
+    assert again.settings.horizon == again.extended_sets.horizon == 0.2
+    assert hyrl_mj.load_run(run.path).settings == again.settings
+    assert stages_done(again) == NAMES[: NAMES.index("retrain")]
+    assert said[0].startswith("extended-sets: ")
+    assert "--horizon 0.2" in said[-1]
+
+
+def test_a_horizon_that_cannot_be_used_changes_nothing(run):
+    before = contents(run.path)
+    with pytest.raises(BadInput, match=r"horizon -1\.0 s"):
+        extend_again(run, -1.0)
+    assert contents(run.path) == before
+
+
+def test_episodes_are_added_on_demand(run):
+    before, said = run.robustness, []
+    examine_run(run, eps=0.05, kinds=["uniform"], count=20, say=said.append)
+    assert hyrl_mj.load_run(run.path).robustness != before
+    assert said[-1].startswith("worst case at noise 0.05: ")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"count": 0}, "0 episodes cannot be simulated"),
+        ({"eps": -0.1}, "finite number >= 0"),
+        ({"eps": 100.0}, "hides the whole state space"),
+        ({"kinds": ["gaussian"]}, "'gaussian'"),
+    ],
+)
+def test_an_examination_that_cannot_be_made_leaves_the_last_one(run, options, message):
+    before = contents(run.path)
+    with pytest.raises(BadInput, match=message):
+        examine_run(run, **options)
+    assert contents(run.path) == before
