@@ -36,7 +36,16 @@ from hyrl_mj.stages import (
     find_critical_set,
     make_partition,
 )
-from hyrl_mj.tasks import Mirror, Outcome, Task, get_task, register, task_names
+from hyrl_mj.tasks import (
+    Learning,
+    Mirror,
+    Outcome,
+    Scene,
+    Task,
+    get_task,
+    register,
+    task_names,
+)
 
 __version__ = "0.1.0"
 __all__ = [
@@ -50,6 +59,7 @@ __all__ = [
     "HybridArc",
     "HybridController",
     "HyrlError",
+    "Learning",
     "LoopSettings",
     "Mirror",
     "MlpPolicy",
@@ -61,6 +71,7 @@ __all__ = [
     "Recorded",
     "Run",
     "Sample",
+    "Scene",
     "Score",
     "Settings",
     "Signal",

@@ -7,6 +7,9 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from hyrl_mj.errors import BadInput
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -63,6 +66,35 @@ class Chart:
         """Whether points (n, d) lie in the charted box: (n,) bool."""
         inside = (z >= self.low) & (z <= self.high)
         return np.asarray((inside | self.periodic).all(axis=-1))
+
+    def check(self, z: ArrayLike, owner: str) -> np.ndarray:
+        """Returns points as a float array (n, d); `owner` names the task in messages.
+
+        Raises:
+            BadInput: wrong shape, not finite, or outside the chart.
+        """
+        try:
+            z = np.atleast_2d(np.asarray(z, dtype=float))
+        except (TypeError, ValueError):
+            raise BadInput(f"a state of {owner} is {self.dimension} numbers, got {z!r}") from None
+        if z.ndim != 2 or z.shape[1] != self.dimension or not len(z):
+            raise BadInput(
+                f"a state of {owner} is {self.dimension} number(s) ({', '.join(self.names)}), "
+                f"got shape {z.shape}"
+            )
+        bad = ~(np.isfinite(z).all(axis=1) & self.contains(z))
+        if bad.any():
+            sides = zip(self.names, self.units, self.low, self.high, self.periodic, strict=True)
+            box = ", ".join(
+                f"{low:g} <= {name} <= {high:g} {unit}"
+                for name, unit, low, high, periodic in sides
+                if not periodic
+            )
+            raise BadInput(
+                f"state {np.argmax(bad)} ({self.format(z[bad][0])}) is outside {owner}: "
+                f"{box or 'give finite numbers'}"
+            )
+        return z
 
     def tree(self, points: np.ndarray) -> cKDTree:
         """A search tree of points (n, d) that knows of the periods; ask it with `in_box` points."""

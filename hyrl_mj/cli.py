@@ -235,7 +235,7 @@ def simulate_run(
             raise BadInput("--q0, --noise, --eps, --horizon and --seed need a --start")
         print_summary(pipeline.run_stage(run, "simulate"))
         return
-    z0 = run.task.check_state([start])
+    z0 = run.task.chart.check([start], run.task.name)
     found = noisy_arcs(run, z0, noise, eps, (q0,), horizon, seed)
     for name, (arc,) in zip(("policy", "hyrl"), found.values(), strict=True):
         arc.save(run.latest_path(name))

@@ -50,10 +50,8 @@ class Run:
 
     @cached_property
     def task(self) -> Task:
-        """The task, with the algorithm that trained it here: pictures call the policy by it."""
-        task = get_task(self.settings.task)
-        task.algorithm = self.settings.stage1.algorithm
-        return task
+        """The task."""
+        return get_task(self.settings.task)
 
     @property
     def agent(self) -> Agent | None:
@@ -67,6 +65,11 @@ class Run:
         if self.agent is None:
             return self._load_policy("policy.safetensors")
         return reopen_agent(self.path, self.agent, self.task, self.settings.seed, self.function)
+
+    @property
+    def policy_title(self) -> str:
+        """The name of the policy in figures and replays: "RL policy (DQN)"."""
+        return f"RL policy ({self.settings.stage1.title})"
 
     @property
     def steady(self) -> Policy:
@@ -158,7 +161,7 @@ class Run:
 
     def arc_paths(self) -> dict[tuple[str, str], Path]:
         """The files of the replays by start ("start0", ..., "critical") and controller."""
-        starts = [f"start{i}" for i in range(len(self.task.replay_starts))]
+        starts = [f"start{i}" for i in range(len(self.task.scene.starts))]
         starts += ["critical"] if len(self.critical_set.points) else []
         loops = ["policy"] + [f"hyrl_q{q}" for q in self.extended_sets.modes]
         return {(s, c): self.path / "arcs" / f"{s}_{c}.npz" for s in starts for c in loops}

@@ -25,7 +25,7 @@ def test_it_can_be_trained(task: Task) -> None:
 def test_its_starts_lie_in_the_chart_and_repeat(task: Task) -> None:
     z = task.starts(2000, np.random.default_rng(0))
     assert z.shape == (2000, task.chart.dimension)
-    np.testing.assert_array_equal(task.check_state(z), z)
+    np.testing.assert_array_equal(task.chart.check(z, task.name), z)
     np.testing.assert_array_equal(task.starts(2000, np.random.default_rng(0)), z)
 
 
@@ -33,12 +33,15 @@ def test_an_episode_stays_finite_and_its_observations_in_their_space(task: Task)
     rng, space, plant = np.random.default_rng(0), observation_space(task), task.plant(32)
     plant.set_state(*task.state(task.starts(32, rng), rng))
     for _ in range(task.max_steps):
-        plant.step(random_inputs(task, 32, rng))
+        u = random_inputs(task, 32, rng)
+        plant.step(u)
         outcome = task.outcome(plant.measurement, plant.unstable)
-        running = plant.measurement[outcome == Outcome.RUNNING]
-        assert all(space.contains(o) for o in task.observation(running).astype(np.float32))
-        assert np.isfinite(task.reward(plant.measurement)).all()
-        assert (task.reward(running) >= task.worst_reward).all(), "worse than worst_reward"
+        running = outcome == Outcome.RUNNING
+        observation = task.observation(plant.measurement[running])
+        assert all(space.contains(o) for o in observation.astype(np.float32))
+        reward = task.reward(plant.measurement, u)
+        assert np.isfinite(reward).all()
+        assert (reward[running] >= task.worst_reward).all(), "worse than worst_reward"
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -102,15 +105,15 @@ def test_the_ways_that_runs_go_are_its_modes(task: Task) -> None:
     loop, settings = PolicyController(Straight()), LoopSettings(quiet=True)
     way = task.direction(closed_loop(task, loop, z, settings=settings).path)
     assert way.shape == (200,)
-    assert set(way) <= {-1, *range(len(task.mode_names))}
+    assert set(way) <= {-1, *range(len(task.scene.mode_names))}
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_what_is_not_finite_is_refused(task: Task, value: float) -> None:
-    z = np.array(task.replay_starts, dtype=float)
+    z = np.array(task.scene.starts, dtype=float)
     z[-1, -1] = value
     with pytest.raises(BadInput, match=f"state {len(z) - 1}"):
-        task.check_state(z)
+        task.chart.check(z, task.name)
     measured = np.full((2, task.measurement_columns), value)
     with pytest.raises(BadInput, match=r"measurement\[0, 0\]"):
         task.check_measurement(measured)
@@ -122,4 +125,4 @@ ILL_SHAPED = [np.zeros((2, 9)), np.zeros((2, 2, 2)), [], "here", [[0.0], [0.0, 1
 @pytest.mark.parametrize("z", ILL_SHAPED)
 def test_a_state_of_the_wrong_shape_names_the_task(task: Task, z: object) -> None:
     with pytest.raises(BadInput, match=task.name):
-        task.check_state(z)  # type: ignore[arg-type]
+        task.chart.check(z, task.name)  # type: ignore[arg-type]

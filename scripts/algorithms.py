@@ -30,7 +30,7 @@ HEADINGS = (
 
 def able(task: str) -> list[str]:
     """The algorithms of SB3 that can have the inputs of a task."""
-    discrete = hyrl_mj.get_task(task).levels is not None
+    discrete = hyrl_mj.get_task(task).learning.levels is not None
     return [name for name, algorithm in ALGORITHMS.items() if algorithm.takes(discrete)]
 
 

@@ -87,7 +87,7 @@ def fate(run: hyrl_mj.Run, arc: hyrl_mj.HybridArc) -> str:
         return FATES[arc.outcome]
     if not arc.arrives(run.task):
         return f"ends {run.task.miss(arc.z[-1:])[0]:.2g} off the set-point"
-    return f"arrives, {run.task.mode_names[run.task.direction(arc.z[:, None])[0]]}"
+    return f"arrives, {run.task.scene.mode_names[run.task.direction(arc.z[:, None])[0]]}"
 
 
 def point(z: np.ndarray) -> str:
@@ -152,9 +152,9 @@ def hybrid(run: hyrl_mj.Run, decided: tuple[int, ...]) -> Iterator[Line]:
     """Lines for the ten replays of Section V; q0 decides the way from the starts `decided`."""
     arcs = run.arcs()
     for q in run.controller.modes:
-        for i in range(len(run.task.replay_starts)):
+        for i in range(len(run.task.scene.starts)):
             arc = arcs[f"start{i}", f"hyrl_q{q}"]
-            paper = f"arrives, {run.task.mode_names[q]}" if i in decided else "arrives"
+            paper = f"arrives, {run.task.scene.mode_names[q]}" if i in decided else "arrives"
             ours, jumps = fate(run, arc), arc.t[np.flatnonzero(np.diff(arc.j))]
             note = ""
             if not ours.startswith(paper) and len(jumps):
@@ -167,7 +167,7 @@ def circle_lines(run: hyrl_mj.Run) -> Iterator[Line]:
     """Example 1."""
     task, sets, parts = run.task, run.extended_sets, run.partition.parts
     z = np.linspace(0, 2 * np.pi, 10_001)[:, None]
-    reward = task.reward(z)
+    reward = task.reward(z, np.zeros_like(z))
     low, high = (limit[0] for limit in task.input_limits)
     yield (
         "set-point",
@@ -198,7 +198,8 @@ def vehicle_lines(run: hyrl_mj.Run) -> Iterator[Line]:
     task, points = run.task, run.critical_set.points
     (x0, y0), (x1, y1) = task.chart.low, task.chart.high
     z = run.partition.grid.nodes
-    uneven = abs(task.reward(z) - task.reward(z * [1, -1])).max()
+    still = np.zeros((len(z), 1))
+    uneven = abs(task.reward(z, still) - task.reward(z * [1, -1], still)).max()
     levels = ", ".join(f"{u:g}" for u in task.input_levels[:, 0])
     yield "set-point", "(3, 0)", "({:g}, {:g})".format(*task.set_point), ""
     yield "input u", "-1, -0.5, 0, 0.5, 1 m/s", f"{levels} m/s", ""
@@ -207,7 +208,7 @@ def vehicle_lines(run: hyrl_mj.Run) -> Iterator[Line]:
     ours = f"x {points[:, 0].min():.2f} to {points[:, 0].max():.2f}, |y| <= {abs(points[:, 1]).max():.4f}"
     yield "M*", "around (0.4, 0)", ours, ""
     yield from common(run, "not told (0.3 s in its code)", ">= 0.11 m", 0.11)
-    yield "runs are watched for", "to the set-point", f"{task.replay_time:g} s", ""
+    yield "runs are watched for", "to the set-point", f"{task.scene.time:g} s", ""
     yield from policy_alone(run, ("arrives, right", "crashes", "arrives, left"))
     yield from hybrid(run, (1, 3))
 

@@ -53,8 +53,8 @@ def sets_of(task, reach=0.2):
 
 def arcs_of(task):
     """Returns the replays, and those from M*, under the paper's noise."""
-    noise, horizon = Noise("alternating", EPS), task.replay_time
-    starts = [*task.replay_starts, decisions(task).points[0]]
+    noise, horizon = Noise("alternating", EPS), task.scene.time
+    starts = [*task.scene.starts, decisions(task).points[0]]
     names = [*(f"start{i}" for i in range(5)), "critical"]
     arcs = {}
     for who, loop, q in (("policy", policy_of(task), None), ("hyrl_q0", controller_of(task), 0),

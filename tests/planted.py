@@ -11,7 +11,7 @@ from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.critical_set import CriticalSet
 from hyrl_mj.stages.hybrid import HybridController
 from hyrl_mj.stages.partition import Partition
-from hyrl_mj.tasks import Outcome, Task
+from hyrl_mj.tasks import Outcome, Scene, Task
 
 
 def euler(task, z, u):
@@ -200,10 +200,8 @@ class Cube(Task):
 
     name = "cube"
     description = "planted"
-    mode_names = ("up", "down")
-    algorithm = "ppo"
+    scene = Scene(starts=(), time=0.6, mode_names=("up", "down"))
     max_steps = 12
-    horizon = 0.3
 
     def __init__(self, level, d=3):
         self.level, self.noisy, names = level, (True,) * d, "abce"[:d]
@@ -225,7 +223,7 @@ class Cube(Task):
     def observation(self, measured):
         return measured
 
-    def reward(self, measurement):
+    def reward(self, measurement, u):
         return np.zeros(len(measurement))
 
     def ending(self, measurement):

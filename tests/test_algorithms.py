@@ -136,15 +136,10 @@ def mine(tmp_path_factory):
     sys.path.remove(str(folder))
 
 
-def task_with(name, algorithm):
-    """A task, and what is to train it."""
-    task = hyrl_mj.get_task(name)
-    task.algorithm = algorithm
-    return task
-
-
-def quick(task, known):
-    return replace(preset(task, "smoke").stage1, samples=FEW[known])
+def quick(task, algorithm, known=None):
+    """Smoke settings of an algorithm with few samples, as many as for the known one of SB3."""
+    stage1 = preset(task, "smoke", algorithm=algorithm).stage1
+    return replace(stage1, samples=FEW[known or algorithm])
 
 
 # ---- the algorithms of SB3
@@ -152,7 +147,7 @@ def quick(task, known):
 
 @pytest.mark.parametrize(("algorithm", "name"), CAN)
 def test_it_trains_a_policy_that_answers_as_sb3_does(algorithm, name):
-    task = task_with(name, algorithm)
+    task = hyrl_mj.get_task(name)
     settings = quick(task, algorithm)
     model = build(task, settings, seed=0)
     before = export(model, task)
@@ -170,7 +165,7 @@ def test_it_trains_a_policy_that_answers_as_sb3_does(algorithm, name):
 
 @pytest.mark.parametrize(("algorithm", "name"), [c for c in CAN if c[0] not in ("ppo", "dqn")])
 def test_the_seed_fixes_the_policy(algorithm, name):
-    task = task_with(name, algorithm)
+    task = hyrl_mj.get_task(name)
     first, again, other = (train(task, quick(task, algorithm), seed).weights for seed in (4, 4, 5))
     assert first.keys() == again.keys()
     assert all(np.array_equal(first[name], again[name]) for name in first)
@@ -179,7 +174,7 @@ def test_the_seed_fixes_the_policy(algorithm, name):
 
 @pytest.mark.parametrize(("algorithm", "name"), CAN)
 def test_actors_and_critics_respect_the_mirror(algorithm, name):
-    task = task_with(name, algorithm)
+    task = hyrl_mj.get_task(name)
     settings = quick(task, algorithm)
     model = build(task, settings, seed=0)
     with single_threaded():
@@ -211,21 +206,21 @@ def values(critic, o, a):
 
 @pytest.mark.parametrize("algorithm", ["a2c", "sac", "td3", "ddpg"])
 def test_the_smoke_preset_learns_the_circle(algorithm):
-    task = task_with("unit_circle", algorithm)
-    settings = preset(task, "smoke").stage1
+    task = hyrl_mj.get_task("unit_circle")
+    settings = preset(task, "smoke", algorithm=algorithm).stage1
     before = evaluate(task, export(build(task, settings, 0), task), hyrl_mj.Noise())[1]
     assert evaluate(task, train(task, settings, 0), hyrl_mj.Noise())[1] > before + 10
 
 
 def test_every_preset_has_every_algorithm_or_says_so():
     for algorithm, name in CAN:
-        task = task_with(name, algorithm)
+        task = hyrl_mj.get_task(name)
         for which in PRESETS:
             if which == "paper" and algorithm not in ("ppo", "dqn"):
                 with pytest.raises(BadInput, match=f"'paper' has no {algorithm}"):
-                    preset(task, which)
+                    preset(task, which, algorithm=algorithm)
                 continue
-            settings = preset(task, which)
+            settings = preset(task, which, algorithm=algorithm)
             assert settings.stage1.algorithm == algorithm
             own = preset(hyrl_mj.get_task(name), which)
             if which != "paper":
@@ -235,7 +230,7 @@ def test_every_preset_has_every_algorithm_or_says_so():
 
 def test_a_mode_goes_on_only_from_a_policy_of_its_own_algorithm(vehicle):
     assert preset(vehicle, "paper").stage6.warm_start
-    assert not preset(task_with("vehicle", "ppo"), "paper").stage6.warm_start
+    assert not preset(vehicle, "paper", algorithm="ppo").stage6.warm_start
 
 
 # ---- refusals
@@ -296,11 +291,11 @@ def test_what_cannot_be_used_is_one_sentence_before_any_training(
 )
 def test_a_class_of_the_users_trains_with_the_settings_of_its_relative(kind, task, known, mine):
     name = f"{mine}:{kind}"
-    task = task_with(task, name)
-    settings = quick(task, known)
+    task = hyrl_mj.get_task(task)
+    settings = quick(task, name, known)
     assert settings.algorithm == name
     assert algorithm_title(name) == kind.upper()
-    ours = preset(task_with(task.name, known), "smoke").stage1
+    ours = preset(task, "smoke", algorithm=known).stage1
     assert settings.options.items() <= ours.options.items()
     assert set(settings.options) == ({"n_steps"} if kind == "Fewer" else set(ours.options))
     check_foreign(task, settings)
@@ -337,8 +332,9 @@ def test_a_whole_run_names_its_algorithm_and_keeps_to_it(tmp_path, monkeypatch, 
     assert "TD3, 12,000 samples" in page
     assert "--algorithm td3" in page
     run = hyrl_mj.load_run(out)
-    assert run.task.algorithm == run.policy.algorithm == "td3"
-    assert hyrl_mj.get_task("unit_circle").algorithm == "ppo", "only the run's own task is changed"
+    assert run.settings.stage1.algorithm == run.policy.algorithm == "td3"
+    assert run.policy_title == "RL policy (TD3)"
+    assert run.task.learning.algorithm == "ppo", "the task keeps its default"
     assert "train: done before" in hyrl(*whole, "--algorithm", "td3")
     for others in ((), ("--algorithm", "sac")):
         with pytest.raises(SystemExit) as ended:

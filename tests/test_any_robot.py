@@ -18,6 +18,7 @@ from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.simulation.rollout import ways
 from hyrl_mj.tasks.checks import check_task
+from hyrl_mj.tasks.registry import reference
 from hyrl_mj.tasks.scaffold import TEMPLATES, write_task
 
 # ---- a point mass in space with a pillar: a chart of three dimensions, two inputs, contacts
@@ -61,7 +62,7 @@ import hyrl_mj
 from hyrl_mj import Outcome
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.envs.core import BatchedEnv
-from hyrl_mj import Chart, Mirror, Outcome, mjcf
+from hyrl_mj import Chart, Learning, Mirror, Outcome, Scene, mjcf
 
 
 class Wasp(hyrl_mj.Task):
@@ -72,11 +73,12 @@ class Wasp(hyrl_mj.Task):
     )
     inputs = ("aside", "aloft")
     noisy = (False, True, False, False)
-    max_steps, horizon, worst_reward = 60, 0.3, 0.0
+    max_steps, worst_reward = 60, 0.0
     start_low, start_high = (0.0, -0.5, 0.3), (0.2, 0.5, 0.7)
-    replay_starts, replay_time = ((0.0, 0.05, 0.5), (0.0, -0.05, 0.5)), 3.0
-    mode_names = ("left", "right")
-    algorithm = "ppo"
+    scene = Scene(
+        starts=((0.0, 0.05, 0.5), (0.0, -0.05, 0.5)), time=3.0, mode_names=("left", "right")
+    )
+    learning = Learning(horizon=0.3)
     mirror = Mirror((1, -1, 1), (-1, 1))
     observation_low, observation_high = (-1.0, -3.0, -2.0), (5.0, 3.0, 3.0)
     set_point = np.array([2.6, 0.0, 0.5])
@@ -98,7 +100,7 @@ class Wasp(hyrl_mj.Task):
         centre = mjcf.geom_pos(self.model, "obstacle")[:2]
         return np.linalg.norm(measured[:, :2] - centre, axis=1) - 0.48
 
-    def reward(self, measured):
+    def reward(self, measured, u):
         near = np.clip(1 - self.clearance(measured) / 0.2, 0, 1)
         off = np.abs(measured[:, 1]) + np.abs(measured[:, 2] - 0.5)
         return np.where(self.failed(measured), 0.0, 3 - np.minimum(off, 2) - near)
@@ -175,15 +177,15 @@ def test_gymnasium_knows_it(wasp):
     observation, info = env.reset(seed=0)
     assert env.observation_space.contains(observation)
     assert task.chart.contains(info["z"])
-    assert hyrl_mj.get_task("wasp").reference == str(wasp)
+    assert reference(hyrl_mj.get_task("wasp")) == str(wasp)
 
 
 USE_INSTALLED = """
 from hyrl_mj import get_task
-from hyrl_mj.tasks.checks import check_task
+from hyrl_mj.tasks import check_task, reference
 
 task = check_task(get_task("wasp"))
-print(task.reference, task.model_path)
+print(reference(task), task.model_path)
 """
 
 
@@ -269,7 +271,7 @@ MISTAKES = {
     "a name that is taken": (
         PY, 'name = "my_robot"', 'name = "vehicle"', r"and so does .*vehicle\.py: rename",
     ),
-    "a part is missing": (PY, "max_steps, horizon = 70, 0.3", "", r"no max_steps, horizon"),
+    "a part is missing": (PY, r"    max_steps = 70\n.*crash.*\n", "", r"no max_steps, worst_reward"),
     "a method is missing": (PY, "def ending", "def finish", r"not finished.*ending"),
     "no actuators": (
         XML, '<actuator>.*</actuator>| ctrl="1 0"', "", r"my_robot\.xml has no actuators",
@@ -309,8 +311,8 @@ MISTAKES = {
         PY, r"return measured\[:, :3\]", "return measured[:, 0]", r"observation\(\) gives shape",
     ),
     "starts the wrong way round": (PY, r"\(0\.0, -0\.8\)", "(0.0, 1.0)", r"start_low is greater"),
-    "an unknown algorithm": (PY, '"dqn"', '"sarsa"', r"algorithm 'sarsa'.*ppo, a2c"),
-    "dqn without levels": (PY, "levels, algorithm = 5,", "algorithm =", r"dqn needs levels"),
+    "an unknown algorithm": (PY, "levels=5", 'levels=5, algorithm="sarsa"', r"algorithm 'sarsa'.*ppo, a2c"),
+    "dqn without levels": (PY, "levels=5", 'algorithm="dqn"', r"dqn needs levels"),
     "a mirror of the wrong length": (
         PY, r"\(1, -1, -1\)", "(1, -1)", r"mirror\.observation is \(1, -1\): give 3",
     ),

@@ -24,6 +24,7 @@ def run(vehicle):
         critical_set=decisions(vehicle),
         split=halves(vehicle),
         check_exact=lambda: None,
+        policy_title="RL policy (DQN)",
         extended_sets=SimpleNamespace(modes=(0, 1)),
     )
 
@@ -31,7 +32,7 @@ def run(vehicle):
 def test_the_starts_are_the_paper_s_and_one_on_the_critical_set(run):
     starts = replay_starts(run)
     assert list(starts) == ["start0", "start1", "start2", "start3", "start4", "critical"]
-    np.testing.assert_array_equal([*starts.values()][:5], run.task.replay_starts)
+    np.testing.assert_array_equal([*starts.values()][:5], run.task.scene.starts)
     np.testing.assert_allclose(starts["critical"], [0, 0])
 
 
@@ -74,7 +75,7 @@ def test_shows_are_one_for_each_mode_or_all_of_the_paper_s_at_once(run):
     (paper,) = replay_shows(run, "paper", "alternating")
     assert (len(paper.policy), len(paper.hybrid)) == (5, 10)
     starts = np.array([arc.z[0] for arc in paper.hybrid])
-    np.testing.assert_allclose(starts, np.repeat(run.task.replay_starts, 2, axis=0))
+    np.testing.assert_allclose(starts, np.repeat(run.task.scene.starts, 2, axis=0))
     np.testing.assert_array_equal(paper.policy[3].z, arcs["start3", "policy"].z)
 
 

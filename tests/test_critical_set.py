@@ -16,7 +16,7 @@ from planted import (
 )
 
 from hyrl_mj import BadInput, CriticalSet, find_critical_set
-from hyrl_mj.tasks.base import SEARCHES
+from hyrl_mj.tasks import SEARCHES
 
 PI = np.pi
 NORMAL = np.array([2.0, -1.0, 2.0]) / 3

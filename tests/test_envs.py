@@ -103,7 +103,7 @@ def test_a_later_reset_without_seed_goes_on_with_other_starts(task):
 
 
 def test_the_vector_env_plays_the_episodes_of_the_single_env(task):
-    starts = np.array(task.replay_starts)
+    starts = np.array(task.scene.starts)
     vec = make_vec(task.name, len(starts))
     vec.action_space.seed(0)
     singles = [make(task.name) for _ in starts]
@@ -176,7 +176,7 @@ def test_the_return_is_that_of_the_formula():
 
 def test_a_start_is_followed_to_the_bit_and_a_bad_one_refused(task):
     env = make(task.name)
-    z = np.array(task.replay_starts[0])
+    z = np.array(task.scene.starts[0])
     np.testing.assert_array_equal(env.reset(options={"z": z})[1]["z"], z)
     with pytest.raises(BadInput, match=task.name):
         env.reset(options={"z": np.full(task.chart.dimension, np.nan)})
@@ -260,7 +260,8 @@ def test_sb3_gets_terminal_observation_and_episode(vehicle):
     assert [info.get("TimeLimit.truncated") for info in infos] == [False, False, None]
     assert infos[0]["episode"]["l"] == 3
     path = np.array([[0.65, 0.0], [0.7, 0.0], [0.75, 0.0]])
-    assert infos[0]["episode"]["r"] == pytest.approx(vehicle.reward(path).sum(), abs=1e-6)
+    earned = vehicle.reward(path, np.zeros((3, 1))).sum()
+    assert infos[0]["episode"]["r"] == pytest.approx(earned, abs=1e-6)
     assert infos[2] == {}
     assert reward.shape == (3,)
     np.testing.assert_allclose(observation, vehicle.observation(env.core.z), atol=1e-6)
@@ -278,7 +279,7 @@ def test_sb3_is_told_that_time_was_up(circle):
 
 
 def test_sb3_starts_where_its_options_say_once(task):
-    env, z = TaskVecEnv(BatchedEnv(task, 2)), np.array(task.replay_starts[:2])
+    env, z = TaskVecEnv(BatchedEnv(task, 2)), np.array(task.scene.starts[:2])
     env.seed(0)
 
     def first_seen(z):
@@ -313,7 +314,7 @@ def test_noise_is_on_the_observation_only(vehicle):
     np.testing.assert_allclose(result.observation[:, 2], [0.4, -0.6], atol=1e-6)
     after = start + np.array([0.05, 0.0])
     np.testing.assert_allclose(env.z, after, atol=1e-6)
-    np.testing.assert_allclose(result.reward, vehicle.reward(after), atol=1e-6)
+    np.testing.assert_allclose(result.reward, vehicle.reward(after, np.zeros((2, 1))), atol=1e-6)
     # x is measured without noise: the clearance is that of (x, y + noise)
     noisy = vehicle.observation(after + np.array([0.0, -0.1]))
     np.testing.assert_allclose(result.observation, noisy, atol=1e-6)
@@ -341,14 +342,14 @@ def test_leaving_the_domain_ends_an_episode_with_its_own_reward(circle):
 @needs_gl
 def test_rgb_array_shows_the_scene(task):
     env = make(task.name, render_mode="rgb_array")
-    env.reset(options={"z": task.replay_starts[0]})
+    env.reset(options={"z": task.scene.starts[0]})
     picture = env.render()
     assert picture.shape == (480, 640, 3)
     assert picture.dtype == np.uint8
     assert picture.std() > 10
-    action = 1.0 if task.levels is None else LEFT
+    action = 1.0 if task.learning.levels is None else LEFT
     for _ in range(10):
-        env.step(np.array([action], np.float32) if task.levels is None else action)
+        env.step(np.array([action], np.float32) if task.learning.levels is None else action)
     assert (env.render() != picture).any(axis=2).sum() > 50, "the robot has moved"
     env.close()
 

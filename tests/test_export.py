@@ -30,16 +30,16 @@ RNG = np.random.default_rng
 
 def network(task, seed=0, activation="relu", kind=MlpPolicy):
     """A network with random weights, large enough that it answers differently from place to place."""
-    rng, outputs = RNG(abs(seed)), task.levels or len(task.inputs)
+    rng, outputs = RNG(abs(seed)), task.learning.levels or len(task.inputs)
     sizes = [(32, len(task.observation_low)), (32, 32), (outputs, 32)]
-    names = ("q_net.q_net.0.", "q_net.q_net.2.", "q_net.q_net.4.") if task.levels else (
+    names = ("q_net.q_net.0.", "q_net.q_net.2.", "q_net.q_net.4.") if task.learning.levels else (
         "mlp_extractor.policy_net.0.", "mlp_extractor.policy_net.2.", "action_net.",
     )  # fmt: skip
     weights = {}
     for name, size in zip(names, sizes, strict=True):
         weights[f"{name}weight"] = rng.normal(size=size).astype(np.float32) / np.sqrt(size[1])
         weights[f"{name}bias"] = rng.normal(size=size[0]).astype(np.float32)
-    return kind(task, "dqn" if task.levels else "ppo", activation, weights)
+    return kind(task, "dqn" if task.learning.levels else "ppo", activation, weights)
 
 
 def smooth_set(task, k, modes):

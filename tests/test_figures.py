@@ -16,7 +16,7 @@ from matplotlib.path import Path as Outline
 from planted import Cube, decisions, plane_policy
 
 import hyrl_mj
-from hyrl_mj import BadInput, HybridController, Outcome, simulate
+from hyrl_mj import BadInput, HybridController, Outcome, Scene, simulate
 from hyrl_mj.sets import Everything, Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
@@ -236,7 +236,7 @@ def test_overview_of_a_ring():
         assert all((side * way[:, 1] > -0.02).all() for way in ways)
         assert all(np.isclose(np.linalg.norm(way[0]), paths.CORE) for way in ways)
     (spiral,) = [way for way in lines_of(panel, style.POLICY_COLOUR) if len(way) == len(noisy.z)]
-    radius = paths.CORE + (1 - paths.CORE) * noisy.t / CIRCLE.replay_time
+    radius = paths.CORE + (1 - paths.CORE) * noisy.t / CIRCLE.scene.time
     np.testing.assert_allclose(np.linalg.norm(spiral, axis=1), radius)
     np.testing.assert_allclose(spiral[:, 0] / radius, np.cos(noisy.z[:, 0]), atol=1e-12)
     np.testing.assert_allclose(marks_of(panel, "x", style.RED), [[-1, 0]], atol=0.02)
@@ -259,7 +259,7 @@ def test_policy_of_a_plane():
     np.testing.assert_allclose(marks_of(image, "o", style.RED), decisions(VEHICLE).points)
     circles = [line for line in beside.lines if line.get_marker() == "o"]
     found = sorted(tuple(np.ravel(line.get_data())) for line in circles)
-    assert found == sorted(VEHICLE.policy_starts)
+    assert found == sorted(VEHICLE.scene.policy_starts)
     assert len(marks_of(beside, "x", style.RED)) == 1
     # The planted policy passes the pillar and goes straight on.
     assert len(marks_of(beside, "x", style.PALE)) == 2
@@ -285,10 +285,10 @@ def test_policy_of_a_ring():
 
 
 def test_the_papers_starts_of_the_policy():
-    angles = np.array(CIRCLE.policy_starts)[:, 0]
+    angles = np.array(CIRCLE.scene.policy_starts)[:, 0]
     points = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     np.testing.assert_allclose(points, [(-0.81, 0.59), (-0.95, -0.31), (-1, 0)], atol=5e-3)
-    assert set(VEHICLE.policy_starts) == {(0.0, 0.15), (0.0, 0.0), (0.0, -0.15)}
+    assert set(VEHICLE.scene.policy_starts) == {(0.0, 0.15), (0.0, 0.0), (0.0, -0.15)}
 
 
 # ---- extended sets
@@ -368,7 +368,7 @@ def test_jumps_over_time_are_marked_and_change_the_colour():
 class Cut(Cube):
     """A chart of three dimensions, drawn at c = -0.3."""
 
-    replay_starts, replay_time = ((0.1, 0.2, -0.3),), 0.3
+    scene = Scene(starts=((0.1, 0.2, -0.3),), time=0.3, mode_names=("up", "down"))
     start_low, start_high = (-0.5,) * 3, (0.5,) * 3
 
 

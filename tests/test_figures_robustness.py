@@ -74,7 +74,7 @@ def test_each_class_that_occurs_has_its_colour(tmp_path, task):
     occurring = (WON, WON_FROM_SOME, BEATEN)
     path, names = tmp_path / "figures" / "map.png", ("policy", "hyrl")
     arrays = map_of(task, names, lambda z: np.arange(len(z)) % 40 // 14)
-    critical = critical_of(task.replay_starts[2])
+    critical = critical_of(task.scene.starts[2])
     draw_map(task, content_of(names), arrays, critical, path)
     for k, colour in enumerate(figures.CLASS_COLOURS):
         assert (len(where(path, colour)) > 1000) == (k in occurring), MAP_CLASSES[k]
@@ -166,7 +166,7 @@ def test_without_a_path_the_figure_is_returned_and_nothing_is_written(tmp_path, 
     monkeypatch.chdir(tmp_path)
     names = ("policy", "hyrl")
     maps = map_of(task, names, lambda z: np.zeros(len(z)), cells=8)
-    critical = critical_of(task.replay_starts[2])
+    critical = critical_of(task.scene.starts[2])
     assert len(draw_map(task, content_of(names), maps, critical).axes) == len(names)
     assert "margin of HyRL" in str(
         [text.get_text() for text in draw_curve(task, content_of(names)).legends[0].get_texts()]

@@ -54,7 +54,7 @@ def twin_moves(lattice, controller, bound):
 
     @cache
     def ends(node, level):
-        plant.set_state(task.qpos(grid.nodes[[node]]))
+        plant.set_state(task.state(grid.nodes[[node]])[0])
         plant.step(lattice.levels[[level]])
         ending, z = task.ending(plant.measurement)[0], task.z(plant.measurement)
         if ending == Outcome.REACHED:

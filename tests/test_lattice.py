@@ -29,7 +29,7 @@ def around_circle(circle):
 def stepped(lattice, level, node):
     """One sample of the plant from nodes (n,) under levels (n,): measurements."""
     plant = lattice.task.plant(len(node))
-    plant.set_state(lattice.task.qpos(lattice.grid.nodes[node]))
+    plant.set_state(lattice.task.state(lattice.grid.nodes[node])[0])
     plant.step(lattice.levels[level])
     return plant.measurement
 

@@ -18,7 +18,7 @@ def test_one_sample_is_the_papers_equation(task):
     rng = np.random.default_rng(1)
     z, u = random_states(task, PAIRS, rng), random_inputs(task, PAIRS, rng)
     plant = task.plant(PAIRS)
-    plant.set_state(task.qpos(z))
+    plant.set_state(task.state(z)[0])
     plant.step(u)
     np.testing.assert_allclose(task.z(plant.measurement), euler(task, z, u), rtol=0, atol=1e-6)
 
@@ -27,7 +27,7 @@ def test_whole_episodes_are_the_papers_equation(task):
     rng, n = np.random.default_rng(2), 50
     z = random_states(task, n, rng)
     plant = task.plant(n)
-    plant.set_state(task.qpos(z))
+    plant.set_state(task.state(z)[0])
     for _ in range({"unit_circle": 150, "vehicle": 60}[task.name]):
         u = random_inputs(task, n, rng)
         z = euler(task, z, u)
@@ -39,16 +39,16 @@ def test_step_backward_inverts_step(task):
     rng = np.random.default_rng(3)
     z, u = random_states(task, PAIRS, rng), random_inputs(task, PAIRS, rng)
     plant = task.plant(PAIRS)
-    plant.set_state(task.qpos(z))
+    plant.set_state(task.state(z)[0])
     plant.step(u)
     plant.step_backward(u)
     np.testing.assert_allclose(task.z(plant.measurement), z, rtol=0, atol=1e-6)
 
 
 def test_step_backward_moves_the_other_way(task):
-    z, u = np.array(task.replay_starts[:1]), np.array([[0.5]])
+    z, u = np.array(task.scene.starts[:1]), np.array([[0.5]])
     plant = task.plant(1)
-    plant.set_state(task.qpos(z))
+    plant.set_state(task.state(z)[0])
     plant.step_backward(u)
     np.testing.assert_allclose(task.z(plant.measurement), 2 * z - euler(task, z, u), atol=1e-6)
 
@@ -58,7 +58,7 @@ def test_the_number_of_threads_changes_no_bit(task):
     for threads in (1, 2):
         rng = np.random.default_rng(4)
         plant = task.plant(300, threads)
-        plant.set_state(task.qpos(random_states(task, 300, rng)))
+        plant.set_state(task.state(random_states(task, 300, rng))[0])
         for _ in range(20):
             plant.step(random_inputs(task, 300, rng))
         states.append(plant.state)
@@ -150,7 +150,7 @@ BAD_INPUTS = {
 @pytest.mark.parametrize("u", BAD_INPUTS.values(), ids=BAD_INPUTS.keys())
 def test_a_bad_input_names_its_simulation_and_changes_nothing(task, u):
     plant = task.plant(3)
-    plant.set_state(task.qpos(np.array(task.replay_starts[:3])))
+    plant.set_state(task.state(np.array(task.scene.starts[:3]))[0])
     before = plant.state
     with pytest.raises(BadInput, match=r"simulation 2") as caught:
         plant.step(u)
@@ -178,7 +178,7 @@ def test_an_input_of_the_wrong_shape_says_the_right_one(task, shape):
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_bad_state_names_its_simulation_and_changes_nothing(task, value):
     plant = task.plant(3)
-    plant.set_state(task.qpos(np.array(task.replay_starts[:3])))
+    plant.set_state(task.state(np.array(task.scene.starts[:3]))[0])
     before, qpos = plant.state, plant.qpos
     qpos[1, 0] = value
     with pytest.raises(BadInput, match=r"\[1, 0\]|simulation 1") as caught:

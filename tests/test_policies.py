@@ -35,7 +35,7 @@ def test_it_gives_what_sb3_gives(task, model):
     ours = export(model, task).act(measured)
     assert ours.shape == (5000, 1)
     assert len(np.unique(ours)) > 1
-    if task.algorithm == "dqn":
+    if task.learning.algorithm == "dqn":
         np.testing.assert_array_equal(ours, task.input_levels[theirs])
     else:
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-5)
@@ -73,7 +73,7 @@ def test_it_comes_back_from_disk(task, policy, tmp_path):
     back = MlpPolicy.load(path)
     assert (back.task.name, back.algorithm, back.activation) == (
         task.name,
-        task.algorithm,
+        task.learning.algorithm,
         policy.activation,
     )
     assert back.hidden == policy.hidden == (128, 128)

@@ -27,7 +27,7 @@ from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.critical_set import CriticalSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
-from hyrl_mj.tasks import registry
+from hyrl_mj.tasks import Scene, registry
 from hyrl_mj.viz.encoding import video
 from hyrl_mj.viz.figures import CLASS_COLOURS
 from hyrl_mj.viz.report import render, write_report
@@ -42,7 +42,7 @@ VOID = {"meta", "img", "br", "link", "input", "hr", "source"}
 
 def linear(task, bias):
     """A policy without hidden layers that turns or steers away from the critical set, and drifts."""
-    if task.algorithm == "ppo":
+    if task.learning.algorithm == "ppo":
         k = len(task.observation_low)
         weight = -np.eye(len(task.inputs), k, k - len(task.inputs))
         names, values = "action_net", (weight, np.full(len(weight), bias))
@@ -54,7 +54,7 @@ def linear(task, bias):
         f"{names}.{part}": value.astype(np.float32)
         for part, value in zip(("weight", "bias"), values, strict=True)
     }
-    return MlpPolicy(task, task.algorithm, "relu", weights)
+    return MlpPolicy(task, task.learning.algorithm, "relu", weights)
 
 
 def plant(path, task, critical, partition, slack=0.2):
@@ -371,11 +371,10 @@ def test_no_critical_set_is_said(copied):
 class Rover(Cube):
     """A task with a chart of three dimensions, which has all that a run needs."""
 
-    name, algorithm, mode_names = "cube", "ppo", ("up", "down")
-    max_steps, replay_time = 6, 0.3
+    max_steps = 6
     start_low, start_high = (-0.5,) * 3, (0.5,) * 3
     observation_low, observation_high = (-1.0,) * 3, (1.0,) * 3
-    replay_starts = ((0.1, 0.0, 0.0), (-0.2, 0.1, 0.0))
+    scene = Scene(starts=((0.1, 0.0, 0.0), (-0.2, 0.1, 0.0)), time=0.3, mode_names=("up", "down"))
 
     def __init__(self):
         super().__init__(lambda z: z[:, 0])

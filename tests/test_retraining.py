@@ -56,17 +56,19 @@ def test_a_mode_that_leaves_its_set_pays_for_ever(vehicle, circle, vehicle_sets)
 def test_a_cautious_reward_is_the_least_around(vehicle):
     rng = np.random.default_rng(0)
     measured = rng.uniform([0.1, -1.3], [2.9, 1.3], (200, 2))
-    worst = cautious_reward(vehicle, measured, np.array([0.0, 0.1]))
+    u = rng.uniform(-1.0, 1.0, (200, 1))
+    worst = cautious_reward(vehicle, measured, u, np.array([0.0, 0.1]))
     for shift in (-0.1, -0.05, 0.0, 0.05, 0.1):
         state = measured + np.array([0.0, shift])
         crashed = vehicle.clearance(state) <= 1e-3
-        assert (worst <= np.where(crashed, 0.0, vehicle.reward(state)) + 1e-12).all()
+        assert (worst <= np.where(crashed, 0.0, vehicle.reward(state, u)) + 1e-12).all()
     np.testing.assert_array_equal(
-        cautious_reward(vehicle, measured, np.zeros(2)),
-        np.where(vehicle.clearance(measured) <= 1e-3, 0.0, vehicle.reward(measured)),
+        cautious_reward(vehicle, measured, u, np.zeros(2)),
+        np.where(vehicle.clearance(measured) <= 1e-3, 0.0, vehicle.reward(measured, u)),
     )
     # Within the noise of the pillar there is nothing to earn.
-    assert cautious_reward(vehicle, np.array([[1.5, 0.84]]), np.array([0.0, 0.1]))[0] == 0.0
+    close = np.array([[1.5, 0.84]])
+    assert cautious_reward(vehicle, close, u[:1], np.array([0.0, 0.1]))[0] == 0.0
 
 
 @pytest.fixture(scope="module")

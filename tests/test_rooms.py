@@ -73,12 +73,12 @@ from hyrl_mj.sets import Everything
 policy = hyrl_mj.MlpPolicy.load(__import__("pathlib").Path({path!r}))
 u = policy.act(np.load({states!r}))
 controller = hyrl_mj.HybridController(policy.task, {{0: policy}}, {{0: Everything()}})
-arc = hyrl_mj.simulate(policy.task, controller, policy.task.replay_starts[0], horizon=0.5)
+arc = hyrl_mj.simulate(policy.task, controller, policy.task.scene.starts[0], horizon=0.5)
 assert len(arc.t) == 11
 
 from hyrl_mj.envs.sb3_policy import Sb3Policy
 
-measured = policy.task.check_state(policy.task.replay_starts)
+measured = policy.task.chart.check(policy.task.scene.starts, policy.task.name)
 actions, (q,) = Sb3Policy(policy.task, controller).predict(policy.task.observation(measured))
 assert len(actions) == len(q) == len(measured)
 assert "torch" not in sys.modules

@@ -116,7 +116,7 @@ def test_a_detour_earns_less_than_the_goal(rover):
     measured = np.zeros((4, 5))
     measured[:, 0] = at, at - 0.5, at - 0.5, at
     measured[2, 2], measured[3, 1] = 0.8, 0.8
-    goal, ahead, turned, off = rover.reward(measured)
+    goal, ahead, turned, off = rover.reward(measured, np.zeros((4, 1)))
     # What to go on for ever is worth to the policies of the modes, whose discount factor is 0.9.
     assert goal >= ahead / (1 - 0.9) - 1e-9 > turned / (1 - 0.9)
     assert off < goal

@@ -45,7 +45,8 @@ def simulated_returns(task, loop, z, noise, seed):
     rollout = closed_loop(
         task, as_controller(loop), z, noise, seed=seed, settings=LoopSettings(quiet=True)
     )
-    rewards = np.array([task.reward(measurement) for measurement in rollout.path[1:]])
+    u = np.zeros((len(z), len(task.inputs)))  # the rewards of these tasks do not depend on it
+    rewards = np.array([task.reward(measurement, u) for measurement in rollout.path[1:]])
     played = np.arange(len(rewards))[:, None] < rollout.length
     return np.where(played, rewards, 0.0).sum(axis=0), rollout.length
 
@@ -142,7 +143,7 @@ def test_a_robot_with_inertia_is_answered_by_its_speed_too(puck):
 
 def test_actions_are_those_of_the_environments(task):
     model, space = Sb3Policy(task, controller_of(task)), action_space(task)
-    observations = observed(task, np.array(task.replay_starts))
+    observations = observed(task, np.array(task.scene.starts))
     actions, (q,) = model.predict(observations)
     assert actions.dtype == space.dtype
     for observation, action, mode in zip(observations, actions, q, strict=True):
@@ -167,7 +168,7 @@ def test_the_mode_is_kept_and_picked_anew_where_an_episode_starts(circle):
 
 
 def test_deterministic_or_not_the_answer_is_the_same(task):
-    model, seen = Sb3Policy(task, policy_of(task)), observed(task, np.array(task.replay_starts))
+    model, seen = Sb3Policy(task, policy_of(task)), observed(task, np.array(task.scene.starts))
     np.testing.assert_array_equal(
         model.predict(seen, deterministic=False)[0], model.predict(seen)[0]
     )
@@ -208,7 +209,7 @@ def test_a_state_of_the_wrong_shape_is_refused(vehicle, state):
 @pytest.mark.parametrize("loop", LOOPS)
 @pytest.mark.parametrize("mode", [7, 0.5, np.nan])
 def test_an_unknown_mode_is_refused(task, loop, mode):
-    seen = observed(task, np.array(task.replay_starts[:1]))
+    seen = observed(task, np.array(task.scene.starts[:1]))
     with pytest.raises(BadInput, match=rf"mode {mode} is unknown: choose one of \(0,"):
         Sb3Policy(task, LOOPS[loop](task)).predict(seen, (np.array([mode]),))
 

@@ -1,5 +1,7 @@
 """The plane that is drawn of a chart of three dimensions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from planted import Cube, sphere_policy
@@ -19,7 +21,7 @@ ACROSS = np.sqrt(RADIUS**2 - HEIGHT**2)
 class Cut(Cube):
     """A cube that is drawn at c = HEIGHT."""
 
-    replay_starts = ((0.1, 0.2, HEIGHT),)
+    scene = replace(Cube.scene, starts=((0.1, 0.2, HEIGHT),))
     start_low, start_high = (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)
     set_point = np.zeros(3)
 

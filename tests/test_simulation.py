@@ -64,7 +64,7 @@ def formula_run(task, controller, z, q, bound):
 def plant_run(task, controller, z, bound):
     """The same in MuJoCo, one simulation by itself: its path."""
     plant, q = task.plant(1, threads=1), np.zeros(1, dtype=int)
-    plant.set_state(task.qpos(z[None]))
+    plant.set_state(task.state(z[None])[0])
     path = [plant.measurement[0]]
     for k in range(task.max_steps):
         if task.ending(plant.measurement)[0] != Outcome.RUNNING:
@@ -148,7 +148,7 @@ def test_noise_leads_the_plain_policy_into_the_obstacle(vehicle):
 def test_hysteresis_does_not_mind(vehicle):
     controller = ideal_controller(vehicle, 0.15)
     for q0 in (0, 1):
-        arcs = simulate(vehicle, controller, np.array(vehicle.replay_starts), ALTERNATING, q0=q0)
+        arcs = simulate(vehicle, controller, np.array(vehicle.scene.starts), ALTERNATING, q0=q0)
         assert [arc.outcome for arc in arcs] == ["reached"] * 5
         assert max(arc.j[-1] for arc in arcs) <= 1
         assert arcs[0].controller == "hyrl"

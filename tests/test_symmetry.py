@@ -25,7 +25,7 @@ def observations(task, n=500):
 def networks(task, policy):
     """The networks of an SB3 policy, and what the mirror does to the output of each."""
     turn = torch.tensor(task.mirror.inputs).float()
-    if task.algorithm == "dqn":
+    if task.learning.algorithm == "dqn":
         return [(policy.q_net.q_net, swap_levels), (policy.q_net_target.q_net, swap_levels)]
     extract = policy.mlp_extractor
     actor = nn.Sequential(*extract.policy_net, policy.action_net)
@@ -52,9 +52,11 @@ def test_it_is_mirrored_from_the_start(task, model):
 def test_it_stays_mirrored_while_it_learns(task, model):
     before = {name: w.clone() for name, w in symmetry.plain_state(model.policy, task).items()}
     with single_threaded():
-        model.learn(4_000 if task.algorithm == "dqn" else 3 * 4_096)
+        model.learn(4_000 if task.learning.algorithm == "dqn" else 3 * 4_096)
     after = symmetry.plain_state(model.policy, task)
-    actor = {"dqn": "q_net.q_net", "ppo": "mlp_extractor.policy_net"}[task.algorithm] + ".2.weight"
+    actor = {"dqn": "q_net.q_net", "ppo": "mlp_extractor.policy_net"}[
+        task.learning.algorithm
+    ] + ".2.weight"
     assert (after[actor] - before[actor]).abs().max() > 1e-3, "it has learned nothing"
     assert_mirrored(task, model.policy)
 
@@ -95,7 +97,7 @@ def test_a_plain_network_is_not_mirrored(task):
 
 def test_a_policy_in_the_mirror_does_the_mirrored_thing(task):
     settings = replace(preset(task, "smoke").stage1, symmetric=False)
-    for algorithm in ("ppo", "dqn") if task.levels else ("ppo",):
+    for algorithm in ("ppo", "dqn") if task.learning.levels else ("ppo",):
         options = settings.options if algorithm == settings.algorithm else {}
         built = build(task, replace(settings, algorithm=algorithm, options=options), seed=1)
         policy = export(built, task)

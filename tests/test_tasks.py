@@ -18,9 +18,12 @@ def test_both_tasks_are_registered():
 
 
 def test_its_mirror_image_earns_the_same_reward(task):
-    z = random_states(task, 500, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    z = random_states(task, 500, rng)
     image = z * [1, -1] if task.name == "vehicle" else -z
-    np.testing.assert_allclose(task.reward(image), task.reward(z), atol=1e-12)
+    u = rng.uniform(*task.input_limits, (500, len(task.inputs)))
+    reward, mirrored = task.reward(z, u), task.reward(image, u * task.mirror.inputs)
+    np.testing.assert_allclose(mirrored, reward, atol=1e-12)
     np.testing.assert_array_equal(task.ending(image), task.ending(z))
     signs = np.array(task.mirror.observation)
     np.testing.assert_allclose(task.observation(image), task.observation(z) * signs, atol=1e-12)
@@ -58,7 +61,7 @@ def test_an_unknown_task_lists_the_known():
     ],
 )
 def test_circle_reward(circle, theta, reward):
-    assert circle.reward(np.array([[theta]])) == pytest.approx(reward, abs=1e-12)
+    assert circle.reward(np.array([[theta]]), np.zeros((1, 1))) == pytest.approx(reward, abs=1e-12)
 
 
 def test_circle_observation_is_the_point_on_the_circle(circle):
@@ -68,7 +71,7 @@ def test_circle_observation_is_the_point_on_the_circle(circle):
 
 
 def test_circle_takes_any_winding(circle):
-    np.testing.assert_array_equal(circle.check_state([7 * PI]), [[7 * PI]])
+    np.testing.assert_array_equal(circle.chart.check([7 * PI], circle.name), [[7 * PI]])
     wrapped = circle.chart.wrap(np.array([[-PI / 2], [9 * PI]]))
     np.testing.assert_allclose(wrapped, [[1.5 * PI], [PI]])
 
@@ -100,7 +103,7 @@ def test_circle_direction(circle):
     ],
 )
 def test_vehicle_reward(vehicle, z, reward):
-    assert vehicle.reward(np.array([z])) == pytest.approx(reward, abs=1e-6)
+    assert vehicle.reward(np.array([z]), np.zeros((1, 1))) == pytest.approx(reward, abs=1e-6)
 
 
 def test_vehicle_observation(vehicle):
@@ -146,6 +149,6 @@ def test_vehicle_direction(vehicle):
 @pytest.mark.parametrize("z", [(-0.1, 0.0), (3.1, 0.0), (0.0, 1.6), (1.0, -9.0)])
 def test_vehicle_state_outside_the_arena(vehicle, z):
     with pytest.raises(BadInput, match=r"outside .*0 <= x <= 3 m, -1.5 <= y <= 1.5 m") as caught:
-        vehicle.check_state([(0.0, 0.0), z])
+        vehicle.chart.check([(0.0, 0.0), z], vehicle.name)
     assert f"x = {z[0]:g} m, y = {z[1]:g} m" in str(caught.value)
     assert "state 1" in str(caught.value)

@@ -18,7 +18,7 @@ FEW = {"ppo": 8_192, "dqn": 4_000}
 
 @pytest.fixture
 def quick(task):
-    return replace(preset(task, "smoke").stage1, samples=FEW[task.algorithm])
+    return replace(preset(task, "smoke").stage1, samples=FEW[task.learning.algorithm])
 
 
 @pytest.fixture(scope="module")

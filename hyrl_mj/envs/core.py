@@ -10,7 +10,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.simulation import NOT_STARTED, AnyNoise, Sample, signal_for
-from hyrl_mj.tasks import Outcome, Task
+from hyrl_mj.tasks import Outcome, Task, at_levels
 
 
 @dataclass(frozen=True)
@@ -128,14 +128,13 @@ class BatchedEnv:
         unstable = self.plant.unstable
         outcome = self.task.outcome(measurement, unstable)
         terminated = outcome != Outcome.RUNNING
-        reward = self.task.reward(measurement)
+        reward = self.task.reward(measurement, u)
         reward[unstable] = self.task.worst_reward
         measured = self._measure(self._everyone)
         if self.domain is not None:
             if self.domain.caution is not None:
-                reward = np.minimum(
-                    reward, cautious_reward(self.task, measured, self.domain.caution)
-                )
+                cautious = cautious_reward(self.task, measured, u, self.domain.caution)
+                reward = np.minimum(reward, cautious)
             left = ~terminated & ~self.domain.contains(self.task.z(measurement))
             reward[left] = self.domain.exit_reward
             terminated = terminated | left
@@ -155,7 +154,7 @@ class BatchedEnv:
         """Inputs (n, m) in the plant's units for actions: levels (n,) int, or inputs (n, m) to clip."""
         if self.task.input_levels is None:
             return np.clip(np.asarray(actions, dtype=float), *self.task.input_limits)
-        return self.task.at_levels(actions)
+        return at_levels(self.task, actions)
 
     def _measure(self, ids: np.ndarray) -> np.ndarray:
         """Returns noisy measurements (k, p) of the rows `ids`."""
@@ -165,8 +164,10 @@ class BatchedEnv:
         return true + self._noise.sample(now)
 
 
-def cautious_reward(task: Task, measured: np.ndarray, caution: np.ndarray) -> np.ndarray:
-    """The least reward (n,) of states within `caution` (p,) of measurements (n, p).
+def cautious_reward(
+    task: Task, measured: np.ndarray, u: np.ndarray, caution: np.ndarray
+) -> np.ndarray:
+    """Returns the least reward (n,) of states within `caution` (p,) of measurements (n, p), inputs (n, m).
 
     A policy whose reward depends on where it might be keeps clear of what noise could hide, without
     having to meet the noise: what it observes and what it earns go together.
@@ -175,6 +176,6 @@ def cautious_reward(task: Task, measured: np.ndarray, caution: np.ndarray) -> np
     worst = np.full(len(measured), np.inf)
     for signs in product(*[shares if c else (0.0,) for c in caution]):
         state = measured + signs * caution
-        reward = np.where(task.failed(state), task.worst_reward, task.reward(state))
+        reward = np.where(task.failed(state), task.worst_reward, task.reward(state, u))
         worst = np.minimum(worst, reward)
     return worst

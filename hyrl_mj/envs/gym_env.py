@@ -44,7 +44,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         task: its name.
         noise: measurement noise on the observation.
         render_mode: None or "rgb_array".
-        camera: a camera of the MJCF.
+        camera: a camera of the MJCF, by default that of the task's scene.
         width, height: of the rendered picture [pixels].
     """
 
@@ -56,7 +56,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         *,
         noise: AnyNoise | None = None,
         render_mode: str | None = None,
-        camera: str = "overhead",
+        camera: str | None = None,
         width: int = 640,
         height: int = 480,
     ):
@@ -66,7 +66,8 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         self.metadata = {**self.metadata, "render_fps": round(1 / self.core.task.dt)}
         self.observation_space = observation_space(self.core.task)
         self.action_space = action_space(self.core.task)
-        self.render_mode, self._camera, self._size = render_mode, camera, (width, height)
+        self.render_mode, self._size = render_mode, (width, height)
+        self._camera = camera or self.core.task.scene.camera
         self._renderer: SceneRenderer | None = None
 
     def reset(
@@ -77,7 +78,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         self.core.seed(int(self.np_random.integers(2**63)))
         z = (options or {}).get("z")
         if z is not None:
-            z = self.core.task.check_state(z)
+            z = self.core.task.chart.check(z, self.core.task.name)
         return self.core.reset(z=z)[0], {"z": self.core.z[0]}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -150,7 +151,7 @@ class TaskVectorEnv(VectorEnv):
             self.core.seed(seed)
         z = (options or {}).get("z")
         if z is not None:
-            z = self.core.task.check_state(z)
+            z = self.core.task.chart.check(z, self.core.task.name)
         return self.core.reset(z=z), {"z": self.core.z}
 
     def step(

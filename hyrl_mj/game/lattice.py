@@ -153,7 +153,7 @@ class Lattice:
         index = np.clip(np.round((u - low) * steps), 0, np.array(counts) - 1).astype(int)
         found = np.ravel_multi_index(tuple(index.T), tuple(counts))
         off = np.abs(self.levels[found] - u).max(axis=1) > 1e-6
-        if self.task.levels is not None and off.any():
+        if self.task.learning.levels is not None and off.any():
             raise BadInput(
                 f"the controller's input {u[off][0].tolist()} is not one of the levels of "
                 f"{self.task.name}: {np.unique(self.levels).tolist()}"

@@ -10,7 +10,7 @@ from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.game import LATTICE
 from hyrl_mj.learning.settings import Settings, Training
 from hyrl_mj.policies import Agent, accepted, check_algorithm, relative
-from hyrl_mj.tasks import Task
+from hyrl_mj.tasks import Task, reference
 
 PRESETS = ("fast", "paper", "smoke")
 
@@ -177,71 +177,73 @@ def preset(
     seed: int = 0,
     horizon: float | None = None,
     agent: Agent | None = None,
+    algorithm: str | None = None,
 ) -> Settings:
-    """The settings of a preset.
+    """Returns the settings of a preset.
 
     Args:
-        task: what they are for; `task.algorithm` trains stage 1.
+        task: what they are for.
         name: "fast", "paper" (the paper's training), or "smoke" (seconds, to see that all runs).
         noise: bound eps of the measurement noise that the controller has to survive.
         seed: of everything random.
         horizon: time T of the backward propagation [s]; by default the sets are sized to the noise, and
             preset "paper" takes the paper's T.
         agent: takes the place of stage 1; the modes then go on from it.
+        algorithm: of stage 1, by default the task's.
 
     Raises:
         BadInput: an unknown preset, or a value that cannot be used.
     """
     if name not in PRESETS:
         raise unknown("preset", name, PRESETS)
-    stage1 = agent or _stage1(task, name)
+    stage1 = agent or _stage1(task, name, algorithm or task.learning.algorithm)
     stage6 = _stage6(task, name, stage1.algorithm)
     task.check_noise(noise)
     dimension = task.chart.dimension
     cells, rods = (_CELLS, _RODS) if task.kinematic else (_CELLS_DYNAMIC, _RODS_DYNAMIC)
     return Settings(
-        task=task.reference,
+        task=reference(task),
         preset=name,
         seed=seed,
         noise=noise,
-        horizon=task.horizon if horizon is None and name == "paper" else horizon,
+        horizon=task.learning.horizon if horizon is None and name == "paper" else horizon,
         stage1=stage1,
         stage6=replace(stage6, warm_start=True) if agent else stage6,
         cells=cells[min(dimension, 4)],
         # Whose agent goes straight on for some samples before it decides has a part of M* that rods miss.
-        search="outcome" if agent else task.search,
+        search="outcome" if agent else task.learning.search,
         rods=rods[min(dimension, 4)],
         lattice=(_LATTICE_SMOKE if name == "smoke" else LATTICE).get(dimension, 0),
     )
 
 
-def _stage1(task: Task, name: str) -> Training:
-    """Stage 1 of a preset, with the task's algorithm."""
-    check_algorithm(task.algorithm, task.name, task.levels)
-    known = relative(task.algorithm, task.levels)
+def _stage1(task: Task, name: str, algorithm: str) -> Training:
+    """Returns stage 1 of a preset, with an algorithm."""
+    levels = task.learning.levels
+    check_algorithm(algorithm, task.name, levels)
+    known = relative(algorithm, levels)
     if name == "paper":
         if known not in _PAPERS:
             raise BadInput(
-                f"preset 'paper' has no {task.algorithm}, the paper trained with {' and '.join(_PAPERS)}: "
+                f"preset 'paper' has no {algorithm}, the paper trained with {' and '.join(_PAPERS)}: "
                 "choose preset fast or smoke"
             )
         found = _PAPERS[known]
     else:
-        found = (_CONTINUOUS if task.levels is None else _LEVELS)[known]
+        found = (_CONTINUOUS if levels is None else _LEVELS)[known]
     if name == "smoke":
         found = replace(found, samples=_SMOKE[known])
     if np.any(np.subtract(task.start_high, task.start_low) < task.chart.sides - 1e-9):
         found = replace(found, episode=None)  # what lies behind the starts has to be driven to
-    if known == task.algorithm:
+    if known == algorithm:
         return found
-    options = accepted(task.algorithm, found.options)
-    return replace(found, algorithm=task.algorithm, options=options)
+    return replace(found, algorithm=algorithm, options=accepted(algorithm, found.options))
 
 
 def _stage6(task: Task, name: str, algorithm: str) -> Training:
-    """Stage 6 of a preset, after stage 1 with an algorithm."""
+    """Returns stage 6 of a preset, after stage 1 with an algorithm."""
     if name == "paper":
-        found = _MODES_PAPER_CONTINUOUS if task.levels is None else _MODES_PAPER_DISCRETE
+        found = _MODES_PAPER_CONTINUOUS if task.learning.levels is None else _MODES_PAPER_DISCRETE
         return replace(found, warm_start=found.warm_start and found.algorithm == algorithm)
-    found = _MODES_CONTINUOUS if task.levels is None else _MODES_DISCRETE
+    found = _MODES_CONTINUOUS if task.learning.levels is None else _MODES_DISCRETE
     return replace(found, samples=_SMOKE_MODES, attempts=1) if name == "smoke" else found

@@ -113,7 +113,7 @@ def build(
     Raises:
         BadInput: an unknown algorithm, or a policy to start from whose networks are those of another one.
     """
-    check_algorithm(settings.algorithm, task.name, task.levels)
+    check_algorithm(settings.algorithm, task.name, task.learning.levels)
     hidden = settings.hidden if start_from is None else start_from.hidden
     activation = settings.activation if start_from is None else start_from.activation
     rate = settings.learning_rate

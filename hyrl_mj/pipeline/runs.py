@@ -60,12 +60,13 @@ def run(
         BadInput: a value that cannot be used.
     """
     found = check_task(get_task(task))
-    found.algorithm = algorithm or found.algorithm
-    settings = preset(found, preset_name, noise=noise, seed=seed, horizon=horizon)
-    if found.algorithm not in ALGORITHMS:
+    settings = preset(
+        found, preset_name, noise=noise, seed=seed, horizon=horizon, algorithm=algorithm
+    )
+    assert isinstance(settings.stage1, Training)
+    if settings.stage1.algorithm not in ALGORITHMS:
         from hyrl_mj.learning.training import check_foreign
 
-        assert isinstance(settings.stage1, Training)
         check_foreign(found, settings.stage1)
     return _run_all(open_or_create(out or Path("runs") / found.name, settings), say)
 

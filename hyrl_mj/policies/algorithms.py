@@ -84,7 +84,9 @@ def check_algorithm(name: str, task: str, levels: int | None) -> None:
         levels: of its input, None for continuous inputs.
     """
     if ":" not in name and name not in ALGORITHMS:
-        raise unknown("algorithm", name, [*ALGORITHMS, "or module:Class of another one"])
+        raise unknown(
+            "algorithm", name, [*ALGORITHMS, f"or module:Class of another one for {task}"]
+        )
     discrete = levels is not None
     if ALGORITHMS[relative(name, levels)].takes(discrete):
         return

@@ -12,7 +12,7 @@ import numpy as np
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadArtifact, BadInput, brief
 from hyrl_mj.policies.mlp import ObservationPolicy
-from hyrl_mj.tasks import Task
+from hyrl_mj.tasks import Task, at_levels
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class FunctionPolicy(ObservationPolicy):
                 f"{what} of shape {wanted}"
             )
         if discrete:
-            return self.task.at_levels(actions)
+            return at_levels(self.task, actions)
         return np.clip(self._finite(actions), *self.task.input_limits)
 
     def _finite(self, actions: np.ndarray) -> np.ndarray:
@@ -142,9 +142,9 @@ def _onnx_function(session: Any, batched: bool, task: Task) -> Callable[[np.ndar
 
 def _preferred(preferences: np.ndarray, task: Task) -> np.ndarray:
     """The levels (n,) int that are preferred, by preferences (n, levels)."""
-    if preferences.ndim != 2 or preferences.shape[1] != task.levels:
+    if preferences.ndim != 2 or preferences.shape[1] != task.learning.levels:
         raise BadInput(
-            f"{task.name} takes preferences of shape (n, {task.levels}) or integers (n,), got "
+            f"{task.name} takes preferences of shape (n, {task.learning.levels}) or integers (n,), got "
             f"{preferences.dtype} of shape {preferences.shape}"
         )
     if not np.isfinite(preferences).all():

@@ -266,7 +266,8 @@ def check_kind(task: Task, levels: bool) -> None:
     if levels == (task.input_levels is not None):
         return
     gives = "chooses among discrete levels" if levels else "gives continuous inputs"
-    takes = "continuous inputs" if task.levels is None else f"one of {task.levels} discrete levels"
+    n = task.learning.levels
+    takes = "continuous inputs" if n is None else f"one of {n} discrete levels"
     raise BadArtifact(f"the network {gives}, the task {task.name} takes {takes}")
 
 

@@ -208,7 +208,7 @@ def simulate_batch(
     seed: int = 0,
 ) -> list[HybridArc]:
     """Simulate the closed loop from n starts (n, d), or from one; as `simulate`, always with a list."""
-    starts = task.check_state(z0)
+    starts = task.chart.check(z0, task.name)
     check_seed(seed)
     loop = as_controller(controller)
     if q0 is not None:

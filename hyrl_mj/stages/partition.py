@@ -45,7 +45,7 @@ class Partition:
     def sentence(self, task: Task) -> str:
         """The result for people."""
         shares = ", ".join(
-            f"{task.mode_name(q)} {100 * part.mask.mean():.0f}%"
+            f"{task.scene.mode_name(q)} {100 * part.mask.mean():.0f}%"
             for q, part in zip(self.modes, self.parts, strict=True)
         )
         return f"share of the chart by mode: {shares}"

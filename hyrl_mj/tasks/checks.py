@@ -1,4 +1,4 @@
-"""Whether a task is whole and consistent, found out before anything is trained."""
+"""Checks that a task is complete and consistent, before anything is trained."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ import numpy as np
 
 from hyrl_mj import mjcf
 from hyrl_mj.errors import BadInput, brief, unknown
-from hyrl_mj.tasks.base import SEARCHES, Outcome, Task
+from hyrl_mj.tasks.base import Outcome, Task
+from hyrl_mj.tasks.learning import SEARCHES
+from hyrl_mj.tasks.outdated import check_current
 from hyrl_mj.tasks.registry import line_in
 
 REQUIRED = (
-    "chart", "inputs", "noisy", "max_steps", "horizon", "worst_reward", "start_low", "start_high",
-    "replay_starts", "replay_time", "mode_names", "algorithm", "observation_low", "observation_high",
+    "chart", "inputs", "noisy", "max_steps", "worst_reward", "start_low", "start_high",
+    "observation_low", "observation_high", "scene",
 )  # fmt: skip
 # Starts that are tried, and the samples of each under random inputs.
 STARTS, SAMPLES = 64, 20
@@ -21,11 +23,12 @@ ROUND_TRIP = 1e-6
 
 
 def check_task(task: Task) -> Task:
-    """The task itself, if it can be trained.
+    """Returns the task itself, if it can be trained.
 
     Raises:
         BadInput: it cannot; the message names the file, what is wrong in it, and what is right.
     """
+    check_current(task)
     where = task.source or task.name
     try:
         _check_parts(task)
@@ -60,24 +63,28 @@ def _check_parts(task: Task) -> None:
         raise BadInput("start_low is greater than start_high: exchange them")
     if task.set_point is not None and np.shape(task.set_point) != (d,):
         raise BadInput(f"set_point has shape {np.shape(task.set_point)}: its chart takes {(d,)}")
-    for start in task.replay_starts:
-        task.check_state(start)
+    scene = task.scene
+    for start in (*scene.starts, *scene.policy_starts):
+        task.chart.check(start, task.name)
+    if not (np.isfinite(scene.time) and scene.time > 0):
+        raise BadInput(f"scene.time is {scene.time}: give a time > 0 s")
     if not np.isfinite(task.noisy).all() or min(task.noisy) < 0:
         raise BadInput(f"noisy is {task.noisy}: give shares of the noise bound, 0 or more")
-    if len(task.mode_names) < 2:
+    if len(scene.mode_names) < 2:
         raise BadInput(
-            f"mode_names is {task.mode_names!r}: name the ways that runs can go, two or more"
+            f"scene.mode_names is {scene.mode_names!r}: name the ways that runs can go, two or more"
         )
 
 
 def _check_training(task: Task) -> None:
-    if task.search not in SEARCHES:
-        raise unknown("search", task.search, SEARCHES)
+    learning = task.learning
+    if learning.search not in SEARCHES:
+        raise unknown("search", learning.search, SEARCHES)
     if not task.inputs:
         raise BadInput("inputs is empty: name the actuators that the policy drives")
-    if task.levels is not None and (task.levels < 2 or len(task.inputs) > 1):
+    if learning.levels is not None and (learning.levels < 2 or len(task.inputs) > 1):
         raise BadInput(
-            f"{task.levels} levels of {len(task.inputs)} input(s) cannot be used: give 2 or more of a "
+            f"{learning.levels} levels of {len(task.inputs)} input(s) cannot be used: give 2 or more of a "
             "single input, or none"
         )
     if task.mirror is not None:
@@ -96,10 +103,10 @@ def _check_model(task: Task) -> None:
         raise BadInput(f"{path.name} has no actuators: give the policy at least one to drive")
     _ = task.input_limits
     for kind, name in (
-        (mujoco.mjtObj.mjOBJ_SITE, "tracked"),
-        (mujoco.mjtObj.mjOBJ_CAMERA, "overhead"),
+        (mujoco.mjtObj.mjOBJ_SITE, task.scene.tracked),
+        (mujoco.mjtObj.mjOBJ_CAMERA, task.scene.camera),
     ):
-        mjcf.object_id(model, kind, name)  # the replay takes them
+        mjcf.object_id(model, kind, name)  # the replay needs them
     steps = task.dt / model.opt.timestep
     if abs(steps - round(steps)) > 1e-6 or steps < 0.5:
         raise BadInput(
@@ -167,28 +174,29 @@ def _check_episode(task: Task) -> None:
                 f"observation[{column}] is {observation[row, column]:g} after {sample} samples, and "
                 f"its bounds are {low[column]:g} and {high[column]:g}: widen them"
             )
-        reward = np.asarray(task.reward(measurement))
+        u = rng.uniform(*task.input_limits, (STARTS, len(task.inputs)))
+        reward = np.asarray(task.reward(measurement, u))
         if reward.shape != (STARTS,) or not np.isfinite(reward[running]).all():
             raise BadInput(
                 f"reward() of {STARTS} measurements must be {STARTS} finite numbers, it has shape "
                 f"{reward.shape} and values like {reward.ravel()[0]:g}"
             )
-        plant.step(rng.uniform(*task.input_limits, (STARTS, len(task.inputs))))
+        plant.step(u)
         path.append(task.z(plant.measurement))
     way = task.direction(np.array(path))
-    for name, found in (
+    for name, values in (
         ("direction", way),
         ("miss", task.miss(path[-1])),
         ("arrived", task.arrived(path[-1])),
         ("danger", task.danger(plant.measurement)),
         ("verdict", task.verdict(plant.measurement)),
     ):
-        if np.shape(found) != (STARTS,):
+        if np.shape(values) != (STARTS,):
             raise BadInput(
-                f"{name}() of {STARTS} runs has shape {np.shape(found)}: it is to be ({STARTS},)"
+                f"{name}() of {STARTS} runs has shape {np.shape(values)}: it is to be ({STARTS},)"
             )
     ways = set(np.unique(way).tolist())
-    if not ways <= {-1, *range(len(task.mode_names))}:
+    if not ways <= {-1, *range(len(task.scene.mode_names))}:
         raise BadInput(
-            f"direction() gives {sorted(ways)}: give -1 or the number of one of the mode_names"
+            f"direction() gives {sorted(ways)}: give -1 or the number of one of scene.mode_names"
         )

@@ -9,7 +9,9 @@ import numpy as np
 from hyrl_mj import mjcf
 from hyrl_mj.chart import Chart
 from hyrl_mj.tasks.base import Mirror, Outcome, Task
+from hyrl_mj.tasks.learning import Learning
 from hyrl_mj.tasks.registry import register
+from hyrl_mj.tasks.scene import Scene
 
 # Inner loop: how fast velocity, height, tilt and its rate follow [1/s, 1/s, 1/s^2, 1/s].
 VELOCITY, HEIGHT, TILT, RATE = 4.0, 2.0, 225.0, 24.0
@@ -26,17 +28,17 @@ class Quadrotor(Task):
     name = "quadrotor"
     description = "fly past a pillar on its left or on its right (DQN)"
     inputs, input_units = ("lateral_velocity",), ("m/s",)
-    levels = 5
     # Of the measurement: x, y, velocity to the side, tilt to the side, touching pillar or floor.
     noisy = (1.0, 1.0, 0.0, 0.0, 0.0)
     max_steps = 80
-    horizon = 0.5
     worst_reward = 0.0
     start_low, start_high = (0.0, -0.7, -0.3), (0.3, 0.7, 0.3)
-    replay_starts = tuple((0.0, y, 0.0) for y in (-0.15, -0.055, 0.0, 0.055, 0.15))
-    replay_time = 3.4
-    mode_names = ("left", "right")
-    algorithm = "dqn"
+    scene = Scene(
+        starts=tuple((0.0, y, 0.0) for y in (-0.15, -0.055, 0.0, 0.055, 0.15)),
+        time=3.4,
+        mode_names=("left", "right"),
+    )
+    learning = Learning(levels=5)
     mirror = Mirror((1, -1, -1, -1), (-1,))
     close = 0.4
     observation_low = (-5.0, -4.0, -6.0, -1.0)
@@ -144,7 +146,7 @@ class Quadrotor(Task):
         radii = sum(mjcf.geom_size(self.model, name)[0] for name in ("obstacle", "hull"))
         return np.asarray(np.linalg.norm(measured[:, :2] - self.obstacle, axis=1) - radii)
 
-    def reward(self, measurement: np.ndarray) -> np.ndarray:
+    def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
         near = np.clip(1 - self.clearance(measurement) / NEAR, 0.0, 1.0)
         reward = np.maximum(3 - np.abs(measurement[:, 1]) - near, 0.0)
         return np.where(self.failed(measurement), 0.0, reward)

@@ -12,20 +12,24 @@ import gymnasium as gym
 
 from hyrl_mj.errors import BadInput, brief, unknown
 from hyrl_mj.tasks.base import Task
+from hyrl_mj.tasks.outdated import check_current
 
 # The group of entry points under which an installed package offers tasks: name = "its.module:Class".
 GROUP = "hyrl_mj.tasks"
 PACKAGE = Path(__file__).resolve().parents[1]
 _REGISTRY: dict[str, type[Task]] = {}
 _FILES: dict[Path, type[Task]] = {}
+# Names of the tasks that other installed packages offer, as far as they have been loaded.
+_INSTALLED: set[str] = set()
 
 
 def register(task: type[Task]) -> type[Task]:
-    """Class decorator: make a task known by its name, to Gymnasium by its `env_id`.
+    """Class decorator: make a task known by its name, and to Gymnasium by its `env_id`.
 
     Raises:
-        BadInput: another file has a task of that name.
+        BadInput: another file has a task of that name, or the task was written for 0.1.
     """
+    check_current(task)
     here, other = _file(task), _REGISTRY.get(task.name)
     if other is not None and _file(other) != here:
         raise BadInput(
@@ -77,15 +81,23 @@ def get_task(name: str | Path) -> Task:
     return _instance(_REGISTRY[name], name)
 
 
+def reference(task: Task) -> str:
+    """Returns what `get_task` finds a task by in another process: its name, or its file."""
+    named = task.source is None or task.name in _INSTALLED
+    return task.name if named else str(task.source)
+
+
 def _offered() -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group=GROUP)}
 
 
-def _instance(task: type[Task], what: str) -> Task:
+def _instance(kind: type[Task], what: str) -> Task:
     try:
-        return task()
+        task = kind()
     except TypeError as error:  # methods that a task must have are missing
         raise BadInput(f"the task of {what} is not finished: {error}") from error
+    check_current(task)
+    return task
 
 
 def _file(task: type[Task]) -> Path | None:
@@ -108,7 +120,7 @@ def _from_entry_point(entry: EntryPoint) -> None:
             f"of hyrl_mj.Task with name = {entry.name!r}, as its.module:Class"
         )
     register(found)
-    found.installed = True
+    _INSTALLED.add(found.name)
 
 
 def _from_file(path: Path) -> type[Task]:

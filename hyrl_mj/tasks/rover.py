@@ -9,7 +9,9 @@ import numpy as np
 from hyrl_mj import mjcf
 from hyrl_mj.chart import Chart
 from hyrl_mj.tasks.base import Mirror, Outcome, Task
+from hyrl_mj.tasks.learning import Learning
 from hyrl_mj.tasks.registry import register
+from hyrl_mj.tasks.scene import Scene
 
 # The heading that still counts as on the way [rad], and how close to the pillar it begins to matter [m].
 ASTRAY, NEAR = 1.4, 0.25
@@ -24,17 +26,17 @@ class Rover(Task):
     name = "rover"
     description = "drive on wheels past a pillar on its left or on its right (DQN)"
     inputs, input_units = ("turn_rate",), ("rad/s",)
-    levels = 5
     # Of the measurement: x, y, heading, rate of turn, touching the pillar.
     noisy = (0.0, 1.0, 0.5, 0.0, 0.0)
     max_steps = 110
-    horizon = 0.5
     worst_reward = 0.0
     start_low, start_high = (0.0, -0.6, -0.3), (0.3, 0.6, 0.3)
-    replay_starts = tuple((0.0, y, 0.0) for y in (-0.15, -0.055, 0.0, 0.055, 0.15))
-    replay_time = 5.0
-    mode_names = ("left", "right")
-    algorithm = "dqn"
+    scene = Scene(
+        starts=tuple((0.0, y, 0.0) for y in (-0.15, -0.055, 0.0, 0.055, 0.15)),
+        time=5.0,
+        mode_names=("left", "right"),
+    )
+    learning = Learning(levels=5)
     mirror = Mirror((1, -1, -1), (-1,))
     close = 0.3
     observation_low = (-5.0, -3.0, -np.pi)
@@ -120,7 +122,7 @@ class Rover(Task):
         radii = sum(mjcf.geom_size(self.model, name)[0] for name in ("obstacle", "bumper"))
         return np.asarray(np.linalg.norm(middle - self.obstacle, axis=1) - radii)
 
-    def reward(self, measurement: np.ndarray) -> np.ndarray:
+    def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
         x, y, heading = measurement[:, :3].T
         near = np.clip(1 - self.clearance(measurement) / NEAR, 0.0, 1.0)
         # Before the pillar the middle is worth less: it would call for crossing it, and then deciding.

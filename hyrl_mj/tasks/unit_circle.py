@@ -9,7 +9,9 @@ import numpy as np
 from hyrl_mj import mjcf
 from hyrl_mj.chart import Chart
 from hyrl_mj.tasks.base import Mirror, Outcome, Task
+from hyrl_mj.tasks.learning import Learning
 from hyrl_mj.tasks.registry import register
+from hyrl_mj.tasks.scene import Scene
 
 PI = np.pi
 # The pointer has arrived when it is this close to the set-point [rad].
@@ -25,19 +27,19 @@ class UnitCircle(Task):
     inputs, input_units = ("turn_rate",), ("rad/s",)
     noisy = (True,)
     max_steps = 150
-    horizon = 0.5
     worst_reward = -1.0
     start_low, start_high = chart.low, chart.high
     precision = 0.015
-    replay_starts = tuple((factor * PI,) for factor in (0.75, 0.9, 1.0, 1.1, 1.25))
-    replay_time = 4.0
-    policy_starts = tuple(
-        (float(np.arctan2(y, x)) % (2 * PI),)
-        for x, y in ((-0.81, 0.59), (-0.95, -0.31), (-1.0, 0.0))
+    scene = Scene(
+        starts=tuple((factor * PI,) for factor in (0.75, 0.9, 1.0, 1.1, 1.25)),
+        time=4.0,
+        mode_names=("clockwise", "counter-clockwise"),
+        policy_starts=tuple(
+            (float(np.arctan2(y, x)) % (2 * PI),)
+            for x, y in ((-0.81, 0.59), (-0.95, -0.31), (-1.0, 0.0))
+        ),
     )
-    mode_names = ("clockwise", "counter-clockwise")
-    search = "rods"
-    algorithm = "ppo"
+    learning = Learning(search="rods")
     mirror = Mirror((1, -1), (-1,))
     observation_low, observation_high = (-1.0, -1.0), (1.0, 1.0)
 
@@ -58,7 +60,7 @@ class UnitCircle(Task):
         cosine, sine = observation[:, :1], observation[:, 1:]
         return self.chart.wrap(np.arctan2(sine, cosine))
 
-    def reward(self, measurement: np.ndarray) -> np.ndarray:
+    def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
         return -np.abs(self.error(measurement)) / PI
 
     def ending(self, measurement: np.ndarray) -> np.ndarray:

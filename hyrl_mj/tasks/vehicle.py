@@ -9,7 +9,9 @@ import numpy as np
 from hyrl_mj import mjcf
 from hyrl_mj.chart import Chart
 from hyrl_mj.tasks.base import Mirror, Outcome, Task
+from hyrl_mj.tasks.learning import Learning
 from hyrl_mj.tasks.registry import register
+from hyrl_mj.tasks.scene import Scene
 
 CRASH_DISTANCE = 1e-3  # [m] from the obstacle's surface
 LANE = 0.2  # [m] from the set-point, across
@@ -29,19 +31,18 @@ class Vehicle(Task):
     env_id = "hyrl_mj/ObstacleAvoidance-v0"
     description = "drive past a pillar on its left or on its right (DQN)"
     inputs, input_units = ("lateral_velocity",), ("m/s",)
-    levels = 5
     noisy = (False, True)
     max_steps = 60
-    horizon = 0.3
     worst_reward = 0.0
     start_low, start_high = (0.0, -1.0), (0.5, 1.0)
     precision = 0.04
-    replay_starts = ((0.0, -0.15), (0.0, -0.055), (0.0, 0.0), (0.0, 0.055), (0.0, 0.15))
-    replay_time = 3.0
-    policy_starts = replay_starts[::2]
-    mode_names = ("left", "right")
-    search = "rods"
-    algorithm = "dqn"
+    scene = Scene(
+        starts=((0.0, -0.15), (0.0, -0.055), (0.0, 0.0), (0.0, 0.055), (0.0, 0.15)),
+        time=3.0,
+        mode_names=("left", "right"),
+        policy_starts=((0.0, -0.15), (0.0, 0.0), (0.0, 0.15)),
+    )
+    learning = Learning(levels=5, search="rods", horizon=0.3)
     mirror = Mirror((1, 1, -1), (-1,))
 
     @cached_property
@@ -105,7 +106,7 @@ class Vehicle(Task):
         inside = x_g - np.sqrt(np.maximum(to_go, 0.0))
         return np.stack([np.where(d_o > 0, x, inside), y], axis=1)
 
-    def reward(self, measurement: np.ndarray) -> np.ndarray:
+    def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
         d_o = self.clearance(measurement)
         barrier = (d_o - 1.5) ** 2 - np.log(np.maximum(d_o, 1e-6))
         return np.maximum(0.0, 3.5 - self.distance_to_go(measurement) - 0.1 * barrier)

@@ -28,7 +28,7 @@ def critical_start(run: Run) -> np.ndarray | None:
     points = run.critical_set.points
     if not len(points):
         return None
-    centre = np.mean(run.task.replay_starts, axis=0)
+    centre = np.mean(run.task.scene.starts, axis=0)
     return points[np.linalg.norm(run.task.chart.difference(points, centre), axis=1).argmin()]
 
 
@@ -81,7 +81,7 @@ def noisy_arcs(
 
 def replay_starts(run: Run) -> dict[str, np.ndarray]:
     """The paper's replay starts (Section V), with one on M* of our own added: (d,) by name."""
-    starts = {f"start{i}": np.array(z) for i, z in enumerate(run.task.replay_starts)}
+    starts = {f"start{i}": np.array(z) for i, z in enumerate(run.task.scene.starts)}
     critical = critical_start(run)
     return starts if critical is None else starts | {"critical": critical}
 
@@ -92,7 +92,7 @@ def replay_arcs(
     """The replays by start and controller, by default under the paper's noise with the run's bound."""
     starts, s = replay_starts(run), run.settings
     z0 = np.array([*starts.values()], dtype=float)
-    found = noisy_arcs(run, z0, noise, eps, run.controller.modes, run.task.replay_time, s.seed)
+    found = noisy_arcs(run, z0, noise, eps, run.controller.modes, run.task.scene.time, s.seed)
     return {
         (name, who): arc
         for who, arcs in found.items()
@@ -123,7 +123,7 @@ def replay_shows(
                 "the latest simulation has its noise: give --noise and --eps to simulate"
             )
         latest = {who: [run.arc(run.latest_path(who))] for who in ("policy", "hyrl")}
-        return [Show(latest["policy"], latest["hyrl"])]
+        return [Show(latest["policy"], latest["hyrl"], run.policy_title)]
     anew = noise is not None or eps is not None
     arcs = replay_arcs(run, noise or "alternating", eps) if anew else run.arcs()
     names = [name for name, who in arcs if who == "policy"]
@@ -131,9 +131,11 @@ def replay_shows(
     if starts == "paper":
         names = [name for name in names if name != "critical"]
         policy = [arcs[name, "policy"] for name in names]
-        return [Show(policy, [arcs[name, mode] for name in names for mode in modes])]
+        hybrid = [arcs[name, mode] for name in names for mode in modes]
+        return [Show(policy, hybrid, run.policy_title)]
     name = "critical" if "critical" in names else names[0]
-    return [Show([arcs[name, "policy"]], [arcs[name, mode]]) for mode in modes]
+    policy = [arcs[name, "policy"]]
+    return [Show(policy, [arcs[name, mode]], run.policy_title) for mode in modes]
 
 
 def replay_floor(run: Run, overlap: bool = True) -> Floor:
@@ -163,7 +165,7 @@ def overview_arcs(task: Task, policy: Policy) -> list[HybridArc]:
     starts, axis = np.tile(low, (OVERVIEW_RUNS, 1)), int(np.argmax(high - low))
     shares = (np.arange(OVERVIEW_RUNS) + 0.5) / OVERVIEW_RUNS
     starts[:, axis] = low[axis] + shares * (high - low)[axis]
-    return simulate_batch(task, policy, starts, horizon=task.replay_time)
+    return simulate_batch(task, policy, starts, horizon=task.scene.time)
 
 
 def policy_start_arcs(task: Task, policy: Policy, eps: float, seed: int) -> list[HybridArc]:
@@ -175,5 +177,5 @@ def policy_start_arcs(task: Task, policy: Policy, eps: float, seed: int) -> list
         eps: bound of the noise.
         seed: of the noise.
     """
-    starts, noise = task.policy_starts or task.replay_starts, Noise("alternating", eps)
-    return simulate_batch(task, policy, starts, noise, horizon=task.replay_time, seed=seed)
+    starts, noise = task.scene.policy_starts, Noise("alternating", eps)
+    return simulate_batch(task, policy, starts, noise, horizon=task.scene.time, seed=seed)

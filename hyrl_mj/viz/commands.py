@@ -36,7 +36,7 @@ def beginning(settings: Settings, out: Path | None = None) -> str:
         )
     words = ["hyrl-mj", *(["robustify", s.task, *agent.options] if agent else ["run", s.task])]
     words += ["--noise", f"{s.noise}", "--seed", f"{s.seed}", "--preset", s.preset]
-    if not agent and s.stage1.algorithm != get_task(s.task).algorithm:
+    if not agent and s.stage1.algorithm != get_task(s.task).learning.algorithm:
         words += ["--algorithm", s.stage1.algorithm]
     if s.horizon is not None:
         words += ["--horizon", f"{s.horizon}"]
@@ -63,6 +63,7 @@ def changed(run: Run) -> list[str]:
     """Settings that the command would not give again: those of a preset of another version."""
     s = run.settings
     again = preset(
-        run.task, s.preset, noise=s.noise, seed=s.seed, horizon=s.horizon, agent=run.agent
-    ).to_json()
+        run.task, s.preset, noise=s.noise, seed=s.seed, horizon=s.horizon,
+        agent=run.agent, algorithm=None if run.agent else s.stage1.algorithm,
+    ).to_json()  # fmt: skip
     return [name.replace("_", " ") for name, value in s.to_json().items() if value != again[name]]

@@ -58,15 +58,15 @@ def usual_arc(run: Run) -> HybridArc:
     """The policy under the paper's noise, from M* if there is one."""
     start = critical_start(run)
     task, noise = run.task, Noise("alternating", run.settings.noise)
-    z0 = task.replay_starts[0] if start is None else start
-    seed, horizon = run.settings.seed, task.replay_time
+    z0 = task.scene.starts[0] if start is None else start
+    seed, horizon = run.settings.seed, task.scene.time
     (arc,) = simulate_batch(task, run.policy, z0, noise, horizon=horizon, seed=seed)
     return arc
 
 
 def _middle(run: Run) -> np.ndarray:
     """The middle of the replay starts (d,)."""
-    return np.asarray(np.mean(run.task.replay_starts, axis=0))
+    return np.asarray(np.mean(run.task.scene.starts, axis=0))
 
 
 def write_worst(run: Run, arc: HybridArc | None, say: Callable[[str], None]) -> None:
@@ -79,7 +79,8 @@ def write_worst(run: Run, arc: HybridArc | None, say: Callable[[str], None]) -> 
     arc.save(path)
     try:
         floor = replay_floor(run, overlap=False)
-        render_replay(run.task, [Show([arc])], path.with_suffix(".mp4"), floor=floor, size=SIZE)
+        show = Show([arc], title=run.policy_title)
+        render_replay(run.task, [show], path.with_suffix(".mp4"), floor=floor, size=SIZE)
     except NoRenderer as error:
         say(f"no video: {error}")
 

@@ -89,7 +89,7 @@ def render(run: Run) -> str:
     return fill(
         "report.html",
         run,
-        modes=[task.mode_name(q) for q in modes],
+        modes=[task.scene.mode_name(q) for q in modes],
         worst=task.noise_on(bool(robustness and robustness["everywhere"])),
         video=film(run.path / "replay.mp4"),
         pictures=pictures(run.path / "figures"),
@@ -202,7 +202,7 @@ def _stages(
 ) -> list[tuple[str, str]]:
     """What each stage has found, in a sentence."""
     task, s, modes = run.task, run.settings, run.extended_sets.modes
-    reach = "; ".join(f"mode {task.mode_name(q)}: {extent(run, q)}" for q in modes)
+    reach = "; ".join(f"mode {task.scene.mode_name(q)}: {extent(run, q)}" for q in modes)
     each = f"up to {s.stage6.attempts} times " if s.stage6.attempts > 1 else ""
     if isinstance(s.stage1, Agent):
         first = f"none: {s.stage1} was given"

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass, replace
+from typing import Any
 
+import mujoco
 import numpy as np
 
 from hyrl_mj.chart import Chart
+from hyrl_mj.plant import Plant
 from hyrl_mj.policies import Policy
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import Grid, GridSet
@@ -17,6 +19,100 @@ from hyrl_mj.tasks import Task
 
 # Grid points along the longest side from which critical points of a section are searched for.
 CELLS = 40
+
+
+class SectionTask(Task):
+    """A task on the plane of its chart's first two coordinates; all else is that of the whole task.
+
+    Args:
+        whole: the task.
+        rest: (d - 2,) values of the other coordinates.
+    """
+
+    def __init__(self, whole: Task, rest: np.ndarray):
+        self.whole, self.rest = whole, rest
+        chart, scene = whole.chart, whole.scene
+        where = zip(chart.names[2:], rest, chart.units[2:], strict=True)
+        self.chart = Chart(
+            chart.names[:2],
+            chart.units[:2],
+            chart.low[:2],
+            chart.high[:2],
+            chart.periodic[:2],
+            section=", ".join(f"{name} = {value:g} {unit}" for name, value, unit in where),
+        )
+        self.start_low, self.start_high = whole.start_low[:2], whole.start_high[:2]
+        self.scene = replace(
+            scene,
+            starts=tuple(z[:2] for z in scene.starts),
+            policy_starts=tuple(z[:2] for z in scene.policy_starts),
+        )
+        self.source, self.learning, self.mirror = whole.source, whole.learning, whole.mirror
+        self.input_units, self.precision, self.close = (
+            whole.input_units,
+            whole.precision,
+            whole.close,
+        )
+
+    def __getattr__(self, name: str) -> Any:
+        """Returns what this class does not define: the whole task's."""
+        return getattr(self.whole, name)
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        return self.whole.model
+
+    @property
+    def input_limits(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.whole.input_limits
+
+    @property
+    def set_point(self) -> np.ndarray | None:
+        return None if self.whole.set_point is None else self.whole.set_point[:2]
+
+    def plant(self, n: int, threads: int = 0) -> Plant:
+        return self.whole.plant(n, threads)
+
+    def state(
+        self, z: np.ndarray, rng: np.random.Generator | None = None
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        return self.whole.state(_lifted(z, self.rest), rng)
+
+    def z(self, measured: np.ndarray) -> np.ndarray:
+        return self.whole.z(measured)[:, :2]
+
+    def with_z(self, measured: np.ndarray, z: np.ndarray) -> np.ndarray:
+        return self.whole.with_z(measured, np.hstack([z, self.whole.z(measured)[:, 2:]]))
+
+    def observation(self, measured: np.ndarray) -> np.ndarray:
+        return self.whole.observation(measured)
+
+    def measured(self, observation: np.ndarray) -> np.ndarray:
+        return self.whole.measured(observation)
+
+    def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
+        return self.whole.reward(measurement, u)
+
+    def ending(self, measurement: np.ndarray) -> np.ndarray:
+        return self.whole.ending(measurement)
+
+    def verdict(self, measurement: np.ndarray) -> np.ndarray:
+        return self.whole.verdict(measurement)
+
+    def arrived(self, z: np.ndarray) -> np.ndarray:
+        return self.whole.arrived(_lifted(z, self.rest))
+
+    def miss(self, z: np.ndarray) -> np.ndarray:
+        return self.whole.miss(_lifted(z, self.rest))
+
+    def danger(self, measurement: np.ndarray) -> np.ndarray:
+        return self.whole.danger(measurement)
+
+    def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        return self.whole.starts(n, rng)[:, :2]
+
+    def direction(self, path: np.ndarray) -> np.ndarray:
+        return self.whole.direction(_lifted(path, self.rest))
 
 
 @dataclass(frozen=True)
@@ -41,33 +137,8 @@ class Section:
         chart = task.chart
         if chart.dimension <= 2:
             return Section(task, task, np.empty(0))
-        rest = np.array(task.replay_starts[0][2:], dtype=float)
-        where = zip(chart.names[2:], rest, chart.units[2:], strict=True)
-        view = copy.copy(task)
-        changed = {
-            "chart": Chart(
-                chart.names[:2],
-                chart.units[:2],
-                chart.low[:2],
-                chart.high[:2],
-                chart.periodic[:2],
-                section=", ".join(f"{name} = {value:g} {unit}" for name, value, unit in where),
-            ),
-            "set_point": None if task.set_point is None else task.set_point[:2],
-            "start_low": task.start_low[:2],
-            "start_high": task.start_high[:2],
-            "replay_starts": tuple(z[:2] for z in task.replay_starts),
-            "policy_starts": tuple(z[:2] for z in task.policy_starts),
-            "state": lambda z, rng=None: task.state(_lifted(z, rest), rng),
-            "z": lambda measured: task.z(measured)[:, :2],
-            "with_z": lambda measured, z: task.with_z(
-                measured, np.hstack([z, task.z(measured)[:, 2:]])
-            ),
-            "direction": lambda path: task.direction(_lifted(path, rest)),
-            "miss": lambda z: task.miss(_lifted(z, rest)),
-        }
-        vars(view).update(changed)
-        return Section(task, view, rest)
+        rest = np.array(task.scene.starts[0][2:], dtype=float)
+        return Section(task, SectionTask(task, rest), rest)
 
     @property
     def cut(self) -> bool:

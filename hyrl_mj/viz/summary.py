@@ -20,7 +20,7 @@ def print_summary(run: Run) -> None:
     _print(replay_table(run, arcs))
     print(run.critical_set.sentence(run.task))
     for q in run.extended_sets.modes:
-        print(f"mode {run.task.mode_name(q)}: {extent(run, q)}")
+        print(f"mode {run.task.scene.mode_name(q)}: {extent(run, q)}")
     print(replay_sentence(run, arcs))
     print_robustness(run)
     print(f"run directory {run.path}")

@@ -69,7 +69,9 @@ def replay_table(run: Run, arcs: Arcs) -> Table:
     """How policy and hybrid controller did from the replay starts, under the same noise."""
     task = run.task
     columns = {"policy": f"policy ({run.settings.stage1.title})"}
-    columns |= {f"hyrl_q{q}": f"HyRL, q0 = {task.mode_name(q)}" for q in run.extended_sets.modes}
+    columns |= {
+        f"hyrl_q{q}": f"HyRL, q0 = {task.scene.mode_name(q)}" for q in run.extended_sets.modes
+    }
     units = ", ".join(dict.fromkeys(task.chart.units))
     rows: list[list[str | Ending]] = []
     for start in dict.fromkeys(start for start, _ in arcs):

@@ -33,7 +33,7 @@ def _step(run: Run, n: int, repeats: int) -> Callable[[], int]:
     task, controller, rng = run.task, run.controller, np.random.default_rng(0)
     z = rng.uniform(task.chart.low, task.chart.high, (n, task.chart.dimension))
     plant = task.plant(n)
-    plant.set_state(task.qpos(z))
+    plant.set_state(task.state(z)[0])
     measured, q = plant.measurement, rng.choice(controller.modes, n)
 
     def work() -> int:

@@ -56,7 +56,7 @@ def _episodes(task: Task, n: int) -> Callable[[], int]:
 
 def _physics(task: Task, n: int) -> Callable[[], int]:
     batch = Batch(task.model, n)
-    batch.qpos[:] = task.qpos(task.starts(n, np.random.default_rng(0)))
+    batch.qpos[:] = task.state(task.starts(n, np.random.default_rng(0)))[0]
     substeps = round(task.dt / task.model.opt.timestep)
 
     def work() -> int:
@@ -140,7 +140,7 @@ class CartPole(Task):
     def observation(self, measured: np.ndarray) -> np.ndarray:
         return measured
 
-    def reward(self, measurement: np.ndarray) -> np.ndarray:
+    def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
         return np.cos(measurement[:, 1])
 
     def ending(self, measurement: np.ndarray) -> np.ndarray:

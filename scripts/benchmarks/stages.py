@@ -80,7 +80,7 @@ def _one_start(task: Task, policy: Any, z: np.ndarray, steps: int, backward: boo
     if model.nkey:
         mujoco.mj_resetDataKeyframe(model, data, 0)
     held = data.ctrl.copy()
-    data.qpos[:] = task.qpos(z[None])[0]
+    data.qpos[:] = task.state(z[None])[0][0]
     mujoco.mj_forward(model, data)
     path = [data.sensordata.copy()]
     drives = [model.actuator(name).id for name in task.inputs]

@@ -7,7 +7,7 @@ pytest test_my_robot.py
 import numpy as np
 
 import hyrl_mj
-from hyrl_mj import Chart, Mirror, Outcome, mjcf
+from hyrl_mj import Chart, Learning, Mirror, Outcome, Scene, mjcf
 
 WALL = 1.4  # [m] to either side
 
@@ -20,13 +20,15 @@ class MyRobot(hyrl_mj.Task):
     chart = Chart(("x", "y"), ("m", "m"), (0.0, -1.5), (3.2, 1.5), (False, False))
     inputs, input_units = ("lateral",), ("m/s",)
     noisy = (False, True, False, False)  # of the measurement: x, y, vy, touching
-    max_steps, horizon = 70, 0.3
+    max_steps = 70
     worst_reward = 0.0  # a crash must not be a way out of a bad reward
     start_low, start_high = (0.0, -0.8), (0.3, 0.8)
-    replay_starts = ((0.0, -0.15), (0.0, 0.0), (0.0, 0.15))
-    replay_time = 3.2
-    mode_names = ("left", "right")
-    levels, algorithm = 5, "dqn"
+    # What replays and figures show: runs from these starts, for so long [s], and the ways that they go.
+    scene = Scene(
+        starts=((0.0, -0.15), (0.0, 0.0), (0.0, 0.15)), time=3.2, mode_names=("left", "right")
+    )
+    # What trains it by default: DQN, because the input has levels.
+    learning = Learning(levels=5, horizon=0.3)
     # Mirrored observations call for mirrored inputs.
     mirror = Mirror(observation=(1, -1, -1), inputs=(-1,))
     observation_low, observation_high = (-1.0, -3.0, -3.0), (5.0, 3.0, 3.0)
@@ -57,7 +59,8 @@ class MyRobot(hyrl_mj.Task):
         radii = mjcf.geom_size(self.model, "obstacle")[0] + mjcf.geom_size(self.model, "puck")[0]
         return np.maximum(np.linalg.norm(measured[:, :2] - centre, axis=1) - radii, 0.0)
 
-    def reward(self, measured):
+    def reward(self, measured, u):
+        """The reward of a step with inputs u (n, m) that led to these measurements."""
         close = np.maximum(1 - self.clearance(measured) / 0.2, 0.0)
         return np.where(self.failed(measured), 0.0, 3 - np.abs(measured[:, 1]) - close)
 

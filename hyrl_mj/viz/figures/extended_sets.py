@@ -85,7 +85,7 @@ def draw_extended_sets(shown: ShownRun, path: Path | None = None) -> Figure:
 
 
 def _set_name(task: Task, mode: int) -> str:
-    return f"$M^{{ext}}_{mode}$, of mode {task.mode_name(mode)}"
+    return f"$M^{{ext}}_{mode}$, of mode {task.scene.mode_name(mode)}"
 
 
 def _shared(sets: ExtendedSets) -> np.ndarray:

@@ -124,7 +124,7 @@ def _band(z: np.ndarray, eps: np.ndarray, longest: np.ndarray) -> np.ndarray:
 def _spirals(panel: Axes, shown: ShownPolicy) -> Artists:
     """Draws the overview of a ring, where time goes outward; returns the legend's entries."""
     task, partition, arc = shown.task, shown.partition, shown.noisy
-    seconds = task.replay_time
+    seconds = task.scene.time
     tints = [mode_tint(mode) for mode in partition.modes]
     arcs(panel, task, classes_of(partition), [*tints, None], OUTER, CORE)
     ring(panel, task, (OUTER, CORE), f",\ntime outward:\n0 to {seconds:g} s")

@@ -112,7 +112,7 @@ def chosen_way(
         Its label in the legend, and the path.
     """
     mode = int(task.direction(arc.z[:, None])[0])
-    colour, label = mode_colour(mode), f"way of mode {task.mode_name(mode)}"
+    colour, label = mode_colour(mode), f"way of mode {task.scene.mode_name(mode)}"
     if failed(arc):
         colour, label = POLICY_COLOUR, "neither way"
     elif mode < 0:
@@ -128,7 +128,7 @@ def hybrid_way(panel: Axes, task: Task, view: View, arc: HybridArc, **looks: Any
         mode = int(arc.q[rows][0])
         colour = mode_colour(mode)
         drawn = line(panel, view, arc.t[rows], arc.z[rows], color=colour, **looks)
-        handles[f"HyRL in mode {task.mode_name(mode)}"] = drawn
+        handles[f"HyRL in mode {task.scene.mode_name(mode)}"] = drawn
     for row in np.flatnonzero(np.diff(arc.j)).tolist():
         # Small and on top, so that a jump at the start shows in its circle.
         handles["jump"] = mark(panel, view, arc, row, "D", color=INK, markersize=3.5, zorder=7)

@@ -92,7 +92,7 @@ def _paper_runs(panel: Axes, shown: ShownPolicy) -> Artists:
 
 def _over_time(panel: Axes, task: Task) -> View:
     """Makes a panel one of the chart's only coordinate over time."""
-    panel.set(xlabel="time [s]", ylabel=axis_label(task, 0), xlim=(0, task.replay_time))
+    panel.set(xlabel="time [s]", ylabel=axis_label(task, 0), xlim=(0, task.scene.time))
     angles_on(panel.yaxis, task, 0)
     return time_view(0)
 

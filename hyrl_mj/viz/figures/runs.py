@@ -56,7 +56,7 @@ def draw_runs(shown: ShownRun, path: Path | None = None) -> Figure:
                     fixed |= set_point_lines(panel, task, coordinate)
         for panel, loop in zip(panels[0], loops, strict=True):
             mode = int(loop.removeprefix("hyrl_q"))
-            panel.set_title(f"started in q0 = {task.mode_name(mode)}", fontweight="bold")
+            panel.set_title(f"started in q0 = {task.scene.mode_name(mode)}", fontweight="bold")
         for panel in panels.ravel():
             panel.label_outer()
         legend(figure, dict(sorted(ways.items())) | marks | fixed)

@@ -104,7 +104,7 @@ def legend(figure: Figure, handles: Mapping[str, Artist], handlelength: float = 
 
 def task_title(task: Task) -> str:
     """Returns the title of a task: "Unit circle"."""
-    return task.name.replace("_", " ").capitalize()
+    return task.scene.title or task.name.replace("_", " ").capitalize()
 
 
 def noise_label(task: Task, kind: str, eps: float) -> str:

@@ -29,15 +29,17 @@ FINER = 2
 
 @dataclass(frozen=True)
 class Show:
-    """What is played together.
+    """Arcs that are played side by side.
 
     Attributes:
         policy: arcs of the stage-1 policy.
         hybrid: arcs of the hybrid controller; none to show the policy alone.
+        title: of the policy, as "RL policy (DQN)".
     """
 
     policy: Sequence[HybridArc]
     hybrid: Sequence[HybridArc] = ()
+    title: str = "RL policy"
 
 
 def render_replay(
@@ -48,21 +50,21 @@ def render_replay(
     floor: Floor | None = None,
     size: tuple[int, int] = (1280, 720),
     fps: int = 30,
-    camera: str = "overhead",
+    camera: str | None = None,
     layout: str = "side-by-side",
     slow_motion: float = 1.0,
 ) -> None:
     """Write a video that plays shows one after the other; its poster beside it, or that alone.
 
     Args:
-        task: what the arcs are of; its MJCF has a site "tracked", whose path is drawn.
+        task: of the arcs; its `scene` names the site whose path is drawn.
         shows: what to play.
         path: of the video, an mp4 or a gif, with the poster as a PNG of the same name; a png for the
             poster alone, the end of the first show.
         floor: what to draw on the floor.
         size: width and height of the video [pixels], even.
         fps: frames a second.
-        camera: a camera of the MJCF.
+        camera: a camera of the MJCF, by default the scene's.
         layout: "side-by-side", or "overlay" for one panel with both controllers.
         slow_motion: how many times slower it is around jumps.
 
@@ -83,8 +85,12 @@ def render_replay(
         raise BadInput(
             f"slow motion {slow_motion:g} cannot be played: give 1 (real time) to {SLOWEST_MOTION}"
         )
+    camera = camera or task.scene.camera
     mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
-    screens = [Screen(task, show.policy, show.hybrid, layout, camera, floor) for show in shows]
+    screens = [
+        Screen(task, (show.title, show.policy), show.hybrid, layout, camera, floor)
+        for show in shows
+    ]
     for screen in screens:
         screen.check(size)
     if path.suffix not in ENCODERS:

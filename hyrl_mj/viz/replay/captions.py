@@ -104,7 +104,7 @@ class Layout:
         arc, row = track.arc, track.arc.at(t)
         if track.modes:
             line.words(f"j = {arc.j[row]}", INK, room="j = 00")
-            line.badge(f"q = {track.task.mode_name(int(arc.q[row]))}", track.colour(row))
+            line.badge(f"q = {track.task.scene.mode_name(int(arc.q[row]))}", track.colour(row))
         if t >= track.end:
             line.badge(*OUTCOMES[_outcome(track)])
 

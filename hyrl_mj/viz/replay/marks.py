@@ -21,8 +21,6 @@ GOOD, BAD = rgb(colours.GOOD), rgb(colours.BAD)
 PAPER, OPEN = (246, 247, 249), (110, 116, 126)
 OVERLAP, CRITICAL, BOUND = rgb(colours.OVERLAP), (205, 30, 45), (120, 95, 200)
 
-# The site of the MJCF whose path is drawn.
-TRACKED = "tracked"
 # Heights above the tracked site [m], from the floor up: what lies higher is seen.
 ON_FLOOR, ON_SETS, ON_BOUND, ON_PATH, ON_TOP = -0.006, -0.004, -0.002, 0.0, 0.006
 THICKNESS = 0.004  # [m]
@@ -98,10 +96,10 @@ def _add(
 
 
 class Tracker:
-    """Where the tracked site of a task's robot is.
+    """The positions of the site of a robot that its task's scene tracks.
 
     Args:
-        task: its MJCF has a site "tracked".
+        task: whose MJCF has that site.
 
     Raises:
         BadInput: it has none.
@@ -109,7 +107,7 @@ class Tracker:
 
     def __init__(self, task: Task):
         self._task, self._data = task, mujoco.MjData(task.model)
-        self._site = mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_SITE, TRACKED)
+        self._site = mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_SITE, task.scene.tracked)
 
     def of_qpos(self, qpos: np.ndarray) -> np.ndarray:
         """Positions (n, nq) -> points (n, 3) [m]."""
@@ -122,7 +120,7 @@ class Tracker:
 
     def of_z(self, z: np.ndarray) -> np.ndarray:
         """Chart points (n, d) -> points (n, 3) [m]."""
-        return self.of_qpos(self._task.qpos(z))
+        return self.of_qpos(self._task.state(z)[0])
 
 
 @dataclass(frozen=True)

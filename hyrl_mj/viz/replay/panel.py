@@ -61,7 +61,7 @@ class Track:
             mujoco.mj_setState(model, data, state, kind)
             self._qpos[i] = data.qpos
         # Noise moves what the chart tells of a position, and leaves the rest as it is.
-        noise = task.qpos(task.z(arc.measured)) - task.qpos(arc.z)
+        noise = task.state(task.z(arc.measured))[0] - task.state(arc.z)[0]
         self._measured = self._qpos + noise
         self.points = self._tracker.of_qpos(self._qpos)
 
@@ -94,7 +94,7 @@ class Track:
         noise = self.task.noise_in_chart(self.arc.bound)
         share = np.linspace(-1, 1, BOUND_PIECES + 1)[:, None]
         lines = [z + share * noise * (np.arange(len(z)) == i) for i in np.flatnonzero(noise)]
-        shifts = [self.task.qpos(line) - self.task.qpos(z[None]) for line in lines]
+        shifts = [self.task.state(line)[0] - self.task.state(z[None])[0] for line in lines]
         return [self._tracker.of_qpos(qpos + shift) for shift in shifts]
 
     def _at(self, t: float, values: np.ndarray) -> np.ndarray:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.policies import algorithm_title
 from hyrl_mj.rendering import LARGEST, Canvas
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
@@ -24,9 +23,9 @@ class Screen:
     """Arcs that are played together, laid out in panels: a title and groups of tracks for each.
 
     Args:
-        task: what the arcs are of.
-        policy, hybrid: arcs of the stage-1 policy, and of the hybrid controller; without these the policy
-            is alone.
+        task: of the arcs.
+        policy: title and arcs of the stage-1 policy.
+        hybrid: arcs of the hybrid controller; without them the policy is shown alone.
         layout: one of `LAYOUTS`.
         camera: a camera of the MJCF.
         floor: what lies on the floor.
@@ -35,22 +34,21 @@ class Screen:
     def __init__(
         self,
         task: Task,
-        policy: Sequence[HybridArc],
+        policy: tuple[str, Sequence[HybridArc]],
         hybrid: Sequence[HybridArc],
         layout: str,
         camera: str,
         floor: Floor | None,
     ):
         self._task, self._camera, self._floor = task, camera, floor
-        learned = Group(
-            f"RL policy ({algorithm_title(task.algorithm)})", [Track(task, a) for a in policy]
-        )
+        title, arcs = policy
+        learned = Group(title, [Track(task, arc) for arc in arcs])
         if not hybrid:
             self._panels: list[tuple[str, list[Group]]] = [(learned.name, [learned])]
             return
         joined = Group("HyRL", [Track(task, arc) for arc in hybrid])
         started = {int(arc.q[0]) for arc in hybrid}
-        where = "each mode" if len(started) > 1 else f"q = {task.mode_name(*started)}"
+        where = "each mode" if len(started) > 1 else f"q = {task.scene.mode_name(*started)}"
         self._panels = [(f"{learned.name} and {joined.name}", [learned, joined])]
         if layout == "side-by-side":
             self._panels = [
