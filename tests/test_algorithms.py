@@ -146,6 +146,7 @@ def quick(task, algorithm, known=None):
 
 
 @pytest.mark.parametrize(("algorithm", "name"), CAN)
+@pytest.mark.slow
 def test_it_trains_a_policy_that_answers_as_sb3_does(algorithm, name):
     task = hyrl_mj.get_task(name)
     settings = quick(task, algorithm)
@@ -164,6 +165,7 @@ def test_it_trains_a_policy_that_answers_as_sb3_does(algorithm, name):
 
 
 @pytest.mark.parametrize(("algorithm", "name"), [c for c in CAN if c[0] not in ("ppo", "dqn")])
+@pytest.mark.slow
 def test_the_seed_fixes_the_policy(algorithm, name):
     task = hyrl_mj.get_task(name)
     first, again, other = (train(task, quick(task, algorithm), seed).weights for seed in (4, 4, 5))
@@ -205,6 +207,7 @@ def values(critic, o, a):
 
 
 @pytest.mark.parametrize("algorithm", ["a2c", "sac", "td3", "ddpg"])
+@pytest.mark.slow
 def test_the_smoke_preset_learns_the_circle(algorithm):
     task = hyrl_mj.get_task("unit_circle")
     settings = preset(task, "smoke", algorithm=algorithm).stage1
@@ -289,6 +292,7 @@ def test_what_cannot_be_used_is_one_sentence_before_any_training(
         ("DerivedDQN", "vehicle", "dqn"),
     ],
 )
+@pytest.mark.slow
 def test_a_class_of_the_users_trains_with_the_settings_of_its_relative(kind, task, known, mine):
     name = f"{mine}:{kind}"
     task = hyrl_mj.get_task(task)
@@ -314,6 +318,7 @@ def test_a_module_in_the_current_folder_is_found(tmp_path, monkeypatch):
 # ---- whole runs
 
 
+@pytest.mark.slow
 def test_a_whole_run_names_its_algorithm_and_keeps_to_it(tmp_path, monkeypatch, capsys):
     out = tmp_path / "run"
 

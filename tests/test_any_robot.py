@@ -135,6 +135,7 @@ def command(*arguments, cwd, path=()):
 
 
 @needs_gl
+@pytest.mark.slow
 def test_a_robot_from_its_own_folder_goes_through_the_whole_pipeline(wasp, tmp_path):
     assert len(WASP_PY.strip().splitlines()) <= 90
     done = command("run", os.path.relpath(wasp, tmp_path), "--preset", "smoke", cwd=tmp_path)
@@ -189,6 +190,7 @@ print(reference(task), task.model_path)
 """
 
 
+@pytest.mark.slow
 def test_an_installed_package_can_offer_tasks(wasp, tmp_path):
     described = tmp_path / "site" / "wasps-1.0.dist-info"
     described.mkdir(parents=True)
@@ -218,6 +220,7 @@ def test_an_installed_package_can_offer_tasks(wasp, tmp_path):
 # ---- a task to start from
 
 
+@pytest.mark.slow
 def test_a_new_task_passes_its_own_tests(tmp_path):
     written = command("new-task", "sledge_2", "--folder", "mine", cwd=tmp_path)
     assert written.returncode == 0, written.stderr
@@ -242,6 +245,7 @@ def test_a_new_task_passes_its_own_tests(tmp_path):
         ("numpy", "a Python package numpy already"),
     ],
 )
+@pytest.mark.slow
 def test_a_name_that_cannot_be_one_is_refused(tmp_path, name, says):
     done = command("new-task", name, cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
@@ -325,6 +329,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
+@pytest.mark.slow
 def test_a_mistake_is_one_sentence_before_any_training(tmp_path, mistake):
     file, old, new, says = MISTAKES[mistake]
     for name in (PY, XML):

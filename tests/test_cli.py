@@ -21,6 +21,8 @@ from hyrl_mj.gl import has_display
 from hyrl_mj.pipeline import steps as pipeline
 from hyrl_mj.viz.figures import FIGURES
 
+pytestmark = pytest.mark.slow  # whole runs, and a process for each command
+
 
 def call(*arguments):
     """Run the command line in a process of its own."""

@@ -48,6 +48,7 @@ def test_a_critical_angle_on_the_circle(search, circle, angle):
     assert critical.resolution == pytest.approx(2 * PI / 120 / 32)
 
 
+@pytest.mark.slow
 def test_a_finer_resolution_gives_a_smaller_error(search, circle):
     angles, shares = (2.345, 3.3, 3.9), (1 / 2, 1 / 16, 1 / 128)
     errors = np.zeros((len(angles), len(shares)))
@@ -139,6 +140,7 @@ def test_two_critical_planes_are_two_pieces(search):
 # ---- four dimensions
 
 
+@pytest.mark.slow
 def test_a_critical_sphere_in_four_dimensions(search):
     ball = Cube(radii, 4)
     errors = []

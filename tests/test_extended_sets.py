@@ -64,6 +64,7 @@ def test_the_circle_s_sets_reach_the_horizon_over_the_critical_angle(on_circle, 
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.02, 0.05])
+@pytest.mark.slow
 def test_little_noise_leaves_no_holes_on_a_fine_grid(circle, noise):
     case = Case(circle, circle_policy(circle), 121, 2880)
     for members in case.extend(0.5, noise).sets:
@@ -203,6 +204,7 @@ def test_sized_sets_survive_being_written(sized, vehicle, tmp_path):
 
 
 @pytest.mark.parametrize(("noise", "horizon"), [(0.1, None), (0.1, 0.3), (0.0, 0.2)])
+@pytest.mark.slow
 def test_forward_runs_give_the_sets_that_backward_ones_give(
     on_circle, on_vehicle, monkeypatch, noise, horizon
 ):

@@ -82,6 +82,7 @@ def inside(outlines: list[Outline], *points):
 
 @TASKS
 @EVERY_FIGURE
+@pytest.mark.slow
 def test_it_is_written_as_png_and_as_pdf_of_one_page(tmp_path, monkeypatch, task, name):
     monkeypatch.setattr(style, "DPI", 80)
     path = tmp_path / "figures" / f"{name}.png"

@@ -124,6 +124,7 @@ TWINS = [
 
 
 @pytest.mark.parametrize(("name", "counts", "controller", "bound"), TWINS)
+@pytest.mark.slow
 def test_the_game_is_its_slow_twin(vehicle, circle, name, counts, controller, bound):
     task, bound = {"vehicle": vehicle, "unit_circle": circle}[name], np.array(bound)
     lattice, loop = Lattice.of(task, Grid(task.chart, counts)), controller(task)

@@ -169,6 +169,7 @@ def test_an_unknown_camera_lists_the_cameras(vehicle):
 
 
 @pytest.mark.parametrize("backend", ["disable", "osmesa-is-not-spelled-so"])
+@pytest.mark.slow
 def test_without_gl_one_message_says_what_to_install(backend):
     code = (
         "import hyrl_mj\n"

@@ -124,6 +124,7 @@ def drawn(tracks, t, size=(320, 320), camera="overhead", floor=None, before=()):
 
 
 @needs_gl
+@pytest.mark.slow
 def test_the_video_plays_both_arcs_in_real_time(tmp_path, show):
     path = tmp_path / "replay.mp4"
     render_replay(TASK, [show, show], path, size=SIZE, fps=FPS)

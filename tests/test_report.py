@@ -478,6 +478,7 @@ def test_nothing_is_wider_than_the_window(written, tmp_path):
 
 @needs_chromium
 @pytest.mark.parametrize(("width", "height"), [(360, 3600), (1280, 2400)])
+@pytest.mark.slow
 def test_the_figures_are_seen(written, tmp_path, width, height):
     shot = tmp_path / "shot.png"
     chromium(written, tmp_path / "profile", width, height, f"--screenshot={shot}")

@@ -31,6 +31,8 @@ from hyrl_mj.stages.extended_sets import boundary, with_room
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.stages.retraining import ByGame, WarmStart, mode_ground, retrain
 
+pytestmark = pytest.mark.slow  # whole runs on agents
+
 SMOKE = {"preset_name": "smoke", "say": str}
 
 

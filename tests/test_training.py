@@ -38,6 +38,7 @@ def untrained(task):
     return training.export(training.build(task, preset(task, "smoke").stage1, seed=0), task)
 
 
+@pytest.mark.slow
 def test_training_returns_the_best_policy_that_it_met(task, monkeypatch):
     """Whatever the evaluations say, the policy with the highest score comes back."""
     scores, policies = iter([(0.5, 3.0), (0.9, -1.0), *[(0.9, -2.0)] * 100]), []
@@ -64,6 +65,7 @@ def test_dqn_learns_the_vehicle_with_some_more_samples(vehicle):
     assert training.evaluate(vehicle, policy, Noise())[1] > 85
 
 
+@pytest.mark.slow
 def test_it_writes_the_latest_checkpoint_and_tensorboard_logs(smoke):
     policy, logs = smoke
     checkpoint = MlpPolicy.load(logs / "checkpoint.safetensors")
@@ -75,12 +77,14 @@ def test_it_writes_the_latest_checkpoint_and_tensorboard_logs(smoke):
     assert events[0].stat().st_size > 200
 
 
+@pytest.mark.slow
 def test_without_a_log_folder_nothing_is_written(task, quick, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     training.train(task, quick, seed=0)
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_the_seed_fixes_every_weight(task, quick):
     first = training.train(task, quick, seed=4)
     assert_same_weights(first, training.train(task, quick, seed=4))
