@@ -108,7 +108,7 @@ def test_the_summary_prints_every_table_and_where_everything_lies(examined, caps
     assert examined.critical_set.sentence(task) in out
     assert replay_sentence(examined, examined.arcs()) in out
     for q in (0, 1):
-        assert f"mode {task.mode_name(q)}: extended set " in out
+        assert f"mode {task.scene.mode_name(q)}: extended set " in out
     assert f"run directory {examined.path}" in out
     assert "no video" in out
     assert f"report {examined.path / 'report.html'}" in out
