@@ -11,7 +11,7 @@ from hyrl_mj.errors import BadArtifact, BadInput, HyrlError, NoRenderer
 from hyrl_mj.export import export_numpy, export_onnx
 from hyrl_mj.game import Game, Score
 from hyrl_mj.learning import Settings
-from hyrl_mj.pipeline import diagnose, robustify, run
+from hyrl_mj.pipeline import AgentOptions, RunOptions, diagnose, robustify, run
 from hyrl_mj.policies import Controller, MlpPolicy, Policy, from_callable, load_agent
 from hyrl_mj.run_directory import Run, load_run
 from hyrl_mj.sets import StateSet
@@ -49,6 +49,7 @@ from hyrl_mj.tasks import (
 
 __version__ = "0.1.0"
 __all__ = [
+    "AgentOptions",
     "BadArtifact",
     "BadInput",
     "Chart",
@@ -70,6 +71,7 @@ __all__ = [
     "Policy",
     "Recorded",
     "Run",
+    "RunOptions",
     "Sample",
     "Scene",
     "Score",

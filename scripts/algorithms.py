@@ -1,6 +1,6 @@
 """The worst case by algorithm: trains what is missing and prints one table a problem.
 
-    python scripts/algorithms.py                     # every algorithm on both problems, seed 0, noise 0.1
+    python scripts/algorithms.py                     # every algorithm on both problems, seed 0, eps 0.1
     python scripts/algorithms.py --tasks vehicle --algorithms a2c --seeds 0 1 2
 
 Runs are resumed; the times are those of what was missing. Exit status 1 if some run does not win all
@@ -17,7 +17,6 @@ from rich.table import Table
 
 import hyrl_mj
 from hyrl_mj import progress
-from hyrl_mj.pipeline.runs import run
 from hyrl_mj.policies import ALGORITHMS, algorithm_title
 from hyrl_mj.viz.tables import arrivals, percent
 
@@ -34,14 +33,15 @@ def able(task: str) -> list[str]:
     return [name for name, algorithm in ALGORITHMS.items() if algorithm.takes(discrete)]
 
 
-def row(task: str, algorithm: str, seed: int, noise: float, out: Path) -> tuple[list[str], bool]:
+def row(task: str, algorithm: str, seed: int, eps: float, out: Path) -> tuple[list[str], bool]:
     """The cells of one run, and whether the hybrid controller wins all replays."""
     began, worked = time.monotonic(), time.process_time()
-    path = out / f"{task}_{algorithm.replace(':', '_')}_{noise:g}_{seed}"
-    found = run(task, noise=noise, seed=seed, algorithm=algorithm, out=path, say=lambda text: None)
-    scores = {who: score[-1] for who, score in found.robustness["game"]["scores"].items()}
-    arcs = found.arcs()
-    replays = {policy: arrivals(found, arcs, policy) for policy in (True, False)}
+    path = out / f"{task}_{algorithm.replace(':', '_')}_{eps:g}_{seed}"
+    options = hyrl_mj.RunOptions(eps=eps, seed=seed, algorithm=algorithm, out=path)
+    run = hyrl_mj.run(task, options, say=lambda text: None)
+    scores = {who: score[-1] for who, score in run.robustness["game"]["scores"].items()}
+    arcs = run.arcs()
+    replays = {policy: arrivals(run, arcs, policy) for policy in (True, False)}
     cells = [algorithm_title(algorithm), str(seed)]
     cells += [percent(scores["policy"]["won"])]
     cells += [percent(scores["hyrl"]["won"]), percent(scores["hyrl"]["won_any"])]
@@ -57,16 +57,16 @@ def main() -> int:
     parser.add_argument("--tasks", nargs="+", default=list(PAPER), choices=PAPER)
     parser.add_argument("--algorithms", nargs="+", help="by default all that can")
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--noise", type=float, default=0.1)
+    parser.add_argument("--eps", type=float, default=0.1, help="bound of the noise")
     parser.add_argument("--out", type=Path, default=Path("runs/algorithms"))
     options = parser.parse_args()
     progress.enabled = sys.stderr.isatty()
     lost = 0
     for task in options.tasks:
-        table = Table(*HEADINGS, title=f"{task}, noise {options.noise:g}, exact game")
+        table = Table(*HEADINGS, title=f"{task}, noise {options.eps:g}, exact game")
         for algorithm in options.algorithms or able(task):
             for seed in options.seeds:
-                cells, good = row(task, algorithm, seed, options.noise, options.out)
+                cells, good = row(task, algorithm, seed, options.eps, options.out)
                 lost += not good
                 table.add_row(*cells)
                 print(task, *cells, file=sys.stderr, flush=True)

@@ -10,6 +10,7 @@ Figures are written as PNG and PDF. The values under "ours" are computed from th
 import argparse
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -58,13 +59,13 @@ def opened(path: Path, task: str) -> hyrl_mj.Run:
     Raises:
         BadInput: it is a run of another task, or has no critical set.
     """
-    settings = {}
+    options = hyrl_mj.RunOptions(out=path)
     if (path / "config.json").is_file():
         s = hyrl_mj.load_run(path).settings
         if s.task != task:
             raise BadInput(f"{path} is a run of {s.task}: give one of {task}")
-        settings = {"noise": s.noise, "seed": s.seed, "preset_name": s.preset, "horizon": s.horizon}
-    run = hyrl_mj.run(task, out=path, say=lambda text: print(f"{path}: {text}"), **settings)
+        options = replace(options, eps=s.noise, seed=s.seed, preset=s.preset, horizon=s.horizon)
+    run = hyrl_mj.run(task, options, say=lambda text: print(f"{path}: {text}"))
     if len(run.extended_sets.modes) < 2 or not len(run.critical_set.points):
         raise BadInput(f"{path} has no critical set to show: give a run with another seed")
     return run

@@ -1,7 +1,7 @@
 """The robustness of ten independent runs: trains what is missing and prints one table a problem.
 
-    python scripts/ten_seeds.py                      # both problems, seeds 0 to 9, noise 0.1
-    python scripts/ten_seeds.py --noise 0.2 --tasks vehicle --seeds 0 1 2
+    python scripts/ten_seeds.py                      # both problems, seeds 0 to 9, eps 0.1
+    python scripts/ten_seeds.py --eps 0.2 --tasks vehicle --seeds 0 1 2
 
 Runs are resumed; a run takes about a minute. Exit status 1 if some figure misses its target.
 """
@@ -17,7 +17,6 @@ from rich.table import Table
 
 import hyrl_mj
 from hyrl_mj import progress
-from hyrl_mj.pipeline.runs import run
 
 PAPER = ("unit_circle", "vehicle")
 # A figure of a run: its heading, how it is read from robustness.json, and what it must be.
@@ -70,24 +69,23 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--tasks", nargs="+", default=list(PAPER), choices=PAPER)
     parser.add_argument("--seeds", nargs="+", type=int, default=list(range(10)))
-    parser.add_argument("--noise", type=float, default=0.1)
+    parser.add_argument("--eps", type=float, default=0.1, help="bound of the noise")
     parser.add_argument("--out", type=Path, default=Path("runs/seeds"))
     options = parser.parse_args()
     progress.enabled = sys.stderr.isatty()
     missed = 0
     for task in options.tasks:
-        wanted = figures(task, options.noise)
-        table = Table(title=f"{task}, noise {options.noise:g}, exact game")
+        wanted = figures(task, options.eps)
+        table = Table(title=f"{task}, noise {options.eps:g}, exact game")
         table.add_column("seed")
         for heading, _, _, target in wanted:
             table.add_column(f"{heading}\n{target}")
         table.add_column("run [s]")
         for seed in options.seeds:
             began = time.monotonic()
-            out = options.out / f"{task}_{options.noise:g}_{seed}"
-            game = run(
-                task, noise=options.noise, seed=seed, out=out, say=lambda text: None
-            ).robustness["game"]
+            out = options.out / f"{task}_{options.eps:g}_{seed}"
+            made = hyrl_mj.RunOptions(eps=options.eps, seed=seed, out=out)
+            game = hyrl_mj.run(task, made, say=lambda text: None).robustness["game"]
             cells = []
             for _, read, good, _ in wanted:
                 value = read(game)

@@ -65,7 +65,7 @@ def planted_circle(tmp_path_factory):
     plant(path, task, decisions(task), halves(task))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hyrl_mj.viz.replay.render_replay", no_renderer)
-        run = hyrl_mj.run("unit_circle", preset_name="smoke", out=path, say=said.append)
+        run = hyrl_mj.run("unit_circle", preset="smoke", out=path, say=said.append)
     return run, said
 
 

@@ -18,7 +18,9 @@ from PIL import Image
 import hyrl_mj
 from hyrl_mj import cli
 from hyrl_mj.gl import has_display
-from hyrl_mj.pipeline import steps as pipeline
+from hyrl_mj.pipeline import ExamineOptions, examination
+from hyrl_mj.pipeline.runs import done as is_done
+from hyrl_mj.pipeline.steps import STAGES
 from hyrl_mj.viz.figures import FIGURES
 
 pytestmark = pytest.mark.slow  # whole runs, and a process for each command
@@ -85,14 +87,14 @@ def test_run_again_does_nothing_again(finished):
     before = contents(finished[0])
     again = call("run", "unit_circle", "--preset", "smoke", "--out", finished[0])
     assert again.returncode == 0
-    assert again.stdout.count("done before") == len(pipeline.STAGES)
+    assert again.stdout.count("done before") == len(STAGES)
     assert contents(finished[0]) == before
 
 
 def test_a_stage_runs_again_and_those_after_it_are_out_of_date(copied):
     assert call("critical-set", copied).returncode == 0
     run = hyrl_mj.load_run(copied)
-    assert [pipeline.done(run, i) for i in range(3)] == [True, True, False]
+    assert [is_done(run, i) for i in range(3)] == [True, True, False]
 
 
 def test_figures_are_drawn_again(copied):
@@ -107,7 +109,7 @@ def test_a_new_horizon_is_used_and_kept(copied):
     assert call("extended-sets", copied, "--horizon", "0.2").returncode == 0
     run = hyrl_mj.load_run(copied)
     assert run.settings.horizon == run.extended_sets.horizon == 0.2
-    assert not pipeline.done(run, [stage.name for stage in pipeline.STAGES].index("retrain"))
+    assert not is_done(run, [stage.name for stage in STAGES].index("retrain"))
 
 
 @pytest.mark.parametrize("name", ["mode_1.safetensors", "arcs/start0_hyrl_q1.npz"])
@@ -134,12 +136,12 @@ def test_a_run_without_a_critical_set_has_one_mode_and_leaves_nothing_of_two(cop
     left = {p.name for p in [*copied.glob("mode_*"), *(copied / "arcs").iterdir()]}
     assert not {n for n in left if "critical" in n or "1." in n.replace("start1", "")}
     again = call("run", "unit_circle", "--preset", "smoke", "--out", copied)
-    assert again.stdout.count("done before") == len(pipeline.STAGES)
+    assert again.stdout.count("done before") == len(STAGES)
 
 
 @needs_gl
 def test_what_was_simulated_is_replayed_and_so_are_the_paper_s_starts_anew(copied):
-    start = ("--start", "3.0", "--q0", "1", "--noise", "worst", "--horizon", "0.5")
+    start = ("--start", "3.0", "--q0", "1", "--noise", "worst", "--time", "0.5")
     assert call("simulate", copied, *start).returncode == 0
     before = contents(copied)
     for name, options in (
@@ -223,9 +225,9 @@ def test_an_interrupted_robustness_run_leaves_the_last_one(copied, monkeypatch):
     def interrupted(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(pipeline, "episodes", interrupted)
+    monkeypatch.setattr(examination, "noisy_episodes", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        pipeline.examine_run(hyrl_mj.load_run(copied), eps=0.2, count=10)
+        examination.examine_run(hyrl_mj.load_run(copied), ExamineOptions(eps=0.2, episodes=10))
     assert contents(copied) == before
 
 
@@ -258,11 +260,11 @@ def test_list_and_help():
     [
         (["run", "unicycle"], ["'unicycle'", "unit_circle, vehicle"]),
         (["run", "vehicle", "--preset", "quick"], ["'quick'", "fast, paper, smoke"]),
-        (["run", "vehicle", "--noise", "-0.1"], ["-0.1", ">= 0"]),
-        (["run", "vehicle", "--noise", "nan"], ["nan", ">= 0"]),
-        (["run", "vehicle", "--noise", "much"], ["--noise", "'much'"]),
+        (["run", "vehicle", "--eps", "-0.1"], ["-0.1", ">= 0"]),
+        (["run", "vehicle", "--eps", "nan"], ["nan", ">= 0"]),
+        (["run", "vehicle", "--eps", "much"], ["--eps", "'much'", "give a number"]),
         (["run", "vehicle", "--horizon", "0"], ["horizon 0", "> 0"]),
-        (["run", "vehicle", "--noise", "1.5"], ["1.5 hides the whole state space", "below 1.5 m"]),
+        (["run", "vehicle", "--eps", "1.5"], ["1.5 hides the whole state space", "below 1.5 m"]),
         (["run", "vehicle", "--seed", "-1"], ["seed -1", "from 0 to"]),
         (["run", "vehicle", "--seed", "5000000000"], ["seed 5000000000", "from 0 to"]),
         (["traim"], ["traim", "critical-set"]),
@@ -283,7 +285,7 @@ def test_bad_input_before_anything_is_made(arguments, parts, tmp_path, monkeypat
         (["simulate", "--start", "1", "--q0", "5"], ["mode 5", "(0, 1)"]),
         (["simulate", "--start", "1", "--noise", "white"], ["'white'", "uniform"]),
         (["simulate", "--start", "1", "--eps", "-1"], ["-1", ">= 0"]),
-        (["simulate", "--start", "1", "--horizon", "0"], ["horizon 0", "> 0"]),
+        (["simulate", "--start", "1", "--time", "0"], ["horizon 0", "> 0"]),
         (["simulate", "--q0", "1"], ["--start"]),
         (["simulate", "--start", "1", "--eps", "4"], ["4 hides the whole", "below 3.14 rad"]),
         (["simulate", "--start", "1", "--eps", "4", "--noise", "worst"], ["4 hides the whole"]),
@@ -313,7 +315,7 @@ def test_bad_input_before_anything_is_made(arguments, parts, tmp_path, monkeypat
         (["export", "--to", "numpy", "--out", "/dev/null/x"], ["a place that can be written"]),
         (["export", "--to", "onnx", "--out", "/dev/null/x"], ["a place that can be written"]),
         (["simulate", "--start", "1", "--seed", "-1"], ["seed -1", "from 0 to"]),
-        (["simulate", "--start", "1", "--horizon", "1e12"], ["horizon 1e+12", "3600"]),
+        (["simulate", "--start", "1", "--time", "1e12"], ["horizon 1e+12", "3600"]),
         (["replay", "--size", "big"], ["'big'", "640x480"]),
         (["replay", "--fps", "0"], ["0 frames a second"]),
     ],

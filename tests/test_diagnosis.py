@@ -33,7 +33,7 @@ def diagnosed(request, tmp_path_factory):
             task.name,
             PLANTED[task.name](task),
             out=tmp_path_factory.mktemp("runs") / task.name,
-            preset_name="smoke",
+            preset="smoke",
             say=said.append,
         )
     return run, [line.removeprefix("diagnose: ") for line in said]

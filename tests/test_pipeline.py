@@ -9,7 +9,7 @@ from planted import circle_policy
 
 import hyrl_mj
 from hyrl_mj import BadInput
-from hyrl_mj.pipeline import examine_run, extend_again, run_stage
+from hyrl_mj.pipeline import ExamineOptions, examine_run, extend_again, run_stage
 from hyrl_mj.pipeline.runs import done
 from hyrl_mj.pipeline.steps import STAGES
 
@@ -109,7 +109,7 @@ def test_an_agent_of_others_is_not_trained(circle, tmp_path):
             "unit_circle",
             circle_policy(circle, critical=2.5),
             out=tmp_path / "run",
-            preset_name="smoke",
+            preset="smoke",
             say=said.append,
         )
     assert said[0].startswith("train: none, ")
@@ -140,7 +140,7 @@ def test_a_horizon_that_cannot_be_used_changes_nothing(run):
 
 def test_episodes_are_added_on_demand(run):
     before, said = run.robustness, []
-    examine_run(run, eps=0.05, kinds=["uniform"], count=20, say=said.append)
+    examine_run(run, ExamineOptions(eps=0.05, noise=("uniform",), episodes=20), said.append)
     assert hyrl_mj.load_run(run.path).robustness != before
     assert said[-1].startswith("worst case at noise 0.05: ")
 
@@ -148,14 +148,14 @@ def test_episodes_are_added_on_demand(run):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"count": 0}, "0 episodes cannot be simulated"),
+        ({"episodes": 0}, "0 episodes cannot be simulated"),
         ({"eps": -0.1}, "finite number >= 0"),
         ({"eps": 100.0}, "hides the whole state space"),
-        ({"kinds": ["gaussian"]}, "'gaussian'"),
+        ({"noise": ("gaussian",)}, "'gaussian'"),
     ],
 )
 def test_an_examination_that_cannot_be_made_leaves_the_last_one(run, options, message):
     before = contents(run.path)
     with pytest.raises(BadInput, match=message):
-        examine_run(run, **options)
+        examine_run(run, ExamineOptions(**options))
     assert contents(run.path) == before

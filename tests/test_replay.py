@@ -21,6 +21,7 @@ from hyrl_mj.mjcf import models_dir
 from hyrl_mj.rendering import Canvas
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
+from hyrl_mj.viz import ReplayOptions
 from hyrl_mj.viz.replay import Show, render_replay
 from hyrl_mj.viz.replay.captions import Group, Layout
 from hyrl_mj.viz.replay.marks import (
@@ -127,7 +128,7 @@ def drawn(tracks, t, size=(320, 320), camera="overhead", floor=None, before=()):
 @pytest.mark.slow
 def test_the_video_plays_both_arcs_in_real_time(tmp_path, show):
     path = tmp_path / "replay.mp4"
-    render_replay(TASK, [show, show], path, size=SIZE, fps=FPS)
+    render_replay(TASK, [show, show], path, ReplayOptions(size=SIZE, fps=FPS))
     frames = frames_of(path)
     (policy,), (hybrid,) = show.policy, show.hybrid
     longest = round(max(policy.t[-1], hybrid.t[-1]) * FPS)
@@ -150,7 +151,7 @@ def test_the_video_plays_both_arcs_in_real_time(tmp_path, show):
 @needs_gl
 def test_around_a_jump_it_is_slower(tmp_path, show):
     path = tmp_path / "replay.mp4"
-    render_replay(TASK, [show], path, size=SIZE, fps=FPS, slow_motion=3)
+    render_replay(TASK, [show], path, ReplayOptions(size=SIZE, fps=FPS, slow_motion=3))
     (arc,) = show.hybrid
     at = arc.t[np.flatnonzero(np.diff(arc.j))[0]]
     slow = min(at, AROUND) + AROUND
@@ -159,12 +160,12 @@ def test_around_a_jump_it_is_slower(tmp_path, show):
 
 @needs_gl
 def test_a_gif_has_as_many_frames_and_a_picture_is_the_last(tmp_path, show):
-    render_replay(TASK, [show], tmp_path / "replay.gif", size=SIZE, fps=FPS)
+    render_replay(TASK, [show], tmp_path / "replay.gif", ReplayOptions(size=SIZE, fps=FPS))
     with Image.open(tmp_path / "replay.gif") as film:
         assert (film.n_frames, film.size) == (round(3.0 * FPS) + 1 + round(HOLD * FPS), SIZE)
         film.seek(film.n_frames - 1)
         last = coarse(np.asarray(film.convert("RGB")))
-    render_replay(TASK, [show], tmp_path / "alone.png", size=SIZE, fps=FPS)
+    render_replay(TASK, [show], tmp_path / "alone.png", ReplayOptions(size=SIZE, fps=FPS))
     alone = coarse(np.asarray(Image.open(tmp_path / "alone.png")))
     assert np.abs(alone - last).max() < 12
     names = sorted(p.name for p in tmp_path.iterdir())
@@ -173,7 +174,9 @@ def test_a_gif_has_as_many_frames_and_a_picture_is_the_last(tmp_path, show):
 
 @needs_gl
 def test_an_overlay_has_both_paths_in_one_scene(tmp_path, show):
-    render_replay(TASK, [show], tmp_path / "one.png", size=(640, 480), layout="overlay")
+    render_replay(
+        TASK, [show], tmp_path / "one.png", ReplayOptions(size=(640, 480), layout="overlay")
+    )
     picture = np.asarray(Image.open(tmp_path / "one.png"))
     for colour in (POLICY_COLOUR, *MODE_COLOURS[:2], GOOD, BAD):
         assert near(picture, colour).sum() > 8
@@ -404,9 +407,11 @@ def test_arcs_of_other_tasks_and_models_are_refused(tmp_path, show, circle):
     (policy,), (hybrid,) = show.policy, show.hybrid
     wrong = replace(hybrid, state=hybrid.state[:, :-1])
     with pytest.raises(BadArtifact, match="simulate it again"):
-        render_replay(TASK, [Show([policy], [wrong])], tmp_path / "replay.mp4", size=SIZE)
+        render_replay(
+            TASK, [Show([policy], [wrong])], tmp_path / "replay.mp4", ReplayOptions(size=SIZE)
+        )
     with pytest.raises(BadArtifact, match="an arc of vehicle cannot be replayed"):
-        render_replay(circle, [show], tmp_path / "replay.mp4", size=SIZE)
+        render_replay(circle, [show], tmp_path / "replay.mp4", ReplayOptions(size=SIZE))
     assert not list(tmp_path.iterdir())
 
 
@@ -426,7 +431,7 @@ def test_arcs_of_other_tasks_and_models_are_refused(tmp_path, show, circle):
 )
 def test_impossible_wishes_are_refused(tmp_path, show, name, options, message):
     with pytest.raises(BadInput, match=message):
-        render_replay(TASK, [show], tmp_path / name, **{"size": SIZE, **options})
+        render_replay(TASK, [show], tmp_path / name, ReplayOptions(**{"size": SIZE, **options}))
     assert not list(tmp_path.iterdir())
 
 
@@ -453,5 +458,5 @@ def test_nothing_is_left_behind_when_ffmpeg_fails(tmp_path, show, monkeypatch, f
 
         monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", nowhere)
     with pytest.raises(NoRenderer, match="reinstall the encoder"):
-        render_replay(TASK, [show], out / "replay.mp4", size=SIZE, fps=FPS)
+        render_replay(TASK, [show], out / "replay.mp4", ReplayOptions(size=SIZE, fps=FPS))
     assert not out.exists() or not list(out.iterdir())

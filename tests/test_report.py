@@ -21,7 +21,7 @@ from planted import Cube, decisions, halves
 
 from hyrl_mj import BadArtifact, BadInput, MlpPolicy, load_run
 from hyrl_mj.learning.presets import preset
-from hyrl_mj.pipeline import steps as pipeline
+from hyrl_mj.pipeline import ExamineOptions, examine_run, run_stage
 from hyrl_mj.run_directory import Run, write_config
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.critical_set import CriticalSet
@@ -94,8 +94,8 @@ def runs(tmp_path_factory):
         paths[name] = path = tmp_path_factory.mktemp("runs") / name
         task = registry.get_task(name)
         run = plant(path, task, decisions(task), halves(task, 60))
-        pipeline.run_stage(run, "simulate", say=str)
-        pipeline.examine_run(run, kinds=["uniform"], count=200, say=str)
+        run_stage(run, "simulate", say=str)
+        examine_run(run, ExamineOptions(noise=("uniform",), episodes=200), say=str)
         film(path)
     return paths
 
@@ -292,7 +292,7 @@ def test_settings_versions_and_the_command_are_told(finished):
     training = {name: cells for name, *cells in page.tables["Training"]}
     stages = (run.settings.stage1, run.settings.stage6)
     assert training["gamma"] == [str(stage.gamma) for stage in stages]
-    assert f"hyrl-mj run {finished.name} --noise 0.1 --seed 0 --preset smoke" in page.text
+    assert f"hyrl-mj run {finished.name} --eps 0.1 --seed 0 --preset smoke" in page.text
     assert "--episodes 200 --noise uniform --seed 0" in page.text
     assert run.critical_set.sentence(run.task) in page.text
 
@@ -303,7 +303,7 @@ def test_the_command_tells_what_is_not_the_default(copied):
     changed = Run(copied, settings)
     write_config(changed)
     text = page_of(copied).text
-    assert f"run {copied.name} --noise 0.05 --seed 7 --preset smoke --horizon 0.4" in text
+    assert f"run {copied.name} --eps 0.05 --seed 7 --preset smoke --horizon 0.4" in text
     assert "--eps 0.1" in text, "it was examined with another bound"
     assert "differ in" not in text
     write_config(Run(copied, replace(settings, cells=99)))
@@ -388,8 +388,8 @@ def test_in_three_dimensions_episodes_stand_in_for_the_game(tmp_path, monkeypatc
     parts = tuple(GridSet.from_mask(grid, part) for part in (up, ~up))
     critical = CriticalSet(np.zeros((1, 3)), np.zeros(1, dtype=int), resolution=0.1, spacing=0.3)
     run = plant(path, task, critical, Partition((0, 1), parts, np.ones(len(grid.nodes), bool)))
-    pipeline.run_stage(run, "simulate", say=str)
-    pipeline.examine_run(run, count=50, say=str)
+    run_stage(run, "simulate", say=str)
+    examine_run(run, ExamineOptions(episodes=50), say=str)
     page = page_of(path)
     assert "The chart of this task has 3, its plant 3: noisy episodes stand in for it" in page.text
     assert len(page.table("episodes")) == len(run.robustness["episodes"])

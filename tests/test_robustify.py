@@ -24,7 +24,7 @@ from hyrl_mj.game.limit import Limit
 from hyrl_mj.learning import training
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.learning.settings import Settings
-from hyrl_mj.pipeline import steps as pipeline
+from hyrl_mj.pipeline.steps import STAGES
 from hyrl_mj.policies.external import read_agent, reopen_agent
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import boundary, with_room
@@ -33,7 +33,7 @@ from hyrl_mj.stages.retraining import ByGame, WarmStart, mode_ground, retrain
 
 pytestmark = pytest.mark.slow  # whole runs on agents
 
-SMOKE = {"preset_name": "smoke", "say": str}
+SMOKE = {"preset": "smoke", "say": str}
 
 
 def call(*arguments):
@@ -153,7 +153,7 @@ def test_the_report_says_that_the_policy_was_given(robust, dqn):
     page = (robust[0] / "report.html").read_text()
     assert "A policy was given" in page
     assert "A policy was trained by" not in page
-    assert f"hyrl-mj robustify vehicle --policy {dqn} --activation relu --noise 0.1" in page
+    assert f"hyrl-mj robustify vehicle --policy {dqn} --activation relu --eps 0.1" in page
     assert "The settings of this run are not those" not in page
 
 
@@ -161,8 +161,8 @@ def test_again_nothing_is_done_again_whatever_the_age_of_the_file(robust, dqn, t
     before = contents(robust[0])
     moved = Path(shutil.copy(dqn, tmp_path / "moved.zip"))
     said = []
-    hyrl_mj.robustify("vehicle", moved, out=robust[0], preset_name="smoke", say=said.append)
-    assert sum("done before" in line for line in said) >= len(pipeline.STAGES) - 2
+    hyrl_mj.robustify("vehicle", moved, out=robust[0], preset="smoke", say=said.append)
+    assert sum("done before" in line for line in said) >= len(STAGES) - 2
     changed = {
         p.name for p in robust[0].rglob("*") if p.is_file() and before.get(p) != p.read_bytes()
     }
@@ -275,7 +275,7 @@ def test_episodes_stand_in_for_the_game_where_the_policy_draws(circle, tmp_path)
         path,
         stochastic=True,
         out=tmp_path / "run",
-        preset_name="smoke",
+        preset="smoke",
         say=said.append,
     )
     assert run.agent.stochastic
@@ -290,9 +290,7 @@ def test_episodes_stand_in_for_the_game_where_the_policy_draws(circle, tmp_path)
 
 def test_without_a_critical_set_one_policy_is_trained_under_noise(circle, tmp_path):
     said = []
-    run = hyrl_mj.robustify(
-        "unit_circle", one_way, out=tmp_path, preset_name="smoke", say=said.append
-    )
+    run = hyrl_mj.robustify("unit_circle", one_way, out=tmp_path, preset="smoke", say=said.append)
     assert any("no critical set found at this resolution (grid " in line for line in said)
     assert run.controller.modes == (0,)
     assert run.extended_sets.sets[0].mask.all()
@@ -397,8 +395,8 @@ def by_chance(observation):
         (by_chance, {}, "without chance or memory"),
         (3, {}, "cannot be called"),
         (away, {"stochastic": True}, "about the file of an agent"),
-        (away, {"noise": -1.0}, "noise bound -1.0"),
-        (away, {"preset_name": "quick"}, "unknown preset 'quick'"),
+        (away, {"eps": -1.0}, "noise bound -1.0"),
+        (away, {"preset": "quick"}, "unknown preset 'quick'"),
     ],
 )
 def test_bad_functions_leave_nothing(policy, options, message, tmp_path):
@@ -415,7 +413,7 @@ def test_bad_functions_leave_nothing(policy, options, message, tmp_path):
         (["unit_circle", "--policy", "{dqn}"], ["network", "unit_circle"]),
         (["vehicle", "--policy", "{dqn}", "--activation", "swish"], ["'swish'", "relu, tanh"]),
         (["vehicle", "--policy", "{dqn}", "--stochastic"], ["dqn", "no distribution"]),
-        (["vehicle", "--policy", "{dqn}", "--noise", "9"], ["9 hides the whole"]),
+        (["vehicle", "--policy", "{dqn}", "--eps", "9"], ["9 hides the whole"]),
         (["boat", "--policy", "{dqn}"], ["'boat'", "unit_circle, vehicle"]),
         (["vehicle"], ["--policy"]),
     ],

@@ -5,7 +5,7 @@ import shutil
 import pytest
 
 import hyrl_mj
-from hyrl_mj.pipeline import examine_run
+from hyrl_mj.pipeline import ExamineOptions, examine_run
 from hyrl_mj.viz.summary import print_robustness, print_summary
 from hyrl_mj.viz.tables import (
     arrivals,
@@ -27,7 +27,7 @@ def examined(run, tmp_path_factory):
     """A copy with noisy episodes, too."""
     path = tmp_path_factory.mktemp("examined") / "run"
     copy = hyrl_mj.load_run(shutil.copytree(run.path, path))
-    examine_run(copy, kinds=["uniform"], count=40, say=str)
+    examine_run(copy, ExamineOptions(noise=("uniform",), episodes=40), str)
     return hyrl_mj.load_run(copy.path)
 
 

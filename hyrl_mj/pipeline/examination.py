@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadInput
 from hyrl_mj.game import BEATEN, WON, WON_FROM_SOME, examine, save
+from hyrl_mj.pipeline.options import ExamineOptions
 from hyrl_mj.policies import Controller
 from hyrl_mj.progress import Say
 from hyrl_mj.run_directory import Run
@@ -23,42 +23,28 @@ from hyrl_mj.viz import robustness_sentence
 KINDS = ("uniform", "alternating", "adversarial")
 # Noisy episodes of a run whose worst case cannot be played exactly, and of one that only shows that all runs.
 EPISODES, EPISODES_SMOKE = 1_000, 200
+# The examination that belongs to a run.
+RUN = ExamineOptions()
 
 
-def examine_run(
-    run: Run,
-    eps: float | None = None,
-    kinds: Sequence[str] = (),
-    count: int | None = None,
-    everywhere: bool = False,
-    seed: int = 0,
-    near: bool = False,
-    say: Say = print,
-) -> dict[str, Any]:
+def examine_run(run: Run, options: ExamineOptions = RUN, say: Say = print) -> dict[str, Any]:
     """Examine policy and hybrid controller under noise, and write `robustness.json` with its pictures.
 
-    Where the exact game can be played it is; noisy episodes are added on demand, and where they are all
-    that there is. Files are written when all is known.
+    The exact game is played where that is possible; noisy episodes are added on request, and where they are
+    the only way. Files are written at the end.
 
     Args:
-        run: with its mode policies.
-        eps: noise bound, by default the run's. The scores are for none, half of it, and it.
-        kinds: of the noise in episodes, by default `KINDS`.
-        count: number of episodes for each kind and controller.
-        everywhere: whether noise acts on all columns of the measurement.
-        seed: of starts and noise of the episodes.
-        near: whether the episodes all start near M*.
+        run: a run with its mode policies.
+        options: what to examine. The scores are for no noise, half the bound, and the bound.
         say: told the result in a line.
 
     Returns:
-        What is in `robustness.json`.
+        The content of `robustness.json`.
 
     Raises:
         BadInput: a value that cannot be used.
     """
-    content, maps = examine_loops(
-        run, run.loops, run.split, eps, kinds, count, everywhere, seed, near
-    )
+    content, maps = examine_loops(run, run.loops, run.split, options)
     folder = run.path / "figures"
     if maps is not None:
         draw_robustness(run, content, maps, folder)
@@ -74,25 +60,28 @@ def examine_loops(
     run: Run,
     loops: dict[str, Controller],
     partition: Partition,
-    eps: float | None = None,
-    kinds: Sequence[str] = (),
-    count: int | None = None,
-    everywhere: bool = False,
-    seed: int = 0,
-    near: bool = False,
+    options: ExamineOptions = RUN,
 ) -> tuple[dict[str, Any], dict[str, np.ndarray] | None]:
-    """What `examine_run` finds out of some controllers, and the maps if the game was played.
+    """Examine controllers under noise, as `examine_run` does.
 
-    By `partition` what the first measurement calls for is judged.
+    Args:
+        run: a run with its critical set.
+        loops: the controllers by name.
+        partition: decides which mode the first measurement should select.
+        options: what to examine.
+
+    Returns:
+        The content of `robustness.json`, and the maps if the game was played.
     """
     task, critical = run.task, run.critical_set
-    eps = run.settings.noise if eps is None else eps
+    eps = run.settings.noise if options.eps is None else options.eps
+    everywhere, count, seed = options.all_coordinates, options.episodes, options.seed
     task.check_noise(eps, everywhere)
     if count is None and not run.exact:
         count = EPISODES_SMOKE if run.settings.preset == "smoke" else EPISODES
     if count is not None and count < 1:
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
-    noises = tuple(Noise(kind, eps, everywhere) for kind in kinds or KINDS)
+    noises = tuple(Noise(kind, eps, everywhere) for kind in options.noise or KINDS)
     content: dict[str, Any] = {"eps": eps, "everywhere": everywhere, "game": None}
     content |= {"episodes": [], "seed": seed}
     winnable, maps = None, None
@@ -105,7 +94,7 @@ def examine_loops(
         last = maps[f"map_{[*loops][-1]}"]
         winnable = grid, np.isin(last, (WON, WON_FROM_SOME, BEATEN))
     if count is not None:
-        regions = Regions(critical, winnable, near)
+        regions = Regions(critical, winnable, options.near_critical)
         content["episodes"] = noisy_episodes(task, regions, loops, noises, count, seed)
     return content, maps
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from hyrl_mj.errors import BadArtifact
 from hyrl_mj.learning import Training, preset
+from hyrl_mj.pipeline.options import AgentOptions, RunOptions, complete
 from hyrl_mj.pipeline.steps import DIAGNOSIS, STAGES, Stage, extended_sets_stage, run_stage
 from hyrl_mj.policies import ALGORITHMS, FUNCTION, AnyPolicy, read_agent
 from hyrl_mj.progress import Say
@@ -33,46 +35,39 @@ def done(run: Run, index: int, stages: Sequence[Stage] = STAGES) -> bool:
 
 
 def run(
-    task: str | Path,
-    *,
-    noise: float = 0.1,
-    seed: int = 0,
-    preset_name: str = "fast",
-    algorithm: str | None = None,
-    out: str | Path | None = None,
-    horizon: float | None = None,
-    say: Say = print,
+    task: str | Path, options: RunOptions | None = None, *, say: Say = print, **changes: Any
 ) -> Run:
     """Run all stages, or those that are missing from the run directory.
 
     Args:
-        task: its name, or the Python file that defines it.
-        noise: bound eps of the measurement noise to survive, in chart units.
-        seed: of everything random.
-        preset_name: "fast", "paper" or "smoke".
-        algorithm: of stage 1, "ppo", "a2c", "dqn", "sac", "td3" or "ddpg", or as `module:Class` another one
-            of SB3's kind; by default the task's.
-        out: the run directory, by default `runs/<task>`.
-        horizon: time T of the backward propagation [s]; by default the sets are sized to the noise.
+        task: name of a task, or the Python file that defines one.
+        options: how to run it, by default `RunOptions()`.
         say: told a line about each stage.
+        changes: fields of the options that differ, as in `run("vehicle", eps=0.2, seed=3)`.
 
     Raises:
         BadInput: a value that cannot be used.
     """
-    found = check_task(get_task(task))
+    options = complete(RunOptions, options, changes)
+    plan = check_task(get_task(task))
     settings = preset(
-        found, preset_name, noise=noise, seed=seed, horizon=horizon, algorithm=algorithm
+        plan,
+        options.preset,
+        noise=options.eps,
+        seed=options.seed,
+        horizon=options.horizon,
+        algorithm=options.algorithm,
     )
     assert isinstance(settings.stage1, Training)
     if settings.stage1.algorithm not in ALGORITHMS:
         from hyrl_mj.learning.training import check_foreign
 
-        check_foreign(found, settings.stage1)
-    return _run_all(open_or_create(out or Path("runs") / found.name, settings), say)
+        check_foreign(plan, settings.stage1)
+    return _run_all(open_or_create(options.out or Path("runs") / plan.name, settings), say)
 
 
 def _run_all(run: Run, say: Say, stages: Sequence[Stage] = STAGES) -> Run:
-    """All stages, or those that are missing."""
+    """Run all stages, or those that are missing."""
     for index, stage in enumerate(stages):
         if stage.name == "train" and run.agent:
             say(f"train: none, {run.agent} is given")
@@ -86,82 +81,66 @@ def _run_all(run: Run, say: Say, stages: Sequence[Stage] = STAGES) -> Run:
 def robustify(
     task: str | Path,
     policy: AnyPolicy,
+    options: AgentOptions | None = None,
     *,
-    activation: str | None = None,
-    stochastic: bool = False,
-    noise: float = 0.1,
-    seed: int = 0,
-    preset_name: str = "fast",
-    out: str | Path | None = None,
-    horizon: float | None = None,
     say: Say = print,
+    **changes: Any,
 ) -> Run:
-    """Make an agent robust that was trained elsewhere: as `run`, with it in the place of stage 1.
+    """Make an agent robust that was trained elsewhere: as `run`, with the agent in place of stage 1.
 
     Args:
-        task: its name, or the Python file that defines it.
+        task: name of a task, or the Python file that defines one.
         policy: the agent: a file (.zip of SB3, .onnx, .safetensors), a function from observations (n, k)
             to inputs (n, m) or levels (n,), or a `Policy`.
-        activation: between the layers, for a zip that does not say.
-        stochastic: whether a network draws its inputs, as it did while it learned. The stages look at its
-            mean or mode; noisy episodes then stand in for the worst-case game.
-        noise, seed, preset_name, horizon, say: as for `run`.
-        out: the run directory, by default `runs/<task>_robust`.
+        options: how to run it, by default `AgentOptions()`.
+        say: told a line about each stage.
+        changes: fields of the options that differ, as for `run`.
 
     Raises:
         BadInput: a value or an agent that cannot be used.
     """
-    values = {"noise": noise, "seed": seed, "horizon": horizon}
-    run = _with_agent(task, policy, activation, stochastic, preset_name, values, out)
-    return _run_all(run, say)
+    return _run_all(_with_agent(task, policy, complete(AgentOptions, options, changes)), say)
 
 
 def diagnose(
     task: str | Path,
     policy: AnyPolicy,
+    options: AgentOptions | None = None,
     *,
-    activation: str | None = None,
-    stochastic: bool = False,
-    noise: float = 0.1,
-    seed: int = 0,
-    preset_name: str = "fast",
-    out: str | Path | None = None,
-    horizon: float | None = None,
     say: Say = print,
+    **changes: Any,
 ) -> Run:
     """Find out what measurement noise can do to an agent, and train nothing.
 
-    The page is `diagnosis.html` in the run directory, the rest in its folder `diagnosis`. `robustify` with
-    the same arguments goes on from there.
+    The page is `diagnosis.html` in the run directory, everything else is in its folder `diagnosis`.
+    `robustify` with the same arguments continues from there.
 
     Args:
-        task, policy, activation, stochastic, noise, seed, preset_name, out, horizon, say: as for
-            `robustify`.
+        task, policy, options, say, changes: as for `robustify`.
 
     Raises:
         BadInput: a value or an agent that cannot be used.
     """
-    values = {"noise": noise, "seed": seed, "horizon": horizon}
-    run = _with_agent(task, policy, activation, stochastic, preset_name, values, out)
+    run = _with_agent(task, policy, complete(AgentOptions, options, changes))
     return _run_all(run, say, DIAGNOSIS)
 
 
-def _with_agent(
-    task: str | Path,
-    policy: AnyPolicy,
-    activation: str | None,
-    stochastic: bool,
-    preset_name: str,
-    values: dict[str, Any],
-    out: str | Path | None,
-) -> Run:
-    """The run directory of an agent, with the agent in it; `values` are those of `preset`."""
-    found = check_task(get_task(task))
-    preset(found, preset_name, **values)  # a wrong value is found before the agent is looked at
-    external = read_agent(found, policy, activation, stochastic, values["seed"])
-    settings = preset(found, preset_name, **values, agent=external.agent)
+def _with_agent(task: str | Path, policy: AnyPolicy, options: AgentOptions) -> Run:
+    """Returns the run directory of an agent, with the agent in it."""
+    plan = check_task(get_task(task))
+    settings = partial(
+        preset,
+        plan,
+        options.preset,
+        noise=options.eps,
+        seed=options.seed,
+        horizon=options.horizon,
+    )
+    settings()  # a wrong value is reported before the agent is read
+    external = read_agent(plan, policy, options.activation, options.stochastic, options.seed)
     function = external.policy if external.agent.algorithm == FUNCTION else None
-    run = open_or_create(out or Path("runs") / f"{found.name}_robust", settings, function)
+    path = options.out or Path("runs") / f"{plan.name}_robust"
+    run = open_or_create(path, settings(agent=external.agent), function)
     if not done(run, 0):
         external.store(run.path)
     return run

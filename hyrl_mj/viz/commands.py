@@ -31,11 +31,11 @@ def beginning(settings: Settings, out: Path | None = None) -> str:
         rest = "" if s.horizon is None else f", horizon={s.horizon}"
         rest += "" if out is None else f", out={str(out)!r}"
         return (
-            f"hyrl_mj.robustify({s.task!r}, policy, noise={s.noise}, seed={s.seed}, "
-            f"preset_name={s.preset!r}{rest})"
+            f"hyrl_mj.robustify({s.task!r}, policy, eps={s.noise}, seed={s.seed}, "
+            f"preset={s.preset!r}{rest})"
         )
     words = ["hyrl-mj", *(["robustify", s.task, *agent.options] if agent else ["run", s.task])]
-    words += ["--noise", f"{s.noise}", "--seed", f"{s.seed}", "--preset", s.preset]
+    words += ["--eps", f"{s.noise}", "--seed", f"{s.seed}", "--preset", s.preset]
     if not agent and s.stage1.algorithm != get_task(s.task).learning.algorithm:
         words += ["--algorithm", s.stage1.algorithm]
     if s.horizon is not None:

@@ -16,6 +16,7 @@ from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, simulate_batch
 from hyrl_mj.viz.arcs import critical_start, replay_floor
 from hyrl_mj.viz.commands import beginning
+from hyrl_mj.viz.options import ReplayOptions
 from hyrl_mj.viz.page import fill, film, pictures
 from hyrl_mj.viz.replay import Show, render_replay
 from hyrl_mj.viz.tables import episode_table, margin_table, margin_text, percent, score_table
@@ -24,8 +25,8 @@ from hyrl_mj.viz.tables import episode_table, margin_table, margin_text, percent
 PAGE, FOLDER = "diagnosis.html", "diagnosis"
 # Lost starts that are simulated, the nearest to the middle of the replay starts first.
 TRIED = 64
-# Of the replay of the policy alone [pixels].
-SIZE = (960, 720)
+# How the replay of the policy alone is rendered.
+REPLAY = ReplayOptions(size=(960, 720))
 
 
 def worst_arc(run: Run) -> HybridArc | None:
@@ -80,7 +81,7 @@ def write_worst(run: Run, arc: HybridArc | None, say: Callable[[str], None]) -> 
     try:
         floor = replay_floor(run, overlap=False)
         show = Show([arc], title=run.policy_title)
-        render_replay(run.task, [show], path.with_suffix(".mp4"), floor=floor, size=SIZE)
+        render_replay(run.task, [show], path.with_suffix(".mp4"), REPLAY, floor=floor)
     except NoRenderer as error:
         say(f"no video: {error}")
 

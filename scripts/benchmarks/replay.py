@@ -10,6 +10,7 @@ import numpy as np
 import hyrl_mj
 from benchmarks import Figure
 from benchmarks.runs import Runs
+from hyrl_mj.viz import ReplayOptions
 from hyrl_mj.viz.replay import Show, render_replay
 
 
@@ -34,8 +35,8 @@ def figures(runs: Runs) -> Iterator[Figure]:
     ):
 
         def ours(size=size, fps=fps, camera=camera) -> int:
-            show = Show([arc], [arc])
-            render_replay(task, [show], runs.folder / "r.mp4", size=size, fps=fps, camera=camera)
+            options = ReplayOptions(size=size, fps=fps, camera=camera)
+            render_replay(task, [Show([arc], [arc])], runs.folder / "r.mp4", options)
             return seconds * fps + 1
 
         def plain(size=size, fps=fps, camera=camera) -> int:

@@ -17,6 +17,7 @@ from hyrl_mj.progress import Progress
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.encoding import ENCODERS, video
+from hyrl_mj.viz.options import ReplayOptions
 from hyrl_mj.viz.replay.marks import Floor
 from hyrl_mj.viz.replay.screen import LAYOUTS, Screen
 from hyrl_mj.viz.replay.timeline import frame_times
@@ -25,6 +26,7 @@ FASTEST, SLOWEST_MOTION = 240, 100  # frames/s, and times slower than real time
 FORMATS = (*ENCODERS, ".png")
 # A poster is drawn so many times larger and then reduced, for smooth edges.
 FINER = 2
+DEFAULTS = ReplayOptions()
 
 
 @dataclass(frozen=True)
@@ -46,27 +48,19 @@ def render_replay(
     task: Task,
     shows: Sequence[Show],
     path: Path,
+    options: ReplayOptions = DEFAULTS,
     *,
     floor: Floor | None = None,
-    size: tuple[int, int] = (1280, 720),
-    fps: int = 30,
-    camera: str | None = None,
-    layout: str = "side-by-side",
-    slow_motion: float = 1.0,
 ) -> None:
-    """Write a video that plays shows one after the other; its poster beside it, or that alone.
+    """Write a video that plays shows one after the other, with a poster beside it; or the poster alone.
 
     Args:
-        task: of the arcs; its `scene` names the site whose path is drawn.
-        shows: what to play.
-        path: of the video, an mp4 or a gif, with the poster as a PNG of the same name; a png for the
-            poster alone, the end of the first show.
+        task: the task of the arcs; its `scene` names the site whose path is drawn.
+        shows: the arcs to play.
+        path: the video, an mp4 or a gif, with the poster as a PNG of the same name; or a png for the
+            poster alone. The poster is the end of the first show.
+        options: how it is rendered.
         floor: what to draw on the floor.
-        size: width and height of the video [pixels], even.
-        fps: frames a second.
-        camera: a camera of the MJCF, by default the scene's.
-        layout: "side-by-side", or "overlay" for one panel with both controllers.
-        slow_motion: how many times slower it is around jumps.
 
     Raises:
         BadArtifact: an arc is not of this task or its model.
@@ -77,51 +71,53 @@ def render_replay(
         raise BadInput(f"{path} is no replay: give a name that ends in one of {', '.join(FORMATS)}")
     if not shows or not all(show.policy for show in shows):
         raise BadInput("there is nothing to replay: give shows with arcs of the policy")
-    if layout not in LAYOUTS:
-        raise unknown("layout", layout, LAYOUTS)
-    if not 1 <= fps <= FASTEST:
-        raise BadInput(f"no video has {fps} frames a second: give 1 to {FASTEST}")
-    if not 1 <= slow_motion <= SLOWEST_MOTION:
+    if options.layout not in LAYOUTS:
+        raise unknown("layout", options.layout, LAYOUTS)
+    if not 1 <= options.fps <= FASTEST:
+        raise BadInput(f"no video has {options.fps} frames a second: give 1 to {FASTEST}")
+    if not 1 <= options.slow_motion <= SLOWEST_MOTION:
         raise BadInput(
-            f"slow motion {slow_motion:g} cannot be played: give 1 (real time) to {SLOWEST_MOTION}"
+            f"slow motion {options.slow_motion:g} cannot be played: give 1 (real time) to "
+            f"{SLOWEST_MOTION}"
         )
-    camera = camera or task.scene.camera
+    camera = options.camera or task.scene.camera
     mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
     screens = [
-        Screen(task, (show.title, show.policy), show.hybrid, layout, camera, floor)
+        Screen(task, (show.title, show.policy), show.hybrid, options.layout, camera, floor)
         for show in shows
     ]
     for screen in screens:
-        screen.check(size)
-    if path.suffix not in ENCODERS:
-        with closing(screens[0].canvas(size)) as canvas:
-            stage = screens[0].open(size, canvas)
-            stage.draw(screens[0].end)
-            large = stage.fine(FINER)
+        screen.check(options.size)
+    if path.suffix in ENCODERS:
+        poster = _film(screens, path, options)
     else:
-        large = _film(screens, path, size, fps, slow_motion)
+        with closing(screens[0].canvas(options.size)) as canvas:
+            stage = screens[0].open(options.size, canvas)
+            stage.draw(screens[0].end)
+            poster = stage.fine(FINER)
     with artifacts.replacing(path.with_suffix(".png")) as temporary:
-        Image.fromarray(large).reduce(FINER).save(temporary)
+        Image.fromarray(poster).reduce(FINER).save(temporary)
 
 
-def _film(
-    screens: Sequence[Screen], path: Path, size: tuple[int, int], fps: int, slow_motion: float
-) -> np.ndarray:
+def _film(screens: Sequence[Screen], path: Path, options: ReplayOptions) -> np.ndarray:
     """Write the video; returns the end of the first show, `FINER` times larger."""
-    times = [frame_times(screen.end, fps, screen.jumps, slow_motion) for screen in screens]
-    done, large = 0, None
+    times = [
+        frame_times(screen.end, options.fps, screen.jumps, options.slow_motion)
+        for screen in screens
+    ]
+    frames, poster = 0, None
     with (
         closing(Progress("rendering", sum(map(len, times)), "frames")) as progress,
-        closing(screens[0].canvas(size)) as canvas,
-        video(path, *size, fps) as add,
+        closing(screens[0].canvas(options.size)) as canvas,
+        video(path, *options.size, options.fps) as add,
     ):
         for screen, when in zip(screens, times, strict=True):
-            stage = screen.open(size, canvas)
+            stage = screen.open(options.size, canvas)
             for t in when:
                 add(stage.draw(t))
-                done += 1
-                progress.update(done)
-            if large is None:
-                large = stage.fine(FINER)
-    assert large is not None
-    return large
+                frames += 1
+                progress.update(frames)
+            if poster is None:
+                poster = stage.fine(FINER)
+    assert poster is not None
+    return poster

@@ -1,0 +1,24 @@
+"""The options of a replay, which `render_replay` and the command line share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ReplayOptions:
+    """How a replay is rendered.
+
+    Attributes:
+        layout: side-by-side, or overlay (both controllers in one scene).
+        camera: a camera of the MJCF, as overhead, chase or three_quarter; by default that of the scene.
+        size: width and height of the video [pixels], even numbers, at least 480x160 side by side.
+        fps: frames per second.
+        slow_motion: how many times slower the video is around jumps.
+    """
+
+    layout: str = "side-by-side"
+    camera: str | None = None
+    size: tuple[int, int] = (1280, 720)
+    fps: int = 30
+    slow_motion: float = 1.0
