@@ -3,26 +3,35 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_args, get_type_hints
 
 import numpy as np
 from safetensors.numpy import load_file, save
 
 from hyrl_mj.errors import BadArtifact, BadInput, brief
 
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
+
+Record = TypeVar("Record")
 # Raised whenever a file of an older version can no longer be read.
 VERSION = 1
+# What to do about a file that cannot be read.
+REMEDY = "run the stage that writes it again"
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a temporary path beside `path`; rename it to `path` when the block ends well.
+    """Yields a temporary path beside `path`, and renames it to `path` when the block ends without error.
 
     Raises:
-        BadInput: it cannot be written.
+        BadInput: the path cannot be written.
     """
     temporary = path.with_name(f".{path.stem}.partial{path.suffix}")
     try:
@@ -30,7 +39,7 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.touch()
         yield temporary
         temporary.replace(path)
-    except BrokenPipeError:  # a program that writes it has died
+    except BrokenPipeError:  # the program that writes the file has died
         raise
     except OSError as error:
         raise BadInput(
@@ -43,17 +52,19 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def reading(path: Path, remedy: str = "") -> Iterator[None]:
-    """Turn whatever a damaged file makes its reader raise into one clear sentence.
+def reading(path: Path, remedy: str = REMEDY) -> Iterator[None]:
+    """Turns whatever error a damaged file leads its reader to into one sentence.
 
     Args:
         path: the file.
-        remedy: what to do about it; by default to run the stage that writes it.
+        remedy: what to do about it.
+
+    Raises:
+        BadArtifact: the file is missing or cannot be read.
     """
     if not path.is_file():
-        raise BadArtifact(
-            f"there is no file {path}: {remedy or 'run the stage that writes it first'}"
-        )
+        first = "run the stage that writes it first" if remedy == REMEDY else remedy
+        raise BadArtifact(f"there is no file {path}: {first}")
     try:
         yield
     except BadArtifact as error:
@@ -61,32 +72,35 @@ def reading(path: Path, remedy: str = "") -> Iterator[None]:
     # The readers of damaged files raise whatever the damage leads them to.
     except Exception as error:
         raise BadArtifact(
-            f"{path} cannot be read ({brief(error)}): it is truncated or not what its name says; "
-            f"{remedy or 'run the stage that writes it again'}"
+            f"{path} cannot be read ({brief(error)}): it is truncated or not what its name says; {remedy}"
         ) from error
 
 
-def check_version(found: Any, kind: str, wanted: str) -> None:
-    """Raise `BadArtifact` unless the file says that it is `wanted` of this version."""
+def check_version(version: Any, kind: str, wanted: str) -> None:
+    """Raises `BadArtifact` unless a file says that it is `wanted` of this version."""
     if kind != wanted:
         raise BadArtifact(f"it holds {kind!r}, not {wanted!r}")
-    if found != VERSION:
+    if version != VERSION:
         raise BadArtifact(
-            f"it is of version {found}, this hyrl_mj reads version {VERSION}: "
-            "run the stage that writes it again"
+            f"it is of version {version}, this hyrl_mj reads version {VERSION}: {REMEDY}"
         )
 
 
-def write_json(path: Path, content: Mapping[str, Any], kind: str) -> None:
-    """Write a JSON object with its kind and version."""
+# ---- JSON
+
+
+def write_json(path: Path, content: Any, kind: str) -> None:
+    """Writes a mapping or a dataclass as a JSON object, with its kind and version."""
+    if is_dataclass(content) and not isinstance(content, type):
+        content = asdict(content)
     with replacing(path) as temporary:
         text = json.dumps({"kind": kind, "version": VERSION, **content}, indent=2)
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
-def read_json(path: Path, kind: str) -> dict[str, Any]:
-    """Read what `write_json` wrote."""
-    with reading(path):
+def read_json(path: Path, kind: str, remedy: str = REMEDY) -> dict[str, Any]:
+    """Returns what `write_json` wrote, as nested dictionaries and lists."""
+    with reading(path, remedy):
         content = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(content, dict):
             raise BadArtifact("it holds no JSON object")
@@ -94,8 +108,130 @@ def read_json(path: Path, kind: str) -> dict[str, Any]:
         return content
 
 
+def read_record(path: Path, kind: str, record: type[Record], remedy: str = REMEDY) -> Record:
+    """Returns what `write_json` wrote of a dataclass, with the types that its fields are declared with.
+
+    Raises:
+        BadArtifact: the file is missing or damaged, or a field is missing, unknown or of another type; the
+            sentence names it.
+    """
+    content = read_json(path, kind, remedy)
+    with reading(path, remedy):
+        return parsed(content, record, remedy)
+
+
+def parsed(content: Mapping[str, Any], record: type[Record], remedy: str = REMEDY) -> Record:
+    """Returns the dataclass that nested dictionaries and lists describe.
+
+    Raises:
+        BadArtifact: a field is missing, unknown or of another type.
+    """
+    from pydantic import ValidationError  # slow to import
+
+    try:
+        value: Record = _adapter(record).validate_json(json.dumps([content]))[0]  # type: ignore[arg-type]
+        return value
+    except ValidationError as error:
+        problems = error.errors(include_url=False, include_input=False)
+    # Where a value may be of several types each of them complains: the one that it fits best is meant.
+    complaints = Counter(problem["loc"][:-1] for problem in problems)
+    problem = min(problems, key=lambda problem: complaints[problem["loc"][:-1]])
+    # The first step leads into the list around the content.
+    field = ".".join(str(step) for step in problem["loc"][1:])
+    text = {
+        "missing": f"it has no {field}",
+        "unexpected_keyword_argument": f"it has an unknown {field}",
+    }.get(problem["type"], f"its {field} cannot be used ({problem['msg']})")
+    raise BadArtifact(f"{text}, so it is damaged or of another version: {remedy}")
+
+
+@cache
+def _adapter(record: type) -> TypeAdapter[Any]:
+    """Returns what reads a record from JSON.
+
+    It is in a tuple, because pydantic takes a configuration for what holds a dataclass, not for itself.
+    """
+    from pydantic import ConfigDict, TypeAdapter  # slow to import
+
+    within: Any = tuple[record]  # type: ignore[valid-type]
+    return TypeAdapter(within, config=ConfigDict(extra="forbid", strict=True))
+
+
+# ---- npz
+
+
+@dataclass(frozen=True)
+class Saved:
+    """Base of the frozen dataclasses that an npz file holds, with an array for each field.
+
+    Numbers and strings are stored as arrays without dimensions, a tuple as one array, and a dictionary of
+    arrays as `<field>_<key>`, one for each entry. A tuple of a type that has `pack` and `unpack` is stored
+    as these say.
+    """
+
+    KIND: ClassVar[str]
+
+    def save(self, path: Path) -> None:
+        """Writes the npz file."""
+        arrays: dict[str, np.ndarray] = {}
+        for field in fields(self):
+            arrays |= _packed(field.name, getattr(self, field.name))
+        write_arrays(path, arrays, self.KIND)
+
+    @classmethod
+    def load(cls, path: Path, context: Any = None) -> Self:
+        """Reads what `save` wrote.
+
+        Args:
+            path: the npz file.
+            context: what the arrays need to be understood: the task, for sets in its chart.
+
+        Raises:
+            BadArtifact: the file is missing, damaged, or holds something else.
+        """
+        arrays, types = read_arrays(path, cls.KIND), get_type_hints(cls)
+        values = {}
+        with reading(path):
+            for field in fields(cls):
+                try:
+                    values[field.name] = _unpacked(field.name, types[field.name], arrays, context)
+                except KeyError as error:
+                    raise BadArtifact(f"it has no array {error}: {REMEDY}") from error
+                except (TypeError, ValueError) as error:
+                    raise BadArtifact(f"its {field.name} cannot be used: {error}") from error
+            return cls(**values)
+
+
+def _packed(name: str, value: Any) -> dict[str, np.ndarray]:
+    """Returns the arrays that hold one field."""
+    if isinstance(value, dict):
+        return {f"{name}_{key}": np.asarray(array) for key, array in value.items()}
+    if isinstance(value, tuple) and value and hasattr(value[0], "pack"):
+        packed: dict[str, np.ndarray] = value[0].pack(value)
+        return packed
+    return {name: np.asarray(value)}
+
+
+def _unpacked(name: str, declared: Any, arrays: Mapping[str, np.ndarray], context: Any) -> Any:
+    """Returns the value of one field, of the type that it is declared with."""
+    if declared == dict[str, np.ndarray]:
+        prefix = f"{name}_"
+        return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+    element: Any = next(iter(get_args(declared)), None)
+    if hasattr(element, "unpack"):
+        return element.unpack(arrays, context)
+    array = arrays[name]
+    if (array.ndim == 0) != (declared in (int, float, str)):
+        raise ValueError(f"an array of {array.ndim} dimensions does not fit")
+    if declared == tuple[int, ...]:
+        return tuple(int(value) for value in array)
+    if declared == tuple[np.ndarray, ...]:
+        return tuple(array)
+    return array if declared is np.ndarray else declared(array.item())
+
+
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], kind: str) -> None:
-    """Write named arrays as npz with their kind and version.
+    """Writes named arrays as npz, with their kind and version.
 
     Raises:
         TypeError: an array of Python objects, which NumPy would pickle.
@@ -109,20 +245,23 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], kind: str) -> Non
 
 
 def read_arrays(path: Path, kind: str) -> dict[str, np.ndarray]:
-    """Read what `write_arrays` wrote."""
+    """Returns the arrays that `write_arrays` wrote."""
     with reading(path), np.load(path, allow_pickle=False) as file:
         content = {name: file[name] for name in file.files}
         check_version(int(content.pop("version")), str(content.pop("kind")), kind)
         return content
 
 
+# ---- safetensors
+
+
 def write_tensors(path: Path, tensors: dict[str, np.ndarray]) -> None:
-    """Write named tensors as safetensors."""
+    """Writes named tensors as safetensors."""
     with replacing(path) as temporary:
         temporary.write_bytes(save({k: np.ascontiguousarray(v) for k, v in tensors.items()}))
 
 
 def read_tensors(path: Path) -> dict[str, np.ndarray]:
-    """Read what `write_tensors` wrote."""
+    """Returns the tensors that `write_tensors` wrote."""
     with reading(path):
         return load_file(path)

@@ -8,12 +8,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadArtifact, BadInput
-from hyrl_mj.game import Lattice
-from hyrl_mj.game import scores as robustness
+from hyrl_mj.game import Lattice, Robustness
 from hyrl_mj.learning import Settings, Training
 from hyrl_mj.policies import (
     FUNCTION,
@@ -35,8 +33,30 @@ PACKAGES = ("mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "media
 
 
 @dataclass(frozen=True)
+class Config:
+    """What `config.json` holds.
+
+    Attributes:
+        settings: every setting of the run.
+        versions: the versions of Python and packages that the run was begun with.
+    """
+
+    settings: Settings
+    versions: dict[str, str]
+
+    @staticmethod
+    def load(path: Path) -> Config:
+        """Reads `config.json`.
+
+        Raises:
+            BadArtifact: the file is damaged or of another version.
+        """
+        return artifacts.read_record(path, "run", Config, "start a new run with another --out")
+
+
+@dataclass(frozen=True)
 class Run:
-    """A run directory. What it holds is read when it is asked for.
+    """A run directory, whose files are read when they are needed.
 
     Attributes:
         path: the directory.
@@ -47,6 +67,12 @@ class Run:
     path: Path
     settings: Settings
     function: AnyPolicy | None = None
+
+    def __repr__(self) -> str:
+        s = self.settings
+        return (
+            f"Run({str(self.path)!r}: {s.task}, eps {s.noise:g}, seed {s.seed}, preset {s.preset})"
+        )
 
     @cached_property
     def task(self) -> Task:
@@ -147,17 +173,14 @@ class Run:
         return {"policy": PolicyController(self.policy), "hyrl": self.controller}
 
     @cached_property
-    def robustness(self) -> dict[str, Any]:
+    def robustness(self) -> Robustness:
         """What `robustness.json` holds."""
-        return robustness.load(self.path / "robustness.json")
+        return Robustness.load(self.path / "robustness.json")
 
     @cached_property
     def versions(self) -> dict[str, str]:
         """The versions of Python and packages that it was begun with."""
-        config = self.path / "config.json"
-        content = artifacts.read_json(config, kind="run")
-        with artifacts.reading(config):
-            return dict(content["versions"])
+        return Config.load(self.path / "config.json").versions
 
     def arc_paths(self) -> dict[tuple[str, str], Path]:
         """The files of the replays by start ("start0", ..., "critical") and controller."""
@@ -216,16 +239,13 @@ def load_run(path: str | Path, policy: AnyPolicy | None = None) -> Run:
             f"{path} is not a run directory: it has no config.json; "
             "make one with hyrl-mj run TASK --out DIR"
         )
-    content = artifacts.read_json(config, kind="run")
-    with artifacts.reading(config):
-        return Run(path, Settings.from_json(content["settings"]), policy)
+    return Run(path, Config.load(config).settings, policy)
 
 
 def write_config(run: Run) -> None:
     """Write `config.json`: every setting, and the versions that go with them."""
     versions = {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
-    content = {"settings": run.settings.to_json(), "versions": versions}
-    artifacts.write_json(run.path / "config.json", content, kind="run")
+    artifacts.write_json(run.path / "config.json", Config(run.settings, versions), kind="run")
 
 
 def _differing(old: Settings, new: Settings) -> Iterator[str]:

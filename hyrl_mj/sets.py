@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from typing import Protocol
@@ -10,6 +11,12 @@ import numpy as np
 
 from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput
+
+
+class HasChart(Protocol):
+    """What tells the chart that sets lie in: a task."""
+
+    chart: Chart
 
 
 class StateSet(Protocol):
@@ -177,6 +184,24 @@ class GridSet:
         inward = ndimage.distance_transform_edt(wide, sampling=grid.spacing)[middle]
         half = grid.cell / 2
         return GridSet(grid, np.where(inside, half - inward, outward - half).ravel())
+
+    @staticmethod
+    def pack(sets: tuple[GridSet, ...]) -> dict[str, np.ndarray]:
+        """Returns the arrays that hold sets on one grid: `grid_counts` (d,), `signed_distance` (k, N)."""
+        return {
+            "grid_counts": np.array(sets[0].grid.counts),
+            "signed_distance": np.stack([members.values for members in sets]),
+        }
+
+    @staticmethod
+    def unpack(arrays: Mapping[str, np.ndarray], task: HasChart) -> tuple[GridSet, ...]:
+        """Returns the sets that `pack` has packed, in the chart of a task."""
+        grid = Grid.from_counts(task.chart, arrays["grid_counts"])
+        return tuple(GridSet(grid, values) for values in arrays["signed_distance"])
+
+    def __repr__(self) -> str:
+        nodes = " x ".join(map(str, self.grid.counts))
+        return f"GridSet({self.mask.mean():.1%} of {nodes} nodes)"
 
     def signed_distance(self, z: np.ndarray) -> np.ndarray:
         return self.grid.interpolate(self.values, z)

@@ -39,12 +39,12 @@ def row(task: str, algorithm: str, seed: int, eps: float, out: Path) -> tuple[li
     path = out / f"{task}_{algorithm.replace(':', '_')}_{eps:g}_{seed}"
     options = hyrl_mj.RunOptions(eps=eps, seed=seed, algorithm=algorithm, out=path)
     run = hyrl_mj.run(task, options, say=lambda text: None)
-    scores = {who: score[-1] for who, score in run.robustness["game"]["scores"].items()}
+    scores = {who: score[-1] for who, score in run.robustness.game.scores.items()}
     arcs = run.arcs()
     replays = {policy: arrivals(run, arcs, policy) for policy in (True, False)}
     cells = [algorithm_title(algorithm), str(seed)]
-    cells += [percent(scores["policy"]["won"])]
-    cells += [percent(scores["hyrl"]["won"]), percent(scores["hyrl"]["won_any"])]
+    cells += [percent(scores["policy"].won)]
+    cells += [percent(scores["hyrl"].won), percent(scores["hyrl"].won_any)]
     cells += [f"{won} of {total}" for won, total in replays.values()]
     cells += [f"{time.monotonic() - began:.0f}", f"{time.process_time() - worked:.0f}"]
     won, total = replays[False]

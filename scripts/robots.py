@@ -90,12 +90,11 @@ def measure(name: str, seed: int, count: int, folder: Path) -> list[str]:
     row = [name, str(seed)]
     for loop, controller in run.loops.items():
         n = min(count, SHARE) if loop == "policy" else count
-        regions = Regions(run.critical_set, near=True)
-        for found in noisy_episodes(run.task, regions, {loop: controller}, noises, n):
-            failed = found["episodes"] - found["outcomes"].get("reached", 0)
-            share = failed / found["episodes"]
-            good = share >= 0.2 if loop == "policy" else failed == 0
-            shown = f"{share:.1%}" if loop == "policy" else f"{failed} of {found['episodes']}"
+        regions = Regions(run.critical_set.points, near=True)
+        for ends in noisy_episodes(run.task, regions, {loop: controller}, noises, n):
+            share = ends.lost / ends.episodes
+            good = share >= 0.2 if loop == "policy" else ends.lost == 0
+            shown = f"{share:.1%}" if loop == "policy" else f"{ends.lost} of {ends.episodes}"
             row.append(shown if good else f"{shown} !")
     quiet = crashes_without_noise(run)
     row += [f"{n}" if n == 0 else f"{n} !" for n in quiet.values()]

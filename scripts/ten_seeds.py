@@ -17,55 +17,56 @@ from rich.table import Table
 
 import hyrl_mj
 from hyrl_mj import progress
+from hyrl_mj.game import GameResult
 
 PAPER = ("unit_circle", "vehicle")
-# A figure of a run: its heading, how it is read from robustness.json, and what it must be.
-Figure = tuple[str, Callable[[dict], float], Callable[[float], bool], str]
+# A figure of a run: its heading, how it is read from the game, and what it must be.
+Figure = tuple[str, Callable[[GameResult], float], Callable[[float], bool], str]
 
 
-def scores(game: dict, key: str) -> list[float]:
-    """One score of HyRL at every noise bound (none, half, all)."""
-    return [score[key] for score in game["scores"]["hyrl"]]
+def scores(game: GameResult, name: str) -> list[float]:
+    """Returns one score of HyRL at every noise bound (none, half, all)."""
+    return [getattr(score, name) for score in game.scores["hyrl"]]
 
 
 def figures(task: str, noise: float) -> list[Figure]:
-    """What each run of a problem must show."""
+    """Returns what each run of a problem must show."""
     if task == "vehicle":
         own = 0.999 if noise <= 0.1 else 0.995
-        found: list[Figure] = []
+        wanted: list[Figure] = []
         for i, name in enumerate(("0", f"{noise / 2:g}", f"{noise:g}")):
             heading = f"won, own q0, noise {name}"
-            found.append((heading, lambda g, i=i: scores(g, "won")[i], least(own), f">= {own}"))
+            wanted.append((heading, lambda g, i=i: scores(g, "won")[i], least(own), f">= {own}"))
         if noise <= 0.1:
-            found.append(("any q0", lambda g: scores(g, "won_any")[-1], least(0.95), ">= 0.95"))
+            wanted.append(("any q0", lambda g: scores(g, "won_any")[-1], least(0.95), ">= 0.95"))
         heading = "|y| at x = 3, no noise [m]"
-        found.append((heading, lambda g: g["miss_without_noise"]["hyrl"], most(0.05), "<= 0.05"))
-        return found
+        wanted.append((heading, lambda g: g.miss_without_noise["hyrl"], most(0.05), "<= 0.05"))
+        return wanted
     band = 0.12 if noise <= 0.1 else 0.22
-    found = [
+    wanted = [
         ("trapped, any q0, all noises", lambda g: 1 - min(scores(g, "won_any")), most(0.0), "0"),
         ("excursion [rad]", lambda g: scores(g, "excursion")[-1], most(band), f"<= {band}"),
     ]
     if noise <= 0.1:
         heading = "worst time, any q0 [s]"
-        found.append((heading, lambda g: scores(g, "time_any")[-1], most(3.4), "<= 3.4"))
+        wanted.append((heading, lambda g: scores(g, "time_any")[-1], most(3.4), "<= 3.4"))
         heading = "own q0 [s]"
-        found.append((heading, lambda g: scores(g, "time")[-1], most(3.1), "<= 3.1"))
-    return found
+        wanted.append((heading, lambda g: scores(g, "time")[-1], most(3.1), "<= 3.1"))
+    return wanted
 
 
 def least(target: float) -> Callable[[float], bool]:
-    """Whether a figure is at least so much."""
+    """Returns whether a figure is at least so much."""
     return lambda value: value >= target
 
 
 def most(target: float) -> Callable[[float], bool]:
-    """Whether a figure is at most so much; the plant itself is right to 1e-6."""
+    """Returns whether a figure is at most so much; the plant itself is right to 1e-6."""
     return lambda value: value <= target + 1e-6
 
 
 def main() -> int:
-    """Run and print; 1 if a target is missed."""
+    """Runs and prints; returns 1 if a target is missed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--tasks", nargs="+", default=list(PAPER), choices=PAPER)
     parser.add_argument("--seeds", nargs="+", type=int, default=list(range(10)))
@@ -85,7 +86,7 @@ def main() -> int:
             began = time.monotonic()
             out = options.out / f"{task}_{options.eps:g}_{seed}"
             made = hyrl_mj.RunOptions(eps=options.eps, seed=seed, out=out)
-            game = hyrl_mj.run(task, made, say=lambda text: None).robustness["game"]
+            game = hyrl_mj.run(task, made, say=lambda text: None).robustness.game
             cells = []
             for _, read, good, _ in wanted:
                 value = read(game)

@@ -163,7 +163,7 @@ def test_its_critical_set_is_found_and_its_parts_are_the_two_sides(wasp):
     critical = hyrl_mj.find_critical_set(task, Sides(), 20, 1 / 16, "outcome")
     assert critical.pieces == 1
     assert np.abs(critical.points[:, 1] - 0.1).max() <= critical.resolution
-    partition = hyrl_mj.make_partition(task, Sides(), critical, 20)
+    partition = hyrl_mj.make_partition(task, Sides(), critical.points, 20)
     assert partition.modes == (0, 1)
     before = np.array([[0.1, 0.4, 0.5], [0.1, -0.4, 0.5]])
     assert [part.contains(before).tolist() for part in partition.parts] == [

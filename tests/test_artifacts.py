@@ -3,11 +3,16 @@
 import json
 import os
 import pickle
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import pytest
 
-from hyrl_mj import BadArtifact, CriticalSet, artifacts
+import hyrl_mj
+from hyrl_mj import BadArtifact, BadInput, CriticalSet, artifacts
+from hyrl_mj.game import Maps
+from hyrl_mj.learning import preset
+from hyrl_mj.run_directory import Config
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
@@ -278,3 +283,147 @@ def test_sets_that_do_not_fit_their_grid_are_refused(tmp_path, vehicle, grid_set
     artifacts.write_arrays(tmp_path / "p.npz", arrays, "partition")
     with pytest.raises(BadArtifact, match=r"p\.npz"):
         Partition.load(tmp_path / "p.npz", vehicle)
+
+
+def test_arrays_of_another_shape_or_name_are_named(tmp_path):
+    arrays = {"points": np.zeros((3, 2)), "component": np.zeros(3, dtype=int)}
+    numbers = {"resolution": np.array(0.1), "spacing": np.array(0.2)}
+    for changed, message in (
+        ({"resolution": np.zeros(2)}, "its resolution cannot be used"),
+        ({"resolution": np.array("far")}, "its resolution cannot be used"),
+        ({"points": np.array(1.0)}, "its points cannot be used"),
+        ({"component": np.zeros(2, dtype=int)}, "one component"),
+    ):
+        artifacts.write_arrays(tmp_path / "c.npz", arrays | numbers | changed, "critical set")
+        with pytest.raises(BadArtifact, match=message) as caught:
+            CriticalSet.load(tmp_path / "c.npz")
+        assert_one_sentence_about(caught, tmp_path / "c.npz")
+    artifacts.write_arrays(tmp_path / "c.npz", arrays, "critical set")
+    with pytest.raises(BadArtifact, match="it has no array 'resolution'"):
+        CriticalSet.load(tmp_path / "c.npz")
+
+
+def test_maps_come_back(tmp_path):
+    maps = Maps(0.1, np.array([2, 3]), {"policy": np.arange(6, dtype=np.int8), "mine": np.ones(6)})
+    maps.save(tmp_path / "m.npz")
+    with np.load(tmp_path / "m.npz", allow_pickle=False) as file:
+        assert set(file.files) == {
+            "kind",
+            "version",
+            "eps",
+            "grid_counts",
+            "map_policy",
+            "map_mine",
+        }
+    back = Maps.load(tmp_path / "m.npz")
+    assert back.eps == 0.1
+    assert back.map.keys() == maps.map.keys()
+    for name, classes in maps.map.items():
+        np.testing.assert_array_equal(back.map[name], classes)
+
+
+def test_results_that_do_not_fit_together_are_refused(grid_set):
+    with pytest.raises(BadInput, match="one component"):
+        CriticalSet(np.zeros((3, 2)), np.zeros(2, dtype=int), 0.1, 0.2)
+    with pytest.raises(BadInput, match="one for each mode"):
+        Partition((0, 1), (grid_set,), grid_set.mask)
+    with pytest.raises(BadInput, match="one grid"):
+        Partition((0,), (grid_set,), np.ones(3, dtype=bool))
+
+
+def test_results_describe_themselves_in_a_line(grid_set):
+    critical = CriticalSet(np.zeros((3, 2)), np.zeros(3, dtype=int), 0.1, 0.2)
+    assert repr(critical) == "CriticalSet(1 piece, 3 points, resolution 0.1)"
+    assert repr(grid_set) == "GridSet(53.8% of 13 x 13 nodes)"
+    partition = Partition((0, 1), (grid_set, ~grid_set), grid_set.mask)
+    assert repr(partition) == "Partition(0: 53.8%, 1: 46.2% of 13 x 13 nodes)"
+    nowhere = np.empty((0, 2)), np.empty(0)
+    sets = ExtendedSets((0,), (grid_set,), (grid_set.mask,), 0.3, 0.1, *nowhere)
+    assert repr(sets) == "ExtendedSets(0: 53.8% of the chart, eps 0.1)"
+
+
+# ---- records
+
+
+@dataclass(frozen=True)
+class Leaf:
+    size: float
+    words: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Stone:
+    weight: float
+    colour: str
+    rough: bool
+
+
+@dataclass(frozen=True)
+class Tree:
+    name: str
+    rings: int
+    held: Leaf | Stone
+    leaves: dict[str, tuple[Leaf, ...]]
+    height: float | None = None
+
+
+TREE = Tree("oak", 3, Leaf(0.1), {"low": (Leaf(1.5, ("a", "b")), Leaf(2.0))})
+
+
+@pytest.mark.parametrize("held", [Leaf(0.1, ("c",)), Stone(1.0, "grey", True)])
+def test_a_record_comes_back(tmp_path, held):
+    tree = replace(TREE, held=held)
+    artifacts.write_json(tmp_path / "t.json", tree, "tree")
+    assert artifacts.read_record(tmp_path / "t.json", "tree", Tree) == tree
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        (("name",), None, "its name cannot be used"),
+        (("rings",), "3", "its rings cannot be used .*integer"),
+        (("rings",), 3.5, "its rings cannot be used"),
+        (("held", "size"), "far", "its held.Leaf.size cannot be used"),
+        (("held", "sise"), 1.0, "it has an unknown held.Leaf.sise"),
+        (("leaves", "low", 1, "size"), [], "its leaves.low.1.size cannot be used"),
+        (("leaves",), 3, "its leaves cannot be used"),
+        (("extra",), 1, "it has an unknown extra"),
+    ],
+)
+def test_a_wrong_field_of_a_record_is_named(tmp_path, path, value, message):
+    content = json.loads(json.dumps(asdict(TREE)))
+    inner = content
+    for step in path[:-1]:
+        inner = inner[step]
+    inner[path[-1]] = value
+    artifacts.write_json(tmp_path / "t.json", content, "tree")
+    with pytest.raises(BadArtifact, match=message) as caught:
+        artifacts.read_record(tmp_path / "t.json", "tree", Tree, "plant it again")
+    assert_one_sentence_about(caught, tmp_path / "t.json")
+    assert str(caught.value).endswith(": plant it again")
+
+
+@pytest.mark.parametrize("missing", ["rings", "held", "leaves"])
+def test_a_missing_field_of_a_record_is_named(missing):
+    content = {name: value for name, value in asdict(TREE).items() if name != missing}
+    with pytest.raises(BadArtifact, match=f"it has no {missing}"):
+        artifacts.parsed(content, Tree)
+    with pytest.raises(BadArtifact, match=r"it has no held\.Stone\.rough"):
+        artifacts.parsed(asdict(TREE) | {"held": {"weight": 1.0, "colour": "grey"}}, Tree)
+
+
+def test_a_config_is_what_was_set(tmp_path, circle):
+    config = Config(preset(circle, "smoke", seed=3), {"python": "3.11"})
+    artifacts.write_json(tmp_path / "config.json", config, "run")
+    assert Config.load(tmp_path / "config.json") == config
+    content = json.loads((tmp_path / "config.json").read_text())
+    assert list(content) == ["kind", "version", "settings", "versions"]
+    content["settings"]["stage6"]["samples"] = "many"
+    (tmp_path / "config.json").write_text(json.dumps(content))
+    with pytest.raises(BadArtifact, match=r"settings\.stage6\.samples cannot be used"):
+        hyrl_mj.load_run(tmp_path)
+    content["settings"]["stage6"]["samples"] = 10
+    content["settings"]["seed"] = -1
+    (tmp_path / "config.json").write_text(json.dumps(content))
+    with pytest.raises(BadArtifact, match="seed -1 cannot be used"):
+        hyrl_mj.load_run(tmp_path)

@@ -213,9 +213,9 @@ def test_robustness_prints_the_worst_case_and_the_episodes(copied):
     assert done.returncode == 0, done.stderr
     for words in ("exact game", "limit", "margins", "uniform 0.1", "adversarial 0.1"):
         assert words in done.stdout
-    content = hyrl_mj.load_run(copied).robustness
-    assert [score["eps"] for score in content["game"]["scores"]["hyrl"]] == [0.0, 0.05, 0.1]
-    kinds = {(r["noise"], r["controller"]) for r in content["episodes"]}
+    robustness = hyrl_mj.load_run(copied).robustness
+    assert [score.eps for score in robustness.game.scores["hyrl"]] == [0.0, 0.05, 0.1]
+    kinds = {(c.noise, c.controller) for c in robustness.episodes}
     assert kinds == {(n, c) for n in ("uniform", "adversarial") for c in ("policy", "hyrl")}
 
 

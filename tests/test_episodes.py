@@ -27,7 +27,7 @@ def record(records, controller, region, noise=None):
     found = [
         r
         for r in records
-        if r["controller"] == controller and r["region"] == region and noise in (None, r["noise"])
+        if r.controller == controller and r.region == region and noise in (None, r.noise)
     ]
     assert len(found) == 1
     return found[0]
@@ -40,7 +40,7 @@ def records(vehicle, on_vehicle):
     noises = tuple(Noise(k, 0.1) for k in ("uniform", "alternating", "adversarial"))
     return noisy_episodes(
         vehicle,
-        Regions(decisions(vehicle), (game.lattice.grid, game.winnable(0.1))),
+        Regions(decisions(vehicle).points, (game.lattice.grid, game.winnable(0.1))),
         {name: controllers[name] for name in ("sign", "ideal")},
         noises,
         600,
@@ -50,18 +50,18 @@ def records(vehicle, on_vehicle):
 def test_the_counts_add_up(records):
     for noise in ("uniform", "alternating", "adversarial"):
         for name in ("sign", "ideal"):
-            mine = [r for r in records if (r["noise"], r["controller"]) == (noise, name)]
-            assert {r["region"] for r in mine} == {"near M*", "elsewhere", "not winnable"}
-            assert sum(r["episodes"] for r in mine) == 600
+            mine = [r for r in records if (r.noise, r.controller) == (noise, name)]
+            assert {r.region for r in mine} == {"near M*", "elsewhere", "not winnable"}
+            assert sum(r.episodes for r in mine) == 600
             for r in mine:
-                assert sum(r["outcomes"].values()) == r["episodes"]
-                assert r["reached"] == r["outcomes"].get("reached", 0) / r["episodes"]
-                assert 0 <= r["interval"][0] <= r["reached"] <= r["interval"][1] <= 1
+                assert sum(r.outcomes.values()) == r.episodes
+                assert r.reached == r.outcomes.get("reached", 0) / r.episodes
+                assert 0 <= r.interval[0] <= r.reached <= r.interval[1] <= 1
 
 
 def test_the_regions_hold_the_same_starts_for_all(records):
     for region in ("near M*", "elsewhere", "not winnable"):
-        assert len({r["episodes"] for r in records if r["region"] == region}) == 1
+        assert len({r.episodes for r in records if r.region == region}) == 1
 
 
 def test_starts_near_the_critical_set_are_those_within_twice_the_noise(vehicle, on_vehicle):
@@ -69,18 +69,18 @@ def test_starts_near_the_critical_set_are_those_within_twice_the_noise(vehicle, 
     left = {"left": on_vehicle[1]["left"]}
     for eps in (0.05, 0.1):
         records = noisy_episodes(
-            vehicle, Regions(decisions(vehicle)), left, (Noise("uniform", eps),), 2000
+            vehicle, Regions(decisions(vehicle).points), left, (Noise("uniform", eps),), 2000
         )
-        assert {r["region"] for r in records} == {"near M*", "elsewhere"}
-        near = record(records, "left", "near M*")["episodes"] / 2000
+        assert {r.region for r in records} == {"near M*", "elsewhere"}
+        near = record(records, "left", "near M*").episodes / 2000
         assert near == pytest.approx(2 * eps, abs=0.03)
 
 
 def test_the_ideal_rule_reaches_the_set_point_from_all_winnable_starts(records):
     for r in records:
-        if r["controller"] == "ideal" and r["region"] != "not winnable":
-            assert set(r["outcomes"]) == {"reached"}
-            assert r["interval"][1] == 1.0
+        if r.controller == "ideal" and r.region != "not winnable":
+            assert set(r.outcomes) == {"reached"}
+            assert r.interval[1] == 1.0
 
 
 def test_adversarial_noise_is_worse_than_chance(records):
@@ -88,9 +88,9 @@ def test_adversarial_noise_is_worse_than_chance(records):
         adversarial, uniform = (
             record(records, "sign", region, k) for k in ("adversarial", "uniform")
         )
-        assert adversarial["reached"] <= uniform["reached"]
+        assert adversarial.reached <= uniform.reached
     near = record(records, "sign", "near M*", "adversarial")
-    assert near["interval"][1] < record(records, "sign", "near M*", "uniform")["interval"][0]
+    assert near.interval[1] < record(records, "sign", "near M*", "uniform").interval[0]
 
 
 def test_no_noise_is_worse_than_the_worst(records, on_vehicle):
@@ -98,8 +98,8 @@ def test_no_noise_is_worse_than_the_worst(records, on_vehicle):
     won = on_vehicle[0].score("sign", 0.1).won
     for kind in ("uniform", "alternating", "adversarial"):
         mine = [record(records, "sign", region, kind) for region in ("near M*", "elsewhere")]
-        lost = sum(r["episodes"] - r["outcomes"]["reached"] for r in mine)
-        assert lost / sum(r["episodes"] for r in mine) <= 1 - won + 0.02
+        lost = sum(r.episodes - r.outcomes["reached"] for r in mine)
+        assert lost / sum(r.episodes for r in mine) <= 1 - won + 0.02
 
 
 def test_the_same_seed_gives_the_same_counts(vehicle, on_vehicle):
@@ -107,7 +107,9 @@ def test_the_same_seed_gives_the_same_counts(vehicle, on_vehicle):
 
     def counts(seed):
         noises = (Noise("uniform", 0.2),)
-        return noisy_episodes(vehicle, Regions(decisions(vehicle)), sign, noises, 300, seed=seed)
+        return noisy_episodes(
+            vehicle, Regions(decisions(vehicle).points), sign, noises, 300, seed=seed
+        )
 
     assert counts(3) == counts(3)
     assert counts(3) != counts(4)
@@ -118,9 +120,9 @@ def test_batches_add_up_and_none_is_the_same(vehicle, on_vehicle, monkeypatch):
     sign, noises = {"sign": on_vehicle[1]["sign"]}, (Noise("uniform", 0.1),)
 
     def near(count):
-        records = noisy_episodes(vehicle, Regions(decisions(vehicle)), sign, noises, count)
-        assert sum(r["episodes"] for r in records) == count
-        return record(records, "sign", "near M*")["episodes"]
+        records = noisy_episodes(vehicle, Regions(decisions(vehicle).points), sign, noises, count)
+        assert sum(r.episodes for r in records) == count
+        return record(records, "sign", "near M*").episodes
 
     one, two, more = (near(count) for count in (100, 200, 250))
     assert one < two < more
@@ -138,7 +140,7 @@ def test_batches_add_up_and_none_is_the_same(vehicle, on_vehicle, monkeypatch):
 def test_episodes_that_make_no_sense_are_refused(vehicle, on_vehicle, noise, count, message):
     sign = {"sign": on_vehicle[1]["sign"]}
     with pytest.raises(BadInput, match=message):
-        noisy_episodes(vehicle, Regions(decisions(vehicle)), sign, (noise,), count)
+        noisy_episodes(vehicle, Regions(decisions(vehicle).points), sign, (noise,), count)
 
 
 @pytest.mark.parametrize("kind", ["uniform", "alternating", "adversarial"])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from planted import circle_policy, one_way_policy, sign_policy
 
-from hyrl_mj import extend, find_critical_set, make_partition
+from hyrl_mj import BadInput, extend, find_critical_set, make_partition
 from hyrl_mj.stages.critical_set import distance_to
 
 PI = np.pi
@@ -18,10 +18,11 @@ class Case:
     def __init__(self, task, policy, rods, cells):
         self.task, self.policy = task, policy
         self.critical = find_critical_set(task, policy, rods, 1 / 32)
-        self.partition = make_partition(task, policy, self.critical, cells)
+        self.partition = make_partition(task, policy, self.critical.points, cells)
 
     def extend(self, horizon, noise):
-        return extend(self.task, self.policy, self.critical, self.partition, noise, horizon)
+        points = self.critical.points
+        return extend(self.task, self.policy, points, self.partition, noise, horizon)
 
 
 @pytest.fixture(scope="module")
@@ -139,12 +140,14 @@ def test_a_single_mode_keeps_everything(vehicle):
     assert sets.modes == (0,)
     assert sets.sets[0].mask.all()
     assert sets.sentence(vehicle) == "one mode, its set is everything"
-    far = distance_to(vehicle, case.critical, np.zeros((3, 2)))
+    far = distance_to(vehicle, case.critical.points, np.zeros((3, 2)))
     np.testing.assert_array_equal(far, [np.inf] * 3)
 
 
 def test_the_distance_to_the_critical_set_goes_the_short_way(circle, on_circle):
-    distance = distance_to(circle, on_circle.critical, np.array([[0.0], [PI + 1], [7 * PI - 1]]))
+    distance = distance_to(
+        circle, on_circle.critical.points, np.array([[0.0], [PI + 1], [7 * PI - 1]])
+    )
     np.testing.assert_allclose(distance, [PI, 1.0, 1.0], atol=2e-3)
 
 
@@ -221,3 +224,16 @@ def test_forward_runs_give_the_sets_that_backward_ones_give(
             slack = hop + 2 * grid.cell
             assert a.dilated(slack).mask[b.mask].all()
             assert b.dilated(slack).mask[a.mask].all()
+
+
+def test_points_of_the_critical_set_that_cannot_be_used_are_refused(on_circle):
+    case = on_circle
+    for points, message in (
+        (case.critical, "give its points"),
+        (np.zeros(3), r"points of shape \(3,\)"),
+        (np.zeros((3, 2)), r"give \(N, 1\)"),
+    ):
+        with pytest.raises(BadInput, match=message):
+            extend(case.task, case.policy, points, case.partition, 0.1)
+        with pytest.raises(BadInput, match=message):
+            make_partition(case.task, case.policy, points, 30)

@@ -11,7 +11,22 @@ from PIL import Image
 
 import hyrl_mj
 from hyrl_mj import BadInput
-from hyrl_mj.game.scores import BEATEN, CURVE, MAP_CLASSES, UNWINNABLE, WON, WON_FROM_SOME
+from hyrl_mj.game import (
+    BEATEN,
+    LIMIT,
+    MAP_CLASSES,
+    UNWINNABLE,
+    WON,
+    WON_FROM_SOME,
+    Curve,
+    GameResult,
+    LatticeSpacing,
+    Maps,
+    Profile,
+    Score,
+    Wins,
+)
+from hyrl_mj.game.examination import CURVE
 from hyrl_mj.sets import Grid
 from hyrl_mj.viz import figures
 from hyrl_mj.viz.figures import robustness_curve, style
@@ -26,33 +41,32 @@ def coarse(monkeypatch):
     monkeypatch.setattr(style, "DPI", 100)
 
 
-def share(won, won_any, excursion=None):
-    return {"eps": EPS, "won": won, "won_any": won_any, "excursion": excursion}
-
-
-def content_of(names, excursion=None, margin=0.05):
+def game_of(names, excursion=None, margin=0.05):
     """What `examine` returns, for controllers that lose more and more."""
     eps = np.array(CURVE)
-    fall = {name: np.clip(1.2 - 4 * eps, 0, 1) for name in names}
-    curves = {
-        name: {"won": won, "won_any": won if name == "policy" else 0.9 * won, "time_any": 3 * won}
-        for name, won in fall.items()
+    fall = np.clip(1.2 - 4 * eps, 0, 1)
+    wins = {
+        name: Wins(tuple(fall), tuple(fall if name == "policy" else 0.9 * fall), tuple(3 * fall))
+        for name in names
     }
-    full = {"won": np.ones(len(eps)), "won_any": 1 - 0.3 * eps, "time_any": np.full(len(eps), 3.0)}
-    return {
-        "everywhere": False,
-        "scores": {n: [share(0.8, 0.72, excursion)] for n in names} | {"limit": [share(1.0, 1.0)]},
-        "margin": dict.fromkeys(names, margin),
-        "curve": {"eps": eps, "winnable": 1 - 0.2 * eps, "limit": full} | curves,
-    }
+    wins[LIMIT] = Wins((1.0,) * len(eps), tuple(1 - 0.3 * eps), (3.0,) * len(eps))
+    scores = {name: (Score(EPS, 0.9, 0.8, 0.72, 3.0, 3.0, excursion),) for name in names}
+    return GameResult(
+        everywhere=False,
+        lattice=LatticeSpacing((0.1,), True, (0.1,)),
+        scores=scores | {LIMIT: (Score(EPS, 0.9, 1.0, 1.0, 3.0, 3.0, None),)},
+        margin=dict.fromkeys(names, margin),
+        miss_without_noise=dict.fromkeys(names, 0.0),
+        curve=Curve(CURVE, tuple(1 - 0.2 * eps), wins),
+        profile=Profile((), {}),
+    )
 
 
-def map_of(task, names, rule, cells=40):
-    """The arrays of `examine`; the classes (N,) are a rule of the nodes (N, d)."""
+def maps_of(task, names, rule, cells=40):
+    """The maps of `examine`; the classes (N,) are a rule of the nodes (N, d)."""
     grid = Grid.with_cells(task.chart, cells)
     classes = np.asarray(rule(grid.nodes), dtype=np.int8)
-    maps = {f"map_{name}": classes for name in names}
-    return {"grid_counts": np.array(grid.counts), "eps": np.array(EPS), **maps}
+    return Maps(EPS, np.array(grid.counts), dict.fromkeys(names, classes))
 
 
 def critical_of(*points):
@@ -66,16 +80,17 @@ def draw_map(task, result, maps, critical, path=None):
 
 
 def draw_curve(task, result, path=None):
-    return figures.draw_robustness_curve(figures.ShownGame(task, critical_of(), result, {}), path)
+    maps = maps_of(task, [], lambda z: np.zeros(len(z)), cells=8)
+    return figures.draw_robustness_curve(figures.ShownGame(task, critical_of(), result, maps), path)
 
 
 @pytest.mark.parametrize("task", [CIRCLE, VEHICLE], ids=lambda task: task.name)
 def test_each_class_that_occurs_has_its_colour(tmp_path, task):
     occurring = (WON, WON_FROM_SOME, BEATEN)
     path, names = tmp_path / "figures" / "map.png", ("policy", "hyrl")
-    arrays = map_of(task, names, lambda z: np.arange(len(z)) % 40 // 14)
+    maps = maps_of(task, names, lambda z: np.arange(len(z)) % 40 // 14)
     critical = critical_of(task.scene.starts[2])
-    draw_map(task, content_of(names), arrays, critical, path)
+    draw_map(task, game_of(names), maps, critical, path)
     for k, colour in enumerate(figures.CLASS_COLOURS):
         assert (len(where(path, colour)) > 1000) == (k in occurring), MAP_CLASSES[k]
     width, height = size_of(path)
@@ -90,8 +105,8 @@ def test_a_map_is_drawn_the_right_way_round(tmp_path, coarse):
     def upper_left(z):
         return np.where((z[:, 0] < 1.0) & (z[:, 1] > 0.5), BEATEN, UNWINNABLE)
 
-    arrays = map_of(VEHICLE, ["hyrl"], upper_left)
-    draw_map(VEHICLE, content_of(["hyrl"]), arrays, critical_of((0.0, 0.0)), path)
+    maps = maps_of(VEHICLE, ["hyrl"], upper_left)
+    draw_map(VEHICLE, game_of(["hyrl"]), maps, critical_of((0.0, 0.0)), path)
     corner, rest = (where(path, figures.CLASS_COLOURS[k]) for k in (BEATEN, UNWINNABLE))
     right, up = np.median(corner, axis=0) - np.median(rest, axis=0)
     assert right < -50
@@ -104,8 +119,8 @@ def test_arcs_of_a_ring_lie_at_their_angle(tmp_path, coarse):
     def through_the_end_of_the_period(z):
         return np.where(np.cos(z[:, 0] - 0.25) > 0.9, BEATEN, UNWINNABLE)
 
-    arrays = map_of(CIRCLE, ["hyrl"], through_the_end_of_the_period, cells=360)
-    draw_map(CIRCLE, content_of(["hyrl"]), arrays, critical_of(), path)
+    maps = maps_of(CIRCLE, ["hyrl"], through_the_end_of_the_period, cells=360)
+    draw_map(CIRCLE, game_of(["hyrl"]), maps, critical_of(), path)
     ring = where(path, figures.CLASS_COLOURS[UNWINNABLE])
     # The ring without its legend: the other arc lies to the right, a little above the centre.
     ring = ring[ring[:, 1] > 100]
@@ -117,17 +132,17 @@ def test_arcs_of_a_ring_lie_at_their_angle(tmp_path, coarse):
 
 def test_a_single_node_of_a_ring_is_seen(tmp_path):
     path = tmp_path / "map.png"
-    arrays = map_of(CIRCLE, ["hyrl"], lambda z: (np.arange(len(z)) == 700) * BEATEN, cells=6000)
-    draw_map(CIRCLE, content_of(["hyrl"]), arrays, critical_of(), path)
+    maps = maps_of(CIRCLE, ["hyrl"], lambda z: (np.arange(len(z)) == 700) * BEATEN, cells=6000)
+    draw_map(CIRCLE, game_of(["hyrl"]), maps, critical_of(), path)
     found = where(path, figures.CLASS_COLOURS[BEATEN])
     assert (found[:, 1] > 200).sum() > 20, "beside what is in the legend"
 
 
 def test_the_critical_set_lies_at_its_angle(tmp_path, coarse):
-    arrays, pictures = map_of(CIRCLE, ["hyrl"], lambda z: WON + 0 * z[:, 0]), []
+    maps, pictures = maps_of(CIRCLE, ["hyrl"], lambda z: WON + 0 * z[:, 0]), []
     for critical in (critical_of(), critical_of((0.75 * np.pi,))):
         path = tmp_path / "map.png"
-        draw_map(CIRCLE, content_of(["hyrl"]), arrays, critical, path)
+        draw_map(CIRCLE, game_of(["hyrl"]), maps, critical, path)
         pictures.append(np.asarray(Image.open(path).convert("RGB"))[::-1].astype(int))
     changed = np.argwhere(np.abs(pictures[1] - pictures[0]).max(axis=-1) > 100)[:, ::-1]
     ring, changed = (
@@ -139,23 +154,23 @@ def test_the_critical_set_lies_at_its_angle(tmp_path, coarse):
 
 def test_curves_and_a_third_controller(tmp_path, coarse):
     names, path = ("policy", "hyrl", "median filter"), tmp_path / "curve.png"
-    draw_curve(VEHICLE, content_of(names), path)
+    draw_curve(VEHICLE, game_of(names), path)
     for colour in (
         *robustness_curve.CURVE_COLOURS[:3],
         robustness_curve.LIMIT_COLOUR,
         robustness_curve.PALE,
     ):
         assert len(where(path, colour)) > 100
-    arrays = map_of(VEHICLE, names, lambda z: np.zeros(len(z)), cells=8)
+    maps = maps_of(VEHICLE, names, lambda z: np.zeros(len(z)), cells=8)
     critical = critical_of((0.0, 0.0))
-    draw_map(VEHICLE, content_of(names), arrays, critical, tmp_path / "map.png")
+    draw_map(VEHICLE, game_of(names), maps, critical, tmp_path / "map.png")
     assert size_of(tmp_path / "map.png")[1] > size_of(path)[1]
 
 
 def test_times_are_drawn_where_runs_last_for_ever(tmp_path, coarse):
     one, two = tmp_path / "one.png", tmp_path / "two.png"
-    draw_curve(CIRCLE, content_of(["hyrl"]), one)
-    draw_curve(CIRCLE, content_of(["hyrl"], excursion=0.1, margin=None), two)
+    draw_curve(CIRCLE, game_of(["hyrl"]), one)
+    draw_curve(CIRCLE, game_of(["hyrl"], excursion=0.1, margin=None), two)
     assert size_of(two)[1] > size_of(one)[1] + 100
     assert size_of(two)[0] <= 800
     assert len(where(two, HYRL)) > len(where(one, HYRL))
@@ -165,11 +180,11 @@ def test_times_are_drawn_where_runs_last_for_ever(tmp_path, coarse):
 def test_without_a_path_the_figure_is_returned_and_nothing_is_written(tmp_path, monkeypatch, task):
     monkeypatch.chdir(tmp_path)
     names = ("policy", "hyrl")
-    maps = map_of(task, names, lambda z: np.zeros(len(z)), cells=8)
+    maps = maps_of(task, names, lambda z: np.zeros(len(z)), cells=8)
     critical = critical_of(task.scene.starts[2])
-    assert len(draw_map(task, content_of(names), maps, critical).axes) == len(names)
+    assert len(draw_map(task, game_of(names), maps, critical).axes) == len(names)
     assert "margin of HyRL" in str(
-        [text.get_text() for text in draw_curve(task, content_of(names)).legends[0].get_texts()]
+        [text.get_text() for text in draw_curve(task, game_of(names)).legends[0].get_texts()]
     )
     assert list(tmp_path.iterdir()) == []
 
@@ -180,24 +195,24 @@ def test_nothing_is_left_behind_when_drawing_fails(tmp_path, monkeypatch, fails)
         path.write_bytes(b"\x89PNG")
         raise OSError("no space left on device")
 
-    path, content = tmp_path / "curve.png", content_of(["hyrl"])
+    path, game = tmp_path / "curve.png", game_of(["hyrl"])
     path.write_bytes(b"an older picture")
     if fails == "on its way":
-        del content["curve"]["hyrl"]
+        del game.curve.wins["hyrl"]
     else:
         monkeypatch.setattr(Figure, "savefig", half)
     with pytest.raises((BadInput, KeyError)):
-        draw_curve(VEHICLE, content, path)
+        draw_curve(VEHICLE, game, path)
     assert path.read_bytes() == b"an older picture"
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_the_users_own_style_is_neither_used_nor_changed(tmp_path, coarse):
     names = ["hyrl"]
-    draw_curve(VEHICLE, content_of(names), tmp_path / "plain.png")
+    draw_curve(VEHICLE, game_of(names), tmp_path / "plain.png")
     with matplotlib.rc_context({"figure.facecolor": "black", "font.size": 30}):
         before = dict(matplotlib.rcParams)
-        draw_curve(VEHICLE, content_of(names), tmp_path / "styled.png")
+        draw_curve(VEHICLE, game_of(names), tmp_path / "styled.png")
         assert dict(matplotlib.rcParams) == before
     assert (tmp_path / "plain.png").read_bytes() == (tmp_path / "styled.png").read_bytes()
 

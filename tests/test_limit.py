@@ -14,7 +14,7 @@ from planted import (
     sign_policy,
 )
 
-from hyrl_mj import CriticalSet, make_partition
+from hyrl_mj import make_partition
 from hyrl_mj.game.lattice import Lattice
 from hyrl_mj.game.limit import Limit
 from hyrl_mj.game.scores import LIMIT, Game
@@ -135,7 +135,7 @@ def test_everything_is_winnable_on_the_circle(on_circle, eps):
 
 
 def test_the_planted_parts_are_those_of_stage_3(vehicle, on_vehicle):
-    partition = make_partition(vehicle, sign_policy(vehicle), decisions(vehicle), 60)
+    partition = make_partition(vehicle, sign_policy(vehicle), decisions(vehicle).points, 60)
     limit = Limit.of(on_vehicle.lattice, partition)
     for eps in (0.0, 0.1):
         bound = on_vehicle.bound(eps)
@@ -144,8 +144,7 @@ def test_the_planted_parts_are_those_of_stage_3(vehicle, on_vehicle):
 
 
 def test_a_single_part_leaves_nothing_to_decide(vehicle):
-    nothing = CriticalSet(np.empty((0, 2)), np.empty(0, dtype=int), resolution=0.01, spacing=0.05)
-    partition = make_partition(vehicle, one_way_policy(vehicle), nothing, 60)
+    partition = make_partition(vehicle, one_way_policy(vehicle), np.empty((0, 2)), 60)
     limit = Limit.of(Lattice.of(vehicle, Grid.with_cells(vehicle.chart, 120)), partition)
     x, y = limit.lattice.grid.nodes.T
     free = (x <= 0.4) & (np.abs(y) <= 1)

@@ -13,13 +13,15 @@ PI = np.pi
 @pytest.fixture(scope="module")
 def circle_parts(circle):
     policy = circle_policy(circle)
-    return make_partition(circle, policy, find_critical_set(circle, policy, 121, 1 / 32), 720)
+    points = find_critical_set(circle, policy, 121, 1 / 32).points
+    return make_partition(circle, policy, points, 720)
 
 
 @pytest.fixture(scope="module")
 def vehicle_parts(vehicle):
     policy = sign_policy(vehicle)
-    return make_partition(vehicle, policy, find_critical_set(vehicle, policy, 60, 1 / 32), 60)
+    points = find_critical_set(vehicle, policy, 60, 1 / 32).points
+    return make_partition(vehicle, policy, points, 60)
 
 
 def inside(part, *z):
@@ -71,7 +73,7 @@ def test_without_a_critical_set_there_is_one_part_that_holds_everything(name, re
     else:
         policy = one_way_policy(task)
     critical = find_critical_set(task, policy, 30, 1 / 4)
-    partition = make_partition(task, policy, critical, 30)
+    partition = make_partition(task, policy, critical.points, 30)
     assert partition.modes == (0,)
     assert partition.parts[0].mask.all()
 
@@ -92,7 +94,7 @@ def test_a_part_policy_does_elsewhere_what_it_does_at_the_nearest_point(circle, 
 def test_a_part_policy_of_a_hesitant_policy_is_decided_at_the_critical_set(circle):
     policy = ChartPolicy(circle, lambda z: np.clip(5 * circle.chart.difference(z, PI), -1, 1))
     critical = find_critical_set(circle, policy, 121, 1 / 32)
-    partition = make_partition(circle, policy, critical, 720)
+    partition = make_partition(circle, policy, critical.points, 720)
     first, second = part_policies(circle, policy, partition, 0.2)
     at = np.array([[PI]])
     assert first.act(at)[0, 0] == pytest.approx(-1.0, abs=0.06)

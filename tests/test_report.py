@@ -226,44 +226,44 @@ def test_the_scores_are_those_of_the_game(copied):
         score.update(numbers)
     (copied / "robustness.json").write_text(json.dumps(content))
     page, run = page_of(copied), load_run(copied)
-    game = run.robustness["game"]
+    game = run.robustness.game
     for who in ("policy", "hyrl"):
-        assert f"{100 * game['scores'][who][-1]['won']:.2f}%" in page.numbers[0]
-        assert f"{100 * game['scores'][who][-1]['won_any']:.2f}%" in page.numbers[1]
+        assert f"{100 * game.scores[who][-1].won:.2f}%" in page.numbers[0]
+        assert f"{100 * game.scores[who][-1].won_any:.2f}%" in page.numbers[1]
     rows = page.table("Worst case")
     names = {"policy": "RL policy", "hyrl": "HyRL", "limit": "limit"}
     for who, name in names.items():
-        for score in game["scores"][who]:
+        for score in game.scores[who]:
             (row,) = [
                 row
                 for row in rows
-                if row["controller"] == name and float(next(iter(row.values()))) == score["eps"]
+                if row["controller"] == name and float(next(iter(row.values()))) == score.eps
             ]
             shares = {"winnable starts": "winnable", "won, own q0": "won", "won, any q0": "won_any"}
             for heading, key in shares.items():
                 shown = float(row[heading].strip("<>%"))
-                assert shown == pytest.approx(100 * score[key], abs=0.0101)
-            if score["excursion"] is not None:
-                assert row["latest arrival, own q0"] == f"{score['time']:.2f} s"
-                assert row["latest, any q0"] == f"{score['time_any']:.2f} s"
-            if score["excursion"] is not None and who != "limit":
-                assert float(row["excursion [rad]"]) == pytest.approx(score["excursion"], abs=1e-3)
-    for row, (who, margin) in zip(page.table("Margins"), game["margin"].items(), strict=True):
+                assert shown == pytest.approx(100 * getattr(score, key), abs=0.0101)
+            if score.excursion is not None:
+                assert row["latest arrival, own q0"] == f"{score.time:.2f} s"
+                assert row["latest, any q0"] == f"{score.time_any:.2f} s"
+            if score.excursion is not None and who != "limit":
+                assert float(row["excursion [rad]"]) == pytest.approx(score.excursion, abs=1e-3)
+    for row, (who, margin) in zip(page.table("Margins"), game.margin.items(), strict=True):
         assert row["controller"] == names[who]
         shown = row["all winnable starts are won up to noise"]
         unit = run.task.chart.units[0]
         assert shown == ("none" if margin is None else f"{margin:.3g} {unit}")
         (off,) = [float(cell) for heading, cell in row.items() if "no noise" in heading]
-        assert off == pytest.approx(game["miss_without_noise"][who], abs=1e-3)
+        assert off == pytest.approx(game.miss_without_noise[who], abs=1e-3)
 
 
 def test_episodes_and_replays_are_those_of_the_run(finished):
     page, run = page_of(finished), load_run(finished)
-    for row, record in zip(page.table("episodes"), run.robustness["episodes"], strict=True):
-        assert row["episodes"] == f"{record['episodes']:,}"
+    for row, record in zip(page.table("episodes"), run.robustness.episodes, strict=True):
+        assert row["episodes"] == f"{record.episodes:,}"
         assert row["noise"].startswith("uniform 0.1 ")
         reached = float(row["reached"].strip("<>%"))
-        assert reached == pytest.approx(100 * record["reached"], abs=0.0101)
+        assert reached == pytest.approx(100 * record.reached, abs=0.0101)
     rows = page.table("How the replays ended")
     assert len(rows) == 6
     for row, (_, arcs) in zip(rows, by_start(run).items(), strict=True):
@@ -392,7 +392,7 @@ def test_in_three_dimensions_episodes_stand_in_for_the_game(tmp_path, monkeypatc
     examine_run(run, ExamineOptions(episodes=50), say=str)
     page = page_of(path)
     assert "The chart of this task has 3, its plant 3: noisy episodes stand in for it" in page.text
-    assert len(page.table("episodes")) == len(run.robustness["episodes"])
+    assert len(page.table("episodes")) == len(run.robustness.episodes)
     assert "winnable" not in page.text
 
 

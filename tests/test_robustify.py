@@ -5,7 +5,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from stable_baselines3 import DQN, PPO
 from test_agents import onnx_file, rewritten, saved, untrained
 
 import hyrl_mj
-from hyrl_mj import BadInput, MlpPolicy
+from hyrl_mj import BadInput, MlpPolicy, artifacts
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.envs.sb3_env import TaskVecEnv
 from hyrl_mj.game.lattice import Lattice
@@ -261,7 +261,7 @@ def test_what_a_policy_is_given_as_is_remembered(circle, tmp_path):
         np.testing.assert_array_equal(acts(measured), before(measured))
     assert read_agent(circle, network).agent == read_agent(circle, tmp_path / "p.safetensors").agent
     settings = preset(circle, "smoke", agent=given.agent)
-    assert Settings.from_json(json.loads(json.dumps(settings.to_json()))) == settings
+    assert artifacts.parsed(asdict(settings), Settings) == settings
 
 
 # ---- chance, and nothing to decide

@@ -1,5 +1,8 @@
 """Scores, margins and maps of the worst-case game, and the files they go into."""
 
+import json
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 from planted import (
@@ -14,15 +17,22 @@ from planted import (
 )
 
 from hyrl_mj import BadArtifact, BadInput, Noise, artifacts, simulate
-from hyrl_mj.game import scores as robustness
-from hyrl_mj.game.scores import (
+from hyrl_mj.game import (
     BEATEN,
     LIMIT,
     OVER,
     UNWINNABLE,
     WON,
     WON_FROM_SOME,
+    Curve,
+    EpisodeCount,
     Game,
+    GameResult,
+    LatticeSpacing,
+    Profile,
+    Robustness,
+    Score,
+    Wins,
     examine,
     worst_signal,
 )
@@ -243,51 +253,54 @@ def examined(request, vehicle, circle, on_vehicle, on_circle):
     }[request.param]
     named = {"policy": controllers["sign"], "hyrl": controllers[list(controllers)[-1]]}
     cells = CELLS[request.param]
-    content, maps = examine(task, decisions(task), halves(task), named, (0.05, 0.1), cells=cells)
-    return task, named, content, maps
+    result, maps = examine(
+        task, decisions(task).points, halves(task), named, (0.05, 0.1), cells=cells
+    )
+    return task, named, result, maps
 
 
 def test_an_examination_holds_what_the_game_says(examined):
-    task, named, content, maps = examined
+    task, named, result, maps = examined
     grid = Grid.with_cells(task.chart, CELLS[task.name])
     game = Game(task, halves(task), named, grid=grid)
     for name in (*named, LIMIT):
-        assert content["scores"][name] == [vars(game.score(name, eps)) for eps in (0.05, 0.1)]
+        assert result.scores[name] == tuple(game.score(name, eps) for eps in (0.05, 0.1))
     for name in named:
-        assert content["margin"][name] == game.margin(name)
-        np.testing.assert_array_equal(maps[f"map_{name}"], game.map(name, 0.1))
-    assert tuple(maps["grid_counts"]) == grid.counts
-    assert maps["eps"] == 0.1
-    assert content["lattice"]["spacing"] == grid.spacing.tolist()
+        assert result.margin[name] == game.margin(name)
+        np.testing.assert_array_equal(maps.map[name], game.map(name, 0.1))
+    assert tuple(maps.grid_counts) == grid.counts
+    assert maps.eps == 0.1
+    assert result.lattice.spacing == tuple(grid.spacing.tolist())
 
 
 def test_the_curve_starts_at_no_noise_and_only_falls_for_the_policy(examined):
-    _, _, content, _ = examined
-    curve = content["curve"]
-    assert curve["eps"][0] == 0
+    _, _, result, _ = examined
+    curve = result.curve
+    assert curve.eps[0] == 0
     for name in ("policy", "hyrl", LIMIT):
-        assert len(curve[name]["won"]) == len(curve["eps"]) == len(curve["winnable"])
-        assert curve[name]["won"][0] == 1.0
-    assert curve["policy"]["won"][-1] < 0.95
-    assert curve[LIMIT]["won"] == [1.0] * len(curve["eps"])
+        assert len(curve.wins[name].won) == len(curve.eps) == len(curve.winnable)
+        assert curve.wins[name].won[0] == 1.0
+    assert curve.wins["policy"].won[-1] < 0.95
+    assert curve.wins[LIMIT].won == (1.0,) * len(curve.eps)
 
 
 def test_the_profile_says_how_much_noise_each_point_of_the_critical_set_bears(examined):
-    task, _, content, _ = examined
-    profile, points = content["profile"], decisions(task).points
-    assert profile["points"] == points[task.may_start(points)].tolist()
+    task, _, result, _ = examined
+    profile, points = result.profile, decisions(task).points
+    assert profile.points == tuple(map(tuple, points[task.may_start(points)].tolist()))
     for name in ("policy", "hyrl", LIMIT):
-        assert len(profile[name]) == len(profile["points"])
+        assert len(profile.eps[name]) == len(profile.points)
     # The sign rule can be held on the very line by noise of one sample's way, and by no less.
-    assert set(profile["policy"]) <= {0.0375, 0.05}
-    assert min(profile["hyrl"]) >= 0.1
-    assert set(profile[LIMIT]) == {content["curve"]["eps"][-1]}
+    assert set(profile.eps["policy"]) <= {0.0375, 0.05}
+    assert min(profile.eps["hyrl"]) >= 0.1
+    assert set(profile.eps[LIMIT]) == {result.curve.eps[-1]}
 
 
 def test_an_examination_survives_being_written(examined, tmp_path):
-    _, _, content, _ = examined
-    robustness.save(tmp_path / "robustness.json", content)
-    assert robustness.load(tmp_path / "robustness.json") == content
+    _, _, result, _ = examined
+    robustness = Robustness(0.1, False, result, (), seed=0)
+    robustness.save(tmp_path / "robustness.json")
+    assert Robustness.load(tmp_path / "robustness.json") == robustness
 
 
 # ---- files
@@ -296,20 +309,20 @@ def test_an_examination_survives_being_written(examined, tmp_path):
 @pytest.mark.parametrize("share", [0, 0.3, 0.9])
 def test_a_truncated_file_is_refused(tmp_path, share):
     path = tmp_path / "robustness.json"
-    robustness.save(path, {"eps": 0.1, "everywhere": False, "game": None, "episodes": []})
+    Robustness(0.1, False, None, (), seed=0).save(path)
     text = path.read_bytes()
     path.write_bytes(text[: int(share * len(text))])
     with pytest.raises(BadArtifact, match=r"robustness.json cannot be read"):
-        robustness.load(path)
+        Robustness.load(path)
 
 
 def test_a_missing_file_and_one_of_another_kind_are_refused(tmp_path):
     path = tmp_path / "robustness.json"
     with pytest.raises(BadArtifact, match="there is no file"):
-        robustness.load(path)
+        Robustness.load(path)
     artifacts.write_json(path, {}, kind="settings")
     with pytest.raises(BadArtifact, match="it holds 'settings', not 'robustness'"):
-        robustness.load(path)
+        Robustness.load(path)
 
 
 def test_a_game_refuses_what_it_does_not_know(on_vehicle):
@@ -319,3 +332,63 @@ def test_a_game_refuses_what_it_does_not_know(on_vehicle):
     for eps in (-0.1, float("nan")):
         with pytest.raises(BadInput, match="finite number >= 0"):
             game.score("limit", eps)
+
+
+# ---- the file
+
+
+GAME = GameResult(
+    everywhere=False,
+    lattice=LatticeSpacing((0.1, 0.1), True, (0.2, 0.2)),
+    scores={
+        "policy": (Score(0.1, 0.98, 0.92, 0.9, 3.0, 3.0, None),),
+        LIMIT: (Score(0.1, 0.98, 1.0, 0.97, 3.0, 3.0, 0.1),),
+    },
+    margin={"policy": None},
+    miss_without_noise={"policy": 0.025},
+    curve=Curve((0.0, 0.1), (1.0, 0.98), {"policy": Wins((1.0, 0.9), (1.0, 0.9), (3.0, 3.0))}),
+    profile=Profile(((0.0, 0.1),), {"policy": (None,)}),
+)
+COUNT = EpisodeCount(
+    "uniform", 0.1, False, "policy", "near M*", 4, {"crashed": 3, "reached": 1}, 0.25, (0.1, 0.7)
+)
+ROBUSTNESS = Robustness(0.1, False, GAME, (COUNT,), seed=2)
+
+
+@pytest.mark.parametrize("robustness", [ROBUSTNESS, Robustness(0.1, True, None, (COUNT,), 0)])
+def test_a_result_comes_back_with_its_types(tmp_path, robustness):
+    robustness.save(tmp_path / "r.json")
+    assert Robustness.load(tmp_path / "r.json") == robustness
+
+
+def test_scores_margins_and_episodes_are_where_readers_of_the_file_expect_them(tmp_path):
+    ROBUSTNESS.save(tmp_path / "r.json")
+    content = json.loads((tmp_path / "r.json").read_text())
+    game = content["game"]
+    names = ["eps", "winnable", "won", "won_any", "time", "time_any", "excursion"]
+    assert list(game["scores"]["policy"][0]) == names
+    assert game["margin"] == {"policy": None}
+    assert game["miss_without_noise"] == {"policy": 0.025}
+    assert content["episodes"] == [asdict(COUNT) | {"interval": [0.1, 0.7]}]
+    assert (content["eps"], content["everywhere"], content["seed"]) == (0.1, False, 2)
+
+
+def test_a_file_of_version_0_1_ends_in_one_sentence(tmp_path):
+    content = json.loads(json.dumps(asdict(ROBUSTNESS)))
+    curve, profile = content["game"]["curve"], content["game"]["profile"]
+    curve |= curve.pop("wins")
+    profile |= profile.pop("eps")
+    artifacts.write_json(tmp_path / "r.json", content, "robustness")
+    with pytest.raises(BadArtifact, match=r"r\.json: it has no game\.curve\.wins.*robustness RUN"):
+        Robustness.load(tmp_path / "r.json")
+
+
+def test_results_describe_themselves_in_a_line():
+    assert repr(ROBUSTNESS) == (
+        "Robustness(eps 0.1, GameResult(won at eps 0.1: policy 92.00%), 4 episodes)"
+    )
+    score = (
+        "Score(eps=0.1, winnable=0.98, won=0.92, won_any=0.9, time=3, time_any=3, excursion=None)"
+    )
+    assert repr(GAME.scores["policy"][0]) == score
+    assert (GAME.controllers, GAME.lasting, COUNT.lost) == (("policy",), True, 3)

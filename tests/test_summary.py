@@ -61,7 +61,7 @@ def test_arrivals_are_counted_without_the_start_on_the_critical_set(run):
 
 
 def test_scores_are_a_row_for_each_bound_and_controller(run):
-    table = score_table(run.task, run.robustness)
+    table = score_table(run.task, run.robustness.game)
     assert [row[0] for row in table.rows] == ["0"] * 3 + ["0.05"] * 3 + ["0.1"] * 3
     assert [row[2] for row in table.rows] == ["RL policy", "HyRL", "limit"] * 3
     assert all(len(row) == len(table.headings) for row in table.rows)
@@ -70,13 +70,13 @@ def test_scores_are_a_row_for_each_bound_and_controller(run):
 
 
 def test_margins_are_a_row_for_each_controller(run):
-    table = margin_table(run.task, run.robustness)
+    table = margin_table(run.task, run.robustness.game)
     assert {row[0] for row in table.rows} <= {"RL policy", "HyRL", "limit"}
     assert all(row[1] == "none" or row[1].endswith(" rad") for row in table.rows)
 
 
 def test_episodes_are_counted_by_noise_controller_and_region(examined):
-    table = episode_table(examined.task, examined.robustness)
+    table = episode_table(examined.task, examined.robustness.episodes)
     assert {row[0] for row in table.rows} == {"uniform 0.1 rad"}
     assert {row[1] for row in table.rows} == {"RL policy", "HyRL"}
     counted = {"RL policy": 0, "HyRL": 0}
@@ -95,12 +95,12 @@ def test_episodes_are_counted_by_noise_controller_and_region(examined):
 def test_the_summary_prints_every_table_and_where_everything_lies(examined, capsys):
     print_summary(examined)
     out = capsys.readouterr().out
-    task, content = examined.task, examined.robustness
+    task, robustness = examined.task, examined.robustness
     tables = (
         replay_table(examined, examined.arcs()),
-        score_table(task, content),
-        margin_table(task, content),
-        episode_table(task, content),
+        score_table(task, robustness.game),
+        margin_table(task, robustness.game),
+        episode_table(task, robustness.episodes),
     )
     for table in tables:
         assert table.title in out

@@ -1,26 +1,32 @@
 """The worst-case game: what no measurement noise within a bound can make the closed loop do.
 
 The plant is tabulated on a lattice of states, and the game is solved on it by backward recursion.
-`Game` scores controllers, and `Limit` says what any controller could win.
+`Game` scores controllers, `Limit` says what any controller could win, and `examine` plays it all and returns
+a `GameResult`.
 """
 
+from hyrl_mj.game.examination import examine
 from hyrl_mj.game.lattice import LATTICE, Lattice
 from hyrl_mj.game.limit import Limit, fewest_samples
-from hyrl_mj.game.scores import (
+from hyrl_mj.game.result import (
     BEATEN,
-    LARGEST,
     LIMIT,
     MAP_CLASSES,
     OVER,
     UNWINNABLE,
     WON,
     WON_FROM_SOME,
-    Game,
+    Curve,
+    EpisodeCount,
+    GameResult,
+    LatticeSpacing,
+    Maps,
+    Profile,
+    Robustness,
     Score,
-    examine,
-    save,
-    worst_signal,
+    Wins,
 )
+from hyrl_mj.game.scores import LARGEST, Game, worst_signal
 from hyrl_mj.game.solver import LOST, NEVER, Answers, Moves, lasting, noisy_moves, solve
 
 __all__ = [
@@ -36,17 +42,23 @@ __all__ = [
     "WON",
     "WON_FROM_SOME",
     "Answers",
+    "Curve",
+    "EpisodeCount",
     "Game",
+    "GameResult",
     "Lattice",
+    "LatticeSpacing",
     "Limit",
+    "Maps",
     "Moves",
+    "Profile",
+    "Robustness",
     "Score",
+    "Wins",
     "examine",
     "fewest_samples",
     "lasting",
     "noisy_moves",
-    "save",
-    "scores",
     "solve",
     "worst_signal",
 ]

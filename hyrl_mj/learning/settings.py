@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass, field
 from numbers import Real
 from typing import Any
 
-from hyrl_mj.errors import BadArtifact, BadInput, check_bound, check_seed
+from hyrl_mj.errors import BadInput, check_bound, check_seed
 from hyrl_mj.policies import Agent, algorithm_title
 
 PRESETS = ("fast", "paper", "smoke")
@@ -58,7 +57,7 @@ class Training:
 
     @property
     def title(self) -> str:
-        """The algorithm for people: "PPO"."""
+        """The name of the algorithm: "PPO"."""
         return algorithm_title(self.algorithm)
 
 
@@ -101,27 +100,3 @@ class Settings:
         ):
             raise BadInput(f"horizon {self.horizon!r} s cannot be used: give a finite time > 0")
         check_seed(self.seed)
-
-    def to_json(self) -> dict[str, Any]:
-        """As nested dicts."""
-        return dataclasses.asdict(self)
-
-    @staticmethod
-    def from_json(content: dict[str, Any]) -> Settings:
-        """From nested dicts.
-
-        Raises:
-            BadArtifact: a setting is missing or unknown.
-        """
-        try:
-            stages = {name: _stage(content[name]) for name in ("stage1", "stage6")}
-            return Settings(**{**content, **stages})
-        except (KeyError, TypeError) as error:
-            raise BadArtifact(f"its settings are not those of this version ({error})") from error
-
-
-def _stage(content: dict[str, Any]) -> Training | Agent:
-    """A training or an agent, from what `to_json` makes of it."""
-    if "sha256" in content:
-        return Agent(**content)
-    return Training(**{**content, "hidden": tuple(content["hidden"])})

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from hyrl_mj import artifacts
 from hyrl_mj.errors import BadInput
-from hyrl_mj.game import BEATEN, WON, WON_FROM_SOME, examine, save
+from hyrl_mj.game import BEATEN, WON, WON_FROM_SOME, EpisodeCount, Maps, Robustness, examine
 from hyrl_mj.pipeline.options import ExamineOptions
 from hyrl_mj.policies import Controller
 from hyrl_mj.progress import Say
 from hyrl_mj.run_directory import Run
-from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import Noise
 from hyrl_mj.stages import Partition, Regions, noisy_episodes
 from hyrl_mj.viz import robustness_sentence
@@ -27,8 +24,8 @@ EPISODES, EPISODES_SMOKE = 1_000, 200
 RUN = ExamineOptions()
 
 
-def examine_run(run: Run, options: ExamineOptions = RUN, say: Say = print) -> dict[str, Any]:
-    """Examine policy and hybrid controller under noise, and write `robustness.json` with its pictures.
+def examine_run(run: Run, options: ExamineOptions = RUN, say: Say = print) -> Robustness:
+    """Examines policy and hybrid controller under noise, and writes `robustness.json` with its pictures.
 
     The exact game is played where that is possible; noisy episodes are added on request, and where they are
     the only way. Files are written at the end.
@@ -38,22 +35,19 @@ def examine_run(run: Run, options: ExamineOptions = RUN, say: Say = print) -> di
         options: what to examine. The scores are for no noise, half the bound, and the bound.
         say: told the result in a line.
 
-    Returns:
-        The content of `robustness.json`.
-
     Raises:
         BadInput: a value that cannot be used.
     """
-    content, maps = examine_loops(run, run.loops, run.split, options)
+    robustness, maps = examine_loops(run, run.loops, run.split, options)
     folder = run.path / "figures"
     if maps is not None:
-        draw_robustness(run, content, maps, folder)
-        artifacts.write_arrays(run.path / "robustness.npz", maps, kind="robustness maps")
-    save(run.path / "robustness.json", content)
+        draw_robustness(run, robustness, maps, folder)
+        maps.save(run.path / "robustness.npz")
+    robustness.save(run.path / "robustness.json")
     if run.agent and run.agent.stochastic:
         say("the policy draws its inputs: noisy episodes stand in for the worst case")
-    say(robustness_sentence(content))
-    return content
+    say(robustness_sentence(robustness))
+    return robustness
 
 
 def examine_loops(
@@ -61,8 +55,8 @@ def examine_loops(
     loops: dict[str, Controller],
     partition: Partition,
     options: ExamineOptions = RUN,
-) -> tuple[dict[str, Any], dict[str, np.ndarray] | None]:
-    """Examine controllers under noise, as `examine_run` does.
+) -> tuple[Robustness, Maps | None]:
+    """Examines controllers under noise, as `examine_run` does.
 
     Args:
         run: a run with its critical set.
@@ -71,9 +65,9 @@ def examine_loops(
         options: what to examine.
 
     Returns:
-        The content of `robustness.json`, and the maps if the game was played.
+        The result, and the maps if the game was played.
     """
-    task, critical = run.task, run.critical_set
+    task, points = run.task, run.critical_set.points
     eps = run.settings.noise if options.eps is None else options.eps
     everywhere, count, seed = options.all_coordinates, options.episodes, options.seed
     task.check_noise(eps, everywhere)
@@ -82,28 +76,25 @@ def examine_loops(
     if count is not None and count < 1:
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
     noises = tuple(Noise(kind, eps, everywhere) for kind in options.noise or KINDS)
-    content: dict[str, Any] = {"eps": eps, "everywhere": everywhere, "game": None}
-    content |= {"episodes": [], "seed": seed}
-    winnable, maps = None, None
+    game, maps, winnable = None, None, None
     if run.exact:
         bounds = tuple(dict.fromkeys((0.0, eps / 2, eps)))
-        content["game"], maps = examine(
-            task, critical.points, partition, loops, bounds, everywhere, run.settings.lattice
+        game, maps = examine(
+            task, points, partition, loops, bounds, everywhere, run.settings.lattice
         )
-        grid = Grid.from_counts(task.chart, maps["grid_counts"])
-        last = maps[f"map_{[*loops][-1]}"]
-        winnable = grid, np.isin(last, (WON, WON_FROM_SOME, BEATEN))
+        last = maps.map[[*loops][-1]]
+        winnable = maps.grid(task.chart), np.isin(last, (WON, WON_FROM_SOME, BEATEN))
+    counts: tuple[EpisodeCount, ...] = ()
     if count is not None:
-        regions = Regions(critical, winnable, options.near_critical)
-        content["episodes"] = noisy_episodes(task, regions, loops, noises, count, seed)
-    return content, maps
+        regions = Regions(points, winnable, options.near_critical)
+        counts = noisy_episodes(task, regions, loops, noises, count, seed)
+    return Robustness(eps, everywhere, game, counts, seed), maps
 
 
-def draw_robustness(
-    run: Run, content: dict[str, Any], maps: dict[str, np.ndarray], folder: Path
-) -> None:
-    """Draw the map and the curve of the game."""
+def draw_robustness(run: Run, robustness: Robustness, maps: Maps, folder: Path) -> None:
+    """Draws the map and the curve of the game."""
     from hyrl_mj.viz import figures
 
-    shown = figures.ShownGame(run.task, run.critical_set, content["game"], maps)
+    assert robustness.game is not None
+    shown = figures.ShownGame(run.task, run.critical_set, robustness.game, maps)
     figures.draw_all(shown, folder)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
 from hyrl_mj.errors import BadInput, NoRenderer, unknown
-from hyrl_mj.game import Lattice, Limit, save
+from hyrl_mj.game import Lattice, Limit
 from hyrl_mj.pipeline.examination import draw_robustness, examine_loops, examine_run
 from hyrl_mj.policies import Agent, MlpPolicy, PolicyController
 from hyrl_mj.progress import Say
@@ -47,7 +47,7 @@ def critical_set_stage(run: Run, say: Say) -> None:
 
 def partition_stage(run: Run, say: Say) -> None:
     """Stage 3: partition the chart."""
-    partition = make_partition(run.task, run.steady, run.critical_set, run.settings.cells)
+    partition = make_partition(run.task, run.steady, run.critical_set.points, run.settings.cells)
     partition.save(run.path / "partition.npz")
     say(partition.sentence(run.task))
 
@@ -55,16 +55,16 @@ def partition_stage(run: Run, say: Say) -> None:
 def extended_sets_stage(run: Run, say: Say) -> None:
     """Stages 4 and 5: extend the parts over the critical set."""
     s, task = run.settings, run.task
-    critical, split, ways = run.critical_set, run.partition, None
+    points, split, ways = run.critical_set.points, run.partition, None
     if run.agent:
         if Lattice.possible(task):
             lattice = Lattice.of(task, Grid.with_cells(task.chart, s.lattice))
             ways = Limit.of(lattice, split)
             split = with_room(task, run.steady, split, ways, s.noise)
             ways = Limit.of(lattice, split)
-            critical = replace(critical, points=boundary(split))
+            points = boundary(split)
         split.save(run.split_path)
-    sets = extend(task, run.steady, critical, split, s.noise, s.horizon, ways)
+    sets = extend(task, run.steady, points, split, s.noise, s.horizon, ways)
     sets.save(run.path / "extended_sets.npz")
     say(sets.sentence(task))
 
@@ -164,15 +164,15 @@ def diagnose_stage(run: Run, say: Say) -> None:
     from hyrl_mj.viz import diagnosis, figures
 
     folder = run.path / diagnosis.FOLDER
-    content, maps = examine_loops(run, {"policy": PolicyController(run.policy)}, run.partition)
+    robustness, maps = examine_loops(run, {"policy": PolicyController(run.policy)}, run.partition)
     arc = diagnosis.worst_arc(run)
     figures.draw_all(figures.shown_policy(run, arc or diagnosis.usual_arc(run)), folder)
     if maps is not None:
-        draw_robustness(run, content, maps, folder)
+        draw_robustness(run, robustness, maps, folder)
     diagnosis.write_worst(run, arc, say)
-    save(folder / "robustness.json", content)
-    diagnosis.write_page(run, content, arc)
-    for sentence in diagnosis.sentences(run, content, arc):
+    robustness.save(folder / "robustness.json")
+    diagnosis.write_page(run, robustness, arc)
+    for sentence in diagnosis.sentences(run, robustness, arc):
         say(sentence)
     say(f"page at {run.path / diagnosis.PAGE}")
 

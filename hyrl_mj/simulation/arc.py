@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hyrl_mj import artifacts
+from hyrl_mj.artifacts import Saved
 from hyrl_mj.errors import BadInput, check_seed
 from hyrl_mj.policies import Controller, Policy, PolicyController, as_controller, check_modes
 from hyrl_mj.simulation.noise import AnyNoise, Noise
@@ -26,7 +25,7 @@ LONGEST = 3600.0
 
 
 @dataclass(frozen=True)
-class HybridArc:
+class HybridArc(Saved):
     """A solution of the hybrid closed loop on its hybrid time domain (paper, Section II-D).
 
     It has one row a sample and one more for every jump: a jump at time t gives two rows with the same
@@ -48,6 +47,8 @@ class HybridArc:
         noise: kind of the measurement noise.
         bound: its bound eps.
     """
+
+    KIND: ClassVar[str] = "hybrid arc"
 
     task: str
     controller: str
@@ -112,23 +113,6 @@ class HybridArc:
     def at(self, t: float) -> int:
         """Returns the last row at or before a time [s]."""
         return int(np.searchsorted(self.t, t + 1e-9, side="right") - 1)
-
-    def save(self, path: Path) -> None:
-        """Write the arc as npz."""
-        arrays = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
-        artifacts.write_arrays(path, arrays, kind="hybrid arc")
-
-    @staticmethod
-    def load(path: Path) -> HybridArc:
-        """Read what `save` wrote.
-
-        Raises:
-            BadArtifact: the file is missing, truncated, or not a hybrid arc of this version.
-        """
-        arrays = artifacts.read_arrays(path, kind="hybrid arc")
-        with artifacts.reading(path):
-            values: dict[str, Any] = {f.name: arrays[f.name] for f in fields(HybridArc)}
-            return HybridArc(**{k: v.item() if v.ndim == 0 else v for k, v in values.items()})
 
 
 @overload

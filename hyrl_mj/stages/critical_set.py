@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
-from hyrl_mj import artifacts
-from hyrl_mj.errors import unknown
+from hyrl_mj.artifacts import Saved
+from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.policies import Policy, PolicyController
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import LoopSettings, closed_loop, ways
@@ -24,28 +24,50 @@ LINK = 2.5
 
 
 @dataclass(frozen=True)
-class CriticalSet:
-    """Points of M* and how they hang together.
+class CriticalSet(Saved):
+    """The critical set M*: its points and its connected pieces.
 
     Attributes:
         points: (N, d) chart points.
         component: (N,) which connected piece of M* each belongs to, from 0.
         resolution: length of the last rods, in chart units: M* is known to half of it.
         spacing: distance between the grid points that the search started from, in chart units.
+
+    Raises:
+        BadInput: the number of points and of components differ.
     """
+
+    KIND: ClassVar[str] = "critical set"
 
     points: np.ndarray
     component: np.ndarray
     resolution: float
     spacing: float
 
+    def __post_init__(self) -> None:
+        if self.points.ndim != 2 or self.component.shape != (len(self.points),):
+            raise BadInput(
+                f"points of shape {self.points.shape} and components of shape {self.component.shape} make "
+                "no critical set: give points (N, d) and one component (N,) for each"
+            )
+
+    def __repr__(self) -> str:
+        return f"CriticalSet({self._counts}, resolution {self.resolution:.3g})"
+
+    @property
+    def _counts(self) -> str:
+        """How many pieces and points there are."""
+        pieces = "1 piece" if self.pieces == 1 else f"{self.pieces} pieces"
+        points = "1 point" if len(self.points) == 1 else f"{len(self.points)} points"
+        return f"{pieces}, {points}"
+
     @property
     def pieces(self) -> int:
-        """Number of connected pieces."""
+        """The number of connected pieces."""
         return int(self.component.max()) + 1 if len(self.component) else 0
 
     def sentence(self, task: Task) -> str:
-        """The result for people."""
+        """Returns a one-line description."""
         if not len(self.points):
             return (
                 f"no critical set found at this resolution (grid {self.spacing:.3g}, pairs down to "
@@ -58,38 +80,7 @@ class CriticalSet:
             else f"{name} {(a + b) / 2:.4g} {unit}"
             for name, unit, a, b in zip(task.chart.names, task.chart.units, low, high, strict=True)
         )
-        pieces = "1 piece" if self.pieces == 1 else f"{self.pieces} pieces"
-        points = "1 point" if len(self.points) == 1 else f"{len(self.points)} points"
-        return f"critical set of {pieces}, {points}, {ranges}"
-
-    def save(self, path: Path) -> None:
-        """Write it as npz."""
-        artifacts.write_arrays(
-            path,
-            {
-                "points": self.points,
-                "component": self.component,
-                "resolution": np.array(self.resolution),
-                "spacing": np.array(self.spacing),
-            },
-            kind="critical set",
-        )
-
-    @staticmethod
-    def load(path: Path) -> CriticalSet:
-        """Read what `save` wrote.
-
-        Raises:
-            BadArtifact: the file is missing, truncated, or not a critical set of this version.
-        """
-        arrays = artifacts.read_arrays(path, kind="critical set")
-        with artifacts.reading(path):
-            return CriticalSet(
-                arrays["points"],
-                arrays["component"],
-                float(arrays["resolution"]),
-                float(arrays["spacing"]),
-            )
+        return f"critical set of {self._counts}, {ranges}"
 
 
 def find_critical_set(
@@ -259,8 +250,31 @@ def _pieces(task: Task, points: np.ndarray, reach: float) -> np.ndarray:
     return connected_components(near, directed=False)[1]
 
 
-def distance_to(task: Task, critical: CriticalSet, z: np.ndarray) -> np.ndarray:
-    """Distance (n,) of chart points (n, d) to M*, in chart units; infinite if M* is empty."""
-    if not len(critical.points):
+def check_points(task: Task, points: np.ndarray) -> np.ndarray:
+    """Returns points of M* (N, d) as an array of numbers.
+
+    Raises:
+        BadInput: they are a `CriticalSet`, or do not fit the chart.
+    """
+    if isinstance(points, CriticalSet):
+        raise BadInput(f"{points!r} cannot be used as points of M*: give its points (N, d)")
+    points = np.asarray(points, dtype=float)
+    if points.ndim != 2 or points.shape[1] != task.chart.dimension:
+        raise BadInput(
+            f"points of shape {points.shape} cannot lie on M* in the chart of {task.name}: give "
+            f"(N, {task.chart.dimension}), none as (0, {task.chart.dimension})"
+        )
+    return points
+
+
+def distance_to(task: Task, points: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Returns the distance (n,) of chart points z (n, d) to M*, in chart units; infinite if M* is empty.
+
+    Args:
+        task: gives the chart.
+        points: (N, d) of M*.
+        z: (n, d) chart points.
+    """
+    if not len(points):
         return np.full(len(z), np.inf)
-    return task.chart.tree(critical.points).query(task.chart.in_box(z))[0]
+    return task.chart.tree(points).query(task.chart.in_box(z))[0]

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput, check_seed
+from hyrl_mj.game import EpisodeCount
 from hyrl_mj.policies import Controller
 from hyrl_mj.progress import Progress
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
-from hyrl_mj.stages.critical_set import CriticalSet, distance_to
+from hyrl_mj.stages.critical_set import check_points, distance_to
 from hyrl_mj.tasks import Outcome, Task
 
 # Episodes that are simulated side by side: memory does not grow with their number.
@@ -27,12 +27,12 @@ class Regions:
     """Start regions of a task, by which noisy episodes are counted.
 
     Attributes:
-        critical: M*; starts within twice the noise bound of it are a region of their own.
+        points: (N, d) of M*; starts within twice the noise bound of it are a region of their own.
         winnable: a grid and which of its nodes can be won; starts that cannot are a region of their own.
         near: whether all episodes start within twice the noise bound of M*.
     """
 
-    critical: CriticalSet
+    points: np.ndarray
     winnable: tuple[Grid, np.ndarray] | None = None
     near: bool = False
 
@@ -45,7 +45,7 @@ class Regions:
         z = task.starts(n, rng)
         if not self.near:
             return z
-        if not len(self.critical.points):
+        if not len(self.points):
             raise BadInput(
                 "no critical set was found, so nothing starts near it: leave --near-critical out"
             )
@@ -72,7 +72,7 @@ class Regions:
 
     def _close(self, task: Task, bound: float, z: np.ndarray) -> np.ndarray:
         """Returns whether starts (n, d) lie within twice the noise bound of M*: (n,) bool."""
-        return np.asarray(distance_to(task, self.critical, z) <= 2 * bound)
+        return np.asarray(distance_to(task, self.points, z) <= 2 * bound)
 
 
 def noisy_episodes(
@@ -82,10 +82,10 @@ def noisy_episodes(
     noises: Sequence[Noise],
     count: int,
     seed: int = 0,
-) -> list[dict[str, Any]]:
-    """Noisy episodes in bulk: outcomes by noise, controller and start region.
+) -> tuple[EpisodeCount, ...]:
+    """Simulates noisy episodes in bulk, and counts how they end by noise, controller and start region.
 
-    All controllers meet the same starts; signals that do not look at the loop are the same, too.
+    All controllers meet the same starts; noise that does not depend on the loop is the same, too.
 
     Args:
         task: what is played, from its start distribution.
@@ -95,21 +95,19 @@ def noisy_episodes(
         count: episodes for each noise and controller.
         seed: of starts and noise.
 
-    Returns:
-        One record for each noise, controller and region: how many episodes had each outcome, and the
-        share that reached the set-point with its 95% interval (Wilson).
-
     Raises:
         BadInput: no episodes, a noise bound that hides the state space, or no starts near M*.
     """
     check_seed(seed)
+    check_points(task, regions.points)
     if count < 1:
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
     for noise in noises:
         task.check_noise(noise.bound, noise.everywhere)
     progress = Progress("noisy episodes", count * len(noises) * len(controllers), "episodes")
-    records, done = [], 0
-    # New ones for each batch would leave more and more holes in the memory.
+    ends: list[EpisodeCount] = []
+    done = 0
+    # New plants for each batch would leave more and more holes in the memory.
     plants = {n: task.plant(n) for n in {min(BATCH, count), count % BATCH} - {0}}
     for noise in noises:
         for name, controller in controllers.items():
@@ -127,29 +125,29 @@ def noisy_episodes(
                     counts[region] += np.bincount(rollout.outcome[inside], minlength=len(Outcome))
                 done += n
                 progress.update(done)
-            records += [
-                _record(noise, name, region, outcomes)
+            ends += [
+                _count(noise, name, region, outcomes)
                 for region, outcomes in counts.items()
                 if outcomes.any()
             ]
     progress.close()
-    return records
+    return tuple(ends)
 
 
-def _record(noise: Noise, name: str, region: str, counts: np.ndarray) -> dict[str, Any]:
-    """Returns what the episodes (outcomes,) of a noise, controller and region came to."""
+def _count(noise: Noise, name: str, region: str, outcomes: np.ndarray) -> EpisodeCount:
+    """Returns how the episodes of one region ended, from the number (outcomes,) of each outcome."""
     from scipy.stats import binomtest  # slow to import, and seldom needed
 
-    reached, total = int(counts[Outcome.REACHED]), int(counts.sum())
+    reached, total = int(outcomes[Outcome.REACHED]), int(outcomes.sum())
     interval = binomtest(reached, total).proportion_ci(0.95, method="wilson")
-    return {
-        "noise": noise.kind,
-        "eps": noise.bound,
-        "everywhere": noise.everywhere,
-        "controller": name,
-        "region": region,
-        "episodes": total,
-        "outcomes": {Outcome(i).label: int(c) for i, c in enumerate(counts) if c},
-        "reached": reached / total,
-        "interval": [float(interval.low), float(interval.high)],
-    }
+    return EpisodeCount(
+        noise=noise.kind,
+        eps=noise.bound,
+        everywhere=noise.everywhere,
+        controller=name,
+        region=region,
+        episodes=total,
+        outcomes={Outcome(i).label: int(n) for i, n in enumerate(outcomes) if n},
+        reached=reached / total,
+        interval=(float(interval.low), float(interval.high)),
+    )

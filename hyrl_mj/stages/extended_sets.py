@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
-from hyrl_mj import artifacts
+from hyrl_mj.artifacts import Saved
 from hyrl_mj.game import NEVER, Limit
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.stages.critical_set import CriticalSet, distance_to
-from hyrl_mj.stages.partition import Partition, part_policies
+from hyrl_mj.stages.critical_set import check_points, distance_to
+from hyrl_mj.stages.partition import Partition, check_sets, part_policies
 from hyrl_mj.stages.reachability import (
     backward_reach,
     forward_reach,
@@ -29,7 +29,7 @@ FILLED = 0.995
 
 
 @dataclass(frozen=True)
-class ExtendedSets:
+class ExtendedSets(Saved):
     """M_ext_i for each mode (paper, Step 5).
 
     Attributes:
@@ -39,8 +39,10 @@ class ExtendedSets:
         horizon: time T of the backward propagation [s]; 0 if there was none.
         noise: bound eps of the measurement noise that the sets are made for.
         narrow: (K, d) points of M* at which a mode has less room than the noise asks for.
-        room: (K,) the room there is, across, in chart units; 2 eps are asked for.
+        room: (K,) the room there is, across, in chart units; 2 eps are needed.
     """
+
+    KIND: ClassVar[str] = "extended sets"
 
     modes: tuple[int, ...]
     sets: tuple[GridSet, ...]
@@ -50,8 +52,15 @@ class ExtendedSets:
     narrow: np.ndarray
     room: np.ndarray
 
+    def __post_init__(self) -> None:
+        check_sets(self.modes, self.sets, self.winning)
+
+    def __repr__(self) -> str:
+        shares = [f"{q}: {m.mask.mean():.1%}" for q, m in zip(self.modes, self.sets, strict=True)]
+        return f"ExtendedSets({', '.join(shares)} of the chart, eps {self.noise:g})"
+
     def sentence(self, task: Task) -> str:
-        """How far the sets overlap, for people."""
+        """Returns a one-line description."""
         if len(self.sets) < 2:
             return "one mode, its set is everything"
         both = self.sets[0] & self.sets[1]
@@ -70,54 +79,17 @@ class ExtendedSets:
             f"{2 * self.noise:g} of room are needed there and as little as {self.room.min():.2g} is left"
         )
 
-    def save(self, path: Path) -> None:
-        """Write them as npz."""
-        artifacts.write_arrays(
-            path,
-            {
-                "modes": np.array(self.modes),
-                "grid_counts": np.array(self.sets[0].grid.counts),
-                "signed_distance": np.stack([s.values for s in self.sets]),
-                "winning": np.stack(self.winning),
-                "horizon": np.array(self.horizon),
-                "noise": np.array(self.noise),
-                "narrow": self.narrow,
-                "room": self.room,
-            },
-            kind="extended sets",
-        )
-
-    @staticmethod
-    def load(path: Path, task: Task) -> ExtendedSets:
-        """Read what `save` wrote.
-
-        Raises:
-            BadArtifact: the file is missing, truncated, or not the extended sets of this task.
-        """
-        arrays = artifacts.read_arrays(path, kind="extended sets")
-        with artifacts.reading(path):
-            grid = Grid.from_counts(task.chart, arrays["grid_counts"])
-            return ExtendedSets(
-                modes=tuple(int(q) for q in arrays["modes"]),
-                sets=tuple(GridSet(grid, values) for values in arrays["signed_distance"]),
-                winning=tuple(arrays["winning"]),
-                horizon=float(arrays["horizon"]),
-                noise=float(arrays["noise"]),
-                narrow=arrays["narrow"],
-                room=arrays["room"],
-            )
-
 
 def extend(
     task: Task,
     policy: Policy,
-    critical: CriticalSet,
+    points: np.ndarray,
     partition: Partition,
     noise: float,
     horizon: float | None = None,
     ways: Limit | None = None,
 ) -> ExtendedSets:
-    """Extend the parts over M*.
+    """Extends the parts over M* (paper, Steps 4 and 5).
 
     X_i are the states that x' = -f(x, pi_i(x)) reaches outside M_i within the horizon, from the
     neighbourhood of M*; for a plant that cannot be run backward, those outside M_i that pi_i brings into
@@ -131,7 +103,7 @@ def extend(
     Args:
         task: gives plant and chart.
         policy: the stage-1 policy.
-        critical: M*, from stage 2.
+        points: (N, d) of M*, from stage 2.
         partition: M_i, from stage 3.
         noise: bound eps of the measurement noise.
         horizon: time T of the backward propagation [s]. By default the shortest with which every set
@@ -141,12 +113,13 @@ def extend(
             trained to go it, and without a horizon every set reaches 2 eps and one sample over the
             boundary of its part there.
     """
+    points = check_points(task, points)
     grid, parts = partition.grid, partition.parts
     eps, hop = task.noise_in_chart(noise), longest_hop(task, policy, grid)
     near = neighbourhood(grid, noise, hop)
     pis = part_policies(task, policy, partition, near)
     wanted = [part.dilated_by_box(2 * eps + hop * (task.noise_in_chart(1.0) > 0)) for part in parts]
-    # W_i, asked for wherever a set may come to lie.
+    # W_i, wherever a set may come to lie.
     radius = 3 * noise + near + (0.0 if horizon is None else horizon / task.dt * near)
     if ways is None:
         winning = tuple(
@@ -160,7 +133,7 @@ def extend(
         for wins, part in zip(winning, parts, strict=True)
     ]
     # Only M* is to be covered; parts that meet again elsewhere, at the set-point, have nothing to decide.
-    off = distance_to(task, critical, grid.nodes)
+    off = distance_to(task, points, grid.nodes)
     around = off <= float(np.linalg.norm(2 * eps + hop))
     reached = list(parts)
     running = len(parts) > 1 and (ways is None or horizon is not None)
@@ -186,13 +159,13 @@ def extend(
         (r & room) | part.dilated_by_box(eps)
         for r, room, part in zip(reached, roomy, parts, strict=True)
     )
-    narrow, room = room_along(task, critical, partition, winning, eps)
-    taken = horizon or (k * task.dt if running else 0.0)
-    return ExtendedSets(partition.modes, sets, winning, taken, noise, narrow, room)
+    narrow, room = room_along(task, points, partition, winning, eps)
+    propagated = horizon or (k * task.dt if running else 0.0)
+    return ExtendedSets(partition.modes, sets, winning, propagated, noise, narrow, room)
 
 
 def open_ways(ways: Limit, grid: Grid) -> tuple[np.ndarray, ...]:
-    """Where on a grid each mode's way is open: (N,) bool."""
+    """Returns where on a grid each mode's way is open: (N,) bool for each."""
     at = ways.lattice.grid.nearest(grid.nodes)
     return tuple(samples[at] < NEVER for samples in ways.samples)
 
@@ -200,11 +173,11 @@ def open_ways(ways: Limit, grid: Grid) -> tuple[np.ndarray, ...]:
 def with_room(
     task: Task, policy: Policy, partition: Partition, ways: Limit, noise: float
 ) -> Partition:
-    """The parts, changed where the policy goes a way that is about to close while another is not.
+    """Returns the parts, changed where the policy goes a way that is about to close while another is not.
 
-    Who drives towards the obstacle's middle and decides at the last moment leaves no room for an overlap.
-    So a state with less room for its way than 2 eps and one sample belongs to the mode whose way has the
-    most. Where every way has that room, or none, the policy's own decision stands.
+    A policy that drives towards the obstacle's middle and decides at the last moment leaves no room for an
+    overlap. So a state with less room for its way than 2 eps and one sample belongs to the mode whose way
+    has the most. Where every way has that room, or none, the policy's own decision stands.
 
     Args:
         task: gives the noisy coordinates.
@@ -230,32 +203,39 @@ def with_room(
 
 
 def boundary(partition: Partition) -> np.ndarray:
-    """Points (N, d) between neighbouring nodes of which no part holds both."""
+    """Returns points (N, d) between neighbouring nodes of which no part holds both."""
     grid = partition.grid
     first, second = grid.neighbours()
-    together = np.any([part.mask[first] & part.mask[second] for part in partition.parts], axis=0)
-    a, b = grid.nodes[first[~together]], grid.nodes[second[~together]]
+    shared = np.any([part.mask[first] & part.mask[second] for part in partition.parts], axis=0)
+    a, b = grid.nodes[first[~shared]], grid.nodes[second[~shared]]
     return np.asarray(a + grid.chart.difference(b, a) / 2)
 
 
 def neighbourhood(grid: Grid, noise: float, hop: np.ndarray) -> float:
-    """The distance from M* that counts as near it: the noise, some cells, and a sample's way (d,)."""
+    """Returns the distance from M* that counts as near it: the noise, some cells, and a sample's way (d,)."""
     return max(noise, NEIGHBOURHOOD_CELLS * grid.cell, float(np.linalg.norm(hop)))
 
 
 def room_along(
     task: Task,
-    critical: CriticalSet,
+    points: np.ndarray,
     partition: Partition,
     winning: tuple[np.ndarray, ...],
     eps: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where on M* some mode has less than 2 eps (d,) of room across M*, though a mode can win there.
+    """Returns where on M* a mode has less than 2 eps (d,) of room across M*, though some mode wins there.
+
+    Args:
+        task: gives the chart.
+        points: (N, d) of M*.
+        partition: gives the grid.
+        winning: W_i of each mode, (N,) bool over the nodes.
+        eps: (d,) noise bound along each coordinate.
 
     Returns:
         Points (K, d) of M*, and the room (K,) at each: how far to either side all modes still succeed.
     """
-    grid, points = partition.grid, critical.points
+    grid = partition.grid
     shares = np.arange(0.0, 1.0 + 1e-9, 0.02)
     reach = 2 * eps.max(initial=0.0)
     if not len(points) or not reach or len(winning) < 2:

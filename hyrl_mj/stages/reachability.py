@@ -19,11 +19,11 @@ LONGEST_HORIZON = 2.0
 
 
 def part_wins(
-    task: Task, pi: PartPolicy, partition: Partition, part: GridSet, asked: GridSet
+    task: Task, pi: PartPolicy, partition: Partition, part: GridSet, candidates: GridSet
 ) -> np.ndarray:
-    """W_i: the nodes (N,) bool of `asked` from which pi_i reaches the goal."""
+    """Returns W_i: the nodes (N,) bool of `candidates` from which pi_i reaches the goal."""
     wins = partition.succeeds & part.mask
-    outside = np.flatnonzero(asked.mask & ~part.mask)
+    outside = np.flatnonzero(candidates.mask & ~part.mask)
     if len(outside):
         loop, settings = PolicyController(pi), LoopSettings(label="extended sets")
         rollout = closed_loop(task, loop, part.grid.nodes[outside], settings=settings)
@@ -34,7 +34,7 @@ def part_wins(
 def backward_reach(
     task: Task, pi: PartPolicy, part: GridSet, rim: np.ndarray
 ) -> Callable[[int], GridSet]:
-    """M_i u X_i by the number of samples.
+    """Returns M_i u X_i as a function of the number of samples.
 
     Args:
         task: gives the plant.
@@ -60,19 +60,19 @@ def backward_reach(
 
 
 def forward_reach(
-    task: Task, pi: PartPolicy, part: GridSet, rim: np.ndarray, asked: np.ndarray
+    task: Task, pi: PartPolicy, part: GridSet, rim: np.ndarray, candidates: np.ndarray
 ) -> Callable[[int], GridSet]:
-    """M_i u X_i by the number of samples, for plants that cannot be run backward.
+    """Returns M_i u X_i as a function of the number of samples, for plants that cannot be run backward.
 
     Args:
         task: gives the plant.
         pi: pi_i.
         part: M_i.
         rim: (N,) bool, its nodes near M*; X_i are those that the closed loop brings there.
-        asked: (N,) bool, the nodes that may come to lie in the extended set.
+        candidates: (N,) bool, the nodes that may come to lie in the extended set.
     """
     grid = part.grid
-    outside = np.flatnonzero(asked & ~part.mask)
+    outside = np.flatnonzero(candidates & ~part.mask)
     arrival = np.full(len(grid.nodes), np.inf)
     if len(outside):
         loop, settings = (
@@ -89,7 +89,7 @@ def forward_reach(
 
 
 def between_samples(path: np.ndarray, grid: Grid) -> np.ndarray:
-    """Points (N, d) along sampled paths (K + 1, n, d), so close that they miss no cell of the grid."""
+    """Returns points (N, d) along paths (K + 1, n, d), so close that they miss no cell of the grid."""
     hops = np.diff(path, axis=0)
     count = max(int(np.ceil(np.abs(hops / grid.spacing).max(initial=0.0))), 1)
     shares = np.arange(count)[:, None, None, None] / count
@@ -98,11 +98,12 @@ def between_samples(path: np.ndarray, grid: Grid) -> np.ndarray:
 
 
 def longest_hop(task: Task, policy: Policy, grid: Grid) -> np.ndarray:
-    """The longest way (d,) that the closed loop goes in one sample along each coordinate."""
+    """Returns the longest way (d,) that the closed loop goes in one sample along each coordinate."""
     loop, settings = PolicyController(policy), LoopSettings(steps=1)
     path = closed_loop(task, loop, grid.nodes, settings=settings).path
     return np.asarray(np.abs(path[-1] - path[0]).max(axis=0))
 
 
 def longest_samples(task: Task) -> int:
+    """Returns the number of samples of the longest horizon."""
     return round(LONGEST_HORIZON / task.dt)

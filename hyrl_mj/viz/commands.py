@@ -3,29 +3,26 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
+from hyrl_mj.game import Robustness
 from hyrl_mj.learning import Settings, preset
 from hyrl_mj.policies import Agent
 from hyrl_mj.run_directory import Run
 from hyrl_mj.tasks import get_task
 
 
-def commands(settings: Settings, robustness: Mapping[str, Any] | None) -> list[str]:
-    """What to type to repeat the run, and the examination if it was another than the run's own."""
+def commands(settings: Settings, robustness: Robustness | None) -> list[str]:
+    """Returns the commands that repeat the run, and its examination if that had options of its own."""
     s = settings
     lines = [beginning(settings)]
-    if robustness and (
-        robustness["episodes"] or robustness["everywhere"] or robustness["eps"] != s.noise
-    ):
+    if robustness and (robustness.episodes or robustness.everywhere or robustness.eps != s.noise):
         lines.append(_examination(robustness))
     return lines
 
 
 def beginning(settings: Settings, out: Path | None = None) -> str:
-    """What begins such a run, or goes on with it: a command, or a call where the agent is no file."""
+    """Returns what begins such a run, or goes on with it: a command, or a call if the agent is no file."""
     s, agent = settings, settings.stage1 if isinstance(settings.stage1, Agent) else None
     if agent and not agent.source:
         rest = "" if s.horizon is None else f", horizon={s.horizon}"
@@ -45,25 +42,25 @@ def beginning(settings: Settings, out: Path | None = None) -> str:
     return shlex.join(words)
 
 
-def _examination(robustness: Mapping[str, Any]) -> str:
-    command = ["hyrl-mj", "robustness", "RUN", "--eps", f"{robustness['eps']}"]
-    if robustness["everywhere"]:
+def _examination(robustness: Robustness) -> str:
+    """Returns the command that repeats an examination."""
+    command = ["hyrl-mj", "robustness", "RUN", "--eps", f"{robustness.eps}"]
+    if robustness.everywhere:
         command.append("--all-coordinates")
-    records = robustness["episodes"]
-    if records:
-        kinds = list(dict.fromkeys(r["noise"] for r in records))
-        one = [r for r in records if (r["noise"], r["controller"]) == (kinds[0], "hyrl")]
-        command += ["--episodes", f"{sum(r['episodes'] for r in one)}", "--noise", ",".join(kinds)]
-        if "seed" in robustness:  # older files do not tell
-            command += ["--seed", f"{robustness['seed']}"]
+    counts = robustness.episodes
+    if counts:
+        kinds = list(dict.fromkeys(c.noise for c in counts))
+        one = [c for c in counts if (c.noise, c.controller) == (kinds[0], "hyrl")]
+        command += ["--episodes", f"{sum(c.episodes for c in one)}", "--noise", ",".join(kinds)]
+        command += ["--seed", f"{robustness.seed}"]
     return shlex.join(command)
 
 
 def changed(run: Run) -> list[str]:
-    """Settings that the command would not give again: those of a preset of another version."""
+    """Returns the settings that the command would not give again: a preset of another version made them."""
     s = run.settings
     again = preset(
         run.task, s.preset, noise=s.noise, seed=s.seed, horizon=s.horizon,
         agent=run.agent, algorithm=None if run.agent else s.stage1.algorithm,
-    ).to_json()  # fmt: skip
-    return [name.replace("_", " ") for name, value in s.to_json().items() if value != again[name]]
+    )  # fmt: skip
+    return [n.replace("_", " ") for n, value in vars(s).items() if value != getattr(again, n)]

@@ -1,15 +1,14 @@
-"""What noise can do to a policy alone: a start that it loses, how, and a page about it."""
+"""The diagnosis of a policy alone under noise: a start that it loses, how, and a page about it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 
 from hyrl_mj import artifacts
 from hyrl_mj.errors import NoRenderer
-from hyrl_mj.game import NEVER, Game, worst_signal
+from hyrl_mj.game import NEVER, Game, Robustness, worst_signal
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import Grid
@@ -17,9 +16,9 @@ from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, simulate_batch
 from hyrl_mj.viz.arcs import critical_start, replay_floor
 from hyrl_mj.viz.commands import beginning
 from hyrl_mj.viz.options import ReplayOptions
-from hyrl_mj.viz.page import fill, film, pictures
+from hyrl_mj.viz.page import fill, film, noise_tables, pictures
 from hyrl_mj.viz.replay import Show, render_replay
-from hyrl_mj.viz.tables import episode_table, margin_table, margin_text, percent, score_table
+from hyrl_mj.viz.tables import margin_text, percent
 
 # In the run directory: the page, and the folder with all that is on it.
 PAGE, FOLDER = "diagnosis.html", "diagnosis"
@@ -30,10 +29,10 @@ REPLAY = ReplayOptions(size=(960, 720))
 
 
 def worst_arc(run: Run) -> HybridArc | None:
-    """A start that the policy loses, with the noise signal that it loses to; None if none was found.
+    """Returns a run that the policy loses, with the noise signal that it loses to; None if none was found.
 
-    Where the game can be played the signal is that of its adversary; else it is adversarial noise, tried
-    from starts of the task's.
+    Where the game can be played the signal is that of its adversary; otherwise it is adversarial noise, tried
+    from starts of the task.
     """
     task, eps, loop = run.task, run.settings.noise, PolicyController(run.policy)
     if run.exact:
@@ -56,7 +55,7 @@ def worst_arc(run: Run) -> HybridArc | None:
 
 
 def usual_arc(run: Run) -> HybridArc:
-    """The policy under the paper's noise, from M* if there is one."""
+    """Returns a run of the policy under the paper's noise, from M* if there is one."""
     start = critical_start(run)
     task, noise = run.task, Noise("alternating", run.settings.noise)
     z0 = task.scene.starts[0] if start is None else start
@@ -66,12 +65,12 @@ def usual_arc(run: Run) -> HybridArc:
 
 
 def _middle(run: Run) -> np.ndarray:
-    """The middle of the replay starts (d,)."""
+    """Returns the middle of the replay starts (d,)."""
     return np.asarray(np.mean(run.task.scene.starts, axis=0))
 
 
 def write_worst(run: Run, arc: HybridArc | None, say: Callable[[str], None]) -> None:
-    """Write the arc and its replay; what an earlier diagnosis has left of them goes."""
+    """Writes the arc and its replay, and removes those of an earlier diagnosis."""
     path = run.path / FOLDER / "worst.npz"
     for suffix in (".npz", ".mp4", ".png"):
         path.with_suffix(suffix).unlink(missing_ok=True)
@@ -86,61 +85,60 @@ def write_worst(run: Run, arc: HybridArc | None, say: Callable[[str], None]) -> 
         say(f"no video: {error}")
 
 
-def sentences(run: Run, content: Mapping[str, Any], arc: HybridArc | None) -> list[str]:
-    """What was found, for people: the critical set, what is lost to noise, the margin, the worst run."""
-    eps, task = content["eps"], run.task
-    where, unit = task.noise_on(content["everywhere"])
-    found = [run.critical_set.sentence(task)]
+def sentences(run: Run, robustness: Robustness, arc: HybridArc | None) -> list[str]:
+    """Returns the results in sentences: the critical set, what noise costs, the margin, the worst run."""
+    eps, task = robustness.eps, run.task
+    where, unit = task.noise_on(robustness.everywhere)
+    results = [run.critical_set.sentence(task)]
     noise = f"noise on {where} of up to {eps:g} {unit}"
-    if content["game"] is not None:
-        score = content["game"]["scores"]["policy"][-1]
-        margin = content["game"]["margin"]["policy"]
-        found.append(
-            f"the worst {noise} makes it lose {percent(1 - score['won'])} of the starts that can be won"
+    if robustness.game is not None:
+        score = robustness.game.scores["policy"][-1]
+        margin = robustness.game.margin["policy"]
+        results.append(
+            f"the worst {noise} makes it lose {percent(1 - score.won)} of the starts that can be won"
         )
-        found.append(
+        results.append(
             "it does not win all of them even without noise"
             if margin is None
             else f"it wins all of them up to noise {margin_text(margin, unit)}"
         )
     else:
-        worst = min(content["episodes"], key=lambda record: record["reached"])
+        worst = min(robustness.episodes, key=lambda count: count.reached)
         if run.agent and run.agent.stochastic:
-            found.append("it draws its inputs, so that noisy episodes stand in for the worst case")
-        found.append(
-            f"under {worst['noise']} {noise} it loses {percent(1 - worst['reached'])} of the episodes "
-            f"that start {worst['region']}"
+            results.append(
+                "it draws its inputs, so that noisy episodes stand in for the worst case"
+            )
+        results.append(
+            f"under {worst.noise} {noise} it loses {percent(1 - worst.reached)} of the episodes "
+            f"that start {worst.region}"
         )
     if arc is None:
-        found.append(f"no start was found that {noise} makes it lose")
+        results.append(f"no start was found that {noise} makes it lose")
     else:
         start = task.chart.format(arc.z[0])
         outcome = arc.outcome.replace("_", " ")
-        found.append(
+        results.append(
             f"from {start} it ends {outcome} after {arc.t[-1]:.2f} s, under {arc.noise} noise"
         )
-    return found
+    return results
 
 
-def write_page(run: Run, content: Mapping[str, Any], arc: HybridArc | None) -> None:
-    """Write the page.
+def write_page(run: Run, robustness: Robustness, arc: HybridArc | None) -> None:
+    """Writes the page.
 
     Raises:
         BadArtifact: a picture on it is damaged.
         BadInput: it cannot be written.
     """
-    task, folder, path = run.task, run.path / FOLDER, run.path / PAGE
-    game = content["game"] is not None
+    folder, path = run.path / FOLDER, run.path / PAGE
     page = fill(
         "diagnosis.html",
         run,
-        sentences=sentences(run, content, arc),
+        sentences=sentences(run, robustness, arc),
         arc=arc,
         video=film(folder / "worst.mp4"),
         pictures=pictures(folder),
-        scores=score_table(task, content) if game else None,
-        margins=margin_table(task, content) if game else None,
-        episodes=episode_table(task, content) if content["episodes"] else None,
+        **noise_tables(run.task, robustness),
         command=beginning(run.settings, run.path),
     )
     with artifacts.replacing(path) as temporary:

@@ -12,9 +12,11 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 
 from hyrl_mj import artifacts
+from hyrl_mj.game import Robustness
 from hyrl_mj.run_directory import Run
+from hyrl_mj.tasks import Task
 from hyrl_mj.viz.figures import FIGURES
-from hyrl_mj.viz.tables import percent
+from hyrl_mj.viz.tables import Table, episode_table, margin_table, percent, score_table
 
 
 @dataclass(frozen=True)
@@ -22,7 +24,7 @@ class Picture:
     """A PNG in the page.
 
     Attributes:
-        name: for people.
+        name: its name.
         data: the file as a data URI.
         width, height: [pixels].
         caption: what it shows.
@@ -36,7 +38,7 @@ class Picture:
 
 
 def fill(template: str, run: Run, **values: Any) -> str:
-    """A page from its template, with what every page of a run says."""
+    """Returns a page from its template, with what every page of a run says."""
     environment = Environment(
         loader=PackageLoader("hyrl_mj"),
         autoescape=True,
@@ -45,7 +47,7 @@ def fill(template: str, run: Run, **values: Any) -> str:
         lstrip_blocks=True,
     )
     return environment.get_template(template).render(
-        # A name that is no Unicode must not keep the page from being written.
+        # A name that is not Unicode must not keep the page from being written.
         name=os.fsencode(run.path.resolve().name).decode("utf-8", "replace"),
         title=run.task.name.replace("_", " ").capitalize(),
         task=run.task,
@@ -59,8 +61,18 @@ def fill(template: str, run: Run, **values: Any) -> str:
     )
 
 
+def noise_tables(task: Task, robustness: Robustness | None) -> dict[str, Table | None]:
+    """Returns the tables of an examination under noise by their names in the templates."""
+    game, episodes = (robustness.game, robustness.episodes) if robustness else (None, ())
+    return {
+        "scores": score_table(task, game) if game else None,
+        "margins": margin_table(task, game) if game else None,
+        "episodes": episode_table(task, episodes) if episodes else None,
+    }
+
+
 def film(path: Path) -> dict[str, Any] | None:
-    """A replay and its poster, if both are there."""
+    """Returns a replay and its poster, None unless both files exist."""
     poster = path.with_suffix(".png")
     if not (path.is_file() and poster.is_file()):
         return None
@@ -84,5 +96,5 @@ def _picture(path: Path, name: str, caption: str = "") -> Picture:
 
 
 def _data(path: Path, kind: str) -> str:
-    """A file as a data URI."""
+    """Returns a file as a data URI."""
     return f"data:{kind};base64,{b64encode(path.read_bytes()).decode()}"

@@ -1,36 +1,30 @@
-"""The report: one page with all that a run has found, which opens anywhere and prints well."""
+"""The report: one page with all results of a run, which opens anywhere and prints well."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadInput
-from hyrl_mj.game import LIMIT, MAP_CLASSES
+from hyrl_mj.game import LIMIT, MAP_CLASSES, EpisodeCount, GameResult, Robustness
 from hyrl_mj.learning import Settings, Training
 from hyrl_mj.policies import Agent, MlpPolicy
 from hyrl_mj.run_directory import Run
 from hyrl_mj.viz.commands import changed, commands
 from hyrl_mj.viz.figures import CLASS_COLOURS
-from hyrl_mj.viz.page import fill, film, pictures
+from hyrl_mj.viz.page import fill, film, noise_tables, pictures
 from hyrl_mj.viz.tables import (
     Arcs,
-    Table,
     arrivals,
-    episode_table,
     excursion_text,
     extent,
-    lasts,
-    margin_table,
     margin_text,
     percent,
     replay_sentence,
     replay_table,
     robustness_sentence,
-    score_table,
 )
 
 # What the classes of the maps mean, in the order of MAP_CLASSES.
@@ -46,12 +40,12 @@ MEANINGS = (
 
 @dataclass(frozen=True)
 class Number:
-    """A figure that the page begins with, of the policy and of HyRL.
+    """A figure at the top of the page, for the policy and for HyRL.
 
     Attributes:
-        what: it is.
+        what: its name.
         policy, hyrl: the values, with unit.
-        note: what else is to be known.
+        note: the conditions that it holds for.
     """
 
     what: str
@@ -61,7 +55,7 @@ class Number:
 
 
 def write_report(run: Run, path: Path) -> None:
-    """Write the page; what a run lacks is said in its place.
+    """Writes the page, which says in its place what a run lacks.
 
     The same artifacts give the same bytes.
 
@@ -81,25 +75,24 @@ def write_report(run: Run, path: Path) -> None:
 
 
 def render(run: Run) -> str:
-    """The page as HTML."""
+    """Returns the page as HTML."""
     task, modes = run.task, run.controller.modes
     robustness = run.robustness if (run.path / "robustness.json").is_file() else None
     arcs = run.arcs() if all(path.is_file() for path in run.arc_paths().values()) else None
-    game = robustness["game"] if robustness else None
     return fill(
         "report.html",
         run,
         modes=[task.scene.mode_name(q) for q in modes],
-        worst=task.noise_on(bool(robustness and robustness["everywhere"])),
+        worst=task.noise_on(bool(robustness and robustness.everywhere)),
         video=film(run.path / "replay.mp4"),
         pictures=pictures(run.path / "figures"),
         robustness=robustness,
-        game=game,
+        game=robustness.game if robustness else None,
         arcs=arcs,
         arrivals=arcs and {who: arrivals(run, arcs, who == "policy") for who in ("policy", "hyrl")},
         numbers=_numbers(run, robustness, arcs),
         replays=arcs and replay_table(run, arcs),
-        **_tables(run, robustness),
+        **noise_tables(task, robustness),
         stages=_stages(run, robustness, arcs),
         table=_settings(run.settings),
         training=_training(run.settings),
@@ -110,53 +103,47 @@ def render(run: Run) -> str:
     )
 
 
-def _tables(run: Run, robustness: Mapping[str, Any] | None) -> dict[str, Table | None]:
-    """The tables of what noise can do, None for those that there are not."""
-    task, found = run.task, robustness or {"game": None, "episodes": []}
-    return {
-        "scores": score_table(task, found) if found["game"] else None,
-        "margins": margin_table(task, found) if found["game"] else None,
-        "episodes": episode_table(task, found) if found["episodes"] else None,
-    }
-
-
 # ---- numbers
 
 
-def _numbers(run: Run, robustness: Mapping[str, Any] | None, arcs: Arcs | None) -> list[Number]:
-    """The key scores."""
-    found: list[Number] = []
-    if robustness is not None and robustness["game"] is not None:
-        found += _game_numbers(run, robustness)
-    elif robustness is not None:
-        found += _episode_numbers(robustness)
+def _numbers(run: Run, robustness: Robustness | None, arcs: Arcs | None) -> list[Number]:
+    """Returns the key scores."""
+    numbers: list[Number] = []
+    if robustness is not None:
+        numbers += (
+            _game_numbers(run, robustness.game)
+            if robustness.game
+            else _episode_numbers(robustness.episodes)
+        )
     if arcs is not None:
-        (won, runs), (ours, all_ours) = (arrivals(run, arcs, policy) for policy in (True, False))
+        (policy, of_policy), (hyrl, of_hyrl) = (
+            arrivals(run, arcs, is_policy) for is_policy in (True, False)
+        )
         note = f"the paper's starts, alternating noise {run.settings.noise:g}"
-        found.append(
+        numbers.append(
             Number(
                 "replays that reach the set-point",
-                f"{won} of {runs}",
-                f"{ours} of {all_ours}",
+                f"{policy} of {of_policy}",
+                f"{hyrl} of {of_hyrl}",
                 note,
             )
         )
-    return found
+    return numbers
 
 
-def _game_numbers(run: Run, robustness: Mapping[str, Any]) -> list[Number]:
-    game = robustness["game"]
-    where, unit = run.task.noise_on(robustness["everywhere"])
-    policy, hyrl, limit = (game["scores"][who][-1] for who in ("policy", "hyrl", LIMIT))
-    noise = f"worst noise on {where} up to {hyrl['eps']:g} {unit}"
-    margins = {who: margin_text(margin, unit) for who, margin in game["margin"].items()}
-    found = [
-        Number("winnable starts won", percent(policy["won"]), percent(hyrl["won"]), noise),
+def _game_numbers(run: Run, game: GameResult) -> list[Number]:
+    """Returns the scores of the worst case at the largest noise bound, and the margins."""
+    where, unit = run.task.noise_on(game.everywhere)
+    policy, hyrl, limit = (game.scores[who][-1] for who in ("policy", "hyrl", LIMIT))
+    noise = f"worst noise on {where} up to {hyrl.eps:g} {unit}"
+    margins = {who: margin_text(margin, unit) for who, margin in game.margin.items()}
+    numbers = [
+        Number("winnable starts won", percent(policy.won), percent(hyrl.won), noise),
         Number(
             "winnable starts won from every start mode",
-            percent(policy["won_any"]),
-            percent(hyrl["won_any"]),
-            f"{noise}; the limit is {percent(limit['won_any'])}",
+            percent(policy.won_any),
+            percent(hyrl.won_any),
+            f"{noise}; the limit is {percent(limit.won_any)}",
         ),
         Number(
             "noise up to which all of them are won",
@@ -165,24 +152,22 @@ def _game_numbers(run: Run, robustness: Mapping[str, Any]) -> list[Number]:
             f"the margin: worst noise on {where}",
         ),
     ]
-    if lasts(game):
-        off, ours = (f"{excursion_text(score['excursion'])} {unit}" for score in (policy, hyrl))
-        found.append(Number("kept off the set-point for ever, at most", off, ours, noise))
-    return found
+    if game.lasting:
+        off = {who: f"{excursion_text(game.scores[who][-1].excursion)} {unit}" for who in margins}
+        what = "kept off the set-point for ever, at most"
+        numbers.append(Number(what, off["policy"], off["hyrl"], noise))
+    return numbers
 
 
-def _episode_numbers(robustness: Mapping[str, Any]) -> list[Number]:
-    """The shares of the kind of noise that is worst, by start region."""
-    records = robustness["episodes"]
-    regions = dict.fromkeys(r["region"] for r in records)
+def _episode_numbers(counts: Sequence[EpisodeCount]) -> list[Number]:
+    """Returns the shares under the worst kind of noise, by start region."""
+    regions = dict.fromkeys(c.region for c in counts)
     shares = {
-        (region, who): min(
-            r["reached"] for r in records if (r["region"], r["controller"]) == (region, who)
-        )
+        (region, who): min(c.reached for c in counts if (c.region, c.controller) == (region, who))
         for region in regions
         for who in ("policy", "hyrl")
     }
-    note = f"the least over {', '.join(dict.fromkeys(r['noise'] for r in records))} noise"
+    note = f"the least over {', '.join(dict.fromkeys(c.noise for c in counts))} noise"
     return [
         Number(
             f"episodes that reach the set-point, starts {region}",
@@ -197,10 +182,8 @@ def _episode_numbers(robustness: Mapping[str, Any]) -> list[Number]:
 # ---- stages and settings
 
 
-def _stages(
-    run: Run, robustness: Mapping[str, Any] | None, arcs: Arcs | None
-) -> list[tuple[str, str]]:
-    """What each stage has found, in a sentence."""
+def _stages(run: Run, robustness: Robustness | None, arcs: Arcs | None) -> list[tuple[str, str]]:
+    """Returns the result of each stage in a sentence."""
     task, s, modes = run.task, run.settings, run.extended_sets.modes
     reach = "; ".join(f"mode {task.scene.mode_name(q)}: {extent(run, q)}" for q in modes)
     each = f"up to {s.stage6.attempts} times " if s.stage6.attempts > 1 else ""
@@ -226,7 +209,7 @@ def _stages(
 
 
 def _settings(settings: Settings) -> list[tuple[str, str]]:
-    """All settings but those of the two trainings."""
+    """Returns all settings but those of the two trainings."""
     return [
         (_words(name), _value(value))
         for name, value in vars(settings).items()
@@ -235,7 +218,7 @@ def _settings(settings: Settings) -> list[tuple[str, str]]:
 
 
 def _training(settings: Settings) -> list[tuple[str, str, str]]:
-    """The settings of the trainings of stages 1 and 6, side by side; an agent has its own."""
+    """Returns the settings of stages 1 and 6 side by side; an agent has its own."""
     first, sixth = (
         vars(stage) | (stage.options if isinstance(stage, Training) else {})
         for stage in (settings.stage1, settings.stage6)
@@ -256,7 +239,7 @@ def _words(name: str) -> str:
 
 
 def _value(value: object) -> str:
-    """A setting for people."""
+    """Returns the text of a setting."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, tuple):

@@ -15,7 +15,7 @@ from hyrl_mj.viz.tables import (
 
 
 def print_summary(run: Run) -> None:
-    """Print how policy and hybrid controller did, from the replay starts and in the worst case."""
+    """Prints how policy and hybrid controller did, from the replay starts and in the worst case."""
     arcs = run.arcs()
     _print(replay_table(run, arcs))
     print(run.critical_set.sentence(run.task))
@@ -29,17 +29,17 @@ def print_summary(run: Run) -> None:
 
 
 def print_robustness(run: Run) -> None:
-    """Print the scores of the worst-case game and the counts of the noisy episodes."""
-    task, content = run.task, run.robustness
-    if content["game"] is not None:
-        _print(score_table(task, content))
-        _print(margin_table(task, content))
-    if content["episodes"]:
-        _print(episode_table(task, content))
+    """Prints the scores of the worst-case game and the counts of the noisy episodes."""
+    game, episodes = run.robustness.game, run.robustness.episodes
+    if game is not None:
+        _print(score_table(run.task, game))
+        _print(margin_table(run.task, game))
+    if episodes:
+        _print(episode_table(run.task, episodes))
 
 
 def _print(table: Table) -> None:
-    """Print a table, every cell whole."""
+    """Prints a table, every cell whole."""
     import rich.table  # slow to import, and --help does not need it
     from rich.console import Console
     from rich.text import Text

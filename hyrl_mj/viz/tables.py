@@ -1,14 +1,13 @@
-"""What a run has found, in rows and sentences for people: the terminal and the report show them."""
+"""The results of a run as tables and sentences, for the terminal and the report."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from hyrl_mj.game import LIMIT
+from hyrl_mj.game import LIMIT, EpisodeCount, GameResult, Robustness
 from hyrl_mj.run_directory import Run
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
@@ -66,7 +65,7 @@ Arcs = Mapping[tuple[str, str], HybridArc]
 
 
 def replay_table(run: Run, arcs: Arcs) -> Table:
-    """How policy and hybrid controller did from the replay starts, under the same noise."""
+    """Returns how policy and hybrid controller did from the replay starts, under the same noise."""
     task = run.task
     columns = {"policy": f"policy ({run.settings.stage1.title})"}
     columns |= {
@@ -92,17 +91,17 @@ def _ending(task: Task, arc: HybridArc) -> Ending:
 
 
 def arrivals(run: Run, arcs: Arcs, policy: bool) -> tuple[int, int]:
-    """How many of the paper's replays arrive, and of how many: those of the policy, or of HyRL."""
-    ours = [
+    """Returns how many of the paper's replays arrive, and how many there are, of the policy or of HyRL."""
+    arrives = [
         arc.arrives(run.task)
         for (start, who), arc in arcs.items()
         if start != "critical" and (who == "policy") == policy
     ]
-    return sum(ours), len(ours)
+    return sum(arrives), len(arrives)
 
 
 def replay_sentence(run: Run, arcs: Arcs) -> str:
-    """From how many of the paper's starts the hybrid controller reaches the set-point, for people."""
+    """Returns from how many of the paper's starts the hybrid controller reaches the set-point."""
     reached, total = arrivals(run, arcs, policy=False)
     return f"HyRL reaches the set-point from {reached} of {total} of the paper's starts"
 
@@ -110,92 +109,80 @@ def replay_sentence(run: Run, arcs: Arcs) -> str:
 # ---- robustness
 
 
-def score_table(task: Task, content: Mapping[str, Any]) -> Table:
-    """The scores of the worst-case game: a row for each noise bound and controller."""
-    game = content["game"]
-    scores = game["scores"]
-    lasting = lasts(game)
-    where, unit = task.noise_on(content["everywhere"])
+def score_table(task: Task, game: GameResult) -> Table:
+    """Returns the scores of the worst-case game: a row for each noise bound and controller."""
+    where, unit = task.noise_on(game.everywhere)
     headings = [f"noise on {where} [{unit}]", "winnable starts", "controller"]
     headings += ["won, own q0", "won, any q0"]
-    if lasting:
+    if game.lasting:
         headings += ["latest arrival, own q0", "latest, any q0", f"excursion [{unit}]"]
     rows = []
-    for level in zip(*scores.values(), strict=True):
-        for who, score in zip(scores, level, strict=True):
-            row = [f"{score['eps']:g}", percent(score["winnable"]), NAMES[who]]
-            row += [percent(score["won"]), percent(score["won_any"])]
-            if lasting:
+    for level in zip(*game.scores.values(), strict=True):
+        for who, score in zip(game.scores, level, strict=True):
+            row = [f"{score.eps:g}", percent(score.winnable), NAMES[who]]
+            row += [percent(score.won), percent(score.won_any)]
+            if game.lasting:
                 row += [
-                    _seconds(score["time"], score["won"]),
-                    _seconds(score["time_any"], score["won_any"]),
-                    excursion_text(None if who == LIMIT else score["excursion"]),
+                    _seconds(score.time, score.won),
+                    _seconds(score.time_any, score.won_any),
+                    excursion_text(None if who == LIMIT else score.excursion),
                 ]
             rows.append(row)
     return Table(f"{task.name}: worst case over all noise signals, exact game", headings, rows)
 
 
-def margin_table(task: Task, content: Mapping[str, Any]) -> Table:
-    """Up to which noise all is won, and how far off runs end without any: a row for each controller."""
-    game = content["game"]
-    _, unit = task.noise_on(content["everywhere"])
+def margin_table(task: Task, game: GameResult) -> Table:
+    """Returns the margins, and how far off runs end without noise: a row for each controller."""
+    _, unit = task.noise_on(game.everywhere)
     units = ", ".join(dict.fromkeys(task.chart.units))
     off = f"off the set-point at most, no noise [{units}]"
     return Table(
         f"{task.name}: margins",
         ["controller", "all winnable starts are won up to noise", off],
         [
-            [NAMES[who], margin_text(margin, unit), f"{game['miss_without_noise'][who]:.3f}"]
-            for who, margin in game["margin"].items()
+            [NAMES[who], margin_text(margin, unit), f"{game.miss_without_noise[who]:.3f}"]
+            for who, margin in game.margin.items()
         ],
     )
 
 
-def lasts(game: Mapping[str, Any]) -> bool:
-    """Whether some run goes on for ever, so that times and excursions tell something."""
-    return any(
-        score["excursion"] is not None for level in game["scores"].values() for score in level
-    )
-
-
 def excursion_text(excursion: float | None) -> str:
-    """How far off the set-point noise keeps a run; none where every run is over some day."""
+    """Returns how far off the set-point noise keeps a run; none where every run ends."""
     return "-" if excursion is None else f"{excursion:.3f}"
 
 
 def margin_text(margin: float | None, unit: str) -> str:
-    """A margin for people; without one not even without noise all is won."""
+    """Returns a margin with its unit; "none" where some run is lost even without noise."""
     return "none" if margin is None else f"{margin:.3g} {unit}"
 
 
-def episode_table(task: Task, content: Mapping[str, Any]) -> Table:
-    """The counts of the noisy episodes: a row for each noise, controller and start region."""
-    _, unit = task.noise_on(content["everywhere"])
+def episode_table(task: Task, counts: Sequence[EpisodeCount]) -> Table:
+    """Returns the counts of the noisy episodes: a row for each noise, controller and start region."""
     rows = []
-    for r in content["episodes"]:
-        low, high = r["interval"]
-        outcomes = ", ".join(f"{k.replace('_', ' ')} {v:,}" for k, v in r["outcomes"].items())
-        row = [f"{r['noise']} {r['eps']:g} {unit}", NAMES[r["controller"]], r["region"]]
-        row += [f"{r['episodes']:,}", percent(r["reached"]), f"{percent(low)} - {percent(high)}"]
+    for c in counts:
+        (low, high), (_, unit) = c.interval, task.noise_on(c.everywhere)
+        outcomes = ", ".join(f"{k.replace('_', ' ')} {v:,}" for k, v in c.outcomes.items())
+        row = [f"{c.noise} {c.eps:g} {unit}", NAMES[c.controller], c.region]
+        row += [f"{c.episodes:,}", percent(c.reached), f"{percent(low)} - {percent(high)}"]
         rows.append([*row, outcomes])
     headings = ("noise", "controller", "starts", "episodes", "reached", "95%", "outcomes")
     return Table(f"{task.name}: noisy episodes", headings, rows)
 
 
-def robustness_sentence(content: Mapping[str, Any]) -> str:
-    """The most important figures, for people."""
-    if content["game"] is None:
+def robustness_sentence(robustness: Robustness) -> str:
+    """Returns the most important figures in one line."""
+    if robustness.game is None:
         worst = {
-            who: min(r["reached"] for r in content["episodes"] if r["controller"] == who)
+            who: min(c.reached for c in robustness.episodes if c.controller == who)
             for who in ("policy", "hyrl")
         }
         return ", ".join(
             f"{NAMES[who]} reaches in {percent(x)} or more" for who, x in worst.items()
         )
-    policy, hyrl = (content["game"]["scores"][who][-1] for who in ("policy", "hyrl"))
+    policy, hyrl = (robustness.game.scores[who][-1] for who in ("policy", "hyrl"))
     return (
-        f"worst case at noise {hyrl['eps']:g}: the policy wins {percent(policy['won'])} of the winnable "
-        f"starts, HyRL {percent(hyrl['won'])}, from every q0 {percent(hyrl['won_any'])}"
+        f"worst case at noise {hyrl.eps:g}: the policy wins {percent(policy.won)} of the winnable "
+        f"starts, HyRL {percent(hyrl.won)}, from every q0 {percent(hyrl.won_any)}"
     )
 
 
@@ -203,7 +190,7 @@ def robustness_sentence(content: Mapping[str, Any]) -> str:
 
 
 def extent(run: Run, mode: int) -> str:
-    """How far a mode's extended set reaches, for people."""
+    """Returns how far a mode's extended set reaches."""
     members = run.extended_sets.sets[run.extended_sets.modes.index(mode)]
     inside, chart = members.mask, run.task.chart
     if inside.all():
@@ -216,12 +203,12 @@ def extent(run: Run, mode: int) -> str:
 
 
 def _point(z: np.ndarray) -> str:
-    """A chart point (d,), to a thousandth."""
+    """Returns a chart point (d,), to a thousandth."""
     return f"({', '.join(f'{v + 0.0:.3f}' for v in np.round(z, 3))})"
 
 
 def percent(share: float) -> str:
-    """A share in percent; only what is everything is called 100%, and only nothing 0%."""
+    """Returns a share in percent; only 1 is called 100%, and only 0 is called 0%."""
     if share in (0, 1):
         return f"{100 * share:.0f}%"
     text = f"{100 * share:.2f}%"
@@ -229,5 +216,5 @@ def percent(share: float) -> str:
 
 
 def _seconds(time: float, won: float) -> str:
-    """A worst time to arrival; where nothing is won there is none."""
+    """Returns a worst time to arrival; "-" where nothing is won."""
     return f"{time:.2f} s" if won else "-"

@@ -56,7 +56,8 @@ def measure(kind: str, size: int, run: Path) -> tuple[float, float]:
         found = hyrl_mj.load_run(run)
         began = time.perf_counter()
         loops = {"HyRL": found.controller}
-        noisy_episodes(task, Regions(found.critical_set), loops, (Noise("uniform", 0.1),), size)
+        regions = Regions(found.critical_set.points)
+        noisy_episodes(task, regions, loops, (Noise("uniform", 0.1),), size)
     took = time.perf_counter() - began
     return took, peak_memory()
 

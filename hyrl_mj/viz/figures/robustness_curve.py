@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from hyrl_mj.game import LIMIT
+from hyrl_mj.game import LIMIT, Wins
 from hyrl_mj.viz.figures.charts import Artists
 from hyrl_mj.viz.figures.shown import ShownGame
 from hyrl_mj.viz.figures.style import (
@@ -25,7 +25,7 @@ from hyrl_mj.viz.figures.style import (
     legend,
     mode_colour,
 )
-from hyrl_mj.viz.tables import NAMES, lasts
+from hyrl_mj.viz.tables import NAMES
 
 # Of the curves: ink as the policy's path in the replay, then blue, purple and vermilion.
 CURVE_COLOURS = (POLICY_COLOUR, *(mode_colour(i) for i in (0, 2, 1)))
@@ -50,32 +50,30 @@ def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
         The figure.
     """
     task, result = shown.task, shown.result
-    curve, scores = result["curve"], result["scores"]
-    names = [name for name in scores if name != LIMIT]
-    eps = np.array(curve["eps"])
-    run_eps = max(score["eps"] for score in scores[names[0]])
-    lasting = lasts(result)
+    names, curve = result.controllers, result.curve
+    eps = np.array(curve.eps)
+    run_eps = max(score.eps for score in result.scores[names[0]])
     # A controller keeps its colour whichever others are in the figure.
     known = list(dict.fromkeys(["policy", "hyrl", *names]))
     numbers = {name: known.index(name) for name in names}
-    where, unit = task.noise_on(result["everywhere"])
-    heights = (3.6, 2.0) if lasting else (3.6,)
+    where, unit = task.noise_on(result.everywhere)
+    heights = (3.6, 2.0) if result.lasting else (3.6,)
     with drawing(path, (WIDTH, 2.0 + sum(heights))) as figure:
         head(figure, task, "what is won against the worst noise")
         panels = figure.subplots(
             len(heights), 1, sharex=True, squeeze=False, height_ratios=heights
         ).ravel()
         shares = panels[0]
-        handles = _limit(shares, eps, curve[LIMIT])
+        handles = _limit(shares, eps, curve.wins[LIMIT])
         for name, number in numbers.items():
-            handles |= _won(shares, number, name, eps, curve[name])
-        (line,) = shares.plot(eps, 100 * np.array(curve["winnable"]), color=PALE, linewidth=1)
+            handles |= _won(shares, number, name, eps, curve.wins[name])
+        (line,) = shares.plot(eps, 100 * np.array(curve.winnable), color=PALE, linewidth=1)
         handles["winnable share of the start region"] = line
-        handles |= _margins(shares, result["margin"], numbers, unit)
+        handles |= _margins(shares, result.margin, numbers, unit)
         shares.set(ylabel="winnable starts that are won [%]", yticks=range(0, 101, 20))
-        if lasting:
+        if result.lasting:
             for name, number in numbers.items():
-                _times(panels[1], number, eps, curve[name])
+                _times(panels[1], number, eps, curve.wins[name])
             panels[1].set_ylabel("worst time to arrival,\nstarts that are won [s]")
         for panel in panels:
             panel.axvline(run_eps, color=INK, linewidth=1, linestyle=(0, (1, 2)), zorder=1)
@@ -96,45 +94,45 @@ def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
     return figure
 
 
-def _limit(panel: Axes, eps: np.ndarray, curve: Mapping[str, Any]) -> Artists:
+def _limit(panel: Axes, eps: np.ndarray, wins: Wins) -> Artists:
     """Draws the limit of any controller, broad and pale, so that curves on it can be seen.
 
     Returns:
         The legend's entries.
     """
     looks: dict[str, Any] = {"color": LIMIT_COLOUR, "linewidth": 7, "solid_capstyle": "butt"}
-    (won,) = panel.plot(eps, 100 * np.array(curve["won"]), **looks)
-    if _same(curve):
+    (won,) = panel.plot(eps, 100 * np.array(wins.won), **looks)
+    if _same(wins):
         return {"limit of any controller": won}
     looks |= {"linestyle": (0, (1.2, 0.5)), "linewidth": 4}
-    (won_any,) = panel.plot(eps, 100 * np.array(curve["won_any"]), **looks)
+    (won_any,) = panel.plot(eps, 100 * np.array(wins.won_any), **looks)
     return {
         "limit of any controller, picks the start mode": won,
         "limit of any controller, from every start mode": won_any,
     }
 
 
-def _won(panel: Axes, number: int, name: str, eps: np.ndarray, curve: Mapping[str, Any]) -> Artists:
+def _won(panel: Axes, number: int, name: str, eps: np.ndarray, wins: Wins) -> Artists:
     """Draws what a controller wins; returns the legend's entries."""
-    won, won_any = 100 * np.array(curve["won"]), 100 * np.array(curve["won_any"])
+    won, won_any = 100 * np.array(wins.won), 100 * np.array(wins.won_any)
     title, looks = NAMES.get(name, name), _looks(number)
     (line,) = panel.plot(eps, won, **looks)
-    if _same(curve):
+    if _same(wins):
         return {title: line}
     (dashed,) = panel.plot(eps, won_any, **looks | _dashed(number))
     return {f"{title}, picks the start mode": line, f"{title}, from every start mode": dashed}
 
 
-def _times(panel: Axes, number: int, eps: np.ndarray, curve: Mapping[str, Any]) -> None:
+def _times(panel: Axes, number: int, eps: np.ndarray, wins: Wins) -> None:
     """Draws the worst time to arrival where anything is won."""
-    looks = _looks(number) | ({} if _same(curve) else _dashed(number))
-    won = np.array(curve["won_any"]) > 0
-    panel.plot(eps, np.where(won, curve["time_any"], np.nan), **looks)
+    looks = _looks(number) | ({} if _same(wins) else _dashed(number))
+    won = np.array(wins.won_any) > 0
+    panel.plot(eps, np.where(won, wins.time_any, np.nan), **looks)
 
 
-def _same(curve: Mapping[str, Any]) -> bool:
+def _same(wins: Wins) -> bool:
     """Returns whether the start mode makes no difference."""
-    return bool(np.allclose(curve["won"], curve["won_any"], atol=1e-9))
+    return bool(np.allclose(wins.won, wins.won_any, atol=1e-9))
 
 
 def _looks(number: int) -> dict[str, Any]:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,7 +11,7 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle, Wedge
 
-from hyrl_mj.game import LIMIT, MAP_CLASSES, OVER, UNWINNABLE
+from hyrl_mj.game import MAP_CLASSES, OVER, UNWINNABLE, Score
 from hyrl_mj.sets import Grid
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.figures.charts import (
@@ -63,22 +62,21 @@ def draw_robustness_map(shown: ShownGame, path: Path | None = None) -> Figure:
         The figure.
     """
     task, result, maps = shown.task, shown.result, shown.maps
-    names = [name for name in result["scores"] if name != LIMIT]
-    grid = Grid.from_counts(task.chart, maps["grid_counts"])
+    names, grid = result.controllers, maps.grid(task.chart)
     rows = -(-len(names) // COLUMNS)
     columns = min(len(names), COLUMNS)
     with drawing(path, (WIDTH, 1.6 + rows * _panel_height(task))) as figure:
-        where, unit = task.noise_on(result["everywhere"])
-        head(figure, task, f"the worst noise on {where} up to eps = {maps['eps']:g} {unit}")
+        where, unit = task.noise_on(result.everywhere)
+        head(figure, task, f"the worst noise on {where} up to eps = {maps.eps:g} {unit}")
         panels = figure.subplots(rows, columns, squeeze=False).ravel()
         handles: Artists = {}
         for panel, name in zip(panels, names, strict=False):
             draw = _ring if is_ring(task) else _box
-            handles |= draw(panel, shown, grid, maps[f"map_{name}"])
-            _head(panel, name, max(result["scores"][name], key=lambda score: score["eps"]))
+            handles |= draw(panel, shown, grid, maps.map[name])
+            _head(panel, name, max(result.scores[name], key=lambda score: score.eps))
         for panel in panels[len(names) :]:
             panel.set_axis_off()
-        classes = np.unique(np.concatenate([maps[f"map_{name}"] for name in names]))
+        classes = np.unique(np.concatenate([maps.map[name] for name in names]))
         legend(figure, {SENTENCES[k]: patch(CLASS_COLOURS[k]) for k in classes} | handles)
     return figure
 
@@ -91,9 +89,9 @@ def _panel_height(task: Task) -> float:
     return 1.1 + (float(3.2 * sides[1] / sides[0]) if len(sides) == 2 else 0.5)
 
 
-def _head(panel: Axes, name: str, score: Mapping[str, Any]) -> None:
+def _head(panel: Axes, name: str, score: Score) -> None:
     """Writes the controller and what it wins above its panel."""
-    won, won_any = percent(score["won"]), percent(score["won_any"])
+    won, won_any = percent(score.won), percent(score.won_any)
     panel.set_title(NAMES.get(name, name), fontsize=11, fontweight="bold", pad=36)
     panel.annotate(
         f"{won} of the winnable starts won,\n"

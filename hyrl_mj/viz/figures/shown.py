@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
-import numpy as np
-
+from hyrl_mj.game import GameResult, Maps
 from hyrl_mj.policies import Policy
 from hyrl_mj.run_directory import Run
 from hyrl_mj.simulation import HybridArc
@@ -70,15 +68,14 @@ class ShownGame:
     Attributes:
         task: what was played; its chart has two coordinates, or one.
         critical: M*.
-        result: of `examine`.
-        maps: of `examine`: `map_<controller>` (N,) int, an index into `MAP_CLASSES` for each node of
-            the grid of `grid_counts` (d,) nodes, and the noise bound `eps` that they hold for.
+        result: the scores, margins and curves.
+        maps: the class of every node.
     """
 
     task: Task
     critical: CriticalSet
-    result: Mapping[str, Any]
-    maps: Mapping[str, np.ndarray]
+    result: GameResult
+    maps: Maps
 
 
 def shown_policy(run: Run, noisy: HybridArc) -> ShownPolicy:

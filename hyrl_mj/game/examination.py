@@ -1,0 +1,151 @@
+"""Examining controllers in the worst case: scores, margins, the curve over all bounds, and maps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from hyrl_mj.game.lattice import LATTICE, Lattice
+from hyrl_mj.game.result import LIMIT, Curve, GameResult, LatticeSpacing, Maps, Profile, Score, Wins
+from hyrl_mj.game.scores import LARGEST, Game, share
+from hyrl_mj.game.solver import NEVER
+from hyrl_mj.policies import Controller
+from hyrl_mj.progress import Progress
+from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.simulation import LoopSettings, closed_loop
+from hyrl_mj.tasks import Task
+
+# Noise bounds of the curve [chart units].
+CURVE = tuple(round(0.0125 * k, 4) for k in range(round(LARGEST / 0.0125) + 1))
+# About so many episodes without noise measure how far off the set-point they end.
+QUIET_EPISODES = 4000
+# Games that are played at a time; each takes tens of megabytes.
+THREADS = 4
+
+
+def examine(
+    task: Task,
+    points: np.ndarray,
+    parts: Iterable[GridSet],
+    controllers: Mapping[str, Controller],
+    bounds: tuple[float, ...],
+    everywhere: bool = False,
+    cells: int | None = None,
+) -> tuple[GameResult, Maps]:
+    """Plays the game: scores at some noise bounds, margins, the curve over all bounds, and the maps.
+
+    Args:
+        task: what is played.
+        points: (N, d) of M*; the margin is profiled along them.
+        parts: M_i of each mode.
+        controllers: by name.
+        bounds: noise bounds of the scores; the maps are drawn for the last.
+        everywhere: whether noise acts on all coordinates.
+        cells: of the lattice along the longest side of the chart, by default the finest. In the plane the
+            curve is played on one of half as many.
+    """
+    for eps in bounds:
+        task.check_noise(eps, everywhere)
+    Lattice.check(task)
+    cells = cells or LATTICE[task.chart.dimension]
+    progress = Progress("worst-case game", len(bounds) + len(CURVE) + 2, "noise bounds")
+    parts = tuple(parts)
+    grid = Grid.with_cells(task.chart, cells)
+    fine = Game(task, parts, controllers, max(*bounds, LARGEST), everywhere, grid)
+    grid = fine.lattice.grid
+    scores = _scores(fine, [*controllers, LIMIT], bounds, progress)
+    margins = dict(zip(controllers, _in_threads(fine.margin, zip(controllers)), strict=True))
+    progress.update(len(bounds) + 1)
+    maps = Maps(
+        eps=bounds[-1],
+        grid_counts=np.array(grid.counts),
+        map={name: fine.map(name, bounds[-1]) for name in controllers},
+    )
+    coarse = fine
+    if task.chart.dimension == 2:
+        half = Grid.with_cells(task.chart, cells // 2)
+        coarse = Game(task, parts, controllers, LARGEST, everywhere, half)
+    curve, profile = _sweep(coarse, [*controllers, LIMIT], points, progress, len(bounds) + 2)
+    progress.close()
+    lattice = LatticeSpacing(
+        spacing=tuple(grid.spacing.tolist()),
+        exact=fine.lattice.exact,
+        curve_spacing=tuple(coarse.lattice.grid.spacing.tolist()),
+    )
+    misses = _misses(coarse, controllers)
+    return GameResult(everywhere, lattice, scores, margins, misses, curve, profile), maps
+
+
+def _scores(
+    game: Game, names: list[str], bounds: tuple[float, ...], progress: Progress
+) -> dict[str, tuple[Score, ...]]:
+    """Returns the scores of each controller, one for each noise bound."""
+    games = [(name, eps) for eps in bounds for name in names]
+    scores: dict[str, list[Score]] = {name: [] for name in names}
+    for k, (name, score) in enumerate(
+        zip(names * len(bounds), _in_threads(game.score, games), strict=True)
+    ):
+        scores[name].append(score)
+        progress.update((k + 1) // len(names))
+    return {name: tuple(level) for name, level in scores.items()}
+
+
+def _sweep(
+    game: Game, names: list[str], points: np.ndarray, progress: Progress, done: int
+) -> tuple[Curve, Profile]:
+    """Returns what each controller wins at every bound of `CURVE`, and how much each point of M* bears.
+
+    Args:
+        game: the game, prepared for the largest of them.
+        names: the controllers and the limit.
+        points: (N, d) of M*.
+        progress: shows how far it is.
+        done: the steps that have been done before.
+    """
+    task, dt = game.task, game.task.dt
+    along = points[task.may_start(points)]
+    at = game.lattice.grid.nearest(along)
+    winnable: list[float] = []
+    rows: dict[str, list[tuple[float, float, float]]] = {name: [] for name in names}
+    holds = {name: np.ones(len(along), dtype=bool) for name in names}
+    borne = {name: np.full(len(along), np.nan) for name in names}
+    values = _in_threads(game.value, [(name, eps) for eps in CURVE for name in names])
+    for k, eps in enumerate(CURVE):
+        region = game.starts & game.winnable(eps)
+        winnable.append(float(region.sum() / max(game.starts.sum(), 1)))
+        for name in names:
+            value = next(values)[:, :-2]
+            own, worst = value[-1], value[:-1].max(axis=0)
+            times = worst[region & (worst < NEVER)]
+            time_any = float(times.max(initial=0) * dt)
+            rows[name].append((share(own[region] < NEVER), share(worst[region] < NEVER), time_any))
+            holds[name] &= own[at] < NEVER
+            borne[name][holds[name]] = eps
+        progress.update(done + k)
+    profile = Profile(
+        points=tuple(tuple(point) for point in along.tolist()),
+        eps={k: tuple(None if np.isnan(x) else float(x) for x in v) for k, v in borne.items()},
+    )
+    wins = {name: Wins(*zip(*row, strict=True)) for name, row in rows.items()}
+    return Curve(CURVE, tuple(winnable), wins), profile
+
+
+def _misses(game: Game, controllers: Mapping[str, Controller]) -> dict[str, float]:
+    """Returns how far off the set-point the runs of each controller end at most without noise."""
+    task = game.task
+    starts = game.lattice.grid.nodes[game.starts & game.winnable(0.0)]
+    starts = starts[:: max(len(starts) // QUIET_EPISODES, 1)]
+    quiet = LoopSettings(quiet=True)
+    return {
+        name: float(task.miss(closed_loop(task, loop, starts, settings=quiet).path[-1]).max())
+        for name, loop in controllers.items()
+    }
+
+
+def _in_threads(work: Callable[..., Any], calls: Iterable[tuple[Any, ...]]) -> Iterator[Any]:
+    """Yields the results of calls in their order, from threads: NumPy releases the interpreter's lock."""
+    with ThreadPoolExecutor(THREADS) as pool:
+        yield from pool.map(lambda call: work(*call), calls)

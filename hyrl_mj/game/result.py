@@ -1,0 +1,241 @@
+"""The results of an examination under noise: scores, margins, curves, maps and counts of episodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from hyrl_mj import artifacts
+from hyrl_mj.chart import Chart
+from hyrl_mj.sets import Grid
+
+# The controller that nothing can beat, beside those that are examined.
+LIMIT = "limit"
+# Classes of the maps.
+WON, WON_FROM_SOME, BEATEN, UNWINNABLE, OVER = range(5)
+MAP_CLASSES = (
+    "won from every start mode",
+    "won if the controller picks the start mode",
+    "lost to the worst noise",
+    "not winnable",
+    "over",
+)
+
+
+@dataclass(frozen=True)
+class Score:
+    """What a controller wins in the worst case.
+
+    Attributes:
+        eps: bound of the noise.
+        winnable: share of the start region that can be won at all.
+        won: share of the winnable starts that are won if the controller picks its start mode.
+        won_any: share of them that are won from every start mode.
+        time, time_any: worst time to arrival [s] from the starts that are won.
+        excursion: how far off the set-point the noise can bring or keep a run for ever; None where every
+            run ends.
+    """
+
+    eps: float
+    winnable: float
+    won: float
+    won_any: float
+    time: float
+    time_any: float
+    excursion: float | None
+
+    def __repr__(self) -> str:
+        values = ", ".join(
+            f"{name}={value if value is None else format(value, '.4g')}"
+            for name, value in vars(self).items()
+        )
+        return f"Score({values})"
+
+
+@dataclass(frozen=True)
+class Wins:
+    """What a controller wins at each noise bound of a curve, as in `Score`."""
+
+    won: tuple[float, ...]
+    won_any: tuple[float, ...]
+    time_any: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """What is won against the noise bound.
+
+    Attributes:
+        eps: the noise bounds.
+        winnable: share of the start region that can be won at all, at each bound.
+        wins: what each controller wins.
+    """
+
+    eps: tuple[float, ...]
+    winnable: tuple[float, ...]
+    wins: dict[str, Wins]
+
+
+@dataclass(frozen=True)
+class Profile:
+    """How much noise can be borne along M*.
+
+    Attributes:
+        points: (N, d) the points of M* in the start region.
+        eps: by controller, the largest bound up to which each point is won; None where it is lost even
+            without noise.
+    """
+
+    points: tuple[tuple[float, ...], ...]
+    eps: dict[str, tuple[float | None, ...]]
+
+
+@dataclass(frozen=True)
+class LatticeSpacing:
+    """How fine the lattice of states is.
+
+    Attributes:
+        spacing: distance between its nodes along each coordinate, in chart units.
+        exact: whether every sample leads from node to node.
+        curve_spacing: the distance on the lattice on which the curve is played.
+    """
+
+    spacing: tuple[float, ...]
+    exact: bool
+    curve_spacing: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class GameResult:
+    """What the worst-case game says of some controllers and of the limit.
+
+    Attributes:
+        everywhere: whether noise acts on all coordinates.
+        lattice: how fine the game was played.
+        scores: for each controller and the limit, one at each noise bound.
+        margin: for each controller, the largest bound at which the whole winnable start region is won; None
+            if it is not even won without noise.
+        miss_without_noise: for each controller, how far off the set-point runs without noise end at most.
+        curve: what is won against the noise bound.
+        profile: how much noise can be borne along M*.
+    """
+
+    everywhere: bool
+    lattice: LatticeSpacing
+    scores: dict[str, tuple[Score, ...]]
+    margin: dict[str, float | None]
+    miss_without_noise: dict[str, float]
+    curve: Curve
+    profile: Profile
+
+    @property
+    def controllers(self) -> tuple[str, ...]:
+        """The names of the controllers, without the limit."""
+        return tuple(name for name in self.scores if name != LIMIT)
+
+    @property
+    def lasting(self) -> bool:
+        """Whether some run goes on for ever, so that times and excursions say something."""
+        return any(score.excursion is not None for level in self.scores.values() for score in level)
+
+    def __repr__(self) -> str:
+        scores = {name: level[-1] for name, level in self.scores.items() if name != LIMIT}
+        shares = ", ".join(f"{name} {score.won:.2%}" for name, score in scores.items())
+        eps = f" at eps {next(iter(scores.values())).eps:g}" if scores else ""
+        return f"GameResult(won{eps}: {shares})"
+
+
+@dataclass(frozen=True)
+class EpisodeCount:
+    """How the noisy episodes of one kind of noise, one controller and one start region ended.
+
+    Attributes:
+        noise, eps, everywhere: the noise: its kind, its bound, and whether it acts on all coordinates.
+        controller: the name of the controller.
+        region: where the episodes start: "near M*", "elsewhere" or "not winnable".
+        episodes: their number.
+        outcomes: how many of them ended in each way.
+        reached: share of them that reached the set-point.
+        interval: the 95% interval of this share (Wilson).
+    """
+
+    noise: str
+    eps: float
+    everywhere: bool
+    controller: str
+    region: str
+    episodes: int
+    outcomes: dict[str, int]
+    reached: float
+    interval: tuple[float, float]
+
+    @property
+    def lost(self) -> int:
+        """How many did not reach the set-point."""
+        return self.episodes - self.outcomes.get("reached", 0)
+
+
+@dataclass(frozen=True)
+class Robustness:
+    """What an examination under noise says; `robustness.json` holds it.
+
+    Attributes:
+        eps: bound of the noise.
+        everywhere: whether noise acts on all columns of the measurement.
+        game: the worst case, where it can be played exactly.
+        episodes: counts of noisy episodes.
+        seed: seed of the starts and the noise of these episodes.
+    """
+
+    eps: float
+    everywhere: bool
+    game: GameResult | None
+    episodes: tuple[EpisodeCount, ...]
+    seed: int
+
+    def __repr__(self) -> str:
+        game = f"{self.game}, " if self.game else ""
+        episodes = sum(count.episodes for count in self.episodes)
+        return f"Robustness(eps {self.eps:g}, {game}{episodes:,} episodes)"
+
+    def save(self, path: Path) -> None:
+        """Writes `robustness.json`."""
+        artifacts.write_json(path, self, "robustness")
+
+    @staticmethod
+    def load(path: Path) -> Robustness:
+        """Reads what `save` wrote.
+
+        Raises:
+            BadArtifact: the file is missing, damaged, or of another version.
+        """
+        return artifacts.read_record(
+            path, "robustness", Robustness, "run hyrl-mj robustness RUN to write it again"
+        )
+
+
+@dataclass(frozen=True)
+class Maps(artifacts.Saved):
+    """The classes of the maps.
+
+    Attributes:
+        eps: bound of the noise that they hold for.
+        grid_counts: (d,) number of nodes along each coordinate.
+        map: for each controller, the class (N,) of every node, an index into `MAP_CLASSES`.
+    """
+
+    KIND: ClassVar[str] = "robustness maps"
+
+    eps: float
+    grid_counts: np.ndarray
+    map: dict[str, np.ndarray]
+
+    def __repr__(self) -> str:
+        return f"Maps(eps {self.eps:g}, {', '.join(self.map)})"
+
+    def grid(self, chart: Chart) -> Grid:
+        """The nodes in the task's chart."""
+        return Grid.from_counts(chart, self.grid_counts)
