@@ -11,7 +11,7 @@ import inspect
 import re
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields, is_dataclass, make_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
 from functools import reduce
 from itertools import pairwise
 from operator import or_
@@ -106,8 +106,11 @@ class Argument:
         described = self.text.partition(BY_DEFAULT)[2].rstrip(".")
         return f"(default: {described or KINDS[self.type].show(self.default)})"
 
-    def field(self) -> tuple[str, Any, Any]:
-        """Returns name, type and default of a field from which tyro reads the words, as they are."""
+    def field(self, helping: bool) -> tuple[str, Any, Any]:
+        """Returns name, type and default of a field for which tyro collects the words, unread.
+
+        Only for its help tyro is told what is required: `call` has the better sentence.
+        """
         help_text = self.text.partition(BY_DEFAULT)[0].rstrip(".") + "."
         if self.type is bool:
             shown = tyro.conf.arg(help=help_text, help_behavior_hint=self.hint)
@@ -123,7 +126,8 @@ class Argument:
         )
         marks = (tyro.conf.Positional,) if self.positional else ()
         annotated = Annotated[(Any, words, shown, *marks)]
-        return self.name, annotated, None
+        required = helping and self.default is MISSING
+        return self.name, annotated, field(default=MISSING if required else None)
 
     def read(self, words: Sequence[str]) -> Any:
         """Returns the value of its words.
@@ -158,11 +162,9 @@ def arguments(function: Callable[..., None]) -> Iterator[Argument]:
         name, kind = parameter.name, types[parameter.name]
         if _has_options(kind):
             inner, inner_texts = get_type_hints(kind), documented(kind)[1]
-            for field in fields(kind):
-                text = inner_texts[field.name]
-                yield Argument(
-                    name, field.name, _given(inner[field.name]), field.default, text, False
-                )
+            for option in fields(kind):
+                of_type, text = _given(inner[option.name]), inner_texts[option.name]
+                yield Argument(name, option.name, of_type, option.default, text, False)
         else:
             default = MISSING if parameter.default is parameter.empty else parameter.default
             kind, positional = _given(kind), parameter.kind is not parameter.KEYWORD_ONLY
@@ -199,9 +201,10 @@ def call(
         option = options.get(word.replace("_", "-"))
         if option and option.type is not bool and following.startswith("--"):
             raise BadInput(f"{word} needs a value: give {KINDS[option.type].meaning}")
+    helping = "-h" in words or "--help" in words
     parsed: Any
     parsed, rest = tyro.cli(
-        make_dataclass("Words", [argument.field() for argument in every]),
+        make_dataclass("Words", [argument.field(helping) for argument in every], kw_only=True),
         prog=f"hyrl-mj {name}",
         description=documented(function)[0],
         args=words,
