@@ -249,13 +249,13 @@ def write_config(run: Run) -> None:
 
 
 def _differing(old: Settings, new: Settings) -> Iterator[str]:
-    """The settings that differ, for people."""
+    """Yields a description of each setting that differs, by the name of its option."""
     for name, there in vars(old).items():
         asked = getattr(new, name)
         if there == asked:
             continue
         if not isinstance(there, Training | Agent):
-            yield f"{name}: {there} there, {asked} asked for"
+            yield f"{'eps' if name == 'noise' else name}: {there} there, {asked} asked for"
         elif Agent in (type(there), type(asked)):
             yield f"policy: {_policy(there)} there, {_policy(asked)} asked for"
         elif there.algorithm != asked.algorithm:
