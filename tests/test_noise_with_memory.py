@@ -1,6 +1,7 @@
 """A new kind of noise is one class: defined here, it works wherever noise does, memory and all."""
 
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from planted import decisions, ideal_controller, sign_policy
 
-from hyrl_mj import BadInput, HybridArc, Noise, Signal, cli, register_noise, simulate
+from hyrl_mj import BadInput, HybridArc, Noise, Run, Signal, cli, parsing, register_noise, simulate
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.simulation.noise import _KINDS
@@ -129,7 +130,8 @@ def command_line(vehicle, monkeypatch, tmp_path):
     run = SimpleNamespace(
         task=vehicle, loops=loops, latest_path=lambda name: tmp_path / f"{name}.npz", path=tmp_path
     )
-    monkeypatch.setattr(cli, "load_run", lambda path: run)
+    opened = replace(parsing.KINDS[Run], read=lambda path: run)
+    monkeypatch.setitem(parsing.KINDS, Run, opened)
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["hyrl-mj", *arguments])

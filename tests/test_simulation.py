@@ -1,5 +1,7 @@
 """The batched closed loop equals plain ones, and its hybrid arcs live on hybrid time domains."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ from hyrl_mj import (
     Outcome,
     closed_loop,
     simulate,
+    simulate_batch,
 )
 from hyrl_mj.policies.controllers import PolicyController
 
@@ -242,6 +245,45 @@ def test_one_start_gives_one_arc_and_several_a_list(vehicle):
     assert isinstance(simulate(vehicle, sign_policy(vehicle), np.zeros(2)), HybridArc)
     arcs = simulate(vehicle, sign_policy(vehicle), np.zeros((3, 2)))
     assert [type(arc) for arc in arcs] == [HybridArc] * 3
+    (alone,) = simulate_batch(vehicle, sign_policy(vehicle), [0.0, 0.0])
+    np.testing.assert_array_equal(alone.z, arcs[0].z)
+
+
+# ---- an arc in a notebook
+
+
+def test_a_short_repr_says_how_it_ended(jumping_arc, circle):
+    assert repr(jumping_arc) == (
+        f"HybridArc(vehicle, hyrl: crashed after {jumping_arc.t[-1]:.2f} s, {jumping_arc.j[-1]} jumps, "
+        "alternating noise of 0.1)"
+    )
+    arc = simulate(circle, circle_policy(circle), [0.0], horizon=0.1)
+    assert repr(arc) == "HybridArc(unit_circle, policy: reached after 0.10 s, 0 jumps, no noise)"
+
+
+def test_a_plot_shows_every_coordinate_by_mode_and_marks_the_jumps(jumping_arc, vehicle, tmp_path):
+    figure = jumping_arc.plot()
+    assert [panel.get_ylabel() for panel in figure.axes] == ["x [m]", "y [m]"]
+    assert figure.axes[-1].get_xlabel() == "t [s]"
+    jumps = jumping_arc.t[np.flatnonzero(np.diff(jumping_arc.j))]
+    assert len(jumps) > 3
+    for panel, z in zip(figure.axes, jumping_arc.z.T, strict=True):
+        lines = [line for line in panel.lines if line.get_linestyle() == "-"]
+        marks = [line.get_xdata()[0] for line in panel.lines if line.get_linestyle() == "--"]
+        np.testing.assert_array_equal(marks, jumps)
+        drawn = np.concatenate([line.get_xydata() for line in lines])
+        np.testing.assert_array_equal(drawn, np.column_stack([jumping_arc.t, z]))
+        assert {line.get_label(): line.get_color() for line in lines} == {
+            "mode 0": "C0",
+            "mode 1": "C1",
+        }
+    assert [text.get_text() for text in figure.axes[0].get_legend().texts] == ["mode 0", "mode 1"]
+    figure.savefig(tmp_path / "arc.png")
+
+
+def test_a_plot_does_without_the_task(jumping_arc):
+    foreign = replace(jumping_arc, task="a robot of somebody's")
+    assert [panel.get_ylabel() for panel in foreign.plot().axes] == ["z[0]", "z[1]"]
 
 
 def test_a_start_that_is_over_already(vehicle):

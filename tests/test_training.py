@@ -94,9 +94,10 @@ def test_the_seed_fixes_every_weight(task, quick):
 
 def test_threads_of_the_physics_do_not_matter(task, quick, monkeypatch):
     policies = []
+    noisy = training.TaskGround(task, quick.gamma, Noise("uniform", 0.1))
     for threads in (1, 2):
         monkeypatch.setattr(training, "BatchedEnv", partial(BatchedEnv, threads=threads))
-        policies.append(training.train(task, quick, seed=4, noise=Noise("uniform", 0.1)))
+        policies.append(training.train(task, quick, seed=4, ground=noisy))
     assert_same_weights(*policies)
 
 
@@ -154,14 +155,16 @@ def test_evaluation_of_a_known_policy(circle):
 
 
 def test_training_ends_when_a_policy_is_good_enough(vehicle):
-    class Judge:
+    class Counted(training.TaskGround):
         enough = (1.0,)
+        settled = 0.0
         asked = 0
 
         def __call__(self, policy):
             self.asked += 1
             return (self.asked / 2,)
 
-    judge, settings = Judge(), preset(vehicle, "smoke").stage6
-    training.train(vehicle, settings, seed=0, judge=judge)
-    assert judge.asked == 2
+    settings = preset(vehicle, "smoke").stage6
+    ground = Counted(vehicle, settings.gamma)
+    training.train(vehicle, settings, seed=0, ground=ground)
+    assert ground.asked == 2

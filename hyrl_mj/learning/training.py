@@ -43,7 +43,7 @@ FINAL_RATE = 0.02
 # How often the policy is checkpointed and judged; on how many episodes.
 CHECKPOINTS = 32
 EPISODES = 256
-# Under which kinds of noise a policy is judged, if it is to stand any.
+# The kinds of noise under which a policy that is trained for noise is judged.
 JUDGES = ("none", "uniform", "alternating")
 # Observations by which a foreign policy is compared with the plain network of its weights, and how far the
 # weights are moved before that.
@@ -55,43 +55,35 @@ def train(
     settings: Training,
     seed: int,
     *,
-    noise: Noise | None = None,
-    domain: Domain | None = None,
+    ground: Ground | None = None,
     start_from: MlpPolicy | None = None,
-    judge: Judge | None = None,
     log_dir: Path | None = None,
     label: str = "training",
 ) -> MlpPolicy:
-    """Train one policy, and return the best that was met.
+    """Train one policy, and return the best of its checkpoints.
 
-    Training goes up and down; as with SB3's `EvalCallback`, the policy is judged at intervals. By default
-    that is done in the second half, on the same episodes every time: the best is the one that most often
-    ends at the set-point, and among equals the one with the highest return.
+    Training goes up and down; as with SB3's `EvalCallback`, the policy is judged at intervals.
 
     Args:
         task: what to learn.
         settings: how.
         seed: of weights, exploration, starts and noise; the same seed gives the same policy on the
             same machine, at any number of physics threads.
-        noise: measurement noise during training.
-        domain: restricts starts and episodes to a part of the state space.
+        ground: where the policy is trained and judged; by default `TaskGround`, without noise.
         start_from: a policy whose weights to go on from; its network replaces `settings.hidden`.
-        judge: scores policies instead, from the beginning, and ends the training early once one is good
-            enough.
         log_dir: where TensorBoard logs and checkpoints go; none are written by default.
         label: what the progress bar says.
 
     Returns:
         The best policy.
     """
-    model = build(task, settings, seed, noise=noise, domain=domain, start_from=start_from)
+    ground = ground or TaskGround(task, settings.gamma)
+    domain = ground.domain(settings.gamma)
+    model = build(task, settings, seed, noise=ground.noise, domain=domain, start_from=start_from)
     if log_dir is not None:
         model.set_logger(configure(str(log_dir / "tensorboard"), ["tensorboard"]))
-    # An untrained policy can be lucky in a few episodes; a judge's verdict stands at any time.
-    settled = settings.samples // 2 if judge is None else 0
-    judge = judge or _Episodes(task, noise or Noise(), domain, settings.gamma)
     interval = LOG_ROLLOUTS if isinstance(model, OnPolicyAlgorithm) else LOG_EPISODES
-    watch = _Watch(settings.samples, judge, settled, log_dir, label)
+    watch = _Watch(settings.samples, ground, log_dir, label)
     with single_threaded():
         model.learn(settings.samples, callback=watch, log_interval=interval)
     watch.close()
@@ -108,7 +100,7 @@ def build(
     domain: Domain | None = None,
     start_from: MlpPolicy | None = None,
 ) -> BaseAlgorithm:
-    """The SB3 algorithm that `train` runs, ready to learn.
+    """Returns the SB3 algorithm that `train` runs, ready to learn.
 
     Raises:
         BadInput: an unknown algorithm, or a policy to start from whose networks are those of another one.
@@ -206,7 +198,7 @@ def evaluate(
     gamma: float = 1.0,
     episodes: int = EPISODES,
 ) -> tuple[float, float]:
-    """How a policy does in episodes from the start distribution, always the same ones.
+    """Evaluates a policy in episodes from the start distribution, always the same ones.
 
     Returns:
         The share of episodes that end at the set-point, and the mean return, discounted by gamma.
@@ -226,43 +218,66 @@ def evaluate(
     return float(success.mean()), float(returns.mean())
 
 
-class Judge(Protocol):
-    """What tells good policies from bad ones.
+class Ground(Protocol):
+    """Where a policy is trained, and how it is judged there.
 
     Attributes:
+        noise: on the measurements during training.
         enough: a score with which training may end.
+        settled: share of the training after which scores count.
     """
 
+    noise: Noise
     enough: Score
+    settled: float
+
+    def domain(self, gamma: float) -> Domain | None:
+        """Returns the part of the state space that episodes are restricted to, for a discount gamma."""
+        ...
 
     def __call__(self, policy: MlpPolicy) -> Score:
-        """The score of a policy; scores are compared from left to right, the higher the better."""
+        """Returns the score of a policy; scores are compared from left to right, the higher the better."""
         ...
 
 
-class _Episodes:
-    """Judges by episodes without noise and with each kind of it."""
+class TaskGround:
+    """All starts of a task, where a policy is judged on the same episodes every time.
+
+    The best is the one that most often ends at the set-point, and among equals the one with the highest
+    return, on average over the kinds of noise in `JUDGES`.
+
+    Args:
+        task: what to learn.
+        gamma: discount of the returns.
+        noise: during training, by default none; its bound is that of all judges.
+    """
 
     enough: Score = (np.inf,)
+    settled = 0.5  # an untrained policy can be lucky in a few episodes
 
-    def __init__(self, task: Task, noise: Noise, domain: Domain | None, gamma: float):
-        self._task, self._domain, self._gamma = task, domain, gamma
-        self._noises = [Noise(k, noise.bound) for k in JUDGES] if noise.bound else [Noise()]
+    def __init__(self, task: Task, gamma: float, noise: Noise | None = None):
+        self.noise, self._task, self._gamma = noise or Noise(), task, gamma
+        bound = self.noise.bound
+        self._noises = [Noise(kind, bound) for kind in JUDGES] if bound else [Noise()]
+
+    def domain(self, gamma: float) -> None:
+        """Returns None: episodes are not restricted."""
 
     def __call__(self, policy: MlpPolicy) -> Score:
-        found = [evaluate(self._task, policy, n, self._domain, self._gamma) for n in self._noises]
-        success, returns = np.mean(found, axis=0)
+        results = [evaluate(self._task, policy, n, None, self._gamma) for n in self._noises]
+        success, returns = np.mean(results, axis=0)
         return float(success), float(returns)
 
 
 class _Watch(BaseCallback):
     """Progress bar, checkpoints at intervals, and the best policy."""
 
-    def __init__(self, samples: int, judge: Judge, settled: int, log_dir: Path | None, label: str):
+    def __init__(self, samples: int, ground: Ground, log_dir: Path | None, label: str):
         super().__init__()
         self.best: MlpPolicy | None = None
         self.best_score: Score = (-np.inf,)
-        self._judge, self._settled, self._log_dir = judge, settled, log_dir
+        self._ground, self._log_dir = ground, log_dir
+        self._settled = int(ground.settled * samples)
         self._next = self._interval = max(samples // CHECKPOINTS, 1)
         self._progress = Progress(label, samples, "samples")
 
@@ -271,10 +286,10 @@ class _Watch(BaseCallback):
         if self.num_timesteps >= self._next:
             self._next += self._interval
             self._checkpoint()
-        return self.best_score < self._judge.enough
+        return self.best_score < self._ground.enough
 
     def _on_training_end(self) -> None:
-        if self.best_score < self._judge.enough:
+        if self.best_score < self._ground.enough:
             self._checkpoint()
 
     def close(self) -> None:
@@ -286,7 +301,7 @@ class _Watch(BaseCallback):
         if self._log_dir is not None:
             policy.save(self._log_dir / "checkpoint.safetensors")
         if self.num_timesteps >= self._settled:
-            score = self._judge(policy)
+            score = self._ground(policy)
             for i, value in enumerate(score):
                 self.logger.record(f"eval/score_{i}", value)
             if score > self.best_score:

@@ -1,8 +1,12 @@
 """Simulation: the closed loop of plant, measurement noise and controller, in batches.
 
 `closed_loop` runs many episodes at once; `simulate` returns them as hybrid arcs. Each kind of measurement
-noise is a class of its own, a `Signal`, that `register_noise` makes known by its name.
+noise is a class of its own, a `Signal`, that `register_noise` makes known by its name; every file in this
+folder may define one.
 """
+
+from importlib import import_module
+from pkgutil import iter_modules
 
 from hyrl_mj.simulation.arc import HybridArc, samples, simulate, simulate_batch
 from hyrl_mj.simulation.lookahead import Lookahead
@@ -41,3 +45,6 @@ __all__ = [
     "simulate_batch",
     "ways",
 ]
+
+for _module in iter_modules(__path__, f"{__name__}."):
+    import_module(_module.name)

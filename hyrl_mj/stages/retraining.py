@@ -129,10 +129,8 @@ def retrain(
             task,
             settings,
             seed=draw,
-            noise=ground.noise,
-            domain=ground.domain(settings.gamma),
+            ground=ground,
             start_from=warm,
-            judge=ground,
             log_dir=log_dir,
             label=f"mode {mode}" + (f", attempt {attempt + 1}" if attempt else ""),
         )
@@ -151,7 +149,7 @@ def mode_ground(task: Task, extended: ExtendedSets, mode: int) -> ModeGround:
 
 
 class ModeGround(ABC):
-    """Where one mode has to win: draws starts from it, and tells its policies apart (a `Judge`).
+    """Where one mode has to win: draws starts from it, and scores its policies (a `Ground` of `train`).
 
     It is every state whose measurement can lie in M_ext_i and from which the mode can still succeed.
 
@@ -161,13 +159,15 @@ class ModeGround(ABC):
         mode: the mode.
 
     Attributes:
-        enough: the score of a policy that will do.
+        enough: the score of a policy that is good enough.
+        settled: share of the training after which scores count: from the beginning.
         noise: on the measurements while the mode is trained.
         bound: how far a measured chart point may be off, by coordinate (d,).
     """
 
     enough: Score
     noise: Noise
+    settled = 0.0
 
     def __init__(self, task: Task, extended: ExtendedSets, mode: int):
         self.task, self.extended, self.mode = task, extended, mode

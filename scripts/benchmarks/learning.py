@@ -15,7 +15,7 @@ import hyrl_mj
 from benchmarks import Figure
 from benchmarks.runs import Runs
 from hyrl_mj.learning import preset
-from hyrl_mj.learning.training import Score, export, single_threaded, train
+from hyrl_mj.learning.training import Score, TaskGround, export, single_threaded, train
 from hyrl_mj.policies import MlpPolicy, algorithm_class
 from hyrl_mj.tasks import Task
 
@@ -45,11 +45,14 @@ def figures(runs: Runs) -> Iterator[Figure]:
         )
 
 
-class _Quality:
+class _Quality(TaskGround):
     """Judges a policy by its quality, as `train` asks for it."""
 
+    settled = 0.0
+
     def __init__(self, task: Task, quality: Callable[[Task, MlpPolicy], float], enough: float):
-        self._task, self._quality, self.enough = task, quality, (enough,)
+        super().__init__(task, gamma=1.0)
+        self._quality, self.enough = quality, (enough,)
 
     def __call__(self, policy: MlpPolicy) -> Score:
         return (self._quality(self._task, policy),)
@@ -60,7 +63,7 @@ def _ours(task: Task, quality: Callable[[Task, MlpPolicy], float], enough: float
 
     def work() -> int:
         judge = _Quality(task, quality, enough)
-        found = train(task, preset(task).stage1, next(seeds), judge=judge)
+        found = train(task, preset(task).stage1, next(seeds), ground=judge)
         if judge(found) < judge.enough:
             raise SystemExit(f"{task.name}: stage 1 did not reach {enough}")
         return 1
