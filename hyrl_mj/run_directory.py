@@ -61,7 +61,7 @@ class Run:
     Attributes:
         path: the directory.
         settings: how it was made.
-        function: the agent that it is about, if that is a function, which no file holds.
+        function: the agent, if it is a function, which no file holds.
     """
 
     path: Path
@@ -81,7 +81,7 @@ class Run:
 
     @property
     def agent(self) -> Agent | None:
-        """The agent that was given in the place of stage 1, if one was."""
+        """The agent that takes the place of stage 1, if there is one."""
         stage1 = self.settings.stage1
         return stage1 if isinstance(stage1, Agent) else None
 
@@ -109,7 +109,7 @@ class Run:
         return Lattice.possible(self.task) and not (self.agent and self.agent.stochastic)
 
     def check_exact(self) -> None:
-        """Raise `BadInput` unless `exact`."""
+        """Raises `BadInput` unless `exact`."""
         Lattice.check(self.task)
         if not self.exact:
             raise BadInput(
@@ -161,54 +161,53 @@ class Run:
         policies = {q: self._load_policy(f"mode_{q}.safetensors") for q in extended.modes}
         flow_sets = dict(zip(extended.modes, extended.sets, strict=True))
         starts = None
-        if (
-            self.agent is not None
-        ):  # its sets reach differently far to either side of where it decides
+        if self.agent is not None:
+            # The sets of an agent reach differently far to either side of where it decides.
             starts = dict(zip(self.split.modes, self.split.parts, strict=True))
         return HybridController(self.task, policies, flow_sets, starts)
 
     @cached_property
     def loops(self) -> dict[str, Controller]:
-        """What is examined: the policy alone, and the hybrid controller."""
+        """The controllers that are examined: the policy alone, and the hybrid controller."""
         return {"policy": PolicyController(self.policy), "hyrl": self.controller}
 
     @cached_property
     def robustness(self) -> Robustness:
-        """What `robustness.json` holds."""
+        """The result of the examination under noise, from `robustness.json`."""
         return Robustness.load(self.path / "robustness.json")
 
     @cached_property
     def versions(self) -> dict[str, str]:
-        """The versions of Python and packages that it was begun with."""
+        """The versions of Python and packages that the run was begun with."""
         return Config.load(self.path / "config.json").versions
 
     def arc_paths(self) -> dict[tuple[str, str], Path]:
-        """The files of the replays by start ("start0", ..., "critical") and controller."""
+        """Returns the files of the replays by start ("start0", ..., "critical") and controller."""
         starts = [f"start{i}" for i in range(len(self.task.scene.starts))]
         starts += ["critical"] if len(self.critical_set.points) else []
         loops = ["policy"] + [f"hyrl_q{q}" for q in self.extended_sets.modes]
         return {(s, c): self.path / "arcs" / f"{s}_{c}.npz" for s in starts for c in loops}
 
     def arcs(self) -> dict[tuple[str, str], HybridArc]:
-        """The replays by start ("start0", ..., "critical") and controller ("policy", "hyrl_q0", ...)."""
+        """Returns the replays by start ("start0", "critical") and controller ("policy", "hyrl_q0")."""
         return {key: self.arc(path) for key, path in self.arc_paths().items()}
 
     def arc(self, path: Path) -> HybridArc:
-        """An arc of this run's task.
+        """Returns an arc of this run's task.
 
         Raises:
-            BadArtifact: it is of another task, or damaged.
+            BadArtifact: the arc is of another task, or damaged.
         """
-        found = HybridArc.load(path)
-        if found.task != self.task.name:
+        arc = HybridArc.load(path)
+        if arc.task != self.task.name:
             raise BadArtifact(
-                f"{path} is an arc of {found.task}, {self.path} a run of {self.task.name}: "
+                f"{path} is an arc of {arc.task}, {self.path} a run of {self.task.name}: "
                 "simulate it again"
             )
-        return found
+        return arc
 
     def latest_path(self, controller: str) -> Path:
-        """The file of the latest simulation from a start of the user's."""
+        """Returns the file of the latest simulation from a start of the user."""
         return self.path / "arcs" / f"latest_{controller}.npz"
 
     def _load_policy(self, name: str) -> MlpPolicy:
@@ -223,14 +222,14 @@ class Run:
 
 
 def load_run(path: str | Path, policy: AnyPolicy | None = None) -> Run:
-    """Open a run directory.
+    """Opens a run directory.
 
     Args:
         path: the directory.
-        policy: the function that the run is about, if it is about one: no file holds it.
+        policy: the agent of the run, if it is a function, which no file holds.
 
     Raises:
-        BadArtifact: it is not one.
+        BadArtifact: the directory holds no run.
     """
     path = Path(path)
     config = path / "config.json"
@@ -243,41 +242,42 @@ def load_run(path: str | Path, policy: AnyPolicy | None = None) -> Run:
 
 
 def write_config(run: Run) -> None:
-    """Write `config.json`: every setting, and the versions that go with them."""
+    """Writes `config.json`: every setting, and the versions that go with them."""
     versions = {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
     artifacts.write_json(run.path / "config.json", Config(run.settings, versions), kind="run")
 
 
 def _differing(old: Settings, new: Settings) -> Iterator[str]:
     """Yields a description of each setting that differs, by the name of its option."""
-    for name, there in vars(old).items():
-        asked = getattr(new, name)
-        if there == asked:
+    for name, before in vars(old).items():
+        now = getattr(new, name)
+        if before == now:
             continue
-        if not isinstance(there, Training | Agent):
-            yield f"{'eps' if name == 'noise' else name}: {there} there, {asked} asked for"
-        elif Agent in (type(there), type(asked)):
-            yield f"policy: {_policy(there)} there, {_policy(asked)} asked for"
-        elif there.algorithm != asked.algorithm:
-            yield f"{name} algorithm: {there.algorithm} there, {asked.algorithm} asked for"
+        if not isinstance(before, Training | Agent):
+            option = "eps" if name == "noise" else name
+            yield f"{option}: {before} there, {now} asked for"
+        elif Agent in (type(before), type(now)):
+            yield f"policy: {_policy(before)} there, {_policy(now)} asked for"
+        elif before.algorithm != now.algorithm:
+            yield f"{name} algorithm: {before.algorithm} there, {now.algorithm} asked for"
         else:
             yield name
 
 
 def _policy(stage1: Training | Agent) -> str:
-    """Stage 1 for people."""
+    """Returns a short name of what stage 1 trains or takes."""
     if isinstance(stage1, Agent):
         return f"{stage1} of sha256 {stage1.sha256[:8]}"
     return f"{stage1.title} to be trained"
 
 
 def open_or_create(path: str | Path, settings: Settings, policy: AnyPolicy | None = None) -> Run:
-    """The run directory at `path` with these settings, made if it is not there yet.
+    """Opens the run directory at `path` with these settings, or makes it.
 
     `policy` is as in `load_run`.
 
     Raises:
-        BadInput: there is a run with other settings; the message names them.
+        BadInput: the directory holds a run with other settings; the message names them.
     """
     path = Path(path)
     if (path / "config.json").exists():
@@ -290,7 +290,7 @@ def open_or_create(path: str | Path, settings: Settings, policy: AnyPolicy | Non
             )
         return run
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise BadInput(f"{path} is there and is not a run directory: choose another --out")
+        raise BadInput(f"{path} exists and is not a run directory: choose another --out")
     run = Run(path, settings, policy)
     write_config(run)
     return run

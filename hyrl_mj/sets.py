@@ -151,7 +151,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class GridSet:
-    """A set given by its signed distance at the nodes of a grid, interpolated in between.
+    """A set by its signed distance at the nodes of a grid, interpolated in between.
 
     Attributes:
         grid: the nodes.
@@ -284,17 +284,17 @@ class GridSet:
 
 
 def within_reach(mask: np.ndarray, window: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
-    """Whether some node of a mask lies within so many nodes (d,) along each axis: bool, of its shape."""
+    """Returns whether some node of a mask lies within so many nodes (d,) along each axis, in its shape."""
     from scipy import ndimage
 
-    found = mask.astype(np.uint8)
+    reached = mask.astype(np.uint8)
     for axis, (w, wraps) in enumerate(zip(window, periodic, strict=True)):
         if w:
             n = mask.shape[axis]
             size = min(2 * w + 1, n) if wraps else 2 * min(int(w), n - 1) + 1
             mode = "wrap" if wraps else "constant"
-            found = ndimage.maximum_filter1d(found, size, axis, mode=mode)
-    return found.astype(bool)
+            reached = ndimage.maximum_filter1d(reached, size, axis, mode=mode)
+    return reached.astype(bool)
 
 
 def _unrolled(grid: Grid, mask: np.ndarray) -> tuple[np.ndarray, tuple[slice, ...]]:

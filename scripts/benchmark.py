@@ -40,7 +40,7 @@ PAIRS = 5
 
 
 def machine() -> str:
-    """What this was measured on."""
+    """Returns a description of this machine."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         cpu = next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
@@ -50,22 +50,22 @@ def machine() -> str:
 
 
 def table(results: list[Measured]) -> Table:
-    """The results for people."""
-    found = Table(title=machine())
+    """Returns the results as a table."""
+    printed = Table(title=machine())
     for heading in ("figure", "ours", "against", "ratio (least - greatest)", "target"):
-        found.add_column(heading)
+        printed.add_column(heading)
     for r in results:
         ours = f"{r.ours:.4g} {r.unit}" + (f", {r.memory:.0f} MB" if r.memory else "")
         other, ratio = "", ""
         if r.other is not None:
             other = f"{r.other:.4g} {r.unit}: {r.against}"
             ratio = f"{np.median(r.ratios):.3g} ({min(r.ratios):.3g} - {max(r.ratios):.3g})"
-        found.add_row(r.name, ours, other, ratio, r.target)
-    return found
+        printed.add_row(r.name, ours, other, ratio, r.target)
+    return printed
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="one pair each, no training")
     parser.add_argument("--only", nargs="+", choices=GROUPS, default=list(GROUPS))

@@ -19,7 +19,7 @@ from hyrl_mj.viz import replay_sentence
 
 
 def circle_return(task: hyrl_mj.Task, policy: hyrl_mj.MlpPolicy, starts: int = 10_000) -> float:
-    """Mean return over 150 samples from starts drawn evenly from pi +- 0.2 rad."""
+    """Returns the mean return over 150 samples from starts drawn evenly from pi +- 0.2 rad."""
     env = BatchedEnv(task, starts)
     env.reset(z=np.pi + np.random.default_rng(0).uniform(-0.2, 0.2, (starts, 1)))
     rewards = [env.step(policy.act(env.plant.measurement)).reward for _ in range(task.max_steps)]
@@ -37,7 +37,7 @@ class Hard:
 
 
 def vehicle_share(task: hyrl_mj.Task, policy: hyrl_mj.MlpPolicy) -> float:
-    """Share of the winnable starts of the box x in [0, 0.5], y in [-1, 1] that the policy passes from."""
+    """Returns the share of the winnable starts in [0, 0.5] x [-1, 1] m that the policy passes from."""
     x, y = np.meshgrid(np.linspace(0, 0.5, 50), np.linspace(-1, 1, 50), indexing="ij")
     z0 = np.stack([x.ravel(), y.ravel()], axis=1)
 
@@ -51,7 +51,7 @@ def vehicle_share(task: hyrl_mj.Task, policy: hyrl_mj.MlpPolicy) -> float:
 
 
 def describe(run: hyrl_mj.Run) -> str:
-    """The figures of one run in one paragraph."""
+    """Returns the figures of one run in one paragraph."""
     arcs = run.arcs()
     paper = [a for (start, who), a in arcs.items() if start != "critical" and who != "policy"]
     lines = [f"{run.path}: {run.task.name}, seed {run.settings.seed}"]
@@ -62,7 +62,7 @@ def describe(run: hyrl_mj.Run) -> str:
         nodes = np.linspace(0, 2 * np.pi, 200_001)[:, None]
         for q in run.controller.modes:
             far = nodes[run.controller.flow_set(q).contains(nodes), 0]
-            # Around the set-point all sets overlap; the edge beyond M* is the one asked for.
+            # Around the set-point all sets overlap; the edge beyond M* is printed.
             edge = far[far < 1.5 * np.pi].max() if q == 0 else far[far > 0.5 * np.pi].min()
             lines.append(f"  mode {q} reaches to {edge / np.pi:.4f} pi")
         ends = [abs(run.task.chart.difference(a.z[-1], np.zeros(1)))[0] for a in paper]

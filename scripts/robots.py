@@ -35,7 +35,7 @@ SHARE = 1_000
 
 @dataclass(frozen=True)
 class Expert:
-    """Passes the pillar on a given side with room to spare, then goes for the set-point.
+    """Passes the pillar on one side with room to spare, then goes for the set-point.
 
     Attributes:
         task: the rover or the quadrotor.
@@ -61,7 +61,7 @@ class Expert:
 
 
 def crashes_without_noise(run: hyrl_mj.Run) -> dict[str, int]:
-    """How often each controller fails from starts that the expert survives on one side."""
+    """Returns how often each controller fails from starts that the expert survives on one side."""
     task = run.task
     z = task.starts(STARTS, np.random.default_rng(0))
     survived = np.zeros(STARTS, dtype=bool)
@@ -69,18 +69,19 @@ def crashes_without_noise(run: hyrl_mj.Run) -> dict[str, int]:
         survived |= reached(task, PolicyController(Expert(task, side)), z)
     if not survived.any():
         raise SystemExit(f"{task.name}: the expert survives from nowhere")
-    found = {name: ~reached(task, loop, z) & survived for name, loop in run.loops.items()}
-    return {name: int(failed.sum()) for name, failed in found.items()}
+    return {
+        name: int((~reached(task, loop, z) & survived).sum()) for name, loop in run.loops.items()
+    }
 
 
 def reached(task: hyrl_mj.Task, loop: Controller, z: np.ndarray) -> np.ndarray:
-    """Whether runs from starts (n, d) reach the end: (n,) bool."""
+    """Returns whether runs from starts (n, d) reach the end: (n,) bool."""
     rollout = closed_loop(task, loop, z, settings=LoopSettings(quiet=True))
     return rollout.outcome == hyrl_mj.Outcome.REACHED
 
 
 def measure(name: str, seed: int, count: int, folder: Path) -> list[str]:
-    """One row of the table; figures that miss their target end in "!"."""
+    """Returns one row of the table; figures that miss their target end in "!"."""
     out, began = folder / f"{name}_{seed}", time.monotonic()
     done_before = (out / "report.html").is_file()
     memory = child(["-m", "hyrl_mj.cli", "run", name, "--seed", str(seed), "--out", str(out)])
@@ -104,7 +105,7 @@ def measure(name: str, seed: int, count: int, folder: Path) -> list[str]:
 
 
 def main() -> int:
-    """Run and print; 1 if a target is missed."""
+    """Runs and prints; returns 1 if a target is missed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     robots = ("rover", "quadrotor")
     parser.add_argument("--tasks", nargs="+", default=list(robots), choices=robots)

@@ -1,8 +1,5 @@
 """Scores, margins and maps of the worst-case game, and the files they go into."""
 
-import json
-from dataclasses import asdict
-
 import numpy as np
 import pytest
 from planted import (
@@ -24,15 +21,8 @@ from hyrl_mj.game import (
     UNWINNABLE,
     WON,
     WON_FROM_SOME,
-    Curve,
-    EpisodeCount,
     Game,
-    GameResult,
-    LatticeSpacing,
-    Profile,
     Robustness,
-    Score,
-    Wins,
     examine,
     worst_signal,
 )
@@ -231,10 +221,10 @@ def test_no_milder_noise_crashes_what_the_worst_does_not(vehicle, on_vehicle):
     np.testing.assert_array_equal(worst, lost)
 
 
-def test_an_answer_is_firm_unless_it_changes_right_beside_the_node(on_vehicle):
+def test_an_answer_is_settled_unless_it_changes_right_beside_the_node(on_vehicle):
     answers = on_vehicle[0].answers["sign"]
-    y = on_vehicle[0].lattice.grid.spacing[1] * np.arange(-answers.pad[1], answers.firm.shape[2])
-    torn = np.unique(np.nonzero(~answers.firm)[2])
+    y = on_vehicle[0].lattice.grid.spacing[1] * np.arange(-answers.pad[1], answers.settled.shape[2])
+    torn = np.unique(np.nonzero(~answers.settled)[2])
     # Where the sides part, and where the pillar is passed and it goes straight on.
     assert set(np.round(y[torn] - 1.5, 4)) == {-0.9, 0.0, 0.9}
 
@@ -332,63 +322,3 @@ def test_a_game_refuses_what_it_does_not_know(on_vehicle):
     for eps in (-0.1, float("nan")):
         with pytest.raises(BadInput, match="finite number >= 0"):
             game.score("limit", eps)
-
-
-# ---- the file
-
-
-GAME = GameResult(
-    everywhere=False,
-    lattice=LatticeSpacing((0.1, 0.1), True, (0.2, 0.2)),
-    scores={
-        "policy": (Score(0.1, 0.98, 0.92, 0.9, 3.0, 3.0, None),),
-        LIMIT: (Score(0.1, 0.98, 1.0, 0.97, 3.0, 3.0, 0.1),),
-    },
-    margin={"policy": None},
-    miss_without_noise={"policy": 0.025},
-    curve=Curve((0.0, 0.1), (1.0, 0.98), {"policy": Wins((1.0, 0.9), (1.0, 0.9), (3.0, 3.0))}),
-    profile=Profile(((0.0, 0.1),), {"policy": (None,)}),
-)
-COUNT = EpisodeCount(
-    "uniform", 0.1, False, "policy", "near M*", 4, {"crashed": 3, "reached": 1}, 0.25, (0.1, 0.7)
-)
-ROBUSTNESS = Robustness(0.1, False, GAME, (COUNT,), seed=2)
-
-
-@pytest.mark.parametrize("robustness", [ROBUSTNESS, Robustness(0.1, True, None, (COUNT,), 0)])
-def test_a_result_comes_back_with_its_types(tmp_path, robustness):
-    robustness.save(tmp_path / "r.json")
-    assert Robustness.load(tmp_path / "r.json") == robustness
-
-
-def test_scores_margins_and_episodes_are_where_readers_of_the_file_expect_them(tmp_path):
-    ROBUSTNESS.save(tmp_path / "r.json")
-    content = json.loads((tmp_path / "r.json").read_text())
-    game = content["game"]
-    names = ["eps", "winnable", "won", "won_any", "time", "time_any", "excursion"]
-    assert list(game["scores"]["policy"][0]) == names
-    assert game["margin"] == {"policy": None}
-    assert game["miss_without_noise"] == {"policy": 0.025}
-    assert content["episodes"] == [asdict(COUNT) | {"interval": [0.1, 0.7]}]
-    assert (content["eps"], content["everywhere"], content["seed"]) == (0.1, False, 2)
-
-
-def test_a_file_of_version_0_1_ends_in_one_sentence(tmp_path):
-    content = json.loads(json.dumps(asdict(ROBUSTNESS)))
-    curve, profile = content["game"]["curve"], content["game"]["profile"]
-    curve |= curve.pop("wins")
-    profile |= profile.pop("eps")
-    artifacts.write_json(tmp_path / "r.json", content, "robustness")
-    with pytest.raises(BadArtifact, match=r"r\.json: it has no game\.curve\.wins.*robustness RUN"):
-        Robustness.load(tmp_path / "r.json")
-
-
-def test_results_describe_themselves_in_a_line():
-    assert repr(ROBUSTNESS) == (
-        "Robustness(eps 0.1, GameResult(won at eps 0.1: policy 92.00%), 4 episodes)"
-    )
-    score = (
-        "Score(eps=0.1, winnable=0.98, won=0.92, won_any=0.9, time=3, time_any=3, excursion=None)"
-    )
-    assert repr(GAME.scores["policy"][0]) == score
-    assert (GAME.controllers, GAME.lasting, COUNT.lost) == (("policy",), True, 3)

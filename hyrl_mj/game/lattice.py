@@ -132,7 +132,7 @@ class Lattice:
         return Lattice(task, grid, levels, after.astype(np.int32), arrived, failed)
 
     def level_of(self, u: np.ndarray) -> np.ndarray:
-        """The levels (n,) int nearest to inputs (n, m).
+        """Returns the levels (n,) int nearest to inputs (n, m).
 
         Raises:
             BadInput: an input that is not finite, out of range, or not one of a discrete task's.
@@ -151,29 +151,29 @@ class Lattice:
         counts = [len(np.unique(column)) for column in self.levels.T]
         steps = (np.array(counts) - 1) / (high - low)
         index = np.clip(np.round((u - low) * steps), 0, np.array(counts) - 1).astype(int)
-        found = np.ravel_multi_index(tuple(index.T), tuple(counts))
-        off = np.abs(self.levels[found] - u).max(axis=1) > 1e-6
+        level = np.ravel_multi_index(tuple(index.T), tuple(counts))
+        off = np.abs(self.levels[level] - u).max(axis=1) > 1e-6
         if self.task.learning.levels is not None and off.any():
             raise BadInput(
                 f"the controller's input {u[off][0].tolist()} is not one of the levels of "
                 f"{self.task.name}: {np.unique(self.levels).tolist()}"
             )
-        return found
+        return level
 
 
 def _over(task: Task, measurement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which states (n, p) end an episode: (n,) bool without success, (n,) bool with it."""
+    """Returns which states (n, p) end an episode: (n,) bool without success, (n,) bool with it."""
     return task.failed(measurement), task.ending(measurement) == Outcome.REACHED
 
 
 def _ended(task: Task, measurement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As `_over`, with the verdict at states where the episode would run on."""
+    """Returns the same as `_over`, with the verdict at states where the episode would run on."""
     failed, reached = _over(task, measurement)
     return failed, reached | ~failed & (task.verdict(measurement) == Outcome.REACHED)
 
 
 def _levels(task: Task, grid: Grid, nodes: np.ndarray) -> np.ndarray:
-    """The inputs (A, m) of the lattice: of a continuous task so many that neighbours lead a cell apart."""
+    """Returns the inputs (A, m); those of a continuous task so dense that neighbours lead a cell apart."""
     if task.input_levels is not None:
         return task.input_levels
     low, high = task.input_limits
@@ -193,16 +193,16 @@ def _levels(task: Task, grid: Grid, nodes: np.ndarray) -> np.ndarray:
 
 
 def _around(grid: Grid, ends: np.ndarray) -> np.ndarray:
-    """The nodes around points (A, N, d), the nearest first: (A, C, N) flat indices."""
+    """Returns the nodes around points (A, N, d), the nearest first: (A, C, N) flat indices."""
     index = (grid.chart.wrap(ends) - grid.chart.low) / grid.spacing
     nearest = np.round(index)
     other = nearest + np.where(np.abs(index - nearest) <= ON_NODE, 0, np.sign(index - nearest))
     between = (other != nearest).any(axis=(0, 1))
     corners = product(*[(0, 1) if b else (0,) for b in between])
     counts = np.array(grid.counts)
-    found = []
+    around = []
     for corner in corners:
         at = np.where(corner, other, nearest).astype(int)
         at = np.where(grid.chart.periodic, at % counts, np.clip(at, 0, counts - 1))
-        found.append(np.ravel_multi_index(tuple(np.moveaxis(at, -1, 0)), grid.counts))
-    return np.stack(found, axis=1)
+        around.append(np.ravel_multi_index(tuple(np.moveaxis(at, -1, 0)), grid.counts))
+    return np.stack(around, axis=1)

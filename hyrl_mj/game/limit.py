@@ -1,7 +1,7 @@
 """What any controller could win: the limit beside every score of the worst-case game.
 
 The limit is a controller that knows the true state to steer by, but has to decide the way by what it
-measures. It picks the side of the first measurement, and from there each way is taken as well as it can be.
+measures. It picks the side of the first measurement, and from there follows each way as well as possible.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ ON_BOUNDARY = 1e-9
 
 @dataclass(frozen=True)
 class Limit:
-    """How each way could be taken by somebody who knows the state.
+    """What a controller could do that knows the state, on each mode's way.
 
     Attributes:
         lattice: of the states.
@@ -42,7 +42,7 @@ class Limit:
 
     @staticmethod
     def of(lattice: Lattice, parts: Iterable[GridSet]) -> Limit:
-        """Find the ways on a lattice, by backward recursion over the best input.
+        """Finds the ways on a lattice, by backward recursion over the best input.
 
         A run goes mode i's way if it enters M_i and then stays there until it arrives; before that it may
         pass through other parts, but not where several meet again.
@@ -69,7 +69,7 @@ class Limit:
         return Limit(lattice, inside, sides, samples, level, hop)
 
     def held(self, bound: np.ndarray) -> np.ndarray:
-        """The most samples until arrival of "pick the side of the first measurement, then hold it".
+        """Returns the most samples until arrival of "pick the side of the first measurement, then hold it".
 
         Returns:
             (N,) int, `NEVER` where noise within bounds (d,) can show a side whose way is closed.
@@ -78,11 +78,11 @@ class Limit:
         return np.asarray(np.where(shown, self.samples, 0).max(axis=0))
 
     def winnable(self, bound: np.ndarray) -> np.ndarray:
-        """Where picking a side by the first measurement and holding it always wins: (N,) bool."""
+        """Returns where picking a side by the first measurement and holding it always wins: (N,) bool."""
         return self.held(bound) < NEVER
 
     def moves(self, bound: np.ndarray) -> Moves:
-        """The adversary's moves against the limit under noise within bounds (d,).
+        """Returns the adversary's moves against the limit under noise within bounds (d,).
 
         Its flow sets are those of stage 5, with the ways that are really open in place of W_i.
         """
@@ -101,7 +101,7 @@ class Limit:
         return Moves.gather(lattice, rows)
 
     def _reach(self, mask: np.ndarray, bound: np.ndarray) -> np.ndarray:
-        """The nodes (N,) bool from which noise within bounds (d,) can show a node of the mask."""
+        """Returns the nodes (N,) bool from which noise within bounds (d,) can show a node of the mask."""
         grid = self.lattice.grid
         window = nodes_within(self.lattice, bound)
         return within_reach(mask.reshape(grid.counts), window, grid.chart.periodic).ravel()
@@ -110,7 +110,7 @@ class Limit:
 def fewest_samples(
     lattice: Lattice, after: np.ndarray, allowed: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The fewest samples until arrival without noise, over allowed transitions.
+    """Returns the fewest samples until arrival without noise, over allowed transitions.
 
     Args:
         lattice: gives the places.
@@ -126,9 +126,11 @@ def fewest_samples(
     level = np.zeros(lattice.nodes, dtype=int)
     open_ = np.flatnonzero(lattice.running & ~lattice.arrived)
     while len(open_):
-        found = np.where(allowed[..., open_], samples[after[..., open_]], NEVER).max(axis=1)
-        best = found.argmin(axis=0)
-        fewest = found[best, np.arange(len(open_))]
+        samples_by_level = np.where(allowed[..., open_], samples[after[..., open_]], NEVER).max(
+            axis=1
+        )
+        best = samples_by_level.argmin(axis=0)
+        fewest = samples_by_level[best, np.arange(len(open_))]
         done = fewest < NEVER
         if not done.any():
             break

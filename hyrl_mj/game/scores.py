@@ -27,7 +27,7 @@ class Game:
     Args:
         task: what is played.
         parts: M_i of each mode, or a `Partition`; the limit takes its sides from them.
-        controllers: by name, controllers or policies; each is asked once.
+        controllers: by name, controllers or policies; each must be a pure function.
         largest: the largest noise bound that will be played.
         everywhere: whether noise acts on all coordinates, not only on those the task calls noisy.
         grid: nodes of the lattice, by default the finest.
@@ -57,7 +57,7 @@ class Game:
         }
 
     def bound(self, eps: float) -> np.ndarray:
-        """Noise bounds by coordinate (d,)."""
+        """Returns the noise bounds by coordinate (d,)."""
         return self.task.noise_in_chart(eps, self.everywhere)
 
     @cached_property
@@ -66,7 +66,7 @@ class Game:
         return self.task.may_start(self.lattice.grid.nodes) & self.lattice.running
 
     def moves(self, name: str, eps: float) -> Moves:
-        """The adversary's moves against a controller, or against the limit."""
+        """Returns the adversary's moves against a controller, or against the limit."""
         if name not in (*self.answers, LIMIT):
             raise unknown("controller", name, (*self.answers, LIMIT))
         self.task.check_noise(eps, self.everywhere)
@@ -78,7 +78,7 @@ class Game:
         return self.limit.moves(bound) if name == LIMIT else noisy_moves(self.answers[name], bound)
 
     def value(self, name: str, eps: float) -> np.ndarray:
-        """The game's value (modes + 1, places), the last row for runs that have not started."""
+        """Returns the game's value (modes + 1, places), the last row for runs that have not started."""
         return self._value(name, self.moves(name, eps), eps)
 
     def winnable(self, eps: float) -> np.ndarray:
@@ -86,7 +86,7 @@ class Game:
         return self.limit.winnable(self.bound(eps))
 
     def score(self, name: str, eps: float) -> Score:
-        """The score of a controller, or of the limit."""
+        """Returns the score of a controller, or of the limit."""
         moves = self.moves(name, eps)
         value = self._value(name, moves, eps)[:, :-2]
         region = self.starts & self.winnable(eps)
@@ -110,7 +110,7 @@ class Game:
         return value
 
     def map(self, name: str, eps: float) -> np.ndarray:
-        """The class (N,) of every node, an index into `MAP_CLASSES`."""
+        """Returns the class (N,) of every node, an index into `MAP_CLASSES`."""
         value = self.value(name, eps)[:, :-2]
         classes = np.full(self.lattice.nodes, BEATEN, dtype=np.int8)
         classes[value[-1] < NEVER] = WON_FROM_SOME
@@ -120,9 +120,9 @@ class Game:
         return classes
 
     def margin(self, name: str) -> float | None:
-        """The largest noise bound at which the whole winnable start region is won, by bisection.
+        """Returns the largest noise bound at which the whole winnable start region is won, by bisection.
 
-        It is known to one cell of the lattice; None if not even without noise all of it is won.
+        It is known to one cell of the lattice; None if some of it is lost even without noise.
         """
         cell = float(self.lattice.grid.spacing[self.bound(1.0) > 0].min())
 
@@ -142,7 +142,7 @@ class Game:
         return low * cell
 
     def worst_noise(self, name: str, eps: float) -> WorstNoise:
-        """The adversary's noise, to simulate with."""
+        """Returns the adversary's noise, to simulate with."""
         return WorstNoise(self.answers[name], self.bound(eps))
 
 
@@ -160,7 +160,7 @@ def worst_signal(
     q0: int | None = None,
     steps: int | None = None,
 ) -> Recorded:
-    """The worst noise signal against a controller from starts (n, d), sample by sample.
+    """Returns the worst noise signal against a controller from starts (n, d), sample by sample.
 
     `simulate` with it from the same starts gives the runs that the game foresees. It lasts for a number of
     steps, by default until the task's time is up.
@@ -177,6 +177,6 @@ def worst_signal(
 
 
 def _true_measurements(task: Task, rollout: Rollout) -> np.ndarray:
-    """What the sensors of a rollout gave before noise: (K, n, p)."""
+    """Returns the measurements of a rollout before noise: (K, n, p)."""
     path = rollout.path[: len(rollout.measured)]
     return np.stack([task.with_z(m, z) for m, z in zip(rollout.measured, path, strict=True)])

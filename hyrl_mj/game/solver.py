@@ -40,20 +40,20 @@ class Answers:
         lattice: of the true states.
         modes: the controller's modes.
         pad: (d,) nodes by which the measured nodes reach beyond the lattice on either side.
-        letter: (Q + 1, measured nodes...) int, level * Q + number of the next mode.
-        firm: (Q + 1, measured nodes...) bool, whether the answer is the same right beside the node. Where it
-            is not, rounding decides what a measurement there provokes.
+        index: (Q + 1, measured nodes...) int, the answer as level * Q + number of the next mode.
+        settled: (Q + 1, measured nodes...) bool, whether the answer is the same right beside the node.
+            Where it is not, rounding decides what a measurement there provokes.
     """
 
     lattice: Lattice
     modes: tuple[int, ...]
     pad: np.ndarray
-    letter: np.ndarray
-    firm: np.ndarray
+    index: np.ndarray
+    settled: np.ndarray
 
     @staticmethod
     def of(lattice: Lattice, controller: Controller, bound: np.ndarray) -> Answers:
-        """Ask a controller.
+        """Returns the answers of a controller.
 
         Args:
             lattice: of the true states.
@@ -79,18 +79,18 @@ class Answers:
                 raise BadInput(f"the controller went to mode {after[unknown][0]}, it has {modes}")
             return lattice.level_of(u) * len(modes) + np.searchsorted(modes, after)
 
-        letters, firm = [], []
+        answers, all_settled = [], []
         beside = BESIDE * grid.spacing * np.eye(len(axes))[bound > 0]
         for q in (*modes, None):
-            letter = ask(q, measured.reshape(-1, len(axes))).reshape(measured.shape[:-1])
-            sure = np.ones(letter.shape, dtype=bool)
-            at = np.nonzero(_borders(letter, grid.chart.periodic))
+            index = ask(q, measured.reshape(-1, len(axes))).reshape(measured.shape[:-1])
+            settled = np.ones(index.shape, dtype=bool)
+            at = np.nonzero(_borders(index, grid.chart.periodic))
             if len(at[0]) and len(beside):
                 others = [ask(q, measured[at] + side) for side in (*beside, *-beside)]
-                sure[at] = (np.array(others) == letter[at]).all(axis=0)
-            letters.append(letter)
-            firm.append(sure)
-        return Answers(lattice, modes, pad, np.stack(letters), np.stack(firm))
+                settled[at] = (np.array(others) == index[at]).all(axis=0)
+            answers.append(index)
+            all_settled.append(settled)
+        return Answers(lattice, modes, pad, np.stack(answers), np.stack(all_settled))
 
     @property
     def middle(self) -> tuple[slice, ...]:
@@ -99,19 +99,19 @@ class Answers:
         return tuple(slice(k, k + n) for k, n in zip(self.pad, counts, strict=True))
 
 
-def _borders(letter: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
-    """The nodes (n, ...) bool with another letter next to them."""
-    found = np.zeros(letter.shape, dtype=bool)
+def _borders(index: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
+    """Returns the nodes (n, ...) bool with another answer next to them."""
+    borders = np.zeros(index.shape, dtype=bool)
     for axis, round_ in enumerate(periodic):
-        differs = np.diff(letter, axis=axis, append=letter.take([0], axis=axis)) != 0
+        differs = np.diff(index, axis=axis, append=index.take([0], axis=axis)) != 0
         if not round_:
             differs[(slice(None),) * axis + (-1,)] = False
-        found |= differs | np.roll(differs, 1, axis=axis)
-    return found
+        borders |= differs | np.roll(differs, 1, axis=axis)
+    return borders
 
 
 def nodes_within(lattice: Lattice, bound: np.ndarray) -> np.ndarray:
-    """How many nodes lie within noise bounds (d,) on either side: (d,) int."""
+    """Returns how many nodes lie within noise bounds (d,) on either side: (d,) int."""
     return np.floor(bound / lattice.grid.spacing + 1e-6).astype(int)
 
 
@@ -137,30 +137,30 @@ class Moves:
     def gather(
         lattice: Lattice, rows: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]
     ) -> Moves:
-        """From each row's nodes (m,) ascending, next modes (m,) and places (m, C) that they lead to."""
+        """Returns the moves, from each row's nodes (m,) ascending, next modes (m,) and places (m, C)."""
         state, counts, target = [], [], []
         for row, (node, mode, ends) in enumerate(rows):
             target.append((ends + (mode * lattice.places)[:, None]).ravel())
-            found = np.bincount(node, minlength=lattice.nodes) * ends.shape[1]
-            state.append(np.flatnonzero(found) + row * lattice.places)
-            counts.append(found[found > 0])
+            moves = np.bincount(node, minlength=lattice.nodes) * ends.shape[1]
+            state.append(np.flatnonzero(moves) + row * lattice.places)
+            counts.append(moves[moves > 0])
         return Moves(lattice, len(state), *map(np.concatenate, (state, counts, target)))
 
 
-def noisy_moves(answers: Answers, bound: np.ndarray, firm: bool = False) -> Moves:
-    """The moves that noise within bounds (d,) gives the adversary against a controller.
+def noisy_moves(answers: Answers, bound: np.ndarray, settled_only: bool = False) -> Moves:
+    """Returns the moves that noise within bounds (d,) gives the adversary against a controller.
 
-    With `firm` those that noise reaches only by a measurement on the very border of two answers are left
-    out; without noise a controller answers in any case.
+    With `settled_only` the moves that noise reaches only by a measurement on the very border of two answers
+    are left out; without noise a controller answers in any case.
     """
     lattice, modes = answers.lattice, len(answers.modes)
     window, periodic = nodes_within(lattice, bound), lattice.grid.chart.periodic
     rows = []
-    for letters, sure in zip(answers.letter, answers.firm, strict=True):
-        used = np.unique(letters)
+    for index, settled in zip(answers.index, answers.settled, strict=True):
+        counts = settled | (not settled_only)
+        used = np.unique(index)
         possible = [
-            within_reach((letters == x) & (sure | (not firm)), window, periodic) | (letters == x)
-            for x in used
+            within_reach((index == x) & counts, window, periodic) | (index == x) for x in used
         ]
         possible = [mask[answers.middle] for mask in possible]
         node, which = np.nonzero(
@@ -172,7 +172,7 @@ def noisy_moves(answers: Answers, bound: np.ndarray, firm: bool = False) -> Move
 
 
 def solve(moves: Moves) -> np.ndarray:
-    """The value of every state by backward recursion: (rows, places) int.
+    """Returns the value of every state by backward recursion: (rows, places) int.
 
     An episode is over where it arrives; all others that never fail or arrive are worth `NEVER`.
     """
@@ -191,17 +191,17 @@ def solve(moves: Moves) -> np.ndarray:
             return value
         after = flat[target]
         after += np.sign(NEVER - after)  # one sample more
-        found = np.maximum.reduceat(after, np.append(0, np.cumsum(counts)[:-1]))
-        if (found == NEVER).all():
+        worst = np.maximum.reduceat(after, np.append(0, np.cumsum(counts)[:-1]))
+        if (worst == NEVER).all():
             return value
         # Each state is decided once: at the earliest failure, or when all its moves have arrived.
-        flat[state] = found
+        flat[state] = worst
 
 
 def lasting(moves: Moves, start: np.ndarray | None = None) -> np.ndarray:
-    """The nodes (N,) bool at which a run can still be after any number of samples, in some mode.
+    """Returns the nodes (N,) bool at which a run can still be after any number of samples, in some mode.
 
-    For a task that is over some day there are none.
+    For a task whose every run ends there are none.
 
     Args:
         moves: of the adversary.
@@ -248,13 +248,13 @@ class WorstNoise(Signal):
         self.bound = float(bound.max(initial=0.0))
         self._answers, self._bound = answers, bound
         self._any = solve(noisy_moves(answers, bound))
-        self._firm = solve(noisy_moves(answers, bound, firm=True))
-        self.value = np.where(self._firm >= NEVER, self._firm, self._any)
+        self._settled = solve(noisy_moves(answers, bound, settled_only=True))
+        self.value = np.where(self._settled >= NEVER, self._settled, self._any)
         window = nodes_within(answers.lattice, bound)
         shifts = np.stack(
             np.meshgrid(*[np.arange(-w, w + 1) for w in window], indexing="ij"), axis=-1
         ).reshape(-1, len(window))
-        # Among equals the largest noise, for what lies between the nodes.
+        # Among equals the largest noise comes first, for states between the nodes.
         self._shifts = shifts[np.argsort(-np.abs(shifts).sum(axis=1), kind="stable")]
 
     def against(self, task: Task, controller: Controller | None) -> Self:
@@ -268,17 +268,17 @@ class WorstNoise(Signal):
         place = grid.nearest(true)
         at = np.stack(np.unravel_index(place, grid.counts), axis=-1)
         row = np.where(q == NOT_STARTED, len(modes), np.searchsorted(modes, q))
-        # Of the few letters that can be provoked the worst is wanted, so all shifts are looked at.
+        # Few answers can be provoked; to find the worst of them all shifts are tried.
         worst, chosen = np.full(len(true), -1), np.zeros_like(true)
         for shift in self._shifts:
             node = np.where(
                 grid.chart.periodic, (at + shift) % grid.counts, at + shift + answers.pad
             )
-            level, mode = np.divmod(answers.letter[(row, *node.T)], len(modes))
+            level, mode = np.divmod(answers.index[(row, *node.T)], len(modes))
             ends = mode[:, None], lattice.after[level, :, place]
-            value, sure = self._any[ends].max(axis=1), self._firm[ends].max(axis=1)
-            counts = answers.firm[(row, *node.T)] | (shift == 0).all()
-            value = np.where(counts & (sure >= NEVER), FIRST + sure, value)
+            value, settled = self._any[ends].max(axis=1), self._settled[ends].max(axis=1)
+            counts = answers.settled[(row, *node.T)] | (shift == 0).all()
+            value = np.where(counts & (settled >= NEVER), FIRST + settled, value)
             better = value > worst
             worst = np.where(better, value, worst)
             chosen[better] = (at + shift)[better]

@@ -71,7 +71,7 @@ class Settings:
         seed: of everything random.
         noise: bound eps of the measurement noise that the controller has to survive.
         horizon: time T of the backward propagation [s]; None to size the sets to the noise.
-        stage1: training of the first policy (stage 1), or the agent that is given instead.
+        stage1: training of the first policy (stage 1), or the agent that takes its place.
         stage6: training of each mode's policy (stage 6).
         cells: grid cells along the longest side of the chart; cells are square in chart units.
         rods: grid points along the longest side from which the search for critical points starts.

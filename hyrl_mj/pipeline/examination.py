@@ -16,7 +16,7 @@ from hyrl_mj.simulation import Noise
 from hyrl_mj.stages import Partition, Regions, noisy_episodes
 from hyrl_mj.viz import robustness_sentence
 
-# The kinds of noise in episodes, unless others are asked for.
+# The kinds of noise in episodes by default.
 KINDS = ("uniform", "alternating", "adversarial")
 # Noisy episodes of a run whose worst case cannot be played exactly, and of one that only shows that all runs.
 EPISODES, EPISODES_SMOKE = 1_000, 200

@@ -28,7 +28,7 @@ def train_stage(run: Run, say: Say) -> None:
     s = run.settings
     if isinstance(s.stage1, Agent):
         raise BadInput(
-            f"{run.path} is about an agent that was given, {s.stage1.source}: there is nothing to train; "
+            f"{run.path} is about an agent, {s.stage1.source}: there is nothing to train; "
             "hyrl-mj robustify with another --policy and another --out takes another one"
         )
     logs = run.path / "logs" / "stage1"
@@ -102,9 +102,9 @@ def mode_paths(run: Run) -> list[Path]:
     return [run.path / f"mode_{q}{suffix}" for q in run.extended_sets.modes for suffix in suffixes]
 
 
-def remove_others(found: Iterable[Path], wanted: Iterable[Path]) -> None:
+def remove_others(paths: Iterable[Path], wanted: Iterable[Path]) -> None:
     """Remove what an earlier run of a stage, with other modes or starts, has left."""
-    for path in set(found) - set(wanted):
+    for path in set(paths) - set(wanted):
         path.unlink()
 
 

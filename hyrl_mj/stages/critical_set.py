@@ -86,7 +86,7 @@ class CriticalSet(Saved):
 def find_critical_set(
     task: Task, policy: Policy, cells: int, resolution: float, method: str = "rods"
 ) -> CriticalSet:
-    """Search for M*.
+    """Searches for the critical set M*.
 
     With `rods` (paper, Step 2), two starts a small distance apart along one chart axis: both ends of a
     rod run the closed loop for a few samples. If they part, the rod is cut in two halves, and so on down
@@ -116,17 +116,19 @@ def find_critical_set(
         raise unknown("method", method, SEARCHES)
     grid, d = Grid.with_cells(task.chart, cells), task.chart.dimension
     if method == "rods":
-        found = _by_rods(task, policy, grid, resolution)
+        centres = _by_rods(task, policy, grid, resolution)
     else:
-        found = critical_points(task, policy, grid.nodes, grid.neighbours(), grid.cell, resolution)
-    points = np.unique(task.chart.wrap(found), axis=0) if len(found) else np.empty((0, d))
+        centres = critical_points(
+            task, policy, grid.nodes, grid.neighbours(), grid.cell, resolution
+        )
+    points = np.unique(task.chart.wrap(centres), axis=0) if len(centres) else np.empty((0, d))
     return CriticalSet(
         points, _pieces(task, points, LINK * grid.cell), resolution * grid.cell, grid.cell
     )
 
 
 def _by_rods(task: Task, policy: Policy, grid: Grid, resolution: float) -> np.ndarray:
-    """Centres (N, d) of the last rods that part."""
+    """Returns the centres (N, d) of the last rods that part."""
     d = task.chart.dimension
     centre = np.repeat(grid.nodes, d, axis=0)
     axis = np.tile(np.arange(d), len(grid.nodes))
@@ -151,7 +153,7 @@ def critical_points(
     cell: float,
     resolution: float,
 ) -> np.ndarray:
-    """The search by outcome: middles (N, d) between close starts whose runs go different ways.
+    """Searches by outcome: returns middles (N, d) between close starts whose runs go different ways.
 
     Args:
         task, policy, resolution: as in `find_critical_set`.
@@ -185,7 +187,7 @@ def critical_points(
 
 
 def _go_apart(task: Task, policy: Policy, a: np.ndarray, b: np.ndarray, far: float) -> np.ndarray:
-    """Whether runs from a and b (n, d) get as far as that apart while both last: (n,) bool.
+    """Returns whether runs from a and b (n, d) get as far as that apart while both last: (n,) bool.
 
     Two runs that a pillar stops on either side of its middle go nowhere different, and neither do two
     that dither around the same point, a sample to and a sample fro.
@@ -205,7 +207,7 @@ def _go_apart(task: Task, policy: Policy, a: np.ndarray, b: np.ndarray, far: flo
 def _ends(
     task: Task, centre: np.ndarray, axis: np.ndarray, length: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The two ends (n, d), (n, d) of rods, kept inside the chart."""
+    """Returns the two ends (n, d), (n, d) of rods, kept inside the chart."""
     offset = np.zeros_like(centre)
     # A hair longer than the grid: halves of a rod overlap, and M* cannot fall between them.
     offset[np.arange(len(centre)), axis] = length / 2 * (1 + 1e-9)
@@ -215,7 +217,7 @@ def _ends(
 
 
 def _part(task: Task, policy: Policy, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Whether the runs from a and b (n, d) part: (n,) bool."""
+    """Returns whether the runs from a and b (n, d) part: (n,) bool."""
     n = len(a)
     loop, settings = PolicyController(policy), LoopSettings(steps=SAMPLES)
     rollout = closed_loop(task, loop, np.vstack([a, b]), settings=settings)
@@ -230,7 +232,7 @@ def _part(task: Task, policy: Policy, a: np.ndarray, b: np.ndarray) -> np.ndarra
 
 
 def _differ(task: Task, policy: Policy, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Whether the runs from a and b (n, d) go different ways in the end: (n,) bool."""
+    """Returns whether the runs from a and b (n, d) go different ways in the end: (n,) bool."""
     n = len(a)
     if not n:
         return np.zeros(0, dtype=bool)
@@ -240,7 +242,7 @@ def _differ(task: Task, policy: Policy, a: np.ndarray, b: np.ndarray) -> np.ndar
 
 
 def _pieces(task: Task, points: np.ndarray, reach: float) -> np.ndarray:
-    """Number the pieces of a point set that are farther apart than `reach`: (N,) int."""
+    """Numbers the pieces of a point set that are farther apart than `reach`: (N,) int."""
     from scipy.sparse.csgraph import connected_components  # slow to import
 
     if not len(points):

@@ -266,7 +266,7 @@ class ByGame(ModeGround):
             return float(self.task.miss(grid.nodes[still]).max() - self.bound.max())
         # Without noise, down to the last nodes on the chart; the sample after these ends most runs.
         # A controller of one mode answers with levels alone.
-        level = answers.letter[0][answers.middle].ravel()
+        level = answers.index[0][answers.middle].ravel()
         last = self.early
         for _ in range(self.task.max_steps):
             place = after[level[last], 0, last]

@@ -188,7 +188,7 @@ def _stages(run: Run, robustness: Robustness | None, arcs: Arcs | None) -> list[
     reach = "; ".join(f"mode {task.scene.mode_name(q)}: {extent(run, q)}" for q in modes)
     each = f"up to {s.stage6.attempts} times " if s.stage6.attempts > 1 else ""
     if isinstance(s.stage1, Agent):
-        first = f"none: {s.stage1} was given"
+        first = f"none: the agent {s.stage1} takes its place"
     else:
         assert isinstance(run.policy, MlpPolicy)
         size = sum(weight.size for weight in run.policy.weights.values())

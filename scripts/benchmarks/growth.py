@@ -53,10 +53,10 @@ def measure(kind: str, size: int, run: Path) -> tuple[float, float]:
         from hyrl_mj.simulation import Noise
         from hyrl_mj.stages import Regions, noisy_episodes
 
-        found = hyrl_mj.load_run(run)
+        finished = hyrl_mj.load_run(run)
         began = time.perf_counter()
-        loops = {"HyRL": found.controller}
-        regions = Regions(found.critical_set.points)
+        loops = {"HyRL": finished.controller}
+        regions = Regions(finished.critical_set.points)
         noisy_episodes(task, regions, loops, (Noise("uniform", 0.1),), size)
     took = time.perf_counter() - began
     return took, peak_memory()

@@ -1,0 +1,167 @@
+"""Records come back from JSON with their types, and a wrong field is named."""
+
+import json
+from dataclasses import asdict, dataclass, replace
+
+import pytest
+from sentences import assert_one_sentence_about
+
+import hyrl_mj
+from hyrl_mj import BadArtifact, artifacts
+from hyrl_mj.game import (
+    LIMIT,
+    Curve,
+    EpisodeCount,
+    GameResult,
+    LatticeSpacing,
+    Profile,
+    Robustness,
+    Score,
+    Wins,
+)
+from hyrl_mj.learning import preset
+from hyrl_mj.run_directory import Config
+
+
+@dataclass(frozen=True)
+class Leaf:
+    size: float
+    words: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Stone:
+    weight: float
+    colour: str
+    rough: bool
+
+
+@dataclass(frozen=True)
+class Tree:
+    name: str
+    rings: int
+    held: Leaf | Stone
+    leaves: dict[str, tuple[Leaf, ...]]
+    height: float | None = None
+
+
+TREE = Tree("oak", 3, Leaf(0.1), {"low": (Leaf(1.5, ("a", "b")), Leaf(2.0))})
+
+
+@pytest.mark.parametrize("held", [Leaf(0.1, ("c",)), Stone(1.0, "grey", True)])
+def test_a_record_comes_back(tmp_path, held):
+    tree = replace(TREE, held=held)
+    artifacts.write_json(tmp_path / "t.json", tree, "tree")
+    assert artifacts.read_record(tmp_path / "t.json", "tree", Tree) == tree
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        (("name",), None, "its name cannot be used"),
+        (("rings",), "3", "its rings cannot be used .*integer"),
+        (("rings",), 3.5, "its rings cannot be used"),
+        (("held", "size"), "far", "its held.Leaf.size cannot be used"),
+        (("held", "sise"), 1.0, "it has an unknown held.Leaf.sise"),
+        (("leaves", "low", 1, "size"), [], "its leaves.low.1.size cannot be used"),
+        (("leaves",), 3, "its leaves cannot be used"),
+        (("extra",), 1, "it has an unknown extra"),
+    ],
+)
+def test_a_wrong_field_of_a_record_is_named(tmp_path, path, value, message):
+    content = json.loads(json.dumps(asdict(TREE)))
+    inner = content
+    for step in path[:-1]:
+        inner = inner[step]
+    inner[path[-1]] = value
+    artifacts.write_json(tmp_path / "t.json", content, "tree")
+    with pytest.raises(BadArtifact, match=message) as caught:
+        artifacts.read_record(tmp_path / "t.json", "tree", Tree, "plant it again")
+    assert_one_sentence_about(caught, tmp_path / "t.json")
+    assert str(caught.value).endswith(": plant it again")
+
+
+@pytest.mark.parametrize("missing", ["rings", "held", "leaves"])
+def test_a_missing_field_of_a_record_is_named(missing):
+    content = {name: value for name, value in asdict(TREE).items() if name != missing}
+    with pytest.raises(BadArtifact, match=f"it has no {missing}"):
+        artifacts.parsed(content, Tree)
+    with pytest.raises(BadArtifact, match=r"it has no held\.Stone\.rough"):
+        artifacts.parsed(asdict(TREE) | {"held": {"weight": 1.0, "colour": "grey"}}, Tree)
+
+
+def test_a_config_is_what_was_set(tmp_path, circle):
+    config = Config(preset(circle, "smoke", seed=3), {"python": "3.11"})
+    artifacts.write_json(tmp_path / "config.json", config, "run")
+    assert Config.load(tmp_path / "config.json") == config
+    content = json.loads((tmp_path / "config.json").read_text())
+    assert list(content) == ["kind", "version", "settings", "versions"]
+    content["settings"]["stage6"]["samples"] = "many"
+    (tmp_path / "config.json").write_text(json.dumps(content))
+    with pytest.raises(BadArtifact, match=r"settings\.stage6\.samples cannot be used"):
+        hyrl_mj.load_run(tmp_path)
+    content["settings"]["stage6"]["samples"] = 10
+    content["settings"]["seed"] = -1
+    (tmp_path / "config.json").write_text(json.dumps(content))
+    with pytest.raises(BadArtifact, match="seed -1 cannot be used"):
+        hyrl_mj.load_run(tmp_path)
+
+
+# ---- robustness.json
+
+
+GAME = GameResult(
+    everywhere=False,
+    lattice=LatticeSpacing((0.1, 0.1), True, (0.2, 0.2)),
+    scores={
+        "policy": (Score(0.1, 0.98, 0.92, 0.9, 3.0, 3.0, None),),
+        LIMIT: (Score(0.1, 0.98, 1.0, 0.97, 3.0, 3.0, 0.1),),
+    },
+    margin={"policy": None},
+    miss_without_noise={"policy": 0.025},
+    curve=Curve((0.0, 0.1), (1.0, 0.98), {"policy": Wins((1.0, 0.9), (1.0, 0.9), (3.0, 3.0))}),
+    profile=Profile(((0.0, 0.1),), {"policy": (None,)}),
+)
+COUNT = EpisodeCount(
+    "uniform", 0.1, False, "policy", "near M*", 4, {"crashed": 3, "reached": 1}, 0.25, (0.1, 0.7)
+)
+ROBUSTNESS = Robustness(0.1, False, GAME, (COUNT,), seed=2)
+
+
+@pytest.mark.parametrize("robustness", [ROBUSTNESS, Robustness(0.1, True, None, (COUNT,), 0)])
+def test_a_result_comes_back_with_its_types(tmp_path, robustness):
+    robustness.save(tmp_path / "r.json")
+    assert Robustness.load(tmp_path / "r.json") == robustness
+
+
+def test_scores_margins_and_episodes_are_where_readers_of_the_file_expect_them(tmp_path):
+    ROBUSTNESS.save(tmp_path / "r.json")
+    content = json.loads((tmp_path / "r.json").read_text())
+    game = content["game"]
+    names = ["eps", "winnable", "won", "won_any", "time", "time_any", "excursion"]
+    assert list(game["scores"]["policy"][0]) == names
+    assert game["margin"] == {"policy": None}
+    assert game["miss_without_noise"] == {"policy": 0.025}
+    assert content["episodes"] == [asdict(COUNT) | {"interval": [0.1, 0.7]}]
+    assert (content["eps"], content["everywhere"], content["seed"]) == (0.1, False, 2)
+
+
+def test_a_file_of_version_0_1_ends_in_one_sentence(tmp_path):
+    content = json.loads(json.dumps(asdict(ROBUSTNESS)))
+    curve, profile = content["game"]["curve"], content["game"]["profile"]
+    curve |= curve.pop("wins")
+    profile |= profile.pop("eps")
+    artifacts.write_json(tmp_path / "r.json", content, "robustness")
+    with pytest.raises(BadArtifact, match=r"r\.json: it has no game\.curve\.wins.*robustness RUN"):
+        Robustness.load(tmp_path / "r.json")
+
+
+def test_results_describe_themselves_in_a_line():
+    assert repr(ROBUSTNESS) == (
+        "Robustness(eps 0.1, GameResult(won at eps 0.1: policy 92.00%), 4 episodes)"
+    )
+    score = (
+        "Score(eps=0.1, winnable=0.98, won=0.92, won_any=0.9, time=3, time_any=3, excursion=None)"
+    )
+    assert repr(GAME.scores["policy"][0]) == score
+    assert (GAME.controllers, GAME.lasting, COUNT.lost) == (("policy",), True, 3)
