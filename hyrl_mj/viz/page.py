@@ -16,6 +16,7 @@ from hyrl_mj.game import Robustness
 from hyrl_mj.run_directory import Run
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.figures import FIGURES
+from hyrl_mj.viz.figures.style import task_title
 from hyrl_mj.viz.tables import Table, episode_table, margin_table, percent, score_table
 
 
@@ -49,7 +50,7 @@ def fill(template: str, run: Run, **values: Any) -> str:
     return environment.get_template(template).render(
         # A name that is not Unicode must not keep the page from being written.
         name=os.fsencode(run.path.resolve().name).decode("utf-8", "replace"),
-        title=run.task.name.replace("_", " ").capitalize(),
+        title=task_title(run.task),
         task=run.task,
         settings=run.settings,
         agent=run.agent,
