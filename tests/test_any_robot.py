@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import gymnasium
@@ -13,10 +14,11 @@ import pytest
 from gl import needs_gl
 
 import hyrl_mj
-from hyrl_mj import Outcome
+from hyrl_mj import BadInput, Outcome
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.simulation.rollout import ways
+from hyrl_mj.tasks import registry
 from hyrl_mj.tasks.checks import check_task
 from hyrl_mj.tasks.registry import reference
 from hyrl_mj.tasks.scaffold import TEMPLATES, write_task
@@ -255,7 +257,7 @@ def test_a_name_that_cannot_be_one_is_refused(tmp_path, name, says):
 
 def test_nothing_is_overwritten(tmp_path):
     (tmp_path / "mine.xml").write_text("precious")
-    with pytest.raises(hyrl_mj.BadInput, match=r"mine\.xml is there already"):
+    with pytest.raises(hyrl_mj.BadInput, match=r"mine\.xml exists already"):
         write_task("mine", tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["mine.xml"]
 
@@ -323,6 +325,8 @@ MISTAKES = {
     "a set-point of the wrong dimension": (
         PY, r"\[3\.0, 0\.0\]", "[3.0]", r"set_point has shape \(1,\)",
     ),
+    "a scene that is none": (PY, r"scene = Scene\(", "scene = dict(", r"scene is .*hyrl_mj\.Scene"),
+    "no time to show": (PY, r"time=3\.2", "time=0.0", r"scene\.time is 0\.0: give a time > 0 s"),
     "one mode": (PY, r'\("left", "right"\)', '("left",)', r"mode_names"),
     "a replay start outside": (PY, r"\(0\.0, 0\.15\)\)", "(0.0, 9.0))", r"y = 9 m.*outside"),
 }  # fmt: skip
@@ -346,6 +350,72 @@ def test_a_mistake_is_one_sentence_before_any_training(tmp_path, mistake):
     assert "Traceback" not in done.stderr
     assert "my_robot" in done.stderr
     assert not (tmp_path / "runs").exists()
+
+
+# ---- tasks written for 0.1
+
+NOW = r"    scene = Scene\(.*?\n    # What trains.*?\n    learning = .*?\n"
+THEN = """    replay_starts = ((0.0, 0.15),)
+    replay_time, mode_names = 3.2, ("left", "right")
+    levels, algorithm = 5, "dqn"
+    horizon = 0.3
+"""
+SCENE = (
+    "replay_starts, replay_time, mode_names -> "
+    "scene = hyrl_mj.Scene(starts=..., time=..., mode_names=...)"
+)
+LEARNING = "levels, algorithm, horizon -> learning = hyrl_mj.Learning(levels=..., algorithm=..., horizon=...)"
+REWARD = "reward(self, measurement) -> reward(self, measurement, u)"
+
+
+def written_for_01(folder, name, attributes=True, reward=True, in_init=False):
+    """Writes a task as the scaffold of 0.1 did, and returns its file."""
+    write_task(name, folder)
+    path = folder / f"{name}.py"
+    text = path.read_text()
+    if attributes:
+        text = re.sub(NOW, THEN, text, flags=re.DOTALL)
+    if reward:
+        text = text.replace("def reward(self, measured, u):", "def reward(self, measured):")
+    if in_init:
+        text += "\n    def __init__(self):\n        self.levels = 5\n        self.search = 'rods'\n"
+    path.write_text(text)
+    return path
+
+
+def test_a_task_written_for_01_is_told_all_that_has_another_name(tmp_path):
+    path = written_for_01(tmp_path, "former_robot")
+    for load in (hyrl_mj.get_task, hyrl_mj.run):
+        with pytest.raises(BadInput) as caught:
+            load(path)
+        assert str(caught.value) == (
+            f"the task former_robot of {path} was written for hyrl_mj 0.1: rename "
+            f"{SCENE}; {LEARNING}; {REWARD}"
+        )
+    done = command("run", path, "--preset", "smoke", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.count("was written for hyrl_mj 0.1") == 1
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_a_reward_of_01_alone_is_told_too(tmp_path):
+    with pytest.raises(BadInput, match=re.escape(f"0.1: rename {REWARD}") + "$"):
+        hyrl_mj.get_task(written_for_01(tmp_path, "former_reward", attributes=False))
+
+
+def test_attributes_of_01_are_found_on_the_instance_too(tmp_path):
+    path = written_for_01(tmp_path, "former_init", False, False, in_init=True)
+    with pytest.raises(BadInput, match=r"levels, search -> learning = hyrl_mj\.Learning"):
+        hyrl_mj.get_task(path)
+
+
+def test_an_installed_task_of_01_is_told_by_its_own_sentence(tmp_path, monkeypatch):
+    path = written_for_01(tmp_path, "former_installed")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    entry = EntryPoint("former_installed", "former_installed:FormerInstalled", registry.GROUP)
+    monkeypatch.setattr(registry, "_offered", lambda: {"former_installed": entry})
+    with pytest.raises(BadInput, match=f"^the task former_installed of {path} was written for"):
+        hyrl_mj.get_task("former_installed")
 
 
 # ---- a simulation that breaks down

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from planted import Cube, sphere_policy
 
-from hyrl_mj import LoopSettings, closed_loop, find_critical_set
+import hyrl_mj
+from hyrl_mj import LoopSettings, Task, closed_loop, find_critical_set
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.viz.replay.marks import on_floor
-from hyrl_mj.viz.section import Section
+from hyrl_mj.viz.section import Section, SectionTask
 
 HEIGHT, RADIUS = 0.3, 0.7
 ACROSS = np.sqrt(RADIUS**2 - HEIGHT**2)
@@ -82,6 +83,63 @@ def test_it_says_where_it_is(section):
     chart = section.task.chart
     assert (chart.names, chart.section) == (("a", "b"), "c = 0.3 m")
     assert section.task.set_point.tolist() == [0.0, 0.0]
+
+
+# Of `Task`, what follows from the chart and the methods, so that a section inherits it.
+DERIVED = {
+    "check_measurement", "check_noise", "dt", "failed", "input_levels", "kinematic", "may_start",
+    "measurement_columns", "model_path", "noise_in_chart", "noise_on", "outcome",
+}  # fmt: skip
+
+
+def test_its_task_defines_all_that_a_task_has():
+    public = {name for name in vars(Task) if not name.startswith("_")}
+    assert public <= {*vars(SectionTask), *DERIVED}, "a new part of a task has to be cut, too"
+
+
+def test_its_task_is_the_whole_one_but_for_the_chart():
+    rover = hyrl_mj.get_task("rover")
+    before = dict(vars(rover))
+    task, rng = Section.of(rover).task, np.random.default_rng(0)
+    assert {name for name in vars(rover) if name not in before} <= {"chart", "set_point", "model"}
+    assert (task.name, task.speed) == ("rover", rover.speed)
+    with pytest.raises(AttributeError, match="wheel_count"):
+        task.wheel_count  # noqa: B018
+    z = rover.starts(20, rng)
+    plant = task.plant(20)
+    plant.set_state(*rover.state(z))
+    u = rng.uniform(*task.input_limits, (20, 1))
+    plant.step(u)
+    measured = plant.measurement
+    for ours, theirs in (
+        (task.reward(measured, u), rover.reward(measured, u)),
+        (task.observation(measured), rover.observation(measured)),
+        (task.ending(measured), rover.ending(measured)),
+        (task.verdict(measured), rover.verdict(measured)),
+        (task.danger(measured), rover.danger(measured)),
+        (task.failed(measured), rover.failed(measured)),
+        (task.z(measured), rover.z(measured)[:, :2]),
+        (task.input_levels, rover.input_levels),
+        (
+            task.starts(9, np.random.default_rng(1)),
+            rover.starts(9, np.random.default_rng(1))[:, :2],
+        ),
+    ):
+        np.testing.assert_array_equal(ours, theirs)
+    flat = z * [1, 1, 0]
+    for ours, theirs in (
+        (task.arrived(z[:, :2]), rover.arrived(flat)),
+        (task.miss(z[:, :2]), rover.miss(flat)),
+        (task.state(z[:, :2])[0], rover.state(flat)[0]),
+        (
+            task.direction(np.stack([z, z + 1])[..., :2]),
+            rover.direction(np.stack([flat, flat + 1])),
+        ),
+    ):
+        np.testing.assert_array_equal(ours, theirs)
+    assert task.learning == rover.learning
+    assert task.scene.starts == tuple(start[:2] for start in rover.scene.starts)
+    assert (task.scene.mode_names, task.scene.time) == (("left", "right"), 5.0)
 
 
 def test_a_plane_is_left_as_it_is(vehicle):

@@ -1,11 +1,16 @@
 """Every registered task is whole and consistent; the paper's two have the paper's numbers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from planted import random_states
 
 import hyrl_mj
-from hyrl_mj import BadInput, Outcome
+from hyrl_mj import BadInput, Learning, Outcome, Scene
+from hyrl_mj.envs import BatchedEnv
+from hyrl_mj.learning import preset
+from hyrl_mj.tasks.unit_circle import UnitCircle
 
 PI = np.pi
 
@@ -44,6 +49,59 @@ def test_bad_measurements_are_refused(task):
 def test_an_unknown_task_lists_the_known():
     with pytest.raises(BadInput, match=r"'vehicel'.*unit_circle, vehicle.*Did you mean 'vehicle'"):
         hyrl_mj.get_task("vehicel")
+
+
+def test_a_task_says_what_it_is_in_one_line(circle, vehicle):
+    assert repr(circle) == "<Task unit_circle: chart (theta), inputs (turn_rate)>"
+    assert repr(vehicle) == "<Task vehicle: chart (x, y), inputs (lateral_velocity)>"
+
+
+# ---- what a replay shows, and what trains a task
+
+
+def test_a_scene_fills_in_what_is_left_out():
+    scene = Scene(starts=((0.0,), (1.0,)), time=2.0, mode_names=("up", "down"))
+    assert scene.policy_starts == scene.starts
+    assert (scene.camera, scene.tracked) == ("overhead", "tracked")
+    assert [scene.mode_name(q) for q in (0, 1, 2, -1)] == ["0 (up)", "1 (down)", "2", "-1"]
+    assert replace(scene, policy_starts=((0.5,),)).policy_starts == ((0.5,),)
+
+
+def test_the_default_algorithm_depends_on_the_levels():
+    assert [Learning().algorithm, Learning(levels=5).algorithm] == ["ppo", "dqn"]
+    assert Learning("a2c", levels=5).algorithm == "a2c"
+    assert (Learning().search, Learning().horizon) == ("outcome", 0.5)
+
+
+def test_a_preset_trains_with_the_algorithm_that_is_asked_for(vehicle):
+    before = vehicle.learning
+    assert preset(vehicle).stage1.algorithm == "dqn"
+    assert preset(vehicle, algorithm="ppo").stage1.algorithm == "ppo"
+    assert vehicle.learning is before
+
+
+# ---- a reward that sees the input
+
+
+class Thrifty(UnitCircle):
+    """The unit circle, where turning costs."""
+
+    def reward(self, measurement, u):
+        return super().reward(measurement, u) - 0.1 * u[:, 0] ** 2
+
+
+def test_the_reward_sees_the_input_of_the_step():
+    task, u = Thrifty(), np.array([[-1.0], [0.0], [0.5]])
+    env = BatchedEnv(task, 3)
+    env.reset(z=np.full((3, 1), 2.0))
+    result = env.step(u)
+    expected = -np.abs(task.error(env.z)) / PI - 0.1 * u[:, 0] ** 2
+    np.testing.assert_allclose(result.reward, expected, atol=1e-12)
+
+
+def test_danger_is_by_default_the_reward_of_inputs_in_the_middle():
+    theta = np.array([[0.0], [1.0], [PI]])
+    np.testing.assert_allclose(Thrifty().danger(theta), [0.0, 1 / PI, 1.0], atol=1e-12)
 
 
 # ---- unit circle

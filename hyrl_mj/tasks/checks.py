@@ -6,19 +6,21 @@ import mujoco
 import numpy as np
 
 from hyrl_mj import mjcf
+from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput, brief, unknown
 from hyrl_mj.tasks.base import Outcome, Task
-from hyrl_mj.tasks.learning import SEARCHES
+from hyrl_mj.tasks.learning import SEARCHES, Learning
 from hyrl_mj.tasks.outdated import check_current
 from hyrl_mj.tasks.registry import line_in
+from hyrl_mj.tasks.scene import Scene
 
 REQUIRED = (
     "chart", "inputs", "noisy", "max_steps", "worst_reward", "start_low", "start_high",
     "observation_low", "observation_high", "scene",
 )  # fmt: skip
-# Starts that are tried, and the samples of each under random inputs.
+# Number of starts that are tried, and of samples from each under random inputs.
 STARTS, SAMPLES = 64, 20
-# How closely the measurement of a chart point's full state has to give the chart point back.
+# Largest error of a chart point that is set as a full state and measured [chart units].
 ROUND_TRIP = 1e-6
 
 
@@ -26,7 +28,7 @@ def check_task(task: Task) -> Task:
     """Returns the task itself, if it can be trained.
 
     Raises:
-        BadInput: it cannot; the message names the file, what is wrong in it, and what is right.
+        BadInput: it cannot; the message names the file, the mistake, and the remedy.
     """
     check_current(task)
     where = task.source or task.name
@@ -48,6 +50,9 @@ def _check_parts(task: Task) -> None:
     missing = [name for name in REQUIRED if not hasattr(task, name)]
     if missing:
         raise BadInput(f"it has no {', '.join(missing)}: add what is missing")
+    for name, kind in (("chart", Chart), ("scene", Scene), ("learning", Learning)):
+        if not isinstance(value := getattr(task, name), kind):
+            raise BadInput(f"{name} is {value!r}: give a hyrl_mj.{kind.__name__}(...)")
     chart, d = task.chart, task.chart.dimension
     for name in ("units", "low", "high", "periodic"):
         if len(getattr(chart, name)) != d:

@@ -1,4 +1,4 @@
-"""Where tasks come from: this package, other installed packages, and files of the user's."""
+"""The registry of tasks: those of this package, of other installed packages, and of the user's files."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ def register(task: type[Task]) -> type[Task]:
         task.source = here
     if "env_id" not in vars(task):
         task.env_id = f"hyrl_mj/{task.__name__}-v0"
-    taken = gym.registry.pop(task.env_id, None)  # by this class, if its decorator has been here
-    if taken is not None and taken.kwargs.get("task") != task.name:
-        gym.registry[task.env_id] = taken
+    registered = gym.registry.pop(task.env_id, None)  # of this very class if it was decorated, too
+    if registered is not None and registered.kwargs.get("task") != task.name:
+        gym.registry[task.env_id] = registered
         raise BadInput(
             f"{here} defines an environment {task.env_id}, and there is another: rename the class, or give "
             "it an env_id"
@@ -58,14 +58,14 @@ def register(task: type[Task]) -> type[Task]:
 
 
 def task_names() -> list[str]:
-    """The names of all tasks of this package and of other installed ones."""
+    """Returns the names of all tasks of this package and of other installed ones."""
     return sorted(_REGISTRY.keys() | _offered().keys())
 
 
 def get_task(name: str | Path) -> Task:
-    """A task by its name, or by the Python file that defines it.
+    """Returns a task, by its name or by the Python file that defines it.
 
-    The file is run, as any Python file is that you import. It defines one subclass of `Task`, and its
+    The file is executed, as Python executes what it imports. It defines one subclass of `Task`, and its
     MJCF lies beside it: `<name>.xml`.
 
     Raises:
@@ -101,26 +101,28 @@ def _instance(kind: type[Task], what: str) -> Task:
 
 
 def _file(task: type[Task]) -> Path | None:
-    """Where a task is defined; None in an interactive session."""
+    """Returns the file that defines a task; None in an interactive session."""
     file = getattr(sys.modules.get(task.__module__), "__file__", None)
     return None if file is None else Path(file).resolve()
 
 
 def _from_entry_point(entry: EntryPoint) -> None:
     try:
-        found = entry.load()
+        task = entry.load()
+    except BadInput:
+        raise
     except (Exception, SystemExit) as error:  # whatever a foreign module raises
         raise BadInput(
             f"the task {entry.name} of {entry.value} cannot be imported ({brief(error)}): mend or "
             "uninstall the package that offers it"
         ) from error
-    if not (isinstance(found, type) and issubclass(found, Task)) or found.name != entry.name:
+    if not (isinstance(task, type) and issubclass(task, Task)) or task.name != entry.name:
         raise BadInput(
             f"the entry point {entry.name} = {entry.value} offers no task of that name: give a subclass "
             f"of hyrl_mj.Task with name = {entry.name!r}, as its.module:Class"
         )
-    register(found)
-    _INSTALLED.add(found.name)
+    register(task)
+    _INSTALLED.add(task.name)
 
 
 def _from_file(path: Path) -> type[Task]:
@@ -131,7 +133,7 @@ def _from_file(path: Path) -> type[Task]:
                 f"there is no task file {path}: hyrl-mj new-task {path.stem} writes one to start from"
             )
         module = _run(path)
-        found = [
+        tasks = [
             value
             for value in vars(module).values()
             if isinstance(value, type)
@@ -139,17 +141,17 @@ def _from_file(path: Path) -> type[Task]:
             and value.__module__ == module.__name__
             and hasattr(value, "name")
         ]
-        if len(found) != 1:
-            names = ", ".join(task.__name__ for task in found) or "none"
+        if len(tasks) != 1:
+            names = ", ".join(task.__name__ for task in tasks) or "none"
             raise BadInput(
                 f"{path} must define one task, a subclass of hyrl_mj.Task with a name: it has {names}"
             )
-        _FILES[path] = register(found[0])
+        _FILES[path] = register(tasks[0])
     return _FILES[path]
 
 
 def _run(path: Path) -> ModuleType:
-    """Import a file as a module of its own; like a script's, its folder can be imported from."""
+    """Import a file as a module of its own, which can import from its folder as a script can."""
     name = f"hyrl_mj_task_{path.stem}_{len(_FILES)}"
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
@@ -173,9 +175,9 @@ def _run(path: Path) -> ModuleType:
 
 
 def line_in(error: BaseException, path: Path | None) -> str:
-    """Where in a file an error came from: ", line 7"; nothing if it did not."""
+    """Returns the line of a file that an error came from: ", line 7"; "" if it came from elsewhere."""
     if isinstance(error, SyntaxError):
-        return ""  # it says so itself
+        return ""  # its text names the line
     lines, trace = [], error.__traceback__
     while trace is not None:
         if trace.tb_frame.f_code.co_filename == str(path):

@@ -1,4 +1,4 @@
-"""A task to start from: one Python file, one MJCF, and the tests that every task must pass."""
+"""The scaffold of a new task: a Python file, an MJCF, and the tests that every task must pass."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ def write_task(name: str, folder: Path) -> list[Path]:
     """Write `<name>.py`, `<name>.xml` and `test_<name>.py` into a folder; nothing is overwritten.
 
     Returns:
-        The files.
+        The paths of the files.
 
     Raises:
-        BadInput: the name cannot be one of a Python file, it is taken, or a file is there already.
+        BadInput: the name is not one of a Python module or is in use, or a file exists already.
     """
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or keyword.iskeyword(name):
         raise BadInput(
@@ -38,8 +38,8 @@ def write_task(name: str, folder: Path) -> list[Path]:
         for path in sorted(TEMPLATES.iterdir())
         if path.is_file()
     }
-    if there := [path for path in texts if path.exists()]:
-        raise BadInput(f"{there[0]} is there already: choose another name, or another folder")
+    if existing := [path for path in texts if path.exists()]:
+        raise BadInput(f"{existing[0]} exists already: choose another name, or another folder")
     folder.mkdir(parents=True, exist_ok=True)
     for path, text in texts.items():
         with artifacts.replacing(path) as temporary:

@@ -1,15 +1,13 @@
-"""The plane of a chart's first two coordinates: what can be drawn of a chart that has more of them."""
+"""Sections: results on charts of more than two dimensions, cut to the plane of the first two coordinates."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from hyrl_mj.chart import Chart
-from hyrl_mj.plant import Plant
 from hyrl_mj.policies import Policy
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import Grid, GridSet
@@ -17,8 +15,13 @@ from hyrl_mj.simulation import HybridArc
 from hyrl_mj.stages import CriticalSet, ExtendedSets, Partition, critical_points
 from hyrl_mj.tasks import Task
 
-# Grid points along the longest side from which critical points of a section are searched for.
+# Grid points along the longest side from which the critical points of a section are searched for.
 CELLS = 40
+
+
+def _of_whole(name: str) -> Any:
+    """Returns a property of `SectionTask`: the attribute or method of the whole task."""
+    return property(lambda section: getattr(section.whole, name))
 
 
 class SectionTask(Task):
@@ -28,6 +31,17 @@ class SectionTask(Task):
         whole: the task.
         rest: (d - 2,) values of the other coordinates.
     """
+
+    source, description = _of_whole("source"), _of_whole("description")
+    input_units, mirror = _of_whole("input_units"), _of_whole("mirror")
+    precision, close = _of_whole("precision"), _of_whole("close")
+    learning, model = _of_whole("learning"), _of_whole("model")
+    plant, input_limits = _of_whole("plant"), _of_whole("input_limits")
+    measure, control = _of_whole("measure"), _of_whole("control")
+    has_inner_loop = _of_whole("has_inner_loop")
+    observation, measured = _of_whole("observation"), _of_whole("measured")
+    reward, danger = _of_whole("reward"), _of_whole("danger")
+    ending, verdict = _of_whole("ending"), _of_whole("verdict")
 
     def __init__(self, whole: Task, rest: np.ndarray):
         self.whole, self.rest = whole, rest
@@ -47,31 +61,14 @@ class SectionTask(Task):
             starts=tuple(z[:2] for z in scene.starts),
             policy_starts=tuple(z[:2] for z in scene.policy_starts),
         )
-        self.source, self.learning, self.mirror = whole.source, whole.learning, whole.mirror
-        self.input_units, self.precision, self.close = (
-            whole.input_units,
-            whole.precision,
-            whole.close,
-        )
 
     def __getattr__(self, name: str) -> Any:
-        """Returns what this class does not define: the whole task's."""
-        return getattr(self.whole, name)
-
-    @property
-    def model(self) -> mujoco.MjModel:
-        return self.whole.model
-
-    @property
-    def input_limits(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.whole.input_limits
+        """Returns what neither this class nor `Task` defines: the robot's own."""
+        return getattr(object.__getattribute__(self, "whole"), name)
 
     @property
     def set_point(self) -> np.ndarray | None:
         return None if self.whole.set_point is None else self.whole.set_point[:2]
-
-    def plant(self, n: int, threads: int = 0) -> Plant:
-        return self.whole.plant(n, threads)
 
     def state(
         self, z: np.ndarray, rng: np.random.Generator | None = None
@@ -84,29 +81,11 @@ class SectionTask(Task):
     def with_z(self, measured: np.ndarray, z: np.ndarray) -> np.ndarray:
         return self.whole.with_z(measured, np.hstack([z, self.whole.z(measured)[:, 2:]]))
 
-    def observation(self, measured: np.ndarray) -> np.ndarray:
-        return self.whole.observation(measured)
-
-    def measured(self, observation: np.ndarray) -> np.ndarray:
-        return self.whole.measured(observation)
-
-    def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return self.whole.reward(measurement, u)
-
-    def ending(self, measurement: np.ndarray) -> np.ndarray:
-        return self.whole.ending(measurement)
-
-    def verdict(self, measurement: np.ndarray) -> np.ndarray:
-        return self.whole.verdict(measurement)
-
     def arrived(self, z: np.ndarray) -> np.ndarray:
         return self.whole.arrived(_lifted(z, self.rest))
 
     def miss(self, z: np.ndarray) -> np.ndarray:
         return self.whole.miss(_lifted(z, self.rest))
-
-    def danger(self, measurement: np.ndarray) -> np.ndarray:
-        return self.whole.danger(measurement)
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         return self.whole.starts(n, rng)[:, :2]
@@ -117,14 +96,15 @@ class SectionTask(Task):
 
 @dataclass(frozen=True)
 class Section:
-    """Results on a chart of more than two dimensions, cut where the other coordinates have fixed values.
+    """The plane through a chart of more than two dimensions in which results are drawn.
 
-    These are those of the first replay start. A chart of one or two dimensions is left as it is.
+    The other coordinates have the values of the scene's first start. A chart of one or two dimensions
+    stays whole.
 
     Attributes:
         whole: the task.
-        task: the same task with a chart of two dimensions; to `direction` and `miss` the others are fixed.
-        rest: (d - 2,) values of the others.
+        task: the task on the plane, a `SectionTask`; `whole` itself if there is nothing to cut.
+        rest: (d - 2,) values of the other coordinates.
     """
 
     whole: Task
@@ -133,7 +113,7 @@ class Section:
 
     @staticmethod
     def of(task: Task) -> Section:
-        """The section of a task."""
+        """Returns the section of a task."""
         chart = task.chart
         if chart.dimension <= 2:
             return Section(task, task, np.empty(0))
@@ -142,22 +122,22 @@ class Section:
 
     @property
     def cut(self) -> bool:
-        """Whether there is more than the section."""
+        """Whether the chart has more coordinates than the section."""
         return self.task is not self.whole
 
     def critical_set(
-        self, found: CriticalSet, policy: Policy, cells: int, resolution: float
+        self, critical: CriticalSet, policy: Policy, cells: int, resolution: float
     ) -> CriticalSet:
-        """M* in the section, searched for there by outcome; `found` if there is nothing to cut.
+        """Returns M* in the section, searched for there by outcome; `critical` if nothing is cut.
 
         Args:
-            found: M* on the whole chart.
+            critical: M* on the whole chart.
             policy: of stage 1.
             cells: of the search along the longest side.
             resolution: length of the last rods, as a share of the first.
         """
-        if not (self.cut and len(found.points)):
-            return found
+        if not (self.cut and len(critical.points)):
+            return critical
         grid = Grid.with_cells(self.task.chart, cells)
         nodes = self.lift(grid.nodes)
         points = critical_points(
@@ -166,29 +146,31 @@ class Section:
         one_piece = np.zeros(len(points), dtype=int)
         return CriticalSet(points, one_piece, resolution * grid.cell, grid.cell)
 
-    def partition(self, found: Partition) -> Partition:
-        """The parts in the section."""
+    def partition(self, partition: Partition) -> Partition:
+        """Returns the parts in the section."""
         if not self.cut:
-            return found
-        parts = tuple(self._set(part) for part in found.parts)
-        at = found.grid.nearest(self.lift(parts[0].grid.nodes))
-        return Partition(found.modes, parts, found.succeeds[at])
+            return partition
+        parts = tuple(self._set(part) for part in partition.parts)
+        at = partition.grid.nearest(self.lift(parts[0].grid.nodes))
+        return Partition(partition.modes, parts, partition.succeeds[at])
 
-    def extended_sets(self, found: ExtendedSets) -> ExtendedSets:
-        """The extended sets in the section."""
+    def extended_sets(self, extended: ExtendedSets) -> ExtendedSets:
+        """Returns the extended sets in the section."""
         if not self.cut:
-            return found
-        sets = tuple(self._set(members) for members in found.sets)
-        at = found.sets[0].grid.nearest(self.lift(sets[0].grid.nodes))
-        winning = tuple(wins[at] for wins in found.winning)
-        return replace(found, sets=sets, winning=winning, narrow=np.empty((0, 2)), room=np.empty(0))
+            return extended
+        sets = tuple(self._set(members) for members in extended.sets)
+        at = extended.sets[0].grid.nearest(self.lift(sets[0].grid.nodes))
+        winning = tuple(wins[at] for wins in extended.winning)
+        return replace(
+            extended, sets=sets, winning=winning, narrow=np.empty((0, 2)), room=np.empty(0)
+        )
 
-    def arc(self, found: HybridArc) -> HybridArc:
-        """An arc, seen in the section."""
-        return replace(found, z=found.z[:, :2]) if self.cut else found
+    def arc(self, arc: HybridArc) -> HybridArc:
+        """Returns an arc with the section's coordinates."""
+        return replace(arc, z=arc.z[:, :2]) if self.cut else arc
 
     def lift(self, z: np.ndarray) -> np.ndarray:
-        """Chart points (n, d) of points of the section (n, 2)."""
+        """Returns the chart points (n, d) of points of the section (n, 2)."""
         return _lifted(z, self.rest)
 
     def _set(self, members: GridSet) -> GridSet:
@@ -197,12 +179,12 @@ class Section:
 
 
 def critical_section(run: Run) -> CriticalSet:
-    """M* of a run in the section of its chart."""
+    """Returns M* of a run in the section of its chart."""
     s = run.settings
     cells = max(s.rods, CELLS)
     return Section.of(run.task).critical_set(run.critical_set, run.steady, cells, s.resolution)
 
 
 def _lifted(z: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Points (..., 2) with the other coordinates (k,): (..., 2 + k)."""
+    """Returns points (..., 2) with the other coordinates (k,) appended: (..., 2 + k)."""
     return np.concatenate([z, np.broadcast_to(rest, (*z.shape[:-1], len(rest)))], axis=-1)
