@@ -99,7 +99,7 @@ class Run:
 
     @property
     def steady(self) -> Policy:
-        """The policy at its mean or mode, where it is sampled: the stages take a function."""
+        """The policy as a function of the measurement: where it is sampled, its mean or mode."""
         policy = self.policy
         return policy.policy if isinstance(policy, SampledPolicy) else policy
 

@@ -1,4 +1,4 @@
-"""What every task must do: import it into a test file that has a fixture `task`, and run pytest there."""
+"""The tests that every task must pass: import them into a test file with a fixture `task`, and run pytest."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hyrl_mj.tasks import Outcome, Task, check_task
 
 
 def random_inputs(task: Task, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Inputs (n, m) all over the input limits."""
+    """Returns inputs (n, m) drawn uniformly between the input limits."""
     low, high = task.input_limits
     return rng.uniform(low, high, (n, len(low)))
 

@@ -228,22 +228,24 @@ def _stage1(task: Task, name: str, algorithm: str) -> Training:
                 f"preset 'paper' has no {algorithm}, the paper trained with {' and '.join(_PAPERS)}: "
                 "choose preset fast or smoke"
             )
-        found = _PAPERS[known]
+        training = _PAPERS[known]
     else:
-        found = (_CONTINUOUS if levels is None else _LEVELS)[known]
+        training = (_CONTINUOUS if levels is None else _LEVELS)[known]
     if name == "smoke":
-        found = replace(found, samples=_SMOKE[known])
+        training = replace(training, samples=_SMOKE[known])
     if np.any(np.subtract(task.start_high, task.start_low) < task.chart.sides - 1e-9):
-        found = replace(found, episode=None)  # what lies behind the starts has to be driven to
+        # Episodes are whole: the states behind the starts are only met by driving there.
+        training = replace(training, episode=None)
     if known == algorithm:
-        return found
-    return replace(found, algorithm=algorithm, options=accepted(algorithm, found.options))
+        return training
+    return replace(training, algorithm=algorithm, options=accepted(algorithm, training.options))
 
 
 def _stage6(task: Task, name: str, algorithm: str) -> Training:
     """Returns stage 6 of a preset, after stage 1 with an algorithm."""
+    continuous = task.learning.levels is None
     if name == "paper":
-        found = _MODES_PAPER_CONTINUOUS if task.learning.levels is None else _MODES_PAPER_DISCRETE
-        return replace(found, warm_start=found.warm_start and found.algorithm == algorithm)
-    found = _MODES_CONTINUOUS if task.learning.levels is None else _MODES_DISCRETE
-    return replace(found, samples=_SMOKE_MODES, attempts=1) if name == "smoke" else found
+        training = _MODES_PAPER_CONTINUOUS if continuous else _MODES_PAPER_DISCRETE
+        return replace(training, warm_start=training.warm_start and training.algorithm == algorithm)
+    training = _MODES_CONTINUOUS if continuous else _MODES_DISCRETE
+    return replace(training, samples=_SMOKE_MODES, attempts=1) if name == "smoke" else training

@@ -16,7 +16,7 @@ WALL = 1.4  # [m] to either side
 class MyRobot(hyrl_mj.Task):
     name = "my_robot"
     description = "glide past a pillar on its left or on its right"
-    # Where the decision falls: the critical set and all other sets are found in these coordinates.
+    # The coordinates in which the decision falls: those of the critical set and of all other sets.
     chart = Chart(("x", "y"), ("m", "m"), (0.0, -1.5), (3.2, 1.5), (False, False))
     inputs, input_units = ("lateral",), ("m/s",)
     noisy = (False, True, False, False)  # of the measurement: x, y, vy, touching
@@ -33,10 +33,10 @@ class MyRobot(hyrl_mj.Task):
     mirror = Mirror(observation=(1, -1, -1), inputs=(-1,))
     observation_low, observation_high = (-1.0, -3.0, -3.0), (5.0, 3.0, 3.0)
     set_point = np.array([3.0, 0.0])
-    close = 0.3  # [m] from the set-point is there
+    close = 0.3  # [m] from the set-point counts as arrived
 
     def state(self, z, rng=None):
-        """It drives at full speed; how fast it drifts aside the chart does not say."""
+        """The full state of a start: at full speed ahead, with a random drift aside."""
         drift = np.zeros(len(z)) if rng is None else rng.uniform(-0.2, 0.2, len(z))
         return z, np.stack([np.ones(len(z)), drift], axis=1)
 
@@ -50,11 +50,11 @@ class MyRobot(hyrl_mj.Task):
         return measured[:, :3]
 
     def measured(self, observation):
-        """Back again, for SB3's evaluate_policy; the networks do not read whether it touches."""
+        """The inverse of observation(), for SB3's evaluate_policy; no network reads `touching`."""
         return np.hstack([observation, np.zeros((len(observation), 1))])
 
     def clearance(self, measured):
-        """How far the puck is from the pillar: (n,) [m]."""
+        """Distance of the puck from the pillar: (n,) [m]."""
         centre = mjcf.geom_pos(self.model, "obstacle")[:2]
         radii = mjcf.geom_size(self.model, "obstacle")[0] + mjcf.geom_size(self.model, "puck")[0]
         return np.maximum(np.linalg.norm(measured[:, :2] - centre, axis=1) - radii, 0.0)
@@ -65,7 +65,7 @@ class MyRobot(hyrl_mj.Task):
         return np.where(self.failed(measured), 0.0, 3 - np.abs(measured[:, 1]) - close)
 
     def danger(self, measured):
-        """What adversarial noise works towards; a crash is always worst."""
+        """What adversarial noise makes as large as it can."""
         return -self.clearance(measured)
 
     def ending(self, measured):
