@@ -33,7 +33,7 @@ class Domain:
 
 @dataclass(frozen=True)
 class StepResult:
-    """What one step of n episodes gave; all arrays have n rows.
+    """The result of one step of n episodes; all arrays have n rows.
 
     Attributes:
         observation: (n, k) float32, noise included.
@@ -51,12 +51,12 @@ class StepResult:
 
     @property
     def done(self) -> np.ndarray:
-        """(n,) bool, the episode is over."""
+        """Whether the episode is over: (n,) bool."""
         return self.terminated | self.truncated
 
 
 class BatchedEnv:
-    """n episodes of one task. Its faces add nothing but the conventions of their libraries.
+    """n episodes of one task. The environments built on it add only the conventions of their libraries.
 
     Args:
         task: what is played.
@@ -89,12 +89,12 @@ class BatchedEnv:
         self.seed(None)
 
     def seed(self, seed: int | None) -> None:
-        """Restart the generator from which starts and noise are drawn."""
+        """Restarts the generator from which starts and noise are drawn."""
         self._rng = np.random.default_rng(seed)
         self._noise.reset(self.n, self._rng)
 
     def reset(self, ids: np.ndarray | None = None, z: np.ndarray | None = None) -> np.ndarray:
-        """Start new episodes in the rows `ids` (all by default).
+        """Starts new episodes in the rows `ids` (all by default).
 
         Args:
             ids: (k,) rows.
@@ -117,7 +117,7 @@ class BatchedEnv:
         return self.task.observation(self._measure(ids)).astype(np.float32)
 
     def step(self, u: np.ndarray) -> StepResult:
-        """Advance every episode by one sample; the caller resets those that are over.
+        """Advances every episode by one sample; the caller resets those that are over.
 
         Args:
             u: (n, m) inputs in the plant's units.
@@ -151,7 +151,7 @@ class BatchedEnv:
         return self.task.z(self.plant.measurement)
 
     def inputs(self, actions: np.ndarray) -> np.ndarray:
-        """Inputs (n, m) in the plant's units for actions: levels (n,) int, or inputs (n, m) to clip."""
+        """Returns inputs (n, m) in the plant's units for levels (n,) int, or for inputs (n, m) to clip."""
         if self.task.input_levels is None:
             return np.clip(np.asarray(actions, dtype=float), *self.task.input_limits)
         return at_levels(self.task, actions)

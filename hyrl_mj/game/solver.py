@@ -72,6 +72,7 @@ class Answers:
         measured = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
         def ask(q: int | None, points: np.ndarray) -> np.ndarray:
+            """Returns the answers (n,) to measurements (n, d) in a mode, None before the start."""
             mode = controller.initial_mode(points) if q is None else np.full(len(points), q)
             u, after = controller.step(mode, points)
             unknown = ~np.isin(after, modes)
@@ -94,7 +95,7 @@ class Answers:
 
     @property
     def middle(self) -> tuple[slice, ...]:
-        """Where the lattice lies among the measured nodes."""
+        """Returns where the lattice lies among the measured nodes."""
         counts = self.lattice.grid.counts
         return tuple(slice(k, k + n) for k, n in zip(self.pad, counts, strict=True))
 

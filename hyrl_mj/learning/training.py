@@ -60,7 +60,7 @@ def train(
     log_dir: Path | None = None,
     label: str = "training",
 ) -> MlpPolicy:
-    """Train one policy, and return the best of its checkpoints.
+    """Trains one policy, and returns the best of its checkpoints.
 
     Training goes up and down; as with SB3's `EvalCallback`, the policy is judged at intervals.
 
@@ -139,7 +139,7 @@ def build(
 
 
 def check_foreign(task: Task, settings: Training) -> None:
-    """Build an algorithm of somebody else's and ask its policy, before anything is trained.
+    """Checks an algorithm that is not SB3's own, and its policy, before anything is trained.
 
     Raises:
         BadInput: it cannot be built with these settings, or its policy does not do what a plain network
@@ -170,7 +170,7 @@ def check_foreign(task: Task, settings: Training) -> None:
 
 
 def export(model: BaseAlgorithm, task: Task) -> MlpPolicy:
-    """The policy that an SB3 algorithm has learned so far, as a plain network."""
+    """Returns the policy that an SB3 algorithm has learned so far, as a plain network."""
     state = symmetry.plain_state(model.policy, task)
     weights = {name: tensor.detach().cpu().numpy().copy() for name, tensor in state.items()}
     activation = next(n for n, a in ACTIVATIONS.items() if a is model.policy.activation_fn)
@@ -180,7 +180,7 @@ def export(model: BaseAlgorithm, task: Task) -> MlpPolicy:
 
 @contextmanager
 def single_threaded() -> Iterator[None]:
-    """One thread for torch and BLAS: small networks are faster, and sums do not depend on the machine."""
+    """Keeps torch and BLAS to one thread: faster for small networks, and sums do not vary by machine."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -270,7 +270,7 @@ class TaskGround:
 
 
 class _Watch(BaseCallback):
-    """Progress bar, checkpoints at intervals, and the best policy."""
+    """Shows progress, judges checkpoints at intervals, and keeps the best policy."""
 
     def __init__(self, samples: int, ground: Ground, log_dir: Path | None, label: str):
         super().__init__()
@@ -293,7 +293,7 @@ class _Watch(BaseCallback):
             self._checkpoint()
 
     def close(self) -> None:
-        """Take the progress bar away."""
+        """Removes the progress bar."""
         self._progress.close()
 
     def _checkpoint(self) -> None:

@@ -160,7 +160,7 @@ def simulate(
     horizon: float | None = None,
     seed: int = 0,
 ) -> HybridArc | list[HybridArc]:
-    """Simulate the closed loop in MuJoCo.
+    """Simulates the closed loop in MuJoCo.
 
     Args:
         task: the robot and its problem.
@@ -191,7 +191,7 @@ def simulate_batch(
     horizon: float | None = None,
     seed: int = 0,
 ) -> list[HybridArc]:
-    """Simulate the closed loop from n starts (n, d), or from one; as `simulate`, always with a list."""
+    """Simulates the closed loop from n starts (n, d), or from one, as `simulate`, and returns a list."""
     starts = task.chart.check(z0, task.name)
     check_seed(seed)
     loop = as_controller(controller)

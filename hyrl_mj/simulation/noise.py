@@ -74,7 +74,7 @@ class Signal(ABC):
         return copy(self)
 
     def reset(self, n: int, rng: np.random.Generator) -> None:
-        """Begin n simulations, with a generator to draw from; a signal with memory makes room for it."""
+        """Begins n simulations, with a generator to draw from; a signal with memory makes room for it."""
         self.rng = rng
 
     @abstractmethod
@@ -100,7 +100,7 @@ _KINDS: dict[str, type[Signal]] = {}
 
 
 def register_noise(signal: type[AnySignal]) -> type[AnySignal]:
-    """Make a class of signals known by its `kind`: a class decorator.
+    """Makes a class of signals known by its `kind`: a class decorator.
 
     `Noise(kind, bound)` and `--noise KIND` find it then. It is built with a bound and the shares of the
     columns, as `Signal`.

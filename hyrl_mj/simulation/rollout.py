@@ -72,7 +72,7 @@ def closed_loop(
     seed: int = 0,
     settings: LoopSettings = LoopSettings(),
 ) -> Rollout:
-    """Run the closed loop from many starts at once.
+    """Runs the closed loop from many starts at once.
 
     Args:
         task: the robot and its problem.

@@ -205,7 +205,7 @@ class ModeGround(ABC):
         return Domain(self.starts, self.within.contains, exit_reward, caution)
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """n starts (n, d): where the game is lost, where the task starts, and all over."""
+        """Draws n starts (n, d): where the game is lost, where the task starts, and all over."""
         at = np.where(
             rng.random(n) < TASK_SHARE, rng.choice(self.early, n), rng.choice(self.nodes, n)
         )
@@ -215,20 +215,20 @@ class ModeGround(ABC):
         return self._around(at, rng)
 
     def _around(self, at: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Points (n, d) in the cells around nodes at (n,)."""
+        """Draws points (n, d) in the cells around nodes at (n,)."""
         n, chart, d = len(at), self.task.chart, self.task.chart.dimension
         z = self.grid.nodes[at] + rng.uniform(-0.5, 0.5, (n, d)) * self.grid.spacing
         return np.where(chart.periodic, z, np.clip(z, chart.low, chart.high))
 
     def _remember(self, lost: np.ndarray, weight: np.ndarray) -> None:
-        """Nodes (k,) that were lost, and how much of the training each is worth (k,)."""
+        """Keeps the nodes (k,) that were lost, and how much of the training each is worth (k,)."""
         self.lost, self._weight = lost, weight / max(weight.sum(), 1e-300)
 
 
 class ByGame(ModeGround):
     """Judges by the worst-case game, which has to be won from every state.
 
-    Minus the share of states lost; minus delay or miss, whichever is more beyond what is allowed.
+    The score is minus the share of states lost, then minus delay or miss, whichever exceeds its limit more.
 
     The delay is that of the latest arrival behind the fewest samples there are. The miss is how far
     off the set-point the noise can keep a run for ever, beyond the noise bound itself; where runs end,
@@ -260,6 +260,7 @@ class ByGame(ModeGround):
         return 0.0, -float(max(delay / ALLOWED_DELAY, miss / self.task.precision))
 
     def _miss(self, answers: Answers, moves: Moves) -> float:
+        """Returns how far off the set-point the runs of the last policy end, or are kept by noise."""
         grid, after = self.lattice.grid, self.lattice.after
         still = lasting(moves, self.wanted)
         if still.any():
@@ -282,8 +283,8 @@ class ByEpisodes(ModeGround):
     """Judges by noisy episodes, where the worst case cannot be played.
 
     They start where the hybrid controller may pick the mode. Without noise all have to arrive at the
-    set-point, under noise to survive. The kinds of noise come in turn, the hardest last: the score is how
-    many of them stop no episode, and minus the share that the next one stops.
+    set-point, under noise to survive. The kinds of noise come in the order of `JUDGES`: the score is how many
+    of them stop no episode, then minus the share of episodes that the next one stops.
 
     Attributes:
         judged: (n, d) where they start.
@@ -303,10 +304,8 @@ class ByEpisodes(ModeGround):
         self._plant = task.plant(TOGETHER)
 
     def score(self, policy: MlpPolicy) -> Score:
-        loop, settings = (
-            PolicyController(policy),
-            LoopSettings(plant=self._plant, vary=True, quiet=True),
-        )
+        loop = PolicyController(policy)
+        settings = LoopSettings(plant=self._plant, vary=True, quiet=True)
         for survived, kind in enumerate(JUDGES):
             for done in range(0, EPISODES, TOGETHER):
                 starts = self.judged[done : done + TOGETHER]

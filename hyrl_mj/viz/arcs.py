@@ -24,7 +24,7 @@ WORST = "worst"
 
 
 def critical_start(run: Run) -> np.ndarray | None:
-    """The point (d,) of M* that is nearest to the replay starts, or None if M* is empty."""
+    """Returns the point (d,) of M* that is nearest to the replay starts, or None if M* is empty."""
     points = run.critical_set.points
     if not len(points):
         return None
@@ -41,7 +41,7 @@ def noisy_arcs(
     horizon: float | None = None,
     seed: int = 0,
 ) -> dict[str, list[HybridArc]]:
-    """Simulate policy and hybrid controller from starts (n, d) under the same noise.
+    """Simulates policy and hybrid controller from starts (n, d) under the same noise.
 
     Args:
         run: with its mode policies.
@@ -80,7 +80,7 @@ def noisy_arcs(
 
 
 def replay_starts(run: Run) -> dict[str, np.ndarray]:
-    """The paper's replay starts (Section V), with one on M* of our own added: (d,) by name."""
+    """Returns the replay starts of the task (paper, Section V) and one on M*: (d,) by name."""
     starts = {f"start{i}": np.array(z) for i, z in enumerate(run.task.scene.starts)}
     critical = critical_start(run)
     return starts if critical is None else starts | {"critical": critical}
@@ -89,7 +89,7 @@ def replay_starts(run: Run) -> dict[str, np.ndarray]:
 def replay_arcs(
     run: Run, noise: str = "alternating", eps: float | None = None
 ) -> dict[tuple[str, str], HybridArc]:
-    """The replays by start and controller, by default under the paper's noise with the run's bound."""
+    """Simulates the replays by start and controller, by default under the paper's noise."""
     starts, s = replay_starts(run), run.settings
     z0 = np.array([*starts.values()], dtype=float)
     found = noisy_arcs(run, z0, noise, eps, run.controller.modes, run.task.scene.time, s.seed)
@@ -103,7 +103,7 @@ def replay_arcs(
 def replay_shows(
     run: Run, starts: str = "critical", noise: str | None = None, eps: float | None = None
 ) -> list[Show]:
-    """What a replay plays.
+    """Returns what a replay plays.
 
     Args:
         run: with its arcs.
@@ -139,7 +139,7 @@ def replay_shows(
 
 
 def replay_floor(run: Run, overlap: bool = True) -> Floor:
-    """What a replay shows on the floor; of a chart of more than two dimensions a section."""
+    """Returns what a replay shows on the floor; of a chart of more than two dimensions a section."""
     section = Section.of(run.task)
     return Floor.of(
         section.task,
