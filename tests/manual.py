@@ -1,0 +1,162 @@
+"""The blocks of README and the manual, and how each is run: python tests/manual.py PAGE runs those of a page.
+
+Blocks run in order in the current folder, which should hold finished runs of preset smoke. What would take
+minutes is shortened, and what needs a network, root or a person at the screen is checked without running it;
+`SHORTER` and `instead` say how.
+"""
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+LANGUAGES = ("bash", "python", "toml")
+# Python that would train for a minute.
+SHORTER = {'hyrl_mj.run("my_robot.py")': 'hyrl_mj.run("my_robot.py", preset="smoke")'}
+TRAINING = ("run", "robustify", "diagnose")
+EPISODES, FRAMES = "200", "4"
+# Scripts that have tests of their own; here their options are looked up.
+TESTED = ("scripts/benchmark.py", "scripts/reproduce_paper.py")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block.
+
+    Attributes:
+        page: the file.
+        line: the number of its first line of text.
+        language: what stands behind the fence.
+        text: its text.
+    """
+
+    page: Path
+    line: int
+    language: str
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.page.name}:{self.line}"
+
+    @property
+    def commands(self) -> list[list[str]]:
+        """The words of each command of a block of bash, without comments."""
+        lines = (shlex.split(line, comments=True) for line in self.text.splitlines())
+        return [words for words in lines if words]
+
+
+def blocks(page: Path) -> list[Block]:
+    """The fenced blocks of a page, in order."""
+    text = page.read_text(encoding="utf-8")
+    return [
+        Block(page, text.count("\n", 0, match.start(2)) + 1, match[1], match[2])
+        for match in re.finditer(r"^```(.*)\n((?:.*\n)*?)^```$", text, re.MULTILINE)
+    ]
+
+
+def shortened(words: list[str]) -> list[str]:
+    """A command of `hyrl-mj` that takes seconds: preset smoke, few episodes and frames."""
+    words = list(words)
+    if words[0] in TRAINING and "--preset" not in words:
+        words += ["--preset", "smoke"]
+    if "--episodes" in words:
+        words[words.index("--episodes") + 1] = EPISODES
+    if words[0] == "replay":
+        words += ["--fps", FRAMES]
+    return words
+
+
+def call(words: list[str]) -> None:
+    """Call the command line in this process."""
+    from hyrl_mj import cli
+
+    sys.argv = ["hyrl-mj", *words]
+    try:
+        cli.main()
+    except SystemExit as end:
+        if end.code:
+            raise AssertionError(f"hyrl-mj {shlex.join(words)}: status {end.code}") from end
+
+
+def extras() -> dict[str, list[str]]:
+    """The optional dependencies of pyproject.toml."""
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    return tomllib.loads(text)["project"]["optional-dependencies"]
+
+
+def instead(words: list[str]) -> bool:
+    """Checks a command that is not run, and says whether it is one of these."""
+    setup = (ROOT / "scripts" / "setup.sh").read_text(encoding="utf-8")
+    match words:
+        case [("scripts/demo" | "scripts/test") as script, *options]:  # minutes, network
+            subprocess.run(["bash", "-n", ROOT / script], check=True)
+            text = (ROOT / script).read_text(encoding="utf-8")
+            assert all(option in text for option in options)
+        case ["source", path]:  # what setup.sh has made
+            assert path.removesuffix("/bin/activate") in setup
+        case ["pip", "install", what] | ["python", "-m", "pip", "install", what]:  # network
+            name, _, extra = what.removesuffix("]").partition("[")
+            assert (
+                name in (".", "hyrl-mj") and (not extra or extra in extras())
+            ) or name == "pytest"
+        case ["apt-get", "install", *packages]:  # root, network
+            assert f"apt_install {' '.join(packages)}" in setup
+        case ["tensorboard", "--logdir", folder]:  # serves for ever
+            assert shutil.which("tensorboard", path=Path(sys.executable).parent)
+            assert list(Path(folder).rglob("events.out.tfevents.*"))
+        case ["python", script, *options] if script in TESTED:  # minutes
+            text = (ROOT / script).read_text(encoding="utf-8")
+            assert all(f'"{option}"' in text for option in options if option.startswith("--"))
+        case ["mkdocs", "build", *_]:  # has a test of its own
+            assert " ".join(words) in (ROOT / ".mkdocs.yml").read_text(encoding="utf-8")
+        case _:
+            return False
+    return True
+
+
+def run_command(words: list[str]) -> None:
+    """Run a command of a block of bash, or what stands for it."""
+    match words:
+        case ["hyrl-mj", *rest]:
+            call(shortened(rest))
+        case ["python", "scripts/plain_dqn.py", *rest]:
+            script = ROOT / "scripts" / "plain_dqn.py"
+            subprocess.run([sys.executable, script, *rest, "--samples", "4000"], check=True)
+        case ["python", "-m", "pytest", *rest]:
+            subprocess.run([sys.executable, "-m", "pytest", "-q", *rest], check=True)
+        case _:
+            assert instead(words), f"nothing says how to run {shlex.join(words)}"
+
+
+def run(page: Path) -> None:
+    """Run the blocks of a page. Those of Python share their names, as the cells of a notebook."""
+    space: dict[str, object] = {"__name__": "__main__"}
+    for block in blocks(page):
+        print(f"== {block}", flush=True)
+        if block.language == "bash":
+            for words in block.commands:
+                print(f"$ {shlex.join(words)}", flush=True)
+                run_command(words)
+        elif block.language == "python":
+            text = block.text
+            for long, short in SHORTER.items():
+                text = text.replace(long, short)
+            exec(compile("\n" * (block.line - 1) + text, block.page, "exec"), space)
+
+
+if __name__ == "__main__":
+    # A viewer waits for a person, and the loops of a robot for the time to pass.
+    import time
+
+    import hyrl_mj.viz.viewing
+
+    hyrl_mj.viz.viewing.view = lambda *arguments: print("viewed", arguments[1])
+    time.sleep = lambda seconds: None
+    sys.path.insert(0, "")  # what a block has written can be imported
+    run(Path(sys.argv[1]))

@@ -1,0 +1,212 @@
+"""README and the manual: every block runs, every command and name exists, and every number is true."""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from gl import needs_gl
+from manual import LANGUAGES, PAGES, ROOT, SHORTER, blocks
+
+import hyrl_mj
+from hyrl_mj import cli
+
+MANUAL = ROOT / "docs"
+TASKS = ("unit_circle", "vehicle")
+texts = {page: page.read_text(encoding="utf-8") for page in PAGES}
+each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+
+
+def prose(page):
+    """A page without its blocks."""
+    return re.sub(r"^```.*?^```$", "", texts[page], flags=re.MULTILINE | re.DOTALL)
+
+
+def code(page):
+    """The words in backticks of a page's prose."""
+    return re.findall(r"`([^`]+)`", prose(page))
+
+
+def call(*words, cwd, timeout=300):
+    """Run Python in a process of its own, with the checkout on its path."""
+    path = os.pathsep.join((str(ROOT), os.environ.get("PYTHONPATH", "")))
+    done = subprocess.run(
+        [sys.executable, *map(str, words)], cwd=cwd, env=os.environ | {"PYTHONPATH": path},
+        capture_output=True, text=True, timeout=timeout,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    return done.stdout
+
+
+# ---- what is written
+
+
+def test_the_readme_is_short():
+    assert len(texts[ROOT / "README.md"].splitlines()) <= 150
+
+
+def test_five_terms_come_before_the_first_table():
+    before = texts[ROOT / "README.md"].split("\n|")[0]
+    for term in ("Chart", "Critical set", "Mode", "Own q0, any q0", "Winnable"):
+        assert f"**{term}**" in before
+
+
+@each_page
+def test_links_lead_somewhere(page):
+    links = re.findall(r"\]\(([^)\s]+)\)", prose(page))
+    for link in links:
+        name, _, anchor = link.partition("#")
+        target = page.parent / name if name else page
+        assert target.is_file(), f"{link} leads nowhere"
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.MULTILINE)
+            assert anchor in [re.sub(r"[^\w]+", "-", heading.lower()) for heading in headings]
+
+
+def test_every_page_is_linked_from_the_readme_and_in_the_navigation():
+    navigation = (ROOT / ".mkdocs.yml").read_text(encoding="utf-8")
+    for page in set(MANUAL.glob("*.md")):
+        assert f"- {page.name}\n" in navigation
+        assert page.name == "index.md" or f"(docs/{page.name})" in texts[ROOT / "README.md"]
+
+
+def test_every_public_name_is_in_the_reference():
+    documented = re.findall(r"^::: hyrl_mj\.(\w+)$", texts[MANUAL / "reference.md"], re.MULTILINE)
+    assert sorted(documented) == sorted(hyrl_mj.__all__)
+
+
+@each_page
+def test_names_in_the_text_exist(page):
+    for name in re.findall(r"`(hyrl_mj(?:\.\w+)+)", prose(page)):
+        if name.startswith("hyrl_mj.tasks"):  # the group of entry points, too
+            continue
+        parent, _, last = name.rpartition(".")
+        module = __import__(parent, fromlist=[last])
+        assert hasattr(module, last), f"{name} does not exist"
+
+
+def options_of(command):
+    """The options that a command of `hyrl-mj` has, from its help."""
+    done = subprocess.run(
+        [sys.executable, "-m", "hyrl_mj.cli", command, "--help"],
+        cwd=ROOT, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return set(re.findall(r"--[a-z][\w-]*", done.stdout))
+
+
+def test_every_command_and_option_exists():
+    commands = [
+        words[1:]
+        for page in PAGES
+        for block in blocks(page)
+        if block.language == "bash"
+        for words in block.commands
+        if words[0] == "hyrl-mj"
+    ]
+    inline = [re.sub(r"[<>]", "", text) for page in PAGES for text in code(page)]
+    commands += [shlex.split(text)[1:] for text in inline if text.startswith("hyrl-mj ")]
+    known = {}
+    for name, *rest in commands:
+        options = {word for word in (name, *rest) if word.startswith("--")}
+        if name.startswith("--"):
+            known.setdefault(name, {"--help", "--version"})
+        elif name not in known:
+            assert name in cli.COMMANDS, f"hyrl-mj has no command {name}"
+            known[name] = options_of(name)
+        assert options <= known[name], f"hyrl-mj {name} has no {options - known[name]}"
+    anywhere = set().union(*known.values(), {"--help", "--version"})
+    alone = {text.split()[0] for text in inline if text.startswith("--")}
+    assert alone <= anywhere, f"no command has {alone - anywhere}"
+
+
+def test_blocks_have_a_language_that_is_run():
+    for page in PAGES:
+        for block in blocks(page):
+            assert block.language in LANGUAGES, f"{block} is {block.language!r}"
+        assert texts[page].count("```") == 2 * len(blocks(page))
+
+
+def test_what_is_shortened_is_written_somewhere():
+    assert all(any(long in text for text in texts.values()) for long in SHORTER)
+
+
+def test_options_and_numbers_of_scripts_exist():
+    for page in PAGES:
+        for script in re.findall(r"scripts/\w+(?:\.py)?", texts[page]):
+            assert (ROOT / script).is_file(), f"{page.name} names {script}"
+
+
+# ---- what runs
+
+
+@pytest.fixture(scope="module")
+def smoke(tmp_path_factory):
+    """A folder with finished runs of preset smoke."""
+    folder = tmp_path_factory.mktemp("smoke")
+    for task in ("vehicle",):
+        call("-m", "hyrl_mj.cli", "run", task, "--preset", "smoke", cwd=folder)
+    return folder
+
+
+def agents(folder):
+    """The two files of agents that the page about Python loads."""
+    import onnx
+    from stable_baselines3 import PPO
+
+    from hyrl_mj.envs import BatchedEnv
+    from hyrl_mj.envs.sb3_env import TaskVecEnv
+
+    circle = hyrl_mj.get_task("unit_circle")
+    PPO("MlpPolicy", TaskVecEnv(BatchedEnv(circle, 1)), device="cpu").save(folder / "agent.zip")
+    observed, u = (
+        onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["n", columns])
+        for name, columns in (("observation", 2), ("u", 1))
+    )
+    weight = onnx.numpy_helper.from_array(np.ones((1, 2), dtype=np.float32), "weight")
+    node = onnx.helper.make_node("Gemm", ["observation", "weight"], ["u"], transB=1)
+    graph = onnx.helper.make_graph([node], "policy", [observed], [u], [weight])
+    opset = [onnx.helper.make_opsetid("", 17)]
+    onnx.save(
+        onnx.helper.make_model(graph, ir_version=8, opset_imports=opset), folder / "agent.onnx"
+    )
+
+
+@pytest.mark.slow
+@needs_gl
+@pytest.mark.parametrize(
+    "page",
+    [page for page in PAGES if any(block.language != "toml" for block in blocks(page))],
+    ids=lambda page: page.stem,
+)
+def test_the_blocks_of_a_page_run(page, smoke, tmp_path):
+    shutil.copytree(smoke, tmp_path, dirs_exist_ok=True)
+    if "agent.onnx" in texts[page]:
+        agents(tmp_path)
+    call(ROOT / "tests" / "manual.py", page, cwd=tmp_path)
+
+
+def test_a_block_that_stops_working_is_noticed(tmp_path):
+    for text in ("```python\n1 / 0\n```\n", "```bash\nhyrl-mj lists\n```\n", "```bash\nls\n```\n"):
+        page = tmp_path / "page.md"
+        page.write_text(text)
+        with pytest.raises(AssertionError):
+            call(ROOT / "tests" / "manual.py", page, cwd=tmp_path)
+
+
+@pytest.mark.slow
+def test_the_manual_is_built_without_a_warning_and_asks_nobody(tmp_path):
+    pages = tmp_path / "site"
+    call("-m", "mkdocs", "build", "-f", ROOT / ".mkdocs.yml", "--strict", "-d", pages, cwd=ROOT)
+    assert {page.with_suffix(".html").name for page in MANUAL.glob("*.md")} <= {
+        path.name for path in pages.glob("*.html")
+    }
+    for path in pages.glob("*.html"):
+        loaded = re.findall(
+            r"<(?:link|script|img)[^>]*(?:href|src)=\"?(http[^\s\">]*)", path.read_text()
+        )
+        assert not loaded
