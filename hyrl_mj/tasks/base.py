@@ -178,7 +178,8 @@ class Task(ABC):
 
         Args:
             u: (n, m) inputs of the policy.
-            qpos, qvel: (n, nq), (n, nv) positions and velocities.
+            qpos: (n, nq) positions.
+            qvel: (n, nv) velocities.
 
         Returns:
             (n, nu) controls of all actuators.
