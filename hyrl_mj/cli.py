@@ -39,7 +39,9 @@ def new_task(name: str, *, folder: Path = Path()) -> None:
     """
     paths = write_task(name, folder)
     print(f"wrote {', '.join(map(str, paths))}")
-    print(f"try them with pytest {paths[-1]}, then hyrl-mj run {paths[0]}")
+    print(
+        f"try them with python -m pytest {paths[-1]} (after pip install pytest), then hyrl-mj run {paths[0]}"
+    )
 
 
 def run(task: str, options: RunOptions) -> None:

@@ -1,7 +1,7 @@
 """A puck that glides past a pillar, on its left or on its right.
 
 hyrl-mj run my_robot.py
-pytest test_my_robot.py
+python -m pytest test_my_robot.py
 """
 
 import numpy as np
