@@ -39,9 +39,8 @@ def new_task(name: str, *, folder: Path = Path()) -> None:
     """
     paths = write_task(name, folder)
     print(f"wrote {', '.join(map(str, paths))}")
-    print(
-        f"try them with python -m pytest {paths[-1]} (after pip install pytest), then hyrl-mj run {paths[0]}"
-    )
+    print(f"try them with python -m pytest {paths[-1]}, after pip install pytest")
+    print(f"then run all stages with hyrl-mj run {paths[0]}")
 
 
 def run(task: str, options: RunOptions) -> None:
