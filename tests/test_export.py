@@ -1,4 +1,4 @@
-"""A controller that is taken away does what it did at home."""
+"""An exported controller does what the controller does, in both forms."""
 
 import re
 import subprocess
@@ -76,19 +76,19 @@ def as_onnx(controller, folder):
 
 
 @pytest.fixture(params=(as_numpy, as_onnx), ids=("numpy", "onnx"))
-def taken(request, tmp_path):
-    """Exports a controller: its step and initial_mode."""
+def exported(request, tmp_path):
+    """Returns an exported controller: its step and initial_mode."""
     return lambda controller: request.param(controller, tmp_path)
 
 
-def assert_same(controller, taken, measured, tolerance=1e-6):
-    step, initial_mode = taken
+def assert_same(controller, exported, measured, tolerance=1e-6):
+    step, initial_mode = exported
     q = RNG(1).choice(controller.modes, len(measured))
-    (u, after), (u_there, after_there) = controller.step(q, measured), step(q, measured)
-    assert u_there.dtype == np.float64
-    assert after_there.dtype == np.int64
-    np.testing.assert_array_equal(after_there, after)
-    np.testing.assert_allclose(u_there, u, rtol=0, atol=tolerance)
+    (u, after), (exported_u, exported_after) = controller.step(q, measured), step(q, measured)
+    assert exported_u.dtype == np.float64
+    assert exported_after.dtype == np.int64
+    np.testing.assert_array_equal(exported_after, after)
+    np.testing.assert_allclose(exported_u, u, rtol=0, atol=tolerance)
     np.testing.assert_array_equal(initial_mode(measured), controller.initial_mode(measured))
     return u, q, after
 
@@ -96,41 +96,41 @@ def assert_same(controller, taken, measured, tolerance=1e-6):
 # ---- agreement
 
 
-def test_it_agrees_on_ten_thousand_states(task, taken):
+def test_it_agrees_on_ten_thousand_states(task, exported):
     controller = planted(task)
     # Beyond the ends of the chart, too, and for the circle any winding.
     measured = random_states(task, 10_000, RNG(0)) * 1.5 - 0.25 * task.chart.sides
-    u, q, after = assert_same(controller, taken(controller), measured)
+    u, q, after = assert_same(controller, exported(controller), measured)
     assert 0.05 < (q != after).mean() < 0.95
     assert len(np.unique(u)) > 2
 
 
 @pytest.mark.parametrize("n", [1, 7])
-def test_batches_of_any_size(n, task, taken):
+def test_batches_of_any_size(n, task, exported):
     controller = planted(task)
-    assert_same(controller, taken(controller), random_states(task, n, RNG(2)))
+    assert_same(controller, exported(controller), random_states(task, n, RNG(2)))
 
 
-def test_three_modes_jump_to_the_deepest(circle, taken):
+def test_three_modes_jump_to_the_deepest(circle, exported):
     controller = planted(circle, modes=(1, 4, 7))
-    _, q, after = assert_same(controller, taken(controller), random_states(circle, 2000, RNG(0)))
+    _, q, after = assert_same(controller, exported(controller), random_states(circle, 2000, RNG(0)))
     assert {(a, b) for a, b in zip(q, after, strict=True) if a != b} == {
         (a, b) for a in (1, 4, 7) for b in (1, 4, 7) if a != b
     }
 
 
-def test_it_begins_by_start_sets_where_there_are_some(vehicle, taken):
+def test_it_begins_by_start_sets_where_there_are_some(vehicle, exported):
     controller = planted(vehicle)
     coarse = Grid.with_cells(vehicle.chart, 10)
     upper = GridSet(coarse, 0.3 - coarse.nodes[:, 1])
     controller = replace(controller, starts={0: upper, 1: ~upper})
     measured = random_states(vehicle, 2000, RNG(0))
-    assert_same(controller, taken(controller), measured)
+    assert_same(controller, exported(controller), measured)
     by_flow = replace(controller, starts=None).initial_mode(measured)
     assert 0.05 < (controller.initial_mode(measured) != by_flow).mean() < 0.95
 
 
-def test_on_the_edge_it_flows(vehicle, taken):
+def test_on_the_edge_it_flows(vehicle, exported):
     grid = Grid(vehicle.chart, (2, 2))
     ramp = GridSet(grid, grid.nodes[:, 1].copy())  # its edge is y = 0, to the bit at the middle
     controller = HybridController(
@@ -138,14 +138,14 @@ def test_on_the_edge_it_flows(vehicle, taken):
     )
     near = np.array([0.0, 5e-10, -5e-10, 2e-9, -2e-9])
     measured = np.column_stack([np.ones(5), near])
-    step, _ = taken(controller)
+    step, _ = exported(controller)
     for q in (0, 1):
         modes = np.full(5, q)
         np.testing.assert_array_equal(step(modes, measured)[1], controller.step(modes, measured)[1])
 
 
 @pytest.mark.parametrize("d", [3, 4])
-def test_charts_of_more_dimensions(d, taken):
+def test_charts_of_more_dimensions(d, exported):
     cube = Cube(lambda z: z[:, 0], d)
     cube.observation_low, cube.observation_high = (-1.0,) * d, (1.0,) * d
     grid = Grid.with_cells(cube.chart, 6)
@@ -153,18 +153,18 @@ def test_charts_of_more_dimensions(d, taken):
     controller = HybridController(
         cube, {q: network(cube, q) for q in (0, 1)}, dict(enumerate(held))
     )
-    assert_same(controller, taken(controller), random_states(cube, 2000, RNG(0)) * 1.2)
+    assert_same(controller, exported(controller), random_states(cube, 2000, RNG(0)) * 1.2)
 
 
-def test_one_mode_without_an_edge(circle, taken):
+def test_one_mode_without_an_edge(circle, exported):
     controller = HybridController(circle, {0: network(circle)}, {0: Everything()})
-    assert_same(controller, taken(controller), random_states(circle, 100, RNG(0)))
+    assert_same(controller, exported(controller), random_states(circle, 100, RNG(0)))
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_activations(activation, circle, taken):
+def test_activations(activation, circle, exported):
     controller = planted(circle, activation=activation)
-    assert_same(controller, taken(controller), random_states(circle, 500, RNG(0)), 1e-5)
+    assert_same(controller, exported(controller), random_states(circle, 500, RNG(0)), 1e-5)
 
 
 class Squashed(MlpPolicy):
@@ -179,16 +179,16 @@ class Squashed(MlpPolicy):
         return low + (np.tanh(self.outputs(observation).astype(float)) + 1) / 2 * (high - low)
 
 
-def test_an_output_that_is_squashed(circle, taken):
+def test_an_output_that_is_squashed(circle, exported):
     controller = planted(circle, kind=Squashed)
-    u, _, _ = assert_same(controller, taken(controller), random_states(circle, 2000, RNG(0)))
+    u, _, _ = assert_same(controller, exported(controller), random_states(circle, 2000, RNG(0)))
     assert (np.abs(u) < 1).mean() > 0.5
 
 
-def test_a_task_of_the_user_s(puck, taken):
+def test_a_task_of_the_user_s(puck, exported):
     controller = planted(puck)
     measured = RNG(0).uniform(-1, 1, (2000, puck.measurement_columns))
-    assert_same(controller, taken(controller), measured)
+    assert_same(controller, exported(controller), measured)
 
 
 # ---- what it says to bad values
@@ -344,7 +344,7 @@ def test_bad_forms_and_places(circle, tmp_path):
     with pytest.raises(BadInput, match="a place that can be written"):
         export(controller, "onnx", tmp_path)
     (tmp_path / "controller.py").write_text("mine")
-    with pytest.raises(BadInput, match="no exported controller"):
+    with pytest.raises(BadInput, match="exists and is no exported controller"):
         export(controller, "numpy", tmp_path)
     assert (tmp_path / "controller.py").read_text() == "mine"
     assert {p.name for p in tmp_path.iterdir()} == {"file", "controller.py"}
@@ -438,9 +438,9 @@ def test_operations_survive_both_forms(name):
     for n in (1, 5, 300):
         x = 2 * RNG(n).normal(size=(n, 3))
         wanted = WHOLE[name](x)
-        for given in (space["f"](x), session.run(None, {"x": x})[0]):
-            assert given.dtype == wanted.dtype
-            np.testing.assert_allclose(given, wanted, rtol=1e-12, atol=1e-14)
+        for result in (space["f"](x), session.run(None, {"x": x})[0]):
+            assert result.dtype == wanted.dtype
+            np.testing.assert_allclose(result, wanted, rtol=1e-12, atol=1e-14)
 
 
 def test_gelu_takes_the_error_function_of_scipy():
@@ -545,8 +545,19 @@ def test_methods_of_other_objects_run_as_they_are():
     assert trace(lambda x: x * encoder.encode(np.ones((1, 2))), {"x": x}, "f").operations()
 
 
+def test_methods_of_the_chart_are_followed(circle, tmp_path):
+    class Charted(type(circle)):
+        def observation(self, measured):
+            z = self.chart.wrap(measured)
+            far = self.chart.difference(z, np.array([1.0]))
+            return np.hstack([far, self.chart.contains(z)[:, None]])
+
+    controller = planted(Charted())
+    assert_same(controller, as_numpy(controller, tmp_path), 9 * RNG(0).normal(size=(500, 1)))
+
+
 def made_arrays(task):
-    """What is plain everywhere else than in code that is being followed."""
+    """Arrays that must stay plain outside of traced code."""
     x = np.zeros((BATCH, 2))
     return [
         x, np.empty((BATCH, 3)), np.ones(BATCH), np.full((BATCH, 2), 7.0), np.arange(BATCH),
@@ -556,7 +567,7 @@ def made_arrays(task):
 
 
 def test_other_threads_have_their_arrays_and_numpy_its_functions(vehicle):
-    """The code that is followed waits until another thread is done."""
+    """The traced code waits until another thread is done."""
     before = dict(vars(np))
     inside, done, made, changed = threading.Event(), threading.Event(), [], []
 

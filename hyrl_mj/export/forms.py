@@ -5,13 +5,15 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from runpy import run_path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadInput, brief, unknown
-from hyrl_mj.export.source import literal, write_function
+from hyrl_mj.export.source import write_function
+from hyrl_mj.export.traced_array import Program
 from hyrl_mj.export.tracing import trace
 from hyrl_mj.export.vocabulary import BATCH
 from hyrl_mj.policies import ACTIVATIONS, MlpPolicy
@@ -23,32 +25,28 @@ if TYPE_CHECKING:
     import onnx
 
 TEMPLATE = Path(__file__).parents[1] / "templates" / "controller.py"
-# Where the part of the template begins and ends that belongs to the task.
+# The task's part of the template begins and ends with these.
 BEGIN, END = "# ---- the task", "# ---- the controller\n"
-# What functions of that part are for.
-SENTENCES = {
-    "chart_point": "Chart points (n, d) of measurements (n, p).",
-    "observation": "What the networks are fed (n, k) for measurements (n, p).",
-}
-# Rows of the batches in which a form is held against the controller, and the share of rows in which rounding
-# may decide differently between two levels or modes; how far other inputs may be off [of their range].
+# Sizes of the batches on which an exported form is compared with the controller; the share of rows in which
+# rounding may decide differently between two levels or modes; the allowed error of other inputs [share of
+# their range].
 CHECKED, TIES, CLOSE = (1, 7, 1000), 0.002, 1e-5
-# The depth of a set without an edge: deeper than any other, and finite.
+# The signed distance of a set without an edge: deeper than any other, and finite.
 DEEPEST = -1e300
 Step = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 def export_numpy(controller: HybridController, folder: str | Path) -> list[Path]:
-    """Write a controller as controller.py and controller.npz, which need NumPy alone.
+    """Writes a controller as controller.py and controller.npz, which need NumPy alone.
 
     The module has `step(q, measured) -> (u, q_next)` and `initial_mode(measured)`, as the controller does.
 
     Args:
-        controller: its modes have networks as policies, and sets on grids as flow sets.
-        folder: where to; made if it is not there.
+        controller: its policies are networks, and its sets are on grids.
+        folder: is created if it does not exist.
 
     Returns:
-        Both files.
+        The paths of both files.
 
     Raises:
         BadInput: the controller cannot be exported, or the files cannot be written.
@@ -56,12 +54,12 @@ def export_numpy(controller: HybridController, folder: str | Path) -> list[Path]
     folder = Path(folder)
     path = folder / TEMPLATE.name
     first_line = TEMPLATE.read_text(encoding="utf-8").splitlines(keepends=True)[0]
-    there = path.read_text(encoding="utf-8", errors="replace") if path.exists() else first_line
-    if not there.startswith(first_line):
-        raise BadInput(f"{path} is there and is no exported controller: choose another folder")
+    present = path.read_text(encoding="utf-8", errors="replace") if path.exists() else first_line
+    if not present.startswith(first_line):
+        raise BadInput(f"{path} exists and is no exported controller: choose another folder")
     with tempfile.TemporaryDirectory() as temporary:
         written = _write(controller, Path(temporary))
-        _check(controller, _load(written[0])["step"], "the NumPy form")
+        _check(controller, run_path(str(written[0]))["step"], "the NumPy form")
         for source in reversed(written):  # the arrays first
             with artifacts.replacing(folder / source.name) as partial:
                 partial.write_bytes(source.read_bytes())
@@ -69,18 +67,18 @@ def export_numpy(controller: HybridController, folder: str | Path) -> list[Path]
 
 
 def export_onnx(controller: HybridController, path: str | Path) -> Path:
-    """Write a controller as one ONNX file: modes, sets and the jump rule in one graph.
+    """Writes a controller as one ONNX file: modes, sets and the jump rule in one graph.
 
     Its inputs are q (n,) int64 and measured (n, p) float64, its outputs u (n, m) float64 and q_next (n,)
-    int64. A graph cannot refuse anything: a q that is no mode, such as -1, is answered as if the loop began,
-    with the initial mode; a measurement that is not finite with q itself and u = NaN.
+    int64. A graph cannot refuse anything: for a q that is no mode, such as -1, it begins in the initial mode;
+    for a measurement that is not finite it returns q itself and u = NaN.
 
     Args:
-        controller: its modes have networks as policies, and sets on grids as flow sets.
-        path: the file.
+        controller: its policies are networks, and its sets are on grids.
+        path: the file to write.
 
     Returns:
-        The file.
+        The path of the file.
 
     Raises:
         BadInput: the controller cannot be exported, the file cannot be written, or the packages onnx and
@@ -92,10 +90,11 @@ def export_onnx(controller: HybridController, path: str | Path) -> Path:
         import onnxruntime
     except ImportError as error:
         raise BadInput(
-            f'ONNX takes the packages onnx and onnxruntime ({error}): pip install "hyrl-mj[onnx]"'
+            f'ONNX needs the packages onnx and onnxruntime ({error}): pip install "hyrl-mj[onnx]"'
         ) from error
     with tempfile.TemporaryDirectory() as temporary:
-        model = _graph(controller, _load(_write(controller, Path(temporary))[0]))
+        path_of_step = _write(controller, Path(temporary))[0]
+        model = _graph(controller, run_path(str(path_of_step)))
     content = model.SerializeToString()
 
     def step(q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -103,8 +102,7 @@ def export_onnx(controller: HybridController, path: str | Path) -> Path:
 
     try:
         session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-    # onnxruntime has its own exceptions, all of them plain ones.
-    except Exception as error:
+    except Exception as error:  # onnxruntime's own exceptions have no other base
         raise BadInput(
             f"{controller.task.name} cannot be exported to ONNX: {brief(error)}"
         ) from error
@@ -118,10 +116,10 @@ FORMS: dict[str, Callable[..., Any]] = {"onnx": export_onnx, "numpy": export_num
 
 
 def export(controller: HybridController, form: str, out: Path) -> None:
-    """Write a controller in one of `FORMS`.
+    """Writes a controller in one of `FORMS`.
 
     Raises:
-        BadInput: the form is unknown, or what the form says.
+        BadInput: the form is unknown, or the errors of `export_numpy` and `export_onnx`.
     """
     if form not in FORMS:
         raise unknown("form", form, FORMS)
@@ -129,21 +127,38 @@ def export(controller: HybridController, form: str, out: Path) -> None:
 
 
 def _write(controller: HybridController, folder: Path) -> tuple[Path, Path]:
-    """Write controller.py and controller.npz."""
-    arrays = _arrays(controller)
+    """Writes controller.py and controller.npz."""
+    networks = [_network(controller, q) for q in controller.modes]
+    arrays = _arrays(controller, networks)
     text = TEMPLATE.read_text(encoding="utf-8")
     begin, end = text.index(BEGIN), text.index(END)
+    task_part = _task_part(controller.task, networks, arrays)
     path = folder / TEMPLATE.name
-    path.write_text(text[:begin] + _task_part(controller, arrays) + text[end:], encoding="utf-8")
+    path.write_text(text[:begin] + task_part + text[end:], encoding="utf-8")
     artifacts.write_arrays(path.with_suffix(".npz"), arrays, kind="controller")
     return path, path.with_suffix(".npz")
 
 
-def _arrays(controller: HybridController) -> dict[str, np.ndarray]:
-    """What the template reads of modes, chart, inputs, sets and networks."""
+def _network(controller: HybridController, q: int) -> MlpPolicy:
+    """Returns the network of a mode."""
+    policy, task = controller.policies[q], controller.task.name
+    if not isinstance(policy, MlpPolicy):
+        raise BadInput(
+            f"the policy of mode {q} is a {type(policy).__name__}: only networks, MlpPolicy, can be "
+            "exported"
+        )
+    if policy.task.name != task:
+        raise BadInput(f"the policy of mode {q} is for {policy.task.name}, not {task}")
+    return policy
+
+
+def _arrays(controller: HybridController, networks: list[MlpPolicy]) -> dict[str, np.ndarray]:
+    """Returns what the template reads of modes, chart, inputs, sets and networks."""
     task, chart = controller.task, controller.task.chart
     if min(controller.modes) < 0:
-        raise BadInput(f"modes {controller.modes} cannot be exported: -1 stands for no mode yet")
+        raise BadInput(
+            f"modes {controller.modes} cannot be exported: give modes >= 0, since -1 stands for no mode"
+        )
     low, high = task.input_limits
     arrays: dict[str, Any] = {
         "modes": np.array(controller.modes, dtype=np.int64),
@@ -160,76 +175,61 @@ def _arrays(controller: HybridController) -> dict[str, np.ndarray]:
         sets = {"flow": controller.flow_sets[q]}
         if controller.starts is not None:
             sets["start"] = controller.starts[q]
-        for kind, held in sets.items():
-            on_grid = _grid_set(held, task, f"{kind} set of mode {q}")
+        for kind, state_set in sets.items():
+            on_grid = _grid_set(state_set, task, f"{kind} set of mode {q}")
             arrays[f"{kind}_{k}"] = on_grid.values
             arrays[f"{kind}_{k}_counts"] = np.array(on_grid.grid.counts, dtype=np.int64)
             arrays[f"{kind}_{k}_spacing"] = on_grid.grid.spacing
-        layers = _policy(controller, q).layers
-        arrays[f"layers_{k}"] = np.array(len(layers))
-        for i, (weight, bias) in enumerate(layers):
+        arrays[f"layers_{k}"] = np.array(len(networks[k].layers))
+        for i, (weight, bias) in enumerate(networks[k].layers):
             arrays[f"weight_{k}_{i}"], arrays[f"bias_{k}_{i}"] = weight, bias
     return arrays
 
 
-def _grid_set(held: StateSet, task: Task, what: str) -> GridSet:
-    """A set on a grid."""
-    if isinstance(held, GridSet) and held.grid.chart == task.chart:
-        return held
-    if isinstance(held, Everything):
+def _grid_set(state_set: StateSet, task: Task, what: str) -> GridSet:
+    """Returns a set on a grid; `what` names it in messages."""
+    if isinstance(state_set, GridSet) and state_set.grid.chart == task.chart:
+        return state_set
+    if isinstance(state_set, Everything):
         grid = Grid(task.chart, (2,) * task.chart.dimension)
-        return GridSet(grid, np.full(2**task.chart.dimension, DEEPEST))
+        return GridSet(grid, np.full(len(grid.nodes), DEEPEST))
     raise BadInput(
-        f"the {what} is a {type(held).__name__}: only a GridSet on the chart of "
+        f"the {what} is a {type(state_set).__name__}: only a GridSet on the chart of "
         f"{task.name}, or Everything, can be exported"
     )
 
 
-def _policy(controller: HybridController, q: int) -> MlpPolicy:
-    """The network of a mode."""
-    policy = controller.policies[q]
-    if not isinstance(policy, MlpPolicy):
-        raise BadInput(
-            f"the policy of mode {q} is a {type(policy).__name__}: only networks, MlpPolicy, can be "
-            "exported"
-        )
-    if policy.task.name != controller.task.name:
-        raise BadInput(
-            f"the policy of mode {q} is for {policy.task.name}, not {controller.task.name}"
-        )
-    return policy
-
-
-def _task_part(controller: HybridController, arrays: dict[str, np.ndarray]) -> str:
-    """The part of the template that belongs to the task; large constants go to `arrays`."""
-    task = controller.task
-    policies = [_policy(controller, q) for q in controller.modes]
+def _task_part(task: Task, networks: list[MlpPolicy], arrays: dict[str, np.ndarray]) -> str:
+    """Returns the task's part of the template; large constants go to `arrays`."""
     units = task.input_units or ("",) * len(task.inputs)
     inputs = tuple(f"{i} [{u}]" if u else i for i, u in zip(task.inputs, units, strict=True))
-    activations = [policy.activation for policy in policies]
+    activations = [network.activation for network in networks]
     lines = [
         f"{BEGIN} {task.name}",
-        f"TASK = {literal(task.name)}",
+        f"TASK = {task.name!r}",
         f"SAMPLE_TIME = {task.dt!r}  # [s]",
         f"MEASUREMENT_COLUMNS = {task.measurement_columns}",
-        f"INPUTS = {literal(inputs)}",
-        f"OUTPUTS = {literal(tuple(policy.output for policy in policies))}\n\n",
+        f"INPUTS = {inputs!r}",
+        f"OUTPUTS = {tuple(network.output for network in networks)!r}\n\n",
     ]
     measured = {"measured": _measurements(task, BATCH, np.random.default_rng(0))}
     x = {"x": np.linspace(-3, 3, BATCH, dtype=np.float32)[:, None]}
-    programs = {
-        "chart_point": trace(task.z, measured, f"the method z of {task.name}"),
-        "observation": trace(task.observation, measured, f"the method observation of {task.name}"),
-        **{a: trace(ACTIVATIONS[a], x, f"the activation {a}") for a in dict.fromkeys(activations)},
-    }
-    for name, program in programs.items():
-        sentence = SENTENCES.get(name, "Between the layers of a network.")
-        lines += [*write_function(name, sentence, program, arrays), "", ""]
-    return "\n".join([*lines, f"ACTIVATIONS = ({', '.join(activations)},)", "", ""])
+
+    def add(name: str, sentence: str, program: Program) -> None:
+        lines.extend([*write_function(name, sentence, program, arrays), "", ""])
+
+    z = trace(task.z, measured, f"the method z of {task.name}")
+    add("chart_point", "Returns the chart points (n, d) of measurements (n, p).", z)
+    observation = trace(task.observation, measured, f"the method observation of {task.name}")
+    add("observation", "Returns the observations (n, k) of measurements (n, p).", observation)
+    for name in dict.fromkeys(activations):
+        program = trace(ACTIVATIONS[name], x, f"the activation {name}")
+        add(name, "The activation between the layers of a network.", program)
+    return "\n".join([*lines, f"ACTIVATIONS = [{', '.join(activations)}]", "", ""])
 
 
-def _graph(controller: HybridController, names: dict[str, Any]) -> onnx.ModelProto:
-    """What `answer` of an exported controller.py does, as a graph."""
+def _graph(controller: HybridController, module: dict[str, Any]) -> onnx.ModelProto:
+    """Returns the function `answer` of an exported controller.py, given by its names, as a graph."""
     from hyrl_mj.export.graph import write_graph
 
     task, rng = controller.task, np.random.default_rng(0)
@@ -237,36 +237,29 @@ def _graph(controller: HybridController, names: dict[str, Any]) -> onnx.ModelPro
         "q": rng.choice(controller.modes, BATCH),
         "measured": _measurements(task, BATCH, rng),
     }
-    program = trace(names["answer"], samples, f"the step of {task.name}")
+    program = trace(module["answer"], samples, f"the step of {task.name}")
     metadata = {
         "task": task.name,
         "modes": ", ".join(map(str, controller.modes)),
-        "inputs": ", ".join(names["INPUTS"]),
+        "inputs": ", ".join(module["INPUTS"]),
         "sample_time": str(task.dt),
     }
     return write_graph(program, ("u", "q_next"), task.name, metadata)
 
 
-def _load(path: Path) -> dict[str, Any]:
-    """The names in an exported controller.py."""
-    names = {"__file__": str(path)}
-    exec(compile(path.read_text(encoding="utf-8"), path, "exec"), names)
-    return names
-
-
 def _measurements(task: Task, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Noisy measurements (n, p) all over the chart."""
+    """Draws noisy measurements (n, p) from the whole chart."""
     z = rng.uniform(task.chart.low, task.chart.high, (n, task.chart.dimension))
     plant = task.plant(n)
     plant.set_state(*task.state(z, rng))
     return plant.measurement + rng.uniform(-0.1, 0.1, (n, task.measurement_columns))
 
 
-def _check(controller: HybridController, step: Step, what: str) -> None:
-    """Refuse a form that does other than the controller."""
+def _check(controller: HybridController, step: Step, form: str) -> None:
+    """Raises `BadInput` where a form does not do what the controller does."""
     task, rng = controller.task, np.random.default_rng(1)
     refusal = (
-        f"{what} of {task.name} cannot be exported: it does not do what the controller does ({{}}); do z() "
+        f"{form} of {task.name} cannot be exported: it does not do what the controller does ({{}}); do z() "
         "and observation() of the task compute each row from that row alone, whatever its values are?"
     )
     low, high = task.input_limits
@@ -276,13 +269,12 @@ def _check(controller: HybridController, step: Step, what: str) -> None:
         q = rng.choice(controller.modes, n)
         u, q_next = controller.step(q, measured)
         try:
-            u_there, q_there = step(q, measured)
-        # A form that does not fit fails in the ways of NumPy or onnxruntime.
-        except Exception as error:
+            exported_u, exported_q = step(q, measured)
+        except Exception as error:  # NumPy and onnxruntime fail in many ways
             raise BadInput(refusal.format(brief(error))) from error
-        if u_there.shape != u.shape or q_there.shape != q.shape:
-            raise BadInput(refusal.format(f"u has shape {u_there.shape} for a batch of {n}"))
-        far = np.abs(u_there - u) > CLOSE * (high - low)
-        wrong += int(np.count_nonzero(far.any(axis=1) | (q_there != q_next)))
+        if exported_u.shape != u.shape or exported_q.shape != q.shape:
+            raise BadInput(refusal.format(f"u has shape {exported_u.shape} for a batch of {n}"))
+        far = np.abs(exported_u - u) > CLOSE * (high - low)
+        wrong += int(np.count_nonzero(far.any(axis=1) | (exported_q != q_next)))
     if wrong > TIES * sum(CHECKED):
         raise BadInput(refusal.format(f"{wrong} of {sum(CHECKED)} answers differ"))

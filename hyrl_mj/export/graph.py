@@ -1,4 +1,4 @@
-"""Writes what code does as an ONNX graph."""
+"""Writes a traced program as an ONNX graph."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 import onnx
 from onnx import helper, numpy_helper
 
-from hyrl_mj.export.traced_array import Operation, Program
+from hyrl_mj.export.traced_array import Operation, Program, Traced, apply
 from hyrl_mj.export.vocabulary import BATCH, ELEMENTWISE
 
-# Those of the oldest onnxruntime that is asked for, and older ones read.
+# The versions that the oldest supported onnxruntime reads.
 OPSET, IR_VERSION = 18, 8
 REDUCED = {
     "sum": "ReduceSum", "max": "ReduceMax", "min": "ReduceMin", "any": "ReduceMax", "all": "ReduceMin",
@@ -22,18 +22,19 @@ REDUCED = {
 def write_graph(
     program: Program, outputs: Sequence[str], name: str, metadata: Mapping[str, str]
 ) -> onnx.ModelProto:
-    """The model that does what a program does, on batches of any size.
+    """Returns a model that computes a program for batches of any size.
 
     Args:
-        program: its inputs and outputs have one row for each of the batch.
+        program: its inputs and outputs have one row for each row of the batch.
         outputs: names of its outputs.
-        name: of the graph.
-        metadata: is kept with the model.
+        name: the name of the graph.
+        metadata: what the model's metadata holds.
     """
     graph = _Graph(program)
-    for operation in program.operations():
-        graph.names[id(operation)] = graph.lower(operation)
     results = list(zip(outputs, program.outputs, strict=True))
+    with np.errstate(all="ignore"):
+        for operation in program.operations():
+            graph.get(operation)
     graph.nodes += [helper.make_node("Identity", [graph.get(o)], [n], name=n) for n, o in results]
     model = helper.make_model(
         helper.make_graph(
@@ -58,141 +59,121 @@ def _described(name: str, operation: Operation) -> onnx.ValueInfoProto:
 
 
 class _Graph:
-    """A graph in the making: nodes, constants, and what the result of each operation is called."""
+    """A graph under construction: its nodes, its constants, and the names of the operations' results."""
 
     def __init__(self, program: Program) -> None:
         self.batch = program.inputs[0]
-        self.names = {id(o): o.operands[0] for o in program.inputs}
+        self.names: dict[Operation, str] = {o: o.operands[0] for o in program.inputs}
         self.nodes: list[onnx.NodeProto] = []
         self.constants: dict[tuple[Any, ...], tuple[str, np.ndarray]] = {}
 
     def node(self, kind: str, *inputs: str, **attributes: Any) -> str:
-        """Add a node; the name of what it gives."""
+        """Adds a node; returns the name of its result."""
         result = f"{kind.lower()}_{len(self.nodes)}"
-        # With a name: older versions of onnxruntime take nodes without one for the same node.
+        # The node has a name, too: older versions of onnxruntime confuse nodes without one.
         self.nodes.append(helper.make_node(kind, list(inputs), [result], name=result, **attributes))
         return result
 
     def constant(self, value: Any, dtype: Any) -> str:
-        """The name of a constant."""
+        """Returns the name of a constant."""
         array = np.ascontiguousarray(np.asarray(value, dtype)).reshape(np.shape(value))
         key = (array.dtype.name, array.shape, array.tobytes())
         return self.constants.setdefault(key, (f"constant_{len(self.constants)}", array))[0]
 
     def get(self, operand: Any, dtype: Any = None) -> str:
-        """The name of an operand, of this type."""
+        """Returns the name of an operand, converted to a type if one is given."""
         if not isinstance(operand, Operation):
             return self.constant(operand, np.asarray(operand).dtype if dtype is None else dtype)
-        name = self.names[id(operand)]
-        same = dtype is None or dtype == operand.value.dtype
-        return name if same else self.cast(name, dtype)
+        if operand not in self.names:
+            self.names[operand] = self.lower(operand)
+        name = self.names[operand]
+        return name if dtype is None or dtype == operand.value.dtype else self.cast(name, dtype)
 
     def operands(self, operation: Operation, dtype: Any = None) -> list[str]:
-        """The names of all operands, of this type or that of the result."""
+        """Returns the names of all operands, in this type or that of the result."""
         return [self.get(o, dtype or operation.value.dtype) for o in operation.operands]
 
     def cast(self, name: str, dtype: Any) -> str:
         return self.node("Cast", name, to=helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))
 
-    def shape(self, shape: tuple[int, ...]) -> str:
-        """The name of a shape that has the size of the batch where the program had `BATCH`."""
+    def shape(self, operation: Operation) -> str:
+        """Returns the name of a shape, with the size of the batch in place of `BATCH`."""
         rows = self.node("Shape", self.get(self.batch), start=0, end=1)
-        parts = [rows if size == BATCH else self.constant([size], np.int64) for size in shape]
+        sizes = operation.options["shape"]
+        parts = [rows if size == BATCH else self.constant([size], np.int64) for size in sizes]
         return self.node("Concat", *parts, axis=0)
 
     def lower(self, operation: Operation) -> str:
-        """Add what an operation takes; the name of its result."""
-        name, is_bool = operation.name, operation.value.dtype.kind == "b"
+        """Adds the nodes of an operation; returns the name of its result."""
+        name, dtype = operation.name, operation.value.dtype
+        is_bool = dtype.kind == "b"
+        if name in EXPANDED:
+            operands = (
+                Traced(o).astype(dtype) if isinstance(o, Operation) else np.asarray(o, dtype)
+                for o in operation.operands
+            )
+            return self.get(EXPANDED[name](*operands).operation)
         if name in ELEMENTWISE:
             values = (o.value if isinstance(o, Operation) else o for o in operation.operands)
             # NumPy compares numbers in the type that they have in common.
-            names = self.operands(operation, np.result_type(*values) if is_bool else None)
-            return self.node(ELEMENTWISE[name], *names)
+            common = np.result_type(*values) if is_bool else None
+            return self.node(ELEMENTWISE[name], *self.operands(operation, common))
         if name in REDUCED:
-            (x,), axes = self.operands(operation), operation.options["axis"]
-            x = self.cast(x, np.int32) if is_bool else x
-            keepdims = operation.options["keepdims"]
+            # ONNX has no reductions of bool.
+            (x,) = self.operands(operation, np.int32 if is_bool else None)
+            axes, keepdims = operation.options["axis"], operation.options["keepdims"]
             x = self.node(REDUCED[name], x, self.constant(axes, np.int64), keepdims=keepdims)
             return self.cast(x, bool) if is_bool else x
         return LOWERED[name](self, operation)
 
 
-def _getitem(g: _Graph, o: Operation) -> str:
-    result, axis = g.get(o.operands[0]), 0
-    sizes = iter(o.operands[0].value.shape)
-    for item in o.options["item"]:
-        if item is None:
-            result = g.node("Unsqueeze", result, g.constant([axis], np.int64))
-        else:
-            size = next(sizes)
-            if item != slice(None) if isinstance(item, slice) else True:
-                picked = g.constant(np.arange(size)[item], np.int64)
-                result = g.node("Gather", result, picked, axis=axis)
-        axis += not isinstance(item, int)
-    return result
-
-
-def _where(g: _Graph, o: Operation) -> str:
-    condition, *values = o.operands
-    return g.node("Where", g.get(condition, bool), *(g.get(v, o.value.dtype) for v in values))
-
-
-def _take(g: _Graph, o: Operation) -> str:
-    array, indices = o.operands
-    return g.node("Gather", g.get(array), g.get(indices, np.int64), **o.options)
-
-
-def _remainder(g: _Graph, o: Operation) -> str:
-    dtype, (x, y) = o.value.dtype, g.operands(o)
-    if dtype.kind == "i":
-        return g.node("Mod", x, y)
-    # Of numbers that are not whole ONNX has the remainder of C, with the sign of x; NumPy's has that of y.
-    zero, rest = g.constant(0, dtype), g.node("Mod", x, y, fmod=1)
-    other_sign = g.node("Less", g.node("Mul", g.node("Sign", rest), g.node("Sign", y)), zero)
-    return g.node("Where", other_sign, g.node("Add", rest, y), rest)
-
-
-def _cos(g: _Graph, x: str, dtype: np.dtype) -> str:
-    """cos(x) = 1 - 2 sin(x / 2)^2: older versions of onnxruntime have no cosine in float64."""
-    half, one, two = (g.constant(number, dtype) for number in (0.5, 1, 2))
-    sin = g.node("Sin", g.node("Mul", x, half))
-    return g.node("Sub", one, g.node("Mul", two, g.node("Mul", sin, sin)))
-
-
-def _arctan2(g: _Graph, o: Operation) -> str:
-    """The angle of points, of which onnxruntime knows the arctan in float32 alone.
-
-    That is a first guess, off by some 1e-7 rad. Turned back by it, a point lies so close to the x axis that
-    the tangent of what is left is its angle.
-    """
-    dtype, (y, x) = o.value.dtype, g.operands(o)
-    zero, pi = g.constant(0, dtype), g.constant(np.pi, dtype)
-    # By |x|: a zero of x has a sign, too, which must not turn that of y.
-    slope = g.cast(g.node("Div", y, g.node("Abs", x)), np.float32)
-    ahead = g.cast(g.node("Atan", slope), dtype)
-    half_turn = g.node("Where", g.node("Less", y, zero), g.node("Neg", pi), pi)
-    behind = g.node("Sub", half_turn, ahead)
-    guess = g.node("Where", g.node("Less", x, zero), behind, ahead)
-    cos, sin = _cos(g, guess, dtype), g.node("Sin", guess)
-    across = g.node("Sub", g.node("Mul", y, cos), g.node("Mul", x, sin))
-    along = g.node("Add", g.node("Mul", x, cos), g.node("Mul", y, sin))
-    angle = g.node("Add", guess, g.node("Div", across, along))
-    origin = g.node("And", g.node("Equal", x, zero), g.node("Equal", y, zero))
-    return g.node("Where", origin, zero, angle)
-
-
 LOWERED: dict[str, Callable[[_Graph, Operation], str]] = {
-    "getitem": _getitem,
     "astype": lambda g, o: g.get(o.operands[0], o.value.dtype),
-    "reshape": lambda g, o: g.node("Reshape", g.get(o.operands[0]), g.shape(o.options["shape"])),
+    "reshape": lambda g, o: g.node("Reshape", g.get(o.operands[0]), g.shape(o)),
     "transpose": lambda g, o: g.node("Transpose", g.get(o.operands[0]), perm=o.options["axes"]),
     "argmax": lambda g, o: g.node("ArgMax", g.get(o.operands[0]), **o.options),
     "argmin": lambda g, o: g.node("ArgMin", g.get(o.operands[0]), **o.options),
-    "where": _where,
+    "where": lambda g, o: g.node("Where", g.get(o.operands[0], bool), *g.operands(o)[1:]),
     "concatenate": lambda g, o: g.node("Concat", *g.operands(o), **o.options),
-    "full": lambda g, o: g.node("Expand", *g.operands(o), g.shape(o.options["shape"])),
-    "take": _take,
+    "full": lambda g, o: g.node("Expand", *g.operands(o), g.shape(o)),
+    "take": lambda g, o: g.node(
+        "Gather", g.get(o.operands[0]), g.get(o.operands[1], np.int64), **o.options
+    ),
+    "fmod": lambda g, o: g.node("Mod", *g.operands(o), fmod=1),
+}
+
+
+# ---- operations that ONNX or onnxruntime lacks, as combinations of others
+
+
+def _cos(x: Any) -> Any:
+    """1 - 2 sin(x / 2)^2: older versions of onnxruntime have no cosine in float64."""
+    sin = np.sin(x / 2)
+    return 1 - 2 * sin * sin
+
+
+def _remainder(x: Any, y: Any) -> Any:
+    """The remainder with the sign of y, from that of C, which has the sign of x."""
+    rest = apply("fmod", x, y)
+    return np.where(np.sign(rest) * np.sign(y) < 0, rest + y, rest)
+
+
+def _arctan2(y: Any, x: Any) -> Any:
+    """The angles of points (x, y) in float64, although onnxruntime has the arctan in float32 alone.
+
+    The float32 angle is a first guess, off by some 1e-7 rad. Turned back by it, a point lies so close to the
+    x axis that the tangent of the remaining angle is that angle.
+    """
+    # By |x|: a zero of x has a sign, too, which must not turn that of y.
+    ahead = apply("arctan", (y / np.absolute(x)).astype(np.float32)).astype(x.dtype)
+    guess = np.where(x < 0, np.where(y < 0, -np.pi - ahead, np.pi - ahead), ahead)
+    cos, sin = _cos(guess), np.sin(guess)
+    angle = guess + (y * cos - x * sin) / (x * cos + y * sin)
+    return np.where((x == 0) & (y == 0), 0.0, angle)
+
+
+EXPANDED: dict[str, Callable[..., Any]] = {
+    "cos": _cos,
     "remainder": _remainder,
-    "cos": lambda g, o: _cos(g, g.operands(o)[0], o.value.dtype),
     "arctan2": _arctan2,
 }

@@ -1,13 +1,13 @@
-"""Operations on arrays, and an array that keeps those it comes from when it goes through NumPy code.
+"""Operations on arrays, and an array that records them while it goes through NumPy code.
 
-It answers NumPy's protocols for arrays of another kind, so that `np.cos(x)`, `x[:, 0]` or `a @ x` come here.
+It implements NumPy's protocols for foreign arrays, so that `np.cos(x)`, `x[:, 0]` or `a @ x` end up here.
 """
 
 from __future__ import annotations
 
 import inspect
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -17,9 +17,8 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from hyrl_mj.export.vocabulary import BATCH, COMPOSED, REDUCTIONS, UFUNCS, Untraceable
 
-# How operations are done that are methods of arrays, or functions that take their arguments in another way.
+# Operations that NumPy has as methods of arrays, or as functions with other arguments.
 EVALUATED: dict[str, Callable[..., Any]] = {
-    "getitem": lambda x, item: x[item],
     "astype": lambda x, dtype: x.astype(dtype),
     "reshape": lambda x, shape: x.reshape(shape),
     "concatenate": lambda *parts, axis: np.concatenate(parts, axis),
@@ -33,10 +32,10 @@ class Operation:
 
     Attributes:
         name: one of `UFUNCS` or `REDUCTIONS`, another function of NumPy (where, concatenate, reshape,
-            transpose, take, full), a method of its arrays (getitem, astype), or "input".
-        operands: other operations, plain arrays or numbers; of "concatenate" all its parts.
-        options: further arguments by name, as axis=1; "item" of "getitem" has an entry for each axis.
-        value: what it gives for the rows that it was followed with.
+            transpose, take, full), a method of its arrays (astype), or "input".
+        operands: other operations, plain arrays or numbers; for "concatenate" all its parts.
+        options: further arguments by name, such as axis=1.
+        value: its result for the sample batch.
         number: grows from one operation to the next.
     """
 
@@ -49,26 +48,27 @@ class Operation:
 
 @dataclass(frozen=True)
 class Program:
-    """What code does, from its arguments to its results."""
+    """The operations of some code, from its arguments to its results."""
 
     inputs: tuple[Operation, ...]
     outputs: tuple[Operation, ...]
 
     def operations(self) -> list[Operation]:
-        """All operations but the inputs, in the order in which they were done."""
-        by_number: dict[int, Operation] = {}
+        """Returns all operations but the inputs, in the order in which they were done."""
+        reached: set[Operation] = set()
         waiting = list(self.outputs)
         while waiting:
             operation = waiting.pop()
-            if operation.number not in by_number and operation.name != "input":
-                by_number[operation.number] = operation
+            if operation not in reached:
+                reached.add(operation)
                 waiting += [o for o in operation.operands if isinstance(o, Operation)]
-        return [by_number[number] for number in sorted(by_number)]
+        return sorted(reached.difference(self.inputs), key=lambda operation: operation.number)
 
 
 def apply(name: str, *operands: Any, **options: Any) -> Traced:
-    """Do one operation, and keep it; its value has to be an array of numbers or bool."""
+    """Does one operation and records it; its value has to be an array of numbers or bool."""
     operands = tuple(o.operation if isinstance(o, Traced) else o for o in operands)
+    operands = tuple(np.asarray(o) if isinstance(o, list | tuple) else o for o in operands)
     values = [o.value if isinstance(o, Operation) else o for o in operands]
     value = np.asarray((EVALUATED.get(name) or getattr(np, name))(*values, **options))
     if value.dtype.kind not in "bif":
@@ -77,12 +77,12 @@ def apply(name: str, *operands: Any, **options: Any) -> Traced:
 
 
 class Traced(NDArrayOperatorsMixin):
-    """An array that remembers where it comes from."""
+    """An array that records the operations it results from."""
 
     def __init__(self, operation: Operation) -> None:
         self.operation = operation
         value = operation.value
-        # Nothing that is done in place changes these.
+        # Operations in place change none of these.
         self.shape, self.ndim, self.dtype = value.shape, value.ndim, value.dtype
 
     def __len__(self) -> int:
@@ -93,17 +93,18 @@ class Traced(NDArrayOperatorsMixin):
             raise Untraceable("loops over the rows of a batch: take all at once")
         return (self[i] for i in range(len(self)))
 
-    def astype(self, dtype: Any, **_: Any) -> Traced:
-        return apply("astype", self, dtype=np.dtype(dtype).name)
+    def astype(self, dtype: Any, **_: Any) -> Any:
+        name = np.dtype(dtype).name
+        return np.copy(self) if name == self.dtype.name else apply("astype", self, dtype=name)
 
     def reshape(self, *shape: Any, **options: Any) -> Traced:
         return _call(np.reshape, self, shape[0] if len(shape) == 1 else shape, **options)
 
-    def transpose(self, *axes: Any) -> Any:
-        return _transpose(self, axes[0] if len(axes) == 1 else axes or None)
+    def transpose(self, *axes: Any) -> Traced:
+        return apply("transpose", self, axes=np.empty(range(self.ndim)).transpose(*axes).shape)
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):  # NumPy asks for protocols of its own
+        if name.startswith("_"):  # NumPy looks for its own protocols
             raise AttributeError(name)
         function = getattr(np, {"flatten": "ravel"}.get(name, name), None)
         if function not in FUNCTIONS:
@@ -142,9 +143,27 @@ class Traced(NDArrayOperatorsMixin):
             raise Untraceable(f"uses {name}, which has no exported form")
         return _call(function, *args, **kwargs)
 
-    def __getitem__(self, index: Any) -> Traced:
-        item = _item(index, self.shape)
-        return self if all(map(_is_whole, item)) else apply("getitem", self, item=item)
+    def __getitem__(self, index: Any) -> Any:
+        entries = list(index) if isinstance(index, tuple) else [index]
+        if any(isinstance(entry, Traced) for entry in entries):
+            raise Untraceable("picks by an index that depends on values: use np.where or np.take")
+        at = next((k for k, entry in enumerate(entries) if entry is Ellipsis), len(entries))
+        left = self.ndim - sum(entry is not None and entry is not Ellipsis for entry in entries)
+        entries[at : at + 1] = [slice(None)] * left
+        picking = [entry for entry in entries if not (entry is None or isinstance(entry, slice))]
+        if len(picking) > 1 and any(map(np.ndim, picking)):
+            raise Untraceable("picks by several arrays at once: take one axis after the other")
+        picked: Any = self
+        axis = 0
+        for entry in entries:
+            if entry is None:
+                picked = np.expand_dims(picked, axis)
+            elif not _is_whole(entry):
+                indices = np.arange(picked.shape[axis])[entry]
+                picked = take(picked, indices if indices.ndim else int(indices), axis)
+                axis += indices.ndim - 1
+            axis += 1
+        return picked
 
     def __setitem__(self, index: Any, value: Any) -> None:
         rows, *columns = index if isinstance(index, tuple) else (index,)
@@ -156,10 +175,10 @@ class Traced(NDArrayOperatorsMixin):
             condition = np.isin(np.arange(self.shape[1]), chosen)
             if chosen.ndim == 0 and np.ndim(value) == 1:
                 value = np.expand_dims(value, 1)
-            elif chosen.ndim and np.ndim(value) and np.shape(value)[-1] == len(chosen) > 1:
-                # To each of all columns the one that goes there, to the others any.
+            elif np.ndim(value) and np.shape(value)[-1] == chosen.size:
+                # Each chosen column gets its own column of the value; what the others get does not count.
                 source = np.zeros(self.shape[1], dtype=int)
-                source[chosen] = np.arange(len(chosen))
+                source[chosen] = np.arange(chosen.size)
                 value = np.take(value, source, axis=-1)
         if isinstance(rows, Traced) and rows.dtype == bool:
             if np.shape(value)[:1] == (BATCH,) and np.ndim(value) >= rows.ndim:
@@ -170,11 +189,10 @@ class Traced(NDArrayOperatorsMixin):
         self._become(np.where(condition, value, self))
 
     def _become(self, result: Any) -> Traced:
-        """Take over what an operation in place gives."""
+        """Takes over the result of an operation in place."""
         if result.shape != self.shape:
             raise Untraceable("assigns an array of another shape")
-        same = result.dtype == self.dtype
-        self.operation = (result if same else result.astype(self.dtype)).operation
+        self.operation = result.astype(self.dtype).operation
         return self
 
 
@@ -182,35 +200,11 @@ def _is_whole(index: Any) -> bool:
     return isinstance(index, slice) and index == slice(None)
 
 
-def _item(index: Any, shape: tuple[int, ...]) -> tuple[Any, ...]:
-    """An index with one entry for each axis, and None for each new one: slices, int, one int array."""
-    entries = list(index) if isinstance(index, tuple) else [index]
-    if any(isinstance(entry, Traced) for entry in entries):
-        raise Untraceable("picks by an index that depends on values: use np.where or np.take")
-    at = next((k for k, entry in enumerate(entries) if entry is Ellipsis), len(entries))
-    left = len(shape) - sum(entry is not None and entry is not Ellipsis for entry in entries)
-    entries[at : at + 1] = [slice(None)] * left
-    item: list[Any] = []
-    sizes = iter(shape)
-    for entry in entries:
-        if entry is not None and next(sizes) == BATCH and not _is_whole(entry):
-            raise Untraceable("picks single rows of a batch")
-        if entry is not None and not isinstance(entry, slice):
-            entry = np.asarray(entry)
-            entry = np.flatnonzero(entry) if entry.dtype == bool else entry
-            entry = entry if entry.ndim else int(entry)
-        item.append(entry)
-    arrays = [i for i in item if isinstance(i, np.ndarray)]
-    if arrays and (len(arrays) > 1 or arrays[0].ndim > 1 or any(isinstance(i, int) for i in item)):
-        raise Untraceable("picks by several arrays at once: take one axis after the other")
-    return tuple(item)
-
-
-# ---- functions that are operations, or decide what the operation is
+# ---- functions that are operations, or choose the options of one
 
 
 def _call(function: Any, *args: Any, **kwargs: Any) -> Any:
-    """Do a function of NumPy as `FUNCTIONS` says."""
+    """Calls what `FUNCTIONS` has for a function of NumPy."""
     replacement = FUNCTIONS[function]
     try:
         inspect.signature(replacement).bind(*args, **kwargs)
@@ -222,8 +216,7 @@ def _call(function: Any, *args: Any, **kwargs: Any) -> Any:
 
 
 def _reduce(name: str, x: Any, axis: Any = None, keepdims: bool = False) -> Traced:
-    axes = range(x.ndim) if axis is None else np.atleast_1d(axis).tolist()
-    axes = tuple(int(a) % x.ndim for a in axes)
+    axes = tuple((np.atleast_1d(range(x.ndim) if axis is None else axis) % x.ndim).tolist())
     if any(x.shape[a] == BATCH for a in axes):
         raise Untraceable(f"uses np.{name} over the rows of a batch: each must stand for itself")
     options = {"axis": axes[0] if name.startswith("arg") else axes, "keepdims": bool(keepdims)}
@@ -232,19 +225,9 @@ def _reduce(name: str, x: Any, axis: Any = None, keepdims: bool = False) -> Trac
 
 def _reshape(x: Any, shape: Any) -> Traced:
     shape = np.reshape(x.operation.value, shape).shape
-    if BATCH in x.shape and BATCH not in shape:
+    if BATCH not in shape:
         raise Untraceable("joins the rows of a batch: each must stand for itself")
     return x if shape == x.shape else apply("reshape", x, shape=shape)
-
-
-def _transpose(x: Any, axes: Any = None) -> Any:
-    axes = tuple(range(x.ndim))[::-1] if axes is None else tuple(a % x.ndim for a in axes)
-    return apply("transpose", x, axes=axes) if x.ndim > 1 else x
-
-
-def _concatenate(parts: Sequence[Any], axis: int = 0) -> Traced:
-    parts = [part if isinstance(part, Traced) else np.asarray(part) for part in parts]
-    return apply("concatenate", *parts, axis=axis % parts[0].ndim)
 
 
 def take(x: Any, indices: Any, axis: int | None = None) -> Traced:
@@ -268,8 +251,10 @@ FUNCTIONS: dict[Any, Callable[..., Any]] = {
     np.amax: partial(_reduce, "max"),
     np.amin: partial(_reduce, "min"),
     np.reshape: _reshape,
-    np.transpose: _transpose,
-    np.concatenate: _concatenate,
+    np.transpose: lambda x, axes=None: x.transpose(axes),
+    np.concatenate: lambda parts, axis=0: apply(
+        "concatenate", *parts, axis=axis % np.ndim(parts[0])
+    ),
     np.take: take,
     np.where: lambda condition, x, y: apply("where", condition, x, y),
     np.full_like: _full_like,

@@ -1,4 +1,4 @@
-"""Follows NumPy code from its argument to its result, and keeps the operations on the way."""
+"""Runs NumPy code on traced arrays, which record the operations from its arguments to its results."""
 
 from __future__ import annotations
 
@@ -15,46 +15,43 @@ from hyrl_mj.export.vocabulary import BATCH, Untraceable
 
 
 def trace(function: Callable[..., Any], samples: Mapping[str, np.ndarray], name: str) -> Program:
-    """What a function does with its arguments.
+    """Returns the operations that a function does with its arguments.
 
     Args:
-        function: takes arrays with one row for each of the batch, gives one such array or a tuple of them.
-        samples: for each argument `BATCH` rows as it may get them.
-        name: of the function, for people.
+        function: takes arrays with one row for each row of the batch; returns one such array or a tuple.
+        samples: for each argument `BATCH` rows of possible values.
+        name: what messages call the function.
 
     Raises:
-        BadInput: it does what cannot be followed.
+        BadInput: the function cannot be traced.
     """
     inputs = tuple(Operation("input", (key,), {}, value) for key, value in samples.items())
     try:
         with np.errstate(all="ignore"):
-            answer = PrivateCopies(REPLACEMENTS).of(function)(*map(Traced, inputs))
+            results = PrivateCopies(REPLACEMENTS).of(function)(*map(Traced, inputs))
     except Untraceable as error:
         raise BadInput(f"{name} cannot be exported: it {error}") from error
-    # Code that is handed another kind of array fails in ways of its own.
-    except Exception as error:
+    except Exception as error:  # code that gets another kind of array fails in many ways
         raise BadInput(
-            f"{name} cannot be exported: it ends with {brief(error)} when it is followed from operation "
-            "to operation; write it with NumPy's functions of arrays alone"
+            f"{name} cannot be exported: it raises {brief(error)} when its operations are traced; write "
+            "it with NumPy's functions of arrays alone"
         ) from error
-    results = answer if isinstance(answer, tuple) else (answer,)
+    results = results if isinstance(results, tuple) else (results,)
     if not all(isinstance(r, Traced) and r.shape[:1] == (BATCH,) for r in results):
-        raise BadInput(
-            f"{name} cannot be exported: it must compute one row for each row that it is given"
-        )
+        raise BadInput(f"{name} cannot be exported: it must return one row for each row it gets")
     return Program(inputs, tuple(result.operation for result in results))
 
 
-# ---- functions that do not ask an array of another kind, in forms that do
+# ---- replacements of functions that ignore NumPy's protocols for foreign arrays
 
 
 def _filled(original: Callable[..., np.ndarray], *args: Any, **kwargs: Any) -> Any:
     """np.zeros((len(x), 3)) and the like: an array that traced values can be assigned to."""
-    made = original(*args, **kwargs)
-    if BATCH not in made.shape:
-        return made
-    number = 0 if original is np.empty else made.flat[0].item()
-    return apply("full", number, shape=made.shape, dtype=made.dtype.name)
+    array = original(*args, **kwargs)
+    if BATCH not in array.shape:
+        return array
+    number = 0 if original is np.empty else array.flat[0].item()
+    return apply("full", number, shape=array.shape, dtype=array.dtype.name)
 
 
 def _converted(original: Callable[..., Any], x: Any, dtype: Any = None, **kwargs: Any) -> Any:
@@ -63,7 +60,7 @@ def _converted(original: Callable[..., Any], x: Any, dtype: Any = None, **kwargs
         x = np.stack(x)
     if not isinstance(x, Traced):
         return original(x, dtype, **kwargs)
-    return np.copy(x) if dtype is None or x.dtype == dtype else x.astype(dtype)
+    return x.astype(x.dtype if dtype is None else dtype)
 
 
 def _take(x: Any, indices: Any, *args: Any, **kwargs: Any) -> Any:
@@ -73,7 +70,9 @@ def _take(x: Any, indices: Any, *args: Any, **kwargs: Any) -> Any:
 
 REPLACEMENTS: dict[str, Callable[..., Any]] = {
     **{f: partial(_filled, getattr(np, f)) for f in ("empty", "zeros", "ones", "full")},
-    **{f: partial(_converted, getattr(np, f)) for f in ("array", "asarray", "asanyarray")},
-    "ascontiguousarray": partial(_converted, np.ascontiguousarray),
+    **{
+        f: partial(_converted, getattr(np, f))
+        for f in ("array", "asarray", "asanyarray", "ascontiguousarray")
+    },
     "take": _take,
 }

@@ -1,4 +1,4 @@
-"""The operations that NumPy code is reduced to, and other functions of NumPy put together from them."""
+"""The operations that NumPy code is reduced to, and other functions of NumPy as combinations of these."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-# Rows of the batch that goes through the code while it is followed. A dimension of this size is taken for
-# that of the batch, so it is a number that nothing else has.
+# Rows of the sample batch that code is traced with. Every dimension of this size counts as the batch, so the
+# number is one that no other dimension has.
 BATCH = 1009
-# Elementwise functions of NumPy that ONNX has, and their names there.
+# Elementwise functions of NumPy that ONNX has, and their names there; onnxruntime has Atan in float32 alone.
 ELEMENTWISE = {
     "absolute": "Abs", "negative": "Neg", "sign": "Sign", "sqrt": "Sqrt", "exp": "Exp", "log": "Log",
-    "sin": "Sin", "tanh": "Tanh", "floor": "Floor", "ceil": "Ceil", "rint": "Round",
+    "sin": "Sin", "tanh": "Tanh", "floor": "Floor", "ceil": "Ceil", "rint": "Round", "arctan": "Atan",
     "add": "Add", "subtract": "Sub", "multiply": "Mul", "divide": "Div", "power": "Pow",
     "matmul": "MatMul", "maximum": "Max", "minimum": "Min", "isnan": "IsNaN", "logical_not": "Not",
     "logical_and": "And", "logical_or": "Or", "logical_xor": "Xor", "equal": "Equal",
@@ -25,19 +25,15 @@ REDUCTIONS = ("sum", "max", "min", "any", "all", "argmax", "argmin")
 
 
 class Untraceable(Exception):
-    """Code does what cannot be followed; the text completes "it ..."."""
+    """Code cannot be traced; the text completes "it ..."."""
 
 
 def _prod(x: Any, axis: Any = None, keepdims: bool = False) -> Any:
     """One factor after the other: older versions of onnxruntime have no product in float64."""
-    if np.ndim(axis) or (axis is None and x.ndim > 1):
+    if axis is None or np.ndim(axis):
         raise Untraceable("uses np.prod other than along one axis")
-    axis = axis or 0
-    if x.shape[axis] == BATCH:
-        raise Untraceable("uses np.prod over the rows of a batch: each must stand for itself")
-    factors = (np.take(x, np.array([i]), axis=axis) for i in range(x.shape[axis]))
-    product = reduce(np.multiply, factors)
-    return product if keepdims else np.squeeze(product, axis=axis)
+    product = reduce(np.multiply, (np.take(x, i, axis=axis) for i in range(x.shape[axis])))
+    return np.expand_dims(product, axis) if keepdims else product
 
 
 def _mean(x: Any, axis: Any = None, keepdims: bool = False) -> Any:
@@ -46,35 +42,14 @@ def _mean(x: Any, axis: Any = None, keepdims: bool = False) -> Any:
 
 
 def _norm(x: Any, ord: Any = None, axis: Any = None, keepdims: bool = False) -> Any:
-    if ord not in (None, 2) or (axis is None and x.ndim > 1) or np.ndim(axis):
+    if ord not in (None, 2) or axis is None or np.ndim(axis):
         raise Untraceable("uses np.linalg.norm other than the Euclidean one along one axis")
     return np.sqrt(np.sum(x * x, axis=axis, keepdims=keepdims))
 
 
-def _swapaxes(x: Any, first: int, second: int) -> Any:
-    axes = list(range(x.ndim))
-    axes[first], axes[second] = axes[second], axes[first]
-    return np.transpose(x, axes)
-
-
-def _expand_dims(x: Any, axis: int) -> Any:
-    item: list[Any] = [slice(None)] * np.ndim(x)
-    item.insert(axis % (len(item) + 1), None)
-    return (x if hasattr(x, "shape") else np.array(x))[tuple(item)]
-
-
-def _squeeze(x: Any, axis: Any = None) -> Any:
-    axes = np.flatnonzero(np.array(x.shape) == 1) if axis is None else np.atleast_1d(axis) % x.ndim
-    return x[tuple(0 if a in axes else slice(None) for a in range(x.ndim))]
-
-
-def _stack(parts: Sequence[Any], axis: int = 0) -> Any:
-    axis %= np.ndim(parts[0]) + 1
-    return np.concatenate([_expand_dims(part, axis) for part in parts], axis=axis)
-
-
-def _at_least_2d(x: Any, new_axis: int = 0) -> Any:
-    return x if np.ndim(x) > 1 else _expand_dims(x, new_axis)
+def _column_stack(parts: Sequence[Any]) -> Any:
+    columns = [part if np.ndim(part) > 1 else np.expand_dims(part, 1) for part in parts]
+    return np.concatenate(columns, axis=1)
 
 
 def _clip(x: Any, a_min: Any = None, a_max: Any = None, *, min: Any = None, max: Any = None) -> Any:
@@ -85,7 +60,7 @@ def _clip(x: Any, a_min: Any = None, a_max: Any = None, *, min: Any = None, max:
 
 def _select(conditions: Sequence[Any], choices: Sequence[Any], default: Any = 0) -> Any:
     pairs = reversed(list(zip(conditions, choices, strict=True)))
-    return reduce(lambda other, pair: np.where(pair[0], pair[1], other), pairs, default)
+    return reduce(lambda rest, pair: np.where(pair[0], pair[1], rest), pairs, default)
 
 
 def _diff(x: Any, axis: int = -1) -> Any:
@@ -106,34 +81,38 @@ def _erf(x: Any) -> Any:
 
 
 def _of_bools(logical: np.ufunc, *operands: Any) -> Any:
-    """An operation on bits, for operands that are bool."""
-    if any(np.dtype(getattr(o, "dtype", type(o))) != bool for o in operands):
+    """Does a bitwise operation, which on bool is a logical one."""
+    arrays = (o if hasattr(o, "dtype") else np.asarray(o) for o in operands)
+    if any(array.dtype.kind != "b" for array in arrays):
         raise Untraceable("works on the bits of numbers")
     return logical(*operands)
 
 
-# By the functions themselves, elementwise ones by their names: SciPy has some of these, too.
+# Functions of NumPy as combinations of others. Elementwise ones by their names: SciPy has some of these, too.
 COMPOSED: dict[Any, Callable[..., Any]] = {
     np.mean: _mean,
     np.prod: _prod,
     np.linalg.norm: _norm,
     np.ravel: lambda x: np.reshape(x, -1),
-    np.stack: _stack,
-    np.hstack: lambda parts: np.concatenate(parts, axis=1 if np.ndim(parts[0]) > 1 else 0),
-    np.vstack: lambda parts: np.concatenate([_at_least_2d(p) for p in parts]),
-    np.column_stack: lambda parts: np.concatenate([_at_least_2d(p, 1) for p in parts], axis=1),
+    np.squeeze: lambda x, axis=None: np.reshape(x, np.empty(x.shape).squeeze(axis).shape),
+    np.expand_dims: lambda x, axis: np.reshape(x, np.expand_dims(np.empty(x.shape), axis).shape),
     np.atleast_1d: lambda x: x,
-    np.atleast_2d: _at_least_2d,
-    np.expand_dims: _expand_dims,
-    np.squeeze: _squeeze,
-    np.swapaxes: _swapaxes,
+    np.atleast_2d: lambda x: x if x.ndim > 1 else x[None],
+    np.swapaxes: lambda x, *pair: np.transpose(x, np.empty(range(x.ndim)).swapaxes(*pair).shape),
+    np.stack: lambda parts, axis=0: np.concatenate(
+        [np.expand_dims(part, axis) for part in parts], axis=axis
+    ),
+    np.hstack: lambda parts: np.concatenate(parts, axis=1 if np.ndim(parts[0]) > 1 else 0),
+    np.vstack: lambda parts: np.concatenate([np.atleast_2d(part) for part in parts]),
+    np.column_stack: _column_stack,
     np.clip: _clip,
     np.select: _select,
     np.diff: _diff,
     np.dot: lambda x, y: x @ y,
-    np.zeros_like: lambda x, dtype=None: np.full_like(x, 0, dtype=dtype),
-    np.empty_like: lambda x, dtype=None: np.full_like(x, 0, dtype=dtype),
-    np.ones_like: lambda x, dtype=None: np.full_like(x, 1, dtype=dtype),
+    **dict.fromkeys(
+        (np.zeros_like, np.empty_like), lambda x, dtype=None: np.full_like(x, 0, dtype)
+    ),
+    np.ones_like: lambda x, dtype=None: np.full_like(x, 1, dtype),
     np.round: _round,
     np.shape: lambda x: x.shape,
     np.ndim: lambda x: x.ndim,
@@ -149,10 +128,8 @@ COMPOSED: dict[Any, Callable[..., Any]] = {
     "square": lambda x: x * x,
     "reciprocal": lambda x: 1 / x,
     "hypot": lambda x, y: np.sqrt(x * x + y * y),
-    "radians": lambda x: x * (np.pi / 180),
-    "deg2rad": lambda x: x * (np.pi / 180),
-    "degrees": lambda x: x * (180 / np.pi),
-    "rad2deg": lambda x: x * (180 / np.pi),
+    **dict.fromkeys(("radians", "deg2rad"), lambda x: x * (np.pi / 180)),
+    **dict.fromkeys(("degrees", "rad2deg"), lambda x: x * (180 / np.pi)),
     "exp2": lambda x: np.exp(x * np.log(2)),
     "expm1": lambda x: np.exp(x) - 1,
     "log1p": lambda x: np.log(1 + x),

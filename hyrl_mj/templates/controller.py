@@ -3,9 +3,9 @@
 It needs the file controller.npz beside it. One sample of the loop:
 
     q = initial_mode(measured)      # once, from the first measurement
-    u, q = step(q, measured)        # jump if the mode's flow set is left, then act
+    u, q = step(q, measured)        # jump if the flow set of the mode has been left, then act
 
-Both take batches; one robot is a batch of one, measured of shape (1, p).
+Both functions take batches; one robot is a batch of one, with a measurement of shape (1, p).
 """
 
 import numpy as np
@@ -15,27 +15,27 @@ with np.load(__file__.rpartition(".")[0] + ".npz", allow_pickle=False) as file:
 
 MODES = ARRAYS["modes"]
 LOW, SIDES, PERIODIC = (ARRAYS[f"chart_{name}"] for name in ("low", "sides", "periodic"))
-# What stands for "in no mode yet".
+# Stands for "in no mode yet".
 NO_MODE = -1
 
-# ---- the task: this part is written anew for each one
+# ---- the task: the export replaces this part
 TASK = "name"
 SAMPLE_TIME = 0.05  # [s]
 MEASUREMENT_COLUMNS = 1
 INPUTS = ("name [unit]",)
-# Of the network of each mode: what is between its layers, and what the last one gives: the value of each
-# "level" of the input, or the input itself, to "clip" or to "squash" (by tanh) to its limits.
-ACTIVATIONS = (np.tanh,)
+# For the network of each mode: the activation between its layers, and what the last layer returns: the value
+# of each "level" of the input, or the input itself, to "clip" or to "squash" (by tanh) to its limits.
+ACTIVATIONS = [np.tanh]
 OUTPUTS = ("clip",)
 
 
 def chart_point(measured):
-    """Chart points (n, d) of measurements (n, p)."""
+    """Returns the chart points (n, d) of measurements (n, p)."""
     return measured
 
 
 def observation(measured):
-    """What the networks are fed (n, k) for measurements (n, p)."""
+    """Returns the observations (n, k) of measurements (n, p), which the networks take."""
     return measured
 
 
@@ -43,7 +43,7 @@ def observation(measured):
 
 
 def step(q, measured):
-    """One sample: jump where the mode's flow set is left, then act.
+    """Does one sample: jumps where the flow set of the mode has been left, then acts.
 
     Args:
         q: (n,) int modes.
@@ -64,13 +64,13 @@ def step(q, measured):
 
 
 def initial_mode(measured):
-    """The modes (n,) whose flow sets, or start sets, hold the first measurements (n, p) most deeply."""
+    """Returns the modes (n,) whose start sets, else flow sets, hold the measurements (n, p) most deeply."""
     measured = checked(measured)
     return answer(np.full(len(measured), NO_MODE), measured)[1]
 
 
 def checked(measured):
-    """Measurements as a float array (n, p)."""
+    """Returns measurements as a float array (n, p)."""
     measured = np.asarray(measured, dtype=np.float64)
     if measured.ndim != 2 or measured.shape[1] != MEASUREMENT_COLUMNS:
         raise ValueError(
@@ -82,36 +82,36 @@ def checked(measured):
 
 
 def answer(q, measured):
-    """`step` without branches: all modes are computed, and then chosen from.
+    """Does `step` without branches: computes all modes, then chooses one.
 
-    A q that is no mode begins in the mode whose start set holds the measurement most deeply. Where a
+    Where q is no mode, the mode whose start set holds the measurement most deeply is chosen. Where a
     measurement is not finite, q stays and u is NaN.
     """
-    z, seen, modes = chart_point(measured), observation(measured), range(len(MODES))
+    z, observed, modes = chart_point(measured), observation(measured), range(len(MODES))
     flow = distances(z, "flow")
     active = q[:, None] == MODES
     flows = (active & (flow <= ARRAYS["on_edge"])).any(axis=1)
     depth = np.where(active, np.inf, flow)
-    if "start_0" in ARRAYS:  # without start sets the flow sets tell
+    if "start_0" in ARRAYS:  # without start sets the flow sets decide
         depth = np.where(active.any(axis=1, keepdims=True), depth, distances(z, "start"))
     deepest = np.take(MODES, depth.argmin(axis=1))
     finite = np.isfinite(measured).all(axis=1)
     q_next = np.where(finite & ~flows, deepest, q)
     u = np.nan
     for k in modes:
-        u = np.where((finite & (q_next == MODES[k]))[:, None], inputs(network(seen, k), k), u)
+        u = np.where((finite & (q_next == MODES[k]))[:, None], inputs(network(observed, k), k), u)
     return u, q_next
 
 
 def distances(z, kind):
-    """Distances (n, modes) of chart points (n, d) to the edges of all modes' sets of a kind."""
+    """Returns the signed distances (n, modes) of chart points (n, d) to all modes' sets of a kind."""
     return np.stack([signed_distance(z, f"{kind}_{k}") for k in range(len(MODES))], axis=1)
 
 
 def signed_distance(z, name):
-    """Distance (n,) of chart points (n, d) to the edge of a set, negative inside.
+    """Returns the distance (n,) of chart points (n, d) to the edge of a set, negative inside.
 
-    It is given at the nodes of a grid, and interpolated in between.
+    It is interpolated between the nodes of a grid.
     """
     counts, spacing = ARRAYS[f"{name}_counts"], ARRAYS[f"{name}_spacing"]
     last = np.where(PERIODIC, np.inf, counts - 1)
@@ -122,30 +122,30 @@ def signed_distance(z, name):
     distance = 0.0
     for corner in np.ndindex(*[2] * len(counts)):
         weight = np.where(np.array(corner, dtype=bool), share, 1 - share).prod(axis=1)
-        # Above the last node of an axis lies nothing: the first one is taken, with a weight of 0.
+        # Above the last node of an axis lies nothing: the first node counts, with a weight of 0.
         node = ((first + np.array(corner)) % counts * strides).sum(axis=1)
         distance = distance + weight * np.take(ARRAYS[name], node)
     return distance
 
 
 def wrapped(z):
-    """The same chart points, periodic coordinates brought into their period."""
+    """Returns chart points with their periodic coordinates brought into the period."""
     turned = np.mod(z - LOW, SIDES)
     # The remainder of a tiny negative number rounds up to the period itself.
     turned = np.where(turned < SIDES, turned, 0.0)
     return np.where(PERIODIC, LOW + turned, z)
 
 
-def network(seen, k):
-    """The last layer of a mode's network for observations."""
-    x, last = seen.astype(np.float32), ARRAYS[f"layers_{k}"] - 1
+def network(observed, k):
+    """Returns the last layer of a mode's network for observations (n, k)."""
+    x, last = observed.astype(np.float32), ARRAYS[f"layers_{k}"] - 1
     for i in range(last):
         x = ACTIVATIONS[k](x @ ARRAYS[f"weight_{k}_{i}"].T + ARRAYS[f"bias_{k}_{i}"])
     return x @ ARRAYS[f"weight_{k}_{last}"].T + ARRAYS[f"bias_{k}_{last}"]
 
 
 def inputs(output, k):
-    """Inputs (n, m) in the plant's units for the last layer of a mode's network."""
+    """Returns inputs (n, m) in the plant's units for the last layer of a mode's network."""
     if OUTPUTS[k] == "level":
         return np.take(ARRAYS["levels"], output.argmax(axis=1), axis=0)
     u, low, high = output.astype(np.float64), ARRAYS["input_low"], ARRAYS["input_high"]
