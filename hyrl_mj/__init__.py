@@ -9,7 +9,7 @@ from hyrl_mj import gl as _gl  # first: it imports mujoco, with a GL backend tha
 from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadArtifact, BadInput, HyrlError, NoRenderer
 from hyrl_mj.export import export_numpy, export_onnx
-from hyrl_mj.game import Game, Score
+from hyrl_mj.game import Game, Robustness, Score
 from hyrl_mj.learning import Settings
 from hyrl_mj.pipeline import AgentOptions, RunOptions, diagnose, robustify, run
 from hyrl_mj.policies import Controller, MlpPolicy, Policy, from_callable, load_agent
@@ -70,6 +70,7 @@ __all__ = [
     "Partition",
     "Policy",
     "Recorded",
+    "Robustness",
     "Run",
     "RunOptions",
     "Sample",
