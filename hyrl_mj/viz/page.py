@@ -38,6 +38,14 @@ class Picture:
     caption: str = ""
 
 
+@dataclass(frozen=True)
+class Film:
+    """A replay in the page: the file as a data URI, and its poster."""
+
+    data: str
+    poster: Picture
+
+
 def fill(template: str, run: Run, **values: Any) -> str:
     """Returns a page from its template, with what every page of a run says."""
     environment = Environment(
@@ -72,12 +80,12 @@ def noise_tables(task: Task, robustness: Robustness | None) -> dict[str, Table |
     }
 
 
-def film(path: Path) -> dict[str, Any] | None:
+def film(path: Path) -> Film | None:
     """Returns a replay and its poster, None unless both files exist."""
     poster = path.with_suffix(".png")
     if not (path.is_file() and poster.is_file()):
         return None
-    return {"data": _data(path, "video/mp4"), "poster": _picture(poster, "replay")}
+    return Film(_data(path, "video/mp4"), _picture(poster, "replay"))
 
 
 def pictures(folder: Path) -> list[Picture]:
