@@ -26,7 +26,7 @@ class RunOptions:
         algorithm: the algorithm of stage 1: ppo, a2c, dqn, sac, td3, ddpg, or module:Class for another one
             with the interface of SB3's, as sb3_contrib:TQC; by default the task's.
         horizon: time T of the backward propagation [s], in the paper 0.5 (unit_circle) and 0.3 (vehicle);
-            by default none, the extended sets are sized to the noise.
+            by default the paper's with preset paper, otherwise the sets are sized to the noise.
         out: the run directory; by default runs/TASK.
     """
 
@@ -50,8 +50,8 @@ class AgentOptions:
         eps: bound of the measurement noise to survive, in the units of the chart.
         seed: seed of everything random.
         preset: fast, paper or smoke, as for `hyrl-mj run`.
-        horizon: time T of the backward propagation [s]; by default none, the extended sets are sized to the
-            noise.
+        horizon: time T of the backward propagation [s]; by default the paper's with preset paper, otherwise
+            the sets are sized to the noise.
         out: the run directory; by default runs/TASK_robust.
     """
 
