@@ -175,6 +175,7 @@ def test_the_seed_fixes_the_policy(algorithm, name):
 
 
 @pytest.mark.parametrize(("algorithm", "name"), CAN)
+@pytest.mark.slow
 def test_actors_and_critics_respect_the_mirror(algorithm, name):
     task = hyrl_mj.get_task(name)
     settings = quick(task, algorithm)

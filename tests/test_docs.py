@@ -99,6 +99,7 @@ def options_of(command):
     return set(re.findall(r"--[a-z][\w-]*", done.stdout))
 
 
+@pytest.mark.slow
 def test_every_command_and_option_exists():
     commands = [
         words[1:]
@@ -190,6 +191,7 @@ def test_the_blocks_of_a_page_run(page, smoke, tmp_path):
     call(ROOT / "tests" / "manual.py", page, cwd=tmp_path)
 
 
+@pytest.mark.slow
 def test_a_block_that_stops_working_is_noticed(tmp_path):
     for text in ("```python\n1 / 0\n```\n", "```bash\nhyrl-mj lists\n```\n", "```bash\nls\n```\n"):
         page = tmp_path / "page.md"

@@ -47,6 +47,7 @@ def records(vehicle, on_vehicle):
     )
 
 
+@pytest.mark.slow
 def test_the_counts_add_up(records):
     for noise in ("uniform", "alternating", "adversarial"):
         for name in ("sign", "ideal"):

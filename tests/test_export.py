@@ -15,6 +15,7 @@ import onnxruntime
 import pytest
 from numpy import empty
 from planted import AnalyticSet, Cube, ideal_controller, random_states
+from scipy import special
 
 import hyrl_mj
 from hyrl_mj import BadInput, HybridController, MlpPolicy, export_numpy, export_onnx
@@ -444,7 +445,6 @@ def test_operations_survive_both_forms(name):
 
 
 def test_gelu_takes_the_error_function_of_scipy():
-    special = pytest.importorskip("scipy.special")
     x = np.linspace(-5, 5, BATCH, dtype=np.float32)[:, None]
     program = trace(lambda x: x * special.erf(x / np.sqrt(np.float32(2))), {"x": x}, "gelu")
     space = {"np": np}

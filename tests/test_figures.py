@@ -167,6 +167,7 @@ def test_every_figure_is_drawn_from_one_kind_of_value_and_has_a_caption():
     assert all(entry.caption.endswith(".") for entry in figures.FIGURES.values())
 
 
+@pytest.mark.slow
 def test_a_new_figure_is_an_entry(tmp_path, monkeypatch):
     def draw_title(shown, path=None):
         with style.drawing(path, (3, 1)) as figure:

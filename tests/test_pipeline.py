@@ -13,6 +13,8 @@ from hyrl_mj.pipeline import ExamineOptions, examine_run, extend_again, run_stag
 from hyrl_mj.pipeline.runs import done
 from hyrl_mj.pipeline.steps import STAGES
 
+pytestmark = pytest.mark.slow  # a planted run goes through all later stages
+
 NAMES = [stage.name for stage in STAGES]
 
 

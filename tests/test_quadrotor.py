@@ -121,6 +121,7 @@ def test_who_decides_late_crashes(quadrotor):
         assert outcome.tolist() == [Outcome.REACHED, Outcome.REACHED, Outcome.CRASHED]
 
 
+@pytest.mark.slow
 def test_an_expert_survives_from_every_start(quadrotor):
     z = quadrotor.starts(300, np.random.default_rng(0))
     won = [fly(quadrotor, Expert(quadrotor, s), z).outcome == Outcome.REACHED for s in (1, -1)]

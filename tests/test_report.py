@@ -457,6 +457,7 @@ def count(picture, colour):
 
 
 @needs_chromium
+@pytest.mark.slow
 def test_nothing_is_wider_than_the_window(written, tmp_path):
     text = re.sub(r"<meta http-equiv=[^>]*>", "", written.read_text(encoding="utf-8"))
     inner = escape(text.replace("</body>", f"{PROBE}</body>"))
@@ -493,6 +494,7 @@ def test_the_figures_are_seen(written, tmp_path, width, height):
 
 
 @needs_chromium
+@pytest.mark.slow
 def test_on_paper_the_video_is_its_poster(written, tmp_path):
     paper = tmp_path / "paper.pdf"
     chromium(written, tmp_path / "profile", 1280, 6000, f"--print-to-pdf={paper}")

@@ -143,6 +143,7 @@ def test_a_mirror_image_that_will_do_is_taken(vehicle, vehicle_sets, quick, monk
         np.testing.assert_array_equal(found.weights[name], weight)
 
 
+@pytest.mark.slow
 def test_one_that_will_not_do_is_not_taken(vehicle, vehicle_sets, quick):
     # An untrained policy drives into the pillar.
     other = untrained(vehicle, quick)
@@ -171,6 +172,7 @@ def round_it(puck, side, clear=0.9):
     return ChartPolicy(puck, lambda z: np.where(z[:, :1] < 1.8, past.rule(z), back.rule(z)))
 
 
+@pytest.mark.slow
 def test_episodes_tell_policies_apart(puck, puck_sets):
     ground = ByEpisodes(puck, puck_sets, 0)
     wrong = ground(one_way_policy(puck, 1.0))
@@ -184,6 +186,7 @@ def test_episodes_tell_policies_apart(puck, puck_sets):
     assert not len(ground.lost)
 
 
+@pytest.mark.slow
 def test_they_start_where_the_mode_may_be_picked(puck, puck_sets):
     for mode, side in ((0, 1.0), (1, -1.0)):
         ground = ByEpisodes(puck, puck_sets, mode)
@@ -194,6 +197,7 @@ def test_they_start_where_the_mode_may_be_picked(puck, puck_sets):
         assert puck.may_start(ground.grid.nodes[ground.grid.nearest(ground.judged)]).all()
 
 
+@pytest.mark.slow
 def test_a_mirror_image_is_taken_there_too(puck, puck_sets, monkeypatch):
     settings = replace(preset(puck, "smoke").stage6, samples=4_096)
     other = training.export(training.build(puck, settings, seed=0), puck)

@@ -94,6 +94,7 @@ def test_who_decides_late_crashes(rover):
         assert outcome.tolist() == [Outcome.REACHED, Outcome.REACHED, Outcome.CRASHED]
 
 
+@pytest.mark.slow
 def test_an_expert_survives_from_every_start(rover):
     z = rover.starts(300, np.random.default_rng(0))
     survived = [drive(rover, Expert(rover, s), z).outcome == Outcome.REACHED for s in (1, -1)]

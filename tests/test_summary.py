@@ -16,6 +16,8 @@ from hyrl_mj.viz.tables import (
     score_table,
 )
 
+pytestmark = pytest.mark.slow  # as in test_pipeline
+
 
 @pytest.fixture(scope="module")
 def run(planted_circle):

@@ -49,6 +49,7 @@ def test_it_is_mirrored_from_the_start(task, model):
     assert_mirrored(task, model.policy)
 
 
+@pytest.mark.slow
 def test_it_stays_mirrored_while_it_learns(task, model):
     before = {name: w.clone() for name, w in symmetry.plain_state(model.policy, task).items()}
     with single_threaded():

@@ -53,12 +53,14 @@ def test_training_returns_the_best_policy_that_it_met(task, monkeypatch):
     assert best is policies[1]
 
 
+@pytest.mark.slow
 def test_ppo_learns_the_circle_with_the_smoke_preset(circle):
     policy = training.train(circle, preset(circle, "smoke").stage1, seed=0)
     before = training.evaluate(circle, untrained(circle), Noise())[1]
     assert training.evaluate(circle, policy, Noise())[1] > before + 10
 
 
+@pytest.mark.slow
 def test_dqn_learns_the_vehicle_with_some_more_samples(vehicle):
     settings = replace(preset(vehicle, "smoke").stage1, samples=60_000)
     policy = training.train(vehicle, settings, seed=0)
@@ -92,6 +94,7 @@ def test_the_seed_fixes_every_weight(task, quick):
     assert any(not np.array_equal(first.weights[n], other.weights[n]) for n in first.weights)
 
 
+@pytest.mark.slow
 def test_threads_of_the_physics_do_not_matter(task, quick, monkeypatch):
     policies = []
     noisy = training.TaskGround(task, quick.gamma, Noise("uniform", 0.1))

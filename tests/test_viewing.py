@@ -185,7 +185,7 @@ def test_without_a_port_the_first_free_one_from_8080_on_is_taken(vehicle, arc, h
 
 
 def test_who_has_the_page_open_sees_the_robot_move(vehicle, arc, headless, monkeypatch):
-    viser = pytest.importorskip("viser")
+    import viser
     from websockets.sync.client import connect
 
     received = []
