@@ -9,7 +9,7 @@ import numpy as np
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.game import LATTICE
 from hyrl_mj.learning.settings import Settings, Training
-from hyrl_mj.policies import Agent, accepted, check_algorithm, relative
+from hyrl_mj.policies import Agent, accepted_options, check_algorithm, sb3_relative
 from hyrl_mj.tasks import Task, reference
 
 PRESETS = ("fast", "paper", "smoke")
@@ -221,7 +221,7 @@ def _stage1(task: Task, name: str, algorithm: str) -> Training:
     """Returns stage 1 of a preset, with an algorithm."""
     levels = task.learning.levels
     check_algorithm(algorithm, task.name, levels)
-    known = relative(algorithm, levels)
+    known = sb3_relative(algorithm, levels)
     if name == "paper":
         if known not in _PAPERS:
             raise BadInput(
@@ -238,7 +238,9 @@ def _stage1(task: Task, name: str, algorithm: str) -> Training:
         training = replace(training, episode=None)
     if known == algorithm:
         return training
-    return replace(training, algorithm=algorithm, options=accepted(algorithm, training.options))
+    return replace(
+        training, algorithm=algorithm, options=accepted_options(algorithm, training.options)
+    )
 
 
 def _stage6(task: Task, name: str, algorithm: str) -> Training:

@@ -1,4 +1,4 @@
-"""Policies and controllers: what answers a measurement with an input.
+"""Policies and controllers, which map a measurement to an input.
 
 A policy is a network, a function or an ONNX model on the observation of a task; a controller adds a
 mode. Agents that were trained elsewhere are read here, and nothing in their files is executed.
@@ -8,11 +8,11 @@ from hyrl_mj.policies.activations import ACTIVATIONS, TORCH_NAMES
 from hyrl_mj.policies.agents import load_agent
 from hyrl_mj.policies.algorithms import (
     ALGORITHMS,
-    accepted,
+    accepted_options,
     algorithm_class,
     algorithm_title,
     check_algorithm,
-    relative,
+    sb3_relative,
 )
 from hyrl_mj.policies.controllers import Controller, PolicyController, as_controller, check_modes
 from hyrl_mj.policies.external import FUNCTION, ONNX, Agent, AnyPolicy, read_agent, reopen_agent
@@ -33,7 +33,7 @@ __all__ = [
     "Policy",
     "PolicyController",
     "SampledPolicy",
-    "accepted",
+    "accepted_options",
     "algorithm_class",
     "algorithm_title",
     "as_controller",
@@ -43,6 +43,6 @@ __all__ = [
     "infer_algorithm",
     "load_agent",
     "read_agent",
-    "relative",
     "reopen_agent",
+    "sb3_relative",
 ]

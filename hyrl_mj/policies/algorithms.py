@@ -1,4 +1,4 @@
-"""The algorithms that can train: those of SB3 by their names, and others like them as `module:Class`."""
+"""The training algorithms: those of SB3 by name, and others with its interface as `module:Class`."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Algorithm:
-    """An algorithm of SB3: the inputs that it can have, and how its policies are built.
+    """An algorithm of SB3: which inputs it takes, and how its policies are built.
 
     Attributes:
         levels: True if it needs levels of the input, False if it needs a continuous input, None if it takes
             either.
-        parts: beginnings of the names of the tensors of the network that acts, from observation to output.
+        parts: prefixes of the tensor names of the policy network, from observation to output.
         activation: SB3's default between the layers.
         squashed: whether the output goes through tanh and is stretched to the task's input limits;
             otherwise it is clipped to them.
         log_std: the tensor, or the layer beside the last one, that holds the logarithm of the standard
-            deviation during training; None if nothing is drawn from a distribution.
+            deviation during training; None if the policy has no distribution.
     """
 
     levels: bool | None
@@ -37,12 +37,12 @@ class Algorithm:
     log_std: str | None = None
 
     def takes(self, discrete: bool) -> bool:
-        """Whether it can have levels of the input (`discrete`), or a continuous input."""
+        """Returns whether it takes levels of the input (`discrete`), or a continuous input."""
         return self.levels in (None, discrete)
 
     @property
     def is_actor_critic(self) -> bool:
-        """Whether its policy network is trained directly, beside a value function (PPO and A2C)."""
+        """Whether it trains the policy network directly, beside a value function (PPO and A2C)."""
         return self.parts == _ACTOR_CRITIC.parts
 
 
@@ -76,75 +76,72 @@ def algorithm_title(name: str) -> str:
 
 
 def check_algorithm(name: str, task: str, levels: int | None) -> None:
-    """Raise `BadInput` where an algorithm is unknown, or cannot have the inputs of a task.
+    """Raises `BadInput` if an algorithm is unknown, or does not take the inputs of a task.
 
     Args:
         name: one of `ALGORITHMS`, or `module:Class` of another one.
-        task: what messages call the task.
-        levels: of its input, None for continuous inputs.
+        task: the name of the task in messages.
+        levels: number of levels of the task's input, None for continuous inputs.
     """
     if ":" not in name and name not in ALGORITHMS:
         raise unknown(
             "algorithm", name, [*ALGORITHMS, f"or module:Class of another one for {task}"]
         )
     discrete = levels is not None
-    if ALGORITHMS[relative(name, levels)].takes(discrete):
+    if ALGORITHMS[sb3_relative(name, levels)].takes(discrete):
         return
-    which = f"takes no levels of the input, {task} has {levels}"
-    if not discrete:
-        which = f"needs levels of the input, {task} has none"
-    able = [other for other, algorithm in ALGORITHMS.items() if algorithm.takes(discrete)]
-    raise BadInput(f"{name} {which}: choose one of {', '.join(able)}")
+    needs = f"needs levels of the input, {task} has none"
+    if discrete:
+        needs = f"takes no levels of the input, {task} has {levels}"
+    allowed = [other for other, algorithm in ALGORITHMS.items() if algorithm.takes(discrete)]
+    raise BadInput(f"{name} {needs}: choose one of {', '.join(allowed)}")
 
 
 def algorithm_class(name: str) -> type[BaseAlgorithm]:
-    """The class of an algorithm, by one of the names of `ALGORITHMS` or as `module:Class`.
-
-    Modules are also looked for in the current folder.
+    """Returns the class of one of `ALGORITHMS`, or of a `module:Class`, from the current folder, too.
 
     Raises:
         BadInput: there is no such module or class, or it is no algorithm of SB3's kind.
     """
-    import stable_baselines3  # slow to import, and only needed here
+    # Slow to import, and only needed here.
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+    module, _, attribute = name.rpartition(":")
     if name in ALGORITHMS:
-        found: type[BaseAlgorithm] = getattr(stable_baselines3, name.upper())
-        return found
-    module, _, attribute = name.partition(":")
+        module, attribute = "stable_baselines3", name.upper()
     sys.path.insert(0, "")
     try:
-        found = getattr(importlib.import_module(module), attribute)
-    except (Exception, SystemExit) as error:  # whatever a foreign module raises
+        algorithm: type[BaseAlgorithm] = getattr(importlib.import_module(module), attribute)
+    except (Exception, SystemExit) as error:  # a foreign module can raise anything
         raise BadInput(f"the algorithm {name} cannot be imported: {brief(error)}") from error
     finally:
         sys.path.remove("")
     kinds = (OnPolicyAlgorithm, OffPolicyAlgorithm)
-    if not (isinstance(found, type) and issubclass(found, kinds)):
+    if not (isinstance(algorithm, type) and issubclass(algorithm, kinds)):
         raise BadInput(
             f"the algorithm {name} is no algorithm of SB3's kind: give a subclass of its "
             "OnPolicyAlgorithm or OffPolicyAlgorithm"
         )
-    return found
+    return algorithm
 
 
-def relative(name: str, levels: int | None) -> str:
-    """The algorithm of SB3 whose settings suit one: itself, what it is derived from, or a similar one."""
+def sb3_relative(name: str, levels: int | None) -> str:
+    """Returns the one of `ALGORITHMS` whose settings suit: itself, a base class, or a similar one."""
     if name in ALGORITHMS:
         return name
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
     kind = algorithm_class(name)
-    own = {algorithm_class(known): known for known in ALGORITHMS}
-    derived = (own[base] for base in kind.__mro__ if base in own)
+    known = {algorithm_class(known): known for known in ALGORITHMS}
+    bases = (known[base] for base in kind.__mro__ if base in known)
     similar = "ppo" if issubclass(kind, OnPolicyAlgorithm) else "dqn" if levels else "sac"
-    return next(derived, similar)
+    return next(bases, similar)
 
 
-def accepted(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of SB3's keywords that an algorithm takes."""
-    takes = inspect.signature(algorithm_class(name).__init__).parameters
-    if any(p.kind is p.VAR_KEYWORD for p in takes.values()):
+def accepted_options(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns those of SB3's keywords that an algorithm takes."""
+    parameters = inspect.signature(algorithm_class(name).__init__).parameters
+    if any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
         return dict(options)
-    return {key: value for key, value in options.items() if key in takes}
+    return {key: value for key, value in options.items() if key in parameters}

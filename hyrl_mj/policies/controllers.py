@@ -1,4 +1,4 @@
-"""What closes the loop: the interface of a controller, and a policy in its shape."""
+"""The interface of a controller, and a single policy as a controller."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ class Controller(Protocol):
 
     @property
     def modes(self) -> tuple[int, ...]:
-        """Its modes."""
+        """The numbers of its modes."""
         ...
 
     def initial_mode(self, measured: np.ndarray) -> np.ndarray:
-        """The mode (n,) to start in, from the first measurements (n, p)."""
+        """Returns the modes (n,) to start in, from the first measurements (n, p)."""
         ...
 
     def step(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Inputs (n, m) and next modes (n,) for modes (n,) and measurements (n, p)."""
+        """Returns inputs (n, m) and next modes (n,) for modes (n,) and measurements (n, p)."""
         ...
 
 
@@ -47,16 +47,12 @@ class PolicyController:
 
 
 def as_controller(loop: Controller | Policy) -> Controller:
-    """A controller itself, or a policy in the shape of one."""
+    """Returns a controller itself, or a policy as a controller."""
     return PolicyController(loop) if isinstance(loop, Policy) else loop
 
 
 def check_modes(q: np.ndarray, modes: Sequence[int]) -> np.ndarray:
-    """Modes (n,) themselves, if all of them are among `modes`.
-
-    Raises:
-        BadInput: one is not.
-    """
+    """Returns q (n,) itself; raises `BadInput` unless all of it is among `modes`."""
     unknown = q[~np.isin(q, modes)]
     if len(unknown):
         raise BadInput(f"mode {unknown[0]} is unknown: choose one of {tuple(modes)}")

@@ -1,4 +1,4 @@
-"""An external agent, which a run makes robust: how it is read, described and stored."""
+"""External agents, which `robustify` starts from: how they are read, described and stored."""
 
 from __future__ import annotations
 
@@ -24,12 +24,11 @@ class Agent:
     """Describes an external agent, which takes the place of the policy that stage 1 trains.
 
     Attributes:
-        algorithm: of SB3 that trained it; "onnx" for a model in that format, "function" for code.
-        source: the file that it came from, as it was given; "" for an object of Python's. Two agents that
-            differ in nothing else are the same.
-        sha256: of what it is: a network's tensors, a model's file, a function's answers.
-        activation: between a network's layers, else None.
-        stochastic: whether it draws its inputs, as it did while it learned.
+        algorithm: the SB3 algorithm that trained it; "onnx" for an ONNX model, "function" for Python code.
+        source: the path of its file; "" for a Python object. Comparisons ignore it.
+        sha256: hash of a network's tensors, of a model's file, or of a function's answers.
+        activation: the function between the layers of a network, else None.
+        stochastic: whether it draws its inputs, as it did during training.
     """
 
     algorithm: str
@@ -45,23 +44,23 @@ class Agent:
 
     @property
     def title(self) -> str:
-        """Returns its kind for display: "DQN", "ONNX" or "FUNCTION"."""
+        """Its kind for display: "DQN", "ONNX" or "FUNCTION"."""
         return algorithm_title(self.algorithm)
 
     @property
     def options(self) -> list[str]:
-        """Returns the command-line options that describe it."""
+        """The command-line options that describe it."""
         options = ["--policy", self.source]
         if self.activation is not None:
             options += ["--activation", self.activation]
         return options + ["--stochastic"] * self.stochastic
 
 
-# The ways in which an agent can be passed in.
+# The values that stand for an agent: a path, a policy, or a function of the observation.
 AnyPolicy = str | Path | Policy | Callable[[np.ndarray], Any]
 # Kinds of agents besides those that SB3 trains.
 ONNX, FUNCTION = "onnx", "function"
-# Number of measurements from which the fingerprint of a function is made, and decimals that count in it.
+# The fingerprint of a function: its number of measurements, and the decimals that count.
 PROBES, DECIMALS = 256, 6
 
 
@@ -70,9 +69,9 @@ class ExternalAgent:
     """An agent that was trained elsewhere, ready to act and to be stored.
 
     Attributes:
-        policy: what acts.
-        agent: what `config.json` says of it.
-        model: the bytes of an ONNX file, else none.
+        policy: the agent as a policy.
+        agent: its description in `config.json`.
+        model: the content of an ONNX file, else empty.
     """
 
     policy: Policy
@@ -80,7 +79,7 @@ class ExternalAgent:
     model: bytes = b""
 
     def store(self, path: Path) -> None:
-        """Write what there is to write of it into a run directory."""
+        """Writes the agent into a run directory; of a function, only its fingerprint."""
         network = self.policy.policy if isinstance(self.policy, SampledPolicy) else self.policy
         if isinstance(network, MlpPolicy):
             network.save(path / "policy.safetensors")
@@ -99,12 +98,11 @@ def read_agent(
     stochastic: bool = False,
     seed: int = 0,
 ) -> ExternalAgent:
-    """An agent as it is given.
+    """Returns an external agent.
 
     Args:
-        task: what it is to act on.
-        policy: a file that `hyrl_mj.load_agent` reads, a policy, or a function as
-            `hyrl_mj.from_callable` takes it.
+        task: the task on which it acts.
+        policy: a file for `hyrl_mj.load_agent`, a policy, or a function for `hyrl_mj.from_callable`.
         activation, stochastic, seed: as in `hyrl_mj.load_agent`; the first two are about files.
 
     Raises:
@@ -131,29 +129,29 @@ def read_agent(
 def reopen_agent(
     path: Path, agent: Agent, task: Task, seed: int, policy: AnyPolicy | None
 ) -> Policy:
-    """The agent of a run directory.
+    """Returns the policy of the agent of a run directory.
 
     Args:
         path: the run directory.
-        agent: what its `config.json` says.
-        task: what it acts on.
-        seed: of the draws of one that is sampled.
-        policy: the function that the directory cannot hold, given again.
+        agent: its description in `config.json`.
+        task: the task on which it acts.
+        seed: the seed of the draws, if it is sampled.
+        policy: the function that the run was made with, which no file holds.
 
     Raises:
-        BadInput: a function that is missing or another one.
+        BadInput: the function is missing, or is another one.
     """
     if agent.algorithm == FUNCTION:
         if policy is None:
             raise BadInput(
-                f"{path} is about a function, which no file holds: open it in Python with "
+                f"{path} was made with a function, which no file holds: open it in Python with "
                 "hyrl_mj.load_run(path, policy=...)"
             )
         external = read_agent(task, policy)
         if external.agent != agent:
             raise BadInput(
-                f"{path} is about a function that answers otherwise than the policy given now: give the "
-                "one that the run was made with"
+                f"{path} was made with a function that answers otherwise than this policy: give that "
+                "function"
             )
         return external.policy
     if policy is not None:
@@ -164,29 +162,24 @@ def reopen_agent(
 
 
 def _network(policy: Policy, task: Task, source: str = "") -> ExternalAgent:
-    """A trained network, which acts by its mean or mode, or is sampled."""
+    """Returns a trained network, sampled or not, as an external agent."""
     stochastic = isinstance(policy, SampledPolicy)
     network = policy.policy if isinstance(policy, SampledPolicy) else policy
     assert isinstance(network, MlpPolicy)
     if network.task.name != task.name:
         raise BadInput(
-            f"a policy for {network.task.name} cannot act on {task.name}: give one for it"
+            f"a policy for {network.task.name} cannot act on {task.name}: give one for {task.name}"
         )
     digest = sha256()
     for name in sorted(network.weights):
         digest.update(name.encode() + np.ascontiguousarray(network.weights[name]).tobytes())
-    return ExternalAgent(
-        policy,
-        Agent(network.algorithm, source, digest.hexdigest(), network.activation, stochastic),
-    )
+    fingerprint = digest.hexdigest()
+    agent = Agent(network.algorithm, source, fingerprint, network.activation, stochastic)
+    return ExternalAgent(policy, agent)
 
 
 def _fingerprint(policy: Policy, task: Task) -> str:
-    """What tells functions apart: a hash of the answers to some measurements, always the same ones.
-
-    Raises:
-        BadInput: the answers are no inputs, or others when it is asked again.
-    """
+    """Returns a hash of a function's answers to fixed measurements; refuses chance and memory."""
     rng = np.random.default_rng(0)
     plant = task.plant(PROBES)
     plant.set_state(*task.state(task.starts(PROBES, rng), rng))
@@ -195,14 +188,14 @@ def _fingerprint(policy: Policy, task: Task) -> str:
     wanted = (PROBES, len(task.inputs))
     if first.shape != wanted or not np.issubdtype(first.dtype, np.number):
         raise BadInput(
-            f"the policy gives {first.dtype} of shape {first.shape} for {PROBES} measurements, {task.name} "
-            f"takes inputs of shape {wanted}"
+            f"the policy gives {first.dtype} of shape {first.shape} for {PROBES} measurements, "
+            f"{task.name} takes inputs of shape {wanted}"
         )
     if not np.isfinite(first).all():
         raise BadInput(f"the policy gives inputs that are not finite: {task.name} takes numbers")
     if not np.allclose(first, again, rtol=0, atol=1e-6):
         raise BadInput(
-            "the function answers the same measurements otherwise when it is asked again: give one without "
+            "the function answers the same measurements otherwise the second time: give one without "
             "chance or memory"
         )
     return sha256((np.round(first.astype(float), DECIMALS) + 0.0).tobytes()).hexdigest()

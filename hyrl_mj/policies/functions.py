@@ -36,23 +36,18 @@ class FunctionPolicy(ObservationPolicy):
             return np.zeros((0, m))
         try:
             actions = np.asarray(self.function(observation.astype(np.float32)))
-        except Exception as error:  # a user's code raises what it likes
+        except Exception as error:  # a user's code can raise anything
             what = error if isinstance(error, BadInput) else f"it raised {brief(error)}"
             raise BadInput(f"{self.name} cannot be used: {what}") from error
         discrete = self.task.input_levels is not None
-        wanted = (n,) if discrete else (n, m)
+        wanted, what = ((n,), "integers") if discrete else ((n, m), "inputs")
         if actions.shape != wanted:
-            what = "integers" if discrete else "inputs"
             raise BadInput(
                 f"{self.name} gives shape {actions.shape} for {n} observations, {self.task.name} takes "
                 f"{what} of shape {wanted}"
             )
         if discrete:
             return at_levels(self.task, actions)
-        return np.clip(self._finite(actions), *self.task.input_limits)
-
-    def _finite(self, actions: np.ndarray) -> np.ndarray:
-        """Inputs (n, m) as floats, all of them finite numbers."""
         try:
             actions = actions.astype(float)
         except (TypeError, ValueError):
@@ -62,11 +57,11 @@ class FunctionPolicy(ObservationPolicy):
             raise BadInput(
                 f"{self.name} gives {actions[~finite][0]}: inputs of {self.task.name} are finite numbers"
             )
-        return actions
+        return np.clip(actions, *self.task.input_limits)
 
 
 def from_callable(function: Callable[[np.ndarray], Any], task: Task) -> FunctionPolicy:
-    """A function of the observation as a policy.
+    """Returns a function of the observation as a policy.
 
     Args:
         function: observations (n, k) float32, as the task's environments give them -> inputs (n, m) in
@@ -75,8 +70,8 @@ def from_callable(function: Callable[[np.ndarray], Any], task: Task) -> Function
         task: the task whose observation it reads and whose inputs it gives.
 
     Raises:
-        BadInput: it is not callable; and whenever the policy is asked: the function raises, or gives
-            another shape, a number that is not finite, or an integer out of range.
+        BadInput: it is not callable. `act` of the policy raises it, too, if the function raises, or
+            returns another shape, a number that is not finite, or an integer out of range.
     """
     if not callable(function):
         raise BadInput(
@@ -86,20 +81,30 @@ def from_callable(function: Callable[[np.ndarray], Any], task: Task) -> Function
 
 
 def from_onnx(path: Path, task: Task, remedy: str) -> FunctionPolicy:
-    """The policy of an ONNX file; it has been tried once."""
+    """Returns the policy of an ONNX file, after a first call of it."""
     try:
         import onnxruntime
     except ImportError:
-        raise BadInput('an .onnx file takes onnxruntime: pip install "hyrl-mj[onnx]"') from None
+        raise BadInput('an .onnx file needs onnxruntime: pip install "hyrl-mj[onnx]"') from None
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4  # what goes wrong is raised, too
+    options.log_severity_level = 4  # errors are raised, too
     with artifacts.reading(path, remedy):
         session = onnxruntime.InferenceSession(
             str(path), options, providers=["CPUExecutionProvider"]
         )
-        batched = _check_onnx_input(session.get_inputs(), task)
-    policy = FunctionPolicy(task, _onnx_function(session, batched, task), f"the model of {path}")
+        takes_batches = _check_onnx_input(session.get_inputs(), task)
+    input_name, output_name = session.get_inputs()[0].name, session.get_outputs()[0].name
+
+    def function(observation: np.ndarray) -> np.ndarray:
+        parts = [observation] if takes_batches else np.split(observation, len(observation))
+        actions = np.concatenate(
+            [session.run([output_name], {input_name: part})[0] for part in parts]
+        )
+        preferences = task.input_levels is not None and np.issubdtype(actions.dtype, np.floating)
+        return _preferred(actions, task) if preferences else actions
+
+    policy = FunctionPolicy(task, function, f"the model of {path}")
     try:
         policy.inputs(np.zeros((2, len(task.observation_low))))
     except BadInput as error:
@@ -108,7 +113,7 @@ def from_onnx(path: Path, task: Task, remedy: str) -> FunctionPolicy:
 
 
 def _check_onnx_input(inputs: list[Any], task: Task) -> bool:
-    """Whether a model takes many observations at once; the other ones take one."""
+    """Returns whether a model takes batches; other models take one observation at a time."""
     k = len(task.observation_low)
     if len(inputs) != 1 or inputs[0].type != "tensor(float)" or len(inputs[0].shape) != 2:
         takes = ", ".join(f"{i.name}: {i.type} of shape {i.shape}" for i in inputs) or "nothing"
@@ -127,21 +132,8 @@ def _check_onnx_input(inputs: list[Any], task: Task) -> bool:
     return rows != 1
 
 
-def _onnx_function(session: Any, batched: bool, task: Task) -> Callable[[np.ndarray], np.ndarray]:
-    """What a model answers to observations (n, k), as `FunctionPolicy` wants it."""
-    given, first = session.get_inputs()[0].name, session.get_outputs()[0].name
-
-    def answer(observation: np.ndarray) -> np.ndarray:
-        parts = [observation] if batched else np.split(observation, len(observation))
-        actions = np.concatenate([session.run([first], {given: part})[0] for part in parts])
-        preferences = task.input_levels is not None and np.issubdtype(actions.dtype, np.floating)
-        return _preferred(actions, task) if preferences else actions
-
-    return answer
-
-
 def _preferred(preferences: np.ndarray, task: Task) -> np.ndarray:
-    """The levels (n,) int that are preferred, by preferences (n, levels)."""
+    """Returns the preferred levels (n,) int for preferences (n, levels)."""
     if preferences.ndim != 2 or preferences.shape[1] != task.learning.levels:
         raise BadInput(
             f"{task.name} takes preferences of shape (n, {task.learning.levels}) or integers (n,), got "

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -22,12 +23,10 @@ from hyrl_mj.tasks import Task, get_task
 Layer = tuple[np.ndarray, np.ndarray]
 # Rows that go through a network at a time: the hidden layers then stay in the processor's cache.
 CHUNK = 4096
-# The last bits of a matrix product depend on the threads that share it, and threads that wait for a
-# busy core take ten times as long as one: batches have a single one.
+# The last bits of a matrix product depend on the number of threads, and threads that wait for a busy core
+# take ten times as long as one: batches run on a single thread.
 BLAS = ThreadpoolController()
-
-
-# How far SB3 lets a layer's log_std go.
+# The range to which SB3 clips the log_std of a layer.
 LOG_STD_RANGE = (-20, 2)
 
 
@@ -36,7 +35,7 @@ class Policy(Protocol):
     """Anything that answers a measurement with an input."""
 
     def act(self, measured: np.ndarray) -> np.ndarray:
-        """Inputs (n, m) in the plant's units for measurements (n, p)."""
+        """Returns inputs (n, m) in the plant's units for measurements (n, p)."""
         ...
 
 
@@ -50,7 +49,7 @@ class ObservationPolicy(ABC):
     task: Task
 
     def act(self, measured: np.ndarray) -> np.ndarray:
-        """Inputs for noisy measurements.
+        """Returns inputs for noisy measurements.
 
         Args:
             measured: (n, p), in the units of the measurement.
@@ -66,18 +65,18 @@ class ObservationPolicy(ABC):
 
     @abstractmethod
     def inputs(self, observation: np.ndarray) -> np.ndarray:
-        """Inputs (n, m) in the plant's units for observations (n, k)."""
+        """Returns inputs (n, m) in the plant's units for observations (n, k)."""
 
 
 @dataclass(frozen=True)
 class MlpPolicy(ObservationPolicy):
-    """A multilayer perceptron on a task's observation; a trained SB3 policy at its mean or mode.
+    """A multilayer perceptron on a task's observation: the mean or mode of a trained SB3 policy.
 
     Attributes:
         task: the task whose observation it reads and whose inputs it gives.
         algorithm: the SB3 algorithm that trained it, one of `ALGORITHMS`.
-        activation: what is between the layers, one of `ACTIVATIONS`.
-        weights: all tensors of the SB3 policy by name, critics included, so that training can go on.
+        activation: the function between the layers, one of `ACTIVATIONS`.
+        weights: all tensors of the SB3 policy by name, including its critics, so that training can continue.
     """
 
     task: Task
@@ -86,39 +85,34 @@ class MlpPolicy(ObservationPolicy):
     weights: Mapping[str, np.ndarray] = field(repr=False)
 
     def __post_init__(self) -> None:
-        layers = _layers(self.weights, self.algorithm)
+        layers, task = self.layers, self.task
         levels = ALGORITHMS[self.algorithm].levels
         if levels is None and "log_std" in self.weights:
             levels = False
         if levels is not None:
-            check_kind(self.task, levels)
-        outputs = len(self.task.input_limits[0]) if self._levels is None else len(self._levels)
-        given = (layers[0][0].shape[1], layers[-1][0].shape[0])
-        wanted = (len(self.task.observation_low), outputs)
-        if given != wanted:
+            check_kind(task, levels)
+        sizes = (layers[0][0].shape[1], layers[-1][0].shape[0])
+        outputs = len(task.inputs) if task.input_levels is None else len(task.input_levels)
+        wanted = (len(task.observation_low), outputs)
+        if sizes != wanted:
             raise BadArtifact(
-                f"the network takes {given[0]} and gives {given[1]} numbers, "
-                f"the task {self.task.name} needs {wanted[0]} and {wanted[1]}"
+                f"the network takes {sizes[0]} and gives {sizes[1]} numbers, "
+                f"the task {task.name} needs {wanted[0]} and {wanted[1]}"
             )
         for (_, bias), (weight, _) in pairwise(layers):
             if weight.shape[1] != len(bias):
                 raise BadArtifact(
                     f"a layer gives {len(bias)} numbers and the next takes {weight.shape[1]}"
                 )
-        if not all(np.isfinite(w).all() and np.isfinite(b).all() for w, b in layers):
+        if not all(np.isfinite(array).all() for layer in layers for array in layer):
             raise BadArtifact("the network has weights that are not finite")
         if self.activation not in ACTIVATIONS:
             raise BadArtifact(
                 f"activation {self.activation!r} is unknown: choose one of {', '.join(ACTIVATIONS)}"
             )
-        object.__setattr__(self, "_network", layers)
 
     @property
-    def _levels(self) -> np.ndarray | None:
-        return self.task.input_levels
-
-    @property
-    def _kind(self) -> Algorithm:
+    def _algorithm(self) -> Algorithm:
         return ALGORITHMS[self.algorithm]
 
     @property
@@ -126,46 +120,42 @@ class MlpPolicy(ObservationPolicy):
         """Widths of the hidden layers."""
         return tuple(len(bias) for _, bias in self.layers[:-1])
 
-    @property
+    @cached_property
     def layers(self) -> list[Layer]:
         """Weight (outputs, inputs) and bias (outputs,) of each layer, from observation to output."""
-        return self._network  # type: ignore[attr-defined]
+        return _layers(self.weights, self.algorithm)
 
     @property
     def output(self) -> str:
-        """What the last layer gives: the value of each "level", or the input, to "clip" or to "squash"."""
-        if self._levels is not None:
+        """What the last layer returns: the value of each "level", or the input, to "clip" or "squash"."""
+        if self.task.input_levels is not None:
             return "level"
-        return "squash" if self._kind.squashed else "clip"
+        return "squash" if self._algorithm.squashed else "clip"
 
     def inputs(self, observation: np.ndarray) -> np.ndarray:
-        """Inputs (n, m) in the plant's units for observations (n, k)."""
-        outputs = self.outputs(observation)
-        if self._levels is not None:
-            return self._levels[outputs.argmax(axis=1)]
-        return self._within_limits(outputs)
+        return self._chosen(self.outputs(observation))
 
     def sample(self, observation: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Inputs (n, m) for observations (n, k), drawn as the policy draws them while it learns.
+        """Draws inputs (n, m) for observations (n, k) from the distribution that was trained.
 
         Raises:
             BadInput: a policy of DQN, TD3 or DDPG, which has no distribution to draw from.
         """
-        if self._kind.log_std is None:
+        if self._algorithm.log_std is None:
             raise BadInput(
                 f"a {self.algorithm} policy has no distribution to draw from: use it as it is, "
                 "without stochastic"
             )
         outputs = self.outputs(observation)
-        if self._levels is not None:
+        if self.task.input_levels is not None:
             # The greatest of preferences with Gumbel noise is a draw from their softmax.
-            return self._levels[(outputs + rng.gumbel(size=outputs.shape)).argmax(axis=1)]
+            return self._chosen(outputs + rng.gumbel(size=outputs.shape))
         spread = np.exp(self._log_std(observation))
-        return self._within_limits(outputs + spread * rng.standard_normal(outputs.shape))
+        return self._chosen(outputs + spread * rng.standard_normal(outputs.shape))
 
     def _log_std(self, observation: np.ndarray) -> np.ndarray:
-        """Logarithm of the Gaussian's standard deviation, (n, m) or (m,)."""
-        name = self._kind.log_std or ""
+        """Returns the logarithm of the Gaussian's standard deviation, (n, m) or (m,)."""
+        name = self._algorithm.log_std or ""
         if name in self.weights:
             return self.weights[name]
         layer = _linear(self.weights, f"{name}.")
@@ -175,20 +165,25 @@ class MlpPolicy(ObservationPolicy):
             )
         return np.clip(self._run(observation, layer[0]), *LOG_STD_RANGE)
 
-    def _within_limits(self, outputs: np.ndarray) -> np.ndarray:
-        """Inputs (n, m) of a continuous task for what the last layer gives (n, m)."""
+    def _chosen(self, outputs: np.ndarray) -> np.ndarray:
+        """Returns inputs (n, m) for the outputs of the last layer."""
+        if self.task.input_levels is not None:
+            return self.task.input_levels[outputs.argmax(axis=1)]
         u, (low, high) = outputs.astype(float), self.task.input_limits
-        if self._kind.squashed:
+        if self._algorithm.squashed:
             u = low + (np.tanh(u) + 1) / 2 * (high - low)
         return np.clip(u, low, high)
 
     def outputs(self, observation: np.ndarray) -> np.ndarray:
-        """The network's last layer for observations (n, k): action values or preferences of a
-        discrete task's levels, else the mean input, before it is squashed if it is."""
+        """Returns the network's last layer for observations (n, k).
+
+        These are action values or preferences of a discrete task's levels (n, levels), else mean inputs
+        (n, m), before the squashing if there is one.
+        """
         return self._run(observation, self.layers[-1])
 
     def _run(self, observation: np.ndarray, last: Layer) -> np.ndarray:
-        """What `last` gives on top of the hidden layers, for observations (n, k)."""
+        """Returns the output of `last` on top of the hidden layers, for observations (n, k)."""
         observation = observation.astype(np.float32)
         if len(observation) <= 1:
             return self._forward(observation, last)
@@ -207,7 +202,7 @@ class MlpPolicy(ObservationPolicy):
         return x
 
     def save(self, path: Path) -> None:
-        """Write `path` (safetensors) and its description beside it (JSON)."""
+        """Writes `path` (safetensors) and its description beside it (JSON)."""
         artifacts.write_tensors(path, dict(self.weights))
         artifacts.write_json(
             path.with_suffix(".json"),
@@ -217,7 +212,7 @@ class MlpPolicy(ObservationPolicy):
 
     @staticmethod
     def load(path: Path) -> MlpPolicy:
-        """Read what `save` wrote.
+        """Reads what `save` wrote.
 
         Raises:
             BadArtifact: a file is missing, truncated, or not a policy of this version.
@@ -235,23 +230,23 @@ class MlpPolicy(ObservationPolicy):
 
 @dataclass(frozen=True)
 class SampledPolicy(ObservationPolicy):
-    """A trained policy that draws its inputs, as it did while it learned.
+    """A trained policy that draws its inputs, as it did during training.
 
     It is reproducible call by call only: the same seed and the same calls in the same order give the
     same inputs, but the same measurement twice does not.
 
     Attributes:
-        policy: gives the distributions.
-        rng: draws from them.
+        policy: the policy whose distributions are drawn from.
+        rng: the random number generator of the draws.
     """
 
     policy: MlpPolicy
     rng: np.random.Generator
 
     def __post_init__(self) -> None:
-        # What cannot be drawn from is refused now, and not in the middle of a run.
-        k = len(self.task.observation_low)
-        self.policy.sample(np.zeros((1, k)), np.random.default_rng(0))
+        # A policy without a distribution is refused now, and not in the middle of a run.
+        observation = np.zeros((1, len(self.task.observation_low)))
+        self.policy.sample(observation, np.random.default_rng(0))
 
     @property
     def task(self) -> Task:  # type: ignore[override]
@@ -262,7 +257,7 @@ class SampledPolicy(ObservationPolicy):
 
 
 def check_kind(task: Task, levels: bool) -> None:
-    """Raise `BadArtifact` where a network that chooses among levels, or does not, meets another task."""
+    """Raises `BadArtifact` if a network with levels, or without, does not have the inputs of a task."""
     if levels == (task.input_levels is not None):
         return
     gives = "chooses among discrete levels" if levels else "gives continuous inputs"
@@ -272,10 +267,10 @@ def check_kind(task: Task, levels: bool) -> None:
 
 
 def _layers(weights: Mapping[str, np.ndarray], algorithm: str) -> list[Layer]:
-    """The (weight, bias) pairs from observation to output, found by SB3's names for them."""
+    """Returns the layers from observation to output, by SB3's names of their tensors."""
     if algorithm not in ALGORITHMS:
         raise BadArtifact(
-            f"a policy of algorithm {algorithm!r} is unknown here: choose one of {', '.join(ALGORITHMS)}"
+            f"algorithm {algorithm!r} of the policy is unknown: choose one of {', '.join(ALGORITHMS)}"
         )
     parts = [_linear(weights, part) for part in ALGORITHMS[algorithm].parts]
     if not parts[-1]:
@@ -284,12 +279,9 @@ def _layers(weights: Mapping[str, np.ndarray], algorithm: str) -> list[Layer]:
 
 
 def _linear(weights: Mapping[str, np.ndarray], prefix: str) -> list[Layer]:
-    """The linear layers whose names begin with `prefix`, in order."""
-    stems = {
-        name.removesuffix("weight")
-        for name in weights
-        if name.startswith(prefix) and name.endswith("weight")
-    }
+    """Returns the linear layers whose names begin with `prefix`, in order."""
+    names = [n for n in weights if n.startswith(prefix) and n.endswith("weight")]
+    stems = [name.removesuffix("weight") for name in names]
     layers = []
     for stem in sorted(stems, key=lambda s: (len(s), s)):
         weight, bias = weights[f"{stem}weight"], weights.get(f"{stem}bias")

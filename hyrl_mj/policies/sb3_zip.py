@@ -1,7 +1,7 @@
-"""The policy of an SB3 agent, read from the zip that `model.save` wrote.
+"""Reads the policy of an SB3 agent from the zip that `model.save` wrote.
 
-The file is treated as data. torch's restricted unpickler reads the tensors, and of the metadata only
-plain JSON is read. Nothing else in the file is unpickled.
+The file is data. torch's restricted unpickler reads the tensors, and a JSON parser the metadata. Nothing
+else in the file is unpickled.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from hyrl_mj.policies.mlp import MlpPolicy, check_kind
 from hyrl_mj.tasks import Task
 
 REMEDY = "give the zip that SB3's model.save wrote, an .onnx file, or a policy.safetensors of a run"
-# What unpacks to more [bytes] is no MLP policy: the largest of them take a few megabytes.
+# Limit on the unpacked size [bytes]: the largest MLP policies take a few megabytes.
 LARGEST = 2**28
-# What parts of tensor names say about agents that are not plain MLPs on a vector.
+# Parts of tensor names of agents that are no plain MLPs on a vector, and what they mean.
 FOREIGN = {
     "lstm": "it has a recurrent policy (lstm)",
     "features_extractor.extractors.": "its observations are a dict",
@@ -36,7 +36,7 @@ FOREIGN = {
 
 
 def read_zip(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The tensors of an SB3 zip by name, and its metadata, {} if it has none."""
+    """Returns the tensors of an SB3 zip by name, and its metadata, {} if it has none."""
     if not is_zipfile(path):
         raise BadArtifact(f"it is not a zip: {REMEDY}")
     with ZipFile(path) as file:
@@ -49,14 +49,14 @@ def read_zip(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def _member(file: ZipFile, name: str) -> bytes:
-    """What a member of a zip unpacks to."""
+    """Returns the content of a member of a zip."""
     if file.getinfo(name).file_size > LARGEST:
         raise BadArtifact(f"its {name} is too large for an MLP policy")
     return file.read(name)
 
 
 def _tensors(content: bytes) -> dict[str, np.ndarray]:
-    """The tensors of a `policy.pth`, by name."""
+    """Returns the tensors of a `policy.pth`, by name."""
     import torch  # slow to import, and only needed here
 
     try:
@@ -67,13 +67,15 @@ def _tensors(content: bytes) -> dict[str, np.ndarray]:
     try:
         if size > LARGEST:
             raise BadArtifact("its policy.pth is too large for an MLP policy")
-        with warnings.catch_warnings(action="ignore"):  # of odd pickles, which are refused anyway
+        with warnings.catch_warnings(
+            action="ignore"
+        ):  # about odd pickles, which are refused anyway
             state = torch.load(io.BytesIO(content), weights_only=True, map_location="cpu")
     except UnpicklingError as error:
-        # torch's own sentence recommends to load it unsafely.
+        # torch's own message recommends to load it unsafely.
         raise BadArtifact(
-            "its policy.pth is damaged or holds more than tensors, as an agent's never does: nothing in it "
-            "was executed; get the agent from who trained it"
+            "its policy.pth is damaged or holds more than tensors, which an agent's never does: nothing in "
+            "it was executed; get the file again from where the agent was trained"
         ) from error
     if not isinstance(state, Mapping):
         raise BadArtifact("its policy.pth holds no tensors by name")
@@ -93,27 +95,27 @@ def _tensors(content: bytes) -> dict[str, np.ndarray]:
 def from_tensors(
     weights: dict[str, np.ndarray], about: dict[str, Any], task: Task, activation: str | None
 ) -> MlpPolicy:
-    """The policy of an SB3 agent whose tensors and metadata have been read."""
+    """Returns the policy of an SB3 agent with these tensors and this metadata."""
     _check_plain(weights, about)
     algorithm = infer_algorithm(weights, about)
     if ALGORITHMS[algorithm].is_actor_critic:
         check_kind(task, levels="log_std" not in weights)
-    wrong = [name for name, weight in weights.items() if not np.isfinite(weight).all()]
-    if wrong:
-        raise BadArtifact(f"its tensor {wrong[0]} has weights that are not finite")
+    for name, weight in weights.items():
+        if not np.isfinite(weight).all():
+            raise BadArtifact(f"its tensor {name} has weights that are not finite")
     activation = _activation(about, activation) or ALGORITHMS[algorithm].activation
     return MlpPolicy(task, algorithm, activation, weights)
 
 
 def _check_plain(weights: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> None:
-    """Refuse agents that are more than an MLP on a vector of numbers."""
+    """Raises `BadArtifact` if an agent is more than an MLP on a vector of numbers."""
     plain = "only plain multilayer perceptrons on a vector of numbers can be used"
     for part, what in FOREIGN.items():
         if any(part in name for name in weights):
             raise BadArtifact(f"{what}: {plain}")
-    if "spaces.dict" in _said(about, "observation_space", ":type:"):
+    if "spaces.dict" in _entry(about, "observation_space", ":type:"):
         raise BadArtifact(f"its observations are a dict: {plain}")
-    extractor = _said(about, "policy_kwargs", "features_extractor_class")
+    extractor = _entry(about, "policy_kwargs", "features_extractor_class")
     if extractor and "torch_layers.FlattenExtractor" not in extractor:
         raise BadArtifact(f"it has a features extractor of its own, {extractor}: {plain}")
     if "actor.log_std" in weights or np.ndim(weights.get("log_std", 0)) == 2:
@@ -121,7 +123,7 @@ def _check_plain(weights: Mapping[str, np.ndarray], about: Mapping[str, Any]) ->
 
 
 def infer_algorithm(weights: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> str:
-    """Which SB3 algorithm trained an agent; "ppo" for A2C, too, where there is no metadata."""
+    """Returns the SB3 algorithm that trained an agent; "ppo" also for A2C if there is no metadata."""
     if any(name.startswith("q_net.q_net.") for name in weights):
         return "dqn"
     if "action_net.weight" in weights:
@@ -136,22 +138,22 @@ def infer_algorithm(weights: Mapping[str, np.ndarray], about: Mapping[str, Any])
     )
 
 
-def _activation(about: Mapping[str, Any], given: str | None) -> str | None:
-    """The activation that the metadata names, else the one given."""
-    said = _said(about, "policy_kwargs", "activation_fn")
+def _activation(about: Mapping[str, Any], chosen: str | None) -> str | None:
+    """Returns the activation that the metadata names, else the chosen one."""
+    entry = _entry(about, "policy_kwargs", "activation_fn")
     classes = {f"<class 'torch.nn.modules.activation.{TORCH_NAMES[n]}'>": n for n in ACTIVATIONS}
-    found = classes.get(said)
-    if said and not found and given is None:
+    name = classes.get(entry)
+    if entry and not name and chosen is None:
         raise BadArtifact(
-            f"its activation {said} is unknown: if it is one of {', '.join(ACTIVATIONS)}, give that as "
+            f"its activation {entry} is unknown: if it is one of {', '.join(ACTIVATIONS)}, give that as "
             "activation"
         )
-    if found and given not in (None, found):
-        raise BadArtifact(f"its activation is {found!r}, not {given!r}: leave the activation out")
-    return found or given
+    if name and chosen not in (None, name):
+        raise BadArtifact(f"its activation is {name!r}, not {chosen!r}: leave the activation out")
+    return name or chosen
 
 
-def _said(about: Mapping[str, Any], key: str, part: str) -> str:
-    """A part of an entry of the metadata as text, "" if it is not there."""
+def _entry(about: Mapping[str, Any], key: str, part: str) -> str:
+    """Returns a part of an entry of the metadata as text, "" if there is none."""
     entry = about.get(key)
     return str(entry.get(part, "")) if isinstance(entry, dict) else ""
