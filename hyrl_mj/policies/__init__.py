@@ -5,7 +5,6 @@ mode. Agents that were trained elsewhere are read here, and nothing in their fil
 """
 
 from hyrl_mj.policies.activations import ACTIVATIONS, TORCH_NAMES
-from hyrl_mj.policies.agents import load_agent
 from hyrl_mj.policies.algorithms import (
     ALGORITHMS,
     accepted_options,
@@ -15,7 +14,15 @@ from hyrl_mj.policies.algorithms import (
     sb3_relative,
 )
 from hyrl_mj.policies.controllers import Controller, PolicyController, as_controller, check_modes
-from hyrl_mj.policies.external import FUNCTION, ONNX, Agent, AnyPolicy, read_agent, reopen_agent
+from hyrl_mj.policies.external import (
+    FUNCTION,
+    ONNX,
+    Agent,
+    AnyPolicy,
+    load_agent,
+    read_agent,
+    reopen_agent,
+)
 from hyrl_mj.policies.functions import from_callable
 from hyrl_mj.policies.mlp import MlpPolicy, Policy, SampledPolicy
 from hyrl_mj.policies.sb3_zip import infer_algorithm
