@@ -93,8 +93,8 @@ def export_onnx(controller: HybridController, path: str | Path) -> Path:
             f'ONNX needs the packages onnx and onnxruntime ({error}): pip install "hyrl-mj[onnx]"'
         ) from error
     with tempfile.TemporaryDirectory() as temporary:
-        path_of_step = _write(controller, Path(temporary))[0]
-        model = _graph(controller, run_path(str(path_of_step)))
+        module_path, _ = _write(controller, Path(temporary))
+        model = _graph(controller, run_path(str(module_path)))
     content = model.SerializeToString()
 
     def step(q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

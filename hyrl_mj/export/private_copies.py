@@ -105,13 +105,13 @@ class PrivateCopies:
                     if name not in NOT_COPIED and (is_method or not hasattr(member, "__get__")):
                         setattr(last, name, self.of(member))
         members = {
-            "__class__": property(lambda _: type(original)),  # what isinstance() asks for
+            "__class__": property(lambda _: type(original)),  # for isinstance()
             "__getattr__": lambda _, name: getattr(original, name),
         }
         stand_in: Any = object.__new__(type("StandIn", (last,), members))
         self._keep(original, stand_in)
-        members = getattr(original, "__dict__", {})
-        vars(stand_in).update({name: self.of(member) for name, member in members.items()})
+        attributes = getattr(original, "__dict__", {})
+        vars(stand_in).update({name: self.of(value) for name, value in attributes.items()})
         return stand_in
 
 
