@@ -158,7 +158,7 @@ def test_curves_and_a_third_controller(tmp_path, coarse):
     for colour in (
         *robustness_curve.CURVE_COLOURS[:3],
         robustness_curve.LIMIT_COLOUR,
-        robustness_curve.PALE,
+        style.PALE,
     ):
         assert len(where(path, colour)) > 100
     maps = maps_of(VEHICLE, names, lambda z: np.zeros(len(z)), cells=8)

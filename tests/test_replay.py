@@ -33,6 +33,7 @@ from hyrl_mj.viz.replay.marks import (
     OVERLAP,
     POLICY_COLOUR,
     Floor,
+    Look,
     Tracker,
     bar,
     disc,
@@ -336,7 +337,7 @@ def test_between_samples_the_robot_is_between_its_places(jump):
 def test_a_bar_lies_between_its_ends_with_its_flat_side_up(end):
     scene = mujoco.MjvScene(TASK.model, maxgeom=5)
     start, end = np.array([0.3, -0.2, 0.1]), np.array([0.3, -0.2, 0.1]) + end
-    bar(scene, start, end, (1, 2, 3), width=0.05, height=0.0)
+    bar(scene, start, end, Look((1, 2, 3), width=0.05))
     geom = scene.geoms[0]
     axes = np.array(geom.mat).reshape(3, 3)
     np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-6)

@@ -15,7 +15,7 @@ from hyrl_mj.tasks import Task
 from hyrl_mj.viz.replay import Floor, Show
 from hyrl_mj.viz.section import Section, critical_section
 
-# What a replay plays.
+# The starts of a replay.
 STARTS = ("critical", "paper", "latest")
 # Runs without noise in the overview: of an even number none starts in the middle.
 OVERVIEW_RUNS = 12
@@ -23,13 +23,16 @@ OVERVIEW_RUNS = 12
 WORST = "worst"
 
 
+def from_middle(task: Task, z: np.ndarray) -> np.ndarray:
+    """Returns the distances (n,) of chart points (n, d) from the middle of the replay starts."""
+    middle = np.mean(task.scene.starts, axis=0)
+    return np.asarray(np.linalg.norm(task.chart.difference(z, middle), axis=1))
+
+
 def critical_start(run: Run) -> np.ndarray | None:
     """Returns the point (d,) of M* that is nearest to the replay starts, or None if M* is empty."""
     points = run.critical_set.points
-    if not len(points):
-        return None
-    centre = np.mean(run.task.scene.starts, axis=0)
-    return points[np.linalg.norm(run.task.chart.difference(points, centre), axis=1).argmin()]
+    return points[from_middle(run.task, points).argmin()] if len(points) else None
 
 
 def noisy_arcs(
@@ -46,14 +49,14 @@ def noisy_arcs(
     Args:
         run: with its mode policies.
         z0: starts.
-        noise: a registered kind, or worst (of the exact game, for each of them).
+        noise: a registered kind, or "worst": the worst case of the exact game, for each controller.
         eps: bound of the noise, by default the run's.
-        q0s: start modes of the hybrid controller, None to let it pick.
+        q0s: start modes of the hybrid controller; with None it picks its start mode.
         horizon: time [s], by default the task's.
         seed: of the noise.
 
     Returns:
-        An arc for each start, of "policy" and of "hyrl_q0" and so on, or "hyrl" for its own choice.
+        For each start an arc of "policy", of "hyrl_q0" and so on, and of "hyrl" for a mode of its own.
 
     Raises:
         BadInput: a value that cannot be used, or a worst case that cannot be played exactly.
@@ -63,19 +66,20 @@ def noisy_arcs(
         raise unknown("noise", noise, kinds)
     bound = task.check_noise(run.settings.noise if eps is None else eps)
     steps = None if horizon is None else samples(task, horizon)
+    game = None
     if noise == WORST:
         run.check_exact()
-    game = Game(task, run.split, run.loops, max(bound, LARGEST)) if noise == WORST else None
+        game = Game(task, run.split, run.loops, max(bound, LARGEST))
     arcs = {}
     for name, loop in run.loops.items():
         for q0 in q0s if name == "hyrl" else (None,):
-            signal: AnyNoise = (
-                worst_signal(game, name, loop, z0, bound, q0, steps)
-                if game
-                else Noise(noise, bound)
-            )
-            who = name if q0 is None else f"{name}_q{q0}"
-            arcs[who] = simulate_batch(task, loop, z0, signal, q0, horizon, seed)
+            signal: AnyNoise
+            if game is None:
+                signal = Noise(noise, bound)
+            else:
+                signal = worst_signal(game, name, loop, z0, bound, q0, steps)
+            key = name if q0 is None else f"{name}_q{q0}"
+            arcs[key] = simulate_batch(task, loop, z0, signal, q0, horizon, seed)
     return arcs
 
 
@@ -90,27 +94,23 @@ def replay_arcs(
     run: Run, noise: str = "alternating", eps: float | None = None
 ) -> dict[tuple[str, str], HybridArc]:
     """Simulates the replays by start and controller, by default under the paper's noise."""
-    starts, s = replay_starts(run), run.settings
+    starts, modes, seed = replay_starts(run), run.controller.modes, run.settings.seed
     z0 = np.array([*starts.values()], dtype=float)
-    found = noisy_arcs(run, z0, noise, eps, run.controller.modes, run.task.scene.time, s.seed)
-    return {
-        (name, who): arc
-        for who, arcs in found.items()
-        for name, arc in zip(starts, arcs, strict=True)
-    }
+    arcs = noisy_arcs(run, z0, noise, eps, modes, run.task.scene.time, seed)
+    return {(start, who): arc for who in arcs for start, arc in zip(starts, arcs[who], strict=True)}
 
 
 def replay_shows(
     run: Run, starts: str = "critical", noise: str | None = None, eps: float | None = None
 ) -> list[Show]:
-    """Returns what a replay plays.
+    """Returns the shows that a replay plays.
 
     Args:
         run: with its arcs.
         starts: "critical" for the start on M*, once for each start mode; "paper" for all of the paper's
-            at once; "latest" for what `hyrl-mj simulate --start` left.
+            starts at once; "latest" for the arcs of the last `hyrl-mj simulate --start`.
         noise: simulates anew under this kind of noise, instead of the arcs on disk.
-        eps: its bound, by default the run's.
+        eps: simulates anew with this bound; by default the run's.
 
     Raises:
         BadInput: a value that cannot be used.
@@ -139,7 +139,7 @@ def replay_shows(
 
 
 def replay_floor(run: Run, overlap: bool = True) -> Floor:
-    """Returns what a replay shows on the floor; of a chart of more than two dimensions a section."""
+    """Returns the marks on the floor of a replay, in the section of the task's chart."""
     section = Section.of(run.task)
     return Floor.of(
         section.task,
@@ -149,17 +149,13 @@ def replay_floor(run: Run, overlap: bool = True) -> Floor:
     )
 
 
-# ---- what the figures show
+# ---- arcs that figures show
 
 
 def overview_arcs(task: Task, policy: Policy) -> list[HybridArc]:
     """Simulates a policy without noise, from starts along the longest side of the start region.
 
-    The other coordinates of the starts are at their lower end.
-
-    Args:
-        task: may be a section's.
-        policy: of stage 1.
+    The other coordinates of the starts are at their lower end. The task may be a section's.
     """
     low, high = np.array(task.start_low), np.array(task.start_high)
     starts, axis = np.tile(low, (OVERVIEW_RUNS, 1)), int(np.argmax(high - low))
@@ -171,11 +167,7 @@ def overview_arcs(task: Task, policy: Policy) -> list[HybridArc]:
 def policy_start_arcs(task: Task, policy: Policy, eps: float, seed: int) -> list[HybridArc]:
     """Simulates a policy from the paper's starts of it (Section III), under the paper's noise.
 
-    Args:
-        task: may be a section's.
-        policy: of stage 1.
-        eps: bound of the noise.
-        seed: of the noise.
+    The task may be a section's; `eps` is the bound of the noise and `seed` draws it.
     """
     starts, noise = task.scene.policy_starts, Noise("alternating", eps)
     return simulate_batch(task, policy, starts, noise, horizon=task.scene.time, seed=seed)

@@ -1,4 +1,4 @@
-"""The diagnosis of a policy alone under noise: a start that it loses, how, and a page about it."""
+"""The diagnosis of a policy alone under noise: a run that it loses, and a page about it."""
 
 from __future__ import annotations
 
@@ -6,21 +6,20 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hyrl_mj import artifacts
 from hyrl_mj.errors import NoRenderer
 from hyrl_mj.game import NEVER, Game, Robustness, worst_signal
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, simulate_batch
-from hyrl_mj.viz.arcs import critical_start, replay_floor
+from hyrl_mj.viz.arcs import critical_start, from_middle, replay_floor
 from hyrl_mj.viz.commands import beginning
 from hyrl_mj.viz.options import ReplayOptions
-from hyrl_mj.viz.page import fill, film, noise_tables, pictures
+from hyrl_mj.viz.page import fill, film, noise_tables, pictures, write
 from hyrl_mj.viz.replay import Show, render_replay
 from hyrl_mj.viz.tables import margin_text, percent
 
-# In the run directory: the page, and the folder with all that is on it.
+# In the run directory: the page, and the folder with its pictures and data.
 PAGE, FOLDER = "diagnosis.html", "diagnosis"
 # Lost starts that are simulated, the nearest to the middle of the replay starts first.
 TRIED = 64
@@ -29,10 +28,10 @@ REPLAY = ReplayOptions(size=(960, 720))
 
 
 def worst_arc(run: Run) -> HybridArc | None:
-    """Returns a run that the policy loses, with the noise signal that it loses to; None if none was found.
+    """Returns a run that the policy loses, or None if no such run was found.
 
-    Where the game can be played the signal is that of its adversary; otherwise it is adversarial noise, tried
-    from starts of the task.
+    Where the game can be played its adversary gives the noise; otherwise the noise is adversarial, from
+    drawn starts of the task.
     """
     task, eps, loop = run.task, run.settings.noise, PolicyController(run.policy)
     if run.exact:
@@ -40,8 +39,7 @@ def worst_arc(run: Run) -> HybridArc | None:
         game = Game(task, run.partition, {"policy": loop}, eps, grid=grid)
         own = game.value("policy", eps)[-1, :-2]
         z0 = game.lattice.grid.nodes[game.starts & game.winnable(eps) & (own >= NEVER)]
-        off = np.linalg.norm(task.chart.difference(z0, _middle(run)), axis=1)
-        z0 = z0[np.argsort(off, kind="stable")[:TRIED]]
+        z0 = z0[np.argsort(from_middle(task, z0), kind="stable")[:TRIED]]
         if not len(z0):
             return None
         noise: AnyNoise = worst_signal(game, "policy", loop, z0, eps)
@@ -62,11 +60,6 @@ def usual_arc(run: Run) -> HybridArc:
     seed, horizon = run.settings.seed, task.scene.time
     (arc,) = simulate_batch(task, run.policy, z0, noise, horizon=horizon, seed=seed)
     return arc
-
-
-def _middle(run: Run) -> np.ndarray:
-    """Returns the middle of the replay starts (d,)."""
-    return np.asarray(np.mean(run.task.scene.starts, axis=0))
 
 
 def write_worst(run: Run, arc: HybridArc | None, say: Callable[[str], None]) -> None:
@@ -105,22 +98,17 @@ def sentences(run: Run, robustness: Robustness, arc: HybridArc | None) -> list[s
     else:
         worst = min(robustness.episodes, key=lambda count: count.reached)
         if run.agent and run.agent.stochastic:
-            results.append(
-                "it draws its inputs, so that noisy episodes stand in for the worst case"
-            )
+            why = "it draws its inputs, so that noisy episodes stand in for the worst case"
+            results.append(why)
         results.append(
             f"under {worst.noise} {noise} it loses {percent(1 - worst.reached)} of the episodes "
             f"that start {worst.region}"
         )
     if arc is None:
-        results.append(f"no start was found that {noise} makes it lose")
-    else:
-        start = task.chart.format(arc.z[0])
-        outcome = arc.outcome.replace("_", " ")
-        results.append(
-            f"from {start} it ends {outcome} after {arc.t[-1]:.2f} s, under {arc.noise} noise"
-        )
-    return results
+        return [*results, f"no start was found that {noise} makes it lose"]
+    start, outcome = task.chart.format(arc.z[0]), arc.outcome.replace("_", " ")
+    end = f"it ends {outcome} after {arc.t[-1]:.2f} s, under {arc.noise} noise"
+    return [*results, f"from {start} {end}"]
 
 
 def write_page(run: Run, robustness: Robustness, arc: HybridArc | None) -> None:
@@ -130,16 +118,17 @@ def write_page(run: Run, robustness: Robustness, arc: HybridArc | None) -> None:
         BadArtifact: a picture on it is damaged.
         BadInput: it cannot be written.
     """
-    folder, path = run.path / FOLDER, run.path / PAGE
-    page = fill(
-        "diagnosis.html",
-        run,
-        sentences=sentences(run, robustness, arc),
-        arc=arc,
-        video=film(folder / "worst.mp4"),
-        pictures=pictures(folder),
-        **noise_tables(run.task, robustness),
-        command=beginning(run.settings, run.path),
+    folder = run.path / FOLDER
+    write(
+        run.path / PAGE,
+        fill(
+            "diagnosis.html",
+            run,
+            sentences=sentences(run, robustness, arc),
+            arc=arc,
+            video=film(folder / "worst.mp4"),
+            pictures=pictures(folder),
+            **noise_tables(run.task, robustness),
+            command=beginning(run.settings, run.path),
+        ),
     )
-    with artifacts.replacing(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Videos, one frame after the other, with one clear message where encoding fails."""
+"""Videos, written frame by frame, with one clear message where encoding fails."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ ENCODERS: dict[str, dict[str, Any]] = {
 def video(
     path: Path, width: int, height: int, fps: float
 ) -> Iterator[Callable[[np.ndarray], None]]:
-    """Write a video, whole or not at all.
+    """Writes a video, whole or not at all.
 
     Args:
-        path: where to; an mp4 or a gif, by its name.
+        path: of the video; its suffix says whether it is an mp4 or a gif.
         width, height: of the frames [pixels], even.
         fps: frames a second.
 
@@ -41,7 +41,7 @@ def video(
         A function that appends one frame (height, width, 3) uint8.
 
     Raises:
-        NoRenderer: ffmpeg is missing or failed; the message says how to mend it.
+        NoRenderer: ffmpeg is missing or failed; the message says what to do.
     """
     try:
         import imageio_ffmpeg

@@ -1,4 +1,4 @@
-"""What the pages of a run share: templates, pictures and films, all inside one file."""
+"""What the pages of a run share: templates, and pictures and videos as data URIs."""
 
 from __future__ import annotations
 
@@ -22,20 +22,19 @@ from hyrl_mj.viz.tables import Table, episode_table, margin_table, percent, scor
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG in the page.
-
-    Attributes:
-        name: its name.
-        data: the file as a data URI.
-        width, height: [pixels].
-        caption: what it shows.
-    """
+    """A PNG in the page: its name, the file as a data URI, size [pixels] and caption."""
 
     name: str
     data: str
     width: int
     height: int
-    caption: str = ""
+    caption: str
+
+
+def write(path: Path, text: str) -> None:
+    """Writes a page, whole or not at all."""
+    with artifacts.replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class Film:
 
 
 def fill(template: str, run: Run, **values: Any) -> str:
-    """Returns a page from its template, with what every page of a run says."""
+    """Returns a page from its template, with the values that every page of a run shows."""
     environment = Environment(
         loader=PackageLoader("hyrl_mj"),
         autoescape=True,
@@ -81,24 +80,23 @@ def noise_tables(task: Task, robustness: Robustness | None) -> dict[str, Table |
 
 
 def film(path: Path) -> Film | None:
-    """Returns a replay and its poster, None unless both files exist."""
+    """Returns a replay and its poster, or None unless both files exist."""
     poster = path.with_suffix(".png")
     if not (path.is_file() and poster.is_file()):
         return None
-    return Film(_data(path, "video/mp4"), _picture(poster, "replay"))
+    return Film(_data(path, "video/mp4"), _picture(poster, "replay", ""))
 
 
 def pictures(folder: Path) -> list[Picture]:
     """Returns the figures that have been drawn into a folder."""
-    paths = {name: folder / f"{name}.png" for name in FIGURES}
     return [
-        _picture(path, name.replace("_", " "), FIGURES[name].caption)
-        for name, path in paths.items()
-        if path.is_file()
+        _picture(path, name.replace("_", " "), entry.caption)
+        for name, entry in FIGURES.items()
+        if (path := folder / f"{name}.png").is_file()
     ]
 
 
-def _picture(path: Path, name: str, caption: str = "") -> Picture:
+def _picture(path: Path, name: str, caption: str) -> Picture:
     with artifacts.reading(path), Image.open(path, formats=("PNG",)) as image:
         image.verify()
         return Picture(name, _data(path, "image/png"), *image.size, caption)

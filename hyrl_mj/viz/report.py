@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hyrl_mj import artifacts
 from hyrl_mj.errors import BadInput
 from hyrl_mj.game import LIMIT, MAP_CLASSES, EpisodeCount, GameResult, Robustness
 from hyrl_mj.learning import Settings, Training
@@ -14,7 +13,7 @@ from hyrl_mj.policies import Agent, MlpPolicy
 from hyrl_mj.run_directory import Run
 from hyrl_mj.viz.commands import changed, commands
 from hyrl_mj.viz.figures import CLASS_COLOURS
-from hyrl_mj.viz.page import fill, film, noise_tables, pictures
+from hyrl_mj.viz.page import fill, film, noise_tables, pictures, write
 from hyrl_mj.viz.tables import (
     Arcs,
     arrivals,
@@ -40,13 +39,7 @@ MEANINGS = (
 
 @dataclass(frozen=True)
 class Number:
-    """A figure at the top of the page, for the policy and for HyRL.
-
-    Attributes:
-        what: its name.
-        policy, hyrl: the values, with unit.
-        note: the conditions that it holds for.
-    """
+    """A number at the top of the page: its name, the values with unit, and under which conditions."""
 
     what: str
     policy: str
@@ -55,7 +48,7 @@ class Number:
 
 
 def write_report(run: Run, path: Path) -> None:
-    """Writes the page, which says in its place what a run lacks.
+    """Writes the page; where a result is missing the page says how to get it.
 
     The same artifacts give the same bytes.
 
@@ -69,9 +62,7 @@ def write_report(run: Run, path: Path) -> None:
     """
     if path.suffix != ".html":
         raise BadInput(f"a report is an html, {path} is not: give a name that ends in .html")
-    page = render(run)
-    with artifacts.replacing(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    write(path, render(run))
 
 
 def render(run: Run) -> str:
@@ -79,6 +70,7 @@ def render(run: Run) -> str:
     task, modes = run.task, run.controller.modes
     robustness = run.robustness if (run.path / "robustness.json").is_file() else None
     arcs = run.arcs() if all(path.is_file() for path in run.arc_paths().values()) else None
+    arrived = arcs and {who: arrivals(run, arcs, who == "policy") for who in ("policy", "hyrl")}
     return fill(
         "report.html",
         run,
@@ -89,8 +81,8 @@ def render(run: Run) -> str:
         robustness=robustness,
         game=robustness.game if robustness else None,
         arcs=arcs,
-        arrivals=arcs and {who: arrivals(run, arcs, who == "policy") for who in ("policy", "hyrl")},
-        numbers=_numbers(run, robustness, arcs),
+        arrivals=arrived,
+        numbers=_numbers(run, robustness, arrived),
         replays=arcs and replay_table(run, arcs),
         **noise_tables(task, robustness),
         stages=_stages(run, robustness, arcs),
@@ -106,77 +98,56 @@ def render(run: Run) -> str:
 # ---- numbers
 
 
-def _numbers(run: Run, robustness: Robustness | None, arcs: Arcs | None) -> list[Number]:
+def _numbers(
+    run: Run, robustness: Robustness | None, arrived: Mapping[str, tuple[int, int]] | None
+) -> list[Number]:
     """Returns the key scores."""
     numbers: list[Number] = []
-    if robustness is not None:
-        numbers += (
-            _game_numbers(run, robustness.game)
-            if robustness.game
-            else _episode_numbers(robustness.episodes)
-        )
-    if arcs is not None:
-        (policy, of_policy), (hyrl, of_hyrl) = (
-            arrivals(run, arcs, is_policy) for is_policy in (True, False)
-        )
+    if robustness and robustness.game:
+        numbers += _game_numbers(run, robustness.game)
+    elif robustness:
+        numbers += _episode_numbers(robustness.episodes)
+    if arrived:
+        shares = (f"{count} of {total}" for count, total in arrived.values())
         note = f"the paper's starts, alternating noise {run.settings.noise:g}"
-        numbers.append(
-            Number(
-                "replays that reach the set-point",
-                f"{policy} of {of_policy}",
-                f"{hyrl} of {of_hyrl}",
-                note,
-            )
-        )
+        numbers.append(Number("replays that reach the set-point", *shares, note))
     return numbers
 
 
 def _game_numbers(run: Run, game: GameResult) -> list[Number]:
     """Returns the scores of the worst case at the largest noise bound, and the margins."""
     where, unit = run.task.noise_on(game.everywhere)
-    policy, hyrl, limit = (game.scores[who][-1] for who in ("policy", "hyrl", LIMIT))
+    scores = policy, hyrl = [game.scores[who][-1] for who in ("policy", "hyrl")]
     noise = f"worst noise on {where} up to {hyrl.eps:g} {unit}"
-    margins = {who: margin_text(margin, unit) for who, margin in game.margin.items()}
+    limit = f"{noise}; the limit is {percent(game.scores[LIMIT][-1].won_any)}"
+    won, won_any = percent(policy.won), percent(policy.won_any)
+    margins = (margin_text(game.margin[who], unit) for who in ("policy", "hyrl"))
     numbers = [
-        Number("winnable starts won", percent(policy.won), percent(hyrl.won), noise),
+        Number("winnable starts won", won, percent(hyrl.won), noise),
+        Number("winnable starts won from every start mode", won_any, percent(hyrl.won_any), limit),
         Number(
-            "winnable starts won from every start mode",
-            percent(policy.won_any),
-            percent(hyrl.won_any),
-            f"{noise}; the limit is {percent(limit.won_any)}",
-        ),
-        Number(
-            "noise up to which all of them are won",
-            margins["policy"],
-            margins["hyrl"],
-            f"the margin: worst noise on {where}",
+            "noise up to which all of them are won", *margins, f"the margin: worst noise on {where}"
         ),
     ]
     if game.lasting:
-        off = {who: f"{excursion_text(game.scores[who][-1].excursion)} {unit}" for who in margins}
-        what = "kept off the set-point for ever, at most"
-        numbers.append(Number(what, off["policy"], off["hyrl"], noise))
+        off = (f"{excursion_text(score.excursion)} {unit}" for score in scores)
+        numbers.append(Number("kept off the set-point for ever, at most", *off, noise))
     return numbers
 
 
 def _episode_numbers(counts: Sequence[EpisodeCount]) -> list[Number]:
     """Returns the shares under the worst kind of noise, by start region."""
-    regions = dict.fromkeys(c.region for c in counts)
-    shares = {
-        (region, who): min(c.reached for c in counts if (c.region, c.controller) == (region, who))
-        for region in regions
-        for who in ("policy", "hyrl")
-    }
     note = f"the least over {', '.join(dict.fromkeys(c.noise for c in counts))} noise"
-    return [
-        Number(
-            f"episodes that reach the set-point, starts {region}",
-            percent(shares[region, "policy"]),
-            percent(shares[region, "hyrl"]),
-            note,
+    numbers = []
+    for region in dict.fromkeys(c.region for c in counts):
+        here = [c for c in counts if c.region == region]
+        shares = (
+            percent(min(c.reached for c in here if c.controller == who))
+            for who in ("policy", "hyrl")
         )
-        for region in regions
-    ]
+        what = f"episodes that reach the set-point, starts {region}"
+        numbers.append(Number(what, *shares, note))
+    return numbers
 
 
 # ---- stages and settings
@@ -186,6 +157,7 @@ def _stages(run: Run, robustness: Robustness | None, arcs: Arcs | None) -> list[
     """Returns the result of each stage in a sentence."""
     task, s, modes = run.task, run.settings, run.extended_sets.modes
     reach = "; ".join(f"mode {task.scene.mode_name(q)}: {extent(run, q)}" for q in modes)
+    retrained = f"a policy for each of {len(modes)} modes: {s.stage6.title}"
     each = f"up to {s.stage6.attempts} times " if s.stage6.attempts > 1 else ""
     if isinstance(s.stage1, Agent):
         first = f"none: the agent {s.stage1} takes its place"
@@ -198,11 +170,7 @@ def _stages(run: Run, robustness: Robustness | None, arcs: Arcs | None) -> list[
         ("critical-set", run.critical_set.sentence(task)),
         ("partition", run.partition.sentence(task)),
         ("extended-sets", f"{run.extended_sets.sentence(task)}; {reach}"),
-        (
-            "retrain",
-            f"a policy for each of {len(modes)} modes: {s.stage6.title}, "
-            f"{each}{s.stage6.samples:,} samples",
-        ),
+        ("retrain", f"{retrained}, {each}{s.stage6.samples:,} samples"),
         ("robustness", "not done" if robustness is None else robustness_sentence(robustness)),
         ("simulate", "not done" if arcs is None else replay_sentence(run, arcs)),
     ]
@@ -220,18 +188,16 @@ def _settings(settings: Settings) -> list[tuple[str, str]]:
 def _training(settings: Settings) -> list[tuple[str, str, str]]:
     """Returns the settings of stages 1 and 6 side by side; an agent has its own."""
     first, sixth = (
-        vars(stage) | (stage.options if isinstance(stage, Training) else {})
+        {
+            name: _value(value)
+            for name, value in (
+                vars(stage) | (stage.options if isinstance(stage, Training) else {})
+            ).items()
+            if name != "options"
+        }
         for stage in (settings.stage1, settings.stage6)
     )
-    return [
-        (
-            _words(name),
-            _value(first[name]) if name in first else "",
-            _value(sixth[name]) if name in sixth else "",
-        )
-        for name in first | sixth
-        if name != "options"
-    ]
+    return [(_words(name), first.get(name, ""), sixth.get(name, "")) for name in first | sixth]
 
 
 def _words(name: str) -> str:

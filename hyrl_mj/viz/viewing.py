@@ -1,4 +1,4 @@
-"""Look inside: an arc in MuJoCo's own viewer, or in a browser where there is no display.
+"""An arc in MuJoCo's own viewer, or in a browser where there is no display.
 
 The page for the browser is served by mjviser, an optional package that shows MuJoCo models with viser. The
 web viewer that MuJoCo 4 brings along listens to the whole network, and has no setting for that.
@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, redirect_stdout
 from copy import copy
+from dataclasses import dataclass
 from io import StringIO
 from typing import TYPE_CHECKING, Protocol
 
@@ -28,28 +29,28 @@ if TYPE_CHECKING:
 FPS = 60
 PAUSE = 1.0  # [s] between the end of an arc and its beginning
 LOOPBACK = "127.0.0.1"
-FIRST_PORT = 8080  # that is tried where none is given
+FIRST_PORT = 8080  # the first to try without a port from the user
 Say = Callable[[str], None]
 
 
 class Viewer(Protocol):
-    """What shows the data of a model."""
+    """Shows the data of a model: a window, or a page."""
 
     def is_running(self) -> bool:
-        """Whether it has not been closed."""
+        """Returns whether the viewer has not been closed."""
 
     def sync(self) -> None:
-        """Show the data as they are now."""
+        """Shows the data as they are now."""
 
 
 def view(task: Task, arc: HybridArc, port: int = 0, say: Say = print) -> None:
-    """Play an arc again and again in real time, until the viewer is closed.
+    """Plays an arc again and again in real time, until the viewer is closed.
 
     Args:
-        task: what the arc is of.
+        task: of the arc.
         arc: the arc.
         port: of the web viewer, 1 to 65535; 0 for the first free one from 8080 on.
-        say: told where the web viewer is.
+        say: called with the address of the web viewer.
 
     Raises:
         BadArtifact: the arc is not of this task's model.
@@ -65,17 +66,11 @@ def view(task: Task, arc: HybridArc, port: int = 0, say: Say = print) -> None:
 
 
 def play(track: Track, model: mujoco.MjModel, data: mujoco.MjData, viewer: Viewer) -> None:
-    """Move a model along an arc, again and again in real time, until the viewer is closed.
+    """Moves a model along an arc, again and again in real time, until the viewer is closed.
 
-    A viewer that takes long is shown fewer frames; the arc does not slow down.
-
-    Args:
-        track: the arc.
-        model, data: what the viewer shows; the data are changed.
-        viewer: the viewer.
+    A slow viewer shows fewer frames; the arc does not slow down.
     """
-    began = time.monotonic()
-    due = began
+    began = due = time.monotonic()
     while viewer.is_running():
         show(track, model, data, (time.monotonic() - began) % (track.end + PAUSE))
         viewer.sync()
@@ -85,13 +80,14 @@ def play(track: Track, model: mujoco.MjModel, data: mujoco.MjData, viewer: Viewe
 
 
 def show(track: Track, model: mujoco.MjModel, data: mujoco.MjData, t: float) -> None:
-    """Bring the data to where an arc is at the time t [s], or at its end after that."""
+    """Sets the data to the state of an arc at the time t [s], or at its end after that."""
     data.time = t
     data.qpos[:] = track.qpos(min(t, track.end))
     mujoco.mj_forward(model, data)
 
 
 def _window(model: mujoco.MjModel, data: mujoco.MjData) -> AbstractContextManager[Viewer]:
+    """Opens MuJoCo's viewer."""
     from mujoco import viewer
 
     try:
@@ -104,69 +100,57 @@ def _window(model: mujoco.MjModel, data: mujoco.MjData) -> AbstractContextManage
 
 @contextmanager
 def _web(model: mujoco.MjModel, data: mujoco.MjData, port: int, say: Say) -> Iterator[Viewer]:
+    """Serves a page with the model until the block ends."""
     try:
         import viser
         from mjviser import ViserMujocoScene
     except ImportError as error:
         raise BadInput(
-            f"there is no display, and the viewer for a browser takes the package mjviser ({error}): "
+            f"there is no display, and the viewer for a browser needs the package mjviser ({error}): "
             'pip install "hyrl-mj[view]", or make a video with hyrl-mj replay'
         ) from error
 
     _check_free(port)
-    with redirect_stdout(StringIO()):  # it has its own way of telling where it listens
+    with redirect_stdout(StringIO()):  # viser prints where it listens
         server = viser.ViserServer(host=LOOPBACK, port=port or FIRST_PORT, verbose=False)
     try:
         # The button would ask a server on the internet for an address that everyone can open.
         server.gui.configure_theme(show_share_button=False)
         scene = ViserMujocoScene(server, model, num_envs=1)
         scene.camera_tracking_enabled = False  # the robot moves, and not the world around it
-        shown = model.vis.global_
         scene.create_visualization_gui(
             camera_distance=model.stat.extent,
-            camera_azimuth=shown.azimuth,
-            camera_elevation=-shown.elevation,  # MuJoCo's is negative from above
+            camera_azimuth=model.vis.global_.azimuth,
+            camera_elevation=-model.vis.global_.elevation,  # MuJoCo's is negative from above
         )
         page = _Page(scene, data)
         page.sync()
-        say(
-            f"watch http://{LOOPBACK}:{server.get_port()}/ (only from this machine); Ctrl+C ends it"
-        )
+        address = f"http://{LOOPBACK}:{server.get_port()}/"
+        say(f"watch {address} (only from this machine); Ctrl+C ends it")
         yield page
     finally:
         with redirect_stdout(StringIO()):
             server.stop()
 
 
+@dataclass
 class _Page:
-    """A model on a page that viser serves.
+    """A model on a page that viser serves."""
 
-    Args:
-        scene: the model, as viser shows it.
-        data: where its parts are.
-    """
-
-    def __init__(self, scene: ViserMujocoScene, data: mujoco.MjData):
-        self._scene, self._data = scene, data
+    scene: ViserMujocoScene
+    data: mujoco.MjData
 
     def is_running(self) -> bool:
-        """True: a page that is closed can be opened again, and Ctrl+C ends it."""
+        """Returns True: a page that is closed can be opened again, and Ctrl+C ends it."""
         return True
 
     def sync(self) -> None:
-        """Send the positions to all who have the page open."""
-        self._scene.update_from_mjdata(self._data)
+        """Sends the positions to everyone who has the page open."""
+        self.scene.update_from_mjdata(self.data)
 
 
 def _check_free(port: int) -> None:
-    """Refuse a port that cannot be listened on: viser would take another one, or wait forever.
-
-    Args:
-        port: on the loopback interface; 0 for any.
-
-    Raises:
-        BadInput: the port is taken, is reserved for root, or is no port number.
-    """
+    """Raises `BadInput` for a port that is in use, reserved or invalid; viser would wait forever."""
     try:
         socket.create_server((LOOPBACK, port)).close()
     except (OSError, OverflowError) as error:

@@ -1,7 +1,8 @@
-"""Figures of a run, drawn from what its stages have found.
+"""Figures of a run, drawn from the results of its stages.
 
-Each function takes what it shows and returns a matplotlib `Figure`; given a path it also writes a PNG and
-a PDF. A new figure is a module here and an entry of `FIGURES`.
+Each drawing function takes the value that it shows, and returns a matplotlib `Figure`. Given the path of a
+PNG it also writes the figure there, and a PDF beside it. A new figure is a module here and an entry of
+`FIGURES`.
 """
 
 from collections.abc import Callable
@@ -28,9 +29,9 @@ class Entry:
 
     Attributes:
         draw: (shown, path or None) -> the figure.
-        shows: the type that `draw` takes; the stage that makes one draws the figure.
+        shows: the type that `draw` takes; the stage that makes such a value draws the figure.
         caption: one or two sentences for the report.
-        flat: whether the chart, or a section of it, must be a plane or a ring.
+        flat: whether the figure needs a chart, or a section of it, that is a plane or a ring.
     """
 
     draw: Callable[[Any, Path | None], Figure]
@@ -83,7 +84,7 @@ FIGURES = {
 
 
 def names(task: Task, shows: type[ShownPolicy | ShownGame]) -> tuple[str, ...]:
-    """Returns the names of the figures that a value of a type has, of those that the chart allows."""
+    """Returns the names of the figures of a type of value that the task's chart allows."""
     return tuple(
         name
         for name, entry in FIGURES.items()

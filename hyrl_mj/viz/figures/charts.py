@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.patches import Circle, Patch, Wedge
 from matplotlib.ticker import FuncFormatter, MultipleLocator
 from scipy.ndimage import gaussian_filter
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.stages import Partition
+from hyrl_mj.stages import CriticalSet
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.figures.style import CASING, GREEN, GREY, INK, PALE, PAPER, angle, axis_label
 
@@ -49,7 +50,7 @@ def check_drawable(task: Task) -> None:
         )
 
 
-def angles_on(axis: Any, task: Task, coordinate: int) -> None:
+def label_angles(axis: Axis, task: Task, coordinate: int) -> None:
     """Labels an axis in multiples of pi if its coordinate is a periodic angle."""
     if task.chart.units[coordinate] == "rad" and task.chart.periodic[coordinate]:
         axis.set_major_locator(MultipleLocator(np.pi / 2))
@@ -60,16 +61,12 @@ def angles_on(axis: Any, task: Task, coordinate: int) -> None:
 
 
 def plane(panel: Axes, task: Task) -> Artists:
-    """Makes a panel the plane of a chart, with the states at which runs are over.
-
-    Returns:
-        The legend's entries.
-    """
+    """Makes a panel the plane of a chart, with the states at which runs end; returns legend entries."""
     (left, bottom), (right, top) = task.chart.low, task.chart.high
     panel.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
     panel.set(xlabel=axis_label(task, 0), ylabel=axis_label(task, 1))
     for coordinate, axis in enumerate((panel.xaxis, panel.yaxis)):
-        angles_on(axis, task, coordinate)
+        label_angles(axis, task, coordinate)
     handles: Artists = {}
     grid = Grid.with_cells(task.chart, OVER_CELLS)
     over = task.failed(measured_at(task, grid.nodes)).reshape(grid.counts)
@@ -94,6 +91,20 @@ def region(panel: Axes, members: GridSet, face: str, edge: str | None = None, **
         panel.contour(x, y, values, [0], colors=[edge], linewidths=1.2, **looks)
 
 
+def image(panel: Axes, grid: Grid, values: np.ndarray, **looks: Any) -> None:
+    """Draws values (N,) of nodes as an image; the nodes of one coordinate as a strip of height 1."""
+    half = grid.spacing / 2
+    low, high = grid.nodes[0] - half, grid.nodes[-1] + half
+    (left, bottom), (right, top) = (low, high) if len(half) > 1 else ((*low, 0), (*high, 1))
+    panel.imshow(
+        values.reshape(grid.counts[0], -1).T,
+        extent=(left, right, bottom, top),
+        origin="lower",
+        interpolation="nearest",
+        **looks,
+    )
+
+
 def patch(face: str, edge: str = INK) -> Patch:
     """Returns a filled field for a legend."""
     return Patch(facecolor=face, edgecolor=edge, linewidth=0.8)
@@ -104,29 +115,23 @@ def patch(face: str, edge: str = INK) -> Patch:
 
 def ring(panel: Axes, task: Task, radii: Sequence[float], note: str = "") -> None:
     """Makes a panel the ring of a periodic coordinate: circles, a clock face, and its label with a note."""
-    low, period = task.chart.low[0], task.chart.high[0] - task.chart.low[0]
+    low, period = task.chart.low[0], task.chart.sides[0]
     for radius in radii:
         panel.add_patch(Circle((0, 0), radius, fill=False, edgecolor=INK, linewidth=0.8, zorder=3))
     # Quarters of the period, as hours on a clock face.
     for quarter in low + period * np.arange(4) / 4:
         at = np.array(on_ring(task, quarter))
         panel.plot(*np.outer(at, (OUTER, TICK)), color=INK, linewidth=0.8)
-        panel.text(
-            at[0] * LABEL, at[1] * LABEL, value_text(task, quarter), ha="center", va="center"
-        )
+        text = angle(quarter) if task.chart.units[0] == "rad" else f"{quarter:g}"
+        panel.text(*LABEL * at, text, ha="center", va="center")
     panel.text(0, 0, axis_label(task, 0) + note, ha="center", va="center")
     panel.set(xlim=(-EDGE, EDGE), ylim=(-EDGE, EDGE), aspect="equal", anchor="S")
     panel.set_axis_off()
 
 
-def value_text(task: Task, value: float) -> str:
-    """Returns the label of a value of a ring's coordinate: "π/2" or "45"."""
-    return angle(value) if task.chart.units[0] == "rad" else f"{value:g}"
-
-
 def on_ring(task: Task, z: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
     """Returns x (n,) and y (n,) on the unit circle of values (n,) of a periodic coordinate."""
-    turned = 2 * np.pi * np.asarray(z) / (task.chart.high[0] - task.chart.low[0])
+    turned = 2 * np.pi * np.asarray(z) / task.chart.sides[0]
     return np.cos(turned), np.sin(turned)
 
 
@@ -138,17 +143,12 @@ def arcs(
     outer: float = OUTER,
     inner: float = INNER,
 ) -> None:
-    """Draws classes (N,) int of equally spaced values of a periodic coordinate as arcs of a ring.
+    """Draws classes (N,) of equally spaced values of a periodic coordinate as arcs of a ring.
 
-    Args:
-        panel: to draw on.
-        task: has the coordinate.
-        classes: indices into the colours.
-        colours: of the classes; None leaves the ring blank.
-        outer, inner: radii of the ring.
+    The classes are indices into `colours`, where None leaves the ring blank.
     """
-    period = task.chart.high[0] - task.chart.low[0]
-    step, origin = 360 / len(classes), 360 * task.chart.low[0] / period  # [degrees]
+    step = 360 / len(classes)  # [degrees]
+    origin = 360 * task.chart.low[0] / task.chart.sides[0]
     # Arcs begin half-way between nodes of different classes; one class all round has no beginning.
     begins = np.flatnonzero(classes != np.roll(classes, 1))
     ends = np.append(begins[1:], begins[:1] + len(classes))
@@ -159,9 +159,8 @@ def arcs(
         theta = origin + step * (begins[arc] - 0.5), origin + step * (ends[arc] - 0.5)
         colour = colours[classes[begins[arc]]]
         if colour is not None:
-            panel.add_patch(
-                Wedge((0, 0), outer, *theta, width=outer - inner, color=colour, linewidth=0.8)
-            )
+            wedge = Wedge((0, 0), outer, *theta, width=outer - inner, color=colour, linewidth=0.8)
+            panel.add_patch(wedge)
 
 
 # ---- marks on planes and rings
@@ -176,13 +175,9 @@ def measured_at(task: Task, z: np.ndarray) -> np.ndarray:
 
 def cross(panel: Axes, x: float, y: float) -> Artists:
     """Marks the set-point; returns the legend's entries."""
-    looks: dict[str, Any] = {
-        "color": GREEN,
-        "markersize": 11,
-        "markeredgewidth": 2.5,
-        "linestyle": "none",
-    }
-    (drawn,) = panel.plot([x], [y], marker="+", clip_on=False, zorder=5, **looks)
+    (drawn,) = panel.plot(
+        x, y, "+", color=GREEN, markersize=11, markeredgewidth=2.5, clip_on=False, zorder=5
+    )
     return {"set-point": drawn}
 
 
@@ -191,14 +186,12 @@ def set_point_lines(panel: Axes, task: Task, coordinate: int) -> Artists:
     if task.set_point is None:
         return {}
     low, high = panel.get_ylim()
-    period = task.chart.high[coordinate] - task.chart.low[coordinate]
     turns = np.arange(-TURNS, TURNS + 1) if task.chart.periodic[coordinate] else np.zeros(1)
-    heights = task.set_point[coordinate] + period * turns
     handles: Artists = {}
-    for height in heights[(heights >= low) & (heights <= high)]:
-        handles["set-point"] = panel.axhline(
-            height, color=GREEN, linewidth=1.2, linestyle="--", zorder=1
-        )
+    for height in task.set_point[coordinate] + task.chart.sides[coordinate] * turns:
+        if low <= height <= high:
+            drawn = panel.axhline(height, color=GREEN, linewidth=1.2, linestyle="--", zorder=1)
+            handles["set-point"] = drawn
     return handles
 
 
@@ -216,18 +209,11 @@ def dots(panel: Axes, points: np.ndarray, colour: str = INK) -> Artists:
 
 
 def spokes(
-    panel: Axes, task: Task, z: np.ndarray, start: float, end: float, colour: str = INK
+    panel: Axes, task: Task, critical: CriticalSet, start: float, colour: str = INK
 ) -> Artists:
-    """Marks points (n,) of M* by lines from radius `start` to `end`; returns the legend's entries."""
-    x, y = on_ring(task, z)
+    """Marks M* by lines from radius `start` to the ring's edge; returns the legend's entries."""
+    x, y = on_ring(task, critical.points[:, 0])
     for line, (_, width) in zip((PAPER, colour), CASING, strict=True):
-        panel.plot(
-            [start * x, end * x], [start * y, end * y], color=line, linewidth=width, zorder=3
-        )
+        ends = [start * x, OUTER * x], [start * y, OUTER * y]
+        panel.plot(*ends, color=line, linewidth=width, zorder=3)
     return dots(panel, np.stack([start * x, start * y], axis=1), colour)
-
-
-def classes_of(partition: Partition) -> np.ndarray:
-    """Returns the part (N,) int that alone holds each node, or the number of parts where several do."""
-    held = np.stack([part.mask for part in partition.parts])
-    return np.where(held.sum(axis=0) == 1, held.argmax(axis=0), len(held))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,31 +13,9 @@ from hyrl_mj.sets import GridSet
 from hyrl_mj.stages import ExtendedSets
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz import colours
-from hyrl_mj.viz.figures.charts import (
-    OUTER,
-    Artists,
-    arcs,
-    check_drawable,
-    dots,
-    is_ring,
-    on_ring,
-    patch,
-    plane,
-    region,
-    ring,
-    spokes,
-)
+from hyrl_mj.viz.figures import charts, style
+from hyrl_mj.viz.figures.charts import OUTER, Artists
 from hyrl_mj.viz.figures.shown import ShownRun
-from hyrl_mj.viz.figures.style import (
-    INK,
-    RED,
-    WIDTH,
-    drawing,
-    head,
-    legend,
-    mode_colour,
-    mode_tint,
-)
 
 # States that several extended sets hold.
 SHARED = colours.OVERLAP
@@ -51,27 +28,16 @@ AROUND = 4.0
 def draw_extended_sets(shown: ShownRun, path: Path | None = None) -> Figure:
     """Draws the extended sets and their overlap; in a plane, with an enlargement around M*.
 
-    Args:
-        shown: has a chart that is a plane or a ring.
-        path: where the PNG and the PDF are written, if anywhere.
-
-    Returns:
-        The figure.
-
     Raises:
         BadInput: the chart is neither a plane nor a ring.
     """
     task, sets = shown.task, shown.sets
-    check_drawable(task)
-    unit = task.noise_on()[1]
-    with drawing(path, (WIDTH, 5.6)) as figure:
-        head(
-            figure,
-            task,
-            f"extended sets for noise up to eps = {sets.noise:g} {unit}"
-            + (f", T = {sets.horizon:.2g} s" if sets.horizon else ""),
-        )
-        if is_ring(task):
+    charts.check_drawable(task)
+    horizon = f", T = {sets.horizon:.2g} s" if sets.horizon else ""
+    title = f"extended sets for noise up to eps = {sets.noise:g} {task.noise_on()[1]}{horizon}"
+    with style.drawing(path, (style.WIDTH, 5.6)) as figure:
+        style.head(figure, task, title)
+        if charts.is_ring(task):
             handles = _set_rings(figure.subplots(), shown)
         elif len(shown.critical.points) and sets.noise > 0:
             whole, near = figure.subplots(1, 2)
@@ -80,7 +46,7 @@ def draw_extended_sets(shown: ShownRun, path: Path | None = None) -> Figure:
             handles |= _enlarge(whole, near, shown)
         else:
             handles = _set_plane(figure.subplots(), shown)
-        legend(figure, handles)
+        style.legend(figure, handles)
     return figure
 
 
@@ -94,22 +60,23 @@ def _shared(sets: ExtendedSets) -> np.ndarray:
 
 
 def _set_rings(panel: Axes, shown: ShownRun) -> Artists:
-    """Draws a ring for each set, its ends written beside it; returns the legend's entries."""
+    """Draws a ring for each set, with its ends beside it; returns the legend's entries."""
     task, sets = shown.task, shown.sets
     shared = _shared(sets)
-    arcs(panel, task, shared.astype(int), (None, SHARED), OUTER, CORE)
+    charts.arcs(panel, task, shared.astype(int), (None, SHARED), OUTER, CORE)
     handles: Artists = {}
     width = (OUTER - CORE - GAP) / len(sets.sets)
     for i, (mode, members) in enumerate(zip(sets.modes, sets.sets, strict=True)):
-        outer, colour = OUTER - GAP - i * width, mode_colour(mode)
-        arcs(panel, task, members.mask.astype(int), (None, colour), outer, outer - width + GAP)
-        handles[_set_name(task, mode)] = patch(colour)
+        outer, colour = OUTER - GAP - i * width, style.mode_colour(mode)
+        inside = members.mask.astype(int)
+        charts.arcs(panel, task, inside, (None, colour), outer, outer - width + GAP)
+        handles[_set_name(task, mode)] = charts.patch(colour)
         # The first set's ends are written outside the rings, the others' inside, one below the other.
         _ends(panel, task, members, OUTSIDE if i == 0 else INSIDE - 0.1 * (i - 1), colour)
     if shared.any():
-        handles["in several of them"] = patch(SHARED)
-    ring(panel, task, (OUTER, CORE))
-    return handles | spokes(panel, task, shown.critical.points[:, 0], CORE - 0.06, OUTER)
+        handles["in several of them"] = charts.patch(SHARED)
+    charts.ring(panel, task, (OUTER, CORE))
+    return handles | charts.spokes(panel, task, shown.critical, CORE - 0.06)
 
 
 def _ends(panel: Axes, task: Task, members: GridSet, radius: float, colour: str) -> None:
@@ -117,7 +84,7 @@ def _ends(panel: Axes, task: Task, members: GridSet, radius: float, colour: str)
     if members.mask.all():
         return
     for value in np.ravel(members.pieces()):
-        x, y = radius * np.array(on_ring(task, value))
+        x, y = radius * np.array(charts.on_ring(task, value))
         text = f"{value / np.pi:.2f}π" if task.chart.units[0] == "rad" else f"{value:.3g}"
         panel.text(x, y, text, color=colour, ha="center", va="center", fontsize=9)
 
@@ -126,18 +93,18 @@ def _set_plane(panel: Axes, shown: ShownRun) -> Artists:
     """Fills the sets in a plane, with outlines; returns the legend's entries."""
     task, sets = shown.task, shown.sets
     handles: Artists = {}
-    looks = [(mode_tint(mode), mode_colour(mode)) for mode in sets.modes]
-    for mode, members, (tint, colour) in zip(sets.modes, sets.sets, looks, strict=True):
-        region(panel, members, tint)
-        handles[_set_name(task, mode)] = patch(tint, colour)
-    grid, shared = sets.sets[0].grid, _shared(sets)
-    region(panel, GridSet.from_mask(grid, shared), SHARED)
+    for mode, members in zip(sets.modes, sets.sets, strict=True):
+        tint = style.mode_tint(mode)
+        charts.region(panel, members, tint)
+        handles[_set_name(task, mode)] = charts.patch(tint, style.mode_colour(mode))
+    shared = _shared(sets)
+    charts.region(panel, GridSet.from_mask(sets.sets[0].grid, shared), SHARED)
     if shared.any():
-        handles["in several of them"] = patch(SHARED, SHARED)
-    for members, (_, colour) in zip(sets.sets, looks, strict=True):
-        region(panel, members, "none", colour, zorder=2)
-    handles |= plane(panel, task)
-    return handles | dots(panel, shown.critical.points)
+        handles["in several of them"] = charts.patch(SHARED, SHARED)
+    for mode, members in zip(sets.modes, sets.sets, strict=True):
+        charts.region(panel, members, "none", style.mode_colour(mode), zorder=2)
+    handles |= charts.plane(panel, task)
+    return handles | charts.dots(panel, shown.critical.points)
 
 
 def _enlarge(whole: Axes, near: Axes, shown: ShownRun) -> Artists:
@@ -146,21 +113,15 @@ def _enlarge(whole: Axes, near: Axes, shown: ShownRun) -> Artists:
     low = np.maximum(points.min(axis=0) - AROUND * eps, task.chart.low)
     high = np.minimum(points.max(axis=0) + AROUND * eps, task.chart.high)
     near.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), title="around M*")
-    box = Rectangle(low, *(high - low), fill=False, edgecolor=INK, linestyle=":", zorder=3)
+    box = Rectangle(low, *(high - low), fill=False, edgecolor=style.INK, linestyle=":", zorder=3)
     whole.add_patch(box)
     for drawn in near.lines:
         drawn.set_clip_on(True)  # marks outside this panel would show beside it
     # The width is drawn at the middle one of M*'s points.
     middle = points[np.argsort(points.sum(axis=1))[len(points) // 2]]
     axis = int(np.argmax(task.noise_in_chart(1.0)))
-    step = np.zeros(2)
-    step[axis] = eps
+    step = eps * np.eye(2)[axis]
     ends = np.stack([middle - step, middle + step]).T
-    looks: dict[str, Any] = {
-        "color": RED,
-        "linewidth": 2,
-        "markersize": 9,
-        "marker": "_|"[axis == 0],
-    }
-    (width,) = near.plot(*ends, zorder=4, **looks)
+    marker = "_|"[axis == 0]
+    (width,) = near.plot(*ends, zorder=4, color=style.RED, linewidth=2, markersize=9, marker=marker)
     return {f"2 eps = {2 * eps:g} {task.chart.units[axis]}": width}

@@ -10,46 +10,12 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
 from hyrl_mj.sets import GridSet
-from hyrl_mj.viz.figures.charts import (
-    OUTER,
-    Artists,
-    arcs,
-    check_drawable,
-    classes_of,
-    cross,
-    dots,
-    is_ring,
-    on_ring,
-    patch,
-    plane,
-    region,
-    ring,
-    spokes,
-)
-from hyrl_mj.viz.figures.paths import (
-    CORE,
-    View,
-    chosen_way,
-    end,
-    line,
-    mark,
-    plane_view,
-    policy_way,
-    spiral_view,
-)
+from hyrl_mj.stages import Partition
+from hyrl_mj.viz.figures import charts, paths, style
+from hyrl_mj.viz.figures.charts import OUTER, Artists
+from hyrl_mj.viz.figures.paths import CORE, View
 from hyrl_mj.viz.figures.shown import ShownPolicy
-from hyrl_mj.viz.figures.style import (
-    INK,
-    PALE,
-    PALE_RED,
-    RED,
-    WIDTH,
-    drawing,
-    head,
-    legend,
-    mode_tint,
-    noise_label,
-)
+from hyrl_mj.viz.figures.style import PALE_RED
 
 # An arrowhead shows the direction of a run after 1/ARROW of its samples.
 ARROW = 7
@@ -58,53 +24,49 @@ ARROW = 7
 def draw_overview(shown: ShownPolicy, path: Path | None = None) -> Figure:
     """Draws the ways that the policy goes without noise, and a run that noise leads astray.
 
-    Args:
-        shown: has a chart that is a plane or a ring.
-        path: where the PNG and the PDF are written, if anywhere.
-
-    Returns:
-        The figure.
-
     Raises:
         BadInput: the chart is neither a plane nor a ring.
     """
     task, arc = shown.task, shown.noisy
-    check_drawable(task)
-    with drawing(path, (WIDTH, 7.6)) as figure:
-        head(figure, task, f"the {shown.algorithm} policy, and where noise leads it")
+    charts.check_drawable(task)
+    with style.drawing(path, (style.WIDTH, 7.6)) as figure:
+        style.head(figure, task, f"the {shown.algorithm} policy, and where noise leads it")
         panel = figure.subplots()
-        panel.set_title(noise_label(task, arc.noise, arc.bound))
-        draw = _spirals if is_ring(task) else _field
-        legend(figure, draw(panel, shown))
+        panel.set_title(style.noise_label(task, arc.noise, arc.bound))
+        draw = _spirals if charts.is_ring(task) else _field
+        handles = {
+            f"only in the part $M_{mode}$": charts.patch(style.mode_tint(mode))
+            for mode in shown.partition.modes
+        }
+        style.legend(figure, handles | draw(panel, shown))
     return figure
 
 
 def _field(panel: Axes, shown: ShownPolicy) -> Artists:
-    """Draws the overview of a plane; returns the legend's entries."""
+    """Draws the overview of a plane; returns the legend's entries, without the parts."""
     task, partition, arc = shown.task, shown.partition, shown.noisy
-    handles: Artists = {}
-    classes, grid = classes_of(partition), partition.grid
+    owners = _owners(partition)
     for i, mode in enumerate(partition.modes):
-        region(panel, GridSet.from_mask(grid, classes == i), mode_tint(mode))
-        handles[f"only in the part $M_{mode}$"] = patch(mode_tint(mode))
-    handles |= plane(panel, task)
-    view = plane_view(task)
+        part = GridSet.from_mask(partition.grid, owners == i)
+        charts.region(panel, part, style.mode_tint(mode))
+    handles = charts.plane(panel, task)
+    view = paths.plane_view(task)
     handles |= _noiseless_runs(panel, shown, view)
     eps = task.noise_in_chart(arc.bound)
-    panel.add_collection(
-        PolyCollection(
-            list(_band(task.chart.wrap(arc.z), eps, view.longest)),
-            color=PALE_RED,
-            linewidth=0.3,
-            zorder=2,
-        )
-    )
+    band = _band(task.chart.wrap(arc.z), eps, view.longest)
+    panel.add_collection(PolyCollection(list(band), color=PALE_RED, linewidth=0.3, zorder=2))
     handles |= _noisy_run(panel, shown, view)
     ahead = arc.z[-1] - arc.z[0]
-    pointing = (3, 0, float(np.degrees(np.arctan2(ahead[1], ahead[0]))) - 90)
-    looks = {"markersize": 13, "markerfacecolor": PALE, "markeredgecolor": INK}
-    handles["robot at its start"] = mark(panel, view, arc, 0, pointing, **looks)
-    return handles | dots(panel, shown.critical.points)
+    triangle = (3, 0, float(np.degrees(np.arctan2(ahead[1], ahead[0]))) - 90)
+    looks = {"markersize": 13, "markerfacecolor": style.PALE, "markeredgecolor": style.INK}
+    handles["robot at its start"] = paths.mark(panel, view, arc, 0, triangle, **looks)
+    return handles | charts.dots(panel, shown.critical.points)
+
+
+def _owners(partition: Partition) -> np.ndarray:
+    """Returns the part (N,) int that alone holds each node, or the number of parts where several do."""
+    held = np.stack([part.mask for part in partition.parts])
+    return np.where(held.sum(axis=0) == 1, held.argmax(axis=0), len(held))
 
 
 def _band(z: np.ndarray, eps: np.ndarray, longest: np.ndarray) -> np.ndarray:
@@ -122,32 +84,28 @@ def _band(z: np.ndarray, eps: np.ndarray, longest: np.ndarray) -> np.ndarray:
 
 
 def _spirals(panel: Axes, shown: ShownPolicy) -> Artists:
-    """Draws the overview of a ring, where time goes outward; returns the legend's entries."""
+    """Draws the overview of a ring, time outward; returns the legend's entries, without the parts."""
     task, partition, arc = shown.task, shown.partition, shown.noisy
     seconds = task.scene.time
-    tints = [mode_tint(mode) for mode in partition.modes]
-    arcs(panel, task, classes_of(partition), [*tints, None], OUTER, CORE)
-    ring(panel, task, (OUTER, CORE), f",\ntime outward:\n0 to {seconds:g} s")
-    handles: Artists = {
-        f"only in the part $M_{mode}$": patch(tint)
-        for mode, tint in zip(partition.modes, tints, strict=True)
-    }
-    view = spiral_view(task, seconds)
-    handles |= _noiseless_runs(panel, shown, view)
+    tints = [style.mode_tint(mode) for mode in partition.modes]
+    charts.arcs(panel, task, _owners(partition), [*tints, None], OUTER, CORE)
+    charts.ring(panel, task, (OUTER, CORE), f",\ntime outward:\n0 to {seconds:g} s")
+    view = paths.spiral_view(task, seconds)
+    handles = _noiseless_runs(panel, shown, view)
     eps = task.noise_in_chart(arc.bound)
     rim = np.vstack([view.points(arc.t, arc.z - eps), view.points(arc.t, arc.z + eps)[::-1]])
     panel.fill(*rim.T, color=PALE_RED, linewidth=0, zorder=2)
     handles |= _noisy_run(panel, shown, view)
     if task.set_point is not None:
-        handles |= cross(panel, *np.ravel(on_ring(task, task.set_point)))
-    return handles | spokes(panel, task, shown.critical.points[:, 0], CORE - 0.06, OUTER)
+        handles |= charts.cross(panel, *np.ravel(charts.on_ring(task, task.set_point)))
+    return handles | charts.spokes(panel, task, shown.critical, CORE - 0.06)
 
 
 def _noiseless_runs(panel: Axes, shown: ShownPolicy, view: View) -> Artists:
     """Draws the runs without noise, with arrowheads; returns the legend's entries."""
     handles: Artists = {}
     for run in shown.noiseless:
-        way, drawn = chosen_way(panel, shown.task, view, run, linewidth=1.3, zorder=3)
+        way, drawn = paths.chosen_way(panel, shown.task, view, run, linewidth=1.3, zorder=3)
         handles[f"without noise: {way}"] = drawn
         row = len(run.t) // ARROW
         points = view.points(run.t[row : row + 2], run.z[row : row + 2])
@@ -162,10 +120,10 @@ def _noiseless_runs(panel: Axes, shown: ShownPolicy, view: View) -> Artists:
 def _noisy_run(panel: Axes, shown: ShownPolicy, view: View) -> Artists:
     """Draws the run under noise and what it measures; returns the legend's entries."""
     task, arc = shown.task, shown.noisy
-    drawn = policy_way(panel, view, arc, linewidth=1.4)
+    drawn = paths.policy_way(panel, view, arc, linewidth=1.4)
     handles: Artists = {f"{shown.policy_title}, with noise": drawn}
-    handles["what it can observe"] = patch(PALE_RED, PALE_RED)
+    handles["what it can observe"] = charts.patch(PALE_RED, PALE_RED)
+    looks = {"linestyle": "none", "marker": ".", "color": style.RED, "markersize": 4, "zorder": 4.5}
     measured = task.z(arc.measured[:-1])
-    looks = {"linestyle": "none", "marker": ".", "color": RED, "markersize": 4, "zorder": 4.5}
-    handles["what it observes"] = line(panel, view, arc.t[:-1], measured, **looks)
-    return handles | end(panel, task, view, arc)
+    handles["what it observes"] = paths.line(panel, view, arc.t[:-1], measured, **looks)
+    return handles | paths.end(panel, task, view, arc)

@@ -12,15 +12,8 @@ from matplotlib.lines import Line2D
 
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Outcome, Task
-from hyrl_mj.viz.figures.charts import Artists, on_ring
-from hyrl_mj.viz.figures.style import (
-    INK,
-    PALE,
-    PAPER,
-    POLICY_COLOUR,
-    RED,
-    mode_colour,
-)
+from hyrl_mj.viz.figures.charts import Artists, label_angles, on_ring
+from hyrl_mj.viz.figures.style import INK, PALE, PAPER, POLICY_COLOUR, RED, axis_label, mode_colour
 
 # Radius at which spirals begin; they end at 1.
 CORE = 0.4
@@ -43,12 +36,14 @@ class View:
 
 def plane_view(task: Task) -> View:
     """Returns the view of paths in the plane of a chart."""
-    half = np.subtract(task.chart.high, task.chart.low) / 2
-    return View(lambda t, z: task.chart.wrap(z), np.where(task.chart.periodic, half, np.inf))
+    chart = task.chart
+    return View(lambda t, z: chart.wrap(z), np.where(chart.periodic, chart.sides / 2, np.inf))
 
 
-def time_view(coordinate: int) -> View:
-    """Returns the view of a coordinate over time."""
+def time_view(panel: Axes, task: Task, coordinate: int) -> View:
+    """Labels a panel of a coordinate over time, and returns its view."""
+    panel.set(xlabel="time [s]", ylabel=axis_label(task, coordinate))
+    label_angles(panel.yaxis, task, coordinate)
     return View(lambda t, z: np.stack([t, z[:, coordinate]], axis=1))
 
 
@@ -106,11 +101,7 @@ def policy_way(panel: Axes, view: View, arc: HybridArc, **looks: Any) -> Line2D:
 def chosen_way(
     panel: Axes, task: Task, view: View, arc: HybridArc, **looks: Any
 ) -> tuple[str, Line2D]:
-    """Draws a run of the stage-1 policy in the colour of the mode whose way it goes.
-
-    Returns:
-        Its label in the legend, and the path.
-    """
+    """Draws a policy's run in the colour of the mode whose way it goes; returns its label and path."""
     mode = int(task.direction(arc.z[:, None])[0])
     colour, label = mode_colour(mode), f"way of mode {task.scene.mode_name(mode)}"
     if failed(arc):

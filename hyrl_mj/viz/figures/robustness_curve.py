@@ -12,23 +12,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from hyrl_mj.game import LIMIT, Wins
+from hyrl_mj.viz.figures import style
 from hyrl_mj.viz.figures.charts import Artists
 from hyrl_mj.viz.figures.shown import ShownGame
-from hyrl_mj.viz.figures.style import (
-    INK,
-    PALE,
-    PAPER,
-    POLICY_COLOUR,
-    WIDTH,
-    drawing,
-    head,
-    legend,
-    mode_colour,
-)
 from hyrl_mj.viz.tables import NAMES
 
 # Of the curves: ink as the policy's path in the replay, then blue, purple and vermilion.
-CURVE_COLOURS = (POLICY_COLOUR, *(mode_colour(i) for i in (0, 2, 1)))
+CURVE_COLOURS = (style.POLICY_COLOUR, *(style.mode_colour(i) for i in (0, 2, 1)))
 LIMIT_COLOUR = "#a9dcc9"
 MARKERS = "osD^"
 # Nodes of a curve from one marker to the next.
@@ -41,13 +31,6 @@ def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
     """Draws what each controller wins against the noise bound.
 
     Where runs last for ever, a second panel shows the worst time to arrival.
-
-    Args:
-        shown: the game.
-        path: where the PNG and the PDF are written, if anywhere.
-
-    Returns:
-        The figure.
     """
     task, result = shown.task, shown.result
     names, curve = result.controllers, result.curve
@@ -58,8 +41,8 @@ def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
     numbers = {name: known.index(name) for name in names}
     where, unit = task.noise_on(result.everywhere)
     heights = (3.6, 2.0) if result.lasting else (3.6,)
-    with drawing(path, (WIDTH, 2.0 + sum(heights))) as figure:
-        head(figure, task, "what is won against the worst noise")
+    with style.drawing(path, (style.WIDTH, 2.0 + sum(heights))) as figure:
+        style.head(figure, task, "what is won against the worst noise")
         panels = figure.subplots(
             len(heights), 1, sharex=True, squeeze=False, height_ratios=heights
         ).ravel()
@@ -67,7 +50,7 @@ def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
         handles = _limit(shares, eps, curve.wins[LIMIT])
         for name, number in numbers.items():
             handles |= _won(shares, number, name, eps, curve.wins[name])
-        (line,) = shares.plot(eps, 100 * np.array(curve.winnable), color=PALE, linewidth=1)
+        (line,) = shares.plot(eps, 100 * np.array(curve.winnable), color=style.PALE, linewidth=1)
         handles["winnable share of the start region"] = line
         handles |= _margins(shares, result.margin, numbers, unit)
         shares.set(ylabel="winnable starts that are won [%]", yticks=range(0, 101, 20))
@@ -76,21 +59,16 @@ def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
                 _times(panels[1], number, eps, curve.wins[name])
             panels[1].set_ylabel("worst time to arrival,\nstarts that are won [s]")
         for panel in panels:
-            panel.axvline(run_eps, color=INK, linewidth=1, linestyle=(0, (1, 2)), zorder=1)
-            panel.grid(color="#e6e8eb", linewidth=0.8)
+            panel.axvline(run_eps, color=style.INK, linewidth=1, linestyle=(0, (1, 2)), zorder=1)
+            style.grid_lines(panel)
             panel.set_axisbelow(True)
             panel.spines[["top", "right"]].set_visible(False)
         right = max(eps[-1], run_eps)
         panels[-1].set(xlabel=f"noise bound eps on {where} [{unit}]", xlim=(0, 1.01 * right))
-        shares.annotate(
-            f"this run: eps = {run_eps:g} {unit}",
-            (run_eps, 1),
-            xycoords=("data", "axes fraction"),
-            xytext=(0, 3),
-            textcoords="offset points",
-            ha="center",
+        style.note_above(
+            shares, f"this run: eps = {run_eps:g} {unit}", run_eps, 3, ("data", "axes fraction")
         )
-        legend(figure, handles, handlelength=3.2)
+        style.legend(figure, handles, handlelength=3.2)
     return figure
 
 
@@ -101,33 +79,35 @@ def _limit(panel: Axes, eps: np.ndarray, wins: Wins) -> Artists:
         The legend's entries.
     """
     looks: dict[str, Any] = {"color": LIMIT_COLOUR, "linewidth": 7, "solid_capstyle": "butt"}
-    (won,) = panel.plot(eps, 100 * np.array(wins.won), **looks)
-    if _same(wins):
-        return {"limit of any controller": won}
-    looks |= {"linestyle": (0, (1.2, 0.5)), "linewidth": 4}
-    (won_any,) = panel.plot(eps, 100 * np.array(wins.won_any), **looks)
-    return {
-        "limit of any controller, picks the start mode": won,
-        "limit of any controller, from every start mode": won_any,
-    }
+    dashed = {"linestyle": (0, (1.2, 0.5)), "linewidth": 4}
+    return _pair(panel, "limit of any controller", eps, wins, looks, dashed)
 
 
 def _won(panel: Axes, number: int, name: str, eps: np.ndarray, wins: Wins) -> Artists:
     """Draws what a controller wins; returns the legend's entries."""
-    won, won_any = 100 * np.array(wins.won), 100 * np.array(wins.won_any)
-    title, looks = NAMES.get(name, name), _looks(number)
-    (line,) = panel.plot(eps, won, **looks)
+    return _pair(panel, NAMES.get(name, name), eps, wins, _looks(number), _dashed(number))
+
+
+def _pair(
+    panel: Axes,
+    title: str,
+    eps: np.ndarray,
+    wins: Wins,
+    looks: dict[str, Any],
+    dashed: dict[str, Any],
+) -> Artists:
+    """Draws the curves of one's own and of any start mode, or one if they coincide; the latter dashed."""
+    (won,) = panel.plot(eps, 100 * np.array(wins.won), **looks)
     if _same(wins):
-        return {title: line}
-    (dashed,) = panel.plot(eps, won_any, **looks | _dashed(number))
-    return {f"{title}, picks the start mode": line, f"{title}, from every start mode": dashed}
+        return {title: won}
+    (won_any,) = panel.plot(eps, 100 * np.array(wins.won_any), **looks | dashed)
+    return {f"{title}, picks the start mode": won, f"{title}, from every start mode": won_any}
 
 
 def _times(panel: Axes, number: int, eps: np.ndarray, wins: Wins) -> None:
     """Draws the worst time to arrival where anything is won."""
     looks = _looks(number) | ({} if _same(wins) else _dashed(number))
-    won = np.array(wins.won_any) > 0
-    panel.plot(eps, np.where(won, wins.time_any, np.nan), **looks)
+    panel.plot(eps, np.where(np.array(wins.won_any) > 0, wins.time_any, np.nan), **looks)
 
 
 def _same(wins: Wins) -> bool:
@@ -156,7 +136,7 @@ def _dashed(number: int) -> dict[str, Any]:
     return {
         "linestyle": "--",
         "linewidth": 1.5,
-        "markerfacecolor": PAPER,
+        "markerfacecolor": style.PAPER,
         "markeredgewidth": 1.5,
         "markevery": ((2 * number + 1) % MARK_EVERY, MARK_EVERY),
     }

@@ -7,42 +7,20 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
+from matplotlib.colors import ListedColormap, NoNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle, Wedge
 
 from hyrl_mj.game import MAP_CLASSES, OVER, UNWINNABLE, Score
 from hyrl_mj.sets import Grid
 from hyrl_mj.tasks import Task
-from hyrl_mj.viz.figures.charts import (
-    INNER,
-    OUTER,
-    TICK,
-    Artists,
-    arcs,
-    dots,
-    is_ring,
-    patch,
-    ring,
-    spokes,
-)
+from hyrl_mj.viz.figures import charts, style
+from hyrl_mj.viz.figures.charts import INNER, OUTER, TICK, Artists
 from hyrl_mj.viz.figures.shown import ShownGame
-from hyrl_mj.viz.figures.style import (
-    CASING,
-    COLUMNS,
-    GREY,
-    INK,
-    WIDTH,
-    axis_label,
-    drawing,
-    head,
-    legend,
-    mode_colour,
-)
 from hyrl_mj.viz.tables import NAMES, percent
 
 # Of MAP_CLASSES, in their order; colour-blind readers can tell them apart, too.
-CLASS_COLOURS = ("#7cc0e8", "#f2c530", mode_colour(1), "#5c2a6b", GREY)
+CLASS_COLOURS = ("#7cc0e8", "#f2c530", style.mode_colour(1), "#5c2a6b", style.GREY)
 SENTENCES = dict(enumerate(MAP_CLASSES)) | {
     UNWINNABLE: "not winnable, whatever the controller",
     OVER: "over: obstacle, or the run has ended",
@@ -52,40 +30,33 @@ CRITICAL = 0.6
 
 
 def draw_robustness_map(shown: ShownGame, path: Path | None = None) -> Figure:
-    """Draws a map for each controller: what becomes of runs from each state.
-
-    Args:
-        shown: the game, with its maps.
-        path: where the PNG and the PDF are written, if anywhere.
-
-    Returns:
-        The figure.
-    """
+    """Draws a map for each controller: what becomes of runs from each state."""
     task, result, maps = shown.task, shown.result, shown.maps
     names, grid = result.controllers, maps.grid(task.chart)
-    rows = -(-len(names) // COLUMNS)
-    columns = min(len(names), COLUMNS)
-    with drawing(path, (WIDTH, 1.6 + rows * _panel_height(task))) as figure:
+    columns = min(len(names), style.COLUMNS)
+    rows = -(-len(names) // style.COLUMNS)
+    draw = _ring if charts.is_ring(task) else _box
+    with style.drawing(path, (style.WIDTH, 1.6 + rows * _panel_height(task))) as figure:
         where, unit = task.noise_on(result.everywhere)
-        head(figure, task, f"the worst noise on {where} up to eps = {maps.eps:g} {unit}")
+        style.head(figure, task, f"the worst noise on {where} up to eps = {maps.eps:g} {unit}")
         panels = figure.subplots(rows, columns, squeeze=False).ravel()
         handles: Artists = {}
         for panel, name in zip(panels, names, strict=False):
-            draw = _ring if is_ring(task) else _box
             handles |= draw(panel, shown, grid, maps.map[name])
             _head(panel, name, max(result.scores[name], key=lambda score: score.eps))
         for panel in panels[len(names) :]:
             panel.set_axis_off()
         classes = np.unique(np.concatenate([maps.map[name] for name in names]))
-        legend(figure, {SENTENCES[k]: patch(CLASS_COLOURS[k]) for k in classes} | handles)
+        fields = {SENTENCES[k]: charts.patch(CLASS_COLOURS[k]) for k in classes}
+        style.legend(figure, fields | handles)
     return figure
 
 
 def _panel_height(task: Task) -> float:
     """Returns the height [inches] of a panel with its title and labels."""
-    if is_ring(task):
+    if charts.is_ring(task):
         return 4.1
-    sides = np.subtract(task.chart.high, task.chart.low)
+    sides = task.chart.sides
     return 1.1 + (float(3.2 * sides[1] / sides[0]) if len(sides) == 2 else 0.5)
 
 
@@ -93,54 +64,34 @@ def _head(panel: Axes, name: str, score: Score) -> None:
     """Writes the controller and what it wins above its panel."""
     won, won_any = percent(score.won), percent(score.won_any)
     panel.set_title(NAMES.get(name, name), fontsize=11, fontweight="bold", pad=36)
-    panel.annotate(
-        f"{won} of the winnable starts won,\n"
-        + ("from every start mode" if won == won_any else f"{won_any} from every start mode"),
-        (0.5, 1),
-        xycoords="axes fraction",
-        xytext=(0, 6),
-        textcoords="offset points",
-        ha="center",
-    )
+    every = "from every start mode" if won == won_any else f"{won_any} from every start mode"
+    style.note_above(panel, f"{won} of the winnable starts won,\n{every}", 0.5, 6)
 
 
 def _box(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> Artists:
-    """Draws a map as an image over the chart; a chart of one coordinate is a strip of height 1.
-
-    Args:
-        panel: to draw on.
-        shown: the game.
-        grid: of the map.
-        classes: (N,) int, indices into `MAP_CLASSES`.
+    """Draws classes (N,) of nodes as an image over the chart; one coordinate is a strip of height 1.
 
     Returns:
         The legend's entries, without the classes.
     """
     task, chart = shown.task, shown.task.chart
-    half, flat = grid.spacing / 2, chart.dimension == 1
+    strip = chart.dimension == 1
+    charts.image(panel, grid, classes, cmap=ListedColormap(CLASS_COLOURS), norm=NoNorm())
     low, high = _corner(chart.low, 0), _corner(chart.high, 1)
-    start, end = _corner(task.start_low, 0), _corner(task.start_high, 1)
-    first, last = _corner(grid.nodes[0] - half, 0), _corner(grid.nodes[-1] + half, 1)
-    panel.imshow(
-        classes.reshape(grid.counts[0], -1).T,
-        cmap=ListedColormap(CLASS_COLOURS),
-        vmin=-0.5,
-        vmax=len(CLASS_COLOURS) - 0.5,
-        extent=(first[0], last[0], first[1], last[1]),
-        origin="lower",
-        interpolation="nearest",
-        aspect=0.12 * (high[0] - low[0]) if flat else "equal",
-    )
-    panel.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel=axis_label(task, 0))
-    panel.set(yticks=[]) if flat else panel.set(ylabel=axis_label(task, 1))
-    sides = end[0] - start[0], end[1] - start[1]
-    for colour, width in CASING:
+    panel.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel=style.axis_label(task, 0))
+    if strip:
+        panel.set(yticks=[], aspect=0.12 * chart.sides[0])
+    else:
+        panel.set(ylabel=style.axis_label(task, 1))
+    start = _corner(task.start_low, 0)
+    sides = np.subtract(_corner(task.start_high, 1), start)
+    for colour, width in style.CASING:
         box = Rectangle(
             start, *sides, fill=False, edgecolor=colour, linewidth=width, clip_on=False, zorder=3
         )
         panel.add_patch(box)
     z = shown.critical.points
-    points = dots(panel, np.hstack([z, np.full_like(z, 0.5)]) if flat else z)
+    points = charts.dots(panel, np.hstack([z, np.full_like(z, 0.5)]) if strip else z)
     return {"start region": box} | points
 
 
@@ -150,15 +101,15 @@ def _corner(ends: Sequence[float], side: float) -> tuple[float, float]:
 
 
 def _ring(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> Artists:
-    """Draws a map over a periodic coordinate as arcs of a ring; arguments and result as of `_box`."""
+    """Draws classes (N,) of nodes as arcs of a ring; returns as `_box`."""
     task = shown.task
-    arcs(panel, task, classes, CLASS_COLOURS)
-    ring(panel, task, (OUTER, INNER))
+    charts.arcs(panel, task, classes, CLASS_COLOURS)
+    charts.ring(panel, task, (OUTER, INNER))
     handles: Artists = {}
-    period = task.chart.high[0] - task.chart.low[0]
-    first, last = (360 * corner[0] / period for corner in (task.start_low, task.start_high))
+    first, last = (
+        360 * corner[0] / task.chart.sides[0] for corner in (task.start_low, task.start_high)
+    )
     if last - first < 360 - 360 / len(classes):
-        handles["start region"] = panel.add_patch(
-            Wedge((0, 0), TICK, first, last, width=0.03, color=INK, linewidth=0)
-        )
-    return handles | spokes(panel, task, shown.critical.points[:, 0], CRITICAL, OUTER)
+        arc = Wedge((0, 0), TICK, first, last, width=0.03, color=style.INK, linewidth=0)
+        handles["start region"] = panel.add_patch(arc)
+    return handles | charts.spokes(panel, task, shown.critical, CRITICAL)

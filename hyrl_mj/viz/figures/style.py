@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from matplotlib import style
 from matplotlib.artist import Artist
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
@@ -61,7 +62,7 @@ def drawing(path: Path | None, size: tuple[float, float]) -> Iterator[Figure]:
     """Gives a figure to draw on, and writes it as PNG and PDF when the block ends without an error.
 
     Args:
-        path: of the PNG; the PDF has the same name. With None nothing is written.
+        path: where the PNG is written, and the PDF beside it; None writes nothing.
         size: width and height [inches], before empty margins are cut off.
     """
     # The user's own matplotlibrc must not change the figure.
@@ -88,15 +89,23 @@ def head(figure: Figure, task: Task, title: str) -> None:
     figure.suptitle(f"{task_title(task)}{where}: {title}", fontsize=12, fontweight="bold")
 
 
+def grid_lines(panel: Axes) -> None:
+    """Draws pale grid lines behind a panel."""
+    panel.grid(color="#e6e8eb", linewidth=0.8)
+
+
+def note_above(panel: Axes, text: str, x: float, gap: float, coords: Any = "axes fraction") -> None:
+    """Writes a text above a panel, centred at x, with a gap [points]."""
+    panel.annotate(
+        text, (x, 1), xycoords=coords, xytext=(0, gap), textcoords="offset points", ha="center"
+    )
+
+
 def legend(figure: Figure, handles: Mapping[str, Artist], handlelength: float = 2.0) -> None:
     """Writes the legend below a figure, where it hides nothing."""
-    figure.legend(
-        list(handles.values()),
-        list(handles),
-        loc="outside lower center",
-        ncols=COLUMNS,
-        handlelength=handlelength,
-    )
+    artists, labels = list(handles.values()), list(handles)
+    place = "outside lower center"
+    figure.legend(artists, labels, loc=place, ncols=COLUMNS, handlelength=handlelength)
 
 
 # ---- labels

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
@@ -14,34 +13,20 @@ from PIL import Image
 from hyrl_mj import artifacts, mjcf
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.progress import Progress
-from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.encoding import ENCODERS, video
 from hyrl_mj.viz.options import ReplayOptions
 from hyrl_mj.viz.replay.marks import Floor
-from hyrl_mj.viz.replay.screen import LAYOUTS, Screen
+from hyrl_mj.viz.replay.screen import LAYOUTS, Screen, Show
 from hyrl_mj.viz.replay.timeline import frame_times
 
 FASTEST, SLOWEST_MOTION = 240, 100  # frames/s, and times slower than real time
 FORMATS = (*ENCODERS, ".png")
-# A poster is drawn so many times larger and then reduced, for smooth edges.
+# A poster is drawn this many times larger and then reduced, for smooth edges.
 FINER = 2
 DEFAULTS = ReplayOptions()
 
-
-@dataclass(frozen=True)
-class Show:
-    """Arcs that are played side by side.
-
-    Attributes:
-        policy: arcs of the stage-1 policy.
-        hybrid: arcs of the hybrid controller; none to show the policy alone.
-        title: of the policy, as "RL policy (DQN)".
-    """
-
-    policy: Sequence[HybridArc]
-    hybrid: Sequence[HybridArc] = ()
-    title: str = "RL policy"
+__all__ = ["Floor", "Show", "render_replay"]
 
 
 def render_replay(
@@ -52,27 +37,28 @@ def render_replay(
     *,
     floor: Floor | None = None,
 ) -> None:
-    """Write a video that plays shows one after the other, with a poster beside it; or the poster alone.
+    """Writes a video that plays shows one after the other, with a poster beside it; or the poster alone.
 
     Args:
         task: the task of the arcs; its `scene` names the site whose path is drawn.
         shows: the arcs to play.
-        path: the video, an mp4 or a gif, with the poster as a PNG of the same name; or a png for the
-            poster alone. The poster is the end of the first show.
-        options: how it is rendered.
-        floor: what to draw on the floor.
+        path: of the video, an mp4 or a gif, with the poster as a PNG of the same name; or of a PNG for
+            the poster alone. The poster shows the end of the first show.
+        options: how the replay is rendered.
+        floor: the marks on the floor.
 
     Raises:
         BadArtifact: an arc is not of this task or its model.
         BadInput: nothing to play, or a value that cannot be used.
         NoRenderer: there is no GL library or no video encoder.
     """
+    size, layout = options.size, options.layout
     if path.suffix not in FORMATS:
         raise BadInput(f"{path} is no replay: give a name that ends in one of {', '.join(FORMATS)}")
     if not shows or not all(show.policy for show in shows):
         raise BadInput("there is nothing to replay: give shows with arcs of the policy")
-    if options.layout not in LAYOUTS:
-        raise unknown("layout", options.layout, LAYOUTS)
+    if layout not in LAYOUTS:
+        raise unknown("layout", layout, LAYOUTS)
     if not 1 <= options.fps <= FASTEST:
         raise BadInput(f"no video has {options.fps} frames a second: give 1 to {FASTEST}")
     if not 1 <= options.slow_motion <= SLOWEST_MOTION:
@@ -82,17 +68,14 @@ def render_replay(
         )
     camera = options.camera or task.scene.camera
     mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
-    screens = [
-        Screen(task, (show.title, show.policy), show.hybrid, options.layout, camera, floor)
-        for show in shows
-    ]
+    screens = [Screen(task, show, layout, camera, floor) for show in shows]
     for screen in screens:
-        screen.check(options.size)
+        screen.check(size)
     if path.suffix in ENCODERS:
         poster = _film(screens, path, options)
     else:
-        with closing(screens[0].canvas(options.size)) as canvas:
-            stage = screens[0].open(options.size, canvas)
+        with closing(screens[0].canvas(size)) as canvas:
+            stage = screens[0].open(size, canvas)
             stage.draw(screens[0].end)
             poster = stage.fine(FINER)
     with artifacts.replacing(path.with_suffix(".png")) as temporary:
@@ -100,12 +83,12 @@ def render_replay(
 
 
 def _film(screens: Sequence[Screen], path: Path, options: ReplayOptions) -> np.ndarray:
-    """Write the video; returns the end of the first show, `FINER` times larger."""
+    """Writes the video; returns the end of the first show, `FINER` times larger."""
     times = [
         frame_times(screen.end, options.fps, screen.jumps, options.slow_motion)
         for screen in screens
     ]
-    frames, poster = 0, None
+    frames, posters = 0, []
     with (
         closing(Progress("rendering", sum(map(len, times)), "frames")) as progress,
         closing(screens[0].canvas(options.size)) as canvas,
@@ -117,7 +100,6 @@ def _film(screens: Sequence[Screen], path: Path, options: ReplayOptions) -> np.n
                 add(stage.draw(t))
                 frames += 1
                 progress.update(frames)
-            if poster is None:
-                poster = stage.fine(FINER)
-    assert poster is not None
-    return poster
+            if not posters:
+                posters.append(stage.fine(FINER))
+    return posters[0]

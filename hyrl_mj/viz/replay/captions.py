@@ -15,6 +15,7 @@ from hyrl_mj.viz.colours import RGB
 from hyrl_mj.viz.replay.marks import BAD, GOOD, INK, OPEN, PAPER, WHITE
 from hyrl_mj.viz.replay.panel import Track
 
+Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 EDGE = (205, 208, 213)
 SMALLEST_TEXT = 8  # [pixels]
 OUTCOMES: dict[str, tuple[str, RGB]] = {
@@ -33,7 +34,7 @@ class Group:
     """Tracks of one controller.
 
     Attributes:
-        name: of the controller, for people.
+        name: of the controller, as captions show it.
         tracks: of its arcs.
     """
 
@@ -47,14 +48,14 @@ class Layout:
 
     Attributes:
         width, height: of the panel [pixels].
-        finer: how many times larger it is drawn than it will be seen.
+        finer: how many times larger the panel is drawn than it will be seen.
     """
 
     width: int
     height: int
     finer: int = 1
 
-    @cached_property
+    @property
     def text(self) -> int:
         """Height of the letters [pixels]."""
         seen = min(self.width / 32, self.height / 30) / self.finer
@@ -71,23 +72,22 @@ class Layout:
         return self.height - 2 * self.bar
 
     @cached_property
-    def fonts(self) -> tuple[ImageFont.FreeTypeFont, ImageFont.FreeTypeFont]:
+    def fonts(self) -> tuple[Font, Font]:
         """A font for titles, and a smaller one."""
-        large = ImageFont.load_default(size=self.text)
-        small = ImageFont.load_default(size=round(0.85 * self.text))
-        assert isinstance(large, ImageFont.FreeTypeFont)
-        assert isinstance(small, ImageFont.FreeTypeFont)
+        sizes = self.text, round(0.85 * self.text)
+        large, small = (ImageFont.load_default(size) for size in sizes)
         return large, small
 
     def above(self, title: str, arc: HybridArc) -> np.ndarray:
-        """The bar with title and noise: (bar, width, 3)."""
+        """Returns the bar with title and noise: (bar, width, 3)."""
         line = _Line(self)
         line.words(title, INK, large=True)
-        line.at_right(_noise(arc))
+        quiet = arc.noise == "none" or arc.bound == 0
+        line.at_right("no noise" if quiet else f"{arc.noise} noise, eps = {arc.bound:g}")
         return line.pixels
 
     def below(self, groups: Sequence[Group], t: float) -> np.ndarray:
-        """The bar with what is going on at time t [s]: (bar, width, 3)."""
+        """Returns the bar with time, modes and outcomes at time t [s]: (bar, width, 3)."""
         line = _Line(self)
         longest = max(track.end for group in groups for track in group.tracks)
         line.words(f"t = {min(t, longest):.2f} s", INK, room="t = 00.00 s")
@@ -95,24 +95,10 @@ class Layout:
             if len(groups) > 1:
                 line.words(group.name, INK)
             if len(group.tracks) == 1:
-                self._one(line, group.tracks[0], t)
+                _one(line, group.tracks[0], t)
             else:
-                self._several(line, group.tracks, t)
+                _several(line, group.tracks, t)
         return line.pixels
-
-    def _one(self, line: _Line, track: Track, t: float) -> None:
-        arc, row = track.arc, track.arc.at(t)
-        if track.modes:
-            line.words(f"j = {arc.j[row]}", INK, room="j = 00")
-            line.badge(f"q = {track.task.scene.mode_name(int(arc.q[row]))}", track.colour(row))
-        if t >= track.end:
-            line.badge(*OUTCOMES[_outcome(track)])
-
-    def _several(self, line: _Line, tracks: Sequence[Track], t: float) -> None:
-        over = Counter(_outcome(track) for track in tracks if t >= track.end)
-        for outcome, number in sorted(over.items()):
-            words, colour = OUTCOMES[outcome]
-            line.badge(f"{number} of {len(tracks)} {words}", colour)
 
 
 class _Line:
@@ -129,37 +115,49 @@ class _Line:
 
     @property
     def pixels(self) -> np.ndarray:
+        """The bar: (height, width, 3) uint8."""
         return np.asarray(self._image)
 
     def words(self, words: str, colour: RGB, *, large: bool = False, room: str = "") -> None:
-        """Words that take at least as much room as others."""
+        """Writes words, which take at least as much room as the text `room`."""
         font = self._large if large else self._small
         self._draw.text((self._x, self._middle), words, colour, font, anchor="lm")
         self._x += max(font.getlength(words), font.getlength(room)) + self._gap
 
     def badge(self, words: str, colour: RGB) -> None:
-        """White words on a coloured plate."""
+        """Writes white words on a coloured plate."""
         pad, half = self._gap / 3, 0.75 * self._gap
         end = self._x + self._small.getlength(words) + 2 * pad
-        plate = (self._x, self._middle - half, end, self._middle + half)
-        self._draw.rectangle(plate, colour)
+        self._draw.rectangle((self._x, self._middle - half, end, self._middle + half), colour)
         at = (self._x + pad, self._middle)
         self._draw.text(at, words, WHITE, self._small, anchor="lm")
         self._x = end + self._gap / 2
 
     def at_right(self, words: str) -> None:
-        """Words at the right end."""
+        """Writes words at the right end."""
         x = self._image.width - self._gap / 2
         self._draw.text((x, self._middle), words, OPEN, self._small, anchor="rm")
 
 
-def _noise(arc: HybridArc) -> str:
-    if arc.noise == "none" or arc.bound == 0:
-        return "no noise"
-    return f"{arc.noise} noise, eps = {arc.bound:g}"
+def _one(line: _Line, track: Track, t: float) -> None:
+    """Writes jumps, mode and outcome of an arc at time t [s]."""
+    arc, row = track.arc, track.arc.at(t)
+    if track.modes:
+        line.words(f"j = {arc.j[row]}", INK, room="j = 00")
+        line.badge(f"q = {track.task.scene.mode_name(int(arc.q[row]))}", track.colour(row))
+    if t >= track.end:
+        line.badge(*OUTCOMES[_outcome(track)])
+
+
+def _several(line: _Line, tracks: Sequence[Track], t: float) -> None:
+    """Counts the outcomes of arcs that have ended by time t [s]."""
+    ended = Counter(_outcome(track) for track in tracks if t >= track.end)
+    for outcome, number in sorted(ended.items()):
+        words, colour = OUTCOMES[outcome]
+        line.badge(f"{number} of {len(tracks)} {words}", colour)
 
 
 def _outcome(track: Track) -> str:
-    """The outcome of an arc; who crosses the finishing line elsewhere than at the set-point misses it."""
+    """Returns the outcome of an arc; "missed" if it crosses the finishing line off the set-point."""
     arc = track.arc
     return "missed" if arc.outcome == "reached" and not arc.arrives(track.task) else arc.outcome

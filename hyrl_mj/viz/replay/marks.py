@@ -1,4 +1,4 @@
-"""What a replay adds to the scene: flat bars and discs of one colour, and what the floor shows."""
+"""What a replay adds to the scene: flat bars and discs of one colour, and the marks on the floor."""
 
 from __future__ import annotations
 
@@ -21,37 +21,39 @@ GOOD, BAD = rgb(colours.GOOD), rgb(colours.BAD)
 PAPER, OPEN = (246, 247, 249), (110, 116, 126)
 OVERLAP, CRITICAL, BOUND = rgb(colours.OVERLAP), (205, 30, 45), (120, 95, 200)
 
-# Heights above the tracked site [m], from the floor up: what lies higher is seen.
+# Heights above the tracked site [m], from the floor up: higher marks hide lower ones.
 ON_FLOOR, ON_SETS, ON_BOUND, ON_PATH, ON_TOP = -0.006, -0.004, -0.002, 0.0, 0.006
 THICKNESS = 0.004  # [m]
-FLYING = 0.3  # whose tracked site is so far above the floor flies [m]
+FLYING = 0.3  # a robot flies if its tracked site is higher than this above the floor [m]
 CRITICAL_RADIUS, OVERLAP_WIDTH = 0.02, 0.16  # [m]
 # Cells of a strip of the overlap: short enough to follow a bent coordinate.
 STRIP = 16
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def bar(
-    scene: mujoco.MjvScene,
-    start: np.ndarray,
-    end: np.ndarray,
-    colour: RGB,
-    *,
-    width: float,
-    height: float,
-    reach: float = 0.0,
-    alpha: float = 1.0,
-) -> None:
-    """Add a flat bar, which is drawn several times faster than a capsule.
+@dataclass(frozen=True)
+class Look:
+    """How a bar looks.
 
-    Args:
-        scene: to add it to.
-        start, end: (3,) points [m].
-        colour: of it.
+    Attributes:
+        colour: red, green and blue.
         width: across [m].
-        height: above the points [m].
-        reach: by which it goes on beyond either end [m].
+        reach: how far the bar goes on beyond either end [m].
         alpha: opacity, 0 to 1.
+    """
+
+    colour: RGB
+    width: float
+    reach: float = 0.0
+    alpha: float = 1.0
+
+
+def bar(
+    scene: mujoco.MjvScene, start: np.ndarray, end: np.ndarray, look: Look, height: float = 0.0
+) -> None:
+    """Adds a flat bar between two points (3,), a height above them [m].
+
+    A bar is drawn several times faster than a capsule.
     """
     length = float(np.linalg.norm(end - start))
     if length < 1e-9:
@@ -59,19 +61,20 @@ def bar(
     x, y, z = (end - start) / length
     flat = np.hypot(x, y)
     cos, sin = (x / flat, y / flat) if flat > 1e-6 else (1.0, 0.0)
-    # Along it, across it on the level, and what is left: NumPy's cross product takes longer than all of it.
+    # Along the bar, across it on the level, and the third axis: NumPy's cross product is slower.
     axes = np.array([[x, -sin, -cos * z], [y, cos, -sin * z], [z, 0.0, flat]])
-    size = (length / 2 + reach, width / 2, THICKNESS / 2)
+    size = (length / 2 + look.reach, look.width / 2, THICKNESS / 2)
     middle = (start + end) / 2 + height * UP
-    _add(scene, mujoco.mjtGeom.mjGEOM_BOX, size, middle, axes, colour, alpha)
+    kind, colour = mujoco.mjtGeom.mjGEOM_BOX, (*look.colour, 255 * look.alpha)
+    _add(scene, kind, size, middle, colour, axes)
 
 
 def disc(
     scene: mujoco.MjvScene, centre: np.ndarray, radius: float, height: float, colour: RGB
 ) -> None:
-    """Add a flat disc around a point (3,), a height above it [m]."""
+    """Adds a flat disc around a point (3,), a height above it [m]."""
     kind, size = mujoco.mjtGeom.mjGEOM_CYLINDER, (radius, THICKNESS / 2, 0.0)
-    _add(scene, kind, size, centre + height * UP, np.eye(3), colour, 1.0)
+    _add(scene, kind, size, centre + height * UP, (*colour, 255), np.eye(3))
 
 
 def _add(
@@ -79,30 +82,26 @@ def _add(
     kind: mujoco.mjtGeom,
     size: tuple[float, float, float],
     pos: np.ndarray,
+    colour: tuple[int, int, int, float],
     axes: np.ndarray,
-    colour: RGB,
-    alpha: float,
 ) -> None:
-    """Add a geom to the scene, unless a very long path has used up all there are."""
+    """Adds a geom to the scene, unless a very long path has used up all geoms."""
     if scene.ngeom < scene.maxgeom:
         geom = scene.geoms[scene.ngeom]
-        rgba = np.array([*colour, 255 * alpha], dtype=np.float32) / 255
+        rgba = np.array(colour, dtype=np.float32) / 255
         mujoco.mjv_initGeom(geom, kind, np.array(size), pos, axes.ravel(), rgba)
-        # MuJoCo leaves in it which geom of the model was drawn in this place before.
+        # MuJoCo leaves the number of the model's geom that was drawn in this place before.
         geom.objtype, geom.objid = mujoco.mjtObj.mjOBJ_UNKNOWN, -1
         geom.specular = 0  # marks keep the colours of the captions
-        geom.transparent = int(alpha < 1)
+        geom.transparent = int(rgba[3] < 1)
         scene.ngeom += 1
 
 
 class Tracker:
     """The positions of the site of a robot that its task's scene tracks.
 
-    Args:
-        task: whose MJCF has that site.
-
     Raises:
-        BadInput: it has none.
+        BadInput: the task's MJCF has no such site.
     """
 
     def __init__(self, task: Task):
@@ -110,7 +109,7 @@ class Tracker:
         self._site = mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_SITE, task.scene.tracked)
 
     def of_qpos(self, qpos: np.ndarray) -> np.ndarray:
-        """Positions (n, nq) -> points (n, 3) [m]."""
+        """Returns the points (n, 3) [m] at positions (n, nq)."""
         points = np.empty((len(qpos), 3))
         for point, position in zip(points, qpos, strict=True):
             self._data.qpos[:] = position
@@ -119,18 +118,18 @@ class Tracker:
         return points
 
     def of_z(self, z: np.ndarray) -> np.ndarray:
-        """Chart points (n, d) -> points (n, 3) [m]."""
+        """Returns the points (n, 3) [m] at chart points (n, d)."""
         return self.of_qpos(self._task.state(z)[0])
 
 
 @dataclass(frozen=True)
 class Floor:
-    """What is known before a run and lies on the floor.
+    """The marks on the floor: what is known before a run.
 
     Attributes:
         critical: (k, 3) points of M* [m].
-        strips: (s, 2, 3) ends of the strips that make up the overlap of the extended sets [m], and
-        widths: (s,) of each [m].
+        strips: (s, 2, 3) ends of the strips that make up the overlap of the extended sets [m].
+        widths: (s,) width of each strip [m].
     """
 
     critical: np.ndarray
@@ -141,7 +140,7 @@ class Floor:
     def of(
         task: Task, critical: CriticalSet, partition: Partition, extended: ExtendedSets | None
     ) -> Floor:
-        """Of the results of the stages, on a chart of one or two dimensions; no sets, no overlap."""
+        """Returns the marks of results on a chart of one or two dimensions; without sets no overlap."""
         tracker, strips, widths = Tracker(task), [], []
         half = partition.grid.spacing / 2
         for ends in _strips(critical, partition, extended) if extended else ():
@@ -155,16 +154,16 @@ class Floor:
         return Floor(points, np.reshape(strips, (-1, 2, 3)), np.array(widths))
 
     def draw(self, scene: mujoco.MjvScene) -> None:
-        """Add it to a scene."""
+        """Adds the marks to a scene."""
         for (start, end), width in zip(self.strips, self.widths, strict=True):
-            # A little longer than it is, so that no gap is seen where the strips turn.
-            bar(scene, start, end, OVERLAP, width=width, height=ON_FLOOR, reach=width / 50)
+            # The strips are a little longer, so that no gap is seen where they turn.
+            bar(scene, start, end, Look(OVERLAP, width, reach=width / 50), ON_FLOOR)
         for point in self.critical:
             disc(scene, point, CRITICAL_RADIUS, ON_SETS, CRITICAL)
 
 
 def on_floor(task: Task, points: np.ndarray) -> np.ndarray:
-    """Where a robot casts its shadow when it is at points (n, 3) [m], if it flies; else these points."""
+    """Returns the points (n, 3) [m] on the floor below robots that fly; those of others unchanged."""
     floor = mujoco.mj_name2id(task.model, mujoco.mjtObj.mjOBJ_GEOM, "floor")
     if floor < 0:
         return points
@@ -177,9 +176,9 @@ def on_floor(task: Task, points: np.ndarray) -> np.ndarray:
 def _strips(
     critical: CriticalSet, partition: Partition, extended: ExtendedSets
 ) -> Iterator[np.ndarray]:
-    """The overlap at M* in strips along the chart's last coordinate: the ends (2, d) of each.
+    """Yields the ends (2, d) of strips along the chart's last coordinate that make up the overlap at M*.
 
-    Where the ways have joined again all sets overlap, and there is nothing to see.
+    Where the ways have joined again all sets overlap, and no strip is drawn.
     """
     grid = extended.sets[0].grid
     if not len(critical.points):

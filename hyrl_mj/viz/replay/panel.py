@@ -20,22 +20,23 @@ from hyrl_mj.viz.replay import marks
 from hyrl_mj.viz.replay.marks import Floor, Tracker
 
 PATH_WIDTH, START_RADIUS, JUMP_RADIUS, CROSS = 0.032, 0.035, 0.055, 0.075  # [m]
-BOUND_WIDTH, BOUND_PIECES = 0.05, 4
-BOUND_ALPHA, GHOST_ALPHA = 0.45, 0.35
-# By which what is drawn anew is larger than what has moved [pixels].
+BOUND_PIECES, GHOST_ALPHA = 4, 0.35
+BOUND_LOOK = marks.Look(marks.BOUND, width=0.05, alpha=0.45)
+FAILED_LOOK = marks.Look(marks.BAD, PATH_WIDTH)
+# The part that is drawn anew is this much larger than what has moved [pixels].
 MARGIN = 2
 FAILED = ("crashed", "out_of_bounds", "stalled", "unstable")
 
 
 class Track:
-    """An arc, ready to be drawn.
+    """An arc with the robot's position at each sample, ready to be drawn.
 
     Args:
-        task: what it is of.
+        task: of the arc.
         arc: the arc.
 
     Raises:
-        BadArtifact: it is of another task, or its states are not of the task's model.
+        BadArtifact: the arc is of another task, or its states do not fit the task's model.
     """
 
     def __init__(self, task: Task, arc: HybridArc):
@@ -48,11 +49,11 @@ class Track:
             )
         model, data = task.model, mujoco.MjData(task.model)
         kind = mujoco.mjtState.mjSTATE_INTEGRATION
-        width = mujoco.mj_stateSize(model, kind)
-        if arc.state.shape != (len(arc.t), width):
+        shape = (len(arc.t), mujoco.mj_stateSize(model, kind))
+        if arc.state.shape != shape:
             raise BadArtifact(
                 f"the states of an arc of {arc.task} have shape {arc.state.shape}, model "
-                f"{mjcf.model_name(model)} needs {(len(arc.t), width)}: simulate it again"
+                f"{mjcf.model_name(model)} needs {shape}: simulate it again"
             )
         self._tracker = Tracker(task)
         # Positions (N, nq) at each row of the arc, those that were measured, and (N, 3) of the site.
@@ -60,7 +61,7 @@ class Track:
         for i, state in enumerate(arc.state):
             mujoco.mj_setState(model, data, state, kind)
             self._qpos[i] = data.qpos
-        # Noise moves what the chart tells of a position, and leaves the rest as it is.
+        # Noise moves the chart's coordinates of a position, and leaves the others as they are.
         noise = task.state(task.z(arc.measured))[0] - task.state(arc.z)[0]
         self._measured = self._qpos + noise
         self.points = self._tracker.of_qpos(self._qpos)
@@ -71,25 +72,25 @@ class Track:
         return np.flatnonzero(np.diff(self.arc.j) > 0) + 1
 
     def colour(self, row: int) -> RGB:
-        """The colour of the path from a row on."""
+        """Returns the colour of the path from a row on."""
         colours = marks.MODE_COLOURS
         return colours[self.arc.q[row] % len(colours)] if self.modes else marks.POLICY_COLOUR
 
     def qpos(self, t: float) -> np.ndarray:
-        """The robot's position (nq,) at time t [s], between samples interpolated."""
+        """Returns the robot's position (nq,) at time t [s], interpolated between samples."""
         return self._at(t, self._qpos)
 
     def point(self, t: float) -> np.ndarray:
-        """The tracked site (3,) [m] at time t [s]."""
+        """Returns the position (3,) [m] of the tracked site at time t [s]."""
         return self._tracker.of_qpos(self.qpos(t)[None])[0]
 
     def measured(self, t: float) -> np.ndarray | None:
-        """Where the robot was measured at the last sample (nq,); None where it was not."""
-        found = self._measured[self.arc.at(t)]
-        return found if np.isfinite(found).all() and self.arc.bound > 0 else None
+        """Returns the position (nq,) that was measured at the last sample; None without noise."""
+        qpos = self._measured[self.arc.at(t)]
+        return qpos if np.isfinite(qpos).all() and self.arc.bound > 0 else None
 
     def bounds(self, t: float) -> list[np.ndarray]:
-        """For each noisy coordinate, points (k, 3) [m] from where to where it may be measured."""
+        """Returns a line (k, 3) [m] for each noisy coordinate: the points that may be measured."""
         z, qpos = self._at(t, self.arc.z), self.qpos(t)
         noise = self.task.noise_in_chart(self.arc.bound)
         share = np.linspace(-1, 1, BOUND_PIECES + 1)[:, None]
@@ -98,7 +99,7 @@ class Track:
         return [self._tracker.of_qpos(qpos + shift) for shift in shifts]
 
     def _at(self, t: float, values: np.ndarray) -> np.ndarray:
-        """Values at the rows (N, c), interpolated at time t: (c,)."""
+        """Returns values (c,) at time t, interpolated between the rows (N, c)."""
         row = self.arc.at(t)
         if row + 1 == len(values):
             return values[row]
@@ -118,16 +119,16 @@ class _Drawn:
 class Panel:
     """Draws tracks in one scene, at times that never go back.
 
-    What stays as it is is drawn once: paths stay in the scene, and while the camera rests only what has
-    moved is drawn anew.
+    What does not change is drawn once: paths stay in the scene, and while the camera rests only the part
+    of the picture that has changed is drawn anew.
 
     Args:
-        task: what the tracks are of.
-        tracks: with their robots.
+        task: of the tracks.
+        tracks: a robot is drawn for each.
         canvas: to draw on.
         width, height: of the picture [pixels].
         camera: a camera of the MJCF; one on the robot follows that of the first track.
-        floor: what lies on the floor.
+        floor: the marks on the floor.
     """
 
     def __init__(
@@ -141,10 +142,10 @@ class Panel:
         floor: Floor | None = None,
     ):
         self._tracks, self._camera = tracks, camera
-        found = mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
-        fixed = task.model.cam_mode[found] == mujoco.mjtCamLight.mjCAMLIGHT_FIXED
-        self._rests = fixed and task.model.cam_bodyid[found] == 0
-        # A bar for each row, and what else there is, with room to spare.
+        number = mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
+        fixed = task.model.cam_mode[number] == mujoco.mjtCamLight.mjCAMLIGHT_FIXED
+        self._rests = fixed and task.model.cam_bodyid[number] == 0
+        # A bar for each row, and all else in the scene, with room to spare.
         geoms = sum(len(track.arc.t) for track in tracks) + GEOMS * (1 + len(tracks))
         self._renderer = SceneRenderer(task.model, width, height, geoms, canvas)
         self._renderer.clear()
@@ -157,33 +158,36 @@ class Panel:
         self._drawn = [_Drawn() for _ in tracks]
 
     def draw(self, t: float, picture: np.ndarray) -> None:
-        """Bring the picture (height, width, 3) of the last call to time t [s]."""
+        """Changes the picture (height, width, 3) of the last call to that of time t [s]."""
         renderer = self._renderer
         times = [min(t, track.end) for track in self._tracks]
-        fresh = self._drawn[0].t < 0
+        first = self._drawn[0].t < 0
         moved = [now > drawn.t for now, drawn in zip(times, self._drawn, strict=True)]
         if not any(moved):
             return
         renderer.drop()
-        passed = [self._path(*each) for each in zip(self._tracks, self._drawn, times, strict=True)]
+        paths = [self._path(*row) for row in zip(self._tracks, self._drawn, times, strict=True)]
         renderer.keep()
         renderer.look(self._tracks[0].qpos(times[0]), self._camera)
-        boxes = [self._robot(*each) for each in zip(self._tracks, times, passed, strict=True)]
-        if fresh or not self._rests:
+        boxes = [self._robot(*row) for row in zip(self._tracks, times, paths, strict=True)]
+        if first or not self._rests:
             renderer.redraw(picture, (0, 0, renderer.width, renderer.height))
         else:
             for box, drawn, is_moved in zip(boxes, self._drawn, moved, strict=True):
-                if is_moved:
-                    self._again(picture, box, drawn.box)
+                # Drawn anew where the robot is or was.
+                left, top = np.minimum(box[:2], drawn.box[:2])
+                right, bottom = np.maximum(box[2:], drawn.box[2:])
+                if is_moved and left < right and top < bottom:
+                    renderer.redraw(picture, (left, top, right, bottom))
         for drawn, now, box in zip(self._drawn, times, boxes, strict=True):
             drawn.t, drawn.box = now, box
 
     def fine(self, finer: int) -> np.ndarray:
-        """The picture of the last call, `finer` times larger."""
+        """Returns the picture of the last call, `finer` times larger."""
         return self._renderer.draw(finer)
 
     def _path(self, track: Track, drawn: _Drawn, t: float) -> np.ndarray:
-        """Add to the scene what has been driven to the last sample; its points (k, 3)."""
+        """Adds the path up to the last sample to the scene; returns its new points (k, 3)."""
         scene, last, first = self._renderer.scene, track.arc.at(t), drawn.row
         for row in range(first, last):
             self._segment(track, row, track.points[row + 1])
@@ -196,21 +200,15 @@ class Panel:
         return track.points[first : last + 1]
 
     def _segment(self, track: Track, row: int, end: np.ndarray) -> None:
+        """Adds the path from a row to a point (3,) to the scene."""
         # Where a path comes back in another mode the later one is drawn over the earlier. Square ends
         # as long as half the width close the gaps at bends.
+        look = marks.Look(track.colour(row), PATH_WIDTH, reach=PATH_WIDTH / 2)
         height = marks.ON_PATH + 2e-4 * (track.arc.j[row] % 20)
-        marks.bar(
-            self._renderer.scene,
-            track.points[row],
-            end,
-            track.colour(row),
-            width=PATH_WIDTH,
-            height=height,
-            reach=PATH_WIDTH / 2,
-        )
+        marks.bar(self._renderer.scene, track.points[row], end, look, height)
 
-    def _robot(self, track: Track, t: float, passed: np.ndarray) -> Box:
-        """Add the robot, its ghost and the noise bound to the scene; where all of it is seen."""
+    def _robot(self, track: Track, t: float, path: np.ndarray) -> Box:
+        """Adds the robot, its ghost and the noise bound to the scene; returns where all is seen."""
         renderer, scene = self._renderer, self._renderer.scene
         first, point = scene.ngeom, track.point(t)
         self._segment(track, track.arc.at(t), point)
@@ -218,15 +216,7 @@ class Panel:
         if not over and track.arc.bound > 0:
             for line in track.bounds(t):
                 for start, end in pairwise(line):
-                    marks.bar(
-                        scene,
-                        start,
-                        end,
-                        marks.BOUND,
-                        width=BOUND_WIDTH,
-                        height=marks.ON_BOUND,
-                        alpha=BOUND_ALPHA,
-                    )
+                    marks.bar(scene, start, end, BOUND_LOOK, marks.ON_BOUND)
         renderer.add_robot(track.qpos(t))
         ghost = track.measured(t)
         if ghost is not None and not over:
@@ -235,31 +225,12 @@ class Panel:
                 scene.geoms[number].transparent = 1
         if over and track.arc.outcome in FAILED:
             for side in ((CROSS, CROSS, 0.0), (CROSS, -CROSS, 0.0)):
-                marks.bar(
-                    scene,
-                    point - side,
-                    point + side,
-                    marks.BAD,
-                    width=PATH_WIDTH,
-                    height=marks.ON_TOP + 0.18,
-                )
+                marks.bar(scene, point - side, point + side, FAILED_LOOK, marks.ON_TOP + 0.18)
         geoms = scene.geoms[first : scene.ngeom]
-        points = np.vstack([passed, *[geom.pos for geom in geoms]])
-        radii = [renderer.reach(geom) for geom in geoms]
-        return self._box(points, np.array([JUMP_RADIUS] * len(passed) + radii))
-
-    def _box(self, points: np.ndarray, radii: np.ndarray) -> Box:
-        """The part of the picture in which balls around points (n, 3) are seen."""
-        renderer = self._renderer
-        low, high = renderer.extent(points, radii)
+        points = np.vstack([path, *[geom.pos for geom in geoms]])
+        radii = [JUMP_RADIUS] * len(path) + [renderer.reach(geom) for geom in geoms]
+        low, high = renderer.extent(points, np.array(radii))
         size = (renderer.width, renderer.height)
         left, top = np.floor(low.min(axis=0) - MARGIN).clip(0, size).astype(int)
         right, bottom = np.ceil(high.max(axis=0) + MARGIN).clip(0, size).astype(int)
         return left, top, right, bottom
-
-    def _again(self, picture: np.ndarray, now: Box, before: Box) -> None:
-        """Draw anew where something is or was."""
-        left, top = min(now[0], before[0]), min(now[1], before[1])
-        right, bottom = max(now[2], before[2]), max(now[3], before[3])
-        if left < right and top < bottom:
-            self._renderer.redraw(picture, (left, top, right, bottom))

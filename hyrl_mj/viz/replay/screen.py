@@ -1,4 +1,4 @@
-"""What is seen at a time: panels side by side or one for all, drawn on one canvas."""
+"""What a replay shows at a time: panels side by side or one for all, drawn on one canvas."""
 
 from __future__ import annotations
 
@@ -19,42 +19,44 @@ LAYOUTS = ("side-by-side", "overlay")
 SMALLEST = (240, 160)  # [pixels] of a panel, for captions that can be read
 
 
+@dataclass(frozen=True)
+class Show:
+    """Arcs that are played at the same time.
+
+    Attributes:
+        policy: arcs of the stage-1 policy.
+        hybrid: arcs of the hybrid controller; none to show the policy alone.
+        title: of the policy, as "RL policy (DQN)".
+    """
+
+    policy: Sequence[HybridArc]
+    hybrid: Sequence[HybridArc] = ()
+    title: str = "RL policy"
+
+
 class Screen:
-    """Arcs that are played together, laid out in panels: a title and groups of tracks for each.
+    """A show, laid out in panels with a title and groups of tracks.
 
     Args:
         task: of the arcs.
-        policy: title and arcs of the stage-1 policy.
-        hybrid: arcs of the hybrid controller; without them the policy is shown alone.
+        show: the arcs.
         layout: one of `LAYOUTS`.
         camera: a camera of the MJCF.
-        floor: what lies on the floor.
+        floor: the marks on the floor.
     """
 
-    def __init__(
-        self,
-        task: Task,
-        policy: tuple[str, Sequence[HybridArc]],
-        hybrid: Sequence[HybridArc],
-        layout: str,
-        camera: str,
-        floor: Floor | None,
-    ):
+    def __init__(self, task: Task, show: Show, layout: str, camera: str, floor: Floor | None):
         self._task, self._camera, self._floor = task, camera, floor
-        title, arcs = policy
-        learned = Group(title, [Track(task, arc) for arc in arcs])
-        if not hybrid:
-            self._panels: list[tuple[str, list[Group]]] = [(learned.name, [learned])]
-            return
-        joined = Group("HyRL", [Track(task, arc) for arc in hybrid])
-        started = {int(arc.q[0]) for arc in hybrid}
-        where = "each mode" if len(started) > 1 else f"q = {task.scene.mode_name(*started)}"
-        self._panels = [(f"{learned.name} and {joined.name}", [learned, joined])]
-        if layout == "side-by-side":
-            self._panels = [
-                (learned.name, [learned]),
-                (f"HyRL, started in {where}", [joined]),
-            ]
+        policy = Group(show.title, [Track(task, arc) for arc in show.policy])
+        hybrid = Group("HyRL", [Track(task, arc) for arc in show.hybrid])
+        self._tracks = [*policy.tracks, *hybrid.tracks]
+        self._panels = [(policy.name, [policy])]
+        if show.hybrid and layout == "overlay":
+            self._panels = [(f"{policy.name} and {hybrid.name}", [policy, hybrid])]
+        elif show.hybrid:
+            modes = {int(arc.q[0]) for arc in show.hybrid}
+            where = "each mode" if len(modes) > 1 else f"q = {task.scene.mode_name(*modes)}"
+            self._panels.append((f"HyRL, started in {where}", [hybrid]))
 
     @property
     def end(self) -> float:
@@ -66,12 +68,8 @@ class Screen:
         """The times [s] of all jumps."""
         return [track.arc.t[row] for track in self._tracks for row in track.jumps]
 
-    @property
-    def _tracks(self) -> list[Track]:
-        return [t for _, groups in self._panels for group in groups for t in group.tracks]
-
     def check(self, size: tuple[int, int]) -> None:
-        """Raise `BadInput` unless it has room in so many pixels."""
+        """Raises `BadInput` unless a frame of this size [pixels] has room for the panels."""
         least = len(self._panels) * SMALLEST[0], SMALLEST[1]
         if any(n % 2 or not small <= n <= LARGEST for n, small in zip(size, least, strict=True)):
             raise BadInput(
@@ -80,19 +78,20 @@ class Screen:
             )
 
     def canvas(self, size: tuple[int, int]) -> Canvas:
-        """What it can be drawn on, in so many pixels. Close it in the end."""
+        """Returns a canvas for the panels of a frame [pixels]; the caller closes it."""
         layout = self._layout(size)
         return Canvas(self._task.model, layout.width, layout.scene_height)
 
     def open(self, size: tuple[int, int], canvas: Canvas) -> Stage:
-        """Get ready to draw it, in so many pixels."""
+        """Returns a stage that draws the show in frames of this size [pixels]."""
         layout, frame = self._layout(size), np.empty((size[1], size[0], 3), dtype=np.uint8)
-        parts = np.split(frame, len(self._panels), axis=1)
+        shape = (layout.width, layout.scene_height)
         views = []
+        parts = np.split(frame, len(self._panels), axis=1)
         for part, (title, groups) in zip(parts, self._panels, strict=True):
             tracks = [track for group in groups for track in group.tracks]
-            at = (layout.width, layout.scene_height, self._camera, self._floor)
-            views.append(_View(part, layout, title, groups, Panel(self._task, tracks, canvas, *at)))
+            panel = Panel(self._task, tracks, canvas, *shape, self._camera, self._floor)
+            views.append(_View(part, layout, title, groups, panel))
         return Stage(frame, views)
 
     def _layout(self, size: tuple[int, int]) -> Layout:
@@ -101,46 +100,50 @@ class Screen:
 
 @dataclass(frozen=True)
 class Stage:
-    """A screen that is being drawn, at times that never go back."""
+    """Draws a show, at times that never go back."""
 
     _frame: np.ndarray
     _views: Sequence[_View]
 
     def draw(self, t: float) -> np.ndarray:
-        """The frame (height, width, 3) at time t [s], valid until the next."""
+        """Returns the frame (height, width, 3) at time t [s], valid until the next call."""
         for view in self._views:
             view.draw(t)
         return self._frame
 
     def fine(self, finer: int) -> np.ndarray:
-        """The frame that was drawn last, `finer` times larger."""
+        """Returns the last frame, `finer` times larger."""
         return np.hstack([view.fine(finer) for view in self._views])
 
 
+@dataclass
 class _View:
     """A panel with its captions, drawn into its part of the frame (height, width, 3)."""
 
-    def __init__(
-        self, part: np.ndarray, layout: Layout, title: str, groups: Sequence[Group], panel: Panel
-    ):
-        self._part, self._layout, self._panel = part, layout, panel
-        self._title, self._groups, self._t = title, groups, -1.0
-        part[: layout.bar] = self._above(layout)
+    part: np.ndarray
+    layout: Layout
+    title: str
+    groups: Sequence[Group]
+    panel: Panel
+    t: float = -1.0
+
+    def __post_init__(self) -> None:
+        self.part[: self.layout.bar] = self._above(self.layout)
 
     def draw(self, t: float) -> None:
-        """Bring it to time t [s]."""
-        if t == self._t:
+        """Brings the part of the frame to time t [s]."""
+        if t == self.t:
             return
-        bar = self._layout.bar
-        self._panel.draw(t, self._part[bar:-bar])
-        self._part[-bar:] = self._layout.below(self._groups, t)
-        self._t = t
+        bar = self.layout.bar
+        self.panel.draw(t, self.part[bar:-bar])
+        self.part[-bar:] = self.layout.below(self.groups, t)
+        self.t = t
 
     def fine(self, finer: int) -> np.ndarray:
-        """It as it was drawn last, `finer` times larger."""
-        layout = Layout(finer * self._layout.width, finer * self._layout.height, finer)
-        scene = self._panel.fine(finer)
-        return np.vstack([self._above(layout), scene, layout.below(self._groups, self._t)])
+        """Returns the part that was drawn last, `finer` times larger."""
+        layout = Layout(finer * self.layout.width, finer * self.layout.height, finer)
+        scene = self.panel.fine(finer)
+        return np.vstack([self._above(layout), scene, layout.below(self.groups, self.t)])
 
     def _above(self, layout: Layout) -> np.ndarray:
-        return layout.above(self._title, self._groups[0].tracks[0].arc)
+        return layout.above(self.title, self.groups[0].tracks[0].arc)

@@ -13,12 +13,12 @@ AROUND = 0.25  # [s] before and after a jump that are played slowly
 def frame_times(
     end: float, fps: float, jumps: Iterable[float] = (), slow_motion: float = 1.0
 ) -> np.ndarray:
-    """The time of the arc at each frame, to its end and a moment longer.
+    """Returns the time of the arc at each frame, to its end and a moment longer.
 
     Args:
         end: the arc's last time [s].
         fps: frames a second.
-        jumps: times [s] around which it is played slowly.
+        jumps: times [s] around which the arc is played slowly.
         slow_motion: how many times slower; 1 for real time.
 
     Returns:
