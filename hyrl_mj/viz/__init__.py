@@ -1,4 +1,4 @@
-"""Pictures, videos, tables and pages of what a run has found.
+"""Pictures, videos, tables and pages of the results of a run.
 
 The modules `arcs`, `diagnosis`, `encoding`, `figures`, `replay`, `report` and `viewing` import
 matplotlib, Pillow or a GL library, so they are imported only where they are needed.

@@ -122,8 +122,8 @@ def replay_shows(
             raise BadInput(
                 "the latest simulation has its noise: give --noise and --eps to simulate"
             )
-        latest = {who: [run.arc(run.latest_path(who))] for who in ("policy", "hyrl")}
-        return [Show(latest["policy"], latest["hyrl"], run.policy_title)]
+        policy, hybrid = ([run.arc(run.latest_path(who))] for who in ("policy", "hyrl"))
+        return [Show(policy, hybrid, run.policy_title)]
     anew = noise is not None or eps is not None
     arcs = replay_arcs(run, noise or "alternating", eps) if anew else run.arcs()
     names = [name for name, who in arcs if who == "policy"]

@@ -1,4 +1,4 @@
-"""The commands that repeat a run, and the settings that they would not give again."""
+"""The commands that repeat a run, and the settings that they would not repeat."""
 
 from __future__ import annotations
 
@@ -14,15 +14,14 @@ from hyrl_mj.tasks import get_task
 
 def commands(settings: Settings, robustness: Robustness | None) -> list[str]:
     """Returns the commands that repeat the run, and its examination if that had options of its own."""
-    s = settings
-    lines = [beginning(settings)]
-    if robustness and (robustness.episodes or robustness.everywhere or robustness.eps != s.noise):
-        lines.append(_examination(robustness))
+    r, lines = robustness, [beginning(settings)]
+    if r and (r.episodes or r.everywhere or r.eps != settings.noise):
+        lines.append(_examination(r))
     return lines
 
 
 def beginning(settings: Settings, out: Path | None = None) -> str:
-    """Returns what begins such a run, or goes on with it: a command, or a call if the agent is no file."""
+    """Returns the command that begins or continues such a run; a call if the agent is not from a file."""
     s, agent = settings, settings.stage1 if isinstance(settings.stage1, Agent) else None
     if agent and not agent.source:
         rest = "" if s.horizon is None else f", horizon={s.horizon}"
@@ -57,7 +56,7 @@ def _examination(robustness: Robustness) -> str:
 
 
 def changed(run: Run) -> list[str]:
-    """Returns the settings that the command would not give again: a preset of another version made them."""
+    """Returns the names of the settings that differ from those of this version's preset."""
     s = run.settings
     again = preset(
         run.task, s.preset, noise=s.noise, seed=s.seed, horizon=s.horizon,

@@ -17,8 +17,7 @@ FFMPEG_CURE = (
     "check that the disk is writable and has room, and reinstall the encoder: "
     "pip install --force-reinstall imageio-ffmpeg"
 )
-# How a video is encoded, by the end of its name: an H.264 that browsers play, or a GIF. More threads than
-# this only take time from the drawing.
+# How a video is encoded, by its suffix: H.264 as browsers play it, or a GIF. More threads slow the drawing.
 H264 = "-preset veryfast -threads 2 -sws_flags fast_bilinear -movflags +faststart"
 ENCODERS: dict[str, dict[str, Any]] = {
     ".mp4": {"codec": "h264", "crf": 20, "ffmpeg_args": H264},
@@ -35,7 +34,7 @@ def video(
     Args:
         path: of the video; its suffix says whether it is an mp4 or a gif.
         width, height: of the frames [pixels], even.
-        fps: frames a second.
+        fps: frames per second.
 
     Yields:
         A function that appends one frame (height, width, 3) uint8.

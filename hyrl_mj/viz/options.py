@@ -11,7 +11,7 @@ class ReplayOptions:
 
     Attributes:
         layout: side-by-side, or overlay (both controllers in one scene).
-        camera: a camera of the MJCF, as overhead, chase or three_quarter; by default that of the scene.
+        camera: a camera of the MJCF, as overhead, chase or three_quarter; by default the scene's.
         size: width and height of the video [pixels], even numbers, at least 480x160 side by side.
         fps: frames per second.
         slow_motion: how many times slower the video is around jumps.

@@ -37,6 +37,9 @@ MEANINGS = (
 )
 
 
+CONTROLLERS = ("policy", "hyrl")  # the columns of the numbers
+
+
 @dataclass(frozen=True)
 class Number:
     """A number at the top of the page: its name, the values with unit, and under which conditions."""
@@ -52,12 +55,8 @@ def write_report(run: Run, path: Path) -> None:
 
     The same artifacts give the same bytes.
 
-    Args:
-        run: with its hybrid controller.
-        path: of the page, an html.
-
     Raises:
-        BadArtifact: the controller is not finished, or a file is damaged.
+        BadArtifact: the hybrid controller is not finished, or a file is damaged.
         BadInput: the path is no html, or cannot be written.
     """
     if path.suffix != ".html":
@@ -67,14 +66,14 @@ def write_report(run: Run, path: Path) -> None:
 
 def render(run: Run) -> str:
     """Returns the page as HTML."""
-    task, modes = run.task, run.controller.modes
+    task = run.task
     robustness = run.robustness if (run.path / "robustness.json").is_file() else None
     arcs = run.arcs() if all(path.is_file() for path in run.arc_paths().values()) else None
-    arrived = arcs and {who: arrivals(run, arcs, who == "policy") for who in ("policy", "hyrl")}
+    arrived = {who: arrivals(run, arcs, who == "policy") for who in CONTROLLERS} if arcs else None
     return fill(
         "report.html",
         run,
-        modes=[task.scene.mode_name(q) for q in modes],
+        modes=[task.scene.mode_name(q) for q in run.controller.modes],
         worst=task.noise_on(bool(robustness and robustness.everywhere)),
         video=film(run.path / "replay.mp4"),
         pictures=pictures(run.path / "figures"),
@@ -108,31 +107,31 @@ def _numbers(
     elif robustness:
         numbers += _episode_numbers(robustness.episodes)
     if arrived:
-        shares = (f"{count} of {total}" for count, total in arrived.values())
+        policy, hyrl = (f"{count} of {total}" for count, total in arrived.values())
         note = f"the paper's starts, alternating noise {run.settings.noise:g}"
-        numbers.append(Number("replays that reach the set-point", *shares, note))
+        numbers.append(Number("replays that reach the set-point", policy, hyrl, note))
     return numbers
 
 
 def _game_numbers(run: Run, game: GameResult) -> list[Number]:
     """Returns the scores of the worst case at the largest noise bound, and the margins."""
     where, unit = run.task.noise_on(game.everywhere)
-    scores = policy, hyrl = [game.scores[who][-1] for who in ("policy", "hyrl")]
-    noise = f"worst noise on {where} up to {hyrl.eps:g} {unit}"
+    scores = [game.scores[who][-1] for who in CONTROLLERS]
+    noise = f"worst noise on {where} up to {scores[0].eps:g} {unit}"
     limit = f"{noise}; the limit is {percent(game.scores[LIMIT][-1].won_any)}"
-    won, won_any = percent(policy.won), percent(policy.won_any)
-    margins = (margin_text(game.margin[who], unit) for who in ("policy", "hyrl"))
-    numbers = [
-        Number("winnable starts won", won, percent(hyrl.won), noise),
-        Number("winnable starts won from every start mode", won_any, percent(hyrl.won_any), limit),
-        Number(
-            "noise up to which all of them are won", *margins, f"the margin: worst noise on {where}"
+    rows = [
+        ("winnable starts won", [percent(s.won) for s in scores], noise),
+        ("winnable starts won from every start mode", [percent(s.won_any) for s in scores], limit),
+        (
+            "noise up to which all of them are won",
+            [margin_text(game.margin[who], unit) for who in CONTROLLERS],
+            f"the margin: worst noise on {where}",
         ),
     ]
     if game.lasting:
-        off = (f"{excursion_text(score.excursion)} {unit}" for score in scores)
-        numbers.append(Number("kept off the set-point for ever, at most", *off, noise))
-    return numbers
+        off = [f"{excursion_text(s.excursion)} {unit}" for s in scores]
+        rows.append(("kept off the set-point for ever, at most", off, noise))
+    return [Number(what, policy, hyrl, note) for what, (policy, hyrl), note in rows]
 
 
 def _episode_numbers(counts: Sequence[EpisodeCount]) -> list[Number]:
@@ -141,12 +140,11 @@ def _episode_numbers(counts: Sequence[EpisodeCount]) -> list[Number]:
     numbers = []
     for region in dict.fromkeys(c.region for c in counts):
         here = [c for c in counts if c.region == region]
-        shares = (
-            percent(min(c.reached for c in here if c.controller == who))
-            for who in ("policy", "hyrl")
+        policy, hyrl = (
+            percent(min(c.reached for c in here if c.controller == who)) for who in CONTROLLERS
         )
         what = f"episodes that reach the set-point, starts {region}"
-        numbers.append(Number(what, *shares, note))
+        numbers.append(Number(what, policy, hyrl, note))
     return numbers
 
 
@@ -157,8 +155,8 @@ def _stages(run: Run, robustness: Robustness | None, arcs: Arcs | None) -> list[
     """Returns the result of each stage in a sentence."""
     task, s, modes = run.task, run.settings, run.extended_sets.modes
     reach = "; ".join(f"mode {task.scene.mode_name(q)}: {extent(run, q)}" for q in modes)
+    attempts = f"up to {s.stage6.attempts} times " if s.stage6.attempts > 1 else ""
     retrained = f"a policy for each of {len(modes)} modes: {s.stage6.title}"
-    each = f"up to {s.stage6.attempts} times " if s.stage6.attempts > 1 else ""
     if isinstance(s.stage1, Agent):
         first = f"none: the agent {s.stage1} takes its place"
     else:
@@ -170,7 +168,7 @@ def _stages(run: Run, robustness: Robustness | None, arcs: Arcs | None) -> list[
         ("critical-set", run.critical_set.sentence(task)),
         ("partition", run.partition.sentence(task)),
         ("extended-sets", f"{run.extended_sets.sentence(task)}; {reach}"),
-        ("retrain", f"{retrained}, {each}{s.stage6.samples:,} samples"),
+        ("retrain", f"{retrained}, {attempts}{s.stage6.samples:,} samples"),
         ("robustness", "not done" if robustness is None else robustness_sentence(robustness)),
         ("simulate", "not done" if arcs is None else replay_sentence(run, arcs)),
     ]
@@ -187,17 +185,14 @@ def _settings(settings: Settings) -> list[tuple[str, str]]:
 
 def _training(settings: Settings) -> list[tuple[str, str, str]]:
     """Returns the settings of stages 1 and 6 side by side; an agent has its own."""
-    first, sixth = (
-        {
-            name: _value(value)
-            for name, value in (
-                vars(stage) | (stage.options if isinstance(stage, Training) else {})
-            ).items()
-            if name != "options"
-        }
-        for stage in (settings.stage1, settings.stage6)
-    )
+    first, sixth = _stage(settings.stage1), _stage(settings.stage6)
     return [(_words(name), first.get(name, ""), sixth.get(name, "")) for name in first | sixth]
+
+
+def _stage(stage: Training | Agent) -> dict[str, str]:
+    """Returns the texts of a stage's settings by name, those of its algorithm among them."""
+    values = vars(stage) | (stage.options if isinstance(stage, Training) else {})
+    return {name: _value(value) for name, value in values.items() if name != "options"}
 
 
 def _words(name: str) -> str:

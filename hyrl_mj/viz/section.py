@@ -1,8 +1,9 @@
-"""Sections: results on charts of more than two dimensions, cut to the plane of the first two coordinates."""
+"""Sections: results on charts of more than two dimensions, cut to the plane of two coordinates."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -15,13 +16,13 @@ from hyrl_mj.simulation import HybridArc
 from hyrl_mj.stages import CriticalSet, ExtendedSets, Partition, critical_points
 from hyrl_mj.tasks import Task
 
-# Grid points along the longest side from which the critical points of a section are searched for.
+# Least number of cells along the longest side in the search for the critical points of a section.
 CELLS = 40
 
 
 def _of_whole(name: str) -> Any:
-    """Returns a property of `SectionTask`: the attribute or method of the whole task."""
-    return property(lambda section: getattr(section.whole, name))
+    """Returns a property of `SectionTask` with the attribute or method of the whole task."""
+    return property(attrgetter(f"whole.{name}"))
 
 
 class SectionTask(Task):
@@ -48,11 +49,11 @@ class SectionTask(Task):
         chart, scene = whole.chart, whole.scene
         where = zip(chart.names[2:], rest, chart.units[2:], strict=True)
         self.chart = Chart(
-            chart.names[:2],
-            chart.units[:2],
-            chart.low[:2],
-            chart.high[:2],
-            chart.periodic[:2],
+            names=chart.names[:2],
+            units=chart.units[:2],
+            low=chart.low[:2],
+            high=chart.high[:2],
+            periodic=chart.periodic[:2],
             section=", ".join(f"{name} = {value:g} {unit}" for name, value, unit in where),
         )
         self.start_low, self.start_high = whole.start_low[:2], whole.start_high[:2]
@@ -103,7 +104,7 @@ class Section:
 
     Attributes:
         whole: the task.
-        task: the task on the plane, a `SectionTask`; `whole` itself if there is nothing to cut.
+        task: the task on the plane, a `SectionTask`; `whole` itself if the chart is not cut.
         rest: (d - 2,) values of the other coordinates.
     """
 
@@ -128,21 +129,17 @@ class Section:
     def critical_set(
         self, critical: CriticalSet, policy: Policy, cells: int, resolution: float
     ) -> CriticalSet:
-        """Returns M* in the section, searched for there by outcome; `critical` if nothing is cut.
+        """Returns M* in the section, searched for by outcome; `critical` itself if nothing is cut.
 
-        Args:
-            critical: M* on the whole chart.
-            policy: of stage 1.
-            cells: of the search along the longest side.
-            resolution: length of the last rods, as a share of the first.
+        The search begins with `cells` along the longest side; `resolution` is the length of its last
+        rods as a share of the first.
         """
         if not (self.cut and len(critical.points)):
             return critical
         grid = Grid.with_cells(self.task.chart, cells)
         nodes = self.lift(grid.nodes)
-        points = critical_points(
-            self.whole, policy, nodes, grid.neighbours(), grid.cell, resolution
-        )[:, :2]
+        rods = grid.neighbours()
+        points = critical_points(self.whole, policy, nodes, rods, grid.cell, resolution)[:, :2]
         one_piece = np.zeros(len(points), dtype=int)
         return CriticalSet(points, one_piece, resolution * grid.cell, grid.cell)
 
@@ -161,9 +158,8 @@ class Section:
         sets = tuple(self._set(members) for members in extended.sets)
         at = extended.sets[0].grid.nearest(self.lift(sets[0].grid.nodes))
         winning = tuple(wins[at] for wins in extended.winning)
-        return replace(
-            extended, sets=sets, winning=winning, narrow=np.empty((0, 2)), room=np.empty(0)
-        )
+        narrow, room = np.empty((0, 2)), np.empty(0)
+        return replace(extended, sets=sets, winning=winning, narrow=narrow, room=room)
 
     def arc(self, arc: HybridArc) -> HybridArc:
         """Returns an arc with the section's coordinates."""

@@ -15,7 +15,7 @@ from hyrl_mj.viz.tables import (
 
 
 def print_summary(run: Run) -> None:
-    """Prints how policy and hybrid controller did, from the replay starts and in the worst case."""
+    """Prints the results of policy and hybrid controller in the replays and in the worst case."""
     arcs = run.arcs()
     _print(replay_table(run, arcs))
     print(run.critical_set.sentence(run.task))

@@ -17,15 +17,7 @@ NAMES = {"policy": "RL policy", "hyrl": "HyRL", LIMIT: "limit"}
 
 @dataclass(frozen=True)
 class Ending:
-    """How a replay ended.
-
-    Attributes:
-        outcome: of the arc.
-        time: when it ended [s].
-        jumps: how often the mode changed.
-        end: the last chart point.
-        success: whether it ended at the set-point.
-    """
+    """How a replay ended: outcome, time [s], number of jumps, last chart point, and whether it arrived."""
 
     outcome: str
     time: float
@@ -35,9 +27,8 @@ class Ending:
 
     @property
     def details(self) -> str:
-        """When it ended, and after how many jumps."""
-        jumps = "1 jump" if self.jumps == 1 else f"{self.jumps} jumps"
-        return f"{self.time:.2f} s, {jumps}"
+        """Time and number of jumps: "2.35 s, 1 jump"."""
+        return f"{self.time:.2f} s, {self.jumps} jump{'' if self.jumps == 1 else 's'}"
 
     def __str__(self) -> str:
         return f"{self.outcome} {self.details}, {self.end}"
@@ -45,13 +36,7 @@ class Ending:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows under headings.
-
-    Attributes:
-        title: over the table.
-        headings: one a column.
-        rows: the cells.
-    """
+    """Rows of cells under a title and headings, one a column."""
 
     title: str
     headings: Sequence[str]
@@ -65,33 +50,30 @@ Arcs = Mapping[tuple[str, str], HybridArc]
 
 
 def replay_table(run: Run, arcs: Arcs) -> Table:
-    """Returns how policy and hybrid controller did from the replay starts, under the same noise."""
-    task = run.task
-    columns = {"policy": f"policy ({run.settings.stage1.title})"}
-    columns |= {
-        f"hyrl_q{q}": f"HyRL, q0 = {task.scene.mode_name(q)}" for q in run.extended_sets.modes
-    }
+    """Returns how the replays of policy and hybrid controller ended: a row for each start."""
+    task, s = run.task, run.settings
+    columns = {"policy": f"policy ({s.stage1.title})"}
+    for q in run.extended_sets.modes:
+        columns[f"hyrl_q{q}"] = f"HyRL, q0 = {task.scene.mode_name(q)}"
     units = ", ".join(dict.fromkeys(task.chart.units))
     rows: list[list[str | Ending]] = []
     for start in dict.fromkeys(start for start, _ in arcs):
         point = _point(arcs[start, "policy"].z[0])
         endings = [_ending(task, arcs[start, who]) for who in columns]
         rows.append([f"{point} on M*" if start == "critical" else point, *endings])
-    return Table(
-        f"{task.name}: alternating noise {run.settings.noise:g}, seed {run.settings.seed}",
-        [f"start ({', '.join(task.chart.names)}) in {units}", *columns.values()],
-        rows,
-    )
+    headings = [f"start ({', '.join(task.chart.names)}) in {units}", *columns.values()]
+    return Table(f"{task.name}: alternating noise {s.noise:g}, seed {s.seed}", headings, rows)
 
 
 def _ending(task: Task, arc: HybridArc) -> Ending:
+    """Returns how an arc ended; "missed" if it ended as a success off the set-point."""
     end, success = _point(task.chart.wrap(arc.z[-1:])[0]), arc.arrives(task)
     outcome = arc.outcome.replace("_", " ") if success or arc.outcome != "reached" else "missed"
     return Ending(outcome, float(arc.t[-1]), int(arc.j[-1]), end, success)
 
 
 def arrivals(run: Run, arcs: Arcs, policy: bool) -> tuple[int, int]:
-    """Returns how many of the paper's replays arrive, and how many there are, of the policy or of HyRL."""
+    """Returns how many of the paper's replays arrive, of the policy or else of HyRL, and of how many."""
     arrives = [
         arc.arrives(run.task)
         for (start, who), arc in arcs.items()
@@ -136,18 +118,16 @@ def margin_table(task: Task, game: GameResult) -> Table:
     _, unit = task.noise_on(game.everywhere)
     units = ", ".join(dict.fromkeys(task.chart.units))
     off = f"off the set-point at most, no noise [{units}]"
-    return Table(
-        f"{task.name}: margins",
-        ["controller", "all winnable starts are won up to noise", off],
-        [
-            [NAMES[who], margin_text(margin, unit), f"{game.miss_without_noise[who]:.3f}"]
-            for who, margin in game.margin.items()
-        ],
-    )
+    rows = [
+        [NAMES[who], margin_text(margin, unit), f"{game.miss_without_noise[who]:.3f}"]
+        for who, margin in game.margin.items()
+    ]
+    headings = ["controller", "all winnable starts are won up to noise", off]
+    return Table(f"{task.name}: margins", headings, rows)
 
 
 def excursion_text(excursion: float | None) -> str:
-    """Returns how far off the set-point noise keeps a run; none where every run ends."""
+    """Returns how far off the set-point noise keeps a run; "-" where every run ends."""
     return "-" if excursion is None else f"{excursion:.3f}"
 
 
@@ -170,15 +150,13 @@ def episode_table(task: Task, counts: Sequence[EpisodeCount]) -> Table:
 
 
 def robustness_sentence(robustness: Robustness) -> str:
-    """Returns the most important figures in one line."""
+    """Returns the most important scores in one line."""
     if robustness.game is None:
-        worst = {
-            who: min(c.reached for c in robustness.episodes if c.controller == who)
-            for who in ("policy", "hyrl")
-        }
-        return ", ".join(
-            f"{NAMES[who]} reaches in {percent(x)} or more" for who, x in worst.items()
-        )
+        parts = []
+        for who in ("policy", "hyrl"):
+            least = min(c.reached for c in robustness.episodes if c.controller == who)
+            parts.append(f"{NAMES[who]} reaches in {percent(least)} or more")
+        return ", ".join(parts)
     policy, hyrl = (robustness.game.scores[who][-1] for who in ("policy", "hyrl"))
     return (
         f"worst case at noise {hyrl.eps:g}: the policy wins {percent(policy.won)} of the winnable "
@@ -190,7 +168,7 @@ def robustness_sentence(robustness: Robustness) -> str:
 
 
 def extent(run: Run, mode: int) -> str:
-    """Returns how far a mode's extended set reaches."""
+    """Returns which part of the chart a mode's extended set covers."""
     members = run.extended_sets.sets[run.extended_sets.modes.index(mode)]
     inside, chart = members.mask, run.task.chart
     if inside.all():

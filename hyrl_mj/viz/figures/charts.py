@@ -95,10 +95,11 @@ def image(panel: Axes, grid: Grid, values: np.ndarray, **looks: Any) -> None:
     """Draws values (N,) of nodes as an image; the nodes of one coordinate as a strip of height 1."""
     half = grid.spacing / 2
     low, high = grid.nodes[0] - half, grid.nodes[-1] + half
-    (left, bottom), (right, top) = (low, high) if len(half) > 1 else ((*low, 0), (*high, 1))
+    if len(half) == 1:
+        low, high = np.append(low, 0.0), np.append(high, 1.0)
     panel.imshow(
         values.reshape(grid.counts[0], -1).T,
-        extent=(left, right, bottom, top),
+        extent=(low[0], high[0], low[1], high[1]),
         origin="lower",
         interpolation="nearest",
         **looks,
@@ -106,7 +107,7 @@ def image(panel: Axes, grid: Grid, values: np.ndarray, **looks: Any) -> None:
 
 
 def patch(face: str, edge: str = INK) -> Patch:
-    """Returns a filled field for a legend."""
+    """Returns a legend's artist of a filled field."""
     return Patch(facecolor=face, edgecolor=edge, linewidth=0.8)
 
 
@@ -114,7 +115,7 @@ def patch(face: str, edge: str = INK) -> Patch:
 
 
 def ring(panel: Axes, task: Task, radii: Sequence[float], note: str = "") -> None:
-    """Makes a panel the ring of a periodic coordinate: circles, a clock face, and its label with a note."""
+    """Makes a panel the ring of a periodic coordinate: circles, quarters, and a label with a note."""
     low, period = task.chart.low[0], task.chart.sides[0]
     for radius in radii:
         panel.add_patch(Circle((0, 0), radius, fill=False, edgecolor=INK, linewidth=0.8, zorder=3))
@@ -123,7 +124,7 @@ def ring(panel: Axes, task: Task, radii: Sequence[float], note: str = "") -> Non
         at = np.array(on_ring(task, quarter))
         panel.plot(*np.outer(at, (OUTER, TICK)), color=INK, linewidth=0.8)
         text = angle(quarter) if task.chart.units[0] == "rad" else f"{quarter:g}"
-        panel.text(*LABEL * at, text, ha="center", va="center")
+        panel.text(LABEL * at[0], LABEL * at[1], text, ha="center", va="center")
     panel.text(0, 0, axis_label(task, 0) + note, ha="center", va="center")
     panel.set(xlim=(-EDGE, EDGE), ylim=(-EDGE, EDGE), aspect="equal", anchor="S")
     panel.set_axis_off()

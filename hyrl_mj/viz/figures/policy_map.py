@@ -45,10 +45,12 @@ def _paper_runs(panel: Axes, shown: ShownPolicy) -> Artists:
     task, ring = shown.task, charts.is_ring(shown.task)
     label = style.noise_label(task, shown.paper[0].noise, shown.paper[0].bound)
     panel.set_title(label.replace(", ", ",\n"))
+    fixed: Artists = {}
     if ring:
         panel.set(xlim=(0, task.scene.time))
-    view = paths.time_view(panel, task, 0) if ring else paths.plane_view(task)
-    fixed = {} if ring else charts.plane(panel, task)
+        view = paths.time_view(panel, task, 0)
+    else:
+        view, fixed = paths.plane_view(task), charts.plane(panel, task)
     ways: Artists = {}
     marks: Artists = {}
     for arc in shown.paper:

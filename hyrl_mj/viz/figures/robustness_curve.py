@@ -20,6 +20,10 @@ from hyrl_mj.viz.tables import NAMES
 # Of the curves: ink as the policy's path in the replay, then blue, purple and vermilion.
 CURVE_COLOURS = (style.POLICY_COLOUR, *(style.mode_colour(i) for i in (0, 2, 1)))
 LIMIT_COLOUR = "#a9dcc9"
+Looks = dict[str, Any]
+# The limit of any controller is broad and pale, so that curves on it can be seen.
+LIMIT_LOOKS: Looks = {"color": LIMIT_COLOUR, "linewidth": 7, "solid_capstyle": "butt"}
+LIMIT_DASHED: Looks = {"linestyle": (0, (1.2, 0.5)), "linewidth": 4}
 MARKERS = "osD^"
 # Nodes of a curve from one marker to the next.
 MARK_EVERY = 6
@@ -47,16 +51,21 @@ def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
             len(heights), 1, sharex=True, squeeze=False, height_ratios=heights
         ).ravel()
         shares = panels[0]
-        handles = _limit(shares, eps, curve.wins[LIMIT])
+        limit = curve.wins[LIMIT]
+        handles = _won(shares, "limit of any controller", eps, limit, LIMIT_LOOKS, LIMIT_DASHED)
         for name, number in numbers.items():
-            handles |= _won(shares, number, name, eps, curve.wins[name])
+            title, looks = NAMES.get(name, name), _looks(number)
+            handles |= _won(shares, title, eps, curve.wins[name], looks, _dashed(number))
         (line,) = shares.plot(eps, 100 * np.array(curve.winnable), color=style.PALE, linewidth=1)
         handles["winnable share of the start region"] = line
         handles |= _margins(shares, result.margin, numbers, unit)
         shares.set(ylabel="winnable starts that are won [%]", yticks=range(0, 101, 20))
         if result.lasting:
             for name, number in numbers.items():
-                _times(panels[1], number, eps, curve.wins[name])
+                wins = curve.wins[name]
+                looks = _looks(number) | ({} if _same(wins) else _dashed(number))
+                times = np.where(np.array(wins.won_any) > 0, wins.time_any, np.nan)
+                panels[1].plot(eps, times, **looks)
             panels[1].set_ylabel("worst time to arrival,\nstarts that are won [s]")
         for panel in panels:
             panel.axvline(run_eps, color=style.INK, linewidth=1, linestyle=(0, (1, 2)), zorder=1)
@@ -72,31 +81,14 @@ def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
     return figure
 
 
-def _limit(panel: Axes, eps: np.ndarray, wins: Wins) -> Artists:
-    """Draws the limit of any controller, broad and pale, so that curves on it can be seen.
+def _won(
+    panel: Axes, title: str, eps: np.ndarray, wins: Wins, looks: Looks, dashed: Looks
+) -> Artists:
+    """Draws what is won, and dashed what is won from every start mode if that differs.
 
     Returns:
         The legend's entries.
     """
-    looks: dict[str, Any] = {"color": LIMIT_COLOUR, "linewidth": 7, "solid_capstyle": "butt"}
-    dashed = {"linestyle": (0, (1.2, 0.5)), "linewidth": 4}
-    return _pair(panel, "limit of any controller", eps, wins, looks, dashed)
-
-
-def _won(panel: Axes, number: int, name: str, eps: np.ndarray, wins: Wins) -> Artists:
-    """Draws what a controller wins; returns the legend's entries."""
-    return _pair(panel, NAMES.get(name, name), eps, wins, _looks(number), _dashed(number))
-
-
-def _pair(
-    panel: Axes,
-    title: str,
-    eps: np.ndarray,
-    wins: Wins,
-    looks: dict[str, Any],
-    dashed: dict[str, Any],
-) -> Artists:
-    """Draws the curves of one's own and of any start mode, or one if they coincide; the latter dashed."""
     (won,) = panel.plot(eps, 100 * np.array(wins.won), **looks)
     if _same(wins):
         return {title: won}
@@ -104,18 +96,12 @@ def _pair(
     return {f"{title}, picks the start mode": won, f"{title}, from every start mode": won_any}
 
 
-def _times(panel: Axes, number: int, eps: np.ndarray, wins: Wins) -> None:
-    """Draws the worst time to arrival where anything is won."""
-    looks = _looks(number) | ({} if _same(wins) else _dashed(number))
-    panel.plot(eps, np.where(np.array(wins.won_any) > 0, wins.time_any, np.nan), **looks)
-
-
 def _same(wins: Wins) -> bool:
     """Returns whether the start mode makes no difference."""
     return bool(np.allclose(wins.won, wins.won_any, atol=1e-9))
 
 
-def _looks(number: int) -> dict[str, Any]:
+def _looks(number: int) -> Looks:
     """Returns the line style of a controller's curve.
 
     Where curves coincide the first is thin and lies on thicker ones, and no marker hides another.
@@ -131,7 +117,7 @@ def _looks(number: int) -> dict[str, Any]:
     }
 
 
-def _dashed(number: int) -> dict[str, Any]:
+def _dashed(number: int) -> Looks:
     """Returns how the line style differs where the controller is started in every mode."""
     return {
         "linestyle": "--",

@@ -1,4 +1,4 @@
-"""What the figures show: the parts of a run, cut to the section of its chart that can be drawn."""
+"""What the figures show: results of a run, cut to the section of its chart that can be drawn."""
 
 from __future__ import annotations
 
@@ -79,11 +79,10 @@ class ShownGame:
 
 
 def shown_policy(run: Run, noisy: HybridArc) -> ShownPolicy:
-    """Returns what the figures of a run's policy show; simulates the arcs that no stage has left.
+    """Returns what the figures of a run's policy show; simulates the arcs that no stage has saved.
 
-    Args:
-        run: with its critical set and partition.
-        noisy: a run of the policy under noise, from M* if there is one.
+    The run needs its critical set and partition. `noisy` is a run of the policy under noise, from M* if
+    there is one.
     """
     section, s = Section.of(run.task), run.settings
     return ShownPolicy(

@@ -31,15 +31,11 @@ GREEN = colours.GOOD  # of the set-point
 _TINTS = ("#d6e8f3", "#fbe4d3", "#f1dcee", "#e1f2fb")
 # Colour and width of lines over a map: a white edge, then the line.
 CASING = ((PAPER, 2.8), (INK, 1.4))
-STYLE = {
+_IN_INK = ("axes.edgecolor", "text.color", "axes.labelcolor", "xtick.color", "ytick.color")
+STYLE = dict.fromkeys(_IN_INK, INK) | {
     "font.size": 10,
     "axes.titlesize": 10,
-    "axes.edgecolor": INK,
     "axes.linewidth": 0.8,
-    "text.color": INK,
-    "axes.labelcolor": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
     "legend.frameon": False,
     "legend.fontsize": 9.5,
     # Text in a PDF stays text, which can be searched and edited.
@@ -104,8 +100,9 @@ def note_above(panel: Axes, text: str, x: float, gap: float, coords: Any = "axes
 def legend(figure: Figure, handles: Mapping[str, Artist], handlelength: float = 2.0) -> None:
     """Writes the legend below a figure, where it hides nothing."""
     artists, labels = list(handles.values()), list(handles)
-    place = "outside lower center"
-    figure.legend(artists, labels, loc=place, ncols=COLUMNS, handlelength=handlelength)
+    figure.legend(
+        artists, labels, loc="outside lower center", ncols=COLUMNS, handlelength=handlelength
+    )
 
 
 # ---- labels

@@ -88,7 +88,8 @@ def _film(screens: Sequence[Screen], path: Path, options: ReplayOptions) -> np.n
         frame_times(screen.end, options.fps, screen.jumps, options.slow_motion)
         for screen in screens
     ]
-    frames, posters = 0, []
+    frames = 0
+    posters: list[np.ndarray] = []
     with (
         closing(Progress("rendering", sum(map(len, times)), "frames")) as progress,
         closing(screens[0].canvas(options.size)) as canvas,
