@@ -18,7 +18,10 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 LANGUAGES = ("bash", "python", "toml")
 # Python that would train for a minute.
-SHORTER = {'hyrl_mj.run("my_robot.py")': 'hyrl_mj.run("my_robot.py", preset="smoke")'}
+SHORTER = {
+    'hyrl_mj.run("my_robot.py")': 'hyrl_mj.run("my_robot.py", preset="smoke")',
+    "eps=0.1, seed=0)": 'eps=0.1, seed=0, preset="smoke")',
+}
 TRAINING = ("run", "robustify", "diagnose")
 EPISODES, FRAMES = "200", "4"
 # Scripts that have tests of their own; here their options are looked up.

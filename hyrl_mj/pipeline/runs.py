@@ -116,7 +116,11 @@ def diagnose(
     `robustify` with the same arguments continues from there.
 
     Args:
-        task, policy, options, say, changes: as for `robustify`.
+        task: name of a task, or the Python file that defines one.
+        policy: the agent, as for `robustify`.
+        options: how to run it, by default `AgentOptions()`.
+        say: told a line about each stage.
+        changes: fields of the options that differ, as for `run`.
 
     Raises:
         BadInput: a value or an agent that cannot be used.
