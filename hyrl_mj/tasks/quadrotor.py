@@ -13,13 +13,13 @@ from hyrl_mj.tasks.learning import Learning
 from hyrl_mj.tasks.registry import register
 from hyrl_mj.tasks.scene import Scene
 
-# Inner loop: how fast velocity, height, tilt and its rate follow [1/s, 1/s, 1/s^2, 1/s].
+# Gains of the inner loop: velocity, height, tilt and its rate [1/s, 1/s, 1/s^2, 1/s].
 VELOCITY, HEIGHT, TILT, RATE = 4.0, 2.0, 225.0, 24.0
-# The steepest tilt that the inner loop asks for, as sideways over upward acceleration.
+# Largest tilt that the inner loop commands, as sideways over upward acceleration.
 STEEPEST = 0.6
-# How close to the pillar it begins to matter [m]; the fastest drift to the side that the sets hold [m/s].
+# Distance from the pillar within which the reward is less [m]; largest drift to the side in the chart [m/s].
 NEAR, FASTEST = 0.3, 1.2
-# Tilt to the side that starts have at most [rad].
+# Largest tilt to the side of a start [rad].
 START_TILT = 0.05
 
 
@@ -28,7 +28,7 @@ class Quadrotor(Task):
     name = "quadrotor"
     description = "fly past a pillar on its left or on its right (DQN)"
     inputs, input_units = ("lateral_velocity",), ("m/s",)
-    # Of the measurement: x, y, velocity to the side, tilt to the side, touching pillar or floor.
+    # Columns of the measurement: x, y, velocity to the side, tilt to the side, touching pillar or floor.
     noisy = (1.0, 1.0, 0.0, 0.0, 0.0)
     max_steps = 80
     worst_reward = 0.0
@@ -74,7 +74,7 @@ class Quadrotor(Task):
 
     @cached_property
     def mixer(self) -> np.ndarray:
-        """(4, 4): from thrust [N] and torques about the body's axes [Nm] to the thrust of each rotor."""
+        """The matrix (4, 4) from thrust [N] and torques about the body's axes [Nm] to the rotors' thrusts."""
         gear = self.model.actuator_gear
         arm = self.model.site_pos[self.model.actuator_trnid[:, 0]]
         # A rotor at (x, y) with thrust f turns the body by (y f, -x f) about its x and y axis.
@@ -84,7 +84,7 @@ class Quadrotor(Task):
         return sensors[:, [0, 1, 4, 7, 9]]
 
     def control(self, u: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        """Velocity, then tilt, then the rotors (n, 4) [N]."""
+        """The inner loop from velocity over tilt to the thrusts of the rotors (n, 4) [N]."""
         body = self.model.body("quadrotor")
         (speed, height), gravity = self.cruise, -self.model.opt.gravity[2]
         axes = rotation(qpos[:, 3:7])
@@ -97,7 +97,7 @@ class Quadrotor(Task):
         push[:, :2] *= np.minimum(1.0, room / np.maximum(sideways, 1e-9))[:, None]
         up = axes[:, :, 2]
         thrust = body.mass * (push * up).sum(axis=1)
-        # The turn from the body's up to where it shall push, and back to yaw 0, in the body's axes.
+        # The rotation, in the body's axes, from the body's up to the direction of the push, and to yaw 0.
         goal = push / np.linalg.norm(push, axis=1, keepdims=True)
         turn = np.einsum("nji,nj->ni", axes, np.cross(up, goal))
         turn[:, 2] = -np.arctan2(axes[:, 1, 0], axes[:, 0, 0])
@@ -105,9 +105,9 @@ class Quadrotor(Task):
         return self.share_out(thrust, torque)
 
     def share_out(self, thrust: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        """Thrusts (n, 4) of the rotors [N], inside their limits, for a thrust (n,) and torques (n, 3) [Nm].
+        """Returns thrusts (n, 4) of the rotors [N] within their limits, for a thrust (n,) and torques (n, 3).
 
-        Where not all can be had, keeping its attitude comes before keeping its height.
+        Where the limits do not allow both, the torques [Nm] come before the thrust [N].
         """
         most = self.model.actuator_ctrlrange[0, 1]
         turning = torque @ self.mixer[:, 1:].T
@@ -142,7 +142,7 @@ class Quadrotor(Task):
         return np.hstack([self.obstacle[0] - observation[:, :1], observation[:, 1:], unseen])
 
     def clearance(self, measured: np.ndarray) -> np.ndarray:
-        """Distance of the hull from the pillar: (n,) [m]."""
+        """Returns the distance of the hull from the pillar: (n,) [m]."""
         radii = sum(mjcf.geom_size(self.model, name)[0] for name in ("obstacle", "hull"))
         return np.asarray(np.linalg.norm(measured[:, :2] - self.obstacle, axis=1) - radii)
 
@@ -167,7 +167,7 @@ class Quadrotor(Task):
 
 
 def rotation(quaternion: np.ndarray) -> np.ndarray:
-    """Rotation matrices (n, 3, 3) of unit quaternions (n, 4): columns are the body's axes."""
+    """Returns rotation matrices (n, 3, 3) of unit quaternions (n, 4): columns are the body's axes."""
     w, x, y, z = quaternion.T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -13,11 +13,12 @@ from hyrl_mj.tasks.learning import Learning
 from hyrl_mj.tasks.registry import register
 from hyrl_mj.tasks.scene import Scene
 
-# The heading that still counts as on the way [rad], and how close to the pillar it begins to matter [m].
+# Largest heading [rad], and distance from the pillar within which the reward is less [m].
 ASTRAY, NEAR = 1.4, 0.25
-# What counts at the goal, in samples' reward; off the middle before the pillar [1/m]; and a heading [1/rad2].
+# Weights of the reward: of arriving (in samples), of the distance off the middle before the pillar [1/m],
+# of the heading [1/rad2].
 FINISH, BEFORE, TURNED = 10, 0.5, 0.15
-# Rate of turn that starts have at most [rad/s].
+# Largest rate of turn of a start [rad/s].
 START_RATE = 0.3
 
 
@@ -26,7 +27,7 @@ class Rover(Task):
     name = "rover"
     description = "drive on wheels past a pillar on its left or on its right (DQN)"
     inputs, input_units = ("turn_rate",), ("rad/s",)
-    # Of the measurement: x, y, heading, rate of turn, touching the pillar.
+    # Columns of the measurement: x, y, heading, rate of turn, touching the pillar.
     noisy = (0.0, 1.0, 0.5, 0.0, 0.0)
     max_steps = 110
     worst_reward = 0.0
@@ -56,7 +57,7 @@ class Rover(Task):
 
     @cached_property
     def set_point(self) -> np.ndarray:
-        """Where to drive, straight ahead (3,) [m, m, rad]."""
+        """The goal, with the heading straight ahead (3,) [m, m, rad]."""
         return np.append(mjcf.site_pos(self.model, "set_point")[:2], 0.0)
 
     @cached_property
@@ -72,7 +73,7 @@ class Rover(Task):
 
     @cached_property
     def speed(self) -> float:
-        """How fast it drives [m/s]."""
+        """Speed ahead [m/s]."""
         return float(mjcf.numeric(self.model, "speed", 1)[0])
 
     def measure(self, sensors: np.ndarray) -> np.ndarray:
@@ -83,7 +84,7 @@ class Rover(Task):
         return self.rates(u[:, 0])
 
     def rates(self, turn: np.ndarray) -> np.ndarray:
-        """Rates (n, 2) of both wheels [rad/s] that turn the rover at rates (n,) [rad/s]."""
+        """Returns rates (n, 2) of both wheels [rad/s] that turn the rover at rates (n,) [rad/s]."""
         radius, half, speed = self.wheels
         return np.stack([speed - turn * half, speed + turn * half], axis=1) / radius
 
@@ -115,7 +116,7 @@ class Rover(Task):
         return np.hstack([self.obstacle[0] - observation[:, :1], observation[:, 1:], unseen])
 
     def clearance(self, measured: np.ndarray) -> np.ndarray:
-        """How far the bumper's middle is from touching the pillar: (n,) [m]."""
+        """Returns the distance of the bumper from the pillar: (n,) [m]."""
         bumper = mjcf.geom_pos(self.model, "bumper")[0]
         heading = measured[:, 2]
         middle = measured[:, :2] + bumper * np.stack([np.cos(heading), np.sin(heading)], axis=1)
@@ -125,10 +126,10 @@ class Rover(Task):
     def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
         x, y, heading = measurement[:, :3].T
         near = np.clip(1 - self.clearance(measurement) / NEAR, 0.0, 1.0)
-        # Before the pillar the middle is worth less: it would call for crossing it, and then deciding.
+        # A full weight before the pillar would draw the rover to the middle, where it decides late.
         off = np.abs(y) * np.where(x < self.obstacle[0], BEFORE, 1.0) + TURNED * heading**2
         reward = np.maximum(3 - off - near, 0.0)
-        # Enough that driving on in detours does not pay.
+        # Arriving must pay more than going on in detours.
         reward = np.where(x >= self.set_point[0], FINISH * reward, reward)
         return np.where(self.failed(measurement), 0.0, reward)
 

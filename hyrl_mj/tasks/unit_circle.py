@@ -14,7 +14,7 @@ from hyrl_mj.tasks.registry import register
 from hyrl_mj.tasks.scene import Scene
 
 PI = np.pi
-# The pointer has arrived when it is this close to the set-point [rad].
+# Distance from the set-point that counts as arrived [rad].
 BAND = 0.3
 
 
@@ -45,12 +45,12 @@ class UnitCircle(Task):
 
     @cached_property
     def set_point(self) -> np.ndarray:
-        """Angle of the set-point (1,) [rad]."""
+        """The angle of the goal (1,) [rad]."""
         x, y, _ = mjcf.site_pos(self.model, "set_point")
         return np.arctan2([y], [x])
 
     def error(self, theta: np.ndarray) -> np.ndarray:
-        """Angle from the set-point in [-pi, pi]: (n,) [rad]."""
+        """Returns the angle from the set-point in [-pi, pi]: (n,) [rad]."""
         return self.chart.difference(theta, self.set_point)[:, 0]
 
     def observation(self, measured: np.ndarray) -> np.ndarray:
@@ -76,7 +76,7 @@ class UnitCircle(Task):
         return np.abs(self.error(z))
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        # Half of them the paper's, where the decision is; the others all over the circle.
+        # Half of them are the paper's, around the decision; the others lie all over the circle.
         opposite = self.set_point + PI + rng.uniform(-0.2, 0.2, (n, 1))
         anywhere = rng.uniform(self.chart.low, self.chart.high, (n, 1))
         return np.where(rng.random((n, 1)) < 0.5, opposite, anywhere)

@@ -19,7 +19,8 @@ ON_THE_LINE = 1e-6  # [m] the error that sixty samples of the kinematic actuator
 
 
 def distance(z: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Distance (n,) of points (n, 2) to one (2,). NumPy's norm takes several times as long."""
+    """Returns the distance (n,) of points (n, 2) from one (2,)."""
+    # NumPy's norm takes several times as long.
     away = z - point
     x, y = away[..., 0], away[..., 1]
     return np.asarray(np.sqrt(x * x + y * y))
@@ -68,7 +69,7 @@ class Vehicle(Task):
 
     @cached_property
     def set_point(self) -> np.ndarray:
-        """Where to drive (2,) [m]."""
+        """The goal (2,) [m]."""
         return mjcf.site_pos(self.model, "set_point")[:2]
 
     @cached_property
@@ -81,11 +82,11 @@ class Vehicle(Task):
         return (2 * diagonal, 2 * diagonal, 2 * self.arena[1][1])
 
     def clearance(self, z: np.ndarray) -> np.ndarray:
-        """Distance to the obstacle's surface, d_o: (n,) [m]."""
+        """Returns the distance to the obstacle's surface, d_o: (n,) [m]."""
         return np.maximum(distance(z, self.obstacle) - self.radius, 0.0)
 
     def distance_to_go(self, z: np.ndarray) -> np.ndarray:
-        """Distance to the set-point, d_g: (n,) [m]."""
+        """Returns the distance to the set-point, d_g: (n,) [m]."""
         return distance(z, self.set_point)
 
     def observation(self, measured: np.ndarray) -> np.ndarray:
@@ -102,7 +103,7 @@ class Vehicle(Task):
         to_obstacle = (d_o + self.radius) ** 2 - (y - y_o) ** 2
         to_go = d_g**2 - (y - y_g) ** 2
         x = (x_o + x_g) / 2 + (to_obstacle - to_go) / (2 * (x_g - x_o))
-        # Inside the obstacle, where noise may put it, the clearance is 0 and tells nothing.
+        # Inside the obstacle, where noise may put a measurement, the clearance is always 0.
         inside = x_g - np.sqrt(np.maximum(to_go, 0.0))
         return np.stack([np.where(d_o > 0, x, inside), y], axis=1)
 
@@ -134,7 +135,7 @@ class Vehicle(Task):
         return -self.clearance(measurement)
 
     def direction(self, path: np.ndarray) -> np.ndarray:
-        # Runs start before the pillar; one that never gets beside it is judged where it ended.
+        # Runs start before the pillar; one that never comes beside it is judged by its last point.
         beside = path[:, :, 0] >= self.obstacle[0]
         when = np.where(beside.any(axis=0), beside.argmax(axis=0), len(path) - 1)
         y = path[when, np.arange(path.shape[1]), 1]
