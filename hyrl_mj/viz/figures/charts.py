@@ -61,7 +61,7 @@ def label_angles(axis: Axis, task: Task, coordinate: int) -> None:
 
 
 def plane(panel: Axes, task: Task) -> Artists:
-    """Makes a panel the plane of a chart, with the states at which runs end; returns legend entries."""
+    """Makes a panel a chart's plane, with the states at which runs end; returns the legend's entries."""
     (left, bottom), (right, top) = task.chart.low, task.chart.high
     panel.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
     panel.set(xlabel=axis_label(task, 0), ylabel=axis_label(task, 1))

@@ -112,13 +112,16 @@ def chosen_way(
 
 
 def hybrid_way(panel: Axes, task: Task, view: View, arc: HybridArc, **looks: Any) -> Artists:
-    """Draws a run of the hybrid controller in the colours of its modes, and marks its jumps."""
+    """Draws a run of the hybrid controller in the colours of its modes, with marks at its jumps.
+
+    Returns:
+        The legend's entries.
+    """
     handles: Artists = {}
     for j in range(arc.j[-1] + 1):
         rows = arc.j == j
         mode = int(arc.q[rows][0])
-        colour = mode_colour(mode)
-        drawn = line(panel, view, arc.t[rows], arc.z[rows], color=colour, **looks)
+        drawn = line(panel, view, arc.t[rows], arc.z[rows], color=mode_colour(mode), **looks)
         handles[f"HyRL in mode {task.scene.mode_name(mode)}"] = drawn
     for row in np.flatnonzero(np.diff(arc.j)).tolist():
         # Small and on top, so that a jump at the start shows in its circle.

@@ -101,7 +101,7 @@ def _corner(ends: Sequence[float], side: float) -> tuple[float, float]:
 
 
 def _ring(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> Artists:
-    """Draws classes (N,) of nodes as arcs of a ring; returns as `_box`."""
+    """Draws classes (N,) of nodes as arcs of a ring; returns entries as `_box`."""
     task = shown.task
     charts.arcs(panel, task, classes, CLASS_COLOURS)
     charts.ring(panel, task, (OUTER, INNER))

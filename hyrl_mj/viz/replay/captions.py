@@ -31,12 +31,7 @@ OUTCOMES: dict[str, tuple[str, RGB]] = {
 
 @dataclass(frozen=True)
 class Group:
-    """Tracks of one controller.
-
-    Attributes:
-        name: of the controller, as captions show it.
-        tracks: of its arcs.
-    """
+    """The name of a controller and the tracks of its arcs."""
 
     name: str
     tracks: Sequence[Track]

@@ -84,66 +84,57 @@ class Screen:
 
     def open(self, size: tuple[int, int], canvas: Canvas) -> Stage:
         """Returns a stage that draws the show in frames of this size [pixels]."""
-        layout, frame = self._layout(size), np.empty((size[1], size[0], 3), dtype=np.uint8)
+        layout = self._layout(size)
         shape = (layout.width, layout.scene_height)
         views = []
-        parts = np.split(frame, len(self._panels), axis=1)
-        for part, (title, groups) in zip(parts, self._panels, strict=True):
+        for title, groups in self._panels:
             tracks = [track for group in groups for track in group.tracks]
             panel = Panel(self._task, tracks, canvas, *shape, self._camera, self._floor)
-            views.append(_View(part, layout, title, groups, panel))
-        return Stage(frame, views)
+            views.append(View(title, groups, panel))
+        return Stage(size, layout, views)
 
     def _layout(self, size: tuple[int, int]) -> Layout:
         return Layout(size[0] // len(self._panels), size[1])
 
 
 @dataclass(frozen=True)
-class Stage:
-    """Draws a show, at times that never go back."""
+class View:
+    """A panel with the title and the groups of tracks for its captions."""
 
-    _frame: np.ndarray
-    _views: Sequence[_View]
+    title: str
+    groups: Sequence[Group]
+    panel: Panel
+
+    def above(self, layout: Layout) -> np.ndarray:
+        """Returns the bar above the panel."""
+        return layout.above(self.title, self.groups[0].tracks[0].arc)
+
+
+class Stage:
+    """Draws views side by side in a frame, at times that never go back."""
+
+    def __init__(self, size: tuple[int, int], layout: Layout, views: Sequence[View]):
+        self._frame = np.empty((size[1], size[0], 3), dtype=np.uint8)
+        self._layout, self._views, self._t = layout, views, -1.0
+        self._parts = np.split(self._frame, len(views), axis=1)
+        for part, view in zip(self._parts, views, strict=True):
+            part[: layout.bar] = view.above(layout)
 
     def draw(self, t: float) -> np.ndarray:
         """Returns the frame (height, width, 3) at time t [s], valid until the next call."""
-        for view in self._views:
-            view.draw(t)
+        bar = self._layout.bar
+        if t != self._t:
+            for part, view in zip(self._parts, self._views, strict=True):
+                view.panel.draw(t, part[bar:-bar])
+                part[-bar:] = self._layout.below(view.groups, t)
+        self._t = t
         return self._frame
 
     def fine(self, finer: int) -> np.ndarray:
         """Returns the last frame, `finer` times larger."""
-        return np.hstack([view.fine(finer) for view in self._views])
-
-
-@dataclass
-class _View:
-    """A panel with its captions, drawn into its part of the frame (height, width, 3)."""
-
-    part: np.ndarray
-    layout: Layout
-    title: str
-    groups: Sequence[Group]
-    panel: Panel
-    t: float = -1.0
-
-    def __post_init__(self) -> None:
-        self.part[: self.layout.bar] = self._above(self.layout)
-
-    def draw(self, t: float) -> None:
-        """Brings the part of the frame to time t [s]."""
-        if t == self.t:
-            return
-        bar = self.layout.bar
-        self.panel.draw(t, self.part[bar:-bar])
-        self.part[-bar:] = self.layout.below(self.groups, t)
-        self.t = t
-
-    def fine(self, finer: int) -> np.ndarray:
-        """Returns the part that was drawn last, `finer` times larger."""
-        layout = Layout(finer * self.layout.width, finer * self.layout.height, finer)
-        scene = self.panel.fine(finer)
-        return np.vstack([self._above(layout), scene, layout.below(self.groups, self.t)])
-
-    def _above(self, layout: Layout) -> np.ndarray:
-        return layout.above(self.title, self.groups[0].tracks[0].arc)
+        layout = Layout(finer * self._layout.width, finer * self._layout.height, finer)
+        columns = [
+            (view.above(layout), view.panel.fine(finer), layout.below(view.groups, self._t))
+            for view in self._views
+        ]
+        return np.hstack([np.vstack(column) for column in columns])
