@@ -53,11 +53,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def reading(path: Path, remedy: str = REMEDY) -> Iterator[None]:
-    """Turns whatever error a damaged file leads its reader to into one sentence.
-
-    Args:
-        path: the file.
-        remedy: what to do about it.
+    """Turns any error of a file's reader into one sentence that ends with the remedy.
 
     Raises:
         BadArtifact: the file is missing or cannot be read.
@@ -69,24 +65,20 @@ def reading(path: Path, remedy: str = REMEDY) -> Iterator[None]:
         yield
     except BadArtifact as error:
         raise BadArtifact(f"{path}: {error}") from error
-    # The readers of damaged files raise whatever the damage leads them to.
-    except Exception as error:
+    except Exception as error:  # a damaged file may raise any error in its reader
         raise BadArtifact(
             f"{path} cannot be read ({brief(error)}): it is truncated or not what its name says; {remedy}"
         ) from error
 
 
 def check_version(version: Any, kind: str, wanted: str) -> None:
-    """Raises `BadArtifact` unless a file says that it is `wanted` of this version."""
+    """Raises `BadArtifact` unless a file is of the wanted kind and of this version."""
     if kind != wanted:
         raise BadArtifact(f"it holds {kind!r}, not {wanted!r}")
     if version != VERSION:
         raise BadArtifact(
             f"it is of version {version}, this hyrl_mj reads version {VERSION}: {REMEDY}"
         )
-
-
-# ---- JSON
 
 
 def write_json(path: Path, content: Any, kind: str) -> None:
@@ -109,11 +101,10 @@ def read_json(path: Path, kind: str, remedy: str = REMEDY) -> dict[str, Any]:
 
 
 def read_record(path: Path, kind: str, record: type[Record], remedy: str = REMEDY) -> Record:
-    """Returns what `write_json` wrote of a dataclass, with the types that its fields are declared with.
+    """Returns the dataclass that `write_json` wrote.
 
     Raises:
-        BadArtifact: the file is missing or damaged, or a field is missing, unknown or of another type; the
-            sentence names it.
+        BadArtifact: the file is missing or damaged, or a field, which is named, does not fit the dataclass.
     """
     content = read_json(path, kind, remedy)
     with reading(path, remedy):
@@ -133,11 +124,12 @@ def parsed(content: Mapping[str, Any], record: type[Record], remedy: str = REMED
         return value
     except ValidationError as error:
         problems = error.errors(include_url=False, include_input=False)
-    # Where a value may be of several types each of them complains: the one that it fits best is meant.
-    complaints = Counter(problem["loc"][:-1] for problem in problems)
-    problem = min(problems, key=lambda problem: complaints[problem["loc"][:-1]])
-    # The first step leads into the list around the content.
-    field = ".".join(str(step) for step in problem["loc"][1:])
+    # For a value of several allowed types pydantic lists the problems of each: report the closest type.
+    counts = Counter(problem["loc"][:-1] for problem in problems)
+    problem = min(problems, key=lambda problem: counts[problem["loc"][:-1]])
+    field = ".".join(
+        str(step) for step in problem["loc"][1:]
+    )  # the first step is the tuple's index
     text = {
         "missing": f"it has no {field}",
         "unexpected_keyword_argument": f"it has an unknown {field}",
@@ -147,26 +139,18 @@ def parsed(content: Mapping[str, Any], record: type[Record], remedy: str = REMED
 
 @cache
 def _adapter(record: type) -> TypeAdapter[Any]:
-    """Returns what reads a record from JSON.
-
-    It is in a tuple, because pydantic takes a configuration for what holds a dataclass, not for itself.
-    """
+    """Returns the JSON reader of a tuple of one record: pydantic refuses a config for a bare dataclass."""
     from pydantic import ConfigDict, TypeAdapter  # slow to import
 
-    within: Any = tuple[record]  # type: ignore[valid-type]
-    return TypeAdapter(within, config=ConfigDict(extra="forbid", strict=True))
-
-
-# ---- npz
+    return TypeAdapter(tuple[record], config=ConfigDict(extra="forbid", strict=True))  # type: ignore[valid-type]
 
 
 @dataclass(frozen=True)
 class Saved:
-    """Base of the frozen dataclasses that an npz file holds, with an array for each field.
+    """Base of the frozen dataclasses that are saved as an npz file, with an array for each field.
 
     Numbers and strings are stored as arrays without dimensions, a tuple as one array, and a dictionary of
-    arrays as `<field>_<key>`, one for each entry. A tuple of a type that has `pack` and `unpack` is stored
-    as these say.
+    arrays as one array `<field>_<key>` for each entry. A type with `pack` and `unpack` stores its own tuples.
     """
 
     KIND: ClassVar[str]
@@ -180,11 +164,7 @@ class Saved:
 
     @classmethod
     def load(cls, path: Path, context: Any = None) -> Self:
-        """Reads what `save` wrote.
-
-        Args:
-            path: the npz file.
-            context: what the arrays need to be understood: the task, for sets in its chart.
+        """Reads what `save` wrote; sets in a task's chart need the task as `context`.
 
         Raises:
             BadArtifact: the file is missing, damaged, or holds something else.
@@ -207,8 +187,7 @@ def _packed(name: str, value: Any) -> dict[str, np.ndarray]:
     if isinstance(value, dict):
         return {f"{name}_{key}": np.asarray(array) for key, array in value.items()}
     if isinstance(value, tuple) and value and hasattr(value[0], "pack"):
-        packed: dict[str, np.ndarray] = value[0].pack(value)
-        return packed
+        return dict(value[0].pack(value))
     return {name: np.asarray(value)}
 
 
@@ -239,8 +218,8 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], kind: str) -> Non
     objects = [name for name, values in arrays.items() if np.asarray(values).dtype.hasobject]
     if objects:
         raise TypeError(f"arrays of Python objects cannot be written: {', '.join(objects)}")
+    content: dict[str, Any] = {"kind": kind, "version": VERSION, **arrays}
     with replacing(path) as temporary:
-        content: dict[str, Any] = {"kind": kind, "version": VERSION, **arrays}
         np.savez_compressed(temporary, **content)
 
 
@@ -250,9 +229,6 @@ def read_arrays(path: Path, kind: str) -> dict[str, np.ndarray]:
         content = {name: file[name] for name in file.files}
         check_version(int(content.pop("version")), str(content.pop("kind")), kind)
         return content
-
-
-# ---- safetensors
 
 
 def write_tensors(path: Path, tensors: dict[str, np.ndarray]) -> None:

@@ -1,21 +1,14 @@
 """Import MuJoCo with a GL backend that does not stop it.
 
-MuJoCo reads `MUJOCO_GL` once, when it is first imported, and loads the GL library that it names then and
-there. Where the library is missing or the name is unknown, `import mujoco` itself fails. Training and
-analysis draw nothing and need no GL, so they must not fail with it: another backend is tried, and at last
-MuJoCo is imported without one.
+MuJoCo reads `MUJOCO_GL` when it is first imported and loads the GL library at once. Where the library is
+missing or the name is unknown, `import mujoco` itself fails. Training and analysis draw nothing and must not
+fail with it: other backends are tried, and at last MuJoCo is imported without one.
 
-Before the next attempt, the modules that the failed one has left in `sys.modules` have to be removed from
-it. Python removes the module that failed, and keeps those that it had imported by then. PyOpenGL stays bound
-to the backend that failed: EGL after OSMesa ends with "OSMesaPlatform has no attribute EGL". And the MuJoCo
-that is imported next lacks `mujoco.rendering`, because Python makes a submodule an attribute of its package
-only when it loads the submodule.
-
-A look for the GL library beforehand cannot take the place of an attempt: whether the import succeeds also
-depends on the versions of PyOpenGL and MuJoCo and on the environment. An attempt in a child process could,
-but each import of this package would wait for a second import of MuJoCo.
-
-Only what an attempt has added is removed; what was imported before it stays as it is.
+Before the next attempt, the modules that the failed one has added must be removed from `sys.modules`:
+PyOpenGL stays bound to the backend that failed ("OSMesaPlatform has no attribute EGL"), and the next MuJoCo
+would lack `mujoco.rendering`, because Python makes a submodule an attribute of its package only when it loads
+the submodule. Looking for the GL library beforehand is not enough, because the import also depends on the
+versions of PyOpenGL and MuJoCo; an attempt in a child process would double the time of every import.
 """
 
 import importlib
@@ -27,29 +20,26 @@ HEADLESS = ("egl", "osmesa")
 
 
 def has_display() -> bool:
-    """Whether windows can be opened; elsewhere than on Linux they always can."""
+    """Returns whether windows can be opened: without a display they cannot on Linux."""
     shown = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     return bool(shown) or not sys.platform.startswith("linux")
 
 
 def import_mujoco() -> str:
-    """Import MuJoCo with the first GL backend that can be loaded, or else without one.
+    """Imports MuJoCo with the first GL backend that can be loaded, or else without one.
 
-    These are tried: what `MUJOCO_GL` names; where it is not set, MuJoCo's own choice if there is a display,
-    else `HEADLESS`. `MUJOCO_GL` is left at the backend in use or, without one, at the first that was tried.
+    The backend that `MUJOCO_GL` names is tried; where it is not set, MuJoCo's own choice if there is a
+    display, else `HEADLESS`. `MUJOCO_GL` is left at the backend in use or, without one, at the first tried.
 
     Returns:
-        Why MuJoCo runs without GL although a backend was tried; empty if it does not.
-
-    Raises:
-        Exception: whatever `import mujoco` raises for a reason other than the GL backend.
+        Why all backends failed; empty if one was loaded or none was needed.
     """
-    asked = os.environ.get("MUJOCO_GL", "")
-    if not asked and (has_display() or "mujoco" in sys.modules):
+    chosen = os.environ.get("MUJOCO_GL", "")
+    if not chosen and (has_display() or "mujoco" in sys.modules):
         importlib.import_module("mujoco")
         return ""
     problems = []
-    backends = (asked,) if asked else HEADLESS
+    backends = (chosen,) if chosen else HEADLESS
     for backend in backends:
         problem = _attempt(backend)
         if not problem:
@@ -62,14 +52,7 @@ def import_mujoco() -> str:
 
 
 def _attempt(backend: str) -> str:
-    """Import MuJoCo with one GL backend; a failed import leaves nothing behind.
-
-    Args:
-        backend: the value of `MUJOCO_GL`.
-
-    Returns:
-        Why the import failed; empty if it succeeded.
-    """
+    """Imports MuJoCo with one GL backend; a failure leaves nothing behind, and its reason is returned."""
     imported = set(sys.modules)
     platform = os.environ.get("PYOPENGL_PLATFORM")
     os.environ["MUJOCO_GL"] = backend
@@ -80,7 +63,7 @@ def _attempt(backend: str) -> str:
         for name in sys.modules.keys() - imported:
             if name.partition(".")[0] in ("mujoco", "OpenGL"):
                 del sys.modules[name]
-        # MuJoCo has set it for PyOpenGL, and refuses to load another backend while it is set so.
+        # MuJoCo has set this for PyOpenGL, and refuses to load another backend while it is set.
         os.environ.pop("PYOPENGL_PLATFORM", None)
         if platform is not None:
             os.environ["PYOPENGL_PLATFORM"] = platform
@@ -88,5 +71,5 @@ def _attempt(backend: str) -> str:
     return ""
 
 
-# Why MuJoCo runs without GL although a backend was tried; empty if it does not.
+# Why all GL backends failed; empty if one was loaded or none was needed.
 GL_PROBLEM = import_mujoco()

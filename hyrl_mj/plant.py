@@ -1,4 +1,4 @@
-"""n copies of a compiled model that are stepped together: the physics under every task."""
+"""The physics of every task: n copies of a compiled model, stepped side by side."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import numpy as np
 from hyrl_mj import mjcf
 from hyrl_mj.errors import BadInput
 
-# What the sensors give (n, sensors) -> the measurement (n, p).
+# Sensor values (n, sensors) -> measurement (n, p).
 Measure = Callable[[np.ndarray], np.ndarray]
 # Inputs (n, m), positions (n, nq), velocities (n, nv) -> controls of all actuators (n, nu).
 Control = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-# A float32 policy may overshoot an input limit by a rounding error; more than this is a mistake.
+# Tolerated excess over an input limit: float32 policies have rounding errors.
 INPUT_TOLERANCE = 1e-6
 
 
@@ -27,11 +27,11 @@ class Plant:
         inputs: names of the actuators that the policy drives, in the order of the columns of u. The
             others hold the control of the model's first keyframe, or zero.
         n: number of copies.
-        threads: threads of the physics, 0 for all cores. The result does not depend on it.
-        measure: makes the measurement of what the sensors give; by default it is just that.
-        control: an inner loop that makes the controls of all actuators out of u, at every physics step
-            and from the true state; they are kept inside each actuator's ctrlrange. `inputs` are then
-            names of MJCF numerics that hold their limits.
+        threads: threads of the physics, 0 for all cores. Results do not depend on it.
+        measure: computes the measurement from the sensor values; by default the sensor values.
+        control: inner loop that computes the controls of all actuators from u and the true state, at every
+            physics step; they are clipped to each actuator's ctrlrange. `inputs` are then names of MJCF
+            numerics that hold the limits of u.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class Plant:
         n: int,
         threads: int = 0,
         *,
-        measure: Measure = lambda given: given,
+        measure: Measure = lambda sensors: sensors,
         control: Control | None = None,
     ):
         from mujoco.batch import Batch  # slow to import
@@ -49,7 +49,7 @@ class Plant:
         self.n, self._measure, self._control = n, measure, control
         self.model = copy.copy(model)
         # A bad state has to stay visible: MuJoCo would reset it and only count a warning. Inputs are
-        # checked here, and clamping them would be in the way of running backward.
+        # checked here, and clamping would prevent backward steps.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
         self.substeps = max(round(mjcf.sample_time(model) / model.opt.timestep), 1)
@@ -64,7 +64,7 @@ class Plant:
         self._initial = self._batch.state[0].copy()
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._ctrl = self._batch.bind("ctrl")
-        # Sensors of joints are read from the state; for others MuJoCo has to compute them after each step.
+        # Sensors of joints are read from the state; MuJoCo has to compute others after each step.
         self._joints = joint_columns(self.model)
         self._stage = mujoco.mjtStage.mjSTAGE_NONE
         if self._joints is None:
@@ -73,15 +73,16 @@ class Plant:
 
     @property
     def measurement(self) -> np.ndarray:
-        """What is measured now, without noise: (n, p), a copy."""
-        given = self._sensors.copy() if self._joints is None else self._batch.state[:, self._joints]
-        return self._measure(given)
+        """The current measurement without noise: (n, p), a copy."""
+        if self._joints is None:
+            return self._measure(self._sensors.copy())
+        return self._measure(self._batch.state[:, self._joints])
 
     @property
     def unstable(self) -> np.ndarray:
-        """(n,) bool, copies whose simulation left the finite numbers since they were put into a state.
+        """The copies (n,) bool whose simulation has diverged since `set_state`.
 
-        They were put back into the model's initial state; the others do not notice.
+        These copies are reset to the model's initial state; the others are not affected.
         """
         return self._unstable.copy()
 
@@ -103,7 +104,7 @@ class Plant:
     def set_state(
         self, qpos: np.ndarray, qvel: np.ndarray | None = None, ids: np.ndarray | None = None
     ) -> None:
-        """Put the copies `ids` (all by default) into a state and make their sensors current.
+        """Sets the state of the copies `ids` (all by default) and updates their sensors.
 
         Args:
             qpos: (k, nq) generalised positions, k the number of copies addressed.
@@ -126,7 +127,7 @@ class Plant:
             self._batch.forward(ids, self._stage)
 
     def step(self, u: np.ndarray, ids: np.ndarray | None = None) -> None:
-        """Advance the copies `ids` (all by default) by one sample under the inputs u.
+        """Advances the copies `ids` (all by default) by one sample under the inputs u.
 
         Args:
             u: (k, m) inputs in the plant's physical units.
@@ -146,7 +147,7 @@ class Plant:
             self._advance(ctrl, ids, 1, sense=not left)
 
     def step_backward(self, u: np.ndarray, ids: np.ndarray | None = None) -> None:
-        """Undo `step`: one sample of x' = -f(x, u), for plants with kinematic actuators only.
+        """Reverses `step`: one sample of x' = -f(x, u), for plants with kinematic actuators only.
 
         Raises:
             BadInput: as `step`, or the plant cannot be run backward.
@@ -160,7 +161,7 @@ class Plant:
 
     @property
     def invertible(self) -> bool:
-        """Whether each degree of freedom simply follows its own velocity actuator."""
+        """Whether each degree of freedom follows its own velocity actuator."""
         model = self.model
         if self._control is not None:
             return False
@@ -169,7 +170,7 @@ class Plant:
         return bool(model.nq == model.nv and driven == list(range(model.njnt)) and follows.all())
 
     def _inputs(self, u: np.ndarray, ids: np.ndarray | None) -> np.ndarray:
-        """Inputs (k, m), checked, inside their limits to the last bit."""
+        """Returns the inputs (k, m), checked and clipped to their limits."""
         count = self.n if ids is None else len(ids)
         u = _checked("input", u, (count, len(self.low)), ids)
         wrong = (u < self.low - INPUT_TOLERANCE) | (u > self.high + INPUT_TOLERANCE)
@@ -182,7 +183,7 @@ class Plant:
         return np.clip(u, self.low, self.high)
 
     def _controls(self, u: np.ndarray) -> np.ndarray:
-        """Controls of all actuators (k, nu) for inputs (k, m)."""
+        """Returns the controls of all actuators (k, nu) for inputs (k, m)."""
         ctrl = np.tile(self._held, (len(u), 1))
         ctrl[:, self._columns] = u
         return ctrl
@@ -192,17 +193,17 @@ class Plant:
     ) -> None:
         rows = slice(None) if ids is None else ids
         self._ctrl[rows] = ctrl
-        # What only sensors need is computed when somebody will look at them.
+        # Sensors are computed only where they will be read.
         stage = self._stage if sense else mujoco.mjtStage.mjSTAGE_NONE
         self._batch.step(ids, substeps, stage)
-        # What MuJoCo itself calls bad: not a number, infinite, or beyond mjMAXVAL.
+        # MuJoCo's own criterion of a bad state: NaN, infinite, or beyond mjMAXVAL.
         for values in (self._qpos, self._qvel):
-            good = np.abs(values) <= mujoco.mjMAXVAL
-            if not good.all():
-                self._give_up(np.flatnonzero(~good.all(axis=1)))
+            valid = np.abs(values) <= mujoco.mjMAXVAL
+            if not valid.all():
+                self._reset_unstable(np.flatnonzero(~valid.all(axis=1)))
 
-    def _give_up(self, ids: np.ndarray) -> None:
-        """Put copies that cannot go on into the initial state, and remember that they could not."""
+    def _reset_unstable(self, ids: np.ndarray) -> None:
+        """Marks copies as unstable and puts them into the initial state."""
         self._unstable[ids] = True
         self._batch.state[ids] = self._initial
         if self._joints is None:
@@ -210,26 +211,22 @@ class Plant:
 
 
 def actuator_columns(model: mujoco.MjModel, names: Sequence[str]) -> list[int]:
-    """The ids of the named actuators.
-
-    Raises:
-        BadInput: the model has no such actuator; the message lists those it has.
-    """
+    """Returns the ids of the named actuators, or raises `BadInput` with the names that the model has."""
     return [mjcf.object_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in names]
 
 
 def input_limits(
     model: mujoco.MjModel, inputs: Sequence[str], of_actuators: bool = True
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper limits (m,), (m,) of the inputs, from the MJCF.
+    """Returns the lower and upper limits (m,), (m,) of the inputs, from the MJCF.
 
     Args:
         model: the compiled model.
         inputs: names of actuators with a `ctrlrange`, or of custom numerics with two values.
-        of_actuators: which of the two.
+        of_actuators: whether the names are those of actuators.
 
     Raises:
-        BadInput: the model has no such actuator or numeric, or it gives no limits.
+        BadInput: the model has no such actuator or numeric, or it has no limits.
     """
     if not of_actuators:
         ranges = np.array([mjcf.numeric(model, name, 2) for name in inputs])
@@ -243,9 +240,9 @@ def input_limits(
 
 
 def joint_columns(model: mujoco.MjModel) -> np.ndarray | None:
-    """Where a state (mjSTATE_INTEGRATION) has what the sensors measure: (p,) columns.
+    """Returns the columns (p,) of a state (mjSTATE_INTEGRATION) that the sensors measure.
 
-    None unless each sensor is the position or velocity of a joint, as it is: only those are in the state.
+    Returns None unless each sensor is the unmodified position or velocity of a joint.
     """
     kind, joint = model.sensor_type, model.sensor_objid
     of_pos = kind == mujoco.mjtSensor.mjSENS_JOINTPOS

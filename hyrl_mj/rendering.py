@@ -1,9 +1,10 @@
-"""Off-screen pictures of a model, with one clear message where that fails."""
+"""Off-screen pictures of a model, with one clear message if rendering fails."""
 
 from __future__ import annotations
 
 import os
 import sys
+from contextlib import suppress
 from copy import copy
 from itertools import pairwise
 from typing import Any
@@ -17,9 +18,9 @@ from hyrl_mj.gl import GL_PROBLEM
 
 GL_CURE = "on Debian or Ubuntu: apt-get install libegl1 libgl1-mesa-dri, and set MUJOCO_GL=egl"
 
-# The widest and highest picture [pixels].
+# Largest width and height of a picture [pixels].
 LARGEST = 4096
-GEOMS = 2_000  # that a scene has room for, by default
+GEOMS = 2_000  # default capacity of a scene
 # A geom that is a label without a text is not drawn.
 HIDDEN = mujoco.mjtGeom.mjGEOM_LABEL
 
@@ -28,11 +29,11 @@ Box = tuple[int, int, int, int]
 
 
 class Canvas:
-    """A GL context off the screen, for pictures of one model. It belongs to the thread that made it.
+    """An off-screen GL context for pictures of one model. Only the thread that created it can use it.
 
     Args:
         model: the compiled model.
-        width, height: of the largest picture [pixels].
+        width, height: size of the largest picture [pixels].
 
     Raises:
         BadInput: a size that no picture can have.
@@ -60,14 +61,14 @@ class Canvas:
 
     @property
     def device(self) -> str:
-        """What GL draws with, by the driver's name for it."""
+        """The driver's name of the GL device."""
         from OpenGL import GL  # chooses its platform when it is imported
 
         self._gl.make_current()
         return str(GL.glGetString(GL.GL_RENDERER).decode())
 
     def draw(self, scene: mujoco.MjvScene, width: int, height: int) -> np.ndarray:
-        """The scene as its camera sees it: (height, width, 3) uint8."""
+        """Returns the picture of the scene's camera: (height, width, 3) uint8."""
         part = mujoco.MjrRect(0, 0, width, height)
         pixels = np.empty((height, width, 3), dtype=np.uint8)
         try:
@@ -79,7 +80,7 @@ class Canvas:
         return pixels[::-1]  # GL counts rows from below
 
     def close(self) -> None:
-        """Give the GL context back."""
+        """Frees the GL context."""
         self._gl.make_current()
         self._context.free()
         self._gl.free()
@@ -88,15 +89,14 @@ class Canvas:
 class SceneRenderer:
     """Draws states of one model from its named cameras.
 
-    A camera's field of view is that of the picture's shorter side: what a square picture shows is seen
-    in one of any shape.
+    A camera's field of view is that of the picture's shorter side, so that a picture of any shape shows all
+    that a square one shows.
 
     Args:
         model: the compiled model.
-        width, height: of the picture [pixels].
-        geoms: how many the scene has room for.
-        canvas: to draw on, of this model and no smaller; its own without one. A GL context takes a tenth
-            of a second.
+        width, height: size of the picture [pixels].
+        geoms: number of geoms that the scene has room for.
+        canvas: canvas of this model, at least as large; by default a new one, which takes 0.1 s.
 
     Raises:
         BadInput: a size that no picture can have.
@@ -116,18 +116,18 @@ class SceneRenderer:
         self.data = mujoco.MjData(self.model)
         self.scene = mujoco.MjvScene(self.model, maxgeom=geoms)
         self._options, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
-        # Of the geoms that stay: their kinds, balls around them, and which are not hidden.
+        # The geoms that stay: their types, bounding spheres, and whether they are shown.
         self._kinds: list[int] = []
         self._balls, self._shown = np.empty((0, 4)), np.empty(0, dtype=bool)
 
     def place(self, qpos: np.ndarray, camera: str) -> None:
-        """Put the robot into a position (nq,) and look at it from a camera."""
+        """Puts the robot into a position (nq,), seen from a camera."""
         self.clear()
         self.look(qpos, camera)
         self.add_robot(qpos)
 
     def clear(self) -> None:
-        """Leave in the scene what never moves."""
+        """Removes all geoms from the scene but static ones."""
         static = mujoco.mjtCatBit.mjCAT_STATIC.value
         mujoco.mj_forward(self.model, self.data)
         mujoco.mjv_updateScene(
@@ -137,7 +137,7 @@ class SceneRenderer:
         self.keep()
 
     def keep(self) -> None:
-        """Let what is in the scene now stay there, as it is."""
+        """Makes the geoms that are in the scene now permanent."""
         more = self.scene.geoms[len(self._kinds) : self.scene.ngeom]
         if more:
             self._kinds += [geom.type for geom in more]
@@ -146,11 +146,11 @@ class SceneRenderer:
             self._shown = np.append(self._shown, np.ones(len(more), dtype=bool))
 
     def drop(self) -> None:
-        """Take out of the scene what came after the last `keep`."""
+        """Removes the geoms that were added after the last `keep`."""
         self.scene.ngeom = len(self._kinds)
 
     def reach(self, geom: mujoco.MjvGeom) -> float:
-        """Radius [m] of a ball around a geom of the scene; that of a plane is infinite."""
+        """Returns the radius [m] of a geom's bounding sphere; infinite for a plane."""
         if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
             return np.inf
         if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM:
@@ -158,7 +158,7 @@ class SceneRenderer:
         return float(np.linalg.norm(geom.size))
 
     def look(self, qpos: np.ndarray, camera: str) -> None:
-        """Look from a camera, which may follow the robot in its position (nq,)."""
+        """Selects a camera, which may follow the robot in its position (nq,)."""
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._camera.fixedcamid = mjcf.object_id(self.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
         self._move(qpos)
@@ -173,11 +173,7 @@ class SceneRenderer:
             )
 
     def add_robot(self, qpos: np.ndarray) -> range:
-        """Add what moves to the scene, in a position (nq,).
-
-        Returns:
-            The numbers of its geoms in the scene.
-        """
+        """Adds the moving geoms in a position (nq,); returns their indices in the scene."""
         self._move(qpos)
         first, moving = self.scene.ngeom, mujoco.mjtCatBit.mjCAT_DYNAMIC.value
         mujoco.mjv_addGeoms(
@@ -186,7 +182,7 @@ class SceneRenderer:
         return range(first, self.scene.ngeom)
 
     def draw(self, finer: int = 1) -> np.ndarray:
-        """The picture: (height, width, 3) uint8, or twice as large with `finer` 2, drawn in four parts."""
+        """Returns the picture (height, width, 3) uint8; `finer` 2 draws it twice as large, in parts."""
         picture = np.empty((finer * self.height, finer * self.width, 3), dtype=np.uint8)
         columns, rows = (
             np.linspace(0, side, finer + 1).astype(int) for side in (self.width, self.height)
@@ -197,15 +193,12 @@ class SceneRenderer:
         return picture
 
     def redraw(self, picture: np.ndarray, box: Box, finer: int = 1) -> None:
-        """Draw a part of the picture (height, width, 3) anew; the rest stays as it is.
-
-        A software rasteriser takes time for each pixel. The camera's frustum is cut to the box, and
-        nothing else is different.
+        """Redraws a part of the picture (height, width, 3), with the camera's frustum cut to the box.
 
         Args:
-            picture: to draw into, `finer` times larger than this renderer's.
-            box: the part, in this renderer's pixels; in the picture it is no larger than `width` x `height`.
-            finer: how many pixels of the picture, across, are one of this renderer's.
+            picture: picture to draw into, `finer` times larger than this renderer's.
+            box: the part, in this renderer's pixels; in the picture it is at most `width` x `height`.
+            finer: width of one pixel of this renderer in pixels of the picture.
         """
         self._hide_outside(box)
         left, top, right, bottom = box
@@ -226,11 +219,7 @@ class SceneRenderer:
             view.frustum_center, view.frustum_width, view.frustum_bottom, view.frustum_top = values
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where points (n, 3) [m] are seen.
-
-        Returns:
-            (n, 2) column and row in the picture [pixels], and (n,) pixels that a metre has there.
-        """
+        """Returns column and row (n, 2) [pixels] of points (n, 3) [m], and their scale (n,) [pixels/m]."""
         eyes, view = self.scene.camera, self.scene.camera[0]
         offset = points - (eyes[0].pos + eyes[1].pos) / 2  # the middle of a stereo pair
         depth = offset @ view.forward
@@ -242,11 +231,11 @@ class SceneRenderer:
         return pixels, scale * shrink
 
     def extent(self, points: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where balls around points (n, 3) with radii (n,) [m] may be seen.
+        """Returns bounds of the pictures of spheres around points (n, 3) with radii (n,) [m].
 
         Returns:
-            (n, 2) least and (n, 2) greatest column and row [pixels], a pixel wider than need be; everywhere
-            for a ball that reaches to the camera.
+            (n, 2) least and (n, 2) greatest column and row [pixels], with a margin of one pixel; infinite
+            for a sphere that reaches the camera.
         """
         eyes, view = self.scene.camera, self.scene.camera[0]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -254,7 +243,7 @@ class SceneRenderer:
             reach = (radii * scale)[:, None]
             near = np.zeros(len(points), dtype=bool)
             if not view.orthographic:
-                # What is nearer than the middle is seen larger, and farther off the axis.
+                # The near side of a sphere appears larger and farther off the axis than its centre.
                 depth = (points - (eyes[0].pos + eyes[1].pos) / 2) @ view.forward
                 off = np.abs(pixels - [self.width / 2, self.height / 2])
                 reach = (radii / (depth - radii))[:, None] * ((scale * depth)[:, None] + off)
@@ -264,12 +253,12 @@ class SceneRenderer:
         return low, high
 
     def close(self) -> None:
-        """Give the GL context back, if it is its own."""
+        """Frees the GL context, unless the canvas was passed by the caller."""
         if self._own:
             self.canvas.close()
 
     def _hide_outside(self, box: Box) -> None:
-        """Leave out what stays and is not seen in a box: GL takes longer for it than for small boxes."""
+        """Hides permanent geoms outside a box, because drawing them takes longer than a small box."""
         left, top, right, bottom = box
         low, high = self.extent(self._balls[:, :3], self._balls[:, 3])
         seen = np.asarray(((low < [right, bottom]) & (high > [left, top])).all(axis=1))
@@ -284,7 +273,7 @@ class SceneRenderer:
 
 
 def check_size(width: int, height: int) -> None:
-    """Raise `BadInput` unless a picture can have this size [pixels]."""
+    """Raises `BadInput` unless a picture can have this size [pixels]."""
     if not (0 < width <= LARGEST and 0 < height <= LARGEST):
         raise BadInput(
             f"a picture of {width} x {height} pixels cannot be drawn: give 1 x 1 to "
@@ -293,20 +282,19 @@ def check_size(width: int, height: int) -> None:
 
 
 def _gl_context(width: int, height: int) -> Any:
-    """A GL context off the screen: of the backend that was chosen, else EGL if there is one."""
+    """Returns an off-screen GL context of the chosen backend, else of EGL if it is available."""
     if not os.environ.get("MUJOCO_GL") and sys.platform.startswith("linux"):
-        # There is a display, or MuJoCo was imported before this package. Its own choice opens windows,
-        # which only the main thread may.
-        try:
+        # With a display, or if MuJoCo was imported first, MuJoCo's own choice opens windows, which only the
+        # main thread may do.
+        with suppress(Exception):  # if EGL is not usable
             from mujoco.egl import GLContext
 
             return GLContext(width, height)
-        except Exception:  # whatever EGL lacks: the other way may go
-            pass
     return mujoco.GLContext(width, height)
 
 
 def _no_gl(error: Exception) -> NoRenderer:
+    """Returns the error to raise when rendering fails."""
     backend = os.environ.get("MUJOCO_GL", "")
     cause = GL_PROBLEM or brief(error)
     return NoRenderer(

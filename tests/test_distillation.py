@@ -15,8 +15,8 @@ from hyrl_mj.learning.training import build, export
 @pytest.fixture(autouse=True)
 def _small(monkeypatch):
     """Fewer states and steps than in a run: the planted policies are simple."""
-    monkeypatch.setattr(distillation, "DISTILLED", 2_048)
-    monkeypatch.setattr(distillation, "DISTILLING", 400)
+    monkeypatch.setattr(distillation, "STATES", 2_048)
+    monkeypatch.setattr(distillation, "STEPS", 400)
 
 
 def settings_of(task, algorithm="ppo"):
@@ -53,7 +53,7 @@ def test_it_is_copied_at_the_starts_that_it_is_given(circle):
 
 
 def test_the_seed_fixes_the_copy(circle, monkeypatch):
-    monkeypatch.setattr(distillation, "DISTILLING", 20)
+    monkeypatch.setattr(distillation, "STEPS", 20)
     copies = [
         distil(circle, homing_policy(circle), circle.starts, settings_of(circle), seed)
         for seed in (0, 0, 1)

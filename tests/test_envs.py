@@ -359,5 +359,5 @@ def test_no_render_mode_no_picture(task):
 
 
 def test_an_unknown_render_mode_is_refused():
-    with pytest.raises(BadInput, match="'ansi' is unknown: None or 'rgb_array'"):
+    with pytest.raises(BadInput, match="'ansi' is unknown: use None or 'rgb_array'"):
         TaskEnv("vehicle", render_mode="ansi")

@@ -122,7 +122,7 @@ def test_noise_on_all_coordinates_is_worse_where_all_matter(vehicle):
 
 def test_noise_beyond_what_was_prepared_is_refused(on_vehicle):
     game, _ = on_vehicle
-    with pytest.raises(BadInput, match=r"noise 0.25 is beyond the largest that was prepared, 0.2"):
+    with pytest.raises(BadInput, match=r"noise 0.25 exceeds the largest bound of this game, 0.2"):
         game.score("sign", 0.25)
 
 

@@ -1,4 +1,4 @@
-"""The batched core under every environment: n episodes of one task, stepped together."""
+"""The batched core of every environment: n episodes of one task, stepped side by side."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class Domain:
 
     Attributes:
         starts: draws n chart points (n, d) with a generator.
-        contains: (n, d) -> (n,) bool; an episode that leaves it is over.
-        exit_reward: the reward for leaving it.
-        caution: (p,) how wrong a measurement may be: if given, the reward is the least that any state
-            within it of the measured one earns, and where one of them has failed the task's worst.
+        contains: (n, d) -> (n,) bool; an episode ends where it leaves the domain.
+        exit_reward: reward for leaving the domain.
+        caution: (p,) largest error of a measurement: if given, the reward is the least of all states within
+            this error of the measured one, and the task's worst where one of them has failed.
     """
 
     starts: Callable[[int, np.random.Generator], np.ndarray]
@@ -37,9 +37,9 @@ class StepResult:
 
     Attributes:
         observation: (n, k) float32, noise included.
-        reward: (n,) of the true state after the step.
-        terminated: (n,) bool, the task (or leaving the domain) ended the episode.
-        truncated: (n,) bool, its time was up.
+        reward: (n,) rewards of the true states after the step.
+        terminated: (n,) bool, whether the task or leaving the domain ended the episode.
+        truncated: (n,) bool, whether the time limit ended the episode.
         outcome: (n,) `Outcome`; RUNNING unless the episode is over.
     """
 
@@ -56,16 +56,16 @@ class StepResult:
 
 
 class BatchedEnv:
-    """n episodes of one task. The environments built on it add only the conventions of their libraries.
+    """n episodes of one task. The environments add only the conventions of their libraries.
 
     Args:
-        task: what is played.
+        task: the robot and its problem.
         n: number of episodes side by side.
         noise: measurement noise on the observations, of a kind that needs no controller; reward and end
-            see the true state.
+            depend on the true state.
         domain: where episodes start and stay; by default the task's starts, and everywhere.
-        max_steps: samples until truncation, by default the task's.
-        threads: threads of the physics, 0 for all cores; the result does not depend on it.
+        max_steps: samples until truncation, by default the task's limit.
+        threads: threads of the physics, 0 for all cores; results do not depend on it.
     """
 
     def __init__(
@@ -85,7 +85,6 @@ class BatchedEnv:
         self.max_steps = max_steps or task.max_steps
         self.plant = task.plant(n, threads)
         self._samples = np.zeros(n, dtype=int)
-        self._everyone = np.arange(n)
         self.seed(None)
 
     def seed(self, seed: int | None) -> None:
@@ -94,19 +93,14 @@ class BatchedEnv:
         self._noise.reset(self.n, self._rng)
 
     def reset(self, ids: np.ndarray | None = None, z: np.ndarray | None = None) -> np.ndarray:
-        """Starts new episodes in the rows `ids` (all by default).
+        """Starts new episodes in the rows `ids` (k,), by default all; returns observations (k, o) float32.
 
-        Args:
-            ids: (k,) rows.
-            z: (k, d) chart points to start from, by default drawn from the start distribution.
-
-        Returns:
-            (k, o) float32, their first observations.
+        The episodes start at chart points z (k, d), by default drawn from the start distribution.
 
         Raises:
-            BadInput: another number of starts than of rows.
+            BadInput: the numbers of starts and rows differ.
         """
-        ids = self._everyone if ids is None else ids
+        ids = np.arange(self.n) if ids is None else ids
         if z is None:
             draw = self.task.starts if self.domain is None else self.domain.starts
             z = draw(len(ids), self._rng)
@@ -117,20 +111,18 @@ class BatchedEnv:
         return self.task.observation(self._measure(ids)).astype(np.float32)
 
     def step(self, u: np.ndarray) -> StepResult:
-        """Advances every episode by one sample; the caller resets those that are over.
+        """Advances all episodes by one sample under inputs u (n, m) in the plant's units.
 
-        Args:
-            u: (n, m) inputs in the plant's units.
+        The caller resets the episodes that are over.
         """
         self.plant.step(u)
         self._samples += 1
-        measurement = self.plant.measurement
-        unstable = self.plant.unstable
+        measurement, unstable = self.plant.measurement, self.plant.unstable
         outcome = self.task.outcome(measurement, unstable)
         terminated = outcome != Outcome.RUNNING
         reward = self.task.reward(measurement, u)
         reward[unstable] = self.task.worst_reward
-        measured = self._measure(self._everyone)
+        measured = self._measure(np.arange(self.n))
         if self.domain is not None:
             if self.domain.caution is not None:
                 cautious = cautious_reward(self.task, measured, u, self.domain.caution)
@@ -169,8 +161,7 @@ def cautious_reward(
 ) -> np.ndarray:
     """Returns the least reward (n,) of states within `caution` (p,) of measurements (n, p), inputs (n, m).
 
-    A policy whose reward depends on where it might be keeps clear of what noise could hide, without
-    having to meet the noise: what it observes and what it earns go together.
+    With this reward a policy learns to keep clear of what noise could hide, without noise in training.
     """
     shares = (-1.0, -0.5, 0.0, 0.5, 1.0) if np.count_nonzero(caution) <= 2 else (-1.0, 0.0, 1.0)
     worst = np.full(len(measured), np.inf)

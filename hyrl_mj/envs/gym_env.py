@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 
 def observation_space(task: Task) -> spaces.Box:
-    """The space of a task's observations."""
+    """Returns the space of a task's observations."""
     low = np.array(task.observation_low, dtype=np.float32)
     high = np.array(task.observation_high, dtype=np.float32)
     return spaces.Box(low, high, dtype=np.float32)
 
 
 def action_space(task: Task) -> spaces.Space[Any]:
-    """The space of a task's inputs: one of its levels, or physical units within the MJCF's limits."""
+    """Returns the space of a task's actions: levels, or inputs in physical units within the MJCF's limits."""
     if task.input_levels is not None:
         return spaces.Discrete(len(task.input_levels))
     low, high = task.input_limits
@@ -37,15 +37,15 @@ def action_space(task: Task) -> spaces.Space[Any]:
 class TaskEnv(gym.Env[np.ndarray, Any]):
     """One episode of a task, for `gymnasium.make`.
 
-    `info["z"]` is the true chart point (d,). When an episode is over, `info["outcome"]` says why:
-    "reached", "crashed", "out_of_bounds" or "stalled".
+    `info["z"]` is the true chart point (d,). When an episode is over, `info["outcome"]` is "reached",
+    "crashed", "out_of_bounds" or "stalled".
 
     Args:
-        task: its name.
+        task: name of the task.
         noise: measurement noise on the observation.
         render_mode: None or "rgb_array".
-        camera: a camera of the MJCF, by default that of the task's scene.
-        width, height: of the rendered picture [pixels].
+        camera: name of a camera of the MJCF, by default that of the task's scene.
+        width, height: size of the rendered picture [pixels].
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
@@ -61,7 +61,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         height: int = 480,
     ):
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise BadInput(f"render_mode {render_mode!r} is unknown: None or 'rgb_array'")
+            raise BadInput(f"render_mode {render_mode!r} is unknown: use None or 'rgb_array'")
         self.core = BatchedEnv(get_task(task), 1, noise=noise, threads=1)
         self.metadata = {**self.metadata, "render_fps": round(1 / self.core.task.dt)}
         self.observation_space = observation_space(self.core.task)
@@ -73,25 +73,22 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode, at the chart point `options["z"]` if given."""
+        """Starts an episode, at the chart point `options["z"]` if given."""
         super().reset(seed=seed)
         self.core.seed(int(self.np_random.integers(2**63)))
-        z = (options or {}).get("z")
-        if z is not None:
-            z = self.core.task.chart.check(z, self.core.task.name)
-        return self.core.reset(z=z)[0], {"z": self.core.z[0]}
+        return self.core.reset(z=_starts(self.core.task, options))[0], {"z": self.core.z[0]}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Apply one action for one sample; see `gymnasium.Env.step`."""
+        """Applies one action for one sample; see `gymnasium.Env.step`."""
         result = self.core.step(self.core.inputs(np.asarray(action)[None]))
         info: dict[str, Any] = {"z": self.core.z[0]}
         if result.done[0]:
-            info["outcome"] = _label(result.outcome[0])
+            info["outcome"] = Outcome(result.outcome[0]).label
         terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
         return result.observation[0], float(result.reward[0]), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
-        """The scene as (height, width, 3) uint8 in render mode "rgb_array", else None."""
+        """Returns the scene as (height, width, 3) uint8 in render mode "rgb_array", else None."""
         if self.render_mode is None:
             return None
         if self._renderer is None:
@@ -102,7 +99,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         return self._renderer.draw()
 
     def close(self) -> None:
-        """Give the GL context back."""
+        """Frees the GL context."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
@@ -115,11 +112,11 @@ class TaskVectorEnv(VectorEnv):
     observations and `infos["final_info"]` their outcomes, both masked by `infos["_final_obs"]`.
 
     Args:
-        task: its name.
-        num_envs: n.
+        task: name of the task.
+        num_envs: number of episodes n.
         noise: measurement noise on the observations.
-        max_episode_steps: samples until truncation, by default the task's.
-        threads: threads of the physics, 0 for all cores; the result does not depend on it.
+        max_episode_steps: samples until truncation, by default the task's limit.
+        threads: threads of the physics, 0 for all cores; results do not depend on it.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -145,19 +142,16 @@ class TaskVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start all episodes, at the chart points `options["z"]` (n, d) if given."""
+        """Starts all episodes, at the chart points `options["z"]` (n, d) if given."""
         super().reset(seed=seed)
         if seed is not None:
             self.core.seed(seed)
-        z = (options or {}).get("z")
-        if z is not None:
-            z = self.core.task.chart.check(z, self.core.task.name)
-        return self.core.reset(z=z), {"z": self.core.z}
+        return self.core.reset(z=_starts(self.core.task, options)), {"z": self.core.z}
 
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Apply one action to each episode for one sample; see `VectorEnv.step`."""
+        """Applies one action to each episode for one sample; see `VectorEnv.step`."""
         result = self.core.step(self.core.inputs(actions))
         observation = result.observation
         infos: dict[str, Any] = {}
@@ -166,14 +160,16 @@ class TaskVectorEnv(VectorEnv):
             final_obs = np.full(self.num_envs, None, dtype=object)
             outcome = np.full(self.num_envs, None, dtype=object)
             for i in ended:
-                final_obs[i], outcome[i] = observation[i].copy(), _label(result.outcome[i])
+                final_obs[i], outcome[i] = observation[i].copy(), Outcome(result.outcome[i]).label
             final_info = {"outcome": outcome, "_outcome": result.done, "z": self.core.z}
             infos = {"final_obs": final_obs, "_final_obs": result.done}
             infos |= {"final_info": final_info, "_final_info": result.done}
             observation[ended] = self.core.reset(ended)
-        infos |= {"z": self.core.z}
+        infos["z"] = self.core.z
         return observation, result.reward, result.terminated, result.truncated, infos
 
 
-def _label(outcome: int) -> str:
-    return Outcome(outcome).label
+def _starts(task: Task, options: dict[str, Any] | None) -> np.ndarray | None:
+    """Returns the chart points `options["z"]`, checked, or None."""
+    z = (options or {}).get("z")
+    return None if z is None else task.chart.check(z, task.name)

@@ -1,4 +1,4 @@
-"""A controller or a policy with SB3's `predict`: what `evaluate_policy` asks of a model."""
+"""A controller or a policy with SB3's `predict`, for `evaluate_policy`."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from hyrl_mj.tasks import Task
 
 @dataclass(frozen=True)
 class Sb3Policy:
-    """A hybrid controller, or a policy, for those who evaluate with SB3. It takes no torch.
+    """A hybrid controller or a policy, for evaluation with SB3. It does not need torch.
 
-    The mode is the state that a recurrent policy of SB3 hands from one sample to the next. The
-    measurement comes from `Task.measured`, and is as exact as the float32 of the observation: nearer
-    than that to the edge of a flow set, the mode may jump where the controller itself would not.
+    The mode is passed from one sample to the next as the state of SB3's recurrent policies. The measurement
+    comes from `Task.measured`, with the precision of float32 observations: closer than that to the edge of a
+    flow set, the mode may jump where the controller itself would not.
 
     Attributes:
-        task: the task whose environments it answers.
-        controller: what is evaluated, a controller or a policy.
+        task: the task of the environments.
+        controller: the controller or policy to evaluate.
     """
 
     task: Task
@@ -35,53 +35,52 @@ class Sb3Policy:
         episode_start: ArrayLike | None = None,
         deterministic: bool = True,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-        """One sample: the mode jumps if it has to, and its policy acts.
+        """Returns the actions of one sample, after the jumps of the modes, and the next state.
 
         Args:
             observation: (k,), or (n, k) of n episodes, noise included.
             state: `(q,)` with the modes (n,) int that the last call returned, n = 1 for a single
                 observation; None where all episodes start.
             episode_start: (n,) bool, or one for all: where it is true, the controller picks its mode
-                from this measurement. By default nowhere, if there is a state.
-            deterministic: for SB3's sake; the answer always is.
+                from this measurement. By default false, if there is a state.
+            deterministic: ignored, because actions are always deterministic.
 
         Returns:
-            The action that the task's environments take, levels () or (n,) int or inputs (m,) or (n, m)
-            float32, and the next state `(q,)`.
+            The action for the task's environments, levels () or (n,) int or inputs (m,) or (n, m) float32,
+            and the next state `(q,)`.
 
         Raises:
             BadInput: wrong shapes, values that are not finite, unknown modes, an input that is no level
                 of a discrete task, or a task without `measured`.
         """
-        seen = self._check_observation(observation)
-        measured = self.task.measured(np.atleast_2d(seen))
+        checked = self._check_observation(observation)
+        measured = self.task.measured(np.atleast_2d(checked))
         u, q = self._loop.step(self._modes(measured, state, episode_start), measured)
         actions = self._actions(u)
-        return actions.squeeze(axis=0) if seen.ndim == 1 else actions, (q,)
+        return actions.squeeze(axis=0) if checked.ndim == 1 else actions, (q,)
 
     @property
     def _loop(self) -> Controller:
         return as_controller(self.controller)
 
     def _check_observation(self, observation: ArrayLike) -> np.ndarray:
-        """The observation as a float array (k,) or (n, k)."""
+        """Returns the observation as a float array (k,) or (n, k)."""
         columns = len(self.task.observation_low)
         try:
-            seen = np.asarray(observation, dtype=float)
+            values = np.asarray(observation, dtype=float)
         except (TypeError, ValueError):
             raise BadInput(
                 f"an observation of {self.task.name} is {columns} numbers, got {observation!r}"
             ) from None
-        if seen.ndim not in (1, 2) or seen.shape[-1] != columns:
+        if values.ndim not in (1, 2) or values.shape[-1] != columns:
             raise BadInput(
                 f"an observation of {self.task.name} has shape ({columns},) or (n, {columns}), "
-                f"got {seen.shape}"
+                f"got {values.shape}"
             )
-        if not np.isfinite(seen).all():
-            raise BadInput(
-                f"observation {seen[~np.isfinite(seen)][0]} cannot be used: it must be finite"
-            )
-        return seen
+        bad = values[~np.isfinite(values)]
+        if len(bad):
+            raise BadInput(f"observation {bad[0]} cannot be used: it must be finite")
+        return values
 
     def _modes(
         self,
@@ -89,7 +88,7 @@ class Sb3Policy:
         state: tuple[np.ndarray, ...] | None,
         episode_start: ArrayLike | None,
     ) -> np.ndarray:
-        """The modes (n,) in which measurements (n, p) find the controller."""
+        """Returns the modes (n,) of the controller before measurements (n, p)."""
         n = len(measured)
         if state is None:
             return self._loop.initial_mode(measured)
@@ -108,7 +107,7 @@ class Sb3Policy:
         return check_modes(q, self._loop.modes).astype(int)
 
     def _actions(self, u: np.ndarray) -> np.ndarray:
-        """The actions that inputs u (n, m) are: levels (n,) of a discrete task, else themselves."""
+        """Returns the actions of inputs u (n, m): levels (n,) of a discrete task, else the inputs."""
         levels = self.task.input_levels
         if levels is None:
             return u.astype(np.float32)

@@ -1,8 +1,7 @@
-"""The worst-case game: what no measurement noise within a bound can make the closed loop do.
+"""The worst-case game: measurement noise within a bound plays against the closed loop.
 
 The plant is tabulated on a lattice of states, and the game is solved on it by backward recursion.
-`Game` scores controllers, `Limit` says what any controller could win, and `examine` plays it all and returns
-a `GameResult`.
+`Game` scores controllers, `Limit` is what any controller could win, and `examine` returns a `GameResult`.
 """
 
 from hyrl_mj.game.examination import examine

@@ -20,9 +20,9 @@ from hyrl_mj.tasks import Task
 
 # Noise bounds of the curve [chart units].
 CURVE = tuple(round(0.0125 * k, 4) for k in range(round(LARGEST / 0.0125) + 1))
-# About so many episodes without noise measure how far off the set-point they end.
+# Approximate number of episodes without noise.
 QUIET_EPISODES = 4000
-# Games that are played at a time; each takes tens of megabytes.
+# Games that are solved at the same time; each takes tens of megabytes.
 THREADS = 4
 
 
@@ -38,14 +38,14 @@ def examine(
     """Plays the game: scores at some noise bounds, margins, the curve over all bounds, and the maps.
 
     Args:
-        task: what is played.
-        points: (N, d) of M*; the margin is profiled along them.
+        task: the robot and its problem.
+        points: (N, d) points of M*, along which the margin is profiled.
         parts: M_i of each mode.
-        controllers: by name.
+        controllers: controllers by name.
         bounds: noise bounds of the scores; the maps are drawn for the last.
         everywhere: whether noise acts on all coordinates.
-        cells: of the lattice along the longest side of the chart, by default the finest. In the plane the
-            curve is played on one of half as many.
+        cells: number of lattice cells along the longest side of the chart, by default the finest lattice.
+            In the plane the curve is computed on a lattice of half as many.
     """
     for eps in bounds:
         task.check_noise(eps, everywhere)
@@ -96,15 +96,7 @@ def _scores(
 def _sweep(
     game: Game, names: list[str], points: np.ndarray, progress: Progress, done: int
 ) -> tuple[Curve, Profile]:
-    """Returns what each controller wins at every bound of `CURVE`, and how much each point of M* bears.
-
-    Args:
-        game: the game, prepared for the largest of them.
-        names: the controllers and the limit.
-        points: (N, d) of M*.
-        progress: shows how far it is.
-        done: the steps that have been done before.
-    """
+    """Returns the curve over `CURVE`, and the profile of the noise that points (N, d) of M* bear."""
     task, dt = game.task, game.task.dt
     along = points[task.may_start(points)]
     at = game.lattice.grid.nearest(along)
@@ -134,7 +126,7 @@ def _sweep(
 
 
 def _misses(game: Game, controllers: Mapping[str, Controller]) -> dict[str, float]:
-    """Returns how far off the set-point the runs of each controller end at most without noise."""
+    """Returns each controller's greatest distance from the set-point at the end of runs without noise."""
     task = game.task
     starts = game.lattice.grid.nodes[game.starts & game.winnable(0.0)]
     starts = starts[:: max(len(starts) // QUIET_EPISODES, 1)]

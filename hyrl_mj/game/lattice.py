@@ -1,4 +1,4 @@
-"""A lattice of states and what one sample of the compiled plant makes of each of its nodes."""
+"""A lattice of states, with the transitions of its nodes by one sample of the compiled plant."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from hyrl_mj.tasks import Outcome, Task
 LATTICE = {1: 12_000, 2: 480}
 # A sample that ends this close to a node, in cells, ends on it.
 ON_NODE = 1e-3
+REMEDY = "use noisy episodes instead (hyrl-mj robustness RUN --episodes N --noise adversarial)"
 
 
 @dataclass(frozen=True)
 class Lattice:
     """The plant's own transition, tabulated over nodes and input levels.
 
-    Two more places follow the N nodes: number N stands for "arrived", N + 1 for "failed". A sample that
-    ends between nodes leads to all nodes around its end, so that an adversary who may choose among them
-    can do whatever could have been done from there: the lattice errs to the adversary's side, by less
-    than a cell a sample.
+    Two more places follow the N nodes: number N is "arrived", N + 1 is "failed". A sample that ends between
+    nodes leads to all nodes around its end, and the adversary chooses among them: the lattice errs to the
+    adversary's side, by less than a cell a sample.
 
     Attributes:
-        task: gives the plant, and says what has arrived or failed.
+        task: the robot and its problem.
         grid: the nodes.
-        levels: (A, m) the inputs: a discrete task's own; of a continuous one as many as one sample can
-            tell apart on the grid.
-        after: (A, C, N) the places around the end of one sample, the nearest first.
-        arrived: (N,) bool, the nodes at which an episode that ended there would be a success.
-        failed: (N,) bool, the nodes at which an episode ends without success.
+        levels: (A, m) inputs: a discrete task's levels; for continuous inputs as many as lead to different
+            nodes in one sample.
+        after: (A, C, N) places around the end of one sample, the nearest first.
+        arrived: (N,) bool, nodes at which an episode that ended there would be a success.
+        failed: (N,) bool, nodes at which an episode ends without success.
     """
 
     task: Task
@@ -68,23 +68,22 @@ class Lattice:
 
     @staticmethod
     def check(task: Task) -> None:
-        """Raise `BadInput` unless the worst case can be played on a lattice of this task's chart."""
+        """Raises `BadInput` unless the game can be played on a lattice of this task's chart."""
         d = task.chart.dimension
         if d not in LATTICE:
             raise BadInput(
                 f"the exact game takes a chart of 1 or 2 dimensions, that of {task.name} has {d}: "
-                "use noisy episodes instead (hyrl-mj robustness RUN --episodes N --noise adversarial)"
+                + REMEDY
             )
         if task.measurement_columns != d or task.model.nq != d or not task.kinematic:
             raise BadInput(
                 f"the exact game takes a plant that one sample maps from chart point to chart point, "
-                f"and {model_name(task.model)} has a larger state: use noisy episodes instead "
-                "(hyrl-mj robustness RUN --episodes N --noise adversarial)"
+                f"and {model_name(task.model)} has a larger state: {REMEDY}"
             )
 
     @staticmethod
     def possible(task: Task) -> bool:
-        """Whether the game can be played on a lattice of this task."""
+        """Returns whether the game can be played on a lattice of this task's chart."""
         try:
             Lattice.check(task)
         except BadInput:
@@ -93,11 +92,7 @@ class Lattice:
 
     @staticmethod
     def of(task: Task, grid: Grid | None = None) -> Lattice:
-        """The lattice of a task.
-
-        Args:
-            task: its chart is that of the lattice.
-            grid: the nodes; by default 12,000 cells along a line, 480 x 480 in the plane.
+        """Returns the lattice of a task, by default of 12,000 cells along a line or 480 x 480 in the plane.
 
         Raises:
             BadInput: the plant's state is more than the chart, or the chart has three dimensions.
@@ -107,13 +102,16 @@ class Lattice:
         nodes = grid.nodes
         plant = task.plant(len(nodes))
         plant.set_state(*task.state(nodes))
-        failed, arrived = _ended(task, plant.measurement)
-        alive = np.flatnonzero(task.ending(plant.measurement) == Outcome.RUNNING)
+        measurement = plant.measurement
+        ending, failed = task.ending(measurement), task.failed(measurement)
+        success = task.verdict(measurement) == Outcome.REACHED
+        arrived = (ending == Outcome.REACHED) | ~failed & success
+        alive = np.flatnonzero(ending == Outcome.RUNNING)
         levels = _levels(task, grid, nodes[alive])
         plant = task.plant(len(alive))
         ends = np.empty((len(levels), *nodes.shape))
-        bad = np.zeros((len(levels), len(nodes)), dtype=bool)
-        good = np.zeros_like(bad)
+        fails = np.zeros((len(levels), len(nodes)), dtype=bool)
+        arrives = np.zeros_like(fails)
         progress = Progress("tabulating the plant", len(levels), "inputs")
         for a, level in enumerate(levels):
             plant.set_state(*task.state(nodes[alive]))
@@ -121,14 +119,15 @@ class Lattice:
             measurement = plant.measurement
             ends[a] = nodes
             ends[a, alive] = task.z(measurement)
-            bad[a, alive], good[a, alive] = _over(task, measurement)
+            fails[a, alive] = task.failed(measurement)
+            arrives[a, alive] = task.ending(measurement) == Outcome.REACHED
             progress.update(a + 1)
         progress.close()
         after = _around(grid, ends)
         outside = ~task.chart.contains(ends)
-        # A state off the chart that has not come to its end is nowhere on the lattice.
-        after = np.where((bad | outside & ~good)[:, None], len(nodes) + 1, after)
-        after = np.where(good[:, None], len(nodes), after)
+        # A running episode that leaves the chart leaves the lattice: it counts as failed.
+        after = np.where((fails | outside & ~arrives)[:, None], len(nodes) + 1, after)
+        after = np.where(arrives[:, None], len(nodes), after)
         return Lattice(task, grid, levels, after.astype(np.int32), arrived, failed)
 
     def level_of(self, u: np.ndarray) -> np.ndarray:
@@ -148,9 +147,9 @@ class Lattice:
                 f"the controller's input {u[wrong][0].tolist()} cannot be applied: the limits of "
                 f"{self.task.name} are {low.tolist()} to {high.tolist()}"
             )
-        counts = [len(np.unique(column)) for column in self.levels.T]
-        steps = (np.array(counts) - 1) / (high - low)
-        index = np.clip(np.round((u - low) * steps), 0, np.array(counts) - 1).astype(int)
+        counts = np.array([len(np.unique(column)) for column in self.levels.T])
+        steps = (counts - 1) / (high - low)
+        index = np.clip(np.round((u - low) * steps), 0, counts - 1).astype(int)
         level = np.ravel_multi_index(tuple(index.T), tuple(counts))
         off = np.abs(self.levels[level] - u).max(axis=1) > 1e-6
         if self.task.learning.levels is not None and off.any():
@@ -161,19 +160,8 @@ class Lattice:
         return level
 
 
-def _over(task: Task, measurement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns which states (n, p) end an episode: (n,) bool without success, (n,) bool with it."""
-    return task.failed(measurement), task.ending(measurement) == Outcome.REACHED
-
-
-def _ended(task: Task, measurement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the same as `_over`, with the verdict at states where the episode would run on."""
-    failed, reached = _over(task, measurement)
-    return failed, reached | ~failed & (task.verdict(measurement) == Outcome.REACHED)
-
-
 def _levels(task: Task, grid: Grid, nodes: np.ndarray) -> np.ndarray:
-    """Returns the inputs (A, m); those of a continuous task so dense that neighbours lead a cell apart."""
+    """Returns inputs (A, m); continuous ones so dense that neighbours lead at most a cell apart."""
     if task.input_levels is not None:
         return task.input_levels
     low, high = task.input_limits

@@ -1,7 +1,7 @@
-"""What any controller could win: the limit beside every score of the worst-case game.
+"""The limit beside every score of the worst-case game: what any controller could win.
 
-The limit is a controller that knows the true state to steer by, but has to decide the way by what it
-measures. It picks the side of the first measurement, and from there follows each way as well as possible.
+The limit is a controller that steers by the true state, but has to choose the way by the measurement. It
+picks the side of the first measurement, and from there follows each way as well as possible.
 """
 
 from __future__ import annotations
@@ -21,16 +21,15 @@ ON_BOUNDARY = 1e-9
 
 @dataclass(frozen=True)
 class Limit:
-    """What a controller could do that knows the state, on each mode's way.
+    """The best that a controller that knows the state can do on each mode's way.
 
     Attributes:
         lattice: of the states.
         parts: (Q, N) bool, M_i at the nodes.
-        sides: (Q, N) bool, whether a measurement there calls for each mode; on the boundary, several.
-        samples: (Q, N) least number of samples until arrival by each mode's way, `NEVER` where it is
-            closed.
-        level: (Q, N) the input level that does it.
-        hop: (d,) longest way of one sample, along each coordinate.
+        sides: (Q, N) bool, the modes that a measurement there selects; several on the boundary.
+        samples: (Q, N) fewest samples until arrival by each mode's way, `NEVER` where it is closed.
+        level: (Q, N) input level that takes the fewest samples.
+        hop: (d,) longest distance of one sample, along each coordinate.
     """
 
     lattice: Lattice
@@ -42,23 +41,19 @@ class Limit:
 
     @staticmethod
     def of(lattice: Lattice, parts: Iterable[GridSet]) -> Limit:
-        """Finds the ways on a lattice, by backward recursion over the best input.
+        """Returns the limit on a lattice for the parts M_i, by backward recursion over the best input.
 
         A run goes mode i's way if it enters M_i and then stays there until it arrives; before that it may
-        pass through other parts, but not where several meet again.
-
-        Args:
-            lattice: the states.
-            parts: M_i of each mode, on one grid.
+        pass through other parts, but not where several overlap.
         """
         sets, nodes = tuple(parts), lattice.grid.nodes
         at = sets[0].grid.nearest(nodes)
         inside = np.stack([part.mask[at] for part in sets])
         depth = np.stack([part.signed_distance(nodes) for part in sets])
         samples, level = np.empty(inside.shape, dtype=int), np.empty(inside.shape, dtype=int)
-        after = lattice.after[:, :1]  # to the limit's side: the nearest node
+        after = lattice.after[:, :1]  # the nearest node, which errs to the limit's side
         for i, part in enumerate(inside):
-            # The two places behind the nodes: arrived is in every part, failed in none.
+            # The place "arrived" is in every part, "failed" in none.
             shared = np.append(part & np.delete(inside, i, axis=0).any(axis=0), [True, False])
             allowed = np.where(part, np.append(part, [True, False])[after], ~shared[after])
             samples[i], level[i] = fewest_samples(lattice, after, allowed)
@@ -69,22 +64,21 @@ class Limit:
         return Limit(lattice, inside, sides, samples, level, hop)
 
     def held(self, bound: np.ndarray) -> np.ndarray:
-        """Returns the most samples until arrival of "pick the side of the first measurement, then hold it".
+        """Returns the most samples until arrival if the side of the first measurement is held: (N,) int.
 
-        Returns:
-            (N,) int, `NEVER` where noise within bounds (d,) can show a side whose way is closed.
+        It is `NEVER` where noise within bounds (d,) can show a side whose way is closed.
         """
         shown = np.stack([self._reach(side, bound) for side in self.sides])
         return np.asarray(np.where(shown, self.samples, 0).max(axis=0))
 
     def winnable(self, bound: np.ndarray) -> np.ndarray:
-        """Returns where picking a side by the first measurement and holding it always wins: (N,) bool."""
+        """Returns the nodes (N,) bool where holding the side of the first measurement always wins."""
         return self.held(bound) < NEVER
 
     def moves(self, bound: np.ndarray) -> Moves:
         """Returns the adversary's moves against the limit under noise within bounds (d,).
 
-        Its flow sets are those of stage 5, with the ways that are really open in place of W_i.
+        The limit's flow sets are those of stage 5, with the ways that are open on the lattice as W_i.
         """
         lattice, modes = self.lattice, len(self.parts)
         noisy = np.where(bound > 0, self.hop, 0.0)
@@ -113,12 +107,12 @@ def fewest_samples(
     """Returns the fewest samples until arrival without noise, over allowed transitions.
 
     Args:
-        lattice: gives the places.
-        after: (A, C, N) where each level leads; of several places around its end the worst counts.
-        allowed: (A, C, N) bool.
+        lattice: the lattice of the nodes.
+        after: (A, C, N) places to which each level leads; the worst of the C places counts.
+        allowed: (A, C, N) bool, allowed transitions.
 
     Returns:
-        (N,) int, `NEVER` where there is no way, and (N,) int, the level to take.
+        (N,) int samples, `NEVER` where there is no way, and (N,) int, the level to take.
     """
     samples = np.full(lattice.places, NEVER)
     samples[:-2][lattice.arrived] = 0
@@ -126,11 +120,8 @@ def fewest_samples(
     level = np.zeros(lattice.nodes, dtype=int)
     open_ = np.flatnonzero(lattice.running & ~lattice.arrived)
     while len(open_):
-        samples_by_level = np.where(allowed[..., open_], samples[after[..., open_]], NEVER).max(
-            axis=1
-        )
-        best = samples_by_level.argmin(axis=0)
-        fewest = samples_by_level[best, np.arange(len(open_))]
+        by_level = np.where(allowed[..., open_], samples[after[..., open_]], NEVER).max(axis=1)
+        best, fewest = by_level.argmin(axis=0), by_level.min(axis=0)
         done = fewest < NEVER
         if not done.any():
             break

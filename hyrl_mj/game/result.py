@@ -12,7 +12,7 @@ from hyrl_mj import artifacts
 from hyrl_mj.chart import Chart
 from hyrl_mj.sets import Grid
 
-# The controller that nothing can beat, beside those that are examined.
+# Name of the limit, a controller that is scored beside the examined ones.
 LIMIT = "limit"
 # Classes of the maps.
 WON, WON_FROM_SOME, BEATEN, UNWINNABLE, OVER = range(5)
@@ -33,10 +33,9 @@ class Score:
         eps: bound of the noise.
         winnable: share of the start region that can be won at all.
         won: share of the winnable starts that are won if the controller picks its start mode.
-        won_any: share of them that are won from every start mode.
+        won_any: share of the winnable starts that are won from every start mode.
         time, time_any: worst time to arrival [s] from the starts that are won.
-        excursion: how far off the set-point the noise can bring or keep a run for ever; None where every
-            run ends.
+        excursion: greatest distance from the set-point of runs that never end; None if all runs end.
     """
 
     eps: float
@@ -48,11 +47,8 @@ class Score:
     excursion: float | None
 
     def __repr__(self) -> str:
-        values = ", ".join(
-            f"{name}={value if value is None else format(value, '.4g')}"
-            for name, value in vars(self).items()
-        )
-        return f"Score({values})"
+        values = {k: None if v is None else f"{v:.4g}" for k, v in vars(self).items()}
+        return f"Score({', '.join(f'{name}={value}' for name, value in values.items())})"
 
 
 @dataclass(frozen=True)
@@ -71,7 +67,7 @@ class Curve:
     Attributes:
         eps: the noise bounds.
         winnable: share of the start region that can be won at all, at each bound.
-        wins: what each controller wins.
+        wins: shares that each controller wins.
     """
 
     eps: tuple[float, ...]
@@ -81,12 +77,11 @@ class Curve:
 
 @dataclass(frozen=True)
 class Profile:
-    """How much noise can be borne along M*.
+    """The noise that can be borne along M*.
 
     Attributes:
-        points: (N, d) the points of M* in the start region.
-        eps: by controller, the largest bound up to which each point is won; None where it is lost even
-            without noise.
+        points: (N, d) points of M* in the start region.
+        eps: by controller, the largest bound up to which each point is won; None if lost without noise.
     """
 
     points: tuple[tuple[float, ...], ...]
@@ -95,12 +90,12 @@ class Profile:
 
 @dataclass(frozen=True)
 class LatticeSpacing:
-    """How fine the lattice of states is.
+    """The distances between the nodes of the lattice of states.
 
     Attributes:
-        spacing: distance between its nodes along each coordinate, in chart units.
+        spacing: distance along each coordinate, in chart units.
         exact: whether every sample leads from node to node.
-        curve_spacing: the distance on the lattice on which the curve is played.
+        curve_spacing: distance on the lattice on which the curve is computed.
     """
 
     spacing: tuple[float, ...]
@@ -110,17 +105,18 @@ class LatticeSpacing:
 
 @dataclass(frozen=True)
 class GameResult:
-    """What the worst-case game says of some controllers and of the limit.
+    """The result of the worst-case game for some controllers and the limit.
 
     Attributes:
         everywhere: whether noise acts on all coordinates.
-        lattice: how fine the game was played.
+        lattice: spacing of the lattice.
         scores: for each controller and the limit, one at each noise bound.
         margin: for each controller, the largest bound at which the whole winnable start region is won; None
             if it is not even won without noise.
-        miss_without_noise: for each controller, how far off the set-point runs without noise end at most.
+        miss_without_noise: for each controller, the greatest distance from the set-point at the end of runs
+            without noise.
         curve: what is won against the noise bound.
-        profile: how much noise can be borne along M*.
+        profile: the noise that can be borne along M*.
     """
 
     everywhere: bool
@@ -138,7 +134,7 @@ class GameResult:
 
     @property
     def lasting(self) -> bool:
-        """Whether some run goes on for ever, so that times and excursions say something."""
+        """Whether some run never ends, so that times and excursions are informative."""
         return any(score.excursion is not None for level in self.scores.values() for score in level)
 
     def __repr__(self) -> str:
@@ -154,12 +150,12 @@ class EpisodeCount:
 
     Attributes:
         noise, eps, everywhere: the noise: its kind, its bound, and whether it acts on all coordinates.
-        controller: the name of the controller.
-        region: where the episodes start: "near M*", "elsewhere" or "not winnable".
-        episodes: their number.
-        outcomes: how many of them ended in each way.
-        reached: share of them that reached the set-point.
-        interval: the 95% interval of this share (Wilson).
+        controller: name of the controller.
+        region: start region of the episodes: "near M*", "elsewhere" or "not winnable".
+        episodes: number of episodes.
+        outcomes: number of episodes with each outcome.
+        reached: share of the episodes that reached the set-point.
+        interval: 95% interval of this share (Wilson).
     """
 
     noise: str
@@ -174,18 +170,18 @@ class EpisodeCount:
 
     @property
     def lost(self) -> int:
-        """How many did not reach the set-point."""
+        """The number of episodes that did not reach the set-point."""
         return self.episodes - self.outcomes.get("reached", 0)
 
 
 @dataclass(frozen=True)
 class Robustness:
-    """What an examination under noise says; `robustness.json` holds it.
+    """The result of an examination under noise, saved as `robustness.json`.
 
     Attributes:
         eps: bound of the noise.
         everywhere: whether noise acts on all columns of the measurement.
-        game: the worst case, where it can be played exactly.
+        game: result of the worst-case game, if it can be played exactly.
         episodes: counts of noisy episodes.
         seed: seed of the starts and the noise of these episodes.
     """
@@ -212,9 +208,8 @@ class Robustness:
         Raises:
             BadArtifact: the file is missing, damaged, or of another version.
         """
-        return artifacts.read_record(
-            path, "robustness", Robustness, "run hyrl-mj robustness RUN to write it again"
-        )
+        remedy = "run hyrl-mj robustness RUN to write it again"
+        return artifacts.read_record(path, "robustness", Robustness, remedy)
 
 
 @dataclass(frozen=True)
@@ -222,7 +217,7 @@ class Maps(artifacts.Saved):
     """The classes of the maps.
 
     Attributes:
-        eps: bound of the noise that they hold for.
+        eps: bound of the noise.
         grid_counts: (d,) number of nodes along each coordinate.
         map: for each controller, the class (N,) of every node, an index into `MAP_CLASSES`.
     """
@@ -237,5 +232,5 @@ class Maps(artifacts.Saved):
         return f"Maps(eps {self.eps:g}, {', '.join(self.map)})"
 
     def grid(self, chart: Chart) -> Grid:
-        """The nodes in the task's chart."""
+        """Returns the nodes as a grid in the task's chart."""
         return Grid.from_counts(chart, self.grid_counts)

@@ -1,4 +1,4 @@
-"""The worst-case game of one task: scores, margins and maps of controllers, and the signals they lose to."""
+"""The worst-case game of one task: scores, margins and maps of controllers, and the worst noise signals."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hyrl_mj.game.result import BEATEN, LIMIT, OVER, UNWINNABLE, WON, WON_FROM_S
 from hyrl_mj.game.solver import NEVER, Answers, Moves, WorstNoise, lasting, noisy_moves, solve
 from hyrl_mj.policies import Controller, Policy, as_controller
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.simulation import LoopSettings, Recorded, Rollout, closed_loop
+from hyrl_mj.simulation import LoopSettings, Recorded, closed_loop
 from hyrl_mj.tasks import Task
 
 # The largest noise bound of the curve [chart units].
@@ -25,11 +25,11 @@ class Game:
     """The worst-case game of one task, for several controllers and any noise bound.
 
     Args:
-        task: what is played.
+        task: the robot and its problem.
         parts: M_i of each mode, or a `Partition`; the limit takes its sides from them.
-        controllers: by name, controllers or policies; each must be a pure function.
-        largest: the largest noise bound that will be played.
-        everywhere: whether noise acts on all coordinates, not only on those the task calls noisy.
+        controllers: controllers or policies by name; each must be a pure function.
+        largest: the largest noise bound that can be played.
+        everywhere: whether noise acts on all coordinates, not only on the task's noisy ones.
         grid: nodes of the lattice, by default the finest.
 
     Raises:
@@ -72,7 +72,8 @@ class Game:
         self.task.check_noise(eps, self.everywhere)
         if eps > self.largest + 1e-9:
             raise BadInput(
-                f"noise {eps:g} is beyond the largest that was prepared, {self.largest:g}"
+                f"noise {eps:g} exceeds the largest bound of this game, {self.largest:g}: "
+                "create Game with a larger `largest`"
             )
         bound = self.bound(eps)
         return self.limit.moves(bound) if name == LIMIT else noisy_moves(self.answers[name], bound)
@@ -82,11 +83,11 @@ class Game:
         return self._value(name, self.moves(name, eps), eps)
 
     def winnable(self, eps: float) -> np.ndarray:
-        """(N,) bool, the nodes from which a way picked by the first measurement can be held."""
+        """Returns the nodes (N,) bool where the way picked by the first measurement can be held."""
         return self.limit.winnable(self.bound(eps))
 
     def score(self, name: str, eps: float) -> Score:
-        """Returns the score of a controller, or of the limit."""
+        """Returns the score of a controller or of the limit."""
         moves = self.moves(name, eps)
         value = self._value(name, moves, eps)[:, :-2]
         region = self.starts & self.winnable(eps)
@@ -105,7 +106,7 @@ class Game:
 
     def _value(self, name: str, moves: Moves, eps: float) -> np.ndarray:
         value = solve(moves)
-        if name == LIMIT:  # by its first measurement it picks a mode and holds it
+        if name == LIMIT:  # it holds the mode that it picks by the first measurement
             value[-1, :-2] = self.limit.held(self.bound(eps))
         return value
 
@@ -122,7 +123,7 @@ class Game:
     def margin(self, name: str) -> float | None:
         """Returns the largest noise bound at which the whole winnable start region is won, by bisection.
 
-        It is known to one cell of the lattice; None if some of it is lost even without noise.
+        The bound is exact to one cell of the lattice; None if some of the region is lost without noise.
         """
         cell = float(self.lattice.grid.spacing[self.bound(1.0) > 0].min())
 
@@ -147,7 +148,7 @@ class Game:
 
 
 def share(won: np.ndarray) -> float:
-    """Returns the share of (n,) bool that is true; of nothing, everything."""
+    """Returns the share of (n,) bool that is true; 1 if n is 0."""
     return float(won.mean()) if len(won) else 1.0
 
 
@@ -162,8 +163,8 @@ def worst_signal(
 ) -> Recorded:
     """Returns the worst noise signal against a controller from starts (n, d), sample by sample.
 
-    `simulate` with it from the same starts gives the runs that the game foresees. It lasts for a number of
-    steps, by default until the task's time is up.
+    `simulate` with this signal from the same starts gives the runs of the game. The signal has a number of
+    steps, by default the task's limit.
     """
     noise = game.worst_noise(name, eps)
     modes = None if q0 is None else np.full(len(z0), q0)
@@ -171,12 +172,7 @@ def worst_signal(
     rollout = closed_loop(game.task, loop, z0, noise, modes, settings=settings)
     if not len(rollout.measured):  # all runs are over where they start
         return Recorded(np.zeros((1, len(z0), game.task.measurement_columns)), eps, kind="worst")
-    true = _true_measurements(game.task, rollout)
+    rows = zip(rollout.measured, rollout.path[:-1], strict=True)
+    true = np.stack([game.task.with_z(measured, z) for measured, z in rows])
     values = np.where(np.isnan(rollout.u).any(axis=-1)[..., None], 0.0, rollout.measured - true)
     return Recorded(values, eps, kind="worst")
-
-
-def _true_measurements(task: Task, rollout: Rollout) -> np.ndarray:
-    """Returns the measurements of a rollout before noise: (K, n, p)."""
-    path = rollout.path[: len(rollout.measured)]
-    return np.stack([task.with_z(m, z) for m, z in zip(rollout.measured, path, strict=True)])

@@ -1,9 +1,8 @@
-"""The worst-case noise game: what no measurement noise within a bound can make the closed loop do.
+"""The solver of the worst-case noise game.
 
 At every sample an adversary who knows everything picks the noise n, |n| <= eps, the controller answers the
-measurement z + n in its mode q, and the plant moves. Played backward on a lattice, the game has a value
-for each state (z, q): the samples after which the episode fails, or after which it has arrived at the
-latest, or that it never arrives.
+measurement z + n in its mode q, and the plant moves. Backward recursion on a lattice gives a value for each
+state (z, q): the samples until the episode fails, or until it arrives at the latest, or `NEVER`.
 """
 
 from __future__ import annotations
@@ -21,28 +20,28 @@ from hyrl_mj.sets import within_reach
 from hyrl_mj.simulation import NOT_STARTED, Sample, Signal, check_controller
 from hyrl_mj.tasks import Task
 
-# How far beside a node its answer has to be the same, in cells.
+# Distance from a node within which its answer has to be the same, in cells.
 BESIDE = 1e-4
-# Values, the worse for the controller the greater: k < NEVER means "arrives after k samples at the latest",
-# LOST - k "fails after k samples".
+# The greater a value, the worse for the controller: k < NEVER means "arrives after k samples at the latest",
+# LOST - k means "fails after k samples".
 NEVER = 1 << 20
 LOST = 1 << 21
-FIRST = 1 << 22  # above all of them
+FIRST = 1 << 22  # greater than all values
 
 
 @dataclass(frozen=True)
 class Answers:
-    """What a controller answers at every node that can be measured, in every mode.
+    """A controller's answers at every node that can be measured, in every mode.
 
-    The last row is that of a run that has not started yet: there the controller picks its own mode.
+    The last row is for a run that has not started yet: there the controller picks its own mode.
 
     Attributes:
-        lattice: of the true states.
+        lattice: lattice of the true states.
         modes: the controller's modes.
         pad: (d,) nodes by which the measured nodes reach beyond the lattice on either side.
         index: (Q + 1, measured nodes...) int, the answer as level * Q + number of the next mode.
         settled: (Q + 1, measured nodes...) bool, whether the answer is the same right beside the node.
-            Where it is not, rounding decides what a measurement there provokes.
+            Where it is not, rounding decides the answer to a measurement there.
     """
 
     lattice: Lattice
@@ -53,15 +52,10 @@ class Answers:
 
     @staticmethod
     def of(lattice: Lattice, controller: Controller, bound: np.ndarray) -> Answers:
-        """Returns the answers of a controller.
-
-        Args:
-            lattice: of the true states.
-            controller: a pure function of mode and measurement.
-            bound: (d,) the largest noise bounds that will be played.
+        """Returns the answers of a controller to measurements with noise of at most `bound` (d,).
 
         Raises:
-            BadInput: the controller answers with something that is no input or no mode of its own.
+            BadInput: the controller gives an invalid input or an unknown mode.
         """
         grid, modes = lattice.grid, controller.modes
         pad = np.where(grid.chart.periodic, 0, nodes_within(lattice, bound))
@@ -71,8 +65,8 @@ class Answers:
         ]
         measured = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
-        def ask(q: int | None, points: np.ndarray) -> np.ndarray:
-            """Returns the answers (n,) to measurements (n, d) in a mode, None before the start."""
+        def answer(q: int | None, points: np.ndarray) -> np.ndarray:
+            """Returns the answers (n,) to measurements (n, d) in a mode, or before the start if q is None."""
             mode = controller.initial_mode(points) if q is None else np.full(len(points), q)
             u, after = controller.step(mode, points)
             unknown = ~np.isin(after, modes)
@@ -83,11 +77,11 @@ class Answers:
         answers, all_settled = [], []
         beside = BESIDE * grid.spacing * np.eye(len(axes))[bound > 0]
         for q in (*modes, None):
-            index = ask(q, measured.reshape(-1, len(axes))).reshape(measured.shape[:-1])
+            index = answer(q, measured.reshape(-1, len(axes))).reshape(measured.shape[:-1])
             settled = np.ones(index.shape, dtype=bool)
             at = np.nonzero(_borders(index, grid.chart.periodic))
             if len(at[0]) and len(beside):
-                others = [ask(q, measured[at] + side) for side in (*beside, *-beside)]
+                others = [answer(q, measured[at] + side) for side in (*beside, *-beside)]
                 settled[at] = (np.array(others) == index[at]).all(axis=0)
             answers.append(index)
             all_settled.append(settled)
@@ -95,37 +89,39 @@ class Answers:
 
     @property
     def middle(self) -> tuple[slice, ...]:
-        """Returns where the lattice lies among the measured nodes."""
+        """The slices of the lattice in the arrays of measured nodes."""
         counts = self.lattice.grid.counts
         return tuple(slice(k, k + n) for k, n in zip(self.pad, counts, strict=True))
 
 
 def _borders(index: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
-    """Returns the nodes (n, ...) bool with another answer next to them."""
+    """Returns the nodes (n, ...) bool that have a neighbour with another answer."""
     borders = np.zeros(index.shape, dtype=bool)
-    for axis, round_ in enumerate(periodic):
+    for axis, wraps in enumerate(periodic):
         differs = np.diff(index, axis=axis, append=index.take([0], axis=axis)) != 0
-        if not round_:
+        if not wraps:
             differs[(slice(None),) * axis + (-1,)] = False
         borders |= differs | np.roll(differs, 1, axis=axis)
     return borders
 
 
 def nodes_within(lattice: Lattice, bound: np.ndarray) -> np.ndarray:
-    """Returns how many nodes lie within noise bounds (d,) on either side: (d,) int."""
+    """Returns the number of nodes within noise bounds (d,) on either side: (d,) int."""
     return np.floor(bound / lattice.grid.spacing + 1e-6).astype(int)
 
 
 @dataclass(frozen=True)
 class Moves:
-    """To which states each state can be led in one sample. States are numbered row * places + place.
+    """The adversary's moves: the states that each state can reach in one sample.
+
+    States are numbered row * places + place.
 
     Attributes:
-        lattice: gives the places.
-        rows: number of modes, and one for runs that have not started yet.
-        state: (S,) the states that have moves.
-        counts: (S,) how many each has.
-        target: (E,) where they lead.
+        lattice: lattice of the places.
+        rows: number of modes, plus one for runs that have not started yet.
+        state: (S,) states that have moves.
+        counts: (S,) number of moves of each state.
+        target: (E,) states that the moves lead to.
     """
 
     lattice: Lattice
@@ -151,8 +147,8 @@ class Moves:
 def noisy_moves(answers: Answers, bound: np.ndarray, settled_only: bool = False) -> Moves:
     """Returns the moves that noise within bounds (d,) gives the adversary against a controller.
 
-    With `settled_only` the moves that noise reaches only by a measurement on the very border of two answers
-    are left out; without noise a controller answers in any case.
+    `settled_only` leaves out moves that need a measurement on the very border of two answers; the move
+    without noise always stays.
     """
     lattice, modes = answers.lattice, len(answers.modes)
     window, periodic = nodes_within(lattice, bound), lattice.grid.chart.periodic
@@ -160,13 +156,9 @@ def noisy_moves(answers: Answers, bound: np.ndarray, settled_only: bool = False)
     for index, settled in zip(answers.index, answers.settled, strict=True):
         counts = settled | (not settled_only)
         used = np.unique(index)
-        possible = [
-            within_reach((index == x) & counts, window, periodic) | (index == x) for x in used
-        ]
-        possible = [mask[answers.middle] for mask in possible]
-        node, which = np.nonzero(
-            np.stack(possible, axis=-1).reshape(lattice.nodes, -1) & lattice.running[:, None]
-        )
+        masks = [within_reach((index == x) & counts, window, periodic) | (index == x) for x in used]
+        possible = np.stack([mask[answers.middle] for mask in masks], axis=-1)
+        node, which = np.nonzero(possible.reshape(lattice.nodes, -1) & lattice.running[:, None])
         level, mode = np.divmod(used[which], modes)
         rows.append((node, mode, lattice.after[level, :, node]))
     return Moves.gather(lattice, rows)
@@ -175,7 +167,7 @@ def noisy_moves(answers: Answers, bound: np.ndarray, settled_only: bool = False)
 def solve(moves: Moves) -> np.ndarray:
     """Returns the value of every state by backward recursion: (rows, places) int.
 
-    An episode is over where it arrives; all others that never fail or arrive are worth `NEVER`.
+    An episode is over where it arrives. A state from which it may neither fail nor arrive is worth `NEVER`.
     """
     lattice = moves.lattice
     value = np.full((moves.rows, lattice.places), NEVER, dtype=np.int32)
@@ -195,27 +187,25 @@ def solve(moves: Moves) -> np.ndarray:
         worst = np.maximum.reduceat(after, np.append(0, np.cumsum(counts)[:-1]))
         if (worst == NEVER).all():
             return value
-        # Each state is decided once: at the earliest failure, or when all its moves have arrived.
+        # Each state gets its value once: at the earliest failure, or when all its moves have arrived.
         flat[state] = worst
 
 
 def lasting(moves: Moves, start: np.ndarray | None = None) -> np.ndarray:
-    """Returns the nodes (N,) bool at which a run can still be after any number of samples, in some mode.
+    """Returns the nodes (N,) bool where a run can still be after any number of samples, in some mode.
 
-    For a task whose every run ends there are none.
-
-    Args:
-        moves: of the adversary.
-        start: (N,) bool, the nodes where runs start, in any mode; by default all.
+    Runs start in any mode at the nodes `start` (N,) bool, by default at all nodes.
     """
     lattice = moves.lattice
     runs = np.zeros((moves.rows, lattice.places), dtype=bool)
     runs.reshape(-1)[moves.state] = True
-    runs[-1] = False  # one sample later a run has started
+    runs[-1] = False  # after one sample every run has started
     alive = runs.copy()
     if start is not None:
         alive[:, :-2] &= start
-    grows = start is not None  # first to all that can be reached, then down to what remains
+    grows = (
+        start is not None
+    )  # first add all nodes that can be reached, then remove those that are left
     while True:
         reached = np.zeros(runs.size, dtype=bool)
         reached[moves.target[np.repeat(alive.reshape(-1)[moves.state], moves.counts)]] = True
@@ -230,17 +220,13 @@ def lasting(moves: Moves, start: np.ndarray | None = None) -> np.ndarray:
 
 
 class WorstNoise(Signal):
-    """The noise of the game's adversary, for use in simulations.
+    """The noise of the game's adversary (bounds (d,)) against a controller's answers, for simulations.
 
-    Where it can, it wins without measurements on the very border of two answers, from where rounding errors
-    of the plant could let a run escape.
-
-    Args:
-        answers: of the controller that it works against.
-        bound: (d,) bounds of the noise.
+    Where possible, it avoids measurements on the very border of two answers, where rounding errors of the
+    plant could let a run escape.
 
     Attributes:
-        value: (modes + 1, places) int of the game that it plays.
+        value: (modes + 1, places) int, values of the game.
     """
 
     kind = "worst"
@@ -269,7 +255,6 @@ class WorstNoise(Signal):
         place = grid.nearest(true)
         at = np.stack(np.unravel_index(place, grid.counts), axis=-1)
         row = np.where(q == NOT_STARTED, len(modes), np.searchsorted(modes, q))
-        # Few answers can be provoked; to find the worst of them all shifts are tried.
         worst, chosen = np.full(len(true), -1), np.zeros_like(true)
         for shift in self._shifts:
             node = np.where(

@@ -1,14 +1,12 @@
 """Learning: the settings of a run, and the training of policies with Stable-Baselines3.
 
-The modules `training`, `distillation` and `symmetry` import torch, so they are imported only where
-they are needed.
+The modules `training`, `distillation` and `symmetry` import torch: import them only where they are needed.
 """
 
-from hyrl_mj.learning.presets import PRESETS, preset
+from hyrl_mj.learning.presets import preset
 from hyrl_mj.learning.settings import Settings, Training
 
 __all__ = [
-    "PRESETS",
     "Settings",
     "Training",
     "distillation",

@@ -14,8 +14,8 @@ from hyrl_mj.tasks import Task, reference
 
 PRESETS = ("fast", "paper", "smoke")
 
-# Stage 1 of preset fast, by algorithm: of tasks with continuous inputs, and of those with levels.
-# Short episodes, for tasks that start all over the chart: the decision falls in their first second.
+# Stage 1 of preset fast, by algorithm, for continuous inputs and for levels.
+# Episodes are short for tasks that start all over the chart: the first second decides the way.
 _PPO = Training(
     algorithm="ppo",
     samples=160_000,
@@ -34,7 +34,7 @@ _A2C = replace(
     algorithm="a2c",
     options={"n_steps": 16, "normalize_advantage": True, "use_rms_prop": False},
 )
-# A gradient step takes milliseconds, a sample hardly anything: many samples to each.
+# A gradient step takes milliseconds and a sample hardly anything: many samples for each step.
 _SAC = replace(
     _PPO,
     algorithm="sac",
@@ -65,16 +65,15 @@ _CONTINUOUS = {
     "td3": _TD3,
     "ddpg": replace(_TD3, algorithm="ddpg"),
 }
-_DQN = Training(
+_DQN = replace(
+    _PPO,
     algorithm="dqn",
     samples=150_000,
     envs=64,
-    hidden=(64, 64),
     activation="relu",
     learning_rate=1e-3,
-    anneal=True,
     gamma=0.9664,
-    symmetric=True,
+    episode=None,
     options={
         "buffer_size": 200_000,
         "learning_starts": 2_000,
@@ -108,31 +107,23 @@ _LEVELS = {
     ),
     "dqn": _DQN,
 }
-# What the paper trained with.
-_PAPER = Training(
-    algorithm="dqn",
+# The paper's training.
+_PAPER = replace(
+    _DQN,
     samples=1_000_000,
     envs=1,
-    hidden=(64, 64),
-    activation="relu",
     learning_rate=1.946e-4,
     anneal=False,
-    gamma=0.9664,
     symmetric=False,
+    options={},
 )
 _PAPERS = {"ppo": replace(_PAPER, algorithm="ppo"), "dqn": _PAPER}
 # Samples of preset smoke.
-_SMOKE = {
-    "ppo": 24_576,
-    "a2c": 65_536,
-    "dqn": 10_000,
-    "sac": 12_000,
-    "td3": 12_000,
-    "ddpg": 12_000,
-}
-# Stage 6, whatever stage 1 was trained with. The modes of a discrete task are trained by PPO, too: the ways
-# differ by less than the error of a freely trained value function, and a policy that is learned directly
-# does not depend on it.
+_SMOKE = {"ppo": 24_576, "a2c": 65_536, "dqn": 10_000} | dict.fromkeys(
+    ("sac", "td3", "ddpg"), 12_000
+)
+# Stage 6, for every algorithm of stage 1. The modes of a discrete task are trained by PPO, too: the returns
+# of the ways differ by less than the error of a freely trained value function.
 _MODES_CONTINUOUS = replace(
     _PPO,
     samples=320_000,
@@ -162,7 +153,7 @@ _SMOKE_MODES = 8_192
 # Grid points along the longest side of the chart, by its dimension: search of M*, and sets.
 _RODS = {1: 120, 2: 120, 3: 24, 4: 8}
 _CELLS = {1: 2880, 2: 240, 3: 48, 4: 16}
-# Coarser ones where every sample takes a physics engine's work: plants with dynamics.
+# Coarser ones for plants with dynamics, whose samples are slower to simulate.
 _RODS_DYNAMIC = {1: 120, 2: 40, 3: 16, 4: 8}
 _CELLS_DYNAMIC = {1: 720, 2: 96, 3: 30, 4: 12}
 # Cells of the worst-case game's lattice in a smoke run.
@@ -182,14 +173,14 @@ def preset(
     """Returns the settings of a preset.
 
     Args:
-        task: what they are for.
-        name: "fast", "paper" (the paper's training), or "smoke" (seconds, to see that all runs).
+        task: the robot and its problem.
+        name: "fast", "paper" (the paper's training), or "smoke" (seconds, to check that all stages run).
         noise: bound eps of the measurement noise that the controller has to survive.
-        seed: of everything random.
+        seed: seed of all random numbers.
         horizon: time T of the backward propagation [s]; by default the sets are sized to the noise, and
             preset "paper" takes the paper's T.
-        agent: takes the place of stage 1; the modes then go on from it.
-        algorithm: of stage 1, by default the task's.
+        agent: agent in place of stage 1; the training of the modes then continues from it.
+        algorithm: algorithm of stage 1, by default the task's.
 
     Raises:
         BadInput: an unknown preset, or a value that cannot be used.
@@ -210,7 +201,7 @@ def preset(
         stage1=stage1,
         stage6=replace(stage6, warm_start=True) if agent else stage6,
         cells=cells[min(dimension, 4)],
-        # Whose agent goes straight on for some samples before it decides has a part of M* that rods miss.
+        # Rods miss a part of M* if the agent goes straight on for some samples before it picks a way.
         search="outcome" if agent else task.learning.search,
         rods=rods[min(dimension, 4)],
         lattice=(_LATTICE_SMOKE if name == "smoke" else LATTICE).get(dimension, 0),
@@ -218,7 +209,7 @@ def preset(
 
 
 def _stage1(task: Task, name: str, algorithm: str) -> Training:
-    """Returns stage 1 of a preset, with an algorithm."""
+    """Returns the training of stage 1 with an algorithm."""
     levels = task.learning.levels
     check_algorithm(algorithm, task.name, levels)
     known = sb3_relative(algorithm, levels)
@@ -234,7 +225,7 @@ def _stage1(task: Task, name: str, algorithm: str) -> Training:
     if name == "smoke":
         training = replace(training, samples=_SMOKE[known])
     if np.any(np.subtract(task.start_high, task.start_low) < task.chart.sides - 1e-9):
-        # Episodes are whole: the states behind the starts are only met by driving there.
+        # Episodes are not cut short: states outside the start region are only met late in an episode.
         training = replace(training, episode=None)
     if known == algorithm:
         return training
@@ -244,7 +235,7 @@ def _stage1(task: Task, name: str, algorithm: str) -> Training:
 
 
 def _stage6(task: Task, name: str, algorithm: str) -> Training:
-    """Returns stage 6 of a preset, after stage 1 with an algorithm."""
+    """Returns the training of stage 6 after stage 1 with an algorithm."""
     continuous = task.learning.levels is None
     if name == "paper":
         training = _MODES_PAPER_CONTINUOUS if continuous else _MODES_PAPER_DISCRETE

@@ -1,4 +1,4 @@
-"""Every setting of a run, in frozen dataclasses with named presets."""
+"""The settings of a run, in frozen dataclasses."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from typing import Any
 from hyrl_mj.errors import BadInput, check_bound, check_seed
 from hyrl_mj.policies import Agent, algorithm_title
 
-PRESETS = ("fast", "paper", "smoke")
-
 
 @dataclass(frozen=True)
 class Training:
@@ -19,25 +17,24 @@ class Training:
 
     Attributes:
         algorithm: one of `hyrl_mj.policies.algorithms.ALGORITHMS`, or `module:Class` of another one.
-        samples: environment samples in all.
-        envs: episodes side by side.
+        samples: total number of environment samples.
+        envs: number of episodes side by side.
         hidden: widths of the hidden layers.
-        activation: between the layers, one of `hyrl_mj.policies.mlp.ACTIVATIONS`.
-        learning_rate: at the start.
-        anneal: whether it falls linearly to (almost) zero.
+        activation: function between the layers, one of `hyrl_mj.policies.mlp.ACTIVATIONS`.
+        learning_rate: learning rate at the start.
+        anneal: whether the learning rate falls linearly to (almost) zero.
         gamma: discount factor.
-        symmetric: whether the network is made to respect the task's mirror symmetry, if it has one.
-            Its weights then serve twice, and the policy has twice the width.
-        warm_start: whether the first attempt goes on from the policy of stage 1 (stage 6 only): DQN from
-            its weights, PPO from what it does on the mode's part, distilled. A Gaussian policy that has
-            made up its mind does not try the other way any more.
-        episode: samples until an episode is truncated, by default the task's; shorter ones see more of
-            the starts.
-        attempts: how often training starts again, with another seed, until its policy is good enough
-            (stage 6 only); the best is kept.
-        action_noise: standard deviation of the noise with which TD3 and DDPG try other inputs, which are
-            stretched to lie between -1 and 1.
-        options: further keywords of the SB3 algorithm.
+        symmetric: whether the network respects the task's mirror symmetry, if it has one. The weights are
+            used twice, and the policy has twice the width.
+        warm_start: whether the first attempt continues from the policy of stage 1 (stage 6 only): DQN from
+            its weights, PPO from its distilled actions on the mode's part. A Gaussian policy of small spread
+            does not explore the other way any more.
+        episode: samples until an episode is truncated, by default the task's; shorter episodes cover more
+            starts.
+        attempts: number of trainings, each with another seed, until a policy is good enough (stage 6 only);
+            the best policy is kept.
+        action_noise: standard deviation of the exploration noise of TD3 and DDPG on inputs scaled to -1..1.
+        options: further keyword arguments of the SB3 algorithm.
     """
 
     algorithm: str
@@ -57,7 +54,7 @@ class Training:
 
     @property
     def title(self) -> str:
-        """The name of the algorithm: "PPO"."""
+        """The name of the algorithm, such as "PPO"."""
         return algorithm_title(self.algorithm)
 
 
@@ -66,18 +63,18 @@ class Settings:
     """All settings of a run; `config.json` holds them.
 
     Attributes:
-        task: its name, or the file that defines it.
-        preset: the name of the preset that the others started from.
-        seed: of everything random.
+        task: name of the task, or the file that defines it.
+        preset: name of the preset of the other settings.
+        seed: seed of all random numbers.
         noise: bound eps of the measurement noise that the controller has to survive.
         horizon: time T of the backward propagation [s]; None to size the sets to the noise.
-        stage1: training of the first policy (stage 1), or the agent that takes its place.
+        stage1: training of the first policy (stage 1), or the agent in its place.
         stage6: training of each mode's policy (stage 6).
         cells: grid cells along the longest side of the chart; cells are square in chart units.
         rods: grid points along the longest side from which the search for critical points starts.
-        lattice: cells along the longest side for the worst-case game.
+        lattice: lattice cells along the longest side for the worst-case game.
         resolution: length of the last rods, as a share of the first.
-        search: how critical points are searched for, by "rods" or "outcome".
+        search: search method for critical points, "rods" or "outcome".
     """
 
     task: str

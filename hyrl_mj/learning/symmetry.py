@@ -1,10 +1,10 @@
-"""A task's mirror symmetry: networks that respect it while they learn, and policies seen in the mirror.
+"""A task's mirror symmetry: networks that respect it while they learn, and mirrored policies.
 
 The rewards of HyRL's problems are symmetric with respect to a hyperplane (paper, Section IV-B), and at
-the start the two ways past an obstacle differ by a thousandth of the return: less than the error of a
-freely trained network, which then decides at an arbitrary place. Here a network f sees the observation o
-and its mirror image S o in one batch, and answers with the mean of f(o) and the mirrored f(S o). That is a
-plain network of twice the width, whose two halves have the same weights.
+the start the returns of the two ways past an obstacle differ by a thousandth. That is less than the error of
+a freely trained network, whose critical points then lie at an arbitrary place. Here a network f gets the
+observation o and its mirror image S o in one batch, and its output is the mean of f(o) and the mirrored
+f(S o). This is a plain network of twice the width, whose two halves have the same weights.
 """
 
 from __future__ import annotations
@@ -20,17 +20,15 @@ from torch import nn
 from hyrl_mj.policies import MlpPolicy
 from hyrl_mj.tasks import Task
 
-# What the mirror does to what a network sees, (k,) signs, and to what it says, a (m, m) matrix.
+# How the mirror changes a network's observation, (k,) signs, and its output, a (m, m) matrix.
 Signs = torch.Tensor | None
 Turn = torch.Tensor | None
 
 
 def impose(policy: Any, task: Task) -> None:
-    """Make the networks of an SB3 MLP policy respect `task.mirror`: actors, critics and their targets.
+    """Makes the networks of an SB3 MLP policy respect `task.mirror`: actors, critics and their targets.
 
-    Args:
-        policy: an SB3 policy; its weights stay, and so do their names.
-        task: a task with a mirror symmetry.
+    The weights and their names stay.
     """
     for name, (signs, turn) in _layers(policy, task).items():
         layer = policy.get_submodule(name)
@@ -42,7 +40,7 @@ def impose(policy: Any, task: Task) -> None:
 
 
 def plain_state(policy: Any, task: Task) -> dict[str, torch.Tensor]:
-    """The state dict of an SB3 policy as a plain network; of twice the width if it was made symmetric."""
+    """Returns the state dict of an SB3 policy as a plain network, of twice the width if it is symmetric."""
     state: dict[str, torch.Tensor] = policy.state_dict()
     if not getattr(policy, "symmetric", False):
         return state
@@ -60,7 +58,7 @@ def plain_state(policy: Any, task: Task) -> dict[str, torch.Tensor]:
 
 
 def mirrored(policy: MlpPolicy) -> MlpPolicy:
-    """The policy that does at a mirrored observation what this one does at the observation, mirrored."""
+    """Returns the mirrored policy: at a mirrored observation it gives this policy's input, mirrored."""
     task = policy.task
     assert task.mirror is not None
     signs, turn = np.array(task.mirror.observation), _turn(task)
@@ -76,7 +74,7 @@ def mirrored(policy: MlpPolicy) -> MlpPolicy:
 
 
 def _turn(task: Task) -> np.ndarray:
-    """(k, k) matrix that mirrors a network's outputs: inputs, or preferences of the levels."""
+    """Returns the (k, k) matrix that mirrors a network's outputs: inputs, or values of the levels."""
     assert task.mirror is not None
     if task.input_levels is None:
         return np.diag(task.mirror.inputs)
@@ -86,44 +84,40 @@ def _turn(task: Task) -> np.ndarray:
 
 
 def _layers(policy: Any, task: Task) -> dict[str, tuple[Signs, Turn]]:
-    """Of each linear layer by name: how the mirror turns what its network sees, if it is the first one, and
-    what its network says, if it is the last one."""
+    """Returns, by name, each linear layer's signs (None unless it is first) and turn (None unless last)."""
     assert task.mirror is not None
     seen = torch.tensor(task.mirror.observation, dtype=torch.float32)
-    # Critics see the inputs, too, stretched to lie between -1 and 1.
+    # Critics get the inputs, too, scaled to -1..1.
     seen_by_critic = torch.tensor(task.mirror.observation + task.mirror.inputs, dtype=torch.float32)
     turn = torch.tensor(_turn(task), dtype=torch.float32)
     linear = {n: layer for n, layer in policy.named_modules() if isinstance(layer, nn.Linear)}
     critics = {n.rpartition(".")[0] + "." for n in linear if n.startswith("critic")}
-    found: dict[str, tuple[Signs, Turn]] = {}
-    for parts, signs, says in (
+    layers: dict[str, tuple[Signs, Turn]] = {}
+    for parts, signs, output in (
         (("q_net.",), seen, turn),
         (("q_net_target.",), seen, turn),
         (("mlp_extractor.policy_net.", "action_net"), seen, turn),
         (("mlp_extractor.value_net.", "value_net"), seen, None),
         (("actor.latent_pi.", "actor.mu"), seen, turn),
-        (("actor.log_std",), None, None),  # beside the mean, on the same hidden layers
+        (("actor.log_std",), None, None),  # shares the hidden layers of the mean
         (("actor_target.",), seen, turn),
         *(((critic,), seen_by_critic, None) for critic in critics),
     ):
         names = [name for name in linear if name.startswith(parts)]
         for name in names:
-            same = torch.eye(linear[name].out_features) if says is None else says
-            found[name] = (
-                signs if name == names[0] else None,
-                same if name == names[-1] else None,
-            )
-    return found
+            last = torch.eye(linear[name].out_features) if output is None else output
+            layers[name] = signs if name == names[0] else None, last if name == names[-1] else None
+    return layers
 
 
-def _see_both(signs: torch.Tensor, layer: nn.Module, given: tuple[torch.Tensor]) -> torch.Tensor:
-    """(n, k) observations -> (2 n, k): they and their mirror images."""
-    return torch.cat([given[0], given[0] * signs])
+def _see_both(signs: torch.Tensor, layer: nn.Module, args: tuple[torch.Tensor]) -> torch.Tensor:
+    """Returns (n, k) observations and their mirror images: (2 n, k)."""
+    return torch.cat([args[0], args[0] * signs])
 
 
 def _average(
-    turn: torch.Tensor, layer: nn.Module, given: tuple[torch.Tensor], output: torch.Tensor
+    turn: torch.Tensor, layer: nn.Module, args: tuple[torch.Tensor], output: torch.Tensor
 ) -> torch.Tensor:
-    """(2 n, k) outputs -> (n, k): the mean of the first half and the second, mirrored."""
+    """Returns the mean (n, k) of the first half of outputs (2 n, k) and the mirrored second half."""
     straight, image = output.chunk(2)
     return (straight + image @ turn.T) / 2

@@ -1,4 +1,4 @@
-"""Train a policy with SB3 on the batched environments (paper, Steps 1 and 6)."""
+"""Training of policies with SB3 on the batched environments (paper, Steps 1 and 6)."""
 
 from __future__ import annotations
 
@@ -36,17 +36,16 @@ from hyrl_mj.tasks import Outcome, Task
 
 Score = tuple[float, ...]
 ACTIVATIONS = {name: getattr(nn, torch_name) for name, torch_name in TORCH_NAMES.items()}
-# How often TensorBoard gets a point: algorithms on their own policy count rollouts, the others episodes.
+# Interval of TensorBoard's points: on-policy algorithms count rollouts, the others episodes.
 LOG_ROLLOUTS, LOG_EPISODES = 1, 100
 # The learning rate falls to this share of its first value, not to zero: the last samples count too.
 FINAL_RATE = 0.02
-# How often the policy is checkpointed and judged; on how many episodes.
+# Number of checkpoints at which the policy is judged, and of the episodes of each.
 CHECKPOINTS = 32
 EPISODES = 256
 # The kinds of noise under which a policy that is trained for noise is judged.
 JUDGES = ("none", "uniform", "alternating")
-# Observations by which a foreign policy is compared with the plain network of its weights, and how far the
-# weights are moved before that.
+# Number of observations for the check of a foreign policy, and the change of its weights before the check.
 CHECKED, MOVED = 64, 0.05
 
 
@@ -60,22 +59,17 @@ def train(
     log_dir: Path | None = None,
     label: str = "training",
 ) -> MlpPolicy:
-    """Trains one policy, and returns the best of its checkpoints.
-
-    Training goes up and down; as with SB3's `EvalCallback`, the policy is judged at intervals.
+    """Trains one policy, and returns the best of its checkpoints, as SB3's `EvalCallback` does.
 
     Args:
-        task: what to learn.
-        settings: how.
-        seed: of weights, exploration, starts and noise; the same seed gives the same policy on the
-            same machine, at any number of physics threads.
+        task: the robot and its problem.
+        settings: settings of the training.
+        seed: seed of weights, exploration, starts and noise; the same seed gives the same policy on the
+            same machine, with any number of physics threads.
         ground: where the policy is trained and judged; by default `TaskGround`, without noise.
-        start_from: a policy whose weights to go on from; its network replaces `settings.hidden`.
-        log_dir: where TensorBoard logs and checkpoints go; none are written by default.
-        label: what the progress bar says.
-
-    Returns:
-        The best policy.
+        start_from: a policy whose weights to continue from; its network replaces `settings.hidden`.
+        log_dir: folder of TensorBoard logs and checkpoints; none are written by default.
+        label: label of the progress bar.
     """
     ground = ground or TaskGround(task, settings.gamma)
     domain = ground.domain(settings.gamma)
@@ -103,7 +97,7 @@ def build(
     """Returns the SB3 algorithm that `train` runs, ready to learn.
 
     Raises:
-        BadInput: an unknown algorithm, or a policy to start from whose networks are those of another one.
+        BadInput: an unknown algorithm, or a policy to start from whose networks differ.
     """
     check_algorithm(settings.algorithm, task.name, task.learning.levels)
     hidden = settings.hidden if start_from is None else start_from.hidden
@@ -131,7 +125,7 @@ def build(
         except RuntimeError as error:
             raise BadInput(
                 f"training with {settings.algorithm} cannot go on from this {start_from.algorithm} "
-                "policy, whose networks are other ones: start afresh"
+                "policy, because its networks differ: start a new training"
             ) from error
     if settings.symmetric and start_from is None and task.mirror is not None:
         symmetry.impose(model.policy, task)
@@ -139,18 +133,18 @@ def build(
 
 
 def check_foreign(task: Task, settings: Training) -> None:
-    """Checks an algorithm that is not SB3's own, and its policy, before anything is trained.
+    """Checks an algorithm that is not SB3's own, and its policy, before training.
 
     Raises:
-        BadInput: it cannot be built with these settings, or its policy does not do what a plain network
-            with its weights does.
+        BadInput: the algorithm cannot be built with these settings, or its policy differs from a plain
+            network of the same weights.
     """
     name = settings.algorithm
     try:
         model = build(task, settings, seed=0)
-    except Exception as error:  # whatever a foreign class raises
+    except Exception as error:  # a foreign class may raise any error
         raise BadInput(f"{name} cannot train {task.name}: {brief(error)}") from error
-    # Layers that do nothing at first, as those that normalise, are seen once all weights have changed.
+    # Layers without effect at first, such as normalisation, have one once all weights have changed.
     generator = torch.Generator().manual_seed(0)
     for tensor in model.policy.state_dict().values():
         if tensor.is_floating_point():
@@ -170,7 +164,7 @@ def check_foreign(task: Task, settings: Training) -> None:
 
 
 def export(model: BaseAlgorithm, task: Task) -> MlpPolicy:
-    """Returns the policy that an SB3 algorithm has learned so far, as a plain network."""
+    """Returns the current policy of an SB3 algorithm as a plain network."""
     state = symmetry.plain_state(model.policy, task)
     weights = {name: tensor.detach().cpu().numpy().copy() for name, tensor in state.items()}
     activation = next(n for n, a in ACTIVATIONS.items() if a is model.policy.activation_fn)
@@ -180,7 +174,7 @@ def export(model: BaseAlgorithm, task: Task) -> MlpPolicy:
 
 @contextmanager
 def single_threaded() -> Iterator[None]:
-    """Keeps torch and BLAS to one thread: faster for small networks, and sums do not vary by machine."""
+    """Limits torch and BLAS to one thread: faster for small networks, with the same sums on any machine."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -198,10 +192,9 @@ def evaluate(
     gamma: float = 1.0,
     episodes: int = EPISODES,
 ) -> tuple[float, float]:
-    """Evaluates a policy in episodes from the start distribution, always the same ones.
+    """Returns the share of episodes that end at the set-point, and the mean return, discounted by gamma.
 
-    Returns:
-        The share of episodes that end at the set-point, and the mean return, discounted by gamma.
+    The starts are drawn from the start distribution and are always the same.
     """
     env = BatchedEnv(task, episodes, noise=noise, domain=domain)
     env.seed(0)
@@ -219,11 +212,11 @@ def evaluate(
 
 
 class Ground(Protocol):
-    """Where a policy is trained, and how it is judged there.
+    """Where a policy is trained and how it is judged.
 
     Attributes:
-        noise: on the measurements during training.
-        enough: a score with which training may end.
+        noise: noise on the measurements during training.
+        enough: score with which training may end.
         settled: share of the training after which scores count.
     """
 
@@ -236,24 +229,19 @@ class Ground(Protocol):
         ...
 
     def __call__(self, policy: MlpPolicy) -> Score:
-        """Returns the score of a policy; scores are compared from left to right, the higher the better."""
+        """Returns the score of a policy; higher is better, compared from left to right."""
         ...
 
 
 class TaskGround:
     """All starts of a task, where a policy is judged on the same episodes every time.
 
-    The best is the one that most often ends at the set-point, and among equals the one with the highest
-    return, on average over the kinds of noise in `JUDGES`.
-
-    Args:
-        task: what to learn.
-        gamma: discount of the returns.
-        noise: during training, by default none; its bound is that of all judges.
+    The score is the share of episodes that end at the set-point, then the mean return discounted by `gamma`,
+    both averaged over the kinds of noise in `JUDGES`, with the bound of the `noise` during training.
     """
 
     enough: Score = (np.inf,)
-    settled = 0.5  # an untrained policy can be lucky in a few episodes
+    settled = 0.5  # an untrained policy can score well by chance
 
     def __init__(self, task: Task, gamma: float, noise: Noise | None = None):
         self.noise, self._task, self._gamma = noise or Noise(), task, gamma

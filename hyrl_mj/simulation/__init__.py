@@ -1,15 +1,14 @@
 """Simulation: the closed loop of plant, measurement noise and controller, in batches.
 
 `closed_loop` runs many episodes at once; `simulate` returns them as hybrid arcs. Each kind of measurement
-noise is a class of its own, a `Signal`, that `register_noise` makes known by its name; every file in this
-folder may define one.
+noise is a class of its own, a `Signal`, that `register_noise` registers by its name. Every module of this
+folder is imported, so that a new kind of noise takes one new file.
 """
 
 from importlib import import_module
 from pkgutil import iter_modules
 
 from hyrl_mj.simulation.arc import HybridArc, samples, simulate, simulate_batch
-from hyrl_mj.simulation.lookahead import Lookahead
 from hyrl_mj.simulation.noise import (
     NOT_STARTED,
     AnyNoise,
@@ -28,7 +27,6 @@ __all__ = [
     "NOT_STARTED",
     "AnyNoise",
     "HybridArc",
-    "Lookahead",
     "LoopSettings",
     "Noise",
     "Recorded",

@@ -28,7 +28,7 @@ LONGEST = 3600.0
 class HybridArc(Saved):
     """A solution of the hybrid closed loop on its hybrid time domain (paper, Section II-D).
 
-    It has one row a sample and one more for every jump: a jump at time t gives two rows with the same
+    An arc has one row a sample and one more for every jump: a jump at time t gives two rows with the same
     t, the first with j and the old mode, the second with j + 1 and the new one.
 
     Attributes:
@@ -37,13 +37,11 @@ class HybridArc(Saved):
         t: (N,) time [s].
         j: (N,) number of jumps so far.
         z: (N, d) true chart points, periodic coordinates unwrapped.
-        measured: (N, p) noisy measurements; not a number in the last row, which ends the arc.
+        measured: (N, p) noisy measurements; NaN in the last row, which ends the arc.
         q: (N,) modes.
-        u: (N, m) inputs applied from this row on; not a number where none is: in the last row, and
-            in the first of the two rows of a jump.
+        u: (N, m) inputs applied from this row on; NaN in the last row and in the first row of a jump.
         state: (N, nstate) MuJoCo's state (`mjSTATE_INTEGRATION`).
-        outcome: label of an `Outcome`: the one that ended the run, or the task's verdict when its time was
-            up.
+        outcome: label of the `Outcome` that ended the run, or of the task's verdict at the time limit.
         noise: kind of the measurement noise.
         bound: its bound eps.
     """
@@ -84,10 +82,9 @@ class HybridArc(Saved):
         panels = figure.subplots(dimension, sharex=True, squeeze=False)[:, 0]
         figure.suptitle(f"{self.task}, {self._summary}", fontsize="medium")
         jumps = np.flatnonzero(np.diff(self.j))
-        # Between two jumps the mode is the same.
-        stretches = np.split(np.arange(len(self.t)), jumps + 1)
+        flows = np.split(np.arange(len(self.t)), jumps + 1)
         for panel, label, z in zip(panels, self._axis_labels(), self.z.T, strict=True):
-            for rows in stretches:
+            for rows in flows:
                 mode = self.q[rows[0]]
                 panel.plot(self.t[rows], z[rows], color=f"C{mode}", label=f"mode {mode}")
             for t in self.t[jumps]:
@@ -100,14 +97,14 @@ class HybridArc(Saved):
         return figure
 
     def _axis_labels(self) -> list[str]:
-        """Returns "x [m]" for each coordinate, or "z[0]" where the task is not known here."""
+        """Returns "x [m]" for each coordinate, or "z[0]" if the task is not registered."""
         d = self.z.shape[1]
         if self.task in task_names() and (chart := get_task(self.task).chart).dimension == d:
             return [f"{n} [{unit}]" for n, unit in zip(chart.names, chart.units, strict=True)]
         return [f"z[{axis}]" for axis in range(d)]
 
     def arrives(self, task: Task) -> bool:
-        """Returns whether it reached the set-point, not the finishing line elsewhere."""
+        """Returns whether the arc ends at the set-point, not elsewhere on the finishing line."""
         return self.outcome == "reached" and bool(task.arrived(self.z[-1:])[0])
 
     def at(self, t: float) -> int:
@@ -125,18 +122,6 @@ def simulate(
     horizon: float | None = None,
     seed: int = 0,
 ) -> HybridArc: ...
-
-
-@overload
-def simulate(
-    task: Task,
-    controller: Controller | Policy,
-    z0: Sequence[Sequence[float]],
-    noise: AnyNoise | None = None,
-    q0: int | np.ndarray | None = None,
-    horizon: float | None = None,
-    seed: int = 0,
-) -> list[HybridArc]: ...
 
 
 @overload
@@ -204,18 +189,17 @@ def simulate_batch(
         q0 = check_modes(np.broadcast_to(q0, len(starts)), loop.modes)
     noise = Noise() if noise is None else noise
     steps = None if horizon is None else samples(task, horizon)
-    rollout = closed_loop(
-        task, loop, starts, noise, q0, seed, LoopSettings(steps=steps, record=True)
-    )
+    settings = LoopSettings(steps=steps, record=True)
+    rollout = closed_loop(task, loop, starts, noise, q0, seed, settings)
     name = "policy" if isinstance(loop, PolicyController) else "hyrl"
     return [_arc(task, name, rollout, i, noise) for i in range(len(starts))]
 
 
 def samples(task: Task, horizon: float) -> int:
-    """Returns how many samples a time [s] takes.
+    """Returns the number of samples in a time [s].
 
     Raises:
-        BadInput: it is not positive, or longer than an hour.
+        BadInput: the time is not positive, or longer than an hour.
     """
     if not (math.isfinite(horizon) and 0 < horizon <= LONGEST):
         raise BadInput(
@@ -235,7 +219,7 @@ def _arc(task: Task, name: str, rollout: Rollout, i: int, noise: AnyNoise) -> Hy
     last_mode = after[-1:] if end else rollout.q0[i : i + 1]
     q = np.where(old, np.append(before, last_mode)[rows], np.append(after, last_mode)[rows])
     jumps = np.append(jumped.cumsum(), jumped.sum())
-    u = _ended(rollout.u[:end, i])[rows]
+    u = _with_nan_row(rollout.u[:end, i])[rows]
     u[old] = np.nan
     return HybridArc(
         task=task.name,
@@ -243,7 +227,7 @@ def _arc(task: Task, name: str, rollout: Rollout, i: int, noise: AnyNoise) -> Hy
         t=rows * task.dt,
         j=jumps[rows] - old,
         z=rollout.path[rows, i],
-        measured=_ended(rollout.measured[:end, i])[rows],
+        measured=_with_nan_row(rollout.measured[:end, i])[rows],
         q=q,
         u=u,
         state=rollout.state[rows, i],
@@ -253,6 +237,6 @@ def _arc(task: Task, name: str, rollout: Rollout, i: int, noise: AnyNoise) -> Hy
     )
 
 
-def _ended(values: np.ndarray) -> np.ndarray:
+def _with_nan_row(values: np.ndarray) -> np.ndarray:
     """Returns values (K, c) with a row of NaN after them."""
     return np.vstack([values, np.full((1, values.shape[1]), np.nan)])

@@ -1,4 +1,4 @@
-"""Noise that looks at the closed loop before it chooses."""
+"""Adversarial noise that simulates the closed loop ahead before it chooses."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from hyrl_mj.policies import Controller
 from hyrl_mj.simulation.noise import NOT_STARTED, Sample, Signal, check_controller, register_noise
 from hyrl_mj.tasks import Outcome, Task
 
-# How many samples a plant with inertia is followed to see what an input leads to.
+# Samples by which a plant with inertia is simulated ahead.
 AHEAD = 6
-# Simulations that are followed side by side.
-AT_ONCE = 2_048
+# Simulations side by side.
+BATCH = 2_048
 
 
 @register_noise
 class Lookahead(Signal):
     """The noise that leads into the greatest danger, by the task's own measure of it.
 
-    A kinematic plant is looked at one sample later. With inertia one sample shows little: the closed loop
-    is followed for `AHEAD` of them, the first with the noise that is tried and the rest without any.
+    A kinematic plant is simulated ahead by one sample. With inertia one sample shows little: the closed loop
+    is simulated for `AHEAD` samples, the first with the candidate noise and the others without noise.
 
-    On each column that noise acts on, both ends of the bound, their halves and zero are tried; with more
-    than two such columns the ends and zero.
+    Candidates on each noisy column are both ends of the bound, their halves and zero; with more than two
+    such columns the ends and zero.
 
     Attributes:
-        samples: how many samples the closed loop is followed.
+        samples: number of samples by which the closed loop is simulated ahead.
     """
 
     kind = "adversarial"
@@ -39,8 +39,8 @@ class Lookahead(Signal):
 
     def __init__(self, bound: float, shares: np.ndarray):
         super().__init__(bound, shares)
-        tried = (0.0, -1.0, 1.0, -0.5, 0.5) if np.count_nonzero(shares) <= 2 else (0.0, -1.0, 1.0)
-        choices = product(*[tried if share else (0.0,) for share in shares])
+        factors = (0.0, -1.0, 1.0, -0.5, 0.5) if np.count_nonzero(shares) <= 2 else (0.0, -1.0, 1.0)
+        choices = product(*[factors if share else (0.0,) for share in shares])
         self._candidates = bound * np.array(list(choices)) * shares
         self._ahead: Plant | None = None
 
@@ -51,7 +51,7 @@ class Lookahead(Signal):
         return signal
 
     def sample(self, now: Sample) -> np.ndarray:
-        """As `Signal.sample`. Among equals no noise is preferred, then the largest."""
+        """Returns the noise as `Signal.sample`; of equal dangers zero comes first, then the largest noise."""
         true, chosen = now.measurement, np.zeros_like(now.measurement)
         unstable = now.plant.unstable[now.rows]
         running = np.flatnonzero(self.task.outcome(true, unstable) == Outcome.RUNNING)
@@ -59,24 +59,23 @@ class Lookahead(Signal):
         answer = np.stack(
             [np.column_stack(self._act(true[running] + c, q)) for c in self._candidates]
         )
-        # Where all candidates get the same answer there is nothing to choose, and each answer is tried once.
-        split = (answer != answer[0]).any(axis=(0, 2))
-        tried = [(answer[:i] == answer[i]).all(axis=2).any(axis=0) for i in range(len(answer))]
-        candidate, at = np.nonzero(split & ~np.stack(tried))
+        # Simulate each distinct answer once, and only where the candidates' answers differ.
+        differs = (answer != answer[0]).any(axis=(0, 2))
+        repeated = [(answer[:i] == answer[i]).all(axis=2).any(axis=0) for i in range(len(answer))]
+        candidate, at = np.nonzero(differs & ~np.stack(repeated))
         rows = now.rows[running[at]]
         qpos, qvel = now.plant.qpos[rows], now.plant.qvel[rows]
         danger = np.full(answer.shape[:2], -np.inf)
-        for first in range(0, len(at), AT_ONCE):
-            these = slice(first, first + AT_ONCE)
-            danger[candidate[these], at[these]] = self._danger(
-                qpos[these], qvel[these], answer[candidate[these], at[these]]
-            )
+        for first in range(0, len(at), BATCH):
+            batch = slice(first, first + BATCH)
+            entries = candidate[batch], at[batch]
+            danger[entries] = self._danger(qpos[batch], qvel[batch], answer[entries])
         chosen[running] = self._candidates[danger.argmax(axis=0)]
         return chosen
 
     def _danger(self, qpos: np.ndarray, qvel: np.ndarray, answer: np.ndarray) -> np.ndarray:
         """Returns the greatest danger (k,) after answers (k, m + 1), inputs and mode, in k states."""
-        ahead = self._ahead = self._ahead or self.task.plant(AT_ONCE)
+        ahead = self._ahead = self._ahead or self.task.plant(BATCH)
         rows = np.arange(len(answer))
         worst = np.full(len(answer), -np.inf)
         ahead.set_state(qpos, qvel, rows)

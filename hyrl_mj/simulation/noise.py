@@ -1,7 +1,7 @@
 """Measurement noise: signals bounded by eps on the columns of the measurement that they act on.
 
-`Noise` names a kind and its bound; a `Signal` is what disturbs one closed loop. To add a kind, write a
-class like those below and register it where it is defined.
+`Noise` names a kind and its bound; a `Signal` disturbs one closed loop. To add a kind, write a class like
+those below and register it where it is defined.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from hyrl_mj.plant import Plant
 from hyrl_mj.policies import Controller
 from hyrl_mj.tasks import Task
 
-# The mode of a run whose controller has not picked one yet: it does so from the first measurement.
+# The mode of a run before its first measurement, from which the controller picks its start mode.
 NOT_STARTED = -1
 
 
@@ -28,11 +28,10 @@ class Sample:
     """What a signal may know when it is sampled, for n of the simulations that it disturbs.
 
     Attributes:
-        rows: (n,) int, which of the simulations.
-        k: (n,) int, the number of each one's sample. Where it is 0 a run begins anew: a signal with memory
-            starts over in these rows.
+        rows: (n,) int indices of the simulations.
+        k: (n,) int sample numbers. Where k is 0 a run begins anew and a signal with memory has to restart.
         measurement: (n, p) true measurements.
-        q: (n,) int, modes; `NOT_STARTED` where none has been picked.
+        q: (n,) int modes; `NOT_STARTED` where none has been picked.
         plant: all simulations.
     """
 
@@ -64,17 +63,15 @@ class Signal(ABC):
     def against(self, task: Task, controller: Controller | None) -> Self:
         """Returns the signal for one closed loop: a copy, because loops do not share their memory.
 
-        Args:
-            task: the task.
-            controller: what closes the loop; None in an environment, where an agent does.
+        The controller is None in an environment, where an agent closes the loop.
 
         Raises:
-            BadInput: the signal works against a controller, and there is none; see `check_controller`.
+            BadInput: the signal needs a controller, and there is none.
         """
         return copy(self)
 
     def reset(self, n: int, rng: np.random.Generator) -> None:
-        """Begins n simulations, with a generator to draw from; a signal with memory makes room for it."""
+        """Begins n simulations with a generator to draw from; a signal with memory allocates it here."""
         self.rng = rng
 
     @abstractmethod
@@ -83,11 +80,7 @@ class Signal(ABC):
 
 
 def check_controller(controller: Controller | None, kind: str) -> Controller:
-    """Returns the controller itself, if there is one that noise of this kind can work against.
-
-    Raises:
-        BadInput: there is none.
-    """
+    """Returns the controller, or raises `BadInput` if there is none for noise of this kind to act against."""
     if controller is None:
         raise BadInput(
             f"{kind} noise needs a controller to act against: use simulate(), or another kind of noise here"
@@ -100,26 +93,25 @@ _KINDS: dict[str, type[Signal]] = {}
 
 
 def register_noise(signal: type[AnySignal]) -> type[AnySignal]:
-    """Makes a class of signals known by its `kind`: a class decorator.
+    """Registers a class of signals by its `kind`, for `Noise(kind, bound)` and `--noise KIND`.
 
-    `Noise(kind, bound)` and `--noise KIND` find it then. It is built with a bound and the shares of the
-    columns, as `Signal`.
+    Use it as a class decorator. The class is constructed with a bound and shares, as `Signal` is.
 
     Raises:
         BadInput: another class has that kind.
     """
-    known = _KINDS.get(signal.kind, signal)
-    if (known.__module__, known.__qualname__) != (signal.__module__, signal.__qualname__):
+    other = _KINDS.get(signal.kind, signal)
+    if (other.__module__, other.__qualname__) != (signal.__module__, signal.__qualname__):
         raise BadInput(
             f"{signal.__name__} cannot be registered: noise {signal.kind!r} is already "
-            f"{known.__module__}.{known.__qualname__}, so choose another kind"
+            f"{other.__module__}.{other.__qualname__}, so choose another kind"
         )
     _KINDS[signal.kind] = signal
     return signal
 
 
 def noise_kinds() -> tuple[str, ...]:
-    """Returns the kinds of noise that are registered."""
+    """Returns the registered kinds of noise."""
     return tuple(_KINDS)
 
 
@@ -145,7 +137,7 @@ class Uniform(Signal):
 
 @register_noise
 class Alternating(Signal):
-    """+bound, -bound, +bound, ...: the paper's noise."""
+    """Noise +bound, -bound, +bound, ...: the paper's."""
 
     kind = "alternating"
 
@@ -155,12 +147,12 @@ class Alternating(Signal):
 
 @dataclass(frozen=True)
 class Recorded(Signal):
-    """A noise signal that is given sample by sample; after its end there is none.
+    """A recorded noise signal; after its last sample there is no noise.
 
     Attributes:
         values: (K, n, p) noise on n simulations, in the unit of the measurement.
-        bound: the bound that it keeps.
-        kind: name of its kind.
+        bound: largest magnitude of the values.
+        kind: name of the kind.
     """
 
     values: np.ndarray
@@ -192,10 +184,10 @@ class Noise:
 
     Attributes:
         kind: "none"; "uniform", drawn anew at every sample from [-bound, bound]; "alternating", +bound,
-            -bound, +bound, ... (the paper's); "adversarial", at each sample the one that leads to the
-            greatest danger soon after; or another one that is registered.
+            -bound, +bound, ... (the paper's); "adversarial", the noise that leads to the greatest danger
+            soon after each sample; or another registered kind.
         bound: largest magnitude eps >= 0, in the unit of the measurement.
-        everywhere: whether it acts on every column of the measurement, not only on the task's noisy ones.
+        everywhere: whether the noise acts on all columns of the measurement, not only on the noisy ones.
     """
 
     kind: str = "none"
@@ -215,22 +207,22 @@ class Noise:
         """Returns the signal of this kind for one closed loop, as `Signal.against`.
 
         Raises:
-            BadInput: it needs a controller and there is none, or its bound hides the whole chart.
+            BadInput: the kind needs a controller and there is none, or the bound hides the whole chart.
         """
         task.check_noise(self.bound, self.everywhere)
         signal = _KINDS[self.kind](self.bound, self.shares(task.noisy))
         return signal.against(task, controller)
 
 
-# What may be given as the noise of a closed loop.
+# The types that a closed loop takes as noise.
 AnyNoise = Noise | Signal
 
 
 def signal_for(noise: AnyNoise | None, task: Task, controller: Controller | None) -> Signal:
-    """Returns the signal for one closed loop, of no noise by default.
+    """Returns the signal for one closed loop, by default without noise.
 
     Raises:
-        BadInput: it is no noise, or cannot be used here.
+        BadInput: `noise` has another type, or cannot be used here.
     """
     noise = Noise() if noise is None else noise
     if not isinstance(noise, AnyNoise):

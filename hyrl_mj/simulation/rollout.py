@@ -18,13 +18,13 @@ class LoopSettings:
     """How the closed loop is run.
 
     Attributes:
-        steps: number of samples, by default until the task's time is up.
-        backward: run x' = -f(x, u) instead; such runs end with the last sample only.
-        record: whether modes, measurements, inputs and states are kept.
-        vary: whether coordinates that the chart does not hold are drawn, too, as in training.
+        steps: number of samples, by default the task's limit.
+        backward: simulate x' = -f(x, u); such runs end with the last sample only.
+        record: whether to keep modes, measurements, inputs and states.
+        vary: whether to draw the coordinates outside the chart at random, as in training.
         plant: n copies of the task's robot to use again; by default new ones.
-        label: what the progress bar says.
-        quiet: show no progress bar, because the caller has one.
+        label: label of the progress bar.
+        quiet: show no progress bar.
     """
 
     steps: int | None = None
@@ -38,15 +38,15 @@ class LoopSettings:
 
 @dataclass(frozen=True)
 class Rollout:
-    """n closed-loop runs over at most K samples. A run that ended stays where it ended.
+    """Results of n closed-loop runs over at most K samples. A run that ended stays where it ended.
 
     Attributes:
         path: (K + 1, n, d) true chart points at the samples, periodic coordinates unwrapped.
         length: (n,) samples until the end of each run.
         outcome: (n,) `Outcome`.
         q0: (n,) modes at the start.
-        before: (K, n) modes at each sample before a jump, and
-        q: (K, n) after it. Recorded only on demand, like the following.
+        before: (K, n) modes at each sample before a jump. Empty without `record`, like all that follow.
+        q: (K, n) modes at each sample after a jump.
         measured: (K, n, p) noisy measurements.
         u: (K, n, m) inputs.
         state: (K + 1, n, nstate) MuJoCo's states.
@@ -76,25 +76,23 @@ def closed_loop(
 
     Args:
         task: the robot and its problem.
-        controller: what closes the loop.
+        controller: the controller that closes the loop.
         z0: (n, d) starts, chart points.
-        noise: on the measurement; none by default.
+        noise: noise on the measurement; none by default.
         q0: (n,) start modes; by default the controller picks them from the first measurement.
-        seed: of the noise; the same seed and n give the same signals whatever the controller.
-        settings: how long, which way, and what is kept.
+        seed: seed of the noise; the same seed and n give the same signals whatever the controller.
+        settings: duration, direction and what to record.
 
     Raises:
         BadInput: the noise cannot be used.
     """
     limit = task.max_steps if settings.steps is None else settings.steps
-    backward, record = settings.backward, settings.record
-    n, rng = len(z0), np.random.default_rng(seed)
-    everyone = np.arange(n)
+    backward, record, n = settings.backward, settings.record, len(z0)
     plant = settings.plant or task.plant(n)
-    others = np.random.default_rng([seed, 1]) if settings.vary else None
-    plant.set_state(*task.state(z0, others))
+    rng_of_starts = np.random.default_rng([seed, 1]) if settings.vary else None
+    plant.set_state(*task.state(z0, rng_of_starts))
     signal = signal_for(noise, task, controller)
-    signal.reset(n, rng)
+    signal.reset(n, np.random.default_rng(seed))
     measurement = plant.measurement
     q = np.full(n, NOT_STARTED) if q0 is None else np.asarray(q0, dtype=int).copy()
     outcome = np.full(n, Outcome.RUNNING) if backward else task.outcome(measurement, plant.unstable)
@@ -102,14 +100,15 @@ def closed_loop(
     path = np.empty((limit + 1, n, task.chart.dimension))
     path[0] = task.z(measurement)
     first_mode = q.copy()
-    kept: dict[str, list[np.ndarray]] = {name: [] for name in ("before", "q", "measured", "u")}
+    shapes = {"before": (), "q": (), "measured": (len(task.noisy),), "u": (len(task.inputs),)}
+    kept: dict[str, list[np.ndarray]] = {name: [] for name in shapes}
     states = [plant.state] if record else []
     progress = None if settings.quiet else Progress(settings.label, limit, "samples")
     for k in range(limit):
         active = np.flatnonzero(outcome == Outcome.RUNNING)
         if not len(active):
             break
-        now = Sample(everyone, np.full(n, k), measurement, q, plant)
+        now = Sample(np.arange(n), np.full(n, k), measurement, q, plant)
         measured = measurement + signal.sample(now)
         if k == 0 and q0 is None:
             q[:] = controller.initial_mode(measured)
@@ -118,15 +117,14 @@ def closed_loop(
         u[active], q[active] = controller.step(q[active], measured[active])
         (plant.step_backward if backward else plant.step)(u[active], active)
         measurement, last, lost = plant.measurement, measurement, plant.unstable
-        measurement[lost] = last[lost]  # where it was before it broke down
+        measurement[lost] = last[lost]  # the last one before the simulation became unstable
         path[k + 1] = task.z(measurement)
         length[active] = k + 1
         if not backward:
             outcome[active] = task.outcome(measurement[active], lost[active])
         if record:
-            values = {"before": before, "q": q.copy(), "measured": measured, "u": u}
-            for name, value in values.items():
-                kept[name].append(value)
+            for name, values in zip(shapes, (before, q.copy(), measured, u), strict=True):
+                kept[name].append(values)
             states.append(np.where(lost[:, None], states[-1], plant.state))
         if progress:
             progress.update(k + 1)
@@ -135,7 +133,6 @@ def closed_loop(
     if not backward:
         late = outcome == Outcome.RUNNING
         outcome[late] = task.verdict(measurement[late])
-    shapes = {"before": (), "q": (), "measured": (len(task.noisy),), "u": (len(task.inputs),)}
     arrays = {k: np.array(values).reshape(-1, n, *shapes[k]) for k, values in kept.items()}
     arrays |= {k: arrays[k].astype(int) for k in ("before", "q")}
     path = path[: length.max() + 1]
@@ -143,5 +140,5 @@ def closed_loop(
 
 
 def ways(task: Task, rollout: Rollout) -> np.ndarray:
-    """Returns which way each run went, (n,) int as `Task.direction`; -1 for one that broke down."""
+    """Returns which way each run went, (n,) int as `Task.direction`; -1 for an unstable one."""
     return np.where(rollout.outcome == Outcome.UNSTABLE, -1, task.direction(rollout.path))
