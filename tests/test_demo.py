@@ -65,12 +65,18 @@ def demo(tmp_path_factory):
     return folder
 
 
-def skip_other_bits(folder):
-    """Skips where stage 1 has learned other weights, as on another kind of processor; see conftest for CI."""
-    for task, recorded in DEMO["policy_sha256"].items():
-        weights = (folder / task / "policy.safetensors").read_bytes()
-        if hashlib.sha256(weights).hexdigest() != recorded:
-            pytest.skip(f"{task} has other weights here than the run that README shows")
+def has_other_weights(folder):
+    """Whether stage 1 has learned other weights than in README's runs, as on another kind of processor."""
+    return any(
+        hashlib.sha256((folder / task / "policy.safetensors").read_bytes()).hexdigest() != recorded
+        for task, recorded in DEMO["policy_sha256"].items()
+    )
+
+
+def game_of(folder, task):
+    """The game's part of robustness.json."""
+    path = folder / task / "robustness.json"
+    return json.loads(path.read_text(encoding="utf-8"))["game"]
 
 
 def written(row, who, game, unit):
@@ -93,12 +99,17 @@ def written(row, who, game, unit):
 
 @pytest.mark.slow
 def test_the_demo_gives_these_numbers(demo):
-    skip_other_bits(demo)
+    if has_other_weights(demo):
+        # Of other weights README says nothing; what holds for each of ten seeds holds for them, too.
+        for task in TASKS:
+            policy, hyrl = (game_of(demo, task)["scores"][who][-1] for who in ("policy", "hyrl"))
+            assert hyrl["won"] >= 0.999 > policy["won"]
+            assert hyrl["won_any"] >= 0.95
+        return
     for row in DEMO["table"]:
-        path = demo / row["task"] / "robustness.json"
-        game = json.loads(path.read_text(encoding="utf-8"))["game"]
         unit = hyrl_mj.get_task(row["task"]).chart.units[0]
         expected = {who: row[who] for who in CONTROLLERS}
+        game = game_of(demo, row["task"])
         assert {who: written(row, who, game, unit) for who in CONTROLLERS} == expected, row
 
 
@@ -106,9 +117,11 @@ def test_the_demo_gives_these_numbers(demo):
 def test_the_demo_gives_this_replay(demo):
     from hyrl_mj.viz.arcs import replay_shows
 
-    skip_other_bits(demo)
     (show,) = replay_shows(hyrl_mj.load_run(demo / "vehicle"), "paper", "worst")
     lost = [Counter(arc.outcome for arc in arcs)["crashed"] for arcs in (show.policy, show.hybrid)]
+    if has_other_weights(demo):
+        assert lost[0] > lost[1] == 0
+        return
     policy, hybrid = (NUMBERS[n] for n in lost)
     of = [NUMBERS[len(arcs)] for arcs in (show.policy, show.hybrid)]
     assert DEMO["worst_replay"] == (
