@@ -215,8 +215,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], kind: str) -> Non
     Raises:
         TypeError: an array of Python objects, which NumPy would pickle.
     """
-    objects = [name for name, values in arrays.items() if np.asarray(values).dtype.hasobject]
-    if objects:
+    if objects := [name for name, array in arrays.items() if np.asarray(array).dtype.hasobject]:
         raise TypeError(f"arrays of Python objects cannot be written: {', '.join(objects)}")
     content: dict[str, Any] = {"kind": kind, "version": VERSION, **arrays}
     with replacing(path) as temporary:

@@ -124,9 +124,8 @@ class BatchedEnv:
         reward[unstable] = self.task.worst_reward
         measured = self._measure(np.arange(self.n))
         if self.domain is not None:
-            if self.domain.caution is not None:
-                cautious = cautious_reward(self.task, measured, u, self.domain.caution)
-                reward = np.minimum(reward, cautious)
+            if (caution := self.domain.caution) is not None:
+                reward = np.minimum(reward, cautious_reward(self.task, measured, u, caution))
             left = ~terminated & ~self.domain.contains(self.task.z(measurement))
             reward[left] = self.domain.exit_reward
             terminated = terminated | left
@@ -150,10 +149,8 @@ class BatchedEnv:
 
     def _measure(self, ids: np.ndarray) -> np.ndarray:
         """Returns noisy measurements (k, p) of the rows `ids`."""
-        true = self.plant.measurement[ids]
-        modes = np.full(len(ids), NOT_STARTED)
-        now = Sample(ids, self._samples[ids], true, modes, self.plant)
-        return true + self._noise.sample(now)
+        true, modes = self.plant.measurement[ids], np.full(len(ids), NOT_STARTED)
+        return true + self._noise.sample(Sample(ids, self._samples[ids], true, modes, self.plant))
 
 
 def cautious_reward(

@@ -55,13 +55,10 @@ class Sb3Policy:
         """
         checked = self._check_observation(observation)
         measured = self.task.measured(np.atleast_2d(checked))
-        u, q = self._loop.step(self._modes(measured, state, episode_start), measured)
+        loop = as_controller(self.controller)
+        u, q = loop.step(_modes(loop, measured, state, episode_start), measured)
         actions = self._actions(u)
         return actions.squeeze(axis=0) if checked.ndim == 1 else actions, (q,)
-
-    @property
-    def _loop(self) -> Controller:
-        return as_controller(self.controller)
 
     def _check_observation(self, observation: ArrayLike) -> np.ndarray:
         """Returns the observation as a float array (k,) or (n, k)."""
@@ -82,30 +79,6 @@ class Sb3Policy:
             raise BadInput(f"observation {bad[0]} cannot be used: it must be finite")
         return values
 
-    def _modes(
-        self,
-        measured: np.ndarray,
-        state: tuple[np.ndarray, ...] | None,
-        episode_start: ArrayLike | None,
-    ) -> np.ndarray:
-        """Returns the modes (n,) of the controller before measurements (n, p)."""
-        n = len(measured)
-        if state is None:
-            return self._loop.initial_mode(measured)
-        if not isinstance(state, tuple) or len(state) != 1 or np.shape(state[0]) != (n,):
-            raise BadInput(
-                f"{n} observation(s) need the state (q,) with the modes q of shape ({n},), got {state!r}"
-            )
-        starts = np.asarray(False if episode_start is None else episode_start, dtype=bool)
-        if starts.shape not in ((), (n,)):
-            raise BadInput(
-                f"{n} observation(s) need an episode_start of shape ({n},), got {starts.shape}"
-            )
-        starts, q = np.broadcast_to(starts, n), np.array(state[0])
-        if starts.any():
-            q[starts] = self._loop.initial_mode(measured[starts])
-        return check_modes(q, self._loop.modes).astype(int)
-
     def _actions(self, u: np.ndarray) -> np.ndarray:
         """Returns the actions of inputs u (n, m): levels (n,) of a discrete task, else the inputs."""
         levels = self.task.input_levels
@@ -118,3 +91,28 @@ class Sb3Policy:
                 f"input {u[off][0]} is none of the {len(levels)} levels that {self.task.name} takes"
             )
         return actions
+
+
+def _modes(
+    loop: Controller,
+    measured: np.ndarray,
+    state: tuple[np.ndarray, ...] | None,
+    episode_start: ArrayLike | None,
+) -> np.ndarray:
+    """Returns the modes (n,) of a controller before measurements (n, p)."""
+    n = len(measured)
+    if state is None:
+        return loop.initial_mode(measured)
+    if not isinstance(state, tuple) or len(state) != 1 or np.shape(state[0]) != (n,):
+        raise BadInput(
+            f"{n} observation(s) need the state (q,) with the modes q of shape ({n},), got {state!r}"
+        )
+    starts = np.asarray(False if episode_start is None else episode_start, dtype=bool)
+    if starts.shape not in ((), (n,)):
+        raise BadInput(
+            f"{n} observation(s) need an episode_start of shape ({n},), got {starts.shape}"
+        )
+    starts, q = np.broadcast_to(starts, n), np.array(state[0])
+    if starts.any():
+        q[starts] = loop.initial_mode(measured[starts])
+    return check_modes(q, loop.modes).astype(int)

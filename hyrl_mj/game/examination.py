@@ -55,26 +55,19 @@ def examine(
     parts = tuple(parts)
     grid = Grid.with_cells(task.chart, cells)
     fine = Game(task, parts, controllers, max(*bounds, LARGEST), everywhere, grid)
-    grid = fine.lattice.grid
     scores = _scores(fine, [*controllers, LIMIT], bounds, progress)
     margins = dict(zip(controllers, _in_threads(fine.margin, zip(controllers)), strict=True))
     progress.update(len(bounds) + 1)
-    maps = Maps(
-        eps=bounds[-1],
-        grid_counts=np.array(grid.counts),
-        map={name: fine.map(name, bounds[-1]) for name in controllers},
-    )
+    classes = {name: fine.map(name, bounds[-1]) for name in controllers}
+    maps = Maps(bounds[-1], np.array(grid.counts), classes)
     coarse = fine
     if task.chart.dimension == 2:
         half = Grid.with_cells(task.chart, cells // 2)
         coarse = Game(task, parts, controllers, LARGEST, everywhere, half)
     curve, profile = _sweep(coarse, [*controllers, LIMIT], points, progress, len(bounds) + 2)
     progress.close()
-    lattice = LatticeSpacing(
-        spacing=tuple(grid.spacing.tolist()),
-        exact=fine.lattice.exact,
-        curve_spacing=tuple(coarse.lattice.grid.spacing.tolist()),
-    )
+    spacing, curve_spacing = (tuple(g.lattice.grid.spacing.tolist()) for g in (fine, coarse))
+    lattice = LatticeSpacing(spacing, fine.lattice.exact, curve_spacing)
     misses = _misses(coarse, controllers)
     return GameResult(everywhere, lattice, scores, margins, misses, curve, profile), maps
 
@@ -84,13 +77,11 @@ def _scores(
 ) -> dict[str, tuple[Score, ...]]:
     """Returns the scores of each controller, one for each noise bound."""
     games = [(name, eps) for eps in bounds for name in names]
-    scores: dict[str, list[Score]] = {name: [] for name in names}
-    for k, (name, score) in enumerate(
-        zip(names * len(bounds), _in_threads(game.score, games), strict=True)
-    ):
-        scores[name].append(score)
-        progress.update((k + 1) // len(names))
-    return {name: tuple(level) for name, level in scores.items()}
+    scores: list[Score] = []
+    for score in _in_threads(game.score, games):
+        scores.append(score)
+        progress.update(len(scores) // len(names))
+    return {name: tuple(scores[i :: len(names)]) for i, name in enumerate(names)}
 
 
 def _sweep(
@@ -111,8 +102,7 @@ def _sweep(
         for name in names:
             value = next(values)[:, :-2]
             own, worst = value[-1], value[:-1].max(axis=0)
-            times = worst[region & (worst < NEVER)]
-            time_any = float(times.max(initial=0) * dt)
+            time_any = float(worst[region & (worst < NEVER)].max(initial=0) * dt)
             rows[name].append((share(own[region] < NEVER), share(worst[region] < NEVER), time_any))
             holds[name] &= own[at] < NEVER
             borne[name][holds[name]] = eps

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 
@@ -17,8 +16,7 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.game.lattice import Lattice
 from hyrl_mj.policies import Controller
 from hyrl_mj.sets import within_reach
-from hyrl_mj.simulation import NOT_STARTED, Sample, Signal, check_controller
-from hyrl_mj.tasks import Task
+from hyrl_mj.simulation import NOT_STARTED, Sample, Signal
 
 # Distance from a node within which its answer has to be the same, in cells.
 BESIDE = 1e-4
@@ -230,6 +228,7 @@ class WorstNoise(Signal):
     """
 
     kind = "worst"
+    needs_controller = True
 
     def __init__(self, answers: Answers, bound: np.ndarray):
         self.bound = float(bound.max(initial=0.0))
@@ -243,10 +242,6 @@ class WorstNoise(Signal):
         ).reshape(-1, len(window))
         # Among equals the largest noise comes first, for states between the nodes.
         self._shifts = shifts[np.argsort(-np.abs(shifts).sum(axis=1), kind="stable")]
-
-    def against(self, task: Task, controller: Controller | None) -> Self:
-        check_controller(controller, self.kind)
-        return super().against(task, controller)
 
     def sample(self, now: Sample) -> np.ndarray:
         answers, lattice = self._answers, self._answers.lattice

@@ -150,12 +150,10 @@ _MODES_PAPER_CONTINUOUS = replace(
 )
 _MODES_PAPER_DISCRETE = replace(_PAPER, samples=300_000, warm_start=True)
 _SMOKE_MODES = 8_192
-# Grid points along the longest side of the chart, by its dimension: search of M*, and sets.
-_RODS = {1: 120, 2: 120, 3: 24, 4: 8}
-_CELLS = {1: 2880, 2: 240, 3: 48, 4: 16}
-# Coarser ones for plants with dynamics, whose samples are slower to simulate.
-_RODS_DYNAMIC = {1: 120, 2: 40, 3: 16, 4: 8}
-_CELLS_DYNAMIC = {1: 720, 2: 96, 3: 30, 4: 12}
+# Grid points along the longest side of the chart, by its dimension, for the search of M* and for the sets;
+# fewer for plants with dynamics, whose samples are slower to simulate.
+_GRIDS = {1: (120, 2880), 2: (120, 240), 3: (24, 48), 4: (8, 16)}
+_GRIDS_DYNAMIC = {1: (120, 720), 2: (40, 96), 3: (16, 30), 4: (8, 12)}
 # Cells of the worst-case game's lattice in a smoke run.
 _LATTICE_SMOKE = {1: 1_200, 2: 120}
 
@@ -191,7 +189,7 @@ def preset(
     stage6 = _stage6(task, name, stage1.algorithm)
     task.check_noise(noise)
     dimension = task.chart.dimension
-    cells, rods = (_CELLS, _RODS) if task.kinematic else (_CELLS_DYNAMIC, _RODS_DYNAMIC)
+    rods, cells = (_GRIDS if task.kinematic else _GRIDS_DYNAMIC)[min(dimension, 4)]
     return Settings(
         task=reference(task),
         preset=name,
@@ -200,10 +198,10 @@ def preset(
         horizon=task.learning.horizon if horizon is None and name == "paper" else horizon,
         stage1=stage1,
         stage6=replace(stage6, warm_start=True) if agent else stage6,
-        cells=cells[min(dimension, 4)],
+        cells=cells,
         # Rods miss a part of M* if the agent goes straight on for some samples before it picks a way.
         search="outcome" if agent else task.learning.search,
-        rods=rods[min(dimension, 4)],
+        rods=rods,
         lattice=(_LATTICE_SMOKE if name == "smoke" else LATTICE).get(dimension, 0),
     )
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from hyrl_mj.plant import Plant
 from hyrl_mj.policies import Controller
-from hyrl_mj.simulation.noise import NOT_STARTED, Sample, Signal, check_controller, register_noise
+from hyrl_mj.simulation.noise import NOT_STARTED, Sample, Signal, register_noise
 from hyrl_mj.tasks import Outcome, Task
 
 # Samples by which a plant with inertia is simulated ahead.
@@ -33,6 +33,7 @@ class Lookahead(Signal):
     """
 
     kind = "adversarial"
+    needs_controller = True
     task: Task
     controller: Controller
     samples: int
@@ -46,7 +47,8 @@ class Lookahead(Signal):
 
     def against(self, task: Task, controller: Controller | None) -> Self:
         signal = super().against(task, controller)
-        signal.task, signal.controller = task, check_controller(controller, self.kind)
+        assert controller is not None
+        signal.task, signal.controller = task, controller
         signal.samples = 1 if task.kinematic else AHEAD
         return signal
 

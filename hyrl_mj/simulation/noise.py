@@ -7,7 +7,6 @@ those below and register it where it is defined.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import Self, TypeVar
@@ -51,10 +50,12 @@ class Signal(ABC):
 
     Attributes:
         kind: name of the kind.
+        needs_controller: whether the signal acts against a controller.
         rng: the generator that random noise is drawn from, after `reset`.
     """
 
     kind: str
+    needs_controller = False
     rng: np.random.Generator
 
     def __init__(self, bound: float, shares: np.ndarray):
@@ -68,6 +69,11 @@ class Signal(ABC):
         Raises:
             BadInput: the signal needs a controller, and there is none.
         """
+        if self.needs_controller and controller is None:
+            raise BadInput(
+                f"{self.kind} noise needs a controller to act against: use simulate(), or another kind of "
+                "noise here"
+            )
         return copy(self)
 
     def reset(self, n: int, rng: np.random.Generator) -> None:
@@ -77,15 +83,6 @@ class Signal(ABC):
     @abstractmethod
     def sample(self, now: Sample) -> np.ndarray:
         """Returns the noise (n, p) on the measurements of a sample, in their unit."""
-
-
-def check_controller(controller: Controller | None, kind: str) -> Controller:
-    """Returns the controller, or raises `BadInput` if there is none for noise of this kind to act against."""
-    if controller is None:
-        raise BadInput(
-            f"{kind} noise needs a controller to act against: use simulate(), or another kind of noise here"
-        )
-    return controller
 
 
 AnySignal = TypeVar("AnySignal", bound=Signal)
@@ -199,10 +196,6 @@ class Noise:
             raise unknown("noise", self.kind, _KINDS)
         check_bound(self.bound)
 
-    def shares(self, noisy: Sequence[float]) -> np.ndarray:
-        """Returns how much of the bound acts on each column (p,): the task's shares, or all of it."""
-        return np.ones(len(noisy)) if self.everywhere else np.array(noisy, dtype=float)
-
     def against(self, task: Task, controller: Controller | None) -> Signal:
         """Returns the signal of this kind for one closed loop, as `Signal.against`.
 
@@ -210,8 +203,8 @@ class Noise:
             BadInput: the kind needs a controller and there is none, or the bound hides the whole chart.
         """
         task.check_noise(self.bound, self.everywhere)
-        signal = _KINDS[self.kind](self.bound, self.shares(task.noisy))
-        return signal.against(task, controller)
+        shares = np.ones(len(task.noisy)) if self.everywhere else np.array(task.noisy, dtype=float)
+        return _KINDS[self.kind](self.bound, shares).against(task, controller)
 
 
 # The types that a closed loop takes as noise.
