@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 
 from hyrl_mj.game.lattice import LATTICE, Lattice
-from hyrl_mj.game.result import LIMIT, Curve, GameResult, LatticeSpacing, Maps, Profile, Score, Wins
+from hyrl_mj.game.result import LIMIT, Curve, GameResult, LatticeSpacing, Maps, Profile, Wins
 from hyrl_mj.game.scores import LARGEST, Game, share
 from hyrl_mj.game.solver import NEVER
 from hyrl_mj.policies import Controller
-from hyrl_mj.progress import Progress
+from hyrl_mj.progress import progress_bar
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import Task
@@ -51,42 +51,29 @@ def examine(
         task.check_noise(eps, everywhere)
     Lattice.check(task)
     cells = cells or LATTICE[task.chart.dimension]
-    progress = Progress("worst-case game", len(bounds) + len(CURVE) + 2, "noise bounds")
     parts = tuple(parts)
     grid = Grid.with_cells(task.chart, cells)
     fine = Game(task, parts, controllers, max(*bounds, LARGEST), everywhere, grid)
-    scores = _scores(fine, [*controllers, LIMIT], bounds, progress)
-    margins = dict(zip(controllers, _in_threads(fine.margin, zip(controllers)), strict=True))
-    progress.update(len(bounds) + 1)
+    names = [*controllers, LIMIT]
+    games = [(name, eps) for eps in bounds for name in names]
+    results = list(_in_threads("worst-case scores", fine.score, games))
+    scores = {name: tuple(results[i :: len(names)]) for i, name in enumerate(names)}
+    bounds_won = _in_threads("margins", fine.margin, [(name,) for name in controllers])
+    margins = dict(zip(controllers, bounds_won, strict=True))
     classes = {name: fine.map(name, bounds[-1]) for name in controllers}
     maps = Maps(bounds[-1], np.array(grid.counts), classes)
     coarse = fine
     if task.chart.dimension == 2:
         half = Grid.with_cells(task.chart, cells // 2)
         coarse = Game(task, parts, controllers, LARGEST, everywhere, half)
-    curve, profile = _sweep(coarse, [*controllers, LIMIT], points, progress, len(bounds) + 2)
-    progress.close()
+    curve, profile = _sweep(coarse, names, points)
     spacing, curve_spacing = (tuple(g.lattice.grid.spacing.tolist()) for g in (fine, coarse))
     lattice = LatticeSpacing(spacing, fine.lattice.exact, curve_spacing)
     misses = _misses(coarse, controllers)
     return GameResult(everywhere, lattice, scores, margins, misses, curve, profile), maps
 
 
-def _scores(
-    game: Game, names: list[str], bounds: tuple[float, ...], progress: Progress
-) -> dict[str, tuple[Score, ...]]:
-    """Returns the scores of each controller, one for each noise bound."""
-    games = [(name, eps) for eps in bounds for name in names]
-    scores: list[Score] = []
-    for score in _in_threads(game.score, games):
-        scores.append(score)
-        progress.update(len(scores) // len(names))
-    return {name: tuple(scores[i :: len(names)]) for i, name in enumerate(names)}
-
-
-def _sweep(
-    game: Game, names: list[str], points: np.ndarray, progress: Progress, done: int
-) -> tuple[Curve, Profile]:
+def _sweep(game: Game, names: list[str], points: np.ndarray) -> tuple[Curve, Profile]:
     """Returns the curve over `CURVE`, and the profile of the noise that points (N, d) of M* bear."""
     task, dt = game.task, game.task.dt
     along = points[task.may_start(points)]
@@ -95,8 +82,9 @@ def _sweep(
     rows: dict[str, list[tuple[float, float, float]]] = {name: [] for name in names}
     holds = {name: np.ones(len(along), dtype=bool) for name in names}
     borne = {name: np.full(len(along), np.nan) for name in names}
-    values = _in_threads(game.value, [(name, eps) for eps in CURVE for name in names])
-    for k, eps in enumerate(CURVE):
+    games = [(name, eps) for eps in CURVE for name in names]
+    values = _in_threads("worst-case curve", game.value, games)
+    for eps in CURVE:
         region = game.starts & game.winnable(eps)
         winnable.append(float(region.sum() / max(game.starts.sum(), 1)))
         for name in names:
@@ -106,7 +94,6 @@ def _sweep(
             rows[name].append((share(own[region] < NEVER), share(worst[region] < NEVER), time_any))
             holds[name] &= own[at] < NEVER
             borne[name][holds[name]] = eps
-        progress.update(done + k)
     profile = Profile(
         points=tuple(tuple(point) for point in along.tolist()),
         eps={k: tuple(None if np.isnan(x) else float(x) for x in v) for k, v in borne.items()},
@@ -127,7 +114,10 @@ def _misses(game: Game, controllers: Mapping[str, Controller]) -> dict[str, floa
     }
 
 
-def _in_threads(work: Callable[..., Any], calls: Iterable[tuple[Any, ...]]) -> Iterator[Any]:
+def _in_threads(
+    label: str, work: Callable[..., Any], calls: Sequence[tuple[Any, ...]]
+) -> Iterator[Any]:
     """Yields the results of calls in their order, from threads: NumPy releases the interpreter's lock."""
     with ThreadPoolExecutor(THREADS) as pool:
-        yield from pool.map(lambda call: work(*call), calls)
+        results = pool.map(lambda call: work(*call), calls)
+        yield from progress_bar(results, label, "games", len(calls))

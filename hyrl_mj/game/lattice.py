@@ -10,7 +10,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.mjcf import model_name
-from hyrl_mj.progress import Progress
+from hyrl_mj.progress import progress_bar
 from hyrl_mj.sets import Grid
 from hyrl_mj.tasks import Outcome, Task
 
@@ -112,8 +112,7 @@ class Lattice:
         ends = np.empty((len(levels), *nodes.shape))
         fails = np.zeros((len(levels), len(nodes)), dtype=bool)
         arrives = np.zeros_like(fails)
-        progress = Progress("tabulating the plant", len(levels), "inputs")
-        for a, level in enumerate(levels):
+        for a, level in enumerate(progress_bar(levels, "tabulating the plant", "inputs")):
             plant.set_state(*task.state(nodes[alive]))
             plant.step(np.tile(level, (len(alive), 1)))
             measurement = plant.measurement
@@ -121,8 +120,6 @@ class Lattice:
             ends[a, alive] = task.z(measurement)
             fails[a, alive] = task.failed(measurement)
             arrives[a, alive] = task.ending(measurement) == Outcome.REACHED
-            progress.update(a + 1)
-        progress.close()
         after = _around(grid, ends)
         outside = ~task.chart.contains(ends)
         # A running episode that leaves the chart leaves the lattice: it counts as failed.

@@ -30,7 +30,7 @@ from hyrl_mj.policies import (
     check_algorithm,
     infer_algorithm,
 )
-from hyrl_mj.progress import Progress
+from hyrl_mj.progress import progress_bar
 from hyrl_mj.simulation import Noise
 from hyrl_mj.tasks import Outcome, Task
 
@@ -267,10 +267,10 @@ class _Watch(BaseCallback):
         self._ground, self._log_dir = ground, log_dir
         self._settled = int(ground.settled * samples)
         self._next = self._interval = max(samples // CHECKPOINTS, 1)
-        self._progress = Progress(label, samples, "samples")
+        self._progress = progress_bar(None, label, "samples", samples)
 
     def _on_step(self) -> bool:
-        self._progress.update(self.num_timesteps)
+        self._progress.update(self.num_timesteps - self._progress.n)
         if self.num_timesteps >= self._next:
             self._next += self._interval
             self._checkpoint()

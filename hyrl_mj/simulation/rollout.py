@@ -8,7 +8,7 @@ import numpy as np
 
 from hyrl_mj.plant import Plant
 from hyrl_mj.policies import Controller
-from hyrl_mj.progress import Progress
+from hyrl_mj.progress import progress_bar
 from hyrl_mj.simulation.noise import NOT_STARTED, AnyNoise, Sample, signal_for
 from hyrl_mj.tasks import Outcome, Task
 
@@ -103,8 +103,7 @@ def closed_loop(
     shapes = {"before": (), "q": (), "measured": (len(task.noisy),), "u": (len(task.inputs),)}
     kept: dict[str, list[np.ndarray]] = {name: [] for name in shapes}
     states = [plant.state] if record else []
-    progress = None if settings.quiet else Progress(settings.label, limit, "samples")
-    for k in range(limit):
+    for k in progress_bar(range(limit), settings.label, "samples", quiet=settings.quiet):
         active = np.flatnonzero(outcome == Outcome.RUNNING)
         if not len(active):
             break
@@ -126,10 +125,6 @@ def closed_loop(
             for name, values in zip(shapes, (before, q.copy(), measured, u), strict=True):
                 kept[name].append(values)
             states.append(np.where(lost[:, None], states[-1], plant.state))
-        if progress:
-            progress.update(k + 1)
-    if progress:
-        progress.close()
     if not backward:
         late = outcome == Outcome.RUNNING
         outcome[late] = task.verdict(measurement[late])

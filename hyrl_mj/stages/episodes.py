@@ -10,7 +10,7 @@ import numpy as np
 from hyrl_mj.errors import BadInput, check_seed
 from hyrl_mj.game import EpisodeCount
 from hyrl_mj.policies import Controller
-from hyrl_mj.progress import Progress
+from hyrl_mj.progress import progress_bar
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
 from hyrl_mj.stages.critical_set import check_points, distance_to
@@ -104,9 +104,9 @@ def noisy_episodes(
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
     for noise in noises:
         task.check_noise(noise.bound, noise.everywhere)
-    progress = Progress("noisy episodes", count * len(noises) * len(controllers), "episodes")
+    total = count * len(noises) * len(controllers)
+    progress = progress_bar(None, "noisy episodes", "episodes", total)
     ends: list[EpisodeCount] = []
-    done = 0
     # New plants for each batch would leave more and more holes in the memory.
     plants = {n: task.plant(n) for n in {min(BATCH, count), count % BATCH} - {0}}
     for noise in noises:
@@ -123,8 +123,7 @@ def noisy_episodes(
                 for region, inside in regions.split(task, noise.bound, z0).items():
                     counts.setdefault(region, np.zeros(len(Outcome), dtype=int))
                     counts[region] += np.bincount(rollout.outcome[inside], minlength=len(Outcome))
-                done += n
-                progress.update(done)
+                progress.update(n)
             ends += [
                 _count(noise, name, region, outcomes)
                 for region, outcomes in counts.items()

@@ -12,7 +12,7 @@ from PIL import Image
 
 from hyrl_mj import artifacts, mjcf
 from hyrl_mj.errors import BadInput, unknown
-from hyrl_mj.progress import Progress
+from hyrl_mj.progress import progress_bar
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.encoding import ENCODERS, video
 from hyrl_mj.viz.options import ReplayOptions
@@ -88,10 +88,9 @@ def _film(screens: Sequence[Screen], path: Path, options: ReplayOptions) -> np.n
         frame_times(screen.end, options.fps, screen.jumps, options.slow_motion)
         for screen in screens
     ]
-    frames = 0
     posters: list[np.ndarray] = []
     with (
-        closing(Progress("rendering", sum(map(len, times)), "frames")) as progress,
+        progress_bar(None, "rendering", "frames", sum(map(len, times))) as progress,
         closing(screens[0].canvas(options.size)) as canvas,
         video(path, *options.size, options.fps) as add,
     ):
@@ -99,8 +98,7 @@ def _film(screens: Sequence[Screen], path: Path, options: ReplayOptions) -> np.n
             stage = screen.open(options.size, canvas)
             for t in when:
                 add(stage.draw(t))
-                frames += 1
-                progress.update(frames)
+                progress.update()
             if not posters:
                 posters.append(stage.fine(FINER))
     return posters[0]
