@@ -7,13 +7,11 @@ file in this folder that defines a task is a task of the package.
 from importlib import import_module
 from pkgutil import iter_modules
 
-from hyrl_mj.tasks.base import Mirror, Outcome, Task, at_levels
+from hyrl_mj.tasks.base import Task, at_levels
 from hyrl_mj.tasks.checks import check_task
-from hyrl_mj.tasks.learning import SEARCHES, Learning
+from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.registry import get_task, reference, register, task_names
 from hyrl_mj.tasks.scaffold import write_task
-from hyrl_mj.tasks.scene import Scene
-from hyrl_mj.tasks.ways import passing_side
 
 __all__ = [
     "SEARCHES",
@@ -25,7 +23,6 @@ __all__ = [
     "at_levels",
     "check_task",
     "get_task",
-    "passing_side",
     "reference",
     "register",
     "task_names",

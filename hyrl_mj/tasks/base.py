@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from enum import IntEnum
 from functools import cached_property
 from pathlib import Path
 
@@ -15,38 +13,7 @@ from hyrl_mj import mjcf
 from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput, check_bound
 from hyrl_mj.plant import Plant, input_limits
-from hyrl_mj.tasks.learning import Learning
-from hyrl_mj.tasks.scene import Scene
-from hyrl_mj.tasks.ways import passing_side
-
-
-class Outcome(IntEnum):
-    """State of an episode. One that is RUNNING at its end was truncated on its way."""
-
-    RUNNING = 0
-    REACHED = 1
-    CRASHED = 2
-    OUT_OF_BOUNDS = 3
-    STALLED = 4
-    UNSTABLE = 5
-
-    @property
-    def label(self) -> str:
-        """The name in messages and in `info`: "reached", "crashed", ..."""
-        return self.name.lower()
-
-
-@dataclass(frozen=True)
-class Mirror:
-    """A mirror symmetry: mirrored observations call for mirrored inputs and earn the same reward.
-
-    Attributes:
-        observation: (k,) signs +1 or -1 of the observation's columns in the mirror.
-        inputs: (m,) signs +1 or -1 of the inputs in the mirror.
-    """
-
-    observation: tuple[int, ...]
-    inputs: tuple[int, ...]
+from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
 
 
 class Task(ABC):
@@ -207,12 +174,12 @@ class Task(ABC):
         return z, None
 
     def z(self, measured: np.ndarray) -> np.ndarray:
-        """Returns the chart points (n, d) of measurements (n, p), by default these."""
-        return measured
+        """Returns the chart points (n, d) of measurements (n, p), by default the first d columns."""
+        return measured[:, : self.chart.dimension]
 
     def with_z(self, measured: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Returns measurements (n, p) changed so that their chart points are z (n, d)."""
-        return z
+        return np.hstack([z, measured[:, self.chart.dimension :]])
 
     @abstractmethod
     def observation(self, measured: np.ndarray) -> np.ndarray:
@@ -317,16 +284,23 @@ class Task(ABC):
     def direction(self, path: np.ndarray) -> np.ndarray:
         """Returns which way runs went, by default on which side of the geom "obstacle" they passed.
 
-        The first two coordinates of the chart are then the robot's position in the plane.
+        The side is seen along the line from the start to the nearest point; the first two coordinates of the
+        chart are then the robot's position in the plane.
 
         Args:
             path: (K + 1, n, d) chart points over time, not wrapped; a run that ended stays put.
 
         Returns:
             (n,) int: the mode whose way the run went, -1 where there was nothing to decide; by default 0
-            for the left and 1 for the right side.
+            for the left and 1 for the right side, -1 for runs that only leave the obstacle behind.
         """
-        return passing_side(path[..., :2], mjcf.geom_pos(self.model, "obstacle")[:2])
+        path, centre = path[..., :2], mjcf.geom_pos(self.model, "obstacle")[:2]
+        nearest = np.linalg.norm(path - centre, axis=2).argmin(axis=0)
+        way = path[nearest, np.arange(path.shape[1])] - path[0]
+        to_centre = centre - path[0]
+        # A run that passes on the left has the obstacle on its right.
+        right = way[:, 0] * to_centre[:, 1] - way[:, 1] * to_centre[:, 0] > 0
+        return np.where(nearest == 0, -1, right.astype(int))
 
 
 def at_levels(task: Task, actions: np.ndarray) -> np.ndarray:

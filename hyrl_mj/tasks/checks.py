@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from hyrl_mj import mjcf
 from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput, brief, unknown
-from hyrl_mj.tasks.base import Outcome, Task
-from hyrl_mj.tasks.learning import SEARCHES, Learning
-from hyrl_mj.tasks.outdated import check_current
-from hyrl_mj.tasks.registry import line_in
-from hyrl_mj.tasks.scene import Scene
+from hyrl_mj.tasks.base import Task
+from hyrl_mj.tasks.description import SEARCHES, Learning, Outcome, Scene
+from hyrl_mj.tasks.registry import check_current, line_in
 
 REQUIRED = (
     "chart", "inputs", "noisy", "max_steps", "worst_reward", "start_low", "start_high",
@@ -47,27 +46,24 @@ def check_task(task: Task) -> Task:
 
 
 def _check_parts(task: Task) -> None:
-    missing = [name for name in REQUIRED if not hasattr(task, name)]
-    if missing:
+    if missing := [name for name in REQUIRED if not hasattr(task, name)]:
         raise BadInput(f"it has no {', '.join(missing)}: add what is missing")
     for name, kind in (("chart", Chart), ("scene", Scene), ("learning", Learning)):
         if not isinstance(value := getattr(task, name), kind):
             raise BadInput(f"{name} is {value!r}: give a hyrl_mj.{kind.__name__}(...)")
     chart, d = task.chart, task.chart.dimension
     for name in ("units", "low", "high", "periodic"):
-        if len(getattr(chart, name)) != d:
-            raise BadInput(
-                f"its chart has {d} name(s) and {len(getattr(chart, name))} value(s) of {name}: give {d}"
-            )
+        if (count := len(getattr(chart, name))) != d:
+            raise BadInput(f"its chart has {d} name(s) and {count} value(s) of {name}: give {d}")
     if not (np.isfinite(chart.sides).all() and (chart.sides > 0).all()):
         raise BadInput("its chart has a side that is not positive: give low < high, both finite")
     for name in ("start_low", "start_high"):
-        if len(getattr(task, name)) != d:
-            raise BadInput(f"{name} has {len(getattr(task, name))} value(s): its chart takes {d}")
+        if (count := len(getattr(task, name))) != d:
+            raise BadInput(f"{name} has {count} value(s): its chart takes {d}")
     if np.greater(task.start_low, task.start_high).any():
         raise BadInput("start_low is greater than start_high: exchange them")
-    if task.set_point is not None and np.shape(task.set_point) != (d,):
-        raise BadInput(f"set_point has shape {np.shape(task.set_point)}: its chart takes {(d,)}")
+    if task.set_point is not None:
+        _check_shape("set_point has", task.set_point, (d,))
     scene = task.scene
     for start in (*scene.starts, *scene.policy_starts):
         task.chart.check(start, task.name)
@@ -93,13 +89,11 @@ def _check_training(task: Task) -> None:
             "single input, or none"
         )
     if task.mirror is not None:
-        for name, wanted in (
-            ("observation", len(task.observation_low)),
-            ("inputs", len(task.inputs)),
-        ):
+        counts = {"observation": len(task.observation_low), "inputs": len(task.inputs)}
+        for name, count in counts.items():
             signs = getattr(task.mirror, name)
-            if len(signs) != wanted or not set(signs) <= {-1, 1}:
-                raise BadInput(f"mirror.{name} is {signs}: give {wanted} values, each 1 or -1")
+            if len(signs) != count or not set(signs) <= {-1, 1}:
+                raise BadInput(f"mirror.{name} is {signs}: give {count} values, each 1 or -1")
 
 
 def _check_model(task: Task) -> None:
@@ -107,11 +101,9 @@ def _check_model(task: Task) -> None:
     if not model.nu:
         raise BadInput(f"{path.name} has no actuators: give the policy at least one to drive")
     _ = task.input_limits
-    for kind, name in (
-        (mujoco.mjtObj.mjOBJ_SITE, task.scene.tracked),
-        (mujoco.mjtObj.mjOBJ_CAMERA, task.scene.camera),
-    ):
-        mjcf.object_id(model, kind, name)  # the replay needs them
+    # The replay needs both.
+    mjcf.object_id(model, mujoco.mjtObj.mjOBJ_SITE, task.scene.tracked)
+    mjcf.object_id(model, mujoco.mjtObj.mjOBJ_CAMERA, task.scene.camera)
     steps = task.dt / model.opt.timestep
     if abs(steps - round(steps)) > 1e-6 or steps < 0.5:
         raise BadInput(
@@ -123,11 +115,11 @@ def _check_model(task: Task) -> None:
 def _check_starts(task: Task) -> None:
     d, p = task.chart.dimension, task.measurement_columns
     z = task.starts(STARTS, np.random.default_rng(0))
-    if z.shape != (STARTS, d):
-        raise BadInput(f"starts({STARTS}) has shape {z.shape}: its chart takes {(STARTS, d)}")
-    if not task.chart.contains(z).all():
-        outside = task.chart.format(z[~task.chart.contains(z)][0])
-        raise BadInput(f"it starts outside its chart, at {outside}: change one of them")
+    _check_shape(f"starts({STARTS}) gives", z, (STARTS, d))
+    outside = z[~task.chart.contains(z)]
+    if len(outside):
+        point = task.chart.format(outside[0])
+        raise BadInput(f"it starts outside its chart, at {point}: change one of them")
     plant = task.plant(STARTS)
     plant.set_state(*task.state(z, np.random.default_rng(1)))
     measurement = plant.measurement
@@ -136,11 +128,8 @@ def _check_starts(task: Task) -> None:
             f"it measures {measurement.shape[1]} column(s), and `noisy` has {p}: make them as many"
         )
     back = task.z(measurement)
-    if back.shape != z.shape:
-        raise BadInput(f"z() gives {back.shape[1:]} values a measurement: its chart takes {d}")
-    moved = task.with_z(measurement, z[::-1])
-    if moved.shape != measurement.shape or task.z(moved).shape != z.shape:
-        raise BadInput(f"with_z() gives shape {moved.shape}: it is to be {measurement.shape}")
+    _check_shape("z() gives", back, z.shape)
+    _check_shape("with_z() gives", task.with_z(measurement, z[::-1]), measurement.shape)
     off = np.abs(task.chart.difference(back, z)).max(axis=1)
     if off.max() > ROUND_TRIP:
         worst = int(off.argmax())
@@ -148,13 +137,12 @@ def _check_starts(task: Task) -> None:
             f"state() and z() do not belong together: {task.chart.format(z[worst])} is measured as "
             f"{task.chart.format(back[worst])}"
         )
-    over = task.ending(measurement) != Outcome.RUNNING
-    if over.any():
-        first = int(over.argmax())
-        label = Outcome(task.ending(measurement)[first]).label
+    ending = task.ending(measurement)
+    over = np.flatnonzero(ending != Outcome.RUNNING)
+    if len(over):
         raise BadInput(
-            f"{over.sum()} of {STARTS} starts are over before they begin: {task.chart.format(z[first])} "
-            f"is {label}; start elsewhere, or change ending()"
+            f"{len(over)} of {STARTS} starts are over before they begin: {task.chart.format(z[over[0]])} "
+            f"is {Outcome(ending[over[0]]).label}; start elsewhere, or change ending()"
         )
 
 
@@ -189,19 +177,18 @@ def _check_episode(task: Task) -> None:
         plant.step(u)
         path.append(task.z(plant.measurement))
     way = task.direction(np.array(path))
-    for name, values in (
-        ("direction", way),
-        ("miss", task.miss(path[-1])),
-        ("arrived", task.arrived(path[-1])),
-        ("danger", task.danger(plant.measurement)),
-        ("verdict", task.verdict(plant.measurement)),
-    ):
-        if np.shape(values) != (STARTS,):
-            raise BadInput(
-                f"{name}() of {STARTS} runs has shape {np.shape(values)}: it is to be ({STARTS},)"
-            )
+    _check_shape("direction() gives", way, (STARTS,))
+    for method in (task.miss, task.arrived):
+        _check_shape(f"{method.__name__}() gives", method(path[-1]), (STARTS,))
+    for method in (task.danger, task.verdict):
+        _check_shape(f"{method.__name__}() gives", method(plant.measurement), (STARTS,))
     ways = set(np.unique(way).tolist())
     if not ways <= {-1, *range(len(task.scene.mode_names))}:
         raise BadInput(
             f"direction() gives {sorted(ways)}: give -1 or the number of one of scene.mode_names"
         )
+
+
+def _check_shape(what: str, values: ArrayLike, shape: tuple[int, ...]) -> None:
+    if np.shape(values) != shape:
+        raise BadInput(f"{what} shape {np.shape(values)}: the task needs {shape}")

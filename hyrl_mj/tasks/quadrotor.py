@@ -7,11 +7,9 @@ from functools import cached_property
 import numpy as np
 
 from hyrl_mj import mjcf
-from hyrl_mj.chart import Chart
-from hyrl_mj.tasks.base import Mirror, Outcome, Task
-from hyrl_mj.tasks.learning import Learning
+from hyrl_mj.tasks.description import Learning, Mirror, Scene
+from hyrl_mj.tasks.pillar import PillarTask
 from hyrl_mj.tasks.registry import register
-from hyrl_mj.tasks.scene import Scene
 
 # Gains of the inner loop: velocity, height, tilt and its rate [1/s, 1/s, 1/s^2, 1/s].
 VELOCITY, HEIGHT, TILT, RATE = 4.0, 2.0, 225.0, 24.0
@@ -24,9 +22,10 @@ START_TILT = 0.05
 
 
 @register
-class Quadrotor(Task):
+class Quadrotor(PillarTask):
     name = "quadrotor"
     description = "fly past a pillar on its left or on its right (DQN)"
+    coordinates, units, largest = ("x", "y", "drift"), ("m", "m", "m/s"), (FASTEST,)
     inputs, input_units = ("lateral_velocity",), ("m/s",)
     # Columns of the measurement: x, y, velocity to the side, tilt to the side, touching pillar or floor.
     noisy = (1.0, 1.0, 0.0, 0.0, 0.0)
@@ -43,28 +42,6 @@ class Quadrotor(Task):
     close = 0.4
     observation_low = (-5.0, -4.0, -6.0, -1.0)
     observation_high = (5.0, 4.0, 6.0, 1.0)
-
-    @cached_property
-    def chart(self) -> Chart:  # type: ignore[override]
-        centre, half = mjcf.site_pos(self.model, "arena"), mjcf.site_size(self.model, "arena")
-        low, high = (centre - half)[:2], (centre + half)[:2]
-        return Chart(
-            ("x", "y", "drift"),
-            ("m", "m", "m/s"),
-            (*low, -FASTEST),
-            (*high, FASTEST),
-            (False, False, False),
-        )
-
-    @cached_property
-    def set_point(self) -> np.ndarray:
-        """The middle of the gate, without a drift to the side (3,) [m, m, m/s]."""
-        return np.append(mjcf.site_pos(self.model, "set_point")[:2], 0.0)
-
-    @cached_property
-    def obstacle(self) -> np.ndarray:
-        """Centre of the pillar (2,) [m]."""
-        return mjcf.geom_pos(self.model, "obstacle")[:2]
 
     @cached_property
     def cruise(self) -> tuple[float, float]:
@@ -128,12 +105,6 @@ class Quadrotor(Task):
         qvel[:, 0], qvel[:, 1] = speed, z[:, 2]
         return qpos, qvel
 
-    def z(self, measured: np.ndarray) -> np.ndarray:
-        return measured[:, :3]
-
-    def with_z(self, measured: np.ndarray, z: np.ndarray) -> np.ndarray:
-        return np.hstack([z, measured[:, 3:]])
-
     def observation(self, measured: np.ndarray) -> np.ndarray:
         return np.hstack([self.obstacle[0] - measured[:, :1], measured[:, 1:4]])
 
@@ -150,20 +121,6 @@ class Quadrotor(Task):
         near = np.clip(1 - self.clearance(measurement) / NEAR, 0.0, 1.0)
         reward = np.maximum(3 - np.abs(measurement[:, 1]) - near, 0.0)
         return np.where(self.failed(measurement), 0.0, reward)
-
-    def ending(self, measurement: np.ndarray) -> np.ndarray:
-        x, y, _, _, touching = measurement.T
-        ends = np.full(len(measurement), Outcome.RUNNING)
-        ends[x >= self.set_point[0]] = Outcome.REACHED
-        ends[np.abs(y) >= self.chart.high[1]] = Outcome.OUT_OF_BOUNDS
-        ends[(touching > 0) | (self.clearance(measurement) <= 0)] = Outcome.CRASHED
-        return ends
-
-    def miss(self, z: np.ndarray) -> np.ndarray:
-        return np.abs(z[:, 1] - self.set_point[1])
-
-    def danger(self, measurement: np.ndarray) -> np.ndarray:
-        return -self.clearance(measurement)
 
 
 def rotation(quaternion: np.ndarray) -> np.ndarray:

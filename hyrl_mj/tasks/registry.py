@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import sys
+import traceback
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
@@ -12,7 +14,6 @@ import gymnasium as gym
 
 from hyrl_mj.errors import BadInput, brief, unknown
 from hyrl_mj.tasks.base import Task
-from hyrl_mj.tasks.outdated import check_current
 
 # The group of entry points under which an installed package offers tasks: name = "its.module:Class".
 GROUP = "hyrl_mj.tasks"
@@ -21,6 +22,11 @@ _REGISTRY: dict[str, type[Task]] = {}
 _FILES: dict[Path, type[Task]] = {}
 # Names of the tasks that other installed packages offer, as far as they have been loaded.
 _INSTALLED: set[str] = set()
+# Attributes of a task in hyrl_mj 0.1 that a `Scene` or a `Learning` holds now, without "replay_".
+_MOVED = {
+    "Scene": ("replay_starts", "replay_time", "policy_starts", "mode_names"),
+    "Learning": ("levels", "algorithm", "search", "horizon"),
+}
 
 
 def register(task: type[Task]) -> type[Task]:
@@ -55,6 +61,27 @@ def register(task: type[Task]) -> type[Task]:
         max_episode_steps=getattr(task, "max_steps", None),  # `check_task` says what is missing
     )
     return task
+
+
+def check_current(task: Task | type[Task]) -> None:
+    """Raises `BadInput` if a task, or its class, has attributes or a reward as in hyrl_mj 0.1."""
+    kind = task if isinstance(task, type) else type(task)
+    bases = [vars(base) for base in kind.__mro__ if issubclass(base, Task) and base is not Task]
+    own = set(vars(task)).union(*bases)
+    changes = []
+    for value, names in _MOVED.items():
+        if old := [name for name in names if name in own]:
+            new = ", ".join(f"{name.removeprefix('replay_')}=..." for name in old)
+            changes.append(f"{', '.join(old)} -> {value.lower()} = hyrl_mj.{value}({new})")
+    try:
+        inspect.signature(kind.reward).bind("self", "measurement", "u")
+    except TypeError:
+        changes.append("reward(self, measurement) -> reward(self, measurement, u)")
+    if changes:
+        raise BadInput(
+            f"the task {getattr(kind, 'name', kind.__name__)} of {_file(kind) or kind.__module__} was "
+            f"written for hyrl_mj 0.1: rename {'; '.join(changes)}"
+        )
 
 
 def task_names() -> list[str]:
@@ -109,9 +136,9 @@ def _file(task: type[Task]) -> Path | None:
 def _from_entry_point(entry: EntryPoint) -> None:
     try:
         task = entry.load()
-    except BadInput:
-        raise
     except (Exception, SystemExit) as error:  # whatever a foreign module raises
+        if isinstance(error, BadInput):
+            raise
         raise BadInput(
             f"the task {entry.name} of {entry.value} cannot be imported ({brief(error)}): mend or "
             "uninstall the package that offers it"
@@ -161,11 +188,10 @@ def _run(path: Path) -> ModuleType:
     sys.path.insert(0, str(path.parent))
     try:
         spec.loader.exec_module(module)
-    except BadInput:
-        del sys.modules[name]
-        raise
     except (Exception, SystemExit) as error:  # whatever the user's file raises
         del sys.modules[name]
+        if isinstance(error, BadInput):
+            raise
         raise BadInput(
             f"{path} cannot be imported: {brief(error)}{line_in(error, path)}"
         ) from error
@@ -178,9 +204,6 @@ def line_in(error: BaseException, path: Path | None) -> str:
     """Returns the line of a file that an error came from: ", line 7"; "" if it came from elsewhere."""
     if isinstance(error, SyntaxError):
         return ""  # its text names the line
-    lines, trace = [], error.__traceback__
-    while trace is not None:
-        if trace.tb_frame.f_code.co_filename == str(path):
-            lines.append(trace.tb_lineno)
-        trace = trace.tb_next
+    calls = traceback.extract_tb(error.__traceback__)
+    lines = [call.lineno for call in calls if call.filename == str(path)]
     return f", line {lines[-1]}" if lines else ""

@@ -7,11 +7,9 @@ from functools import cached_property
 import numpy as np
 
 from hyrl_mj import mjcf
-from hyrl_mj.chart import Chart
-from hyrl_mj.tasks.base import Mirror, Outcome, Task
-from hyrl_mj.tasks.learning import Learning
+from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.pillar import PillarTask
 from hyrl_mj.tasks.registry import register
-from hyrl_mj.tasks.scene import Scene
 
 # Largest heading [rad], and distance from the pillar within which the reward is less [m].
 ASTRAY, NEAR = 1.4, 0.25
@@ -23,9 +21,10 @@ START_RATE = 0.3
 
 
 @register
-class Rover(Task):
+class Rover(PillarTask):
     name = "rover"
     description = "drive on wheels past a pillar on its left or on its right (DQN)"
+    coordinates, units, largest = ("x", "y", "heading"), ("m", "m", "rad"), (ASTRAY,)
     inputs, input_units = ("turn_rate",), ("rad/s",)
     # Columns of the measurement: x, y, heading, rate of turn, touching the pillar.
     noisy = (0.0, 1.0, 0.5, 0.0, 0.0)
@@ -42,28 +41,6 @@ class Rover(Task):
     close = 0.3
     observation_low = (-5.0, -3.0, -np.pi)
     observation_high = (5.0, 3.0, np.pi)
-
-    @cached_property
-    def chart(self) -> Chart:  # type: ignore[override]
-        centre, half = mjcf.site_pos(self.model, "arena"), mjcf.site_size(self.model, "arena")
-        low, high = (centre - half)[:2], (centre + half)[:2]
-        return Chart(
-            ("x", "y", "heading"),
-            ("m", "m", "rad"),
-            (*low, -ASTRAY),
-            (*high, ASTRAY),
-            (False, False, False),
-        )
-
-    @cached_property
-    def set_point(self) -> np.ndarray:
-        """The goal, with the heading straight ahead (3,) [m, m, rad]."""
-        return np.append(mjcf.site_pos(self.model, "set_point")[:2], 0.0)
-
-    @cached_property
-    def obstacle(self) -> np.ndarray:
-        """Centre of the pillar (2,) [m]."""
-        return mjcf.geom_pos(self.model, "obstacle")[:2]
 
     @cached_property
     def wheels(self) -> tuple[float, float, float]:
@@ -101,12 +78,6 @@ class Rover(Task):
         qvel = np.column_stack([*ahead, nothing, nothing, turn, self.rates(turn)])
         return qpos, qvel
 
-    def z(self, measured: np.ndarray) -> np.ndarray:
-        return measured[:, :3]
-
-    def with_z(self, measured: np.ndarray, z: np.ndarray) -> np.ndarray:
-        return np.hstack([z, measured[:, 3:]])
-
     def observation(self, measured: np.ndarray) -> np.ndarray:
         ahead = self.obstacle[0] - measured[:, :1]
         return np.hstack([ahead, measured[:, 1:3]])
@@ -134,17 +105,7 @@ class Rover(Task):
         return np.where(self.failed(measurement), 0.0, reward)
 
     def ending(self, measurement: np.ndarray) -> np.ndarray:
-        x, y, heading, _, touching = measurement.T
-        ends = np.full(len(measurement), Outcome.RUNNING)
-        ends[x >= self.set_point[0]] = Outcome.REACHED
-        ends[(np.abs(y) >= self.chart.high[1]) | (np.abs(heading) >= ASTRAY)] = (
-            Outcome.OUT_OF_BOUNDS
-        )
-        ends[(touching > 0) | (self.clearance(measurement) <= 0)] = Outcome.CRASHED
+        ends = super().ending(measurement)
+        astray = np.abs(measurement[:, 2]) >= ASTRAY
+        ends[astray & (ends != Outcome.CRASHED)] = Outcome.OUT_OF_BOUNDS
         return ends
-
-    def miss(self, z: np.ndarray) -> np.ndarray:
-        return np.abs(z[:, 1] - self.set_point[1])
-
-    def danger(self, measurement: np.ndarray) -> np.ndarray:
-        return -self.clearance(measurement)

@@ -8,14 +8,11 @@ import numpy as np
 
 from hyrl_mj import mjcf
 from hyrl_mj.chart import Chart
-from hyrl_mj.tasks.base import Mirror, Outcome, Task
-from hyrl_mj.tasks.learning import Learning
+from hyrl_mj.tasks.base import Task
+from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.registry import register
-from hyrl_mj.tasks.scene import Scene
 
 PI = np.pi
-# Distance from the set-point that counts as arrived [rad].
-BAND = 0.3
 
 
 @register
@@ -29,7 +26,7 @@ class UnitCircle(Task):
     max_steps = 150
     worst_reward = -1.0
     start_low, start_high = chart.low, chart.high
-    precision = 0.015
+    precision, close = 0.015, 0.3
     scene = Scene(
         starts=tuple((factor * PI,) for factor in (0.75, 0.9, 1.0, 1.1, 1.25)),
         time=4.0,
@@ -66,12 +63,6 @@ class UnitCircle(Task):
     def ending(self, measurement: np.ndarray) -> np.ndarray:
         return np.full(len(measurement), Outcome.RUNNING)
 
-    def verdict(self, measurement: np.ndarray) -> np.ndarray:
-        return np.where(self.arrived(measurement), Outcome.REACHED, Outcome.STALLED)
-
-    def arrived(self, z: np.ndarray) -> np.ndarray:
-        return self.miss(z) <= BAND
-
     def miss(self, z: np.ndarray) -> np.ndarray:
         return np.abs(self.error(z))
 
@@ -83,5 +74,5 @@ class UnitCircle(Task):
 
     def direction(self, path: np.ndarray) -> np.ndarray:
         turned = path[-1, :, 0] - path[0, :, 0]
-        decided = np.abs(self.error(path[0])) > BAND
+        decided = np.abs(self.error(path[0])) > self.close
         return np.where(decided, np.where(turned < 0, 0, 1), -1)

@@ -7,14 +7,11 @@ from functools import cached_property
 import numpy as np
 
 from hyrl_mj import mjcf
-from hyrl_mj.chart import Chart
-from hyrl_mj.tasks.base import Mirror, Outcome, Task
-from hyrl_mj.tasks.learning import Learning
+from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.pillar import PillarTask
 from hyrl_mj.tasks.registry import register
-from hyrl_mj.tasks.scene import Scene
 
 CRASH_DISTANCE = 1e-3  # [m] from the obstacle's surface
-LANE = 0.2  # [m] from the set-point, across
 ON_THE_LINE = 1e-6  # [m] the error that sixty samples of the kinematic actuator add up to
 
 
@@ -27,7 +24,7 @@ def distance(z: np.ndarray, point: np.ndarray) -> np.ndarray:
 
 
 @register
-class Vehicle(Task):
+class Vehicle(PillarTask):
     name = "vehicle"
     env_id = "hyrl_mj/ObstacleAvoidance-v0"
     description = "drive past a pillar on its left or on its right (DQN)"
@@ -36,7 +33,7 @@ class Vehicle(Task):
     max_steps = 60
     worst_reward = 0.0
     start_low, start_high = (0.0, -1.0), (0.5, 1.0)
-    precision = 0.04
+    precision, close = 0.04, 0.2
     scene = Scene(
         starts=((0.0, -0.15), (0.0, -0.055), (0.0, 0.0), (0.0, 0.055), (0.0, 0.15)),
         time=3.0,
@@ -47,30 +44,9 @@ class Vehicle(Task):
     mirror = Mirror((1, 1, -1), (-1,))
 
     @cached_property
-    def chart(self) -> Chart:  # type: ignore[override]
-        low, high = self.arena
-        return Chart(("x", "y"), ("m", "m"), tuple(low), tuple(high), (False, False))
-
-    @cached_property
-    def arena(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corner of the arena (2,), (2,) [m]."""
-        centre, half = mjcf.site_pos(self.model, "arena"), mjcf.site_size(self.model, "arena")
-        return (centre - half)[:2], (centre + half)[:2]
-
-    @cached_property
-    def obstacle(self) -> np.ndarray:
-        """Centre of the obstacle (2,) [m]."""
-        return mjcf.geom_pos(self.model, "obstacle")[:2]
-
-    @cached_property
     def radius(self) -> float:
         """Radius of the obstacle [m]."""
         return float(mjcf.geom_size(self.model, "obstacle")[0])
-
-    @cached_property
-    def set_point(self) -> np.ndarray:
-        """The goal (2,) [m]."""
-        return mjcf.site_pos(self.model, "set_point")[:2]
 
     @cached_property
     def observation_low(self) -> tuple[float, ...]:  # type: ignore[override]
@@ -124,15 +100,6 @@ class Vehicle(Task):
     def verdict(self, measurement: np.ndarray) -> np.ndarray:
         passed = measurement[:, 0] >= self.set_point[0] - ON_THE_LINE
         return np.where(passed, Outcome.REACHED, Outcome.RUNNING)
-
-    def arrived(self, z: np.ndarray) -> np.ndarray:
-        return self.miss(z) <= LANE
-
-    def miss(self, z: np.ndarray) -> np.ndarray:
-        return np.abs(z[:, 1] - self.set_point[1])
-
-    def danger(self, measurement: np.ndarray) -> np.ndarray:
-        return -self.clearance(measurement)
 
     def direction(self, path: np.ndarray) -> np.ndarray:
         # Runs start before the pillar; one that never comes beside it is judged by its last point.

@@ -1,0 +1,94 @@
+"""The values that describe a task: how episodes end, its mirror symmetry, its scene, its training."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+# The searches for the critical set.
+SEARCHES = ("rods", "outcome")
+
+
+class Outcome(IntEnum):
+    """State of an episode. One that is RUNNING at its end was truncated on its way."""
+
+    RUNNING = 0
+    REACHED = 1
+    CRASHED = 2
+    OUT_OF_BOUNDS = 3
+    STALLED = 4
+    UNSTABLE = 5
+
+    @property
+    def label(self) -> str:
+        """The name in messages and in `info`: "reached", "crashed", ..."""
+        return self.name.lower()
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """A mirror symmetry: mirrored observations call for mirrored inputs and earn the same reward.
+
+    Attributes:
+        observation: (k,) signs +1 or -1 of the observation's columns in the mirror.
+        inputs: (m,) signs +1 or -1 of the inputs in the mirror.
+    """
+
+    observation: tuple[int, ...]
+    inputs: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What replays and figures show of a task: starts, names, and the view of the MJCF.
+
+    Attributes:
+        starts: (k, d) chart points from which the replayed runs start.
+        time: how long runs are shown [s].
+        mode_names: what the runs of each mode do, in the order of the modes, as ("left", "right").
+        policy_starts: (l, d) chart points from which the figure of the policy draws runs, by default
+            `starts`.
+        title: the task's name in figures, by default its `name` in words.
+        camera: the MJCF's camera of the replay.
+        tracked: the MJCF's site whose path the replay draws.
+    """
+
+    starts: Sequence[Sequence[float]]
+    time: float
+    mode_names: Sequence[str]
+    policy_starts: Sequence[Sequence[float]] = ()
+    title: str = ""
+    camera: str = "overhead"
+    tracked: str = "tracked"
+
+    def __post_init__(self) -> None:
+        if not len(self.policy_starts):
+            object.__setattr__(self, "policy_starts", self.starts)
+
+    def mode_name(self, mode: int) -> str:
+        """Returns the number of a mode with its name: "0 (left)"."""
+        named = 0 <= mode < len(self.mode_names)
+        return f"{mode} ({self.mode_names[mode]})" if named else str(mode)
+
+
+@dataclass(frozen=True)
+class Learning:
+    """Defaults of a task's training and of the stages after it; a run's settings can differ.
+
+    Attributes:
+        algorithm: an algorithm of SB3, as "ppo", or "module:Class"; by default "dqn" where the input has
+            levels, else "ppo".
+        levels: number of equally spaced levels of the single input; None for continuous inputs.
+        search: the search for the critical set, by "rods" or by "outcome"; see `find_critical_set`.
+        horizon: the paper's horizon T of the backward propagation [s].
+    """
+
+    algorithm: str = ""
+    levels: int | None = None
+    search: str = "outcome"
+    horizon: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not self.algorithm:
+            object.__setattr__(self, "algorithm", "ppo" if self.levels is None else "dqn")

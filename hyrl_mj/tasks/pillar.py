@@ -1,0 +1,66 @@
+"""Tasks in the plane: pass a pillar on its left or on its right, to a goal behind it."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from functools import cached_property
+
+import numpy as np
+
+from hyrl_mj import mjcf
+from hyrl_mj.chart import Chart
+from hyrl_mj.tasks.base import Task
+from hyrl_mj.tasks.description import Outcome
+
+
+class PillarTask(Task):
+    """A task whose MJCF has the geom "obstacle", and the sites "set_point" and "arena".
+
+    Chart and measurement begin with x and y. The last column of the measurement is positive where the robot
+    touches the pillar.
+    """
+
+    #: names and units of the chart's coordinates, and the largest magnitude of each one after x and y
+    coordinates: tuple[str, ...] = ("x", "y")
+    units: tuple[str, ...] = ("m", "m")
+    largest: tuple[float, ...] = ()
+
+    @cached_property
+    def chart(self) -> Chart:  # type: ignore[override]
+        low = (*self.arena[0], *(-value for value in self.largest))
+        high = (*self.arena[1], *self.largest)
+        return Chart(self.coordinates, self.units, low, high, (False,) * len(low))
+
+    @cached_property
+    def arena(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner of the arena (2,), (2,) [m]."""
+        centre, half = mjcf.site_pos(self.model, "arena"), mjcf.site_size(self.model, "arena")
+        return (centre - half)[:2], (centre + half)[:2]
+
+    @cached_property
+    def set_point(self) -> np.ndarray:
+        """The goal (d,), with zeros after x and y."""
+        return np.append(mjcf.site_pos(self.model, "set_point")[:2], np.zeros(len(self.largest)))
+
+    @cached_property
+    def obstacle(self) -> np.ndarray:
+        """Centre of the pillar (2,) [m]."""
+        return mjcf.geom_pos(self.model, "obstacle")[:2]
+
+    @abstractmethod
+    def clearance(self, measured: np.ndarray) -> np.ndarray:
+        """Returns the distance of the robot from the pillar: (n,) [m]."""
+
+    def ending(self, measurement: np.ndarray) -> np.ndarray:
+        x, y, touching = measurement[:, [0, 1, -1]].T
+        ends = np.full(len(measurement), Outcome.RUNNING)
+        ends[x >= self.set_point[0]] = Outcome.REACHED
+        ends[np.abs(y) >= self.chart.high[1]] = Outcome.OUT_OF_BOUNDS
+        ends[(touching > 0) | (self.clearance(measurement) <= 0)] = Outcome.CRASHED
+        return ends
+
+    def miss(self, z: np.ndarray) -> np.ndarray:
+        return np.abs(z[:, 1] - self.set_point[1])
+
+    def danger(self, measurement: np.ndarray) -> np.ndarray:
+        return -self.clearance(measurement)
