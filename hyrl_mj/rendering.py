@@ -6,7 +6,6 @@ import os
 import sys
 from contextlib import suppress
 from copy import copy
-from itertools import pairwise
 from typing import Any
 
 import mujoco
@@ -44,12 +43,11 @@ class Canvas:
         check_size(width, height)
         # Compiled models are shared, and the size of the buffer is one of their settings.
         self.model = copy(model)
-        # Half a picture at twice the size may be a pixel larger.
         shape = self.model.vis.global_
-        shape.offwidth, shape.offheight = width + 1, height + 1
+        shape.offwidth, shape.offheight = width, height
         self._gl: Any = None
         try:
-            self._gl = _gl_context(width + 1, height + 1)
+            self._gl = _gl_context(width, height)
             self._gl.make_current()
             self._context = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100)
         # Each GL backend fails in its own way: ImportError, AttributeError, RuntimeError, ...
@@ -181,25 +179,14 @@ class SceneRenderer:
         )
         return range(first, self.scene.ngeom)
 
-    def draw(self, finer: int = 1) -> np.ndarray:
-        """Returns the picture (height, width, 3) uint8; `finer` 2 draws it twice as large, in parts."""
-        picture = np.empty((finer * self.height, finer * self.width, 3), dtype=np.uint8)
-        columns, rows = (
-            np.linspace(0, side, finer + 1).astype(int) for side in (self.width, self.height)
-        )
-        for left, right in pairwise(columns):
-            for top, bottom in pairwise(rows):
-                self.redraw(picture, (left, top, right, bottom), finer)
+    def draw(self) -> np.ndarray:
+        """Returns the picture (height, width, 3) uint8."""
+        picture = np.empty((self.height, self.width, 3), dtype=np.uint8)
+        self.redraw(picture, (0, 0, self.width, self.height))
         return picture
 
-    def redraw(self, picture: np.ndarray, box: Box, finer: int = 1) -> None:
-        """Redraws a part of the picture (height, width, 3), with the camera's frustum cut to the box.
-
-        Args:
-            picture: picture to draw into, `finer` times larger than this renderer's.
-            box: the part, in this renderer's pixels; in the picture it is at most `width` x `height`.
-            finer: width of one pixel of this renderer in pixels of the picture.
-        """
+    def redraw(self, picture: np.ndarray, box: Box) -> None:
+        """Redraws a part of the picture (height, width, 3), with the camera's frustum cut to the box."""
         self._hide_outside(box)
         left, top, right, bottom = box
         kept = [
@@ -211,10 +198,7 @@ class SceneRenderer:
             view.frustum_center = centre - half + x * (left + right) / 2
             view.frustum_width = x * (right - left) / 2
             view.frustum_bottom, view.frustum_top = high - y * bottom, high - y * top
-        rows, columns = (slice(finer * a, finer * b) for a, b in ((top, bottom), (left, right)))
-        picture[rows, columns] = self.canvas.draw(
-            self.scene, finer * (right - left), finer * (bottom - top)
-        )
+        picture[top:bottom, left:right] = self.canvas.draw(self.scene, right - left, bottom - top)
         for view, values in zip(self.scene.camera, kept, strict=True):
             view.frustum_center, view.frustum_width, view.frustum_bottom, view.frustum_top = values
 

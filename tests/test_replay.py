@@ -23,7 +23,7 @@ from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.viz import ReplayOptions
 from hyrl_mj.viz.replay import Show, render_replay
-from hyrl_mj.viz.replay.captions import Group, Layout
+from hyrl_mj.viz.replay.captions import Layout
 from hyrl_mj.viz.replay.marks import (
     BAD,
     CRITICAL,
@@ -33,13 +33,12 @@ from hyrl_mj.viz.replay.marks import (
     OVERLAP,
     POLICY_COLOUR,
     Floor,
-    Look,
-    Tracker,
     bar,
     disc,
+    tracked_points,
 )
 from hyrl_mj.viz.replay.panel import Panel, Track
-from hyrl_mj.viz.replay.timeline import AROUND, HOLD, frame_times
+from hyrl_mj.viz.replay.screen import AROUND, HOLD, frame_times
 
 SIZE, FPS = (480, 240), 20
 TASK = hyrl_mj.get_task("vehicle")
@@ -330,14 +329,14 @@ def test_between_samples_the_robot_is_between_its_places(jump):
     np.testing.assert_allclose(track.qpos(0.125), (z[row] + z[row + 1]) / 2, atol=1e-9)
     # The tracked site is the vehicle itself.
     np.testing.assert_allclose(track.points[:, :2], z, atol=1e-9)
-    np.testing.assert_allclose(Tracker(TASK).of_z(z), track.points, atol=1e-6)
+    np.testing.assert_allclose(tracked_points(TASK, z), track.points, atol=1e-6)
 
 
 @pytest.mark.parametrize("end", [(1, 0, 0), (-0.3, 0.4, 0), (0.2, 0.1, -0.5), (0, 0, 0.7)])
 def test_a_bar_lies_between_its_ends_with_its_flat_side_up(end):
     scene = mujoco.MjvScene(TASK.model, maxgeom=5)
     start, end = np.array([0.3, -0.2, 0.1]), np.array([0.3, -0.2, 0.1]) + end
-    bar(scene, start, end, Look((1, 2, 3), width=0.05))
+    bar(scene, start, end, (1, 2, 3), width=0.05)
     geom = scene.geoms[0]
     axes = np.array(geom.mat).reshape(3, 3)
     np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-6)
@@ -373,7 +372,7 @@ def test_time_goes_slowly_around_jumps_and_only_there():
 
 def test_captions_tell_mode_and_outcome(jump):
     layout = Layout(640, 480)
-    group = [Group("HyRL", [Track(TASK, jump)])]
+    group = {"HyRL": [Track(TASK, jump)]}
     early, late = (layout.below(group, t) for t in (0.0, 3.0))
     # Mode 1 at first, mode 0 after the jump; the outcome appears only at the end.
     for picture, mode in ((early, 1), (late, 0)):
@@ -386,14 +385,14 @@ def test_captions_tell_mode_and_outcome(jump):
 def test_who_crosses_the_line_elsewhere_has_not_arrived():
     arc = jumping_arc(home=0.0)
     assert arc.outcome == "reached"
-    caption = Layout(640, 480).below([Group("HyRL", [Track(TASK, arc)])], 3.0)
+    caption = Layout(640, 480).below({"HyRL": [Track(TASK, arc)]}, 3.0)
     assert near(caption, GOOD).sum() == 0
     assert near(caption, OPEN).sum() > 200
 
 
 def test_captions_of_several_arcs_count_outcomes(crash, jump):
     layout = Layout(640, 480)
-    group = [Group("both", [Track(TASK, arc) for arc in (crash, jump)])]
+    group = {"both": [Track(TASK, arc) for arc in (crash, jump)]}
     colours = [
         [bool(near(layout.below(group, t), c).sum() > 200) for c in (BAD, GOOD)]
         for t in (0.0, 1.5, 3.0)

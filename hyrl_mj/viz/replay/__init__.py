@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 
 import mujoco
-import numpy as np
-from PIL import Image
 
 from hyrl_mj import artifacts, mjcf
 from hyrl_mj.errors import BadInput, unknown
@@ -18,12 +15,9 @@ from hyrl_mj.viz.encoding import ENCODERS, video
 from hyrl_mj.viz.options import ReplayOptions
 from hyrl_mj.viz.replay.marks import Floor
 from hyrl_mj.viz.replay.screen import LAYOUTS, Screen, Show
-from hyrl_mj.viz.replay.timeline import frame_times
 
 FASTEST, SLOWEST_MOTION = 240, 100  # frames/s, and times slower than real time
 FORMATS = (*ENCODERS, ".png")
-# A poster is drawn this many times larger and then reduced, for smooth edges.
-FINER = 2
 DEFAULTS = ReplayOptions()
 
 __all__ = ["Floor", "Show", "render_replay"]
@@ -52,13 +46,12 @@ def render_replay(
         BadInput: nothing to play, or a value that cannot be used.
         NoRenderer: there is no GL library or no video encoder.
     """
-    size, layout = options.size, options.layout
     if path.suffix not in FORMATS:
         raise BadInput(f"{path} is no replay: give a name that ends in one of {', '.join(FORMATS)}")
     if not shows or not all(show.policy for show in shows):
         raise BadInput("there is nothing to replay: give shows with arcs of the policy")
-    if layout not in LAYOUTS:
-        raise unknown("layout", layout, LAYOUTS)
+    if options.layout not in LAYOUTS:
+        raise unknown("layout", options.layout, LAYOUTS)
     if not 1 <= options.fps <= FASTEST:
         raise BadInput(f"no video has {options.fps} frames a second: give 1 to {FASTEST}")
     if not 1 <= options.slow_motion <= SLOWEST_MOTION:
@@ -68,37 +61,17 @@ def render_replay(
         )
     camera = options.camera or task.scene.camera
     mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
-    screens = [Screen(task, show, layout, camera, floor) for show in shows]
-    for screen in screens:
-        screen.check(size)
+    screens = [Screen(task, show, options, camera, floor) for show in shows]
+    poster = screens[0].poster()
     if path.suffix in ENCODERS:
-        poster = _film(screens, path, options)
-    else:
-        with closing(screens[0].canvas(size)) as canvas:
-            stage = screens[0].open(size, canvas)
-            stage.draw(screens[0].end)
-            poster = stage.fine(FINER)
+        times = [screen.times(options.fps, options.slow_motion) for screen in screens]
+        with (
+            progress_bar(None, "rendering", "frames", sum(map(len, times))) as progress,
+            video(path, *options.size, options.fps) as add,
+        ):
+            for screen, when in zip(screens, times, strict=True):
+                for frame in screen.frames(when):
+                    add(frame)
+                    progress.update()
     with artifacts.replacing(path.with_suffix(".png")) as temporary:
-        Image.fromarray(poster).reduce(FINER).save(temporary)
-
-
-def _film(screens: Sequence[Screen], path: Path, options: ReplayOptions) -> np.ndarray:
-    """Writes the video; returns the end of the first show, `FINER` times larger."""
-    times = [
-        frame_times(screen.end, options.fps, screen.jumps, options.slow_motion)
-        for screen in screens
-    ]
-    posters: list[np.ndarray] = []
-    with (
-        progress_bar(None, "rendering", "frames", sum(map(len, times))) as progress,
-        closing(screens[0].canvas(options.size)) as canvas,
-        video(path, *options.size, options.fps) as add,
-    ):
-        for screen, when in zip(screens, times, strict=True):
-            stage = screen.open(options.size, canvas)
-            for t in when:
-                add(stage.draw(t))
-                progress.update()
-            if not posters:
-                posters.append(stage.fine(FINER))
-    return posters[0]
+        poster.save(temporary)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -29,12 +29,8 @@ OUTCOMES: dict[str, tuple[str, RGB]] = {
 }
 
 
-@dataclass(frozen=True)
-class Group:
-    """The name of a controller and the tracks of its arcs."""
-
-    name: str
-    tracks: Sequence[Track]
+# The tracks of each controller's arcs, by its title.
+Groups = Mapping[str, Sequence[Track]]
 
 
 @dataclass(frozen=True)
@@ -69,9 +65,7 @@ class Layout:
     @cached_property
     def fonts(self) -> tuple[Font, Font]:
         """A font for titles, and a smaller one."""
-        sizes = self.text, round(0.85 * self.text)
-        large, small = (ImageFont.load_default(size) for size in sizes)
-        return large, small
+        return ImageFont.load_default(self.text), ImageFont.load_default(round(0.85 * self.text))
 
     def above(self, title: str, arc: HybridArc) -> np.ndarray:
         """Returns the bar with title and noise: (bar, width, 3)."""
@@ -81,18 +75,21 @@ class Layout:
         line.at_right("no noise" if quiet else f"{arc.noise} noise, eps = {arc.bound:g}")
         return line.pixels
 
-    def below(self, groups: Sequence[Group], t: float) -> np.ndarray:
+    def below(self, groups: Groups, t: float) -> np.ndarray:
         """Returns the bar with time, modes and outcomes at time t [s]: (bar, width, 3)."""
         line = _Line(self)
-        longest = max(track.end for group in groups for track in group.tracks)
+        longest = max(track.end for tracks in groups.values() for track in tracks)
         line.words(f"t = {min(t, longest):.2f} s", INK, room="t = 00.00 s")
-        for group in groups:
+        for title, tracks in groups.items():
             if len(groups) > 1:
-                line.words(group.name, INK)
-            if len(group.tracks) == 1:
-                _one(line, group.tracks[0], t)
-            else:
-                _several(line, group.tracks, t)
+                line.words(title, INK)
+            if len(tracks) == 1:
+                _modes(line, tracks[0], t)
+            ended = Counter(_outcome(track) for track in tracks if t >= track.end)
+            for outcome, number in sorted(ended.items()):
+                words, colour = OUTCOMES[outcome]
+                share = f"{number} of {len(tracks)} " if len(tracks) > 1 else ""
+                line.badge(share + words, colour)
         return line.pixels
 
 
@@ -124,8 +121,7 @@ class _Line:
         pad, half = self._gap / 3, 0.75 * self._gap
         end = self._x + self._small.getlength(words) + 2 * pad
         self._draw.rectangle((self._x, self._middle - half, end, self._middle + half), colour)
-        at = (self._x + pad, self._middle)
-        self._draw.text(at, words, WHITE, self._small, anchor="lm")
+        self._draw.text((self._x + pad, self._middle), words, WHITE, self._small, anchor="lm")
         self._x = end + self._gap / 2
 
     def at_right(self, words: str) -> None:
@@ -134,22 +130,12 @@ class _Line:
         self._draw.text((x, self._middle), words, OPEN, self._small, anchor="rm")
 
 
-def _one(line: _Line, track: Track, t: float) -> None:
-    """Writes jumps, mode and outcome of an arc at time t [s]."""
+def _modes(line: _Line, track: Track, t: float) -> None:
+    """Writes the number of jumps and the mode of an arc at time t [s]."""
     arc, row = track.arc, track.arc.at(t)
     if track.modes:
         line.words(f"j = {arc.j[row]}", INK, room="j = 00")
         line.badge(f"q = {track.task.scene.mode_name(int(arc.q[row]))}", track.colour(row))
-    if t >= track.end:
-        line.badge(*OUTCOMES[_outcome(track)])
-
-
-def _several(line: _Line, tracks: Sequence[Track], t: float) -> None:
-    """Counts the outcomes of arcs that have ended by time t [s]."""
-    ended = Counter(_outcome(track) for track in tracks if t >= track.end)
-    for outcome, number in sorted(ended.items()):
-        words, colour = OUTCOMES[outcome]
-        line.badge(f"{number} of {len(tracks)} {words}", colour)
 
 
 def _outcome(track: Track) -> str:

@@ -19,7 +19,7 @@ MODE_COLOURS = tuple(map(rgb, colours.MODES))
 POLICY_COLOUR, INK, WHITE = map(rgb, (colours.POLICY, colours.INK, colours.WHITE))
 GOOD, BAD = rgb(colours.GOOD), rgb(colours.BAD)
 PAPER, OPEN = (246, 247, 249), (110, 116, 126)
-OVERLAP, CRITICAL, BOUND = rgb(colours.OVERLAP), (205, 30, 45), (120, 95, 200)
+OVERLAP, CRITICAL, BOUND = rgb(colours.OVERLAP), (205, 30, 45), (120, 95, 200, 115)
 
 # Heights above the tracked site [m], from the floor up: higher marks hide lower ones.
 ON_FLOOR, ON_SETS, ON_BOUND, ON_PATH, ON_TOP = -0.006, -0.004, -0.002, 0.0, 0.006
@@ -31,29 +31,24 @@ STRIP = 16
 UP = np.array([0.0, 0.0, 1.0])
 
 
-@dataclass(frozen=True)
-class Look:
-    """How a bar looks.
-
-    Attributes:
-        colour: red, green and blue.
-        width: across [m].
-        reach: how far the bar goes on beyond either end [m].
-        alpha: opacity, 0 to 1.
-    """
-
-    colour: RGB
-    width: float
-    reach: float = 0.0
-    alpha: float = 1.0
-
-
 def bar(
-    scene: mujoco.MjvScene, start: np.ndarray, end: np.ndarray, look: Look, height: float = 0.0
+    scene: mujoco.MjvScene,
+    start: np.ndarray,
+    end: np.ndarray,
+    colour: tuple[int, ...],
+    width: float,
+    height: float = 0.0,
+    reach: float = 0.0,
 ) -> None:
-    """Adds a flat bar between two points (3,), a height above them [m].
+    """Adds a flat bar between two points (3,), which is drawn several times faster than a capsule.
 
-    A bar is drawn several times faster than a capsule.
+    Args:
+        scene: receives the bar.
+        start, end: the points [m].
+        colour: red, green, blue and, if the bar is not opaque, its opacity, 0 to 255.
+        width: across [m].
+        height: of the bar above the points [m].
+        reach: how far the bar goes on beyond either end [m].
     """
     length = float(np.linalg.norm(end - start))
     if length < 1e-9:
@@ -63,18 +58,17 @@ def bar(
     cos, sin = (x / flat, y / flat) if flat > 1e-6 else (1.0, 0.0)
     # Along the bar, across it on the level, and the third axis: NumPy's cross product is slower.
     axes = np.array([[x, -sin, -cos * z], [y, cos, -sin * z], [z, 0.0, flat]])
-    size = (length / 2 + look.reach, look.width / 2, THICKNESS / 2)
+    size = (length / 2 + reach, width / 2, THICKNESS / 2)
     middle = (start + end) / 2 + height * UP
-    kind, colour = mujoco.mjtGeom.mjGEOM_BOX, (*look.colour, 255 * look.alpha)
-    _add(scene, kind, size, middle, colour, axes)
+    _add(scene, mujoco.mjtGeom.mjGEOM_BOX, size, middle, colour, axes)
 
 
 def disc(
     scene: mujoco.MjvScene, centre: np.ndarray, radius: float, height: float, colour: RGB
 ) -> None:
     """Adds a flat disc around a point (3,), a height above it [m]."""
-    kind, size = mujoco.mjtGeom.mjGEOM_CYLINDER, (radius, THICKNESS / 2, 0.0)
-    _add(scene, kind, size, centre + height * UP, (*colour, 255), np.eye(3))
+    size = (radius, THICKNESS / 2, 0.0)
+    _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, centre + height * UP, colour, np.eye(3))
 
 
 def _add(
@@ -82,13 +76,13 @@ def _add(
     kind: mujoco.mjtGeom,
     size: tuple[float, float, float],
     pos: np.ndarray,
-    colour: tuple[int, int, int, float],
+    colour: tuple[int, ...],
     axes: np.ndarray,
 ) -> None:
     """Adds a geom to the scene, unless a very long path has used up all geoms."""
     if scene.ngeom < scene.maxgeom:
         geom = scene.geoms[scene.ngeom]
-        rgba = np.array(colour, dtype=np.float32) / 255
+        rgba = np.append(colour, 255)[:4].astype(np.float32) / 255
         mujoco.mjv_initGeom(geom, kind, np.array(size), pos, axes.ravel(), rgba)
         # MuJoCo leaves the number of the model's geom that was drawn in this place before.
         geom.objtype, geom.objid = mujoco.mjtObj.mjOBJ_UNKNOWN, -1
@@ -97,29 +91,15 @@ def _add(
         scene.ngeom += 1
 
 
-class Tracker:
-    """The positions of the site of a robot that its task's scene tracks.
-
-    Raises:
-        BadInput: the task's MJCF has no such site.
-    """
-
-    def __init__(self, task: Task):
-        self._task, self._data = task, mujoco.MjData(task.model)
-        self._site = mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_SITE, task.scene.tracked)
-
-    def of_qpos(self, qpos: np.ndarray) -> np.ndarray:
-        """Returns the points (n, 3) [m] at positions (n, nq)."""
-        points = np.empty((len(qpos), 3))
-        for point, position in zip(points, qpos, strict=True):
-            self._data.qpos[:] = position
-            mujoco.mj_kinematics(self._task.model, self._data)
-            point[:] = self._data.site_xpos[self._site]
-        return points
-
-    def of_z(self, z: np.ndarray) -> np.ndarray:
-        """Returns the points (n, 3) [m] at chart points (n, d)."""
-        return self.of_qpos(self._task.state(z)[0])
+def tracked_points(task: Task, qpos: np.ndarray) -> np.ndarray:
+    """Returns the points (n, 3) [m] of the site that the task's scene tracks at positions (n, nq)."""
+    data, points = mujoco.MjData(task.model), np.empty((len(qpos), 3))
+    site = mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_SITE, task.scene.tracked)
+    for point, position in zip(points, qpos, strict=True):
+        data.qpos[:] = position
+        mujoco.mj_kinematics(task.model, data)
+        point[:] = data.site_xpos[site]
+    return points
 
 
 @dataclass(frozen=True)
@@ -141,23 +121,25 @@ class Floor:
         task: Task, critical: CriticalSet, partition: Partition, extended: ExtendedSets | None
     ) -> Floor:
         """Returns the marks of results on a chart of one or two dimensions; without sets no overlap."""
-        tracker, strips, widths = Tracker(task), [], []
-        half = partition.grid.spacing / 2
+
+        def places(z: np.ndarray) -> np.ndarray:
+            return on_floor(task, tracked_points(task, task.state(z)[0]))
+
+        strips, widths, half = [], [], partition.grid.spacing / 2
         for ends in _strips(critical, partition, extended) if extended else ():
             middle = ends.mean(axis=0)
             side = middle + np.where(np.arange(len(half)) == 0, half, 0.0)
-            points = on_floor(task, tracker.of_z(np.vstack([ends, middle, side])))
+            points = places(np.vstack([ends, middle, side]))
             strips.append(points[:2])
             across = 2 * float(np.linalg.norm(points[3] - points[2]))
             widths.append(OVERLAP_WIDTH if len(half) == 1 else across)
-        points = on_floor(task, tracker.of_z(critical.points))
-        return Floor(points, np.reshape(strips, (-1, 2, 3)), np.array(widths))
+        return Floor(places(critical.points), np.reshape(strips, (-1, 2, 3)), np.array(widths))
 
     def draw(self, scene: mujoco.MjvScene) -> None:
         """Adds the marks to a scene."""
         for (start, end), width in zip(self.strips, self.widths, strict=True):
             # The strips are a little longer, so that no gap is seen where they turn.
-            bar(scene, start, end, Look(OVERLAP, width, reach=width / 50), ON_FLOOR)
+            bar(scene, start, end, OVERLAP, width, ON_FLOOR, width / 50)
         for point in self.critical:
             disc(scene, point, CRITICAL_RADIUS, ON_SETS, CRITICAL)
 

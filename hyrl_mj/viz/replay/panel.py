@@ -17,12 +17,9 @@ from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.colours import RGB
 from hyrl_mj.viz.replay import marks
-from hyrl_mj.viz.replay.marks import Floor, Tracker
 
-PATH_WIDTH, START_RADIUS, JUMP_RADIUS, CROSS = 0.032, 0.035, 0.055, 0.075  # [m]
+PATH_WIDTH, BOUND_WIDTH, START_RADIUS, JUMP_RADIUS, CROSS = 0.032, 0.05, 0.035, 0.055, 0.075  # [m]
 BOUND_PIECES, GHOST_ALPHA = 4, 0.35
-BOUND_LOOK = marks.Look(marks.BOUND, width=0.05, alpha=0.45)
-FAILED_LOOK = marks.Look(marks.BAD, PATH_WIDTH)
 # The part that is drawn anew is this much larger than what has moved [pixels].
 MARGIN = 2
 FAILED = ("crashed", "out_of_bounds", "stalled", "unstable")
@@ -55,7 +52,6 @@ class Track:
                 f"the states of an arc of {arc.task} have shape {arc.state.shape}, model "
                 f"{mjcf.model_name(model)} needs {shape}: simulate it again"
             )
-        self._tracker = Tracker(task)
         # Positions (N, nq) at each row of the arc, those that were measured, and (N, 3) of the site.
         self._qpos = np.empty((len(arc.t), model.nq))
         for i, state in enumerate(arc.state):
@@ -64,7 +60,7 @@ class Track:
         # Noise moves the chart's coordinates of a position, and leaves the others as they are.
         noise = task.state(task.z(arc.measured))[0] - task.state(arc.z)[0]
         self._measured = self._qpos + noise
-        self.points = self._tracker.of_qpos(self._qpos)
+        self.points = marks.tracked_points(task, self._qpos)
 
     @cached_property
     def jumps(self) -> np.ndarray:
@@ -82,7 +78,7 @@ class Track:
 
     def point(self, t: float) -> np.ndarray:
         """Returns the position (3,) [m] of the tracked site at time t [s]."""
-        return self._tracker.of_qpos(self.qpos(t)[None])[0]
+        return marks.tracked_points(self.task, self.qpos(t)[None])[0]
 
     def measured(self, t: float) -> np.ndarray | None:
         """Returns the position (nq,) that was measured at the last sample; None without noise."""
@@ -96,7 +92,7 @@ class Track:
         share = np.linspace(-1, 1, BOUND_PIECES + 1)[:, None]
         lines = [z + share * noise * (np.arange(len(z)) == i) for i in np.flatnonzero(noise)]
         shifts = [self.task.state(line)[0] - self.task.state(z[None])[0] for line in lines]
-        return [self._tracker.of_qpos(qpos + shift) for shift in shifts]
+        return [marks.tracked_points(self.task, qpos + shift) for shift in shifts]
 
     def _at(self, t: float, values: np.ndarray) -> np.ndarray:
         """Returns values (c,) at time t, interpolated between the rows (N, c)."""
@@ -139,7 +135,7 @@ class Panel:
         width: int,
         height: int,
         camera: str,
-        floor: Floor | None = None,
+        floor: marks.Floor | None = None,
     ):
         self._tracks, self._camera = tracks, camera
         number = mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
@@ -161,30 +157,23 @@ class Panel:
         """Changes the picture (height, width, 3) of the last call to that of time t [s]."""
         renderer = self._renderer
         times = [min(t, track.end) for track in self._tracks]
-        first = self._drawn[0].t < 0
-        moved = [now > drawn.t for now, drawn in zip(times, self._drawn, strict=True)]
-        if not any(moved):
+        if all(now <= drawn.t for now, drawn in zip(times, self._drawn, strict=True)):
             return
+        whole = self._drawn[0].t < 0 or not self._rests
         renderer.drop()
         paths = [self._path(*row) for row in zip(self._tracks, self._drawn, times, strict=True)]
         renderer.keep()
         renderer.look(self._tracks[0].qpos(times[0]), self._camera)
         boxes = [self._robot(*row) for row in zip(self._tracks, times, paths, strict=True)]
-        if first or not self._rests:
+        if whole:
             renderer.redraw(picture, (0, 0, renderer.width, renderer.height))
-        else:
-            for box, drawn, is_moved in zip(boxes, self._drawn, moved, strict=True):
-                # Drawn anew where the robot is or was.
-                left, top = np.minimum(box[:2], drawn.box[:2])
-                right, bottom = np.maximum(box[2:], drawn.box[2:])
-                if is_moved and left < right and top < bottom:
-                    renderer.redraw(picture, (left, top, right, bottom))
         for drawn, now, box in zip(self._drawn, times, boxes, strict=True):
+            # Drawn anew where the robot is or was.
+            left, top = np.minimum(box[:2], drawn.box[:2])
+            right, bottom = np.maximum(box[2:], drawn.box[2:])
+            if not whole and now > drawn.t and left < right and top < bottom:
+                renderer.redraw(picture, (left, top, right, bottom))
             drawn.t, drawn.box = now, box
-
-    def fine(self, finer: int) -> np.ndarray:
-        """Returns the picture of the last call, `finer` times larger."""
-        return self._renderer.draw(finer)
 
     def _path(self, track: Track, drawn: _Drawn, t: float) -> np.ndarray:
         """Adds the path up to the last sample to the scene; returns its new points (k, 3)."""
@@ -203,9 +192,9 @@ class Panel:
         """Adds the path from a row to a point (3,) to the scene."""
         # Where a path comes back in another mode the later one is drawn over the earlier. Square ends
         # as long as half the width close the gaps at bends.
-        look = marks.Look(track.colour(row), PATH_WIDTH, reach=PATH_WIDTH / 2)
         height = marks.ON_PATH + 2e-4 * (track.arc.j[row] % 20)
-        marks.bar(self._renderer.scene, track.points[row], end, look, height)
+        start, colour = track.points[row], track.colour(row)
+        marks.bar(self._renderer.scene, start, end, colour, PATH_WIDTH, height, PATH_WIDTH / 2)
 
     def _robot(self, track: Track, t: float, path: np.ndarray) -> Box:
         """Adds the robot, its ghost and the noise bound to the scene; returns where all is seen."""
@@ -216,7 +205,7 @@ class Panel:
         if not over and track.arc.bound > 0:
             for line in track.bounds(t):
                 for start, end in pairwise(line):
-                    marks.bar(scene, start, end, BOUND_LOOK, marks.ON_BOUND)
+                    marks.bar(scene, start, end, marks.BOUND, BOUND_WIDTH, marks.ON_BOUND)
         renderer.add_robot(track.qpos(t))
         ghost = track.measured(t)
         if ghost is not None and not over:
@@ -225,7 +214,8 @@ class Panel:
                 scene.geoms[number].transparent = 1
         if over and track.arc.outcome in FAILED:
             for side in ((CROSS, CROSS, 0.0), (CROSS, -CROSS, 0.0)):
-                marks.bar(scene, point - side, point + side, FAILED_LOOK, marks.ON_TOP + 0.18)
+                ends = point - side, point + side
+                marks.bar(scene, *ends, marks.BAD, PATH_WIDTH, marks.ON_TOP + 0.18)
         geoms = scene.geoms[first : scene.ngeom]
         points = np.vstack([path, *[geom.pos for geom in geoms]])
         radii = [JUMP_RADIUS] * len(path) + [renderer.reach(geom) for geom in geoms]

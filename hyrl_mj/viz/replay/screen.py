@@ -1,22 +1,29 @@
-"""What a replay shows at a time: panels side by side or one for all, drawn on one canvas."""
+"""What a replay shows at a time: panels side by side or one for all, each with its captions."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
+from PIL import Image
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.rendering import LARGEST, Canvas
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
-from hyrl_mj.viz.replay.captions import Group, Layout
+from hyrl_mj.viz.options import ReplayOptions
+from hyrl_mj.viz.replay.captions import Layout
 from hyrl_mj.viz.replay.marks import Floor
 from hyrl_mj.viz.replay.panel import Panel, Track
 
 LAYOUTS = ("side-by-side", "overlay")
 SMALLEST = (240, 160)  # [pixels] of a panel, for captions that can be read
+# A poster is drawn this many times larger, if it can be, and then reduced, for smooth edges.
+FINER = 2
+HOLD = 1.0  # [s] that the last frame stays
+AROUND = 0.25  # [s] before and after a jump that are played slowly
 
 
 @dataclass(frozen=True)
@@ -35,106 +42,106 @@ class Show:
 
 
 class Screen:
-    """A show, laid out in panels with a title and groups of tracks.
+    """A show, laid out in panels with captions.
 
     Args:
         task: of the arcs.
         show: the arcs.
-        layout: one of `LAYOUTS`.
+        options: how the replay is rendered.
         camera: a camera of the MJCF.
         floor: the marks on the floor.
+
+    Raises:
+        BadArtifact: an arc is not of this task or its model.
+        BadInput: the panels do not fit into a frame of this size.
     """
 
-    def __init__(self, task: Task, show: Show, layout: str, camera: str, floor: Floor | None):
+    def __init__(
+        self, task: Task, show: Show, options: ReplayOptions, camera: str, floor: Floor | None
+    ):
         self._task, self._camera, self._floor = task, camera, floor
-        policy = Group(show.title, [Track(task, arc) for arc in show.policy])
-        hybrid = Group("HyRL", [Track(task, arc) for arc in show.hybrid])
-        self._tracks = [*policy.tracks, *hybrid.tracks]
-        self._panels = [(policy.name, [policy])]
-        if show.hybrid and layout == "overlay":
-            self._panels = [(f"{policy.name} and {hybrid.name}", [policy, hybrid])]
+        policy = {show.title: [Track(task, arc) for arc in show.policy]}
+        hybrid = {"HyRL": [Track(task, arc) for arc in show.hybrid]}
+        self._tracks = [*policy[show.title], *hybrid["HyRL"]]
+        self._panels = {show.title: policy}
+        if show.hybrid and options.layout == "overlay":
+            self._panels = {f"{show.title} and HyRL": policy | hybrid}
         elif show.hybrid:
             modes = {int(arc.q[0]) for arc in show.hybrid}
             where = "each mode" if len(modes) > 1 else f"q = {task.scene.mode_name(*modes)}"
-            self._panels.append((f"HyRL, started in {where}", [hybrid]))
-
-    @property
-    def end(self) -> float:
-        """The last time [s] of all arcs."""
-        return max(track.end for track in self._tracks)
-
-    @property
-    def jumps(self) -> list[float]:
-        """The times [s] of all jumps."""
-        return [track.arc.t[row] for track in self._tracks for row in track.jumps]
-
-    def check(self, size: tuple[int, int]) -> None:
-        """Raises `BadInput` unless a frame of this size [pixels] has room for the panels."""
-        least = len(self._panels) * SMALLEST[0], SMALLEST[1]
+            self._panels[f"HyRL, started in {where}"] = hybrid
+        size, least = options.size, (len(self._panels) * SMALLEST[0], SMALLEST[1])
         if any(n % 2 or not small <= n <= LARGEST for n, small in zip(size, least, strict=True)):
             raise BadInput(
                 f"a video of {size[0]} x {size[1]} pixels cannot be drawn: give even numbers from "
                 f"{least[0]} x {least[1]} to {LARGEST} x {LARGEST}"
             )
+        self._size = size[0] // len(self._panels), size[1]
+        self._end = max(track.end for track in self._tracks)
 
-    def canvas(self, size: tuple[int, int]) -> Canvas:
-        """Returns a canvas for the panels of a frame [pixels]; the caller closes it."""
-        layout = self._layout(size)
-        return Canvas(self._task.model, layout.width, layout.scene_height)
+    def times(self, fps: float, slow_motion: float) -> np.ndarray:
+        """Returns the time of the arcs at each frame, as `frame_times`."""
+        jumps = [track.arc.t[row] for track in self._tracks for row in track.jumps]
+        return frame_times(self._end, fps, jumps, slow_motion)
 
-    def open(self, size: tuple[int, int], canvas: Canvas) -> Stage:
-        """Returns a stage that draws the show in frames of this size [pixels]."""
-        layout = self._layout(size)
-        shape = (layout.width, layout.scene_height)
-        views = []
-        for title, groups in self._panels:
-            tracks = [track for group in groups for track in group.tracks]
-            panel = Panel(self._task, tracks, canvas, *shape, self._camera, self._floor)
-            views.append(View(title, groups, panel))
-        return Stage(size, layout, views)
+    def frames(self, times: Iterable[float], finer: int = 1) -> Iterator[np.ndarray]:
+        """Yields the frame (height, width, 3) at each time [s], valid until the next one.
 
-    def _layout(self, size: tuple[int, int]) -> Layout:
-        return Layout(size[0] // len(self._panels), size[1])
+        Args:
+            times: never go back.
+            finer: how many times larger the frames are drawn.
+        """
+        width, height = (finer * side for side in self._size)
+        layout = Layout(width, height, finer)
+        frame = np.empty((height, len(self._panels) * width, 3), dtype=np.uint8)
+        parts = np.split(frame, len(self._panels), axis=1)
+        with closing(Canvas(self._task.model, width, layout.scene_height)) as canvas:
+            panels = []
+            for part, (title, groups) in zip(parts, self._panels.items(), strict=True):
+                tracks = [track for group in groups.values() for track in group]
+                part[: layout.bar] = layout.above(title, tracks[0].arc)
+                panels.append(
+                    Panel(
+                        self._task, tracks, canvas, width, layout.scene_height, self._camera,
+                        self._floor,
+                    )
+                )  # fmt: skip
+            drawn = -1.0
+            for t in times:
+                if t != drawn:
+                    for part, panel, groups in zip(
+                        parts, panels, self._panels.values(), strict=True
+                    ):
+                        panel.draw(t, part[layout.bar : -layout.bar])
+                        part[-layout.bar :] = layout.below(groups, t)
+                drawn = t
+                yield frame
+
+    def poster(self) -> Image.Image:
+        """Returns the last frame, with smooth edges."""
+        finer = min(FINER, LARGEST // max(self._size))
+        (frame,) = self.frames([self._end], finer)
+        return Image.fromarray(frame).reduce(finer)
 
 
-@dataclass(frozen=True)
-class View:
-    """A panel with the title and the groups of tracks for its captions."""
+def frame_times(
+    end: float, fps: float, jumps: Iterable[float] = (), slow_motion: float = 1.0
+) -> np.ndarray:
+    """Returns the time of the arc at each frame, to its end and a moment longer.
 
-    title: str
-    groups: Sequence[Group]
-    panel: Panel
+    Args:
+        end: the arc's last time [s].
+        fps: frames a second.
+        jumps: times [s] around which the arc is played slowly.
+        slow_motion: how many times slower; 1 for real time.
 
-    def above(self, layout: Layout) -> np.ndarray:
-        """Returns the bar above the panel."""
-        return layout.above(self.title, self.groups[0].tracks[0].arc)
-
-
-class Stage:
-    """Draws views side by side in a frame, at times that never go back."""
-
-    def __init__(self, size: tuple[int, int], layout: Layout, views: Sequence[View]):
-        self._frame = np.empty((size[1], size[0], 3), dtype=np.uint8)
-        self._layout, self._views, self._t = layout, views, -1.0
-        self._parts = np.split(self._frame, len(views), axis=1)
-        for part, view in zip(self._parts, views, strict=True):
-            part[: layout.bar] = view.above(layout)
-
-    def draw(self, t: float) -> np.ndarray:
-        """Returns the frame (height, width, 3) at time t [s], valid until the next call."""
-        bar = self._layout.bar
-        if t != self._t:
-            for part, view in zip(self._parts, self._views, strict=True):
-                view.panel.draw(t, part[bar:-bar])
-                part[-bar:] = self._layout.below(view.groups, t)
-        self._t = t
-        return self._frame
-
-    def fine(self, finer: int) -> np.ndarray:
-        """Returns the last frame, `finer` times larger."""
-        layout = Layout(finer * self._layout.width, finer * self._layout.height, finer)
-        columns = [
-            (view.above(layout), view.panel.fine(finer), layout.below(view.groups, self._t))
-            for view in self._views
-        ]
-        return np.hstack([np.vstack(column) for column in columns])
+    Returns:
+        (k,) times [s]: 0 first, `end` last.
+    """
+    edges = np.array([[t - AROUND, t + AROUND] for t in jumps]).reshape(-1, 2).clip(0, end)
+    at = np.unique([0.0, end, *edges.ravel()])
+    middles = (at[1:] + at[:-1]) / 2
+    slow = ((edges[:, :1] < middles) & (middles < edges[:, 1:])).any(axis=0)
+    played = np.append(0.0, np.cumsum(np.diff(at) * np.where(slow, slow_motion, 1.0)))
+    moving = int(np.ceil(played[-1] * fps - 1e-6)) + 1
+    return np.interp(np.arange(moving + round(HOLD * fps)) / fps, played, at)
