@@ -170,9 +170,8 @@ def test_every_figure_is_drawn_from_one_kind_of_value_and_has_a_caption():
 @pytest.mark.slow
 def test_a_new_figure_is_an_entry(tmp_path, monkeypatch):
     def draw_title(shown, path=None):
-        with style.drawing(path, (3, 1)) as figure:
-            style.head(figure, shown.task, shown.policy_title)
-        return figure
+        with style.drawing(path, 1.0, shown.task, shown.policy_title) as figure:
+            return figure
 
     monkeypatch.setitem(
         figures.FIGURES, "title", figures.Entry(draw_title, figures.ShownPolicy, "The title.")

@@ -18,9 +18,12 @@ from hyrl_mj.viz.figures.extended_sets import draw_extended_sets
 from hyrl_mj.viz.figures.overview import draw_overview
 from hyrl_mj.viz.figures.policy_map import draw_policy_map
 from hyrl_mj.viz.figures.robustness_curve import draw_robustness_curve
-from hyrl_mj.viz.figures.robustness_map import CLASS_COLOURS, draw_robustness_map
+from hyrl_mj.viz.figures.robustness_map import CLASS_COLOURS as CLASS_COLOURS
+from hyrl_mj.viz.figures.robustness_map import draw_robustness_map
 from hyrl_mj.viz.figures.runs import draw_runs
-from hyrl_mj.viz.figures.shown import ShownGame, ShownPolicy, ShownRun, shown_policy, shown_run
+from hyrl_mj.viz.figures.shown import ShownGame, ShownPolicy, ShownRun
+from hyrl_mj.viz.figures.shown import shown_policy as shown_policy
+from hyrl_mj.viz.figures.shown import shown_run as shown_run
 
 
 @dataclass(frozen=True)
@@ -98,23 +101,3 @@ def draw_all(shown: ShownPolicy | ShownGame, folder: Path) -> tuple[str, ...]:
     for name in drawn:
         FIGURES[name].draw(shown, folder / f"{name}.png")
     return drawn
-
-
-__all__ = [
-    "CLASS_COLOURS",
-    "FIGURES",
-    "Entry",
-    "ShownGame",
-    "ShownPolicy",
-    "ShownRun",
-    "draw_all",
-    "draw_extended_sets",
-    "draw_overview",
-    "draw_policy_map",
-    "draw_robustness_curve",
-    "draw_robustness_map",
-    "draw_runs",
-    "names",
-    "shown_policy",
-    "shown_run",
-]

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.patches import Circle, Patch, Wedge
+from matplotlib.patches import Circle, Wedge
 from matplotlib.ticker import FuncFormatter, MultipleLocator
 from scipy.ndimage import gaussian_filter
 
@@ -25,9 +24,6 @@ OUTER, INNER, TICK, LABEL, EDGE = 1.0, 0.7, 1.05, 1.18, 1.25
 OVER_CELLS, OVER_BLUR = 240, 1.5
 # Periods to either side at which the set-point is drawn over time.
 TURNS = 9
-
-# Entries of a legend: the artist of each label.
-Artists = dict[str, Artist]
 
 
 def is_ring(task: Task) -> bool:
@@ -60,24 +56,22 @@ def label_angles(axis: Axis, task: Task, coordinate: int) -> None:
 # ---- planes
 
 
-def plane(panel: Axes, task: Task) -> Artists:
-    """Makes a panel a chart's plane, with the states at which runs end; returns the legend's entries."""
+def plane(panel: Axes, task: Task) -> None:
+    """Makes a panel a chart's plane, with the set-point and the states at which runs fail."""
     (left, bottom), (right, top) = task.chart.low, task.chart.high
     panel.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
     panel.set(xlabel=axis_label(task, 0), ylabel=axis_label(task, 1))
     for coordinate, axis in enumerate((panel.xaxis, panel.yaxis)):
         label_angles(axis, task, coordinate)
-    handles: Artists = {}
     grid = Grid.with_cells(task.chart, OVER_CELLS)
     over = task.failed(measured_at(task, grid.nodes)).reshape(grid.counts)
     if over.any():
         # Blurred, the mask has a smooth outline where it is one half, without the steps of its cells.
         blurred = gaussian_filter(over.astype(float), OVER_BLUR, mode="nearest")
         region(panel, GridSet(grid, 0.5 - blurred.ravel()), GREY, PALE, zorder=2.2)
-        handles["obstacle, or out of bounds"] = patch(GREY, PALE)
+        legend_field(panel, "obstacle, or out of bounds", GREY, PALE)
     if task.set_point is not None:
-        handles |= cross(panel, *task.set_point)
-    return handles
+        cross(panel, *task.set_point)
 
 
 def region(panel: Axes, members: GridSet, face: str, edge: str | None = None, **looks: Any) -> None:
@@ -106,9 +100,9 @@ def image(panel: Axes, grid: Grid, values: np.ndarray, **looks: Any) -> None:
     )
 
 
-def patch(face: str, edge: str = INK) -> Patch:
-    """Returns a legend's artist of a filled field."""
-    return Patch(facecolor=face, edgecolor=edge, linewidth=0.8)
+def legend_field(panel: Axes, label: str, face: str, edge: str = INK) -> None:
+    """Gives the legend a filled field."""
+    panel.fill([], [], facecolor=face, edgecolor=edge, linewidth=0.8, label=label)
 
 
 # ---- rings
@@ -174,47 +168,38 @@ def measured_at(task: Task, z: np.ndarray) -> np.ndarray:
     return plant.measurement
 
 
-def cross(panel: Axes, x: float, y: float) -> Artists:
-    """Marks the set-point; returns the legend's entries."""
-    (drawn,) = panel.plot(
-        x, y, "+", color=GREEN, markersize=11, markeredgewidth=2.5, clip_on=False, zorder=5
-    )
-    return {"set-point": drawn}
+def cross(panel: Axes, x: float, y: float) -> None:
+    """Marks the set-point."""
+    looks: dict[str, Any] = {"markersize": 11, "markeredgewidth": 2.5, "clip_on": False}
+    panel.plot(x, y, "+", color=GREEN, zorder=5, label="set-point", **looks)
 
 
-def set_point_lines(panel: Axes, task: Task, coordinate: int) -> Artists:
-    """Draws the set-point in a panel over time, once a period; returns the legend's entries."""
+def set_point_lines(panel: Axes, task: Task, coordinate: int) -> None:
+    """Draws the set-point in a panel over time, once a period."""
     if task.set_point is None:
-        return {}
+        return
     low, high = panel.get_ylim()
     turns = np.arange(-TURNS, TURNS + 1) if task.chart.periodic[coordinate] else np.zeros(1)
-    handles: Artists = {}
+    looks: dict[str, Any] = {"linewidth": 1.2, "linestyle": "--", "label": "set-point"}
     for height in task.set_point[coordinate] + task.chart.sides[coordinate] * turns:
         if low <= height <= high:
-            drawn = panel.axhline(height, color=GREEN, linewidth=1.2, linestyle="--", zorder=1)
-            handles["set-point"] = drawn
-    return handles
+            panel.axhline(height, color=GREEN, zorder=1, **looks)
 
 
-def dots(panel: Axes, points: np.ndarray, colour: str = INK) -> Artists:
-    """Marks points (n, 2) of M*, given in the panel; returns the legend's entries."""
+def dots(panel: Axes, points: np.ndarray, colour: str = INK) -> None:
+    """Marks points (n, 2) of M*, given in the panel."""
     if not len(points):
-        return {}
-    x, y = points.T
+        return
+    looks: dict[str, Any] = {"markeredgewidth": 0, "clip_on": False, "zorder": 3.5}
     # All white edges first, so that points close to each other merge into one line.
-    for fill, size in ((PAPER, 5.0), (colour, 3.6)):
-        (drawn,) = panel.plot(
-            x, y, "o", markersize=size, color=fill, markeredgewidth=0, clip_on=False, zorder=3.5
-        )
-    return {"critical set M*": drawn}
+    panel.plot(*points.T, "o", markersize=5.0, color=PAPER, **looks)
+    panel.plot(*points.T, "o", markersize=3.6, color=colour, label="critical set M*", **looks)
 
 
-def spokes(
-    panel: Axes, task: Task, critical: CriticalSet, start: float, colour: str = INK
-) -> Artists:
-    """Marks M* by lines from radius `start` to the ring's edge; returns the legend's entries."""
+def spokes(panel: Axes, task: Task, critical: CriticalSet, start: float, colour: str = INK) -> None:
+    """Marks M* by lines from radius `start` to the ring's edge."""
     x, y = on_ring(task, critical.points[:, 0])
     for line, (_, width) in zip((PAPER, colour), CASING, strict=True):
         ends = [start * x, OUTER * x], [start * y, OUTER * y]
         panel.plot(*ends, color=line, linewidth=width, zorder=3)
-    return dots(panel, np.stack([start * x, start * y], axis=1), colour)
+    dots(panel, np.stack([start * x, start * y], axis=1), colour)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,15 +11,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from hyrl_mj.sets import GridSet
-from hyrl_mj.stages import ExtendedSets
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz import colours
 from hyrl_mj.viz.figures import charts, style
-from hyrl_mj.viz.figures.charts import OUTER, Artists
+from hyrl_mj.viz.figures.charts import OUTER
 from hyrl_mj.viz.figures.shown import ShownRun
 
 # States that several extended sets hold.
-SHARED = colours.OVERLAP
+SHARED, SEVERAL = colours.OVERLAP, "in several of them"
 # Inner radius of the innermost ring, the gap between rings, and the radii of the text at the ends of a set.
 CORE, GAP, OUTSIDE, INSIDE = 0.6, 0.05, 1.14, 0.47
 # How far the enlarged panel reaches around M*, in noise bounds.
@@ -35,18 +35,19 @@ def draw_extended_sets(shown: ShownRun, path: Path | None = None) -> Figure:
     charts.check_drawable(task)
     horizon = f", T = {sets.horizon:.2g} s" if sets.horizon else ""
     title = f"extended sets for noise up to eps = {sets.noise:g} {task.noise_on()[1]}{horizon}"
-    with style.drawing(path, (style.WIDTH, 5.6)) as figure:
-        style.head(figure, task, title)
+    # The nodes (N,) that several sets hold.
+    shared = np.asarray(np.sum([members.mask for members in sets.sets], axis=0) > 1)
+    with style.drawing(path, 5.6, task, title) as figure:
         if charts.is_ring(task):
-            handles = _set_rings(figure.subplots(), shown)
+            _set_rings(figure.subplots(), shown, shared)
         elif len(shown.critical.points) and sets.noise > 0:
             whole, near = figure.subplots(1, 2)
-            handles = _set_plane(whole, shown)
-            _set_plane(near, shown)
-            handles |= _enlarge(whole, near, shown)
+            _set_plane(whole, shown, shared)
+            _set_plane(near, shown, shared)
+            _enlarge(whole, near, shown)
         else:
-            handles = _set_plane(figure.subplots(), shown)
-        style.legend(figure, handles)
+            _set_plane(figure.subplots(), shown, shared)
+        style.legend(figure)
     return figure
 
 
@@ -54,29 +55,22 @@ def _set_name(task: Task, mode: int) -> str:
     return f"$M^{{ext}}_{mode}$, of mode {task.scene.mode_name(mode)}"
 
 
-def _shared(sets: ExtendedSets) -> np.ndarray:
-    """Returns (N,) bool: the nodes that several sets hold."""
-    return np.asarray(np.sum([members.mask for members in sets.sets], axis=0) > 1)
-
-
-def _set_rings(panel: Axes, shown: ShownRun) -> Artists:
-    """Draws a ring for each set, with its ends beside it; returns the legend's entries."""
+def _set_rings(panel: Axes, shown: ShownRun, shared: np.ndarray) -> None:
+    """Draws a ring for each set, with its ends beside it."""
     task, sets = shown.task, shown.sets
-    shared = _shared(sets)
     charts.arcs(panel, task, shared.astype(int), (None, SHARED), OUTER, CORE)
-    handles: Artists = {}
     width = (OUTER - CORE - GAP) / len(sets.sets)
     for i, (mode, members) in enumerate(zip(sets.modes, sets.sets, strict=True)):
         outer, colour = OUTER - GAP - i * width, style.mode_colour(mode)
         inside = members.mask.astype(int)
         charts.arcs(panel, task, inside, (None, colour), outer, outer - width + GAP)
-        handles[_set_name(task, mode)] = charts.patch(colour)
+        charts.legend_field(panel, _set_name(task, mode), colour)
         # The first set's ends are written outside the rings, the others' inside, one below the other.
         _ends(panel, task, members, OUTSIDE if i == 0 else INSIDE - 0.1 * (i - 1), colour)
     if shared.any():
-        handles["in several of them"] = charts.patch(SHARED)
+        charts.legend_field(panel, SEVERAL, SHARED)
     charts.ring(panel, task, (OUTER, CORE))
-    return handles | charts.spokes(panel, task, shown.critical, CORE - 0.06)
+    charts.spokes(panel, task, shown.critical, CORE - 0.06)
 
 
 def _ends(panel: Axes, task: Task, members: GridSet, radius: float, colour: str) -> None:
@@ -89,25 +83,23 @@ def _ends(panel: Axes, task: Task, members: GridSet, radius: float, colour: str)
         panel.text(x, y, text, color=colour, ha="center", va="center", fontsize=9)
 
 
-def _set_plane(panel: Axes, shown: ShownRun) -> Artists:
-    """Fills the sets in a plane, with outlines; returns the legend's entries."""
+def _set_plane(panel: Axes, shown: ShownRun, shared: np.ndarray) -> None:
+    """Fills the sets in a plane, with outlines."""
     task, sets = shown.task, shown.sets
-    handles: Artists = {}
     for mode, members in zip(sets.modes, sets.sets, strict=True):
         tint = style.mode_tint(mode)
         charts.region(panel, members, tint)
-        handles[_set_name(task, mode)] = charts.patch(tint, style.mode_colour(mode))
-    shared = _shared(sets)
+        charts.legend_field(panel, _set_name(task, mode), tint, style.mode_colour(mode))
     charts.region(panel, GridSet.from_mask(sets.sets[0].grid, shared), SHARED)
     if shared.any():
-        handles["in several of them"] = charts.patch(SHARED, SHARED)
+        charts.legend_field(panel, SEVERAL, SHARED, SHARED)
     for mode, members in zip(sets.modes, sets.sets, strict=True):
         charts.region(panel, members, "none", style.mode_colour(mode), zorder=2)
-    handles |= charts.plane(panel, task)
-    return handles | charts.dots(panel, shown.critical.points)
+    charts.plane(panel, task)
+    charts.dots(panel, shown.critical.points)
 
 
-def _enlarge(whole: Axes, near: Axes, shown: ShownRun) -> Artists:
+def _enlarge(whole: Axes, near: Axes, shown: ShownRun) -> None:
     """Shows the neighbourhood of M* in the second panel, with the width that noise requires."""
     task, points, eps = shown.task, shown.critical.points, shown.sets.noise
     low = np.maximum(points.min(axis=0) - AROUND * eps, task.chart.low)
@@ -122,6 +114,6 @@ def _enlarge(whole: Axes, near: Axes, shown: ShownRun) -> Artists:
     axis = int(np.argmax(task.noise_in_chart(1.0)))
     step = eps * np.eye(2)[axis]
     ends = np.stack([middle - step, middle + step]).T
-    marker = "_|"[axis == 0]
-    (width,) = near.plot(*ends, zorder=4, color=style.RED, linewidth=2, markersize=9, marker=marker)
-    return {f"2 eps = {2 * eps:g} {task.chart.units[axis]}": width}
+    looks: dict[str, Any] = {"color": style.RED, "linewidth": 2, "markersize": 9, "zorder": 4}
+    label = f"2 eps = {2 * eps:g} {task.chart.units[axis]}"
+    near.plot(*ends, marker="_|"[axis == 0], label=label, **looks)

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from hyrl_mj.sets import GridSet
 from hyrl_mj.stages import Partition
 from hyrl_mj.viz.figures import charts, paths, style
-from hyrl_mj.viz.figures.charts import OUTER, Artists
+from hyrl_mj.viz.figures.charts import OUTER
 from hyrl_mj.viz.figures.paths import CORE, View
 from hyrl_mj.viz.figures.shown import ShownPolicy
 from hyrl_mj.viz.figures.style import PALE_RED
@@ -29,38 +29,39 @@ def draw_overview(shown: ShownPolicy, path: Path | None = None) -> Figure:
     """
     task, arc = shown.task, shown.noisy
     charts.check_drawable(task)
-    with style.drawing(path, (style.WIDTH, 7.6)) as figure:
-        style.head(figure, task, f"the {shown.algorithm} policy, and where noise leads it")
+    title = f"the {shown.algorithm} policy, and where noise leads it"
+    with style.drawing(path, 7.6, task, title) as figure:
         panel = figure.subplots()
         panel.set_title(style.noise_label(task, arc.noise, arc.bound))
-        draw = _spirals if charts.is_ring(task) else _field
-        handles = {
-            f"only in the part $M_{mode}$": charts.patch(style.mode_tint(mode))
-            for mode in shown.partition.modes
-        }
-        style.legend(figure, handles | draw(panel, shown))
+        for mode in shown.partition.modes:
+            charts.legend_field(panel, f"only in the part $M_{mode}$", style.mode_tint(mode))
+        if charts.is_ring(task):
+            _spirals(panel, shown)
+        else:
+            _field(panel, shown)
+        style.legend(figure)
     return figure
 
 
-def _field(panel: Axes, shown: ShownPolicy) -> Artists:
-    """Draws the overview of a plane; returns the legend's entries, without the parts."""
+def _field(panel: Axes, shown: ShownPolicy) -> None:
+    """Draws the overview of a plane."""
     task, partition, arc = shown.task, shown.partition, shown.noisy
     owners = _owners(partition)
     for i, mode in enumerate(partition.modes):
         part = GridSet.from_mask(partition.grid, owners == i)
         charts.region(panel, part, style.mode_tint(mode))
-    handles = charts.plane(panel, task)
+    charts.plane(panel, task)
     view = paths.plane_view(task)
-    handles |= _noiseless_runs(panel, shown, view)
+    _noiseless_runs(panel, shown, view)
     eps = task.noise_in_chart(arc.bound)
     band = _band(task.chart.wrap(arc.z), eps, view.longest)
     panel.add_collection(PolyCollection(list(band), color=PALE_RED, linewidth=0.3, zorder=2))
-    handles |= _noisy_run(panel, shown, view)
+    _noisy_run(panel, shown, view)
     ahead = arc.z[-1] - arc.z[0]
     triangle = (3, 0, float(np.degrees(np.arctan2(ahead[1], ahead[0]))) - 90)
     looks = {"markersize": 13, "markerfacecolor": style.PALE, "markeredgecolor": style.INK}
-    handles["robot at its start"] = paths.mark(panel, view, arc, 0, triangle, **looks)
-    return handles | charts.dots(panel, shown.critical.points)
+    paths.mark(panel, view, arc, 0, triangle, label="robot at its start", **looks)
+    charts.dots(panel, shown.critical.points)
 
 
 def _owners(partition: Partition) -> np.ndarray:
@@ -83,30 +84,29 @@ def _band(z: np.ndarray, eps: np.ndarray, longest: np.ndarray) -> np.ndarray:
     return np.concatenate([boxes, *swept])
 
 
-def _spirals(panel: Axes, shown: ShownPolicy) -> Artists:
-    """Draws the overview of a ring, time outward; returns the legend's entries, without the parts."""
+def _spirals(panel: Axes, shown: ShownPolicy) -> None:
+    """Draws the overview of a ring, time outward."""
     task, partition, arc = shown.task, shown.partition, shown.noisy
     seconds = task.scene.time
     tints = [style.mode_tint(mode) for mode in partition.modes]
     charts.arcs(panel, task, _owners(partition), [*tints, None], OUTER, CORE)
     charts.ring(panel, task, (OUTER, CORE), f",\ntime outward:\n0 to {seconds:g} s")
     view = paths.spiral_view(task, seconds)
-    handles = _noiseless_runs(panel, shown, view)
+    _noiseless_runs(panel, shown, view)
     eps = task.noise_in_chart(arc.bound)
     rim = np.vstack([view.points(arc.t, arc.z - eps), view.points(arc.t, arc.z + eps)[::-1]])
     panel.fill(*rim.T, color=PALE_RED, linewidth=0, zorder=2)
-    handles |= _noisy_run(panel, shown, view)
+    _noisy_run(panel, shown, view)
     if task.set_point is not None:
-        handles |= charts.cross(panel, *np.ravel(charts.on_ring(task, task.set_point)))
-    return handles | charts.spokes(panel, task, shown.critical, CORE - 0.06)
+        charts.cross(panel, *np.ravel(charts.on_ring(task, task.set_point)))
+    charts.spokes(panel, task, shown.critical, CORE - 0.06)
 
 
-def _noiseless_runs(panel: Axes, shown: ShownPolicy, view: View) -> Artists:
-    """Draws the runs without noise, with arrowheads; returns the legend's entries."""
-    handles: Artists = {}
+def _noiseless_runs(panel: Axes, shown: ShownPolicy, view: View) -> None:
+    """Draws the runs without noise, with arrowheads."""
+    thin = {"linewidth": 1.3, "zorder": 3}
     for run in shown.noiseless:
-        way, drawn = paths.chosen_way(panel, shown.task, view, run, linewidth=1.3, zorder=3)
-        handles[f"without noise: {way}"] = drawn
+        drawn = paths.chosen_way(panel, shown.task, view, run, "without noise: ", **thin)
         row = len(run.t) // ARROW
         points = view.points(run.t[row : row + 2], run.z[row : row + 2])
         if len(points) < 2 or (np.abs(points[1] - points[0]) > view.longest).any():
@@ -114,16 +114,14 @@ def _noiseless_runs(panel: Axes, shown: ShownPolicy, view: View) -> Artists:
         looks = {"arrowstyle": "-|>", "color": drawn.get_color(), "shrinkA": 0, "shrinkB": 0}
         arrow = looks | {"mutation_scale": 11}
         panel.annotate("", points[1], points[0], arrowprops=arrow, zorder=3)
-    return dict(sorted(handles.items()))
 
 
-def _noisy_run(panel: Axes, shown: ShownPolicy, view: View) -> Artists:
-    """Draws the run under noise and what it measures; returns the legend's entries."""
+def _noisy_run(panel: Axes, shown: ShownPolicy, view: View) -> None:
+    """Draws the run under noise and what it measures."""
     task, arc = shown.task, shown.noisy
-    drawn = paths.policy_way(panel, view, arc, linewidth=1.4)
-    handles: Artists = {f"{shown.policy_title}, with noise": drawn}
-    handles["what it can observe"] = charts.patch(PALE_RED, PALE_RED)
+    paths.policy_way(panel, view, arc, linewidth=1.4, label=f"{shown.policy_title}, with noise")
+    charts.legend_field(panel, "what it can observe", PALE_RED, PALE_RED)
     looks = {"linestyle": "none", "marker": ".", "color": style.RED, "markersize": 4, "zorder": 4.5}
     measured = task.z(arc.measured[:-1])
-    handles["what it observes"] = paths.line(panel, view, arc.t[:-1], measured, **looks)
-    return handles | paths.end(panel, task, view, arc)
+    paths.line(panel, view, arc.t[:-1], measured, label="what it observes", **looks)
+    paths.end(panel, task, view, arc)

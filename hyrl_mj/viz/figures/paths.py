@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from hyrl_mj.simulation import HybridArc
-from hyrl_mj.tasks import Outcome, Task
-from hyrl_mj.viz.figures.charts import Artists, label_angles, on_ring
+from hyrl_mj.tasks import Task
+from hyrl_mj.viz.figures.charts import label_angles, on_ring
 from hyrl_mj.viz.figures.style import INK, PALE, PAPER, POLICY_COLOUR, RED, axis_label, mode_colour
 
 # Radius at which spirals begin; they end at 1.
@@ -66,31 +66,25 @@ def line(panel: Axes, view: View, t: np.ndarray, z: np.ndarray, **looks: Any) ->
     return drawn
 
 
-def mark(panel: Axes, view: View, arc: HybridArc, row: int, shape: Any, **looks: Any) -> Line2D:
+def mark(panel: Axes, view: View, arc: HybridArc, row: int, shape: Any, **looks: Any) -> None:
     """Marks a row of an arc with one of matplotlib's markers."""
     ((x, y),) = view.points(arc.t[[row]], arc.z[[row]])
     looks = {"markersize": 6, "clip_on": False, "zorder": 6} | looks
-    (drawn,) = panel.plot([x], [y], marker=shape, linestyle="none", **looks)
-    return drawn
+    panel.plot([x], [y], marker=shape, linestyle="none", **looks)
 
 
-def ends(panel: Axes, task: Task, view: View, arc: HybridArc) -> Artists:
-    """Marks where a run starts and ends, in red if it has failed; returns the legend's entries."""
-    start = mark(panel, view, arc, 0, "o", markerfacecolor=PAPER, markeredgecolor=INK)
-    return {"start": start} | end(panel, task, view, arc)
+def ends(panel: Axes, task: Task, view: View, arc: HybridArc) -> None:
+    """Marks where a run starts and ends."""
+    mark(panel, view, arc, 0, "o", markerfacecolor=PAPER, markeredgecolor=INK, label="start")
+    end(panel, task, view, arc)
 
 
-def end(panel: Axes, task: Task, view: View, arc: HybridArc) -> Artists:
-    """Marks where a run ends, in red if it has failed; returns the legend's entries."""
+def end(panel: Axes, task: Task, view: View, arc: HybridArc) -> None:
+    """Marks where a run ends, in red if it has failed."""
     label, colour = ("end", INK) if arc.arrives(task) else ("end: off the set-point", PALE)
-    if failed(arc):
+    if arc.outcome != "reached":
         label, colour = ENDS.get(arc.outcome, f"end: {arc.outcome}"), RED
-    return {label: mark(panel, view, arc, -1, "x", color=colour, markeredgewidth=2)}
-
-
-def failed(arc: HybridArc) -> bool:
-    """Returns whether a run has not reached the set-point."""
-    return arc.outcome != Outcome.REACHED.label
+    mark(panel, view, arc, -1, "x", color=colour, markeredgewidth=2, label=label)
 
 
 def policy_way(panel: Axes, view: View, arc: HybridArc, **looks: Any) -> Line2D:
@@ -99,31 +93,25 @@ def policy_way(panel: Axes, view: View, arc: HybridArc, **looks: Any) -> Line2D:
 
 
 def chosen_way(
-    panel: Axes, task: Task, view: View, arc: HybridArc, **looks: Any
-) -> tuple[str, Line2D]:
-    """Draws a policy's run in the colour of the mode whose way it goes; returns its label and path."""
+    panel: Axes, task: Task, view: View, arc: HybridArc, prefix: str = "", **looks: Any
+) -> Line2D:
+    """Draws a policy's run in the colour of the mode whose way it goes; `prefix` begins the label."""
     mode = int(task.direction(arc.z[:, None])[0])
     colour, label = mode_colour(mode), f"way of mode {task.scene.mode_name(mode)}"
-    if failed(arc):
+    if arc.outcome != "reached":
         colour, label = POLICY_COLOUR, "neither way"
     elif mode < 0:
         colour, label = PALE, "nothing to decide"
-    return label, line(panel, view, arc.t, arc.z, color=colour, **looks)
+    return line(panel, view, arc.t, arc.z, color=colour, label=prefix + label, **looks)
 
 
-def hybrid_way(panel: Axes, task: Task, view: View, arc: HybridArc, **looks: Any) -> Artists:
-    """Draws a run of the hybrid controller in the colours of its modes, with marks at its jumps.
-
-    Returns:
-        The legend's entries.
-    """
-    handles: Artists = {}
+def hybrid_way(panel: Axes, task: Task, view: View, arc: HybridArc) -> None:
+    """Draws a run of the hybrid controller in the colours of its modes, with marks at its jumps."""
     for j in range(arc.j[-1] + 1):
         rows = arc.j == j
         mode = int(arc.q[rows][0])
-        drawn = line(panel, view, arc.t[rows], arc.z[rows], color=mode_colour(mode), **looks)
-        handles[f"HyRL in mode {task.scene.mode_name(mode)}"] = drawn
+        looks = {"color": mode_colour(mode), "label": f"HyRL in mode {task.scene.mode_name(mode)}"}
+        line(panel, view, arc.t[rows], arc.z[rows], linewidth=2.0, **looks)
     for row in np.flatnonzero(np.diff(arc.j)).tolist():
         # Small and on top, so that a jump at the start shows in its circle.
-        handles["jump"] = mark(panel, view, arc, row, "D", color=INK, markersize=3.5, zorder=7)
-    return handles
+        mark(panel, view, arc, row, "D", color=INK, markersize=3.5, zorder=7, label="jump")

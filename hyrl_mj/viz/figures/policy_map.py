@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from hyrl_mj.sets import Grid
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.figures import charts, paths, style
-from hyrl_mj.viz.figures.charts import INNER, OUTER, Artists
+from hyrl_mj.viz.figures.charts import INNER, OUTER
 from hyrl_mj.viz.figures.shown import ShownPolicy
 
 # Nodes at which the policy is evaluated: of a ring, and along the longest side of a plane.
@@ -30,44 +30,35 @@ def draw_policy_map(shown: ShownPolicy, path: Path | None = None) -> Figure:
     """
     task = shown.task
     charts.check_drawable(task)
-    with style.drawing(path, (style.WIDTH, 5.2)) as figure:
-        style.head(figure, task, f"the {shown.algorithm} policy")
+    with style.drawing(path, 5.2, task, f"the {shown.algorithm} policy") as figure:
         *maps, panel = figure.subplots(1, len(task.inputs) + 1)
-        handles: Artists = {}
         for i, input_panel in enumerate(maps):
-            handles |= _input_map(input_panel, shown, i)
-        style.legend(figure, handles | _paper_runs(panel, shown))
+            _input_map(input_panel, shown, i)
+        _paper_runs(panel, shown)
+        style.legend(figure, by_label=True)
     return figure
 
 
-def _paper_runs(panel: Axes, shown: ShownPolicy) -> Artists:
-    """Draws the runs from the paper's starts beside the maps; returns the legend's entries."""
+def _paper_runs(panel: Axes, shown: ShownPolicy) -> None:
+    """Draws the runs from the paper's starts."""
     task, ring = shown.task, charts.is_ring(shown.task)
     label = style.noise_label(task, shown.paper[0].noise, shown.paper[0].bound)
     panel.set_title(label.replace(", ", ",\n"))
-    fixed: Artists = {}
     if ring:
         panel.set(xlim=(0, task.scene.time))
         view = paths.time_view(panel, task, 0)
     else:
-        view, fixed = paths.plane_view(task), charts.plane(panel, task)
-    ways: Artists = {}
-    marks: Artists = {}
+        charts.plane(panel, task)
+        view = paths.plane_view(task)
     for arc in shown.paper:
-        way, drawn = paths.chosen_way(panel, task, view, arc, linewidth=2.0)
-        ways[way] = drawn
-        marks |= paths.ends(panel, task, view, arc)
+        paths.chosen_way(panel, task, view, arc, linewidth=2.0)
+        paths.ends(panel, task, view, arc)
     if ring:
-        fixed |= charts.set_point_lines(panel, task, 0)
-    return fixed | dict(sorted(ways.items())) | marks
+        charts.set_point_lines(panel, task, 0)
 
 
-def _input_map(panel: Axes, shown: ShownPolicy, i: int) -> Artists:
-    """Draws the map of an input, measured without noise, with its colour bar.
-
-    Returns:
-        The legend's entries.
-    """
+def _input_map(panel: Axes, shown: ShownPolicy, i: int) -> None:
+    """Draws the map of an input, measured without noise, with its colour bar."""
     task, ring, chart = shown.task, charts.is_ring(shown.task), shown.task.chart
     colours, scale, ticks = _input_colours(task, i)
     grid = Grid(chart, (RING_NODES,)) if ring else Grid.with_cells(chart, PLANE_CELLS)
@@ -76,17 +67,17 @@ def _input_map(panel: Axes, shown: ShownPolicy, i: int) -> Artists:
         shades, classes = np.unique(colours(scale(values)), axis=0, return_inverse=True)
         charts.arcs(panel, task, classes.ravel(), shades)
         charts.ring(panel, task, (OUTER, INNER))
-        handles = charts.spokes(panel, task, shown.critical, 0.6, style.RED)
+        charts.spokes(panel, task, shown.critical, 0.6, style.RED)
     else:
         charts.image(panel, grid, values, cmap=colours, norm=scale)
-        handles = charts.plane(panel, task) | charts.dots(panel, shown.critical.points, style.RED)
+        charts.plane(panel, task)
+        charts.dots(panel, shown.critical.points, style.RED)
     # After the ring, whose place in the panel the colour bar sets.
     bar = panel.figure.colorbar(
         ScalarMappable(scale, colours),
         ax=panel, location="right", shrink=0.7, aspect=20, ticks=ticks,
     )  # fmt: skip
     bar.set_label(style.input_label(task, i))
-    return handles
 
 
 def _input_colours(task: Task, i: int) -> tuple[Colormap, Normalize, np.ndarray | None]:

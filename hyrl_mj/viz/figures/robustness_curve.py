@@ -9,11 +9,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from hyrl_mj.game import LIMIT, Wins
 from hyrl_mj.viz.figures import style
-from hyrl_mj.viz.figures.charts import Artists
 from hyrl_mj.viz.figures.shown import ShownGame
 from hyrl_mj.viz.tables import NAMES
 
@@ -45,20 +43,20 @@ def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
     numbers = {name: known.index(name) for name in names}
     where, unit = task.noise_on(result.everywhere)
     heights = (3.6, 2.0) if result.lasting else (3.6,)
-    with style.drawing(path, (style.WIDTH, 2.0 + sum(heights))) as figure:
-        style.head(figure, task, "what is won against the worst noise")
+    title = "what is won against the worst noise"
+    with style.drawing(path, 2.0 + sum(heights), task, title) as figure:
         panels = figure.subplots(
             len(heights), 1, sharex=True, squeeze=False, height_ratios=heights
         ).ravel()
         shares = panels[0]
         limit = curve.wins[LIMIT]
-        handles = _won(shares, "limit of any controller", eps, limit, LIMIT_LOOKS, LIMIT_DASHED)
+        _won(shares, "limit of any controller", eps, limit, LIMIT_LOOKS, LIMIT_DASHED)
         for name, number in numbers.items():
-            title, looks = NAMES.get(name, name), _looks(number)
-            handles |= _won(shares, title, eps, curve.wins[name], looks, _dashed(number))
-        (line,) = shares.plot(eps, 100 * np.array(curve.winnable), color=style.PALE, linewidth=1)
-        handles["winnable share of the start region"] = line
-        handles |= _margins(shares, result.margin, numbers, unit)
+            looks, dashed = _looks(number), _dashed(number)
+            _won(shares, NAMES.get(name, name), eps, curve.wins[name], looks, dashed)
+        label = "winnable share of the start region"
+        shares.plot(eps, 100 * np.array(curve.winnable), color=style.PALE, linewidth=1, label=label)
+        _margins(shares, result.margin, numbers, unit)
         shares.set(ylabel="winnable starts that are won [%]", yticks=range(0, 101, 20))
         if result.lasting:
             for name, number in numbers.items():
@@ -77,23 +75,17 @@ def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
         style.note_above(
             shares, f"this run: eps = {run_eps:g} {unit}", run_eps, 3, ("data", "axes fraction")
         )
-        style.legend(figure, handles, handlelength=3.2)
+        style.legend(figure, handlelength=3.2)
     return figure
 
 
-def _won(
-    panel: Axes, title: str, eps: np.ndarray, wins: Wins, looks: Looks, dashed: Looks
-) -> Artists:
-    """Draws what is won, and dashed what is won from every start mode if that differs.
-
-    Returns:
-        The legend's entries.
-    """
-    (won,) = panel.plot(eps, 100 * np.array(wins.won), **looks)
-    if _same(wins):
-        return {title: won}
-    (won_any,) = panel.plot(eps, 100 * np.array(wins.won_any), **looks | dashed)
-    return {f"{title}, picks the start mode": won, f"{title}, from every start mode": won_any}
+def _won(panel: Axes, title: str, eps: np.ndarray, wins: Wins, looks: Looks, dashed: Looks) -> None:
+    """Draws what is won, and dashed what is won from every start mode if that differs."""
+    label = title if _same(wins) else f"{title}, picks the start mode"
+    panel.plot(eps, 100 * np.array(wins.won), label=label, **looks)
+    if not _same(wins):
+        label = f"{title}, from every start mode"
+        panel.plot(eps, 100 * np.array(wins.won_any), label=label, **looks | dashed)
 
 
 def _same(wins: Wins) -> bool:
@@ -130,16 +122,14 @@ def _dashed(number: int) -> Looks:
 
 def _margins(
     panel: Axes, margins: Mapping[str, float | None], numbers: Mapping[str, int], unit: str
-) -> Artists:
-    """Marks the margins above the curves, a row for each controller; returns the legend's entries."""
-    handles: Artists = {}
+) -> None:
+    """Marks the margins above the curves, a row for each controller."""
     panel.set_ylim(-3, TOP + ROW * len(numbers))
     for row, (name, number) in enumerate(numbers.items()):
-        margin, title = margins[name], NAMES.get(name, name)
+        margin, label = margins[name], f"margin of {NAMES.get(name, name)}"
         if margin is None:
-            handles[f"margin of {title}: none"] = Line2D([], [], linestyle="none")
+            panel.plot([], [], linestyle="none", label=f"{label}: none")
             continue
         looks = _looks(number) | {"marker": "v", "linestyle": "none", "markevery": None}
-        (mark,) = panel.plot([margin], [TOP + ROW * row], **looks)
-        handles[f"margin of {title}: all is won up to {margin:.3g} {unit}"] = mark
-    return handles
+        label += f": all is won up to {margin:.3g} {unit}"
+        panel.plot([margin], [TOP + ROW * row], label=label, **looks)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,7 +16,7 @@ from hyrl_mj.game import MAP_CLASSES, OVER, UNWINNABLE, Score
 from hyrl_mj.sets import Grid
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.figures import charts, style
-from hyrl_mj.viz.figures.charts import INNER, OUTER, TICK, Artists
+from hyrl_mj.viz.figures.charts import INNER, OUTER, TICK
 from hyrl_mj.viz.figures.shown import ShownGame
 from hyrl_mj.viz.tables import NAMES, percent
 
@@ -36,19 +37,18 @@ def draw_robustness_map(shown: ShownGame, path: Path | None = None) -> Figure:
     columns = min(len(names), style.COLUMNS)
     rows = -(-len(names) // style.COLUMNS)
     draw = _ring if charts.is_ring(task) else _box
-    with style.drawing(path, (style.WIDTH, 1.6 + rows * _panel_height(task))) as figure:
-        where, unit = task.noise_on(result.everywhere)
-        style.head(figure, task, f"the worst noise on {where} up to eps = {maps.eps:g} {unit}")
+    where, unit = task.noise_on(result.everywhere)
+    title = f"the worst noise on {where} up to eps = {maps.eps:g} {unit}"
+    with style.drawing(path, 1.6 + rows * _panel_height(task), task, title) as figure:
         panels = figure.subplots(rows, columns, squeeze=False).ravel()
-        handles: Artists = {}
+        for k in np.unique(np.concatenate([maps.map[name] for name in names])):
+            charts.legend_field(panels[0], SENTENCES[k], CLASS_COLOURS[k])
         for panel, name in zip(panels, names, strict=False):
-            handles |= draw(panel, shown, grid, maps.map[name])
+            draw(panel, shown, grid, maps.map[name])
             _head(panel, name, max(result.scores[name], key=lambda score: score.eps))
         for panel in panels[len(names) :]:
             panel.set_axis_off()
-        classes = np.unique(np.concatenate([maps.map[name] for name in names]))
-        fields = {SENTENCES[k]: charts.patch(CLASS_COLOURS[k]) for k in classes}
-        style.legend(figure, fields | handles)
+        style.legend(figure)
     return figure
 
 
@@ -68,12 +68,8 @@ def _head(panel: Axes, name: str, score: Score) -> None:
     style.note_above(panel, f"{won} of the winnable starts won,\n{every}", 0.5, 6)
 
 
-def _box(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> Artists:
-    """Draws classes (N,) of nodes as an image over the chart; one coordinate is a strip of height 1.
-
-    Returns:
-        The legend's entries, without the classes.
-    """
+def _box(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> None:
+    """Draws classes (N,) of nodes as an image over the chart; one coordinate is a strip of height 1."""
     task, chart = shown.task, shown.task.chart
     strip = chart.dimension == 1
     charts.image(panel, grid, classes, cmap=ListedColormap(CLASS_COLOURS), norm=NoNorm())
@@ -86,13 +82,11 @@ def _box(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> Arti
     start = _corner(task.start_low, 0)
     sides = np.subtract(_corner(task.start_high, 1), start)
     for colour, width in style.CASING:
-        box = Rectangle(
-            start, *sides, fill=False, edgecolor=colour, linewidth=width, clip_on=False, zorder=3
-        )
+        looks: dict[str, Any] = {"edgecolor": colour, "linewidth": width, "clip_on": False}
+        box = Rectangle(start, *sides, fill=False, zorder=3, label="start region", **looks)
         panel.add_patch(box)
     z = shown.critical.points
-    points = charts.dots(panel, np.hstack([z, np.full_like(z, 0.5)]) if strip else z)
-    return {"start region": box} | points
+    charts.dots(panel, np.hstack([z, np.full_like(z, 0.5)]) if strip else z)
 
 
 def _corner(ends: Sequence[float], side: float) -> tuple[float, float]:
@@ -100,16 +94,14 @@ def _corner(ends: Sequence[float], side: float) -> tuple[float, float]:
     return float(ends[0]), float(ends[1]) if len(ends) > 1 else side
 
 
-def _ring(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> Artists:
-    """Draws classes (N,) of nodes as arcs of a ring; returns entries as `_box`."""
+def _ring(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> None:
+    """Draws classes (N,) of nodes as arcs of a ring."""
     task = shown.task
     charts.arcs(panel, task, classes, CLASS_COLOURS)
     charts.ring(panel, task, (OUTER, INNER))
-    handles: Artists = {}
-    first, last = (
-        360 * corner[0] / task.chart.sides[0] for corner in (task.start_low, task.start_high)
-    )
+    ends = task.start_low[0], task.start_high[0]
+    first, last = (360 * end / task.chart.sides[0] for end in ends)  # [degrees]
     if last - first < 360 - 360 / len(classes):
-        arc = Wedge((0, 0), TICK, first, last, width=0.03, color=style.INK, linewidth=0)
-        handles["start region"] = panel.add_patch(arc)
-    return handles | charts.spokes(panel, task, shown.critical, CRITICAL)
+        looks: dict[str, Any] = {"width": 0.03, "color": style.INK, "linewidth": 0}
+        panel.add_patch(Wedge((0, 0), TICK, first, last, label="start region", **looks))
+    charts.spokes(panel, task, shown.critical, CRITICAL)

@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from hyrl_mj.viz.figures import charts, paths, style
-from hyrl_mj.viz.figures.charts import Artists
 from hyrl_mj.viz.figures.shown import ShownRun
 
 
@@ -18,38 +17,34 @@ def draw_runs(shown: ShownRun, path: Path | None = None) -> Figure:
     Of a chart with two coordinates the paths are shown in its plane, else each coordinate over time.
     Only the paper's starts ("start0", ...) are drawn.
     """
-    task, replays, title = shown.whole, shown.replays, shown.policy_title
+    task, replays, policy_title = shown.whole, shown.replays, shown.policy_title
     loops = list(dict.fromkeys(who for _, who in replays if who != "policy"))
     starts = list(dict.fromkeys(start for start, _ in replays if start.startswith("start")))
     plane = task.chart.dimension == 2
     rows = 1 if plane else task.chart.dimension
     first = replays[starts[0], "policy"]
-    with style.drawing(path, (style.WIDTH, 1.6 + 3.4 * rows)) as figure:
-        noise = style.noise_label(task, first.noise, first.bound)
-        style.head(figure, task, f"HyRL and {title}\nunder the same {noise}")
+    noise = style.noise_label(task, first.noise, first.bound)
+    title = f"HyRL and {policy_title}\nunder the same {noise}"
+    with style.drawing(path, 1.6 + 3.4 * rows, task, title) as figure:
         panels = figure.subplots(rows, len(loops), sharex=True, sharey="row", squeeze=False)
-        fixed: Artists = {}
-        ways: Artists = {}
-        marks: Artists = {}
         for (coordinate, column), panel in np.ndenumerate(panels):
-            loop = loops[column]
             if plane:
                 view = paths.plane_view(task)
-                fixed |= charts.plane(panel, task)
+                charts.plane(panel, task)
             else:
                 view = paths.time_view(panel, task, coordinate)
                 style.grid_lines(panel)
             for start in starts:
-                hybrid, policy = replays[start, loop], replays[start, "policy"]
-                ways |= paths.hybrid_way(panel, task, view, hybrid, linewidth=2.0)
-                marks |= paths.ends(panel, task, view, hybrid)
-                ways[title] = paths.policy_way(panel, view, policy, linewidth=1.0)
-                marks |= paths.ends(panel, task, view, policy)
+                hybrid, policy = replays[start, loops[column]], replays[start, "policy"]
+                paths.hybrid_way(panel, task, view, hybrid)
+                paths.ends(panel, task, view, hybrid)
+                paths.policy_way(panel, view, policy, linewidth=1.0, label=policy_title)
+                paths.ends(panel, task, view, policy)
             if not plane:
-                fixed |= charts.set_point_lines(panel, task, coordinate)
+                charts.set_point_lines(panel, task, coordinate)
             if coordinate == 0:
-                mode = int(loop.removeprefix("hyrl_q"))
+                mode = int(loops[column].removeprefix("hyrl_q"))
                 panel.set_title(f"started in q0 = {task.scene.mode_name(mode)}", fontweight="bold")
             panel.label_outer()
-        style.legend(figure, dict(sorted(ways.items())) | marks | fixed)
+        style.legend(figure, by_label=True)
     return figure

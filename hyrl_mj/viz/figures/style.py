@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
@@ -54,17 +54,21 @@ def mode_tint(mode: int) -> str:
 
 
 @contextmanager
-def drawing(path: Path | None, size: tuple[float, float]) -> Iterator[Figure]:
+def drawing(path: Path | None, height: float, task: Task, title: str) -> Iterator[Figure]:
     """Gives a figure to draw on, and writes it as PNG and PDF when the block ends without an error.
 
     Args:
         path: where the PNG is written, and the PDF beside it; None writes nothing.
-        size: width and height [inches], before empty margins are cut off.
+        height: of the figure [inches], before empty margins are cut off.
+        task: the title of the figure begins with its name and, if the chart is cut, where.
+        title: how the title of the figure goes on.
     """
+    where = f" at {task.chart.section}" if task.chart.section else ""
     # The user's own matplotlibrc must not change the figure.
     with style.context(["default", STYLE]):
         layout = ConstrainedLayoutEngine(compress=True, h_pad=PAD, w_pad=PAD)
-        figure = Figure(figsize=size, layout=layout)
+        figure = Figure(figsize=(WIDTH, height), layout=layout)
+        figure.suptitle(f"{task_title(task)}{where}: {title}", fontsize=12, fontweight="bold")
         yield figure
         if path is None:
             return
@@ -79,12 +83,6 @@ def drawing(path: Path | None, size: tuple[float, float]) -> Iterator[Figure]:
             figure.savefig(pdf, format="pdf", metadata={"CreationDate": None}, **cut)
 
 
-def head(figure: Figure, task: Task, title: str) -> None:
-    """Writes the title above a figure."""
-    where = f" at {task.chart.section}" if task.chart.section else ""
-    figure.suptitle(f"{task_title(task)}{where}: {title}", fontsize=12, fontweight="bold")
-
-
 def grid_lines(panel: Axes) -> None:
     """Draws pale grid lines behind a panel."""
     panel.grid(color="#e6e8eb", linewidth=0.8)
@@ -97,12 +95,15 @@ def note_above(panel: Axes, text: str, x: float, gap: float, coords: Any = "axes
     )
 
 
-def legend(figure: Figure, handles: Mapping[str, Artist], handlelength: float = 2.0) -> None:
-    """Writes the legend below a figure, where it hides nothing."""
-    artists, labels = list(handles.values()), list(handles)
-    figure.legend(
-        artists, labels, loc="outside lower center", ncols=COLUMNS, handlelength=handlelength
-    )
+def legend(figure: Figure, by_label: bool = False, **looks: Any) -> None:
+    """Writes the labels of all panels below a figure, each once, in the order of drawing or sorted."""
+    entries: dict[str, Artist] = {}
+    for panel in figure.axes:
+        artists, labels = panel.get_legend_handles_labels()
+        entries |= dict(zip(labels, artists, strict=True))
+    order = sorted(entries) if by_label else list(entries)
+    artists = [entries[label] for label in order]
+    figure.legend(artists, order, loc="outside lower center", ncols=COLUMNS, **looks)
 
 
 # ---- labels
