@@ -139,7 +139,7 @@ def test_a_single_mode_keeps_everything(vehicle):
     sets = case.extend(0.3, 0.1)
     assert sets.modes == (0,)
     assert sets.sets[0].mask.all()
-    assert sets.sentence(vehicle) == "one mode, its set is everything"
+    assert sets.sentence(vehicle) == "one mode, whose set is the whole chart"
     far = distance_to(vehicle, case.critical.points, np.zeros((3, 2)))
     np.testing.assert_array_equal(far, [np.inf] * 3)
 

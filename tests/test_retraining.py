@@ -13,7 +13,7 @@ from hyrl_mj.learning.presets import preset
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
-from hyrl_mj.stages.retraining import TOGETHER, ByEpisodes, ByGame, retrain
+from hyrl_mj.stages.retraining import BATCH, ByEpisodes, ByGame, retrain
 
 # ---- where modes are trained
 
@@ -177,7 +177,7 @@ def test_episodes_tell_policies_apart(puck, puck_sets):
     ground = ByEpisodes(puck, puck_sets, 0)
     wrong = ground(one_way_policy(puck, 1.0))
     assert wrong[0] == 0, "it never comes back to the set-point"
-    assert len(ground.lost) == round(-wrong[1] * TOGETHER) > 0
+    assert len(ground.lost) == round(-wrong[1] * BATCH) > 0
     # As close as it gets without noise, but not with it.
     grazing = ground(round_it(puck, 1.0, clear=0.6))
     good = ground(round_it(puck, 1.0))

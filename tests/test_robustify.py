@@ -27,8 +27,7 @@ from hyrl_mj.learning.settings import Settings
 from hyrl_mj.pipeline.steps import STAGES
 from hyrl_mj.policies.external import read_agent, reopen_agent
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.stages.extended_sets import boundary, with_room
-from hyrl_mj.stages.partition import Partition
+from hyrl_mj.stages import Partition, boundary, with_room
 from hyrl_mj.stages.retraining import ByGame, WarmStart, mode_ground, retrain
 
 pytestmark = pytest.mark.slow  # whole runs on agents

@@ -1,15 +1,14 @@
-"""The stages of HyRL between training and examination (paper, Section IV): a function and a result for each.
+"""The stages of HyRL after training (paper, Section IV-C): a function and a result for each.
 
 Stage 2 is `find_critical_set`, stage 3 `make_partition`, stages 4 and 5 `extend`, stage 6
-`retraining.retrain`, and stage 7 `HybridController`. The module `retraining` imports torch, so it
-is imported only where it is needed.
+`retraining.retrain`, and stage 7 `HybridController`. `retraining` imports torch: import it where needed.
 """
 
 from hyrl_mj.stages.critical_set import CriticalSet, critical_points, find_critical_set
 from hyrl_mj.stages.episodes import Regions, noisy_episodes
-from hyrl_mj.stages.extended_sets import ExtendedSets, boundary, extend, with_room
+from hyrl_mj.stages.extended_sets import ExtendedSets, extend
 from hyrl_mj.stages.hybrid import ON_EDGE, HybridController
-from hyrl_mj.stages.partition import Partition, make_partition
+from hyrl_mj.stages.partition import Partition, boundary, make_partition, with_room
 
 __all__ = [
     "ON_EDGE",

@@ -1,4 +1,4 @@
-"""Noisy episodes in bulk: statistics for charts and plants of any kind."""
+"""Noisy episodes in bulk: how often controllers reach the set-point, for charts and plants of any kind."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
 from hyrl_mj.stages.critical_set import check_points, distance_to
 from hyrl_mj.tasks import Outcome, Task
 
-# Episodes that are simulated side by side: memory does not grow with their number.
+# Episodes that are simulated at once, which limits the memory.
 BATCH = 4_096
-# After so many starts, none of which lies near M*, there are none.
+# The search for starts near M* ends after this many draws without one.
 RARE = 100_000
 
 
 @dataclass(frozen=True)
 class Regions:
-    """Start regions of a task, by which noisy episodes are counted.
+    """The start regions of a task for which noisy episodes are counted separately.
 
     Attributes:
-        points: (N, d) of M*; starts within twice the noise bound of it are a region of their own.
-        winnable: a grid and which of its nodes can be won; starts that cannot are a region of their own.
+        points: (N, d) of M*; starts within twice the noise bound of M* are one region.
+        winnable: a grid and (N,) bool, which of its nodes are winnable; the other starts are one region.
         near: whether all episodes start within twice the noise bound of M*.
     """
 
@@ -37,10 +37,10 @@ class Regions:
     near: bool = False
 
     def draw(self, task: Task, bound: float, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Returns n starts (n, d) from the task's distribution, under noise up to a bound.
+        """Returns n starts (n, d) from the task's distribution, for noise up to a bound.
 
         Raises:
-            BadInput: they are to lie near M*, and hardly any or none do.
+            BadInput: the starts have to lie near M*, but M* is empty or hardly any start lies there.
         """
         z = task.starts(n, rng)
         if not self.near:
@@ -66,9 +66,9 @@ class Regions:
         near = self._close(task, bound, z0)
         if self.winnable is None:
             return {"near M*": near, "elsewhere": ~near}
-        grid, can = self.winnable
-        open_ = can[grid.nearest(z0)]
-        return {"near M*": near & open_, "elsewhere": ~near & open_, "not winnable": ~open_}
+        grid, winnable = self.winnable
+        won = winnable[grid.nearest(z0)]
+        return {"near M*": near & won, "elsewhere": ~near & won, "not winnable": ~won}
 
     def _close(self, task: Task, bound: float, z: np.ndarray) -> np.ndarray:
         """Returns whether starts (n, d) lie within twice the noise bound of M*: (n,) bool."""
@@ -83,17 +83,17 @@ def noisy_episodes(
     count: int,
     seed: int = 0,
 ) -> tuple[EpisodeCount, ...]:
-    """Simulates noisy episodes in bulk, and counts how they end by noise, controller and start region.
+    """Simulates noisy episodes, and counts their outcomes by noise, controller and start region.
 
-    All controllers meet the same starts; noise that does not depend on the loop is the same, too.
+    All controllers get the same starts, and the same noise signals unless these depend on the loop.
 
     Args:
-        task: what is played, from its start distribution.
-        regions: by which the starts are counted.
+        task: the robot and its problem.
+        regions: the start regions.
         controllers: by name.
         noises: kinds and bounds.
         count: episodes for each noise and controller.
-        seed: of starts and noise.
+        seed: seed of starts and noise.
 
     Raises:
         BadInput: no episodes, a noise bound that hides the state space, or no starts near M*.
@@ -107,28 +107,24 @@ def noisy_episodes(
     total = count * len(noises) * len(controllers)
     progress = progress_bar(None, "noisy episodes", "episodes", total)
     ends: list[EpisodeCount] = []
-    # New plants for each batch would leave more and more holes in the memory.
+    # The plants are used again: new ones for each batch would fragment the memory.
     plants = {n: task.plant(n) for n in {min(BATCH, count), count % BATCH} - {0}}
     for noise in noises:
         for name, controller in controllers.items():
             counts: dict[str, np.ndarray] = {}
             for first in range(0, count, BATCH):
                 n = min(BATCH, count - first)
-                draw, signal = np.random.SeedSequence([seed, first]).generate_state(2)
-                z0 = regions.draw(task, noise.bound, n, np.random.default_rng(draw))
+                start_seed, noise_seed = np.random.SeedSequence([seed, first]).generate_state(2)
+                z0 = regions.draw(task, noise.bound, n, np.random.default_rng(start_seed))
                 settings = LoopSettings(vary=True, plant=plants[n], quiet=True)
-                rollout = closed_loop(
-                    task, controller, z0, noise, seed=int(signal), settings=settings
+                runs = closed_loop(
+                    task, controller, z0, noise, seed=int(noise_seed), settings=settings
                 )
                 for region, inside in regions.split(task, noise.bound, z0).items():
-                    counts.setdefault(region, np.zeros(len(Outcome), dtype=int))
-                    counts[region] += np.bincount(rollout.outcome[inside], minlength=len(Outcome))
+                    number = np.bincount(runs.outcome[inside], minlength=len(Outcome))
+                    counts[region] = counts.get(region, 0) + number
                 progress.update(n)
-            ends += [
-                _count(noise, name, region, outcomes)
-                for region, outcomes in counts.items()
-                if outcomes.any()
-            ]
+            ends += [_count(noise, name, r, number) for r, number in counts.items() if number.any()]
     progress.close()
     return tuple(ends)
 

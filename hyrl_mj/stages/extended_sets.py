@@ -1,45 +1,49 @@
-"""Stage 5: extend each part over the critical set, by running the closed loop backward."""
+"""Stage 5 (paper, Step 5): the extended sets M_ext_i, which overlap over the critical set."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from hyrl_mj.artifacts import Saved
-from hyrl_mj.game import NEVER, Limit
+from hyrl_mj.game import Limit
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.stages.critical_set import check_points, distance_to
-from hyrl_mj.stages.partition import Partition, check_sets, part_policies
-from hyrl_mj.stages.reachability import (
-    backward_reach,
-    forward_reach,
+from hyrl_mj.stages.critical_set import check_points, distance_to, policy_runs, ranges
+from hyrl_mj.stages.partition import (
+    Partition,
+    PartPolicy,
+    check_sets,
     longest_hop,
-    longest_samples,
-    part_wins,
+    neighbourhood,
+    open_ways,
+    part_policies,
 )
-from hyrl_mj.tasks import Task
+from hyrl_mj.tasks import Outcome, Task
 
-# The neighbourhood of M* is at least this many cells wide, and as wide as the loop goes in one sample.
-NEIGHBOURHOOD_CELLS = 4
-# A horizon is long enough when the backward runs have filled this share of the overlap that is wanted.
+# A horizon is long enough when the propagated sets fill this share of the overlap that the noise needs.
 FILLED = 0.995
+# Gaps of this many cells between the samples of the backward runs are closed.
+GAP_CELLS = 1.5
+# The longest horizon that is tried [s].
+LONGEST_HORIZON = 2.0
 
 
 @dataclass(frozen=True)
 class ExtendedSets(Saved):
-    """M_ext_i for each mode (paper, Step 5).
+    """The extended sets M_ext_i (paper, Step 5).
 
     Attributes:
         modes: the modes.
-        sets: M_ext_i, in the same order.
-        winning: W_i as (N,) bool over the grid's nodes: where pi_i reaches its goal.
-        horizon: time T of the backward propagation [s]; 0 if there was none.
+        sets: M_ext_i of each mode, in the same order.
+        winning: W_i as (N,) bool over the grid's nodes, from where pi_i reaches the set-point.
+        horizon: time T of the backward propagation [s]; 0 without propagation.
         noise: bound eps of the measurement noise that the sets are made for.
-        narrow: (K, d) points of M* at which a mode has less room than the noise asks for.
-        room: (K,) the room there is, across, in chart units; 2 eps are needed.
+        narrow: (K, d) points of M* where the noise needs more room than a mode has.
+        room: (K,) room across M* at these points, in chart units; 2 eps are needed.
     """
 
     KIND: ClassVar[str] = "extended sets"
@@ -62,21 +66,16 @@ class ExtendedSets(Saved):
     def sentence(self, task: Task) -> str:
         """Returns a one-line description."""
         if len(self.sets) < 2:
-            return "one mode, its set is everything"
-        both = self.sets[0] & self.sets[1]
-        share = both.mask.mean()
+            return "one mode, whose set is the whole chart"
+        share = (self.sets[0] & self.sets[1]).mask.mean()
         reach = f"T = {self.horizon:.2g} s" if self.horizon else "as far as the ways are open"
         text = f"{len(self.sets)} extended sets, {reach}, the first two share {100 * share:.1f}% of the chart"
         if not len(self.narrow):
             return text
-        low, high, chart = self.narrow.min(axis=0), self.narrow.max(axis=0), task.chart
-        where = ", ".join(
-            f"{name} {a:.3g} to {b:.3g} {unit}" if b - a > 1e-3 else f"{name} {a:.3g} {unit}"
-            for name, unit, a, b in zip(chart.names, chart.units, low, high, strict=True)
-        )
         return (
-            f"{text}; no overlap can be wide enough for noise {self.noise:g} at {where}: "
-            f"{2 * self.noise:g} of room are needed there and as little as {self.room.min():.2g} is left"
+            f"{text}; no overlap can be wide enough for noise {self.noise:g} at "
+            f"{ranges(task.chart, self.narrow, 1e-3)}: {2 * self.noise:g} of room are needed there and as "
+            f"little as {self.room.min():.2g} is left"
         )
 
 
@@ -91,14 +90,14 @@ def extend(
 ) -> ExtendedSets:
     """Extends the parts over M* (paper, Steps 4 and 5).
 
-    X_i are the states that x' = -f(x, pi_i(x)) reaches outside M_i within the horizon, from the
-    neighbourhood of M*; for a plant that cannot be run backward, those outside M_i that pi_i brings into
-    M_i within the horizon. They are trimmed to where mode i still succeeds, with room for the noise, and
-    every part is widened by the noise bound, so that a wrong measurement does not flip the mode back:
+    X_i are the states outside M_i that x' = -f(x, pi_i(x)) reaches from the neighbourhood of M* within the
+    horizon; for a plant that cannot run backward, those that pi_i brings into M_i within the horizon. They
+    are trimmed to where mode i still succeeds, with room for the noise. Every part is widened by the noise
+    bound, so that a wrong measurement does not switch back:
 
         M_ext_i = ((M_i u X_i) n (W_i eroded by eps)) u (M_i dilated by eps)
 
-    Erosion and dilation act along the coordinates that are measured with noise.
+    Erosion and dilation act along the noisy coordinates.
 
     Args:
         task: gives plant and chart.
@@ -106,12 +105,12 @@ def extend(
         points: (N, d) of M*, from stage 2.
         partition: M_i, from stage 3.
         noise: bound eps of the measurement noise.
-        horizon: time T of the backward propagation [s]. By default the shortest with which every set
-            reaches 2 eps and one sample over M*, where its mode still succeeds, and then no farther.
-        ways: which way is open from where. An agent need not know how to go on its way from beyond the
-            place where it decides otherwise; with `ways` W_i is where way i is open, for the mode will be
-            trained to go it, and without a horizon every set reaches 2 eps and one sample over the
-            boundary of its part there.
+        horizon: time T of the backward propagation [s]. By default, the shortest with which every set
+            reaches 2 eps and one sample over M* wherever its mode succeeds; the sets end there.
+        ways: from where each way is open, for an agent, which may be unable to go its way from beyond the
+            place where it decides otherwise. W_i is then where way i is open, because stage 6 trains the
+            mode to go it. Without a horizon, every set reaches 2 eps and one sample over the boundary of
+            its part.
     """
     points = check_points(task, points)
     grid, parts = partition.grid, partition.parts
@@ -119,123 +118,144 @@ def extend(
     near = neighbourhood(grid, noise, hop)
     pis = part_policies(task, policy, partition, near)
     wanted = [part.dilated_by_box(2 * eps + hop * (task.noise_in_chart(1.0) > 0)) for part in parts]
-    # W_i, wherever a set may come to lie.
+    # The extended sets lie within these.
     radius = 3 * noise + near + (0.0 if horizon is None else horizon / task.dt * near)
+    candidates = [part.dilated(radius).mask for part in parts]
     if ways is None:
         winning = tuple(
-            part_wins(task, pi, partition, part, part.dilated(radius))
-            for pi, part in zip(pis, parts, strict=True)
+            _part_wins(task, pi, partition, part, candidate)
+            for pi, part, candidate in zip(pis, parts, candidates, strict=True)
         )
     else:
         winning = open_ways(ways, grid)
     roomy = [
-        GridSet.from_mask(grid, wins | ~part.dilated(radius).mask).eroded_by_box(eps)
-        for wins, part in zip(winning, parts, strict=True)
+        GridSet.from_mask(grid, wins | ~candidate).eroded_by_box(eps)
+        for wins, candidate in zip(winning, candidates, strict=True)
     ]
-    # Only M* is to be covered; parts that meet again elsewhere, at the set-point, have nothing to decide.
+    # Only M* has to be covered: where parts meet elsewhere, as at the set-point, nothing is left to decide.
     off = distance_to(task, points, grid.nodes)
     around = off <= float(np.linalg.norm(2 * eps + hop))
-    reached = list(parts)
-    running = len(parts) > 1 and (ways is None or horizon is not None)
-    if running:
+    propagated = horizon or 0.0
+    if len(parts) > 1 and (ways is None or horizon is not None):
         reach = [
-            backward_reach(task, pi, part, part.mask & (off <= near))
+            _backward_reach(task, pi, part, part.mask & (off <= near))
             if task.kinematic
-            else forward_reach(task, pi, part, part.mask & (off <= near), part.dilated(radius).mask)
-            for pi, part in zip(pis, parts, strict=True)
+            else _forward_reach(task, pi, part, part.mask & (off <= near), candidate)
+            for pi, part, candidate in zip(pis, parts, candidates, strict=True)
         ]
-    steps = [max(round(horizon / task.dt), 1)] if horizon else range(1, longest_samples(task) + 1)
-    for k in steps if running else ():
-        reached = [part | within(k) for part, within in zip(parts, reach, strict=True)]
-        goals = [
-            (w & r).mask & ~p.mask & around for w, r, p in zip(wanted, roomy, parts, strict=True)
-        ]
-        filled = [r.mask[goal].mean() for r, goal in zip(reached, goals, strict=True) if goal.any()]
-        if min(filled, default=1.0) >= FILLED:
-            break
-    if horizon is None:
-        reached = [r & w for r, w in zip(reached, wanted, strict=True)] if running else wanted
+        longest = _longest_samples(task)
+        for k in [max(round(horizon / task.dt), 1)] if horizon else range(1, longest + 1):
+            reached = [part | within(k) for part, within in zip(parts, reach, strict=True)]
+            goals = [
+                (w & room).mask & ~part.mask & around
+                for w, room, part in zip(wanted, roomy, parts, strict=True)
+            ]
+            pairs = zip(reached, goals, strict=True)
+            filled = [r.mask[goal].mean() for r, goal in pairs if goal.any()]
+            if min(filled, default=1.0) >= FILLED:
+                break
+        propagated = horizon or k * task.dt
+        if horizon is None:
+            reached = [r & w for r, w in zip(reached, wanted, strict=True)]
+    else:
+        reached = wanted if horizon is None else list(parts)
     sets = tuple(
         (r & room) | part.dilated_by_box(eps)
         for r, room, part in zip(reached, roomy, parts, strict=True)
     )
-    narrow, room = room_along(task, points, partition, winning, eps)
-    propagated = horizon or (k * task.dt if running else 0.0)
+    narrow, room = _narrow(task, points, grid, winning, eps)
     return ExtendedSets(partition.modes, sets, winning, propagated, noise, narrow, room)
 
 
-def open_ways(ways: Limit, grid: Grid) -> tuple[np.ndarray, ...]:
-    """Returns where on a grid each mode's way is open: (N,) bool for each."""
-    at = ways.lattice.grid.nearest(grid.nodes)
-    return tuple(samples[at] < NEVER for samples in ways.samples)
+def _part_wins(
+    task: Task, pi: PartPolicy, partition: Partition, part: GridSet, candidates: np.ndarray
+) -> np.ndarray:
+    """Returns W_i: the nodes (N,) bool among the candidates (N,) from which pi_i reaches the set-point."""
+    wins = partition.succeeds & part.mask
+    outside = np.flatnonzero(candidates & ~part.mask)
+    if len(outside):
+        rollout = policy_runs(task, pi, part.grid.nodes[outside], label="extended sets")
+        wins[outside] = rollout.outcome == Outcome.REACHED
+    return wins
 
 
-def with_room(
-    task: Task, policy: Policy, partition: Partition, ways: Limit, noise: float
-) -> Partition:
-    """Returns the parts, changed where the policy goes a way that is about to close while another is not.
-
-    A policy that drives towards the obstacle's middle and decides at the last moment leaves no room for an
-    overlap. So a state with less room for its way than 2 eps and one sample belongs to the mode whose way
-    has the most. Where every way has that room, or none, the policy's own decision stands.
+def _backward_reach(
+    task: Task, pi: PartPolicy, part: GridSet, rim: np.ndarray
+) -> Callable[[int], GridSet]:
+    """Returns M_i u X_i as a function of the number of samples, by backward runs from the rim.
 
     Args:
-        task: gives the noisy coordinates.
-        policy: the agent.
-        partition: M_i, by the way that it goes.
-        ways: which way is open from where.
-        noise: bound eps of the measurement noise.
+        task: gives the plant.
+        pi: pi_i.
+        part: M_i.
+        rim: (N,) bool, the nodes of M_i near M*.
     """
-    grid = partition.grid
-    if len(partition.parts) < 2:
-        return partition
-    hop = longest_hop(task, policy, grid) * (task.noise_in_chart(1.0) > 0)
-    wanted = float((2 * task.noise_in_chart(noise) + hop).max())
-    room = -np.stack([GridSet.from_mask(grid, open_).values for open_ in open_ways(ways, grid)])
-    masks = np.stack([part.mask for part in partition.parts])
-    own = np.where(masks, room, -np.inf).max(axis=0)
-    best = room.argmax(axis=0)
-    moved = (masks.sum(axis=0) == 1) & (own < wanted) & (room.max(axis=0) > np.maximum(own, 0))
-    parts = tuple(
-        GridSet.from_mask(grid, np.where(moved, best == i, mask)) for i, mask in enumerate(masks)
-    )
-    return Partition(partition.modes, parts, partition.succeeds)
+    grid, gap = part.grid, GAP_CELLS * part.grid.cell
+    nodes = grid.nodes[rim]
+
+    def within(samples: int) -> GridSet:
+        visited = np.zeros(len(grid.nodes), dtype=bool)
+        if len(nodes):
+            runs = policy_runs(task, pi, nodes, steps=samples, backward=True, label="backward")
+            z = _between_samples(runs.path, grid)
+            visited[grid.nearest(z[task.chart.contains(z)])] = True
+        # A closing, together with M_i, fills the gaps between the samples.
+        wide = GridSet.from_mask(grid, visited | part.mask).dilated(gap)
+        return GridSet.from_mask(grid, wide.mask).eroded(gap)
+
+    return within
 
 
-def boundary(partition: Partition) -> np.ndarray:
-    """Returns points (N, d) between neighbouring nodes of which no part holds both."""
-    grid = partition.grid
-    first, second = grid.neighbours()
-    shared = np.any([part.mask[first] & part.mask[second] for part in partition.parts], axis=0)
-    a, b = grid.nodes[first[~shared]], grid.nodes[second[~shared]]
-    return np.asarray(a + grid.chart.difference(b, a) / 2)
+def _forward_reach(
+    task: Task, pi: PartPolicy, part: GridSet, rim: np.ndarray, candidates: np.ndarray
+) -> Callable[[int], GridSet]:
+    """Returns the same as `_backward_reach`, for plants that cannot run backward.
+
+    X_i are the candidates (N,) from which a forward run enters M_i on the rim.
+    """
+    grid = part.grid
+    outside = np.flatnonzero(candidates & ~part.mask)
+    arrival = np.full(len(grid.nodes), np.inf)
+    if len(outside):
+        longest = _longest_samples(task)
+        rollout = policy_runs(task, pi, grid.nodes[outside], steps=longest, label="forward")
+        under_way = np.ones(len(outside), dtype=bool)
+        for k, z in enumerate(rollout.path[1:], 1):
+            enters = under_way & part.contains(z)
+            arrival[outside[enters & rim[grid.nearest(z)]]] = k
+            under_way &= ~enters
+    return lambda samples: GridSet.from_mask(grid, part.mask | (arrival <= samples))
 
 
-def neighbourhood(grid: Grid, noise: float, hop: np.ndarray) -> float:
-    """Returns the distance from M* that counts as near it: the noise, some cells, and a sample's way (d,)."""
-    return max(noise, NEIGHBOURHOOD_CELLS * grid.cell, float(np.linalg.norm(hop)))
+def _longest_samples(task: Task) -> int:
+    """Returns the number of samples of the longest horizon."""
+    return round(LONGEST_HORIZON / task.dt)
 
 
-def room_along(
-    task: Task,
-    points: np.ndarray,
-    partition: Partition,
-    winning: tuple[np.ndarray, ...],
-    eps: np.ndarray,
+def _between_samples(path: np.ndarray, grid: Grid) -> np.ndarray:
+    """Returns points (N, d) along paths (K + 1, n, d), so close that they miss no cell of the grid."""
+    hops = np.diff(path, axis=0)
+    count = max(int(np.ceil(np.abs(hops / grid.spacing).max(initial=0.0))), 1)
+    shares = np.arange(count)[:, None, None, None] / count
+    d = path.shape[-1]
+    return np.concatenate([(path[:-1] + shares * hops).reshape(-1, d), path[-1]])
+
+
+def _narrow(
+    task: Task, points: np.ndarray, grid: Grid, winning: tuple[np.ndarray, ...], eps: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns where on M* a mode has less than 2 eps (d,) of room across M*, though some mode wins there.
+    """Returns where on M* some mode wins, but the modes have less than 2 eps (d,) of room across M*.
 
     Args:
         task: gives the chart.
         points: (N, d) of M*.
-        partition: gives the grid.
+        grid: the grid of W_i.
         winning: W_i of each mode, (N,) bool over the nodes.
         eps: (d,) noise bound along each coordinate.
 
     Returns:
         Points (K, d) of M*, and the room (K,) at each: how far to either side all modes still succeed.
     """
-    grid = partition.grid
     shares = np.arange(0.0, 1.0 + 1e-9, 0.02)
     reach = 2 * eps.max(initial=0.0)
     if not len(points) or not reach or len(winning) < 2:
@@ -246,9 +266,9 @@ def room_along(
             continue
         line = grid.nearest((points[:, None] + shares[:, None] * direction).reshape(-1, len(eps)))
         for wins in winning:
-            ok = wins[line].reshape(len(points), -1)
-            first = np.where(ok.all(axis=1), len(shares), ok.argmin(axis=1))
-            room = np.minimum(room, np.maximum(first - 1, 0) * 0.02 * reach)
+            succeeds = wins[line].reshape(len(points), -1)
+            first_loss = np.where(succeeds.all(axis=1), len(shares), succeeds.argmin(axis=1))
+            room = np.minimum(room, np.maximum(first_loss - 1, 0) * 0.02 * reach)
     someone = np.any([wins[grid.nearest(points)] for wins in winning], axis=0)
     narrow = someone & (room < reach - grid.cell)
     return points[narrow], room[narrow]

@@ -1,4 +1,4 @@
-"""Stage 7: the hybrid system that joins the mode policies with hysteresis."""
+"""Stage 7 (paper, Step 7): the hybrid system that joins the mode policies with hysteresis."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ from hyrl_mj.policies import Policy, check_modes
 from hyrl_mj.sets import Complement, StateSet
 from hyrl_mj.tasks import Task
 
-# A point this close to the edge of a flow set is on it [chart units].
+# A point this close to the edge of a flow set is on the edge [chart units].
 ON_EDGE = 1e-9
 Rows = np.ndarray | slice
 
 
 @dataclass(frozen=True)
 class HybridController:
-    """H = (C, F, D, G) with state (z, q) (paper, Step 7), sampled: a pure function, no hidden state.
+    """H = (C, F, D, G) with state (z, q) (paper, Step 7, equations (9) and (10)), sampled.
 
-    In mode q the policy pi_q flows on C_q = M_ext_q. On D_q, the closure of the rest, q jumps, to the
-    other mode; with more than two, to the one whose flow set holds z most deeply. On the edge, where
-    both are allowed, it flows: noise of just the bound that the sets are made for does not flip it.
+    In mode q the policy pi_q flows on C_q = M_ext_q. On D_q, the closure of the rest, q jumps to the other
+    mode; among several, to the one whose flow set holds z most deeply. On the edge, where both are allowed,
+    the controller flows, so that noise of exactly the bound does not switch the mode. The controller is a
+    pure function of measurement and mode.
 
     Attributes:
         task: gives the chart and checks measurements.
         policies: the policy of each mode.
         flow_sets: C_q of each mode.
-        starts: a set for each mode by which the start mode is picked; by default the flow sets.
+        starts: a set for each mode that selects the start mode; by default the flow sets.
     """
 
     task: Task
@@ -56,28 +57,21 @@ class HybridController:
         return tuple(sorted(self.policies))
 
     def flow_set(self, q: int) -> StateSet:
-        """C_q, where mode q flows."""
-        self._rows(np.array([q]))
+        """Returns C_q, where mode q flows."""
+        check_modes(np.array([q]), self.modes)
         return self.flow_sets[q]
 
     def jump_set(self, q: int) -> StateSet:
-        """D_q, where mode q jumps."""
+        """Returns D_q, where mode q jumps."""
         return Complement(self.flow_set(q))
 
     def initial_mode(self, measured: np.ndarray) -> np.ndarray:
-        """The mode whose flow set, or start set, holds the first measurement most deeply.
-
-        Args:
-            measured: (n, p) measurements.
-
-        Returns:
-            (n,) int modes.
-        """
+        """Returns the modes (n,) whose start sets hold the first measurements (n, p) most deeply."""
         z = self.task.z(self.task.check_measurement(measured))
-        return self._deepest(self.modes, z, self.starts)
+        return self._deepest(self.modes, z, self.starts or self.flow_sets)
 
     def step(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """One sample: jump where z lies in D_q, then u = pi_q(measured).
+        """Computes one sample: modes jump where z lies in D_q, then u = pi_q(measured).
 
         Args:
             q: (n,) int modes.
@@ -105,7 +99,7 @@ class HybridController:
         return u, q_next.astype(int)
 
     def _jump(self, q: np.ndarray, z: np.ndarray, rows_of: dict[int, Rows]) -> np.ndarray:
-        """The modes (n,) after the jumps that z (n, d) calls for; q itself if it calls for none."""
+        """Returns the modes (n,) after the jumps from z (n, d); q itself without jumps."""
         q_next = q
         for mode, rows in rows_of.items():
             jumps = self.flow_sets[mode].signed_distance(z[rows]) > ON_EDGE
@@ -113,24 +107,20 @@ class HybridController:
                 others = [other for other in self.modes if other != mode]
                 q_next = q.copy() if q_next is q else q_next
                 jumping = np.arange(len(q))[rows][jumps]
-                q_next[jumping] = self._deepest(others, z[jumping])
+                q_next[jumping] = self._deepest(others, z[jumping], self.flow_sets)
         return q_next
 
     def _deepest(
-        self, modes: Sequence[int], z: np.ndarray, sets: Mapping[int, StateSet] | None = None
+        self, modes: Sequence[int], z: np.ndarray, sets: Mapping[int, StateSet]
     ) -> np.ndarray:
-        """That of the modes (n,) whose set, by default its flow set, holds z (n, d) most deeply."""
+        """Returns those of the modes (n,) whose sets hold z (n, d) most deeply."""
         if len(modes) == 1:
             return np.full(len(z), modes[0])
-        distances = [(sets or self.flow_sets)[q].signed_distance(z) for q in modes]
+        distances = [sets[q].signed_distance(z) for q in modes]
         return np.array(modes)[np.argmin(distances, axis=0)]
 
     def _rows(self, q: np.ndarray) -> dict[int, Rows]:
-        """The rows of q (n,) in each mode that has any.
-
-        Raises:
-            BadInput: a mode is unknown.
-        """
+        """Returns the rows of q (n,) in each mode that occurs; refuses unknown modes."""
         if len(q) == 1 and q[0] in self.modes:
             return {int(q[0]): slice(None)}  # without a copy
         rows = {mode: (q == mode).nonzero()[0] for mode in self.modes}

@@ -1,4 +1,4 @@
-"""Stages 3 and 4: split the chart by the way the closed loop goes, and one policy for each part."""
+"""Stages 3 and 4 (paper, Steps 3 and 4): the parts M_i of the chart, and a policy pi_i for each part."""
 
 from __future__ import annotations
 
@@ -10,24 +10,28 @@ import numpy as np
 
 from hyrl_mj.artifacts import Saved
 from hyrl_mj.errors import BadInput
-from hyrl_mj.policies import Policy, PolicyController
+from hyrl_mj.game import NEVER, Limit
+from hyrl_mj.policies import Policy
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.simulation import LoopSettings, closed_loop, ways
-from hyrl_mj.stages.critical_set import check_points
+from hyrl_mj.simulation import ways
+from hyrl_mj.stages.critical_set import check_points, policy_runs
 from hyrl_mj.tasks import Outcome, Task
+
+# The neighbourhood of M* is at least this many cells wide, and as wide as the longest hop in one sample.
+NEIGHBOURHOOD_CELLS = 4
 
 
 @dataclass(frozen=True)
 class Partition(Saved):
     """The parts M_i (paper, Step 3).
 
-    States where there is nothing left to decide (beyond the obstacle, at the set-point) belong to
-    every part.
+    States from which nothing is left to decide (beyond the obstacle, at the set-point) belong to every
+    part.
 
     Attributes:
         modes: the modes.
-        parts: M_i for each mode, in the same order.
-        succeeds: (N,) bool, the grid's nodes from which the stage-1 policy reaches its goal.
+        parts: M_i of each mode, in the same order.
+        succeeds: (N,) bool, the grid's nodes from which the stage-1 policy reaches the set-point.
     """
 
     KIND: ClassVar[str] = "partition"
@@ -49,7 +53,7 @@ class Partition(Saved):
 
     @property
     def grid(self) -> Grid:
-        """The grid that the parts live on."""
+        """The grid of the parts."""
         return self.parts[0].grid
 
     def sentence(self, task: Task) -> str:
@@ -79,33 +83,79 @@ def check_sets(
 def make_partition(task: Task, policy: Policy, points: np.ndarray, cells: int) -> Partition:
     """Splits the nodes of a grid by the way that the closed loop goes from each (paper, Step 3).
 
-    Without a critical set there is nothing to split: one part, mode 0, holds everything.
+    If M* is empty, there is one part, of mode 0, that holds the whole chart.
 
     Args:
-        task: gives chart, plant, and the direction of a run.
+        task: gives chart, plant, and the way of a run.
         policy: the stage-1 policy.
         points: (N, d) of M*, from stage 2.
         cells: cells of the grid along the longest side of the chart.
     """
     points = check_points(task, points)
     grid = Grid.with_cells(task.chart, cells)
-    loop, settings = PolicyController(policy), LoopSettings(label="partition")
-    rollout = closed_loop(task, loop, grid.nodes, settings=settings)
-    succeeds = rollout.outcome == Outcome.REACHED
+    rollout = policy_runs(task, policy, grid.nodes, label="partition")
     way = ways(task, rollout)
     if not len(points):
         way = np.full_like(way, -1)
     modes = tuple(int(q) for q in np.unique(way[way >= 0])) or (0,)
     parts = tuple(GridSet.from_mask(grid, (way == q) | (way < 0)) for q in modes)
-    return Partition(modes, parts, succeeds)
+    return Partition(modes, parts, rollout.outcome == Outcome.REACHED)
+
+
+def with_room(
+    task: Task, policy: Policy, partition: Partition, limit: Limit, noise: float
+) -> Partition:
+    """Returns the parts, changed where the policy goes a way that is about to close while another is not.
+
+    An agent that drives towards the middle of an obstacle and decides at the last moment leaves no room for
+    an overlap. A state with less room for its way than 2 eps and one sample is therefore assigned to the
+    mode whose way has the most room. Where every way has that room, or none has any, the decision of the
+    policy stands.
+
+    Args:
+        task: gives the noisy coordinates.
+        policy: the agent.
+        partition: M_i, by the way that the policy goes.
+        limit: from where each way is open.
+        noise: bound eps of the measurement noise.
+    """
+    grid = partition.grid
+    if len(partition.parts) < 2:
+        return partition
+    hop = longest_hop(task, policy, grid) * (task.noise_in_chart(1.0) > 0)
+    wanted = float((2 * task.noise_in_chart(noise) + hop).max())
+    room = -np.stack([GridSet.from_mask(grid, open_).values for open_ in open_ways(limit, grid)])
+    masks = np.stack([part.mask for part in partition.parts])
+    own = np.where(masks, room, -np.inf).max(axis=0)
+    best = room.argmax(axis=0)
+    moved = (masks.sum(axis=0) == 1) & (own < wanted) & (room.max(axis=0) > np.maximum(own, 0))
+    parts = tuple(
+        GridSet.from_mask(grid, np.where(moved, best == i, mask)) for i, mask in enumerate(masks)
+    )
+    return Partition(partition.modes, parts, partition.succeeds)
+
+
+def open_ways(limit: Limit, grid: Grid) -> tuple[np.ndarray, ...]:
+    """Returns the nodes (N,) bool of a grid from which each mode's way is open."""
+    at = limit.lattice.grid.nearest(grid.nodes)
+    return tuple(samples[at] < NEVER for samples in limit.samples)
+
+
+def boundary(partition: Partition) -> np.ndarray:
+    """Returns points (N, d) between neighbouring nodes of which no part holds both."""
+    grid = partition.grid
+    first, second = grid.neighbours()
+    shared = np.any([part.mask[first] & part.mask[second] for part in partition.parts], axis=0)
+    a, b = grid.nodes[first[~shared]], grid.nodes[second[~shared]]
+    return np.asarray(a + grid.chart.difference(b, a) / 2)
 
 
 @dataclass(frozen=True)
 class PartPolicy:
-    """pi_i: the stage-1 policy on M_i, elsewhere what it does at the nearest point (paper, Step 4).
+    """pi_i (paper, Step 4): the stage-1 policy on M_i; elsewhere, its input at the nearest point of M_i.
 
-    Near M* a continuous policy goes neither way, so the neighbourhood of the boundary counts as
-    elsewhere: there, too, pi_i does what the stage-1 policy does where it has made up its mind.
+    Near M* a continuous policy decides for neither way. The neighbourhood of the boundary therefore counts
+    as elsewhere: there, too, pi_i takes the input of the nearest point at which the policy has decided.
 
     Attributes:
         task: gives the chart.
@@ -124,7 +174,18 @@ class PartPolicy:
 
 
 def part_policies(
-    task: Task, policy: Policy, partition: Partition, neighbourhood: float
+    task: Task, policy: Policy, partition: Partition, near: float
 ) -> tuple[PartPolicy, ...]:
-    """Returns pi_i for each mode; `neighbourhood` is the distance from M* that counts as near it."""
-    return tuple(PartPolicy(task, policy, part.eroded(neighbourhood)) for part in partition.parts)
+    """Returns pi_i of each mode; `near` is the width of the neighbourhood of M*."""
+    return tuple(PartPolicy(task, policy, part.eroded(near)) for part in partition.parts)
+
+
+def neighbourhood(grid: Grid, noise: float, hop: np.ndarray) -> float:
+    """Returns the width of the neighbourhood of M*: the noise, some cells, or one sample's hop (d,)."""
+    return max(noise, NEIGHBOURHOOD_CELLS * grid.cell, float(np.linalg.norm(hop)))
+
+
+def longest_hop(task: Task, policy: Policy, grid: Grid) -> np.ndarray:
+    """Returns the longest hop (d,) of the closed loop in one sample, along each coordinate."""
+    path = policy_runs(task, policy, grid.nodes, steps=1).path
+    return np.asarray(np.abs(path[-1] - path[0]).max(axis=0))

@@ -1,4 +1,4 @@
-"""Stage 6: one policy for each extended set, trained there and nowhere else."""
+"""Stage 6 (paper, Step 6): one policy for each extended set, trained on that set only."""
 
 from __future__ import annotations
 
@@ -9,47 +9,35 @@ from pathlib import Path
 
 import numpy as np
 
+from hyrl_mj import game
 from hyrl_mj.envs import Domain
-from hyrl_mj.game import (
-    LOST,
-    NEVER,
-    Answers,
-    Lattice,
-    Moves,
-    fewest_samples,
-    lasting,
-    noisy_moves,
-    solve,
-)
 from hyrl_mj.learning import Training, symmetry
 from hyrl_mj.learning.distillation import distil, fits
 from hyrl_mj.learning.training import Score, train
 from hyrl_mj.policies import ALGORITHMS, MlpPolicy, Policy, PolicyController
 from hyrl_mj.sets import GridSet
 from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
-from hyrl_mj.stages.extended_sets import ExtendedSets, neighbourhood
-from hyrl_mj.stages.partition import Partition, part_policies
-from hyrl_mj.stages.reachability import longest_hop
+from hyrl_mj.stages.extended_sets import ExtendedSets
+from hyrl_mj.stages.partition import Partition, longest_hop, neighbourhood, part_policies
 from hyrl_mj.tasks import Outcome, Task
 
-# Of the starts of training episodes this share is where the game is lost, if it is; of the others this
-# share comes from where the task starts, the rest from all over the mode's domain.
+# If the game is lost from some states, this share of the training episodes starts there.
 LOST_SHARE = 0.2
+# Of the other episodes, this share starts where the task starts, the rest anywhere in the mode's domain.
 TASK_SHARE = 0.7
-# States that fail in k samples are met in proportion to k to this power: failures are learned backward.
+# States that lose in k samples are drawn in proportion to k to this power: they are learned backward.
 URGENCY = -1.5
-# The latest arrival may be this share behind the fewest samples there are.
+# The latest arrival may take this share longer than the fewest samples possible.
 ALLOWED_DELAY = 0.03
-# The kinds of noise that a policy is judged by where the worst case cannot be played, the mildest first.
+# Where the worst case cannot be computed: the kinds of noise that judge a policy, the mildest first, the
+# episodes for each kind, and how many run at once. Most policies are bad and fail in the first batch.
 JUDGES = ("none", "uniform", "alternating", "adversarial")
-# Episodes for each kind of noise that a policy is judged by where the worst case cannot be played, and how
-# many at a time: bad policies, which most are, need not be followed through all.
-EPISODES, TOGETHER = 256, 64
+EPISODES, BATCH = 256, 64
 
 
 @dataclass(frozen=True)
 class WarmStart:
-    """What the first attempt of stage 6 can go on from.
+    """What the first attempt of stage 6 continues from.
 
     Attributes:
         policy: the stage-1 policy, or the agent.
@@ -60,27 +48,22 @@ class WarmStart:
     partition: Partition
 
     def policy_for(self, ground: ModeGround, settings: Training, seed: int) -> MlpPolicy | None:
-        """Returns the policy that training goes on from; None if it has to start afresh.
+        """Returns the policy that training continues from; None if it starts from new weights.
 
-        PPO and A2C go on from pi_i, what the policy does on M_i, continued over the boundary (paper, Step
-        4), distilled into their network. The policy's own weights would bring its decision along, which
-        they do not let go of. Other algorithms go on from the weights, if these fit.
-
-        Args:
-            ground: of the mode.
-            settings: of the training.
-            seed: of weights and points of the distillation.
+        PPO and A2C continue from pi_i (paper, Step 4), distilled into their network: with the policy's own
+        weights, they would keep its decision. Other algorithms continue from the weights, if these fit.
+        `seed` draws the weights and the points of the distillation.
         """
         task, policy, partition = ground.task, self.policy, self.partition
         if not ALGORITHMS[settings.algorithm].is_actor_critic:
-            if isinstance(policy, MlpPolicy) and fits(task, settings, policy):
-                return policy
-            return None
+            return (
+                policy if isinstance(policy, MlpPolicy) and fits(task, settings, policy) else None
+            )
         hop = longest_hop(task, policy, partition.grid)
         near = neighbourhood(partition.grid, ground.extended.noise, hop)
         index = partition.modes.index(ground.mode)
-        part = part_policies(task, policy, partition, near)[index]
-        return distil(task, part, ground.starts, settings, seed)
+        pi = part_policies(task, policy, partition, near)[index]
+        return distil(task, pi, ground.starts, settings, seed)
 
 
 def retrain(
@@ -92,23 +75,23 @@ def retrain(
     others: Iterable[MlpPolicy] = (),
     log_dir: Path | None = None,
 ) -> MlpPolicy:
-    """Train the policy of one mode (paper, Step 6).
+    """Trains the policy of one mode (paper, Step 6).
 
-    A policy that passes an obstacle closer than the noise bound is led into it, and no switching cures
-    that. So the reward is that of the worst state that the measurement may stand for, and training goes
-    on where the worst-case game is lost.
+    Noise leads a policy that passes an obstacle closer than the noise bound into the obstacle, and no
+    switching prevents that. The reward is therefore that of the worst state within the noise bound of the
+    measurement, and training continues where the worst-case game is lost.
 
     Args:
         ground: where the mode has to win, and the judge of its policies; see `mode_ground`.
-        settings: how to train.
-        seed: of everything random; each mode and attempt derives its own from it.
-        warm_start: what the first attempt goes on from, if `settings.warm_start` asks for it.
-        others: policies of other modes: if the mirror image of one is good enough here, it is taken.
-        log_dir: where logs and checkpoints go.
+        settings: settings of the training.
+        seed: seed of all random numbers; each mode and attempt derives its own from it.
+        warm_start: what the first attempt continues from, if `settings.warm_start` is set.
+        others: policies of other modes; a mirror image of one is used if it is good enough for this mode.
+        log_dir: folder of logs and checkpoints.
 
     Returns:
-        The best policy of all attempts and the one that they went on from, or the first mirror image that
-        is good enough.
+        The first mirror image that is good enough; otherwise the best policy, of all attempts and the one
+        that the first continued from.
     """
     task, mode = ground.task, ground.mode
     if task.mirror is not None:
@@ -144,25 +127,25 @@ def retrain(
 
 
 def mode_ground(task: Task, extended: ExtendedSets, mode: int) -> ModeGround:
-    """The ground of a mode: judged by the worst-case game where it can be played, else by episodes."""
-    return (ByGame if Lattice.possible(task) else ByEpisodes)(task, extended, mode)
+    """Returns the ground of a mode, judged by the worst-case game if possible, otherwise by episodes."""
+    return (ByGame if game.Lattice.possible(task) else ByEpisodes)(task, extended, mode)
 
 
 class ModeGround(ABC):
-    """Where one mode has to win: draws starts from it, and scores its policies (a `Ground` of `train`).
+    """Where one mode has to win: draws starts from it, and scores policies (a `Ground` of `train`).
 
-    It is every state whose measurement can lie in M_ext_i and from which the mode can still succeed.
+    These are all states whose measurement can lie in M_ext_i and from which the mode can still succeed.
 
     Args:
-        task: what is to be learned.
+        task: the robot and its problem.
         extended: M_ext_i and W_i.
         mode: the mode.
 
     Attributes:
         enough: the score of a policy that is good enough.
         settled: share of the training after which scores count: from the beginning.
-        noise: on the measurements while the mode is trained.
-        bound: how far a measured chart point may be off, by coordinate (d,).
+        noise: noise on the measurements during training.
+        bound: (d,) largest error of a measured chart point, along each coordinate.
     """
 
     enough: Score
@@ -179,7 +162,7 @@ class ModeGround(ABC):
         plant = task.plant(len(self.grid.nodes))
         plant.set_state(*task.state(self.grid.nodes))
         alive = task.ending(plant.measurement) == Outcome.RUNNING
-        # If the stage-1 policy never succeeds here, training may still find a way.
+        # Where the stage-1 policy never succeeds, training may still find a way.
         wins = extended.winning[index]
         self.wanted = within & alive & (wins if (within & alive & wins).any() else True)
         self.nodes = np.flatnonzero(self.wanted)
@@ -189,50 +172,48 @@ class ModeGround(ABC):
         self._latest: tuple[MlpPolicy, Score] | None = None
 
     def __call__(self, policy: MlpPolicy) -> Score:
-        """The score of a policy. Starts are drawn from what the latest policy has lost."""
+        """Returns the score of a policy. Later starts are drawn where the latest policy has lost."""
         if self._latest is None or self._latest[0] is not policy:
             self._latest = policy, self.score(policy)
         return self._latest[1]
 
     @abstractmethod
     def score(self, policy: MlpPolicy) -> Score:
-        """What `__call__` gives for a policy that was not just asked about."""
+        """Computes the score of a policy, and remembers where it lost."""
 
     def domain(self, gamma: float) -> Domain:
-        """Where training goes on; leaving it counts as the worst reward for ever."""
+        """Returns the domain of training; leaving it costs the worst reward for ever."""
         caution = self.extended.noise * np.array(self.task.noisy, dtype=float)
         exit_reward = self.task.worst_reward / (1 - gamma)
         return Domain(self.starts, self.within.contains, exit_reward, caution)
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draws n starts (n, d): where the game is lost, where the task starts, and all over."""
-        at = np.where(
-            rng.random(n) < TASK_SHARE, rng.choice(self.early, n), rng.choice(self.nodes, n)
-        )
+        early = rng.random(n) < TASK_SHARE
+        at = np.where(early, rng.choice(self.early, n), rng.choice(self.nodes, n))
         if len(self.lost):
             lost = rng.choice(self.lost, n, p=self._weight)
             at = np.where(rng.random(n) < LOST_SHARE, lost, at)
         return self._around(at, rng)
 
     def _around(self, at: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Draws points (n, d) in the cells around nodes at (n,)."""
-        n, chart, d = len(at), self.task.chart, self.task.chart.dimension
-        z = self.grid.nodes[at] + rng.uniform(-0.5, 0.5, (n, d)) * self.grid.spacing
+        """Draws points (n, d) in the cells around the nodes of indices `at` (n,)."""
+        nodes, chart = self.grid.nodes[at], self.task.chart
+        z = nodes + rng.uniform(-0.5, 0.5, nodes.shape) * self.grid.spacing
         return np.where(chart.periodic, z, np.clip(z, chart.low, chart.high))
 
     def _remember(self, lost: np.ndarray, weight: np.ndarray) -> None:
-        """Keeps the nodes (k,) that were lost, and how much of the training each is worth (k,)."""
+        """Keeps the lost nodes (k,), and the weights (k,) with which starts are drawn from them."""
         self.lost, self._weight = lost, weight / max(weight.sum(), 1e-300)
 
 
 class ByGame(ModeGround):
     """Judges by the worst-case game, which has to be won from every state.
 
-    The score is minus the share of states lost, then minus delay or miss, whichever exceeds its limit more.
-
-    The delay is that of the latest arrival behind the fewest samples there are. The miss is how far
-    off the set-point the noise can keep a run for ever, beyond the noise bound itself; where runs end,
-    how far off they end without noise.
+    The score is minus the share of lost states, then minus the larger of delay and miss, each as a multiple
+    of its limit. The delay is how much longer the latest arrival takes than the fewest samples possible. The
+    miss is how far from the set-point, beyond the noise bound, noise can keep a run for ever; if runs end, it
+    is how far from the set-point they end without noise.
     """
 
     enough: Score = (0.0, -1.0)
@@ -240,18 +221,18 @@ class ByGame(ModeGround):
 
     def __init__(self, task: Task, extended: ExtendedSets, mode: int):
         super().__init__(task, extended, mode)
-        self.lattice = Lattice.of(task, self.grid)
+        self.lattice = game.Lattice.of(task, self.grid)
         after = self.lattice.after
         inside = np.append(self.within.mask, [True, False])[after]
-        fewest, _ = fewest_samples(self.lattice, after, inside)
-        self.fewest = int(fewest[self.nodes][fewest[self.nodes] < NEVER].max(initial=0))
+        fewest, _ = game.fewest_samples(self.lattice, after, inside)
+        self.fewest = int(fewest[self.nodes][fewest[self.nodes] < game.NEVER].max(initial=0))
 
     def score(self, policy: MlpPolicy) -> Score:
-        answers = Answers.of(self.lattice, PolicyController(policy), self.bound)
-        moves = noisy_moves(answers, self.bound)
-        value = solve(moves)[0, :-2]
-        lost = np.flatnonzero(self.wanted & (value >= NEVER))
-        samples = np.where(value > NEVER, LOST - value, self.task.max_steps)[lost]
+        answers = game.Answers.of(self.lattice, PolicyController(policy), self.bound)
+        moves = game.noisy_moves(answers, self.bound)
+        value = game.solve(moves)[0, :-2]
+        lost = np.flatnonzero(self.wanted & (value >= game.NEVER))
+        samples = np.where(value > game.NEVER, game.LOST - value, self.task.max_steps)[lost]
         self._remember(lost, np.maximum(samples, 1.0) ** URGENCY)
         if len(lost):
             return -len(lost) / len(self.nodes), -np.inf
@@ -259,14 +240,14 @@ class ByGame(ModeGround):
         miss = self._miss(answers, moves)
         return 0.0, -float(max(delay / ALLOWED_DELAY, miss / self.task.precision))
 
-    def _miss(self, answers: Answers, moves: Moves) -> float:
-        """Returns how far off the set-point the runs of the last policy end, or are kept by noise."""
+    def _miss(self, answers: game.Answers, moves: game.Moves) -> float:
+        """Returns the miss, from the answers of a policy and the moves of the noise."""
         grid, after = self.lattice.grid, self.lattice.after
-        still = lasting(moves, self.wanted)
+        still = game.lasting(moves, self.wanted)
         if still.any():
             return float(self.task.miss(grid.nodes[still]).max() - self.bound.max())
-        # Without noise, down to the last nodes on the chart; the sample after these ends most runs.
-        # A controller of one mode answers with levels alone.
+        # Follow the runs without noise to their last nodes on the chart; the next sample ends most of them.
+        # The answers of a controller with one mode are levels.
         level = answers.index[0][answers.middle].ravel()
         last = self.early
         for _ in range(self.task.max_steps):
@@ -280,14 +261,14 @@ class ByGame(ModeGround):
 
 
 class ByEpisodes(ModeGround):
-    """Judges by noisy episodes, where the worst case cannot be played.
+    """Judges by noisy episodes, where the worst case cannot be computed.
 
-    They start where the hybrid controller may pick the mode. Without noise all have to arrive at the
-    set-point, under noise to survive. The kinds of noise come in the order of `JUDGES`: the score is how many
-    of them stop no episode, then minus the share of episodes that the next one stops.
+    The episodes start where the hybrid controller may select the mode. Without noise all have to arrive at
+    the set-point, under noise all have to survive. The score is the number of kinds of noise, in the order of
+    `JUDGES`, that stop no episode, then minus the share of episodes that the next kind stops.
 
     Attributes:
-        judged: (n, d) where they start.
+        judged: (n, d) starts of the episodes.
     """
 
     enough: Score = (float(len(JUDGES)), 0.0)
@@ -301,14 +282,14 @@ class ByEpisodes(ModeGround):
         rng = np.random.default_rng(0)
         first = rng.choice(self.early[picked] if picked.any() else self.early, EPISODES)
         self.judged = self._around(first, rng)
-        self._plant = task.plant(TOGETHER)
+        self._plant = task.plant(BATCH)
 
     def score(self, policy: MlpPolicy) -> Score:
         loop = PolicyController(policy)
         settings = LoopSettings(plant=self._plant, vary=True, quiet=True)
         for survived, kind in enumerate(JUDGES):
-            for done in range(0, EPISODES, TOGETHER):
-                starts = self.judged[done : done + TOGETHER]
+            for done in range(0, EPISODES, BATCH):
+                starts = self.judged[done : done + BATCH]
                 noise = Noise(kind, self.extended.noise)
                 run = closed_loop(self.task, loop, starts, noise, seed=done, settings=settings)
                 won = run.outcome == Outcome.REACHED
@@ -317,5 +298,5 @@ class ByEpisodes(ModeGround):
                 lost = self.grid.nearest(starts[~won])
                 self._remember(lost, np.ones(len(lost)))
                 if len(lost):
-                    return float(survived), -len(lost) / (done + TOGETHER)
+                    return float(survived), -len(lost) / (done + BATCH)
         return self.enough

@@ -15,7 +15,7 @@ from benchmarks.runs import Runs
 from hyrl_mj import Run, Task, extend, find_critical_set
 from hyrl_mj.learning.training import build
 from hyrl_mj.simulation import LoopSettings
-from hyrl_mj.stages import reachability
+from hyrl_mj.stages import critical_set
 from hyrl_mj.stages.critical_set import PARTING, SAMPLES
 from hyrl_mj.stages.partition import PartPolicy
 from hyrl_mj.tasks import Outcome
@@ -45,13 +45,13 @@ def _extension(run: Run) -> Figure:
     task, settings = run.task, run.settings
     args = (task, run.policy, run.critical_set.points, run.partition, settings.noise)
     calls: list[tuple[Any, np.ndarray, LoopSettings]] = []
-    batched = reachability.closed_loop
+    batched = critical_set.closed_loop
 
     def noted(task: Task, controller: Any, z0: np.ndarray, *, settings: LoopSettings) -> Any:
         calls.append((controller.policy, z0, settings))
         return batched(task, controller, z0, settings=settings)
 
-    with mock.patch.object(reachability, "closed_loop", noted):
+    with mock.patch.object(critical_set, "closed_loop", noted):
         extend(*args)
     starts = sum(len(z0) for _, z0, _ in calls)
     predict = _Predict(run)
