@@ -382,18 +382,18 @@ def test_of_three_dimensions_a_section_is_drawn_and_the_runs_over_time():
     arcs = {("start0", "policy"): simulate(cube, policy, starts)[0]}
     for q in (0, 1):
         arcs["start0", f"hyrl_q{q}"] = simulate(cube, loop, starts, q0=q)[0]
-    section = Section.of(cube)
-    grid = Grid.with_cells(section.task.chart, 20)
+    section = Section(cube)
+    grid = Grid.with_cells(section.chart, 20)
     half = GridSet(grid, grid.nodes[:, 0])
     shown = figures.ShownRun(
-        section.task,
+        section,
         "PPO",
         policy,
         NONE,
         Partition((0, 1), (half, ~half), half.mask),
         noisy=section.arc(arcs["start0", "policy"]),
-        noiseless=tuple(overview_arcs(section.task, policy)),
-        paper=tuple(policy_start_arcs(section.task, policy, EPS, 0)),
+        noiseless=tuple(overview_arcs(section, policy)),
+        paper=tuple(policy_start_arcs(section, policy, EPS, 0)),
         whole=cube,
         sets=ExtendedSets((0, 1), (half, ~half), (), 0.3, EPS, np.empty((0, 2)), np.empty(0)),
         replays=arcs,

@@ -1,6 +1,7 @@
 """The plane that is drawn of a chart of three dimensions."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,8 +13,9 @@ from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
+from hyrl_mj.viz import section as section_module
 from hyrl_mj.viz.replay.marks import on_floor
-from hyrl_mj.viz.section import Section, SectionTask
+from hyrl_mj.viz.section import Section
 
 HEIGHT, RADIUS = 0.3, 0.7
 ACROSS = np.sqrt(RADIUS**2 - HEIGHT**2)
@@ -34,7 +36,7 @@ def cube():
 
 @pytest.fixture(scope="module")
 def section(cube):
-    return Section.of(cube)
+    return Section(cube)
 
 
 @pytest.fixture(scope="module")
@@ -60,10 +62,13 @@ def test_a_ball_becomes_a_disc(section, ball):
         np.testing.assert_array_equal(wins[sure], inside[sure])
 
 
-def test_its_critical_set_is_searched_for_in_the_plane(cube, section):
+def test_its_critical_set_is_searched_for_in_the_plane(cube, section, monkeypatch):
     policy = sphere_policy(cube, RADIUS)
     whole = find_critical_set(cube, policy, 8, 1 / 4)
-    found = section.critical_set(whole, policy, 20, 1 / 16)
+    settings = SimpleNamespace(rods=20, resolution=1 / 16)
+    run = SimpleNamespace(critical_set=whole, steady=policy, settings=settings)
+    monkeypatch.setattr(section_module, "CELLS", 20)
+    found = section.critical_set(run)
     assert found.points.shape[1] == 2
     assert len(found.points) > 30
     off = np.abs(np.linalg.norm(found.points, axis=1) - ACROSS)
@@ -73,16 +78,16 @@ def test_its_critical_set_is_searched_for_in_the_plane(cube, section):
 def test_runs_in_it_are_those_of_the_whole_task(cube, section):
     z = np.array([[0.2, 0.1], [-0.5, 0.4]])
     loop = PolicyController(sphere_policy(cube, RADIUS))
-    seen = closed_loop(section.task, loop, z, settings=LoopSettings(steps=5))
+    seen = closed_loop(section, loop, z, settings=LoopSettings(steps=5))
     whole = closed_loop(cube, loop, section.lift(z), settings=LoopSettings(steps=5))
     np.testing.assert_array_equal(seen.path, whole.path[..., :2])
     np.testing.assert_array_equal(seen.measured, whole.measured)
 
 
 def test_it_says_where_it_is(section):
-    chart = section.task.chart
+    chart = section.chart
     assert (chart.names, chart.section) == (("a", "b"), "c = 0.3 m")
-    assert section.task.set_point.tolist() == [0.0, 0.0]
+    assert section.set_point.tolist() == [0.0, 0.0]
 
 
 # Of `Task`, what follows from the chart and the methods, so that a section inherits it.
@@ -94,14 +99,19 @@ DERIVED = {
 
 def test_its_task_defines_all_that_a_task_has():
     public = {name for name in vars(Task) if not name.startswith("_")}
-    assert public <= {*vars(SectionTask), *DERIVED}, "a new part of a task has to be cut, too"
+    assert public <= {*vars(Section), *DERIVED}, "a new part of a task has to be cut, too"
 
 
 def test_its_task_is_the_whole_one_but_for_the_chart():
     rover = hyrl_mj.get_task("rover")
     before = dict(vars(rover))
-    task, rng = Section.of(rover).task, np.random.default_rng(0)
-    assert {name for name in vars(rover) if name not in before} <= {"chart", "set_point", "model"}
+    task, rng = Section(rover), np.random.default_rng(0)
+    assert {name for name in vars(rover) if name not in before} <= {
+        "arena",
+        "chart",
+        "set_point",
+        "model",
+    }
     assert (task.name, task.speed) == ("rover", rover.speed)
     with pytest.raises(AttributeError, match="wheel_count"):
         task.wheel_count  # noqa: B018
@@ -143,8 +153,9 @@ def test_its_task_is_the_whole_one_but_for_the_chart():
 
 
 def test_a_plane_is_left_as_it_is(vehicle):
-    section = Section.of(vehicle)
-    assert section.task is vehicle
+    section = Section(vehicle)
+    assert section.chart == vehicle.chart
+    assert section.scene == vehicle.scene
     assert not section.cut
     something = object()
     assert section.partition(something) is something

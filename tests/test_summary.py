@@ -6,11 +6,12 @@ import pytest
 
 import hyrl_mj
 from hyrl_mj.pipeline import ExamineOptions, examine_run
-from hyrl_mj.viz.summary import print_robustness, print_summary
 from hyrl_mj.viz.tables import (
     arrivals,
     episode_table,
     margin_table,
+    print_robustness,
+    print_summary,
     replay_sentence,
     replay_table,
     score_table,

@@ -6,16 +6,12 @@ matplotlib, Pillow or a GL library, so they are imported only where they are nee
 
 from hyrl_mj.viz.commands import beginning
 from hyrl_mj.viz.options import ReplayOptions
-from hyrl_mj.viz.section import Section, critical_section
-from hyrl_mj.viz.summary import print_robustness, print_summary
-from hyrl_mj.viz.tables import replay_sentence, robustness_sentence
+from hyrl_mj.viz.tables import print_robustness, print_summary, replay_sentence, robustness_sentence
 
 __all__ = [
     "ReplayOptions",
-    "Section",
     "arcs",
     "beginning",
-    "critical_section",
     "diagnosis",
     "encoding",
     "figures",

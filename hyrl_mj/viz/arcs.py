@@ -13,7 +13,7 @@ from hyrl_mj.run_directory import Run
 from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, noise_kinds, samples, simulate_batch
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.replay import Floor, Show
-from hyrl_mj.viz.section import Section, critical_section
+from hyrl_mj.viz.section import Section
 
 # The starts of a replay.
 STARTS = ("critical", "paper", "latest")
@@ -140,10 +140,10 @@ def replay_shows(
 
 def replay_floor(run: Run, overlap: bool = True) -> Floor:
     """Returns the marks on the floor of a replay, in the section of the task's chart."""
-    section = Section.of(run.task)
+    section = Section(run.task)
     return Floor.of(
-        section.task,
-        critical_section(run),
+        section,
+        section.critical_set(run),
         section.partition(run.split if overlap else run.partition),
         section.extended_sets(run.extended_sets) if overlap else None,
     )

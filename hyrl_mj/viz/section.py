@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
 from hyrl_mj.chart import Chart
-from hyrl_mj.policies import Policy
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import HybridArc
@@ -21,15 +20,19 @@ CELLS = 40
 
 
 def _of_whole(name: str) -> Any:
-    """Returns a property of `SectionTask` with the attribute or method of the whole task."""
+    """Returns a property of `Section` with the attribute or method of the whole task."""
     return property(attrgetter(f"whole.{name}"))
 
 
-class SectionTask(Task):
-    """A task on the plane of its chart's first two coordinates; all else is that of the whole task.
+class Section(Task):
+    """A task on the plane of its chart's first two coordinates, in which results are drawn.
 
-    Args:
+    The other coordinates have the values of the scene's first start; all else is that of the whole task.
+    A chart of one or two dimensions stays whole.
+
+    Attributes:
         whole: the task.
+        cut: whether its chart has more coordinates than the section.
         rest: (d - 2,) values of the other coordinates.
     """
 
@@ -44,10 +47,11 @@ class SectionTask(Task):
     reward, danger = _of_whole("reward"), _of_whole("danger")
     ending, verdict = _of_whole("ending"), _of_whole("verdict")
 
-    def __init__(self, whole: Task, rest: np.ndarray):
-        self.whole, self.rest = whole, rest
+    def __init__(self, whole: Task):
         chart, scene = whole.chart, whole.scene
-        where = zip(chart.names[2:], rest, chart.units[2:], strict=True)
+        self.whole, self.cut = whole, chart.dimension > 2
+        self.rest = np.array(scene.starts[0][2:], dtype=float)
+        where = zip(chart.names[2:], self.rest, chart.units[2:], strict=True)
         self.chart = Chart(
             names=chart.names[:2],
             units=chart.units[:2],
@@ -74,7 +78,7 @@ class SectionTask(Task):
     def state(
         self, z: np.ndarray, rng: np.random.Generator | None = None
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        return self.whole.state(_lifted(z, self.rest), rng)
+        return self.whole.state(self.lift(z), rng)
 
     def z(self, measured: np.ndarray) -> np.ndarray:
         return self.whole.z(measured)[:, :2]
@@ -83,68 +87,37 @@ class SectionTask(Task):
         return self.whole.with_z(measured, np.hstack([z, self.whole.z(measured)[:, 2:]]))
 
     def arrived(self, z: np.ndarray) -> np.ndarray:
-        return self.whole.arrived(_lifted(z, self.rest))
+        return self.whole.arrived(self.lift(z))
 
     def miss(self, z: np.ndarray) -> np.ndarray:
-        return self.whole.miss(_lifted(z, self.rest))
+        return self.whole.miss(self.lift(z))
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         return self.whole.starts(n, rng)[:, :2]
 
     def direction(self, path: np.ndarray) -> np.ndarray:
-        return self.whole.direction(_lifted(path, self.rest))
+        return self.whole.direction(self.lift(path))
 
+    def lift(self, z: np.ndarray) -> np.ndarray:
+        """Returns the points (..., d) of the whole chart at points (..., 2) of the section."""
+        rest = np.broadcast_to(self.rest, (*z.shape[:-1], len(self.rest)))
+        return np.concatenate([z, rest], axis=-1)
 
-@dataclass(frozen=True)
-class Section:
-    """The plane through a chart of more than two dimensions in which results are drawn.
+    # ---- results in the section
 
-    The other coordinates have the values of the scene's first start. A chart of one or two dimensions
-    stays whole.
-
-    Attributes:
-        whole: the task.
-        task: the task on the plane, a `SectionTask`; `whole` itself if the chart is not cut.
-        rest: (d - 2,) values of the other coordinates.
-    """
-
-    whole: Task
-    task: Task
-    rest: np.ndarray
-
-    @staticmethod
-    def of(task: Task) -> Section:
-        """Returns the section of a task."""
-        chart = task.chart
-        if chart.dimension <= 2:
-            return Section(task, task, np.empty(0))
-        rest = np.array(task.scene.starts[0][2:], dtype=float)
-        return Section(task, SectionTask(task, rest), rest)
-
-    @property
-    def cut(self) -> bool:
-        """Whether the chart has more coordinates than the section."""
-        return self.task is not self.whole
-
-    def critical_set(
-        self, critical: CriticalSet, policy: Policy, cells: int, resolution: float
-    ) -> CriticalSet:
-        """Returns M* in the section, searched for by outcome; `critical` itself if nothing is cut.
-
-        The search begins with `cells` along the longest side; `resolution` is the length of its last
-        rods as a share of the first.
-        """
-        if not (self.cut and len(critical.points)):
-            return critical
-        grid = Grid.with_cells(self.task.chart, cells)
-        nodes = self.lift(grid.nodes)
-        rods = grid.neighbours()
-        points = critical_points(self.whole, policy, nodes, rods, grid.cell, resolution)[:, :2]
+    def critical_set(self, run: Run) -> CriticalSet:
+        """Returns M* of a run, searched for by outcome in the section."""
+        if not (self.cut and len(run.critical_set.points)):
+            return run.critical_set
+        resolution = run.settings.resolution
+        grid = Grid.with_cells(self.chart, max(run.settings.rods, CELLS))
+        nodes, rods = self.lift(grid.nodes), grid.neighbours()
+        points = critical_points(self.whole, run.steady, nodes, rods, grid.cell, resolution)[:, :2]
         one_piece = np.zeros(len(points), dtype=int)
         return CriticalSet(points, one_piece, resolution * grid.cell, grid.cell)
 
     def partition(self, partition: Partition) -> Partition:
-        """Returns the parts in the section."""
+        """Returns the parts."""
         if not self.cut:
             return partition
         parts = tuple(self._set(part) for part in partition.parts)
@@ -152,7 +125,7 @@ class Section:
         return Partition(partition.modes, parts, partition.succeeds[at])
 
     def extended_sets(self, extended: ExtendedSets) -> ExtendedSets:
-        """Returns the extended sets in the section."""
+        """Returns the extended sets."""
         if not self.cut:
             return extended
         sets = tuple(self._set(members) for members in extended.sets)
@@ -165,22 +138,6 @@ class Section:
         """Returns an arc with the section's coordinates."""
         return replace(arc, z=arc.z[:, :2]) if self.cut else arc
 
-    def lift(self, z: np.ndarray) -> np.ndarray:
-        """Returns the chart points (n, d) of points of the section (n, 2)."""
-        return _lifted(z, self.rest)
-
     def _set(self, members: GridSet) -> GridSet:
-        grid = Grid(self.task.chart, members.grid.counts[:2])
+        grid = Grid(self.chart, members.grid.counts[:2])
         return GridSet(grid, members.signed_distance(self.lift(grid.nodes)))
-
-
-def critical_section(run: Run) -> CriticalSet:
-    """Returns M* of a run in the section of its chart."""
-    s = run.settings
-    cells = max(s.rods, CELLS)
-    return Section.of(run.task).critical_set(run.critical_set, run.steady, cells, s.resolution)
-
-
-def _lifted(z: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Returns points (..., 2) with the other coordinates (k,) appended: (..., 2 + k)."""
-    return np.concatenate([z, np.broadcast_to(rest, (*z.shape[:-1], len(rest)))], axis=-1)

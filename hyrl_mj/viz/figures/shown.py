@@ -12,7 +12,7 @@ from hyrl_mj.simulation import HybridArc
 from hyrl_mj.stages import CriticalSet, ExtendedSets, Partition
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.arcs import overview_arcs, policy_start_arcs
-from hyrl_mj.viz.section import Section, critical_section
+from hyrl_mj.viz.section import Section
 
 
 @dataclass(frozen=True)
@@ -84,23 +84,22 @@ def shown_policy(run: Run, noisy: HybridArc) -> ShownPolicy:
     The run needs its critical set and partition. `noisy` is a run of the policy under noise, from M* if
     there is one.
     """
-    section, s = Section.of(run.task), run.settings
+    section, s = Section(run.task), run.settings
     return ShownPolicy(
-        section.task,
+        section,
         s.stage1.title,
         run.steady,
-        critical_section(run),
+        section.critical_set(run),
         section.partition(run.partition),
         section.arc(noisy),
-        tuple(overview_arcs(section.task, run.steady)),
-        tuple(policy_start_arcs(section.task, run.steady, s.noise, s.seed)),
+        tuple(overview_arcs(section, run.steady)),
+        tuple(policy_start_arcs(section, run.steady, s.noise, s.seed)),
     )
 
 
 def shown_run(run: Run) -> ShownRun:
     """Returns what the figures of a run show; its replays have been simulated."""
-    arcs, section = run.arcs(), Section.of(run.task)
+    arcs, sets = run.arcs(), Section(run.task).extended_sets(run.extended_sets)
     start = "critical" if ("critical", "policy") in arcs else "start0"
     policy = shown_policy(run, arcs[start, "policy"])
-    sets = section.extended_sets(run.extended_sets)
     return ShownRun(**vars(policy), whole=run.task, sets=sets, replays=arcs)
