@@ -15,7 +15,7 @@ from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, simulate_batch
 from hyrl_mj.viz.arcs import critical_start, from_middle, replay_floor
 from hyrl_mj.viz.commands import beginning
 from hyrl_mj.viz.options import ReplayOptions
-from hyrl_mj.viz.page import fill, film, noise_tables, pictures, write
+from hyrl_mj.viz.page import fill, film, pictures, write
 from hyrl_mj.viz.replay import Show, render_replay
 from hyrl_mj.viz.tables import margin_text, percent
 
@@ -98,8 +98,9 @@ def sentences(run: Run, robustness: Robustness, arc: HybridArc | None) -> list[s
     else:
         worst = min(robustness.episodes, key=lambda count: count.reached)
         if run.agent and run.agent.stochastic:
-            why = "it draws its inputs, so that noisy episodes stand in for the worst case"
-            results.append(why)
+            results.append(
+                "it draws its inputs, so that noisy episodes stand in for the worst case"
+            )
         results.append(
             f"under {worst.noise} {noise} it loses {percent(1 - worst.reached)} of the episodes "
             f"that start {worst.region}"
@@ -124,11 +125,11 @@ def write_page(run: Run, robustness: Robustness, arc: HybridArc | None) -> None:
         fill(
             "diagnosis.html",
             run,
+            robustness,
             sentences=sentences(run, robustness, arc),
             arc=arc,
             video=film(folder / "worst.mp4"),
             pictures=pictures(folder),
-            **noise_tables(run.task, robustness),
             command=beginning(run.settings, run.path),
         ),
     )

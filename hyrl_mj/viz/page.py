@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from base64 import b64encode
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,21 +14,21 @@ from PIL import Image
 from hyrl_mj import artifacts
 from hyrl_mj.game import Robustness
 from hyrl_mj.run_directory import Run
-from hyrl_mj.tasks import Task
 from hyrl_mj.viz.figures import FIGURES
 from hyrl_mj.viz.figures.style import task_title
-from hyrl_mj.viz.tables import Table, episode_table, margin_table, percent, score_table
+from hyrl_mj.viz.tables import episode_table, margin_table, percent, score_table
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG in the page: its name, the file as a data URI, size [pixels] and caption."""
+    """A PNG: its name, the file as a data URI, size [pixels] and caption, and the video that it begins."""
 
     name: str
     data: str
     width: int
     height: int
     caption: str
+    video: str = ""
 
 
 def write(path: Path, text: str) -> None:
@@ -37,16 +37,10 @@ def write(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-@dataclass(frozen=True)
-class Film:
-    """A replay in the page: the file as a data URI, and its poster."""
-
-    data: str
-    poster: Picture
-
-
-def fill(template: str, run: Run, **values: Any) -> str:
+def fill(template: str, run: Run, robustness: Robustness | None, **values: Any) -> str:
     """Returns a page from its template, with the values that every page of a run shows."""
+    task, game = run.task, robustness.game if robustness else None
+    episodes = robustness.episodes if robustness else ()
     environment = Environment(
         loader=PackageLoader("hyrl_mj"),
         autoescape=True,
@@ -57,34 +51,29 @@ def fill(template: str, run: Run, **values: Any) -> str:
     return environment.get_template(template).render(
         # A name that is not Unicode must not keep the page from being written.
         name=os.fsencode(run.path.resolve().name).decode("utf-8", "replace"),
-        title=task_title(run.task),
-        task=run.task,
+        title=task_title(task),
+        task=task,
         settings=run.settings,
         agent=run.agent,
         exact=run.exact,
         critical=run.critical_set,
-        unit=run.task.noise_on()[1],
+        unit=task.noise_on()[1],
         percent=percent,
+        robustness=robustness,
+        game=game,
+        scores=score_table(task, game) if game else None,
+        margins=margin_table(task, game) if game else None,
+        episodes=episode_table(task, episodes) if episodes else None,
         **values,
     )
 
 
-def noise_tables(task: Task, robustness: Robustness | None) -> dict[str, Table | None]:
-    """Returns the tables of an examination under noise by their names in the templates."""
-    game, episodes = (robustness.game, robustness.episodes) if robustness else (None, ())
-    return {
-        "scores": score_table(task, game) if game else None,
-        "margins": margin_table(task, game) if game else None,
-        "episodes": episode_table(task, episodes) if episodes else None,
-    }
-
-
-def film(path: Path) -> Film | None:
-    """Returns a replay and its poster, or None unless both files exist."""
+def film(path: Path) -> Picture | None:
+    """Returns the poster of a replay with its video, or None unless both files exist."""
     poster = path.with_suffix(".png")
     if not (path.is_file() and poster.is_file()):
         return None
-    return Film(_data(path, "video/mp4"), _picture(poster, "replay", ""))
+    return replace(_picture(poster, "replay", ""), video=_data(path, "video/mp4"))
 
 
 def pictures(folder: Path) -> list[Picture]:

@@ -8,12 +8,12 @@ from pathlib import Path
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.game import LIMIT, MAP_CLASSES, EpisodeCount, GameResult, Robustness
-from hyrl_mj.learning import Settings, Training
+from hyrl_mj.learning import Training
 from hyrl_mj.policies import Agent, MlpPolicy
 from hyrl_mj.run_directory import Run
 from hyrl_mj.viz.commands import changed, commands
 from hyrl_mj.viz.figures import CLASS_COLOURS
-from hyrl_mj.viz.page import fill, film, noise_tables, pictures, write
+from hyrl_mj.viz.page import fill, film, pictures, write
 from hyrl_mj.viz.tables import (
     Arcs,
     arrivals,
@@ -26,6 +26,7 @@ from hyrl_mj.viz.tables import (
     robustness_sentence,
 )
 
+CONTROLLERS = ("policy", "hyrl")  # the columns of the numbers
 # What the classes of the maps mean, in the order of MAP_CLASSES.
 MEANINGS = (
     "Whatever the noise does, in whichever mode the controller starts, the run ends well.",
@@ -37,16 +38,12 @@ MEANINGS = (
 )
 
 
-CONTROLLERS = ("policy", "hyrl")  # the columns of the numbers
-
-
 @dataclass(frozen=True)
 class Number:
-    """A number at the top of the page: its name, the values with unit, and under which conditions."""
+    """A number at the top of the page: its name, the values of `CONTROLLERS` with unit, and a note."""
 
     what: str
-    policy: str
-    hyrl: str
+    values: Sequence[str]
     note: str
 
 
@@ -70,23 +67,24 @@ def render(run: Run) -> str:
     robustness = run.robustness if (run.path / "robustness.json").is_file() else None
     arcs = run.arcs() if all(path.is_file() for path in run.arc_paths().values()) else None
     arrived = {who: arrivals(run, arcs, who == "policy") for who in CONTROLLERS} if arcs else None
+    stages = run.settings.stage1, run.settings.stage6
+    options = [stage.options if isinstance(stage, Training) else {} for stage in stages]
+    first, sixth = (_texts(vars(s) | more) for s, more in zip(stages, options, strict=True))
     return fill(
         "report.html",
         run,
+        robustness,
         modes=[task.scene.mode_name(q) for q in run.controller.modes],
         worst=task.noise_on(bool(robustness and robustness.everywhere)),
         video=film(run.path / "replay.mp4"),
         pictures=pictures(run.path / "figures"),
-        robustness=robustness,
-        game=robustness.game if robustness else None,
         arcs=arcs,
         arrivals=arrived,
         numbers=_numbers(run, robustness, arrived),
         replays=arcs and replay_table(run, arcs),
-        **noise_tables(task, robustness),
         stages=_stages(run, robustness, arcs),
-        table=_settings(run.settings),
-        training=_training(run.settings),
+        table=_texts(vars(run.settings)),
+        training=[(name, first.get(name, ""), sixth.get(name, "")) for name in first | sixth],
         versions=run.versions,
         commands=commands(run.settings, robustness),
         changed=changed(run),
@@ -107,9 +105,9 @@ def _numbers(
     elif robustness:
         numbers += _episode_numbers(robustness.episodes)
     if arrived:
-        policy, hyrl = (f"{count} of {total}" for count, total in arrived.values())
+        counts = [f"{count} of {total}" for count, total in arrived.values()]
         note = f"the paper's starts, alternating noise {run.settings.noise:g}"
-        numbers.append(Number("replays that reach the set-point", policy, hyrl, note))
+        numbers.append(Number("replays that reach the set-point", counts, note))
     return numbers
 
 
@@ -119,19 +117,18 @@ def _game_numbers(run: Run, game: GameResult) -> list[Number]:
     scores = [game.scores[who][-1] for who in CONTROLLERS]
     noise = f"worst noise on {where} up to {scores[0].eps:g} {unit}"
     limit = f"{noise}; the limit is {percent(game.scores[LIMIT][-1].won_any)}"
-    rows = [
-        ("winnable starts won", [percent(s.won) for s in scores], noise),
-        ("winnable starts won from every start mode", [percent(s.won_any) for s in scores], limit),
-        (
-            "noise up to which all of them are won",
-            [margin_text(game.margin[who], unit) for who in CONTROLLERS],
-            f"the margin: worst noise on {where}",
-        ),
+    won, won_any = [percent(s.won) for s in scores], [percent(s.won_any) for s in scores]
+    margins = [margin_text(game.margin[who], unit) for who in CONTROLLERS]
+    worst = f"the margin: worst noise on {where}"
+    numbers = [
+        Number("winnable starts won", won, noise),
+        Number("winnable starts won from every start mode", won_any, limit),
+        Number("noise up to which all of them are won", margins, worst),
     ]
     if game.lasting:
         off = [f"{excursion_text(s.excursion)} {unit}" for s in scores]
-        rows.append(("kept off the set-point for ever, at most", off, noise))
-    return [Number(what, policy, hyrl, note) for what, (policy, hyrl), note in rows]
+        numbers.append(Number("kept off the set-point for ever, at most", off, noise))
+    return numbers
 
 
 def _episode_numbers(counts: Sequence[EpisodeCount]) -> list[Number]:
@@ -139,12 +136,12 @@ def _episode_numbers(counts: Sequence[EpisodeCount]) -> list[Number]:
     note = f"the least over {', '.join(dict.fromkeys(c.noise for c in counts))} noise"
     numbers = []
     for region in dict.fromkeys(c.region for c in counts):
-        here = [c for c in counts if c.region == region]
-        policy, hyrl = (
-            percent(min(c.reached for c in here if c.controller == who)) for who in CONTROLLERS
-        )
+        shares = [
+            percent(min(c.reached for c in counts if (c.region, c.controller) == (region, who)))
+            for who in CONTROLLERS
+        ]
         what = f"episodes that reach the set-point, starts {region}"
-        numbers.append(Number(what, policy, hyrl, note))
+        numbers.append(Number(what, shares, note))
     return numbers
 
 
@@ -174,32 +171,13 @@ def _stages(run: Run, robustness: Robustness | None, arcs: Arcs | None) -> list[
     ]
 
 
-def _settings(settings: Settings) -> list[tuple[str, str]]:
-    """Returns all settings but those of the two trainings."""
-    return [
-        (_words(name), _value(value))
-        for name, value in vars(settings).items()
-        if not isinstance(value, Training | Agent)
-    ]
+def _texts(settings: Mapping[str, object]) -> dict[str, str]:
+    """Returns the texts of settings by their names in words, without those that hold other settings."""
+    plain = {n: v for n, v in settings.items() if not isinstance(v, Training | Agent | Mapping)}
+    return {name.replace("_", " "): _text(value) for name, value in plain.items()}
 
 
-def _training(settings: Settings) -> list[tuple[str, str, str]]:
-    """Returns the settings of stages 1 and 6 side by side; an agent has its own."""
-    first, sixth = _stage(settings.stage1), _stage(settings.stage6)
-    return [(_words(name), first.get(name, ""), sixth.get(name, "")) for name in first | sixth]
-
-
-def _stage(stage: Training | Agent) -> dict[str, str]:
-    """Returns the texts of a stage's settings by name, those of its algorithm among them."""
-    values = vars(stage) | (stage.options if isinstance(stage, Training) else {})
-    return {name: _value(value) for name, value in values.items() if name != "options"}
-
-
-def _words(name: str) -> str:
-    return name.replace("_", " ")
-
-
-def _value(value: object) -> str:
+def _text(value: object) -> str:
     """Returns the text of a setting."""
     if isinstance(value, bool):
         return "yes" if value else "no"

@@ -8,39 +8,26 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, redirect_stdout
 from copy import copy
-from dataclasses import dataclass
 from io import StringIO
-from typing import TYPE_CHECKING, Protocol
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.gl import has_display
+from hyrl_mj.progress import Say
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.replay.panel import Track
-
-if TYPE_CHECKING:
-    from mjviser import ViserMujocoScene
 
 FPS = 60
 PAUSE = 1.0  # [s] between the end of an arc and its beginning
 LOOPBACK = "127.0.0.1"
 FIRST_PORT = 8080  # the first to try without a port from the user
-Say = Callable[[str], None]
-
-
-class Viewer(Protocol):
-    """Shows the data of a model: a window, or a page."""
-
-    def is_running(self) -> bool:
-        """Returns whether the viewer has not been closed."""
-
-    def sync(self) -> None:
-        """Shows the data as they are now."""
 
 
 def view(task: Task, arc: HybridArc, port: int = 0, say: Say = print) -> None:
@@ -65,10 +52,11 @@ def view(task: Task, arc: HybridArc, port: int = 0, say: Say = print) -> None:
         play(track, model, data, viewer)
 
 
-def play(track: Track, model: mujoco.MjModel, data: mujoco.MjData, viewer: Viewer) -> None:
+def play(track: Track, model: mujoco.MjModel, data: mujoco.MjData, viewer: Any) -> None:
     """Moves a model along an arc, again and again in real time, until the viewer is closed.
 
-    A slow viewer shows fewer frames; the arc does not slow down.
+    The viewer has `is_running()`, and `sync()` to show the data. A slow viewer shows fewer frames; the arc
+    does not slow down.
     """
     began = due = time.monotonic()
     while viewer.is_running():
@@ -86,7 +74,7 @@ def show(track: Track, model: mujoco.MjModel, data: mujoco.MjData, t: float) -> 
     mujoco.mj_forward(model, data)
 
 
-def _window(model: mujoco.MjModel, data: mujoco.MjData) -> AbstractContextManager[Viewer]:
+def _window(model: mujoco.MjModel, data: mujoco.MjData) -> AbstractContextManager[Any]:
     """Opens MuJoCo's viewer."""
     from mujoco import viewer
 
@@ -99,7 +87,7 @@ def _window(model: mujoco.MjModel, data: mujoco.MjData) -> AbstractContextManage
 
 
 @contextmanager
-def _web(model: mujoco.MjModel, data: mujoco.MjData, port: int, say: Say) -> Iterator[Viewer]:
+def _web(model: mujoco.MjModel, data: mujoco.MjData, port: int, say: Say) -> Iterator[Any]:
     """Serves a page with the model until the block ends."""
     try:
         import viser
@@ -110,7 +98,12 @@ def _web(model: mujoco.MjModel, data: mujoco.MjData, port: int, say: Say) -> Ite
             'pip install "hyrl-mj[view]", or make a video with hyrl-mj replay'
         ) from error
 
-    _check_free(port)
+    try:  # viser would wait forever for a port that is in use, reserved or invalid
+        socket.create_server((LOOPBACK, port)).close()
+    except (OSError, OverflowError) as error:
+        raise BadInput(
+            f"port {port} cannot be used ({error}): give a free one, 1024 to 65535, or none"
+        ) from error
     with redirect_stdout(StringIO()):  # viser prints where it listens
         server = viser.ViserServer(host=LOOPBACK, port=port or FIRST_PORT, verbose=False)
     try:
@@ -123,37 +116,11 @@ def _web(model: mujoco.MjModel, data: mujoco.MjData, port: int, say: Say) -> Ite
             camera_azimuth=model.vis.global_.azimuth,
             camera_elevation=-model.vis.global_.elevation,  # MuJoCo's is negative from above
         )
-        page = _Page(scene, data)
-        page.sync()
+        scene.update_from_mjdata(data)
         address = f"http://{LOOPBACK}:{server.get_port()}/"
         say(f"watch {address} (only from this machine); Ctrl+C ends it")
-        yield page
+        # A page that is closed can be opened again, and Ctrl+C ends it.
+        yield SimpleNamespace(is_running=lambda: True, sync=lambda: scene.update_from_mjdata(data))
     finally:
         with redirect_stdout(StringIO()):
             server.stop()
-
-
-@dataclass
-class _Page:
-    """A model on a page that viser serves."""
-
-    scene: ViserMujocoScene
-    data: mujoco.MjData
-
-    def is_running(self) -> bool:
-        """Returns True: a page that is closed can be opened again, and Ctrl+C ends it."""
-        return True
-
-    def sync(self) -> None:
-        """Sends the positions to everyone who has the page open."""
-        self.scene.update_from_mjdata(self.data)
-
-
-def _check_free(port: int) -> None:
-    """Raises `BadInput` for a port that is in use, reserved or invalid; viser would wait forever."""
-    try:
-        socket.create_server((LOOPBACK, port)).close()
-    except (OSError, OverflowError) as error:
-        raise BadInput(
-            f"port {port} cannot be used ({error}): give a free one, 1024 to 65535, or none"
-        ) from error

@@ -80,10 +80,9 @@ class Track:
         """Returns the position (3,) [m] of the tracked site at time t [s]."""
         return marks.tracked_points(self.task, self.qpos(t)[None])[0]
 
-    def measured(self, t: float) -> np.ndarray | None:
-        """Returns the position (nq,) that was measured at the last sample; None without noise."""
-        qpos = self._measured[self.arc.at(t)]
-        return qpos if np.isfinite(qpos).all() and self.arc.bound > 0 else None
+    def measured(self, t: float) -> np.ndarray:
+        """Returns the position (nq,) that was measured at the last sample; NaN without a measurement."""
+        return self._measured[self.arc.at(t)]
 
     def bounds(self, t: float) -> list[np.ndarray]:
         """Returns a line (k, 3) [m] for each noisy coordinate: the points that may be measured."""
@@ -96,18 +95,13 @@ class Track:
 
     def _at(self, t: float, values: np.ndarray) -> np.ndarray:
         """Returns values (c,) at time t, interpolated between the rows (N, c)."""
-        row = self.arc.at(t)
-        if row + 1 == len(values):
-            return values[row]
-        share = (t - self.arc.t[row]) / (self.arc.t[row + 1] - self.arc.t[row])
-        return (1 - share) * values[row] + share * values[row + 1]
+        return np.array([np.interp(t, self.arc.t, column) for column in values.T])
 
 
 @dataclass
 class _Drawn:
-    """How far a track has been drawn: to which row, at which time, and where in the picture."""
+    """Until which time a track has been drawn, and where in the picture."""
 
-    row: int = 0
     t: float = -1.0
     box: Box = (0, 0, 0, 0)
 
@@ -161,7 +155,8 @@ class Panel:
             return
         whole = self._drawn[0].t < 0 or not self._rests
         renderer.drop()
-        paths = [self._path(*row) for row in zip(self._tracks, self._drawn, times, strict=True)]
+        since = [max(drawn.t, 0.0) for drawn in self._drawn]
+        paths = [self._path(*row) for row in zip(self._tracks, since, times, strict=True)]
         renderer.keep()
         renderer.look(self._tracks[0].qpos(times[0]), self._camera)
         boxes = [self._robot(*row) for row in zip(self._tracks, times, paths, strict=True)]
@@ -175,9 +170,9 @@ class Panel:
                 renderer.redraw(picture, (left, top, right, bottom))
             drawn.t, drawn.box = now, box
 
-    def _path(self, track: Track, drawn: _Drawn, t: float) -> np.ndarray:
-        """Adds the path up to the last sample to the scene; returns its new points (k, 3)."""
-        scene, last, first = self._renderer.scene, track.arc.at(t), drawn.row
+    def _path(self, track: Track, since: float, t: float) -> np.ndarray:
+        """Adds the samples of the path since a time [s] to the scene; returns their points (k, 3)."""
+        scene, first, last = self._renderer.scene, track.arc.at(since), track.arc.at(t)
         for row in range(first, last):
             self._segment(track, row, track.points[row + 1])
         for row in track.jumps[(track.jumps > first) & (track.jumps <= last)]:
@@ -185,7 +180,6 @@ class Panel:
             marks.disc(scene, track.points[row], JUMP_RADIUS, height, marks.INK)
             above = height + marks.THICKNESS
             marks.disc(scene, track.points[row], 0.6 * JUMP_RADIUS, above, marks.WHITE)
-        drawn.row = last
         return track.points[first : last + 1]
 
     def _segment(self, track: Track, row: int, end: np.ndarray) -> None:
@@ -201,18 +195,16 @@ class Panel:
         renderer, scene = self._renderer, self._renderer.scene
         first, point = scene.ngeom, track.point(t)
         self._segment(track, track.arc.at(t), point)
-        over = t >= track.end
-        if not over and track.arc.bound > 0:
+        renderer.add_robot(track.qpos(t))
+        if t < track.end and track.arc.bound > 0:
             for line in track.bounds(t):
                 for start, end in pairwise(line):
                     marks.bar(scene, start, end, marks.BOUND, BOUND_WIDTH, marks.ON_BOUND)
-        renderer.add_robot(track.qpos(t))
-        ghost = track.measured(t)
-        if ghost is not None and not over:
-            for number in renderer.add_robot(ghost):
-                scene.geoms[number].rgba[3] = GHOST_ALPHA
-                scene.geoms[number].transparent = 1
-        if over and track.arc.outcome in FAILED:
+            if np.isfinite(ghost := track.measured(t)).all():
+                for number in renderer.add_robot(ghost):
+                    scene.geoms[number].rgba[3] = GHOST_ALPHA
+                    scene.geoms[number].transparent = 1
+        if t >= track.end and track.arc.outcome in FAILED:
             for side in ((CROSS, CROSS, 0.0), (CROSS, -CROSS, 0.0)):
                 ends = point - side, point + side
                 marks.bar(scene, *ends, marks.BAD, PATH_WIDTH, marks.ON_TOP + 0.18)
