@@ -1,4 +1,4 @@
-"""The coordinates in which decisions fall, some of them on a circle."""
+"""Charts: the coordinates in which decisions fall, some of them on a circle."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Chart:
         return np.subtract(self.high, self.low)
 
     def wrap(self, z: np.ndarray) -> np.ndarray:
-        """The same points (n, d), periodic coordinates brought into [low, high); z itself without any."""
+        """Returns points (n, d) with periodic coordinates brought into [low, high); z itself without any."""
         if not any(self.periodic):
             return z
         turned = np.mod(z - self.origin, self.sides)
@@ -58,12 +58,12 @@ class Chart:
         return np.where(self.periodic, self.origin + turned, z)
 
     def difference(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """a - b (n, d), the short way round in periodic coordinates."""
+        """Returns a - b (n, d), the short way round in periodic coordinates."""
         delta = np.subtract(a, b)
         return np.where(self.periodic, delta - self.sides * np.round(delta / self.sides), delta)
 
     def contains(self, z: np.ndarray) -> np.ndarray:
-        """Whether points (n, d) lie in the charted box: (n,) bool."""
+        """Returns (n,) bool: whether points (n, d) lie in the charted box."""
         inside = (z >= self.low) & (z <= self.high)
         return np.asarray((inside | self.periodic).all(axis=-1))
 
@@ -84,12 +84,9 @@ class Chart:
             )
         bad = ~(np.isfinite(z).all(axis=1) & self.contains(z))
         if bad.any():
-            sides = zip(self.names, self.units, self.low, self.high, self.periodic, strict=True)
-            box = ", ".join(
-                f"{low:g} <= {name} <= {high:g} {unit}"
-                for name, unit, low, high, periodic in sides
-                if not periodic
-            )
+            axes = zip(self.names, self.units, self.low, self.high, strict=True)
+            sides = [f"{low:g} <= {name} <= {high:g} {unit}" for name, unit, low, high in axes]
+            box = ", ".join(s for s, wraps in zip(sides, self.periodic, strict=True) if not wraps)
             raise BadInput(
                 f"state {np.argmax(bad)} ({self.format(z[bad][0])}) is outside {owner}: "
                 f"{box or 'give finite numbers'}"
@@ -97,7 +94,7 @@ class Chart:
         return z
 
     def tree(self, points: np.ndarray) -> cKDTree:
-        """A search tree of points (n, d) that knows of the periods; ask it with `in_box` points."""
+        """Returns a search tree of points (n, d) that heeds the periods; query it with `in_box` points."""
         from scipy.spatial import cKDTree  # slow to import
 
         # Coordinates that are not periodic get a box so large that its other side is never near.
@@ -105,11 +102,11 @@ class Chart:
         return cKDTree(self.in_box(points), boxsize=size)
 
     def in_box(self, z: np.ndarray) -> np.ndarray:
-        """Points (n, d) in the coordinates of `tree`: never negative."""
+        """Returns points (n, d) in the coordinates of `tree`, which are never negative."""
         return self.wrap(z) - self.origin + np.where(self.periodic, 0.0, 1e3 * self.sides)
 
     def format(self, z: np.ndarray) -> str:
-        """One point (d,) for people: "x = 0.1 m, y = -0.2 m"."""
+        """Returns the text of a point (d,): "x = 0.1 m, y = -0.2 m"."""
         return ", ".join(
             f"{n} = {v:.4g} {u}" for n, v, u in zip(self.names, z, self.units, strict=True)
         )

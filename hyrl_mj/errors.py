@@ -1,4 +1,4 @@
-"""What can go wrong, in sentences for people: what was given, what is allowed, how to mend it."""
+"""Errors whose text says in one sentence what was given, what is allowed, and what to do."""
 
 import math
 from collections.abc import Iterable
@@ -7,7 +7,7 @@ from numbers import Integral, Real
 
 
 class HyrlError(Exception):
-    """Base of every error that the package raises on purpose; its text is one clear sentence."""
+    """Base of every error that the package raises on purpose."""
 
     exit_status = 1
 
@@ -26,22 +26,22 @@ class NoRenderer(HyrlError):
     """Off-screen rendering or video encoding is not possible on this machine."""
 
 
-def unknown(what: str, given: object, allowed: Iterable[str]) -> BadInput:
-    """The error for a name that is not one of `allowed`."""
+def unknown(what: str, value: object, allowed: Iterable[str]) -> BadInput:
+    """Returns the error for a name that is not one of `allowed`."""
     names = list(allowed)
-    close = get_close_matches(str(given), names, n=1)
+    close = get_close_matches(str(value), names, n=1)
     hint = f" Did you mean {close[0]!r}?" if close else ""
-    return BadInput(f"unknown {what} {given!r}: choose one of {', '.join(names)}.{hint}")
+    return BadInput(f"unknown {what} {value!r}: choose one of {', '.join(names)}.{hint}")
 
 
 def brief(error: BaseException) -> str:
-    """The kind of an error and the beginning of what it says, in one line."""
+    """Returns the kind of an error and the beginning of its text, in one line."""
     text = " ".join(str(error).split())
     return f"{type(error).__name__}: {text if len(text) <= 160 else text[:157] + '...'}"
 
 
 def check_seed(seed: int) -> int:
-    """The seed itself, if it is one.
+    """Returns the seed, if it can be used.
 
     Raises:
         BadInput: it is not an integer from 0 to 2**32 - 1, what NumPy, torch and SB3 all take.
@@ -52,7 +52,7 @@ def check_seed(seed: int) -> int:
 
 
 def check_bound(bound: float) -> float:
-    """The noise bound itself, if it is one.
+    """Returns the noise bound, if it can be used.
 
     Raises:
         BadInput: it is negative, infinite or not a number.

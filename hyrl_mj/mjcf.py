@@ -1,4 +1,4 @@
-"""Find and compile MJCF models; read their geometry, so that it is written down nowhere else."""
+"""MJCF models: compiles them and reads their geometry, so that it is written down nowhere else."""
 
 from functools import lru_cache
 from pathlib import Path
@@ -10,7 +10,7 @@ from hyrl_mj.errors import BadInput, unknown
 
 
 def models_dir() -> Path:
-    """The folder with the MJCF files: in the installed package, else beside it in the checkout."""
+    """Returns the folder of the MJCF files: in the installed package, else beside it in the checkout."""
     package = Path(__file__).resolve().parent
     installed = package / "models"
     return installed if installed.is_dir() else package.parent / "models"
@@ -18,7 +18,7 @@ def models_dir() -> Path:
 
 @lru_cache
 def load(path: Path) -> mujoco.MjModel:
-    """Compile an MJCF file. Compiled models are shared: treat them as read-only.
+    """Returns a compiled MJCF file. Compiled models are shared: do not write to them.
 
     Raises:
         BadInput: the file is missing or MuJoCo cannot compile it.
@@ -28,12 +28,12 @@ def load(path: Path) -> mujoco.MjModel:
     try:
         return mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
-        said = " ".join(str(error).split())
-        raise BadInput(f"MuJoCo cannot compile {path}: {said}") from error
+        reason = " ".join(str(error).split())
+        raise BadInput(f"MuJoCo cannot compile {path}: {reason}") from error
 
 
 def object_id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
-    """The id of a named object.
+    """Returns the id of a named object.
 
     Raises:
         BadInput: the model has no such object; the message lists those it has.
@@ -46,7 +46,7 @@ def object_id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:
 
 
 def names(model: mujoco.MjModel, kind: mujoco.mjtObj) -> list[str]:
-    """The names of all objects of one kind, in the order of their ids."""
+    """Returns the names of all objects of one kind, in the order of their ids."""
     count = {
         mujoco.mjtObj.mjOBJ_ACTUATOR: model.nu,
         mujoco.mjtObj.mjOBJ_CAMERA: model.ncam,
@@ -59,48 +59,47 @@ def names(model: mujoco.MjModel, kind: mujoco.mjtObj) -> list[str]:
 
 
 def model_name(model: mujoco.MjModel) -> str:
-    """The name that the MJCF gives the model."""
+    """Returns the name that the MJCF gives the model."""
     return bytes(model.names).split(b"\0", 1)[0].decode()
 
 
 def site_pos(model: mujoco.MjModel, name: str) -> np.ndarray:
-    """Position of a site in its body's frame: (3,) [m]."""
+    """Returns the position of a site in its body's frame: (3,) [m]."""
     return model.site_pos[object_id(model, mujoco.mjtObj.mjOBJ_SITE, name)].copy()
 
 
 def site_size(model: mujoco.MjModel, name: str) -> np.ndarray:
-    """Half sizes of a site: (3,) [m]."""
+    """Returns the half sizes of a site: (3,) [m]."""
     return model.site_size[object_id(model, mujoco.mjtObj.mjOBJ_SITE, name)].copy()
 
 
 def geom_pos(model: mujoco.MjModel, name: str) -> np.ndarray:
-    """Position of a geom in its body's frame: (3,) [m]."""
+    """Returns the position of a geom in its body's frame: (3,) [m]."""
     return model.geom_pos[object_id(model, mujoco.mjtObj.mjOBJ_GEOM, name)].copy()
 
 
 def geom_size(model: mujoco.MjModel, name: str) -> np.ndarray:
-    """Sizes of a geom, for a cylinder (radius, half height, 0): (3,) [m]."""
+    """Returns the sizes of a geom, for a cylinder (radius, half height, 0): (3,) [m]."""
     return model.geom_size[object_id(model, mujoco.mjtObj.mjOBJ_GEOM, name)].copy()
 
 
 def numeric(model: mujoco.MjModel, name: str, size: int) -> np.ndarray:
-    """The values (size,) of a custom numeric.
+    """Returns the values (size,) of a custom numeric.
 
     Raises:
         BadInput: the model has no such numeric, or one of another size.
     """
     index = object_id(model, mujoco.mjtObj.mjOBJ_NUMERIC, name)
-    first, found = model.numeric_adr[index], model.numeric_size[index]
-    if found != size:
+    first, count = model.numeric_adr[index], model.numeric_size[index]
+    if count != size:
         raise BadInput(
-            f"numeric {name} of model {model_name(model)} has {found} value(s): give it {size}"
+            f"numeric {name} of model {model_name(model)} has {count} value(s): give it {size}"
         )
     return np.array(model.numeric_data[first : first + size])
 
 
 def sample_time(model: mujoco.MjModel) -> float:
-    """The controller's sample time [s]: the custom numeric `sample_time`, else the timestep."""
-    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, "sample_time")
-    if index < 0:
+    """Returns the controller's sample time [s]: the custom numeric `sample_time`, else the timestep."""
+    if "sample_time" not in names(model, mujoco.mjtObj.mjOBJ_NUMERIC):
         return float(model.opt.timestep)
-    return float(model.numeric_data[model.numeric_adr[index]])
+    return float(numeric(model, "sample_time", 1)[0])

@@ -104,21 +104,20 @@ class Plant:
     def set_state(
         self, qpos: np.ndarray, qvel: np.ndarray | None = None, ids: np.ndarray | None = None
     ) -> None:
-        """Sets the state of the copies `ids` (all by default) and updates their sensors.
+        """Sets the state of the copies `ids` (k,), ascending, all by default, and updates their sensors.
 
         Args:
-            qpos: (k, nq) generalised positions, k the number of copies addressed.
+            qpos: (k, nq) generalised positions.
             qvel: (k, nv) generalised velocities; zero by default.
-            ids: (k,) indices of the copies, ascending.
+            ids: indices of the copies.
 
         Raises:
             BadInput: a wrong shape or a value that is not finite.
         """
-        count = self.n if ids is None else len(ids)
-        qpos = _checked("qpos", qpos, (count, self.model.nq), ids)
-        qvel = np.zeros((count, self.model.nv)) if qvel is None else qvel
-        qvel = _checked("qvel", qvel, (count, self.model.nv), ids)
-        rows = slice(None) if ids is None else ids
+        rows = self._rows(ids)
+        qvel = np.zeros((len(rows), self.model.nv)) if qvel is None else qvel
+        qpos = _checked("qpos", qpos, self.model.nq, rows)
+        qvel = _checked("qvel", qvel, self.model.nv, rows)
         self._batch.state[rows] = self._initial  # time, activations and warm starts, too
         self._qpos[rows], self._qvel[rows] = qpos, qvel
         self._ctrl[rows] = self._held
@@ -127,22 +126,18 @@ class Plant:
             self._batch.forward(ids, self._stage)
 
     def step(self, u: np.ndarray, ids: np.ndarray | None = None) -> None:
-        """Advances the copies `ids` (all by default) by one sample under the inputs u.
-
-        Args:
-            u: (k, m) inputs in the plant's physical units.
-            ids: (k,) indices of the copies, ascending.
+        """Advances the copies `ids` (k,), ascending, all by default, by one sample under inputs u (k, m).
 
         Raises:
             BadInput: a wrong shape, a value that is not finite, or one outside the input limits.
         """
-        u, rows = self._inputs(u, ids), slice(None) if ids is None else ids
+        u, rows = self._inputs(u, ids), self._rows(ids)
         if self._control is None:
             self._advance(self._controls(u), ids, self.substeps)
             return
         for left in reversed(range(self.substeps)):
             ctrl = self._control(u, self._qpos[rows], self._qvel[rows])
-            ctrl = _checked("control", ctrl, (len(u), self.model.nu), ids)
+            ctrl = _checked("control", ctrl, self.model.nu, rows)
             ctrl = np.clip(ctrl, self._ctrl_low, self._ctrl_high)
             self._advance(ctrl, ids, 1, sense=not left)
 
@@ -162,23 +157,26 @@ class Plant:
     @property
     def invertible(self) -> bool:
         """Whether each degree of freedom follows its own velocity actuator."""
-        model = self.model
         if self._control is not None:
             return False
+        model = self.model
         driven = sorted(model.actuator_trnid[:, 0])
         follows = -model.actuator_biasprm[:, 2] >= 1e6
         return bool(model.nq == model.nv and driven == list(range(model.njnt)) and follows.all())
 
+    def _rows(self, ids: np.ndarray | None) -> np.ndarray:
+        return np.arange(self.n) if ids is None else ids
+
     def _inputs(self, u: np.ndarray, ids: np.ndarray | None) -> np.ndarray:
         """Returns the inputs (k, m), checked and clipped to their limits."""
-        count = self.n if ids is None else len(ids)
-        u = _checked("input", u, (count, len(self.low)), ids)
+        rows = self._rows(ids)
+        u = _checked("input", u, len(self.low), rows)
         wrong = (u < self.low - INPUT_TOLERANCE) | (u > self.high + INPUT_TOLERANCE)
         if wrong.any():
             row, column = np.argwhere(wrong)[0]
             raise BadInput(
-                f"input {u[row, column]:g} of simulation {row if ids is None else ids[row]} is "
-                f"outside the limits [{self.low[column]:g}, {self.high[column]:g}] of the MJCF"
+                f"input {u[row, column]:g} of simulation {rows[row]} is outside the limits "
+                f"[{self.low[column]:g}, {self.high[column]:g}] of the MJCF"
             )
         return np.clip(u, self.low, self.high)
 
@@ -191,8 +189,7 @@ class Plant:
     def _advance(
         self, ctrl: np.ndarray, ids: np.ndarray | None, substeps: int, sense: bool = True
     ) -> None:
-        rows = slice(None) if ids is None else ids
-        self._ctrl[rows] = ctrl
+        self._ctrl[self._rows(ids)] = ctrl
         # Sensors are computed only where they will be read.
         stage = self._stage if sense else mujoco.mjtStage.mjSTAGE_NONE
         self._batch.step(ids, substeps, stage)
@@ -200,14 +197,11 @@ class Plant:
         for values in (self._qpos, self._qvel):
             valid = np.abs(values) <= mujoco.mjMAXVAL
             if not valid.all():
-                self._reset_unstable(np.flatnonzero(~valid.all(axis=1)))
-
-    def _reset_unstable(self, ids: np.ndarray) -> None:
-        """Marks copies as unstable and puts them into the initial state."""
-        self._unstable[ids] = True
-        self._batch.state[ids] = self._initial
-        if self._joints is None:
-            self._batch.forward(ids, self._stage)
+                bad = np.flatnonzero(~valid.all(axis=1))
+                self._unstable[bad] = True
+                self._batch.state[bad] = self._initial
+                if self._joints is None:
+                    self._batch.forward(bad, self._stage)
 
 
 def actuator_columns(model: mujoco.MjModel, names: Sequence[str]) -> list[int]:
@@ -228,15 +222,15 @@ def input_limits(
     Raises:
         BadInput: the model has no such actuator or numeric, or it has no limits.
     """
-    if not of_actuators:
+    if of_actuators:
+        columns = actuator_columns(model, inputs)
+        for name, column in zip(inputs, columns, strict=True):
+            if not model.actuator_ctrllimited[column]:
+                raise BadInput(f"actuator {name} needs a ctrlrange in the MJCF: its input limits")
+        ranges = model.actuator_ctrlrange[columns]
+    else:
         ranges = np.array([mjcf.numeric(model, name, 2) for name in inputs])
-        return ranges[:, 0], ranges[:, 1]
-    columns = actuator_columns(model, inputs)
-    for name, column in zip(inputs, columns, strict=True):
-        if not model.actuator_ctrllimited[column]:
-            raise BadInput(f"actuator {name} needs a ctrlrange in the MJCF: its input limits")
-    low, high = model.actuator_ctrlrange[columns].T
-    return low.copy(), high.copy()
+    return ranges[:, 0], ranges[:, 1]
 
 
 def joint_columns(model: mujoco.MjModel) -> np.ndarray | None:
@@ -256,17 +250,14 @@ def joint_columns(model: mujoco.MjModel) -> np.ndarray | None:
     return np.where(of_pos, qpos + model.jnt_qposadr[joint], qvel + model.jnt_dofadr[joint])
 
 
-def _checked(
-    name: str, values: np.ndarray, shape: tuple[int, int], ids: np.ndarray | None
-) -> np.ndarray:
-    values = np.asarray(values, dtype=float)
+def _checked(name: str, values: np.ndarray, columns: int, rows: np.ndarray) -> np.ndarray:
+    values, shape = np.asarray(values, dtype=float), (len(rows), columns)
     if values.shape != shape:
         raise BadInput(f"{name} has shape {values.shape}, it must be {shape}")
     bad = ~np.isfinite(values)
     if bad.any():
         row, column = np.argwhere(bad)[0]
-        simulation = row if ids is None else ids[row]
         raise BadInput(
-            f"{name}[{column}] of simulation {simulation} is {values[row, column]}, it must be finite"
+            f"{name}[{column}] of simulation {rows[row]} is {values[row, column]}, it must be finite"
         )
     return values

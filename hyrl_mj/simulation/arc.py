@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, overload
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -112,19 +111,6 @@ class HybridArc(Saved):
         return int(np.searchsorted(self.t, t + 1e-9, side="right") - 1)
 
 
-@overload
-def simulate(
-    task: Task,
-    controller: Controller | Policy,
-    z0: Sequence[float],
-    noise: AnyNoise | None = None,
-    q0: int | None = None,
-    horizon: float | None = None,
-    seed: int = 0,
-) -> HybridArc: ...
-
-
-@overload
 def simulate(
     task: Task,
     controller: Controller | Policy,
@@ -133,18 +119,7 @@ def simulate(
     q0: int | np.ndarray | None = None,
     horizon: float | None = None,
     seed: int = 0,
-) -> Any: ...
-
-
-def simulate(
-    task: Task,
-    controller: Controller | Policy,
-    z0: ArrayLike,
-    noise: AnyNoise | None = None,
-    q0: int | np.ndarray | None = None,
-    horizon: float | None = None,
-    seed: int = 0,
-) -> HybridArc | list[HybridArc]:
+) -> Any:
     """Simulates the closed loop in MuJoCo.
 
     Args:
@@ -157,7 +132,7 @@ def simulate(
         seed: of the noise.
 
     Returns:
-        One arc for one start, a list of arcs for several.
+        A `HybridArc` for one start, a list of them for several.
 
     Raises:
         BadInput: a start outside the chart, an unknown mode, modes that do not fit the starts, a noise or
@@ -209,7 +184,6 @@ def samples(task: Task, horizon: float) -> int:
 
 
 def _arc(task: Task, name: str, rollout: Rollout, i: int, noise: AnyNoise) -> HybridArc:
-    """Returns run i of a rollout as a hybrid arc."""
     end = rollout.length[i]
     before, after = rollout.before[:end, i], rollout.q[:end, i]
     jumped = before != after
@@ -238,5 +212,4 @@ def _arc(task: Task, name: str, rollout: Rollout, i: int, noise: AnyNoise) -> Hy
 
 
 def _with_nan_row(values: np.ndarray) -> np.ndarray:
-    """Returns values (K, c) with a row of NaN after them."""
     return np.vstack([values, np.full((1, values.shape[1]), np.nan)])

@@ -177,11 +177,16 @@ def _check_episode(task: Task) -> None:
         plant.step(u)
         path.append(task.z(plant.measurement))
     way = task.direction(np.array(path))
-    _check_shape("direction() gives", way, (STARTS,))
-    for method in (task.miss, task.arrived):
-        _check_shape(f"{method.__name__}() gives", method(path[-1]), (STARTS,))
-    for method in (task.danger, task.verdict):
-        _check_shape(f"{method.__name__}() gives", method(plant.measurement), (STARTS,))
+    z, measurement = path[-1], plant.measurement
+    results = {
+        "direction": way,
+        "miss": task.miss(z),
+        "arrived": task.arrived(z),
+        "danger": task.danger(measurement),
+        "verdict": task.verdict(measurement),
+    }
+    for name, values in results.items():
+        _check_shape(f"{name}() gives", values, (STARTS,))
     ways = set(np.unique(way).tolist())
     if not ways <= {-1, *range(len(task.scene.mode_names))}:
         raise BadInput(
