@@ -21,8 +21,7 @@ from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.envs.sb3_env import TaskVecEnv
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.learning.training import build
-from hyrl_mj.policies.activations import ACTIVATIONS, TORCH_NAMES
-from hyrl_mj.policies.mlp import SampledPolicy
+from hyrl_mj.policies.mlp import ACTIVATIONS, TORCH_NAMES, SampledPolicy
 from hyrl_mj.tasks.unit_circle import UnitCircle
 
 OFF_POLICY = (DQN, SAC, TD3, DDPG)

@@ -6,11 +6,4 @@ The modules `training`, `distillation` and `symmetry` import torch: import them 
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.learning.settings import Settings, Training
 
-__all__ = [
-    "Settings",
-    "Training",
-    "distillation",
-    "preset",
-    "symmetry",
-    "training",
-]
+__all__ = ["Settings", "Training", "distillation", "preset", "symmetry", "training"]

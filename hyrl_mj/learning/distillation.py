@@ -32,15 +32,14 @@ def fits(task: Task, settings: Training, policy: MlpPolicy) -> bool:
 def distil(task: Task, policy: Policy, starts: Starts, settings: Training, seed: int) -> MlpPolicy:
     """Returns a network that imitates a policy, by regression; PPO and A2C can continue from it.
 
+    Its value function and spread are untrained.
+
     Args:
         task: the robot and its problem.
         policy: the policy to copy, of any kind.
         starts: draws the chart points (n, d) at which the policy is copied.
         settings: settings of the training that continues, with its network and algorithm.
         seed: seed of weights and points.
-
-    Returns:
-        A policy of `settings.algorithm`, whose value function and spread are untrained.
     """
     model = build(task, settings, seed)
     rng = np.random.default_rng(seed)

@@ -14,7 +14,7 @@ from hyrl_mj.tasks import Task, reference
 
 PRESETS = ("fast", "paper", "smoke")
 
-# Stage 1 of preset fast, by algorithm, for continuous inputs and for levels.
+# Stage 1 of preset fast, by algorithm, for continuous inputs and for levels; the key replaces `algorithm`.
 # Episodes are short for tasks that start all over the chart: the first second decides the way.
 _PPO = Training(
     algorithm="ppo",
@@ -29,19 +29,15 @@ _PPO = Training(
     episode=20,
     options={"n_steps": 32, "batch_size": 1024, "n_epochs": 8},
 )
-_A2C = replace(
-    _PPO,
-    algorithm="a2c",
-    options={"n_steps": 16, "normalize_advantage": True, "use_rms_prop": False},
-)
+_A2C = replace(_PPO, options={"n_steps": 16, "normalize_advantage": True, "use_rms_prop": False})
 # A gradient step takes milliseconds and a sample hardly anything: many samples for each step.
-_SAC = replace(
+_TD3 = replace(
     _PPO,
-    algorithm="sac",
     samples=48_000,
     envs=32,
     activation="relu",
     gamma=0.95,
+    action_noise=0.3,
     options={
         "buffer_size": 100_000,
         "learning_starts": 1_000,
@@ -49,31 +45,30 @@ _SAC = replace(
         "train_freq": 1,
         "gradient_steps": 1,
         "tau": 0.02,
-        "ent_coef": 0.02,
     },
 )
-_TD3 = replace(
-    _SAC,
-    algorithm="td3",
-    action_noise=0.3,
-    options={name: value for name, value in _SAC.options.items() if name != "ent_coef"},
-)
-_CONTINUOUS = {
-    "ppo": _PPO,
-    "a2c": _A2C,
-    "sac": _SAC,
-    "td3": _TD3,
-    "ddpg": replace(_TD3, algorithm="ddpg"),
-}
-_DQN = replace(
+_SAC = replace(_TD3, action_noise=0.0, options={**_TD3.options, "ent_coef": 0.02})
+_CONTINUOUS = {"ppo": _PPO, "a2c": _A2C, "sac": _SAC, "td3": _TD3, "ddpg": _TD3}
+_PPO_LEVELS = replace(
     _PPO,
-    algorithm="dqn",
-    samples=150_000,
-    envs=64,
+    samples=200_000,
     activation="relu",
-    learning_rate=1e-3,
     gamma=0.9664,
     episode=None,
+    options={**_PPO.options, "ent_coef": 0.02, "gae_lambda": 0.95},
+)
+_A2C_LEVELS = replace(
+    _PPO_LEVELS,
+    samples=300_000,
+    envs=32,
+    gamma=0.95,
+    options={**_A2C.options, "n_steps": 8, "ent_coef": 0.01, "gae_lambda": 0.9},
+)
+_DQN = replace(
+    _PPO_LEVELS,
+    samples=150_000,
+    envs=64,
+    learning_rate=1e-3,
     options={
         "buffer_size": 200_000,
         "learning_starts": 2_000,
@@ -87,27 +82,8 @@ _DQN = replace(
         "exploration_final_eps": 0.05,
     },
 )
-_PPO_LEVELS = replace(
-    _PPO,
-    samples=200_000,
-    activation="relu",
-    gamma=0.9664,
-    episode=None,
-    options={**_PPO.options, "ent_coef": 0.02, "gae_lambda": 0.95},
-)
-_LEVELS = {
-    "ppo": _PPO_LEVELS,
-    "a2c": replace(
-        _PPO_LEVELS,
-        algorithm="a2c",
-        samples=300_000,
-        envs=32,
-        gamma=0.95,
-        options={**_A2C.options, "n_steps": 8, "ent_coef": 0.01, "gae_lambda": 0.9},
-    ),
-    "dqn": _DQN,
-}
-# The paper's training.
+_LEVELS = {"ppo": _PPO_LEVELS, "a2c": _A2C_LEVELS, "dqn": _DQN}
+# The paper's training, and its algorithms.
 _PAPER = replace(
     _DQN,
     samples=1_000_000,
@@ -117,21 +93,13 @@ _PAPER = replace(
     symmetric=False,
     options={},
 )
-_PAPERS = {"ppo": replace(_PAPER, algorithm="ppo"), "dqn": _PAPER}
+_PAPERS = ("ppo", "dqn")
 # Samples of preset smoke.
-_SMOKE = {"ppo": 24_576, "a2c": 65_536, "dqn": 10_000} | dict.fromkeys(
-    ("sac", "td3", "ddpg"), 12_000
-)
+_SMOKE = {"ppo": 24_576, "a2c": 65_536, "dqn": 10_000, "sac": 12_000, "td3": 12_000, "ddpg": 12_000}
 # Stage 6, for every algorithm of stage 1. The modes of a discrete task are trained by PPO, too: the returns
 # of the ways differ by less than the error of a freely trained value function.
 _MODES_CONTINUOUS = replace(
-    _PPO,
-    samples=320_000,
-    activation="relu",
-    gamma=0.95,
-    symmetric=False,
-    episode=40,
-    attempts=3,
+    _PPO, samples=320_000, activation="relu", gamma=0.95, symmetric=False, episode=40, attempts=3
 )
 _MODES_DISCRETE = replace(
     _MODES_CONTINUOUS,
@@ -141,14 +109,9 @@ _MODES_DISCRETE = replace(
     options={**_PPO.options, "ent_coef": 0.003, "gae_lambda": 0.9},
 )
 _MODES_PAPER_CONTINUOUS = replace(
-    _PAPER,
-    algorithm="ppo",
-    samples=100_000,
-    hidden=(112, 112),
-    learning_rate=3.45e-4,
-    gamma=0.9637,
+    _PAPER, samples=100_000, hidden=(112, 112), learning_rate=3.45e-4, gamma=0.9637
 )
-_MODES_PAPER_DISCRETE = replace(_PAPER, samples=300_000, warm_start=True)
+_MODES_PAPER_DISCRETE = replace(_PAPER, algorithm="dqn", samples=300_000, warm_start=True)
 _SMOKE_MODES = 8_192
 # Grid points along the longest side of the chart, by its dimension, for the search of M* and for the sets;
 # fewer for plants with dynamics, whose samples are slower to simulate.
@@ -211,25 +174,20 @@ def _stage1(task: Task, name: str, algorithm: str) -> Training:
     levels = task.learning.levels
     check_algorithm(algorithm, task.name, levels)
     known = sb3_relative(algorithm, levels)
-    if name == "paper":
-        if known not in _PAPERS:
-            raise BadInput(
-                f"preset 'paper' has no {algorithm}, the paper trained with {' and '.join(_PAPERS)}: "
-                "choose preset fast or smoke"
-            )
-        training = _PAPERS[known]
-    else:
-        training = (_CONTINUOUS if levels is None else _LEVELS)[known]
+    if name == "paper" and known not in _PAPERS:
+        raise BadInput(
+            f"preset 'paper' has no {algorithm}, the paper trained with {' and '.join(_PAPERS)}: "
+            "choose preset fast or smoke"
+        )
+    training = _PAPER if name == "paper" else (_CONTINUOUS if levels is None else _LEVELS)[known]
     if name == "smoke":
         training = replace(training, samples=_SMOKE[known])
     if np.any(np.subtract(task.start_high, task.start_low) < task.chart.sides - 1e-9):
         # Episodes are not cut short: states outside the start region are only met late in an episode.
         training = replace(training, episode=None)
-    if known == algorithm:
-        return training
-    return replace(
-        training, algorithm=algorithm, options=accepted_options(algorithm, training.options)
-    )
+    if known != algorithm:
+        training = replace(training, options=accepted_options(algorithm, training.options))
+    return replace(training, algorithm=algorithm)
 
 
 def _stage6(task: Task, name: str, algorithm: str) -> Training:

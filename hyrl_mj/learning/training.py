@@ -80,7 +80,6 @@ def train(
     watch = _Watch(settings.samples, ground, log_dir, label)
     with single_threaded():
         model.learn(settings.samples, callback=watch, log_interval=interval)
-    watch.close()
     assert watch.best is not None
     return watch.best
 
@@ -279,9 +278,6 @@ class _Watch(BaseCallback):
     def _on_training_end(self) -> None:
         if self.best_score < self._ground.enough:
             self._checkpoint()
-
-    def close(self) -> None:
-        """Removes the progress bar."""
         self._progress.close()
 
     def _checkpoint(self) -> None:

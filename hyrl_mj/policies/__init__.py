@@ -4,7 +4,6 @@ A policy is a network, a function or an ONNX model on the observation of a task;
 mode. Agents that were trained elsewhere are read here, and nothing in their files is executed.
 """
 
-from hyrl_mj.policies.activations import ACTIVATIONS, TORCH_NAMES
 from hyrl_mj.policies.algorithms import (
     ALGORITHMS,
     accepted_options,
@@ -24,7 +23,7 @@ from hyrl_mj.policies.external import (
     reopen_agent,
 )
 from hyrl_mj.policies.functions import from_callable
-from hyrl_mj.policies.mlp import MlpPolicy, Policy, SampledPolicy
+from hyrl_mj.policies.mlp import ACTIVATIONS, TORCH_NAMES, MlpPolicy, Policy, SampledPolicy
 from hyrl_mj.policies.sb3_zip import infer_algorithm
 
 __all__ = [

@@ -43,28 +43,19 @@ class Algorithm:
     @property
     def is_actor_critic(self) -> bool:
         """Whether it trains the policy network directly, beside a value function (PPO and A2C)."""
-        return self.parts == _ACTOR_CRITIC.parts
+        return self.parts == _ON_POLICY_PARTS
 
 
 # SB3 1.x had layers that policy and value function share.
-_ACTOR_CRITIC = Algorithm(
-    levels=None,
-    parts=("mlp_extractor.shared_net.", "mlp_extractor.policy_net.", "action_net."),
-    activation="tanh",
-    log_std="log_std",
-)
-_DETERMINISTIC = Algorithm(levels=False, parts=("actor.mu.",), activation="relu", squashed=True)
+_ON_POLICY_PARTS = ("mlp_extractor.shared_net.", "mlp_extractor.policy_net.", "action_net.")
+_ACTOR_CRITIC = Algorithm(None, _ON_POLICY_PARTS, "tanh", log_std="log_std")
+_DETERMINISTIC = Algorithm(False, ("actor.mu.",), "relu", squashed=True)
+_SAC = Algorithm(False, ("actor.latent_pi.", "actor.mu."), "relu", True, "actor.log_std")
 ALGORITHMS = {
     "ppo": _ACTOR_CRITIC,
     "a2c": _ACTOR_CRITIC,
-    "dqn": Algorithm(levels=True, parts=("q_net.q_net.",), activation="relu"),
-    "sac": Algorithm(
-        levels=False,
-        parts=("actor.latent_pi.", "actor.mu."),
-        activation="relu",
-        squashed=True,
-        log_std="actor.log_std",
-    ),
+    "dqn": Algorithm(True, ("q_net.q_net.",), "relu"),
+    "sac": _SAC,
     "td3": _DETERMINISTIC,
     "ddpg": _DETERMINISTIC,
 }
@@ -78,15 +69,11 @@ def algorithm_title(name: str) -> str:
 def check_algorithm(name: str, task: str, levels: int | None) -> None:
     """Raises `BadInput` if an algorithm is unknown, or does not take the inputs of a task.
 
-    Args:
-        name: one of `ALGORITHMS`, or `module:Class` of another one.
-        task: the name of the task in messages.
-        levels: number of levels of the task's input, None for continuous inputs.
+    The inputs have a number of levels, or None if they are continuous.
     """
     if ":" not in name and name not in ALGORITHMS:
-        raise unknown(
-            "algorithm", name, [*ALGORITHMS, f"or module:Class of another one for {task}"]
-        )
+        names = [*ALGORITHMS, f"or module:Class of another one for {task}"]
+        raise unknown("algorithm", name, names)
     discrete = levels is not None
     if ALGORITHMS[sb3_relative(name, levels)].takes(discrete):
         return

@@ -12,10 +12,15 @@ import numpy as np
 
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadArtifact, BadInput, check_seed, unknown
-from hyrl_mj.policies.activations import ACTIVATIONS
 from hyrl_mj.policies.algorithms import algorithm_title
 from hyrl_mj.policies.functions import from_callable, from_onnx
-from hyrl_mj.policies.mlp import MlpPolicy, ObservationPolicy, Policy, SampledPolicy
+from hyrl_mj.policies.mlp import (
+    ACTIVATIONS,
+    MlpPolicy,
+    ObservationPolicy,
+    Policy,
+    SampledPolicy,
+)
 from hyrl_mj.policies.sb3_zip import REMEDY, from_tensors, read_zip
 from hyrl_mj.tasks import Task
 
@@ -108,21 +113,16 @@ def load_agent(
     to its limits. A policy class that overrides `forward` is not recognised, and acts as SB3's own.
 
     An ONNX model has one input, observations (n, k) float32, and as its first output inputs (n, m) in the
-    plant's units; for a discrete task preferences (n, levels) or integers (n,).
-
-    A `.safetensors` file is one that `MlpPolicy.save` wrote, with its description beside it.
+    plant's units; for a discrete task preferences (n, levels) or integers (n,). A `.safetensors` file is one
+    that `MlpPolicy.save` wrote, with its description beside it.
 
     Args:
-        path: the file.
-        task: the task on which the policy acts.
+        path, task: the file, and the task on which the policy acts.
         activation: the function between the layers, one of `hyrl_mj.policies.ACTIVATIONS`, for a zip that
             does not name it; by default SB3's: "tanh" for PPO and A2C, "relu" for the others.
         stochastic: draw from the policy's distribution instead of acting by its mean or mode (PPO, A2C,
             SAC). Such a policy is reproducible call by call only.
         seed: the seed of these draws.
-
-    Returns:
-        A `FunctionPolicy` for an `.onnx` file, else an `MlpPolicy` or `SampledPolicy`.
 
     Raises:
         BadInput: an unknown activation, a bad seed, or a policy without a distribution to draw from.
@@ -140,12 +140,10 @@ def load_agent(
         policy = MlpPolicy.load(path)
         if policy.task.name != task.name:
             raise BadArtifact(
-                f"{path} is a policy for {policy.task.name}: {task.name} needs its own"
+                f"{path} is a policy for {policy.task.name}: give one for {task.name}"
             )
         if activation not in (None, policy.activation):
-            raise BadArtifact(
-                f"{path} has activation {policy.activation!r}: leave the activation out"
-            )
+            raise BadArtifact(f"{path} has activation {policy.activation!r}: leave activation out")
     else:
         with artifacts.reading(path, REMEDY):
             weights, about = read_zip(path)
@@ -160,12 +158,9 @@ def read_agent(
     stochastic: bool = False,
     seed: int = 0,
 ) -> ExternalAgent:
-    """Returns an external agent.
+    """Returns an external agent: a file for `load_agent`, a policy, or a function for `from_callable`.
 
-    Args:
-        task: the task on which it acts.
-        policy: a file for `hyrl_mj.load_agent`, a policy, or a function for `hyrl_mj.from_callable`.
-        activation, stochastic, seed: as in `hyrl_mj.load_agent`; the first two are about files.
+    Activation and stochastic are about files.
 
     Raises:
         BadInput: it cannot be used, or does not fit the task.
@@ -191,14 +186,9 @@ def read_agent(
 def reopen_agent(
     path: Path, agent: Agent, task: Task, seed: int, policy: AnyPolicy | None
 ) -> Policy:
-    """Returns the policy of the agent of a run directory.
+    """Returns the policy of the agent of a run directory, as `config.json` describes it.
 
-    Args:
-        path: the run directory.
-        agent: its description in `config.json`.
-        task: the task on which it acts.
-        seed: the seed of the draws, if it is sampled.
-        policy: the function that the run was made with, which no file holds.
+    A run with a function needs that function as `policy`. The seed is that of a sampled agent's draws.
 
     Raises:
         BadInput: the function is missing, or is another one.
@@ -212,8 +202,7 @@ def reopen_agent(
         external = read_agent(task, policy)
         if external.agent != agent:
             raise BadInput(
-                f"{path} was made with a function that answers otherwise than this policy: give that "
-                "function"
+                f"{path} was made with a function that answers otherwise: give that function"
             )
         return external.policy
     if policy is not None:
@@ -235,8 +224,8 @@ def _network(policy: Policy, task: Task, source: str = "") -> ExternalAgent:
     digest = sha256()
     for name in sorted(network.weights):
         digest.update(name.encode() + np.ascontiguousarray(network.weights[name]).tobytes())
-    fingerprint = digest.hexdigest()
-    agent = Agent(network.algorithm, source, fingerprint, network.activation, stochastic)
+    tensors = digest.hexdigest()
+    agent = Agent(network.algorithm, source, tensors, network.activation, stochastic)
     return ExternalAgent(policy, agent)
 
 

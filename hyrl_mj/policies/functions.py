@@ -98,9 +98,8 @@ def from_onnx(path: Path, task: Task, remedy: str) -> FunctionPolicy:
 
     def function(observation: np.ndarray) -> np.ndarray:
         parts = [observation] if takes_batches else np.split(observation, len(observation))
-        actions = np.concatenate(
-            [session.run([output_name], {input_name: part})[0] for part in parts]
-        )
+        outputs = [session.run([output_name], {input_name: part})[0] for part in parts]
+        actions = np.concatenate(outputs)
         preferences = task.input_levels is not None and np.issubdtype(actions.dtype, np.floating)
         return _preferred(actions, task) if preferences else actions
 

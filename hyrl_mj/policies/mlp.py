@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
@@ -15,10 +15,32 @@ from threadpoolctl import ThreadpoolController
 
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadArtifact, BadInput
-from hyrl_mj.policies.activations import ACTIVATIONS
 from hyrl_mj.policies.algorithms import ALGORITHMS, Algorithm
 from hyrl_mj.tasks import Task, get_task
 
+
+def _sigmoid(x: np.ndarray) -> np.ndarray:
+    return 0.5 * (1 + np.tanh(0.5 * x))  # never overflows
+
+
+def _gelu(x: np.ndarray) -> np.ndarray:
+    from scipy.special import erf  # slow to import, and seldom needed
+
+    return np.asarray(0.5 * x * (1 + erf(x / np.sqrt(np.float32(2)))))
+
+
+# The functions between the layers, of arrays of any shape, and their classes in `torch.nn`.
+ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "relu": lambda x: np.maximum(x, 0),
+    "tanh": np.tanh,
+    "elu": lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0))),
+    "leaky_relu": lambda x: np.where(x > 0, x, 0.01 * x),
+    "silu": lambda x: x * _sigmoid(x),
+    "gelu": _gelu,
+    "sigmoid": _sigmoid,
+}
+_CLASSES = ("ReLU", "Tanh", "ELU", "LeakyReLU", "SiLU", "GELU", "Sigmoid")
+TORCH_NAMES = dict(zip(ACTIVATIONS, _CLASSES, strict=True))
 # A linear layer: weight (outputs, inputs) and bias (outputs,).
 Layer = tuple[np.ndarray, np.ndarray]
 # Rows that go through a network at a time: the hidden layers then stay in the processor's cache.
@@ -85,8 +107,7 @@ class MlpPolicy(ObservationPolicy):
     weights: Mapping[str, np.ndarray] = field(repr=False)
 
     def __post_init__(self) -> None:
-        layers, task = self.layers, self.task
-        levels = ALGORITHMS[self.algorithm].levels
+        layers, task, levels = self.layers, self.task, self._algorithm.levels
         if levels is None and "log_std" in self.weights:
             levels = False
         if levels is not None:
@@ -113,6 +134,11 @@ class MlpPolicy(ObservationPolicy):
 
     @property
     def _algorithm(self) -> Algorithm:
+        if self.algorithm not in ALGORITHMS:
+            raise BadArtifact(
+                f"algorithm {self.algorithm!r} of the policy is unknown: choose one of "
+                f"{', '.join(ALGORITHMS)}"
+            )
         return ALGORITHMS[self.algorithm]
 
     @property
@@ -123,7 +149,10 @@ class MlpPolicy(ObservationPolicy):
     @cached_property
     def layers(self) -> list[Layer]:
         """Weight (outputs, inputs) and bias (outputs,) of each layer, from observation to output."""
-        return _layers(self.weights, self.algorithm)
+        parts = [_linear(self.weights, part) for part in self._algorithm.parts]
+        if not parts[-1]:
+            raise BadArtifact(f"the file holds no network of a {self.algorithm} policy")
+        return [layer for part in parts for layer in part]
 
     @property
     def output(self) -> str:
@@ -160,9 +189,7 @@ class MlpPolicy(ObservationPolicy):
             return self.weights[name]
         layer = _linear(self.weights, f"{name}.")
         if not layer:
-            raise BadArtifact(
-                f"the {self.algorithm} policy has no log_std: it cannot be drawn from"
-            )
+            raise BadArtifact(f"the {self.algorithm} policy has no log_std to draw with")
         return np.clip(self._run(observation, layer[0]), *LOG_STD_RANGE)
 
     def _chosen(self, outputs: np.ndarray) -> np.ndarray:
@@ -264,18 +291,6 @@ def check_kind(task: Task, levels: bool) -> None:
     n = task.learning.levels
     takes = "continuous inputs" if n is None else f"one of {n} discrete levels"
     raise BadArtifact(f"the network {gives}, the task {task.name} takes {takes}")
-
-
-def _layers(weights: Mapping[str, np.ndarray], algorithm: str) -> list[Layer]:
-    """Returns the layers from observation to output, by SB3's names of their tensors."""
-    if algorithm not in ALGORITHMS:
-        raise BadArtifact(
-            f"algorithm {algorithm!r} of the policy is unknown: choose one of {', '.join(ALGORITHMS)}"
-        )
-    parts = [_linear(weights, part) for part in ALGORITHMS[algorithm].parts]
-    if not parts[-1]:
-        raise BadArtifact(f"the file holds no network of a {algorithm} policy")
-    return [layer for part in parts for layer in part]
 
 
 def _linear(weights: Mapping[str, np.ndarray], prefix: str) -> list[Layer]:

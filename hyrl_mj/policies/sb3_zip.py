@@ -18,9 +18,8 @@ from zipfile import BadZipFile, ZipFile, is_zipfile
 import numpy as np
 
 from hyrl_mj.errors import BadArtifact
-from hyrl_mj.policies.activations import ACTIVATIONS, TORCH_NAMES
 from hyrl_mj.policies.algorithms import ALGORITHMS
-from hyrl_mj.policies.mlp import MlpPolicy, check_kind
+from hyrl_mj.policies.mlp import ACTIVATIONS, TORCH_NAMES, MlpPolicy, check_kind
 from hyrl_mj.tasks import Task
 
 REMEDY = "give the zip that SB3's model.save wrote, an .onnx file, or a policy.safetensors of a run"
@@ -67,9 +66,8 @@ def _tensors(content: bytes) -> dict[str, np.ndarray]:
     try:
         if size > LARGEST:
             raise BadArtifact("its policy.pth is too large for an MLP policy")
-        with warnings.catch_warnings(
-            action="ignore"
-        ):  # about odd pickles, which are refused anyway
+        # torch warns of odd pickles, which are refused anyway.
+        with warnings.catch_warnings(action="ignore"):
             state = torch.load(io.BytesIO(content), weights_only=True, map_location="cpu")
     except UnpicklingError as error:
         # torch's own message recommends to load it unsafely.
