@@ -84,7 +84,7 @@ class BatchedEnv:
         self._noise = signal_for(noise, task, None)
         self.max_steps = max_steps or task.max_steps
         self.plant = task.plant(n, threads)
-        self._samples = np.zeros(n, dtype=int)
+        self.samples = np.zeros(n, dtype=int)  # of each episode so far
         self.seed(None)
 
     def seed(self, seed: int | None) -> None:
@@ -107,7 +107,7 @@ class BatchedEnv:
         if len(z) != len(ids):
             raise BadInput(f"{len(ids)} episode(s) need as many starts, got {len(z)}")
         self.plant.set_state(*self.task.state(z, self._rng), ids=ids)
-        self._samples[ids] = 0
+        self.samples[ids] = 0
         return self.task.observation(self._measure(ids)).astype(np.float32)
 
     def step(self, u: np.ndarray) -> StepResult:
@@ -116,7 +116,7 @@ class BatchedEnv:
         The caller resets the episodes that are over.
         """
         self.plant.step(u)
-        self._samples += 1
+        self.samples += 1
         measurement, unstable = self.plant.measurement, self.plant.unstable
         outcome = self.task.outcome(measurement, unstable)
         terminated = outcome != Outcome.RUNNING
@@ -130,7 +130,7 @@ class BatchedEnv:
             reward[left] = self.domain.exit_reward
             terminated = terminated | left
             outcome[left] = Outcome.OUT_OF_BOUNDS
-        truncated = ~terminated & (self._samples >= self.max_steps)
+        truncated = ~terminated & (self.samples >= self.max_steps)
         if truncated.any():
             outcome[truncated] = self.task.verdict(measurement[truncated])
         observation = self.task.observation(measured).astype(np.float32)
@@ -150,7 +150,7 @@ class BatchedEnv:
     def _measure(self, ids: np.ndarray) -> np.ndarray:
         """Returns noisy measurements (k, p) of the rows `ids`."""
         true, modes = self.plant.measurement[ids], np.full(len(ids), NOT_STARTED)
-        return true + self._noise.sample(Sample(ids, self._samples[ids], true, modes, self.plant))
+        return true + self._noise.sample(Sample(ids, self.samples[ids], true, modes, self.plant))
 
 
 def cautious_reward(

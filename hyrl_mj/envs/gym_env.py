@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 
 def observation_space(task: Task) -> spaces.Box:
     """Returns the space of a task's observations."""
-    low = np.array(task.observation_low, dtype=np.float32)
-    high = np.array(task.observation_high, dtype=np.float32)
+    low, high = np.float32(task.observation_low), np.float32(task.observation_high)
     return spaces.Box(low, high, dtype=np.float32)
 
 
@@ -76,7 +75,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         """Starts an episode, at the chart point `options["z"]` if given."""
         super().reset(seed=seed)
         self.core.seed(int(self.np_random.integers(2**63)))
-        return self.core.reset(z=_starts(self.core.task, options))[0], {"z": self.core.z[0]}
+        return self.core.reset(z=starts(self.core.task, options))[0], {"z": self.core.z[0]}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Applies one action for one sample; see `gymnasium.Env.step`."""
@@ -114,9 +113,7 @@ class TaskVectorEnv(VectorEnv):
     Args:
         task: name of the task.
         num_envs: number of episodes n.
-        noise: measurement noise on the observations.
-        max_episode_steps: samples until truncation, by default the task's limit.
-        threads: threads of the physics, 0 for all cores; results do not depend on it.
+        noise, max_episode_steps, threads: as of `BatchedEnv`.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -146,30 +143,27 @@ class TaskVectorEnv(VectorEnv):
         super().reset(seed=seed)
         if seed is not None:
             self.core.seed(seed)
-        return self.core.reset(z=_starts(self.core.task, options)), {"z": self.core.z}
+        return self.core.reset(z=starts(self.core.task, options)), {"z": self.core.z}
 
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Applies one action to each episode for one sample; see `VectorEnv.step`."""
         result = self.core.step(self.core.inputs(actions))
-        observation = result.observation
+        observation, z = result.observation, self.core.z
         infos: dict[str, Any] = {}
         ended = np.flatnonzero(result.done)
+        for i in ended:
+            info = {"outcome": Outcome(result.outcome[i]).label, "z": z[i]}
+            last = {"final_obs": observation[i].copy(), "final_info": info}
+            infos = self._add_info(infos, last, i)
         if len(ended):
-            final_obs = np.full(self.num_envs, None, dtype=object)
-            outcome = np.full(self.num_envs, None, dtype=object)
-            for i in ended:
-                final_obs[i], outcome[i] = observation[i].copy(), Outcome(result.outcome[i]).label
-            final_info = {"outcome": outcome, "_outcome": result.done, "z": self.core.z}
-            infos = {"final_obs": final_obs, "_final_obs": result.done}
-            infos |= {"final_info": final_info, "_final_info": result.done}
             observation[ended] = self.core.reset(ended)
         infos["z"] = self.core.z
         return observation, result.reward, result.terminated, result.truncated, infos
 
 
-def _starts(task: Task, options: dict[str, Any] | None) -> np.ndarray | None:
+def starts(task: Task, options: dict[str, Any] | None) -> np.ndarray | None:
     """Returns the chart points `options["z"]`, checked, or None."""
     z = (options or {}).get("z")
     return None if z is None else task.chart.check(z, task.name)

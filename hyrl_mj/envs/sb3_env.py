@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from hyrl_mj.envs.core import BatchedEnv
-from hyrl_mj.envs.gym_env import action_space, observation_space
+from hyrl_mj.envs.gym_env import action_space, observation_space, starts
 from hyrl_mj.tasks import Outcome
 
 
@@ -20,7 +20,7 @@ class TaskVecEnv(VecEnv):
         self.core = core
         self.render_mode = None
         self._actions = np.zeros(0)
-        self._returns, self._lengths = np.zeros(core.n), np.zeros(core.n, dtype=int)
+        self._returns = np.zeros(core.n)
         super().__init__(core.n, observation_space(core.task), action_space(core.task))
 
     def seed(self, seed: int | None = None) -> list[int | None]:
@@ -32,10 +32,9 @@ class TaskVecEnv(VecEnv):
         """Starts all episodes, at chart points if `set_options([{"z": z}, ...])` has set one for each."""
         points = [options.get("z") for options in self._options]
         self._reset_options()
-        task, default = self.core.task, all(point is None for point in points)
-        z = None if default else task.chart.check(points, task.name)
-        self._returns[:], self._lengths[:] = 0, 0
-        return self.core.reset(z=z)
+        default = all(point is None for point in points)
+        self._returns[:] = 0
+        return self.core.reset(z=starts(self.core.task, {} if default else {"z": points}))
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keeps the actions for `step_wait`."""
@@ -45,20 +44,19 @@ class TaskVecEnv(VecEnv):
         """Advances all episodes; see `VecEnv.step_wait`."""
         result = self.core.step(self.core.inputs(self._actions))
         self._returns += result.reward
-        self._lengths += 1
-        observation = result.observation
+        observation, lengths = result.observation, self.core.samples
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         ended = np.flatnonzero(result.done)
         for i in ended:
             infos[i] = {
                 "terminal_observation": observation[i].copy(),
                 "TimeLimit.truncated": bool(result.truncated[i]),
-                "episode": {"r": float(self._returns[i]), "l": int(self._lengths[i]), "t": 0.0},
+                "episode": {"r": float(self._returns[i]), "l": int(lengths[i]), "t": 0.0},
                 "outcome": Outcome(result.outcome[i]).label,
             }
         if len(ended):
             observation[ended] = self.core.reset(ended)
-            self._returns[ended], self._lengths[ended] = 0, 0
+            self._returns[ended] = 0
         return observation, result.reward.astype(np.float32), result.done, infos
 
     def close(self) -> None:

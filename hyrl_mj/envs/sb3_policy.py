@@ -62,18 +62,13 @@ class Sb3Policy:
 
     def _check_observation(self, observation: ArrayLike) -> np.ndarray:
         """Returns the observation as a float array (k,) or (n, k)."""
-        columns = len(self.task.observation_low)
+        columns, what = len(self.task.observation_low), f"an observation of {self.task.name}"
         try:
             values = np.asarray(observation, dtype=float)
         except (TypeError, ValueError):
-            raise BadInput(
-                f"an observation of {self.task.name} is {columns} numbers, got {observation!r}"
-            ) from None
+            raise BadInput(f"{what} is {columns} numbers, got {observation!r}") from None
         if values.ndim not in (1, 2) or values.shape[-1] != columns:
-            raise BadInput(
-                f"an observation of {self.task.name} has shape ({columns},) or (n, {columns}), "
-                f"got {values.shape}"
-            )
+            raise BadInput(f"{what} has shape ({columns},) or (n, {columns}), got {values.shape}")
         bad = values[~np.isfinite(values)]
         if len(bad):
             raise BadInput(f"observation {bad[0]} cannot be used: it must be finite")
