@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def observation_space(task: Task) -> spaces.Box:
     """Returns the space of a task's observations."""
-    low, high = np.float32(task.observation_low), np.float32(task.observation_high)
+    low, high = np.array([task.observation_low, task.observation_high], dtype=np.float32)
     return spaces.Box(low, high, dtype=np.float32)
 
 
@@ -156,7 +156,7 @@ class TaskVectorEnv(VectorEnv):
         for i in ended:
             info = {"outcome": Outcome(result.outcome[i]).label, "z": z[i]}
             last = {"final_obs": observation[i].copy(), "final_info": info}
-            infos = self._add_info(infos, last, i)
+            infos = self._add_info(infos, last, int(i))
         if len(ended):
             observation[ended] = self.core.reset(ended)
         infos["z"] = self.core.z

@@ -37,7 +37,7 @@ Step = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 def export_numpy(controller: HybridController, folder: str | Path) -> list[Path]:
-    """Writes a controller as controller.py and controller.npz, which need NumPy alone.
+    """Writes a controller as controller.py and controller.npz, which need NumPy alone; returns their paths.
 
     The module has `step(q, measured) -> (u, q_next)` and `initial_mode(measured)`, as the controller does.
 
@@ -45,17 +45,13 @@ def export_numpy(controller: HybridController, folder: str | Path) -> list[Path]
         controller: its policies are networks, and its sets are on grids.
         folder: is created if it does not exist.
 
-    Returns:
-        The paths of both files.
-
     Raises:
         BadInput: the controller cannot be exported, or the files cannot be written.
     """
     folder = Path(folder)
     path = folder / TEMPLATE.name
-    first_line = TEMPLATE.read_text(encoding="utf-8").splitlines(keepends=True)[0]
-    present = path.read_text(encoding="utf-8", errors="replace") if path.exists() else first_line
-    if not present.startswith(first_line):
+    first_line = TEMPLATE.read_text(encoding="utf-8").partition("\n")[0]
+    if path.exists() and first_line not in path.read_text(encoding="utf-8", errors="replace"):
         raise BadInput(f"{path} exists and is no exported controller: choose another folder")
     with tempfile.TemporaryDirectory() as temporary:
         written = _write(controller, Path(temporary))
@@ -67,7 +63,7 @@ def export_numpy(controller: HybridController, folder: str | Path) -> list[Path]
 
 
 def export_onnx(controller: HybridController, path: str | Path) -> Path:
-    """Writes a controller as one ONNX file: modes, sets and the jump rule in one graph.
+    """Writes a controller as one ONNX file, and returns its path: modes, sets and the jump rule in one graph.
 
     Its inputs are q (n,) int64 and measured (n, p) float64, its outputs u (n, m) float64 and q_next (n,)
     int64. A graph cannot refuse anything: for a q that is no mode, such as -1, it begins in the initial mode;
@@ -76,9 +72,6 @@ def export_onnx(controller: HybridController, path: str | Path) -> Path:
     Args:
         controller: its policies are networks, and its sets are on grids.
         path: the file to write.
-
-    Returns:
-        The path of the file.
 
     Raises:
         BadInput: the controller cannot be exported, the file cannot be written, or the packages onnx and
@@ -161,14 +154,10 @@ def _arrays(controller: HybridController, networks: list[MlpPolicy]) -> dict[str
         )
     low, high = task.input_limits
     arrays: dict[str, Any] = {
-        "modes": np.array(controller.modes, dtype=np.int64),
-        "on_edge": np.array(ON_EDGE),
-        "chart_low": chart.origin,
-        "chart_sides": chart.sides,
-        "chart_periodic": np.array(chart.periodic),
-        "input_low": low,
-        "input_high": high,
-    }
+        "modes": np.array(controller.modes, dtype=np.int64), "on_edge": ON_EDGE, "chart_low": chart.origin,
+        "chart_sides": chart.sides, "chart_periodic": chart.periodic,
+        "input_low": low, "input_high": high,
+    }  # fmt: skip
     if task.input_levels is not None:
         arrays["levels"] = task.input_levels
     for k, q in enumerate(controller.modes):
@@ -178,12 +167,12 @@ def _arrays(controller: HybridController, networks: list[MlpPolicy]) -> dict[str
         for kind, state_set in sets.items():
             on_grid = _grid_set(state_set, task, f"{kind} set of mode {q}")
             arrays[f"{kind}_{k}"] = on_grid.values
-            arrays[f"{kind}_{k}_counts"] = np.array(on_grid.grid.counts, dtype=np.int64)
+            arrays[f"{kind}_{k}_counts"] = on_grid.grid.counts
             arrays[f"{kind}_{k}_spacing"] = on_grid.grid.spacing
-        arrays[f"layers_{k}"] = np.array(len(networks[k].layers))
+        arrays[f"layers_{k}"] = len(networks[k].layers)
         for i, (weight, bias) in enumerate(networks[k].layers):
             arrays[f"weight_{k}_{i}"], arrays[f"bias_{k}_{i}"] = weight, bias
-    return arrays
+    return {name: np.array(value) for name, value in arrays.items()}
 
 
 def _grid_set(state_set: StateSet, task: Task, what: str) -> GridSet:
@@ -257,13 +246,12 @@ def _measurements(task: Task, n: int, rng: np.random.Generator) -> np.ndarray:
 
 def _check(controller: HybridController, step: Step, form: str) -> None:
     """Raises `BadInput` where a form does not do what the controller does."""
-    task, rng = controller.task, np.random.default_rng(1)
+    task, rng, wrong = controller.task, np.random.default_rng(1), 0
     refusal = (
         f"{form} of {task.name} cannot be exported: it does not do what the controller does ({{}}); do z() "
         "and observation() of the task compute each row from that row alone, whatever its values are?"
     )
     low, high = task.input_limits
-    wrong = 0
     for n in CHECKED:
         measured = _measurements(task, n, rng)
         q = rng.choice(controller.modes, n)

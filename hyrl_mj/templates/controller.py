@@ -15,8 +15,7 @@ with np.load(__file__.rpartition(".")[0] + ".npz", allow_pickle=False) as file:
 
 MODES = ARRAYS["modes"]
 LOW, SIDES, PERIODIC = (ARRAYS[f"chart_{name}"] for name in ("low", "sides", "periodic"))
-# Stands for "in no mode yet".
-NO_MODE = -1
+NO_MODE = -1  # stands for "in no mode yet"
 
 # ---- the task: the export replaces this part
 TASK = "name"
@@ -87,7 +86,7 @@ def answer(q, measured):
     Where q is no mode, the mode whose start set holds the measurement most deeply is chosen. Where a
     measurement is not finite, q stays and u is NaN.
     """
-    z, observed, modes = chart_point(measured), observation(measured), range(len(MODES))
+    z, observed = chart_point(measured), observation(measured)
     flow = distances(z, "flow")
     active = q[:, None] == MODES
     flows = (active & (flow <= ARRAYS["on_edge"])).any(axis=1)
@@ -98,24 +97,25 @@ def answer(q, measured):
     finite = np.isfinite(measured).all(axis=1)
     q_next = np.where(finite & ~flows, deepest, q)
     u = np.nan
-    for k in modes:
-        u = np.where((finite & (q_next == MODES[k]))[:, None], inputs(network(observed, k), k), u)
+    for k in range(len(MODES)):
+        u = np.where((finite & (q_next == MODES[k]))[:, None], inputs(observed, k), u)
     return u, q_next
 
 
 def distances(z, kind):
     """Returns the signed distances (n, modes) of chart points (n, d) to all modes' sets of a kind."""
+    turned = np.mod(z - LOW, SIDES)
+    # The remainder of a tiny negative number rounds up to the period itself.
+    turned = np.where(turned < SIDES, turned, 0.0)
+    z = np.where(PERIODIC, LOW + turned, z)
     return np.stack([signed_distance(z, f"{kind}_{k}") for k in range(len(MODES))], axis=1)
 
 
 def signed_distance(z, name):
-    """Returns the distance (n,) of chart points (n, d) to the edge of a set, negative inside.
-
-    It is interpolated between the nodes of a grid.
-    """
+    """Returns the distance (n,) of points (n, d) to the edge of a set, negative inside, from its grid."""
     counts, spacing = ARRAYS[f"{name}_counts"], ARRAYS[f"{name}_spacing"]
     last = np.where(PERIODIC, np.inf, counts - 1)
-    index = np.minimum(np.maximum((wrapped(z) - LOW) / spacing, 0), last)
+    index = np.minimum(np.maximum((z - LOW) / spacing, 0), last)
     below = np.floor(index)
     share, first = index - below, below.astype(np.int64)
     strides = np.append(np.cumprod(counts[:0:-1])[::-1], 1)
@@ -128,27 +128,15 @@ def signed_distance(z, name):
     return distance
 
 
-def wrapped(z):
-    """Returns chart points with their periodic coordinates brought into the period."""
-    turned = np.mod(z - LOW, SIDES)
-    # The remainder of a tiny negative number rounds up to the period itself.
-    turned = np.where(turned < SIDES, turned, 0.0)
-    return np.where(PERIODIC, LOW + turned, z)
-
-
-def network(observed, k):
-    """Returns the last layer of a mode's network for observations (n, k)."""
-    x, last = observed.astype(np.float32), ARRAYS[f"layers_{k}"] - 1
-    for i in range(last):
-        x = ACTIVATIONS[k](x @ ARRAYS[f"weight_{k}_{i}"].T + ARRAYS[f"bias_{k}_{i}"])
-    return x @ ARRAYS[f"weight_{k}_{last}"].T + ARRAYS[f"bias_{k}_{last}"]
-
-
-def inputs(output, k):
-    """Returns inputs (n, m) in the plant's units for the last layer of a mode's network."""
+def inputs(observed, k):
+    """Returns inputs (n, m) in the plant's units of a mode's network for observations (n, o)."""
+    x = observed.astype(np.float32)
+    for i in range(ARRAYS[f"layers_{k}"]):
+        x = ACTIVATIONS[k](x) if i else x
+        x = x @ ARRAYS[f"weight_{k}_{i}"].T + ARRAYS[f"bias_{k}_{i}"]
     if OUTPUTS[k] == "level":
-        return np.take(ARRAYS["levels"], output.argmax(axis=1), axis=0)
-    u, low, high = output.astype(np.float64), ARRAYS["input_low"], ARRAYS["input_high"]
+        return np.take(ARRAYS["levels"], x.argmax(axis=1), axis=0)
+    u, low, high = x.astype(np.float64), ARRAYS["input_low"], ARRAYS["input_high"]
     if OUTPUTS[k] == "squash":
         u = low + (np.tanh(u) + 1) / 2 * (high - low)
     return np.minimum(np.maximum(u, low), high)
