@@ -1,11 +1,11 @@
-"""Sets in a task's chart, as signed distances: negative inside, positive outside, in chart units."""
+"""Sets in a task's chart, by their signed distance in chart units: negative inside, positive outside."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, reduce
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -13,22 +13,14 @@ from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput
 
 
-class HasChart(Protocol):
-    """What tells the chart that sets lie in: a task."""
-
-    chart: Chart
-
-
 class StateSet(Protocol):
     """A closed set of chart points."""
 
     def signed_distance(self, z: np.ndarray) -> np.ndarray:
-        """(n,) distance of points (n, d) to the boundary, negative inside, in chart units."""
-        ...
+        """Returns the distance (n,) of points (n, d) to the boundary, negative inside, in chart units."""
 
     def contains(self, z: np.ndarray) -> np.ndarray:
-        """(n,) bool, whether points (n, d) lie in the set."""
-        ...
+        """Returns whether points (n, d) lie in the set: (n,) bool."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +36,7 @@ class Everything:
 
 @dataclass(frozen=True)
 class Complement:
-    """The closure of all that lies outside another set."""
+    """The closure of the complement of a set."""
 
     inner: StateSet
 
@@ -60,7 +52,7 @@ class Grid:
     """Nodes that cover a chart, equally spaced along each coordinate.
 
     Attributes:
-        chart: what it covers. A periodic coordinate has no node at the end of the period.
+        chart: the chart. A periodic coordinate has no node at the end of the period.
         counts: number of nodes along each coordinate.
     """
 
@@ -69,16 +61,16 @@ class Grid:
 
     @staticmethod
     def with_cells(chart: Chart, cells: int) -> Grid:
-        """A grid with square cells (in chart units), `cells` of them along the longest side."""
+        """Returns a grid with square cells (in chart units), `cells` of them along the longest side."""
         number = np.maximum(np.round(cells * chart.sides / chart.sides.max()).astype(int), 2)
         return Grid(chart, tuple(int(k) for k in number + ~np.array(chart.periodic)))
 
     @staticmethod
     def from_counts(chart: Chart, counts: np.ndarray) -> Grid:
-        """A grid with so many nodes along each coordinate.
+        """Returns a grid from the number of nodes (d,) along each coordinate.
 
         Raises:
-            BadInput: their number is not that of the chart's coordinates.
+            BadInput: the chart has another number of coordinates.
         """
         if len(counts) != chart.dimension:
             raise BadInput(
@@ -89,8 +81,7 @@ class Grid:
     @cached_property
     def spacing(self) -> np.ndarray:
         """Distance between nodes along each coordinate (d,)."""
-        gaps = np.array(self.counts) - ~np.array(self.chart.periodic)
-        return self.chart.sides / gaps
+        return self.chart.sides / (np.array(self.counts) - ~np.array(self.chart.periodic))
 
     @property
     def cell(self) -> float:
@@ -99,7 +90,7 @@ class Grid:
 
     @cached_property
     def nodes(self) -> np.ndarray:
-        """All nodes (N, d), the last coordinate running fastest."""
+        """All nodes (N, d); the last coordinate varies fastest."""
         axes = [
             low + step * np.arange(count)
             for low, step, count in zip(self.chart.low, self.spacing, self.counts, strict=True)
@@ -108,21 +99,21 @@ class Grid:
 
     @cached_property
     def _last(self) -> np.ndarray:
-        """Greatest fractional index along each coordinate (d,); a circle has no last node."""
+        """Greatest index along each coordinate (d,); infinite for a periodic one."""
         return np.where(self.chart.periodic, np.inf, np.array(self.counts) - 1)
 
     def index(self, z: np.ndarray) -> np.ndarray:
-        """Fractional indices (n, d) of points, kept on the grid."""
+        """Returns the fractional indices (n, d) of points (n, d), clipped to the grid."""
         index = (self.chart.wrap(z) - self.chart.origin) / self.spacing
         return np.minimum(np.maximum(index, 0), self._last)
 
     def nearest(self, z: np.ndarray) -> np.ndarray:
-        """Flat indices (n,) of the nodes nearest to points (n, d)."""
+        """Returns the flat indices (n,) of the nodes nearest to points (n, d)."""
         index = np.round(self.index(z)).astype(int) % self.counts
         return np.ravel_multi_index(tuple(index.T), self.counts)
 
     def neighbours(self) -> tuple[np.ndarray, np.ndarray]:
-        """All pairs of nodes next to each other along a coordinate: flat indices (k,), (k,)."""
+        """Returns all pairs of neighbours along a coordinate, as flat indices (k,), (k,)."""
         index = np.arange(int(np.prod(self.counts))).reshape(self.counts)
         pairs = []
         for axis, periodic in enumerate(self.chart.periodic):
@@ -134,24 +125,24 @@ class Grid:
 
     @cached_property
     def _corners(self) -> np.ndarray:
-        """The corners of a cell (d, 2**d, 1): 0 is below, 1 above; the last coordinate runs fastest."""
+        """The corners (d, 2**d, 1) of a cell: 0 is the lower node along a coordinate, 1 the upper."""
         return np.indices((2,) * len(self.counts)).reshape(len(self.counts), -1, 1)
 
     def interpolate(self, values: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Multilinear interpolation (n,) of values at the nodes (N,) at points (n, d)."""
+        """Returns the values (n,) at points (n, d), multilinearly interpolated from the nodes' (N,)."""
         index = self.index(z).T[:, None]
         below = index.astype(int)
         share = index - below
         weights = reduce(np.multiply, np.where(self._corners, share, 1 - share))
-        # Above the last node of an axis lies nothing: "wrap" finds the first one, with a weight of 0.
+        # On the last node of an axis the upper corner has the weight 0: "wrap" keeps its index valid.
         nodes = np.ravel_multi_index(tuple(below + self._corners), self.counts, mode="wrap")
-        # One corner after the other: NumPy's sum of one point is not to the bit that of many.
+        # The corners are added in turn: np.sum rounds differently for one point than for many.
         return reduce(np.add, weights * values[nodes])
 
 
 @dataclass(frozen=True)
 class GridSet:
-    """A set by its signed distance at the nodes of a grid, interpolated in between.
+    """A set given by its signed distance at the nodes of a grid, interpolated in between.
 
     Attributes:
         grid: the nodes.
@@ -172,7 +163,7 @@ class GridSet:
 
     @staticmethod
     def from_mask(grid: Grid, inside: np.ndarray) -> GridSet:
-        """The set whose nodes are `inside` (N,) bool; its boundary runs half-way between nodes."""
+        """Returns the set with the nodes `inside` (N,) bool; its boundary lies half-way between nodes."""
         from scipy import ndimage  # slow to import
 
         inside = inside.reshape(grid.counts)
@@ -187,15 +178,15 @@ class GridSet:
 
     @staticmethod
     def pack(sets: tuple[GridSet, ...]) -> dict[str, np.ndarray]:
-        """Returns the arrays that hold sets on one grid: `grid_counts` (d,), `signed_distance` (k, N)."""
+        """Returns sets on one grid as the arrays `grid_counts` (d,) and `signed_distance` (k, N)."""
         return {
             "grid_counts": np.array(sets[0].grid.counts),
             "signed_distance": np.stack([members.values for members in sets]),
         }
 
     @staticmethod
-    def unpack(arrays: Mapping[str, np.ndarray], task: HasChart) -> tuple[GridSet, ...]:
-        """Returns the sets that `pack` has packed, in the chart of a task."""
+    def unpack(arrays: Mapping[str, np.ndarray], task: Any) -> tuple[GridSet, ...]:
+        """Returns the sets from the arrays of `pack`, in the chart of a task."""
         grid = Grid.from_counts(task.chart, arrays["grid_counts"])
         return tuple(GridSet(grid, values) for values in arrays["signed_distance"])
 
@@ -219,36 +210,34 @@ class GridSet:
         return GridSet(self.grid, -self.values)
 
     def dilated(self, by: float) -> GridSet:
-        """All points within `by` of the set (in chart units)."""
+        """Returns all points within the distance `by` of the set [chart units]."""
         return GridSet(self.grid, self.values - by)
 
     def eroded(self, by: float) -> GridSet:
-        """The points of the set that are deeper than `by` in it."""
+        """Returns the points of the set at least `by` from its boundary [chart units]."""
         return GridSet(self.grid, self.values + by)
 
     def dilated_by_box(self, half: np.ndarray) -> GridSet:
-        """All points z + n with z in the set and |n_i| <= half_i (d,), and up to the next nodes."""
+        """Returns all points z + n with z in the set and |n_i| <= half_i (d,), rounded up to nodes."""
         window = np.ceil(half / self.grid.spacing - 1e-6).astype(int)
         if not window.any():
             return self
-        shape, periodic = self.grid.counts, self.grid.chart.periodic
-        return GridSet.from_mask(
-            self.grid, within_reach(self.mask.reshape(shape), window, periodic).ravel()
-        )
+        mask = self.mask.reshape(self.grid.counts)
+        return GridSet.from_mask(self.grid, within_reach(mask, window, self.grid.chart.periodic))
 
     def eroded_by_box(self, half: np.ndarray) -> GridSet:
-        """The points z of which all z + n, |n_i| <= half_i (d,), are in the set or off the chart."""
+        """Returns the points z for which all z + n, |n_i| <= half_i (d,), are in the set or off the chart."""
         return ~(~self).dilated_by_box(half)
 
     @property
     def mask(self) -> np.ndarray:
-        """(N,) bool, the nodes in the set."""
+        """Whether each node is in the set: (N,) bool."""
         return self.values <= 0
 
     def pieces(self) -> list[tuple[float, float]]:
-        """First and last node of each piece of a set in one dimension.
+        """Returns the first and last node of each piece of a set in one dimension.
 
-        A piece that holds the seam of a periodic coordinate ends at a smaller value than it begins.
+        For a piece across the seam of a periodic coordinate, the last is smaller than the first.
         """
         inside, nodes = self.mask, self.grid.nodes[:, 0]
         before, after = np.roll(inside, 1), np.roll(inside, -1)
@@ -261,7 +250,7 @@ class GridSet:
 
     @cached_property
     def _nearest_inside(self) -> np.ndarray:
-        """(N,) flat index of the inner node that is nearest to each node."""
+        """Flat index (N,) of the inner node nearest to each node."""
         from scipy import ndimage
 
         grid, inside = self.grid, self.mask.reshape(self.grid.counts)
@@ -275,7 +264,7 @@ class GridSet:
         return np.ravel_multi_index(tuple(index), grid.counts).ravel()
 
     def project(self, z: np.ndarray) -> np.ndarray:
-        """Points (n, d) of the set: z itself where it is inside, else the nearest node inside."""
+        """Returns points (n, d) of the set: z where it is inside, elsewhere the nearest inner node."""
         inside = self.contains(z)
         if inside.all() or not self.mask.any():
             return z
@@ -284,7 +273,7 @@ class GridSet:
 
 
 def within_reach(mask: np.ndarray, window: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
-    """Returns whether some node of a mask lies within so many nodes (d,) along each axis, in its shape."""
+    """Returns the mask dilated by a window of so many nodes (d,) along each axis."""
     from scipy import ndimage
 
     reached = mask.astype(np.uint8)
@@ -298,9 +287,9 @@ def within_reach(mask: np.ndarray, window: np.ndarray, periodic: tuple[bool, ...
 
 
 def _unrolled(grid: Grid, mask: np.ndarray) -> tuple[np.ndarray, tuple[slice, ...]]:
-    """The mask with half a period more at either end of periodic coordinates, and where it is in it.
+    """Returns the mask with half a period more at both ends of periodic axes, and the slices of the mask.
 
-    That much holds the shortest way between any two of its nodes.
+    The shortest way between any two nodes of the mask then runs inside.
     """
     extra = [n // 2 + 1 if p else 0 for n, p in zip(grid.counts, grid.chart.periodic, strict=True)]
     wide = np.pad(mask, [(k, k) for k in extra], mode="wrap")

@@ -7,7 +7,7 @@ import pytest
 import hyrl_mj
 from hyrl_mj import AgentOptions, RunOptions
 from hyrl_mj.errors import BadInput
-from hyrl_mj.pipeline.options import complete
+from hyrl_mj.pipeline.runs import complete
 
 
 def test_changes_are_made_on_top_of_the_options():

@@ -1,14 +1,14 @@
-"""What noise can do to the policy and to the hybrid controller of a run."""
+"""The examination: what noise can do to the policy and to the hybrid controller of a run."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.game import BEATEN, WON, WON_FROM_SOME, EpisodeCount, Maps, Robustness, examine
-from hyrl_mj.pipeline.options import ExamineOptions
 from hyrl_mj.policies import Controller
 from hyrl_mj.progress import Say
 from hyrl_mj.run_directory import Run
@@ -18,30 +18,52 @@ from hyrl_mj.viz import robustness_sentence
 
 # The kinds of noise in episodes by default.
 KINDS = ("uniform", "alternating", "adversarial")
-# Noisy episodes of a run whose worst case cannot be played exactly, and of one that only shows that all runs.
+# Noisy episodes of a run whose worst case cannot be computed; fewer with preset smoke.
 EPISODES, EPISODES_SMOKE = 1_000, 200
-# The examination that belongs to a run.
-RUN = ExamineOptions()
 
 
-def examine_run(run: Run, options: ExamineOptions = RUN, say: Say = print) -> Robustness:
-    """Examines policy and hybrid controller under noise, and writes `robustness.json` with its pictures.
+@dataclass(frozen=True)
+class ExamineOptions:
+    """The options of an examination under noise.
 
-    The exact game is played where that is possible; noisy episodes are added on request, and where they are
-    the only way. Files are written at the end.
+    Attributes:
+        eps: bound of the noise, in the units of the chart; by default the run's.
+        episodes: noisy episodes for each kind of noise and each controller; by default none where the worst
+            case can be computed exactly, on charts of one or two dimensions.
+        noise: kinds of noise in the episodes; by default uniform,alternating,adversarial.
+        all_coordinates: add noise to every coordinate of the measurement, not only to the noisy ones of the
+            task.
+        near_critical: start all episodes within twice the bound of the critical set.
+        seed: seed of starts and noise of the episodes.
+    """
+
+    eps: float | None = None
+    episodes: int | None = None
+    noise: tuple[str, ...] = ()
+    all_coordinates: bool = False
+    near_critical: bool = False
+    seed: int = 0
+
+
+def examine_run(
+    run: Run, options: ExamineOptions = ExamineOptions(), say: Say = print
+) -> Robustness:
+    """Examines policy and hybrid controller under noise, and writes `robustness.json` with its figures.
+
+    The exact game is played where possible; noisy episodes are added on request, or replace the game. All
+    files are written at the end.
 
     Args:
         run: a run with its mode policies.
         options: what to examine. The scores are for no noise, half the bound, and the bound.
-        say: told the result in a line.
+        say: receives the result in a line.
 
     Raises:
         BadInput: a value that cannot be used.
     """
     robustness, maps = examine_loops(run, run.loops, run.split, options)
-    folder = run.path / "figures"
     if maps is not None:
-        draw_robustness(run, robustness, maps, folder)
+        draw_robustness(run, robustness, maps, run.path / "figures")
         maps.save(run.path / "robustness.npz")
     robustness.save(run.path / "robustness.json")
     if run.agent and run.agent.stochastic:
@@ -54,7 +76,7 @@ def examine_loops(
     run: Run,
     loops: dict[str, Controller],
     partition: Partition,
-    options: ExamineOptions = RUN,
+    options: ExamineOptions = ExamineOptions(),
 ) -> tuple[Robustness, Maps | None]:
     """Examines controllers under noise, as `examine_run` does.
 
@@ -92,7 +114,7 @@ def examine_loops(
 
 
 def draw_robustness(run: Run, robustness: Robustness, maps: Maps, folder: Path) -> None:
-    """Draws the map and the curve of the game."""
+    """Draws the maps and the curve of the game."""
     from hyrl_mj.viz import figures
 
     assert robustness.game is not None

@@ -1,81 +1,124 @@
-"""Whole runs: from a task, or from an agent, to a finished run directory."""
+"""Whole runs: from a task, or from an agent, to a finished run directory.
+
+The options are frozen values that Python and the command line share. In their docstrings, "by default ..." at
+the end of an entry is the default that `--help` shows.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from hyrl_mj.errors import BadArtifact
-from hyrl_mj.learning import Training, preset
-from hyrl_mj.pipeline.options import AgentOptions, RunOptions, complete
+from hyrl_mj.errors import BadArtifact, BadInput, unknown
+from hyrl_mj.learning import Settings, Training, preset
 from hyrl_mj.pipeline.steps import DIAGNOSIS, STAGES, Stage, extended_sets_stage, run_stage
 from hyrl_mj.policies import ALGORITHMS, FUNCTION, AnyPolicy, read_agent
 from hyrl_mj.progress import Say
 from hyrl_mj.run_directory import Run, load_run, open_or_create, write_config
-from hyrl_mj.tasks import check_task, get_task
+from hyrl_mj.tasks import Task, check_task, get_task
 from hyrl_mj.viz import beginning
 
+# Names of options in version 0.1, and their names now.
+RENAMED = {"noise": "eps", "preset_name": "preset"}
 
-def done(run: Run, index: int, stages: Sequence[Stage] = STAGES) -> bool:
-    """Whether a stage's files are there and no older than those of the stages before it."""
-    try:
-        outputs = [stage.outputs(run) for stage in stages[: index + 1]]
-    except BadArtifact:  # a stage before it has not been done, so its outputs are not known
-        return False
-    if not all(path.is_file() for paths in outputs for path in paths):
-        return False
-    source = run.task.source
-    if source is not None:  # a robot of the user's that was changed is trained again
-        outputs = [[source, run.task.model_path], *outputs]
-    times = [[path.stat().st_mtime_ns for path in paths] for paths in outputs]
-    return min(times[-1]) >= max((t for earlier in times[:-1] for t in earlier), default=0)
+
+@dataclass(frozen=True)
+class RunOptions:
+    """The options of a run that trains its own policy.
+
+    Attributes:
+        eps: bound of the measurement noise to survive, in the units of the chart.
+        seed: seed of all random numbers.
+        preset: fast, paper (the paper's training, ten minutes), or smoke (seconds).
+        algorithm: the algorithm of stage 1: ppo, a2c, dqn, sac, td3, ddpg, or module:Class for another one
+            with the interface of SB3's, as sb3_contrib:TQC; by default the task's.
+        horizon: time T of the backward propagation [s], in the paper 0.5 (unit_circle) and 0.3 (vehicle);
+            by default the paper's with preset paper, otherwise the sets are sized to the noise.
+        out: the run directory; by default runs/TASK.
+    """
+
+    eps: float = 0.1
+    seed: int = 0
+    preset: str = "fast"
+    algorithm: str | None = None
+    horizon: float | None = None
+    out: str | Path | None = None
+
+
+@dataclass(frozen=True)
+class AgentOptions:
+    """The options of a run on an agent that was trained elsewhere.
+
+    Attributes:
+        activation: activation between the layers of the agent's network, for a zip that does not name it; by
+            default that of SB3's policy.
+        stochastic: sample the inputs of the agent, as during its training (PPO, A2C, SAC); noisy episodes
+            then replace the worst-case game.
+        eps: bound of the measurement noise to survive, in the units of the chart.
+        seed: seed of all random numbers.
+        preset: fast, paper or smoke, as for `hyrl-mj run`.
+        horizon: time T of the backward propagation [s]; by default the paper's with preset paper, otherwise
+            the sets are sized to the noise.
+        out: the run directory; by default runs/TASK_robust.
+    """
+
+    activation: str | None = None
+    stochastic: bool = False
+    eps: float = 0.1
+    seed: int = 0
+    preset: str = "fast"
+    horizon: float | None = None
+    out: str | Path | None = None
+
+
+Options = TypeVar("Options", RunOptions, AgentOptions)
+
+
+def complete(kind: type[Options], options: Options | None, changes: dict[str, Any]) -> Options:
+    """Returns options, by default those of `kind`, with some of them changed.
+
+    Raises:
+        BadInput: they are of another kind, or a change has a name that no option has.
+    """
+    if options is None:
+        options = kind()
+    if not isinstance(options, kind):
+        raise BadInput(f"options {options!r} cannot be used: give {kind.__name__}(...)")
+    names = [field.name for field in fields(kind)]
+    for name, value in changes.items():
+        if name in RENAMED and name not in names:
+            new = RENAMED[name]
+            raise BadInput(f"the option {name} is now called {new}: give {new}={value!r}")
+        if name not in names:
+            raise unknown("option", name, names)
+    return replace(options, **changes)
 
 
 def run(
     task: str | Path, options: RunOptions | None = None, *, say: Say = print, **changes: Any
 ) -> Run:
-    """Run all stages, or those that are missing from the run directory.
+    """Runs all stages, or those that the run directory lacks.
 
     Args:
         task: name of a task, or the Python file that defines one.
-        options: how to run it, by default `RunOptions()`.
-        say: told a line about each stage.
-        changes: fields of the options that differ, as in `run("vehicle", eps=0.2, seed=3)`.
+        options: the options, by default `RunOptions()`.
+        say: receives a line about each stage.
+        changes: fields of the options to change, as in `run("vehicle", eps=0.2, seed=3)`.
 
     Raises:
         BadInput: a value that cannot be used.
     """
     options = complete(RunOptions, options, changes)
-    plan = check_task(get_task(task))
-    settings = preset(
-        plan,
-        options.preset,
-        noise=options.eps,
-        seed=options.seed,
-        horizon=options.horizon,
-        algorithm=options.algorithm,
-    )
+    checked = check_task(get_task(task))
+    settings = _settings(checked, options, algorithm=options.algorithm)
     assert isinstance(settings.stage1, Training)
     if settings.stage1.algorithm not in ALGORITHMS:
         from hyrl_mj.learning.training import check_foreign
 
-        check_foreign(plan, settings.stage1)
-    return _run_all(open_or_create(options.out or Path("runs") / plan.name, settings), say)
-
-
-def _run_all(run: Run, say: Say, stages: Sequence[Stage] = STAGES) -> Run:
-    """Run all stages, or those that are missing."""
-    for index, stage in enumerate(stages):
-        if stage.name == "train" and run.agent:
-            say(f"train: none, {run.agent} is given")
-        elif done(run, index, stages):
-            say(f"{stage.name}: done before")
-        else:
-            run = run_stage(run, stage.name, say)
-    return run
+        check_foreign(checked, settings.stage1)
+    return _run_all(open_or_create(options.out or Path("runs") / checked.name, settings), say)
 
 
 def robustify(
@@ -86,15 +129,15 @@ def robustify(
     say: Say = print,
     **changes: Any,
 ) -> Run:
-    """Make an agent robust that was trained elsewhere: as `run`, with the agent in place of stage 1.
+    """Makes an agent robust that was trained elsewhere: as `run`, with the agent in place of stage 1.
 
     Args:
-        task: name of a task, or the Python file that defines one.
+        task: as for `run`.
         policy: the agent: a file (.zip of SB3, .onnx, .safetensors), a function from observations (n, k)
             to inputs (n, m) or levels (n,), or a `Policy`.
-        options: how to run it, by default `AgentOptions()`.
-        say: told a line about each stage.
-        changes: fields of the options that differ, as for `run`.
+        options: the options, by default `AgentOptions()`.
+        say: as for `run`.
+        changes: as for `run`.
 
     Raises:
         BadInput: a value or an agent that cannot be used.
@@ -110,17 +153,10 @@ def diagnose(
     say: Say = print,
     **changes: Any,
 ) -> Run:
-    """Find out what measurement noise can do to an agent, and train nothing.
+    """Examines what measurement noise can do to an agent; trains nothing.
 
-    The page is `diagnosis.html` in the run directory, everything else is in its folder `diagnosis`.
-    `robustify` with the same arguments continues from there.
-
-    Args:
-        task: name of a task, or the Python file that defines one.
-        policy: the agent, as for `robustify`.
-        options: how to run it, by default `AgentOptions()`.
-        say: told a line about each stage.
-        changes: fields of the options that differ, as for `run`.
+    The page is `diagnosis.html` in the run directory; all other files are in its folder `diagnosis`. The
+    arguments are those of `robustify`, which continues in the same run directory.
 
     Raises:
         BadInput: a value or an agent that cannot be used.
@@ -129,31 +165,56 @@ def diagnose(
     return _run_all(run, say, DIAGNOSIS)
 
 
-def _with_agent(task: str | Path, policy: AnyPolicy, options: AgentOptions) -> Run:
-    """Returns the run directory of an agent, with the agent in it."""
-    plan = check_task(get_task(task))
-    settings = partial(
-        preset,
-        plan,
-        options.preset,
-        noise=options.eps,
-        seed=options.seed,
-        horizon=options.horizon,
-    )
-    settings()  # a wrong value is reported before the agent is read
-    external = read_agent(plan, policy, options.activation, options.stochastic, options.seed)
-    function = external.policy if external.agent.algorithm == FUNCTION else None
-    path = options.out or Path("runs") / f"{plan.name}_robust"
-    run = open_or_create(path, settings(agent=external.agent), function)
-    if not done(run, 0):
-        external.store(run.path)
-    return run
-
-
 def extend_again(run: Run, horizon: float, say: Say = print) -> Run:
-    """Run stages 4 and 5 with another horizon T [s], and keep it in `config.json` if that went well."""
+    """Runs stages 4 and 5 with another horizon T [s], and writes T to `config.json` if they succeed."""
     changed = Run(run.path, replace(run.settings, horizon=horizon), run.function)
     extended_sets_stage(changed, lambda text: say(f"extended-sets: {text}"))
     write_config(changed)
     say(f"go on with {beginning(changed.settings, run.path)}")
     return load_run(run.path, run.function)
+
+
+def done(run: Run, index: int, stages: Sequence[Stage] = STAGES) -> bool:
+    """Returns whether a stage's files exist and are no older than those of the stages before it."""
+    try:
+        outputs = [stage.outputs(run) for stage in stages[: index + 1]]
+    except BadArtifact:  # the outputs depend on an earlier stage that is not done
+        return False
+    if not all(path.is_file() for paths in outputs for path in paths):
+        return False
+    if run.task.source is not None:  # after a change in a user's robot, training starts again
+        outputs = [[run.task.source, run.task.model_path], *outputs]
+    times = [[path.stat().st_mtime_ns for path in paths] for paths in outputs]
+    return min(times[-1]) >= max((t for earlier in times[:-1] for t in earlier), default=0)
+
+
+def _run_all(run: Run, say: Say, stages: Sequence[Stage] = STAGES) -> Run:
+    """Runs the stages that are not done."""
+    for index, stage in enumerate(stages):
+        if stage.name == "train" and run.agent:
+            say(f"train: none, {run.agent} is given")
+        elif done(run, index, stages):
+            say(f"{stage.name}: done before")
+        else:
+            run = run_stage(run, stage.name, say)
+    return run
+
+
+def _settings(task: Task, options: RunOptions | AgentOptions, **changes: Any) -> Settings:
+    """Returns the settings of the preset that options name."""
+    eps, seed, horizon = options.eps, options.seed, options.horizon
+    return preset(task, options.preset, noise=eps, seed=seed, horizon=horizon, **changes)
+
+
+def _with_agent(task: str | Path, policy: AnyPolicy, options: AgentOptions) -> Run:
+    """Returns the run directory of an agent, which then holds the agent."""
+    checked = check_task(get_task(task))
+    _settings(checked, options)  # a wrong value is reported before the agent is read
+    external = read_agent(checked, policy, options.activation, options.stochastic, options.seed)
+    settings = _settings(checked, options, agent=external.agent)
+    function = external.policy if external.agent.algorithm == FUNCTION else None
+    path = options.out or Path("runs") / f"{checked.name}_robust"
+    run = open_or_create(path, settings, function)
+    if not done(run, 0):
+        external.store(run.path)
+    return run

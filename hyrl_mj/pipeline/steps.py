@@ -1,4 +1,4 @@
-"""The stages in order: each fills its part of a run directory, from which any can start again."""
+"""The stages in order: each reads the files of those before it from the run directory, and writes its own."""
 
 from __future__ import annotations
 
@@ -18,27 +18,25 @@ from hyrl_mj.sets import Grid
 from hyrl_mj.stages import boundary, extend, find_critical_set, make_partition, with_room
 from hyrl_mj.viz import replay_sentence
 
-# ---- the stages: each reads the artifacts of those before it and writes its own
-
 
 def train_stage(run: Run, say: Say) -> None:
-    """Stage 1: train the policy."""
+    """Stage 1: trains the policy."""
     from hyrl_mj.learning.training import train
 
     s = run.settings
     if isinstance(s.stage1, Agent):
         raise BadInput(
-            f"{run.path} is about an agent, {s.stage1.source}: there is nothing to train; "
-            "hyrl-mj robustify with another --policy and another --out takes another one"
+            f"{run.path} holds a run on the agent {s.stage1.source}: there is nothing to train; for another "
+            "agent, use hyrl-mj robustify with another --policy and another --out"
         )
-    logs = run.path / "logs" / "stage1"
-    policy = train(run.task, s.stage1, s.seed, log_dir=logs, label="stage 1")
+    log_dir = run.path / "logs" / "stage1"
+    policy = train(run.task, s.stage1, s.seed, log_dir=log_dir, label="stage 1")
     policy.save(run.path / "policy.safetensors")
     say(f"policy of {sum(w.size for w in policy.weights.values())} weights")
 
 
 def critical_set_stage(run: Run, say: Say) -> None:
-    """Stage 2: find the critical set."""
+    """Stage 2: finds the critical set."""
     s = run.settings
     critical = find_critical_set(run.task, run.steady, s.rods, s.resolution, s.search)
     critical.save(run.path / "critical_set.npz")
@@ -46,14 +44,14 @@ def critical_set_stage(run: Run, say: Say) -> None:
 
 
 def partition_stage(run: Run, say: Say) -> None:
-    """Stage 3: partition the chart."""
+    """Stage 3: partitions the chart."""
     partition = make_partition(run.task, run.steady, run.critical_set.points, run.settings.cells)
     partition.save(run.path / "partition.npz")
     say(partition.sentence(run.task))
 
 
 def extended_sets_stage(run: Run, say: Say) -> None:
-    """Stages 4 and 5: extend the parts over the critical set."""
+    """Stages 4 and 5: extends the parts over the critical set."""
     s, task = run.settings, run.task
     points, split, ways = run.critical_set.points, run.partition, None
     if run.agent:
@@ -70,11 +68,10 @@ def extended_sets_stage(run: Run, say: Say) -> None:
 
 
 def retrain_stage(run: Run, say: Say) -> None:
-    """Stages 6 and 7: train the policy of each mode."""
+    """Stage 6: trains the policy of each mode."""
     from hyrl_mj.stages.retraining import WarmStart, mode_ground, retrain
 
     s, sets = run.settings, run.extended_sets
-    logs = run.path / "logs"
     policies: dict[int, MlpPolicy] = {}
     for q in sets.modes:
         policies[q] = retrain(
@@ -83,7 +80,7 @@ def retrain_stage(run: Run, say: Say) -> None:
             s.seed,
             warm_start=WarmStart(run.steady, run.partition),
             others=[*policies.values()],
-            log_dir=logs / f"mode_{q}",
+            log_dir=run.path / "logs" / f"mode_{q}",
         )
     for q, policy in policies.items():
         policy.save(run.path / f"mode_{q}.safetensors")
@@ -91,25 +88,20 @@ def retrain_stage(run: Run, say: Say) -> None:
     say(f"policies of {len(policies)} modes")
 
 
-def robustness_stage(run: Run, say: Say) -> None:
-    """Find out what noise can do to the policy and to the hybrid controller."""
-    examine_run(run, say=say)
-
-
 def mode_paths(run: Run) -> list[Path]:
-    """The files of the mode policies."""
+    """Returns the files of the mode policies."""
     suffixes = (".safetensors", ".json")
     return [run.path / f"mode_{q}{suffix}" for q in run.extended_sets.modes for suffix in suffixes]
 
 
 def remove_others(paths: Iterable[Path], wanted: Iterable[Path]) -> None:
-    """Remove what an earlier run of a stage, with other modes or starts, has left."""
+    """Removes the files of an earlier run of a stage, with other modes or starts."""
     for path in set(paths) - set(wanted):
         path.unlink()
 
 
 def simulate_stage(run: Run, say: Say) -> None:
-    """Simulate the paper's replay starts, and one on M*, under the paper's noise."""
+    """Stage 7: simulates the paper's replay starts, and one on M*, under the paper's noise."""
     from hyrl_mj.viz.arcs import replay_arcs
 
     arcs, paths = replay_arcs(run), run.arc_paths()
@@ -121,17 +113,16 @@ def simulate_stage(run: Run, say: Say) -> None:
 
 
 def figures_stage(run: Run, say: Say) -> None:
-    """Draw the figures of a run; those that its chart does not allow are left out."""
+    """Draws the figures of a run that its chart allows."""
     from hyrl_mj.viz import figures
 
     folder = run.path / "figures"
-    # Everything is read before anything is written.
     drawn = figures.draw_all(figures.shown_run(run), folder)
     say(f"{', '.join(drawn)} in {folder}, as PNG and PDF")
 
 
 def figure_paths(run: Run) -> list[Path]:
-    """The files that `figures_stage` writes."""
+    """Returns the files that `figures_stage` writes."""
     from hyrl_mj.viz import figures
 
     folder, names = run.path / "figures", figures.names(run.task, figures.ShownRun)
@@ -139,7 +130,7 @@ def figure_paths(run: Run) -> list[Path]:
 
 
 def replay_stage(run: Run, say: Say) -> None:
-    """Render the replay of the start on M*; without GL or ffmpeg say why, and go on."""
+    """Renders the replay of the start on M*; without GL or ffmpeg reports why not."""
     from hyrl_mj.viz.arcs import replay_floor, replay_shows
     from hyrl_mj.viz.replay import render_replay
 
@@ -151,7 +142,7 @@ def replay_stage(run: Run, say: Say) -> None:
 
 
 def report_stage(run: Run, say: Say) -> None:
-    """Write the report of all that there is."""
+    """Writes the report of all results."""
     from hyrl_mj.viz.report import write_report
 
     path = run.path / "report.html"
@@ -160,7 +151,7 @@ def report_stage(run: Run, say: Say) -> None:
 
 
 def diagnose_stage(run: Run, say: Say) -> None:
-    """Find out what noise can do to the policy alone, draw it, and write it on a page."""
+    """Examines what noise can do to the policy alone, and writes figures and a page."""
     from hyrl_mj.viz import diagnosis, figures
 
     folder = run.path / diagnosis.FOLDER
@@ -179,45 +170,43 @@ def diagnose_stage(run: Run, say: Say) -> None:
 
 @dataclass(frozen=True)
 class Stage:
-    """One step of the pipeline: its function, and the files that tell that it has been done."""
+    """One step of the pipeline: its function, and the files whose age tells whether it is done."""
 
     name: str
-    work: Callable[[Run, Say], None]
+    work: Callable[[Run, Say], object]
     outputs: Callable[[Run], list[Path]]
 
 
-def _files(*names: str) -> Callable[[Run], list[Path]]:
-    return lambda run: [run.path / name for name in names]
+def _file(name: str) -> Callable[[Run], list[Path]]:
+    return lambda run: [run.path / name]
 
 
 STAGES = (
     Stage("train", train_stage, lambda run: run.policy_files),
-    Stage("critical-set", critical_set_stage, _files("critical_set.npz")),
-    Stage("partition", partition_stage, _files("partition.npz")),
+    Stage("critical-set", critical_set_stage, _file("critical_set.npz")),
+    Stage("partition", partition_stage, _file("partition.npz")),
     Stage("extended-sets", extended_sets_stage, lambda run: run.set_files),
     Stage("retrain", retrain_stage, mode_paths),
-    Stage("robustness", robustness_stage, _files("robustness.json")),
+    Stage("robustness", lambda run, say: examine_run(run, say=say), _file("robustness.json")),
     Stage("simulate", simulate_stage, lambda run: list(run.arc_paths().values())),
     Stage("figures", figures_stage, figure_paths),
-    Stage("replay", replay_stage, _files("replay.mp4")),
-    Stage("report", report_stage, _files("report.html")),
+    Stage("replay", replay_stage, _file("replay.mp4")),
+    Stage("report", report_stage, _file("report.html")),
 )
-
-
-# What `diagnose` does: the first stages, which `robustify` then need not do again, and a page.
-DIAGNOSIS = (*STAGES[:3], Stage("diagnose", diagnose_stage, _files("diagnosis.html")))
+# The stages of `diagnose`: the first three, which `robustify` need not run again, and a page.
+DIAGNOSIS = (*STAGES[:3], Stage("diagnose", diagnose_stage, _file("diagnosis.html")))
 
 
 def run_stage(run: Run, name: str, say: Say = print) -> Run:
-    """Run one stage from what is on disk; the run is returned anew, with its result.
+    """Runs one stage from the files on disk, and returns the run with its result.
 
     Raises:
-        BadInput: there is no stage of that name.
+        BadInput: an unknown stage.
     """
     stages = {stage.name: stage for stage in (*DIAGNOSIS, *STAGES)}
     if name not in stages:
         raise unknown("stage", name, stages)
-    # The physics has the cores; BLAS threads that wait for one of them only stall.
+    # The physics uses all cores: BLAS threads would only wait for them.
     with threadpool_limits(1, user_api="blas"):
         stages[name].work(run, lambda text: say(f"{name}: {text}"))
     return load_run(run.path, run.function)
