@@ -1,11 +1,11 @@
 """Hysteresis-Based RL on MuJoCo: learned policies that measurement noise cannot break at a decision.
 
-The stages, in the order of the data flow: `tasks`, `training`, `critical_set`, `partition`,
-`extended_sets`, `retraining`, `hybrid`, `robustness`, `simulation`, `replay`; `pipeline` runs them all.
-Importing this package needs neither torch nor a GL library.
+`run` trains a policy and makes it robust, `robustify` starts from an agent, and `load_run` opens the result.
+The stages between are `find_critical_set`, `make_partition`, `extend` and `HybridController`. Importing this
+package needs neither torch nor a GL library.
 """
 
-from hyrl_mj import gl as _gl  # first: it imports mujoco, with a GL backend that does not stop it
+from hyrl_mj import gl as _gl  # first: imports mujoco, with a GL backend that exists here
 from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadArtifact, BadInput, HyrlError, NoRenderer
 from hyrl_mj.export import export_numpy, export_onnx
@@ -36,16 +36,7 @@ from hyrl_mj.stages import (
     find_critical_set,
     make_partition,
 )
-from hyrl_mj.tasks import (
-    Learning,
-    Mirror,
-    Outcome,
-    Scene,
-    Task,
-    get_task,
-    register,
-    task_names,
-)
+from hyrl_mj.tasks import Learning, Mirror, Outcome, Scene, Task, get_task, register, task_names
 
 __version__ = "0.1.0"
 __all__ = [

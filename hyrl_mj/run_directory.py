@@ -1,4 +1,4 @@
-"""The run directory: what the stages leave on disk, and how it is opened."""
+"""The run directory: the files that the stages write, and the `Run` that reads them."""
 
 from __future__ import annotations
 
@@ -9,36 +9,26 @@ from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 
-from hyrl_mj import artifacts
+from hyrl_mj import artifacts, policies
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.game import Lattice, Robustness
 from hyrl_mj.learning import Settings, Training
-from hyrl_mj.policies import (
-    FUNCTION,
-    ONNX,
-    Agent,
-    AnyPolicy,
-    Controller,
-    MlpPolicy,
-    Policy,
-    PolicyController,
-    SampledPolicy,
-    reopen_agent,
-)
+from hyrl_mj.policies import Agent, AnyPolicy, MlpPolicy, Policy
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.stages import CriticalSet, ExtendedSets, HybridController, Partition
 from hyrl_mj.tasks import Task, get_task
 
+# The packages whose versions `config.json` records.
 PACKAGES = ("mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "mediapy")
 
 
 @dataclass(frozen=True)
 class Config:
-    """What `config.json` holds.
+    """The content of `config.json`.
 
     Attributes:
         settings: every setting of the run.
-        versions: the versions of Python and packages that the run was begun with.
+        versions: versions of Python and the packages at the start of the run.
     """
 
     settings: Settings
@@ -56,12 +46,12 @@ class Config:
 
 @dataclass(frozen=True)
 class Run:
-    """A run directory, whose files are read when they are needed.
+    """A run directory, whose files are read when needed.
 
     Attributes:
         path: the directory.
-        settings: how it was made.
-        function: the agent, if it is a function, which no file holds.
+        settings: every setting of the run.
+        function: the agent, if it is a function, which no file can hold.
     """
 
     path: Path
@@ -81,7 +71,7 @@ class Run:
 
     @property
     def agent(self) -> Agent | None:
-        """The agent that takes the place of stage 1, if there is one."""
+        """The agent in place of stage 1; None if stage 1 trains a policy."""
         stage1 = self.settings.stage1
         return stage1 if isinstance(stage1, Agent) else None
 
@@ -90,7 +80,8 @@ class Run:
         """The policy of stage 1, or the agent."""
         if self.agent is None:
             return self._load_policy("policy.safetensors")
-        return reopen_agent(self.path, self.agent, self.task, self.settings.seed, self.function)
+        seed, function = self.settings.seed, self.function
+        return policies.reopen_agent(self.path, self.agent, self.task, seed, function)
 
     @property
     def policy_title(self) -> str:
@@ -99,13 +90,13 @@ class Run:
 
     @property
     def steady(self) -> Policy:
-        """The policy as a function of the measurement: where it is sampled, its mean or mode."""
+        """The policy as a function of the measurement: the mean or mode of one that draws its inputs."""
         policy = self.policy
-        return policy.policy if isinstance(policy, SampledPolicy) else policy
+        return policy.policy if isinstance(policy, policies.SampledPolicy) else policy
 
     @property
     def exact(self) -> bool:
-        """Whether the worst case can be played: it takes a lattice, and a policy that does not draw."""
+        """Whether the exact game can be played: on a lattice, against a policy that draws nothing."""
         return Lattice.possible(self.task) and not (self.agent and self.agent.stochastic)
 
     def check_exact(self) -> None:
@@ -120,28 +111,28 @@ class Run:
     @property
     def policy_files(self) -> list[Path]:
         """The files that hold the policy of stage 1, or the agent."""
-        special = {ONNX: ["policy.onnx"], FUNCTION: ["policy.json"]}
+        special = {policies.ONNX: ["policy.onnx"], policies.FUNCTION: ["policy.json"]}
         network = ["policy.safetensors", "policy.json"]
         return [self.path / n for n in special.get(self.settings.stage1.algorithm, network)]
 
     @cached_property
     def critical_set(self) -> CriticalSet:
-        """M*, of stage 2."""
+        """M*, from stage 2."""
         return CriticalSet.load(self.path / "critical_set.npz")
 
     @cached_property
     def partition(self) -> Partition:
-        """The parts M_i, of stage 3."""
+        """The parts M_i, from stage 3."""
         return Partition.load(self.path / "partition.npz", self.task)
 
     @cached_property
     def split(self) -> Partition:
-        """The parts that are extended: M_i, for an agent changed where they leave no room."""
+        """The parts that stage 5 extends: M_i, for an agent changed where they leave no room."""
         return self.partition if self.agent is None else Partition.load(self.split_path, self.task)
 
     @property
     def split_path(self) -> Path:
-        """The file of `split`, if it has one of its own."""
+        """The file of `split` for an agent."""
         return self.path / "split.npz"
 
     @property
@@ -151,25 +142,24 @@ class Run:
 
     @cached_property
     def extended_sets(self) -> ExtendedSets:
-        """The extended sets M_ext_i, of stage 5."""
+        """The extended sets M_ext_i, from stage 5."""
         return ExtendedSets.load(self.path / "extended_sets.npz", self.task)
 
     @cached_property
     def controller(self) -> HybridController:
-        """The hybrid controller, of stage 7."""
-        extended = self.extended_sets
-        policies = {q: self._load_policy(f"mode_{q}.safetensors") for q in extended.modes}
+        """The hybrid controller, from stage 7."""
+        extended, starts = self.extended_sets, None
+        mode_policies = {q: self._load_policy(f"mode_{q}.safetensors") for q in extended.modes}
         flow_sets = dict(zip(extended.modes, extended.sets, strict=True))
-        starts = None
         if self.agent is not None:
-            # The sets of an agent reach differently far to either side of where it decides.
+            # The flow sets of an agent may reach farther to one side of its decision than to the other.
             starts = dict(zip(self.split.modes, self.split.parts, strict=True))
-        return HybridController(self.task, policies, flow_sets, starts)
+        return HybridController(self.task, mode_policies, flow_sets, starts)
 
     @cached_property
-    def loops(self) -> dict[str, Controller]:
-        """The controllers that are examined: the policy alone, and the hybrid controller."""
-        return {"policy": PolicyController(self.policy), "hyrl": self.controller}
+    def loops(self) -> dict[str, policies.Controller]:
+        """The controllers by name: the policy alone, and the hybrid controller."""
+        return {"policy": policies.PolicyController(self.policy), "hyrl": self.controller}
 
     @cached_property
     def robustness(self) -> Robustness:
@@ -178,26 +168,22 @@ class Run:
 
     @cached_property
     def versions(self) -> dict[str, str]:
-        """The versions of Python and packages that the run was begun with."""
+        """The versions of Python and the packages at the start of the run."""
         return Config.load(self.path / "config.json").versions
 
     def arc_paths(self) -> dict[tuple[str, str], Path]:
-        """Returns the files of the replays by start ("start0", ..., "critical") and controller."""
+        """Returns the replays' files by start ("start0", "critical") and controller ("policy", "hyrl_q0")."""
         starts = [f"start{i}" for i in range(len(self.task.scene.starts))]
         starts += ["critical"] if len(self.critical_set.points) else []
         loops = ["policy"] + [f"hyrl_q{q}" for q in self.extended_sets.modes]
         return {(s, c): self.path / "arcs" / f"{s}_{c}.npz" for s in starts for c in loops}
 
     def arcs(self) -> dict[tuple[str, str], HybridArc]:
-        """Returns the replays by start ("start0", "critical") and controller ("policy", "hyrl_q0")."""
+        """Returns the replays by start and controller, as `arc_paths`."""
         return {key: self.arc(path) for key, path in self.arc_paths().items()}
 
     def arc(self, path: Path) -> HybridArc:
-        """Returns an arc of this run's task.
-
-        Raises:
-            BadArtifact: the arc is of another task, or damaged.
-        """
+        """Reads an arc; raises `BadArtifact` if it is damaged, or of another task than the run's."""
         arc = HybridArc.load(path)
         if arc.task != self.task.name:
             raise BadArtifact(
@@ -207,11 +193,13 @@ class Run:
         return arc
 
     def latest_path(self, controller: str) -> Path:
-        """Returns the file of the latest simulation from a start of the user."""
+        """Returns the file of the latest simulation from the user's own start."""
         return self.path / "arcs" / f"latest_{controller}.npz"
 
     def _load_policy(self, name: str) -> MlpPolicy:
-        task = self.task  # first: a task of the user's is known by its name once its file is loaded
+        task = (
+            self.task
+        )  # first: this loads the file of a user's task, which registers the task's name
         policy = MlpPolicy.load(self.path / name)
         if policy.task.name != task.name:
             raise BadArtifact(
@@ -226,7 +214,7 @@ def load_run(path: str | Path, policy: AnyPolicy | None = None) -> Run:
 
     Args:
         path: the directory.
-        policy: the agent of the run, if it is a function, which no file holds.
+        policy: the agent of the run, if it is a function, which no file can hold.
 
     Raises:
         BadArtifact: the directory holds no run.
@@ -242,7 +230,7 @@ def load_run(path: str | Path, policy: AnyPolicy | None = None) -> Run:
 
 
 def write_config(run: Run) -> None:
-    """Writes `config.json`: every setting, and the versions that go with them."""
+    """Writes `config.json`: every setting, and the versions of Python and the packages."""
     versions = {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
     artifacts.write_json(run.path / "config.json", Config(run.settings, versions), kind="run")
 
@@ -251,30 +239,22 @@ def _differing(old: Settings, new: Settings) -> Iterator[str]:
     """Yields a description of each setting that differs, by the name of its option."""
     for name, before in vars(old).items():
         now = getattr(new, name)
-        if before == now:
-            continue
-        if not isinstance(before, Training | Agent):
-            option = "eps" if name == "noise" else name
-            yield f"{option}: {before} there, {now} asked for"
-        elif Agent in (type(before), type(now)):
-            yield f"policy: {_policy(before)} there, {_policy(now)} asked for"
-        elif before.algorithm != now.algorithm:
-            yield f"{name} algorithm: {before.algorithm} there, {now.algorithm} asked for"
-        else:
-            yield name
+        if before != now:
+            option = {"noise": "eps", "stage1": "policy"}.get(name, name)
+            old_text, new_text = _brief(before), _brief(now)
+            change = f": {old_text} there, {new_text} given" if old_text != new_text else ""
+            yield option + change
 
 
-def _policy(stage1: Training | Agent) -> str:
-    """Returns a short name of what stage 1 trains or takes."""
-    if isinstance(stage1, Agent):
-        return f"{stage1} of sha256 {stage1.sha256[:8]}"
-    return f"{stage1.title} to be trained"
+def _brief(setting: object) -> str:
+    """Returns a short description of the value of a setting."""
+    if isinstance(setting, Agent):
+        return f"{setting} of sha256 {setting.sha256[:8]}"
+    return f"training with {setting.algorithm}" if isinstance(setting, Training) else str(setting)
 
 
 def open_or_create(path: str | Path, settings: Settings, policy: AnyPolicy | None = None) -> Run:
-    """Opens the run directory at `path` with these settings, or makes it.
-
-    `policy` is as in `load_run`.
+    """Opens the run directory at `path` with these settings, or creates it; `policy` is as in `load_run`.
 
     Raises:
         BadInput: the directory holds a run with other settings; the message names them.

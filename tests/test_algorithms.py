@@ -346,8 +346,9 @@ def test_a_whole_run_names_its_algorithm_and_keeps_to_it(tmp_path, monkeypatch, 
         with pytest.raises(SystemExit) as ended:
             hyrl(*whole, *others)
         assert ended.value.code == 2
-        asked = others[-1] if others else "ppo"
-        assert f"stage1 algorithm: td3 there, {asked} asked for" in capsys.readouterr().err
+        other = others[-1] if others else "ppo"
+        differing = f"policy: training with td3 there, training with {other} given"
+        assert differing in capsys.readouterr().err
 
 
 def test_short_episodes_are_for_tasks_that_start_everywhere(circle, monkeypatch):

@@ -337,9 +337,9 @@ def test_a_folder_that_is_no_run(tmp_path):
 
 def test_other_settings_do_not_overwrite_a_run(finished):
     done = call("run", "unit_circle", "--preset", "smoke", "--seed", "7", "--out", finished[0])
-    assert_one_sentence(done, "seed: 0 there, 7 asked for")
+    assert_one_sentence(done, "seed: 0 there, 7 given")
     done = call("run", "unit_circle", "--preset", "smoke", "--eps", "0.2", "--out", finished[0])
-    assert_one_sentence(done, "eps: 0.1 there, 0.2 asked for")
+    assert_one_sentence(done, "eps: 0.1 there, 0.2 given")
 
 
 @pytest.mark.parametrize(

@@ -215,11 +215,11 @@ def test_a_function_is_given_again_when_the_run_is_opened(circle_run):
 
 def test_another_agent_does_not_overwrite_a_run(circle_run):
     before = contents(circle_run.path)
-    with pytest.raises(BadInput, match=r"policy: an agent of Python code .* asked for"):
+    with pytest.raises(BadInput, match=r"policy: an agent of Python code .* given"):
         hyrl_mj.robustify("unit_circle", away, out=circle_run.path, **SMOKE)
-    with pytest.raises(BadInput, match="to be trained asked for"):
+    with pytest.raises(BadInput, match="training with ppo given"):
         hyrl_mj.run("unit_circle", out=circle_run.path, **SMOKE)
-    with pytest.raises(BadInput, match="seed: 0 there, 1 asked for"):
+    with pytest.raises(BadInput, match="seed: 0 there, 1 given"):
         hyrl_mj.robustify("unit_circle", off_centre, seed=1, out=circle_run.path, **SMOKE)
     assert contents(circle_run.path) == before
 
