@@ -1,4 +1,4 @@
-"""The command line `hyrl-mj`: one function per command, and errors as one sentence with an exit status."""
+"""The command line `hyrl-mj`: a function for each command, and a sentence and exit status for each error."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import os
 import sys
 import textwrap
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from hyrl_mj import __version__, pipeline, progress
@@ -100,11 +99,19 @@ def extended_sets(run: Run, *, horizon: float | None = None) -> None:
         pipeline.extend_again(run, horizon)
 
 
-@dataclass(frozen=True)
-class SimulateOptions:
-    """What is simulated.
+def simulate(
+    run: Run,
+    *,
+    start: tuple[float, ...] | None = None,
+    q0: int | None = None,
+    noise: str = "alternating",
+    eps: float | None = None,
+    time: float | None = None,
+    seed: int = 0,
+) -> None:
+    """Simulate policy and controller; without --start, the paper's replays.
 
-    Attributes:
+    Args:
         start: start in chart coordinates, as x y [m] (vehicle) or theta [rad] (unit_circle); by default the
             starts of the paper's replays.
         q0: start mode; by default the controller selects it from the first measurement.
@@ -114,27 +121,15 @@ class SimulateOptions:
         time: time to simulate [s]; by default the task's.
         seed: seed of the noise.
     """
-
-    start: tuple[float, ...] | None = None
-    q0: int | None = None
-    noise: str = "alternating"
-    eps: float | None = None
-    time: float | None = None
-    seed: int = 0
-
-
-def simulate(run: Run, options: SimulateOptions) -> None:
-    """Simulate policy and controller; without --start, the paper's replays."""
     from hyrl_mj.viz.arcs import noisy_arcs
 
-    o = options
-    if o.start is None:
-        if o != SimulateOptions():
+    if start is None:
+        if (q0, noise, eps, time, seed) != (None, "alternating", None, None, 0):
             raise BadInput("--q0, --noise, --eps, --time and --seed need a --start")
         print_summary(pipeline.run_stage(run, "simulate"))
         return
-    z0 = run.task.chart.check([o.start], run.task.name)
-    arcs = noisy_arcs(run, z0, o.noise, o.eps, (o.q0,), o.time, o.seed)
+    z0 = run.task.chart.check([start], run.task.name)
+    arcs = noisy_arcs(run, z0, noise, eps, (q0,), time, seed)
     for name, (arc,) in zip(("policy", "hyrl"), arcs.values(), strict=True):
         arc.save(run.latest_path(name))
         end = run.task.chart.format(arc.z[-1])
@@ -275,15 +270,17 @@ BOUND = {"--noise": "--eps"}
 RENAMED = {"run": BOUND, "robustify": BOUND, "diagnose": BOUND, "simulate": {"--horizon": "--time"}}
 
 
+HEAD = """\
+usage: hyrl-mj [-h] [--version] COMMAND ...
+
+Hysteresis-Based RL on MuJoCo: policies that withstand measurement noise.
+
+commands (hyrl-mj COMMAND --help shows the options of one):"""
+
+
 def overview() -> str:
     """Returns the help of `hyrl-mj`."""
-    lines = [
-        "usage: hyrl-mj [-h] [--version] COMMAND ...",
-        "",
-        "Hysteresis-Based RL on MuJoCo: policies that withstand measurement noise.",
-        "",
-        "commands (hyrl-mj COMMAND --help shows the options of one):",
-    ]
+    lines = [HEAD]
     for name, command in COMMANDS.items():
         summary = documented(command)[0].partition("\n")[0]
         lines.append(textwrap.fill(f"  {name:15}{summary}", 80, subsequent_indent=" " * 17))

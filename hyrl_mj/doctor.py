@@ -1,4 +1,4 @@
-"""`hyrl-mj doctor`: which libraries this machine has, what it lacks, and how to mend that."""
+"""`hyrl-mj doctor`: which libraries this machine has, which it lacks, and how to install them."""
 
 from __future__ import annotations
 
@@ -61,77 +61,72 @@ def report() -> tuple[list[str], bool]:
     """Examines this machine.
 
     Returns:
-        Lines to print, with the cure for what is missing; whether all is well.
+        Lines to print, with the cure for what is missing; whether nothing is.
     """
     lines, missing = versions()
+    healthy = not missing
     if missing:
         lines.append(f"cure: pip install {' '.join(missing)}")
-    (device, picture), film = _rendering(), _encoding_problem()
     lines.append(f"GL backend         MUJOCO_GL={os.environ.get('MUJOCO_GL', '(not set)')}")
-    lines.append(f"rendering          {device if picture is None else f'FAILED: {picture}'}")
-    lines.append(f"a second of video  {'encoded' if film is None else f'FAILED: {film}'}")
-    well = not missing and picture is None and film is None
-    if not well:
+    for title, attempt in (("rendering", _rendering), ("a second of video", _encoding)):
+        try:
+            result = attempt()
+        except NoRenderer as error:
+            result, healthy = f"FAILED: {error}", False
+        lines.append(f"{title:<18} {result}")
+    if not healthy:
         lines.append("Training and analysis need neither pictures nor videos.")
-    return lines, well
+    return lines, healthy
 
 
 def versions() -> tuple[list[str], list[str]]:
     """Returns a line per distribution with its version, and the names of those that are missing."""
-    installed = {name: _version(name) for name in DISTRIBUTIONS}
-    lines = [f"{name:<18} {version or 'MISSING'}" for name, version in installed.items()]
-    missing = [name for name, version in installed.items() if version is None]
-    return [f"python             {platform.python_version()}", *lines], missing
+    lines, missing = [f"python             {platform.python_version()}"], []
+    for name in DISTRIBUTIONS:
+        try:
+            version = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            version = "MISSING"
+            missing.append(name)
+        lines.append(f"{name:<18} {version}")
+    return lines, missing
 
 
-def _version(name: str) -> str | None:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return None
-
-
-def _rendering() -> tuple[str, str | None]:
+def _rendering() -> str:
     """Draws in a child process, because a broken GL driver may take its process down.
 
     Returns:
-        The GL device and its speed; why nothing can be drawn and the cure, or None if it can.
+        The GL device and its speed.
+
+    Raises:
+        NoRenderer: nothing can be drawn.
     """
-    package = str(Path(__file__).resolve().parents[1])
-    paths = os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH")]))
     try:
         child = subprocess.run(
             [sys.executable, "-c", _FRAMES],
-            env={**os.environ, "PYTHONPATH": paths},
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
             capture_output=True,
             text=True,
             errors="replace",
             timeout=RENDER_TIMEOUT,
         )
     except subprocess.TimeoutExpired:
-        return "", f"no picture within {RENDER_TIMEOUT:g} s; {GL_CURE}"
-    if child.returncode == 0:
-        return child.stdout.strip(), None
+        raise NoRenderer(f"no picture within {RENDER_TIMEOUT:g} s; {GL_CURE}") from None
     if child.returncode < 0:
-        return "", f"the GL driver crashed ({_signal(-child.returncode)}); {GL_CURE}"
-    said = child.stderr.strip().splitlines() or ["it said nothing"]
-    return "", said[-1] if GL_CURE in said[-1] else f"{said[-1]}; {GL_CURE}"
+        name = signal.Signals(-child.returncode).name
+        raise NoRenderer(f"the GL driver crashed ({name}); {GL_CURE}")
+    if child.returncode > 0:
+        *_, last = child.stderr.strip().splitlines() or ["no picture"]
+        raise NoRenderer(last if GL_CURE in last else f"{last}; {GL_CURE}")
+    return child.stdout.strip()
 
 
-def _signal(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
-
-
-def _encoding_problem() -> str | None:
-    """Returns why no video can be encoded, and the cure; None if one can."""
-    with tempfile.TemporaryDirectory() as folder:
-        try:
-            with video(Path(folder) / "trial.mp4", 64, 48, 10) as add:
-                for level in range(0, 250, 25):
-                    add(np.full((48, 64, 3), level, dtype=np.uint8))
-        except NoRenderer as error:
-            return str(error)
-    return None
+def _encoding() -> str:
+    """Encodes a video, or raises `NoRenderer`."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        video(Path(folder) / "trial.mp4", 64, 48, 10) as add,
+    ):
+        for level in range(0, 250, 25):
+            add(np.full((48, 64, 3), level, dtype=np.uint8))
+    return "encoded"

@@ -1,8 +1,8 @@
-"""From the words of a command line to a call: help, types, defaults and mistakes in plain language.
+"""From the words of a command line to a call of a function, with help from its docstring.
 
-`call` makes a command of a function. Keyword-only parameters are options, the others are given by their
-place, and a parameter that is a frozen dataclass stands for an option per field. Help is what the docstrings
-say of parameters and fields; the end of an entry, "; by default ...", says what None stands for.
+Keyword-only parameters are options, the others are given by their place, and a parameter that is a frozen
+dataclass stands for an option per field. "; by default ..." at the end of an entry of the docstring says
+what None stands for.
 """
 
 from __future__ import annotations
@@ -12,12 +12,9 @@ import re
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
-from functools import reduce
 from itertools import pairwise
-from operator import or_
 from pathlib import Path
-from types import NoneType
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import tyro
 
@@ -30,10 +27,10 @@ class Kind:
     """How the values of a type are written on the command line.
 
     Attributes:
-        metavar: what stands for a value in the help.
-        meaning: what to give, in an error.
-        read: makes the value of a word, or raises ValueError.
-        show: makes the word of a default.
+        metavar: stands for a value in the help.
+        meaning: what to give, for errors.
+        read: returns the value of a word, or raises ValueError.
+        show: returns the word of a default.
     """
 
     metavar: str
@@ -51,23 +48,22 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(","))
 
 
+FLAG = Kind("", "no value", bool, lambda default: "off")
+SEVERAL = Kind("NUMBER ...", "one or more numbers", float)  # the kind that takes several words
 KINDS: dict[Any, Kind] = {
+    bool: FLAG,
     str: Kind("NAME", "a name", str),
     int: Kind("INTEGER", "an integer", int),
     float: Kind("NUMBER", "a number", float, "{:g}".format),
     Path: Kind("PATH", "a path", Path),
     str | Path: Kind("PATH", "a path", Path),
     Run: Kind("RUN", "a run directory", load_run),
-    tuple[float, ...]: Kind("NUMBER ...", "one or more numbers", float),
+    tuple[float, ...]: SEVERAL,
     tuple[str, ...]: Kind("NAME,...", "names, separated by commas", _names, ",".join),
     tuple[int, int]: Kind(
-        "WIDTHxHEIGHT",
-        "WIDTHxHEIGHT in pixels, as 640x480",
-        _size,
-        lambda size: "x".join(map(str, size)),
+        "WIDTHxHEIGHT", "WIDTHxHEIGHT in pixels, as 640x480", _size, "{0[0]}x{0[1]}".format
     ),
 }
-SEVERAL = tuple[float, ...]  # the type that takes several words
 BY_DEFAULT = "; by default "
 
 
@@ -76,74 +72,60 @@ class Argument:
     """One argument of a command.
 
     Attributes:
-        parameter: the parameter of the function that it is, or a field of.
-        name: of the parameter or the field.
-        type: its type, without None.
-        default: its default, or `MISSING`.
-        text: what its docstring says.
+        name: of a parameter of the function, or of a field of its options.
+        kind: how its values are written.
+        default: or `MISSING`.
+        text: its entry in the docstring.
         positional: whether it is given by its place.
     """
 
-    parameter: str
     name: str
-    type: Any
+    kind: Kind
     default: Any
     text: str
     positional: bool
 
     @property
     def title(self) -> str:
-        """How the user sees it: "--slow-motion", or "TASK"."""
+        """The name on the command line: "--slow-motion", or "TASK"."""
         return self.name.upper() if self.positional else f"--{self.name.replace('_', '-')}"
-
-    @property
-    def hint(self) -> str:
-        """What the help says of its default."""
-        if self.default is MISSING:
-            return "(required)"
-        if self.type is bool:
-            return "(default: off)"
-        described = self.text.partition(BY_DEFAULT)[2].rstrip(".")
-        return f"(default: {described or KINDS[self.type].show(self.default)})"
 
     def field(self, helping: bool) -> tuple[str, Any, Any]:
         """Returns name, type and default of a field for which tyro collects the words, unread.
 
-        Only for its help tyro is told what is required: `call` has the better sentence.
+        tyro marks required arguments in its help; `call` has the better sentence when one is missing.
         """
-        help_text = self.text.partition(BY_DEFAULT)[0].rstrip(".") + "."
-        if self.type is bool:
-            shown = tyro.conf.arg(help=help_text, help_behavior_hint=self.hint)
+        text, _, by_default = self.text.rstrip(".").partition(BY_DEFAULT)
+        required = self.default is MISSING
+        hint = "required" if required else f"default: {by_default or self.kind.show(self.default)}"
+        shown = tyro.conf.arg(help=f"{text}.", help_behavior_hint=f"({hint})")
+        if self.kind is FLAG:
             return self.name, Annotated[bool, shown], False
-        metavar = self.title if self.positional else KINDS[self.type].metavar
-        shown = tyro.conf.arg(metavar=metavar, help=help_text, help_behavior_hint=self.hint)
         words = tyro.constructors.PrimitiveConstructorSpec[Any](
-            nargs="*" if self.type == SEVERAL else 1,
-            metavar=metavar,
+            nargs="*" if self.kind is SEVERAL else 1,
+            metavar=self.title if self.positional else self.kind.metavar,
             instance_from_str=list,
             is_instance=lambda value: True,
             str_from_instance=lambda value: [],
         )
-        marks = (tyro.conf.Positional,) if self.positional else ()
-        annotated = Annotated[(Any, words, shown, *marks)]
-        required = helping and self.default is MISSING
-        return self.name, annotated, field(default=MISSING if required else None)
+        place = (tyro.conf.Positional,) if self.positional else ()
+        default = MISSING if helping and required else None
+        return self.name, Annotated[(Any, words, shown, *place)], field(default=default)
 
     def read(self, words: Sequence[str]) -> Any:
         """Returns the value of its words.
 
         Raises:
-            BadInput: they are of another type.
+            BadInput: they are of another kind.
         """
-        kind = KINDS[self.type]
         try:
-            values = tuple(map(kind.read, words))
+            values = tuple(map(self.kind.read, words))
         except BadInput:
             raise
         except ValueError:
-            value = shlex.join(words)
-            raise BadInput(f"{self.title} {value!r} cannot be used: give {kind.meaning}") from None
-        return values if self.type == SEVERAL else values[0]
+            wrong = f"{self.title} {shlex.join(words)!r}"
+            raise BadInput(f"{wrong} cannot be used: give {self.kind.meaning}") from None
+        return values if self.kind is SEVERAL else values[0]
 
 
 def documented(thing: Any) -> tuple[str, dict[str, str]]:
@@ -155,36 +137,30 @@ def documented(thing: Any) -> tuple[str, dict[str, str]]:
     return "\n\n".join(paragraphs), {name: " ".join(entry.split()) for name, entry in entries}
 
 
-def arguments(function: Callable[..., None]) -> Iterator[Argument]:
-    """Yields the arguments of a command, in the order of its parameters."""
+def arguments(function: Callable[..., Any], inside: bool = False) -> Iterator[Argument]:
+    """Yields the arguments of a command, in the order of its parameters.
+
+    `inside` an options parameter, the function is its dataclass, and all arguments are options.
+    """
     types, texts = get_type_hints(function), documented(function)[1]
-    for parameter in inspect.signature(function).parameters.values():
-        name, kind = parameter.name, types[parameter.name]
-        if _has_options(kind):
-            inner, inner_texts = get_type_hints(kind), documented(kind)[1]
-            for option in fields(kind):
-                of_type, text = _given(inner[option.name]), inner_texts[option.name]
-                yield Argument(name, option.name, of_type, option.default, text, False)
-        else:
-            default = MISSING if parameter.default is parameter.empty else parameter.default
-            kind, positional = _given(kind), parameter.kind is not parameter.KEYWORD_ONLY
-            text = texts.get(name) or KINDS[kind].meaning
-            yield Argument(name, name, kind, default, text, positional)
+    for name, parameter in inspect.signature(function).parameters.items():
+        if _has_options(types[name]):
+            yield from arguments(types[name], inside=True)
+            continue
+        kind = next(KINDS[kind] for kind in KINDS if types[name] in (kind, kind | None))
+        default = MISSING if parameter.default is parameter.empty else parameter.default
+        positional = not inside and parameter.kind is not parameter.KEYWORD_ONLY
+        yield Argument(name, kind, default, texts.get(name) or kind.meaning, positional)
 
 
-def _given(kind: Any) -> Any:
-    """Returns a type without None."""
-    kinds = [option for option in get_args(kind) if option is not NoneType]
-    return reduce(or_, kinds) if NoneType in get_args(kind) else kind
+def _has_options(kind: Any) -> bool:
+    return is_dataclass(kind) and kind not in KINDS
 
 
 def call(
-    function: Callable[..., None],
-    name: str,
-    words: Sequence[str],
-    renamed: Mapping[str, str],
+    function: Callable[..., None], name: str, words: Sequence[str], renamed: Mapping[str, str]
 ) -> None:
-    """Call the function of a command with the words of a user.
+    """Calls the function of a command with the words of a user.
 
     Args:
         function: the command.
@@ -199,8 +175,8 @@ def call(
     options = {argument.title: argument for argument in every if not argument.positional}
     for word, following in pairwise([*words, "--"]):
         option = options.get(word.replace("_", "-"))
-        if option and option.type is not bool and following.startswith("--"):
-            raise BadInput(f"{word} needs a value: give {KINDS[option.type].meaning}")
+        if option and option.kind is not FLAG and following.startswith("--"):
+            raise BadInput(f"{word} needs a value: give {option.kind.meaning}")
     helping = "-h" in words or "--help" in words
     parsed: Any
     parsed, rest = tyro.cli(
@@ -213,25 +189,18 @@ def call(
     )
     if rest:
         raise _unexpected(rest[0], name, words, options, renamed)
-    values: dict[str, dict[str, Any]] = {}
+    keywords: dict[str, Any] = {}
     for argument in every:
-        said = getattr(parsed, argument.name)
-        if said:
-            value = said if argument.type is bool else argument.read(said)
-            values.setdefault(argument.parameter, {})[argument.name] = value
+        typed = getattr(parsed, argument.name)
+        if typed:
+            keywords[argument.name] = typed if typed is True else argument.read(typed)
         elif argument.default is MISSING:
             raise BadInput(f"{name} needs {argument.title}: {argument.text}")
-    types = get_type_hints(function)
-    keywords: dict[str, Any] = {}
-    for parameter in inspect.signature(function).parameters:
-        inner, kind = values.get(parameter, {}), types[parameter]
-        keywords |= {parameter: kind(**inner)} if _has_options(kind) else inner
+    for parameter, kind in get_type_hints(function).items():
+        if _has_options(kind):
+            inside = [option.name for option in fields(kind) if option.name in keywords]
+            keywords[parameter] = kind(**{option: keywords.pop(option) for option in inside})
     function(**keywords)
-
-
-def _has_options(kind: Any) -> bool:
-    """Returns whether a type stands for an option per field."""
-    return is_dataclass(kind) and kind not in KINDS
 
 
 def _unexpected(

@@ -10,13 +10,14 @@ import pytest
 from gl import needs_gl
 
 from hyrl_mj import doctor
+from hyrl_mj.errors import NoRenderer
 
 
 @pytest.fixture
 def healthy(monkeypatch):
     """A machine that renders and encodes, whatever this one can do."""
-    monkeypatch.setattr(doctor, "_rendering", lambda: ("a rasteriser", None))
-    monkeypatch.setattr(doctor, "_encoding_problem", lambda: None)
+    monkeypatch.setattr(doctor, "_rendering", lambda: "a rasteriser")
+    monkeypatch.setattr(doctor, "_encoding", lambda: "encoded")
 
 
 def test_versions_without_importing():
@@ -51,7 +52,7 @@ def test_a_missing_distribution(healthy, monkeypatch):
 
 def test_no_gl(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disable")
-    monkeypatch.setattr(doctor, "_encoding_problem", lambda: None)
+    monkeypatch.setattr(doctor, "_encoding", lambda: "encoded")
     lines, well = doctor.report()
     assert not well
     (line,) = [line for line in lines if line.startswith("rendering")]
@@ -66,25 +67,21 @@ def test_no_gl(monkeypatch):
 def test_a_gl_driver_that_crashes_or_hangs(monkeypatch, code, says):
     monkeypatch.setattr(doctor, "_FRAMES", code)
     monkeypatch.setattr(doctor, "RENDER_TIMEOUT", 2.0)
-    _, problem = doctor._rendering()
-    assert problem is not None
-    assert says in problem
-    assert doctor.GL_CURE in problem
+    with pytest.raises(NoRenderer, match=says) as refused:
+        doctor._rendering()
+    assert doctor.GL_CURE in str(refused.value)
 
 
 def test_ffmpeg(monkeypatch, tmp_path):
-    assert doctor._encoding_problem() is None
+    assert doctor._encoding() == "encoded"
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(tmp_path / "ffmpeg"))
-    problem = doctor._encoding_problem()
-    assert problem is not None
-    assert "pip install" in problem
+    with pytest.raises(NoRenderer, match="pip install"):
+        doctor._encoding()
 
 
 @needs_gl
 def test_it_says_what_renders_and_how_fast():
-    device, problem = doctor._rendering()
-    assert problem is None
-    name, speed = device.rsplit(", ", 1)
+    name, speed = doctor._rendering().rsplit(", ", 1)
     assert name
     assert float(speed.split()[0]) > 0
     assert speed.endswith("full frames/s at 640 x 480")

@@ -229,13 +229,10 @@ def _print(table: Table) -> None:
     """Prints a table, every cell whole."""
     import rich.table  # slow to import, and --help does not need it
     from rich.console import Console
-    from rich.text import Text
 
-    drawn = rich.table.Table(title=table.title)
-    for heading in table.headings:
-        drawn.add_column(Text(heading))
+    drawn = rich.table.Table(*table.headings, title=table.title)
     for row in table.rows:
-        drawn.add_row(*(Text(str(cell)) for cell in row))
+        drawn.add_row(*map(str, row))
     # Off a terminal rich assumes 80 columns, which would cut the cells.
-    console = Console()
-    Console(width=None if console.is_terminal else 160).print(drawn)
+    width = None if Console().is_terminal else 160
+    Console(width=width, markup=False, emoji=False, highlight=False).print(drawn)
