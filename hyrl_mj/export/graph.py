@@ -22,13 +22,9 @@ REDUCED = {
 def write_graph(
     program: Program, outputs: Sequence[str], name: str, metadata: Mapping[str, str]
 ) -> onnx.ModelProto:
-    """Returns a model that computes a program for batches of any size.
+    """Returns a model that computes a program, with these names of its outputs, for batches of any size.
 
-    Args:
-        program: its inputs and outputs have one row for each row of the batch.
-        outputs: names of its outputs.
-        name: the name of the graph.
-        metadata: what the model's metadata holds.
+    Inputs and outputs of the program have one row for each row of the batch.
     """
     graph = _Graph(program)
     results = list(zip(outputs, program.outputs, strict=True))
@@ -94,6 +90,7 @@ class _Graph:
         return [self.get(o, dtype or operation.value.dtype) for o in operation.operands]
 
     def cast(self, name: str, dtype: Any) -> str:
+        """Converts a result to a type; returns the name of the converted one."""
         return self.node("Cast", name, to=helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))
 
     def shape(self, operation: Operation) -> str:
@@ -147,19 +144,19 @@ LOWERED: dict[str, Callable[[_Graph, Operation], str]] = {
 
 
 def _cos(x: Any) -> Any:
-    """1 - 2 sin(x / 2)^2: older versions of onnxruntime have no cosine in float64."""
+    """Returns 1 - 2 sin(x / 2)^2: older versions of onnxruntime have no cosine in float64."""
     sin = np.sin(x / 2)
     return 1 - 2 * sin * sin
 
 
 def _remainder(x: Any, y: Any) -> Any:
-    """The remainder with the sign of y, from that of C, which has the sign of x."""
+    """Returns the remainder with the sign of y, from that of C, which has the sign of x."""
     rest = apply("fmod", x, y)
     return np.where(np.sign(rest) * np.sign(y) < 0, rest + y, rest)
 
 
 def _arctan2(y: Any, x: Any) -> Any:
-    """The angles of points (x, y) in float64, although onnxruntime has the arctan in float32 alone.
+    """Returns the angles of points (x, y) in float64; onnxruntime has the arctan in float32 alone.
 
     The float32 angle is a first guess, off by some 1e-7 rad. Turned back by it, a point lies so close to the
     x axis that the tangent of the remaining angle is that angle.
@@ -172,8 +169,4 @@ def _arctan2(y: Any, x: Any) -> Any:
     return np.where((x == 0) & (y == 0), 0.0, angle)
 
 
-EXPANDED: dict[str, Callable[..., Any]] = {
-    "cos": _cos,
-    "remainder": _remainder,
-    "arctan2": _arctan2,
-}
+EXPANDED = {"cos": _cos, "remainder": _remainder, "arctan2": _arctan2}

@@ -67,7 +67,7 @@ def _expression(operation: Operation, write: Callable[[Any], str]) -> str:
 
 
 def _literal(x: Any) -> str:
-    """Source of a number or an array that gives it back to the last bit."""
+    """Returns the source of a number or an array, which gives it back to the last bit."""
     value = np.asarray(x).tolist()
     text = repr(value) if np.isfinite(x).all() else f"float('{value}')"
     if isinstance(x, np.ndarray):

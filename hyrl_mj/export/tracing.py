@@ -41,7 +41,7 @@ def trace(function: Callable[..., Any], samples: Mapping[str, np.ndarray], name:
     inputs = tuple(Operation("input", (key,), {}, value) for key, value in samples.items())
     try:
         with np.errstate(all="ignore"):
-            results = PrivateCopies(REPLACEMENTS).of(function)(*map(Traced, inputs))
+            results = _PrivateCopies().of(function)(*map(Traced, inputs))
     except Untraceable as error:
         raise BadInput(f"{name} cannot be exported: it {error}") from error
     except Exception as error:  # code that gets another kind of array fails in many ways
@@ -59,7 +59,7 @@ def trace(function: Callable[..., Any], samples: Mapping[str, np.ndarray], name:
 
 
 def _filled(original: Callable[..., np.ndarray], *args: Any, **kwargs: Any) -> Any:
-    """np.zeros((len(x), 3)) and the like: an array that traced values can be assigned to."""
+    """Does np.zeros((len(x), 3)) and the like: makes an array that traced values can be assigned to."""
     array = original(*args, **kwargs)
     if BATCH not in array.shape:
         return array
@@ -68,7 +68,7 @@ def _filled(original: Callable[..., np.ndarray], *args: Any, **kwargs: Any) -> A
 
 
 def _converted(original: Callable[..., Any], x: Any, dtype: Any = None, **kwargs: Any) -> Any:
-    """np.asarray(x), np.array([x, y]) and the like."""
+    """Does np.asarray(x), np.array([x, y]) and the like."""
     if isinstance(x, list | tuple) and any(isinstance(part, Traced) for part in x):
         x = np.stack(x)
     if not isinstance(x, Traced):
@@ -77,16 +77,14 @@ def _converted(original: Callable[..., Any], x: Any, dtype: Any = None, **kwargs
 
 
 def _take(x: Any, indices: Any, *args: Any, **kwargs: Any) -> Any:
-    """np.take(table, x)."""
     return (take if isinstance(indices, Traced) else np.take)(x, indices, *args, **kwargs)
 
 
+FILLING = (np.empty, np.zeros, np.ones, np.full)
+CONVERTING = (np.array, np.asarray, np.asanyarray, np.ascontiguousarray)
 REPLACEMENTS: dict[str, Callable[..., Any]] = {
-    **{f: partial(_filled, getattr(np, f)) for f in ("empty", "zeros", "ones", "full")},
-    **{
-        f: partial(_converted, getattr(np, f))
-        for f in ("array", "asarray", "asanyarray", "ascontiguousarray")
-    },
+    **{function.__name__: partial(_filled, function) for function in FILLING},
+    **{function.__name__: partial(_converted, function) for function in CONVERTING},
     "take": _take,
 }
 
@@ -94,22 +92,18 @@ REPLACEMENTS: dict[str, Callable[..., Any]] = {
 # ---- private copies of code
 
 
-class PrivateCopies:
-    """Copies of functions, and of the functions and methods that they call.
+class _PrivateCopies:
+    """Copies of functions, and of the functions and methods that they call, with `REPLACEMENTS`.
 
     Methods are copied of the object whose bound method is copied, and of objects of this package, such as
     charts. Methods of other objects run as they are.
-
-    Args:
-        replacements: what copies call instead of functions of NumPy, by the names of these.
     """
 
-    def __init__(self, replacements: Mapping[str, Callable[..., Any]]) -> None:
-        numpy = ModuleType("numpy")
-        vars(numpy).update(vars(np), **replacements)
+    def __init__(self) -> None:
         # Original and copy by the id of the original, which is kept so that its id stays its own.
-        self._copies: dict[int, tuple[Any, Any]] = {id(np): (np, numpy)}
-        for name, replacement in replacements.items():
+        self._copies: dict[int, tuple[Any, Any]] = {}
+        vars(self._keep(np, ModuleType("numpy"))).update(vars(np), **REPLACEMENTS)
+        for name, replacement in REPLACEMENTS.items():
             self._keep(getattr(np, name), replacement)
 
     def _keep(self, original: Any, copy: Any) -> Any:
@@ -129,7 +123,7 @@ class PrivateCopies:
             return partial(self.of(x.func), *x.args, **x.keywords)
         if isinstance(x, FunctionType) and _is_copied(x.__globals__.get("__name__")):
             return self._function(x)
-        if _package(type(x).__module__) == _package(__name__):
+        if type(x).__module__.startswith("hyrl_mj."):
             return self._object(x)
         if isinstance(x, ModuleType) and _is_copied(x.__name__):
             view = self._keep(x, ModuleType(x.__name__))
@@ -186,16 +180,11 @@ class PrivateCopies:
         return stand_in
 
 
-def _package(module: str | None) -> str:
-    return (module or "").partition(".")[0]
-
-
 def _is_copied(module: str | None) -> bool:
-    """Whether code of a module is copied."""
-    return _package(module) not in LEFT_AS_THEY_ARE
+    return (module or "").partition(".")[0] not in LEFT_AS_THEY_ARE
 
 
 def _names(code: CodeType) -> set[str]:
-    """The global names that code reads, nested functions included; and some names of attributes."""
+    """Returns the global names that code reads, nested functions included, and names of attributes."""
     inner = (_names(constant) for constant in code.co_consts if isinstance(constant, CodeType))
     return set(code.co_names).union(*inner)

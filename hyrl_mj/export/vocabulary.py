@@ -29,7 +29,7 @@ class Untraceable(Exception):
 
 
 def _prod(x: Any, axis: Any = None, keepdims: bool = False) -> Any:
-    """One factor after the other: older versions of onnxruntime have no product in float64."""
+    """Multiplies one factor after the other: older onnxruntimes have no product in float64."""
     if axis is None or np.ndim(axis):
         raise Untraceable("uses np.prod other than along one axis")
     product = reduce(np.multiply, (np.take(x, i, axis=axis) for i in range(x.shape[axis])))
@@ -73,7 +73,7 @@ def _round(x: Any, decimals: int = 0) -> Any:
 
 
 def _erf(x: Any) -> Any:
-    """SciPy's error function within 2e-7 (Abramowitz and Stegun, 7.1.26); NumPy and ONNX have none."""
+    """Returns SciPy's error function within 2e-7 (Abramowitz and Stegun, 7.1.26), which ONNX lacks."""
     t = 1 / (1 + 0.3275911 * np.absolute(x))
     factors = (1.061405429, -1.453152027, 1.421413741, -0.284496736, 0.254829592)
     polynomial = reduce(lambda rest, factor: (rest + factor) * t, factors, 0.0)
