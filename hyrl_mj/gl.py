@@ -1,14 +1,13 @@
-"""Import MuJoCo with a GL backend that does not stop it.
+"""Imports MuJoCo with a GL backend that does not stop it.
 
 MuJoCo reads `MUJOCO_GL` when it is first imported and loads the GL library at once. Where the library is
 missing or the name is unknown, `import mujoco` itself fails. Training and analysis draw nothing and must not
 fail with it: other backends are tried, and at last MuJoCo is imported without one.
 
-Before the next attempt, the modules that the failed one has added must be removed from `sys.modules`:
-PyOpenGL stays bound to the backend that failed ("OSMesaPlatform has no attribute EGL"), and the next MuJoCo
-would lack `mujoco.rendering`, because Python makes a submodule an attribute of its package only when it loads
-the submodule. Looking for the GL library beforehand is not enough, because the import also depends on the
-versions of PyOpenGL and MuJoCo; an attempt in a child process would double the time of every import.
+Before the next attempt, the modules that the failed one has added are removed from `sys.modules`: PyOpenGL
+stays bound to the backend that failed, and Python makes a submodule an attribute of its package only when it
+loads the submodule. Looking for the GL library beforehand is not enough, because the import also depends on
+the versions of PyOpenGL and MuJoCo; an attempt in a child process would double the time of every import.
 """
 
 import importlib
@@ -21,8 +20,8 @@ HEADLESS = ("egl", "osmesa")
 
 def has_display() -> bool:
     """Returns whether windows can be opened: without a display they cannot on Linux."""
-    shown = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    return bool(shown) or not sys.platform.startswith("linux")
+    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    return bool(display) or not sys.platform.startswith("linux")
 
 
 def import_mujoco() -> str:
@@ -30,9 +29,7 @@ def import_mujoco() -> str:
 
     The backend that `MUJOCO_GL` names is tried; where it is not set, MuJoCo's own choice if there is a
     display, else `HEADLESS`. `MUJOCO_GL` is left at the backend in use or, without one, at the first tried.
-
-    Returns:
-        Why all backends failed; empty if one was loaded or none was needed.
+    Returns why all backends failed; empty if one was loaded or none was needed.
     """
     chosen = os.environ.get("MUJOCO_GL", "")
     if not chosen and (has_display() or "mujoco" in sys.modules):
@@ -41,8 +38,7 @@ def import_mujoco() -> str:
     problems = []
     backends = (chosen,) if chosen else HEADLESS
     for backend in backends:
-        problem = _attempt(backend)
-        if not problem:
+        if not (problem := _attempt(backend)):
             return ""
         problems.append(f"{backend}: {problem}")
     os.environ["MUJOCO_GL"] = "disable"

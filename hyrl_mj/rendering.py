@@ -22,6 +22,7 @@ LARGEST = 4096
 GEOMS = 2_000  # default capacity of a scene
 # A geom that is a label without a text is not drawn.
 HIDDEN = mujoco.mjtGeom.mjGEOM_LABEL
+FRUSTUM = ("frustum_center", "frustum_width", "frustum_bottom", "frustum_top")
 
 # Left, top, right and bottom of a part of a picture [pixels], the last two excluded.
 Box = tuple[int, int, int, int]
@@ -40,7 +41,11 @@ class Canvas:
     """
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int):
-        check_size(width, height)
+        if not (0 < width <= LARGEST and 0 < height <= LARGEST):
+            raise BadInput(
+                f"a picture of {width} x {height} pixels cannot be drawn: give 1 x 1 to "
+                f"{LARGEST} x {LARGEST}"
+            )
         # Compiled models are shared, and the size of the buffer is one of their settings.
         self.model = copy(model)
         shape = self.model.vis.global_
@@ -97,8 +102,7 @@ class SceneRenderer:
         canvas: canvas of this model, at least as large; by default a new one, which takes 0.1 s.
 
     Raises:
-        BadInput: a size that no picture can have.
-        NoRenderer: there is no GL library; the message says which to install.
+        BadInput, NoRenderer: as `Canvas`.
     """
 
     def __init__(
@@ -126,11 +130,9 @@ class SceneRenderer:
 
     def clear(self) -> None:
         """Removes all geoms from the scene but static ones."""
-        static = mujoco.mjtCatBit.mjCAT_STATIC.value
-        mujoco.mj_forward(self.model, self.data)
-        mujoco.mjv_updateScene(
-            self.model, self.data, self._options, None, self._camera, static, self.scene
-        )
+        model, data, static = self.model, self.data, mujoco.mjtCatBit.mjCAT_STATIC.value
+        mujoco.mj_forward(model, data)
+        mujoco.mjv_updateScene(model, data, self._options, None, self._camera, static, self.scene)
         self._kinds, self._balls, self._shown = [], self._balls[:0], self._shown[:0]
         self.keep()
 
@@ -162,13 +164,11 @@ class SceneRenderer:
         self._move(qpos)
         mujoco.mjv_updateCamera(self.model, self.data, self._camera, self.scene)
         mujoco.mjv_makeLights(self.model, self.data, self.scene)
+        wider, shape = max(self.height / self.width, 1.0), self.width / self.height
         for view in self.scene.camera:
-            wider = max(self.height / self.width, 1.0)
             view.frustum_bottom *= wider
             view.frustum_top *= wider
-            view.frustum_width = (
-                (view.frustum_top - view.frustum_bottom) / 2 * self.width / self.height
-            )
+            view.frustum_width = (view.frustum_top - view.frustum_bottom) / 2 * shape
 
     def add_robot(self, qpos: np.ndarray) -> range:
         """Adds the moving geoms in a position (nq,); returns their indices in the scene."""
@@ -189,18 +189,16 @@ class SceneRenderer:
         """Redraws a part of the picture (height, width, 3), with the camera's frustum cut to the box."""
         self._hide_outside(box)
         left, top, right, bottom = box
-        kept = [
-            (v.frustum_center, v.frustum_width, v.frustum_bottom, v.frustum_top)
-            for v in self.scene.camera
-        ]
-        for view, (centre, half, low, high) in zip(self.scene.camera, kept, strict=True):
+        whole = [[getattr(view, name) for name in FRUSTUM] for view in self.scene.camera]
+        for view, (centre, half, low, high) in zip(self.scene.camera, whole, strict=True):
             x, y = 2 * half / self.width, (high - low) / self.height  # of one pixel
             view.frustum_center = centre - half + x * (left + right) / 2
             view.frustum_width = x * (right - left) / 2
             view.frustum_bottom, view.frustum_top = high - y * bottom, high - y * top
         picture[top:bottom, left:right] = self.canvas.draw(self.scene, right - left, bottom - top)
-        for view, values in zip(self.scene.camera, kept, strict=True):
-            view.frustum_center, view.frustum_width, view.frustum_bottom, view.frustum_top = values
+        for view, values in zip(self.scene.camera, whole, strict=True):
+            for name, value in zip(FRUSTUM, values, strict=True):
+                setattr(view, name, value)
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns column and row (n, 2) [pixels] of points (n, 3) [m], and their scale (n,) [pixels/m]."""
@@ -217,24 +215,20 @@ class SceneRenderer:
     def extent(self, points: np.ndarray, radii: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns bounds of the pictures of spheres around points (n, 3) with radii (n,) [m].
 
-        Returns:
-            (n, 2) least and (n, 2) greatest column and row [pixels], with a margin of one pixel; infinite
-            for a sphere that reaches the camera.
+        These are the least and the greatest column and row, (n, 2) each [pixels], with a margin of one
+        pixel; infinite for a sphere that reaches the camera.
         """
         eyes, view = self.scene.camera, self.scene.camera[0]
         with np.errstate(divide="ignore", invalid="ignore"):
             pixels, scale = self.project(points)
             reach = (radii * scale)[:, None]
-            near = np.zeros(len(points), dtype=bool)
             if not view.orthographic:
                 # The near side of a sphere appears larger and farther off the axis than its centre.
                 depth = (points - (eyes[0].pos + eyes[1].pos) / 2) @ view.forward
                 off = np.abs(pixels - [self.width / 2, self.height / 2])
                 reach = (radii / (depth - radii))[:, None] * ((scale * depth)[:, None] + off)
-                near = depth <= radii
-            low, high = pixels - reach - 1, pixels + reach + 1
-        low[near], high[near] = -np.inf, np.inf
-        return low, high
+                reach[depth <= radii], pixels[depth <= radii] = np.inf, 0.0
+        return pixels - reach - 1, pixels + reach + 1
 
     def close(self) -> None:
         """Frees the GL context, unless the canvas was passed by the caller."""
@@ -254,15 +248,6 @@ class SceneRenderer:
         self.data.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
-
-
-def check_size(width: int, height: int) -> None:
-    """Raises `BadInput` unless a picture can have this size [pixels]."""
-    if not (0 < width <= LARGEST and 0 < height <= LARGEST):
-        raise BadInput(
-            f"a picture of {width} x {height} pixels cannot be drawn: give 1 x 1 to "
-            f"{LARGEST} x {LARGEST}"
-        )
 
 
 def _gl_context(width: int, height: int) -> Any:
