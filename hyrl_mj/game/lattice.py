@@ -162,16 +162,13 @@ def _levels(task: Task, grid: Grid, nodes: np.ndarray) -> np.ndarray:
     if task.input_levels is not None:
         return task.input_levels
     low, high = task.input_limits
-    axes = []
+    plant, axes = task.plant(2), []
     for i in range(len(low)):
-        ends = []
-        for value in (low[i], high[i]):
-            u = (low + high) / 2
-            u[i] = value
-            plant = task.plant(1)
-            plant.set_state(*task.state(nodes[:1]))
-            plant.step(u[None])
-            ends.append(task.z(plant.measurement)[0])
+        u = np.tile((low + high) / 2, (2, 1))
+        u[:, i] = low[i], high[i]
+        plant.set_state(*task.state(nodes[[0, 0]]))
+        plant.step(u)
+        ends = task.z(plant.measurement)
         cells = np.abs((ends[1] - ends[0]) / grid.spacing).max()
         axes.append(np.linspace(low[i], high[i], int(np.ceil(cells)) + 1))
     return np.array(list(product(*axes)))

@@ -128,9 +128,8 @@ class Game:
         cell = float(self.lattice.grid.spacing[self.bound(1.0) > 0].min())
 
         def all_won(cells: int) -> bool:
-            eps = cells * cell
-            own = self.value(name, eps)[-1, :-2]
-            return bool((own[self.starts & self.winnable(eps)] < NEVER).all())
+            own = self.value(name, cells * cell)[-1, :-2]
+            return bool((own[self.starts & self.winnable(cells * cell)] < NEVER).all())
 
         low, high = 0, int(self.largest / cell + 1e-6)
         if not all_won(low):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -201,9 +202,8 @@ def lasting(moves: Moves, start: np.ndarray | None = None) -> np.ndarray:
     alive = runs.copy()
     if start is not None:
         alive[:, :-2] &= start
-    grows = (
-        start is not None
-    )  # first add all nodes that can be reached, then remove those that are left
+    # First add all nodes that can be reached, then remove those that runs leave.
+    grows = start is not None
     while True:
         reached = np.zeros(runs.size, dtype=bool)
         reached[moves.target[np.repeat(alive.reshape(-1)[moves.state], moves.counts)]] = True
@@ -222,9 +222,6 @@ class WorstNoise(Signal):
 
     Where possible, it avoids measurements on the very border of two answers, where rounding errors of the
     plant could let a run escape.
-
-    Attributes:
-        value: (modes + 1, places) int, values of the game.
     """
 
     kind = "worst"
@@ -235,11 +232,8 @@ class WorstNoise(Signal):
         self._answers, self._bound = answers, bound
         self._any = solve(noisy_moves(answers, bound))
         self._settled = solve(noisy_moves(answers, bound, settled_only=True))
-        self.value = np.where(self._settled >= NEVER, self._settled, self._any)
         window = nodes_within(answers.lattice, bound)
-        shifts = np.stack(
-            np.meshgrid(*[np.arange(-w, w + 1) for w in window], indexing="ij"), axis=-1
-        ).reshape(-1, len(window))
+        shifts = np.array(list(product(*[range(-w, w + 1) for w in window])))
         # Among equals the largest noise comes first, for states between the nodes.
         self._shifts = shifts[np.argsort(-np.abs(shifts).sum(axis=1), kind="stable")]
 
@@ -252,9 +246,8 @@ class WorstNoise(Signal):
         row = np.where(q == NOT_STARTED, len(modes), np.searchsorted(modes, q))
         worst, chosen = np.full(len(true), -1), np.zeros_like(true)
         for shift in self._shifts:
-            node = np.where(
-                grid.chart.periodic, (at + shift) % grid.counts, at + shift + answers.pad
-            )
+            near = at + shift
+            node = np.where(grid.chart.periodic, near % grid.counts, near + answers.pad)
             level, mode = np.divmod(answers.index[(row, *node.T)], len(modes))
             ends = mode[:, None], lattice.after[level, :, place]
             value, settled = self._any[ends].max(axis=1), self._settled[ends].max(axis=1)
@@ -262,7 +255,7 @@ class WorstNoise(Signal):
             value = np.where(counts & (settled >= NEVER), FIRST + settled, value)
             better = value > worst
             worst = np.where(better, value, worst)
-            chosen[better] = (at + shift)[better]
+            chosen[better] = near[better]
         measured = grid.chart.low + grid.spacing * chosen
         noise = grid.chart.difference(measured, grid.chart.wrap(true))
         return np.clip(noise, -self._bound, self._bound)
