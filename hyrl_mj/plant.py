@@ -1,7 +1,5 @@
 """The physics of every task: n copies of a compiled model, stepped side by side."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Sequence
 

@@ -1,7 +1,5 @@
 """The tests that every task must pass: import them into a test file with a fixture `task`, and run pytest."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

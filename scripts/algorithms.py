@@ -17,7 +17,7 @@ from rich.table import Table
 
 import hyrl_mj
 from hyrl_mj import progress
-from hyrl_mj.policies import ALGORITHMS, algorithm_title
+from hyrl_mj.policies import ALGORITHMS, algorithms
 from hyrl_mj.viz.tables import arrivals, percent
 
 PAPER = ("unit_circle", "vehicle")
@@ -42,7 +42,7 @@ def row(task: str, algorithm: str, seed: int, eps: float, out: Path) -> tuple[li
     scores = {who: score[-1] for who, score in run.robustness.game.scores.items()}
     arcs = run.arcs()
     replays = {policy: arrivals(run, arcs, policy) for policy in (True, False)}
-    cells = [algorithm_title(algorithm), str(seed)]
+    cells = [algorithms.title(algorithm), str(seed)]
     cells += [percent(scores["policy"].won)]
     cells += [percent(scores["hyrl"].won), percent(scores["hyrl"].won_any)]
     cells += [f"{won} of {total}" for won, total in replays.values()]

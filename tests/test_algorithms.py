@@ -10,14 +10,9 @@ import pytest
 import hyrl_mj
 from hyrl_mj import BadInput, cli
 from hyrl_mj.envs.core import BatchedEnv
-from hyrl_mj.learning.presets import PRESETS, preset
+from hyrl_mj.learning.settings import PRESETS, preset
 from hyrl_mj.learning.training import build, check_foreign, evaluate, export, single_threaded, train
-from hyrl_mj.policies.algorithms import (
-    ALGORITHMS,
-    algorithm_class,
-    algorithm_title,
-    check_algorithm,
-)
+from hyrl_mj.policies import ALGORITHMS, algorithms
 
 # What can have the inputs of which task.
 CAN = [
@@ -299,7 +294,7 @@ def test_a_class_of_the_users_trains_with_the_settings_of_its_relative(kind, tas
     task = hyrl_mj.get_task(task)
     settings = quick(task, name, known)
     assert settings.algorithm == name
-    assert algorithm_title(name) == kind.upper()
+    assert algorithms.title(name) == kind.upper()
     ours = preset(task, "smoke", algorithm=known).stage1
     assert settings.options.items() <= ours.options.items()
     assert set(settings.options) == ({"n_steps"} if kind == "Fewer" else set(ours.options))
@@ -311,8 +306,8 @@ def test_a_module_in_the_current_folder_is_found(tmp_path, monkeypatch):
     (tmp_path / "beside_me.py").write_text("from stable_baselines3 import A2C as Mine\n")
     monkeypatch.chdir(tmp_path)
     before = list(sys.path)
-    check_algorithm("beside_me:Mine", "any", None)
-    assert algorithm_class("beside_me:Mine").__name__ == "A2C"
+    algorithms.check("beside_me:Mine", "any", None)
+    assert algorithms.sb3_class("beside_me:Mine").__name__ == "A2C"
     assert sys.path == before
 
 

@@ -20,7 +20,7 @@ from PIL import Image
 from planted import Cube, decisions, halves
 
 from hyrl_mj import BadArtifact, BadInput, MlpPolicy, load_run
-from hyrl_mj.learning.presets import preset
+from hyrl_mj.learning.settings import preset
 from hyrl_mj.pipeline import ExamineOptions, examine_run, run_stage
 from hyrl_mj.run_directory import Run, write_config
 from hyrl_mj.sets import Grid, GridSet

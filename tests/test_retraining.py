@@ -9,7 +9,7 @@ from planted import ChartPolicy, ideal_controller, one_way_policy
 from hyrl_mj import closed_loop
 from hyrl_mj.envs.core import cautious_reward
 from hyrl_mj.learning import symmetry, training
-from hyrl_mj.learning.presets import preset
+from hyrl_mj.learning.settings import preset
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets

@@ -22,8 +22,7 @@ from hyrl_mj.envs.sb3_env import TaskVecEnv
 from hyrl_mj.game.lattice import Lattice
 from hyrl_mj.game.limit import Limit
 from hyrl_mj.learning import training
-from hyrl_mj.learning.presets import preset
-from hyrl_mj.learning.settings import Settings
+from hyrl_mj.learning.settings import Settings, preset
 from hyrl_mj.pipeline.steps import STAGES
 from hyrl_mj.policies.external import read_agent, reopen_agent
 from hyrl_mj.sets import Grid, GridSet

@@ -1,7 +1,5 @@
 """Examining controllers in the worst case: scores, margins, the curve over all bounds, and maps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any

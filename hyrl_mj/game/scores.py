@@ -1,7 +1,5 @@
 """The worst-case game of one task: scores, margins and maps of controllers, and the worst noise signals."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from functools import cached_property
 

@@ -3,7 +3,6 @@
 The modules `training`, `distillation` and `symmetry` import torch: import them only where they are needed.
 """
 
-from hyrl_mj.learning.presets import preset
-from hyrl_mj.learning.settings import Settings, Training
+from hyrl_mj.learning.settings import Settings, Training, preset
 
 __all__ = ["Settings", "Training", "distillation", "preset", "symmetry", "training"]

@@ -1,7 +1,5 @@
 """Distillation: copies any policy into a network from which training can continue."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -7,8 +7,6 @@ observation o and its mirror image S o in one batch, and its output is the mean 
 f(S o). This is a plain network of twice the width, whose two halves have the same weights.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from typing import Any

@@ -26,8 +26,7 @@ from hyrl_mj.policies import (
     ALGORITHMS,
     TORCH_NAMES,
     MlpPolicy,
-    algorithm_class,
-    check_algorithm,
+    algorithms,
     infer_algorithm,
 )
 from hyrl_mj.progress import progress_bar
@@ -98,7 +97,7 @@ def build(
     Raises:
         BadInput: an unknown algorithm, or a policy to start from whose networks differ.
     """
-    check_algorithm(settings.algorithm, task.name, task.learning.levels)
+    algorithms.check(settings.algorithm, task.name, task.learning.levels)
     hidden = settings.hidden if start_from is None else start_from.hidden
     activation = settings.activation if start_from is None else start_from.activation
     rate = settings.learning_rate
@@ -107,7 +106,7 @@ def build(
     if settings.action_noise:
         m = len(task.inputs)
         options["action_noise"] = NormalActionNoise(np.zeros(m), np.full(m, settings.action_noise))
-    model = algorithm_class(settings.algorithm)(
+    model = algorithms.sb3_class(settings.algorithm)(
         "MlpPolicy",
         TaskVecEnv(env),
         seed=seed,
@@ -167,7 +166,7 @@ def export(model: BaseAlgorithm, task: Task) -> MlpPolicy:
     state = symmetry.plain_state(model.policy, task)
     weights = {name: tensor.detach().cpu().numpy().copy() for name, tensor in state.items()}
     activation = next(n for n, a in ACTIVATIONS.items() if a is model.policy.activation_fn)
-    own = (name for name in ALGORITHMS if type(model) is algorithm_class(name))
+    own = (name for name in ALGORITHMS if type(model) is algorithms.sb3_class(name))
     return MlpPolicy(task, next(own, "") or infer_algorithm(weights, {}), activation, weights)
 
 

@@ -4,14 +4,7 @@ A policy is a network, a function or an ONNX model on the observation of a task;
 mode. Agents that were trained elsewhere are read here, and nothing in their files is executed.
 """
 
-from hyrl_mj.policies.algorithms import (
-    ALGORITHMS,
-    accepted_options,
-    algorithm_class,
-    algorithm_title,
-    check_algorithm,
-    sb3_relative,
-)
+from hyrl_mj.policies.algorithms import ALGORITHMS
 from hyrl_mj.policies.controllers import Controller, PolicyController, as_controller, check_modes
 from hyrl_mj.policies.external import (
     FUNCTION,
@@ -39,16 +32,12 @@ __all__ = [
     "Policy",
     "PolicyController",
     "SampledPolicy",
-    "accepted_options",
-    "algorithm_class",
-    "algorithm_title",
+    "algorithms",
     "as_controller",
-    "check_algorithm",
     "check_modes",
     "from_callable",
     "infer_algorithm",
     "load_agent",
     "read_agent",
     "reopen_agent",
-    "sb3_relative",
 ]

@@ -61,12 +61,12 @@ ALGORITHMS = {
 }
 
 
-def algorithm_title(name: str) -> str:
+def title(name: str) -> str:
     """Returns the display name of an algorithm: "PPO", or "TQC" for "sb3_contrib:TQC"."""
     return name.rpartition(":")[2].upper()
 
 
-def check_algorithm(name: str, task: str, levels: int | None) -> None:
+def check(name: str, task: str, levels: int | None) -> None:
     """Raises `BadInput` if an algorithm is unknown, or does not take the inputs of a task.
 
     The inputs have a number of levels, or None if they are continuous.
@@ -84,7 +84,7 @@ def check_algorithm(name: str, task: str, levels: int | None) -> None:
     raise BadInput(f"{name} {needs}: choose one of {', '.join(allowed)}")
 
 
-def algorithm_class(name: str) -> type[BaseAlgorithm]:
+def sb3_class(name: str) -> type[BaseAlgorithm]:
     """Returns the class of one of `ALGORITHMS`, or of a `module:Class`, from the current folder, too.
 
     Raises:
@@ -119,8 +119,8 @@ def sb3_relative(name: str, levels: int | None) -> str:
         return name
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-    kind = algorithm_class(name)
-    known = {algorithm_class(known): known for known in ALGORITHMS}
+    kind = sb3_class(name)
+    known = {sb3_class(known): known for known in ALGORITHMS}
     bases = (known[base] for base in kind.__mro__ if base in known)
     similar = "ppo" if issubclass(kind, OnPolicyAlgorithm) else "dqn" if levels else "sac"
     return next(bases, similar)
@@ -128,7 +128,7 @@ def sb3_relative(name: str, levels: int | None) -> str:
 
 def accepted_options(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """Returns those of SB3's keywords that an algorithm takes."""
-    parameters = inspect.signature(algorithm_class(name).__init__).parameters
+    parameters = inspect.signature(sb3_class(name).__init__).parameters
     if any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
         return dict(options)
     return {key: value for key, value in options.items() if key in parameters}

@@ -1,7 +1,5 @@
 """External agents, which `robustify` starts from: how they are read, described and stored."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from hashlib import sha256
@@ -12,7 +10,7 @@ import numpy as np
 
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadArtifact, BadInput, check_seed, unknown
-from hyrl_mj.policies.algorithms import algorithm_title
+from hyrl_mj.policies import algorithms
 from hyrl_mj.policies.functions import from_callable, from_onnx
 from hyrl_mj.policies.mlp import (
     ACTIVATIONS,
@@ -51,7 +49,7 @@ class Agent:
     @property
     def title(self) -> str:
         """Its kind for display: "DQN", "ONNX" or "FUNCTION"."""
-        return algorithm_title(self.algorithm)
+        return algorithms.title(self.algorithm)
 
     @property
     def options(self) -> list[str]:

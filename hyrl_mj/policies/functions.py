@@ -1,7 +1,5 @@
 """Policies that are functions of the observation: Python callables and ONNX models."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ The file is data. torch's restricted unpickler reads the tensors, and a JSON par
 else in the file is unpickled.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import warnings

@@ -1,7 +1,5 @@
 """Adversarial noise that simulates the closed loop ahead before it chooses."""
 
-from __future__ import annotations
-
 from itertools import product
 from typing import Self
 

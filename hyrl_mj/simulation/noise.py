@@ -4,8 +4,6 @@
 those below and register it where it is defined.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from copy import copy
 from dataclasses import dataclass

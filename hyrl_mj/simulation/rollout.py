@@ -1,7 +1,5 @@
 """The closed loop of task, noise and controller, for many starts at once."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

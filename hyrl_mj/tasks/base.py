@@ -1,7 +1,5 @@
 """The task: a plant with a measurement, a chart, an observation, a reward, an end and starts."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from functools import cached_property
 from pathlib import Path

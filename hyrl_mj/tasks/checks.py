@@ -1,7 +1,5 @@
 """Checks that a task is complete and consistent, before anything is trained."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike

@@ -1,7 +1,5 @@
 """The values that describe a task: how episodes end, its mirror symmetry, its scene, its training."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum

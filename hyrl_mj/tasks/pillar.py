@@ -1,7 +1,5 @@
 """Tasks in the plane: pass a pillar on its left or on its right, to a goal behind it."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from functools import cached_property
 

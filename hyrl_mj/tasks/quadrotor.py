@@ -1,7 +1,5 @@
 """A quadrotor: fly past a pillar at speed, on its left or on its right, to a gate behind it."""
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

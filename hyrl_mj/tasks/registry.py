@@ -1,7 +1,5 @@
 """The registry of tasks: those of this package, of other installed packages, and of the user's files."""
 
-from __future__ import annotations
-
 import importlib.util
 import inspect
 import sys

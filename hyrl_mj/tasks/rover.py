@@ -1,7 +1,5 @@
 """A rover on wheels: drive past a pillar on its left or on its right, to a goal behind it."""
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

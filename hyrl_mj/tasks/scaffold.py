@@ -1,7 +1,5 @@
 """The scaffold of a new task: a Python file, an MJCF, and the tests that every task must pass."""
 
-from __future__ import annotations
-
 import keyword
 import re
 from importlib.util import find_spec

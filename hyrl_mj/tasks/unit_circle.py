@@ -1,7 +1,5 @@
 """The unit circle: turn a pointer to the set-point, clockwise or counter-clockwise (paper, Example 1)."""
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Obstacle avoidance: drive past a pillar on its left or on its right (paper, Example 2)."""
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

@@ -16,7 +16,7 @@ from benchmarks import Figure
 from benchmarks.runs import Runs
 from hyrl_mj.learning import preset
 from hyrl_mj.learning.training import Score, TaskGround, export, single_threaded, train
-from hyrl_mj.policies import MlpPolicy, algorithm_class
+from hyrl_mj.policies import MlpPolicy, algorithms
 from hyrl_mj.tasks import Task
 
 # How good a policy has to be: the mean return from pi +- 0.2 rad; the share of winnable starts passed.
@@ -76,7 +76,7 @@ def _paper(task: Task, quality: Callable[[Task, MlpPolicy], float], enough: floa
 
     def work() -> int:
         settings = preset(task, "paper").stage1
-        model = algorithm_class(settings.algorithm)(
+        model = algorithms.sb3_class(settings.algorithm)(
             "MlpPolicy",
             gymnasium.make(task.env_id),
             seed=next(seeds),
