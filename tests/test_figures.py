@@ -22,7 +22,7 @@ from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.viz import figures
 from hyrl_mj.viz.arcs import overview_arcs, policy_start_arcs
-from hyrl_mj.viz.figures import charts, extended_sets, paths, style
+from hyrl_mj.viz.figures import charts, extended_sets, runs, style
 from hyrl_mj.viz.page import pictures
 from hyrl_mj.viz.section import Section
 
@@ -236,9 +236,9 @@ def test_overview_of_a_ring():
         ways = lines_of(panel, style.mode_colour(mode))
         assert ways
         assert all((side * way[:, 1] > -0.02).all() for way in ways)
-        assert all(np.isclose(np.linalg.norm(way[0]), paths.CORE) for way in ways)
+        assert all(np.isclose(np.linalg.norm(way[0]), runs.CORE) for way in ways)
     (spiral,) = [way for way in lines_of(panel, style.POLICY_COLOUR) if len(way) == len(noisy.z)]
-    radius = paths.CORE + (1 - paths.CORE) * noisy.t / CIRCLE.scene.time
+    radius = runs.CORE + (1 - runs.CORE) * noisy.t / CIRCLE.scene.time
     np.testing.assert_allclose(np.linalg.norm(spiral, axis=1), radius)
     np.testing.assert_allclose(spiral[:, 0] / radius, np.cos(noisy.z[:, 0]), atol=1e-12)
     np.testing.assert_allclose(marks_of(panel, "x", style.RED), [[-1, 0]], atol=0.02)
@@ -432,11 +432,11 @@ def test_a_path_round_a_period_is_broken_at_the_seam():
     class Torus(type(VEHICLE)):
         chart = hyrl_mj.Chart(("a", "b"), ("rad",) * 2, (0.0,) * 2, (2 * np.pi,) * 2, (True, False))
 
-    view = paths.plane_view(Torus())
+    view = runs.plane_view(Torus())
     z = np.stack([np.linspace(5, 8, 31), np.full(31, 1.0)], axis=1)
     with style.style.context("default"):
         panel = Figure().subplots()
-        x, y = paths.line(panel, view, np.arange(31), z).get_data()
+        x, y = runs.line(panel, view, np.arange(31), z).get_data()
     assert np.isnan(x).sum() == 1
     assert np.nanmax(np.abs(np.diff(x))) < 0.2
     assert np.nanmax(x) < 2 * np.pi

@@ -29,10 +29,10 @@ from hyrl_mj.game import (
 from hyrl_mj.game.examination import CURVE
 from hyrl_mj.sets import Grid
 from hyrl_mj.viz import figures
-from hyrl_mj.viz.figures import robustness_curve, style
+from hyrl_mj.viz.figures import robustness, style
 
 CIRCLE, VEHICLE = hyrl_mj.get_task("unit_circle"), hyrl_mj.get_task("vehicle")
-HYRL = robustness_curve.CURVE_COLOURS[1]
+HYRL = robustness.CURVE_COLOURS[1]
 
 
 @pytest.fixture
@@ -156,8 +156,8 @@ def test_curves_and_a_third_controller(tmp_path, coarse):
     names, path = ("policy", "hyrl", "median filter"), tmp_path / "curve.png"
     draw_curve(VEHICLE, game_of(names), path)
     for colour in (
-        *robustness_curve.CURVE_COLOURS[:3],
-        robustness_curve.LIMIT_COLOUR,
+        *robustness.CURVE_COLOURS[:3],
+        robustness.LIMIT_COLOUR,
         style.PALE,
     ):
         assert len(where(path, colour)) > 100

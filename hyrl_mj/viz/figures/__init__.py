@@ -15,11 +15,9 @@ from matplotlib.figure import Figure
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.figures.charts import drawable
 from hyrl_mj.viz.figures.extended_sets import draw_extended_sets
-from hyrl_mj.viz.figures.overview import draw_overview
-from hyrl_mj.viz.figures.policy_map import draw_policy_map
-from hyrl_mj.viz.figures.robustness_curve import draw_robustness_curve
-from hyrl_mj.viz.figures.robustness_map import CLASS_COLOURS as CLASS_COLOURS
-from hyrl_mj.viz.figures.robustness_map import draw_robustness_map
+from hyrl_mj.viz.figures.policy import draw_overview, draw_policy_map
+from hyrl_mj.viz.figures.robustness import CLASS_COLOURS as CLASS_COLOURS
+from hyrl_mj.viz.figures.robustness import draw_robustness_curve, draw_robustness_map
 from hyrl_mj.viz.figures.runs import draw_runs
 from hyrl_mj.viz.figures.shown import ShownGame, ShownPolicy, ShownRun
 from hyrl_mj.viz.figures.shown import shown_policy as shown_policy

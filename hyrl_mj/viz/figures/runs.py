@@ -1,14 +1,123 @@
-"""Runs of the hybrid controller beside those of the stage-1 policy."""
+"""Runs as paths in a panel: in the plane of a chart, over time, or as spirals on a ring."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
-from hyrl_mj.viz.figures import charts, paths, style
+from hyrl_mj.simulation import HybridArc
+from hyrl_mj.tasks import Task
+from hyrl_mj.viz.figures import charts, style
 from hyrl_mj.viz.figures.shown import ShownRun
+from hyrl_mj.viz.figures.style import INK, PALE, PAPER, POLICY_COLOUR, RED, mode_colour
+
+# Radius at which spirals begin; they end at 1.
+CORE = 0.4
+# What the legend calls the end of a run, by its outcome, where "end: outcome" is not clear.
+ENDS = {"running": "end, not there yet", "out_of_bounds": "end: out of bounds"}
+
+
+@dataclass(frozen=True)
+class View:
+    """Where runs lie in a panel.
+
+    Attributes:
+        points: (times (N,) [s], chart points (N, d)) -> points of the panel (N, 2).
+        longest: (2,) a longer step crosses the seam of a periodic coordinate, and is not drawn.
+    """
+
+    points: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    longest: np.ndarray = field(default_factory=lambda: np.full(2, np.inf))
+
+
+def plane_view(task: Task) -> View:
+    """Returns the view of paths in the plane of a chart."""
+    chart = task.chart
+    return View(lambda t, z: chart.wrap(z), np.where(chart.periodic, chart.sides / 2, np.inf))
+
+
+def time_view(panel: Axes, task: Task, coordinate: int) -> View:
+    """Labels a panel of a coordinate over time, and returns its view."""
+    panel.set(xlabel="time [s]", ylabel=style.axis_label(task, coordinate))
+    charts.label_angles(panel.yaxis, task, coordinate)
+    return View(lambda t, z: np.stack([t, z[:, coordinate]], axis=1))
+
+
+def spiral_view(task: Task, horizon: float) -> View:
+    """Returns the view of a periodic coordinate as an angle; time goes outward to the horizon [s]."""
+
+    def points(t: np.ndarray, z: np.ndarray) -> np.ndarray:
+        radius = CORE + (1 - CORE) * t / horizon
+        return np.stack(charts.on_ring(task, z[:, 0]), axis=1) * radius[:, None]
+
+    return View(points)
+
+
+def line(panel: Axes, view: View, t: np.ndarray, z: np.ndarray, **looks: Any) -> Line2D:
+    """Draws a path: times (N,) [s], chart points (N, d)."""
+    points = view.points(t, z)
+    gaps = (np.abs(np.diff(points, axis=0)) > view.longest).any(axis=1)
+    x, y = np.insert(points, np.flatnonzero(gaps) + 1, np.nan, axis=0).T
+    (drawn,) = panel.plot(x, y, **looks)
+    return drawn
+
+
+def mark(panel: Axes, view: View, arc: HybridArc, row: int, shape: Any, **looks: Any) -> None:
+    """Marks a row of an arc with one of matplotlib's markers."""
+    ((x, y),) = view.points(arc.t[[row]], arc.z[[row]])
+    looks = {"markersize": 6, "clip_on": False, "zorder": 6} | looks
+    panel.plot([x], [y], marker=shape, linestyle="none", **looks)
+
+
+def ends(panel: Axes, task: Task, view: View, arc: HybridArc) -> None:
+    """Marks where a run starts and ends."""
+    mark(panel, view, arc, 0, "o", markerfacecolor=PAPER, markeredgecolor=INK, label="start")
+    end(panel, task, view, arc)
+
+
+def end(panel: Axes, task: Task, view: View, arc: HybridArc) -> None:
+    """Marks where a run ends, in red if it has failed."""
+    label, colour = ("end", INK) if arc.arrives(task) else ("end: off the set-point", PALE)
+    if arc.outcome != "reached":
+        label, colour = ENDS.get(arc.outcome, f"end: {arc.outcome}"), RED
+    mark(panel, view, arc, -1, "x", color=colour, markeredgewidth=2, label=label)
+
+
+def policy_way(panel: Axes, view: View, arc: HybridArc, **looks: Any) -> Line2D:
+    """Draws a run of the stage-1 policy in ink."""
+    return line(panel, view, arc.t, arc.z, color=POLICY_COLOUR, zorder=4, **looks)
+
+
+def chosen_way(
+    panel: Axes, task: Task, view: View, arc: HybridArc, prefix: str = "", **looks: Any
+) -> Line2D:
+    """Draws a policy's run in the colour of the mode whose way it goes; `prefix` begins the label."""
+    mode = int(task.direction(arc.z[:, None])[0])
+    colour, label = mode_colour(mode), f"way of mode {task.scene.mode_name(mode)}"
+    if arc.outcome != "reached":
+        colour, label = POLICY_COLOUR, "neither way"
+    elif mode < 0:
+        colour, label = PALE, "nothing to decide"
+    return line(panel, view, arc.t, arc.z, color=colour, label=prefix + label, **looks)
+
+
+def hybrid_way(panel: Axes, task: Task, view: View, arc: HybridArc) -> None:
+    """Draws a run of the hybrid controller in the colours of its modes, with marks at its jumps."""
+    for j in range(arc.j[-1] + 1):
+        rows = arc.j == j
+        mode = int(arc.q[rows][0])
+        looks = {"color": mode_colour(mode), "label": f"HyRL in mode {task.scene.mode_name(mode)}"}
+        line(panel, view, arc.t[rows], arc.z[rows], linewidth=2.0, **looks)
+    for row in np.flatnonzero(np.diff(arc.j)).tolist():
+        # Small and on top, so that a jump at the start shows in its circle.
+        mark(panel, view, arc, row, "D", color=INK, markersize=3.5, zorder=7, label="jump")
 
 
 def draw_runs(shown: ShownRun, path: Path | None = None) -> Figure:
@@ -29,17 +138,17 @@ def draw_runs(shown: ShownRun, path: Path | None = None) -> Figure:
         panels = figure.subplots(rows, len(loops), sharex=True, sharey="row", squeeze=False)
         for (coordinate, column), panel in np.ndenumerate(panels):
             if plane:
-                view = paths.plane_view(task)
+                view = plane_view(task)
                 charts.plane(panel, task)
             else:
-                view = paths.time_view(panel, task, coordinate)
+                view = time_view(panel, task, coordinate)
                 style.grid_lines(panel)
             for start in starts:
                 hybrid, policy = replays[start, loops[column]], replays[start, "policy"]
-                paths.hybrid_way(panel, task, view, hybrid)
-                paths.ends(panel, task, view, hybrid)
-                paths.policy_way(panel, view, policy, linewidth=1.0, label=policy_title)
-                paths.ends(panel, task, view, policy)
+                hybrid_way(panel, task, view, hybrid)
+                ends(panel, task, view, hybrid)
+                policy_way(panel, view, policy, linewidth=1.0, label=policy_title)
+                ends(panel, task, view, policy)
             if not plane:
                 charts.set_point_lines(panel, task, coordinate)
             if coordinate == 0:

@@ -1,24 +1,31 @@
-"""The overview: which way the stage-1 policy goes without noise, and where noise leads it."""
+"""The figures of the stage-1 policy: where it goes without noise and with it, and a map of its inputs."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
+from matplotlib.colors import BoundaryNorm, Colormap, ListedColormap, Normalize
 from matplotlib.figure import Figure
 
-from hyrl_mj.sets import GridSet
+from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages import Partition
-from hyrl_mj.viz.figures import charts, paths, style
-from hyrl_mj.viz.figures.charts import OUTER
-from hyrl_mj.viz.figures.paths import CORE, View
+from hyrl_mj.tasks import Task
+from hyrl_mj.viz.figures import charts, runs, style
+from hyrl_mj.viz.figures.charts import INNER, OUTER
+from hyrl_mj.viz.figures.runs import CORE, View
 from hyrl_mj.viz.figures.shown import ShownPolicy
 from hyrl_mj.viz.figures.style import PALE_RED
 
 # An arrowhead shows the direction of a run after 1/ARROW of its samples.
 ARROW = 7
+# Nodes at which the policy is evaluated: of a ring, and along the longest side of a plane.
+RING_NODES, PLANE_CELLS = 720, 240
+INPUT_COLOURS = "PRGn"
 
 
 def draw_overview(shown: ShownPolicy, path: Path | None = None) -> Figure:
@@ -51,7 +58,7 @@ def _field(panel: Axes, shown: ShownPolicy) -> None:
         part = GridSet.from_mask(partition.grid, owners == i)
         charts.region(panel, part, style.mode_tint(mode))
     charts.plane(panel, task)
-    view = paths.plane_view(task)
+    view = runs.plane_view(task)
     _noiseless_runs(panel, shown, view)
     eps = task.noise_in_chart(arc.bound)
     band = _band(task.chart.wrap(arc.z), eps, view.longest)
@@ -60,7 +67,7 @@ def _field(panel: Axes, shown: ShownPolicy) -> None:
     ahead = arc.z[-1] - arc.z[0]
     triangle = (3, 0, float(np.degrees(np.arctan2(ahead[1], ahead[0]))) - 90)
     looks = {"markersize": 13, "markerfacecolor": style.PALE, "markeredgecolor": style.INK}
-    paths.mark(panel, view, arc, 0, triangle, label="robot at its start", **looks)
+    runs.mark(panel, view, arc, 0, triangle, label="robot at its start", **looks)
     charts.dots(panel, shown.critical.points)
 
 
@@ -91,7 +98,7 @@ def _spirals(panel: Axes, shown: ShownPolicy) -> None:
     tints = [style.mode_tint(mode) for mode in partition.modes]
     charts.arcs(panel, task, _owners(partition), [*tints, None], OUTER, CORE)
     charts.ring(panel, task, (OUTER, CORE), f",\ntime outward:\n0 to {seconds:g} s")
-    view = paths.spiral_view(task, seconds)
+    view = runs.spiral_view(task, seconds)
     _noiseless_runs(panel, shown, view)
     eps = task.noise_in_chart(arc.bound)
     rim = np.vstack([view.points(arc.t, arc.z - eps), view.points(arc.t, arc.z + eps)[::-1]])
@@ -105,10 +112,10 @@ def _spirals(panel: Axes, shown: ShownPolicy) -> None:
 def _noiseless_runs(panel: Axes, shown: ShownPolicy, view: View) -> None:
     """Draws the runs without noise, with arrowheads."""
     thin = {"linewidth": 1.3, "zorder": 3}
-    for run in shown.noiseless:
-        drawn = paths.chosen_way(panel, shown.task, view, run, "without noise: ", **thin)
-        row = len(run.t) // ARROW
-        points = view.points(run.t[row : row + 2], run.z[row : row + 2])
+    for arc in shown.noiseless:
+        drawn = runs.chosen_way(panel, shown.task, view, arc, "without noise: ", **thin)
+        row = len(arc.t) // ARROW
+        points = view.points(arc.t[row : row + 2], arc.z[row : row + 2])
         if len(points) < 2 or (np.abs(points[1] - points[0]) > view.longest).any():
             continue  # the run ends where it starts, or crosses the seam at this sample
         looks = {"arrowstyle": "-|>", "color": drawn.get_color(), "shrinkA": 0, "shrinkB": 0}
@@ -119,9 +126,84 @@ def _noiseless_runs(panel: Axes, shown: ShownPolicy, view: View) -> None:
 def _noisy_run(panel: Axes, shown: ShownPolicy, view: View) -> None:
     """Draws the run under noise and what it measures."""
     task, arc = shown.task, shown.noisy
-    paths.policy_way(panel, view, arc, linewidth=1.4, label=f"{shown.policy_title}, with noise")
+    runs.policy_way(panel, view, arc, linewidth=1.4, label=f"{shown.policy_title}, with noise")
     charts.legend_field(panel, "what it can observe", PALE_RED, PALE_RED)
     looks = {"linestyle": "none", "marker": ".", "color": style.RED, "markersize": 4, "zorder": 4.5}
     measured = task.z(arc.measured[:-1])
-    paths.line(panel, view, arc.t[:-1], measured, label="what it observes", **looks)
-    paths.end(panel, task, view, arc)
+    runs.line(panel, view, arc.t[:-1], measured, label="what it observes", **looks)
+    runs.end(panel, task, view, arc)
+
+
+# ---- the map of the inputs
+
+
+def draw_policy_map(shown: ShownPolicy, path: Path | None = None) -> Figure:
+    """Draws a map of each input of the policy, and the policy's runs from the paper's starts.
+
+    Raises:
+        BadInput: the chart is neither a plane nor a ring.
+    """
+    task = shown.task
+    charts.check_drawable(task)
+    with style.drawing(path, 5.2, task, f"the {shown.algorithm} policy") as figure:
+        *maps, panel = figure.subplots(1, len(task.inputs) + 1)
+        for i, input_panel in enumerate(maps):
+            _input_map(input_panel, shown, i)
+        _paper_runs(panel, shown)
+        style.legend(figure, by_label=True)
+    return figure
+
+
+def _paper_runs(panel: Axes, shown: ShownPolicy) -> None:
+    """Draws the runs from the paper's starts."""
+    task, ring = shown.task, charts.is_ring(shown.task)
+    label = style.noise_label(task, shown.paper[0].noise, shown.paper[0].bound)
+    panel.set_title(label.replace(", ", ",\n"))
+    if ring:
+        panel.set(xlim=(0, task.scene.time))
+        view = runs.time_view(panel, task, 0)
+    else:
+        charts.plane(panel, task)
+        view = runs.plane_view(task)
+    for arc in shown.paper:
+        runs.chosen_way(panel, task, view, arc, linewidth=2.0)
+        runs.ends(panel, task, view, arc)
+    if ring:
+        charts.set_point_lines(panel, task, 0)
+
+
+def _input_map(panel: Axes, shown: ShownPolicy, i: int) -> None:
+    """Draws the map of an input, measured without noise, with its colour bar."""
+    task, ring, chart = shown.task, charts.is_ring(shown.task), shown.task.chart
+    colours, scale, ticks = _input_colours(task, i)
+    grid = Grid(chart, (RING_NODES,)) if ring else Grid.with_cells(chart, PLANE_CELLS)
+    values = shown.policy.act(charts.measured_at(task, grid.nodes))[:, i]
+    if ring:
+        shades, classes = np.unique(colours(scale(values)), axis=0, return_inverse=True)
+        charts.arcs(panel, task, classes.ravel(), shades)
+        charts.ring(panel, task, (OUTER, INNER))
+        charts.spokes(panel, task, shown.critical, 0.6, style.RED)
+    else:
+        charts.image(panel, grid, values, cmap=colours, norm=scale)
+        charts.plane(panel, task)
+        charts.dots(panel, shown.critical.points, style.RED)
+    # After the ring, whose place in the panel the colour bar sets.
+    bar = panel.figure.colorbar(
+        ScalarMappable(scale, colours),
+        ax=panel, location="right", shrink=0.7, aspect=20, ticks=ticks,
+    )  # fmt: skip
+    bar.set_label(style.input_label(task, i))
+
+
+def _input_colours(task: Task, i: int) -> tuple[Colormap, Normalize, np.ndarray | None]:
+    """Returns the colours of an input, their scale, and the ticks of a discrete input."""
+    low, high = (float(limit[i]) for limit in task.input_limits)
+    # Without the darkest shades, on which no other mark can be seen.
+    shades = ListedColormap(colormaps[INPUT_COLOURS](np.linspace(0.08, 0.92, 256)))
+    if task.input_levels is None:
+        return shades, Normalize(low, high), None
+    levels = np.unique(task.input_levels[:, i])
+    half = (levels[1] - levels[0]) / 2
+    bounds = np.append(levels - half, high + half)
+    colours = ListedColormap(shades(np.linspace(0, 1, len(levels))))
+    return colours, BoundaryNorm(bounds, len(levels)), levels
