@@ -1,4 +1,4 @@
-"""Files of a run directory: no pickles, versioned, and written whole or not at all."""
+"""The files of a run directory: versioned, without pickles, and written whole or not at all."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
 Record = TypeVar("Record")
-# Raised whenever a file of an older version can no longer be read.
+# The version of the files; a file of another version is refused.
 VERSION = 1
-# What to do about a file that cannot be read.
+# The remedy for a file that cannot be read.
 REMEDY = "run the stage that writes it again"
 
 
@@ -53,7 +53,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def reading(path: Path, remedy: str = REMEDY) -> Iterator[None]:
-    """Turns any error of a file's reader into one sentence that ends with the remedy.
+    """Turns any error of a file's reader into a `BadArtifact` that names the file and the remedy.
 
     Raises:
         BadArtifact: the file is missing or cannot be read.
@@ -72,13 +72,11 @@ def reading(path: Path, remedy: str = REMEDY) -> Iterator[None]:
 
 
 def check_version(version: Any, kind: str, wanted: str) -> None:
-    """Raises `BadArtifact` unless a file is of the wanted kind and of this version."""
+    """Raises `BadArtifact` unless a file is of the wanted kind and version."""
     if kind != wanted:
         raise BadArtifact(f"it holds {kind!r}, not {wanted!r}")
     if version != VERSION:
-        raise BadArtifact(
-            f"it is of version {version}, this hyrl_mj reads version {VERSION}: {REMEDY}"
-        )
+        raise BadArtifact(f"it is of version {version}, hyrl_mj reads version {VERSION}: {REMEDY}")
 
 
 def write_json(path: Path, content: Any, kind: str) -> None:
@@ -91,7 +89,7 @@ def write_json(path: Path, content: Any, kind: str) -> None:
 
 
 def read_json(path: Path, kind: str, remedy: str = REMEDY) -> dict[str, Any]:
-    """Returns what `write_json` wrote, as nested dictionaries and lists."""
+    """Returns the content that `write_json` wrote, as nested dictionaries and lists."""
     with reading(path, remedy):
         content = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(content, dict):
@@ -104,7 +102,7 @@ def read_record(path: Path, kind: str, record: type[Record], remedy: str = REMED
     """Returns the dataclass that `write_json` wrote.
 
     Raises:
-        BadArtifact: the file is missing or damaged, or a field, which is named, does not fit the dataclass.
+        BadArtifact: the file is missing or damaged, or a field does not fit; the message names the field.
     """
     content = read_json(path, kind, remedy)
     with reading(path, remedy):
@@ -120,16 +118,13 @@ def parsed(content: Mapping[str, Any], record: type[Record], remedy: str = REMED
     from pydantic import ValidationError  # slow to import
 
     try:
-        value: Record = _adapter(record).validate_json(json.dumps([content]))[0]  # type: ignore[arg-type]
-        return value
+        return _adapter(record).validate_json(json.dumps([content]))[0]  # type: ignore[arg-type]
     except ValidationError as error:
         problems = error.errors(include_url=False, include_input=False)
-    # For a value of several allowed types pydantic lists the problems of each: report the closest type.
+    # For a union, pydantic lists the problems of every type: report those of the closest type.
     counts = Counter(problem["loc"][:-1] for problem in problems)
     problem = min(problems, key=lambda problem: counts[problem["loc"][:-1]])
-    field = ".".join(
-        str(step) for step in problem["loc"][1:]
-    )  # the first step is the tuple's index
+    field = ".".join(map(str, problem["loc"][1:]))  # the first step is the tuple's index
     text = {
         "missing": f"it has no {field}",
         "unexpected_keyword_argument": f"it has an unknown {field}",
@@ -139,7 +134,7 @@ def parsed(content: Mapping[str, Any], record: type[Record], remedy: str = REMED
 
 @cache
 def _adapter(record: type) -> TypeAdapter[Any]:
-    """Returns the JSON reader of a tuple of one record: pydantic refuses a config for a bare dataclass."""
+    """Returns the JSON reader of a tuple of one record; pydantic takes no config for a dataclass alone."""
     from pydantic import ConfigDict, TypeAdapter  # slow to import
 
     return TypeAdapter(tuple[record], config=ConfigDict(extra="forbid", strict=True))  # type: ignore[valid-type]
@@ -149,8 +144,9 @@ def _adapter(record: type) -> TypeAdapter[Any]:
 class Saved:
     """Base of the frozen dataclasses that are saved as an npz file, with an array for each field.
 
-    Numbers and strings are stored as arrays without dimensions, a tuple as one array, and a dictionary of
-    arrays as one array `<field>_<key>` for each entry. A type with `pack` and `unpack` stores its own tuples.
+    Numbers and strings become arrays without dimensions, a tuple becomes one array, and a dictionary of
+    arrays becomes an array `<field>_<key>` for each entry. Types with `pack` and `unpack` convert tuples of
+    themselves.
     """
 
     KIND: ClassVar[str]
@@ -164,10 +160,10 @@ class Saved:
 
     @classmethod
     def load(cls, path: Path, context: Any = None) -> Self:
-        """Reads what `save` wrote; sets in a task's chart need the task as `context`.
+        """Reads an npz file of `save`; sets in a task's chart need the task as `context`.
 
         Raises:
-            BadArtifact: the file is missing, damaged, or holds something else.
+            BadArtifact: the file is missing, damaged, or of another kind.
         """
         arrays, types = read_arrays(path, cls.KIND), get_type_hints(cls)
         values = {}
@@ -192,7 +188,7 @@ def _packed(name: str, value: Any) -> dict[str, np.ndarray]:
 
 
 def _unpacked(name: str, declared: Any, arrays: Mapping[str, np.ndarray], context: Any) -> Any:
-    """Returns the value of one field, of the type that it is declared with."""
+    """Returns the value of one field, of its declared type."""
     if declared == dict[str, np.ndarray]:
         prefix = f"{name}_"
         return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
@@ -213,7 +209,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], kind: str) -> Non
     """Writes named arrays as npz, with their kind and version.
 
     Raises:
-        TypeError: an array of Python objects, which NumPy would pickle.
+        TypeError: an array holds Python objects, which NumPy would pickle.
     """
     if objects := [name for name, array in arrays.items() if np.asarray(array).dtype.hasobject]:
         raise TypeError(f"arrays of Python objects cannot be written: {', '.join(objects)}")

@@ -36,11 +36,7 @@ class Config:
 
     @staticmethod
     def load(path: Path) -> Config:
-        """Reads `config.json`.
-
-        Raises:
-            BadArtifact: the file is damaged or of another version.
-        """
+        """Reads `config.json`; raises `BadArtifact` if it is damaged or of another version."""
         return artifacts.read_record(path, "run", Config, "start a new run with another --out")
 
 
@@ -59,10 +55,8 @@ class Run:
     function: AnyPolicy | None = None
 
     def __repr__(self) -> str:
-        s = self.settings
-        return (
-            f"Run({str(self.path)!r}: {s.task}, eps {s.noise:g}, seed {s.seed}, preset {s.preset})"
-        )
+        s, path = self.settings, str(self.path)
+        return f"Run({path!r}: {s.task}, eps {s.noise:g}, seed {s.seed}, preset {s.preset})"
 
     @cached_property
     def task(self) -> Task:
@@ -223,8 +217,7 @@ def load_run(path: str | Path, policy: AnyPolicy | None = None) -> Run:
     config = path / "config.json"
     if not config.is_file():
         raise BadArtifact(
-            f"{path} is not a run directory: it has no config.json; "
-            "make one with hyrl-mj run TASK --out DIR"
+            f"{path} is not a run directory (no config.json): make one with hyrl-mj run TASK --out DIR"
         )
     return Run(path, Config.load(config).settings, policy)
 

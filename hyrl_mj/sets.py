@@ -14,37 +14,32 @@ from hyrl_mj.errors import BadInput
 
 
 class StateSet(Protocol):
-    """A closed set of chart points."""
+    """A closed set of chart points, given by its signed distance."""
 
     def signed_distance(self, z: np.ndarray) -> np.ndarray:
         """Returns the distance (n,) of points (n, d) to the boundary, negative inside, in chart units."""
 
     def contains(self, z: np.ndarray) -> np.ndarray:
         """Returns whether points (n, d) lie in the set: (n,) bool."""
+        return self.signed_distance(z) <= 0
 
 
 @dataclass(frozen=True)
-class Everything:
+class Everything(StateSet):
     """The whole chart, without a boundary."""
 
     def signed_distance(self, z: np.ndarray) -> np.ndarray:
         return np.full(len(z), -np.inf)
 
-    def contains(self, z: np.ndarray) -> np.ndarray:
-        return np.ones(len(z), dtype=bool)
-
 
 @dataclass(frozen=True)
-class Complement:
+class Complement(StateSet):
     """The closure of the complement of a set."""
 
     inner: StateSet
 
     def signed_distance(self, z: np.ndarray) -> np.ndarray:
         return -self.inner.signed_distance(z)
-
-    def contains(self, z: np.ndarray) -> np.ndarray:
-        return self.inner.signed_distance(z) >= 0
 
 
 @dataclass(frozen=True)
@@ -73,9 +68,7 @@ class Grid:
             BadInput: the chart has another number of coordinates.
         """
         if len(counts) != chart.dimension:
-            raise BadInput(
-                f"a grid of {len(counts)} dimensions does not fit the chart {chart.names}"
-            )
+            raise BadInput(f"a grid of {len(counts)} dimensions does not fit chart {chart.names}")
         return Grid(chart, tuple(int(n) for n in counts))
 
     @cached_property
@@ -99,7 +92,7 @@ class Grid:
 
     @cached_property
     def _last(self) -> np.ndarray:
-        """Greatest index along each coordinate (d,); infinite for a periodic one."""
+        """The greatest index (d,); infinite for periodic coordinates."""
         return np.where(self.chart.periodic, np.inf, np.array(self.counts) - 1)
 
     def index(self, z: np.ndarray) -> np.ndarray:
@@ -141,7 +134,7 @@ class Grid:
 
 
 @dataclass(frozen=True)
-class GridSet:
+class GridSet(StateSet):
     """A set given by its signed distance at the nodes of a grid, interpolated in between.
 
     Attributes:
@@ -154,9 +147,7 @@ class GridSet:
 
     def __post_init__(self) -> None:
         if self.values.shape != (np.prod(self.grid.counts),):
-            raise BadInput(
-                f"{self.values.shape} signed distances do not fit {self.grid.counts} nodes"
-            )
+            raise BadInput(f"{self.values.shape} distances do not fit {self.grid.counts} nodes")
         if not np.isfinite(self.values).all():
             raise BadInput("signed distances must be finite, and some are not")
         self.values.setflags(write=False)
@@ -191,14 +182,10 @@ class GridSet:
         return tuple(GridSet(grid, values) for values in arrays["signed_distance"])
 
     def __repr__(self) -> str:
-        nodes = " x ".join(map(str, self.grid.counts))
-        return f"GridSet({self.mask.mean():.1%} of {nodes} nodes)"
+        return f"GridSet({self.mask.mean():.1%} of {' x '.join(map(str, self.grid.counts))} nodes)"
 
     def signed_distance(self, z: np.ndarray) -> np.ndarray:
         return self.grid.interpolate(self.values, z)
-
-    def contains(self, z: np.ndarray) -> np.ndarray:
-        return self.signed_distance(z) <= 0
 
     def __or__(self, other: GridSet) -> GridSet:
         return GridSet(self.grid, np.minimum(self.values, other.values))
@@ -246,7 +233,7 @@ class GridSet:
         begins, ends = np.flatnonzero(inside & ~before), np.flatnonzero(inside & ~after)
         if len(ends) and ends[0] < begins[0]:
             ends = np.roll(ends, -1)
-        return [(float(nodes[a]), float(nodes[b])) for a, b in zip(begins, ends, strict=True)]
+        return list(zip(nodes[begins].tolist(), nodes[ends].tolist(), strict=True))
 
     @cached_property
     def _nearest_inside(self) -> np.ndarray:
@@ -258,10 +245,8 @@ class GridSet:
         at = ndimage.distance_transform_edt(
             ~wide, sampling=grid.spacing, return_distances=False, return_indices=True
         )
-        index = [
-            (i[middle] - part.start) % n for i, part, n in zip(at, middle, grid.counts, strict=True)
-        ]
-        return np.ravel_multi_index(tuple(index), grid.counts).ravel()
+        index = tuple(i[middle] - part.start for i, part in zip(at, middle, strict=True))
+        return np.ravel_multi_index(index, grid.counts, mode="wrap").ravel()
 
     def project(self, z: np.ndarray) -> np.ndarray:
         """Returns points (n, d) of the set: z where it is inside, elsewhere the nearest inner node."""

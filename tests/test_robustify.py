@@ -6,6 +6,7 @@ import subprocess
 import sys
 import zipfile
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ from hyrl_mj.pipeline.steps import STAGES
 from hyrl_mj.policies.external import read_agent, reopen_agent
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages import Partition, boundary, with_room
-from hyrl_mj.stages.retraining import ByGame, WarmStart, mode_ground, retrain
+from hyrl_mj.stages.retraining import ByGame, mode_ground, retrain, start_policy
 
 pytestmark = pytest.mark.slow  # whole runs on agents
 
@@ -305,7 +306,7 @@ def ground(circle_run):
 
 def start_of(run, policy, ground, **changed):
     settings = replace(run.settings.stage6, **changed)
-    return WarmStart(policy, run.partition).policy_for(ground, settings, 0)
+    return start_policy(policy, run.partition, ground, settings, 0)
 
 
 def test_a_function_is_distilled_part_by_part(circle_run, ground):
@@ -337,7 +338,7 @@ def test_a_start_that_will_do_is_not_trained(circle_run, monkeypatch):
     monkeypatch.setattr(ByGame, "score", lambda ground, policy: (0.0, -0.5))
     monkeypatch.setattr("hyrl_mj.stages.retraining.train", None)
     run, settings = circle_run, circle_run.settings.stage6
-    warm_start = WarmStart(run.policy, run.partition)
+    warm_start = partial(start_policy, run.policy, run.partition)
     found = retrain(mode_ground(run.task, run.extended_sets, 0), settings, 0, warm_start=warm_start)
     assert (found.act(np.linspace(0.5, 2.4, 50)[:, None]) < 0).all()
 

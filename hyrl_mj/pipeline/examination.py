@@ -78,16 +78,9 @@ def examine_loops(
     partition: Partition,
     options: ExamineOptions = ExamineOptions(),
 ) -> tuple[Robustness, Maps | None]:
-    """Examines controllers under noise, as `examine_run` does.
+    """Examines controllers by name, and returns the result, and the maps if the game was played.
 
-    Args:
-        run: a run with its critical set.
-        loops: the controllers by name.
-        partition: decides which mode the first measurement should select.
-        options: what to examine.
-
-    Returns:
-        The result, and the maps if the game was played.
+    `partition` decides which mode the first measurement should select.
     """
     task, points = run.task, run.critical_set.points
     eps = run.settings.noise if options.eps is None else options.eps

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
@@ -69,18 +70,16 @@ def extended_sets_stage(run: Run, say: Say) -> None:
 
 def retrain_stage(run: Run, say: Say) -> None:
     """Stage 6: trains the policy of each mode."""
-    from hyrl_mj.stages.retraining import WarmStart, mode_ground, retrain
+    from hyrl_mj.stages.retraining import mode_ground, retrain, start_policy
 
     s, sets = run.settings, run.extended_sets
     policies: dict[int, MlpPolicy] = {}
+    warm_start = partial(start_policy, run.steady, run.partition)
     for q in sets.modes:
+        ground, log_dir = mode_ground(run.task, sets, q), run.path / "logs" / f"mode_{q}"
+        others = [*policies.values()]
         policies[q] = retrain(
-            mode_ground(run.task, sets, q),
-            s.stage6,
-            s.seed,
-            warm_start=WarmStart(run.steady, run.partition),
-            others=[*policies.values()],
-            log_dir=run.path / "logs" / f"mode_{q}",
+            ground, s.stage6, s.seed, warm_start=warm_start, others=others, log_dir=log_dir
         )
     for q, policy in policies.items():
         policy.save(run.path / f"mode_{q}.safetensors")

@@ -247,11 +247,7 @@ def _pieces(task: Task, points: np.ndarray, reach: float) -> np.ndarray:
 
 
 def check_points(task: Task, points: np.ndarray) -> np.ndarray:
-    """Returns points of M* (N, d) as an array of numbers.
-
-    Raises:
-        BadInput: they are a `CriticalSet`, or do not fit the chart.
-    """
+    """Returns points (N, d) of M* as an array of floats; raises `BadInput` if they do not fit the chart."""
     if isinstance(points, CriticalSet):
         raise BadInput(f"{points!r} cannot be used as points of M*: give its points (N, d)")
     points = np.asarray(points, dtype=float)

@@ -42,15 +42,15 @@ class Regions:
         Raises:
             BadInput: the starts have to lie near M*, but M* is empty or hardly any start lies there.
         """
-        z = task.starts(n, rng)
         if not self.near:
-            return z
+            return task.starts(n, rng)
         if not len(self.points):
             raise BadInput(
                 "no critical set was found, so nothing starts near it: leave --near-critical out"
             )
-        kept, drawn = np.empty((0, z.shape[1])), 0
+        kept, drawn = np.empty((0, task.chart.dimension)), 0
         while len(kept) < n:
+            z = task.starts(n, rng)
             kept = np.vstack([kept, z[self._close(task, bound, z)]])
             drawn += n
             if not len(kept) and drawn >= RARE:
@@ -58,7 +58,6 @@ class Regions:
                     f"of {drawn:,} starts of {task.name} none lies within {2 * bound:g} of its critical "
                     "set: leave --near-critical out, or start elsewhere"
                 )
-            z = task.starts(n, rng)
         return kept[:n]
 
     def split(self, task: Task, bound: float, z0: np.ndarray) -> dict[str, np.ndarray]:

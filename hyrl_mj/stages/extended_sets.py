@@ -143,7 +143,7 @@ def extend(
             else _forward_reach(task, pi, part, part.mask & (off <= near), candidate)
             for pi, part, candidate in zip(pis, parts, candidates, strict=True)
         ]
-        longest = _longest_samples(task)
+        longest = round(LONGEST_HORIZON / task.dt)
         for k in [max(round(horizon / task.dt), 1)] if horizon else range(1, longest + 1):
             reached = [part | within(k) for part, within in zip(parts, reach, strict=True)]
             goals = [
@@ -182,13 +182,9 @@ def _part_wins(
 def _backward_reach(
     task: Task, pi: PartPolicy, part: GridSet, rim: np.ndarray
 ) -> Callable[[int], GridSet]:
-    """Returns M_i u X_i as a function of the number of samples, by backward runs from the rim.
+    """Returns M_i u X_i as a function of the number of samples.
 
-    Args:
-        task: gives the plant.
-        pi: pi_i.
-        part: M_i.
-        rim: (N,) bool, the nodes of M_i near M*.
+    X_i are the states that backward runs reach from the rim (N,) bool, the nodes of M_i near M*.
     """
     grid, gap = part.grid, GAP_CELLS * part.grid.cell
     nodes = grid.nodes[rim]
@@ -209,15 +205,12 @@ def _backward_reach(
 def _forward_reach(
     task: Task, pi: PartPolicy, part: GridSet, rim: np.ndarray, candidates: np.ndarray
 ) -> Callable[[int], GridSet]:
-    """Returns the same as `_backward_reach`, for plants that cannot run backward.
-
-    X_i are the candidates (N,) from which a forward run enters M_i on the rim.
-    """
+    """As `_backward_reach`, but X_i are the candidates (N,) whose forward runs enter M_i on the rim (N,)."""
     grid = part.grid
     outside = np.flatnonzero(candidates & ~part.mask)
     arrival = np.full(len(grid.nodes), np.inf)
     if len(outside):
-        longest = _longest_samples(task)
+        longest = round(LONGEST_HORIZON / task.dt)
         rollout = policy_runs(task, pi, grid.nodes[outside], steps=longest, label="forward")
         under_way = np.ones(len(outside), dtype=bool)
         for k, z in enumerate(rollout.path[1:], 1):
@@ -225,11 +218,6 @@ def _forward_reach(
             arrival[outside[enters & rim[grid.nearest(z)]]] = k
             under_way &= ~enters
     return lambda samples: GridSet.from_mask(grid, part.mask | (arrival <= samples))
-
-
-def _longest_samples(task: Task) -> int:
-    """Returns the number of samples of the longest horizon."""
-    return round(LONGEST_HORIZON / task.dt)
 
 
 def _between_samples(path: np.ndarray, grid: Grid) -> np.ndarray:
@@ -244,17 +232,9 @@ def _between_samples(path: np.ndarray, grid: Grid) -> np.ndarray:
 def _narrow(
     task: Task, points: np.ndarray, grid: Grid, winning: tuple[np.ndarray, ...], eps: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns where on M* some mode wins, but the modes have less than 2 eps (d,) of room across M*.
+    """Returns the points (K, d) of M* where some mode wins, but the room (K,) is less than 2 eps (d,).
 
-    Args:
-        task: gives the chart.
-        points: (N, d) of M*.
-        grid: the grid of W_i.
-        winning: W_i of each mode, (N,) bool over the nodes.
-        eps: (d,) noise bound along each coordinate.
-
-    Returns:
-        Points (K, d) of M*, and the room (K,) at each: how far to either side all modes still succeed.
+    The room is the distance to either side of M* over which all modes win.
     """
     shares = np.arange(0.0, 1.0 + 1e-9, 0.02)
     reach = 2 * eps.max(initial=0.0)

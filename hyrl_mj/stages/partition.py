@@ -68,11 +68,7 @@ class Partition(Saved):
 def check_sets(
     modes: tuple[int, ...], sets: tuple[GridSet, ...], masks: tuple[np.ndarray, ...]
 ) -> None:
-    """Checks that there is one set for each mode, and that masks (N,) have an entry for each node.
-
-    Raises:
-        BadInput: they do not fit each other.
-    """
+    """Raises `BadInput` unless there is one set for each mode, and all sets and masks (N,) have one size."""
     if not sets or len(sets) != len(modes):
         raise BadInput(f"{len(sets)} sets do not fit {len(modes)} modes: give one for each mode")
     shapes = {members.values.shape for members in sets} | {mask.shape for mask in masks}

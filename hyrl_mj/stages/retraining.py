@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -35,35 +34,27 @@ JUDGES = ("none", "uniform", "alternating", "adversarial")
 EPISODES, BATCH = 256, 64
 
 
-@dataclass(frozen=True)
-class WarmStart:
-    """What the first attempt of stage 6 continues from.
+def start_policy(
+    policy: Policy, partition: Partition, ground: ModeGround, settings: Training, seed: int
+) -> MlpPolicy | None:
+    """Returns the policy that the training of a mode continues from; None if it starts from new weights.
 
-    Attributes:
+    PPO and A2C continue from pi_i (paper, Step 4), distilled into their network: with the weights of the
+    stage-1 policy they would keep its decision. Other algorithms continue from its weights, if these fit.
+
+    Args:
         policy: the stage-1 policy, or the agent.
         partition: M_i, from stage 3.
+        ground: the ground of the mode.
+        settings: settings of the training.
+        seed: seed of the weights and the points of the distillation.
     """
-
-    policy: Policy
-    partition: Partition
-
-    def policy_for(self, ground: ModeGround, settings: Training, seed: int) -> MlpPolicy | None:
-        """Returns the policy that training continues from; None if it starts from new weights.
-
-        PPO and A2C continue from pi_i (paper, Step 4), distilled into their network: with the policy's own
-        weights, they would keep its decision. Other algorithms continue from the weights, if these fit.
-        `seed` draws the weights and the points of the distillation.
-        """
-        task, policy, partition = ground.task, self.policy, self.partition
-        if not ALGORITHMS[settings.algorithm].is_actor_critic:
-            return (
-                policy if isinstance(policy, MlpPolicy) and fits(task, settings, policy) else None
-            )
-        hop = longest_hop(task, policy, partition.grid)
-        near = neighbourhood(partition.grid, ground.extended.noise, hop)
-        index = partition.modes.index(ground.mode)
-        pi = part_policies(task, policy, partition, near)[index]
-        return distil(task, pi, ground.starts, settings, seed)
+    task, grid = ground.task, partition.grid
+    if not ALGORITHMS[settings.algorithm].is_actor_critic:
+        return policy if isinstance(policy, MlpPolicy) and fits(task, settings, policy) else None
+    near = neighbourhood(grid, ground.extended.noise, longest_hop(task, policy, grid))
+    pi = part_policies(task, policy, partition, near)[partition.modes.index(ground.mode)]
+    return distil(task, pi, ground.starts, settings, seed)
 
 
 def retrain(
@@ -71,7 +62,7 @@ def retrain(
     settings: Training,
     seed: int,
     *,
-    warm_start: WarmStart | None = None,
+    warm_start: Callable[[ModeGround, Training, int], MlpPolicy | None] | None = None,
     others: Iterable[MlpPolicy] = (),
     log_dir: Path | None = None,
 ) -> MlpPolicy:
@@ -85,7 +76,8 @@ def retrain(
         ground: where the mode has to win, and the judge of its policies; see `mode_ground`.
         settings: settings of the training.
         seed: seed of all random numbers; each mode and attempt derives its own from it.
-        warm_start: what the first attempt continues from, if `settings.warm_start` is set.
+        warm_start: returns the policy that the first attempt continues from, if `settings.warm_start` is
+            set; see `start_policy`.
         others: policies of other modes; a mirror image of one is used if it is good enough for this mode.
         log_dir: folder of logs and checkpoints.
 
@@ -98,32 +90,24 @@ def retrain(
         for image in (symmetry.mirrored(other) for other in others):
             if ground(image) >= ground.enough:
                 return image
-    best: tuple[Score, MlpPolicy] | None = None
+    tried: list[tuple[Score, MlpPolicy]] = []
     for attempt in range(settings.attempts):
         draw = int(np.random.SeedSequence([seed, 1 + mode, attempt]).generate_state(1)[0])
         warm = None
         if warm_start is not None and settings.warm_start and not attempt:
-            warm = warm_start.policy_for(ground, settings, draw)
+            warm = warm_start(ground, settings, draw)
         if warm is not None:
-            best = ground(warm), warm
-            if best[0] >= ground.enough:
-                return warm
+            tried.append((ground(warm), warm))
+            if tried[-1][0] >= ground.enough:
+                break
+        label = f"mode {mode}, attempt {attempt + 1}" if attempt else f"mode {mode}"
         trained = train(
-            task,
-            settings,
-            seed=draw,
-            ground=ground,
-            start_from=warm,
-            log_dir=log_dir,
-            label=f"mode {mode}" + (f", attempt {attempt + 1}" if attempt else ""),
+            task, settings, draw, ground=ground, start_from=warm, log_dir=log_dir, label=label
         )
-        score = ground(trained)
-        if best is None or score > best[0]:
-            best = score, trained
-        if score >= ground.enough:
+        tried.append((ground(trained), trained))
+        if tried[-1][0] >= ground.enough:
             break
-    assert best is not None
-    return best[1]
+    return max(tried, key=lambda result: result[0])[1]
 
 
 def mode_ground(task: Task, extended: ExtendedSets, mode: int) -> ModeGround:
@@ -142,15 +126,12 @@ class ModeGround(ABC):
         mode: the mode.
 
     Attributes:
-        enough: the score of a policy that is good enough.
-        settled: share of the training after which scores count: from the beginning.
-        noise: noise on the measurements during training.
         bound: (d,) largest error of a measured chart point, along each coordinate.
     """
 
     enough: Score
     noise: Noise
-    settled = 0.0
+    settled = 0.0  # scores count from the beginning
 
     def __init__(self, task: Task, extended: ExtendedSets, mode: int):
         self.task, self.extended, self.mode = task, extended, mode
