@@ -11,7 +11,7 @@ from PIL import Image
 
 import hyrl_mj
 from hyrl_mj import BadInput
-from hyrl_mj.game import (
+from hyrl_mj.game.result import (
     BEATEN,
     LIMIT,
     MAP_CLASSES,
@@ -26,7 +26,7 @@ from hyrl_mj.game import (
     Score,
     Wins,
 )
-from hyrl_mj.game.examination import CURVE
+from hyrl_mj.game.scores import CURVE
 from hyrl_mj.sets import Grid
 from hyrl_mj.viz import figures
 from hyrl_mj.viz.figures import robustness, style

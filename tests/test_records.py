@@ -8,7 +8,7 @@ from sentences import assert_one_sentence_about
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, artifacts
-from hyrl_mj.game import (
+from hyrl_mj.game.result import (
     LIMIT,
     Curve,
     EpisodeCount,

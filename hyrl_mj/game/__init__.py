@@ -4,7 +4,6 @@ The plant is tabulated on a lattice of states, and the game is solved on it by b
 `Game` scores controllers, `Limit` is what any controller could win, and `examine` returns a `GameResult`.
 """
 
-from hyrl_mj.game.examination import examine
 from hyrl_mj.game.lattice import LATTICE, Lattice
 from hyrl_mj.game.limit import Limit, fewest_samples
 from hyrl_mj.game.result import (
@@ -15,17 +14,14 @@ from hyrl_mj.game.result import (
     UNWINNABLE,
     WON,
     WON_FROM_SOME,
-    Curve,
     EpisodeCount,
     GameResult,
-    LatticeSpacing,
     Maps,
-    Profile,
     Robustness,
     Score,
     Wins,
 )
-from hyrl_mj.game.scores import LARGEST, Game, worst_signal
+from hyrl_mj.game.scores import LARGEST, Game, examine, worst_signal
 from hyrl_mj.game.solver import LOST, NEVER, Answers, Moves, lasting, noisy_moves, solve
 
 __all__ = [
@@ -41,16 +37,13 @@ __all__ = [
     "WON",
     "WON_FROM_SOME",
     "Answers",
-    "Curve",
     "EpisodeCount",
     "Game",
     "GameResult",
     "Lattice",
-    "LatticeSpacing",
     "Limit",
     "Maps",
     "Moves",
-    "Profile",
     "Robustness",
     "Score",
     "Wins",

@@ -33,8 +33,7 @@ def distil(task: Task, policy: Policy, starts: Starts, settings: Training, seed:
     Its value function and spread are untrained.
 
     Args:
-        task: the robot and its problem.
-        policy: the policy to copy, of any kind.
+        task, policy: the robot and its problem, and the policy to copy, of any kind.
         starts: draws the chart points (n, d) at which the policy is copied.
         settings: settings of the training that continues, with its network and algorithm.
         seed: seed of weights and points.

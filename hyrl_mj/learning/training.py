@@ -61,8 +61,7 @@ def train(
     """Trains one policy, and returns the best of its checkpoints, as SB3's `EvalCallback` does.
 
     Args:
-        task: the robot and its problem.
-        settings: settings of the training.
+        task, settings: the robot and its problem, and the settings of the training.
         seed: seed of weights, exploration, starts and noise; the same seed gives the same policy on the
             same machine, with any number of physics threads.
         ground: where the policy is trained and judged; by default `TaskGround`, without noise.
@@ -224,11 +223,9 @@ class Ground(Protocol):
 
     def domain(self, gamma: float) -> Domain | None:
         """Returns the part of the state space that episodes are restricted to, for a discount gamma."""
-        ...
 
     def __call__(self, policy: MlpPolicy) -> Score:
         """Returns the score of a policy; higher is better, compared from left to right."""
-        ...
 
 
 class TaskGround:

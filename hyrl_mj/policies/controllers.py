@@ -16,15 +16,12 @@ class Controller(Protocol):
     @property
     def modes(self) -> tuple[int, ...]:
         """The numbers of its modes."""
-        ...
 
     def initial_mode(self, measured: np.ndarray) -> np.ndarray:
         """Returns the modes (n,) to start in, from the first measurements (n, p)."""
-        ...
 
     def step(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns inputs (n, m) and next modes (n,) for modes (n,) and measurements (n, p)."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ class FunctionPolicy(ObservationPolicy):
     """A function of the observation as a policy.
 
     Attributes:
-        task: the task whose observation it reads and whose inputs it gives.
         function: observations (n, k) float32 -> inputs (n, m) in the plant's units, which are clipped to
             the task's limits; or the numbers of a discrete task's levels (n,) int.
         name: what messages call it.
@@ -65,7 +64,7 @@ def from_callable(function: Callable[[np.ndarray], Any], task: Task) -> Function
         function: observations (n, k) float32, as the task's environments give them -> inputs (n, m) in
             the plant's units, which are clipped to the task's limits. For a discrete task: the numbers of
             the levels, (n,) integers.
-        task: the task whose observation it reads and whose inputs it gives.
+        task: the robot and its problem.
 
     Raises:
         BadInput: it is not callable. `act` of the policy raises it, too, if the function raises, or

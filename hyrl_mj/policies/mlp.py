@@ -58,7 +58,6 @@ class Policy(Protocol):
 
     def act(self, measured: np.ndarray) -> np.ndarray:
         """Returns inputs (n, m) in the plant's units for measurements (n, p)."""
-        ...
 
 
 class ObservationPolicy(ABC):
@@ -71,13 +70,7 @@ class ObservationPolicy(ABC):
     task: Task
 
     def act(self, measured: np.ndarray) -> np.ndarray:
-        """Returns inputs for noisy measurements.
-
-        Args:
-            measured: (n, p), in the units of the measurement.
-
-        Returns:
-            (n, m) inputs in the plant's units, inside its limits.
+        """Returns inputs (n, m) in the plant's units, inside its limits, for noisy measurements (n, p).
 
         Raises:
             BadInput: a wrong shape, or a value that is not finite.
@@ -95,7 +88,6 @@ class MlpPolicy(ObservationPolicy):
     """A multilayer perceptron on a task's observation: the mean or mode of a trained SB3 policy.
 
     Attributes:
-        task: the task whose observation it reads and whose inputs it gives.
         algorithm: the SB3 algorithm that trained it, one of `ALGORITHMS`.
         activation: the function between the layers, one of `ACTIVATIONS`.
         weights: all tensors of the SB3 policy by name, including its critics, so that training can continue.

@@ -217,7 +217,5 @@ def signal_for(noise: AnyNoise | None, task: Task, controller: Controller | None
     """
     noise = Noise() if noise is None else noise
     if not isinstance(noise, AnyNoise):
-        raise BadInput(
-            f'noise {noise!r} cannot be used: give a hyrl_mj.Noise("alternating", 0.1), say'
-        )
+        raise BadInput(f'noise {noise!r} cannot be used: give a hyrl_mj.Noise("uniform", 0.1), say')
     return noise.against(task, controller)

@@ -127,9 +127,8 @@ class Task(ABC):
         finite = np.isfinite(measured)
         if np.count_nonzero(finite) < measured.size:
             row, column = np.argwhere(~finite)[0]
-            raise BadInput(
-                f"measurement[{row}, {column}] is {measured[row, column]}, it must be finite"
-            )
+            value = measured[row, column]
+            raise BadInput(f"measurement[{row}, {column}] is {value}, it must be finite")
         return measured
 
     def measure(self, sensors: np.ndarray) -> np.ndarray:
@@ -137,17 +136,10 @@ class Task(ABC):
         return sensors
 
     def control(self, u: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        """The inner loop, at the rate of the physics and from the true state; by default there is none.
+        """Returns the controls (n, nu) of all actuators: the inner loop, at the rate of the physics.
 
-        A task that has one gives names of MJCF numerics as `inputs`; they hold the limits.
-
-        Args:
-            u: (n, m) inputs of the policy.
-            qpos: (n, nq) positions.
-            qvel: (n, nv) velocities.
-
-        Returns:
-            (n, nu) controls of all actuators.
+        It sees the policy's inputs u (n, m) and the true state qpos (n, nq), qvel (n, nv). By default there
+        is none. A task that has one gives names of MJCF numerics as `inputs`; they hold the limits.
         """
         return u
 
@@ -159,15 +151,10 @@ class Task(ABC):
     def state(
         self, z: np.ndarray, rng: np.random.Generator | None = None
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Returns the full state of chart points, by default these as positions, at rest.
+        """Returns the full state of chart points (n, d): qpos (n, nq) and qvel (n, nv), None at rest.
 
-        Args:
-            z: (n, d) chart points.
-            rng: draws the coordinates that the chart does not hold, as a start distribution would;
-                without it they have their usual values.
-
-        Returns:
-            qpos (n, nq) and qvel (n, nv), None at rest.
+        By default the chart points are the positions. `rng` draws the coordinates that the chart does not
+        hold, as a start distribution would; without it they have their usual values.
         """
         return z, None
 
@@ -192,8 +179,7 @@ class Task(ABC):
             BadInput: the task does not define it.
         """
         raise BadInput(
-            f"{self.name} does not say which measurement an observation belongs to: "
-            "give it a measured(observation)"
+            f"{self.name} does not say what was measured: give it a measured(observation)"
         )
 
     @abstractmethod
@@ -312,8 +298,6 @@ def at_levels(task: Task, actions: np.ndarray) -> np.ndarray:
     integers = np.issubdtype(actions.dtype, np.integer)
     wrong = actions[(actions < 0) | (actions >= len(levels))] if integers else actions
     if wrong.size:
-        raise BadInput(
-            f"action {wrong.flat[0]} cannot be used: {task.name} takes integers from 0 to "
-            f"{len(levels) - 1}"
-        )
+        allowed = f"{task.name} takes integers from 0 to {len(levels) - 1}"
+        raise BadInput(f"action {wrong.flat[0]} cannot be used: {allowed}")
     return levels[actions]

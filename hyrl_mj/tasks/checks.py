@@ -11,10 +11,6 @@ from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Outcome, Scene
 from hyrl_mj.tasks.registry import check_current, line_in
 
-REQUIRED = (
-    "chart", "inputs", "noisy", "max_steps", "worst_reward", "start_low", "start_high",
-    "observation_low", "observation_high", "scene",
-)  # fmt: skip
 # Number of starts that are tried, and of samples from each under random inputs.
 STARTS, SAMPLES = 64, 20
 # Largest error of a chart point that is set as a full state and measured [chart units].
@@ -44,7 +40,7 @@ def check_task(task: Task) -> Task:
 
 
 def _check_parts(task: Task) -> None:
-    if missing := [name for name in REQUIRED if not hasattr(task, name)]:
+    if missing := [name for name in Task.__annotations__ if not hasattr(task, name)]:
         raise BadInput(f"it has no {', '.join(missing)}: add what is missing")
     for name, kind in (("chart", Chart), ("scene", Scene), ("learning", Learning)):
         if not isinstance(value := getattr(task, name), kind):
