@@ -432,10 +432,10 @@ def test_a_path_round_a_period_is_broken_at_the_seam():
     class Torus(type(VEHICLE)):
         chart = hyrl_mj.Chart(("a", "b"), ("rad",) * 2, (0.0,) * 2, (2 * np.pi,) * 2, (True, False))
 
-    view = runs.plane_view(Torus())
     z = np.stack([np.linspace(5, 8, 31), np.full(31, 1.0)], axis=1)
     with style.style.context("default"):
         panel = Figure().subplots()
+        view = runs.make_view(panel, Torus())
         x, y = runs.line(panel, view, np.arange(31), z).get_data()
     assert np.isnan(x).sum() == 1
     assert np.nanmax(np.abs(np.diff(x))) < 0.2

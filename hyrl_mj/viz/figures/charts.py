@@ -174,9 +174,9 @@ def cross(panel: Axes, x: float, y: float) -> None:
     panel.plot(x, y, "+", color=GREEN, zorder=5, label="set-point", **looks)
 
 
-def set_point_lines(panel: Axes, task: Task, coordinate: int) -> None:
-    """Draws the set-point in a panel over time, once a period."""
-    if task.set_point is None:
+def set_point_lines(panel: Axes, task: Task, coordinate: int = 0) -> None:
+    """Draws the set-point in a panel over time, once a period; a plane has its cross."""
+    if task.set_point is None or task.chart.dimension == 2:
         return
     low, high = panel.get_ylim()
     turns = np.arange(-TURNS, TURNS + 1) if task.chart.periodic[coordinate] else np.zeros(1)

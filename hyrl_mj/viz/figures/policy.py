@@ -57,8 +57,7 @@ def _field(panel: Axes, shown: ShownPolicy) -> None:
     for i, mode in enumerate(partition.modes):
         part = GridSet.from_mask(partition.grid, owners == i)
         charts.region(panel, part, style.mode_tint(mode))
-    charts.plane(panel, task)
-    view = runs.plane_view(task)
+    view = runs.make_view(panel, task)
     _noiseless_runs(panel, shown, view)
     eps = task.noise_in_chart(arc.bound)
     band = _band(task.chart.wrap(arc.z), eps, view.longest)
@@ -111,15 +110,15 @@ def _spirals(panel: Axes, shown: ShownPolicy) -> None:
 
 def _noiseless_runs(panel: Axes, shown: ShownPolicy, view: View) -> None:
     """Draws the runs without noise, with arrowheads."""
-    thin = {"linewidth": 1.3, "zorder": 3}
+    looks = {"linewidth": 1.3, "zorder": 3}
     for arc in shown.noiseless:
-        drawn = runs.chosen_way(panel, shown.task, view, arc, "without noise: ", **thin)
+        drawn = runs.chosen_way(panel, shown.task, view, arc, "without noise: ", **looks)
         row = len(arc.t) // ARROW
         points = view.points(arc.t[row : row + 2], arc.z[row : row + 2])
         if len(points) < 2 or (np.abs(points[1] - points[0]) > view.longest).any():
             continue  # the run ends where it starts, or crosses the seam at this sample
-        looks = {"arrowstyle": "-|>", "color": drawn.get_color(), "shrinkA": 0, "shrinkB": 0}
-        arrow = looks | {"mutation_scale": 11}
+        arrow = {"arrowstyle": "-|>", "mutation_scale": 11, "shrinkA": 0, "shrinkB": 0}
+        arrow["color"] = drawn.get_color()
         panel.annotate("", points[1], points[0], arrowprops=arrow, zorder=3)
 
 
@@ -156,20 +155,13 @@ def draw_policy_map(shown: ShownPolicy, path: Path | None = None) -> Figure:
 
 def _paper_runs(panel: Axes, shown: ShownPolicy) -> None:
     """Draws the runs from the paper's starts."""
-    task, ring = shown.task, charts.is_ring(shown.task)
-    label = style.noise_label(task, shown.paper[0].noise, shown.paper[0].bound)
-    panel.set_title(label.replace(", ", ",\n"))
-    if ring:
-        panel.set(xlim=(0, task.scene.time))
-        view = runs.time_view(panel, task, 0)
-    else:
-        charts.plane(panel, task)
-        view = runs.plane_view(task)
+    task, first = shown.task, shown.paper[0]
+    panel.set_title(style.noise_label(task, first.noise, first.bound).replace(", ", ",\n"))
+    view = runs.make_view(panel, task)
     for arc in shown.paper:
         runs.chosen_way(panel, task, view, arc, linewidth=2.0)
         runs.ends(panel, task, view, arc)
-    if ring:
-        charts.set_point_lines(panel, task, 0)
+    charts.set_point_lines(panel, task)
 
 
 def _input_map(panel: Axes, shown: ShownPolicy, i: int) -> None:

@@ -12,7 +12,7 @@ from matplotlib.colors import ListedColormap, NoNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle, Wedge
 
-from hyrl_mj.game import LIMIT, MAP_CLASSES, OVER, UNWINNABLE, Score, Wins
+from hyrl_mj.game import LIMIT, MAP_CLASSES, OVER, UNWINNABLE, Wins
 from hyrl_mj.sets import Grid
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.figures import charts, style
@@ -57,7 +57,13 @@ def draw_robustness_map(shown: ShownGame, path: Path | None = None) -> Figure:
             charts.legend_field(panels[0], SENTENCES[k], CLASS_COLOURS[k])
         for panel, name in zip(panels, names, strict=False):
             draw(panel, shown, grid, maps.map[name])
-            _head(panel, name, max(result.scores[name], key=lambda score: score.eps))
+            panel.set_title(NAMES.get(name, name), fontsize=11, fontweight="bold", pad=36)
+            score = max(result.scores[name], key=lambda score: score.eps)
+            won, won_any = percent(score.won), percent(score.won_any)
+            modes = (
+                "from every start mode" if won == won_any else f"{won_any} from every start mode"
+            )
+            style.note_above(panel, f"{won} of the winnable starts won,\n{modes}", 0.5, 6)
         for panel in panels[len(names) :]:
             panel.set_axis_off()
         style.legend(figure)
@@ -70,14 +76,6 @@ def _panel_height(task: Task) -> float:
         return 4.1
     sides = task.chart.sides
     return 1.1 + (float(3.2 * sides[1] / sides[0]) if len(sides) == 2 else 0.5)
-
-
-def _head(panel: Axes, name: str, score: Score) -> None:
-    """Writes the controller and what it wins above its panel."""
-    won, won_any = percent(score.won), percent(score.won_any)
-    panel.set_title(NAMES.get(name, name), fontsize=11, fontweight="bold", pad=36)
-    every = "from every start mode" if won == won_any else f"{won_any} from every start mode"
-    style.note_above(panel, f"{won} of the winnable starts won,\n{every}", 0.5, 6)
 
 
 def _box(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> None:
@@ -138,11 +136,9 @@ def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
     heights = (3.6, 2.0) if result.lasting else (3.6,)
     title = "what is won against the worst noise"
     with style.drawing(path, 2.0 + sum(heights), task, title) as figure:
-        panels = figure.subplots(
-            len(heights), 1, sharex=True, squeeze=False, height_ratios=heights
-        ).ravel()
-        shares = panels[0]
-        limit = curve.wins[LIMIT]
+        rows: Looks = {"nrows": len(heights), "height_ratios": heights}
+        panels = figure.subplots(sharex=True, squeeze=False, **rows).ravel()
+        shares, limit = panels[0], curve.wins[LIMIT]
         _won(shares, "limit of any controller", eps, limit, LIMIT_LOOKS, LIMIT_DASHED)
         for name, number in numbers.items():
             looks, dashed = _looks(number), _dashed(number)
@@ -161,13 +157,11 @@ def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
         for panel in panels:
             panel.axvline(run_eps, color=style.INK, linewidth=1, linestyle=(0, (1, 2)), zorder=1)
             style.grid_lines(panel)
-            panel.set_axisbelow(True)
             panel.spines[["top", "right"]].set_visible(False)
-        right = max(eps[-1], run_eps)
-        panels[-1].set(xlabel=f"noise bound eps on {where} [{unit}]", xlim=(0, 1.01 * right))
-        style.note_above(
-            shares, f"this run: eps = {run_eps:g} {unit}", run_eps, 3, ("data", "axes fraction")
-        )
+        limits = (0, 1.01 * max(eps[-1], run_eps))
+        panels[-1].set(xlabel=f"noise bound eps on {where} [{unit}]", xlim=limits)
+        note = f"this run: eps = {run_eps:g} {unit}"
+        style.note_above(shares, note, run_eps, 3, ("data", "axes fraction"))
         style.legend(figure, handlelength=3.2)
     return figure
 

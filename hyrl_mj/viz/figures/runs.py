@@ -37,16 +37,15 @@ class View:
     longest: np.ndarray = field(default_factory=lambda: np.full(2, np.inf))
 
 
-def plane_view(task: Task) -> View:
-    """Returns the view of paths in the plane of a chart."""
+def make_view(panel: Axes, task: Task, coordinate: int = 0) -> View:
+    """Makes a panel the plane of a chart of two dimensions, else a coordinate over time."""
     chart = task.chart
-    return View(lambda t, z: chart.wrap(z), np.where(chart.periodic, chart.sides / 2, np.inf))
-
-
-def time_view(panel: Axes, task: Task, coordinate: int) -> View:
-    """Labels a panel of a coordinate over time, and returns its view."""
+    if chart.dimension == 2:
+        charts.plane(panel, task)
+        return View(lambda t, z: chart.wrap(z), np.where(chart.periodic, chart.sides / 2, np.inf))
     panel.set(xlabel="time [s]", ylabel=style.axis_label(task, coordinate))
     charts.label_angles(panel.yaxis, task, coordinate)
+    style.grid_lines(panel)
     return View(lambda t, z: np.stack([t, z[:, coordinate]], axis=1))
 
 
@@ -129,28 +128,21 @@ def draw_runs(shown: ShownRun, path: Path | None = None) -> Figure:
     task, replays, policy_title = shown.whole, shown.replays, shown.policy_title
     loops = list(dict.fromkeys(who for _, who in replays if who != "policy"))
     starts = list(dict.fromkeys(start for start, _ in replays if start.startswith("start")))
-    plane = task.chart.dimension == 2
-    rows = 1 if plane else task.chart.dimension
+    rows = 1 if task.chart.dimension == 2 else task.chart.dimension
     first = replays[starts[0], "policy"]
     noise = style.noise_label(task, first.noise, first.bound)
     title = f"HyRL and {policy_title}\nunder the same {noise}"
     with style.drawing(path, 1.6 + 3.4 * rows, task, title) as figure:
         panels = figure.subplots(rows, len(loops), sharex=True, sharey="row", squeeze=False)
         for (coordinate, column), panel in np.ndenumerate(panels):
-            if plane:
-                view = plane_view(task)
-                charts.plane(panel, task)
-            else:
-                view = time_view(panel, task, coordinate)
-                style.grid_lines(panel)
+            view = make_view(panel, task, coordinate)
             for start in starts:
                 hybrid, policy = replays[start, loops[column]], replays[start, "policy"]
                 hybrid_way(panel, task, view, hybrid)
                 ends(panel, task, view, hybrid)
                 policy_way(panel, view, policy, linewidth=1.0, label=policy_title)
                 ends(panel, task, view, policy)
-            if not plane:
-                charts.set_point_lines(panel, task, coordinate)
+            charts.set_point_lines(panel, task, coordinate)
             if coordinate == 0:
                 mode = int(loops[column].removeprefix("hyrl_q"))
                 panel.set_title(f"started in q0 = {task.scene.mode_name(mode)}", fontweight="bold")

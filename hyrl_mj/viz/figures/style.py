@@ -23,8 +23,7 @@ DPI = 200  # [pixels/inch]
 WIDTH, PAD = 7.8, 0.1  # [inches] of a figure, and of the margin around it
 COLUMNS = 2  # panels beside each other, and columns of a legend
 INK, PAPER, PALE = colours.INK, colours.WHITE, "#8b919b"
-# States at which a run is over.
-GREY = "#dcdee2"
+GREY = "#dcdee2"  # states at which a run is over
 POLICY_COLOUR, RED, PALE_RED = colours.POLICY, colours.BAD, "#f4c9c7"
 GREEN = colours.GOOD  # of the set-point
 # The colours of the modes, mixed with white.
@@ -84,8 +83,9 @@ def drawing(path: Path | None, height: float, task: Task, title: str) -> Iterato
 
 
 def grid_lines(panel: Axes) -> None:
-    """Draws pale grid lines behind a panel."""
+    """Draws pale grid lines below everything else in a panel."""
     panel.grid(color="#e6e8eb", linewidth=0.8)
+    panel.set_axisbelow(True)
 
 
 def note_above(panel: Axes, text: str, x: float, gap: float, coords: Any = "axes fraction") -> None:
