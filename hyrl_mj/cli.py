@@ -25,7 +25,7 @@ def list_tasks() -> None:
         try:
             task = get_task(name)
             print(f"{name:14} {task.env_id:30} {task.description}")
-        except BadInput as error:  # of another package
+        except BadInput as error:  # a broken task of another package
             print(f"{name:14} {error}")
 
 
@@ -176,9 +176,9 @@ def replay(
     from hyrl_mj.viz.arcs import replay_floor, replay_shows
     from hyrl_mj.viz.replay import render_replay
 
-    own = ReplayOptions(camera=options.camera, size=options.size, fps=options.fps)
-    if out is None and (starts, noise, eps, options) != ("critical", None, None, own):
-        # The report says of replay.mp4 what a run puts there.
+    usual = ReplayOptions(camera=options.camera, size=options.size, fps=options.fps)
+    if out is None and (starts, noise, eps, options) != ("critical", None, None, usual):
+        # The report describes replay.mp4 as a run makes it.
         raise BadInput("another replay than that of the run needs an --out, as in --out mine.mp4")
     out = out or run.path / "replay.mp4"
     shows = replay_shows(run, starts, noise, eps)
@@ -288,11 +288,7 @@ def overview() -> str:
 
 
 def dispatch(words: Sequence[str]) -> None:
-    """Do what the words after `hyrl-mj` say.
-
-    Raises:
-        BadInput: there is no such command, or it cannot use the words.
-    """
+    """Runs the command that the words after `hyrl-mj` name, or raises `BadInput`."""
     match words:
         case ["-h" | "--help", *_]:
             print(overview())

@@ -58,11 +58,7 @@ except HyrlError as error:
 
 
 def report() -> tuple[list[str], bool]:
-    """Examines this machine.
-
-    Returns:
-        Lines to print, with the cure for what is missing; whether nothing is.
-    """
+    """Returns lines about this machine, with the cure for what is missing, and whether nothing is."""
     lines, missing = versions()
     healthy = not missing
     if missing:
@@ -93,14 +89,8 @@ def versions() -> tuple[list[str], list[str]]:
 
 
 def _rendering() -> str:
-    """Draws in a child process, because a broken GL driver may take its process down.
-
-    Returns:
-        The GL device and its speed.
-
-    Raises:
-        NoRenderer: nothing can be drawn.
-    """
+    """Returns the GL device and its speed, or raises `NoRenderer`."""
+    # In a child process, because a broken GL driver may take its process down.
     try:
         child = subprocess.run(
             [sys.executable, "-c", _FRAMES],

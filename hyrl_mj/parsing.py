@@ -113,11 +113,7 @@ class Argument:
         return self.name, Annotated[(Any, words, shown, *place)], field(default=default)
 
     def read(self, words: Sequence[str]) -> Any:
-        """Returns the value of its words.
-
-        Raises:
-            BadInput: they are of another kind.
-        """
+        """Returns the value of its words, or raises `BadInput`."""
         try:
             values = tuple(map(self.kind.read, words))
         except BadInput:
@@ -160,13 +156,9 @@ def _has_options(kind: Any) -> bool:
 def call(
     function: Callable[..., None], name: str, words: Sequence[str], renamed: Mapping[str, str]
 ) -> None:
-    """Calls the function of a command with the words of a user.
+    """Calls the function of a command with the words that a user types after "hyrl-mj" and its name.
 
-    Args:
-        function: the command.
-        name: the name of the command, which follows "hyrl-mj".
-        words: what the user types after it.
-        renamed: options that the command no longer has, and what they are called now.
+    `renamed` holds the options that the command no longer has, with their new names.
 
     Raises:
         BadInput: the words cannot be used.

@@ -52,20 +52,14 @@ class Section(Task):
         self.whole, self.cut = whole, chart.dimension > 2
         self.rest = np.array(scene.starts[0][2:], dtype=float)
         where = zip(chart.names[2:], self.rest, chart.units[2:], strict=True)
-        self.chart = Chart(
-            names=chart.names[:2],
-            units=chart.units[:2],
-            low=chart.low[:2],
-            high=chart.high[:2],
-            periodic=chart.periodic[:2],
-            section=", ".join(f"{name} = {value:g} {unit}" for name, value, unit in where),
-        )
+        place = ", ".join(f"{name} = {value:g} {unit}" for name, value, unit in where)
+        low, high, periodic = chart.low[:2], chart.high[:2], chart.periodic[:2]
+        self.chart = Chart(chart.names[:2], chart.units[:2], low, high, periodic, place)
         self.start_low, self.start_high = whole.start_low[:2], whole.start_high[:2]
-        self.scene = replace(
-            scene,
-            starts=tuple(z[:2] for z in scene.starts),
-            policy_starts=tuple(z[:2] for z in scene.policy_starts),
+        starts, policy_starts = (
+            tuple(z[:2] for z in points) for points in (scene.starts, scene.policy_starts)
         )
+        self.scene = replace(scene, starts=starts, policy_starts=policy_starts)
 
     def __getattr__(self, name: str) -> Any:
         """Returns what neither this class nor `Task` defines: the robot's own."""

@@ -17,18 +17,12 @@ NAMES = {"policy": "RL policy", "hyrl": "HyRL", LIMIT: "limit"}
 
 @dataclass(frozen=True)
 class Ending:
-    """How a replay ended: outcome, time [s], number of jumps, last chart point, and whether it arrived."""
+    """How a replay ended: outcome, "2.35 s, 1 jump", last chart point, and whether it arrived."""
 
     outcome: str
-    time: float
-    jumps: int
+    details: str
     end: str
     success: bool
-
-    @property
-    def details(self) -> str:
-        """Time and number of jumps: "2.35 s, 1 jump"."""
-        return f"{self.time:.2f} s, {self.jumps} jump{'' if self.jumps == 1 else 's'}"
 
     def __str__(self) -> str:
         return f"{self.outcome} {self.details}, {self.end}"
@@ -69,7 +63,8 @@ def _ending(task: Task, arc: HybridArc) -> Ending:
     """Returns how an arc ended; "missed" if it ended as a success off the set-point."""
     end, success = _point(task.chart.wrap(arc.z[-1:])[0]), arc.arrives(task)
     outcome = arc.outcome.replace("_", " ") if success or arc.outcome != "reached" else "missed"
-    return Ending(outcome, float(arc.t[-1]), int(arc.j[-1]), end, success)
+    details = f"{arc.t[-1]:.2f} s, {arc.j[-1]} jump{'' if arc.j[-1] == 1 else 's'}"
+    return Ending(outcome, details, end, success)
 
 
 def arrivals(run: Run, arcs: Arcs, policy: bool) -> tuple[int, int]:
@@ -104,11 +99,8 @@ def score_table(task: Task, game: GameResult) -> Table:
             row = [f"{score.eps:g}", percent(score.winnable), NAMES[who]]
             row += [percent(score.won), percent(score.won_any)]
             if game.lasting:
-                row += [
-                    _seconds(score.time, score.won),
-                    _seconds(score.time_any, score.won_any),
-                    excursion_text(None if who == LIMIT else score.excursion),
-                ]
+                row += [_seconds(score.time, score.won), _seconds(score.time_any, score.won_any)]
+                row.append(excursion_text(None if who == LIMIT else score.excursion))
             rows.append(row)
     return Table(f"{task.name}: worst case over all noise signals, exact game", headings, rows)
 

@@ -46,8 +46,9 @@ def check_drawable(task: Task) -> None:
         )
 
 
-def label_angles(axis: Axis, task: Task, coordinate: int) -> None:
-    """Labels an axis in multiples of pi if its coordinate is a periodic angle."""
+def label_axis(axis: Axis, task: Task, coordinate: int) -> None:
+    """Labels an axis with its coordinate of the chart; a periodic angle in multiples of pi."""
+    axis.set_label_text(axis_label(task, coordinate))
     if task.chart.units[coordinate] == "rad" and task.chart.periodic[coordinate]:
         axis.set_major_locator(MultipleLocator(np.pi / 2))
         axis.set_major_formatter(FuncFormatter(lambda value, _: angle(value)))
@@ -60,9 +61,8 @@ def plane(panel: Axes, task: Task) -> None:
     """Makes a panel a chart's plane, with the set-point and the states at which runs fail."""
     (left, bottom), (right, top) = task.chart.low, task.chart.high
     panel.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
-    panel.set(xlabel=axis_label(task, 0), ylabel=axis_label(task, 1))
-    for coordinate, axis in enumerate((panel.xaxis, panel.yaxis)):
-        label_angles(axis, task, coordinate)
+    label_axis(panel.xaxis, task, 0)
+    label_axis(panel.yaxis, task, 1)
     grid = Grid.with_cells(task.chart, OVER_CELLS)
     over = task.failed(measured_at(task, grid.nodes)).reshape(grid.counts)
     if over.any():
@@ -91,13 +91,8 @@ def image(panel: Axes, grid: Grid, values: np.ndarray, **looks: Any) -> None:
     low, high = grid.nodes[0] - half, grid.nodes[-1] + half
     if len(half) == 1:
         low, high = np.append(low, 0.0), np.append(high, 1.0)
-    panel.imshow(
-        values.reshape(grid.counts[0], -1).T,
-        extent=(low[0], high[0], low[1], high[1]),
-        origin="lower",
-        interpolation="nearest",
-        **looks,
-    )
+    rows, extent = values.reshape(grid.counts[0], -1).T, (low[0], high[0], low[1], high[1])
+    panel.imshow(rows, extent=extent, origin="lower", interpolation="nearest", **looks)
 
 
 def legend_field(panel: Axes, label: str, face: str, edge: str = INK) -> None:
@@ -131,12 +126,7 @@ def on_ring(task: Task, z: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def arcs(
-    panel: Axes,
-    task: Task,
-    classes: np.ndarray,
-    colours: Sequence[Any] | np.ndarray,
-    outer: float = OUTER,
-    inner: float = INNER,
+    panel: Axes, task: Task, classes: np.ndarray, colours: Any, outer: float, inner: float
 ) -> None:
     """Draws classes (N,) of equally spaced values of a periodic coordinate as arcs of a ring.
 

@@ -76,7 +76,7 @@ def _owners(partition: Partition) -> np.ndarray:
     return np.where(held.sum(axis=0) == 1, held.argmax(axis=0), len(held))
 
 
-def _band(z: np.ndarray, eps: np.ndarray, longest: np.ndarray) -> np.ndarray:
+def _band(z: np.ndarray, eps: np.ndarray, longest: np.ndarray | float) -> np.ndarray:
     """Returns quadrilaterals (k, 4, 2) that cover a path (K, 2) and all points within +-eps (2,) of it.
 
     A box that moves along a straight line covers itself and the area that its two diagonals sweep. Steps
@@ -172,7 +172,7 @@ def _input_map(panel: Axes, shown: ShownPolicy, i: int) -> None:
     values = shown.policy.act(charts.measured_at(task, grid.nodes))[:, i]
     if ring:
         shades, classes = np.unique(colours(scale(values)), axis=0, return_inverse=True)
-        charts.arcs(panel, task, classes.ravel(), shades)
+        charts.arcs(panel, task, classes.ravel(), shades, OUTER, INNER)
         charts.ring(panel, task, (OUTER, INNER))
         charts.spokes(panel, task, shown.critical, 0.6, style.RED)
     else:

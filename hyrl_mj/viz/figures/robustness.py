@@ -84,11 +84,12 @@ def _box(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> None
     strip = chart.dimension == 1
     charts.image(panel, grid, classes, cmap=ListedColormap(CLASS_COLOURS), norm=NoNorm())
     low, high = _corner(chart.low, 0), _corner(chart.high, 1)
-    panel.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel=style.axis_label(task, 0))
+    panel.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    charts.label_axis(panel.xaxis, task, 0)
     if strip:
         panel.set(yticks=[], aspect=0.12 * chart.sides[0])
     else:
-        panel.set(ylabel=style.axis_label(task, 1))
+        charts.label_axis(panel.yaxis, task, 1)
     start = _corner(task.start_low, 0)
     sides = np.subtract(_corner(task.start_high, 1), start)
     for colour, width in style.CASING:
@@ -107,7 +108,7 @@ def _corner(ends: Sequence[float], side: float) -> tuple[float, float]:
 def _ring(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> None:
     """Draws classes (N,) of nodes as arcs of a ring."""
     task = shown.task
-    charts.arcs(panel, task, classes, CLASS_COLOURS)
+    charts.arcs(panel, task, classes, CLASS_COLOURS, OUTER, INNER)
     charts.ring(panel, task, (OUTER, INNER))
     ends = task.start_low[0], task.start_high[0]
     first, last = (360 * end / task.chart.sides[0] for end in ends)  # [degrees]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +30,11 @@ class View:
 
     Attributes:
         points: (times (N,) [s], chart points (N, d)) -> points of the panel (N, 2).
-        longest: (2,) a longer step crosses the seam of a periodic coordinate, and is not drawn.
+        longest: (2,) a longer step crosses the seam of a periodic coordinate and is not drawn.
     """
 
     points: Callable[[np.ndarray, np.ndarray], np.ndarray]
-    longest: np.ndarray = field(default_factory=lambda: np.full(2, np.inf))
+    longest: np.ndarray | float = np.inf
 
 
 def make_view(panel: Axes, task: Task, coordinate: int = 0) -> View:
@@ -43,8 +43,8 @@ def make_view(panel: Axes, task: Task, coordinate: int = 0) -> View:
     if chart.dimension == 2:
         charts.plane(panel, task)
         return View(lambda t, z: chart.wrap(z), np.where(chart.periodic, chart.sides / 2, np.inf))
-    panel.set(xlabel="time [s]", ylabel=style.axis_label(task, coordinate))
-    charts.label_angles(panel.yaxis, task, coordinate)
+    panel.set_xlabel("time [s]")
+    charts.label_axis(panel.yaxis, task, coordinate)
     style.grid_lines(panel)
     return View(lambda t, z: np.stack([t, z[:, coordinate]], axis=1))
 
