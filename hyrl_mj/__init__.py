@@ -5,7 +5,7 @@ The stages between are `find_critical_set`, `make_partition`, `extend` and `Hybr
 package needs neither torch nor a GL library.
 """
 
-from hyrl_mj import gl as _gl  # first: imports mujoco, with a GL backend that exists here
+from hyrl_mj import gl as gl  # first: imports mujoco, with a GL backend that exists here
 from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadArtifact, BadInput, HyrlError, NoRenderer
 from hyrl_mj.export import export_numpy, export_onnx
@@ -90,5 +90,3 @@ __all__ = [
     "simulate_batch",
     "task_names",
 ]
-
-del _gl

@@ -53,11 +53,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def reading(path: Path, remedy: str = REMEDY) -> Iterator[None]:
-    """Turns any error of a file's reader into a `BadArtifact` that names the file and the remedy.
-
-    Raises:
-        BadArtifact: the file is missing or cannot be read.
-    """
+    """Raises `BadArtifact`, with the remedy, if a file is missing or the block that reads it fails."""
     if not path.is_file():
         first = "run the stage that writes it first" if remedy == REMEDY else remedy
         raise BadArtifact(f"there is no file {path}: {first}")

@@ -28,7 +28,7 @@ class Config:
 
     Attributes:
         settings: every setting of the run.
-        versions: versions of Python and the packages at the start of the run.
+        versions: the versions of Python and the packages when the run began.
     """
 
     settings: Settings
@@ -162,7 +162,7 @@ class Run:
 
     @cached_property
     def versions(self) -> dict[str, str]:
-        """The versions of Python and the packages at the start of the run."""
+        """The versions of Python and the packages when the run began."""
         return Config.load(self.path / "config.json").versions
 
     def arc_paths(self) -> dict[tuple[str, str], Path]:
@@ -191,9 +191,7 @@ class Run:
         return self.path / "arcs" / f"latest_{controller}.npz"
 
     def _load_policy(self, name: str) -> MlpPolicy:
-        task = (
-            self.task
-        )  # first: this loads the file of a user's task, which registers the task's name
+        task = self.task  # first: the file of a user's task registers its name
         policy = MlpPolicy.load(self.path / name)
         if policy.task.name != task.name:
             raise BadArtifact(

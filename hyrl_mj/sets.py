@@ -62,11 +62,7 @@ class Grid:
 
     @staticmethod
     def from_counts(chart: Chart, counts: np.ndarray) -> Grid:
-        """Returns a grid from the number of nodes (d,) along each coordinate.
-
-        Raises:
-            BadInput: the chart has another number of coordinates.
-        """
+        """Returns a grid with `counts` (d,) nodes; raises `BadInput` if the chart has another dimension."""
         if len(counts) != chart.dimension:
             raise BadInput(f"a grid of {len(counts)} dimensions does not fit chart {chart.names}")
         return Grid(chart, tuple(int(n) for n in counts))
@@ -122,7 +118,7 @@ class Grid:
         return np.indices((2,) * len(self.counts)).reshape(len(self.counts), -1, 1)
 
     def interpolate(self, values: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Returns the values (n,) at points (n, d), multilinearly interpolated from the nodes' (N,)."""
+        """Returns values at points (n, d) by multilinear interpolation of the nodes' values (N,): (n,)."""
         index = self.index(z).T[:, None]
         below = index.astype(int)
         share = index - below

@@ -33,9 +33,6 @@ class CriticalSet(Saved):
         component: (N,) index of the connected piece of M* that each point belongs to.
         resolution: length of the shortest rods, in chart units; M* is known to half of it.
         spacing: distance between the grid points that the search started from, in chart units.
-
-    Raises:
-        BadInput: the numbers of points and of components differ.
     """
 
     KIND: ClassVar[str] = "critical set"

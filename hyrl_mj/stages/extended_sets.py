@@ -107,10 +107,9 @@ def extend(
         noise: bound eps of the measurement noise.
         horizon: time T of the backward propagation [s]. By default, the shortest with which every set
             reaches 2 eps and one sample over M* wherever its mode succeeds; the sets end there.
-        ways: from where each way is open, for an agent, which may be unable to go its way from beyond the
-            place where it decides otherwise. W_i is then where way i is open, because stage 6 trains the
-            mode to go it. Without a horizon, every set reaches 2 eps and one sample over the boundary of
-            its part.
+        ways: from where each way is open, for an agent. Beyond its decision an agent may be unable to go
+            the other way, but stage 6 trains the mode to do so: W_i is then where way i is open. Without a
+            horizon, every set reaches 2 eps and one sample over the boundary of its part.
     """
     points = check_points(task, points)
     grid, parts = partition.grid, partition.parts
@@ -118,7 +117,7 @@ def extend(
     near = neighbourhood(grid, noise, hop)
     pis = part_policies(task, policy, partition, near)
     wanted = [part.dilated_by_box(2 * eps + hop * (task.noise_in_chart(1.0) > 0)) for part in parts]
-    # The extended sets lie within these.
+    # The extended sets lie among these candidates.
     radius = 3 * noise + near + (0.0 if horizon is None else horizon / task.dt * near)
     candidates = [part.dilated(radius).mask for part in parts]
     if ways is None:
@@ -143,13 +142,13 @@ def extend(
             else _forward_reach(task, pi, part, part.mask & (off <= near), candidate)
             for pi, part, candidate in zip(pis, parts, candidates, strict=True)
         ]
+        goals = [
+            (w & room).mask & ~part.mask & around
+            for w, room, part in zip(wanted, roomy, parts, strict=True)
+        ]
         longest = round(LONGEST_HORIZON / task.dt)
         for k in [max(round(horizon / task.dt), 1)] if horizon else range(1, longest + 1):
             reached = [part | within(k) for part, within in zip(parts, reach, strict=True)]
-            goals = [
-                (w & room).mask & ~part.mask & around
-                for w, room, part in zip(wanted, roomy, parts, strict=True)
-            ]
             pairs = zip(reached, goals, strict=True)
             filled = [r.mask[goal].mean() for r, goal in pairs if goal.any()]
             if min(filled, default=1.0) >= FILLED:
@@ -241,9 +240,8 @@ def _narrow(
     if not len(points) or not reach or len(winning) < 2:
         return np.empty((0, task.chart.dimension)), np.empty(0)
     room = np.full(len(points), reach)
-    for direction in np.vstack([np.diag(2 * eps), -np.diag(2 * eps)]):
-        if not direction.any():
-            continue
+    directions = np.vstack([np.diag(2 * eps), -np.diag(2 * eps)])
+    for direction in directions[directions.any(axis=1)]:
         line = grid.nearest((points[:, None] + shares[:, None] * direction).reshape(-1, len(eps)))
         for wins in winning:
             succeeds = wins[line].reshape(len(points), -1)

@@ -40,16 +40,13 @@ class HybridController:
     starts: Mapping[int, StateSet] | None = None
 
     def __post_init__(self) -> None:
-        if set(self.policies) != set(self.flow_sets) or not self.policies:
-            raise BadInput(
-                f"policies of modes {sorted(self.policies)} do not fit flow sets of modes "
-                f"{sorted(self.flow_sets)}: give one of each for every mode"
-            )
-        if self.starts is not None and set(self.starts) != set(self.policies):
-            raise BadInput(
-                f"start sets of modes {sorted(self.starts)} do not fit modes {sorted(self.policies)}: give "
-                "one for every mode, or none"
-            )
+        starts = self.flow_sets if self.starts is None else self.starts
+        for name, sets in {"flow sets": self.flow_sets, "start sets": starts}.items():
+            if set(sets) != set(self.policies) or not sets:
+                raise BadInput(
+                    f"{name} of modes {sorted(sets)} do not fit policies of modes "
+                    f"{sorted(self.policies)}: give one of each for every mode"
+                )
 
     @cached_property
     def modes(self) -> tuple[int, ...]:
@@ -84,16 +81,14 @@ class HybridController:
             BadInput: wrong shapes, values that are not finite, or unknown modes.
         """
         measured = self.task.check_measurement(measured)
-        q = np.asarray(q)
-        if q.shape != (len(measured),):
-            raise BadInput(
-                f"{len(measured)} measurements need q of shape ({len(measured)},), got {q.shape}"
-            )
+        q, n = np.asarray(q), len(measured)
+        if q.shape != (n,):
+            raise BadInput(f"{n} measurements need q of shape ({n},), got {q.shape}")
         rows_of = self._rows(q)
         q_next = self._jump(q, self.task.z(measured), rows_of)
         if q_next is not q:
             rows_of = self._rows(q_next)
-        u = np.empty((len(measured), len(self.task.inputs)))
+        u = np.empty((n, len(self.task.inputs)))
         for mode, rows in rows_of.items():
             u[rows] = self.policies[mode].act(measured[rows])
         return u, q_next.astype(int)
