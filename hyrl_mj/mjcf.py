@@ -93,7 +93,7 @@ def numeric(model: mujoco.MjModel, name: str, size: int) -> np.ndarray:
     first, count = model.numeric_adr[index], model.numeric_size[index]
     if count != size:
         raise BadInput(
-            f"numeric {name} of model {model_name(model)} has {count} value(s): give it {size}"
+            f"numeric {name} of {model_name(model)} has {count} value(s): give it {size}"
         )
     return np.array(model.numeric_data[first : first + size])
 

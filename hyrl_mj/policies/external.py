@@ -234,11 +234,11 @@ def _fingerprint(policy: Policy, task: Task) -> str:
     plant.set_state(*task.state(task.starts(PROBES, rng), rng))
     measured = plant.measurement
     first, again = (np.asarray(policy.act(measured)) for _ in range(2))
-    wanted = (PROBES, len(task.inputs))
-    if first.shape != wanted or not np.issubdtype(first.dtype, np.number):
+    shape = (PROBES, len(task.inputs))
+    if first.shape != shape or not np.issubdtype(first.dtype, np.number):
         raise BadInput(
             f"the policy gives {first.dtype} of shape {first.shape} for {PROBES} measurements, "
-            f"{task.name} takes inputs of shape {wanted}"
+            f"{task.name} takes inputs of shape {shape}"
         )
     if not np.isfinite(first).all():
         raise BadInput(f"the policy gives inputs that are not finite: {task.name} takes numbers")

@@ -37,11 +37,11 @@ class FunctionPolicy(ObservationPolicy):
             what = error if isinstance(error, BadInput) else f"it raised {brief(error)}"
             raise BadInput(f"{self.name} cannot be used: {what}") from error
         discrete = self.task.input_levels is not None
-        wanted, what = ((n,), "integers") if discrete else ((n, m), "inputs")
-        if actions.shape != wanted:
+        shape, what = ((n,), "integers") if discrete else ((n, m), "inputs")
+        if actions.shape != shape:
             raise BadInput(
                 f"{self.name} gives shape {actions.shape} for {n} observations, {self.task.name} takes "
-                f"{what} of shape {wanted}"
+                f"{what} of shape {shape}"
             )
         if discrete:
             return at_levels(self.task, actions)

@@ -106,11 +106,11 @@ class MlpPolicy(ObservationPolicy):
             check_kind(task, levels)
         sizes = (layers[0][0].shape[1], layers[-1][0].shape[0])
         outputs = len(task.inputs) if task.input_levels is None else len(task.input_levels)
-        wanted = (len(task.observation_low), outputs)
-        if sizes != wanted:
+        needed = (len(task.observation_low), outputs)
+        if sizes != needed:
             raise BadArtifact(
                 f"the network takes {sizes[0]} and gives {sizes[1]} numbers, "
-                f"the task {task.name} needs {wanted[0]} and {wanted[1]}"
+                f"the task {task.name} needs {needed[0]} and {needed[1]}"
             )
         for (_, bias), (weight, _) in pairwise(layers):
             if weight.shape[1] != len(bias):

@@ -64,7 +64,7 @@ def _tensors(content: bytes) -> dict[str, np.ndarray]:
     try:
         if size > LARGEST:
             raise BadArtifact("its policy.pth is too large for an MLP policy")
-        # torch warns of odd pickles, which are refused anyway.
+        # torch warns of unusual pickles, which are refused anyway.
         with warnings.catch_warnings(action="ignore"):
             state = torch.load(io.BytesIO(content), weights_only=True, map_location="cpu")
     except UnpicklingError as error:
@@ -128,9 +128,9 @@ def infer_algorithm(weights: Mapping[str, np.ndarray], about: Mapping[str, Any])
         return "sac"
     if "actor.mu.0.weight" in weights:
         return "td3" if any(name.startswith("critic.qf1.") for name in weights) else "ddpg"
-    some = ", ".join(list(weights)[:3]) or "none"
+    first = ", ".join(list(weights)[:3]) or "none"
     raise BadArtifact(
-        f"its tensors ({some}) are of no MLP policy of {', '.join(ALGORITHMS)}: {REMEDY}"
+        f"its tensors ({first}) are of no MLP policy of {', '.join(ALGORITHMS)}: {REMEDY}"
     )
 
 

@@ -154,20 +154,18 @@ def simulate_batch(
     """Simulates the closed loop from n starts (n, d), or from one, as `simulate`, and returns a list."""
     starts = task.chart.check(z0, task.name)
     check_seed(seed)
-    loop = as_controller(controller)
+    loop, n = as_controller(controller), len(starts)
     if q0 is not None:
         q0 = np.asarray(q0)
-        if q0.shape not in ((), (len(starts),)):
-            raise BadInput(
-                f"{len(starts)} starts need one q0 or {len(starts)}, got shape {q0.shape}"
-            )
-        q0 = check_modes(np.broadcast_to(q0, len(starts)), loop.modes)
+        if q0.shape not in ((), (n,)):
+            raise BadInput(f"{n} starts need one q0 or {n}, got shape {q0.shape}")
+        q0 = check_modes(np.broadcast_to(q0, n), loop.modes)
     noise = Noise() if noise is None else noise
     steps = None if horizon is None else samples(task, horizon)
     settings = LoopSettings(steps=steps, record=True)
     rollout = closed_loop(task, loop, starts, noise, q0, seed, settings)
     name = "policy" if isinstance(loop, PolicyController) else "hyrl"
-    return [_arc(task, name, rollout, i, noise) for i in range(len(starts))]
+    return [_arc(task, name, rollout, i, noise) for i in range(n)]
 
 
 def samples(task: Task, horizon: float) -> int:
@@ -193,7 +191,10 @@ def _arc(task: Task, name: str, rollout: Rollout, i: int, noise: AnyNoise) -> Hy
     last_mode = after[-1:] if end else rollout.q0[i : i + 1]
     q = np.where(old, np.append(before, last_mode)[rows], np.append(after, last_mode)[rows])
     jumps = np.append(jumped.cumsum(), jumped.sum())
-    u = _with_nan_row(rollout.u[:end, i])[rows]
+    measured, u = (
+        np.pad(values[:end, i], ((0, 1), (0, 0)), constant_values=np.nan)[rows]
+        for values in (rollout.measured, rollout.u)
+    )
     u[old] = np.nan
     return HybridArc(
         task=task.name,
@@ -201,7 +202,7 @@ def _arc(task: Task, name: str, rollout: Rollout, i: int, noise: AnyNoise) -> Hy
         t=rows * task.dt,
         j=jumps[rows] - old,
         z=rollout.path[rows, i],
-        measured=_with_nan_row(rollout.measured[:end, i])[rows],
+        measured=measured,
         q=q,
         u=u,
         state=rollout.state[rows, i],
@@ -209,7 +210,3 @@ def _arc(task: Task, name: str, rollout: Rollout, i: int, noise: AnyNoise) -> Hy
         noise=noise.kind,
         bound=noise.bound,
     )
-
-
-def _with_nan_row(values: np.ndarray) -> np.ndarray:
-    return np.vstack([values, np.full((1, values.shape[1]), np.nan)])

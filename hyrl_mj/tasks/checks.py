@@ -66,9 +66,7 @@ def _check_parts(task: Task) -> None:
     if not np.isfinite(task.noisy).all() or min(task.noisy) < 0:
         raise BadInput(f"noisy is {task.noisy}: give shares of the noise bound, 0 or more")
     if len(scene.mode_names) < 2:
-        raise BadInput(
-            f"scene.mode_names is {scene.mode_names!r}: name the ways that runs can go, two or more"
-        )
+        raise BadInput(f"scene.mode_names is {scene.mode_names!r}: name two or more")
 
 
 def _check_training(task: Task) -> None:
@@ -128,7 +126,7 @@ def _check_starts(task: Task) -> None:
     if off.max() > ROUND_TRIP:
         worst = int(off.argmax())
         raise BadInput(
-            f"state() and z() do not belong together: {task.chart.format(z[worst])} is measured as "
+            f"state() and z() do not belong to each other: {task.chart.format(z[worst])} is measured as "
             f"{task.chart.format(back[worst])}"
         )
     ending = task.ending(measurement)
@@ -183,9 +181,7 @@ def _check_episode(task: Task) -> None:
         _check_shape(f"{name}() gives", values, (STARTS,))
     ways = set(np.unique(way).tolist())
     if not ways <= {-1, *range(len(task.scene.mode_names))}:
-        raise BadInput(
-            f"direction() gives {sorted(ways)}: give -1 or the number of one of scene.mode_names"
-        )
+        raise BadInput(f"direction() gives {sorted(ways)}: give -1 or an index of scene.mode_names")
 
 
 def _check_shape(what: str, values: ArrayLike, shape: tuple[int, ...]) -> None:

@@ -64,8 +64,8 @@ class Quadrotor(PillarTask):
         (speed, height), gravity = self.cruise, -self.model.opt.gravity[2]
         axes = rotation(qpos[:, 3:7])
         climb = HEIGHT * (height - qpos[:, 2])
-        wanted = np.column_stack([np.full(len(u), speed), u[:, 0], climb]) - qvel[:, :3]
-        push = VELOCITY * wanted + [0.0, 0.0, gravity]
+        error = np.column_stack([np.full(len(u), speed), u[:, 0], climb]) - qvel[:, :3]
+        push = VELOCITY * error + [0.0, 0.0, gravity]
         push[:, 2] = np.clip(push[:, 2], 0.5 * gravity, 1.3 * gravity)
         sideways = np.linalg.norm(push[:, :2], axis=1)
         room = STEEPEST * push[:, 2]

@@ -138,7 +138,7 @@ def _from_entry_point(entry: EntryPoint) -> None:
         if isinstance(error, BadInput):
             raise
         raise BadInput(
-            f"the task {entry.name} of {entry.value} cannot be imported ({brief(error)}): mend or "
+            f"the task {entry.name} of {entry.value} cannot be imported ({brief(error)}): repair or "
             "uninstall the package that offers it"
         ) from error
     if not (isinstance(task, type) and issubclass(task, Task)) or task.name != entry.name:
