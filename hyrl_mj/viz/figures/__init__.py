@@ -1,8 +1,9 @@
 """Figures of a run, drawn from the results of its stages.
 
 Each drawing function takes the value that it shows, and returns a matplotlib `Figure`. Given the path of a
-PNG it also writes the figure there, and a PDF beside it. A new figure is a module here and an entry of
-`FIGURES`.
+PNG it also writes the figure there, and a PDF beside it. All but runs, robustness map and curve raise
+`BadInput` for a chart that is neither a plane nor a ring. A new figure is a function in a module here and
+an entry of `FIGURES`.
 """
 
 from collections.abc import Callable

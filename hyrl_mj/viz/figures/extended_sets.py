@@ -26,11 +26,7 @@ AROUND = 4.0
 
 
 def draw_extended_sets(shown: ShownRun, path: Path | None = None) -> Figure:
-    """Draws the extended sets and their overlap; in a plane, with an enlargement around M*.
-
-    Raises:
-        BadInput: the chart is neither a plane nor a ring.
-    """
+    """Draws the extended sets and their overlap; in a plane, with an enlargement around M*."""
     task, sets = shown.task, shown.sets
     charts.check_drawable(task)
     horizon = f", T = {sets.horizon:.2g} s" if sets.horizon else ""

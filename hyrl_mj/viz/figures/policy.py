@@ -29,11 +29,7 @@ INPUT_COLOURS = "PRGn"
 
 
 def draw_overview(shown: ShownPolicy, path: Path | None = None) -> Figure:
-    """Draws the ways that the policy goes without noise, and a run that noise leads astray.
-
-    Raises:
-        BadInput: the chart is neither a plane nor a ring.
-    """
+    """Draws the ways that the policy goes without noise, and a run that noise leads astray."""
     task, arc = shown.task, shown.noisy
     charts.check_drawable(task)
     title = f"the {shown.algorithm} policy, and where noise leads it"
@@ -125,7 +121,8 @@ def _noiseless_runs(panel: Axes, shown: ShownPolicy, view: View) -> None:
 def _noisy_run(panel: Axes, shown: ShownPolicy, view: View) -> None:
     """Draws the run under noise and what it measures."""
     task, arc = shown.task, shown.noisy
-    runs.policy_way(panel, view, arc, linewidth=1.4, label=f"{shown.policy_title}, with noise")
+    looks = {"color": style.POLICY_COLOUR, "linewidth": 1.4, "zorder": 4}
+    runs.line(panel, view, arc.t, arc.z, label=f"{shown.policy_title}, with noise", **looks)
     charts.legend_field(panel, "what it can observe", PALE_RED, PALE_RED)
     looks = {"linestyle": "none", "marker": ".", "color": style.RED, "markersize": 4, "zorder": 4.5}
     measured = task.z(arc.measured[:-1])
@@ -137,11 +134,7 @@ def _noisy_run(panel: Axes, shown: ShownPolicy, view: View) -> None:
 
 
 def draw_policy_map(shown: ShownPolicy, path: Path | None = None) -> Figure:
-    """Draws a map of each input of the policy, and the policy's runs from the paper's starts.
-
-    Raises:
-        BadInput: the chart is neither a plane nor a ring.
-    """
+    """Draws a map of each input of the policy, and the policy's runs from the paper's starts."""
     task = shown.task
     charts.check_drawable(task)
     with style.drawing(path, 5.2, task, f"the {shown.algorithm} policy") as figure:
@@ -184,7 +177,8 @@ def _input_map(panel: Axes, shown: ShownPolicy, i: int) -> None:
         ScalarMappable(scale, colours),
         ax=panel, location="right", shrink=0.7, aspect=20, ticks=ticks,
     )  # fmt: skip
-    bar.set_label(style.input_label(task, i))
+    unit = f" [{task.input_units[i]}]" if task.input_units else ""
+    bar.set_label(task.inputs[i].replace("_", " ") + unit)
 
 
 def _input_colours(task: Task, i: int) -> tuple[Colormap, Normalize, np.ndarray | None]:

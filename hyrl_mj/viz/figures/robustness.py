@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -83,26 +83,21 @@ def _box(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> None
     task, chart = shown.task, shown.task.chart
     strip = chart.dimension == 1
     charts.image(panel, grid, classes, cmap=ListedColormap(CLASS_COLOURS), norm=NoNorm())
-    low, high = _corner(chart.low, 0), _corner(chart.high, 1)
+    low, high = [*chart.low, 0][:2], [*chart.high, 1][:2]
     panel.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     charts.label_axis(panel.xaxis, task, 0)
     if strip:
         panel.set(yticks=[], aspect=0.12 * chart.sides[0])
     else:
         charts.label_axis(panel.yaxis, task, 1)
-    start = _corner(task.start_low, 0)
-    sides = np.subtract(_corner(task.start_high, 1), start)
-    for colour, width in style.CASING:
-        looks: Looks = {"edgecolor": colour, "linewidth": width, "clip_on": False}
-        box = Rectangle(start, *sides, fill=False, zorder=3, label="start region", **looks)
+    x, y = [*task.start_low, 0][:2]
+    width, height = np.subtract([*task.start_high, 1][:2], (x, y))
+    looks: Looks = {"fill": False, "zorder": 3, "clip_on": False, "label": "start region"}
+    for colour, line in style.CASING:
+        box = Rectangle((x, y), width, height, edgecolor=colour, linewidth=line, **looks)
         panel.add_patch(box)
     z = shown.critical.points
     charts.dots(panel, np.hstack([z, np.full_like(z, 0.5)]) if strip else z)
-
-
-def _corner(ends: Sequence[float], side: float) -> tuple[float, float]:
-    """Returns a corner (d,) of a chart as a point of the figure's plane."""
-    return float(ends[0]), float(ends[1]) if len(ends) > 1 else side
 
 
 def _ring(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> None:

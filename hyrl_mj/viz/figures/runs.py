@@ -89,11 +89,6 @@ def end(panel: Axes, task: Task, view: View, arc: HybridArc) -> None:
     mark(panel, view, arc, -1, "x", color=colour, markeredgewidth=2, label=label)
 
 
-def policy_way(panel: Axes, view: View, arc: HybridArc, **looks: Any) -> Line2D:
-    """Draws a run of the stage-1 policy in ink."""
-    return line(panel, view, arc.t, arc.z, color=POLICY_COLOUR, zorder=4, **looks)
-
-
 def chosen_way(
     panel: Axes, task: Task, view: View, arc: HybridArc, prefix: str = "", **looks: Any
 ) -> Line2D:
@@ -132,6 +127,7 @@ def draw_runs(shown: ShownRun, path: Path | None = None) -> Figure:
     first = replays[starts[0], "policy"]
     noise = style.noise_label(task, first.noise, first.bound)
     title = f"HyRL and {policy_title}\nunder the same {noise}"
+    thin = {"color": POLICY_COLOUR, "linewidth": 1.0, "zorder": 4}
     with style.drawing(path, 1.6 + 3.4 * rows, task, title) as figure:
         panels = figure.subplots(rows, len(loops), sharex=True, sharey="row", squeeze=False)
         for (coordinate, column), panel in np.ndenumerate(panels):
@@ -140,7 +136,7 @@ def draw_runs(shown: ShownRun, path: Path | None = None) -> Figure:
                 hybrid, policy = replays[start, loops[column]], replays[start, "policy"]
                 hybrid_way(panel, task, view, hybrid)
                 ends(panel, task, view, hybrid)
-                policy_way(panel, view, policy, linewidth=1.0, label=policy_title)
+                line(panel, view, policy.t, policy.z, label=policy_title, **thin)
                 ends(panel, task, view, policy)
             charts.set_point_lines(panel, task, coordinate)
             if coordinate == 0:

@@ -125,12 +125,6 @@ def axis_label(task: Task, axis: int) -> str:
     return f"{task.chart.names[axis]} [{task.chart.units[axis]}]"
 
 
-def input_label(task: Task, i: int) -> str:
-    """Returns an input with its unit: "turn rate [rad/s]"."""
-    unit = f" [{task.input_units[i]}]" if task.input_units else ""
-    return task.inputs[i].replace("_", " ") + unit
-
-
 def angle(value: float) -> str:
     """Returns an angle in multiples of pi: "3π/2"."""
     turns = Fraction(value / np.pi).limit_denominator(12)
