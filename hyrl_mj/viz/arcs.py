@@ -15,12 +15,9 @@ from hyrl_mj.tasks import Task
 from hyrl_mj.viz.replay import Floor, Show
 from hyrl_mj.viz.section import Section
 
-# The starts of a replay.
-STARTS = ("critical", "paper", "latest")
-# Runs without noise in the overview: of an even number none starts in the middle.
-OVERVIEW_RUNS = 12
-# The noise of the exact game, beside the registered kinds, which do without one.
-WORST = "worst"
+STARTS = ("critical", "paper", "latest")  # of a replay
+OVERVIEW_RUNS = 12  # without noise; of an even number none starts in the middle
+WORST = "worst"  # the noise of the exact game; the registered kinds do without one
 
 
 def from_middle(task: Task, z: np.ndarray) -> np.ndarray:
@@ -56,7 +53,7 @@ def noisy_arcs(
         seed: of the noise.
 
     Returns:
-        For each start an arc of "policy", of "hyrl_q0" and so on, and of "hyrl" for a mode of its own.
+        The arcs of "policy", of "hyrl_q0" and so on, and of "hyrl" with a mode of its own, one for each start.
 
     Raises:
         BadInput: a value that cannot be used, or a worst case that cannot be played exactly.
@@ -73,10 +70,8 @@ def noisy_arcs(
     arcs = {}
     for name, loop in run.loops.items():
         for q0 in q0s if name == "hyrl" else (None,):
-            signal: AnyNoise
-            if game is None:
-                signal = Noise(noise, bound)
-            else:
+            signal: AnyNoise = Noise(noise, bound)
+            if game is not None:
                 signal = worst_signal(game, name, loop, z0, bound, q0, steps)
             key = name if q0 is None else f"{name}_q{q0}"
             arcs[key] = simulate_batch(task, loop, z0, signal, q0, horizon, seed)
@@ -117,23 +112,23 @@ def replay_shows(
     """
     if starts not in STARTS:
         raise unknown("starts", starts, STARTS)
+    anew = noise is not None or eps is not None
     if starts == "latest":
-        if noise is not None or eps is not None:
+        if anew:
             raise BadInput(
                 "the latest simulation has its noise: give --noise and --eps to simulate"
             )
         policy, hybrid = ([run.arc(run.latest_path(who))] for who in ("policy", "hyrl"))
         return [Show(policy, hybrid, run.policy_title)]
-    anew = noise is not None or eps is not None
     arcs = replay_arcs(run, noise or "alternating", eps) if anew else run.arcs()
-    names = [name for name, who in arcs if who == "policy"]
+    names = dict.fromkeys(name for name, _ in arcs)
     modes = [f"hyrl_q{q}" for q in run.extended_sets.modes]
     if starts == "paper":
-        names = [name for name in names if name != "critical"]
+        names.pop("critical", None)
         policy = [arcs[name, "policy"] for name in names]
         hybrid = [arcs[name, mode] for name in names for mode in modes]
         return [Show(policy, hybrid, run.policy_title)]
-    name = "critical" if "critical" in names else names[0]
+    name = "critical" if "critical" in names else next(iter(names))
     policy = [arcs[name, "policy"]]
     return [Show(policy, [arcs[name, mode]], run.policy_title) for mode in modes]
 
@@ -149,9 +144,6 @@ def replay_floor(run: Run, overlap: bool = True) -> Floor:
     )
 
 
-# ---- arcs that figures show
-
-
 def overview_arcs(task: Task, policy: Policy) -> list[HybridArc]:
     """Simulates a policy without noise, from starts along the longest side of the start region.
 
@@ -165,9 +157,9 @@ def overview_arcs(task: Task, policy: Policy) -> list[HybridArc]:
 
 
 def policy_start_arcs(task: Task, policy: Policy, eps: float, seed: int) -> list[HybridArc]:
-    """Simulates a policy from the paper's starts of it (Section III), under the paper's noise.
+    """Simulates a policy from the paper's starts (Section III), under the paper's noise of bound `eps`.
 
-    The task may be a section's; `eps` is the bound of the noise and `seed` draws it.
+    The task may be a section's.
     """
     starts, noise = task.scene.policy_starts, Noise("alternating", eps)
     return simulate_batch(task, policy, starts, noise, horizon=task.scene.time, seed=seed)
