@@ -23,7 +23,7 @@ from hyrl_mj.stages.partition import Partition
 from hyrl_mj.viz import figures
 from hyrl_mj.viz.arcs import overview_arcs, policy_start_arcs
 from hyrl_mj.viz.figures import charts, extended_sets, runs, style
-from hyrl_mj.viz.page import pictures
+from hyrl_mj.viz.report import pictures
 from hyrl_mj.viz.section import Section
 
 CIRCLE, VEHICLE = hyrl_mj.get_task("unit_circle"), hyrl_mj.get_task("vehicle")

@@ -21,8 +21,7 @@ class Domain:
         starts: draws n chart points (n, d) with a generator.
         contains: (n, d) -> (n,) bool; an episode ends where it leaves the domain.
         exit_reward: reward for leaving the domain.
-        caution: (p,) largest error of a measurement: if given, the reward is the least of all states within
-            this error of the measured one, and the task's worst where one of them has failed.
+        caution: (p,) largest error of a measurement: if given, the reward is `cautious_reward`.
     """
 
     starts: Callable[[int, np.random.Generator], np.ndarray]
@@ -95,10 +94,7 @@ class BatchedEnv:
     def reset(self, ids: np.ndarray | None = None, z: np.ndarray | None = None) -> np.ndarray:
         """Starts new episodes in the rows `ids` (k,), by default all; returns observations (k, o) float32.
 
-        The episodes start at chart points z (k, d), by default drawn from the start distribution.
-
-        Raises:
-            BadInput: the numbers of starts and rows differ.
+        The episodes start at chart points z, one a row (k, d), by default drawn from the start distribution.
         """
         ids = np.arange(self.n) if ids is None else ids
         if z is None:
@@ -158,7 +154,8 @@ def cautious_reward(
 ) -> np.ndarray:
     """Returns the least reward (n,) of states within `caution` (p,) of measurements (n, p), inputs (n, m).
 
-    With this reward a policy learns to keep clear of what noise could hide, without noise in training.
+    It is the task's worst where one of these states has failed. With this reward a policy learns to keep
+    clear of what noise could hide, without noise in training.
     """
     shares = (-1.0, -0.5, 0.0, 0.5, 1.0) if np.count_nonzero(caution) <= 2 else (-1.0, 0.0, 1.0)
     worst = np.full(len(measured), np.inf)

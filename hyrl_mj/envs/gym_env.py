@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -14,9 +14,6 @@ from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.errors import BadInput
 from hyrl_mj.simulation import AnyNoise
 from hyrl_mj.tasks import Outcome, Task, get_task
-
-if TYPE_CHECKING:
-    from hyrl_mj.rendering import SceneRenderer
 
 
 def observation_space(task: Task) -> spaces.Box:
@@ -67,7 +64,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         self.action_space = action_space(self.core.task)
         self.render_mode, self._size = render_mode, (width, height)
         self._camera = camera or self.core.task.scene.camera
-        self._renderer: SceneRenderer | None = None
+        self._renderer: Any = None  # a `SceneRenderer`, opened by the first picture
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

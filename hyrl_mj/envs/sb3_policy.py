@@ -14,15 +14,11 @@ from hyrl_mj.tasks import Task
 
 @dataclass(frozen=True)
 class Sb3Policy:
-    """A hybrid controller or a policy, for evaluation with SB3. It does not need torch.
+    """A hybrid controller or a policy, for evaluation with SB3 on environments of a task, without torch.
 
     The mode is passed from one sample to the next as the state of SB3's recurrent policies. The measurement
     comes from `Task.measured`, with the precision of float32 observations: closer than that to the edge of a
     flow set, the mode may jump where the controller itself would not.
-
-    Attributes:
-        task: the task of the environments.
-        controller: the controller or policy to evaluate.
     """
 
     task: Task
@@ -46,8 +42,7 @@ class Sb3Policy:
             deterministic: ignored, because actions are always deterministic.
 
         Returns:
-            The action for the task's environments, levels () or (n,) int or inputs (m,) or (n, m) float32,
-            and the next state `(q,)`.
+            Levels () or (n,) int, or inputs (m,) or (n, m) float32; and the next state `(q,)`.
 
         Raises:
             BadInput: wrong shapes, values that are not finite, unknown modes, an input that is no level

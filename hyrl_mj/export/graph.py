@@ -169,4 +169,8 @@ def _arctan2(y: Any, x: Any) -> Any:
     return np.where((x == 0) & (y == 0), 0.0, angle)
 
 
-EXPANDED = {"cos": _cos, "remainder": _remainder, "arctan2": _arctan2}
+EXPANDED: dict[str, Callable[..., Any]] = {
+    "cos": _cos,
+    "remainder": _remainder,
+    "arctan2": _arctan2,
+}

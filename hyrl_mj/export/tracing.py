@@ -80,11 +80,10 @@ def _take(x: Any, indices: Any, *args: Any, **kwargs: Any) -> Any:
     return (take if isinstance(indices, Traced) else np.take)(x, indices, *args, **kwargs)
 
 
-FILLING = (np.empty, np.zeros, np.ones, np.full)
-CONVERTING = (np.array, np.asarray, np.asanyarray, np.ascontiguousarray)
+FILLING, CONVERTING = "empty zeros ones full", "array asarray asanyarray ascontiguousarray"
 REPLACEMENTS: dict[str, Callable[..., Any]] = {
-    **{function.__name__: partial(_filled, function) for function in FILLING},
-    **{function.__name__: partial(_converted, function) for function in CONVERTING},
+    **{name: partial(_filled, getattr(np, name)) for name in FILLING.split()},
+    **{name: partial(_converted, getattr(np, name)) for name in CONVERTING.split()},
     "take": _take,
 }
 

@@ -53,7 +53,7 @@ def noisy_arcs(
         seed: of the noise.
 
     Returns:
-        The arcs of "policy", of "hyrl_q0" and so on, and of "hyrl" with a mode of its own, one for each start.
+        For each start an arc of "policy", of "hyrl_q0" and so on, and of "hyrl" for a mode of its own.
 
     Raises:
         BadInput: a value that cannot be used, or a worst case that cannot be played exactly.
@@ -70,8 +70,10 @@ def noisy_arcs(
     arcs = {}
     for name, loop in run.loops.items():
         for q0 in q0s if name == "hyrl" else (None,):
-            signal: AnyNoise = Noise(noise, bound)
-            if game is not None:
+            signal: AnyNoise
+            if game is None:
+                signal = Noise(noise, bound)
+            else:
                 signal = worst_signal(game, name, loop, z0, bound, q0, steps)
             key = name if q0 is None else f"{name}_q{q0}"
             arcs[key] = simulate_batch(task, loop, z0, signal, q0, horizon, seed)

@@ -15,8 +15,8 @@ from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, simulate_batch
 from hyrl_mj.viz.arcs import critical_start, from_middle, replay_floor
 from hyrl_mj.viz.commands import beginning
 from hyrl_mj.viz.options import ReplayOptions
-from hyrl_mj.viz.page import fill, film, pictures, write
 from hyrl_mj.viz.replay import Show, render_replay
+from hyrl_mj.viz.report import fill, film, pictures, write
 from hyrl_mj.viz.tables import margin_text, percent
 
 # In the run directory: the page, and the folder with its pictures and data.

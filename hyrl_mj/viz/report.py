@@ -1,30 +1,27 @@
-"""The report: one page with all results of a run, which opens anywhere and prints well."""
+"""The pages of a run, with pictures and videos as data URIs; first of all the report of all results."""
 
 from __future__ import annotations
 
+import os
+from base64 import b64encode
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from PIL import Image
+
+from hyrl_mj import artifacts
 from hyrl_mj.errors import BadInput
 from hyrl_mj.game import LIMIT, MAP_CLASSES, EpisodeCount, GameResult, Robustness
 from hyrl_mj.learning import Training
 from hyrl_mj.policies import Agent, MlpPolicy
 from hyrl_mj.run_directory import Run
+from hyrl_mj.viz import tables
 from hyrl_mj.viz.commands import changed, commands
-from hyrl_mj.viz.figures import CLASS_COLOURS
-from hyrl_mj.viz.page import fill, film, pictures, write
-from hyrl_mj.viz.tables import (
-    Arcs,
-    arrivals,
-    excursion_text,
-    extent,
-    margin_text,
-    percent,
-    replay_sentence,
-    replay_table,
-    robustness_sentence,
-)
+from hyrl_mj.viz.figures import CLASS_COLOURS, FIGURES
+from hyrl_mj.viz.figures.style import task_title
 
 CONTROLLERS = ("policy", "hyrl")  # the columns of the numbers
 # What the classes of the maps mean, in the order of MAP_CLASSES.
@@ -47,6 +44,18 @@ class Number:
     note: str
 
 
+@dataclass(frozen=True)
+class Picture:
+    """A PNG: its name, the file as a data URI, size [pixels] and caption, and the video that it begins."""
+
+    name: str
+    data: str
+    width: int
+    height: int
+    caption: str
+    video: str = ""
+
+
 def write_report(run: Run, path: Path) -> None:
     """Writes the page; where a result is missing the page says how to get it.
 
@@ -66,7 +75,9 @@ def render(run: Run) -> str:
     task = run.task
     robustness = run.robustness if (run.path / "robustness.json").is_file() else None
     arcs = run.arcs() if all(path.is_file() for path in run.arc_paths().values()) else None
-    arrived = {who: arrivals(run, arcs, who == "policy") for who in CONTROLLERS} if arcs else None
+    arrived = (
+        {who: tables.arrivals(run, arcs, who == "policy") for who in CONTROLLERS} if arcs else None
+    )
     stages = run.settings.stage1, run.settings.stage6
     options = [stage.options if isinstance(stage, Training) else {} for stage in stages]
     first, sixth = (_texts(vars(s) | more) for s, more in zip(stages, options, strict=True))
@@ -81,7 +92,7 @@ def render(run: Run) -> str:
         arcs=arcs,
         arrivals=arrived,
         numbers=_numbers(run, robustness, arrived),
-        replays=arcs and replay_table(run, arcs),
+        replays=arcs and tables.replay_table(run, arcs),
         stages=_stages(run, robustness, arcs),
         table=_texts(vars(run.settings)),
         training=[(name, first.get(name, ""), sixth.get(name, "")) for name in first | sixth],
@@ -116,9 +127,10 @@ def _game_numbers(run: Run, game: GameResult) -> list[Number]:
     where, unit = run.task.noise_on(game.everywhere)
     scores = [game.scores[who][-1] for who in CONTROLLERS]
     noise = f"worst noise on {where} up to {scores[0].eps:g} {unit}"
-    limit = f"{noise}; the limit is {percent(game.scores[LIMIT][-1].won_any)}"
-    won, won_any = [percent(s.won) for s in scores], [percent(s.won_any) for s in scores]
-    margins = [margin_text(game.margin[who], unit) for who in CONTROLLERS]
+    limit = f"{noise}; the limit is {tables.percent(game.scores[LIMIT][-1].won_any)}"
+    won = [tables.percent(s.won) for s in scores]
+    won_any = [tables.percent(s.won_any) for s in scores]
+    margins = [tables.margin_text(game.margin[who], unit) for who in CONTROLLERS]
     worst = f"the margin: worst noise on {where}"
     numbers = [
         Number("winnable starts won", won, noise),
@@ -126,7 +138,7 @@ def _game_numbers(run: Run, game: GameResult) -> list[Number]:
         Number("noise up to which all of them are won", margins, worst),
     ]
     if game.lasting:
-        off = [f"{excursion_text(s.excursion)} {unit}" for s in scores]
+        off = [f"{tables.excursion_text(s.excursion)} {unit}" for s in scores]
         numbers.append(Number("kept off the set-point for ever, at most", off, noise))
     return numbers
 
@@ -136,22 +148,24 @@ def _episode_numbers(counts: Sequence[EpisodeCount]) -> list[Number]:
     note = f"the least over {', '.join(dict.fromkeys(c.noise for c in counts))} noise"
     numbers = []
     for region in dict.fromkeys(c.region for c in counts):
-        shares = [
-            percent(min(c.reached for c in counts if (c.region, c.controller) == (region, who)))
+        least = [
+            min(c.reached for c in counts if (c.region, c.controller) == (region, who))
             for who in CONTROLLERS
         ]
         what = f"episodes that reach the set-point, starts {region}"
-        numbers.append(Number(what, shares, note))
+        numbers.append(Number(what, list(map(tables.percent, least)), note))
     return numbers
 
 
 # ---- stages and settings
 
 
-def _stages(run: Run, robustness: Robustness | None, arcs: Arcs | None) -> list[tuple[str, str]]:
+def _stages(
+    run: Run, robustness: Robustness | None, arcs: tables.Arcs | None
+) -> list[tuple[str, str]]:
     """Returns the result of each stage in a sentence."""
     task, s, modes = run.task, run.settings, run.extended_sets.modes
-    reach = "; ".join(f"mode {task.scene.mode_name(q)}: {extent(run, q)}" for q in modes)
+    reach = "; ".join(f"mode {task.scene.mode_name(q)}: {tables.extent(run, q)}" for q in modes)
     attempts = f"up to {s.stage6.attempts} times " if s.stage6.attempts > 1 else ""
     retrained = f"a policy for each of {len(modes)} modes: {s.stage6.title}"
     if isinstance(s.stage1, Agent):
@@ -166,8 +180,11 @@ def _stages(run: Run, robustness: Robustness | None, arcs: Arcs | None) -> list[
         ("partition", run.partition.sentence(task)),
         ("extended-sets", f"{run.extended_sets.sentence(task)}; {reach}"),
         ("retrain", f"{retrained}, {attempts}{s.stage6.samples:,} samples"),
-        ("robustness", "not done" if robustness is None else robustness_sentence(robustness)),
-        ("simulate", "not done" if arcs is None else replay_sentence(run, arcs)),
+        (
+            "robustness",
+            "not done" if robustness is None else tables.robustness_sentence(robustness),
+        ),
+        ("simulate", "not done" if arcs is None else tables.replay_sentence(run, arcs)),
     ]
 
 
@@ -184,3 +201,71 @@ def _text(value: object) -> str:
     if isinstance(value, tuple):
         return ", ".join(map(str, value))
     return "by default" if value is None else f"{value}"
+
+
+# ---- what pages share
+
+
+def write(path: Path, text: str) -> None:
+    """Writes a page, whole or not at all."""
+    with artifacts.replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def fill(template: str, run: Run, robustness: Robustness | None, **values: Any) -> str:
+    """Returns a page from its template, with the values that every page of a run shows."""
+    task, game = run.task, robustness.game if robustness else None
+    episodes = robustness.episodes if robustness else ()
+    environment = Environment(
+        loader=PackageLoader("hyrl_mj"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(
+        # A name that is not Unicode must not keep the page from being written.
+        name=os.fsencode(run.path.resolve().name).decode("utf-8", "replace"),
+        title=task_title(task),
+        task=task,
+        settings=run.settings,
+        agent=run.agent,
+        exact=run.exact,
+        critical=run.critical_set,
+        unit=task.noise_on()[1],
+        percent=tables.percent,
+        robustness=robustness,
+        game=game,
+        scores=tables.score_table(task, game) if game else None,
+        margins=tables.margin_table(task, game) if game else None,
+        episodes=tables.episode_table(task, episodes) if episodes else None,
+        **values,
+    )
+
+
+def film(path: Path) -> Picture | None:
+    """Returns the poster of a replay with its video, or None unless both files exist."""
+    poster = path.with_suffix(".png")
+    if not (path.is_file() and poster.is_file()):
+        return None
+    return replace(_picture(poster, "replay", ""), video=_data(path, "video/mp4"))
+
+
+def pictures(folder: Path) -> list[Picture]:
+    """Returns the figures that have been drawn into a folder."""
+    return [
+        _picture(path, name.replace("_", " "), entry.caption)
+        for name, entry in FIGURES.items()
+        if (path := folder / f"{name}.png").is_file()
+    ]
+
+
+def _picture(path: Path, name: str, caption: str) -> Picture:
+    with artifacts.reading(path), Image.open(path, formats=("PNG",)) as image:
+        image.verify()
+        return Picture(name, _data(path, "image/png"), *image.size, caption)
+
+
+def _data(path: Path, kind: str) -> str:
+    """Returns a file as a data URI."""
+    return f"data:{kind};base64,{b64encode(path.read_bytes()).decode()}"

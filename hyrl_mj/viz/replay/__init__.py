@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 
 import mujoco
@@ -65,13 +66,9 @@ def render_replay(
     poster = screens[0].poster()
     if path.suffix in ENCODERS:
         times = [screen.times(options.fps, options.slow_motion) for screen in screens]
-        with (
-            progress_bar(None, "rendering", "frames", sum(map(len, times))) as progress,
-            video(path, *options.size, options.fps) as add,
-        ):
-            for screen, when in zip(screens, times, strict=True):
-                for frame in screen.frames(when):
-                    add(frame)
-                    progress.update()
+        frames = chain.from_iterable(map(Screen.frames, screens, times))
+        with video(path, *options.size, options.fps) as add:
+            for frame in progress_bar(frames, "rendering", "frames", sum(map(len, times))):
+                add(frame)
     with artifacts.replacing(path.with_suffix(".png")) as temporary:
         poster.save(temporary)

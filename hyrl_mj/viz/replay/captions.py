@@ -35,12 +35,7 @@ Groups = Mapping[str, Sequence[Track]]
 
 @dataclass(frozen=True)
 class Layout:
-    """Where a panel has its captions.
-
-    Attributes:
-        width, height: of the panel [pixels].
-        finer: how many times larger the panel is drawn than it will be seen.
-    """
+    """Where a panel has its captions: its size [pixels], `finer` times larger than it will be seen."""
 
     width: int
     height: int
@@ -78,13 +73,16 @@ class Layout:
     def below(self, groups: Groups, t: float) -> np.ndarray:
         """Returns the bar with time, modes and outcomes at time t [s]: (bar, width, 3)."""
         line = _Line(self)
-        longest = max(track.end for tracks in groups.values() for track in tracks)
-        line.words(f"t = {min(t, longest):.2f} s", INK, room="t = 00.00 s")
+        end = max(track.end for tracks in groups.values() for track in tracks)
+        line.words(f"t = {min(t, end):.2f} s", INK, room="t = 00.00 s")
         for title, tracks in groups.items():
             if len(groups) > 1:
                 line.words(title, INK)
-            if len(tracks) == 1:
-                _modes(line, tracks[0], t)
+            if len(tracks) == 1 and tracks[0].modes:
+                arc, row = tracks[0].arc, tracks[0].arc.at(t)
+                line.words(f"j = {arc.j[row]}", INK, room="j = 00")
+                mode = tracks[0].task.scene.mode_name(int(arc.q[row]))
+                line.badge(f"q = {mode}", tracks[0].colour(row))
             ended = Counter(_outcome(track) for track in tracks if t >= track.end)
             for outcome, number in sorted(ended.items()):
                 words, colour = OUTCOMES[outcome]
@@ -128,14 +126,6 @@ class _Line:
         """Writes words at the right end."""
         x = self._image.width - self._gap / 2
         self._draw.text((x, self._middle), words, OPEN, self._small, anchor="rm")
-
-
-def _modes(line: _Line, track: Track, t: float) -> None:
-    """Writes the number of jumps and the mode of an arc at time t [s]."""
-    arc, row = track.arc, track.arc.at(t)
-    if track.modes:
-        line.words(f"j = {arc.j[row]}", INK, room="j = 00")
-        line.badge(f"q = {track.task.scene.mode_name(int(arc.q[row]))}", track.colour(row))
 
 
 def _outcome(track: Track) -> str:

@@ -43,8 +43,7 @@ def bar(
     """Adds a flat bar between two points (3,), which is drawn several times faster than a capsule.
 
     Args:
-        scene: receives the bar.
-        start, end: the points [m].
+        scene, start, end: the scene, and the points [m].
         colour: red, green, blue and, if the bar is not opaque, its opacity, 0 to 255.
         width: across [m].
         height: of the bar above the points [m].

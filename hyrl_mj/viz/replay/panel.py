@@ -28,17 +28,12 @@ FAILED = ("crashed", "out_of_bounds", "stalled", "unstable")
 class Track:
     """An arc with the robot's position at each sample, ready to be drawn.
 
-    Args:
-        task: of the arc.
-        arc: the arc.
-
     Raises:
         BadArtifact: the arc is of another task, or its states do not fit the task's model.
     """
 
     def __init__(self, task: Task, arc: HybridArc):
-        self.task, self.arc = task, arc
-        self.end = float(arc.t[-1])
+        self.task, self.arc, self.end = task, arc, float(arc.t[-1])
         self.modes = arc.controller != "policy"
         if arc.task != task.name:
             raise BadArtifact(
@@ -107,18 +102,10 @@ class _Drawn:
 
 
 class Panel:
-    """Draws tracks in one scene, at times that never go back.
+    """Draws a robot for each track in one scene, at times that never go back.
 
     What does not change is drawn once: paths stay in the scene, and while the camera rests only the part
-    of the picture that has changed is drawn anew.
-
-    Args:
-        task: of the tracks.
-        tracks: a robot is drawn for each.
-        canvas: to draw on.
-        width, height: of the picture [pixels].
-        camera: a camera of the MJCF; one on the robot follows that of the first track.
-        floor: the marks on the floor.
+    of the picture that has changed is drawn anew. A camera on the robot follows that of the first track.
     """
 
     def __init__(

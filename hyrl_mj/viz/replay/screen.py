@@ -44,13 +44,6 @@ class Show:
 class Screen:
     """A show, laid out in panels with captions.
 
-    Args:
-        task: of the arcs.
-        show: the arcs.
-        options: how the replay is rendered.
-        camera: a camera of the MJCF.
-        floor: the marks on the floor.
-
     Raises:
         BadArtifact: an arc is not of this task or its model.
         BadInput: the panels do not fit into a frame of this size.
@@ -87,9 +80,7 @@ class Screen:
     def frames(self, times: Iterable[float], finer: int = 1) -> Iterator[np.ndarray]:
         """Yields the frame (height, width, 3) at each time [s], valid until the next one.
 
-        Args:
-            times: never go back.
-            finer: how many times larger the frames are drawn.
+        The times never go back; the frames are drawn `finer` times larger than the replay.
         """
         width, height = (finer * side for side in self._size)
         layout = Layout(width, height, finer)
@@ -127,16 +118,9 @@ class Screen:
 def frame_times(
     end: float, fps: float, jumps: Iterable[float] = (), slow_motion: float = 1.0
 ) -> np.ndarray:
-    """Returns the time of the arc at each frame, to its end and a moment longer.
+    """Returns the time of the arc at each frame (k,) [s], from 0 to its `end` and a moment longer.
 
-    Args:
-        end: the arc's last time [s].
-        fps: frames a second.
-        jumps: times [s] around which the arc is played slowly.
-        slow_motion: how many times slower; 1 for real time.
-
-    Returns:
-        (k,) times [s]: 0 first, `end` last.
+    Around the times [s] of the jumps the arc is played `slow_motion` times slower.
     """
     edges = np.array([[t - AROUND, t + AROUND] for t in jumps]).reshape(-1, 2).clip(0, end)
     at = np.unique([0.0, end, *edges.ravel()])
