@@ -254,7 +254,7 @@ class GridSet(StateSet):
 
 
 def within_reach(mask: np.ndarray, window: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
-    """Returns the mask dilated by a window of so many nodes (d,) along each axis."""
+    """Returns a mask, shaped as its grid, dilated by `window` (d,) nodes along each axis."""
     from scipy import ndimage
 
     reached = mask.astype(np.uint8)

@@ -88,8 +88,7 @@ def complete(kind: type[Options], options: Options | None, changes: dict[str, An
         raise BadInput(f"options {options!r} cannot be used: give {kind.__name__}(...)")
     names = [field.name for field in fields(kind)]
     for name, value in changes.items():
-        if name in RENAMED and name not in names:
-            new = RENAMED[name]
+        if new := RENAMED.get(name):
             raise BadInput(f"the option {name} is now called {new}: give {new}={value!r}")
         if name not in names:
             raise unknown("option", name, names)

@@ -40,13 +40,13 @@ class Regions:
         """Returns n starts (n, d) from the task's distribution, for noise up to a bound.
 
         Raises:
-            BadInput: the starts have to lie near M*, but M* is empty or hardly any start lies there.
+            BadInput: the starts have to lie near M*, but M* is empty or no start of the task is near it.
         """
         if not self.near:
             return task.starts(n, rng)
         if not len(self.points):
             raise BadInput(
-                "no critical set was found, so nothing starts near it: leave --near-critical out"
+                "the critical set is empty, so no episode starts near it: leave --near-critical out"
             )
         kept, drawn = np.empty((0, task.chart.dimension)), 0
         while len(kept) < n:

@@ -48,7 +48,6 @@ class Partition(Saved):
         return f"Partition({', '.join(shares)} of {' x '.join(map(str, self.grid.counts))} nodes)"
 
     def __iter__(self) -> Iterator[GridSet]:
-        """Iterates over the parts M_i."""
         return iter(self.parts)
 
     @property
