@@ -80,7 +80,7 @@ def test_chart_and_state_belong_together(task: Task) -> None:
 
 
 def test_an_observation_leads_back_to_its_measurement(task: Task) -> None:
-    if type(task).measured is Task.measured:  # it does without, and says so
+    if type(task).measured is Task.measured:  # an error names the missing method
         with pytest.raises(BadInput, match="measured"):
             task.measured(np.zeros((1, len(task.observation_low))))
         return
@@ -90,7 +90,7 @@ def test_an_observation_leads_back_to_its_measurement(task: Task) -> None:
     seen = task.observation(plant.measurement).astype(np.float32).astype(float)
     measured = task.measured(seen)
     off = task.chart.difference(task.z(measured), task.z(plant.measurement))
-    assert (np.abs(off) <= 1e-5 * task.chart.sides).all(), "not where the chart says"
+    assert (np.abs(off) <= 1e-5 * task.chart.sides).all(), "at another chart point"
     np.testing.assert_allclose(task.observation(measured), seen, rtol=1e-5, atol=1e-5)
 
 

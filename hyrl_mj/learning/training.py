@@ -1,7 +1,5 @@
 """Training of policies with SB3 on the batched environments (paper, Steps 1 and 6)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -46,6 +44,26 @@ EPISODES = 256
 JUDGES = ("none", "uniform", "alternating")
 # Number of observations for the check of a foreign policy, and the change of its weights before the check.
 CHECKED, MOVED = 64, 0.05
+
+
+class Ground(Protocol):
+    """Where a policy is trained and how it is judged.
+
+    Attributes:
+        noise: noise on the measurements during training.
+        enough: score with which training may end.
+        settled: share of the training after which scores count.
+    """
+
+    noise: Noise
+    enough: Score
+    settled: float
+
+    def domain(self, gamma: float) -> Domain | None:
+        """Returns the part of the state space that episodes are restricted to, for a discount gamma."""
+
+    def __call__(self, policy: MlpPolicy) -> Score:
+        """Returns the score of a policy; higher is better, compared from left to right."""
 
 
 def train(
@@ -206,26 +224,6 @@ def evaluate(
         weight *= gamma * ~result.done
         observation = result.observation
     return float(success.mean()), float(returns.mean())
-
-
-class Ground(Protocol):
-    """Where a policy is trained and how it is judged.
-
-    Attributes:
-        noise: noise on the measurements during training.
-        enough: score with which training may end.
-        settled: share of the training after which scores count.
-    """
-
-    noise: Noise
-    enough: Score
-    settled: float
-
-    def domain(self, gamma: float) -> Domain | None:
-        """Returns the part of the state space that episodes are restricted to, for a discount gamma."""
-
-    def __call__(self, policy: MlpPolicy) -> Score:
-        """Returns the score of a policy; higher is better, compared from left to right."""
 
 
 class TaskGround:

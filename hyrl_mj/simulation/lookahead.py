@@ -51,7 +51,7 @@ class Lookahead(Signal):
         return signal
 
     def sample(self, now: Sample) -> np.ndarray:
-        """Returns the noise as `Signal.sample`; of equal dangers zero comes first, then the largest noise."""
+        """Returns the most dangerous noise; among equals zero comes first, then the largest noise."""
         true, chosen = now.measurement, np.zeros_like(now.measurement)
         unstable = now.plant.unstable[now.rows]
         running = np.flatnonzero(self.task.outcome(true, unstable) == Outcome.RUNNING)

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from functools import cached_property
+from itertools import compress
 from pathlib import Path
 
 import mujoco
@@ -102,13 +103,13 @@ class Task(ABC):
         return len(self.noisy)
 
     def plant(self, n: int, threads: int = 0) -> Plant:
-        """Returns n copies of the robot, stepped by so many threads (0: all cores)."""
+        """Returns n copies of the robot, stepped by a number of threads, 0 for one on every core."""
         control = self.control if self.has_inner_loop else None
         return Plant(self.model, self.inputs, n, threads, measure=self.measure, control=control)
 
     @cached_property
     def kinematic(self) -> bool:
-        """Whether the robot simply follows its inputs, so that it can be run backward."""
+        """Whether the robot follows its inputs without inertia, so that it can be run backward."""
         return self.plant(1).invertible
 
     def check_measurement(self, measured: np.ndarray) -> np.ndarray:
@@ -123,7 +124,7 @@ class Task(ABC):
                 f"a measurement of {self.name} has shape (n, {self.measurement_columns}), "
                 f"got {measured.shape}"
             )
-        # A robot asks for one measurement at a time; `all()` takes three times as long for it.
+        # For the single measurement of a robot at work `all()` takes three times as long.
         finite = np.isfinite(measured)
         if np.count_nonzero(finite) < measured.size:
             row, column = np.argwhere(~finite)[0]
@@ -168,7 +169,7 @@ class Task(ABC):
 
     @abstractmethod
     def observation(self, measured: np.ndarray) -> np.ndarray:
-        """Returns what the network is fed: (n, k)."""
+        """Returns the network's inputs (n, k) for measurements (n, p)."""
 
     def measured(self, observation: np.ndarray) -> np.ndarray:
         """Returns the measurements (n, p) of observations (n, k): the inverse of `observation`.
@@ -179,7 +180,7 @@ class Task(ABC):
             BadInput: the task does not define it.
         """
         raise BadInput(
-            f"{self.name} does not say what was measured: give it a measured(observation)"
+            f"{self.name} does not say how to invert observation(): give it a measured(observation)"
         )
 
     @abstractmethod
@@ -200,7 +201,7 @@ class Task(ABC):
         return np.where(unstable, Outcome.UNSTABLE, self.ending(measurement))
 
     def failed(self, measurement: np.ndarray) -> np.ndarray:
-        """Returns (n,) bool: whether states end an episode without success."""
+        """Returns (n,) bool: whether measurements (n, p) end an episode without success."""
         ending = self.ending(measurement)
         return np.asarray((ending != Outcome.RUNNING) & (ending != Outcome.REACHED))
 
@@ -219,9 +220,9 @@ class Task(ABC):
         return np.asarray(np.linalg.norm(self.chart.difference(z, self.set_point), axis=1))
 
     def danger(self, measurement: np.ndarray) -> np.ndarray:
-        """Returns how dangerous states are (n,), which adversarial noise makes as large as it can.
+        """Returns the danger (n,) of measurements (n, p), which adversarial noise maximises.
 
-        By default the negative reward, with inputs in the middle of their limits.
+        By default this is the negative reward, with inputs in the middle of their limits.
         """
         middle = np.mean(self.input_limits, axis=0)
         return -self.reward(measurement, np.tile(middle, (len(measurement), 1)))
@@ -243,13 +244,12 @@ class Task(ABC):
 
     def noise_on(self, everywhere: bool = False) -> tuple[str, str]:
         """Returns the chart coordinates that noise acts on, and their unit: "x and y", "m"."""
-        hit = self.noise_in_chart(1.0, everywhere) > 0
-        names = [name for name, h in zip(self.chart.names, hit, strict=True) if h]
-        units = [unit for unit, h in zip(self.chart.units, hit, strict=True) if h]
-        return " and ".join(names), ", ".join(dict.fromkeys(units))
+        noisy = self.noise_in_chart(1.0, everywhere) > 0
+        units = dict.fromkeys(compress(self.chart.units, noisy))
+        return " and ".join(compress(self.chart.names, noisy)), ", ".join(units)
 
     def check_noise(self, bound: float, everywhere: bool = False) -> float:
-        """Returns the noise bound, if measurements still tell something about the state.
+        """Returns the noise bound, if measurements can still tell states apart.
 
         Raises:
             BadInput: it is not a number >= 0, or so large that it hides the whole chart.

@@ -28,7 +28,7 @@ _MOVED = {
 
 
 def register(task: type[Task]) -> type[Task]:
-    """Class decorator: make a task known by its name, and to Gymnasium by its `env_id`.
+    """Registers a task by its name, and in Gymnasium by its `env_id`; use it as a class decorator.
 
     Raises:
         BadInput: another file has a task of that name, or the task was written for 0.1.
@@ -176,7 +176,7 @@ def _from_file(path: Path) -> type[Task]:
 
 
 def _run(path: Path) -> ModuleType:
-    """Import a file as a module of its own, which can import from its folder as a script can."""
+    """Imports a file as a module of its own, which can import from its folder as a script can."""
     name = f"hyrl_mj_task_{path.stem}_{len(_FILES)}"
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None

@@ -13,10 +13,9 @@ TEMPLATES = Path(__file__).parents[1] / "templates" / "task"
 
 
 def write_task(name: str, folder: Path) -> list[Path]:
-    """Write `<name>.py`, `<name>.xml` and `test_<name>.py` into a folder; nothing is overwritten.
+    """Writes `<name>.py`, `<name>.xml` and `test_<name>.py` into a folder, and returns their paths.
 
-    Returns:
-        The paths of the files.
+    Nothing is overwritten.
 
     Raises:
         BadInput: the name is not one of a Python module or is in use, or a file exists already.
