@@ -126,7 +126,7 @@ class Traced(NDArrayOperatorsMixin):
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
         name, out = ufunc.__name__, options.pop("out", (None,))[0]
-        if method != "__call__" or options or (name not in UFUNCS and name not in COMPOSED):
+        if method != "__call__" or options or name not in UFUNCS | COMPOSED.keys():
             how = f".{method}" if method != "__call__" else ""
             how += f" with {', '.join(options)}" if options else ""
             raise Untraceable(f"uses np.{name}{how}, which has no exported form")
@@ -231,7 +231,7 @@ def _reshape(x: Any, shape: Any) -> Traced:
 
 
 def take(x: Any, indices: Any, axis: int | None = None) -> Traced:
-    """np.take of an array along an axis, by indices that are plain or traced."""
+    """Does np.take along an axis, by indices that are plain or traced."""
     if axis is None and np.ndim(x) != 1:
         raise Untraceable("uses np.take without an axis")
     axis = (axis or 0) % np.ndim(x)

@@ -21,10 +21,8 @@ from hyrl_mj.viz.tables import margin_text, percent
 
 # In the run directory: the page, and the folder with its pictures and data.
 PAGE, FOLDER = "diagnosis.html", "diagnosis"
-# Lost starts that are simulated, the nearest to the middle of the replay starts first.
-TRIED = 64
-# How the replay of the policy alone is rendered.
-REPLAY = ReplayOptions(size=(960, 720))
+TRIED = 64  # lost starts that are simulated, the nearest to the middle of the replay starts first
+REPLAY = ReplayOptions(size=(960, 720))  # of the policy alone
 
 
 def worst_arc(run: Run) -> HybridArc | None:
@@ -54,11 +52,9 @@ def worst_arc(run: Run) -> HybridArc | None:
 
 def usual_arc(run: Run) -> HybridArc:
     """Returns a run of the policy under the paper's noise, from M* if there is one."""
-    start = critical_start(run)
-    task, noise = run.task, Noise("alternating", run.settings.noise)
-    z0 = task.scene.starts[0] if start is None else start
-    seed, horizon = run.settings.seed, task.scene.time
-    (arc,) = simulate_batch(task, run.policy, z0, noise, horizon=horizon, seed=seed)
+    start, scene, s = critical_start(run), run.task.scene, run.settings
+    z0, noise = scene.starts[0] if start is None else start, Noise("alternating", s.noise)
+    (arc,) = simulate_batch(run.task, run.policy, z0, noise, horizon=scene.time, seed=s.seed)
     return arc
 
 
@@ -85,26 +81,18 @@ def sentences(run: Run, robustness: Robustness, arc: HybridArc | None) -> list[s
     results = [run.critical_set.sentence(task)]
     noise = f"noise on {where} of up to {eps:g} {unit}"
     if robustness.game is not None:
-        score = robustness.game.scores["policy"][-1]
-        margin = robustness.game.margin["policy"]
-        results.append(
-            f"the worst {noise} makes it lose {percent(1 - score.won)} of the starts that can be won"
-        )
-        results.append(
-            "it does not win all of them even without noise"
-            if margin is None
-            else f"it wins all of them up to noise {margin_text(margin, unit)}"
-        )
+        lost = percent(1 - robustness.game.scores["policy"][-1].won)
+        results.append(f"the worst {noise} makes it lose {lost} of the starts that can be won")
+        if (margin := robustness.game.margin["policy"]) is None:
+            results.append("it does not win all of them even without noise")
+        else:
+            results.append(f"it wins all of them up to noise {margin_text(margin, unit)}")
     else:
-        worst = min(robustness.episodes, key=lambda count: count.reached)
         if run.agent and run.agent.stochastic:
-            results.append(
-                "it draws its inputs, so that noisy episodes stand in for the worst case"
-            )
-        results.append(
-            f"under {worst.noise} {noise} it loses {percent(1 - worst.reached)} of the episodes "
-            f"that start {worst.region}"
-        )
+            results.append("it draws its inputs: noisy episodes stand in for the worst case")
+        worst = min(robustness.episodes, key=lambda count: count.reached)
+        lost = f"{percent(1 - worst.reached)} of the episodes that start {worst.region}"
+        results.append(f"under {worst.noise} {noise} it loses {lost}")
     if arc is None:
         return [*results, f"no start was found that {noise} makes it lose"]
     start, outcome = task.chart.format(arc.z[0]), arc.outcome.replace("_", " ")
@@ -120,16 +108,14 @@ def write_page(run: Run, robustness: Robustness, arc: HybridArc | None) -> None:
         BadInput: it cannot be written.
     """
     folder = run.path / FOLDER
-    write(
-        run.path / PAGE,
-        fill(
-            "diagnosis.html",
-            run,
-            robustness,
-            sentences=sentences(run, robustness, arc),
-            arc=arc,
-            video=film(folder / "worst.mp4"),
-            pictures=pictures(folder),
-            command=beginning(run.settings, run.path),
-        ),
+    text = fill(
+        "diagnosis.html",
+        run,
+        robustness,
+        sentences=sentences(run, robustness, arc),
+        arc=arc,
+        video=film(folder / "worst.mp4"),
+        pictures=pictures(folder),
+        command=beginning(run.settings, run.path),
     )
+    write(run.path / PAGE, text)
