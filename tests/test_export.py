@@ -431,9 +431,9 @@ WHOLE = {
 def test_operations_survive_both_forms(name):
     program = trace(WHOLE[name], {"x": RNG(0).normal(size=(BATCH, 3))}, name)
     arrays = {}
-    lines = write_function("f", "It does something.", program, arrays)
+    source = write_function("f", "It does something.", program, arrays)
     space = {"np": np, "ARRAYS": arrays}
-    exec("\n".join(lines), space)
+    exec(source, space)
     model = write_graph(program, ("y",), "f", {})
     session = onnxruntime.InferenceSession(model.SerializeToString())
     for n in (1, 5, 300):
@@ -448,7 +448,7 @@ def test_gelu_takes_the_error_function_of_scipy():
     x = np.linspace(-5, 5, BATCH, dtype=np.float32)[:, None]
     program = trace(lambda x: x * special.erf(x / np.sqrt(np.float32(2))), {"x": x}, "gelu")
     space = {"np": np}
-    exec("\n".join(write_function("f", "", program, {})), space)
+    exec(write_function("f", "", program, {}), space)
     wanted = x * special.erf(x / np.sqrt(np.float32(2)))
     assert space["f"](x).dtype == np.float32
     np.testing.assert_allclose(space["f"](x), wanted, rtol=0, atol=2e-6)
@@ -530,9 +530,9 @@ exec(
 def test_code_is_followed_into(shape):
     program = trace(SHAPES[shape], {"x": RNG(0).normal(size=(BATCH, 2))}, shape)
     arrays = {}
-    lines = write_function("f", "It does something.", program, arrays)
+    source = write_function("f", "It does something.", program, arrays)
     space = {"np": np, "ARRAYS": arrays}
-    exec("\n".join(lines), space)
+    exec(source, space)
     x = RNG(1).normal(size=(5, 2))
     np.testing.assert_allclose(space["f"](x), SHAPES[shape](x), rtol=1e-15)
 

@@ -13,7 +13,6 @@ import numpy as np
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadInput, brief, unknown
 from hyrl_mj.export.source import write_function
-from hyrl_mj.export.traced_array import Program
 from hyrl_mj.export.tracing import trace
 from hyrl_mj.export.vocabulary import BATCH
 from hyrl_mj.policies import ACTIVATIONS, MlpPolicy
@@ -193,28 +192,27 @@ def _task_part(task: Task, networks: list[MlpPolicy], arrays: dict[str, np.ndarr
     units = task.input_units or ("",) * len(task.inputs)
     inputs = tuple(f"{i} [{u}]" if u else i for i, u in zip(task.inputs, units, strict=True))
     activations = [network.activation for network in networks]
-    lines = [
+    measured = {"measured": _measurements(task, BATCH, np.random.default_rng(0))}
+    x = {"x": np.linspace(-3, 3, BATCH, dtype=np.float32)[:, None]}
+    z = trace(task.z, measured, f"the method z of {task.name}")
+    observation = trace(task.observation, measured, f"the method observation of {task.name}")
+    constants = [
         f"{BEGIN} {task.name}",
         f"TASK = {task.name!r}",
         f"SAMPLE_TIME = {task.dt!r}  # [s]",
         f"MEASUREMENT_COLUMNS = {task.measurement_columns}",
         f"INPUTS = {inputs!r}",
-        f"OUTPUTS = {tuple(network.output for network in networks)!r}\n\n",
+        f"OUTPUTS = {tuple(network.output for network in networks)!r}",
     ]
-    measured = {"measured": _measurements(task, BATCH, np.random.default_rng(0))}
-    x = {"x": np.linspace(-3, 3, BATCH, dtype=np.float32)[:, None]}
-
-    def add(name: str, sentence: str, program: Program) -> None:
-        lines.extend([*write_function(name, sentence, program, arrays), "", ""])
-
-    z = trace(task.z, measured, f"the method z of {task.name}")
-    add("chart_point", "Returns the chart points (n, d) of measurements (n, p).", z)
-    observation = trace(task.observation, measured, f"the method observation of {task.name}")
-    add("observation", "Returns the observations (n, k) of measurements (n, p).", observation)
+    parts = [
+        "\n".join(constants),
+        write_function("chart_point", "Returns chart points (n, d).", z, arrays),
+        write_function("observation", "Returns observations (n, k).", observation, arrays),
+    ]
     for name in dict.fromkeys(activations):
         program = trace(ACTIVATIONS[name], x, f"the activation {name}")
-        add(name, "The activation between the layers of a network.", program)
-    return "\n".join([*lines, f"ACTIVATIONS = [{', '.join(activations)}]", "", ""])
+        parts.append(write_function(name, "Activates a layer of a network.", program, arrays))
+    return "\n\n\n".join([*parts, f"ACTIVATIONS = [{', '.join(activations)}]\n\n"])
 
 
 def _graph(controller: HybridController, module: dict[str, Any]) -> onnx.ModelProto:
@@ -222,11 +220,8 @@ def _graph(controller: HybridController, module: dict[str, Any]) -> onnx.ModelPr
     from hyrl_mj.export.graph import write_graph
 
     task, rng = controller.task, np.random.default_rng(0)
-    samples = {
-        "q": rng.choice(controller.modes, BATCH),
-        "measured": _measurements(task, BATCH, rng),
-    }
-    program = trace(module["answer"], samples, f"the step of {task.name}")
+    q, measured = rng.choice(controller.modes, BATCH), _measurements(task, BATCH, rng)
+    program = trace(module["answer"], {"q": q, "measured": measured}, f"the step of {task.name}")
     metadata = {
         "task": task.name,
         "modes": ", ".join(map(str, controller.modes)),

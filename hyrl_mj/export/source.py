@@ -24,8 +24,8 @@ WRITTEN = {
 
 def write_function(
     name: str, sentence: str, program: Program, arrays: dict[str, np.ndarray]
-) -> list[str]:
-    """Returns the lines of a Python function that computes a program.
+) -> str:
+    """Returns the source of a Python function that computes a program.
 
     Args:
         name: the name of the function.
@@ -51,8 +51,8 @@ def write_function(
     for number, operation in enumerate(operations):
         body.append(f"v{number} = {_expression(operation, write)}")
         names[operation] = f"v{number}"
-    lines = [f'"""{sentence}"""', *body, f"return {names[result]}"]
-    return [f"def {name}({argument.operands[0]}):", *(f"    {line}" for line in lines)]
+    head = [f"def {name}({argument.operands[0]}):", f'"""{sentence}"""']
+    return "\n    ".join([*head, *body, f"return {names[result]}"])
 
 
 def _expression(operation: Operation, write: Callable[[Any], str]) -> str:
