@@ -73,7 +73,7 @@ class Lattice:
         if d not in LATTICE:
             raise BadInput(
                 f"the exact game takes a chart of 1 or 2 dimensions, that of {task.name} has {d}: "
-                + REMEDY
+                f"{REMEDY}"
             )
         if task.measurement_columns != d or task.model.nq != d or not task.kinematic:
             raise BadInput(
@@ -133,16 +133,14 @@ class Lattice:
         Raises:
             BadInput: an input that is not finite, out of range, or not one of a discrete task's.
         """
-        low, high = self.task.input_limits
+        name, (low, high) = self.task.name, self.task.input_limits
         if u.ndim != 2 or u.shape[1] != len(low):
-            raise BadInput(
-                f"a controller of {self.task.name} gives (n, {len(low)}) inputs, got {u.shape}"
-            )
+            raise BadInput(f"a controller of {name} gives (n, {len(low)}) inputs, got {u.shape}")
         wrong = ~((u >= low - 1e-6) & (u <= high + 1e-6)).all(axis=1)
         if wrong.any():
             raise BadInput(
                 f"the controller's input {u[wrong][0].tolist()} cannot be applied: the limits of "
-                f"{self.task.name} are {low.tolist()} to {high.tolist()}"
+                f"{name} are {low.tolist()} to {high.tolist()}"
             )
         counts = np.array([len(np.unique(column)) for column in self.levels.T])
         steps = (counts - 1) / (high - low)
@@ -151,8 +149,8 @@ class Lattice:
         off = np.abs(self.levels[level] - u).max(axis=1) > 1e-6
         if self.task.learning.levels is not None and off.any():
             raise BadInput(
-                f"the controller's input {u[off][0].tolist()} is not one of the levels of "
-                f"{self.task.name}: {np.unique(self.levels).tolist()}"
+                f"the controller's input {u[off][0].tolist()} is not one of the levels of {name}: "
+                f"{np.unique(self.levels).tolist()}"
             )
         return level
 

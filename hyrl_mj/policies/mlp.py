@@ -223,11 +223,8 @@ class MlpPolicy(ObservationPolicy):
     def save(self, path: Path) -> None:
         """Writes `path` (safetensors) and its description beside it (JSON)."""
         artifacts.write_tensors(path, dict(self.weights))
-        artifacts.write_json(
-            path.with_suffix(".json"),
-            {"task": self.task.name, "algorithm": self.algorithm, "activation": self.activation},
-            kind="policy",
-        )
+        about = {"task": self.task.name, "algorithm": self.algorithm, "activation": self.activation}
+        artifacts.write_json(path.with_suffix(".json"), about, kind="policy")
 
     @staticmethod
     def load(path: Path) -> MlpPolicy:
@@ -236,15 +233,11 @@ class MlpPolicy(ObservationPolicy):
         Raises:
             BadArtifact: a file is missing, truncated, or not a policy of this version.
         """
-        description = artifacts.read_json(path.with_suffix(".json"), kind="policy")
+        about = artifacts.read_json(path.with_suffix(".json"), kind="policy")
         weights = artifacts.read_tensors(path)
         with artifacts.reading(path):
-            return MlpPolicy(
-                task=get_task(description["task"]),
-                algorithm=description["algorithm"],
-                activation=description["activation"],
-                weights=weights,
-            )
+            task = get_task(about["task"])
+            return MlpPolicy(task, about["algorithm"], about["activation"], weights)
 
 
 @dataclass(frozen=True)
