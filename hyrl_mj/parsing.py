@@ -1,8 +1,7 @@
 """From the words of a command line to a call of a function, with help from its docstring.
 
-Keyword-only parameters are options, the others are given by their place, and a parameter that is a frozen
-dataclass stands for an option per field. "; by default ..." at the end of an entry of the docstring says
-what None stands for.
+Keyword-only parameters are options, the others are positional, and a parameter that is a frozen dataclass
+stands for an option per field. An entry of the docstring ends in "; by default ..." if None has a meaning.
 """
 
 from __future__ import annotations
@@ -76,7 +75,7 @@ class Argument:
         kind: how its values are written.
         default: or `MISSING`.
         text: its entry in the docstring.
-        positional: whether it is given by its place.
+        positional: whether it has no `--name`.
     """
 
     name: str
@@ -125,7 +124,7 @@ class Argument:
 
 
 def documented(thing: Any) -> tuple[str, dict[str, str]]:
-    """Returns the description in a docstring, and what it says of each argument or attribute."""
+    """Returns the description in a docstring, and its entries by argument or attribute."""
     text = inspect.getdoc(thing) or ""
     description = re.split(r"\n\n(?:Args|Attributes|Raises|Returns):\n", text)[0]
     paragraphs = [" ".join(paragraph.split()) for paragraph in description.split("\n\n")]

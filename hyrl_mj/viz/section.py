@@ -36,13 +36,11 @@ class Section(Task):
         rest: (d - 2,) values of the other coordinates.
     """
 
-    source, description = _of_whole("source"), _of_whole("description")
-    input_units, mirror = _of_whole("input_units"), _of_whole("mirror")
-    precision, close = _of_whole("precision"), _of_whole("close")
-    learning, model = _of_whole("learning"), _of_whole("model")
-    plant, input_limits = _of_whole("plant"), _of_whole("input_limits")
-    measure, control = _of_whole("measure"), _of_whole("control")
-    has_inner_loop = _of_whole("has_inner_loop")
+    source, description, mirror = _of_whole("source"), _of_whole("description"), _of_whole("mirror")
+    precision, close, learning = _of_whole("precision"), _of_whole("close"), _of_whole("learning")
+    model, plant, measure = _of_whole("model"), _of_whole("plant"), _of_whole("measure")
+    control, has_inner_loop = _of_whole("control"), _of_whole("has_inner_loop")
+    input_units, input_limits = _of_whole("input_units"), _of_whole("input_limits")
     observation, measured = _of_whole("observation"), _of_whole("measured")
     reward, danger = _of_whole("reward"), _of_whole("danger")
     ending, verdict = _of_whole("ending"), _of_whole("verdict")

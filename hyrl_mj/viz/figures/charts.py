@@ -14,7 +14,6 @@ from scipy.ndimage import gaussian_filter
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.stages import CriticalSet
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.figures.style import CASING, GREEN, GREY, INK, PALE, PAPER, angle, axis_label
 
@@ -177,7 +176,7 @@ def set_point_lines(panel: Axes, task: Task, coordinate: int = 0) -> None:
 
 
 def dots(panel: Axes, points: np.ndarray, colour: str = INK) -> None:
-    """Marks points (n, 2) of M*, given in the panel."""
+    """Marks points (n, 2) of M*, in the panel's coordinates."""
     if not len(points):
         return
     looks: dict[str, Any] = {"markeredgewidth": 0, "clip_on": False, "zorder": 3.5}
@@ -186,9 +185,9 @@ def dots(panel: Axes, points: np.ndarray, colour: str = INK) -> None:
     panel.plot(*points.T, "o", markersize=3.6, color=colour, label="critical set M*", **looks)
 
 
-def spokes(panel: Axes, task: Task, critical: CriticalSet, start: float, colour: str = INK) -> None:
-    """Marks M* by lines from radius `start` to the ring's edge."""
-    x, y = on_ring(task, critical.points[:, 0])
+def spokes(panel: Axes, task: Task, z: np.ndarray, start: float, colour: str = INK) -> None:
+    """Marks points (n, 1) of M* by lines from radius `start` to the ring's edge."""
+    x, y = on_ring(task, z[:, 0])
     for line, (_, width) in zip((PAPER, colour), CASING, strict=True):
         ends = [start * x, OUTER * x], [start * y, OUTER * y]
         panel.plot(*ends, color=line, linewidth=width, zorder=3)

@@ -66,7 +66,7 @@ def _set_rings(panel: Axes, shown: ShownRun, shared: np.ndarray) -> None:
     if shared.any():
         charts.legend_field(panel, SEVERAL, SHARED)
     charts.ring(panel, task, (OUTER, CORE))
-    charts.spokes(panel, task, shown.critical, CORE - 0.06)
+    charts.spokes(panel, task, shown.critical.points, CORE - 0.06)
 
 
 def _ends(panel: Axes, task: Task, members: GridSet, radius: float, colour: str) -> None:

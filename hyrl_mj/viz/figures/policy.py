@@ -101,7 +101,7 @@ def _spirals(panel: Axes, shown: ShownPolicy) -> None:
     _noisy_run(panel, shown, view)
     if task.set_point is not None:
         charts.cross(panel, *np.ravel(charts.on_ring(task, task.set_point)))
-    charts.spokes(panel, task, shown.critical, CORE - 0.06)
+    charts.spokes(panel, task, shown.critical.points, CORE - 0.06)
 
 
 def _noiseless_runs(panel: Axes, shown: ShownPolicy, view: View) -> None:
@@ -167,7 +167,7 @@ def _input_map(panel: Axes, shown: ShownPolicy, i: int) -> None:
         shades, classes = np.unique(colours(scale(values)), axis=0, return_inverse=True)
         charts.arcs(panel, task, classes.ravel(), shades, OUTER, INNER)
         charts.ring(panel, task, (OUTER, INNER))
-        charts.spokes(panel, task, shown.critical, 0.6, style.RED)
+        charts.spokes(panel, task, shown.critical.points, 0.6, style.RED)
     else:
         charts.image(panel, grid, values, cmap=colours, norm=scale)
         charts.plane(panel, task)

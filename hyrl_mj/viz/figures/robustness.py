@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -110,7 +109,7 @@ def _ring(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> Non
     if last - first < 360 - 360 / len(classes):
         looks: Looks = {"width": 0.03, "color": style.INK, "linewidth": 0}
         panel.add_patch(Wedge((0, 0), TICK, first, last, label="start region", **looks))
-    charts.spokes(panel, task, shown.critical, CRITICAL)
+    charts.spokes(panel, task, shown.critical.points, CRITICAL)
 
 
 # ---- the curve
@@ -141,7 +140,7 @@ def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
             _won(shares, NAMES.get(name, name), eps, curve.wins[name], looks, dashed)
         label = "winnable share of the start region"
         shares.plot(eps, 100 * np.array(curve.winnable), color=style.PALE, linewidth=1, label=label)
-        _margins(shares, result.margin, numbers, unit)
+        _margins(shares, shown, numbers, unit)
         shares.set(ylabel="winnable starts that are won [%]", yticks=range(0, 101, 20))
         if result.lasting:
             for name, number in numbers.items():
@@ -203,13 +202,11 @@ def _dashed(number: int) -> Looks:
     }
 
 
-def _margins(
-    panel: Axes, margins: Mapping[str, float | None], numbers: Mapping[str, int], unit: str
-) -> None:
+def _margins(panel: Axes, shown: ShownGame, numbers: dict[str, int], unit: str) -> None:
     """Marks the margins above the curves, a row for each controller."""
     panel.set_ylim(-3, TOP + ROW * len(numbers))
     for row, (name, number) in enumerate(numbers.items()):
-        margin, label = margins[name], f"margin of {NAMES.get(name, name)}"
+        margin, label = shown.result.margin[name], f"margin of {NAMES.get(name, name)}"
         if margin is None:
             panel.plot([], [], linestyle="none", label=f"{label}: none")
             continue
