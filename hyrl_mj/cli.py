@@ -264,11 +264,9 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "doctor": doctor,
 }
 
-
 # Options of version 0.1, by command.
 BOUND = {"--noise": "--eps"}
 RENAMED = {"run": BOUND, "robustify": BOUND, "diagnose": BOUND, "simulate": {"--horizon": "--time"}}
-
 
 HEAD = """\
 usage: hyrl-mj [-h] [--version] COMMAND ...
@@ -317,9 +315,7 @@ def main() -> None:
         print(f"hyrl-mj: {error.strerror}{where}", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:
-        print(
-            "hyrl-mj: interrupted; what was finished is kept, run again to resume", file=sys.stderr
-        )
+        print("hyrl-mj: interrupted; finished work is kept, run again to resume", file=sys.stderr)
         sys.exit(130)
 
 

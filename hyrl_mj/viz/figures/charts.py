@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.patches import Circle, Wedge
-from matplotlib.ticker import FuncFormatter, MultipleLocator
+from matplotlib.ticker import MultipleLocator
 from scipy.ndimage import gaussian_filter
 
 from hyrl_mj.errors import BadInput
@@ -50,7 +50,7 @@ def label_axis(axis: Axis, task: Task, coordinate: int) -> None:
     axis.set_label_text(axis_label(task, coordinate))
     if task.chart.units[coordinate] == "rad" and task.chart.periodic[coordinate]:
         axis.set_major_locator(MultipleLocator(np.pi / 2))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: angle(value)))
+        axis.set_major_formatter(lambda value, _: angle(value))
 
 
 # ---- planes

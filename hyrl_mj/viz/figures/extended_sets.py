@@ -18,7 +18,7 @@ from hyrl_mj.viz.figures.charts import OUTER
 from hyrl_mj.viz.figures.shown import ShownRun
 
 # States that several extended sets hold.
-SHARED, SEVERAL = colours.OVERLAP, "in several of them"
+SHARED = colours.OVERLAP
 # Inner radius of the innermost ring, the gap between rings, and the radii of the text at the ends of a set.
 CORE, GAP, OUTSIDE, INSIDE = 0.6, 0.05, 1.14, 0.47
 # How far the enlarged panel reaches around M*, in noise bounds.
@@ -33,22 +33,22 @@ def draw_extended_sets(shown: ShownRun, path: Path | None = None) -> Figure:
     title = f"extended sets for noise up to eps = {sets.noise:g} {task.noise_on()[1]}{horizon}"
     # The nodes (N,) that several sets hold.
     shared = np.asarray(np.sum([members.mask for members in sets.sets], axis=0) > 1)
+    ring = charts.is_ring(task)
+    enlarged = not ring and len(shown.critical.points) > 0 and sets.noise > 0
     with style.drawing(path, 5.6, task, title) as figure:
-        if charts.is_ring(task):
-            _set_rings(figure.subplots(), shown, shared)
-        elif len(shown.critical.points) and sets.noise > 0:
-            whole, near = figure.subplots(1, 2)
-            _set_plane(whole, shown, shared)
-            _set_plane(near, shown, shared)
-            _enlarge(whole, near, shown)
-        else:
-            _set_plane(figure.subplots(), shown, shared)
+        panels = figure.subplots(1, 1 + enlarged, squeeze=False).ravel()
+        for mode in sets.modes:
+            label = f"$M^{{ext}}_{mode}$, of mode {task.scene.mode_name(mode)}"
+            colour, tint = style.mode_colour(mode), style.mode_tint(mode)
+            charts.legend_field(panels[0], label, colour if ring else tint, colour)
+        if shared.any():
+            charts.legend_field(panels[0], "in several of them", SHARED, SHARED)
+        for panel in panels:
+            (_set_rings if ring else _set_plane)(panel, shown, shared)
+        if enlarged:
+            _enlarge(panels[0], panels[1], shown)
         style.legend(figure)
     return figure
-
-
-def _set_name(task: Task, mode: int) -> str:
-    return f"$M^{{ext}}_{mode}$, of mode {task.scene.mode_name(mode)}"
 
 
 def _set_rings(panel: Axes, shown: ShownRun, shared: np.ndarray) -> None:
@@ -60,11 +60,8 @@ def _set_rings(panel: Axes, shown: ShownRun, shared: np.ndarray) -> None:
         outer, colour = OUTER - GAP - i * width, style.mode_colour(mode)
         inside = members.mask.astype(int)
         charts.arcs(panel, task, inside, (None, colour), outer, outer - width + GAP)
-        charts.legend_field(panel, _set_name(task, mode), colour)
         # The first set's ends are written outside the rings, the others' inside, one below the other.
         _ends(panel, task, members, OUTSIDE if i == 0 else INSIDE - 0.1 * (i - 1), colour)
-    if shared.any():
-        charts.legend_field(panel, SEVERAL, SHARED)
     charts.ring(panel, task, (OUTER, CORE))
     charts.spokes(panel, task, shown.critical.points, CORE - 0.06)
 
@@ -83,12 +80,8 @@ def _set_plane(panel: Axes, shown: ShownRun, shared: np.ndarray) -> None:
     """Fills the sets in a plane, with outlines."""
     task, sets = shown.task, shown.sets
     for mode, members in zip(sets.modes, sets.sets, strict=True):
-        tint = style.mode_tint(mode)
-        charts.region(panel, members, tint)
-        charts.legend_field(panel, _set_name(task, mode), tint, style.mode_colour(mode))
+        charts.region(panel, members, style.mode_tint(mode))
     charts.region(panel, GridSet.from_mask(sets.sets[0].grid, shared), SHARED)
-    if shared.any():
-        charts.legend_field(panel, SEVERAL, SHARED, SHARED)
     for mode, members in zip(sets.modes, sets.sets, strict=True):
         charts.region(panel, members, "none", style.mode_colour(mode), zorder=2)
     charts.plane(panel, task)
