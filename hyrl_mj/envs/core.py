@@ -94,7 +94,10 @@ class BatchedEnv:
     def reset(self, ids: np.ndarray | None = None, z: np.ndarray | None = None) -> np.ndarray:
         """Starts new episodes in the rows `ids` (k,), by default all; returns observations (k, o) float32.
 
-        The episodes start at chart points z, one a row (k, d), by default drawn from the start distribution.
+        The episodes start at chart points z (k, d), by default drawn from the start distribution.
+
+        Raises:
+            BadInput: the numbers of starts and rows differ.
         """
         ids = np.arange(self.n) if ids is None else ids
         if z is None:

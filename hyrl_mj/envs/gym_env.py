@@ -110,7 +110,8 @@ class TaskVectorEnv(VectorEnv):
     Args:
         task: name of the task.
         num_envs: number of episodes n.
-        noise, max_episode_steps, threads: as of `BatchedEnv`.
+        noise, threads: as in `BatchedEnv`.
+        max_episode_steps: samples until truncation, by default the task's limit.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}

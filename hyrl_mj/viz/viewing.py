@@ -34,7 +34,7 @@ def view(task: Task, arc: HybridArc, port: int = 0, say: Say = print) -> None:
     """Plays an arc again and again in real time, until the viewer is closed.
 
     Args:
-        task, arc: the arc, and its task.
+        task, arc: the arc and its task.
         port: of the web viewer, 1 to 65535; 0 for the first free one from 8080 on.
         say: called with the address of the web viewer.
 
