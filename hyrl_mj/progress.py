@@ -14,10 +14,9 @@ enabled = False
 def progress_bar(
     work: Iterable[Any] | None, label: str, unit: str, total: int | None = None, quiet: bool = False
 ) -> Any:
-    """Returns a tqdm bar over the work, which appears once it has lasted half a second.
+    """Returns a tqdm bar over the work, which appears once the work has lasted half a second.
 
-    Without an iterable of the work the caller updates and closes the bar, and `total` says how many units
-    of work there are.
+    Without an iterable, the caller updates and closes the bar, and `total` is the number of units of work.
     """
     from tqdm import tqdm  # slow to import
 

@@ -104,7 +104,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
 class TaskVectorEnv(VectorEnv):
     """n episodes of a task at once, for `gymnasium.make_vec` with the mode "vector_entry_point".
 
-    Episodes that end start anew in the same step: `infos["final_obs"]` holds their last
+    Episodes that end restart in the same step: `infos["final_obs"]` holds their last
     observations and `infos["final_info"]` their outcomes, both masked by `infos["_final_obs"]`.
 
     Args:

@@ -216,7 +216,7 @@ def _task_part(task: Task, networks: list[MlpPolicy], arrays: dict[str, np.ndarr
 
 
 def _graph(controller: HybridController, module: dict[str, Any]) -> onnx.ModelProto:
-    """Returns the function `answer` of an exported controller.py, given by its names, as a graph."""
+    """Returns the function `answer` of an exported controller.py, a namespace, as a graph."""
     from hyrl_mj.export.graph import write_graph
 
     task, rng = controller.task, np.random.default_rng(0)

@@ -21,7 +21,7 @@ from hyrl_mj.errors import BadInput, brief
 from hyrl_mj.export.traced_array import Operation, Program, Traced, apply, take
 from hyrl_mj.export.vocabulary import BATCH, Untraceable
 
-# Packages whose code is not copied: it does not take foreign arrays, or needs no help.
+# Packages whose code is not copied: it accepts no foreign arrays, or handles them itself.
 LEFT_AS_THEY_ARE = {*sys.stdlib_module_names, "numpy", "scipy", "mujoco", "torch"}
 # Members that a copy of a class must not have: they would act when it is created or deleted.
 NOT_COPIED = {"__init_subclass__", "__del__", "__abstractmethods__", "_abc_impl"}

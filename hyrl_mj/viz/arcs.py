@@ -106,23 +106,23 @@ def replay_shows(
         run: with its arcs.
         starts: "critical" for the start on M*, once for each start mode; "paper" for all of the paper's
             starts at once; "latest" for the arcs of the last `hyrl-mj simulate --start`.
-        noise: simulates anew under this kind of noise, instead of the arcs on disk.
-        eps: simulates anew with this bound; by default the run's.
+        noise: the kind of noise of a new simulation; by default the arcs on disk are played.
+        eps: the bound of a new simulation, by default the run's.
 
     Raises:
         BadInput: a value that cannot be used.
     """
     if starts not in STARTS:
         raise unknown("starts", starts, STARTS)
-    anew = noise is not None or eps is not None
+    is_new = noise is not None or eps is not None
     if starts == "latest":
-        if anew:
+        if is_new:
             raise BadInput(
                 "the latest simulation has its noise: give --noise and --eps to simulate"
             )
         policy, hybrid = ([run.arc(run.latest_path(who))] for who in ("policy", "hyrl"))
         return [Show(policy, hybrid, run.policy_title)]
-    arcs = replay_arcs(run, noise or "alternating", eps) if anew else run.arcs()
+    arcs = replay_arcs(run, noise or "alternating", eps) if is_new else run.arcs()
     names = dict.fromkeys(name for name, _ in arcs)
     modes = [f"hyrl_q{q}" for q in run.extended_sets.modes]
     if starts == "paper":

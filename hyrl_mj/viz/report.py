@@ -1,4 +1,4 @@
-"""The pages of a run, with pictures and videos as data URIs; first of all the report of all results."""
+"""The report of all results of a run, and what its pages share: pictures and videos as data URIs."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Number:
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG: its name, the file as a data URI, size [pixels] and caption, and the video that it begins."""
+    """A PNG: its name, the file as a data URI, size [pixels] and caption; of a poster also the video."""
 
     name: str
     data: str

@@ -92,7 +92,7 @@ class Layout:
 
 
 class _Line:
-    """A bar that is written on from left to right."""
+    """A bar with words, from left to right."""
 
     def __init__(self, layout: Layout):
         self._large, self._small = layout.fonts

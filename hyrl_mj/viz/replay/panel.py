@@ -20,7 +20,7 @@ from hyrl_mj.viz.replay import marks
 
 PATH_WIDTH, BOUND_WIDTH, START_RADIUS, JUMP_RADIUS, CROSS = 0.032, 0.05, 0.035, 0.055, 0.075  # [m]
 BOUND_PIECES, GHOST_ALPHA = 4, 0.35
-# The part that is drawn anew is this much larger than what has moved [pixels].
+# The part that is redrawn is this much larger than what has moved [pixels].
 MARGIN = 2
 FAILED = ("crashed", "out_of_bounds", "stalled", "unstable")
 
@@ -95,7 +95,7 @@ class Track:
 
 @dataclass
 class _Drawn:
-    """Until which time a track has been drawn, and where in the picture."""
+    """The time up to which a track has been drawn, and the part of the picture that it is in."""
 
     t: float = -1.0
     box: Box = (0, 0, 0, 0)
@@ -105,7 +105,7 @@ class Panel:
     """Draws a robot for each track in one scene, at times that never go back.
 
     What does not change is drawn once: paths stay in the scene, and while the camera rests only the part
-    of the picture that has changed is drawn anew. A camera on the robot follows that of the first track.
+    of the picture that has changed is redrawn. A camera on the robot follows that of the first track.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class Panel:
         if whole:
             renderer.redraw(picture, (0, 0, renderer.width, renderer.height))
         for drawn, now, box in zip(self._drawn, times, boxes, strict=True):
-            # Drawn anew where the robot is or was.
+            # The robot is or was in this part.
             left, top = np.minimum(box[:2], drawn.box[:2])
             right, bottom = np.maximum(box[2:], drawn.box[2:])
             if not whole and now > drawn.t and left < right and top < bottom:
