@@ -178,7 +178,7 @@ def _point(z: np.ndarray) -> str:
 
 
 def percent(share: float) -> str:
-    """Returns a share in percent; only 1 is called 100%, and only 0 is called 0%."""
+    """Returns a share in percent; "100%" stands for exactly 1, and "0%" for exactly 0."""
     if share in (0, 1):
         return f"{100 * share:.0f}%"
     text = f"{100 * share:.2f}%"
