@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import io
 import json
+import os
+import re
+import secrets
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cache
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_args, get_type_hints
+from zipfile import ZipFile
 
 import numpy as np
-from safetensors.numpy import load_file, save
+from safetensors.numpy import load, save
 
 from hyrl_mj.errors import BadArtifact, BadInput, brief
 
@@ -26,18 +33,31 @@ VERSION = 1
 REMEDY = "run the stage that writes it again"
 
 
+# Limits on what is read [bytes], so that a crafted file cannot fill the memory.
+LARGEST_JSON, LARGEST = 2**24, 2**27
+# The names of temporary files, which only a process that was killed leaves behind.
+TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.partial(\.\w+)?")
+# Called with each path before `replacing` writes it.
+before_writing: ContextVar[Callable[[Path], None]] = ContextVar(
+    "before_writing", default=lambda path: None
+)
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yields a temporary path beside `path`, and renames it to `path` when the block ends without error.
+    """Yields a new temporary file beside `path`, and renames it to `path` if the block ends without error.
+
+    Each writer has a temporary file of its own, and no link is followed.
 
     Raises:
         BadInput: the path cannot be written.
     """
-    temporary = path.with_name(f".{path.stem}.partial{path.suffix}")
+    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(6)}.partial{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.touch()
+        os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
         yield temporary
+        before_writing.get()(path)
         temporary.replace(path)
     except BrokenPipeError:  # the program that writes the file has died
         raise
@@ -67,7 +87,7 @@ def reading(path: Path, remedy: str = REMEDY) -> Iterator[None]:
         ) from error
 
 
-def check_version(version: Any, kind: str, wanted: str) -> None:
+def check_version(version: Any, kind: Any, wanted: str) -> None:
     """Raises `BadArtifact` unless a file is of the wanted kind and version."""
     if kind != wanted:
         raise BadArtifact(f"it holds {kind!r}, not {wanted!r}")
@@ -75,23 +95,65 @@ def check_version(version: Any, kind: str, wanted: str) -> None:
         raise BadArtifact(f"it is of version {version}, hyrl_mj reads version {VERSION}: {REMEDY}")
 
 
+def read_limited(path: Path, limit: int = LARGEST) -> bytes:
+    """Returns the content of a file, if it is no longer than the limit [bytes]."""
+    with path.open("rb") as file:
+        content = file.read(limit + 1)
+    if len(content) > limit:
+        raise BadArtifact(f"it is larger than {limit / 2**20:g} MiB, which no such file is")
+    return content
+
+
 def write_json(path: Path, content: Any, kind: str) -> None:
-    """Writes a mapping or a dataclass as a JSON object, with its kind and version."""
+    """Writes a mapping or a dataclass as a JSON object, with its kind, its version and its own SHA-256."""
     if is_dataclass(content) and not isinstance(content, type):
         content = asdict(content)
     with replacing(path) as temporary:
-        text = json.dumps({"kind": kind, "version": VERSION, **content}, indent=2)
-        temporary.write_text(text + "\n", encoding="utf-8")
+        temporary.write_text(_json({"kind": kind, "version": VERSION, **content}), encoding="utf-8")
+
+
+def _json(content: dict[str, Any]) -> str:
+    """Returns the text of a JSON object, which ends with the SHA-256 of the rest."""
+    own = sha256(json.dumps(content).encode()).hexdigest()
+    return json.dumps(content | {"sha256": own}, indent=2) + "\n"
 
 
 def read_json(path: Path, kind: str, remedy: str = REMEDY) -> dict[str, Any]:
     """Returns the content that `write_json` wrote, as nested dictionaries and lists."""
+    return _read_json(path, kind, remedy, lambda content: content)
+
+
+def _read_json(
+    path: Path, kind: str, remedy: str, parse: Callable[[dict[str, Any]], Record]
+) -> Record:
+    """Returns what `parse` makes of the content of a JSON file."""
     with reading(path, remedy):
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if not isinstance(content, dict):
+        text = read_limited(path, LARGEST_JSON).decode()
+        whole = json.loads(text)
+        if not isinstance(whole, dict):
             raise BadArtifact("it holds no JSON object")
-        check_version(content.pop("version"), content.pop("kind"), kind)
-        return content
+        if (odd := next(_unprintable(whole), None)) is not None:
+            raise BadArtifact(f"it holds control characters, in {odd!r}")
+        content = {name: whole[name] for name in whole if name not in ("kind", "version", "sha256")}
+        check_version(whole.get("version"), whole.get("kind"), kind)
+        value = parse(content)  # before its SHA-256 is compared: the message names the field
+        whole.pop("sha256", None)
+        if text != _json(whole):
+            raise BadArtifact(
+                f"it was changed after it was written (its sha256 does not fit): {remedy}"
+            )
+        return value
+
+
+def _unprintable(content: Any) -> Iterator[str]:
+    """Yields each string with control characters in nested dictionaries and lists."""
+    if isinstance(content, str) and not content.isprintable():
+        yield content
+    elif isinstance(content, dict):
+        yield from _unprintable([*content, *content.values()])
+    elif isinstance(content, list):
+        for value in content:
+            yield from _unprintable(value)
 
 
 def read_record(path: Path, kind: str, record: type[Record], remedy: str = REMEDY) -> Record:
@@ -100,9 +162,7 @@ def read_record(path: Path, kind: str, record: type[Record], remedy: str = REMED
     Raises:
         BadArtifact: the file is missing or damaged, or a field does not fit; the message names the field.
     """
-    content = read_json(path, kind, remedy)
-    with reading(path, remedy):
-        return parsed(content, record, remedy)
+    return _read_json(path, kind, remedy, lambda content: parsed(content, record, remedy))
 
 
 def parsed(content: Mapping[str, Any], record: type[Record], remedy: str = REMEDY) -> Record:
@@ -198,7 +258,12 @@ def _unpacked(name: str, declared: Any, arrays: Mapping[str, np.ndarray], contex
         return tuple(int(value) for value in array)
     if declared == tuple[np.ndarray, ...]:
         return tuple(array)
-    return array if declared is np.ndarray else declared(array.item())
+    if declared is np.ndarray:
+        return array
+    value = declared(array.item())
+    if isinstance(value, str) and not value.isprintable():
+        raise ValueError("it holds control characters")
+    return value
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], kind: str) -> None:
@@ -216,10 +281,30 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], kind: str) -> Non
 
 def read_arrays(path: Path, kind: str) -> dict[str, np.ndarray]:
     """Returns the arrays that `write_arrays` wrote."""
-    with reading(path), np.load(path, allow_pickle=False) as file:
-        content = {name: file[name] for name in file.files}
+    with reading(path), ZipFile(path) as file:
+        content = {}
+        left = LARGEST
+        for name in file.namelist():
+            member = read_member(file, name, left)
+            left -= len(member)
+            content[name.removesuffix(".npy")] = np.lib.format.read_array(io.BytesIO(member))
         check_version(int(content.pop("version")), str(content.pop("kind")), kind)
         return content
+
+
+def read_member(file: ZipFile, name: str, limit: int = LARGEST) -> bytes:
+    """Returns the content of a member of a zip, if it is no longer than the limit [bytes].
+
+    The sizes in the directory of the zip may be wrong, so only a little is unpacked at a time.
+    """
+    parts, size = [], 0
+    with file.open(name) as member:
+        while part := member.read(2**16):
+            parts.append(part)
+            size += len(part)
+            if size > limit:
+                raise BadArtifact(f"its {name} unpacks to more than {limit / 2**20:g} MiB")
+    return b"".join(parts)
 
 
 def write_tensors(path: Path, tensors: dict[str, np.ndarray]) -> None:
@@ -231,4 +316,4 @@ def write_tensors(path: Path, tensors: dict[str, np.ndarray]) -> None:
 def read_tensors(path: Path) -> dict[str, np.ndarray]:
     """Returns the tensors that `write_tensors` wrote."""
     with reading(path):
-        return load_file(path)
+        return load(read_limited(path))

@@ -8,13 +8,14 @@ import os
 import sys
 import textwrap
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from hyrl_mj import __version__, pipeline, progress
 from hyrl_mj.errors import BadInput, HyrlError, unknown
 from hyrl_mj.parsing import call, documented
 from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions
-from hyrl_mj.run_directory import Run, load_run
+from hyrl_mj.run_directory import Run
 from hyrl_mj.tasks import get_task, task_names, write_task
 from hyrl_mj.viz import ReplayOptions, print_robustness, print_summary
 
@@ -129,11 +130,15 @@ def simulate(
         print_summary(pipeline.run_stage(run, "simulate"))
         return
     z0 = run.task.chart.check([start], run.task.name)
-    arcs = noisy_arcs(run, z0, noise, eps, (q0,), time, seed)
-    for name, (arc,) in zip(("policy", "hyrl"), arcs.values(), strict=True):
-        arc.save(run.latest_path(name))
-        end = run.task.chart.format(arc.z[-1])
-        print(f"{name:7} {arc.outcome:14} t = {arc.t[-1]:.2f} s, {arc.j[-1]} jumps, {end}")
+
+    def work(run: Run) -> None:
+        arcs = noisy_arcs(run, z0, noise, eps, (q0,), time, seed)
+        for name, (arc,) in zip(("policy", "hyrl"), arcs.values(), strict=True):
+            arc.save(run.latest_path(name))
+            end = run.task.chart.format(arc.z[-1])
+            print(f"{name:7} {arc.outcome:14} t = {arc.t[-1]:.2f} s, {arc.j[-1]} jumps, {end}")
+
+    pipeline.as_stage(run, "simulate --start", work)
     print(f"saved as {run.path / 'arcs'}/latest_*.npz")
 
 
@@ -148,7 +153,7 @@ def robustness(run: Run, options: ExamineOptions) -> None:
             option = "--noise" if options.noise else "--near-critical"
             raise BadInput(f"{option} is about the episodes: say how many, as in --episodes 100000")
     pipeline.examine_run(run, options)
-    print_robustness(load_run(run.path))
+    print_robustness(replace(run))
     print(f"pictures in {run.path / 'figures'}")
 
 
@@ -176,13 +181,21 @@ def replay(
     from hyrl_mj.viz.arcs import replay_floor, replay_shows
     from hyrl_mj.viz.replay import render_replay
 
+    usual_out = run.path / "replay.mp4"
     usual = ReplayOptions(camera=options.camera, size=options.size, fps=options.fps)
     if out is None and (starts, noise, eps, options) != ("critical", None, None, usual):
         # The report describes replay.mp4 as a run makes it.
         raise BadInput("another replay than that of the run needs an --out, as in --out mine.mp4")
-    out = out or run.path / "replay.mp4"
-    shows = replay_shows(run, starts, noise, eps)
-    render_replay(run.task, shows, out, options, floor=replay_floor(run))
+
+    def work(run: Run) -> None:
+        shows = replay_shows(run, starts, noise, eps)
+        render_replay(run.task, shows, out or usual_out, options, floor=replay_floor(run))
+
+    if out is None:
+        pipeline.as_stage(run, "replay", work)
+    else:
+        work(run)
+    out = out or usual_out
     print(f"{'picture' if out.suffix == '.png' else 'video'} at {out}")
 
 
@@ -214,9 +227,11 @@ def report(run: Run, *, out: Path | None = None) -> None:
     """
     from hyrl_mj.viz.report import write_report
 
-    out = out or run.path / "report.html"
-    write_report(run, out)
-    print(f"page at {out}")
+    if out is None:
+        pipeline.run_stage(run, "report")
+    else:
+        write_report(run, out)
+        print(f"page at {out}")
 
 
 def export(run: Run, *, to: str, out: Path) -> None:

@@ -7,9 +7,15 @@ from numbers import Integral, Real
 
 
 class HyrlError(Exception):
-    """Base of every error that the package raises on purpose."""
+    """Base of every error that the package raises on purpose.
+
+    Control characters in its text, which may come from a file, are written as escapes.
+    """
 
     exit_status = 1
+
+    def __init__(self, text: object = "") -> None:
+        super().__init__(printable(str(text)))
 
 
 class BadInput(HyrlError, ValueError):
@@ -24,6 +30,11 @@ class BadArtifact(BadInput):
 
 class NoRenderer(HyrlError):
     """Off-screen rendering or video encoding is not possible on this machine."""
+
+
+def printable(text: str) -> str:
+    """Returns a text that cannot control a terminal: other characters than printable ones are escaped."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def unknown(what: str, value: object, allowed: Iterable[str]) -> BadInput:

@@ -48,6 +48,7 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 FLAG = Kind("", "no value", bool, lambda default: "off")
+RUN = Kind("RUN", "a run directory", Path)
 SEVERAL = Kind("NUMBER ...", "one or more numbers", float)  # the kind that takes several words
 KINDS: dict[Any, Kind] = {
     bool: FLAG,
@@ -56,7 +57,7 @@ KINDS: dict[Any, Kind] = {
     float: Kind("NUMBER", "a number", float, "{:g}".format),
     Path: Kind("PATH", "a path", Path),
     str | Path: Kind("PATH", "a path", Path),
-    Run: Kind("RUN", "a run directory", load_run),
+    Run: RUN,
     tuple[float, ...]: SEVERAL,
     tuple[str, ...]: Kind("NAME,...", "names, separated by commas", _names, ",".join),
     tuple[int, int]: Kind(
@@ -123,6 +124,16 @@ class Argument:
         return values if self.kind is SEVERAL else values[0]
 
 
+# An option of each command that opens a run.
+TASK = Argument(
+    "task",
+    KINDS[Path],
+    None,
+    "the Python file of the run's task, which is executed; by default only a file that you have run before",
+    positional=False,
+)
+
+
 def documented(thing: Any) -> tuple[str, dict[str, str]]:
     """Returns the description in a docstring, and its entries by argument or attribute."""
     text = inspect.getdoc(thing) or ""
@@ -163,6 +174,8 @@ def call(
         BadInput: the words cannot be used.
     """
     every = [*arguments(function)]
+    if any(argument.kind is RUN for argument in every):
+        every.append(TASK)
     options = {argument.title: argument for argument in every if not argument.positional}
     for word, following in pairwise([*words, "--"]):
         option = options.get(word.replace("_", "-"))
@@ -187,6 +200,8 @@ def call(
             keywords[argument.name] = typed if typed is True else argument.read(typed)
         elif argument.default is MISSING:
             raise BadInput(f"{name} needs {argument.title}: {argument.text}")
+    if TASK in every:
+        keywords["run"] = load_run(keywords["run"], task=keywords.pop(TASK.name, None))
     for parameter, kind in get_type_hints(function).items():
         if _has_options(kind):
             inside = [option.name for option in fields(kind) if option.name in keywords]

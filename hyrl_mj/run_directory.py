@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import platform
 from collections.abc import Iterator
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 
@@ -13,13 +16,14 @@ from hyrl_mj import artifacts, policies
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.game import Lattice, Robustness
 from hyrl_mj.learning import Settings, Training
+from hyrl_mj.manifest import FILES, LOCK, Manifest, check_no_links, digest, locked
 from hyrl_mj.policies import Agent, AnyPolicy, MlpPolicy, Policy
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.stages import CriticalSet, ExtendedSets, HybridController, Partition
-from hyrl_mj.tasks import Task, get_task
+from hyrl_mj.tasks import Task, described_task, get_task, reference
 
 # The packages whose versions `config.json` records.
-PACKAGES = ("mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "mediapy")
+PACKAGES = ("hyrl-mj", "mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "mediapy")
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,31 @@ class Run:
     @cached_property
     def task(self) -> Task:
         """The task."""
-        return get_task(self.settings.task)
+        return described_task(self.settings.task)
+
+    @cached_property
+    def manifest(self) -> Manifest:
+        """The record of the stages that are finished."""
+        values = asdict(self.settings)
+        del values["task"]
+        last = {stage: values | {"horizon": None} for stage in FILES} | {"extended-sets": values}
+        texts = {stage: json.dumps(v, sort_keys=True, default=str) for stage, v in last.items()}
+        return Manifest(
+            self.path, {n: sha256(text.encode()).hexdigest() for n, text in texts.items()}
+        )
+
+    @property
+    def code(self) -> str:
+        """SHA-256 of the files that define a task of the user's; "" for a task of an installed package."""
+        source = self.task.source
+        return "" if source is None else digest(source, self.task.model_path)
+
+    def stage(self, name: str) -> AbstractContextManager[None]:
+        """Returns the block in which a stage reads its inputs from this run, and writes its files.
+
+        A run remembers what it has read, so a stage takes a run of its own.
+        """
+        return self.manifest.stage(name, self.code)
 
     @property
     def agent(self) -> Agent | None:
@@ -73,7 +101,9 @@ class Run:
     def policy(self) -> Policy:
         """The policy of stage 1, or the agent."""
         if self.agent is None:
-            return self._load_policy("policy.safetensors")
+            return self._load_policy("policy")
+        for path in self.policy_files:
+            self.manifest.checked(path)
         seed, function = self.settings.seed, self.function
         return policies.reopen_agent(self.path, self.agent, self.task, seed, function)
 
@@ -112,38 +142,32 @@ class Run:
     @cached_property
     def critical_set(self) -> CriticalSet:
         """M*, from stage 2."""
-        return CriticalSet.load(self.path / "critical_set.npz")
+        return CriticalSet.load(self._checked("critical_set.npz"))
 
     @cached_property
     def partition(self) -> Partition:
         """The parts M_i, from stage 3."""
-        return Partition.load(self.path / "partition.npz", self.task)
+        return Partition.load(self._checked("partition.npz"), self.task)
 
     @cached_property
     def split(self) -> Partition:
         """The parts that stage 5 extends: M_i, for an agent changed where they leave no room."""
-        return self.partition if self.agent is None else Partition.load(self.split_path, self.task)
-
-    @property
-    def split_path(self) -> Path:
-        """The file of `split` for an agent."""
-        return self.path / "split.npz"
-
-    @property
-    def set_files(self) -> list[Path]:
-        """The files of stage 5."""
-        return [self.path / "extended_sets.npz", *[self.split_path] * (self.agent is not None)]
+        return (
+            self.partition
+            if self.agent is None
+            else Partition.load(self._checked("split.npz"), self.task)
+        )
 
     @cached_property
     def extended_sets(self) -> ExtendedSets:
         """The extended sets M_ext_i, from stage 5."""
-        return ExtendedSets.load(self.path / "extended_sets.npz", self.task)
+        return ExtendedSets.load(self._checked("extended_sets.npz"), self.task)
 
     @cached_property
     def controller(self) -> HybridController:
         """The hybrid controller, from stage 7."""
         extended, starts = self.extended_sets, None
-        mode_policies = {q: self._load_policy(f"mode_{q}.safetensors") for q in extended.modes}
+        mode_policies = {q: self._load_policy(f"mode_{q}") for q in extended.modes}
         flow_sets = dict(zip(extended.modes, extended.sets, strict=True))
         if self.agent is not None:
             # The flow sets of an agent may reach farther to one side of its decision than to the other.
@@ -158,7 +182,7 @@ class Run:
     @cached_property
     def robustness(self) -> Robustness:
         """The result of the examination under noise, from `robustness.json`."""
-        return Robustness.load(self.path / "robustness.json")
+        return Robustness.load(self._checked("robustness.json"))
 
     @cached_property
     def versions(self) -> dict[str, str]:
@@ -178,7 +202,7 @@ class Run:
 
     def arc(self, path: Path) -> HybridArc:
         """Reads an arc; raises `BadArtifact` if it is damaged, or of another task than the run's."""
-        arc = HybridArc.load(path)
+        arc = HybridArc.load(self.manifest.checked(path))
         if arc.task != self.task.name:
             raise BadArtifact(
                 f"{path} is an arc of {arc.task}, {self.path} a run of {self.task.name}: "
@@ -190,26 +214,29 @@ class Run:
         """Returns the file of the latest simulation from the user's own start."""
         return self.path / "arcs" / f"latest_{controller}.npz"
 
-    def _load_policy(self, name: str) -> MlpPolicy:
-        task = self.task  # first: the file of a user's task registers its name
-        policy = MlpPolicy.load(self.path / name)
-        if policy.task.name != task.name:
-            raise BadArtifact(
-                f"{self.path} is a run of {task.name}, but holds a policy for "
-                f"{policy.task.name}: run the stage that writes it again"
-            )
-        return policy
+    def _checked(self, name: str) -> Path:
+        """Returns the path of a file, if it is to be believed."""
+        return self.manifest.checked(self.path / name)
+
+    def _load_policy(self, stem: str) -> MlpPolicy:
+        self._checked(f"{stem}.json")
+        return MlpPolicy.load(self._checked(f"{stem}.safetensors"), self.task)
 
 
-def load_run(path: str | Path, policy: AnyPolicy | None = None) -> Run:
-    """Opens a run directory.
+def load_run(
+    path: str | Path, policy: AnyPolicy | None = None, task: str | Path | None = None
+) -> Run:
+    """Opens a run directory. No code runs but that of installed packages.
 
     Args:
         path: the directory.
         policy: the agent of the run, if it is a function, which no file can hold.
+        task: the Python file that defines the task, if the task is the user's and this machine has not run
+            it before. The file is executed.
 
     Raises:
-        BadArtifact: the directory holds no run.
+        BadArtifact: the directory holds no run, or a link.
+        BadInput: the task is in a file that must be named first.
     """
     path = Path(path)
     config = path / "config.json"
@@ -217,7 +244,11 @@ def load_run(path: str | Path, policy: AnyPolicy | None = None) -> Run:
         raise BadArtifact(
             f"{path} is not a run directory (no config.json): make one with hyrl-mj run TASK --out DIR"
         )
-    return Run(path, Config.load(config).settings, policy)
+    check_no_links(path)
+    settings = Config.load(config).settings
+    if task is not None:
+        settings = replace(settings, task=reference(get_task(task)))
+    return Run(path, settings, policy)
 
 
 def write_config(run: Run) -> None:
@@ -244,24 +275,33 @@ def _brief(setting: object) -> str:
     return f"training with {setting.algorithm}" if isinstance(setting, Training) else str(setting)
 
 
-def open_or_create(path: str | Path, settings: Settings, policy: AnyPolicy | None = None) -> Run:
-    """Opens the run directory at `path` with these settings, or creates it; `policy` is as in `load_run`.
+@contextmanager
+def opened(path: str | Path, settings: Settings, policy: AnyPolicy | None = None) -> Iterator[Run]:
+    """Opens the run directory at `path` with these settings, or creates it, and holds its lock in the block.
+
+    `policy` is as in `load_run`.
 
     Raises:
-        BadInput: the directory holds a run with other settings; the message names them.
+        BadInput: another process works there, or the directory holds a run with other settings; the message
+            names them.
     """
     path = Path(path)
-    if (path / "config.json").exists():
-        run = load_run(path, policy)
-        if run.settings != settings:
+    if path.exists() and not (path.is_dir() and _may_hold_run(path)):
+        raise BadInput(f"{path} exists and is not a run directory: choose another --out")
+    with locked(path):
+        run = Run(path, settings, policy)
+        if not (path / "config.json").exists():
+            write_config(run)
+        elif (run := load_run(path, policy)).settings != settings:
             differing = "; ".join(_differing(run.settings, settings))
             raise BadInput(
                 f"{path} holds a run with other settings ({differing}): "
                 "choose another --out, give the same settings, or remove it"
             )
-        return run
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise BadInput(f"{path} exists and is not a run directory: choose another --out")
-    run = Run(path, settings, policy)
-    write_config(run)
-    return run
+        yield run
+
+
+def _may_hold_run(folder: Path) -> bool:
+    """Returns whether a folder holds a run, or nothing."""
+    names = {path.name for path in folder.iterdir()}
+    return "config.json" in names or not names - {LOCK}

@@ -3,14 +3,15 @@
 `run`, `robustify` and `diagnose` make a whole run; `run_stage` runs one stage again from the files on disk.
 """
 
-from hyrl_mj.pipeline.examination import ExamineOptions, examine_run
+from hyrl_mj.pipeline.examination import ExamineOptions
 from hyrl_mj.pipeline.runs import AgentOptions, RunOptions, diagnose, extend_again, robustify, run
-from hyrl_mj.pipeline.steps import run_stage
+from hyrl_mj.pipeline.steps import as_stage, examine_run, run_stage
 
 __all__ = [
     "AgentOptions",
     "ExamineOptions",
     "RunOptions",
+    "as_stage",
     "diagnose",
     "examine_run",
     "extend_again",

@@ -45,22 +45,11 @@ class ExamineOptions:
     seed: int = 0
 
 
-def examine_run(
-    run: Run, options: ExamineOptions = ExamineOptions(), say: Say = print
-) -> Robustness:
-    """Examines policy and hybrid controller under noise, and writes `robustness.json` with its figures.
+USUAL = ExamineOptions()
 
-    The exact game is played where possible; noisy episodes are added on request, or replace the game. All
-    files are written at the end.
 
-    Args:
-        run: a run with its mode policies.
-        options: what to examine. The scores are for no noise, half the bound, and the bound.
-        say: receives the result in a line.
-
-    Raises:
-        BadInput: a value that cannot be used.
-    """
+def examine_stage(run: Run, say: Say, options: ExamineOptions = USUAL) -> None:
+    """Examines policy and hybrid controller under noise; all files are written at the end."""
     robustness, maps = examine_loops(run, run.loops, run.split, options)
     if maps is not None:
         draw_robustness(run, robustness, maps, run.path / "figures")
@@ -69,14 +58,13 @@ def examine_run(
     if run.agent and run.agent.stochastic:
         say("the policy draws its inputs: noisy episodes stand in for the worst case")
     say(robustness_sentence(robustness))
-    return robustness
 
 
 def examine_loops(
     run: Run,
     loops: dict[str, Controller],
     partition: Partition,
-    options: ExamineOptions = ExamineOptions(),
+    options: ExamineOptions = USUAL,
 ) -> tuple[Robustness, Maps | None]:
     """Examines controllers by name, and returns the result, and the maps if the game was played.
 

@@ -6,17 +6,19 @@ the end of an entry is the default that `--help` shows.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from hyrl_mj.errors import BadArtifact, BadInput, unknown
+from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.learning import Settings, Training, preset
-from hyrl_mj.pipeline.steps import DIAGNOSIS, STAGES, Stage, extended_sets_stage, run_stage
-from hyrl_mj.policies import ALGORITHMS, FUNCTION, AnyPolicy, read_agent
+from hyrl_mj.manifest import locked
+from hyrl_mj.pipeline.steps import DIAGNOSIS, STAGES, extended_sets_stage, run_stage
+from hyrl_mj.policies import ALGORITHMS, FUNCTION, AnyPolicy, algorithms, read_agent
 from hyrl_mj.progress import Say
-from hyrl_mj.run_directory import Run, load_run, open_or_create, write_config
+from hyrl_mj.run_directory import Run, load_run, opened, write_config
 from hyrl_mj.tasks import Task, check_task, get_task
 from hyrl_mj.viz import beginning
 
@@ -117,7 +119,10 @@ def run(
         from hyrl_mj.learning.training import check_foreign
 
         check_foreign(checked, settings.stage1)
-    return _run_all(open_or_create(options.out or Path("runs") / checked.name, settings), say)
+    if options.algorithm is not None:
+        algorithms.remember(options.algorithm)
+    with opened(options.out or Path("runs") / checked.name, settings) as run:
+        return _run_all(run, say)
 
 
 def robustify(
@@ -141,7 +146,8 @@ def robustify(
     Raises:
         BadInput: a value or an agent that cannot be used.
     """
-    return _run_all(_with_agent(task, policy, complete(AgentOptions, options, changes)), say)
+    with _with_agent(task, policy, complete(AgentOptions, options, changes)) as run:
+        return _run_all(run, say)
 
 
 def diagnose(
@@ -160,42 +166,30 @@ def diagnose(
     Raises:
         BadInput: a value or an agent that cannot be used.
     """
-    run = _with_agent(task, policy, complete(AgentOptions, options, changes))
-    return _run_all(run, say, DIAGNOSIS)
+    with _with_agent(task, policy, complete(AgentOptions, options, changes)) as run:
+        return _run_all(run, say, DIAGNOSIS)
 
 
 def extend_again(run: Run, horizon: float, say: Say = print) -> Run:
     """Runs stages 4 and 5 with another horizon T [s], and writes T to `config.json` if they succeed."""
     changed = Run(run.path, replace(run.settings, horizon=horizon), run.function)
-    extended_sets_stage(changed, lambda text: say(f"extended-sets: {text}"))
-    write_config(changed)
-    say(f"go on with {beginning(changed.settings, run.path)}")
+    with locked(run.path):
+        with changed.stage("extended-sets"):
+            extended_sets_stage(changed, lambda text: say(f"extended-sets: {text}"))
+        write_config(changed)
+    say(f"go on with {beginning(changed, run.path)}")
     return load_run(run.path, run.function)
 
 
-def done(run: Run, index: int, stages: Sequence[Stage] = STAGES) -> bool:
-    """Returns whether a stage's files exist and are no older than those of the stages before it."""
-    try:
-        outputs = [stage.outputs(run) for stage in stages[: index + 1]]
-    except BadArtifact:  # the outputs depend on an earlier stage that is not done
-        return False
-    if not all(path.is_file() for paths in outputs for path in paths):
-        return False
-    if run.task.source is not None:  # after a change in a user's robot, training starts again
-        outputs = [[run.task.source, run.task.model_path], *outputs]
-    times = [[path.stat().st_mtime_ns for path in paths] for paths in outputs]
-    return min(times[-1]) >= max((t for earlier in times[:-1] for t in earlier), default=0)
-
-
-def _run_all(run: Run, say: Say, stages: Sequence[Stage] = STAGES) -> Run:
+def _run_all(run: Run, say: Say, stages: Iterable[str] = STAGES) -> Run:
     """Runs the stages that are not done."""
-    for index, stage in enumerate(stages):
-        if stage.name == "train" and run.agent:
+    for stage in stages:
+        if stage == "train" and run.agent:
             say(f"train: none, {run.agent} is given")
-        elif done(run, index, stages):
-            say(f"{stage.name}: done before")
+        elif run.manifest.is_done(stage, run.code):
+            say(f"{stage}: done before")
         else:
-            run = run_stage(run, stage.name, say)
+            run = run_stage(run, stage, say)
     return run
 
 
@@ -205,15 +199,17 @@ def _settings(task: Task, options: RunOptions | AgentOptions, **changes: Any) ->
     return preset(task, options.preset, noise=eps, seed=seed, horizon=horizon, **changes)
 
 
-def _with_agent(task: str | Path, policy: AnyPolicy, options: AgentOptions) -> Run:
-    """Returns the run directory of an agent, which then holds the agent."""
+@contextmanager
+def _with_agent(task: str | Path, policy: AnyPolicy, options: AgentOptions) -> Iterator[Run]:
+    """Opens the run directory of an agent, which then holds the agent, and holds its lock in the block."""
     checked = check_task(get_task(task))
     _settings(checked, options)  # a wrong value is reported before the agent is read
     external = read_agent(checked, policy, options.activation, options.stochastic, options.seed)
     settings = _settings(checked, options, agent=external.agent)
     function = external.policy if external.agent.algorithm == FUNCTION else None
     path = options.out or Path("runs") / f"{checked.name}_robust"
-    run = open_or_create(path, settings, function)
-    if not done(run, 0):
-        external.store(run.path)
-    return run
+    with opened(path, settings, function) as run:
+        if not run.manifest.is_done("train", run.code):
+            with run.stage("train"):
+                external.store(run.path)
+        yield run

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
 from hyrl_mj.errors import BadInput, NoRenderer, unknown
-from hyrl_mj.game import Lattice, Limit
-from hyrl_mj.pipeline.examination import draw_robustness, examine_loops, examine_run
-from hyrl_mj.policies import Agent, MlpPolicy, PolicyController
+from hyrl_mj.game import Lattice, Limit, Robustness
+from hyrl_mj.pipeline.examination import (
+    USUAL,
+    ExamineOptions,
+    draw_robustness,
+    examine_loops,
+    examine_stage,
+)
+from hyrl_mj.policies import Agent, MlpPolicy, PolicyController, algorithms
 from hyrl_mj.progress import Say
-from hyrl_mj.run_directory import Run, load_run
+from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import Grid
 from hyrl_mj.stages import boundary, extend, find_critical_set, make_partition, with_room
 from hyrl_mj.viz import replay_sentence
@@ -30,6 +35,7 @@ def train_stage(run: Run, say: Say) -> None:
             f"{run.path} holds a run on the agent {s.stage1.source}: there is nothing to train; for another "
             "agent, use hyrl-mj robustify with another --policy and another --out"
         )
+    algorithms.check_named(s.stage1.algorithm)
     log_dir = run.path / "logs" / "stage1"
     policy = train(run.task, s.stage1, s.seed, log_dir=log_dir, label="stage 1")
     policy.save(run.path / "policy.safetensors")
@@ -62,7 +68,7 @@ def extended_sets_stage(run: Run, say: Say) -> None:
             split = with_room(task, run.steady, split, ways, s.noise)
             ways = Limit.of(lattice, split)
             points = boundary(split)
-        split.save(run.split_path)
+        split.save(run.path / "split.npz")
     sets = extend(task, run.steady, points, split, s.noise, s.horizon, ways)
     sets.save(run.path / "extended_sets.npz")
     say(sets.sentence(task))
@@ -73,6 +79,7 @@ def retrain_stage(run: Run, say: Say) -> None:
     from hyrl_mj.stages.retraining import mode_ground, retrain, start_policy
 
     s, sets = run.settings, run.extended_sets
+    algorithms.check_named(s.stage6.algorithm)
     policies: dict[int, MlpPolicy] = {}
     warm_start = partial(start_policy, run.steady, run.partition)
     for q in sets.modes:
@@ -83,20 +90,7 @@ def retrain_stage(run: Run, say: Say) -> None:
         )
     for q, policy in policies.items():
         policy.save(run.path / f"mode_{q}.safetensors")
-    remove_others(run.path.glob("mode_*"), mode_paths(run))
     say(f"policies of {len(policies)} modes")
-
-
-def mode_paths(run: Run) -> list[Path]:
-    """Returns the files of the mode policies."""
-    suffixes = (".safetensors", ".json")
-    return [run.path / f"mode_{q}{suffix}" for q in run.extended_sets.modes for suffix in suffixes]
-
-
-def remove_others(paths: Iterable[Path], wanted: Iterable[Path]) -> None:
-    """Removes the files of an earlier run of a stage, with other modes or starts."""
-    for path in set(paths) - set(wanted):
-        path.unlink()
 
 
 def simulate_stage(run: Run, say: Say) -> None:
@@ -106,8 +100,6 @@ def simulate_stage(run: Run, say: Say) -> None:
     arcs, paths = replay_arcs(run), run.arc_paths()
     for key, arc in arcs.items():
         arc.save(paths[key])
-    folder = run.path / "arcs"
-    remove_others(folder.glob("*.npz"), [*paths.values(), *folder.glob("latest_*.npz")])
     say(f"{len(arcs)} arcs; {replay_sentence(run, arcs)}")
 
 
@@ -118,14 +110,6 @@ def figures_stage(run: Run, say: Say) -> None:
     folder = run.path / "figures"
     drawn = figures.draw_all(figures.shown_run(run), folder)
     say(f"{', '.join(drawn)} in {folder}, as PNG and PDF")
-
-
-def figure_paths(run: Run) -> list[Path]:
-    """Returns the files that `figures_stage` writes."""
-    from hyrl_mj.viz import figures
-
-    folder, names = run.path / "figures", figures.names(run.task, figures.ShownRun)
-    return [folder / f"{name}{suffix}" for name in names for suffix in (".png", ".pdf")]
 
 
 def replay_stage(run: Run, say: Say) -> None:
@@ -167,45 +151,60 @@ def diagnose_stage(run: Run, say: Say) -> None:
     say(f"page at {run.path / diagnosis.PAGE}")
 
 
-@dataclass(frozen=True)
-class Stage:
-    """One step of the pipeline: its function, and the files whose age tells whether it is done."""
-
-    name: str
-    work: Callable[[Run, Say], object]
-    outputs: Callable[[Run], list[Path]]
-
-
-def _file(name: str) -> Callable[[Run], list[Path]]:
-    return lambda run: [run.path / name]
-
-
-STAGES = (
-    Stage("train", train_stage, lambda run: run.policy_files),
-    Stage("critical-set", critical_set_stage, _file("critical_set.npz")),
-    Stage("partition", partition_stage, _file("partition.npz")),
-    Stage("extended-sets", extended_sets_stage, lambda run: run.set_files),
-    Stage("retrain", retrain_stage, mode_paths),
-    Stage("robustness", lambda run, say: examine_run(run, say=say), _file("robustness.json")),
-    Stage("simulate", simulate_stage, lambda run: list(run.arc_paths().values())),
-    Stage("figures", figures_stage, figure_paths),
-    Stage("replay", replay_stage, _file("replay.mp4")),
-    Stage("report", report_stage, _file("report.html")),
-)
+# The stages of a run in their order; stages 4 and 5 of the paper are one.
+STAGES: dict[str, Callable[[Run, Say], None]] = {
+    "train": train_stage,
+    "critical-set": critical_set_stage,
+    "partition": partition_stage,
+    "extended-sets": extended_sets_stage,
+    "retrain": retrain_stage,
+    "robustness": examine_stage,
+    "simulate": simulate_stage,
+    "figures": figures_stage,
+    "replay": replay_stage,
+    "report": report_stage,
+}
 # The stages of `diagnose`: the first three, which `robustify` need not run again, and a page.
-DIAGNOSIS = (*STAGES[:3], Stage("diagnose", diagnose_stage, _file("diagnosis.html")))
+DIAGNOSIS = {**dict(list(STAGES.items())[:3]), "diagnose": diagnose_stage}
 
 
 def run_stage(run: Run, name: str, say: Say = print) -> Run:
     """Runs one stage from the files on disk, and returns the run with its result.
 
     Raises:
-        BadInput: an unknown stage.
+        BadInput: an unknown stage, or another process works on the run directory.
     """
-    stages = {stage.name: stage for stage in (*DIAGNOSIS, *STAGES)}
-    if name not in stages:
+    if name not in (stages := DIAGNOSIS | STAGES):
         raise unknown("stage", name, stages)
+    return as_stage(
+        run, name, lambda fresh: stages[name](fresh, lambda text: say(f"{name}: {text}"))
+    )
+
+
+def examine_run(run: Run, options: ExamineOptions = USUAL, say: Say = print) -> Robustness:
+    """Examines policy and hybrid controller under noise, and writes `robustness.json` with its figures.
+
+    The exact game is played where possible; noisy episodes are added on request, or replace the game.
+
+    Args:
+        run: a run with its mode policies.
+        options: what to examine. The scores are for no noise, half the bound, and the bound.
+        say: receives the result in a line.
+
+    Raises:
+        BadInput: a value that cannot be used, or another process works on the run directory.
+    """
+    return as_stage(run, "robustness", partial(examine_stage, say=say, options=options)).robustness
+
+
+def as_stage(run: Run, name: str, work: Callable[[Run], object]) -> Run:
+    """Does the work of a stage on a run, records it, and returns the run with its result.
+
+    Raises:
+        BadInput: another process works on the run directory.
+    """
+    fresh = replace(run)  # it reads every file anew, so that the manifest records what was read
     # The physics uses all cores: BLAS threads would only wait for them.
-    with threadpool_limits(1, user_api="blas"):
-        stages[name].work(run, lambda text: say(f"{name}: {text}"))
-    return load_run(run.path, run.function)
+    with threadpool_limits(1, user_api="blas"), fresh.stage(name):
+        work(fresh)
+    return replace(run)

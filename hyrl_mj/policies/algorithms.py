@@ -7,8 +7,11 @@ import inspect
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.machinery import PathFinder
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hyrl_mj import trust
 from hyrl_mj.errors import BadInput, brief, unknown
 
 if TYPE_CHECKING:
@@ -111,6 +114,31 @@ def sb3_class(name: str) -> type[BaseAlgorithm]:
             "OnPolicyAlgorithm or OffPolicyAlgorithm"
         )
     return algorithm
+
+
+def remember(name: str) -> None:
+    """Records that the user has named an algorithm, so that runs with it can be trained again."""
+    if (source := _source(name)) is not None:
+        trust.remember(source)
+
+
+def check_named(name: str) -> None:
+    """Raises `BadInput` if an algorithm, which a file names, is in a module that the user has not named."""
+    if name in ALGORITHMS:
+        return
+    source = _source(name)
+    if source is None or not trust.is_known(source):
+        raise BadInput(
+            f"the run trains with {name}, from a module that you have not named before, as it is now: if "
+            f"you trust it, name it with hyrl-mj run TASK --algorithm {name}"
+        )
+
+
+def _source(name: str) -> Path | None:
+    """Returns the file of the top-level module of a `module:Class`, without an import of it."""
+    top = name.partition(":")[0].partition(".")[0]
+    spec = PathFinder.find_spec(top, ["", *sys.path]) if name not in ALGORITHMS and top else None
+    return Path(spec.origin) if spec and spec.origin else None
 
 
 def sb3_relative(name: str, levels: int | None) -> str:

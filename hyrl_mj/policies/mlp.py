@@ -16,7 +16,7 @@ from threadpoolctl import ThreadpoolController
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.policies.algorithms import ALGORITHMS, Algorithm
-from hyrl_mj.tasks import Task, get_task
+from hyrl_mj.tasks import Task, get_task, task_names
 
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:
@@ -227,16 +227,29 @@ class MlpPolicy(ObservationPolicy):
         artifacts.write_json(path.with_suffix(".json"), about, kind="policy")
 
     @staticmethod
-    def load(path: Path) -> MlpPolicy:
+    def load(path: Path, task: Task | None = None) -> MlpPolicy:
         """Reads what `save` wrote.
 
+        Args:
+            path: the safetensors file, with its description beside it.
+            task: the task of the policy; by default the one that the description names.
+
         Raises:
-            BadArtifact: a file is missing, truncated, or not a policy of this version.
+            BadArtifact: a file is missing, truncated, or not a policy of this version; or the policy is for
+                another task.
         """
         about = artifacts.read_json(path.with_suffix(".json"), kind="policy")
         weights = artifacts.read_tensors(path)
         with artifacts.reading(path):
-            task = get_task(about["task"])
+            name = about["task"]
+            if task is None:
+                if name not in task_names():
+                    raise BadArtifact(
+                        f"it is for the task {name!r}, which is unknown: give the task"
+                    )
+                task = get_task(name)
+            if name != task.name:
+                raise BadArtifact(f"it is a policy for {name}: {task.name} needs its own")
             return MlpPolicy(task, about["algorithm"], about["activation"], weights)
 
 

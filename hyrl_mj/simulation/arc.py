@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, overload
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -110,42 +109,6 @@ class HybridArc(Saved):
     def at(self, t: float) -> int:
         """Returns the last row at or before a time [s]."""
         return int(np.searchsorted(self.t, t + 1e-9, side="right") - 1)
-
-
-@overload
-def simulate(
-    task: Task,
-    controller: Controller | Policy,
-    z0: Sequence[float],
-    noise: AnyNoise | None = None,
-    q0: int | np.ndarray | None = None,
-    horizon: float | None = None,
-    seed: int = 0,
-) -> HybridArc: ...
-
-
-@overload
-def simulate(
-    task: Task,
-    controller: Controller | Policy,
-    z0: Sequence[Sequence[float]],
-    noise: AnyNoise | None = None,
-    q0: int | np.ndarray | None = None,
-    horizon: float | None = None,
-    seed: int = 0,
-) -> list[HybridArc]: ...
-
-
-@overload
-def simulate(
-    task: Task,
-    controller: Controller | Policy,
-    z0: np.ndarray,
-    noise: AnyNoise | None = None,
-    q0: int | np.ndarray | None = None,
-    horizon: float | None = None,
-    seed: int = 0,
-) -> Any: ...
 
 
 def simulate(

@@ -10,6 +10,7 @@ from types import ModuleType
 
 import gymnasium as gym
 
+from hyrl_mj import trust
 from hyrl_mj.errors import BadInput, brief, unknown
 from hyrl_mj.tasks.base import Task
 
@@ -97,7 +98,9 @@ def get_task(name: str | Path) -> Task:
         BadInput: there is no such task, or its file cannot be used; the message says why.
     """
     if str(name).endswith(".py"):
-        return _instance(_from_file(Path(name)), str(name))
+        task = _instance(_from_file(Path(name)), str(name))
+        trust.remember(Path(name))
+        return task
     name = str(name)
     if name not in _REGISTRY and name in (offered := _offered()):
         _from_entry_point(offered[name])
@@ -110,6 +113,24 @@ def reference(task: Task) -> str:
     """Returns what `get_task` finds a task by in another process: its name, or its file."""
     named = task.source is None or task.name in _INSTALLED
     return task.name if named else str(task.source)
+
+
+def described_task(name: str) -> Task:
+    """Returns the task that a file of a run names, by `reference`; code of unknown origin does not run.
+
+    A task's file is executed only if the user has named it, in this process or before on this machine.
+
+    Raises:
+        BadInput: there is no such task, or it is in a file that the user has not named.
+    """
+    path = Path(name)
+    if name.endswith(".py") and path.resolve() not in _FILES and not trust.is_known(path):
+        raise BadInput(
+            f"the task is defined in {path}, and opening a run executes no file that you have not run "
+            "before, as it is now: if you trust the file, name it with --task FILE, in Python with "
+            "load_run(path, task=FILE)"
+        )
+    return get_task(name)
 
 
 def _offered() -> dict[str, EntryPoint]:

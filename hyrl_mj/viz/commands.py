@@ -6,23 +6,22 @@ import shlex
 from pathlib import Path
 
 from hyrl_mj.game import Robustness
-from hyrl_mj.learning import Settings, preset
-from hyrl_mj.policies import Agent
+from hyrl_mj.learning import preset
+from hyrl_mj.policies import ALGORITHMS
 from hyrl_mj.run_directory import Run
-from hyrl_mj.tasks import get_task
 
 
-def commands(settings: Settings, robustness: Robustness | None) -> list[str]:
+def commands(run: Run, robustness: Robustness | None) -> list[str]:
     """Returns the commands that repeat the run, and its examination if that had options of its own."""
-    r, lines = robustness, [beginning(settings)]
-    if r and (r.episodes or r.everywhere or r.eps != settings.noise):
+    r, lines = robustness, [beginning(run)]
+    if r and (r.episodes or r.everywhere or r.eps != run.settings.noise):
         lines.append(_examination(r))
     return lines
 
 
-def beginning(settings: Settings, out: Path | None = None) -> str:
+def beginning(run: Run, out: Path | None = None) -> str:
     """Returns the command that begins or continues such a run; a call if the agent is not from a file."""
-    s, agent = settings, settings.stage1 if isinstance(settings.stage1, Agent) else None
+    s, agent = run.settings, run.agent
     if agent and not agent.source:
         rest = "" if s.horizon is None else f", horizon={s.horizon}"
         rest += "" if out is None else f", out={str(out)!r}"
@@ -32,7 +31,7 @@ def beginning(settings: Settings, out: Path | None = None) -> str:
         )
     words = ["hyrl-mj", *(["robustify", s.task, *agent.options] if agent else ["run", s.task])]
     words += ["--eps", f"{s.noise}", "--seed", f"{s.seed}", "--preset", s.preset]
-    if not agent and s.stage1.algorithm != get_task(s.task).learning.algorithm:
+    if not agent and s.stage1.algorithm != run.task.learning.algorithm:
         words += ["--algorithm", s.stage1.algorithm]
     if s.horizon is not None:
         words += ["--horizon", f"{s.horizon}"]
@@ -57,9 +56,12 @@ def _examination(robustness: Robustness) -> str:
 
 def changed(run: Run) -> list[str]:
     """Returns the names of the settings that differ from those of this version's preset."""
-    s = run.settings
+    s, algorithm = run.settings, None if run.agent else run.settings.stage1.algorithm
+    known = algorithm is None or algorithm in ALGORITHMS
     again = preset(
         run.task, s.preset, noise=s.noise, seed=s.seed, horizon=s.horizon,
-        agent=run.agent, algorithm=None if run.agent else s.stage1.algorithm,
+        agent=run.agent, algorithm=algorithm if known else None,
     )  # fmt: skip
-    return [n.replace("_", " ") for n, value in vars(s).items() if value != getattr(again, n)]
+    # Another algorithm than SB3's is not imported, so its settings cannot be compared.
+    compared = [name for name in vars(s) if known or name not in ("stage1", "stage6")]
+    return [n.replace("_", " ") for n in compared if getattr(s, n) != getattr(again, n)]

@@ -116,6 +116,6 @@ def write_page(run: Run, robustness: Robustness, arc: HybridArc | None) -> None:
         arc=arc,
         video=film(folder / "worst.mp4"),
         pictures=pictures(folder),
-        command=beginning(run.settings, run.path),
+        command=beginning(run, run.path),
     )
     write(run.path / PAGE, text)

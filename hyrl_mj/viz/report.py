@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -73,8 +73,9 @@ def write_report(run: Run, path: Path) -> None:
 def render(run: Run) -> str:
     """Returns the page as HTML."""
     task = run.task
-    robustness = run.robustness if (run.path / "robustness.json").is_file() else None
-    arcs = run.arcs() if all(path.is_file() for path in run.arc_paths().values()) else None
+    has = run.manifest.has
+    robustness = run.robustness if has(run.path / "robustness.json") else None
+    arcs = run.arcs() if all(map(has, run.arc_paths().values())) else None
     arrived = (
         {who: tables.arrivals(run, arcs, who == "policy") for who in CONTROLLERS} if arcs else None
     )
@@ -87,8 +88,8 @@ def render(run: Run) -> str:
         robustness,
         modes=[task.scene.mode_name(q) for q in run.controller.modes],
         worst=task.noise_on(bool(robustness and robustness.everywhere)),
-        video=film(run.path / "replay.mp4"),
-        pictures=pictures(run.path / "figures"),
+        video=film(run.path / "replay.mp4", has),
+        pictures=pictures(run.path / "figures", has),
         arcs=arcs,
         arrivals=arrived,
         numbers=_numbers(run, robustness, arrived),
@@ -97,7 +98,7 @@ def render(run: Run) -> str:
         table=_texts(vars(run.settings)),
         training=[(name, first.get(name, ""), sixth.get(name, "")) for name in first | sixth],
         versions=run.versions,
-        commands=commands(run.settings, robustness),
+        commands=commands(run, robustness),
         changed=changed(run),
         classes=list(zip(MAP_CLASSES, CLASS_COLOURS, MEANINGS, strict=True)),
     )
@@ -243,20 +244,20 @@ def fill(template: str, run: Run, robustness: Robustness | None, **values: Any) 
     )
 
 
-def film(path: Path) -> Picture | None:
-    """Returns the poster of a replay with its video, or None unless both files exist."""
+def film(path: Path, has: Callable[[Path], bool] = Path.is_file) -> Picture | None:
+    """Returns the poster of a replay with its video, or None unless both files can be shown."""
     poster = path.with_suffix(".png")
-    if not (path.is_file() and poster.is_file()):
+    if not (has(path) and has(poster)):
         return None
     return replace(_picture(poster, "replay", ""), video=_data(path, "video/mp4"))
 
 
-def pictures(folder: Path) -> list[Picture]:
-    """Returns the figures that have been drawn into a folder."""
+def pictures(folder: Path, has: Callable[[Path], bool] = Path.is_file) -> list[Picture]:
+    """Returns the figures in a folder that can be shown."""
     return [
         _picture(path, name.replace("_", " "), entry.caption)
         for name, entry in FIGURES.items()
-        if (path := folder / f"{name}.png").is_file()
+        if has(path := folder / f"{name}.png")
     ]
 
 

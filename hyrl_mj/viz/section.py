@@ -60,7 +60,7 @@ class Section(Task):
         self.scene = replace(scene, starts=starts, policy_starts=policy_starts)
 
     def __getattr__(self, name: str) -> Any:
-        """Returns an attribute of the robot that neither this class nor `Task` defines."""
+        """Returns what neither this class nor `Task` defines: the robot's own."""
         return getattr(object.__getattribute__(self, "whole"), name)
 
     @property

@@ -178,7 +178,7 @@ def _point(z: np.ndarray) -> str:
 
 
 def percent(share: float) -> str:
-    """Returns a share in percent; "100%" stands for exactly 1, and "0%" for exactly 0."""
+    """Returns a share in percent; only 1 is called 100%, and only 0 is called 0%."""
     if share in (0, 1):
         return f"{100 * share:.0f}%"
     text = f"{100 * share:.2f}%"
@@ -204,7 +204,8 @@ def print_summary(run: Run) -> None:
     print_robustness(run)
     print(f"run directory {run.path}")
     for what, name in (("video", "replay.mp4"), ("report", "report.html")):
-        print(f"{what} {run.path / name}" if (run.path / name).is_file() else f"no {what}")
+        path = run.path / name
+        print(f"{what} {path}" if run.manifest.has(path) else f"no {what}")
 
 
 def print_robustness(run: Run) -> None:

@@ -86,7 +86,7 @@ FIGURES = {
 
 
 def names(task: Task, shows: type[ShownPolicy | ShownGame]) -> tuple[str, ...]:
-    """Returns the names of the figures that show a type of value, if the task's chart allows them."""
+    """Returns the names of the figures of a type of value that the task's chart allows."""
     return tuple(
         name
         for name, entry in FIGURES.items()

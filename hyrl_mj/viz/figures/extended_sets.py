@@ -98,7 +98,7 @@ def _enlarge(whole: Axes, near: Axes, shown: ShownRun) -> None:
     whole.add_patch(box)
     for drawn in near.lines:
         drawn.set_clip_on(True)  # marks outside this panel would show beside it
-    # The width is drawn at the middle point of M*.
+    # The width is drawn at the middle one of M*'s points.
     middle = points[np.argsort(points.sum(axis=1))[len(points) // 2]]
     axis = int(np.argmax(task.noise_in_chart(1.0)))
     step = eps * np.eye(2)[axis]

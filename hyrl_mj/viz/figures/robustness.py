@@ -19,7 +19,7 @@ from hyrl_mj.viz.figures.charts import INNER, OUTER, TICK
 from hyrl_mj.viz.figures.shown import ShownGame
 from hyrl_mj.viz.tables import NAMES, percent
 
-# The colours of MAP_CLASSES, in their order. Colour-blind readers can tell them apart, too.
+# Of MAP_CLASSES, in their order; colour-blind readers can tell them apart, too.
 CLASS_COLOURS = ("#7cc0e8", "#f2c530", style.mode_colour(1), "#5c2a6b", style.GREY)
 SENTENCES = dict(enumerate(MAP_CLASSES)) | {
     UNWINNABLE: "not winnable, whatever the controller",
@@ -27,7 +27,7 @@ SENTENCES = dict(enumerate(MAP_CLASSES)) | {
 }
 # Radius of the dots of M*: inside the ring, where they hide no class.
 CRITICAL = 0.6
-# The colours of the curves: ink as the policy's path in the replay, then blue, purple and vermilion.
+# Of the curves: ink as the policy's path in the replay, then blue, purple and vermilion.
 CURVE_COLOURS = (style.POLICY_COLOUR, *(style.mode_colour(i) for i in (0, 2, 1)))
 LIMIT_COLOUR = "#a9dcc9"
 Looks = dict[str, Any]

@@ -20,7 +20,7 @@ from hyrl_mj.viz.figures.style import INK, PALE, PAPER, POLICY_COLOUR, RED, mode
 
 # Radius at which spirals begin; they end at 1.
 CORE = 0.4
-# The legend's label of the end of a run, for outcomes of which "end: outcome" is not clear.
+# What the legend calls the end of a run, by its outcome, where "end: outcome" is not clear.
 ENDS = {"running": "end, not there yet", "out_of_bounds": "end: out of bounds"}
 
 

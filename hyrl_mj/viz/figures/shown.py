@@ -20,9 +20,9 @@ class ShownPolicy:
     """What the figures of a stage-1 policy show.
 
     Attributes:
-        task: the task in its section.
-        algorithm: the algorithm that trained the policy, "DQN".
-        policy: the policy of stage 1; a stochastic one takes its mean or mode.
+        task: in the section.
+        algorithm: that trained the policy, "DQN".
+        policy: of stage 1, at its mean or mode where it is sampled.
         critical: M*.
         partition: the parts M_i.
         noisy: a run under noise, from M* if there is one.
@@ -41,7 +41,7 @@ class ShownPolicy:
 
     @property
     def policy_title(self) -> str:
-        """The policy's name in legends: "RL policy (DQN)"."""
+        """What legends call the policy: "RL policy (DQN)"."""
         return f"RL policy ({self.algorithm})"
 
 
@@ -50,8 +50,8 @@ class ShownRun(ShownPolicy):
     """What the figures of a finished run show: its policy, and its hybrid controller.
 
     Attributes:
-        whole: the task with its whole chart.
-        sets: the extended sets M_ext_i.
+        whole: the task with all of its chart.
+        sets: M_ext_i.
         replays: arcs on the whole chart by start ("start0", ..., "critical") and controller ("policy",
             "hyrl_q0", ...), under the same noise.
     """
@@ -66,7 +66,7 @@ class ShownGame:
     """What the figures of the worst-case game show.
 
     Attributes:
-        task: the task, whose chart has one or two coordinates.
+        task: what was played; its chart has two coordinates, or one.
         critical: M*.
         result: the scores, margins and curves.
         maps: the class of every node.

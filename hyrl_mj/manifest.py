@@ -1,0 +1,269 @@
+"""The manifest of a run directory: which stage wrote each file and from what; and one writer at a time.
+
+A stage is recorded after all of its files are written. A file is believed only if its stage is recorded with
+the present settings, its SHA-256 is the recorded one, and what the stage read has not changed since.
+Modification times mean nothing.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from hyrl_mj import artifacts
+from hyrl_mj.errors import BadArtifact, BadInput
+
+NAME, LOCK = "manifest.json", ".lock"
+# The names of the files that each stage may write: no other file is ever believed or removed.
+PICTURE = r"\.(png|pdf)"
+FILES = {
+    "train": r"policy\.(safetensors|json|onnx)",
+    "critical-set": r"critical_set\.npz",
+    "partition": r"partition\.npz",
+    "diagnose": r"diagnosis\.html|diagnosis/(robustness\.json|worst\.(npz|mp4)|\w+" + PICTURE + ")",
+    "extended-sets": r"(extended_sets|split)\.npz",
+    "retrain": r"mode_\d+\.(safetensors|json)",
+    "robustness": r"robustness\.(json|npz)|figures/robustness_\w+" + PICTURE,
+    "simulate": r"arcs/(start\d+|critical)_(policy|hyrl_q\d+)\.npz",
+    "simulate --start": r"arcs/latest_\w+\.npz",
+    "figures": r"figures/(?!robustness_)\w+" + PICTURE,
+    "replay": r"replay\.(mp4|png)",
+    "report": r"report\.html",
+}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What is recorded of a finished stage.
+
+    Attributes:
+        settings: SHA-256 of the settings that it was made with.
+        code: SHA-256 of the files that define the user's task; "" for a task of an installed package.
+        inputs: SHA-256 of each file that it read; "" for a file that it did without.
+        outputs: SHA-256 of each file that it wrote.
+    """
+
+    settings: str
+    code: str
+    inputs: dict[str, str]
+    outputs: dict[str, str]
+
+
+@dataclass(frozen=True)
+class _Stages:
+    stages: dict[str, Entry]
+
+
+# What the stage at work has read, as `Entry.inputs`.
+_READ: ContextVar[dict[str, str] | None] = ContextVar("read", default=None)
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """The manifest of a run directory, which is read anew for each question.
+
+    Attributes:
+        folder: the run directory.
+        settings: SHA-256 of the present settings, by stage.
+    """
+
+    folder: Path
+    settings: Mapping[str, str]
+
+    @contextmanager
+    def stage(self, stage: str, code: str) -> Iterator[None]:
+        """Records a stage, which reads files with `checked` and writes its own in this block.
+
+        Other files of the stage are removed at the end of the block. A block that writes nothing changes
+        nothing.
+
+        Args:
+            stage: one of `FILES`.
+            code: as in `Entry`.
+
+        Raises:
+            BadInput: another process works on the run directory, or it cannot be written.
+        """
+        with locked(self.folder):
+            written: list[Path] = []
+
+            def before_writing(path: Path) -> None:
+                if re.fullmatch(FILES[stage], self._name(path)):
+                    written.append(path)
+                    entries = self._entries()
+                    if entries.pop(stage, None):  # from now on its files do not belong together
+                        self._write(entries)
+
+            read: dict[str, str] = {}
+            tokens = _READ.set(read), artifacts.before_writing.set(before_writing)
+            try:
+                yield
+            finally:
+                _READ.reset(tokens[0])
+                artifacts.before_writing.reset(tokens[1])
+            if not written:
+                return
+            outputs = {self._name(path): digest(path) for path in written}
+            for path in self.folder.glob("**/*"):
+                name = self._name(path)
+                if re.fullmatch(FILES[stage], name) and name not in outputs:
+                    path.unlink()
+            entry = Entry(self.settings[stage], code, read, outputs)
+            self._write(self._entries() | {stage: entry})
+
+    def is_done(self, stage: str, code: str) -> bool:
+        """Returns whether a stage is finished, with this code, and all of its files are to be believed."""
+        entry = self._entries().get(stage)
+        return (
+            entry is not None
+            and entry.code == code
+            and not any(self._doubt(name) for name in entry.outputs)
+        )
+
+    def checked(self, path: Path) -> Path:
+        """Returns the path of a file of the run directory itself, if the file is to be believed.
+
+        Raises:
+            BadArtifact: it is missing, unfinished, damaged or outdated; the message names its stage.
+        """
+        name = self._name(path)
+        if doubt := self._doubt(name):
+            stage = next(s for s, names in FILES.items() if re.fullmatch(names, name))
+            raise BadArtifact(f"{path} {doubt}: {_remedy(stage, self.folder)}")
+        self._note(name, self._current()[name])
+        return path
+
+    def has(self, path: Path) -> bool:
+        """Returns whether a file that may be left out is there and up to date.
+
+        Raises:
+            BadArtifact: it is damaged.
+        """
+        if (name := self._name(path)) in self._current() and path.is_file():
+            return self.checked(path) == path
+        self._note(name, "")
+        return False
+
+    def _doubt(self, name: str) -> str:
+        """Returns why a file is not to be believed, "" if it is."""
+        path, recorded = self.folder / name, _outputs(self._entries().values())
+        if not path.is_file():
+            return "is missing"
+        if name not in recorded:
+            return "is of a stage that did not finish"
+        if digest(path) != recorded[name]:
+            return "was changed after it was written (its sha256 does not fit)"
+        return "" if name in self._current() else "is older than what it was made from"
+
+    def _current(self) -> dict[str, str]:
+        """Returns the SHA-256 of each file whose settings and inputs have not changed since."""
+        entries = self._entries()
+        current: dict[str, str] = {}
+        for stage in FILES:  # each reads only files of stages before it
+            entry = entries.get(stage)
+            if entry and entry.settings == self.settings[stage]:
+                inputs = entry.inputs.items()
+                if all(current.get(name, "") == content for name, content in inputs):
+                    current |= entry.outputs
+        return current
+
+    def _note(self, name: str, content: str) -> None:
+        """Records that the stage at work has read a file."""
+        if (read := _READ.get()) is not None:
+            read[name] = content
+
+    def _name(self, path: Path) -> str:
+        return path.relative_to(self.folder).as_posix() if path.is_relative_to(self.folder) else ""
+
+    def _entries(self) -> dict[str, Entry]:
+        path = self.folder / NAME
+        if not path.is_file():
+            return {}
+        remedy = "remove it, and all stages run again"
+        stages = artifacts.read_record(path, "manifest", _Stages, remedy).stages
+        for stage, entry in stages.items():
+            for name in entry.outputs:
+                if stage not in FILES or not re.fullmatch(FILES[stage], name):
+                    raise BadArtifact(f"{path}: no stage {stage!r} writes {name!r}: {remedy}")
+        return stages
+
+    def _write(self, entries: dict[str, Entry]) -> None:
+        artifacts.write_json(self.folder / NAME, _Stages(entries), kind="manifest")
+
+
+def digest(*paths: Path) -> str:
+    """Returns the SHA-256 of the content of files."""
+    content = sha256()
+    for path in paths:
+        content.update(path.read_bytes())
+    return content.hexdigest()
+
+
+def _outputs(entries: Iterable[Entry]) -> dict[str, str]:
+    """Returns the recorded SHA-256 of all files that stages wrote."""
+    return {name: content for entry in entries for name, content in entry.outputs.items()}
+
+
+def _remedy(stage: str, folder: Path) -> str:
+    if stage == "simulate --start":
+        return f"simulate it again with hyrl-mj simulate {folder} --start ..."
+    return (
+        f"run the stage that writes it again, with hyrl-mj {stage} {folder} or by resuming the run"
+    )
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Holds the lock of a run directory, which one thread of one process can hold, more than once.
+
+    Raises:
+        BadInput: another process or thread works there; the message says which and since when.
+    """
+    path = folder.resolve() / LOCK
+    lock = FileLock(path, is_singleton=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock.acquire(blocking=False)
+    except Timeout:
+        holder = ""
+        with suppress(OSError, ValueError):
+            holder = f" ({path.read_text(encoding='utf-8').strip()})"
+        raise BadInput(
+            f"another process is working on {folder}{holder}: wait until it ends, or choose another "
+            "run directory"
+        ) from None
+    except OSError as error:
+        raise BadInput(
+            f"{folder} cannot be written ({error.strerror or error}): give a place that can be "
+            "written and has room"
+        ) from error
+    try:
+        if lock.lock_counter == 1:
+            since = time.strftime("%Y-%m-%d %H:%M:%S")
+            with suppress(OSError):
+                path.write_text(f"process {os.getpid()}, since {since}\n", encoding="utf-8")
+            for left in folder.glob("**/.*"):  # by a process that was killed
+                if artifacts.TEMPORARY.fullmatch(left.name):
+                    left.unlink(missing_ok=True)
+        yield
+    finally:
+        lock.release()
+
+
+def check_no_links(folder: Path) -> None:
+    """Raises `BadArtifact` if a run directory holds a link, which would lead out of it."""
+    for root, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            if (path := Path(root, name)).is_symlink():
+                raise BadArtifact(
+                    f"{path} is a link, and a run directory holds none: put the file itself there"
+                )

@@ -1,0 +1,61 @@
+"""The code of the user's that this machine has run: only such code is loaded without being named again.
+
+A run directory names the file of its task. Opening a directory from a stranger must not run that file, and
+opening a run of one's own should not ask for it each time. So whenever the user names a file, its path and
+SHA-256 are recorded outside all run directories.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from contextlib import suppress
+from hashlib import sha256
+from pathlib import Path
+
+from hyrl_mj.artifacts import replacing
+from hyrl_mj.errors import BadInput
+
+
+def store() -> Path | None:
+    """Returns the file of the records, after the XDG base directories; None without a home directory."""
+    if state := os.environ.get("XDG_STATE_HOME"):
+        return Path(state) / "hyrl_mj" / "code.json"
+    try:
+        return Path.home() / ".local" / "state" / "hyrl_mj" / "code.json"
+    except RuntimeError:
+        return None
+
+
+def remember(path: Path) -> None:
+    """Records that the user has named this file of code; without a place for records, nothing is kept."""
+    file, records = store(), _records()
+    entry = {str(path.resolve()): _digest(path)}
+    if file is None or records | entry == records:
+        return
+    with suppress(BadInput), replacing(file) as temporary:
+        temporary.write_text(json.dumps(records | entry, indent=2) + "\n", encoding="utf-8")
+
+
+def is_known(path: Path) -> bool:
+    """Returns whether this machine has run the file, as it is now, because the user named it."""
+    digest = _digest(path)
+    return digest is not None and _records().get(str(path.resolve())) == digest
+
+
+def _records() -> dict[str, str | None]:
+    """Returns the hashes of the files by path; none where the records are missing or damaged."""
+    file = store()
+    try:
+        content = json.loads(file.read_text(encoding="utf-8")) if file else {}
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _digest(path: Path) -> str | None:
+    """Returns the SHA-256 of a file, None if it cannot be read."""
+    try:
+        return sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return None
