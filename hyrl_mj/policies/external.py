@@ -115,7 +115,8 @@ def load_agent(
     that `MlpPolicy.save` wrote, with its description beside it.
 
     Args:
-        path, task: the file, and the task on which the policy acts.
+        path: the file.
+        task: the task on which the policy acts.
         activation: the function between the layers, one of `hyrl_mj.policies.ACTIVATIONS`, for a zip that
             does not name it; by default SB3's: "tanh" for PPO and A2C, "relu" for the others.
         stochastic: draw from the policy's distribution instead of acting by its mean or mode (PPO, A2C,
