@@ -118,15 +118,14 @@ def _json(content: dict[str, Any]) -> str:
     return json.dumps(content | {"sha256": own}, indent=2) + "\n"
 
 
-def read_json(path: Path, kind: str, remedy: str = REMEDY) -> dict[str, Any]:
-    """Returns the content that `write_json` wrote, as nested dictionaries and lists."""
-    return _read_json(path, kind, remedy, lambda content: content)
-
-
-def _read_json(
-    path: Path, kind: str, remedy: str, parse: Callable[[dict[str, Any]], Record]
+def read_json(
+    path: Path, kind: str, parse: Callable[[dict[str, Any]], Record], remedy: str = REMEDY
 ) -> Record:
-    """Returns what `parse` makes of the content of a JSON file."""
+    """Returns what `parse` makes of the nested dictionaries and lists that `write_json` wrote.
+
+    Raises:
+        BadArtifact: the file is missing or damaged, or `parse` refuses its content.
+    """
     with reading(path, remedy):
         text = read_limited(path, LARGEST_JSON).decode()
         whole = json.loads(text)
@@ -162,7 +161,7 @@ def read_record(path: Path, kind: str, record: type[Record], remedy: str = REMED
     Raises:
         BadArtifact: the file is missing or damaged, or a field does not fit; the message names the field.
     """
-    return _read_json(path, kind, remedy, lambda content: parsed(content, record, remedy))
+    return read_json(path, kind, lambda content: parsed(content, record, remedy), remedy)
 
 
 def parsed(content: Mapping[str, Any], record: type[Record], remedy: str = REMEDY) -> Record:

@@ -256,6 +256,9 @@ def locked(folder: Path) -> Iterator[None]:
                     left.unlink(missing_ok=True)
         yield
     finally:
+        if lock.lock_counter == 1:
+            with suppress(OSError):
+                path.write_text("", encoding="utf-8")  # a finished run directory is always the same
         lock.release()
 
 

@@ -1,5 +1,6 @@
 """Planted truths: policies whose critical set is known, and a task in three dimensions."""
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -7,6 +8,8 @@ import mujoco
 import numpy as np
 
 from hyrl_mj.chart import Chart
+from hyrl_mj.manifest import FILES, Entry, digest
+from hyrl_mj.run_directory import load_run
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.critical_set import CriticalSet
 from hyrl_mj.stages.hybrid import HybridController
@@ -258,3 +261,17 @@ def sphere_policy(task, radius):
         return np.where(r >= radius, 1.0, -1.0) * z / np.maximum(r, 0.05)
 
     return ChartPolicy(task, rule)
+
+
+def believe(path, task=None):
+    """Records the files of a run directory as they are now, as if its stages had just written them."""
+    run = load_run(path)
+    code = run.code if task is None else ""
+    files = {p.relative_to(path).as_posix(): digest(p) for p in path.rglob("*") if p.is_file()}
+    run.manifest._write(
+        {
+            stage: Entry(run.manifest.settings[stage], code, {}, outputs)
+            for stage, names in FILES.items()
+            if (outputs := {n: content for n, content in files.items() if re.fullmatch(names, n)})
+        }
+    )

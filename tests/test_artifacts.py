@@ -36,7 +36,7 @@ def write(kind, path):
 def read(kind, path, what="thing"):
     if kind == "npz":
         return artifacts.read_arrays(path, what)
-    return artifacts.read_json(path, what) if kind == "json" else artifacts.read_tensors(path)
+    return artifacts.read_json(path, what, dict) if kind == "json" else artifacts.read_tensors(path)
 
 
 @pytest.fixture(params=["npz", "json", "safetensors"])
@@ -118,7 +118,7 @@ def test_json_that_is_not_ours(tmp_path, text):
     path = tmp_path / "a.json"
     path.write_text(text)
     with pytest.raises(BadArtifact) as caught:
-        artifacts.read_json(path, "thing")
+        artifacts.read_json(path, "thing", dict)
     assert_one_sentence_about(caught, path)
 
 
@@ -137,7 +137,7 @@ def test_another_version_is_named(tmp_path):
     path = tmp_path / "a.json"
     path.write_text(json.dumps({"kind": "thing", "version": 99}))
     with pytest.raises(BadArtifact, match=r"version 99.*reads version 1") as caught:
-        artifacts.read_json(path, "thing")
+        artifacts.read_json(path, "thing", dict)
     assert_one_sentence_about(caught, path)
     np.savez(tmp_path / "a.npz", kind=np.array("thing"), version=np.array(99))
     with pytest.raises(BadArtifact, match="version 99"):

@@ -2,20 +2,20 @@
 
 import os
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from planted import circle_policy
 
 import hyrl_mj
-from hyrl_mj import BadInput
+from hyrl_mj import BadArtifact, BadInput
 from hyrl_mj.pipeline import ExamineOptions, examine_run, extend_again, run_stage
-from hyrl_mj.pipeline.runs import done
 from hyrl_mj.pipeline.steps import STAGES
 
 pytestmark = pytest.mark.slow  # a planted run goes through all later stages
 
-NAMES = [stage.name for stage in STAGES]
+NAMES = [*STAGES]
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def contents(path):
 
 
 def stages_done(run):
-    return [name for i, name in enumerate(NAMES) if done(run, i)]
+    return [name for name in NAMES if run.manifest.is_done(name, run.code)]
 
 
 # ---- whole runs
@@ -55,19 +55,32 @@ def test_what_the_stages_leave(planted_circle):
 
 
 def test_what_cannot_be_drawn_is_tried_again(planted_circle):
-    assert stages_done(planted_circle[0]) == NAMES[: NAMES.index("replay")]
+    assert stages_done(planted_circle[0]) == [name for name in NAMES if name != "replay"]
 
 
 @pytest.mark.parametrize("name", ["policy.safetensors", "critical_set.npz", "extended_sets.npz"])
-def test_a_newer_result_makes_those_after_it_out_of_date(run, name):
-    stage = {"policy": "train", "critical_set": "critical-set", "extended_sets": "extended-sets"}
+def test_a_newer_file_with_the_same_content_changes_nothing(run, name):
+    before = stages_done(run)
     os.utime(run.path / name)
-    assert stages_done(run) == NAMES[: NAMES.index(stage[name.split(".")[0]]) + 1]
+    assert stages_done(run) == before
+
+
+def test_another_result_makes_those_that_were_made_from_it_out_of_date(run):
+    other = replace(run.critical_set, points=run.critical_set.points + 0.01)
+    before = stages_done(run)
+    with run.stage("critical-set"):
+        other.save(run.path / "critical_set.npz")
+    # Extended sets and mode policies of this run are planted: they were made from nothing.
+    built = ["robustness", "simulate", "figures", "report"]
+    assert [name for name in before if name not in stages_done(run)] == built
+    with pytest.raises(BadArtifact, match=r"robustness.json is older than what it was made from"):
+        _ = hyrl_mj.load_run(run.path).robustness
 
 
 def test_a_missing_result_makes_its_stage_undone(run):
+    before = stages_done(run)
     (run.path / "mode_1.safetensors").unlink()
-    assert stages_done(run) == NAMES[: NAMES.index("retrain")]
+    assert [name for name in before if name not in stages_done(run)] == ["retrain"]
 
 
 # ---- one stage
@@ -100,13 +113,14 @@ def test_the_critical_set_and_the_parts_are_those_of_the_policy(run):
     again = run_stage(run_stage(run, "critical-set", say=str), "partition", say=str)
     assert np.abs(again.critical_set.points - np.pi).max() < 0.01
     assert again.partition.parts[0].contains(np.array([[2.0], [4.0]])).tolist() == [True, False]
-    assert stages_done(again) == NAMES[:3]
+    # Extended sets and mode policies of this run are planted: they were made from nothing.
+    assert stages_done(again) == NAMES[:5]
 
 
 def test_an_agent_of_others_is_not_trained(circle, tmp_path):
     said = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hyrl_mj.pipeline.runs.DIAGNOSIS", STAGES[:2])
+        patch.setattr("hyrl_mj.pipeline.runs.DIAGNOSIS", NAMES[:2])
         run = hyrl_mj.diagnose(
             "unit_circle",
             circle_policy(circle, critical=2.5),
@@ -128,7 +142,9 @@ def test_another_horizon_is_kept_and_what_follows_is_out_of_date(run):
     again = extend_again(run, 0.2, say=said.append)
     assert again.settings.horizon == again.extended_sets.horizon == 0.2
     assert hyrl_mj.load_run(run.path).settings == again.settings
-    assert stages_done(again) == NAMES[: NAMES.index("retrain")]
+    assert stages_done(again) == NAMES[:5], (
+        "its mode policies are planted: they were made from nothing"
+    )
     assert said[0].startswith("extended-sets: ")
     assert "--horizon 0.2" in said[-1]
 

@@ -8,7 +8,7 @@ import json
 import re
 import shutil
 from base64 import b64decode
-from dataclasses import replace
+from dataclasses import asdict, replace
 from html import escape
 from html.parser import HTMLParser
 from pathlib import Path
@@ -17,9 +17,10 @@ import numpy as np
 import pytest
 from browser import chromium, needs_chromium
 from PIL import Image
-from planted import Cube, decisions, halves
+from planted import Cube, believe, decisions, halves
 
 from hyrl_mj import BadArtifact, BadInput, MlpPolicy, load_run
+from hyrl_mj.artifacts import replacing, write_json
 from hyrl_mj.learning.settings import preset
 from hyrl_mj.pipeline import ExamineOptions, examine_run, run_stage
 from hyrl_mj.run_directory import Run, write_config
@@ -61,18 +62,23 @@ def plant(path, task, critical, partition, slack=0.2):
     """All but what noise can do, the replays and the video."""
     run = Run(path, preset(task, "smoke"))
     write_config(run)
-    linear(task, 0.0).save(path / "policy.safetensors")
-    critical.save(path / "critical_set.npz")
-    partition.save(path / "partition.npz")
+    with run.stage("train"):
+        linear(task, 0.0).save(path / "policy.safetensors")
+    with run.stage("critical-set"):
+        critical.save(path / "critical_set.npz")
+    with run.stage("partition"):
+        partition.save(path / "partition.npz")
     grid = partition.grid
-    ExtendedSets(
-        partition.modes,
-        tuple(GridSet(grid, part.values - slack) for part in partition.parts),
-        tuple(np.ones(len(grid.nodes), dtype=bool) for _ in partition.parts),
-        0.3, 0.1, np.empty((0, task.chart.dimension)), np.empty(0),
-    ).save(path / "extended_sets.npz")  # fmt: skip
-    for q in partition.modes:
-        linear(task, 0.3 - 0.6 * q).save(path / f"mode_{q}.safetensors")
+    with run.stage("extended-sets"):
+        ExtendedSets(
+            partition.modes,
+            tuple(GridSet(grid, part.values - slack) for part in partition.parts),
+            tuple(np.ones(len(grid.nodes), dtype=bool) for _ in partition.parts),
+            0.3, 0.1, np.empty((0, task.chart.dimension)), np.empty(0),
+        ).save(path / "extended_sets.npz")  # fmt: skip
+    with run.stage("retrain"):
+        for q in partition.modes:
+            linear(task, 0.3 - 0.6 * q).save(path / f"mode_{q}.safetensors")
     return load_run(path)
 
 
@@ -80,10 +86,12 @@ def film(path):
     """A replay and its poster: magenta on the left, green on the right."""
     frame = np.full((POSTER[1], POSTER[0], 3), MAGENTA, dtype=np.uint8)
     frame[:, POSTER[0] // 2 :] = GREEN
-    with video(path / "replay.mp4", *POSTER, 10) as add:
-        for _ in range(5):
-            add(frame)
-    Image.fromarray(frame).save(path / "replay.png")
+    with load_run(path).stage("replay"):
+        with video(path / "replay.mp4", *POSTER, 10) as add:
+            for _ in range(5):
+                add(frame)
+        with replacing(path / "replay.png") as temporary:
+            Image.fromarray(frame).save(temporary)
 
 
 @pytest.fixture(scope="module")
@@ -219,12 +227,14 @@ def test_pictures_and_video_are_the_files(finished):
 
 
 def test_the_scores_are_those_of_the_game(copied):
-    content, rng = json.loads((copied / "robustness.json").read_text()), np.random.default_rng(0)
+    content = asdict(load_run(copied).robustness)
+    rng = np.random.default_rng(0)
     # Numbers of which no two are the same.
     for score in (score for scores in content["game"]["scores"].values() for score in scores):
         numbers = {key: rng.random() for key in score if key != "eps" and score[key] is not None}
         score.update(numbers)
-    (copied / "robustness.json").write_text(json.dumps(content))
+    write_json(copied / "robustness.json", content, "robustness")
+    believe(copied)
     page, run = page_of(copied), load_run(copied)
     game = run.robustness.game
     for who in ("policy", "hyrl"):
@@ -302,11 +312,13 @@ def test_the_command_tells_what_is_not_the_default(copied):
     settings = replace(run.settings, noise=0.05, seed=7, horizon=0.4)
     changed = Run(copied, settings)
     write_config(changed)
+    believe(copied)
     text = page_of(copied).text
     assert f"run {copied.name} --eps 0.05 --seed 7 --preset smoke --horizon 0.4" in text
     assert "--eps 0.1" in text, "it was examined with another bound"
     assert "differ in" not in text
     write_config(Run(copied, replace(settings, cells=99)))
+    believe(copied)
     assert "differ in: cells." in page_of(copied).text
 
 
@@ -362,6 +374,7 @@ def test_no_critical_set_is_said(copied):
     d = run.task.chart.dimension
     none = replace(run.critical_set, points=np.empty((0, d)), component=np.zeros(0, dtype=int))
     none.save(copied / "critical_set.npz")
+    believe(copied)
     page = page_of(copied)
     assert "no critical set found at this resolution" in page.text
     assert "on the critical set" not in page.text

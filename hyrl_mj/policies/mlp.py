@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
@@ -238,19 +238,18 @@ class MlpPolicy(ObservationPolicy):
             BadArtifact: a file is missing, truncated, or not a policy of this version; or the policy is for
                 another task.
         """
-        about = artifacts.read_json(path.with_suffix(".json"), kind="policy")
         weights = artifacts.read_tensors(path)
-        with artifacts.reading(path):
+
+        def described(about: dict[str, Any]) -> MlpPolicy:
             name = about["task"]
-            if task is None:
-                if name not in task_names():
-                    raise BadArtifact(
-                        f"it is for the task {name!r}, which is unknown: give the task"
-                    )
-                task = get_task(name)
-            if name != task.name:
-                raise BadArtifact(f"it is a policy for {name}: {task.name} needs its own")
-            return MlpPolicy(task, about["algorithm"], about["activation"], weights)
+            known = task or (get_task(name) if name in task_names() else None)
+            if known is None:
+                raise BadArtifact(f"it is for the unknown task {name!r}: give the task")
+            if name != known.name:
+                raise BadArtifact(f"it is a policy for {name}: {known.name} needs its own")
+            return MlpPolicy(known, about["algorithm"], about["activation"], weights)
+
+        return artifacts.read_json(path.with_suffix(".json"), "policy", described)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,195 @@
+"""The manifest of a run directory believes what stages recorded, and nothing else; one writer at a time."""
+
+import re
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from hyrl_mj import BadArtifact, BadInput, artifacts
+from hyrl_mj.manifest import FILES, LOCK, NAME, Manifest, check_no_links, locked
+
+SETTINGS = dict.fromkeys(FILES, "these")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A run directory of three stages: the second reads the first's file, the third the second's."""
+    write(tmp_path, "train", "policy.json", "a")
+    write(tmp_path, "critical-set", "critical_set.npz", "b", "policy.json")
+    write(tmp_path, "partition", "partition.npz", "c", "critical_set.npz")
+    return tmp_path
+
+
+def put(path, text):
+    with artifacts.replacing(path) as temporary:
+        temporary.write_text(text)
+
+
+def write(folder, stage, name, text, *inputs, settings=SETTINGS, code=""):
+    manifest = Manifest(folder, settings)
+    with manifest.stage(stage, code):
+        for source in inputs:
+            manifest.checked(folder / source)
+        put(folder / name, text)
+
+
+def done(folder, settings=SETTINGS, code=""):
+    return [s for s in FILES if Manifest(folder, settings).is_done(s, code)]
+
+
+def test_a_stage_is_done_when_its_files_are_those_that_it_wrote(folder):
+    assert done(folder) == ["train", "critical-set", "partition"]
+    assert Manifest(folder, SETTINGS).checked(folder / "partition.npz") == folder / "partition.npz"
+
+
+@pytest.mark.parametrize(
+    ("harm", "sentence"),
+    [
+        (lambda path: path.unlink(), "is missing"),
+        (lambda path: path.write_text("x"), "was changed after it was written"),
+        (lambda path: path.write_text(""), "was changed after it was written"),
+    ],
+)
+def test_a_damaged_file_is_named_with_its_stage(harm, sentence, folder):
+    harm(folder / "critical_set.npz")
+    assert done(folder) == ["train", "partition"], "the partition was made from the file as it was"
+    with pytest.raises(BadArtifact, match=rf"critical_set.npz {sentence}.*hyrl-mj critical-set"):
+        Manifest(folder, SETTINGS).checked(folder / "critical_set.npz")
+
+
+def test_another_input_makes_all_that_follows_out_of_date(folder):
+    write(folder, "train", "policy.json", "other")
+    assert done(folder) == ["train"]
+    with pytest.raises(BadArtifact, match=r"partition.npz is older than what it was made from"):
+        Manifest(folder, SETTINGS).checked(folder / "partition.npz")
+    write(folder, "train", "policy.json", "a")
+    assert done(folder) == ["train", "critical-set", "partition"], "contents count, not times"
+
+
+def test_other_settings_or_code_make_a_stage_undone(folder):
+    assert done(folder, SETTINGS | {"critical-set": "those"}) == ["train"]
+    assert done(folder, code="a changed robot") == []
+
+
+def test_a_stage_that_breaks_off_is_not_believed(folder):
+    def break_off():
+        with Manifest(folder, SETTINGS).stage("train", ""):
+            put(folder / "policy.json", "half")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        break_off()
+    assert done(folder) == []
+    with pytest.raises(BadArtifact, match=r"policy.json is of a stage that did not finish"):
+        Manifest(folder, SETTINGS).checked(folder / "policy.json")
+
+
+def test_a_stage_that_fails_before_it_writes_changes_nothing(folder):
+    before = (folder / NAME).read_bytes()
+    with pytest.raises(RuntimeError), Manifest(folder, SETTINGS).stage("train", ""):
+        raise RuntimeError
+    assert (folder / NAME).read_bytes() == before
+    assert done(folder) == ["train", "critical-set", "partition"]
+
+
+def test_a_file_that_a_stage_did_without_makes_it_out_of_date_once_it_is_there(folder):
+    manifest = Manifest(folder, SETTINGS)
+    with manifest.stage("report", ""):
+        assert not manifest.has(folder / "replay.mp4")
+        assert manifest.has(folder / "partition.npz")
+        put(folder / "report.html", "no video")
+    assert "report" in done(folder)
+    write(folder, "replay", "replay.mp4", "video")
+    assert "report" not in done(folder)
+
+
+def test_files_of_an_earlier_run_go_and_others_stay(folder):
+    write(folder, "retrain", "mode_0.json", "x")
+    for name in ("mode_7.json", "mode_7.txt", "my_mode_7.json", "arcs/mode_7.json"):
+        put(folder / name, "left")
+    write(folder, "retrain", "mode_1.json", "x")
+    left = {p.relative_to(folder).as_posix() for p in folder.rglob("*mode*")}
+    assert left == {"mode_1.json", "mode_7.txt", "my_mode_7.json", "arcs/mode_7.json"}
+
+
+@pytest.mark.parametrize("name", ["../victim.json", "/etc/passwd", "config.json", "notes.txt"])
+def test_a_manifest_that_names_other_files_is_refused(name, folder):
+    entry = {"settings": "these", "code": "", "inputs": {}, "outputs": {name: "0"}}
+    artifacts.write_json(folder / NAME, {"stages": {"train": entry}}, "manifest")
+    with pytest.raises(BadArtifact, match=re.escape(f"no stage 'train' writes {name!r}")):
+        done(folder)
+
+
+def test_inputs_in_a_circle_end(folder):
+    entry = {"settings": "these", "code": "", "outputs": {"policy.json": "0"}}
+    entry["inputs"] = {"policy.json": "0", "partition.npz": "1"}
+    artifacts.write_json(folder / NAME, {"stages": {"train": entry}}, "manifest")
+    assert done(folder) == []
+
+
+# ---- writers
+
+
+def test_a_second_process_is_told_who_works_there(tmp_path):
+    code = f"""
+import pathlib, sys
+from hyrl_mj.manifest import locked
+with locked(pathlib.Path({str(tmp_path)!r})):
+    print("locked", flush=True)
+    sys.stdin.read()
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout.readline() == "locked\n"
+        with (
+            pytest.raises(BadInput, match=rf"process {other.pid}, since 20\d\d-"),
+            locked(tmp_path),
+        ):
+            pass
+        other.kill()
+    with locked(tmp_path), locked(tmp_path):
+        pass
+
+
+def test_a_second_thread_is_refused_too(tmp_path):
+    said = []
+
+    def work():
+        try:
+            with locked(tmp_path):
+                said.append("worked")
+        except BadInput as error:
+            said.append(str(error))
+
+    with locked(tmp_path):
+        thread = threading.Thread(target=work)
+        thread.start()
+        thread.join()
+    assert len(said) == 1
+    assert "is working on" in said[0]
+
+
+def test_what_a_killed_writer_has_left_goes_and_nothing_else(tmp_path):
+    left = tmp_path / ".policy.0123456789ab.partial.json"
+    mine = tmp_path / ".policy.partial.json"
+    for path in (left, mine):
+        path.write_text("half")
+    with locked(tmp_path):
+        pass
+    assert sorted(path.name for path in tmp_path.iterdir()) == [LOCK, mine.name]
+
+
+# ---- links
+
+
+@pytest.mark.parametrize("name", ["arcs", "replay.mp4", "figures/runs.png", ".lock"])
+def test_a_link_in_a_run_directory_is_refused(name, folder, tmp_path_factory):
+    victim = tmp_path_factory.mktemp("victim")
+    (folder / name).parent.mkdir(exist_ok=True)
+    (folder / name).unlink(missing_ok=True)
+    (folder / name).symlink_to(victim)
+    with pytest.raises(BadArtifact, match=re.escape(f"{folder / name} is a link")):
+        check_no_links(folder)

@@ -1,0 +1,155 @@
+"""Opening what somebody else has made executes nothing: code runs only where the user names it."""
+
+import re
+import shutil
+from dataclasses import replace
+
+import pytest
+from planted import believe
+from test_cli import call
+
+import hyrl_mj
+from hyrl_mj import BadArtifact, BadInput, artifacts, trust
+from hyrl_mj.pipeline import run_stage
+from hyrl_mj.policies import algorithms
+from hyrl_mj.run_directory import Run, write_config
+from hyrl_mj.tasks import described_task
+
+EVIL = "import pathlib\npathlib.Path({marker!r}).touch()\n"
+
+
+@pytest.fixture
+def marker(tmp_path):
+    """The file that appears if foreign code runs."""
+    return tmp_path / "executed"
+
+
+@pytest.fixture
+def received(planted_circle, tmp_path):
+    """A run directory that may be changed."""
+    return shutil.copytree(planted_circle[0].path, tmp_path / "received")
+
+
+@pytest.fixture
+def evil(marker, tmp_path, monkeypatch):
+    """A Python file in the working directory that leaves the marker."""
+    path = tmp_path / "evilmod.py"
+    path.write_text(EVIL.format(marker=str(marker)))
+    monkeypatch.chdir(tmp_path)
+    return path
+
+
+def open_everything(path):
+    run = hyrl_mj.load_run(path)
+    run.controller.initial_mode(run.critical_set.points)
+    _ = run.policy, run.robustness, run.arcs()
+    for stage in ("simulate", "figures", "report"):
+        run = run_stage(run, stage, say=str)
+
+
+@pytest.mark.slow
+def test_the_run_itself_opens(received):
+    open_everything(received)
+
+
+def test_a_run_that_names_a_file_as_its_task_is_refused(received, evil, marker):
+    run = hyrl_mj.load_run(received)
+    write_config(Run(received, replace(run.settings, task=str(evil))))
+    believe(received, task="unit_circle")
+    with pytest.raises(BadInput, match=rf"{re.escape(str(evil))}.*--task FILE"):
+        open_everything(received)
+    assert not marker.exists()
+
+
+def test_a_policy_that_names_a_file_as_its_task_is_refused(received, evil, marker):
+    description = artifacts.read_json(received / "mode_0.json", "policy", dict)
+    artifacts.write_json(received / "mode_0.json", description | {"task": str(evil)}, "policy")
+    believe(received)
+    with pytest.raises(BadArtifact, match="it is a policy for"):
+        open_everything(received)
+    with pytest.raises(BadArtifact, match="for the unknown task"):
+        hyrl_mj.MlpPolicy.load(received / "mode_0.safetensors")
+    assert not marker.exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["stage1", "stage6"])
+def test_an_algorithm_that_a_run_names_is_not_imported(stage, received, evil, marker):
+    run = hyrl_mj.load_run(received)
+    foreign = replace(getattr(run.settings, stage), algorithm="evilmod:X")
+    write_config(Run(received, replace(run.settings, **{stage: foreign})))
+    believe(received)
+    open_everything(received)
+    with pytest.raises(BadInput, match="from a module that you have not named before"):
+        run_stage(hyrl_mj.load_run(received), {"stage1": "train", "stage6": "retrain"}[stage])
+    assert not marker.exists()
+
+
+# ---- what the user has named
+
+
+@pytest.fixture
+def robot(tmp_path):
+    """A task file of the user's, which has not run yet."""
+    from hyrl_mj.tasks.scaffold import write_task
+
+    return write_task("robot_of_mine", tmp_path)[0]
+
+
+def test_a_task_file_that_the_user_has_named_is_known_until_it_changes(robot):
+    assert not trust.is_known(robot)
+    code = f"import hyrl_mj; hyrl_mj.get_task({str(robot)!r})"
+    assert python(code).returncode == 0
+    assert trust.is_known(robot)
+    opened = f"from hyrl_mj.tasks import described_task; print(described_task({str(robot)!r}).name)"
+    assert python(opened).stdout == "robot_of_mine\n"
+    robot.write_text(robot.read_text() + "\n# changed\n")
+    with pytest.raises(BadInput, match="as it is now"):
+        described_task(str(robot))
+
+
+def test_an_algorithm_that_the_user_has_named_is_known(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text("raise RuntimeError('imported')\n")
+    with pytest.raises(BadInput, match="--algorithm mine:Fast"):
+        algorithms.check_named("mine:Fast")
+    algorithms.remember("mine:Fast")
+    algorithms.check_named("mine:Fast")
+    algorithms.check_named("ppo")
+
+
+@pytest.mark.parametrize("content", ["", "[1]", "{", '{"a": 1}'])
+def test_damaged_records_are_none(content, robot):
+    trust.store().parent.mkdir(parents=True, exist_ok=True)
+    trust.store().write_text(content)
+    assert not trust.is_known(robot)
+
+
+def test_without_a_place_for_records_nothing_is_known(robot, monkeypatch, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    monkeypatch.setenv("XDG_STATE_HOME", str(blocked))
+    trust.remember(robot)
+    assert not trust.is_known(robot)
+
+
+@pytest.mark.slow
+def test_a_run_of_somebody_else_s_robot_opens_when_its_file_is_named(received, robot):
+    run = hyrl_mj.load_run(received)
+    write_config(Run(received, replace(run.settings, task=str(robot.with_name("elsewhere.py")))))
+    believe(received, task="unit_circle")
+    refused = call("report", received)
+    assert refused.returncode == 2
+    assert refused.stderr.count("\n") == 1
+    assert "--task FILE" in refused.stderr
+    other = call("report", received, "--task", robot)
+    assert other.returncode == 2, "its policies are for another robot"
+    assert "does not fit" in other.stderr
+    assert other.stderr.count("\n") == 1
+
+
+def python(code):
+    import subprocess
+    import sys
+
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
