@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 Record = TypeVar("Record")
 # The version of the files; a file of another version is refused.
-VERSION = 1
+VERSION = 2
 # The remedy for a file that cannot be read.
 REMEDY = "run the stage that writes it again"
 

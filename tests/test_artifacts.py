@@ -136,7 +136,7 @@ def test_an_npz_that_is_not_ours(tmp_path):
 def test_another_version_is_named(tmp_path):
     path = tmp_path / "a.json"
     path.write_text(json.dumps({"kind": "thing", "version": 99}))
-    with pytest.raises(BadArtifact, match=r"version 99.*reads version 1") as caught:
+    with pytest.raises(BadArtifact, match=r"version 99.*reads version 2") as caught:
         artifacts.read_json(path, "thing", dict)
     assert_one_sentence_about(caught, path)
     np.savez(tmp_path / "a.npz", kind=np.array("thing"), version=np.array(99))

@@ -110,7 +110,7 @@ def test_a_truncated_policy_is_named(policy, tmp_path, ending):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"version": 2}, "version 2"),
+        ({"version": 1}, "version 1"),
         ({"kind": "critical set"}, "'critical set', not 'policy'"),
         ({"task": "humanoid"}, "unknown task 'humanoid'"),
         ({"algorithm": "trpo"}, "'trpo'"),

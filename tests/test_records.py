@@ -95,7 +95,7 @@ def test_a_config_is_what_was_set(tmp_path, circle):
     artifacts.write_json(tmp_path / "config.json", config, "run")
     assert Config.load(tmp_path / "config.json") == config
     content = json.loads((tmp_path / "config.json").read_text())
-    assert list(content) == ["kind", "version", "settings", "versions"]
+    assert list(content) == ["kind", "version", "settings", "versions", "sha256"]
     content["settings"]["stage6"]["samples"] = "many"
     (tmp_path / "config.json").write_text(json.dumps(content))
     with pytest.raises(BadArtifact, match=r"settings\.stage6\.samples cannot be used"):
