@@ -1,9 +1,11 @@
 """Errors whose text says in one sentence what was given, what is allowed, and what to do."""
 
 import math
+import traceback
 from collections.abc import Iterable
 from difflib import get_close_matches
 from numbers import Integral, Real
+from pathlib import Path
 
 
 class HyrlError(Exception):
@@ -49,6 +51,15 @@ def brief(error: BaseException) -> str:
     """Returns the kind of an error and the beginning of its text, in one line."""
     text = " ".join(str(error).split())
     return f"{type(error).__name__}: {text if len(text) <= 160 else text[:157] + '...'}"
+
+
+def line_in(error: BaseException, path: Path | None) -> str:
+    """Returns the line of a file that an error came from: ", line 7"; "" if it came from elsewhere."""
+    if isinstance(error, SyntaxError):
+        return ""  # its text names the line
+    calls = traceback.extract_tb(error.__traceback__)
+    lines = [call.lineno for call in calls if call.filename == str(path)]
+    return f", line {lines[-1]}" if lines else ""
 
 
 def check_seed(seed: int) -> int:

@@ -103,3 +103,28 @@ def sample_time(model: mujoco.MjModel) -> float:
     if "sample_time" not in names(model, mujoco.mjtObj.mjOBJ_NUMERIC):
         return float(model.opt.timestep)
     return float(numeric(model, "sample_time", 1)[0])
+
+
+def wrong_physics(model: mujoco.MjModel, version: str = mujoco.__version__) -> str:
+    """Returns why a version of MuJoCo simulates a model wrongly, and the remedy; "" if it does not.
+
+    MuJoCo 4.0.0 factorises the Hessian of the Newton solver wrongly if the constraint Jacobian is sparse
+    (https://github.com/google-deepmind/mujoco/releases/tag/4.0.1).
+    """
+    newton = model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
+    if version != "4.0.0" or not (newton and mujoco.mj_isSparse(model) and _constrained(model)):
+        return ""
+    return (
+        f"MuJoCo 4.0.0 computes wrong constraint forces for {model_name(model)}, whose Jacobian is "
+        'sparse: give its MJCF <option jacobian="dense"/>, or install another version of MuJoCo'
+    )
+
+
+def _constrained(model: mujoco.MjModel) -> bool:
+    """Returns whether a model can have constraints: contacts, limits, friction losses or equalities."""
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT:
+        return False
+    touching = model.geom_contype.any() and model.geom_conaffinity.any()
+    limited = model.jnt_limited.any() or model.tendon_limited.any()
+    rubbing = model.dof_frictionloss.any() or model.tendon_frictionloss.any()
+    return bool(model.neq or model.npair or touching or limited or rubbing)

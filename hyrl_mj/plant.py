@@ -1,12 +1,16 @@
 """The physics of every task: n copies of a compiled model, stepped side by side."""
 
 import copy
+import ctypes
+import os
 from collections.abc import Callable, Sequence
+from typing import Any
+from weakref import WeakSet
 
 import mujoco
 import numpy as np
 
-from hyrl_mj import mjcf
+from hyrl_mj import mjcf, mujoco_log
 from hyrl_mj.errors import BadInput
 
 # Sensor values (n, sensors) -> measurement (n, p).
@@ -20,6 +24,8 @@ INPUT_TOLERANCE = 1e-6
 class Plant:
     """n copies of a MuJoCo model with named inputs, advanced by one controller sample at a time.
 
+    A plant can be pickled and copied, with its states, and goes on in a forked process.
+
     Args:
         model: the compiled model; the plant keeps a copy of it.
         inputs: names of the actuators that the policy drives, in the order of the columns of u. The
@@ -30,6 +36,9 @@ class Plant:
         control: inner loop that computes the controls of all actuators from u and the true state, at every
             physics step; they are clipped to each actuator's ctrlrange. `inputs` are then names of MJCF
             numerics that hold the limits of u.
+
+    Raises:
+        BadInput: the model has no such inputs, or this version of MuJoCo simulates it wrongly.
     """
 
     def __init__(
@@ -42,9 +51,9 @@ class Plant:
         measure: Measure = lambda sensors: sensors,
         control: Control | None = None,
     ):
-        from mujoco.batch import Batch  # slow to import
-
-        self.n, self._measure, self._control = n, measure, control
+        if problem := mjcf.wrong_physics(model):
+            raise BadInput(problem)
+        self.n, self._threads, self._measure, self._control = n, threads, measure, control
         self.model = copy.copy(model)
         # A bad state has to stay visible: MuJoCo would reset it and only count a warning. Inputs are
         # checked here, and clamping would prevent backward steps.
@@ -57,17 +66,40 @@ class Plant:
         ranges = np.where(limited, model.actuator_ctrlrange, [-np.inf, np.inf])
         self._ctrl_low, self._ctrl_high = ranges.T
         self._held = model.key_ctrl[0].copy() if model.nkey else np.zeros(model.nu)
-        self._batch = Batch(self.model, n, threads)
         self._unstable = np.zeros(n, dtype=bool)
-        self._initial = self._batch.state[0].copy()
-        self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
-        self._ctrl = self._batch.bind("ctrl")
         # Sensors of joints are read from the state; MuJoCo has to compute others after each step.
         self._joints = joint_columns(self.model)
         self._stage = mujoco.mjtStage.mjSTAGE_NONE
         if self._joints is None:
-            self._sensors = self._batch.bind("sensordata")
             self._stage = mujoco.mjtStage(int(self.model.sensor_needstage.max()))
+        self._open()
+        self._initial = self._batch.state[0].copy()
+
+    def _open(self, state: np.ndarray | None = None) -> None:
+        """Makes the copies of the model, in states (n, nstate), by default the initial one."""
+        from mujoco.batch import Batch  # slow to import
+
+        mujoco_log.install()
+        self._batch = Batch(self.model, self.n, self._threads)
+        self._forked = False
+        self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
+        self._ctrl = self._batch.bind("ctrl")
+        if self._joints is None:
+            self._sensors = self._batch.bind("sensordata")
+        if state is not None:
+            self._batch.state[:] = state
+            if self._joints is None:
+                self._batch.forward(None, self._stage)
+        _OPEN.add(self)
+
+    def __getstate__(self) -> dict[str, Any]:
+        of_batch = ("_batch", "_qpos", "_qvel", "_ctrl", "_sensors")
+        return {k: v for k, v in vars(self).items() if k not in of_batch} | {"_state": self.state}
+
+    def __setstate__(self, values: dict[str, Any]) -> None:
+        state = values.pop("_state")
+        vars(self).update(values)
+        self._open(state)
 
     @property
     def measurement(self) -> np.ndarray:
@@ -83,6 +115,11 @@ class Plant:
         These copies are reset to the model's initial state; the others are not affected.
         """
         return self._unstable.copy()
+
+    @property
+    def warnings(self) -> np.ndarray:
+        """How often MuJoCo has warned about each copy: (n,) int."""
+        return np.asarray(self._batch.warning[..., 1].sum(axis=1))
 
     @property
     def qpos(self) -> np.ndarray:
@@ -112,6 +149,7 @@ class Plant:
         Raises:
             BadInput: a wrong shape or a value that is not finite.
         """
+        self._wake()
         rows = self._rows(ids)
         qvel = np.zeros((len(rows), self.model.nv)) if qvel is None else qvel
         qpos = _checked("qpos", qpos, self.model.nq, rows)
@@ -129,6 +167,7 @@ class Plant:
         Raises:
             BadInput: a wrong shape, a value that is not finite, or one outside the input limits.
         """
+        self._wake()
         u, rows = self._inputs(u, ids), self._rows(ids)
         if self._control is None:
             self._advance(self._controls(u), ids, self.substeps)
@@ -150,6 +189,7 @@ class Plant:
                 f"the plant {mjcf.model_name(self.model)} cannot be run backward: that takes a "
                 "velocity actuator with kv >= 1e6 on every degree of freedom, one to one"
             )
+        self._wake()
         self._advance(-self._controls(self._inputs(u, ids)), ids, self.substeps)
 
     @property
@@ -161,6 +201,11 @@ class Plant:
         driven = sorted(model.actuator_trnid[:, 0])
         follows = -model.actuator_biasprm[:, 2] >= 1e6
         return bool(model.nq == model.nv and driven == list(range(model.njnt)) and follows.all())
+
+    def _wake(self) -> None:
+        """Makes new copies in a forked process: MuJoCo's threads are in the other one."""
+        if self._forked:
+            self._open(self._batch.state)
 
     def _rows(self, ids: np.ndarray | None) -> np.ndarray:
         return np.arange(self.n) if ids is None else ids
@@ -191,6 +236,7 @@ class Plant:
         # Sensors are computed only where they will be read.
         stage = self._stage if sense else mujoco.mjtStage.mjSTAGE_NONE
         self._batch.step(ids, substeps, stage)
+        mujoco_log.say()
         # MuJoCo's own criterion of a bad state: NaN, infinite, or beyond mjMAXVAL.
         for values in (self._qpos, self._qvel):
             valid = np.abs(values) <= mujoco.mjMAXVAL
@@ -259,3 +305,17 @@ def _checked(name: str, values: np.ndarray, columns: int, rows: np.ndarray) -> n
             f"{name}[{column}] of simulation {rows[row]} is {values[row, column]}, it must be finite"
         )
     return values
+
+
+_OPEN: WeakSet[Plant] = WeakSet()
+
+
+def _after_fork() -> None:
+    for plant in _OPEN:
+        plant._forked = True
+        # MuJoCo would end the process where it deletes a batch without its threads.
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(plant._batch))
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows
+    os.register_at_fork(after_in_child=_after_fork)

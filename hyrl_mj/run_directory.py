@@ -64,8 +64,10 @@ class Run:
 
     @cached_property
     def task(self) -> Task:
-        """The task."""
-        return described_task(self.settings.task)
+        """The task; raises `BadInput` if the settings do not fit it."""
+        task = described_task(self.settings.task)
+        self.settings.check(task)
+        return task
 
     @cached_property
     def manifest(self) -> Manifest:

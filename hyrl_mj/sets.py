@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, reduce
@@ -11,6 +12,9 @@ import numpy as np
 
 from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput
+
+# The runs from more nodes than this do not fit into the memory of a small machine.
+MOST_NODES = 2**20
 
 
 class StateSet(Protocol):
@@ -56,9 +60,19 @@ class Grid:
 
     @staticmethod
     def with_cells(chart: Chart, cells: int) -> Grid:
-        """Returns a grid with square cells (in chart units), `cells` of them along the longest side."""
+        """Returns a grid with square cells (in chart units), `cells` of them along the longest side.
+
+        Raises:
+            BadInput: it would have more than `MOST_NODES` nodes.
+        """
         number = np.maximum(np.round(cells * chart.sides / chart.sides.max()).astype(int), 2)
-        return Grid(chart, tuple(int(k) for k in number + ~np.array(chart.periodic)))
+        counts = tuple(int(k) for k in number + ~np.array(chart.periodic))
+        if (nodes := math.prod(counts)) > MOST_NODES:
+            raise BadInput(
+                f"a grid of {cells:,} cells along the longest side has {nodes:,} nodes: give fewer cells, "
+                f"for at most {MOST_NODES:,}"
+            )
+        return Grid(chart, counts)
 
     @staticmethod
     def from_counts(chart: Chart, counts: np.ndarray) -> Grid:

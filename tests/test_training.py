@@ -109,9 +109,9 @@ def test_torch_gets_its_threads_back(fails):
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(2)
-        with pytest.raises(KeyError) if fails else training.single_threaded():
+        with pytest.raises(KeyError) if fails else training.threads(1):
             if fails:
-                with training.single_threaded():
+                with training.threads(1):
                     raise KeyError
             assert torch.get_num_threads() == 1
         assert torch.get_num_threads() == 2

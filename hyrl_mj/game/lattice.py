@@ -18,6 +18,8 @@ from hyrl_mj.tasks import Outcome, Task
 LATTICE = {1: 12_000, 2: 480}
 # A sample that ends this close to a node, in cells, ends on it.
 ON_NODE = 1e-3
+# Transitions of the largest lattice, each of which takes about 100 bytes while they are tabulated.
+MOST_TRANSITIONS = 2**24
 REMEDY = "use noisy episodes instead (hyrl-mj robustness RUN --episodes N --noise adversarial)"
 
 
@@ -95,7 +97,8 @@ class Lattice:
         """Returns the lattice of a task, by default of 12,000 cells along a line or 480 x 480 in the plane.
 
         Raises:
-            BadInput: the plant's state is more than the chart, or the chart has three dimensions.
+            BadInput: the plant's state is more than the chart, the chart has three dimensions, or the
+                lattice is too fine for the memory.
         """
         Lattice.check(task)
         grid = grid or Grid.with_cells(task.chart, LATTICE[task.chart.dimension])
@@ -108,6 +111,11 @@ class Lattice:
         arrived = (ending == Outcome.REACHED) | ~failed & success
         alive = np.flatnonzero(ending == Outcome.RUNNING)
         levels = _levels(task, grid, nodes[alive])
+        if len(levels) * len(nodes) > MOST_TRANSITIONS:
+            raise BadInput(
+                f"a lattice of {len(nodes):,} nodes and {len(levels):,} inputs does not fit into the memory: "
+                "give fewer cells (`lattice` in the settings)"
+            )
         plant = task.plant(len(alive))
         ends = np.empty((len(levels), *nodes.shape))
         fails = np.zeros((len(levels), len(nodes)), dtype=bool)

@@ -7,7 +7,7 @@ import torch
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.learning.settings import Training
-from hyrl_mj.learning.training import build, export, single_threaded
+from hyrl_mj.learning.training import build, export, threads
 from hyrl_mj.policies import ALGORITHMS, MlpPolicy, Policy
 from hyrl_mj.progress import progress_bar
 from hyrl_mj.tasks import Task
@@ -53,7 +53,7 @@ def distil(task: Task, policy: Policy, starts: Starts, settings: Training, seed:
     parts, parameters = ALGORITHMS[settings.algorithm].parts, model.policy.named_parameters()
     actor = [weights for name, weights in parameters if name.startswith(parts)]
     optimizer = torch.optim.Adam(actor, lr=settings.learning_rate)
-    with single_threaded():
+    with threads(1):
         for _ in progress_bar(range(STEPS), "distilling the agent", "steps"):
             rows = torch.as_tensor(rng.integers(STATES, size=BATCH))
             _, likelihood, _ = model.policy.evaluate_actions(observations[rows], actions[rows])

@@ -1,21 +1,39 @@
 """The settings of a run, in frozen dataclasses, and their presets: fast, paper and smoke."""
 
-import math
 from dataclasses import dataclass, field, replace
-from numbers import Real
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput, check_bound, check_seed, unknown
 from hyrl_mj.game import LATTICE
-from hyrl_mj.policies import Agent, algorithms
-from hyrl_mj.tasks import Task, reference
+from hyrl_mj.learning.options import check_options
+from hyrl_mj.policies import ACTIVATIONS, ALGORITHMS, Agent, algorithms
+from hyrl_mj.ranges import (
+    By,
+    Flag,
+    Instance,
+    Integer,
+    Number,
+    OneOf,
+    Optional,
+    Several,
+    Text,
+    check_fields,
+)
+from hyrl_mj.sets import Grid
+from hyrl_mj.tasks import SEARCHES, Task, reference
+
+PRESETS = ("fast", "paper", "smoke")
+
+# Samples of the longest episode, and grid cells along the longest side of a chart.
+LONGEST = 100_000
+CELLS = Integer(2, 10**6)
 
 
 @dataclass(frozen=True)
 class Training:
-    """How SB3 trains one policy.
+    """How SB3 trains one policy. A field beside whose type a rule stands is checked by it.
 
     Attributes:
         algorithm: one of `hyrl_mj.policies.ALGORITHMS`, or `module:Class` of another one.
@@ -39,20 +57,26 @@ class Training:
         options: further keyword arguments of the SB3 algorithm.
     """
 
-    algorithm: str
-    samples: int
-    envs: int
-    hidden: tuple[int, ...]
-    activation: str
-    learning_rate: float
-    anneal: bool
-    gamma: float
-    symmetric: bool
-    warm_start: bool = False
-    episode: int | None = None
-    attempts: int = 1
-    action_noise: float = 0.0
+    algorithm: Annotated[str, Text()]
+    samples: Annotated[int, Integer(1, 10**9)]
+    envs: Annotated[int, Integer(1, 2**16)]
+    hidden: Annotated[tuple[int, ...], Several(Integer(1, 4_096), 1, 16)]
+    activation: Annotated[str, OneOf(ACTIVATIONS)]
+    learning_rate: Annotated[float, Number(0, 1, above=True)]
+    anneal: Annotated[bool, Flag()]
+    gamma: Annotated[float, Number(0, 1, above=True)]
+    symmetric: Annotated[bool, Flag()]
+    warm_start: Annotated[bool, Flag()] = False
+    episode: Annotated[int | None, Optional(Integer(1, LONGEST))] = None
+    attempts: Annotated[int, Integer(1, 1_000)] = 1
+    action_noise: Annotated[float, Number(0, 10)] = 0.0
     options: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        if ":" not in self.algorithm and self.algorithm not in ALGORITHMS:
+            raise unknown("algorithm", self.algorithm, [*ALGORITHMS, "or module:Class"])
+        check_options(self.algorithm, self.options, samples=self.samples, envs=self.envs)
 
     @property
     def title(self) -> str:
@@ -79,31 +103,49 @@ class Settings:
         search: search method for critical points, "rods" or "outcome".
     """
 
-    task: str
-    preset: str
-    seed: int
-    noise: float
-    horizon: float | None
-    stage1: Training | Agent
-    stage6: Training
-    cells: int
-    rods: int
-    lattice: int
-    resolution: float = 1 / 32
-    search: str = "rods"
+    task: Annotated[str, Text()]
+    preset: Annotated[str, OneOf(PRESETS)]
+    seed: Annotated[int, By(check_seed)]
+    noise: Annotated[float, By(check_bound)]
+    horizon: Annotated[float | None, Optional(Number(0, 3_600, above=True))]
+    stage1: Annotated[Training | Agent, Instance((Training, Agent))]
+    stage6: Annotated[Training, Instance((Training,))]
+    cells: Annotated[int, CELLS]
+    rods: Annotated[int, CELLS]
+    lattice: Annotated[int, Integer(0, 10**6)]
+    resolution: Annotated[float, Number(1e-6, 1)] = 1 / 32
+    search: Annotated[str, OneOf(SEARCHES)] = "rods"
 
     def __post_init__(self) -> None:
-        check_bound(self.noise)
-        if self.horizon is not None and not (
-            isinstance(self.horizon, Real) and math.isfinite(self.horizon) and self.horizon > 0
-        ):
-            raise BadInput(f"horizon {self.horizon!r} s cannot be used: give a finite time > 0")
-        check_seed(self.seed)
+        check_fields(self)
+        if self.stage6.gamma == 1:
+            raise BadInput(
+                "stage6.gamma 1.0 cannot be used, because the cost of leaving a mode's set for ever would be "
+                "infinite: give a number less than 1"
+            )
+        if self.stage6.algorithm not in ALGORITHMS:
+            raise unknown("stage6.algorithm", self.stage6.algorithm, ALGORITHMS)
+
+    def check(self, task: Task) -> None:
+        """Raises `BadInput` if a value does not fit the task: its chart, its episodes, or its inputs."""
+        task.check_noise(self.noise)
+        longest = task.max_steps * task.dt
+        if self.horizon is not None and self.horizon > longest:
+            raise BadInput(
+                f"horizon {self.horizon:g} s cannot be used: give at most {longest:g} s, the length of an "
+                f"episode of {task.name}"
+            )
+        trainings = [t for t in (self.stage1, self.stage6) if isinstance(t, Training)]
+        for name in {training.algorithm for training in trainings} & set(ALGORITHMS):
+            algorithms.check(name, task.name, task.learning.levels)
+        counts = [self.cells, self.rods]
+        if task.chart.dimension in LATTICE:
+            counts.append(CELLS.checked("lattice", self.lattice))
+        for count in counts:
+            Grid.with_cells(task.chart, count)
 
 
-PRESETS = ("fast", "paper", "smoke")
-
-# Stage 1 of preset fast, by algorithm, for continuous inputs and for levels; the key replaces `algorithm`.
+# Stage 1 of preset fast, by algorithm, for continuous inputs and for levels.
 # Episodes are short for tasks that start all over the chart: the first second decides the way.
 _PPO = Training(
     algorithm="ppo",
@@ -118,10 +160,15 @@ _PPO = Training(
     episode=20,
     options={"n_steps": 32, "batch_size": 1024, "n_epochs": 8},
 )
-_A2C = replace(_PPO, options={"n_steps": 16, "normalize_advantage": True, "use_rms_prop": False})
+_A2C = replace(
+    _PPO,
+    algorithm="a2c",
+    options={"n_steps": 16, "normalize_advantage": True, "use_rms_prop": False},
+)
 # A gradient step takes milliseconds and a sample hardly anything: many samples for each step.
 _TD3 = replace(
     _PPO,
+    algorithm="td3",
     samples=48_000,
     envs=32,
     activation="relu",
@@ -136,8 +183,9 @@ _TD3 = replace(
         "tau": 0.02,
     },
 )
-_SAC = replace(_TD3, action_noise=0.0, options={**_TD3.options, "ent_coef": 0.02})
-_CONTINUOUS = {"ppo": _PPO, "a2c": _A2C, "sac": _SAC, "td3": _TD3, "ddpg": _TD3}
+_DDPG = replace(_TD3, algorithm="ddpg")
+_SAC = replace(_TD3, algorithm="sac", action_noise=0.0, options={**_TD3.options, "ent_coef": 0.02})
+_CONTINUOUS = {"ppo": _PPO, "a2c": _A2C, "sac": _SAC, "td3": _TD3, "ddpg": _DDPG}
 _PPO_LEVELS = replace(
     _PPO,
     samples=200_000,
@@ -148,6 +196,7 @@ _PPO_LEVELS = replace(
 )
 _A2C_LEVELS = replace(
     _PPO_LEVELS,
+    algorithm="a2c",
     samples=300_000,
     envs=32,
     gamma=0.95,
@@ -155,6 +204,7 @@ _A2C_LEVELS = replace(
 )
 _DQN = replace(
     _PPO_LEVELS,
+    algorithm="dqn",
     samples=150_000,
     envs=64,
     learning_rate=1e-3,
@@ -175,6 +225,7 @@ _LEVELS = {"ppo": _PPO_LEVELS, "a2c": _A2C_LEVELS, "dqn": _DQN}
 # The paper's training, and its algorithms.
 _PAPER = replace(
     _DQN,
+    algorithm="ppo",
     samples=1_000_000,
     envs=1,
     learning_rate=1.946e-4,
@@ -239,10 +290,9 @@ def preset(
         raise unknown("preset", name, PRESETS)
     stage1 = agent or _stage1(task, name, algorithm or task.learning.algorithm)
     stage6 = _stage6(task, name, stage1.algorithm)
-    task.check_noise(noise)
     dimension = task.chart.dimension
     rods, cells = (_GRIDS if task.kinematic else _GRIDS_DYNAMIC)[min(dimension, 4)]
-    return Settings(
+    settings = Settings(
         task=reference(task),
         preset=name,
         seed=seed,
@@ -256,6 +306,8 @@ def preset(
         rods=rods,
         lattice=(_LATTICE_SMOKE if name == "smoke" else LATTICE).get(dimension, 0),
     )
+    settings.check(task)
+    return settings
 
 
 def _stage1(task: Task, name: str, algorithm: str) -> Training:
@@ -274,11 +326,10 @@ def _stage1(task: Task, name: str, algorithm: str) -> Training:
     if np.any(np.subtract(task.start_high, task.start_low) < task.chart.sides - 1e-9):
         # Episodes are not cut short: states outside the start region are only met late in an episode.
         training = replace(training, episode=None)
+    options = training.options
     if known != algorithm:
-        training = replace(
-            training, options=algorithms.accepted_options(algorithm, training.options)
-        )
-    return replace(training, algorithm=algorithm)
+        options = algorithms.accepted_options(algorithm, options)
+    return replace(training, algorithm=algorithm, options=options)
 
 
 def _stage6(task: Task, name: str, algorithm: str) -> Training:

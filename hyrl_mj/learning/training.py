@@ -17,7 +17,7 @@ from torch import nn
 
 from hyrl_mj.envs import BatchedEnv, Domain
 from hyrl_mj.envs.sb3_env import TaskVecEnv
-from hyrl_mj.errors import BadInput, brief
+from hyrl_mj.errors import BadInput, HyrlError, brief
 from hyrl_mj.learning import symmetry
 from hyrl_mj.learning.settings import Training
 from hyrl_mj.policies import (
@@ -42,6 +42,8 @@ CHECKPOINTS = 32
 EPISODES = 256
 # The kinds of noise under which a policy that is trained for noise is judged.
 JUDGES = ("none", "uniform", "alternating")
+# Threads that orthogonalise the initial weights: one gives other sums than two or more, which agree.
+FOR_BUILDING = 2
 # Number of observations for the check of a foreign policy, and the change of its weights before the check.
 CHECKED, MOVED = 64, 0.05
 
@@ -81,11 +83,14 @@ def train(
     Args:
         task, settings: the robot and its problem, and the settings of the training.
         seed: seed of weights, exploration, starts and noise; the same seed gives the same policy on the
-            same machine, with any number of physics threads.
+            same kind of processor, with any number of cores and threads.
         ground: where the policy is trained and judged; by default `TaskGround`, without noise.
         start_from: a policy whose weights to continue from; its network replaces `settings.hidden`.
         log_dir: folder of TensorBoard logs and checkpoints; none are written by default.
         label: label of the progress bar.
+
+    Raises:
+        BadInput: settings that SB3 cannot train with, or a training whose weights grow without bound.
     """
     ground = ground or TaskGround(task, settings.gamma)
     domain = ground.domain(settings.gamma)
@@ -94,8 +99,16 @@ def train(
         model.set_logger(configure(str(log_dir / "tensorboard"), ["tensorboard"]))
     interval = LOG_ROLLOUTS if isinstance(model, OnPolicyAlgorithm) else LOG_EPISODES
     watch = _Watch(settings.samples, ground, log_dir, label)
-    with single_threaded():
-        model.learn(settings.samples, callback=watch, log_interval=interval)
+    try:
+        with threads(1):  # faster for small networks
+            model.learn(settings.samples, callback=watch, log_interval=interval)
+    except (HyrlError, OSError):
+        raise
+    except Exception as error:  # whatever SB3 and torch raise
+        raise BadInput(
+            f"training with {settings.algorithm} broke off after {model.num_timesteps:,} samples "
+            f"({brief(error)}): change its settings, now {_described(settings)}"
+        ) from error
     assert watch.best is not None
     return watch.best
 
@@ -112,7 +125,8 @@ def build(
     """Returns the SB3 algorithm that `train` runs, ready to learn.
 
     Raises:
-        BadInput: an unknown algorithm, or a policy to start from whose networks differ.
+        BadInput: an unknown algorithm, settings that it refuses, or a policy to start from whose networks
+            differ.
     """
     algorithms.check(settings.algorithm, task.name, task.learning.levels)
     hidden = settings.hidden if start_from is None else start_from.hidden
@@ -123,16 +137,28 @@ def build(
     if settings.action_noise:
         m = len(task.inputs)
         options["action_noise"] = NormalActionNoise(np.zeros(m), np.full(m, settings.action_noise))
-    model = algorithms.sb3_class(settings.algorithm)(
-        "MlpPolicy",
-        TaskVecEnv(env),
-        seed=seed,
-        device="cpu",
-        gamma=settings.gamma,
-        learning_rate=(lambda left: rate * max(left, FINAL_RATE)) if settings.anneal else rate,
-        policy_kwargs={"net_arch": list(hidden), "activation_fn": ACTIVATIONS[activation]},
-        **options,
-    )
+    kind = algorithms.sb3_class(settings.algorithm)
+    try:
+        with threads(FOR_BUILDING):
+            model = kind(
+                "MlpPolicy",
+                TaskVecEnv(env),
+                seed=seed,
+                device="cpu",
+                gamma=settings.gamma,
+                learning_rate=(lambda left: rate * max(left, FINAL_RATE))
+                if settings.anneal
+                else rate,
+                policy_kwargs={"net_arch": list(hidden), "activation_fn": ACTIVATIONS[activation]},
+                **options,
+            )
+    except HyrlError:
+        raise
+    except Exception as error:  # whatever SB3, torch and foreign classes raise
+        raise BadInput(
+            f"{settings.algorithm} cannot train {task.name}: {brief(error)}; change its settings, now "
+            f"{_described(settings)}"
+        ) from error
     if start_from is not None:
         state = {name: torch.as_tensor(np.array(w)) for name, w in start_from.weights.items()}
         try:
@@ -155,10 +181,7 @@ def check_foreign(task: Task, settings: Training) -> None:
             network of the same weights.
     """
     name = settings.algorithm
-    try:
-        model = build(task, settings, seed=0)
-    except Exception as error:  # a foreign class may raise any error
-        raise BadInput(f"{name} cannot train {task.name}: {brief(error)}") from error
+    model = build(task, settings, seed=0)
     # Layers without effect at first, such as normalisation, have one once all weights have changed.
     generator = torch.Generator().manual_seed(0)
     for tensor in model.policy.state_dict().values():
@@ -178,6 +201,13 @@ def check_foreign(task: Task, settings: Training) -> None:
         raise BadInput(f"{plain}: what it answers is not what its weights say")
 
 
+def _described(settings: Training) -> str:
+    """Returns the settings that SB3 gets: "learning_rate 0.003, gamma 0.98, n_steps 32"."""
+    own = ("samples", "envs", "hidden", "learning_rate", "gamma")
+    values = {name: getattr(settings, name) for name in own} | settings.options
+    return ", ".join(f"{name} {value}" for name, value in values.items())
+
+
 def export(model: BaseAlgorithm, task: Task) -> MlpPolicy:
     """Returns the current policy of an SB3 algorithm as a plain network."""
     state = symmetry.plain_state(model.policy, task)
@@ -188,12 +218,12 @@ def export(model: BaseAlgorithm, task: Task) -> MlpPolicy:
 
 
 @contextmanager
-def single_threaded() -> Iterator[None]:
-    """Limits torch and BLAS to one thread: faster for small networks, with the same sums on any machine."""
+def threads(count: int) -> Iterator[None]:
+    """Fixes the threads of torch and BLAS: their sums are then the same on any number of cores."""
     before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    torch.set_num_threads(count)
     try:
-        with threadpool_limits(1, user_api="blas"):
+        with threadpool_limits(count, user_api="blas"):
             yield
     finally:
         torch.set_num_threads(before)
@@ -276,6 +306,11 @@ class _Watch(BaseCallback):
 
     def _checkpoint(self) -> None:
         policy = export(self.model, self.training_env.core.task)
+        if not all(np.isfinite(weights).all() for weights in policy.weights.values()):
+            raise BadInput(
+                f"the training diverged: after {self.num_timesteps:,} samples its weights are not finite; "
+                "lower learning_rate, or bound the reward"
+            )
         if self._log_dir is not None:
             policy.save(self._log_dir / "checkpoint.safetensors")
         if self.num_timesteps >= self._settled:

@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from functools import cached_property
 from itertools import compress
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -13,6 +14,7 @@ from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput, check_bound
 from hyrl_mj.plant import Plant, input_limits
 from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.guard import guard
 
 
 class Task(ABC):
@@ -20,6 +22,9 @@ class Task(ABC):
 
     A task is stateless, and nothing writes to it. Its methods take batches: measurements (n, p), chart
     points (n, d), inputs (n, m), in the units of the MJCF. Read geometry and limits from the compiled model.
+
+    An error in a method, or a result of a wrong shape, becomes a `BadInput` that names the method and the
+    state; so does an observation or a chart point that is not finite.
     """
 
     #: the task's name, also that of its MJCF `models/<name>.xml`
@@ -59,6 +64,10 @@ class Task(ABC):
     scene: Scene
     #: what trains it by default
     learning: Learning = Learning()
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        guard(cls)
 
     def __repr__(self) -> str:
         coordinates, inputs = ", ".join(self.chart.names), ", ".join(self.inputs)

@@ -3,7 +3,6 @@
 import importlib.util
 import inspect
 import sys
-import traceback
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
@@ -11,7 +10,7 @@ from types import ModuleType
 import gymnasium as gym
 
 from hyrl_mj import trust
-from hyrl_mj.errors import BadInput, brief, unknown
+from hyrl_mj.errors import BadInput, brief, line_in, unknown
 from hyrl_mj.tasks.base import Task
 
 # The group of entry points under which an installed package offers tasks: name = "its.module:Class".
@@ -217,12 +216,3 @@ def _run(path: Path) -> ModuleType:
     finally:
         sys.path.remove(str(path.parent))
     return module
-
-
-def line_in(error: BaseException, path: Path | None) -> str:
-    """Returns the line of a file that an error came from: ", line 7"; "" if it came from elsewhere."""
-    if isinstance(error, SyntaxError):
-        return ""  # its text names the line
-    calls = traceback.extract_tb(error.__traceback__)
-    lines = [call.lineno for call in calls if call.filename == str(path)]
-    return f", line {lines[-1]}" if lines else ""

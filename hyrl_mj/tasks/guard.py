@@ -1,0 +1,151 @@
+"""What a task's own methods raise or return wrongly becomes one sentence, with the state that provoked it.
+
+The methods are guarded where a subclass of `Task` is made, so that the sentence is the same in checks,
+training, simulation and the game.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from functools import wraps
+from inspect import isfunction
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hyrl_mj.errors import BadInput, HyrlError, brief, line_in
+from hyrl_mj.tasks.description import Outcome
+
+if TYPE_CHECKING:
+    from hyrl_mj.tasks.base import Task
+
+# The attribute whose length is the number of columns of what a method returns, by the method's name. Those
+# with "" return one value for each row.
+COLUMNS = {
+    "z": "start_low",
+    "with_z": "noisy",
+    "observation": "observation_low",
+    "measured": "noisy",
+    "reward": "",
+    "ending": "",
+    "failed": "",
+    "verdict": "",
+    "arrived": "",
+    "miss": "",
+    "danger": "",
+    "direction": "",
+}
+# Methods whose results are checked by the plant.
+PASSED_ON = ("measure", "state", "control")
+# Methods whose results have to be finite wherever they are asked for.
+FINITE = ("z", "with_z", "observation")
+OUTCOMES = ("ending", "verdict")
+# Methods of chart points; the other ones take measurements, or what no chart point can be told from.
+OF_POINTS, UNPLACED = ("state", "arrived", "miss"), ("measure", "measured", "control")
+# The most rows that are tried one by one in search of the one that raises an error.
+TRIED = 4_096
+
+
+def guard(kind: type[Task]) -> None:
+    """Guards the methods that a subclass of `Task` defines itself."""
+    for name in (*COLUMNS, *PASSED_ON):
+        if isfunction(method := vars(kind).get(name)):
+            setattr(kind, name, _guarded(name, method))
+
+
+def check_finite(task: Task, name: str, values: np.ndarray, measurement: np.ndarray) -> None:
+    """Raises `BadInput` if the values (n,) that method `name` gave for measurements (n, p) are not finite."""
+    if not math.isfinite(values.sum()) and not (finite := np.isfinite(values)).all():
+        row = int(np.argmin(finite))
+        raise BadInput(
+            f"{name}() of the task {task.name} gives {values[row]}{_place(task, name, [measurement], row)}: "
+            "give finite numbers"
+        )
+
+
+def _guarded(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
+    @wraps(method)
+    def checked(self: Task, *args: Any, **kwargs: Any) -> Any:
+        if not (
+            args and isinstance(args[0], np.ndarray)
+        ):  # an array that is traced for an export, say
+            return method(self, *args, **kwargs)
+        try:
+            result = method(self, *args, **kwargs)
+        except HyrlError:
+            raise
+        except Exception as error:  # whatever the user's own code raises
+            row = _row_of(lambda *rows: method(self, *rows), args, name)
+            raise BadInput(
+                f"{name}() of the task {self.name} raises {brief(error)}{line_in(error, self.source)}"
+                f"{_place(self, name, args, row)}"
+            ) from error
+        if name in COLUMNS:
+            _check_result(self, name, args, result)
+        return result
+
+    return checked
+
+
+def _check_result(task: Task, name: str, args: tuple[Any, ...], result: Any) -> None:
+    """Checks the shape of what a method returned, and whether it is finite if it has to be."""
+    n = args[0].shape[1 if name == "direction" else 0]
+    columns = COLUMNS[name]
+    shape = (n, len(getattr(task, columns))) if columns else (n,)
+    if not isinstance(result, np.ndarray) or result.shape != shape:
+        given = (
+            f"shape {result.shape}"
+            if isinstance(result, np.ndarray)
+            else f"a {type(result).__name__}"
+        )
+        raise BadInput(
+            f"{name}() of the task {task.name} gives {given} for {n} row(s): give an array of shape {shape}"
+        )
+    if name in OUTCOMES and not (result.dtype.kind in "iu" and _are_outcomes(result)):
+        raise BadInput(
+            f"{name}() of the task {task.name} gives {result.dtype} values like {result.flat[0]}: give a "
+            "hyrl_mj.Outcome for each row"
+        )
+    if name in FINITE and not math.isfinite(result.sum()):
+        finite = np.isfinite(result).all(axis=1)
+        if not finite.all():
+            row = int(np.argmin(finite))
+            raise BadInput(
+                f"{name}() of the task {task.name} gives {result[row].tolist()}"
+                f"{_place(task, name, args, row)}: give finite numbers"
+            )
+
+
+def _are_outcomes(values: np.ndarray) -> bool:
+    return not values.size or (values.min() >= min(Outcome) and values.max() <= max(Outcome))
+
+
+def _row_of(method: Callable[..., Any], args: tuple[Any, ...], name: str) -> int | None:
+    """Returns the first row for which a method raises an error on its own; None if there is none."""
+    axis = 1 if name == "direction" else 0
+    n = args[0].shape[axis] if args[0].ndim > axis else 0
+    for row in range(min(n, TRIED)):
+        rows = [
+            np.take(a, [row], axis) if isinstance(a, np.ndarray) and a.ndim > axis else a
+            for a in args
+        ]
+        try:
+            method(*rows)
+        except Exception:
+            return row
+    return None
+
+
+def _place(task: Task, name: str, args: Any, row: int | None) -> str:
+    """Returns where a method failed: " at x = 0.1 m, y = 0.2 m"; "" if that cannot be told."""
+    with suppress(Exception):  # the method that tells the chart point may be the one that failed
+        if row is not None and name not in UNPLACED:
+            first = args[0][0] if name == "direction" else args[0]
+            placed = name in (*OF_POINTS, "direction")
+            point = first[row] if placed else task.z(first[[row]])[0]
+            return f" at {task.chart.format(point)}"
+    if row is None:
+        return ""
+    return f" for {np.array2string(np.asarray(args[0][row]), precision=4, threshold=8)}"
