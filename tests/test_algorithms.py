@@ -11,7 +11,7 @@ import hyrl_mj
 from hyrl_mj import BadInput, cli
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.learning.settings import PRESETS, preset
-from hyrl_mj.learning.training import build, check_foreign, evaluate, export, single_threaded, train
+from hyrl_mj.learning.training import build, check_foreign, evaluate, export, threads, train
 from hyrl_mj.policies import ALGORITHMS, algorithms
 
 # What can have the inputs of which task.
@@ -147,7 +147,7 @@ def test_it_trains_a_policy_that_answers_as_sb3_does(algorithm, name):
     settings = quick(task, algorithm)
     model = build(task, settings, seed=0)
     before = export(model, task)
-    with single_threaded():
+    with threads(1):
         model.learn(settings.samples)
     policy = export(model, task)
     assert policy.algorithm == algorithm
@@ -175,7 +175,7 @@ def test_actors_and_critics_respect_the_mirror(algorithm, name):
     task = hyrl_mj.get_task(name)
     settings = quick(task, algorithm)
     model = build(task, settings, seed=0)
-    with single_threaded():
+    with threads(1):
         model.learn(settings.samples)
     policy, rng = export(model, task), np.random.default_rng(0)
     o = rng.uniform(task.observation_low, task.observation_high, (200, len(task.observation_low)))

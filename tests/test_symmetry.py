@@ -9,7 +9,7 @@ from torch import nn
 
 from hyrl_mj.learning import symmetry
 from hyrl_mj.learning.settings import preset
-from hyrl_mj.learning.training import build, export, single_threaded
+from hyrl_mj.learning.training import build, export, threads
 
 
 @pytest.fixture
@@ -52,7 +52,7 @@ def test_it_is_mirrored_from_the_start(task, model):
 @pytest.mark.slow
 def test_it_stays_mirrored_while_it_learns(task, model):
     before = {name: w.clone() for name, w in symmetry.plain_state(model.policy, task).items()}
-    with single_threaded():
+    with threads(1):
         model.learn(4_000 if task.learning.algorithm == "dqn" else 3 * 4_096)
     after = symmetry.plain_state(model.policy, task)
     actor = {"dqn": "q_net.q_net", "ppo": "mlp_extractor.policy_net"}[

@@ -15,7 +15,7 @@ import hyrl_mj
 from benchmarks import Figure
 from benchmarks.runs import Runs
 from hyrl_mj.learning import preset
-from hyrl_mj.learning.training import Score, TaskGround, export, single_threaded, train
+from hyrl_mj.learning.training import Score, TaskGround, export, threads, train
 from hyrl_mj.policies import MlpPolicy, algorithms
 from hyrl_mj.tasks import Task
 
@@ -87,7 +87,7 @@ def _paper(task: Task, quality: Callable[[Task, MlpPolicy], float], enough: floa
             **settings.options,
         )
         judge = _Quality(task, quality, enough)
-        with single_threaded():
+        with threads(1):
             model.learn(settings.samples, callback=_Until(task, judge))
         if judge(export(model, task)) < judge.enough:
             late = f"{task.name}: SB3 did not reach {enough} in {PATIENCE:.0f} s"
