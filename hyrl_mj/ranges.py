@@ -7,7 +7,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cache
@@ -35,6 +34,11 @@ def refused(name: str, value: object, allowed: str) -> BadInput:
     return BadInput(f"{name} {shown} cannot be used: give {allowed}")
 
 
+def _is(value: Any, kind: type) -> bool:
+    """Returns whether a value is a number of a kind; True and False are none."""
+    return isinstance(value, kind) and not isinstance(value, bool)
+
+
 @dataclass(frozen=True)
 class Integer:
     """An integer from `low` to `high`."""
@@ -43,9 +47,7 @@ class Integer:
     high: int
 
     def checked(self, name: str, value: Any) -> int:
-        if not isinstance(value, Integral) or isinstance(value, bool):
-            raise refused(name, value, self.allowed)
-        if not self.low <= value <= self.high:
+        if not _is(value, Integral) or not self.low <= value <= self.high:
             raise refused(name, value, self.allowed)
         return int(value)
 
@@ -63,9 +65,10 @@ class Number:
     above: bool = False
 
     def checked(self, name: str, value: Any) -> float:
-        if not isinstance(value, Real) or isinstance(value, bool) or math.isnan(value):
+        # NaN is not within any range.
+        if not _is(value, Real) or not self.low <= value <= self.high:
             raise refused(name, value, self.allowed)
-        if not self.low <= value <= self.high or (self.above and value == self.low):
+        if self.above and value == self.low:
             raise refused(name, value, self.allowed)
         return float(value)
 
@@ -161,7 +164,7 @@ def check_fields(record: Any) -> None:
     Raises:
         BadInput: a value is not allowed.
     """
-    for name, rule in _rules(type(record)).items():
+    for name, rule in _rules(type(record)).items():  # type: ignore[arg-type]
         object.__setattr__(record, name, rule.checked(name, getattr(record, name)))
 
 
