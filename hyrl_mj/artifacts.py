@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import re
@@ -16,11 +15,11 @@ from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_args, get_type_hints
-from zipfile import ZipFile
 
 import numpy as np
 from safetensors.numpy import load, save
 
+from hyrl_mj import archives
 from hyrl_mj.errors import BadArtifact, BadInput, brief
 
 if TYPE_CHECKING:
@@ -280,30 +279,10 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], kind: str) -> Non
 
 def read_arrays(path: Path, kind: str) -> dict[str, np.ndarray]:
     """Returns the arrays that `write_arrays` wrote."""
-    with reading(path), ZipFile(path) as file:
-        content = {}
-        left = LARGEST
-        for name in file.namelist():
-            member = read_member(file, name, left)
-            left -= len(member)
-            content[name.removesuffix(".npy")] = np.lib.format.read_array(io.BytesIO(member))
+    with reading(path):
+        content = archives.read_npz(path, LARGEST)
         check_version(int(content.pop("version")), str(content.pop("kind")), kind)
         return content
-
-
-def read_member(file: ZipFile, name: str, limit: int = LARGEST) -> bytes:
-    """Returns the content of a member of a zip, if it is no longer than the limit [bytes].
-
-    The sizes in the directory of the zip may be wrong, so only a little is unpacked at a time.
-    """
-    parts, size = [], 0
-    with file.open(name) as member:
-        while part := member.read(2**16):
-            parts.append(part)
-            size += len(part)
-            if size > limit:
-                raise BadArtifact(f"its {name} unpacks to more than {limit / 2**20:g} MiB")
-    return b"".join(parts)
 
 
 def write_tensors(path: Path, tensors: dict[str, np.ndarray]) -> None:

@@ -26,7 +26,7 @@ NAME, LOCK = "manifest.json", ".lock"
 # The names of the files that each stage may write: no other file is ever believed or removed.
 PICTURE = r"\.(png|pdf)"
 FILES = {
-    "train": r"policy\.(safetensors|json|onnx)",
+    "train": r"policy\.(safetensors|json|onnx)|vecnormalize\.npz",
     "critical-set": r"critical_set\.npz",
     "partition": r"partition\.npz",
     "diagnose": r"diagnosis\.html|diagnosis/(robustness\.json|worst\.(npz|mp4)|\w+" + PICTURE + ")",

@@ -9,6 +9,7 @@ from hyrl_mj.policies.controllers import Controller, PolicyController, as_contro
 from hyrl_mj.policies.external import (
     FUNCTION,
     ONNX,
+    STATISTICS,
     Agent,
     AnyPolicy,
     load_agent,
@@ -17,6 +18,13 @@ from hyrl_mj.policies.external import (
 )
 from hyrl_mj.policies.functions import from_callable
 from hyrl_mj.policies.mlp import ACTIVATIONS, TORCH_NAMES, MlpPolicy, Policy, SampledPolicy
+from hyrl_mj.policies.preprocessing import (
+    Normalization,
+    PreprocessedPolicy,
+    Preprocessing,
+    as_function,
+    network,
+)
 from hyrl_mj.policies.sb3_zip import infer_algorithm
 
 __all__ = [
@@ -24,20 +32,26 @@ __all__ = [
     "ALGORITHMS",
     "FUNCTION",
     "ONNX",
+    "STATISTICS",
     "TORCH_NAMES",
     "Agent",
     "AnyPolicy",
     "Controller",
     "MlpPolicy",
+    "Normalization",
     "Policy",
     "PolicyController",
+    "PreprocessedPolicy",
+    "Preprocessing",
     "SampledPolicy",
     "algorithms",
     "as_controller",
+    "as_function",
     "check_modes",
     "from_callable",
     "infer_algorithm",
     "load_agent",
+    "network",
     "read_agent",
     "reopen_agent",
 ]

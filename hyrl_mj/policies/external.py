@@ -1,7 +1,7 @@
 """External agents, which `robustify` starts from: how they are read, described and stored."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadArtifact, BadInput, check_seed, unknown
 from hyrl_mj.policies import algorithms
-from hyrl_mj.policies.functions import from_callable, from_onnx
+from hyrl_mj.policies.functions import from_callable
 from hyrl_mj.policies.mlp import (
     ACTIVATIONS,
     MlpPolicy,
@@ -19,6 +19,8 @@ from hyrl_mj.policies.mlp import (
     Policy,
     SampledPolicy,
 )
+from hyrl_mj.policies.onnx_model import from_onnx
+from hyrl_mj.policies.preprocessing import UNCHANGED, PreprocessedPolicy, Preprocessing, network
 from hyrl_mj.policies.sb3_zip import REMEDY, from_tensors, read_zip
 from hyrl_mj.tasks import Task
 
@@ -33,6 +35,9 @@ class Agent:
         sha256: hash of a network's tensors, of a model's file, or of a function's answers.
         activation: the function between the layers of a network, else None.
         stochastic: whether it draws its inputs, as it did during training.
+        statistics: hash of the statistics of `VecNormalize` that its observations go through; "" without.
+        n_stack: number of observations that it sees at once.
+        vecnormalize: the path of the statistics; "" without, or for a Python object. Comparisons ignore it.
     """
 
     algorithm: str
@@ -40,11 +45,22 @@ class Agent:
     sha256: str
     activation: str | None = None
     stochastic: bool = False
+    statistics: str = ""
+    n_stack: int = 1
+    vecnormalize: str = field(default="", compare=False)
 
     def __str__(self) -> str:
         """Returns a one-line description: "agent.zip (DQN, sampled)"."""
-        drawn = ", sampled" if self.stochastic else ""
-        return f"{self.source or 'an agent of Python code'} ({self.title}{drawn})"
+        words = [self.title]
+        words += ["normalised"] * bool(self.statistics)
+        words += [f"{self.n_stack} observations"] * (self.n_stack > 1)
+        words += ["sampled"] * self.stochastic
+        return f"{self.source or 'an agent of Python code'} ({', '.join(words)})"
+
+    @property
+    def is_function(self) -> bool:
+        """Whether its input is a function of the measurement: it draws nothing and has no memory."""
+        return not self.stochastic and self.n_stack == 1
 
     @property
     def title(self) -> str:
@@ -57,11 +73,17 @@ class Agent:
         options = ["--policy", self.source]
         if self.activation is not None:
             options += ["--activation", self.activation]
+        if self.vecnormalize:
+            options += ["--vecnormalize", self.vecnormalize]
+        if self.n_stack > 1:
+            options += ["--n-stack", f"{self.n_stack}"]
         return options + ["--stochastic"] * self.stochastic
 
 
 # The values that stand for an agent: a path, a policy, or a function of the observation.
 AnyPolicy = str | Path | Policy | Callable[[np.ndarray], Any]
+# The statistics of `VecNormalize` in a run directory.
+STATISTICS = "vecnormalize.npz"
 # Kinds of agents besides those that SB3 trains.
 ONNX, FUNCTION = "onnx", "function"
 # The fingerprint of a function: its number of measurements, and the decimals that count.
@@ -84,15 +106,17 @@ class ExternalAgent:
 
     def store(self, path: Path) -> None:
         """Writes the agent into a run directory; of a function, only its fingerprint."""
-        network = self.policy.policy if isinstance(self.policy, SampledPolicy) else self.policy
-        if isinstance(network, MlpPolicy):
-            network.save(path / "policy.safetensors")
+        if (mlp := network(self.policy)) is not None:
+            mlp.save(path / "policy.safetensors")
         elif self.model:
             with artifacts.replacing(path / "policy.onnx") as temporary:
                 temporary.write_bytes(self.model)
         else:
             content = {"algorithm": FUNCTION, "sha256": self.agent.sha256}
             artifacts.write_json(path / "policy.json", content, kind="policy")
+        normalization = _preprocessing(self.policy).normalization
+        if normalization is not None and self.agent.algorithm != FUNCTION:
+            normalization.save(path / STATISTICS)
 
 
 def load_agent(
@@ -101,18 +125,21 @@ def load_agent(
     activation: str | None = None,
     stochastic: bool = False,
     seed: int = 0,
+    vecnormalize: str | Path | None = None,
+    n_stack: int = 1,
 ) -> ObservationPolicy:
     """Reads a trained agent as a policy: an SB3 zip, an `.onnx` file, or a `policy.safetensors` of a run.
 
     Zips are those that `model.save` writes for PPO, A2C, DQN, SAC, TD3 and DDPG with an MLP policy, also by
     SB3 1.x. Nothing in them is executed, and every member but `policy.pth` may be missing. The agent must
-    have learned on the task's own observation, in its order and scale: the statistics of `VecNormalize` are
-    in another file and are not applied. Spaces come from the task: inputs of TD3, DDPG and SAC are stretched
-    to its limits. A policy class that overrides `forward` is not recognised, and acts as SB3's own.
+    have learned on the task's own observation, in its order and scale, and on its inputs; what the zip tells
+    about its training is checked. A policy class that overrides `forward` is not recognised, and acts as
+    SB3's own.
 
     An ONNX model has one input, observations (n, k) float32, and as its first output inputs (n, m) in the
-    plant's units; for a discrete task preferences (n, levels) or integers (n,). A `.safetensors` file is one
-    that `MlpPolicy.save` wrote, with its description beside it.
+    plant's units; for a discrete task preferences (n, levels) or integers (n,). It is tried in a process
+    with limits of time and memory first. A `.safetensors` file is one that `MlpPolicy.save` wrote, with its
+    description beside it.
 
     Args:
         path: the file.
@@ -122,6 +149,10 @@ def load_agent(
         stochastic: draw from the policy's distribution instead of acting by its mean or mode (PPO, A2C,
             SAC). Such a policy is reproducible call by call only.
         seed: the seed of these draws.
+        vecnormalize: an npz file with the statistics of the `VecNormalize` of its training: arrays mean,
+            var, clip, and epsilon.
+        n_stack: the number of observations that it sees at once, if it was trained under `VecFrameStack`.
+            Its `act` is then the steady answer; in closed loops it acts with its memory.
 
     Raises:
         BadInput: an unknown activation, a bad seed, or a policy without a distribution to draw from.
@@ -131,23 +162,30 @@ def load_agent(
     if activation is not None and activation not in ACTIVATIONS:
         raise unknown("activation", activation, ACTIVATIONS)
     check_seed(seed)
+    preprocessing = Preprocessing.of(vecnormalize, n_stack, task)
+    policy: ObservationPolicy
     if path.suffix == ".onnx":
         if stochastic or activation is not None:
             raise BadInput("an .onnx file acts as it is: give neither an activation nor stochastic")
-        return from_onnx(path, task, REMEDY)
-    if path.suffix == ".safetensors":
-        policy = MlpPolicy.load(path)
-        if policy.task.name != task.name:
-            raise BadArtifact(
-                f"{path} is a policy for {policy.task.name}: give one for {task.name}"
-            )
-        if activation not in (None, policy.activation):
-            raise BadArtifact(f"{path} has activation {policy.activation!r}: leave activation out")
+        policy = from_onnx(path, task, REMEDY, n_stack)
     else:
+        policy = mlp = _load_network(path, task, activation, preprocessing)
+        policy = SampledPolicy(mlp, np.random.default_rng(seed)) if stochastic else mlp
+    return PreprocessedPolicy(policy, preprocessing) if preprocessing else policy
+
+
+def _load_network(
+    path: Path, task: Task, activation: str | None, preprocessing: Preprocessing
+) -> MlpPolicy:
+    """Returns the network in a zip or a `.safetensors` file."""
+    if path.suffix != ".safetensors":
         with artifacts.reading(path, REMEDY):
-            weights, about = read_zip(path)
-            policy = from_tensors(weights, about, task, activation)
-    return SampledPolicy(policy, np.random.default_rng(seed)) if stochastic else policy
+            tensors, about = read_zip(path)
+            return from_tensors(tensors, about, task, activation, preprocessing)
+    policy = MlpPolicy.load(path, task, preprocessing.n_stack)
+    if activation not in (None, policy.activation):
+        raise BadArtifact(f"{path} has activation {policy.activation!r}: leave activation out")
+    return policy
 
 
 def read_agent(
@@ -156,30 +194,35 @@ def read_agent(
     activation: str | None = None,
     stochastic: bool = False,
     seed: int = 0,
+    vecnormalize: str | Path | None = None,
+    n_stack: int = 1,
 ) -> ExternalAgent:
     """Returns an external agent: a file for `load_agent`, a policy, or a function for `from_callable`.
 
-    Activation and stochastic are about files.
+    The options are about files, as in `load_agent`.
 
     Raises:
         BadInput: it cannot be used, or does not fit the task.
     """
     if isinstance(policy, str | Path):
         path = Path(policy)
-        loaded: Policy = load_agent(path, task, activation, stochastic, seed)
+        loaded = load_agent(path, task, activation, stochastic, seed, vecnormalize, n_stack)
+        statistics = "" if vecnormalize is None else str(vecnormalize)
         if path.suffix != ".onnx":
-            return _network(loaded, task, str(path))
-        model = path.read_bytes()
-        return ExternalAgent(loaded, Agent(ONNX, str(path), sha256(model).hexdigest()), model)
-    if activation is not None or stochastic:
+            return _network(loaded, task, str(path), statistics)
+        model = artifacts.read_limited(path)
+        agent = Agent(ONNX, str(path), sha256(model).hexdigest(), vecnormalize=statistics)
+        return ExternalAgent(loaded, _seeing(agent, loaded), model)
+    if activation is not None or stochastic or vecnormalize is not None or n_stack != 1:
         raise BadInput(
-            "activation and stochastic are about the file of an agent: leave them out, and give a policy "
-            "that load_agent(..., stochastic=True) made"
+            "activation, stochastic, vecnormalize and n_stack are about the file of an agent: leave them "
+            "out, and give a policy that load_agent(..., stochastic=True) made, say"
         )
-    if isinstance(policy, MlpPolicy | SampledPolicy):
+    if isinstance(policy, Policy) and network(policy) is not None:
         return _network(policy, task)
     function = policy if isinstance(policy, Policy) else from_callable(policy, task)
-    return ExternalAgent(function, Agent(FUNCTION, "", _fingerprint(function, task)))
+    agent = Agent(FUNCTION, "", _fingerprint(function, task))
+    return ExternalAgent(function, _seeing(agent, function))
 
 
 def reopen_agent(
@@ -206,26 +249,38 @@ def reopen_agent(
         return external.policy
     if policy is not None:
         raise BadInput(f"{path} holds its own policy: open it without another one")
-    if agent.algorithm == ONNX:
-        return load_agent(path / "policy.onnx", task)
-    return load_agent(path / "policy.safetensors", task, stochastic=agent.stochastic, seed=seed)
+    file = path / ("policy.onnx" if agent.algorithm == ONNX else "policy.safetensors")
+    statistics = path / STATISTICS if agent.statistics else None
+    stochastic, n_stack = agent.stochastic, agent.n_stack
+    return load_agent(file, task, None, stochastic, seed, statistics, n_stack)
 
 
-def _network(policy: Policy, task: Task, source: str = "") -> ExternalAgent:
+def _network(policy: Policy, task: Task, source: str = "", vecnormalize: str = "") -> ExternalAgent:
     """Returns a trained network, sampled or not, as an external agent."""
-    stochastic = isinstance(policy, SampledPolicy)
-    network = policy.policy if isinstance(policy, SampledPolicy) else policy
-    assert isinstance(network, MlpPolicy)
-    if network.task.name != task.name:
+    mlp = network(policy)
+    assert mlp is not None
+    if mlp.task.name != task.name:
         raise BadInput(
-            f"a policy for {network.task.name} cannot act on {task.name}: give one for {task.name}"
+            f"a policy for {mlp.task.name} cannot act on {task.name}: give one for {task.name}"
         )
     digest = sha256()
-    for name in sorted(network.weights):
-        digest.update(name.encode() + np.ascontiguousarray(network.weights[name]).tobytes())
-    tensors = digest.hexdigest()
-    agent = Agent(network.algorithm, source, tensors, network.activation, stochastic)
-    return ExternalAgent(policy, agent)
+    for name in sorted(mlp.weights):
+        digest.update(name.encode() + np.ascontiguousarray(mlp.weights[name]).tobytes())
+    inner = policy.policy if isinstance(policy, PreprocessedPolicy) else policy
+    stochastic = isinstance(inner, SampledPolicy)
+    agent = Agent(mlp.algorithm, source, digest.hexdigest(), mlp.activation, stochastic)
+    return ExternalAgent(policy, _seeing(replace(agent, vecnormalize=vecnormalize), policy))
+
+
+def _preprocessing(policy: Policy) -> Preprocessing:
+    return policy.preprocessing if isinstance(policy, PreprocessedPolicy) else UNCHANGED
+
+
+def _seeing(agent: Agent, policy: Policy) -> Agent:
+    """Returns the description of an agent with that of what it sees."""
+    preprocessing = _preprocessing(policy)
+    statistics = preprocessing.normalization.sha256 if preprocessing.normalization else ""
+    return replace(agent, statistics=statistics, n_stack=preprocessing.n_stack)
 
 
 def _fingerprint(policy: Policy, task: Task) -> str:

@@ -1,14 +1,13 @@
-"""Policies that are functions of the observation: Python callables and ONNX models."""
+"""Policies that are functions of the observation: Python functions, modules of torch."""
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hyrl_mj import artifacts
-from hyrl_mj.errors import BadArtifact, BadInput, brief
+from hyrl_mj.errors import BadInput, brief
 from hyrl_mj.policies.mlp import ObservationPolicy
 from hyrl_mj.tasks import Task, at_levels
 
@@ -63,7 +62,8 @@ def from_callable(function: Callable[[np.ndarray], Any], task: Task) -> Function
     Args:
         function: observations (n, k) float32, as the task's environments give them -> inputs (n, m) in
             the plant's units, which are clipped to the task's limits. For a discrete task: the numbers of
-            the levels, (n,) integers.
+            the levels, (n,) integers. Or a `torch.nn.Module` that does so with tensors; for a discrete task
+            it may also give preferences (n, levels). It is put into evaluation mode.
         task: the robot and its problem.
 
     Raises:
@@ -74,61 +74,36 @@ def from_callable(function: Callable[[np.ndarray], Any], task: Task) -> Function
         raise BadInput(
             f"{function!r} cannot be called: give a function from observations (n, k) to inputs (n, m)"
         )
+    if _is_module(function):
+        return FunctionPolicy(task, _of_arrays(function, task), "the module")
     return FunctionPolicy(task, function)
 
 
-def from_onnx(path: Path, task: Task, remedy: str) -> FunctionPolicy:
-    """Returns the policy of an ONNX file, after a first call of it."""
-    try:
-        import onnxruntime
-    except ImportError:
-        raise BadInput('an .onnx file needs onnxruntime: pip install "hyrl-mj[onnx]"') from None
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4  # errors are raised, too
-    with artifacts.reading(path, remedy):
-        session = onnxruntime.InferenceSession(
-            str(path), options, providers=["CPUExecutionProvider"]
-        )
-        takes_batches = _check_onnx_input(session.get_inputs(), task)
-    input_name, output_name = session.get_inputs()[0].name, session.get_outputs()[0].name
+def _is_module(function: object) -> bool:
+    """Returns whether an object is a `torch.nn.Module`; it is none if nobody has imported torch."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(function, torch.nn.Module)
+
+
+def _of_arrays(module: Any, task: Task) -> Callable[[np.ndarray], np.ndarray]:
+    """Returns a `torch.nn.Module` as a function of arrays."""
+    import torch
 
     def function(observation: np.ndarray) -> np.ndarray:
-        parts = [observation] if takes_batches else np.split(observation, len(observation))
-        outputs = [session.run([output_name], {input_name: part})[0] for part in parts]
-        actions = np.concatenate(outputs)
-        preferences = task.input_levels is not None and np.issubdtype(actions.dtype, np.floating)
-        return _preferred(actions, task) if preferences else actions
+        module.eval()
+        weight = next(module.parameters(), torch.empty(0))
+        with torch.no_grad():
+            answer = module(torch.from_numpy(observation).to(weight.device))
+        if not isinstance(answer, torch.Tensor):
+            raise BadInput(f"it gives {type(answer).__name__}, not a tensor")
+        actions: np.ndarray = answer.cpu().numpy()
+        preferences = task.input_levels is not None and actions.dtype.kind == "f"
+        return preferred_levels(actions, task) if preferences else actions
 
-    policy = FunctionPolicy(task, function, f"the model of {path}")
-    try:
-        policy.inputs(np.zeros((2, len(task.observation_low))))
-    except BadInput as error:
-        raise BadArtifact(str(error)) from error
-    return policy
-
-
-def _check_onnx_input(inputs: list[Any], task: Task) -> bool:
-    """Returns whether a model takes batches; other models take one observation at a time."""
-    k = len(task.observation_low)
-    if len(inputs) != 1 or inputs[0].type != "tensor(float)" or len(inputs[0].shape) != 2:
-        takes = ", ".join(f"{i.name}: {i.type} of shape {i.shape}" for i in inputs) or "nothing"
-        raise BadArtifact(
-            f"the model takes {takes}: it has to take one input, observations (n, {k}) float32"
-        )
-    rows, columns = inputs[0].shape
-    if isinstance(columns, int) and columns != k:
-        raise BadArtifact(
-            f"the model takes {columns} numbers, an observation of {task.name} has {k}"
-        )
-    if isinstance(rows, int) and rows != 1:
-        raise BadArtifact(
-            f"the model takes {rows} observations at a time: export it for any number of them, or for one"
-        )
-    return rows != 1
+    return function
 
 
-def _preferred(preferences: np.ndarray, task: Task) -> np.ndarray:
+def preferred_levels(preferences: np.ndarray, task: Task) -> np.ndarray:
     """Returns the preferred levels (n,) int for preferences (n, levels)."""
     if preferences.ndim != 2 or preferences.shape[1] != task.learning.levels:
         raise BadInput(

@@ -91,12 +91,14 @@ class MlpPolicy(ObservationPolicy):
         algorithm: the SB3 algorithm that trained it, one of `ALGORITHMS`.
         activation: the function between the layers, one of `ACTIVATIONS`.
         weights: all tensors of the SB3 policy by name, including its critics, so that training can continue.
+        frames: number of observations that it sees at once; more than one takes a `PreprocessedPolicy`.
     """
 
     task: Task
     algorithm: str
     activation: str
     weights: Mapping[str, np.ndarray] = field(repr=False)
+    frames: int = 1
 
     def __post_init__(self) -> None:
         layers, task, levels = self.layers, self.task, self._algorithm.levels
@@ -106,11 +108,14 @@ class MlpPolicy(ObservationPolicy):
             check_kind(task, levels)
         sizes = (layers[0][0].shape[1], layers[-1][0].shape[0])
         outputs = len(task.inputs) if task.input_levels is None else len(task.input_levels)
-        needed = (len(task.observation_low), outputs)
+        k = len(task.observation_low)
+        needed = (self.frames * k, outputs)
         if sizes != needed:
+            stacked = sizes[1] == outputs and sizes[0] > k and sizes[0] % k == 0
+            hint = f": give --n-stack {sizes[0] // k} if it saw as many at once" if stacked else ""
             raise BadArtifact(
                 f"the network takes {sizes[0]} and gives {sizes[1]} numbers, "
-                f"the task {task.name} needs {needed[0]} and {needed[1]}"
+                f"the task {task.name} needs {needed[0]} and {needed[1]}{hint}"
             )
         for (_, bias), (weight, _) in pairwise(layers):
             if weight.shape[1] != len(bias):
@@ -227,12 +232,13 @@ class MlpPolicy(ObservationPolicy):
         artifacts.write_json(path.with_suffix(".json"), about, kind="policy")
 
     @staticmethod
-    def load(path: Path, task: Task | None = None) -> MlpPolicy:
+    def load(path: Path, task: Task | None = None, frames: int = 1) -> MlpPolicy:
         """Reads what `save` wrote.
 
         Args:
             path: the safetensors file, with its description beside it.
             task: the task of the policy; by default the one that the description names.
+            frames: number of observations that the policy sees at once.
 
         Raises:
             BadArtifact: a file is missing, truncated, or not a policy of this version; or the policy is for
@@ -247,7 +253,7 @@ class MlpPolicy(ObservationPolicy):
                 raise BadArtifact(f"it is for the unknown task {name!r}: give the task")
             if name != known.name:
                 raise BadArtifact(f"it is a policy for {name}: {known.name} needs its own")
-            return MlpPolicy(known, about["algorithm"], about["activation"], weights)
+            return MlpPolicy(known, about["algorithm"], about["activation"], weights, frames)
 
         return artifacts.read_json(path.with_suffix(".json"), "policy", described)
 
@@ -269,7 +275,7 @@ class SampledPolicy(ObservationPolicy):
 
     def __post_init__(self) -> None:
         # A policy without a distribution is refused now, and not in the middle of a run.
-        observation = np.zeros((1, len(self.task.observation_low)))
+        observation = np.zeros((1, self.policy.frames * len(self.task.observation_low)))
         self.policy.sample(observation, np.random.default_rng(0))
 
     @property
@@ -290,12 +296,20 @@ def check_kind(task: Task, levels: bool) -> None:
     raise BadArtifact(f"the network {gives}, the task {task.name} takes {takes}")
 
 
+def layer_names(weights: Mapping[str, np.ndarray], prefix: str) -> list[str]:
+    """Returns the names of weights and biases of the linear layers whose names begin with `prefix`."""
+    return [f"{stem}{part}" for stem in _stems(weights, prefix) for part in ("weight", "bias")]
+
+
+def _stems(weights: Mapping[str, np.ndarray], prefix: str) -> list[str]:
+    names = [n for n in weights if n.startswith(prefix) and n.endswith("weight")]
+    return sorted((name.removesuffix("weight") for name in names), key=lambda s: (len(s), s))
+
+
 def _linear(weights: Mapping[str, np.ndarray], prefix: str) -> list[Layer]:
     """Returns the linear layers whose names begin with `prefix`, in order."""
-    names = [n for n in weights if n.startswith(prefix) and n.endswith("weight")]
-    stems = [name.removesuffix("weight") for name in names]
     layers = []
-    for stem in sorted(stems, key=lambda s: (len(s), s)):
+    for stem in _stems(weights, prefix):
         weight, bias = weights[f"{stem}weight"], weights.get(f"{stem}bias")
         if weight.ndim != 2 or bias is None or bias.shape != weight.shape[:1]:
             raise BadArtifact(

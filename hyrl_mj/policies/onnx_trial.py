@@ -1,0 +1,170 @@
+"""A program that examines and tries an ONNX model within limits of time and memory; see `onnx_model`.
+
+It runs in a process of its own, `python onnx_trial.py COLUMNS ROWS < model`, and writes a JSON object: the
+`inputs` and `outputs` of the model, or the `problem` because of which it is refused, or an `error` of the
+reader.
+"""
+
+import json
+import math
+import sys
+import time
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+
+# More than this is not needed for a policy: seconds of the processor, and bytes.
+SECONDS, MEMORY = 5, 200 * 2**20
+SINGLY = 32  # calls of a model that takes one observation at a time
+# A policy is made of these operators. Others repeat, branch, draw, read files, or belong to a vendor.
+OPERATORS = {
+    "Abs", "Acos", "Acosh", "Add", "And", "ArgMax", "ArgMin", "Asin", "Asinh", "Atan", "Atanh",
+    "AveragePool", "BatchNormalization", "Cast", "CastLike", "Ceil", "Celu", "Clip", "Concat", "Constant",
+    "ConstantOfShape", "Conv", "Cos", "Cosh", "CumSum", "DequantizeLinear", "Div", "Dropout", "Einsum",
+    "Elu", "Equal", "Erf", "Exp", "Expand", "Flatten", "Floor", "Gather", "GatherElements", "GatherND",
+    "Gelu", "Gemm", "GlobalAveragePool", "GlobalMaxPool", "Greater", "GreaterOrEqual", "GroupNormalization",
+    "HardSigmoid", "HardSwish", "Hardmax", "Identity", "InstanceNormalization", "IsInf", "IsNaN",
+    "LayerNormalization", "LeakyRelu", "Less", "LessOrEqual", "Log", "LogSoftmax", "LpNormalization",
+    "MatMul", "Max", "MaxPool", "Mean", "MeanVarianceNormalization", "Min", "Mish", "Mod", "Mul", "Neg",
+    "Not", "OneHot", "Or", "PRelu", "Pad", "Pow", "QuantizeLinear", "RMSNormalization", "Range",
+    "Reciprocal", "ReduceL1", "ReduceL2", "ReduceLogSum", "ReduceLogSumExp", "ReduceMax", "ReduceMean",
+    "ReduceMin", "ReduceProd", "ReduceSum", "ReduceSumSquare", "Relu", "Reshape", "Round",
+    "ScatterElements", "ScatterND", "Selu", "Shape", "Shrink", "Sigmoid", "Sign", "Sin", "Sinh", "Size",
+    "Slice", "Softmax", "Softplus", "Softsign", "Split", "Sqrt", "Squeeze", "Sub", "Sum", "Swish", "Tan",
+    "Tanh", "ThresholdedRelu", "Tile", "TopK", "Transpose", "Trilu", "Unsqueeze", "Where", "Xor",
+}  # fmt: skip
+# The inputs that set the size of an operator's output: they must not depend on the observation.
+SIZES = {
+    "ConstantOfShape": (0,), "Expand": (1,), "OneHot": (1,), "Pad": (1, 3), "Range": (0, 1, 2),
+    "Reshape": (1,), "Slice": (1, 2, 3, 4), "Split": (1,), "Squeeze": (1,), "Tile": (1,), "TopK": (1,),
+    "Unsqueeze": (1,),
+}  # fmt: skip
+
+
+class Refused(Exception):
+    """The model is not run."""
+
+
+def limit() -> None:
+    """Limits the time and the memory of this process from now on, where the system can."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    soft = math.ceil(time.process_time()) + SECONDS
+    resource.setrlimit(resource.RLIMIT_CPU, (soft, soft + 1))
+    try:
+        with open("/proc/self/status", encoding="ascii") as status:
+            (used,) = (line.split()[1] for line in status if line.startswith("VmData"))
+    except OSError:  # macOS
+        return
+    most = int(used) * 1024 + MEMORY
+    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+
+
+def check(model: onnx.ModelProto) -> None:
+    """Raises `Refused` if a model has an operator or a reference that a policy does not need."""
+    for function in model.functions:
+        if function.domain in ("", "ai.onnx"):
+            raise Refused(f"it has a function with the name of an operator, {function.name}")
+    if model.functions:
+        from onnx.inliner import inline_local_functions
+
+        model = inline_local_functions(model)
+    graph = model.graph
+    tensors = list(graph.initializer)
+    tensors += [t for s in graph.sparse_initializer for t in (s.values, s.indices)]
+    constants = {tensor.name for tensor in graph.initializer}
+    seen = {value.name for value in graph.input} - constants
+    for node in graph.node:
+        if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
+            name = ".".join(filter(None, (node.domain, node.op_type)))
+            raise Refused(f"its operator {name} is none that a policy needs")
+        if node.op_type == "Dropout" and len(node.input) > 2 and node.input[2]:
+            raise Refused("its operator Dropout draws random numbers")
+        sizes = [node.input[i] for i in SIZES.get(node.op_type, ()) if i < len(node.input)]
+        if seen.intersection(sizes):
+            raise Refused(
+                f"the size of what its operator {node.op_type} gives depends on the observation"
+            )
+        if node.op_type not in ("Shape", "Size") and seen.intersection(node.input):
+            seen.update(node.output)
+        for attribute in node.attribute:
+            tensors += [attribute.t, *attribute.tensors]
+            tensors += [attribute.sparse_tensor.values, attribute.sparse_tensor.indices]
+    if any(t.external_data or t.data_location == onnx.TensorProto.EXTERNAL for t in tensors):
+        raise Refused("its numbers are in another file (external data): save it in one file")
+
+
+def examine(content: bytes, columns: int, rows: int) -> dict[str, Any]:
+    """Returns inputs and outputs of a model, after it has answered random observations more than once.
+
+    Raises:
+        Refused: it is not run, or it is no function of the observation.
+    """
+    check(onnx.load_model_from_string(content))
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    inputs = [[i.name, i.type, list(i.shape)] for i in session.get_inputs()]
+    outputs = [o.name for o in session.get_outputs()]
+    if not outputs:
+        raise Refused("it gives no output")
+    if len(inputs) == 1 and inputs[0][1] == "tensor(float)" and len(inputs[0][2]) == 2:
+        (name, _, (batch, width)), *_ = inputs
+        if width in (None, columns) or isinstance(width, str):
+            one = batch == 1
+            if one or not isinstance(batch, int):
+                _try(lambda o: session.run(outputs[:1], {name: o})[0], columns, rows, one)
+    return {"inputs": inputs, "outputs": outputs}
+
+
+def _try(answer: Any, columns: int, rows: int, one: bool) -> None:
+    """Raises `Refused` if the model answers an observation otherwise the second time, or beside others."""
+    observation = np.random.default_rng(0).normal(size=(rows, columns)).astype(np.float32)
+    if one:
+        parts = np.split(observation[:SINGLY], SINGLY)
+        first, again = (np.concatenate([answer(part) for part in parts]) for _ in range(2))
+        if not np.array_equal(first, again, equal_nan=_is_float(first)):
+            raise Refused("it answers the same observations otherwise the second time")
+        return
+    first, again = answer(observation), answer(observation)
+    if not np.array_equal(first, again, equal_nan=_is_float(first)):
+        raise Refused("it answers the same observations otherwise the second time")
+    if not first.shape or len(first) != rows:
+        return  # reported with its shape where it is first used
+    fewer = answer(np.ascontiguousarray(observation[:1:-2]))
+    # Sums in another order differ in their last digits.
+    same = np.isclose(fewer, first[:1:-2], rtol=1e-3, atol=1e-4, equal_nan=True)
+    if np.mean(same) < 0.99:
+        raise Refused("its answer to an observation depends on the other observations of the batch")
+
+
+def _is_float(answers: np.ndarray) -> bool:
+    return answers.dtype.kind == "f"
+
+
+def main() -> None:
+    columns, rows = map(int, sys.argv[1:])
+    content = sys.stdin.buffer.read()
+    limit()
+    result: dict[str, Any]
+    try:
+        result = examine(content, columns, rows)
+    except Refused as refused:
+        result = {"problem": str(refused)}
+    except MemoryError:
+        result = {"problem": f"it needs more than {MEMORY >> 20} MB of memory"}
+    except Exception as error:  # of the readers, whose errors are of many kinds
+        text = " ".join(str(error).split())
+        result = {"error": f"{type(error).__name__}: {text[:160]}"}
+        if "alloc" in text.lower():
+            result = {"problem": f"it needs more than {MEMORY >> 20} MB of memory"}
+    json.dump(result, sys.stdout)
+
+
+if __name__ == "__main__":
+    main()

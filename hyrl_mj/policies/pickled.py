@@ -1,0 +1,159 @@
+"""Reads the plain content of a pickle without unpickling it: nothing is imported, called or hashed.
+
+A pickle is a program for a stack machine. This one records each call as a `Call` instead of making it, and
+knows only the instructions that occur where numbers and tensors are pickled.
+"""
+
+from __future__ import annotations
+
+import pickletools
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from hyrl_mj.errors import BadArtifact
+
+# Limit on the pickled text around the numbers [bytes]: a network of ten layers takes a few kilobytes.
+LARGEST = 2**19
+_CONSTANTS = {
+    "BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT", "BINUNICODE", "SHORT_BINUNICODE",
+    "BINUNICODE8", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8", "BINSTRING", "SHORT_BINSTRING",
+}  # fmt: skip
+_VALUES = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
+_TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
+_IGNORED = {"PROTO", "FRAME", "STOP"}
+_MARK = object()
+
+
+@dataclass(frozen=True)
+class Name:
+    """The name of a function or a class, "module.name"."""
+
+    text: str
+
+
+@dataclass
+class Call:
+    """A call that unpickling would make.
+
+    Attributes:
+        function: the name of the function or class, "" if it is the result of another call.
+        arguments: what it would be called with.
+        state: what the result would be given afterwards, None if nothing.
+        items: the entries that the result would be given, pairs of key and value.
+    """
+
+    function: str
+    arguments: Any
+    state: Any = None
+    items: list[tuple[Any, Any]] = field(default_factory=list)
+
+
+class Items(list[tuple[Any, Any]]):
+    """The entries of a dictionary, pairs of key and value."""
+
+
+def read(content: bytes) -> Any:
+    """Returns the content of a pickle: numbers, strings, bytes, tuples, lists, `Items` and `Call`s.
+
+    Raises:
+        BadArtifact: it holds an instruction that numbers and tensors do not need.
+        ValueError, IndexError: it is damaged.
+    """
+    stack: list[Any] = []
+    memo: dict[int, Any] = {}
+    for opcode, argument, _ in pickletools.genops(content):
+        name = opcode.name
+        if name in _CONSTANTS:
+            stack.append(argument)
+        elif name in _VALUES:
+            stack.append(_VALUES[name])
+        elif name in ("BINPUT", "LONG_BINPUT", "MEMOIZE"):
+            memo[len(memo) if argument is None else argument] = stack[-1]
+        elif name in ("BINGET", "LONG_BINGET") and argument is not None:
+            stack.append(memo[argument])
+        elif name not in _IGNORED:
+            _step(name, argument, stack)
+    if len(stack) != 1:
+        raise ValueError("the pickle is damaged")
+    return stack.pop()
+
+
+def _step(name: str, argument: Any, stack: list[Any]) -> None:
+    """Carries out one of the instructions that make an object."""
+    match name:
+        case "MARK":
+            stack.append(_MARK)
+        case "EMPTY_LIST":
+            stack.append([])
+        case "EMPTY_DICT":
+            stack.append(Items())
+        case "TUPLE":
+            stack.append(tuple(_to_mark(stack)))
+        case "TUPLE1" | "TUPLE2" | "TUPLE3":
+            n = _TUPLES[name]
+            stack[-n:] = [tuple(stack[-n:])]
+        case "GLOBAL":
+            stack.append(Name(argument.replace(" ", ".", 1)))
+        case "STACK_GLOBAL":
+            module, attribute = stack.pop(-2), stack.pop()
+            plain = isinstance(module, str) and isinstance(attribute, str)
+            stack.append(Name(f"{module}.{attribute}" if plain else ""))
+        case "REDUCE" | "NEWOBJ":
+            arguments, function = stack.pop(), stack.pop()
+            stack.append(Call(function.text if isinstance(function, Name) else "", arguments))
+        case "BINPERSID":
+            stack.append(Call("persistent", stack.pop()))
+        case "BUILD":
+            state = stack.pop()
+            if isinstance(stack[-1], Call):
+                stack[-1].state = state
+        case "APPEND" | "APPENDS":
+            values = [stack.pop()] if name == "APPEND" else _to_mark(stack)
+            if isinstance(stack[-1], list):
+                stack[-1].extend(values)
+        case "SETITEM" | "SETITEMS":
+            flat = [stack.pop(-2), stack.pop()] if name == "SETITEM" else _to_mark(stack)
+            into = stack[-1].items if isinstance(stack[-1], Call) else stack[-1]
+            into.extend(zip(flat[::2], flat[1::2], strict=True))
+        case _:
+            raise BadArtifact(f"it holds the instruction {name}, which numbers do not need")
+
+
+def _to_mark(stack: list[Any]) -> list[Any]:
+    """Takes everything above the last mark from the stack, and returns it."""
+    at = len(stack) - 1
+    while stack[at] is not _MARK:
+        at -= 1
+    values = stack[at + 1 :]
+    del stack[at:]
+    return values
+
+
+def array(content: bytes) -> np.ndarray | None:
+    """Returns the array of numbers that NumPy pickled; None if it is none, or of another kind."""
+    if len(content) > LARGEST:
+        return None
+    try:
+        return _array(read(content))
+    except Exception:  # a damaged pickle may raise any error
+        return None
+
+
+def _array(found: Any) -> np.ndarray | None:
+    if not isinstance(found, Call):
+        return None
+    module, _, function = found.function.rpartition(".")
+    if not module.startswith("numpy"):
+        return None
+    if function == "_frombuffer":  # NumPy's pickles of protocol 5
+        data, kind, shape, order = found.arguments
+    elif function == "_reconstruct":
+        _, shape, kind, fortran, data = found.state
+        order = "F" if fortran else "C"
+    else:
+        return None
+    text, swapped = kind.arguments[0], kind.state[1]
+    numbers = np.frombuffer(data, dtype=np.dtype(text).newbyteorder(swapped))
+    return numbers.reshape(shape, order=order).astype(float)

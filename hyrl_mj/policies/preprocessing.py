@@ -1,0 +1,209 @@
+"""What stands between the observation of a task and an agent: `VecNormalize` and `VecFrameStack`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+
+from hyrl_mj import archives, artifacts
+from hyrl_mj.errors import BadArtifact, BadInput
+from hyrl_mj.policies.mlp import MlpPolicy, ObservationPolicy, Policy, SampledPolicy
+from hyrl_mj.tasks import Task
+
+# SB3's, where a file of statistics does not give it.
+EPSILON = 1e-8
+LARGEST = 2**20  # of a file of statistics [bytes]
+LARGEST_STACK = 1000
+RECIPE = "write it with mean, var and clip, as docs/your-agent.md shows"
+
+
+@dataclass(frozen=True)
+class Normalization:
+    """The statistics of `VecNormalize`: an agent sees clip((o - mean) / sqrt(var + epsilon), -clip, clip).
+
+    Attributes:
+        mean, var: (k,) of observations, or (n_stack k,) of stacked ones.
+        clip: the largest magnitude of a normalised observation.
+        epsilon: keeps the divisor from zero.
+    """
+
+    mean: np.ndarray
+    var: np.ndarray
+    clip: float
+    epsilon: float = EPSILON
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Returns normalised observations."""
+        scaled = (observation - self.mean) / np.sqrt(self.var + self.epsilon)
+        return np.clip(scaled, -self.clip, self.clip)
+
+    @cached_property
+    def sha256(self) -> str:
+        """The hash of all statistics."""
+        numbers = (self.mean, self.var, np.array([self.clip, self.epsilon]))
+        return sha256(b"".join(np.asarray(n, dtype="<f8").tobytes() for n in numbers)).hexdigest()
+
+    def save(self, path: Path) -> None:
+        """Writes the npz file."""
+        with artifacts.replacing(path) as temporary:
+            np.savez(temporary, **{name: getattr(self, name) for name in _FIELDS})
+
+    @staticmethod
+    def load(path: Path) -> Normalization:
+        """Reads an npz file with the arrays mean, var, clip, and epsilon unless it is SB3's.
+
+        Raises:
+            BadArtifact: an array is missing, or has numbers that cannot be.
+        """
+        with artifacts.reading(path, RECIPE):
+            arrays = archives.read_npz(path, LARGEST)
+            if missing := [name for name in _FIELDS[:3] if name not in arrays]:
+                raise BadArtifact(f"it has no array {' and no '.join(missing)}: {RECIPE}")
+            values = {n: np.asarray(arrays[n], dtype=float) for n in _FIELDS if n in arrays}
+            mean, var, clip = (values[name] for name in _FIELDS[:3])
+            epsilon = values.get("epsilon", np.array(EPSILON))
+            if mean.ndim != 1 or var.shape != mean.shape or clip.size != 1 or epsilon.size != 1:
+                raise BadArtifact(
+                    f"its mean and var are two rows of numbers, clip is one number: {RECIPE}"
+                )
+            finite = (
+                np.isfinite(mean).all() and np.isfinite(var).all() and np.isfinite(epsilon).all()
+            )
+            if not (finite and (var >= 0).all() and clip.item() > 0 and (var + epsilon > 0).all()):
+                raise BadArtifact(
+                    "its numbers cannot be statistics: mean is finite, var >= 0, clip > 0, epsilon > 0"
+                )
+            return Normalization(mean, var, clip.item(), epsilon.item())
+
+
+_FIELDS = ("mean", "var", "clip", "epsilon")
+
+
+@dataclass(frozen=True)
+class Preprocessing:
+    """How an agent sees a task.
+
+    Attributes:
+        normalization: the statistics of `VecNormalize`; None without.
+        n_stack: number of observations that it sees at once (`VecFrameStack`).
+    """
+
+    normalization: Normalization | None = None
+    n_stack: int = 1
+
+    @staticmethod
+    def of(vecnormalize: str | Path | None, n_stack: int, task: Task) -> Preprocessing:
+        """Returns the preprocessing of a file of statistics and a number of observations.
+
+        Raises:
+            BadInput: they cannot be used, or do not fit the task.
+        """
+        whole = isinstance(n_stack, int) and not isinstance(n_stack, bool)
+        if not whole or not 1 <= n_stack <= LARGEST_STACK:
+            raise BadInput(
+                f"n_stack {n_stack!r} cannot be used: give the number of observations that the agent sees at "
+                f"once, from 1 to {LARGEST_STACK}"
+            )
+        if vecnormalize is None:
+            return Preprocessing(None, n_stack)
+        statistics, k = Normalization.load(Path(vecnormalize)), len(task.observation_low)
+        if len(statistics.mean) not in (k, n_stack * k):
+            raise BadArtifact(
+                f"{vecnormalize} is about observations of {len(statistics.mean)} numbers, those of "
+                f"{task.name} have {k}: give the statistics of the agent's own training"
+            )
+        return Preprocessing(statistics, n_stack)
+
+    def __bool__(self) -> bool:
+        return self.normalization is not None or self.n_stack > 1
+
+    def __call__(self, frames: np.ndarray) -> np.ndarray:
+        """Returns what an agent sees (n, n_stack k) of its last observations (n, n_stack, k), oldest first.
+
+        Observations before the start are NaN; the agent sees zeros there, as after a reset of
+        `VecFrameStack`.
+        """
+        n, stack, k = frames.shape
+        frames = frames.astype(np.float32)  # as an environment gives them
+        normalize = self.normalization
+        if normalize is not None and len(normalize.mean) == k:
+            frames = normalize(frames)
+        seen = np.nan_to_num(frames, nan=0.0).reshape(n, stack * k)
+        if normalize is not None and len(normalize.mean) != k:
+            seen = normalize(seen)
+        return seen
+
+
+# An agent that sees the observation of the task itself.
+UNCHANGED = Preprocessing()
+
+
+@dataclass(frozen=True)
+class PreprocessedPolicy(ObservationPolicy):
+    """An agent that sees more or something else than the observation of the task.
+
+    `act` is its steady answer: to a measurement that has not changed for as long as it remembers. With
+    its memory it acts in closed loops, which call `act_after`.
+
+    Attributes:
+        policy: the agent.
+        preprocessing: what it sees.
+        remembers: whether it acts with its memory in closed loops.
+    """
+
+    policy: ObservationPolicy
+    preprocessing: Preprocessing
+    remembers: bool = True
+
+    @property
+    def task(self) -> Task:  # type: ignore[override]
+        return self.policy.task
+
+    @property
+    def memory(self) -> int:
+        """The number of past measurements that it reads in a closed loop."""
+        return self.preprocessing.n_stack - 1 if self.remembers else 0
+
+    def inputs(self, observation: np.ndarray) -> np.ndarray:
+        frames = np.repeat(observation[:, None], self.preprocessing.n_stack, axis=1)
+        return self.policy.inputs(self.preprocessing(frames))
+
+    def act_after(self, measured: np.ndarray, past: np.ndarray) -> np.ndarray:
+        """Returns inputs (n, m) for measurements (n, p) and those before them, (n, memory, p), oldest first.
+
+        Past measurements are NaN before the start.
+        """
+        task = self.task
+        frames = [task.observation(task.check_measurement(measured))]
+        for before in np.moveaxis(past, 1, 0)[::-1]:
+            started = np.isfinite(before).all(axis=1)
+            frame = np.full(frames[0].shape, np.nan)
+            if started.any():
+                frame[started] = task.observation(before[started])
+            frames.insert(0, frame)
+        return self.policy.inputs(self.preprocessing(np.stack(frames, axis=1)))
+
+
+def as_function(policy: Policy) -> Policy:
+    """Returns a policy as a function of the measurement.
+
+    Of one that draws its inputs this is its mean or mode, of one with memory its steady answer.
+    """
+    if isinstance(policy, SampledPolicy):
+        return policy.policy
+    if isinstance(policy, PreprocessedPolicy):
+        inner = as_function(policy.policy)
+        assert isinstance(inner, ObservationPolicy)
+        return replace(policy, policy=inner, remembers=False)
+    return policy
+
+
+def network(policy: object) -> MlpPolicy | None:
+    """Returns the network of a policy, None if it has none."""
+    while isinstance(policy, SampledPolicy | PreprocessedPolicy):
+        policy = policy.policy
+    return policy if isinstance(policy, MlpPolicy) else None
