@@ -3,13 +3,19 @@
 import logging
 import re
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import mujoco
 
-# How often MuJoCo has warned in this process, by the text of its warnings with # in place of numbers.
+# How often MuJoCo has warned in this process, by kind: the text of its warning with # in place of numbers.
 counts: Counter[str] = Counter()
-_new: list[str] = []
 _NUMBER = re.compile(r"-?\d[\d.e+-]*")
+# The last text of each kind that has not been said yet, and the kinds that have.
+_new: dict[str, str] = {}
+_said: set[str] = set()
+# Not empty while warnings are kept.
+_kept: list[bool] = []
 
 
 def install() -> None:
@@ -20,12 +26,24 @@ def install() -> None:
 
 def say() -> None:
     """Logs each new kind of warning, once in a process, with the logger "hyrl_mj"."""
-    while _new:
-        text = _new.pop()
-        logging.getLogger("hyrl_mj").warning(
-            "MuJoCo warns: %s This is said once, and further warnings of this kind are counted.",
-            text,
-        )
+    while _new and not _kept:
+        kind, text = _new.popitem()
+        if kind not in _said:
+            _said.add(kind)
+            logging.getLogger("hyrl_mj").warning(
+                "MuJoCo warns: %s (said once; further warnings of this kind are only counted)", text
+            )
+
+
+@contextmanager
+def kept() -> Iterator[dict[str, str]]:
+    """Yields the warnings of the block, text by kind, which are not said."""
+    _kept.append(True)
+    try:
+        yield _new
+    finally:
+        _kept.pop()
+        _new.clear()
 
 
 def since(before: Counter[str]) -> str:
@@ -41,6 +59,6 @@ def _count(text: str) -> None:
     """Counts a warning; called by MuJoCo, also from its own threads."""
     line = " ".join(text.split())
     kind = _NUMBER.sub("#", line)
-    if not counts[kind]:
-        _new.append(line)
     counts[kind] += 1
+    if _kept or kind not in _said:
+        _new[kind] = line

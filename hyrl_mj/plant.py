@@ -1,16 +1,13 @@
 """The physics of every task: n copies of a compiled model, stepped side by side."""
 
 import copy
-import ctypes
-import os
 from collections.abc import Callable, Sequence
 from typing import Any
-from weakref import WeakSet
 
 import mujoco
 import numpy as np
 
-from hyrl_mj import mjcf, mujoco_log
+from hyrl_mj import forked, mjcf, mujoco_log
 from hyrl_mj.errors import BadInput
 
 # Sensor values (n, sensors) -> measurement (n, p).
@@ -81,7 +78,7 @@ class Plant:
 
         mujoco_log.install()
         self._batch = Batch(self.model, self.n, self._threads)
-        self._forked = False
+        forked.own(self._batch)
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._ctrl = self._batch.bind("ctrl")
         if self._joints is None:
@@ -90,7 +87,6 @@ class Plant:
             self._batch.state[:] = state
             if self._joints is None:
                 self._batch.forward(None, self._stage)
-        _OPEN.add(self)
 
     def __getstate__(self) -> dict[str, Any]:
         of_batch = ("_batch", "_qpos", "_qvel", "_ctrl", "_sensors")
@@ -204,7 +200,7 @@ class Plant:
 
     def _wake(self) -> None:
         """Makes new copies in a forked process: MuJoCo's threads are in the other one."""
-        if self._forked:
+        if forked.is_left(self._batch):
             self._open(self._batch.state)
 
     def _rows(self, ids: np.ndarray | None) -> np.ndarray:
@@ -305,17 +301,3 @@ def _checked(name: str, values: np.ndarray, columns: int, rows: np.ndarray) -> n
             f"{name}[{column}] of simulation {rows[row]} is {values[row, column]}, it must be finite"
         )
     return values
-
-
-_OPEN: WeakSet[Plant] = WeakSet()
-
-
-def _after_fork() -> None:
-    for plant in _OPEN:
-        plant._forked = True
-        # MuJoCo would end the process where it deletes a batch without its threads.
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(plant._batch))
-
-
-if hasattr(os, "register_at_fork"):  # not on Windows
-    os.register_at_fork(after_in_child=_after_fork)

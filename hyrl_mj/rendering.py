@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 from contextlib import suppress
 from copy import copy
 from typing import Any
@@ -11,9 +12,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from hyrl_mj import mjcf
+from hyrl_mj import forked, mjcf
 from hyrl_mj.errors import BadInput, NoRenderer, brief
 from hyrl_mj.gl import GL_PROBLEM
+from hyrl_mj.ranges import Integer
 
 GL_CURE = "on Debian or Ubuntu: apt-get install libegl1 libgl1-mesa-dri, and set MUJOCO_GL=egl"
 
@@ -23,6 +25,9 @@ GEOMS = 2_000  # default capacity of a scene
 # A geom that is a label without a text is not drawn.
 HIDDEN = mujoco.mjtGeom.mjGEOM_LABEL
 FRUSTUM = ("frustum_center", "frustum_width", "frustum_bottom", "frustum_top")
+
+# The processes that have opened GL contexts: this one, or one that it was forked from.
+_GL_PROCESSES: set[int] = set()
 
 # Left, top, right and bottom of a part of a picture [pixels], the last two excluded.
 Box = tuple[int, int, int, int]
@@ -37,10 +42,13 @@ class Canvas:
 
     Raises:
         BadInput: a size that no picture can have.
-        NoRenderer: there is no GL library; the message says which to install.
+        NoRenderer: there is no GL library; the message says which to install. Or this process was forked from
+            one that has drawn pictures.
     """
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int):
+        for name, pixels in (("width", width), ("height", height)):
+            Integer(-(2**31), 2**31).checked(name, pixels)
         if not (0 < width <= LARGEST and 0 < height <= LARGEST):
             raise BadInput(
                 f"a picture of {width} x {height} pixels cannot be drawn: give 1 x 1 to "
@@ -51,8 +59,13 @@ class Canvas:
         shape = self.model.vis.global_
         shape.offwidth, shape.offheight = width, height
         self._gl: Any = None
+        self._thread = threading.get_ident()
+        if _GL_PROCESSES - {os.getpid()}:
+            raise _in_fork()
+        _GL_PROCESSES.add(os.getpid())
         try:
             self._gl = _gl_context(width, height)
+            forked.own(self._gl)
             self._gl.make_current()
             self._context = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100)
         # Each GL backend fails in its own way: ImportError, AttributeError, RuntimeError, ...
@@ -67,15 +80,20 @@ class Canvas:
         """The driver's name of the GL device."""
         from OpenGL import GL  # chooses its platform when it is imported
 
-        self._gl.make_current()
+        self._enter()
         return str(GL.glGetString(GL.GL_RENDERER).decode())
 
     def draw(self, scene: mujoco.MjvScene, width: int, height: int) -> np.ndarray:
-        """Returns the picture of the scene's camera: (height, width, 3) uint8."""
+        """Returns the picture of the scene's camera: (height, width, 3) uint8.
+
+        Raises:
+            BadInput: another thread than the one that created the canvas draws.
+            NoRenderer: drawing fails, or a forked process draws.
+        """
+        self._enter()
         part = mujoco.MjrRect(0, 0, width, height)
         pixels = np.empty((height, width, 3), dtype=np.uint8)
         try:
-            self._gl.make_current()
             mujoco.mjr_render(part, scene, self._context)
             mujoco.mjr_readPixels(pixels, None, part, self._context)
         except mujoco.FatalError as error:
@@ -83,10 +101,22 @@ class Canvas:
         return pixels[::-1]  # GL counts rows from below
 
     def close(self) -> None:
-        """Frees the GL context."""
+        """Frees the GL context; in a forked process does nothing."""
+        if not forked.is_left(self._gl):
+            self._enter()
+            self._context.free()
+            self._gl.free()
+
+    def _enter(self) -> None:
+        """Makes the GL context current."""
+        if forked.is_left(self._gl):
+            raise _in_fork()
+        if threading.get_ident() != self._thread:
+            raise BadInput(
+                "pictures can only be drawn by the thread that drew the first one: draw all of them there, "
+                "or make an environment in each thread"
+            )
         self._gl.make_current()
-        self._context.free()
-        self._gl.free()
 
 
 class SceneRenderer:
@@ -260,6 +290,13 @@ def _gl_context(width: int, height: int) -> Any:
 
             return GLContext(width, height)
     return mujoco.GLContext(width, height)
+
+
+def _in_fork() -> NoRenderer:
+    return NoRenderer(
+        "this process was forked from one that has drawn pictures, and cannot draw any: start it with "
+        'multiprocessing\'s context "spawn", or draw the first picture after the fork'
+    )
 
 
 def _no_gl(error: Exception) -> NoRenderer:

@@ -9,8 +9,12 @@ from itertools import product
 import numpy as np
 
 from hyrl_mj.errors import BadInput
+from hyrl_mj.ranges import Integer, Optional
 from hyrl_mj.simulation import NOT_STARTED, AnyNoise, Sample, signal_for
-from hyrl_mj.tasks import Outcome, Task, at_levels
+from hyrl_mj.tasks import Outcome, Task, at_levels, check_finite
+
+# The most episodes side by side.
+MOST = 2**20
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,9 @@ class BatchedEnv:
         domain: where episodes start and stay; by default the task's starts, and everywhere.
         max_steps: samples until truncation, by default the task's limit.
         threads: threads of the physics, 0 for all cores; results do not depend on it.
+
+    Raises:
+        BadInput: a value that cannot be used.
     """
 
     def __init__(
@@ -77,17 +84,23 @@ class BatchedEnv:
         max_steps: int | None = None,
         threads: int = 0,
     ):
-        if n < 1:
-            raise BadInput(f"{n} episodes side by side cannot be played: give at least 1")
+        n = Integer(1, MOST).checked("the number of episodes side by side", n)
+        limit = Optional(Integer(1, 10**9)).checked("the limit of samples", max_steps)
+        threads = Integer(0, 1_024).checked("threads", threads)
         self.task, self.n, self.domain = task, n, domain
         self._noise = signal_for(noise, task, None)
-        self.max_steps = max_steps or task.max_steps
+        self.max_steps = limit or task.max_steps
         self.plant = task.plant(n, threads)
         self.samples = np.zeros(n, dtype=int)  # of each episode so far
         self.seed(None)
 
     def seed(self, seed: int | None) -> None:
-        """Restarts the generator from which starts and noise are drawn."""
+        """Restarts the generator from which starts and noise are drawn.
+
+        Raises:
+            BadInput: the seed is not an integer >= 0, or None.
+        """
+        seed = Optional(Integer(0, 2**64)).checked("seed", seed)
         self._rng = np.random.default_rng(seed)
         self._noise.reset(self.n, self._rng)
 
@@ -113,6 +126,9 @@ class BatchedEnv:
         """Advances all episodes by one sample under inputs u (n, m) in the plant's units.
 
         The caller resets the episodes that are over.
+
+        Raises:
+            BadInput: inputs that cannot be applied, or a method of the task that fails.
         """
         self.plant.step(u)
         self.samples += 1
@@ -129,6 +145,7 @@ class BatchedEnv:
             reward[left] = self.domain.exit_reward
             terminated = terminated | left
             outcome[left] = Outcome.OUT_OF_BOUNDS
+        check_finite(self.task, "reward", reward, measurement)
         truncated = ~terminated & (self.samples >= self.max_steps)
         if truncated.any():
             outcome[truncated] = self.task.verdict(measurement[truncated])
@@ -141,10 +158,26 @@ class BatchedEnv:
         return self.task.z(self.plant.measurement)
 
     def inputs(self, actions: np.ndarray) -> np.ndarray:
-        """Returns inputs (n, m) in the plant's units for levels (n,) int, or for inputs (n, m) to clip."""
-        if self.task.input_levels is None:
-            return np.clip(np.asarray(actions, dtype=float), *self.task.input_limits)
-        return at_levels(self.task, actions)
+        """Returns inputs (n, m) in the plant's units for levels (n,) int, or for inputs (n, m) to clip.
+
+        Raises:
+            BadInput: actions of another shape or type, or numbers of no level.
+        """
+        try:
+            values = np.asarray(actions)
+        except ValueError:
+            raise BadInput(f"actions {actions!r} cannot be used: give an array") from None
+        discrete, m = self.task.input_levels is not None, len(self.task.inputs)
+        fits = values.ndim == 1 if discrete else values.ndim == 2 and values.shape[1] == m
+        if not fits or not values.size or values.dtype.kind not in "iuf":
+            one = "an integer" if discrete else f"an array of shape ({m},)"
+            raise BadInput(
+                f"actions of shape {values.shape} and type {values.dtype} cannot be used: {self.task.name} "
+                f"takes {one} for each episode"
+            )
+        if discrete:
+            return at_levels(self.task, values)
+        return np.clip(values.astype(float), *self.task.input_limits)
 
     def _measure(self, ids: np.ndarray) -> np.ndarray:
         """Returns noisy measurements (k, p) of the rows `ids`."""

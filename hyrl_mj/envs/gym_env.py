@@ -5,13 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from hyrl_mj import mjcf
 from hyrl_mj.envs.core import BatchedEnv
-from hyrl_mj.errors import BadInput
+from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.simulation import AnyNoise
 from hyrl_mj.tasks import Outcome, Task, get_task
 
@@ -42,6 +44,9 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         render_mode: None or "rgb_array".
         camera: name of a camera of the MJCF, by default that of the task's scene.
         width, height: size of the rendered picture [pixels].
+
+    Raises:
+        BadInput: a value that cannot be used.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
@@ -64,6 +69,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         self.action_space = action_space(self.core.task)
         self.render_mode, self._size = render_mode, (width, height)
         self._camera = camera or self.core.task.scene.camera
+        mjcf.object_id(self.core.task.model, mujoco.mjtObj.mjOBJ_CAMERA, self._camera)
         self._renderer: Any = None  # a `SceneRenderer`, opened by the first picture
 
     def reset(
@@ -76,7 +82,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Applies one action for one sample; see `gymnasium.Env.step`."""
-        result = self.core.step(self.core.inputs(np.asarray(action)[None]))
+        result = self.core.step(self.core.inputs([action]))
         info: dict[str, Any] = {"z": self.core.z[0]}
         if result.done[0]:
             info["outcome"] = Outcome(result.outcome[0]).label
@@ -93,6 +99,9 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
             self._renderer = SceneRenderer(self.core.task.model, *self._size)
         self._renderer.place(self.core.plant.qpos[0], self._camera)
         return self._renderer.draw()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_renderer": None}  # a copy draws with a renderer of its own
 
     def close(self) -> None:
         """Frees the GL context."""
@@ -112,6 +121,10 @@ class TaskVectorEnv(VectorEnv):
         num_envs: number of episodes n.
         noise, threads: as in `BatchedEnv`.
         max_episode_steps: samples until truncation, by default the task's limit.
+        render_mode: None: many episodes at once draw no pictures.
+
+    Raises:
+        BadInput: a value that cannot be used.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -124,15 +137,21 @@ class TaskVectorEnv(VectorEnv):
         noise: AnyNoise | None = None,
         max_episode_steps: int | None = None,
         threads: int = 0,
+        render_mode: None = None,
     ):
+        if render_mode is not None:
+            raise BadInput(
+                f"render_mode {render_mode!r} cannot be used with many episodes at once: use gymnasium.make "
+                'for one, or gymnasium.make_vec(..., vectorization_mode="sync")'
+            )
         self.core = BatchedEnv(
             get_task(task), num_envs, noise=noise, max_steps=max_episode_steps, threads=threads
         )
-        self.num_envs = num_envs
+        self.num_envs, self.render_mode = self.core.n, None
         self.single_observation_space = observation_space(self.core.task)
         self.single_action_space = action_space(self.core.task)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -163,5 +182,18 @@ class TaskVectorEnv(VectorEnv):
 
 def starts(task: Task, options: dict[str, Any] | None) -> np.ndarray | None:
     """Returns the chart points `options["z"]`, checked, or None."""
-    z = (options or {}).get("z")
+    options = {} if options is None else options
+    check_options(options)
+    z = options.get("z")
     return None if z is None else task.chart.check(z, task.name)
+
+
+def check_options(options: dict[str, Any]) -> None:
+    """Raises `BadInput` unless the options of a reset hold nothing but a start "z"."""
+    if not isinstance(options, dict):
+        raise BadInput(
+            f"options {options!r} cannot be used: give a dictionary with the start, as {{'z': z}}"
+        )
+    for name in options:
+        if name != "z":
+            raise unknown("option", name, ["z"])

@@ -9,14 +9,21 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from hyrl_mj.envs.core import BatchedEnv
-from hyrl_mj.envs.gym_env import action_space, observation_space, starts
+from hyrl_mj.envs.gym_env import action_space, check_options, observation_space, starts
+from hyrl_mj.errors import BadInput
 from hyrl_mj.tasks import Outcome
 
 
 class TaskVecEnv(VecEnv):
-    """A `BatchedEnv` with SB3's conventions: reset in the same step, infos filled only at an end."""
+    """A `BatchedEnv` with SB3's conventions: reset in the same step, infos filled only at an end.
+
+    Raises:
+        BadInput: `core` is something else.
+    """
 
     def __init__(self, core: BatchedEnv):
+        if not isinstance(core, BatchedEnv):
+            raise BadInput(f"{core!r} cannot be used: give a BatchedEnv(task, n)")
         self.core = core
         self.render_mode = None
         self._actions = np.zeros(0)
@@ -30,8 +37,11 @@ class TaskVecEnv(VecEnv):
 
     def reset(self) -> np.ndarray:
         """Starts all episodes, at chart points if `set_options([{"z": z}, ...])` has set one for each."""
-        points = [options.get("z") for options in self._options]
+        given = self._options
         self._reset_options()
+        for options in given:
+            check_options(options)
+        points = [options.get("z") for options in given]
         default = all(point is None for point in points)
         self._returns[:] = 0
         return self.core.reset(z=starts(self.core.task, {} if default else {"z": points}))

@@ -10,6 +10,7 @@ from pkgutil import iter_modules
 from hyrl_mj.tasks.base import Task, at_levels
 from hyrl_mj.tasks.checks import check_task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.guard import check_finite
 from hyrl_mj.tasks.registry import described_task, get_task, reference, register, task_names
 from hyrl_mj.tasks.scaffold import write_task
 
@@ -21,6 +22,7 @@ __all__ = [
     "Scene",
     "Task",
     "at_levels",
+    "check_finite",
     "check_task",
     "described_task",
     "get_task",

@@ -37,7 +37,7 @@ COLUMNS = {
     "danger": "",
     "direction": "",
 }
-# Methods whose results are checked by the plant.
+# Methods whose results have other shapes.
 PASSED_ON = ("measure", "state", "control")
 # Methods whose results have to be finite wherever they are asked for.
 FINITE = ("z", "with_z", "observation")
@@ -76,7 +76,7 @@ def _guarded(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
             result = method(self, *args, **kwargs)
         except HyrlError:
             raise
-        except Exception as error:  # whatever the user's own code raises
+        except (Exception, SystemExit) as error:  # whatever the user's own code raises
             row = _row_of(lambda *rows: method(self, *rows), args, name)
             raise BadInput(
                 f"{name}() of the task {self.name} raises {brief(error)}{line_in(error, self.source)}"
@@ -84,6 +84,8 @@ def _guarded(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
             ) from error
         if name in COLUMNS:
             _check_result(self, name, args, result)
+        elif name == "state":
+            _check_state(self, args, result)
         return result
 
     return checked
@@ -103,10 +105,10 @@ def _check_result(task: Task, name: str, args: tuple[Any, ...], result: Any) -> 
         raise BadInput(
             f"{name}() of the task {task.name} gives {given} for {n} row(s): give an array of shape {shape}"
         )
-    if name in OUTCOMES and not (result.dtype.kind in "iu" and _are_outcomes(result)):
+    if name in OUTCOMES and n and not _are_outcomes(result):
         raise BadInput(
-            f"{name}() of the task {task.name} gives {result.dtype} values like {result.flat[0]}: give a "
-            "hyrl_mj.Outcome for each row"
+            f"{name}() of the task {task.name} gives {result.dtype} from {result.min()} to "
+            f"{result.max()}: give a hyrl_mj.Outcome for each row"
         )
     if name in FINITE and not math.isfinite(result.sum()):
         finite = np.isfinite(result).all(axis=1)
@@ -119,7 +121,24 @@ def _check_result(task: Task, name: str, args: tuple[Any, ...], result: Any) -> 
 
 
 def _are_outcomes(values: np.ndarray) -> bool:
-    return not values.size or (values.min() >= min(Outcome) and values.max() <= max(Outcome))
+    return bool(values.dtype.kind in "iu" and values.min() >= 0 and values.max() <= max(Outcome))
+
+
+def _check_state(task: Task, args: tuple[Any, ...], result: Any) -> None:
+    """Checks the full states that `state` returned: qpos (n, nq) and qvel (n, nv), or None."""
+    if not isinstance(result, tuple) or len(result) != 2:
+        raise BadInput(
+            f"state() of the task {task.name} gives a {type(result).__name__}: give a tuple (qpos, qvel), "
+            "with None for qvel at rest"
+        )
+    for part, values in zip(("qpos", "qvel"), result, strict=True):
+        finite = np.isfinite(np.asarray(0.0 if values is None else values, dtype=float))
+        if not finite.all():
+            row = int(np.argwhere(~finite)[0][0])
+            raise BadInput(
+                f"state() of the task {task.name} gives a {part} that is not finite"
+                f"{_place(task, 'state', args, row)}: give finite numbers"
+            )
 
 
 def _row_of(method: Callable[..., Any], args: tuple[Any, ...], name: str) -> int | None:
@@ -133,7 +152,7 @@ def _row_of(method: Callable[..., Any], args: tuple[Any, ...], name: str) -> int
         ]
         try:
             method(*rows)
-        except Exception:
+        except (Exception, SystemExit):
             return row
     return None
 

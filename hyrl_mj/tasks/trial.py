@@ -1,0 +1,161 @@
+"""A task is tried out: whole episodes under random inputs, and under extreme ones from all over its chart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+
+import numpy as np
+
+from hyrl_mj import mujoco_log
+from hyrl_mj.errors import BadInput
+from hyrl_mj.sets import Grid
+from hyrl_mj.tasks.base import Task
+from hyrl_mj.tasks.description import Outcome
+from hyrl_mj.tasks.guard import check_finite
+
+# Steps of the physics that the episodes of a trial take together, at most; and how many run side by side.
+STEPS, FEWEST, MOST = 200_000, 16, 256
+# Of these, starts as training draws them; the others are nodes of a grid of so many nodes.
+STARTS, NODES = 32, 128
+# Corners of the input limits that are tried, at most.
+CORNERS = 16
+
+# Number of the sample -> inputs (n, m).
+Inputs = Callable[[int], np.ndarray]
+
+
+def try_random(task: Task) -> np.ndarray:
+    """Plays episodes under random inputs, and returns their outcomes (n,).
+
+    Raises:
+        BadInput: the physics breaks down, or what a method returns cannot be used.
+    """
+    n, rng = _side_by_side(task), np.random.default_rng(0)
+    z = task.starts(n, rng)
+    return _play(
+        task, z, lambda k: rng.uniform(*task.input_limits, (n, len(task.inputs))), "random"
+    )
+
+
+def try_extreme(task: Task) -> np.ndarray:
+    """Plays episodes under inputs at their limits, held and alternating; returns their outcomes (n,).
+
+    They begin all over the chart, because the stages after training do so, too.
+
+    Raises:
+        BadInput: as `try_random`.
+    """
+    rng = np.random.default_rng(0)
+    corners = np.array(list(product(*zip(*task.input_limits, strict=True), repeat=1)))
+    corners = corners[rng.permutation(len(corners))[:CORNERS]]
+    places = np.vstack([task.starts(STARTS, rng), task.scene.starts, _nodes(task)])
+    chosen = rng.permutation(2 * len(corners) * len(places))[: _side_by_side(task)]
+    place, corner, alternating = np.unravel_index(chosen, (len(places), len(corners), 2))
+    held, opposite = corners[corner], np.sum(task.input_limits, axis=0) - corners[corner]
+
+    def inputs(k: int) -> np.ndarray:
+        return np.where((alternating & (k % 2))[:, None], opposite, held)
+
+    return _play(task, places[place], inputs, "extreme")
+
+
+def _samples(task: Task) -> int:
+    """Returns the number of samples of a tried episode."""
+    substeps = task.dt / task.model.opt.timestep
+    return int(min(task.max_steps, max(STEPS / substeps / FEWEST, 1)))
+
+
+def _side_by_side(task: Task) -> int:
+    """Returns the number of episodes side by side."""
+    steps = _samples(task) * task.dt / task.model.opt.timestep
+    return int(np.clip(STEPS / steps, FEWEST, MOST))
+
+
+def _nodes(task: Task) -> np.ndarray:
+    """Returns the nodes (k, d) of a coarse grid of the chart, at which episodes go on."""
+    cells = next(
+        c
+        for c in range(NODES, 0, -1)
+        if len(Grid.with_cells(task.chart, c).nodes) <= NODES or c == 1
+    )
+    nodes = Grid.with_cells(task.chart, cells).nodes
+    nodes = nodes[np.random.default_rng(0).permutation(len(nodes))[:NODES]]
+    plant = task.plant(len(nodes))
+    plant.set_state(*task.state(nodes))
+    return nodes[task.ending(plant.measurement) == Outcome.RUNNING]
+
+
+def _play(task: Task, z: np.ndarray, inputs: Inputs, kind: str) -> np.ndarray:
+    """Plays episodes from starts z (n, d), checks each sample, and returns the outcomes (n,)."""
+    n, rng = len(z), np.random.default_rng(1)
+    plant = task.plant(n)
+    plant.set_state(*task.state(z, rng))
+    outcome, path = np.full(n, Outcome.RUNNING), [task.z(plant.measurement)]
+    _check_observation(task, plant.measurement, 0)
+    for sample in range(1, _samples(task) + 1):
+        active = np.flatnonzero(outcome == Outcome.RUNNING)
+        if not len(active):
+            break
+        u = inputs(sample)
+        with mujoco_log.kept() as warnings:
+            plant.step(u[active], active)
+            broken = plant.unstable | (plant.warnings > 0)
+            if broken.any():
+                row, text = int(np.argmax(broken)), next(iter(warnings.values()), "")
+                raise BadInput(
+                    f"its simulation breaks down under {kind} inputs, from {task.chart.format(z[row])} after "
+                    f"{sample} sample(s) with the last inputs {u[row].tolist()} ({text}): in "
+                    f"{task.model_path.name}, lower kv or gear, make light bodies heavier, or shorten the "
+                    "timestep"
+                )
+        measurement = plant.measurement
+        outcome[active] = task.outcome(measurement[active], np.zeros(len(active), dtype=bool))
+        _check_step(task, measurement[active], u[active], outcome[active], sample)
+        path.append(np.where((outcome == Outcome.RUNNING)[:, None], task.z(measurement), path[-1]))
+    _check_end(task, np.array(path), plant.measurement)
+    return outcome
+
+
+def _check_step(
+    task: Task, measurement: np.ndarray, u: np.ndarray, outcome: np.ndarray, sample: int
+) -> None:
+    """Checks observation and reward of a step that ended in measurements (k, p)."""
+    running = outcome == Outcome.RUNNING
+    _check_observation(task, measurement[running], sample)
+    task.observation(measurement)  # the last one of an episode is learned from, too
+    reward = task.reward(measurement, u)
+    check_finite(task, "reward", reward, measurement)
+    low = running & (reward < task.worst_reward)
+    if low.any():
+        point = task.chart.format(task.z(measurement)[np.argmax(low)])
+        raise BadInput(
+            f"reward() gives {reward[low][0]:g} at {point}, and worst_reward is {task.worst_reward:g}: "
+            "lower it, or bound the reward"
+        )
+
+
+def _check_observation(task: Task, measurement: np.ndarray, sample: int) -> None:
+    """Raises `BadInput` if observations of measurements (n, p) do not lie in their bounds."""
+    low, high = np.array(task.observation_low), np.array(task.observation_high)
+    observation = task.observation(measurement)
+    outside = ~((observation >= low) & (observation <= high))
+    if outside.any():
+        row, column = np.argwhere(outside)[0]
+        raise BadInput(
+            f"observation[{column}] is {observation[row, column]:g} after {sample} samples, and "
+            f"its bounds are {low[column]:g} and {high[column]:g}: widen them"
+        )
+
+
+def _check_end(task: Task, path: np.ndarray, measurement: np.ndarray) -> None:
+    """Tries the methods that judge a whole episode, on paths (K + 1, n, d)."""
+    ways = set(np.unique(task.direction(path)).tolist())
+    if not ways <= {-1, *range(len(task.scene.mode_names))}:
+        raise BadInput(f"direction() gives {sorted(ways)}: give -1 or an index of scene.mode_names")
+    task.arrived(path[-1])
+    task.verdict(measurement)
+    for name, values in (("miss", task.miss(path[-1])), ("danger", task.danger(measurement))):
+        if np.isnan(values).any():
+            point = task.chart.format(path[-1][int(np.argmax(np.isnan(values)))])
+            raise BadInput(f"{name}() gives nan at {point}: give numbers")
