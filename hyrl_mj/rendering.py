@@ -7,6 +7,7 @@ import sys
 import threading
 from contextlib import suppress
 from copy import copy
+from numbers import Integral
 from typing import Any
 
 import mujoco
@@ -15,7 +16,6 @@ import numpy as np
 from hyrl_mj import forked, mjcf
 from hyrl_mj.errors import BadInput, NoRenderer, brief
 from hyrl_mj.gl import GL_PROBLEM
-from hyrl_mj.ranges import Integer
 
 GL_CURE = "on Debian or Ubuntu: apt-get install libegl1 libgl1-mesa-dri, and set MUJOCO_GL=egl"
 
@@ -47,9 +47,8 @@ class Canvas:
     """
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int):
-        for name, pixels in (("width", width), ("height", height)):
-            Integer(-(2**31), 2**31).checked(name, pixels)
-        if not (0 < width <= LARGEST and 0 < height <= LARGEST):
+        sizes = width, height
+        if not all(isinstance(n, Integral) and 0 < n <= LARGEST for n in sizes):
             raise BadInput(
                 f"a picture of {width} x {height} pixels cannot be drawn: give 1 x 1 to "
                 f"{LARGEST} x {LARGEST}"

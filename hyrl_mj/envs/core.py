@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.ranges import Integer, Optional
@@ -157,7 +158,7 @@ class BatchedEnv:
         """The true chart points (n, d)."""
         return self.task.z(self.plant.measurement)
 
-    def inputs(self, actions: np.ndarray) -> np.ndarray:
+    def inputs(self, actions: ArrayLike) -> np.ndarray:
         """Returns inputs (n, m) in the plant's units for levels (n,) int, or for inputs (n, m) to clip.
 
         Raises:

@@ -68,7 +68,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         self.observation_space = observation_space(self.core.task)
         self.action_space = action_space(self.core.task)
         self.render_mode, self._size = render_mode, (width, height)
-        self._camera = camera or self.core.task.scene.camera
+        self._camera = str(camera or self.core.task.scene.camera)
         mjcf.object_id(self.core.task.model, mujoco.mjtObj.mjOBJ_CAMERA, self._camera)
         self._renderer: Any = None  # a `SceneRenderer`, opened by the first picture
 
@@ -178,6 +178,9 @@ class TaskVectorEnv(VectorEnv):
             observation[ended] = self.core.reset(ended)
         infos["z"] = self.core.z
         return observation, result.reward, result.terminated, result.truncated, infos
+
+    def render(self) -> None:
+        """Returns None: many episodes at once draw no pictures."""
 
 
 def starts(task: Task, options: dict[str, Any] | None) -> np.ndarray | None:

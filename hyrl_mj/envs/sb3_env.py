@@ -35,13 +35,20 @@ class TaskVecEnv(VecEnv):
         self.core.seed(seed)
         return [seed] * self.num_envs
 
+    def set_options(self, options: list[dict[str, Any]] | dict[str, Any] | None = None) -> None:
+        """Keeps the options of the next `reset`: one dictionary for each episode, or one for all.
+
+        Raises:
+            BadInput: options that no episode takes.
+        """
+        for each in options if isinstance(options, list) else [options or {}]:
+            check_options(each)
+        super().set_options(options)
+
     def reset(self) -> np.ndarray:
         """Starts all episodes, at chart points if `set_options([{"z": z}, ...])` has set one for each."""
-        given = self._options
+        points = [options.get("z") for options in self._options]
         self._reset_options()
-        for options in given:
-            check_options(options)
-        points = [options.get("z") for options in given]
         default = all(point is None for point in points)
         self._returns[:] = 0
         return self.core.reset(z=starts(self.core.task, {} if default else {"z": points}))
@@ -68,6 +75,10 @@ class TaskVecEnv(VecEnv):
             observation[ended] = self.core.reset(ended)
             self._returns[ended] = 0
         return observation, result.reward.astype(np.float32), result.done, infos
+
+    def get_images(self) -> list[None]:
+        """Returns None for each episode: many episodes at once draw no pictures."""
+        return [None] * self.num_envs
 
     def close(self) -> None:
         """Does nothing: there are no resources to free."""

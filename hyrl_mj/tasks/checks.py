@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from hyrl_mj import mjcf
 from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput, brief, line_in, unknown
-from hyrl_mj.ranges import Integer, Number, Optional, Several, Text
+from hyrl_mj.ranges import Integer, Number, Optional, Rule, Several, Text
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.registry import check_current
@@ -20,7 +20,7 @@ STARTS = 64
 # Most physics steps of a sample.
 SUBSTEPS = 5_000
 # What the values of a task's attributes may be.
-RULES = {
+RULES: dict[str, Rule] = {
     "max_steps": Integer(1, 100_000),
     "worst_reward": Number(-1e9, 1e9),
     "precision": Number(0, np.inf, above=True),
@@ -132,10 +132,16 @@ def _check_model(task: Task) -> None:
     model, path = task.model, task.model_path
     if not model.nu:
         raise BadInput(f"{path.name} has no actuators: give the policy at least one to drive")
-    _ = task.input_limits
+    low, high = task.input_limits
+    if not (np.isfinite([low, high]).all() and (low < high).all()):
+        raise BadInput(
+            f"its input limits are {low} and {high} in {path.name}: give finite ones, low < high"
+        )
     # The replay needs both.
     mjcf.object_id(model, mujoco.mjtObj.mjOBJ_SITE, task.scene.tracked)
     mjcf.object_id(model, mujoco.mjtObj.mjOBJ_CAMERA, task.scene.camera)
+    for name, value in (("timestep", model.opt.timestep), ("sample_time", task.dt)):
+        Number(0, LONGEST, above=True).checked(f"{name} in {path.name}", value)
     steps = task.dt / model.opt.timestep
     if abs(steps - round(steps)) > 1e-6 or steps < 0.5:
         raise BadInput(
