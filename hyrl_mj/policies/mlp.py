@@ -313,7 +313,7 @@ def _linear(weights: Mapping[str, np.ndarray], prefix: str) -> list[Layer]:
         weight, bias = weights[f"{stem}weight"], weights.get(f"{stem}bias")
         if weight.ndim != 2 or bias is None or bias.shape != weight.shape[:1]:
             raise BadArtifact(
-                f"{stem}weight belongs to no linear layer with a bias: only plain multilayer "
+                f"{stem[:80]}weight belongs to no linear layer with a bias: only plain multilayer "
                 "perceptrons can be used"
             )
         layers.append((weight, bias))

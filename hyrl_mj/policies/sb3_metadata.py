@@ -25,6 +25,7 @@ EPISODES, SAMPLES = 256, 20
 NOISE = 0.1
 # The error of an observation in float32, with room to spare.
 ROUNDING = 1e-3
+SHOWN = 6  # numbers of a range in messages
 NUMBER = re.compile(r"[-+]?(?:inf|nan|\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+)")
 
 
@@ -62,7 +63,8 @@ def _numbers(space: Mapping[str, Any], part: str) -> np.ndarray | None:
 
 def _box(low: np.ndarray, high: np.ndarray) -> str:
     """Returns "[-1, 1]", or "[-1, 1] x [0, 2]"."""
-    return " x ".join(f"[{a:g}, {b:g}]" for a, b in zip(low, high, strict=False))
+    text = [f"[{a:g}, {b:g}]" for a, b in zip(low[:SHOWN], high[:SHOWN], strict=False)]
+    return " x ".join(text + ["..."] * (max(len(low), len(high)) > SHOWN))
 
 
 def check_observations(about: Mapping[str, Any], task: Task, on_policy: bool) -> None:

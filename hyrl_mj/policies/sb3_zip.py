@@ -26,6 +26,7 @@ INSTEAD = "export it to .onnx, or give a function that calls model.predict in Py
 PLAIN = f"only plain multilayer perceptrons on a vector of numbers can be used: {INSTEAD}"
 # Limit on the metadata [bytes]: those of SB3 take some ten kilobytes.
 LARGEST_METADATA = 2**22
+LONGEST_TEXT = 120  # of a file, in messages
 # What the metadata of SBX, which has SB3's interface, says of its policy.
 SBX = re.compile(rb"[\"']sbx\.")
 # Parts of tensor names of agents that are no plain MLPs on a vector, and what they mean.
@@ -83,7 +84,7 @@ def from_tensors(
     weights = {name: t for name, t in tensors.items() if t.dtype == np.float32}
     for name, weight in weights.items():
         if not np.isfinite(weight).all():
-            raise BadArtifact(f"its tensor {name} has weights that are not finite")
+            raise BadArtifact(f"its tensor {_short(name)} has weights that are not finite")
     activation = _activation(about, activation) or ALGORITHMS[algorithm].activation
     policy = MlpPolicy(task, algorithm, activation, weights, preprocessing.n_stack)
     sb3_metadata.check_inputs(about, task)
@@ -115,7 +116,7 @@ def _check_used(tensors: Mapping[str, np.ndarray], algorithm: str) -> None:
     used = {name for prefix in prefixes for name in layer_names(tensors, prefix)} | {spread}
     other = [n for n in tensors if n not in used and not n.startswith(CRITICS)]
     if other:
-        names = ", ".join(other[:3]) + (", ..." if len(other) > 3 else "")
+        names = _short(", ".join(other[:3])) + (", ..." if len(other) > 3 else "")
         raise BadArtifact(f"no {algorithm} policy of SB3 has its tensors {names}: {PLAIN}")
 
 
@@ -129,7 +130,7 @@ def infer_algorithm(weights: Mapping[str, np.ndarray], about: Mapping[str, Any])
         return "sac"
     if "actor.mu.0.weight" in weights:
         return "td3" if any(name.startswith("critic.qf1.") for name in weights) else "ddpg"
-    first = ", ".join(list(weights)[:3]) or "none"
+    first = _short(", ".join(list(weights)[:3])) or "none"
     raise BadArtifact(
         f"its tensors ({first}) are of no MLP policy of {', '.join(ALGORITHMS)}: {REMEDY}"
     )
@@ -153,4 +154,9 @@ def _activation(about: Mapping[str, Any], chosen: str | None) -> str | None:
 def entry(about: Mapping[str, Any], key: str, part: str) -> str:
     """Returns a part of an entry of the metadata as text, "" if there is none."""
     found = about.get(key)
-    return str(found.get(part, "")) if isinstance(found, dict) else ""
+    return _short(str(found.get(part, ""))) if isinstance(found, dict) else ""
+
+
+def _short(text: str) -> str:
+    """Returns the beginning of a text from a file, for messages."""
+    return text if len(text) <= LONGEST_TEXT else f"{text[:LONGEST_TEXT]}..."
