@@ -116,22 +116,25 @@ class Run:
 
     @property
     def steady(self) -> Policy:
-        """The policy as a function of the measurement: the mean or mode of one that draws its inputs."""
-        policy = self.policy
-        return policy.policy if isinstance(policy, policies.SampledPolicy) else policy
+        """The policy as a function of the measurement.
+
+        Of one that draws its inputs this is its mean or mode, of one with memory its steady answer.
+        """
+        return policies.as_function(self.policy)
 
     @property
     def exact(self) -> bool:
-        """Whether the exact game can be played: on a lattice, against a policy that draws nothing."""
-        return Lattice.possible(self.task) and not (self.agent and self.agent.stochastic)
+        """Whether the exact game can be played: on a lattice, against a function of the measurement."""
+        return Lattice.possible(self.task) and not (self.agent and self.agent.why_no_function)
 
     def check_exact(self) -> None:
         """Raises `BadInput` unless `exact`."""
         Lattice.check(self.task)
-        if not self.exact:
+        if self.agent and self.agent.why_no_function:
             raise BadInput(
-                "the exact game takes a function of the measurement, and this policy draws its inputs: use "
-                "noisy episodes instead (hyrl-mj robustness RUN --episodes N --noise adversarial)"
+                "the exact game takes a function of the measurement, which this policy is not "
+                f"({self.agent.why_no_function}): use noisy episodes instead (hyrl-mj robustness RUN "
+                "--episodes N --noise adversarial)"
             )
 
     @property
@@ -139,7 +142,10 @@ class Run:
         """The files that hold the policy of stage 1, or the agent."""
         special = {policies.ONNX: ["policy.onnx"], policies.FUNCTION: ["policy.json"]}
         network = ["policy.safetensors", "policy.json"]
-        return [self.path / n for n in special.get(self.settings.stage1.algorithm, network)]
+        names = special.get(self.settings.stage1.algorithm, network)
+        if self.agent and self.agent.statistics and self.agent.algorithm != policies.FUNCTION:
+            names = [*names, policies.STATISTICS]
+        return [self.path / name for name in names]
 
     @cached_property
     def critical_set(self) -> CriticalSet:

@@ -281,9 +281,9 @@ def test_episodes_stand_in_for_the_game_where_the_policy_draws(circle, tmp_path)
     assert not run.exact
     assert any("noisy episodes stand in for the worst case" in line for line in said)
     page = (tmp_path / "run" / "diagnosis.html").read_text()
-    assert "This policy draws its inputs: noisy episodes stand in for it." in page
+    assert "which this policy is not (it draws its inputs): noisy episodes stand in for it." in page
     assert isinstance(run.steady, MlpPolicy)
-    with pytest.raises(BadInput, match="draws its inputs"):
+    with pytest.raises(BadInput, match="it draws its inputs"):
         run.check_exact()
 
 

@@ -55,8 +55,8 @@ def examine_stage(run: Run, say: Say, options: ExamineOptions = USUAL) -> None:
         draw_robustness(run, robustness, maps, run.path / "figures")
         maps.save(run.path / "robustness.npz")
     robustness.save(run.path / "robustness.json")
-    if run.agent and run.agent.stochastic:
-        say("the policy draws its inputs: noisy episodes stand in for the worst case")
+    if run.agent and run.agent.why_no_function:
+        say(f"{run.agent.why_no_function}: noisy episodes stand in for the worst case")
     say(robustness_sentence(robustness))
 
 

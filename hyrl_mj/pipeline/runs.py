@@ -58,6 +58,10 @@ class AgentOptions:
             default that of SB3's policy.
         stochastic: sample the inputs of the agent, as during its training (PPO, A2C, SAC); noisy episodes
             then replace the worst-case game.
+        vecnormalize: statistics of the VecNormalize that the agent was trained under, an npz file with mean,
+            var, clip and epsilon; by default none.
+        n_stack: the number of observations that the agent sees at once, for one trained under VecFrameStack;
+            noisy episodes then replace the worst-case game.
         eps: bound of the measurement noise to survive, in the units of the chart.
         seed: seed of all random numbers.
         preset: fast, paper or smoke, as for `hyrl-mj run`.
@@ -68,6 +72,8 @@ class AgentOptions:
 
     activation: str | None = None
     stochastic: bool = False
+    vecnormalize: str | Path | None = None
+    n_stack: int = 1
     eps: float = 0.1
     seed: int = 0
     preset: str = "fast"
@@ -204,7 +210,10 @@ def _with_agent(task: str | Path, policy: AnyPolicy, options: AgentOptions) -> I
     """Opens the run directory of an agent, which then holds the agent, and holds its lock in the block."""
     checked = check_task(get_task(task))
     _settings(checked, options)  # a wrong value is reported before the agent is read
-    external = read_agent(checked, policy, options.activation, options.stochastic, options.seed)
+    o = options
+    external = read_agent(
+        checked, policy, o.activation, o.stochastic, o.seed, o.vecnormalize, o.n_stack
+    )
     settings = _settings(checked, options, agent=external.agent)
     function = external.policy if external.agent.algorithm == FUNCTION else None
     path = options.out or Path("runs") / f"{checked.name}_robust"

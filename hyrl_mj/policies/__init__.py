@@ -5,7 +5,15 @@ mode. Agents that were trained elsewhere are read here, and nothing in their fil
 """
 
 from hyrl_mj.policies.algorithms import ALGORITHMS
-from hyrl_mj.policies.controllers import Controller, PolicyController, as_controller, check_modes
+from hyrl_mj.policies.controllers import (
+    Controller,
+    PolicyController,
+    answer,
+    as_controller,
+    check_modes,
+    nothing_past,
+    remembering,
+)
 from hyrl_mj.policies.external import (
     FUNCTION,
     ONNX,
@@ -45,6 +53,7 @@ __all__ = [
     "Preprocessing",
     "SampledPolicy",
     "algorithms",
+    "answer",
     "as_controller",
     "as_function",
     "check_modes",
@@ -52,6 +61,8 @@ __all__ = [
     "infer_algorithm",
     "load_agent",
     "network",
+    "nothing_past",
     "read_agent",
+    "remembering",
     "reopen_agent",
 ]

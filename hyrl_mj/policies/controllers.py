@@ -8,6 +8,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.policies.mlp import Policy
+from hyrl_mj.policies.preprocessing import PreprocessedPolicy
 
 
 class Controller(Protocol):
@@ -26,7 +27,10 @@ class Controller(Protocol):
 
 @dataclass(frozen=True)
 class PolicyController:
-    """A single policy as a controller with one mode, 0, that never jumps."""
+    """A single policy as a controller with one mode, 0, that never jumps.
+
+    A policy with memory needs the past measurements; without them it gives its steady answer.
+    """
 
     policy: Policy
 
@@ -37,8 +41,37 @@ class PolicyController:
     def initial_mode(self, measured: np.ndarray) -> np.ndarray:
         return np.zeros(len(measured), dtype=int)
 
-    def step(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    @property
+    def memory(self) -> int:
+        """The number of past measurements that `step` takes."""
+        return self.policy.memory if isinstance(self.policy, PreprocessedPolicy) else 0
+
+    def step(
+        self, q: np.ndarray, measured: np.ndarray, past: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Returns inputs (n, m) and next modes (n,); `past` (n, memory, p) is NaN before the start."""
+        if past is not None and isinstance(self.policy, PreprocessedPolicy) and self.memory:
+            return self.policy.act_after(measured, past), q
         return self.policy.act(measured), q
+
+
+def nothing_past(controller: Controller, n: int, columns: int) -> np.ndarray:
+    """Returns the past (n, memory, p) of n runs at their start; most controllers have a memory of 0."""
+    return np.full((n, getattr(controller, "memory", 0), columns), np.nan)
+
+
+def answer(
+    controller: Controller, q: np.ndarray, measured: np.ndarray, past: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns inputs (n, m) and next modes (n,) of a controller that may have a memory."""
+    if past.shape[1] and isinstance(controller, PolicyController):
+        return controller.step(q, measured, past)
+    return controller.step(q, measured)
+
+
+def remembering(past: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """Returns the past (n, memory, p) after measurements (n, p)."""
+    return np.concatenate([past[:, 1:], measured[:, None]], axis=1) if past.shape[1] else past
 
 
 def as_controller(loop: Controller | Policy) -> Controller:

@@ -58,9 +58,10 @@ class Agent:
         return f"{self.source or 'an agent of Python code'} ({', '.join(words)})"
 
     @property
-    def is_function(self) -> bool:
-        """Whether its input is a function of the measurement: it draws nothing and has no memory."""
-        return not self.stochastic and self.n_stack == 1
+    def why_no_function(self) -> str:
+        """Why its input is no function of the measurement, as "it draws its inputs"; "" if it is one."""
+        memory = f"it sees its last {self.n_stack} observations" if self.n_stack > 1 else ""
+        return " and ".join(filter(None, ["it draws its inputs" * self.stochastic, memory]))
 
     @property
     def title(self) -> str:

@@ -21,7 +21,7 @@ from hyrl_mj.tasks import Task
 LARGEST = 2**25
 # Rows that a model answers at a time: so many as were tried.
 ROWS = 1024
-# The longest that the trial may last [s], whose model may use the processor for five.
+# The longest that the trial may last [s], whose model may use the processor for four.
 LONGEST = 30
 INSTEAD = "in Python, give a function of your own that runs it"
 
@@ -101,7 +101,7 @@ def _end(run: subprocess.CompletedProcess[bytes]) -> str:
     import signal
 
     if run.returncode == -getattr(signal, "SIGXCPU", 0):
-        return f"it takes longer than 5 s for {ROWS} observations; {INSTEAD}"
+        return f"it takes longer than 4 s for {ROWS} observations; {INSTEAD}"
     if run.returncode < 0:
         return f"it makes onnxruntime crash, or needs more than 200 MB of memory; {INSTEAD}"
     last = run.stderr.decode(errors="replace").strip().rpartition("\n")[2]

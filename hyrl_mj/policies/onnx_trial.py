@@ -16,7 +16,7 @@ import onnx
 import onnxruntime
 
 # More than this is not needed for a policy: seconds of the processor, and bytes.
-SECONDS, MEMORY = 5, 200 * 2**20
+SECONDS, MEMORY = 4, 200 * 2**20
 SINGLY = 32  # calls of a model that takes one observation at a time
 # A policy is made of these operators. Others repeat, branch, draw, read files, or belong to a vendor.
 OPERATORS = {

@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 
 from hyrl_mj.plant import Plant
-from hyrl_mj.policies import Controller
+from hyrl_mj.policies import Controller, answer, nothing_past, remembering
 from hyrl_mj.simulation.noise import NOT_STARTED, Sample, Signal, register_noise
 from hyrl_mj.tasks import Outcome, Task
 
@@ -56,31 +56,44 @@ class Lookahead(Signal):
         unstable = now.plant.unstable[now.rows]
         running = np.flatnonzero(self.task.outcome(true, unstable) == Outcome.RUNNING)
         q = now.q[running]
-        answer = np.stack(
-            [np.column_stack(self._act(true[running] + c, q)) for c in self._candidates]
+        past = nothing_past(self.controller, *true.shape) if now.past is None else now.past
+        past = past[running]
+        answers = np.stack(
+            [np.column_stack(self._act(true[running] + c, q, past)) for c in self._candidates]
         )
-        # Simulate each distinct answer once, and only where the candidates' answers differ.
-        differs = (answer != answer[0]).any(axis=(0, 2))
-        repeated = [(answer[:i] == answer[i]).all(axis=2).any(axis=0) for i in range(len(answer))]
+        # Simulate each distinct answer once, and only where the candidates' answers differ. With memory
+        # the same answer to two candidates does not make them equal.
+        differs = (answers != answers[0]).any(axis=(0, 2)) | (past.shape[1] > 0)
+        repeated = [
+            (answers[:i] == answers[i]).all(axis=2).any(axis=0) & (past.shape[1] == 0)
+            for i in range(len(answers))
+        ]
         candidate, at = np.nonzero(differs & ~np.stack(repeated))
         rows = now.rows[running[at]]
         qpos, qvel = now.plant.qpos[rows], now.plant.qvel[rows]
-        danger = np.full(answer.shape[:2], -np.inf)
+        danger = np.full(answers.shape[:2], -np.inf)
         for first in range(0, len(at), BATCH):
             batch = slice(first, first + BATCH)
             entries = candidate[batch], at[batch]
-            danger[entries] = self._danger(qpos[batch], qvel[batch], answer[entries])
+            measured = true[running[at[batch]]] + self._candidates[candidate[batch]]
+            known = remembering(past[at[batch]], measured)
+            danger[entries] = self._danger(qpos[batch], qvel[batch], answers[entries], known)
         chosen[running] = self._candidates[danger.argmax(axis=0)]
         return chosen
 
-    def _danger(self, qpos: np.ndarray, qvel: np.ndarray, answer: np.ndarray) -> np.ndarray:
-        """Returns the greatest danger (k,) after answers (k, m + 1), inputs and mode, in k states."""
+    def _danger(
+        self, qpos: np.ndarray, qvel: np.ndarray, answers: np.ndarray, past: np.ndarray
+    ) -> np.ndarray:
+        """Returns the greatest danger (k,) after answers (k, m + 1), inputs and mode, in k states.
+
+        `past` (k, memory, p) are the measurements up to these answers.
+        """
         ahead = self._ahead = self._ahead or self.task.plant(BATCH)
-        rows = np.arange(len(answer))
-        worst = np.full(len(answer), -np.inf)
+        rows = np.arange(len(answers))
+        worst = np.full(len(answers), -np.inf)
         ahead.set_state(qpos, qvel, rows)
         for _ in range(self.samples):
-            u, q = answer[:, :-1], answer[:, -1].astype(int)
+            u, q = answers[:, :-1], answers[:, -1].astype(int)
             ahead.step(u, rows)
             after = ahead.measurement[rows]
             outcome = self.task.outcome(after, ahead.unstable[rows])
@@ -91,10 +104,14 @@ class Lookahead(Signal):
             rows = rows[goes_on]
             if not len(rows):
                 break
-            answer = np.column_stack(self._act(after[goes_on], q[goes_on]))
+            after, q, past = after[goes_on], q[goes_on], past[goes_on]
+            answers = np.column_stack(self._act(after, q, past))
+            past = remembering(past, after)
         return worst
 
-    def _act(self, measured: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _act(
+        self, measured: np.ndarray, q: np.ndarray, past: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Returns the controller's inputs (n, m) and modes (n,) for measurements (n, p) in modes (n,)."""
         mode = np.where(q == NOT_STARTED, self.controller.initial_mode(measured), q)
-        return self.controller.step(mode, measured)
+        return answer(self.controller, mode, measured, past)

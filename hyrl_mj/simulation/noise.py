@@ -30,6 +30,7 @@ class Sample:
         measurement: (n, p) true measurements.
         q: (n,) int modes; `NOT_STARTED` where none has been picked.
         plant: all simulations.
+        past: (n, memory, p) past measurements, for a controller that takes them; None for others.
     """
 
     rows: np.ndarray
@@ -37,6 +38,7 @@ class Sample:
     measurement: np.ndarray
     q: np.ndarray
     plant: Plant
+    past: np.ndarray | None = None
 
 
 class Signal(ABC):

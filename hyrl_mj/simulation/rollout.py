@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hyrl_mj.plant import Plant
-from hyrl_mj.policies import Controller
+from hyrl_mj.policies import Controller, answer, nothing_past, remembering
 from hyrl_mj.progress import progress_bar
 from hyrl_mj.simulation.noise import NOT_STARTED, AnyNoise, Sample, signal_for
 from hyrl_mj.tasks import Outcome, Task
@@ -92,6 +92,7 @@ def closed_loop(
     signal = signal_for(noise, task, controller)
     signal.reset(n, np.random.default_rng(seed))
     measurement = plant.measurement
+    past = nothing_past(controller, n, measurement.shape[1])
     q = np.full(n, NOT_STARTED) if q0 is None else np.asarray(q0, dtype=int).copy()
     outcome = np.full(n, Outcome.RUNNING) if backward else task.outcome(measurement, plant.unstable)
     length = np.zeros(n, dtype=int)
@@ -105,13 +106,14 @@ def closed_loop(
         active = np.flatnonzero(outcome == Outcome.RUNNING)
         if not len(active):
             break
-        now = Sample(np.arange(n), np.full(n, k), measurement, q, plant)
+        now = Sample(np.arange(n), np.full(n, k), measurement, q, plant, past)
         measured = measurement + signal.sample(now)
         if k == 0 and q0 is None:
             q[:] = controller.initial_mode(measured)
             first_mode = q.copy()
         before, u = q.copy(), np.full((n, len(task.inputs)), np.nan)
-        u[active], q[active] = controller.step(q[active], measured[active])
+        u[active], q[active] = answer(controller, q[active], measured[active], past[active])
+        past = remembering(past, measured)
         (plant.step_backward if backward else plant.step)(u[active], active)
         measurement, last, lost = plant.measurement, measurement, plant.unstable
         measurement[lost] = last[lost]  # the last one before the simulation became unstable

@@ -88,8 +88,9 @@ def sentences(run: Run, robustness: Robustness, arc: HybridArc | None) -> list[s
         else:
             results.append(f"it wins all of them up to noise {margin_text(margin, unit)}")
     else:
-        if run.agent and run.agent.stochastic:
-            results.append("it draws its inputs: noisy episodes stand in for the worst case")
+        if run.agent and run.agent.why_no_function:
+            why = run.agent.why_no_function
+            results.append(f"{why}: noisy episodes stand in for the worst case")
         worst = min(robustness.episodes, key=lambda count: count.reached)
         lost = f"{percent(1 - worst.reached)} of the episodes that start {worst.region}"
         results.append(f"under {worst.noise} {noise} it loses {lost}")
