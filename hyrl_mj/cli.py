@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 import gc
-import os
 import sys
 import textwrap
 from collections.abc import Callable, Sequence
@@ -12,11 +11,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from hyrl_mj import __version__, pipeline, progress
-from hyrl_mj.errors import BadInput, HyrlError, unknown
+from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.parsing import call, documented
 from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions
 from hyrl_mj.run_directory import Run
+from hyrl_mj.streams import Streams
 from hyrl_mj.tasks import get_task, task_names, write_task
+from hyrl_mj.verdict import FAILED
 from hyrl_mj.viz import ReplayOptions, print_robustness, print_summary
 
 
@@ -46,24 +47,33 @@ def new_task(name: str, *, folder: Path = Path()) -> None:
 def run(task: str, options: RunOptions) -> None:
     """Run all stages on a task, from training to the report.
 
-    An existing run directory is resumed: only what is missing is done.
+    An existing run directory is resumed: only what is missing is done. The run ends with a verdict: WON,
+    HELD, WEAK, or FAILED, which gives exit status 1.
 
     Args:
         task: a task, see `hyrl-mj list`, or a Python file that defines one, see `hyrl-mj new-task`.
     """
-    print_summary(pipeline.run(task, options))
+    finish(pipeline.run(task, options))
 
 
 def robustify(task: str, *, policy: Path, options: AgentOptions) -> None:
     """Make an agent robust that was trained elsewhere: all stages but the first.
 
-    An existing run directory is resumed: only what is missing is done.
+    An existing run directory is resumed: only what is missing is done. The run ends with a verdict, as that
+    of `hyrl-mj run`.
 
     Args:
         task: a task, see `hyrl-mj list`, or a Python file that defines one.
         policy: the agent, a .zip that SB3's model.save wrote, an .onnx file, or a .safetensors file.
     """
-    print_summary(pipeline.robustify(task, policy, options))
+    finish(pipeline.robustify(task, policy, options))
+
+
+def finish(run: Run) -> None:
+    """Prints the results of a whole run; if it FAILED, ends with exit status 1."""
+    print_summary(run)
+    if run.verdict.word == FAILED:
+        raise SystemExit(1)
 
 
 def diagnose(task: str, *, policy: Path, options: AgentOptions) -> None:
@@ -317,21 +327,11 @@ def dispatch(words: Sequence[str]) -> None:
 
 def main() -> None:
     """The console script `hyrl-mj`."""
+    streams = Streams()
     progress.enabled = sys.stderr.isatty()
     # Python would look for garbage among torch's modules for most of a second before it ends.
     atexit.register(gc.freeze)
-    try:
-        dispatch(sys.argv[1:])
-    except HyrlError as error:
-        print(f"hyrl-mj: {error}", file=sys.stderr)
-        sys.exit(error.exit_status)
-    except OSError as error:
-        where = "" if error.filename is None else f": {os.fsdecode(error.filename)}"
-        print(f"hyrl-mj: {error.strerror}{where}", file=sys.stderr)
-        sys.exit(1)
-    except KeyboardInterrupt:
-        print("hyrl-mj: interrupted; finished work is kept, run again to resume", file=sys.stderr)
-        sys.exit(130)
+    sys.exit(streams.run(lambda: dispatch(sys.argv[1:])))
 
 
 if __name__ == "__main__":

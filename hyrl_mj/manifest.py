@@ -26,12 +26,12 @@ NAME, LOCK = "manifest.json", ".lock"
 # The names of the files that each stage may write: no other file is ever believed or removed.
 PICTURE = r"\.(png|pdf)"
 FILES = {
-    "train": r"policy\.(safetensors|json|onnx)|vecnormalize\.npz",
+    "train": r"policy\.(safetensors|json|onnx)|vecnormalize\.npz|arrivals\.json",
     "critical-set": r"critical_set\.npz",
     "partition": r"partition\.npz",
     "diagnose": r"diagnosis\.html|diagnosis/(robustness\.json|worst\.(npz|mp4)|\w+" + PICTURE + ")",
     "extended-sets": r"(extended_sets|split)\.npz",
-    "retrain": r"mode_\d+\.(safetensors|json)",
+    "retrain": r"mode_\d+\.(safetensors|json)|retraining\.json",
     "robustness": r"robustness\.(json|npz)|figures/robustness_\w+" + PICTURE,
     "simulate": r"arcs/(start\d+|critical)_(policy|hyrl_q\d+)\.npz",
     "simulate --start": r"arcs/latest_\w+\.npz",

@@ -19,8 +19,16 @@ from hyrl_mj.learning import Settings, Training
 from hyrl_mj.manifest import FILES, LOCK, Manifest, check_no_links, digest, locked
 from hyrl_mj.policies import Agent, AnyPolicy, MlpPolicy, Policy
 from hyrl_mj.simulation import HybridArc
-from hyrl_mj.stages import CriticalSet, ExtendedSets, HybridController, Partition
+from hyrl_mj.stages import (
+    Arrivals,
+    CriticalSet,
+    ExtendedSets,
+    HybridController,
+    Partition,
+    Retraining,
+)
 from hyrl_mj.tasks import Task, described_task, get_task, reference
+from hyrl_mj.verdict import Verdict
 
 # The packages whose versions `config.json` records.
 PACKAGES = ("hyrl-mj", "mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "mediapy")
@@ -191,6 +199,22 @@ class Run:
     def robustness(self) -> Robustness:
         """The result of the examination under noise, from `robustness.json`."""
         return Robustness.load(self._checked("robustness.json"))
+
+    @cached_property
+    def arrivals(self) -> Arrivals:
+        """From how many starts the policy of stage 1, or the agent, arrives without noise."""
+        return Arrivals.load(self._checked("arrivals.json"))
+
+    @cached_property
+    def retraining(self) -> Retraining:
+        """How stage 6 ended for each mode."""
+        return Retraining.load(self._checked("retraining.json"))
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """What the run is worth, in one word with its reasons."""
+        facts = self.robustness, self.retraining, self.arrivals
+        return Verdict.of(self.task, self.settings.noise, *facts)
 
     @cached_property
     def versions(self) -> dict[str, str]:

@@ -20,6 +20,7 @@ from hyrl_mj.game.result import (
     Robustness,
     Score,
     Wins,
+    percent,
 )
 from hyrl_mj.game.scores import LARGEST, Game, examine, worst_signal
 from hyrl_mj.game.solver import LOST, NEVER, Answers, Moves, lasting, noisy_moves, solve
@@ -51,6 +52,7 @@ __all__ = [
     "fewest_samples",
     "lasting",
     "noisy_moves",
+    "percent",
     "solve",
     "worst_signal",
 ]

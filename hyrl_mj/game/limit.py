@@ -72,8 +72,8 @@ class Limit:
         return np.asarray(np.where(shown, self.samples, 0).max(axis=0))
 
     def winnable(self, bound: np.ndarray) -> np.ndarray:
-        """Returns the nodes (N,) bool where holding the side of the first measurement always wins."""
-        return self.held(bound) < NEVER
+        """Returns the nodes (N,) bool where holding the side of the first measurement wins in time."""
+        return self.held(bound) <= self.lattice.task.max_steps
 
     def moves(self, bound: np.ndarray) -> Moves:
         """Returns the adversary's moves against the limit under noise within bounds (d,).

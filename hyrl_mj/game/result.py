@@ -25,9 +25,17 @@ MAP_CLASSES = (
 )
 
 
+def percent(share: float) -> str:
+    """Returns a share in percent; only 1 is called 100%, and only 0 is called 0%."""
+    if share in (0, 1):
+        return f"{100 * share:.0f}%"
+    text = f"{100 * share:.2f}%"
+    return {"100.00%": ">99.99%", "0.00%": "<0.01%"}.get(text, text)
+
+
 @dataclass(frozen=True)
 class Score:
-    """What a controller wins in the worst case.
+    """What a controller wins in the worst case: it arrives before the episode's time is over.
 
     Attributes:
         eps: bound of the noise.

@@ -86,11 +86,14 @@ class Game:
         return self.limit.moves(bound) if name == LIMIT else noisy_moves(self.answers[name], bound)
 
     def value(self, name: str, eps: float) -> np.ndarray:
-        """Returns the game's value (modes + 1, places), the last row for runs that have not started."""
+        """Returns the game's value (modes + 1, places), the last row for runs that have not started.
+
+        Only what happens within an episode counts: a value below `NEVER` is at most the task's `max_steps`.
+        """
         return self._value(name, self.moves(name, eps), eps)
 
     def winnable(self, eps: float) -> np.ndarray:
-        """Returns the nodes (N,) bool where the way picked by the first measurement can be held."""
+        """Returns the nodes (N,) bool where holding the way of the first measurement wins in time."""
         return self.limit.winnable(self.bound(eps))
 
     def score(self, name: str, eps: float) -> Score:
@@ -112,9 +115,10 @@ class Game:
         )
 
     def _value(self, name: str, moves: Moves, eps: float) -> np.ndarray:
-        value = solve(moves)
+        value = solve(moves, self.task.max_steps)
         if name == LIMIT:  # it holds the mode that it picks by the first measurement
-            value[-1, :-2] = self.limit.held(self.bound(eps))
+            held = self.limit.held(self.bound(eps))
+            value[-1, :-2] = np.where(held <= self.task.max_steps, held, NEVER)
         return value
 
     def map(self, name: str, eps: float) -> np.ndarray:
@@ -264,6 +268,8 @@ def _misses(game: Game, controllers: Mapping[str, Controller]) -> dict[str, floa
     """Returns each controller's greatest distance from the set-point at the end of runs without noise."""
     task = game.task
     starts = game.lattice.grid.nodes[game.starts & game.winnable(0.0)]
+    if not len(starts):
+        return dict.fromkeys(controllers, 0.0)
     starts = starts[:: max(len(starts) // QUIET_EPISODES, 1)]
     quiet = LoopSettings(quiet=True)
     return {

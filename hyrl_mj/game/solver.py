@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import product
+from itertools import count, product
 
 import numpy as np
 
@@ -163,10 +163,15 @@ def noisy_moves(answers: Answers, bound: np.ndarray, settled_only: bool = False)
     return Moves.gather(lattice, rows)
 
 
-def solve(moves: Moves) -> np.ndarray:
+def solve(moves: Moves, samples: int | None = None) -> np.ndarray:
     """Returns the value of every state by backward recursion: (rows, places) int.
 
     An episode is over where it arrives. A state from which it may neither fail nor arrive is worth `NEVER`.
+
+    Args:
+        moves: the adversary's moves.
+        samples: duration of an episode; what happens later does not count. By default, episodes have no
+            time limit.
     """
     lattice = moves.lattice
     value = np.full((moves.rows, lattice.places), NEVER, dtype=np.int32)
@@ -175,19 +180,21 @@ def solve(moves: Moves) -> np.ndarray:
     value[:, -2], value[:, -1] = 0, LOST
     flat = value.ravel()
     state, counts, target = moves.state, moves.counts, moves.target
-    while True:
+    # The k-th pass finds the states that fail or arrive in k samples.
+    for _ in count() if samples is None else range(samples):
         undecided = flat[state] == NEVER
         target = target[np.repeat(undecided, counts)]
         state, counts = state[undecided], counts[undecided]
         if not len(state):
-            return value
+            break
         after = flat[target]
         after += np.sign(NEVER - after)  # one sample more
         worst = np.maximum.reduceat(after, np.append(0, np.cumsum(counts)[:-1]))
         if (worst == NEVER).all():
-            return value
+            break
         # Each state gets its value once: at the earliest failure, or when all its moves have arrived.
         flat[state] = worst
+    return value
 
 
 def lasting(moves: Moves, start: np.ndarray | None = None) -> np.ndarray:

@@ -17,7 +17,7 @@ from hyrl_mj.stages import Partition, Regions, noisy_episodes
 from hyrl_mj.viz import robustness_sentence
 
 # The kinds of noise in episodes by default.
-KINDS = ("uniform", "alternating", "adversarial")
+KINDS = ("none", "uniform", "alternating", "adversarial")
 # Noisy episodes of a run whose worst case cannot be computed; fewer with preset smoke.
 EPISODES, EPISODES_SMOKE = 1_000, 200
 
@@ -30,7 +30,7 @@ class ExamineOptions:
         eps: bound of the noise, in the units of the chart; by default the run's.
         episodes: noisy episodes for each kind of noise and each controller; by default none where the worst
             case can be computed exactly, on charts of one or two dimensions.
-        noise: kinds of noise in the episodes; by default uniform,alternating,adversarial.
+        noise: kinds of noise in the episodes; by default none,uniform,alternating,adversarial.
         all_coordinates: add noise to every coordinate of the measurement, not only to the noisy ones of the
             task.
         near_critical: start all episodes within twice the bound of the critical set.
@@ -92,6 +92,12 @@ def examine_loops(
         regions = Regions(points, winnable, options.near_critical)
         counts = noisy_episodes(task, regions, loops, noises, count, seed)
     return Robustness(eps, everywhere, game, counts, seed), maps
+
+
+def is_usual(run: Run) -> bool:
+    """Returns whether the examination on disk is under the run's own noise, and not under another one."""
+    found = run.robustness
+    return found.eps == run.settings.noise and not found.everywhere
 
 
 def draw_robustness(run: Run, robustness: Robustness, maps: Maps, folder: Path) -> None:

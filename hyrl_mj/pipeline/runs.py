@@ -15,10 +15,12 @@ from typing import Any, TypeVar
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.learning import Settings, Training, preset
 from hyrl_mj.manifest import locked
+from hyrl_mj.pipeline.examination import is_usual
 from hyrl_mj.pipeline.steps import DIAGNOSIS, STAGES, extended_sets_stage, run_stage
 from hyrl_mj.policies import ALGORITHMS, FUNCTION, AnyPolicy, algorithms, read_agent
 from hyrl_mj.progress import Say
 from hyrl_mj.run_directory import Run, load_run, opened, write_config
+from hyrl_mj.stages import Arrivals
 from hyrl_mj.tasks import Task, check_task, get_task
 from hyrl_mj.viz import beginning
 
@@ -191,8 +193,8 @@ def _run_all(run: Run, say: Say, stages: Iterable[str] = STAGES) -> Run:
     """Runs the stages that are not done."""
     for stage in stages:
         if stage == "train" and run.agent:
-            say(f"train: none, {run.agent} is given")
-        elif run.manifest.is_done(stage, run.code):
+            say(f"train: none, {run.agent} is given; it {run.arrivals}")
+        elif run.manifest.is_done(stage, run.code) and (stage != "robustness" or is_usual(run)):
             say(f"{stage}: done before")
         else:
             run = run_stage(run, stage, say)
@@ -220,5 +222,7 @@ def _with_agent(task: str | Path, policy: AnyPolicy, options: AgentOptions) -> I
     with opened(path, settings, function) as run:
         if not run.manifest.is_done("train", run.code):
             with run.stage("train"):
+                arrivals = Arrivals.of(checked, external.policy)
                 external.store(run.path)
+                arrivals.save(run.path / "arrivals.json")
         yield run

@@ -21,7 +21,16 @@ from hyrl_mj.policies import Agent, MlpPolicy, PolicyController, algorithms
 from hyrl_mj.progress import Say
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import Grid
-from hyrl_mj.stages import boundary, extend, find_critical_set, make_partition, with_room
+from hyrl_mj.stages import (
+    Arrivals,
+    Retraining,
+    boundary,
+    extend,
+    find_critical_set,
+    make_partition,
+    with_room,
+)
+from hyrl_mj.verdict import mode_sentence
 from hyrl_mj.viz import replay_sentence
 
 
@@ -38,8 +47,10 @@ def train_stage(run: Run, say: Say) -> None:
     algorithms.check_named(s.stage1.algorithm)
     log_dir = run.path / "logs" / "stage1"
     policy = train(run.task, s.stage1, s.seed, log_dir=log_dir, label="stage 1")
+    arrivals = Arrivals.of(run.task, policy)
     policy.save(run.path / "policy.safetensors")
-    say(f"policy of {sum(w.size for w in policy.weights.values())} weights")
+    arrivals.save(run.path / "arrivals.json")
+    say(f"a policy of {sum(w.size for w in policy.weights.values())} weights {arrivals}")
 
 
 def critical_set_stage(run: Run, say: Say) -> None:
@@ -81,16 +92,20 @@ def retrain_stage(run: Run, say: Say) -> None:
     s, sets = run.settings, run.extended_sets
     algorithms.check_named(s.stage6.algorithm)
     policies: dict[int, MlpPolicy] = {}
+    results = []
     warm_start = partial(start_policy, run.steady, run.partition)
     for q in sets.modes:
         ground, log_dir = mode_ground(run.task, sets, q), run.path / "logs" / f"mode_{q}"
         others = [*policies.values()]
-        policies[q] = retrain(
+        policies[q], result = retrain(
             ground, s.stage6, s.seed, warm_start=warm_start, others=others, log_dir=log_dir
         )
+        results.append(result)
     for q, policy in policies.items():
         policy.save(run.path / f"mode_{q}.safetensors")
-    say(f"policies of {len(policies)} modes")
+    Retraining(tuple(results)).save(run.path / "retraining.json")
+    for result in results:
+        say(mode_sentence(run.task, result))
 
 
 def simulate_stage(run: Run, say: Say) -> None:

@@ -9,14 +9,18 @@ from hyrl_mj.stages.episodes import Regions, noisy_episodes
 from hyrl_mj.stages.extended_sets import ExtendedSets, extend
 from hyrl_mj.stages.hybrid import ON_EDGE, HybridController
 from hyrl_mj.stages.partition import Partition, boundary, make_partition, with_room
+from hyrl_mj.stages.results import Arrivals, ModeResult, Retraining
 
 __all__ = [
     "ON_EDGE",
+    "Arrivals",
     "CriticalSet",
     "ExtendedSets",
     "HybridController",
+    "ModeResult",
     "Partition",
     "Regions",
+    "Retraining",
     "boundary",
     "critical_points",
     "extend",

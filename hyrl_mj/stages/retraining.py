@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from hyrl_mj.sets import GridSet
 from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition, longest_hop, neighbourhood, part_policies
+from hyrl_mj.stages.results import ModeResult
 from hyrl_mj.tasks import Outcome, Task
 
 # If the game is lost from some states, this share of the training episodes starts there.
@@ -65,7 +67,7 @@ def retrain(
     warm_start: Callable[[ModeGround, Training, int], MlpPolicy | None] | None = None,
     others: Iterable[MlpPolicy] = (),
     log_dir: Path | None = None,
-) -> MlpPolicy:
+) -> tuple[MlpPolicy, ModeResult]:
     """Trains the policy of one mode (paper, Step 6).
 
     Noise leads a policy that passes an obstacle closer than the noise bound into the obstacle, and no
@@ -83,14 +85,15 @@ def retrain(
 
     Returns:
         The first mirror image that is good enough; otherwise the best policy, of all attempts and the one
-        that the first continued from.
+        that the first continued from. And how the training ended.
     """
     task, mode = ground.task, ground.mode
     if task.mirror is not None:
         for image in (symmetry.mirrored(other) for other in others):
             if ground(image) >= ground.enough:
-                return image
+                return image, ModeResult(mode, ground.won(image), 0)
     tried: list[tuple[Score, MlpPolicy]] = []
+    trainings = 0
     for attempt in range(settings.attempts):
         draw = int(np.random.SeedSequence([seed, 1 + mode, attempt]).generate_state(1)[0])
         warm = None
@@ -104,10 +107,12 @@ def retrain(
         trained = train(
             task, settings, draw, ground=ground, start_from=warm, log_dir=log_dir, label=label
         )
+        trainings += 1
         tried.append((ground(trained), trained))
         if tried[-1][0] >= ground.enough:
             break
-    return max(tried, key=lambda result: result[0])[1]
+    best = max(tried, key=lambda result: result[0])[1]
+    return best, ModeResult(mode, ground.won(best), trainings)
 
 
 def mode_ground(task: Task, extended: ExtendedSets, mode: int) -> ModeGround:
@@ -161,6 +166,10 @@ class ModeGround(ABC):
     @abstractmethod
     def score(self, policy: MlpPolicy) -> Score:
         """Computes the score of a policy, and remembers where it lost."""
+
+    @abstractmethod
+    def won(self, policy: MlpPolicy) -> float:
+        """Returns the share that a policy wins, as in `ModeResult`."""
 
     def domain(self, gamma: float) -> Domain:
         """Returns the domain of training; leaving it costs the worst reward for ever."""
@@ -221,6 +230,12 @@ class ByGame(ModeGround):
         miss = self._miss(answers, moves)
         return 0.0, -float(max(delay / ALLOWED_DELAY, miss / self.task.precision))
 
+    def won(self, policy: MlpPolicy) -> float:
+        answers = game.Answers.of(self.lattice, PolicyController(policy), self.bound)
+        moves = game.noisy_moves(answers, self.bound)
+        value = game.solve(moves, self.task.max_steps)[0, :-2]
+        return float((value[self.nodes] < game.NEVER).mean())
+
     def _miss(self, answers: game.Answers, moves: game.Moves) -> float:
         """Returns the miss, from the answers of a policy and the moves of the noise."""
         grid, after = self.lattice.grid, self.lattice.after
@@ -266,18 +281,24 @@ class ByEpisodes(ModeGround):
         self._plant = task.plant(BATCH)
 
     def score(self, policy: MlpPolicy) -> Score:
-        loop = PolicyController(policy)
-        settings = LoopSettings(plant=self._plant, vary=True, quiet=True)
         for survived, kind in enumerate(JUDGES):
             for done in range(0, EPISODES, BATCH):
-                starts = self.judged[done : done + BATCH]
-                noise = Noise(kind, self.extended.noise)
-                run = closed_loop(self.task, loop, starts, noise, seed=done, settings=settings)
-                won = run.outcome == Outcome.REACHED
-                if kind == "none":
-                    won &= self.task.arrived(run.path[-1])
-                lost = self.grid.nearest(starts[~won])
+                won = self._play(policy, kind, done)
+                lost = self.grid.nearest(self.judged[done : done + BATCH][~won])
                 self._remember(lost, np.ones(len(lost)))
                 if len(lost):
                     return float(survived), -len(lost) / (done + BATCH)
         return self.enough
+
+    def won(self, policy: MlpPolicy) -> float:
+        batches = product(JUDGES, range(0, EPISODES, BATCH))
+        return float(np.mean([self._play(policy, kind, done) for kind, done in batches]))
+
+    def _play(self, policy: MlpPolicy, kind: str, done: int) -> np.ndarray:
+        """Returns which of the episodes of one batch are won: (BATCH,) bool."""
+        settings = LoopSettings(plant=self._plant, vary=True, quiet=True)
+        starts, noise = self.judged[done : done + BATCH], Noise(kind, self.extended.noise)
+        loop = PolicyController(policy)
+        run = closed_loop(self.task, loop, starts, noise, seed=done, settings=settings)
+        won = run.outcome == Outcome.REACHED
+        return np.asarray(won & self.task.arrived(run.path[-1]) if kind == "none" else won)

@@ -12,6 +12,7 @@ from hyrl_mj.policies import PolicyController
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, simulate_batch
+from hyrl_mj.verdict import NO_NOISE
 from hyrl_mj.viz.arcs import critical_start, from_middle, replay_floor
 from hyrl_mj.viz.commands import beginning
 from hyrl_mj.viz.options import ReplayOptions
@@ -78,7 +79,7 @@ def sentences(run: Run, robustness: Robustness, arc: HybridArc | None) -> list[s
     """Returns the results in sentences: the critical set, what noise costs, the margin, the worst run."""
     eps, task = robustness.eps, run.task
     where, unit = task.noise_on(robustness.everywhere)
-    results = [run.critical_set.sentence(task)]
+    results = [f"it {run.arrivals}", run.critical_set.sentence(task)]
     noise = f"noise on {where} of up to {eps:g} {unit}"
     if robustness.game is not None:
         lost = percent(1 - robustness.game.scores["policy"][-1].won)
@@ -91,7 +92,8 @@ def sentences(run: Run, robustness: Robustness, arc: HybridArc | None) -> list[s
         if run.agent and run.agent.why_no_function:
             why = run.agent.why_no_function
             results.append(f"{why}: noisy episodes stand in for the worst case")
-        worst = min(robustness.episodes, key=lambda count: count.reached)
+        noisy = [count for count in robustness.episodes if count.noise != NO_NOISE]
+        worst = min(noisy, key=lambda count: count.reached)
         lost = f"{percent(1 - worst.reached)} of the episodes that start {worst.region}"
         results.append(f"under {worst.noise} {noise} it loses {lost}")
     if arc is None:

@@ -18,6 +18,7 @@ from hyrl_mj.game import LIMIT, MAP_CLASSES, EpisodeCount, GameResult, Robustnes
 from hyrl_mj.learning import Training
 from hyrl_mj.policies import Agent, MlpPolicy
 from hyrl_mj.run_directory import Run
+from hyrl_mj.verdict import NO_NOISE
 from hyrl_mj.viz import tables
 from hyrl_mj.viz.commands import changed, commands
 from hyrl_mj.viz.figures import CLASS_COLOURS, FIGURES
@@ -79,6 +80,7 @@ def render(run: Run) -> str:
     arrived = (
         {who: tables.arrivals(run, arcs, who == "policy") for who in CONTROLLERS} if arcs else None
     )
+    facts = [run.path / name for name in ("arrivals.json", "retraining.json")]
     stages = run.settings.stage1, run.settings.stage6
     options = [stage.options if isinstance(stage, Training) else {} for stage in stages]
     first, sixth = (_texts(vars(s) | more) for s, more in zip(stages, options, strict=True))
@@ -92,6 +94,7 @@ def render(run: Run) -> str:
         pictures=pictures(run.path / "figures", has),
         arcs=arcs,
         arrivals=arrived,
+        verdict=run.verdict if robustness and all(map(has, facts)) else None,
         numbers=_numbers(run, robustness, arrived),
         replays=arcs and tables.replay_table(run, arcs),
         stages=_stages(run, robustness, arcs),
@@ -146,11 +149,12 @@ def _game_numbers(run: Run, game: GameResult) -> list[Number]:
 
 def _episode_numbers(counts: Sequence[EpisodeCount]) -> list[Number]:
     """Returns the shares under the worst kind of noise, by start region."""
-    note = f"the least over {', '.join(dict.fromkeys(c.noise for c in counts))} noise"
+    noisy = [c for c in counts if c.noise != NO_NOISE] or counts
+    note = f"the least over {', '.join(dict.fromkeys(c.noise for c in noisy))} noise"
     numbers = []
-    for region in dict.fromkeys(c.region for c in counts):
+    for region in dict.fromkeys(c.region for c in noisy):
         least = [
-            min(c.reached for c in counts if (c.region, c.controller) == (region, who))
+            min(c.reached for c in noisy if (c.region, c.controller) == (region, who))
             for who in CONTROLLERS
         ]
         what = f"episodes that reach the set-point, starts {region}"

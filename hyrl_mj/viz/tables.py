@@ -7,11 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hyrl_mj.game import LIMIT, EpisodeCount, GameResult, Robustness
+from hyrl_mj.game import LIMIT, EpisodeCount, GameResult, Robustness, percent
 from hyrl_mj.run_directory import Run
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
 
+# No table is wider [columns].
+WIDEST = 10_000
 NAMES = {"policy": "RL policy", "hyrl": "HyRL", LIMIT: "limit"}
 
 
@@ -177,14 +179,6 @@ def _point(z: np.ndarray) -> str:
     return f"({', '.join(f'{v + 0.0:.3f}' for v in np.round(z, 3))})"
 
 
-def percent(share: float) -> str:
-    """Returns a share in percent; only 1 is called 100%, and only 0 is called 0%."""
-    if share in (0, 1):
-        return f"{100 * share:.0f}%"
-    text = f"{100 * share:.2f}%"
-    return {"100.00%": ">99.99%", "0.00%": "<0.01%"}.get(text, text)
-
-
 def _seconds(time: float, won: float) -> str:
     """Returns a worst time to arrival; "-" where nothing is won."""
     return f"{time:.2f} s" if won else "-"
@@ -194,8 +188,9 @@ def _seconds(time: float, won: float) -> str:
 
 
 def print_summary(run: Run) -> None:
-    """Prints the results of policy and hybrid controller in the replays and in the worst case."""
+    """Prints the verdict, and the results of policy and hybrid controller in replays and worst case."""
     arcs = run.arcs()
+    print_verdict(run)
     _print(replay_table(run, arcs))
     print(run.critical_set.sentence(run.task))
     for q in run.extended_sets.modes:
@@ -206,6 +201,13 @@ def print_summary(run: Run) -> None:
     for what, name in (("video", "replay.mp4"), ("report", "report.html")):
         path = run.path / name
         print(f"{what} {path}" if run.manifest.has(path) else f"no {what}")
+
+
+def print_verdict(run: Run) -> None:
+    """Prints the verdict with its reasons."""
+    print(run.verdict)
+    for reason in run.verdict.reasons:
+        print(f"- {reason}")
 
 
 def print_robustness(run: Run) -> None:
@@ -219,13 +221,23 @@ def print_robustness(run: Run) -> None:
 
 
 def _print(table: Table) -> None:
-    """Prints a table, every cell whole."""
+    """Prints a table, every cell whole; on a terminal too narrow for its words, a line for each cell."""
     import rich.table  # slow to import, and --help does not need it
     from rich.console import Console
+    from rich.measure import Measurement
 
     drawn = rich.table.Table(*table.headings, title=table.title)
     for row in table.rows:
         drawn.add_row(*map(str, row))
     # Off a terminal rich assumes 80 columns, which would cut the cells.
     width = None if Console().is_terminal else 160
-    Console(width=width, markup=False, emoji=False, highlight=False).print(drawn)
+    console = Console(width=width, markup=False, emoji=False, highlight=False)
+    wide = console.options.update(max_width=WIDEST)
+    if Measurement.get(console, wide, drawn).minimum <= console.width:
+        console.print(drawn)
+        return
+    print(table.title)
+    for row in table.rows:
+        print()
+        for heading, cell in zip(table.headings, row, strict=True):
+            print(f"{heading}: {cell}")

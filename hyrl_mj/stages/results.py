@@ -1,0 +1,82 @@
+"""What stages 1 and 6 know about the policies that they give: how often each one wins."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hyrl_mj import artifacts
+from hyrl_mj.policies import Policy, PolicyController
+from hyrl_mj.simulation import LoopSettings, closed_loop
+from hyrl_mj.tasks import Outcome, Task
+
+# Number of episodes from which arrivals are counted.
+EPISODES = 1_000
+
+
+@dataclass(frozen=True)
+class Arrivals:
+    """From how many of its task's starts a policy arrives without noise, saved as `arrivals.json`.
+
+    Attributes:
+        arrived: number of episodes that end at the set-point within the task's `max_steps`.
+        episodes: number of episodes.
+    """
+
+    arrived: int
+    episodes: int
+
+    def __str__(self) -> str:
+        return f"arrives from {self.arrived:,} of {self.episodes:,} of its starts without noise"
+
+    @staticmethod
+    def of(task: Task, policy: Policy) -> Arrivals:
+        """Counts the arrivals of a policy from starts of the task, which are the same each time."""
+        starts = task.starts(EPISODES, np.random.default_rng(0))
+        settings = LoopSettings(vary=True, label="arrivals")
+        run = closed_loop(task, PolicyController(policy), starts, settings=settings)
+        arrived = (run.outcome == Outcome.REACHED) & task.arrived(run.path[-1])
+        return Arrivals(int(arrived.sum()), len(starts))
+
+    def save(self, path: Path) -> None:
+        """Writes `arrivals.json`."""
+        artifacts.write_json(path, self, "arrivals")
+
+    @staticmethod
+    def load(path: Path) -> Arrivals:
+        """Reads what `save` wrote; raises `BadArtifact` if it is missing, damaged, or of another version."""
+        return artifacts.read_record(path, "arrivals", Arrivals)
+
+
+@dataclass(frozen=True)
+class ModeResult:
+    """How the training of one mode ended.
+
+    Attributes:
+        mode: the mode.
+        won: share of the states of its set from which its policy arrives in time, whatever the noise; where
+            the worst case cannot be computed, share of the noisy episodes in which it arrives.
+        attempts: number of trainings; none if a mirror image or the warm start is good enough.
+    """
+
+    mode: int
+    won: float
+    attempts: int
+
+
+@dataclass(frozen=True)
+class Retraining:
+    """How stage 6 ended: a result for each mode. Saved as `retraining.json`."""
+
+    modes: tuple[ModeResult, ...]
+
+    def save(self, path: Path) -> None:
+        """Writes `retraining.json`."""
+        artifacts.write_json(path, self, "retraining")
+
+    @staticmethod
+    def load(path: Path) -> Retraining:
+        """Reads what `save` wrote; raises `BadArtifact` if it is missing, damaged, or of another version."""
+        return artifacts.read_record(path, "retraining", Retraining)

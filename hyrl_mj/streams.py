@@ -1,0 +1,134 @@
+"""Standard output and standard error that cannot stop a command.
+
+A run takes minutes, and what it writes to disk does not depend on who reads what it says. A closed stream, a
+pipe whose reader has gone, a full disk behind a redirection, or a character that the terminal does not know
+must not end it. What could not be shown is said once, at the end.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, TextIO
+
+from hyrl_mj.errors import BadInput, HyrlError, brief
+
+# A narrower terminal breaks the lines itself: libraries that lay out text cannot [columns].
+NARROWEST = 60
+
+
+class _Raw(io.FileIO):
+    """A stream that swallows everything after the first write that fails, whose error it keeps."""
+
+    problem: OSError | None = None
+
+    def write(self, data: Any) -> int | None:  # type: ignore[override]
+        if self.problem is None:
+            try:
+                return super().write(data)
+            except OSError as error:
+                self.problem = error
+        return len(memoryview(data))
+
+
+class Streams:
+    """The standard streams of a command, made lasting.
+
+    Streams that are closed are opened on the null device, so that no file that is opened later takes their
+    place, and gets what libraries print.
+    """
+
+    def __init__(self) -> None:
+        self._closed = [stream is None for stream in (sys.stdin, sys.stdout, sys.stderr)]
+        for number in range(3):
+            try:
+                os.fstat(number)
+            except OSError:
+                os.open(os.devnull, os.O_RDWR)  # the lowest free number, which is this one
+        if shutil.get_terminal_size().columns < NARROWEST:
+            os.environ["COLUMNS"] = str(NARROWEST)
+        self._raw: dict[int, _Raw] = {}
+        sys.stdout, sys.stderr = self._lasting(sys.stdout, 1), self._lasting(sys.stderr, 2)
+
+    def _lasting(self, stream: TextIO | None, number: int) -> TextIO:
+        """Returns the stream in place of one that Python has opened."""
+        if stream is None:
+            return open(os.devnull, "w", encoding="utf-8")
+        try:
+            if stream.fileno() != number:
+                return stream
+        except (OSError, ValueError, AttributeError):  # a test has put another object in its place
+            return stream
+        self._raw[number] = raw = _Raw(number, "wb", closefd=False)
+        return io.TextIOWrapper(
+            io.BufferedWriter(raw),
+            encoding=stream.encoding,
+            errors="backslashreplace",
+            line_buffering=True,
+        )
+
+    def run(self, command: Callable[[], None]) -> int:
+        """Runs a command, says what went wrong, and returns the exit status."""
+        status = self._status(command)
+        with suppress(OSError):
+            sys.stdout.flush()
+        if self._closed[1]:
+            self._complain("standard output is closed, so that nothing could be shown")
+        elif (problem := self._problem(1)) and problem.errno == errno.EPIPE:
+            self._complain("the reader of standard output has gone: the rest was not shown")
+        elif problem:
+            why = problem.strerror or problem
+            self._complain(f"standard output cannot be written ({why}): the rest was not shown")
+            status = status or 1
+        return status
+
+    def _status(self, command: Callable[[], None]) -> int:
+        """Runs a command, says what went wrong, and returns its own exit status."""
+        try:
+            check_working_directory()
+            command()
+        except HyrlError as error:
+            self._complain(str(error))
+            return error.exit_status
+        except OSError as error:
+            where = "" if error.filename is None else f": {os.fsdecode(error.filename)}"
+            self._complain(f"{error.strerror or brief(error)}{where}")
+            return 1
+        except KeyboardInterrupt:
+            self._complain("interrupted; finished work is kept, run again to resume")
+            return 130
+        except SystemExit as error:
+            return error.code if isinstance(error.code, int) else int(error.code is not None)
+        except Exception as error:
+            if self._is_deaf:  # the traceback would not be seen
+                self._complain(brief(error))
+            raise
+        return 0
+
+    @property
+    def _is_deaf(self) -> bool:
+        """Whether nobody reads standard error."""
+        sys.stderr.flush()
+        return self._closed[2] or self._problem(2) is not None
+
+    def _complain(self, text: str) -> None:
+        """Says what went wrong on standard error, or on standard output if nobody reads the other."""
+        print(f"hyrl-mj: {text}", file=sys.stdout if self._is_deaf else sys.stderr, flush=True)
+
+    def _problem(self, number: int) -> OSError | None:
+        return self._raw[number].problem if number in self._raw else None
+
+
+def check_working_directory() -> None:
+    """Raises `BadInput` if the working directory is gone."""
+    try:
+        os.getcwd()
+    except OSError as error:
+        raise BadInput(
+            f"the working directory cannot be found ({error.strerror}): change to another, as with cd"
+        ) from error

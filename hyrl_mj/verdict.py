@@ -1,0 +1,222 @@
+"""The verdict on a run: one word, a sentence, and the reasons."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from hyrl_mj.game import Robustness, percent
+from hyrl_mj.stages import Arrivals, ModeResult, Retraining
+from hyrl_mj.tasks import Task
+
+WON, HELD, WEAK, FAILED = "WON", "HELD", "WEAK", "FAILED"
+# The share that counts as nearly all.
+NEARLY = 0.99
+# The kind of noise of episodes without noise.
+NO_NOISE = "none"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the hybrid controller of a run is worth.
+
+    `word` is the first of these whose condition holds. To win is to arrive within the task's `max_steps`;
+    nearly all are 99%.
+
+    - WON: the worst-case game can be played, and HyRL wins every winnable start at the run's noise bound.
+    - HELD: the game cannot be played, and HyRL arrives in nearly all episodes under each kind of noise.
+    - FAILED: no start is winnable, or HyRL wins less than the policy without noise, or stage 6 gave up: for
+      some mode no attempt gave a policy that wins nearly all of its set.
+    - WEAK: HyRL wins more than the policy under noise, or the policy does not arrive from nearly all of its
+      starts without noise, or the examination was under less noise than the run's bound.
+    - FAILED: none of these. HyRL loses, and is no better than the policy.
+
+    In the game, HyRL picks its start mode. In episodes, the kind of noise that stops a controller most often
+    counts.
+
+    Attributes:
+        word: "WON", "HELD", "WEAK" or "FAILED".
+        sentence: what decided.
+        reasons: the results behind it, a sentence each.
+    """
+
+    word: str
+    sentence: str
+    reasons: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{self.word}: {self.sentence}"
+
+    @staticmethod
+    def of(
+        task: Task,
+        bound: float,
+        robustness: Robustness,
+        retraining: Retraining,
+        arrivals: Arrivals,
+    ) -> Verdict:
+        """Returns the verdict on a run.
+
+        Args:
+            task: the robot and its problem.
+            bound: the run's noise bound.
+            robustness: the result of the examination.
+            retraining: the result of stage 6.
+            arrivals: from how many starts the policy of stage 1, or the agent, arrives without noise.
+        """
+        case = _Case(task, bound, robustness, retraining, arrivals)
+        reasons = tuple(case.reasons())
+        for word, grounds in (
+            (WON if robustness.game else HELD, case.success()),
+            (FAILED, case.failures()),
+            (WEAK, case.weaknesses()),
+        ):
+            if sentence := "; ".join(grounds):
+                return Verdict(word, sentence, reasons)
+        return Verdict(FAILED, f"HyRL is no better than the policy under {case.noise}", reasons)
+
+
+@dataclass(frozen=True)
+class _Wins:
+    """What a controller wins: shares of the winnable starts, or of the episodes.
+
+    Attributes:
+        quiet: without noise, None if that was not examined.
+        noisy: under noise, None if that was not examined.
+    """
+
+    quiet: float | None
+    noisy: float | None
+
+    @staticmethod
+    def of(robustness: Robustness, who: str) -> _Wins:
+        """Returns what "policy" or "hyrl" wins."""
+        if robustness.game:
+            scores = robustness.game.scores[who]
+            quiet = [score.won for score in scores if score.eps == 0]
+            return _Wins(quiet[0] if quiet else None, scores[-1].won)
+        shares = {
+            kind: arrived / episodes
+            for kind, (arrived, episodes) in _by_kind(robustness, who).items()
+        }
+        quiet_share = shares.pop(NO_NOISE, None)
+        return _Wins(quiet_share, min(shares.values()) if shares else None)
+
+
+@dataclass(frozen=True)
+class _Case:
+    """What a verdict is decided by; the attributes are those of `Verdict.of`."""
+
+    task: Task
+    bound: float
+    robustness: Robustness
+    retraining: Retraining
+    arrivals: Arrivals
+
+    @property
+    def policy(self) -> _Wins:
+        return _Wins.of(self.robustness, "policy")
+
+    @property
+    def hyrl(self) -> _Wins:
+        return _Wins.of(self.robustness, "hyrl")
+
+    @property
+    def noise(self) -> str:
+        """The noise of the examination, in words."""
+        where, unit = self.task.noise_on(self.robustness.everywhere)
+        return f"noise of up to {self.robustness.eps:g} {unit} on {where}"
+
+    @property
+    def examined(self) -> bool:
+        """Whether the examination was under as much noise as the run's bound."""
+        return self.robustness.eps >= self.bound and self.hyrl.noisy is not None
+
+    @property
+    def winnable(self) -> float:
+        """The share of the starts that can be won under the noise."""
+        game = self.robustness.game
+        return game.scores["hyrl"][-1].winnable if game else 1.0
+
+    def success(self) -> Iterator[str]:
+        """Yields why the run is WON or HELD, if it is."""
+        won = self.hyrl.noisy
+        if not self.examined or not self.winnable or won is None:
+            return
+        if self.robustness.game and won == 1:
+            yield f"HyRL wins every start that can be won, under the worst {self.noise}"
+        elif not self.robustness.game and won >= NEARLY:
+            counts = _by_kind(self.robustness, "hyrl")
+            arrived, total = (sum(column) for column in zip(*counts.values(), strict=True))
+            yield f"HyRL arrives in {arrived:,} of {total:,} episodes, with {self.noise}"
+
+    def failures(self) -> Iterator[str]:
+        """Yields why the run FAILED, if it did for sure."""
+        if not self.winnable:
+            yield f"no start can be won under {self.noise}"
+        policy, hyrl = self.policy.quiet, self.hyrl.quiet
+        if policy is not None and hyrl is not None and hyrl < policy:
+            yield f"without noise HyRL wins {percent(hyrl)}, less than the policy ({percent(policy)})"
+        for result in self.retraining.modes:
+            if result.won < NEARLY:
+                yield f"stage 6 gave up: {mode_sentence(self.task, result)}"
+
+    def weaknesses(self) -> Iterator[str]:
+        """Yields why the run is WEAK, if it is."""
+        if self.arrivals.arrived < NEARLY * self.arrivals.episodes:
+            yield f"the policy {self.arrivals}"
+        policy, hyrl = self.policy.noisy, self.hyrl.noisy
+        if policy is not None and hyrl is not None and hyrl > policy:
+            yield (
+                f"HyRL wins {percent(hyrl)} under {self.noise}, not all, but more than the policy "
+                f"({percent(policy)})"
+            )
+        if not self.examined:
+            yield (
+                f"HyRL was not examined under the run's noise bound {self.bound:g}, which "
+                "hyrl-mj robustness RUN does"
+            )
+
+    def reasons(self) -> Iterator[str]:
+        """Yields the results behind the verdict."""
+        yield from self._shares() if self.robustness.game else self._counts()
+        yield f"stage 1: the policy {self.arrivals}"
+        for result in self.retraining.modes:
+            yield f"stage 6: {mode_sentence(self.task, result)}"
+
+    def _shares(self) -> Iterator[str]:
+        """Yields what is won in the worst-case game."""
+        if self.winnable < 1:
+            yield f"under {self.noise} {percent(self.winnable)} of the starts can be won"
+        assert self.robustness.game
+        policy, hyrl = (self.robustness.game.scores[who] for who in ("policy", "hyrl"))
+        for ours, theirs in zip(hyrl, policy, strict=True):
+            if ours.eps in (0, self.robustness.eps):
+                when = f"under the worst {self.noise}" if ours.eps else "without noise"
+                yield f"{when} HyRL wins {percent(ours.won)}, the policy {percent(theirs.won)}"
+
+    def _counts(self) -> Iterator[str]:
+        """Yields the numbers of episodes that arrive, by kind of noise."""
+        policy = _by_kind(self.robustness, "policy")
+        for kind, (arrived, episodes) in _by_kind(self.robustness, "hyrl").items():
+            when = "without noise" if kind == NO_NOISE else f"under {kind} {self.noise}"
+            theirs, _ = policy[kind]
+            yield f"{when} HyRL arrives in {arrived:,} of {episodes:,} episodes, the policy in {theirs:,}"
+
+
+def _by_kind(robustness: Robustness, who: str) -> dict[str, tuple[int, int]]:
+    """Returns how many of a controller's episodes arrive, and of how many, by kind of noise."""
+    counts: dict[str, tuple[int, int]] = {}
+    for count in robustness.episodes:
+        if count.controller == who:
+            arrived, episodes = counts.get(count.noise, (0, 0))
+            counts[count.noise] = arrived + count.episodes - count.lost, episodes + count.episodes
+    return counts
+
+
+def mode_sentence(task: Task, result: ModeResult) -> str:
+    """Returns how well the policy of a mode holds its set."""
+    trainings = f"{result.attempts} training{'' if result.attempts == 1 else 's'}"
+    how = f"after {trainings}" if result.attempts else "without a training of its own"
+    mode = f"the policy of mode {task.scene.mode_name(result.mode)}"
+    return f"{mode} wins {percent(result.won)} of its set, {how}"
