@@ -128,6 +128,11 @@ class _Case:
         return f"noise of up to {self.robustness.eps:g} {unit} on {where}"
 
     @property
+    def whole(self) -> str:
+        """What shares are shares of."""
+        return "the winnable starts" if self.robustness.game else "the episodes"
+
+    @property
     def examined(self) -> bool:
         """Whether the examination was under as much noise as the run's bound."""
         return self.robustness.eps >= self.bound and self.hyrl.noisy is not None
@@ -144,7 +149,7 @@ class _Case:
         if not self.examined or not self.winnable or won is None:
             return
         if self.robustness.game and won == 1:
-            yield f"HyRL wins every start that can be won, under the worst {self.noise}"
+            yield f"HyRL wins every winnable start under the worst {self.noise}"
         elif not self.robustness.game and won >= NEARLY:
             counts = _by_kind(self.robustness, "hyrl")
             arrived, total = (sum(column) for column in zip(*counts.values(), strict=True))
@@ -153,13 +158,17 @@ class _Case:
     def failures(self) -> Iterator[str]:
         """Yields why the run FAILED, if it did for sure."""
         if not self.winnable:
-            yield f"no start can be won under {self.noise}"
+            yield f"no start is winnable under {self.noise}"
         policy, hyrl = self.policy.quiet, self.hyrl.quiet
         if policy is not None and hyrl is not None and hyrl < policy:
-            yield f"without noise HyRL wins {percent(hyrl)}, less than the policy ({percent(policy)})"
-        for result in self.retraining.modes:
-            if result.won < NEARLY:
-                yield f"stage 6 gave up: {mode_sentence(self.task, result)}"
+            yield (
+                f"without noise HyRL wins {percent(hyrl)} of {self.whole}, less than the policy "
+                f"({percent(policy)})"
+            )
+        given_up = [result.mode for result in self.retraining.modes if result.won < NEARLY]
+        if given_up:
+            modes = " and ".join(map(self.task.scene.mode_name, given_up))
+            yield f"stage 6 gave up on mode {modes}"
 
     def weaknesses(self) -> Iterator[str]:
         """Yields why the run is WEAK, if it is."""
@@ -168,8 +177,8 @@ class _Case:
         policy, hyrl = self.policy.noisy, self.hyrl.noisy
         if policy is not None and hyrl is not None and hyrl > policy:
             yield (
-                f"HyRL wins {percent(hyrl)} under {self.noise}, not all, but more than the policy "
-                f"({percent(policy)})"
+                f"HyRL wins {percent(hyrl)} of {self.whole} under {self.noise}, not all, but more "
+                f"than the policy ({percent(policy)})"
             )
         if not self.examined:
             yield (
@@ -187,13 +196,16 @@ class _Case:
     def _shares(self) -> Iterator[str]:
         """Yields what is won in the worst-case game."""
         if self.winnable < 1:
-            yield f"under {self.noise} {percent(self.winnable)} of the starts can be won"
+            yield f"under {self.noise} {percent(self.winnable)} of the starts are winnable"
         assert self.robustness.game
         policy, hyrl = (self.robustness.game.scores[who] for who in ("policy", "hyrl"))
         for ours, theirs in zip(hyrl, policy, strict=True):
             if ours.eps in (0, self.robustness.eps):
                 when = f"under the worst {self.noise}" if ours.eps else "without noise"
-                yield f"{when} HyRL wins {percent(ours.won)}, the policy {percent(theirs.won)}"
+                yield (
+                    f"{when} HyRL wins {percent(ours.won)} of {self.whole}, the policy "
+                    f"{percent(theirs.won)}"
+                )
 
     def _counts(self) -> Iterator[str]:
         """Yields the numbers of episodes that arrive, by kind of noise."""

@@ -25,6 +25,7 @@ from hyrl_mj.learning.settings import preset
 from hyrl_mj.pipeline import ExamineOptions, examine_run, run_stage
 from hyrl_mj.run_directory import Run, write_config
 from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.stages import Arrivals, ModeResult, Retraining
 from hyrl_mj.stages.critical_set import CriticalSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
@@ -64,6 +65,7 @@ def plant(path, task, critical, partition, slack=0.2):
     write_config(run)
     with run.stage("train"):
         linear(task, 0.0).save(path / "policy.safetensors")
+        Arrivals(990, 1_000).save(path / "arrivals.json")
     with run.stage("critical-set"):
         critical.save(path / "critical_set.npz")
     with run.stage("partition"):
@@ -79,6 +81,8 @@ def plant(path, task, critical, partition, slack=0.2):
     with run.stage("retrain"):
         for q in partition.modes:
             linear(task, 0.3 - 0.6 * q).save(path / f"mode_{q}.safetensors")
+        results = tuple(ModeResult(q, 1.0, 1) for q in partition.modes)
+        Retraining(results).save(path / "retraining.json")
     return load_run(path)
 
 

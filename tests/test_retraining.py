@@ -138,7 +138,7 @@ def test_a_mirror_image_that_will_do_is_taken(vehicle, vehicle_sets, quick, monk
     other = untrained(vehicle, quick)
     image = symmetry.mirrored(other)
     monkeypatch.setattr(ByGame, "score", lambda ground, policy: (0.0, -0.5))
-    found = retrain(ByGame(vehicle, vehicle_sets, 1), quick, seed=0, others=[other])
+    found, _ = retrain(ByGame(vehicle, vehicle_sets, 1), quick, seed=0, others=[other])
     for name, weight in image.weights.items():
         np.testing.assert_array_equal(found.weights[name], weight)
 
@@ -148,8 +148,8 @@ def test_one_that_will_not_do_is_not_taken(vehicle, vehicle_sets, quick):
     # An untrained policy drives into the pillar.
     other = untrained(vehicle, quick)
     assert ByGame(vehicle, vehicle_sets, 1)(symmetry.mirrored(other)) < (0.0, -1.0)
-    alone = retrain(ByGame(vehicle, vehicle_sets, 1), quick, seed=0)
-    found = retrain(ByGame(vehicle, vehicle_sets, 1), quick, seed=0, others=[other])
+    alone, _ = retrain(ByGame(vehicle, vehicle_sets, 1), quick, seed=0)
+    found, _ = retrain(ByGame(vehicle, vehicle_sets, 1), quick, seed=0, others=[other])
     for name, weight in alone.weights.items():
         np.testing.assert_array_equal(found.weights[name], weight)
 
@@ -202,6 +202,6 @@ def test_a_mirror_image_is_taken_there_too(puck, puck_sets, monkeypatch):
     settings = replace(preset(puck, "smoke").stage6, samples=4_096)
     other = training.export(training.build(puck, settings, seed=0), puck)
     monkeypatch.setattr(ByEpisodes, "score", lambda ground, policy: ground.enough)
-    found = retrain(ByEpisodes(puck, puck_sets, 1), settings, seed=0, others=[other])
+    found, _ = retrain(ByEpisodes(puck, puck_sets, 1), settings, seed=0, others=[other])
     for name, weight in symmetry.mirrored(other).weights.items():
         np.testing.assert_array_equal(found.weights[name], weight)

@@ -339,7 +339,9 @@ def test_a_start_that_will_do_is_not_trained(circle_run, monkeypatch):
     monkeypatch.setattr("hyrl_mj.stages.retraining.train", None)
     run, settings = circle_run, circle_run.settings.stage6
     warm_start = partial(start_policy, run.policy, run.partition)
-    found = retrain(mode_ground(run.task, run.extended_sets, 0), settings, 0, warm_start=warm_start)
+    found, _ = retrain(
+        mode_ground(run.task, run.extended_sets, 0), settings, 0, warm_start=warm_start
+    )
     assert (found.act(np.linspace(0.5, 2.4, 50)[:, None]) < 0).all()
 
 
