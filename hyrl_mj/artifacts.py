@@ -172,9 +172,16 @@ def parsed(content: Mapping[str, Any], record: type[Record], remedy: str = REMED
     from pydantic import ValidationError  # slow to import
 
     try:
-        return _adapter(record).validate_json(json.dumps([content]))[0]  # type: ignore[arg-type]
+        value = _adapter(record).validate_json(json.dumps([content]))[0]  # type: ignore[arg-type]
     except ValidationError as error:
         problems = error.errors(include_url=False, include_input=False)
+    else:
+        # Files are written with every field: a default would hide that one is missing.
+        if missing := next(_missing(asdict(value), content), None):
+            raise BadArtifact(
+                f"it has no {missing}, so it is damaged or of another version: {remedy}"
+            )
+        return value
     # For a union, pydantic lists the problems of every type: report those of the closest type.
     counts = Counter(problem["loc"][:-1] for problem in problems)
     problem = min(problems, key=lambda problem: counts[problem["loc"][:-1]])
@@ -182,8 +189,25 @@ def parsed(content: Mapping[str, Any], record: type[Record], remedy: str = REMED
     text = {
         "missing": f"it has no {field}",
         "unexpected_keyword_argument": f"it has an unknown {field}",
-    }.get(problem["type"], f"its {field} cannot be used ({problem['msg']})")
+    }.get(
+        problem["type"],
+        f"its {field} cannot be used ({problem['msg'].removeprefix('Value error, ')})",
+    )
     raise BadArtifact(f"{text}, so it is damaged or of another version: {remedy}")
+
+
+def _missing(whole: Any, content: Any, field: str = "") -> Iterator[str]:
+    """Yields the fields of nested dictionaries and lists that others do not have."""
+    if isinstance(whole, dict):
+        for name, value in whole.items():
+            inner = f"{field}.{name}".lstrip(".")
+            if name not in content:
+                yield inner
+            else:
+                yield from _missing(value, content[name], inner)
+    elif isinstance(whole, list | tuple):
+        for i, (value, part) in enumerate(zip(whole, content, strict=True)):
+            yield from _missing(value, part, f"{field}.{i}")
 
 
 @cache

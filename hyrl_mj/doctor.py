@@ -11,14 +11,17 @@ import tempfile
 from importlib import metadata
 from pathlib import Path
 
+import mujoco
 import numpy as np
 
+from hyrl_mj import mjcf
 from hyrl_mj.errors import NoRenderer
 from hyrl_mj.rendering import GL_CURE
 from hyrl_mj.viz.encoding import video
 
 # Distributions whose versions matter. Read from their metadata: importing torch takes seconds.
 DISTRIBUTIONS = (
+    "hyrl-mj",
     "mujoco",
     "gymnasium",
     "stable-baselines3",
@@ -63,6 +66,11 @@ def report() -> tuple[list[str], bool]:
     healthy = not missing
     if missing:
         lines.append(f"cure: pip install {' '.join(missing)}")
+    if mujoco.__version__ == mjcf.WRONG_VERSION:
+        lines.append(
+            "note: MuJoCo 4.0.0 computes wrong forces with a sparse constraint Jacobian; such models are "
+            "refused, and those of this package are dense"
+        )
     lines.append(f"GL backend         MUJOCO_GL={os.environ.get('MUJOCO_GL', '(not set)')}")
     for title, attempt in (("rendering", _rendering), ("a second of video", _encoding)):
         try:

@@ -8,6 +8,9 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput, unknown
 
+# The version of MuJoCo that computes wrong constraint forces where the Jacobian is sparse.
+WRONG_VERSION = "4.0.0"
+
 
 def models_dir() -> Path:
     """Returns the folder of the MJCF files: in the installed package, else beside it in the checkout."""
@@ -112,7 +115,9 @@ def wrong_physics(model: mujoco.MjModel, version: str = mujoco.__version__) -> s
     (https://github.com/google-deepmind/mujoco/releases/tag/4.0.1).
     """
     newton = model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
-    if version != "4.0.0" or not (newton and mujoco.mj_isSparse(model) and _constrained(model)):
+    if version != WRONG_VERSION or not (
+        newton and mujoco.mj_isSparse(model) and _constrained(model)
+    ):
         return ""
     return (
         f"MuJoCo 4.0.0 computes wrong constraint forces for {model_name(model)}, whose Jacobian is "

@@ -9,11 +9,13 @@ import numpy as np
 
 from hyrl_mj import forked, mjcf, mujoco_log
 from hyrl_mj.errors import BadInput
+from hyrl_mj.ranges import Integer
 
 # Sensor values (n, sensors) -> measurement (n, p).
 Measure = Callable[[np.ndarray], np.ndarray]
 # Inputs (n, m), positions (n, nq), velocities (n, nv) -> controls of all actuators (n, nu).
 Control = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+MOST = 2**24  # copies
 # Tolerated excess over an input limit: float32 policies have rounding errors.
 INPUT_TOLERANCE = 1e-6
 
@@ -50,6 +52,7 @@ class Plant:
     ):
         if problem := mjcf.wrong_physics(model):
             raise BadInput(problem)
+        n = Integer(1, MOST).checked("the number of copies of a robot", n)
         self.n, self._threads, self._measure, self._control = n, threads, measure, control
         self.model = copy.copy(model)
         # A bad state has to stay visible: MuJoCo would reset it and only count a warning. Inputs are

@@ -14,7 +14,7 @@ from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput
 
 # The runs from more nodes than this do not fit into the memory of a small machine.
-MOST_NODES = 2**20
+MOST_NODES = 2**19
 
 
 class StateSet(Protocol):

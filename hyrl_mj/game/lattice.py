@@ -98,7 +98,7 @@ class Lattice:
 
         Raises:
             BadInput: the plant's state is more than the chart, the chart has three dimensions, or the
-                lattice is too fine for the memory.
+                lattice is too coarse, or too fine for the memory.
         """
         Lattice.check(task)
         grid = grid or Grid.with_cells(task.chart, LATTICE[task.chart.dimension])
@@ -110,6 +110,11 @@ class Lattice:
         success = task.verdict(measurement) == Outcome.REACHED
         arrived = (ending == Outcome.REACHED) | ~failed & success
         alive = np.flatnonzero(ending == Outcome.RUNNING)
+        if not len(alive):
+            raise BadInput(
+                f"a lattice of {len(nodes):,} nodes has none at which an episode of {task.name} goes on: give "
+                "more cells (`lattice` in the settings)"
+            )
         levels = _levels(task, grid, nodes[alive])
         if len(levels) * len(nodes) > MOST_TRANSITIONS:
             raise BadInput(

@@ -77,6 +77,11 @@ class Training:
         if ":" not in self.algorithm and self.algorithm not in ALGORITHMS:
             raise unknown("algorithm", self.algorithm, [*ALGORITHMS, "or module:Class"])
         check_options(self.algorithm, self.options, samples=self.samples, envs=self.envs)
+        if self.action_noise and self.algorithm in ("ppo", "a2c", "dqn"):
+            raise BadInput(
+                f"action_noise {self.action_noise:g} cannot be used, because {self.algorithm} explores "
+                "without it: give 0"
+            )
 
     @property
     def title(self) -> str:

@@ -8,6 +8,7 @@ from functools import partial
 
 from threadpoolctl import threadpool_limits
 
+from hyrl_mj import mujoco_log
 from hyrl_mj.errors import BadInput, NoRenderer, unknown
 from hyrl_mj.game import Lattice, Limit, Robustness
 from hyrl_mj.pipeline.examination import (
@@ -191,9 +192,15 @@ def run_stage(run: Run, name: str, say: Say = print) -> Run:
     """
     if name not in (stages := DIAGNOSIS | STAGES):
         raise unknown("stage", name, stages)
-    return as_stage(
-        run, name, lambda fresh: stages[name](fresh, lambda text: say(f"{name}: {text}"))
-    )
+
+    def say_here(text: str) -> None:
+        say(f"{name}: {text}")
+
+    before = mujoco_log.counts.copy()
+    finished = as_stage(run, name, lambda fresh: stages[name](fresh, say_here))
+    if warnings := mujoco_log.since(before):
+        say_here(warnings)
+    return finished
 
 
 def examine_run(run: Run, options: ExamineOptions = USUAL, say: Say = print) -> Robustness:
