@@ -112,7 +112,7 @@ class Lattice:
         alive = np.flatnonzero(ending == Outcome.RUNNING)
         if not len(alive):
             raise BadInput(
-                f"a lattice of {len(nodes):,} nodes has none at which an episode of {task.name} goes on: give "
+                f"a lattice of {len(nodes):,} nodes has none at which {task.name} goes on: give "
                 "more cells (`lattice` in the settings)"
             )
         levels = _levels(task, grid, nodes[alive])
