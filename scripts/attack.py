@@ -1,0 +1,148 @@
+"""Attacks hyrl_mj: crashes, kills, damaged and crafted files, wrong settings and tasks, rivals, bad machines.
+
+    python scripts/attack.py                        # all of it, under ten minutes on two cores
+    python scripts/attack.py --short                # a sample of each attack
+    python scripts/attack.py --only received --match zip --seed 3
+
+Prints for each attack how many trials were made, survived and broke, and a line about each trial that broke;
+the exit status is 1 if any did.
+"""
+
+import os
+
+# Before anything is imported: forked processes take one thread each, and draw without a screen.
+os.environ.setdefault("MUJOCO_GL", "egl")
+os.environ["OMP_NUM_THREADS"] = "1"
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+
+import argparse
+import multiprocessing
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from random import Random
+
+from attacks import (
+    Trial,
+    configurations,
+    crashes,
+    damage,
+    kills,
+    received,
+    small,
+    surroundings,
+    tasks,
+    writers,
+)
+from attacks.material import Material
+from rich.console import Console
+from rich.table import Table
+
+PROCESSES = 2
+
+
+@dataclass(frozen=True)
+class Attack:
+    """An attack: its trials, and how many of them are made.
+
+    Attributes:
+        what: is done, in the table.
+        trials: (material, random numbers, count) -> the trials; those that follow from a run may be fewer.
+        count, short: number of trials, and with `--short`.
+    """
+
+    what: str
+    trials: Callable[[Material, Random, int], list[Trial]]
+    count: int
+    short: int
+
+
+ATTACKS = {
+    "crashes": Attack(
+        "crashed before and after every rename, then resumed", crashes.trials, 10_000, 12
+    ),
+    "kills": Attack("killed at a random moment, then resumed", kills.trials, 50, 4),
+    "artifacts": Attack("truncated, or one bit flipped", damage.trials, 80, 10),
+    "received": Attack("crafted files of a stranger", received.trials, 10_000, 20),
+    "configurations": Attack(
+        "one setting changed, through every stage", configurations.trials, 200, 24
+    ),
+    "tasks": Attack("task file or MJCF with one mistake", tasks.trials, 10_000, 12),
+    "writers": Attack("two and four writers, and a reader", writers.trials, 20, 2),
+    "surroundings": Attack("each pair of bad surroundings", surroundings.trials, 10_000, 5),
+}
+
+# The trials that are under way, for the forked processes that make them.
+UNDER_WAY: list[tuple[str, Trial]] = []
+
+
+def attempt(index: int) -> tuple[str, str, str, float]:
+    """Makes a trial, and returns its attack, its name, what broke, and how long it took [s]."""
+    attack, trial = UNDER_WAY[index]
+    began = time.monotonic()
+    with tempfile.TemporaryDirectory(dir=os.environ["TMPDIR"]) as folder:
+        os.chmod(folder, 0o755)
+        try:
+            broke = trial.attempt(Path(folder))
+        except Exception:  # a mistake of the attack's own must not end the others
+            broke = f"the attack itself failed: {traceback.format_exc()}"
+    return attack, trial.name, broke, time.monotonic() - began
+
+
+def table(results: list[tuple[str, str, str, float]]) -> Table:
+    """Returns the numbers of trials by attack."""
+    printed = Table()
+    for heading in ("attack", "what", "tried", "survived", "broke", "seconds"):
+        printed.add_column(heading)
+    for name in dict.fromkeys(result[0] for result in results):
+        own = [result for result in results if result[0] == name]
+        broke = sum(bool(result[2]) for result in own)
+        counts = (len(own), len(own) - broke, broke)
+        seconds = f"{sum(result[3] for result in own):.0f}"
+        printed.add_row(name, ATTACKS[name].what, *map(str, counts), seconds)
+    return printed
+
+
+def main() -> int:
+    """Makes the trials, and returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", help=f"some of {','.join(ATTACKS)}")
+    parser.add_argument("--match", default="", help="only trials whose name contains this")
+    parser.add_argument("--short", action="store_true", help="a sample of each attack")
+    parser.add_argument("--seed", type=int, default=0, help="seed of all random numbers")
+    parser.add_argument("--verbose", action="store_true", help="name each trial on standard error")
+    options = parser.parse_args()
+    chosen = options.only.split(",") if options.only else list(ATTACKS)
+    if unknown := set(chosen) - ATTACKS.keys():
+        parser.error(f"unknown attack {', '.join(unknown)}: choose some of {', '.join(ATTACKS)}")
+    small.shorten()
+    results = []
+    with tempfile.TemporaryDirectory(prefix="attack_") as folder:
+        os.chmod(folder, 0o755)
+        os.environ |= {"TMPDIR": folder, "XDG_STATE_HOME": f"{folder}/state"}
+        tempfile.tempdir = folder
+        material = Material(Path(folder))
+        for name in chosen:
+            attack = ATTACKS[name]
+            count = attack.short if options.short else attack.count
+            trials = attack.trials(material, Random(f"{options.seed} {name}"), count)
+            UNDER_WAY.extend((name, trial) for trial in trials if options.match in trial.name)
+        with multiprocessing.get_context("fork").Pool(PROCESSES) as pool:
+            for result in pool.imap_unordered(attempt, range(len(UNDER_WAY))):
+                results.append(result)
+                if options.verbose or result[2]:
+                    print(f"{result[0]}: {result[1]}: {result[2] or 'survived'}", file=sys.stderr)
+    results.sort(key=lambda result: chosen.index(result[0]))
+    Console(width=None if sys.stdout.isatty() else 120).print(table(results))
+    for name, trial, broke, _ in results:
+        if broke:
+            print(f"{name}: {trial}: {broke}")
+    return int(any(result[2] for result in results))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,368 @@
+"""Run directories of a stranger: payloads, links, bombs, lies. None may do harm, whatever is done with it."""
+
+import io
+import json
+import os
+import pickle
+import struct
+import zipfile
+import zlib
+from base64 import b64encode
+from collections.abc import Callable
+from functools import partial
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from attacks import MARKER
+from attacks.crafted_agents import ESCAPE, Payload, header, zeros
+from hyrl_mj import artifacts
+
+SCRIPT = "<script>alert('executed')</script>"
+SECRET = b"this is the user's own text, and nobody else's"
+ENCODED = b64encode(SECRET).decode()
+KINDS = {"config.json": "run", "robustness.json": "robustness", "manifest.json": "manifest"}
+
+
+# ---- how a stranger writes
+
+
+def content_of(path: Path) -> dict[str, Any]:
+    content = json.loads(path.read_text(encoding="utf-8"))
+    return {name: content[name] for name in content if name not in ("kind", "version", "sha256")}
+
+
+def write(path: Path, content: dict[str, Any]) -> None:
+    """Writes a JSON file of a run with its right SHA-256."""
+    artifacts.write_json(path, content, KINDS.get(path.name, "policy"))
+
+
+def forged(path: Path, name: str) -> None:
+    """Makes the manifest vouch for a file as it is now: anyone who writes a run directory can."""
+    own = sha256((path / name).read_bytes()).hexdigest()
+    manifest = content_of(path / "manifest.json")
+    for entry in manifest["stages"].values():
+        for part in ("inputs", "outputs"):
+            if name in entry[part]:
+                entry[part][name] = own
+    write(path / "manifest.json", manifest)
+
+
+def changed(path: Path, name: str, change: Callable[[dict[str, Any]], object]) -> None:
+    """Changes a JSON file, and forges the manifest."""
+    content = content_of(path / name)
+    change(content)
+    write(path / name, content)
+    if name not in ("config.json", "manifest.json"):
+        forged(path, name)
+
+
+def arrays(path: Path, name: str, **new: Any) -> None:
+    """Changes arrays of an npz file, and forges the manifest; values that are bytes are written as such."""
+    with np.load(path / name, allow_pickle=False) as file:
+        members = {member: file[member] for member in file.files} | new
+    with zipfile.ZipFile(path / name, "w", zipfile.ZIP_DEFLATED) as file:
+        for member, value in members.items():
+            buffer = io.BytesIO()
+            if not isinstance(value, bytes):
+                np.lib.format.write_array(buffer, np.asarray(value))
+            file.writestr(f"{member}.npy", value if isinstance(value, bytes) else buffer.getvalue())
+    forged(path, name)
+
+
+def replaced(path: Path, name: str, content: bytes) -> None:
+    (path / name).write_bytes(content)
+    forged(path, name)
+
+
+# ---- code
+
+
+def evil(folder: Path, name: str = "evil.py") -> Path:
+    """Writes a file of code that leaves the marker behind."""
+    path = folder / name
+    path.write_text(f"open({str(folder / MARKER)!r}, 'w').close()\nclass X: pass\n")
+    return path
+
+
+def names_code(folder: Path, path: Path, name: str, key: str) -> None:
+    changed(path, name, lambda content: content.update({key: str(evil(folder))}))
+
+
+def config_names_code(folder: Path, path: Path, task: str) -> None:
+    evil(folder)
+    evil(path)
+    setting(path, "task", task.format(folder=folder, path=path))
+
+
+def names_module(folder: Path, path: Path, stage: str) -> None:
+    evil(folder, "evilmod.py")
+    evil(path, "evilmod.py")
+    changed(path, "config.json", lambda c: c["settings"][stage].update(algorithm="evilmod:X"))
+
+
+def policy_names_module(folder: Path, path: Path) -> None:
+    evil(folder, "evilmod.py")
+    changed(path, "mode_0.json", lambda content: content.update(algorithm="evilmod:X"))
+
+
+def setting(path: Path, name: str, value: object) -> None:
+    changed(path, "config.json", lambda content: content["settings"].update({name: value}))
+
+
+def pickled_array(folder: Path, path: Path) -> None:
+    buffer = io.BytesIO()
+    np.save(buffer, np.array([Payload()], dtype=object), allow_pickle=True)
+    arrays(path, "critical_set.npz", points=buffer.getvalue())
+
+
+def calls_in_header(folder: Path, path: Path) -> None:
+    text = f"{{'descr': '<f8', 'fortran_order': False, 'shape': (open({MARKER!r}, 'w').fileno(),)}}"
+    raw = text.encode().ljust(118) + b"\n"
+    magic = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(raw)) + raw
+    arrays(path, "critical_set.npz", points=magic + bytes(8))
+
+
+def pickle_for_json(folder: Path, path: Path) -> None:
+    replaced(path, "robustness.json", pickle.dumps(Payload()))
+
+
+# ---- shapes and sizes
+
+
+def npy(shape: str, descr: str = "<f8", rest: bytes = b"") -> bytes:
+    """Returns an npy member with a header of one's own."""
+    text = f"{{'descr': {descr!r}, 'fortran_order': False, 'shape': {shape}}}"
+    raw = text.encode().ljust(117) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(raw)) + raw + rest
+
+
+def array_bomb(folder: Path, path: Path) -> None:
+    with zipfile.ZipFile(path / "partition.npz", "w", zipfile.ZIP_DEFLATED) as file:
+        zeros(file, "succeeds.npy")
+    forged(path, "partition.npz")
+
+
+def sparse(folder: Path, path: Path, name: str) -> None:
+    with (path / name).open("wb") as file:
+        file.truncate(2**32)
+
+
+def picture_bomb(folder: Path, path: Path) -> None:
+    """A picture of 60,000 x 60,000 pixels in a few bytes."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return (
+            struct.pack(">L", len(data)) + kind + data + struct.pack(">L", zlib.crc32(kind + data))
+        )
+
+    size = struct.pack(">LLBBBBB", 60_000, 60_000, 8, 0, 0, 0, 0)
+    data = zlib.compress(bytes(60_001 * 100))
+    whole = chunk(b"IHDR", size) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+    replaced(path, "figures/overview.png", b"\x89PNG\r\n\x1a\n" + whole)
+
+
+def many_files(folder: Path, path: Path) -> None:
+    for number in range(20_000):
+        (path / "arcs" / f"start{number + 100}_policy.npz").touch()
+
+
+def deep_folders(folder: Path, path: Path) -> None:
+    here = os.open(path, os.O_RDONLY)
+    for _ in range(1500):
+        os.mkdir("d", dir_fd=here)
+        below = os.open("d", os.O_RDONLY, dir_fd=here)
+        os.close(here)
+        here = below
+    os.close(here)
+
+
+# ---- links, and what is no file
+
+
+def linked(folder: Path, path: Path, name: str, target: str) -> None:
+    """Puts a link in the place of a file or a folder."""
+    place = path / name
+    if place.is_dir():
+        place.rename(folder / "aside")
+    else:
+        place.unlink(missing_ok=True)
+    place.symlink_to(target.format(folder=folder, victim=folder / "victim"))
+
+
+def hard_linked(folder: Path, path: Path, name: str) -> None:
+    (path / name).unlink(missing_ok=True)
+    (path / name).parent.mkdir(exist_ok=True, parents=True)
+    os.link(folder / "victim" / "secret.txt", path / name)
+
+
+def piped(folder: Path, path: Path, name: str) -> None:
+    (path / name).unlink(missing_ok=True)
+    os.mkfifo(path / name)
+
+
+def folder_for_file(folder: Path, path: Path, name: str) -> None:
+    (path / name).unlink(missing_ok=True)
+    (path / name / "inside").mkdir(parents=True)
+
+
+def file_for_folder(folder: Path, path: Path, name: str) -> None:
+    (path / name).rename(folder / "aside")
+    (path / name).write_text("no folder")
+
+
+# ---- manifests
+
+
+def manifest(folder: Path, path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    changed(path, "manifest.json", lambda content: change(content["stages"]))
+
+
+def claims(stages: dict[str, Any], *names: str) -> None:
+    for name in names:
+        stages["simulate"]["outputs"][name] = "0" * 64
+
+
+def in_a_circle(stages: dict[str, Any]) -> None:
+    last = stages["report"]["outputs"]
+    stages["train"]["inputs"] = dict(last)
+
+
+def text(folder: Path, path: Path, name: str, content: str) -> None:
+    (path / name).write_text(content, encoding="utf-8", errors="surrogatepass")
+
+
+def robustness_says(folder: Path, path: Path, what: str) -> None:
+    """Strings that the report shows."""
+
+    def change(content: dict[str, Any]) -> None:
+        count = {
+            "noise": what, "eps": 0.1, "everywhere": False, "controller": "hyrl", "region": what,
+            "episodes": 4, "outcomes": {what: 4}, "reached": 0.5, "interval": [0.1, 0.9],
+        }  # fmt: skip
+        content["episodes"] = [count, {**count, "controller": "policy"}]
+
+    changed(path, "robustness.json", change)
+
+
+def versions_say(folder: Path, path: Path, what: str) -> None:
+    changed(path, "config.json", lambda content: content["versions"].update({what: what}))
+
+
+DIRECTORIES: dict[str, Callable[[Path, Path], None]] = {
+    "mode_0.json names a file of code": partial(names_code, name="mode_0.json", key="task"),
+    "policy.json names a file of code": partial(names_code, name="policy.json", key="task"),
+    "mode_0.json names a module": policy_names_module,
+    "config.json names a file of code": partial(config_names_code, task="{folder}/evil.py"),
+    "config.json names a file of code in itself": partial(config_names_code, task="{path}/evil.py"),
+    "config.json names a file of code near by": partial(config_names_code, task="evil.py"),
+    "config.json names a module for stage 1": partial(names_module, stage="stage1"),
+    "config.json names a module for stage 6": partial(names_module, stage="stage6"),
+    "a pickled array": pickled_array,
+    "a call in the header of an array": calls_in_header,
+    "a pickle for a JSON file": pickle_for_json,
+    "an npz bomb": array_bomb,
+    "an array of 2**50 numbers": lambda folder, path: arrays(
+        path, "partition.npz", succeeds=npy("(1125899906842624,)")
+    ),
+    "an array of 2**31 numbers": lambda folder, path: arrays(
+        path, "partition.npz", succeeds=npy("(2147483648,)", "|b1")
+    ),
+    "an array of records of 2 GB": lambda folder, path: arrays(
+        path, "partition.npz", succeeds=npy("(1,)", "|V2147483647")
+    ),
+    "a grid of 2**40 nodes": lambda folder, path: arrays(
+        path, "partition.npz", counts=np.array([2**40])
+    ),
+    "a hundred thousand modes": lambda folder, path: arrays(
+        path, "extended_sets.npz", modes=np.arange(100_000)
+    ),
+    "modes that are NaN": lambda folder, path: arrays(
+        path, "extended_sets.npz", modes=np.array([np.nan, np.inf])
+    ),
+    "an empty M* in three dimensions": lambda folder, path: arrays(
+        path, "critical_set.npz", points=np.zeros((4, 3)), component=np.zeros(4, int)
+    ),
+    "M* at infinity": lambda folder, path: arrays(
+        path, "critical_set.npz", points=np.array([[np.inf]]), component=np.array([0])
+    ),
+    "an arc of strings": lambda folder, path: arrays(
+        path, "arcs/start0_policy.npz", t=np.array(["a", "b"])
+    ),
+    "an arc without rows": lambda folder, path: arrays(
+        path, "arcs/start0_policy.npz",
+        **{n: np.zeros((0,)) for n in ("t", "j", "q")}, z=np.zeros((0, 1)), u=np.zeros((0, 1)),
+    ),
+    "an arc that colours the terminal": lambda folder, path: arrays(
+        path, "arcs/start0_policy.npz", outcome=np.array(ESCAPE), noise=np.array(ESCAPE)
+    ),
+    "weights that are NaN": lambda folder, path: replaced(
+        path, "mode_0.safetensors",
+        (path / "mode_0.safetensors").read_bytes()[:-4] + struct.pack("<f", np.nan),
+    ),
+    "weights of 2**62 numbers": lambda folder, path: replaced(
+        path, "mode_0.safetensors", header({"a": {
+            "dtype": "F32", "shape": [2**31, 2**31], "data_offsets": [0, 64]}}, rest=bytes(64)),
+    ),
+    "a picture of 60,000 x 60,000 pixels": picture_bomb,
+    "20,000 files": many_files,
+    "1,500 folders, each in the one before": deep_folders,
+    **{
+        f"4 GB of nothing for {name}": partial(sparse, name=name)
+        for name in ("config.json", "manifest.json", "replay.mp4", "policy.safetensors", ".lock")
+    },
+    **{
+        f"{name} is a link to {target.format(victim='VICTIM', folder='HERE')}": partial(
+            linked, name=name, target=target
+        )
+        for name, target in (
+            ("arcs", "{victim}"), ("figures", "{victim}"), ("replay.mp4", "{victim}/secret.txt"),
+            ("figures/overview.png", "{victim}/secret.txt"), (".lock", "{victim}/secret.txt"),
+            ("manifest.json", "{victim}/secret.txt"), ("config.json", "{victim}/secret.txt"),
+            ("logs", "{victim}"), (".report.partial.html", "{victim}/secret.txt"),
+            ("report.html", "{victim}/new.html"), ("loop", "loop"), ("arcs/start0_policy.npz", "/etc/passwd"),
+        )
+    },
+    **{
+        f"{name} is a second name of a file of the user's": partial(hard_linked, name=name)
+        for name in (".lock", "report.html", "replay.mp4", "logs/stage1/progress.csv")
+    },
+    **{
+        f"{name} is a pipe": partial(piped, name=name)
+        for name in (".lock", "config.json", "manifest.json", "policy.json", "replay.mp4")
+    },
+    **{
+        f"{name} is a folder": partial(folder_for_file, name=name)
+        for name in (".lock", "manifest.json", "mode_0.json", "replay.mp4", "report.html",
+                     ".policy.0123456789ab.partial.json")
+    },
+    "arcs is a file": partial(file_for_folder, name="arcs"),
+    "figures is a file": partial(file_for_folder, name="figures"),
+    "the manifest claims files above": partial(
+        manifest, change=lambda stages: claims(stages, "../victim/secret.txt", "arcs/../../victim/secret.txt")
+    ),
+    "the manifest claims a name in two lines": partial(
+        manifest, change=lambda stages: claims(stages, "arcs/start1_policy.npz\n")
+    ),
+    "the manifest claims 100,000 files": partial(
+        manifest,
+        change=lambda stages: claims(stages, *(f"arcs/start{n}_policy.npz" for n in range(100_000))),
+    ),
+    "the manifest has a stage that nobody knows": partial(
+        manifest, change=lambda stages: stages.update({ESCAPE: stages["train"]})
+    ),
+    "the manifest's stages read each other": partial(manifest, change=in_a_circle),
+    "a deep config.json": partial(text, name="config.json", content="[" * 10**5 + "]" * 10**5),
+    "a config.json with half a character": partial(
+        text, name="config.json", content='{"kind": "run", "version": 2, "a": "\\ud800"}'
+    ),
+    "a deep manifest": partial(text, name="manifest.json", content='{"a":' * 10**5),
+    "a version that colours the terminal": partial(versions_say, what=ESCAPE),
+    "a version that is a script": partial(versions_say, what=SCRIPT),
+    "episodes that are a script": partial(robustness_says, what=SCRIPT),
+    "episodes that colour the terminal": partial(robustness_says, what=ESCAPE),
+    "a task that is a script": lambda folder, path: setting(path, "task", SCRIPT),
+    "a preset that is a script": lambda folder, path: setting(path, "preset", SCRIPT),
+}  # fmt: skip

@@ -1,0 +1,48 @@
+"""Runs of a few seconds: less training, coarser grids, small pictures. What is attacked stays the same.
+
+As a program it is `hyrl-mj` with such runs, for surroundings that only a new process can have:
+
+    python scripts/attacks/small.py run unit_circle --preset smoke
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import torch._dynamo  # noqa: F401
+
+import hyrl_mj.learning.settings as settings
+import hyrl_mj.learning.training as training
+import hyrl_mj.viz.figures.style as style
+import hyrl_mj.viz.replay as replay
+from hyrl_mj import cli
+from hyrl_mj.viz.figures import FIGURES
+
+SIZE, FPS, LATTICE = (480, 160), 2, 240
+KEPT = {"policy", "robustness_curve"}  # of the figures
+
+
+def shorten() -> None:
+    """Shortens preset smoke and the replays, in this process and those that it forks."""
+    settings._LATTICE_SMOKE |= {1: LATTICE, 2: 60}
+    settings._GRIDS |= {1: (24, 240), 2: (24, 48)}
+    settings._GRIDS_DYNAMIC |= {1: (24, 240), 2: (16, 32)}
+    settings._SMOKE |= {"ppo": 8_192, "dqn": 3_000}
+    settings._SMOKE_MODES = 4_096
+    training.CHECKPOINTS, training.EPISODES = 2, 64
+    style.DPI = 30
+    style.STYLE["pdf.fonttype"] = 3
+    for name in FIGURES.keys() - KEPT:
+        del FIGURES[name]
+    render = replay.render_replay
+
+    def render_small(
+        task: Any, shows: Any, path: Any, options: Any = replay.DEFAULTS, **more: Any
+    ) -> None:
+        render(task, shows, path, replace(options, size=SIZE, fps=FPS), **more)
+
+    replay.render_replay = render_small
+
+
+if __name__ == "__main__":
+    shorten()
+    cli.main()

@@ -1,0 +1,159 @@
+"""Bad surroundings, each pair of them: training must not suffer, and a sentence says what is missing."""
+
+import os
+import pwd
+import resource
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import partial
+from itertools import combinations
+from pathlib import Path
+from random import Random
+
+from attacks import Answer, Trial, child, command, differences, files, small
+from attacks.material import RUN, TASK, Material
+
+# The largest file that a full disk takes [bytes]: policies fit, videos and pages do not.
+ROOM = 60_000
+# Files that no surroundings but those of the disk may change.
+TRAINED = ("policy.safetensors", "mode_0.safetensors", "mode_1.safetensors", "robustness.json")
+
+
+def trials(material: Material, draw: Random, count: int) -> list[Trial]:
+    """Returns a trial for each pair, or some of them."""
+    material.finished()
+    pairs = list(combinations(CONDITIONS, 2))
+    pairs = pairs if count >= len(pairs) else draw.sample(pairs, count)
+    return [Trial(" and ".join(pair), partial(_attempt, material, pair)) for pair in pairs]
+
+
+# ---- the surroundings; each is set in the process that then runs
+
+
+def no_gl() -> None:
+    os.environ["MUJOCO_GL"] = "osmesa"
+    os.environ["LD_LIBRARY_PATH"] = "/nonexistent"
+
+
+def broken_gl() -> None:
+    """EGL is there, and finds no driver."""
+    os.environ["__EGL_VENDOR_LIBRARY_FILENAMES"] = "/nonexistent.json"
+
+
+def no_ffmpeg() -> None:
+    os.environ["IMAGEIO_FFMPEG_EXE"] = "/nonexistent/ffmpeg"
+
+
+def broken_ffmpeg(script: str) -> None:
+    path = Path("ffmpeg").resolve()
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(0o755)
+    os.environ["IMAGEIO_FFMPEG_EXE"] = str(path)
+
+
+def full_disk() -> None:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (ROOM, ROOM))
+
+
+def read_only() -> None:
+    """Nothing but temporary files can be written; root may write everywhere, and so becomes nobody."""
+    Path(TASK).mkdir()
+    Path(TASK).chmod(0o555)
+    Path().chmod(0o555)
+    if os.getuid() == 0:
+        os.setuid(pwd.getpwnam("nobody").pw_uid)
+
+
+def closed(fd: int) -> None:
+    """As after `>&-`: Python starts without the stream."""
+    os.close(fd)
+    if fd == 1:
+        sys.stdout = None  # type: ignore[assignment]
+    else:
+        sys.stderr = None  # type: ignore[assignment]
+
+
+def ascii_only() -> None:
+    os.environ |= {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
+
+
+def narrow() -> None:
+    os.environ["COLUMNS"] = "1"
+
+
+CONDITIONS: dict[str, Callable[[], None]] = {
+    "no GL": no_gl,
+    "broken GL": broken_gl,
+    "no ffmpeg": no_ffmpeg,
+    "an ffmpeg that fails": partial(broken_ffmpeg, "exit 1"),
+    "an ffmpeg that writes nothing": partial(broken_ffmpeg, "cat > /dev/null"),
+    "an ffmpeg that never reads": partial(broken_ffmpeg, "exec sleep 600"),
+    "a full disk": full_disk,
+    "a read-only folder": read_only,
+    "closed stdout": partial(closed, 1),
+    "closed stderr": partial(closed, 2),
+    "an ASCII locale": ascii_only,
+    "COLUMNS=1": narrow,
+}
+# What a process only learns when it starts.
+FRESH = {"no GL", "an ASCII locale"}
+DISK = {"a full disk", "a read-only folder"}
+NO_VIDEO = {name for name in CONDITIONS if "GL" in name or "ffmpeg" in name}
+
+
+def _attempt(material: Material, pair: tuple[str, ...], folder: Path) -> str:
+    """Runs in the pair of surroundings, then resumes in good ones."""
+    folder.chmod(0o777)
+    answer = child(partial(_run, pair), folder, seconds=120)
+    Path(folder).chmod(0o777)
+    broke = _judged(pair, answer) or _harmed(material, pair, folder)
+    if broke:
+        return broke
+    if "a read-only folder" in pair:
+        (folder / TASK).chmod(0o755)
+    resumed = child(command(*RUN), folder)
+    if broke := resumed.broke(ended=(0, 1)):
+        return f"resumed: {broke}"
+    wrong = differences(folder / TASK, material.finished())
+    return f"resumed, and not as before: {wrong}" if wrong else ""
+
+
+def _run(pair: tuple[str, ...]) -> None:
+    """Sets the surroundings of this process, and runs."""
+    # A read-only folder comes last: other surroundings write into it.
+    for name in sorted(pair, key=lambda name: name in ("a read-only folder", *DISK)):
+        CONDITIONS[name]()
+    if not FRESH & set(pair):
+        command(*RUN)()
+        return
+    words = [sys.executable, str(Path(small.__file__)), *RUN]
+    sys.exit(subprocess.run(words, stdin=subprocess.DEVNULL, check=False).returncode)
+
+
+def _judged(pair: tuple[str, ...], answer: Answer) -> str:
+    """Returns what is wrong with the answer: it must say once what is missing, where it can be said."""
+    failed = set(pair) & DISK
+    if broke := answer.broke(ended=(1, 2) if failed else (0, 1)):
+        return broke
+    out, err = "closed stdout" not in pair, "closed stderr" not in pair
+    if failed and err and answer.err.count("hyrl-mj: ") != 1:
+        return f"not one sentence about the disk, but {answer.err!r}"
+    if not failed and out and set(pair) & NO_VIDEO and answer.out.count("no video") != 1:
+        return f"not one sentence about the video, but {answer.out!r}"
+    if "video at" in answer.out and set(pair) & NO_VIDEO:
+        return "it says that there is a video"
+    return ""
+
+
+def _harmed(material: Material, pair: tuple[str, ...], folder: Path) -> str:
+    """Returns which results of training the surroundings have changed."""
+    if not (folder / TASK).is_dir():
+        return ""
+    found, sound = files(folder / TASK), files(material.finished())
+    for name in TRAINED:
+        if name not in found and not set(pair) & DISK:
+            return f"{name} is missing"
+        if name in found and found[name].read_bytes() != sound[name].read_bytes():
+            return f"{name} has other bytes"
+    return ""
