@@ -17,11 +17,13 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 import argparse
 import multiprocessing
+import subprocess
 import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
@@ -84,13 +86,24 @@ def attempt(index: int) -> tuple[str, str, str, float]:
     """Makes a trial, and returns its attack, its name, what broke, and how long it took [s]."""
     attack, trial = UNDER_WAY[index]
     began = time.monotonic()
-    with tempfile.TemporaryDirectory(dir=os.environ["TMPDIR"]) as folder:
-        os.chmod(folder, 0o755)
+    with scratch() as folder:
         try:
-            broke = trial.attempt(Path(folder))
+            broke = trial.attempt(folder)
         except Exception:  # a mistake of the attack's own must not end the others
             broke = f"the attack itself failed: {traceback.format_exc()}"
     return attack, trial.name, broke, time.monotonic() - began
+
+
+@contextmanager
+def scratch() -> Iterator[Path]:
+    """Makes an empty folder, which everybody may read, and removes it after the block."""
+    folder = Path(tempfile.mkdtemp(prefix="attack_"))
+    folder.chmod(0o755)
+    try:
+        yield folder
+    finally:
+        # Python's own removal gives up in a thousand folders, each in the one before.
+        subprocess.run(["rm", "-rf", folder], check=True)
 
 
 def table(results: list[tuple[str, str, str, float]]) -> Table:
@@ -121,11 +134,10 @@ def main() -> int:
         parser.error(f"unknown attack {', '.join(unknown)}: choose some of {', '.join(ATTACKS)}")
     small.shorten()
     results = []
-    with tempfile.TemporaryDirectory(prefix="attack_") as folder:
-        os.chmod(folder, 0o755)
-        os.environ |= {"TMPDIR": folder, "XDG_STATE_HOME": f"{folder}/state"}
-        tempfile.tempdir = folder
-        material = Material(Path(folder))
+    with scratch() as folder:
+        os.environ |= {"TMPDIR": f"{folder}", "XDG_STATE_HOME": f"{folder}/state"}
+        tempfile.tempdir = str(folder)
+        material = Material(folder)
         for name in chosen:
             attack = ATTACKS[name]
             count = attack.short if options.short else attack.count

@@ -6,9 +6,8 @@ As a program it is `hyrl-mj` with such runs, for surroundings that only a new pr
 """
 
 from dataclasses import replace
+from importlib import import_module
 from typing import Any
-
-import torch._dynamo  # noqa: F401
 
 import hyrl_mj.learning.settings as settings
 import hyrl_mj.learning.training as training
@@ -19,10 +18,26 @@ from hyrl_mj.viz.figures import FIGURES
 
 SIZE, FPS, LATTICE = (480, 160), 2, 240
 KEPT = {"policy", "robustness_curve"}  # of the figures
+# What commands import when they need it.
+LATE = (
+    "hyrl_mj.export",
+    "hyrl_mj.viz.arcs",
+    "hyrl_mj.viz.diagnosis",
+    "hyrl_mj.viz.report",
+    "imageio_ffmpeg",
+    "mediapy",
+    "onnxruntime",
+    "pydantic",
+    "stable_baselines3",
+    "tensorboard",
+    "torch._dynamo",
+)
 
 
 def shorten() -> None:
     """Shortens preset smoke and the replays, in this process and those that it forks."""
+    for name in LATE:
+        import_module(name)
     settings._LATTICE_SMOKE |= {1: LATTICE, 2: 60}
     settings._GRIDS |= {1: (24, 240), 2: (24, 48)}
     settings._GRIDS_DYNAMIC |= {1: (24, 240), 2: (16, 32)}
