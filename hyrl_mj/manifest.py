@@ -23,6 +23,8 @@ from hyrl_mj import artifacts
 from hyrl_mj.errors import BadArtifact, BadInput
 
 NAME, LOCK = "manifest.json", ".lock"
+# The largest manifest [bytes], which is read many times, and the most folders within each other.
+LARGEST_MANIFEST, DEEPEST = 2**20, 8
 # The names of the files that each stage may write: no other file is ever believed or removed.
 PICTURE = r"\.(png|pdf)"
 FILES = {
@@ -137,7 +139,9 @@ class Manifest:
         """
         name = self._name(path)
         if doubt := self._doubt(name):
-            stage = next(s for s, names in FILES.items() if re.fullmatch(names, name))
+            stage = next((s for s, names in FILES.items() if re.fullmatch(names, name)), None)
+            if stage is None:
+                raise BadArtifact(f"{path} is no file that a run writes, so nothing vouches for it")
             raise BadArtifact(f"{path} {doubt}: {_remedy(stage, self.folder)}")
         self._note(name, self._current()[name])
         return path
@@ -160,6 +164,8 @@ class Manifest:
             return "is missing"
         if name not in recorded:
             return "is of a stage that did not finish"
+        if path.stat().st_size > artifacts.LARGEST:
+            return f"is larger than {artifacts.LARGEST / 2**20:g} MiB, which no file of a run is"
         if digest(path) != recorded[name]:
             return "was changed after it was written (its sha256 does not fit)"
         return "" if name in self._current() else "is older than what it was made from"
@@ -189,6 +195,8 @@ class Manifest:
         if not path.is_file():
             return {}
         remedy = "remove it, and all stages run again"
+        if path.stat().st_size > LARGEST_MANIFEST:
+            raise BadArtifact(f"{path} is larger than any manifest: {remedy}")
         stages = artifacts.read_record(path, "manifest", _Stages, remedy).stages
         for stage, entry in stages.items():
             for name in entry.outputs:
@@ -206,7 +214,9 @@ def digest(*paths: Path) -> str:
     """Returns the SHA-256 of the content of files."""
     content = sha256()
     for path in paths:
-        content.update(path.read_bytes())
+        with path.open("rb") as file:
+            while part := file.read(2**20):
+                content.update(part)
     return content.hexdigest()
 
 
@@ -231,6 +241,7 @@ def locked(folder: Path) -> Iterator[None]:
         BadInput: another process or thread works there; the message says which and since when.
     """
     path = folder.resolve() / LOCK
+    check_contents(folder)
     lock = FileLock(path, is_singleton=True)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -264,11 +275,19 @@ def locked(folder: Path) -> Iterator[None]:
         lock.release()
 
 
-def check_no_links(folder: Path) -> None:
-    """Raises `BadArtifact` if a run directory holds a link, which would lead out of it."""
+def check_contents(folder: Path) -> None:
+    """Raises `BadArtifact` if a run directory holds what leads out of it, or what no run has.
+
+    These are links, a lock that is a second name of another file, and folders far within each other.
+    """
     for root, folders, files in os.walk(folder):
+        if len(Path(root).relative_to(folder).parts) > DEEPEST:
+            raise BadArtifact(
+                f"{folder} holds more than {DEEPEST} folders within each other: it is no run directory"
+            )
         for name in (*folders, *files):
-            if (path := Path(root, name)).is_symlink():
+            path = Path(root, name)
+            if path.is_symlink() or (name == LOCK and path.is_file() and path.stat().st_nlink > 1):
                 raise BadArtifact(
                     f"{path} is a link, and a run directory holds none: put the file itself there"
                 )

@@ -16,7 +16,7 @@ from hyrl_mj import artifacts, policies
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.game import Lattice, Robustness
 from hyrl_mj.learning import Settings, Training
-from hyrl_mj.manifest import FILES, LOCK, Manifest, check_no_links, digest, locked
+from hyrl_mj.manifest import FILES, LOCK, Manifest, check_contents, digest, locked
 from hyrl_mj.policies import Agent, AnyPolicy, MlpPolicy, Policy
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.stages import (
@@ -158,7 +158,12 @@ class Run:
     @cached_property
     def critical_set(self) -> CriticalSet:
         """M*, from stage 2."""
-        return CriticalSet.load(self._checked("critical_set.npz"))
+        critical = CriticalSet.load(path := self._checked("critical_set.npz"))
+        if critical.points.shape[1] != self.task.chart.dimension:
+            raise BadArtifact(
+                f"{path} is in another chart than that of {self.task.name}: find it again"
+            )
+        return critical
 
     @cached_property
     def partition(self) -> Partition:
@@ -235,9 +240,11 @@ class Run:
     def arc(self, path: Path) -> HybridArc:
         """Reads an arc; raises `BadArtifact` if it is damaged, or of another task than the run's."""
         arc = HybridArc.load(self.manifest.checked(path))
-        if arc.task != self.task.name:
+        task = self.task
+        columns = task.chart.dimension, task.measurement_columns, len(task.inputs)
+        if arc.task != task.name or arc.columns != columns:
             raise BadArtifact(
-                f"{path} is an arc of {arc.task}, {self.path} a run of {self.task.name}: "
+                f"{path} is an arc of {arc.task}, {self.path} a run of {task.name}: "
                 "simulate it again"
             )
         return arc
@@ -276,7 +283,7 @@ def load_run(
         raise BadArtifact(
             f"{path} is not a run directory (no config.json): make one with hyrl-mj run TASK --out DIR"
         )
-    check_no_links(path)
+    check_contents(path)
     settings = Config.load(config).settings
     if task is not None:
         settings = replace(settings, task=reference(get_task(task)))

@@ -8,7 +8,7 @@ import threading
 import pytest
 
 from hyrl_mj import BadArtifact, BadInput, artifacts
-from hyrl_mj.manifest import FILES, LOCK, NAME, Manifest, check_no_links, locked
+from hyrl_mj.manifest import FILES, LOCK, NAME, Manifest, check_contents, locked
 
 SETTINGS = dict.fromkeys(FILES, "these")
 
@@ -192,4 +192,4 @@ def test_a_link_in_a_run_directory_is_refused(name, folder, tmp_path_factory):
     (folder / name).unlink(missing_ok=True)
     (folder / name).symlink_to(victim)
     with pytest.raises(BadArtifact, match=re.escape(f"{folder / name} is a link")):
-        check_no_links(folder)
+        check_contents(folder)

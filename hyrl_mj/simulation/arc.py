@@ -60,6 +60,21 @@ class HybridArc(Saved):
     noise: str
     bound: float
 
+    def __post_init__(self) -> None:
+        rows = len(np.atleast_1d(self.t))
+        tables = {"z": self.z, "measured": self.measured, "u": self.u, "state": self.state}
+        fits = all(np.shape(a) == (rows,) for a in (self.t, self.j, self.q))
+        fits = fits and all(np.ndim(a) == 2 and len(a) == rows for a in tables.values())
+        numbers = all(np.asarray(a).dtype.kind in "biuf" for a in (self.t, *tables.values()))
+        modes = np.issubdtype(np.asarray(self.q).dtype, np.integer)
+        if not (rows and fits and numbers and modes and np.isfinite(self.t).all()):
+            raise BadInput("these arrays make no arc: give numbers in one row for each sample")
+
+    @property
+    def columns(self) -> tuple[int, int, int]:
+        """The numbers of columns of z, of the measurement, and of the inputs: d, p, m."""
+        return self.z.shape[1], self.measured.shape[1], self.u.shape[1]
+
     def __repr__(self) -> str:
         return f"HybridArc({self.task}, {self._summary})"
 

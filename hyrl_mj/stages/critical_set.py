@@ -48,6 +48,8 @@ class CriticalSet(Saved):
                 f"points of shape {self.points.shape} and components of shape {self.component.shape} make "
                 "no critical set: give points (N, d) and one component (N,) for each"
             )
+        if not np.isfinite(self.points).all():
+            raise BadInput("points of M* that are not finite make no critical set")
 
     def __repr__(self) -> str:
         return f"CriticalSet({self._counts}, resolution {self.resolution:.3g})"

@@ -59,7 +59,7 @@ SETTINGS: dict[str, tuple[Any, ...]] = {
 # What is no mistake: a missing horizon or episode has a meaning.
 MEANT = {("horizon", "null"), ("episode", "null"), ("options", "{}"), ("anneal", "true"),
          ("anneal", "false"), ("symmetric", "true"), ("symmetric", "false"), ("warm_start", "true"),
-         ("warm_start", "false")}  # fmt: skip
+         ("warm_start", "false"), ("versions", "{}")}  # fmt: skip
 
 
 def trials(material: Material, draw: Random, count: int) -> list[Trial]:
