@@ -124,11 +124,12 @@ class Manifest:
 
     def is_done(self, stage: str, code: str) -> bool:
         """Returns whether a stage is finished, with this code, and all of its files are to be believed."""
-        entry = self._entries().get(stage)
+        entries = self._entries()
+        entry = entries.get(stage)
         return (
             entry is not None
             and entry.code == code
-            and not any(self._doubt(name) for name in entry.outputs)
+            and not any(self._doubt(name, entries) for name in entry.outputs)
         )
 
     def checked(self, path: Path) -> Path:
@@ -137,13 +138,15 @@ class Manifest:
         Raises:
             BadArtifact: it is missing, unfinished, damaged or outdated; the message names its stage.
         """
-        name = self._name(path)
-        if doubt := self._doubt(name):
+        name, entries = self._name(path), self._entries()
+        while (doubt := self._doubt(name, entries)) and entries != (new := self._entries()):
+            entries = new  # a stage has begun or ended meanwhile, which explains the doubt
+        if doubt:
             stage = next((s for s, names in FILES.items() if re.fullmatch(names, name)), None)
             if stage is None:
                 raise BadArtifact(f"{path} is no file that a run writes, so nothing vouches for it")
             raise BadArtifact(f"{path} {doubt}: {_remedy(stage, self.folder)}")
-        self._note(name, self._current()[name])
+        self._note(name, self._current(entries)[name])
         return path
 
     def has(self, path: Path) -> bool:
@@ -152,27 +155,31 @@ class Manifest:
         Raises:
             BadArtifact: it is damaged.
         """
-        if (name := self._name(path)) in self._current() and path.is_file():
+        if (name := self._name(path)) in self._current(self._entries()) and path.is_file():
             return self.checked(path) == path
         self._note(name, "")
         return False
 
-    def _doubt(self, name: str) -> str:
-        """Returns why a file is not to be believed, "" if it is."""
-        path, recorded = self.folder / name, _outputs(self._entries().values())
+    def _doubt(self, name: str, entries: Mapping[str, Entry]) -> str:
+        """Returns why a file is not to be believed after the entries of a manifest, "" if it is."""
+        path, recorded = self.folder / name, _outputs(entries.values())
         if not path.is_file():
             return "is missing"
         if name not in recorded:
             return "is of a stage that did not finish"
-        if path.stat().st_size > artifacts.LARGEST:
-            return f"is larger than {artifacts.LARGEST / 2**20:g} MiB, which no file of a run is"
-        if digest(path) != recorded[name]:
-            return "was changed after it was written (its sha256 does not fit)"
-        return "" if name in self._current() else "is older than what it was made from"
+        try:
+            if path.stat().st_size > artifacts.LARGEST:
+                return (
+                    f"is larger than {artifacts.LARGEST / 2**20:g} MiB, which no file of a run is"
+                )
+            if digest(path) != recorded[name]:
+                return "was changed after it was written (its sha256 does not fit)"
+        except FileNotFoundError:  # a stage has just removed it
+            return "is missing"
+        return "" if name in self._current(entries) else "is older than what it was made from"
 
-    def _current(self) -> dict[str, str]:
+    def _current(self, entries: Mapping[str, Entry]) -> dict[str, str]:
         """Returns the SHA-256 of each file whose settings and inputs have not changed since."""
-        entries = self._entries()
         current: dict[str, str] = {}
         for stage in FILES:  # each reads only files of stages before it
             entry = entries.get(stage)

@@ -26,7 +26,6 @@ LATE = (
     "hyrl_mj.viz.report",
     "imageio_ffmpeg",
     "mediapy",
-    "onnxruntime",
     "pydantic",
     "stable_baselines3",
     "tensorboard",
