@@ -7,7 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from functools import partial
-from itertools import combinations
+from itertools import combinations, cycle
 from pathlib import Path
 from random import Random
 
@@ -16,6 +16,8 @@ from attacks.material import RUN, TASK, Material
 
 # The largest file that a full disk takes [bytes]: policies fit, videos and pages do not.
 ROOM = 60_000
+# Encoders that do not encode: one of them in each trial.
+BROKEN = {"fails": "exit 1", "writes nothing": "cat > /dev/null", "never reads": "exec sleep 600"}
 # Files that no surroundings but those of the disk may change.
 TRAINED = ("policy.safetensors", "mode_0.safetensors", "mode_1.safetensors", "robustness.json")
 
@@ -25,7 +27,13 @@ def trials(material: Material, draw: Random, count: int) -> list[Trial]:
     material.finished()
     pairs = list(combinations(CONDITIONS, 2))
     pairs = pairs if count >= len(pairs) else draw.sample(pairs, count)
-    return [Trial(" and ".join(pair), partial(_attempt, material, pair)) for pair in pairs]
+    return [
+        Trial(
+            f"{' and '.join(pair)} ({ffmpeg})" if "broken ffmpeg" in pair else " and ".join(pair),
+            partial(_attempt, material, pair, BROKEN[ffmpeg]),
+        )
+        for pair, ffmpeg in zip(pairs, cycle(BROKEN), strict=False)
+    ]
 
 
 # ---- the surroundings; each is set in the process that then runs
@@ -45,11 +53,9 @@ def no_ffmpeg() -> None:
     os.environ["IMAGEIO_FFMPEG_EXE"] = "/nonexistent/ffmpeg"
 
 
-def broken_ffmpeg(script: str) -> None:
-    path = Path("ffmpeg").resolve()
-    path.write_text(f"#!/bin/sh\n{script}\n")
-    path.chmod(0o755)
-    os.environ["IMAGEIO_FFMPEG_EXE"] = str(path)
+def broken_ffmpeg() -> None:
+    """The trial has written it."""
+    os.environ["IMAGEIO_FFMPEG_EXE"] = str(Path("ffmpeg").resolve())
 
 
 def full_disk() -> None:
@@ -86,9 +92,7 @@ CONDITIONS: dict[str, Callable[[], None]] = {
     "no GL": no_gl,
     "broken GL": broken_gl,
     "no ffmpeg": no_ffmpeg,
-    "an ffmpeg that fails": partial(broken_ffmpeg, "exit 1"),
-    "an ffmpeg that writes nothing": partial(broken_ffmpeg, "cat > /dev/null"),
-    "an ffmpeg that never reads": partial(broken_ffmpeg, "exec sleep 600"),
+    "broken ffmpeg": broken_ffmpeg,
     "a full disk": full_disk,
     "a read-only folder": read_only,
     "closed stdout": partial(closed, 1),
@@ -102,9 +106,11 @@ DISK = {"a full disk", "a read-only folder"}
 NO_VIDEO = {name for name in CONDITIONS if "GL" in name or "ffmpeg" in name}
 
 
-def _attempt(material: Material, pair: tuple[str, ...], folder: Path) -> str:
+def _attempt(material: Material, pair: tuple[str, ...], ffmpeg: str, folder: Path) -> str:
     """Runs in the pair of surroundings, then resumes in good ones."""
     folder.chmod(0o777)
+    (folder / "ffmpeg").write_text(f"#!/bin/sh\n{ffmpeg}\n")
+    (folder / "ffmpeg").chmod(0o755)
     answer = child(partial(_run, pair), folder, seconds=120)
     Path(folder).chmod(0o777)
     broke = _judged(pair, answer) or _harmed(material, pair, folder)

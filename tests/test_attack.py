@@ -1,0 +1,136 @@
+"""The attack finds what breaks, and its short lane finds nothing."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "scripts"))
+
+from attacks import Answer, child, differences
+from attacks.crafted_agents import Payload
+
+from hyrl_mj.errors import BadInput
+
+SCRIPTS = str(Path(__file__).parent.parent / "scripts")
+# Weaknesses that are planted, and the attacks that must find them.
+PLANTED = {
+    "kills": "from hyrl_mj.manifest import Manifest; Manifest.is_done = lambda *a: True",
+    "artifacts": "from hyrl_mj.manifest import Manifest; Manifest.checked = lambda self, path: path",
+}
+
+
+def attack(*words, weakness=""):
+    code = f"import sys; sys.path.insert(0, {SCRIPTS!r}); import attack; {weakness}\n"
+    return subprocess.run(
+        [sys.executable, "-c", f"{code}sys.exit(attack.main())", *words],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.mark.slow
+def test_the_short_lane_finds_nothing():
+    answer = attack("--short")
+    assert answer.returncode == 0, answer.stdout + answer.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PLANTED)
+def test_a_planted_weakness_is_found(name):
+    answer = attack("--short", "--only", name, weakness=PLANTED[name])
+    assert answer.returncode == 1, answer.stdout + answer.stderr
+    assert f"{name}: " in answer.stdout
+
+
+# ---- one process
+
+
+def answered(work, folder, **more):
+    return child(work, folder, **more).broke()
+
+
+def test_what_a_process_does_is_told(tmp_path):
+    def work():
+        print("out")
+        print("hyrl-mj: err", file=sys.stderr)
+        Path("file").touch()
+        sys.exit(2)
+
+    answer = child(work, tmp_path)
+    assert (answer.status, answer.out, answer.err) == (2, "out\n", "hyrl-mj: err\n")
+    assert (tmp_path / "file").exists()
+    assert answer.broke() == ""
+
+
+def test_a_traceback_is_no_sentence(tmp_path):
+    def work():
+        raise BadInput("not caught")
+
+    assert "traceback" in answered(work, tmp_path)
+
+
+def test_a_process_that_hangs_is_ended_with_those_that_it_began(tmp_path):
+    def work():
+        subprocess.run(["sleep", "60"], check=False)
+
+    began = time.monotonic()
+    assert "hangs" in answered(work, tmp_path, seconds=0.5)
+    assert time.monotonic() - began < 30
+
+
+def test_a_signal_ends_a_process(tmp_path):
+    answer = child(lambda: time.sleep(60), tmp_path, sent=(0.1, int(signal.SIGTERM)))
+    assert answer.status == -signal.SIGTERM
+    assert "exit status -15" in answer.broke()
+
+
+def test_memory_is_that_of_the_process(tmp_path):
+    usual = child(lambda: None, tmp_path).memory
+    assert child(lambda: len(b"x" * 300 * 2**20), tmp_path).memory > usual + 250
+
+
+@pytest.mark.parametrize(
+    ("err", "found"),
+    [
+        ("hyrl-mj: one\nhyrl-mj: two\n", "not one sentence"),
+        ("", "not one sentence"),
+        ("hyrl-mj: \x1b[31mred\n", "control characters"),
+    ],
+)
+def test_what_is_no_sentence_is_found(err, found):
+    assert found in Answer(2, "", err, 0.1, 1.0, False).broke()
+
+
+def test_a_payload_leaves_its_mark(tmp_path):
+    import pickle
+
+    child(lambda: pickle.loads(pickle.dumps(Payload())), tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["executed"]
+
+
+def test_run_directories_are_compared_by_their_bytes(tmp_path):
+    for name in ("one", "other"):
+        for file in ("same", "logs/progress.csv", ".lock"):
+            path = tmp_path / name / file
+            path.parent.mkdir(exist_ok=True, parents=True)
+            path.write_text(name if file != "same" else "same")
+    one, other = tmp_path / "one", tmp_path / "other"
+    assert differences(one, other) == ""
+    (one / "same").write_text("else")
+    (one / "more").touch()
+    (other / "less").touch()
+    text = "less is missing, more is left over, same has other bytes"
+    assert differences(one, other) == text
+
+
+def test_unknown_attacks_are_named():
+    answer = attack("--only", "attacks")
+    assert answer.returncode == 2
+    assert "unknown attack attacks: choose some of crashes, kills" in answer.stderr
