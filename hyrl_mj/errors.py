@@ -49,8 +49,8 @@ def unknown(what: str, value: object, allowed: Iterable[str]) -> BadInput:
 
 def brief(error: BaseException) -> str:
     """Returns the kind of an error and the beginning of its text, in one line."""
-    text = " ".join(str(error).split())
-    return f"{type(error).__name__}: {text if len(text) <= 160 else text[:157] + '...'}"
+    kind, text = type(error).__name__, " ".join(str(error).split())
+    return f"{kind}: {text if len(text) <= 160 else text[:157] + '...'}" if text else kind
 
 
 def line_in(error: BaseException, path: Path | None) -> str:

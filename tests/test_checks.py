@@ -1,0 +1,256 @@
+"""What is wrong with a task is found before it is trained, and what fails later names the state."""
+
+import itertools
+import re
+
+import numpy as np
+import pytest
+
+import hyrl_mj
+from hyrl_mj import BadInput, Outcome, mjcf, mujoco_log
+from hyrl_mj.envs import BatchedEnv
+from hyrl_mj.policies import PolicyController
+from hyrl_mj.simulation import LoopSettings, closed_loop
+from hyrl_mj.tasks import check_task, trial
+from hyrl_mj.tasks.scaffold import write_task
+
+PY, XML = "py", "xml"
+NUMBER = itertools.count()
+
+
+def changed(folder, *edits):
+    """Returns the task of the scaffold after edits (file, pattern, replacement)."""
+    name = f"changed_{next(NUMBER)}"
+    write_task(name, folder)
+    for file, old, new in edits:
+        path = folder / f"{name}.{file}"
+        text = path.read_text()
+        assert re.search(old, text), old
+        path.write_text(re.sub(old, new, text))
+    return hyrl_mj.get_task(folder / f"{name}.py")
+
+
+OBSERVED = r"return measured\[:, :3\]\n\n    def measured"
+REWARDED, REWARD = r"        close = np\.maximum", "        close = np.maximum"
+ENDED, THEN = r"        return ends\n", "\n\n    def measured"
+CROSSED = r"ends\[measured\[:, 0\] >= self\.set_point\[0\]\] = Outcome\.REACHED"
+MISTAKES = {
+    "no start to replay": ((PY, r"starts=\(.*\)\),? time", "starts=(), time"), "scene.starts is empty"),
+    "a limit that is a float": ((PY, "max_steps = 70", "max_steps = 70.0"), "max_steps 70.0 cannot be"),
+    "a limit of no samples": ((PY, "max_steps = 70", "max_steps = 0"), "integer from 1 to 100,000"),
+    "a limit that is true": ((PY, "max_steps = 70", "max_steps = True"), "max_steps True cannot be"),
+    "endings in a column": ((PY, ENDED, "        return ends[:, None]\n"), r"ending\(\) .*shape \(64, 1\)"),
+    "one ending for all": ((PY, ENDED, "        return Outcome.RUNNING\n"), r"ending\(\) .*a Outcome for"),
+    "endings in a list": ((PY, ENDED, "        return list(ends)\n"), r"ending\(\) .*gives a list"),
+    "no endings": ((PY, ENDED, "        ends = 0\n"), r"ending\(\) .*gives a NoneType"),
+    "endings that are floats": ((PY, ENDED, "        return ends / 2\n"), "give a hyrl_mj.Outcome"),
+    "an unknown ending": ((PY, r"= Outcome\.OUT_OF_BOUNDS", "= 9"), "give a hyrl_mj.Outcome"),
+    "a reward that is nan late": (
+        (PY, REWARDED, "        measured = np.where(measured > 2.5, np.nan, measured)\n" + REWARD),
+        r"reward\(\) .*gives nan at x = 2\.5",
+    ),
+    "an error late": (
+        (PY, REWARDED, "        assert (measured[:, 0] < 2.5).all(), 'far'\n" + REWARD),
+        r"reward\(\) .*AssertionError: far, line \d+ at x = 2\.5",
+    ),
+    "an observation that is nan late": (
+        (PY, OBSERVED, "return np.where(measured < 2.5, measured, -np.inf)[:, :3]" + THEN),
+        r"observation\(\) .*-inf.* at x = 2\.5",
+    ),
+    "an error at the end": (
+        (PY, OBSERVED, "assert (measured[:, 0] < 3).all()\n        return measured[:, :3]" + THEN),
+        r"observation\(\) .*AssertionError.* at x = 3\.",
+    ),
+    "an exit": ((PY, REWARDED, "        raise SystemExit(0)\n" + REWARD), "SystemExit: 0"),
+    "a state that is nan": ((PY, "return z, np.stack", "return z * np.nan, np.stack"), "qpos that is not"),
+    "a state that is no pair": ((PY, "return z, np.stack", "return np.stack"), "give a tuple"),
+    "a miss that is nan": ((PY, r"np\.abs\(z\[:, 1\]\)", "np.nan * z[:, 1]"), r"miss\(\) gives nan at x"),
+    "misses in columns": ((PY, r"np\.abs\(z\[:, 1\]\)", "np.abs(z)"), r"miss\(\) .*shape \(\d+, 2\)"),
+    "one danger for all": ((PY, r"return -self\.clearance\(measured\)", "return 1.0"), r"danger\(\).*float"),
+    "a sample of too many steps": ((XML, 'data="0.05"', 'data="100"'), "10,000 physics steps.*5,000"),
+    "a sample that is not a time": ((XML, 'data="0.05"', 'data="nan"'), "sample_time .*nan cannot be used"),
+    "a timestep of zero": ((XML, 'timestep="0.01"', 'timestep="0"'), "timestep .*0.0 cannot be used"),
+    "a reward below its bound": ((PY, "worst_reward = 0.0", "worst_reward = 2.5"), "worst_reward is 2.5"),
+    "a bound that is nan": ((PY, "worst_reward = 0.0", "worst_reward = np.nan"), "worst_reward nan"),
+    "no distance that counts": ((PY, "close = 0.3", "close = -1.0"), "close -1.0 cannot be used"),
+    "bounds the wrong way": (
+        (PY, "observation_low, observation_high =", "observation_high, observation_low ="),
+        "the lower ones first",
+    ),
+    "noise on too few columns": ((PY, r"noisy = .*\n", "noisy = ()\n"), r"noisy \[\] cannot be used"),
+    "noise that is negative": ((PY, r"noisy = .*\n", "noisy = (0, -1, 0, 0)\n"), r"noisy\[1\] -1"),
+    "levels in a text": ((PY, "levels=5", "levels='5'"), r"learning\.levels '5'"),
+    "a mirror that is none": ((PY, r"mirror = Mirror\(.*\)", "mirror = (1, -1)"), r"hyrl_mj\.Mirror"),
+    "a start that is nan": ((PY, r"\(0\.0, -0\.8\)", "(0.0, np.nan)"), "give finite numbers"),
+    "a name that is a path": ((PY, r'    name = "\w+"', '    name = "../up"'), "letters, digits and _"),
+    "a servo too strong for its link": (
+        ((XML, 'kv="12"', 'kv="1e9"'), (XML, 'mass="1"', 'mass="0.001"')),
+        r"breaks down under random inputs, from x = .*QACC.*lower kv or gear",
+    ),
+    "a gear too large": ((XML, 'kv="12"', 'kv="12" gear="1e12"'), "breaks down under"),
+    "a body pushed apart": ((XML, 'gravity="0 0 0"', 'gravity="1e12 0 0"'), "breaks down under"),
+    "a sparse Jacobian": ((XML, "<option", '<option jacobian="sparse"'), r'4\.0\.0.*jacobian="dense"'),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_one_sentence(tmp_path, monkeypatch, mistake, caplog):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(mjcf, "WRONG_VERSION", mjcf.mujoco.__version__)
+    edits, says = MISTAKES[mistake]
+    edits = edits if isinstance(edits[0], tuple) else (edits,)
+    with pytest.raises(BadInput, match=says) as refused:
+        check_task(changed(tmp_path, *edits))
+    text = str(refused.value)
+    assert "\n" not in text
+    assert str(tmp_path) in text
+    assert caplog.text == "", "MuJoCo's warnings are part of the sentence"
+    assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
+
+
+def test_starts_that_have_arrived_already_are_found(tmp_path):
+    still = ((PY, CROSSED, "pass"), (PY, r"\(5\.0, 3\.0, 3\.0\)", "(9.0, 3.0, 3.0)"))
+    there = (PY, r"np\.abs\(z\[:, 1\]\)", "0 * z[:, 1]")
+    check_task(changed(tmp_path, *still))
+    with pytest.raises(BadInput, match="64 of 64 starts already count as arrived, as x = "):
+        check_task(changed(tmp_path, *still, there))
+
+
+def test_extreme_inputs_from_all_over_the_chart_break_it_down(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    light = ((XML, 'kv="12"', 'kv="1e9"'), (XML, 'mass="1"', 'mass="0.001"'))
+    with pytest.raises(BadInput, match="breaks down under extreme inputs, from x = "):
+        trial.try_extreme(changed(tmp_path, *light))
+
+
+def test_every_corner_is_held_and_alternates(vehicle, monkeypatch):
+    seen = []
+
+    def play(task, z, inputs, kind):
+        seen.append((z, np.array([inputs(k) for k in range(4)])))
+        return np.zeros(len(z))
+
+    monkeypatch.setattr(trial, "_play", play)
+    trial.try_extreme(vehicle)
+    [(z, u)] = seen
+    held = (u == u[0]).all(axis=(0, 2))
+    assert 0 < held.sum() < len(z)
+    np.testing.assert_array_equal(u[1:, ~held], -u[:-1, ~held])
+    assert set(u.ravel()) == {-1.0, 1.0}
+    assert np.ptp(z[:, 0]) > 1.5, "all over the chart, not only at the start"
+
+
+def test_the_steps_of_a_trial_are_bounded(vehicle, monkeypatch):
+    monkeypatch.setattr(type(vehicle), "max_steps", 100_000)
+    steps = trial._samples(vehicle) * trial._side_by_side(vehicle)
+    assert steps <= trial.STEPS
+
+
+# ---- later, wherever a method is called
+
+
+class Late:
+    """Steers ahead."""
+
+    def act(self, measured):
+        return np.zeros((len(measured), 1))
+
+
+LATE_END = "        assert (measured[:, 0] < 1).all()\n        return ends\n"
+LATE_Z = "return np.where(measured[:, :2] > 1, np.nan, measured[:, :2])\n"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        (ENDED, LATE_END, r"ending\(\) .*AssertionError.* at x = 1"),
+        (r"return measured\[:, :2\]\n", LATE_Z, r"z\(\) of the task .* gives \[nan"),
+    ],
+)
+def test_a_failure_in_a_simulation_names_method_and_state(tmp_path, old, new, says):
+    task, settings = changed(tmp_path, (PY, old, new)), LoopSettings(quiet=True)
+    with pytest.raises(BadInput, match=says):
+        closed_loop(task, PolicyController(Late()), np.array([[0.0, 0.9]]), settings=settings)
+
+
+@pytest.mark.parametrize(
+    ("new", "says"),
+    [
+        ("        assert (measured[:, 0] < 1).all()\n", r"AssertionError.* at x = 1"),
+        ("        return np.where(measured[:, 0] < 1, 1.0, np.nan)\n", r"gives nan at x = 1"),
+        ("        return np.ones(3)\n", r"gives shape \(3,\) for 2 row"),
+    ],
+)
+def test_a_failure_in_an_environment_names_method_and_state(tmp_path, new, says):
+    env = BatchedEnv(changed(tmp_path, (PY, REWARDED, new + REWARD)), 2)
+    env.reset(z=np.array([[0.0, 0.9], [0.0, -0.9]]))
+
+    def play():
+        for _ in range(40):
+            env.step(np.zeros((2, 1)))
+
+    with pytest.raises(BadInput, match=r"reward\(\) of the task .*" + says):
+        play()
+
+
+def test_an_error_that_no_single_row_raises_has_no_state(tmp_path):
+    new = "        assert len(measured) == 1\n        close = np.maximum"
+    task = changed(tmp_path, (PY, REWARDED, new))
+    with pytest.raises(BadInput, match=r"AssertionError, line \d+$"):
+        task.reward(np.zeros((2, 4)), np.zeros((2, 1)))
+
+
+def test_a_method_that_works_returns_what_it_did(vehicle):
+    z = np.array([[0.1, 0.2], [0.3, 0.4]])
+    np.testing.assert_array_equal(vehicle.ending(z), [Outcome.RUNNING] * 2)
+    assert type(vehicle).ending.__wrapped__.__qualname__.endswith("ending")
+
+
+# ---- MuJoCo's warnings
+
+
+def test_warnings_are_counted_and_said_once(tmp_path, monkeypatch, caplog):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(mujoco_log, "_said", set())
+    light = ((XML, 'kv="12"', 'kv="1e9"'), (XML, 'mass="1"', 'mass="0.001"'))
+    plant = changed(tmp_path, *light).plant(20)
+    before = mujoco_log.counts.copy()
+    for _ in range(5):
+        plant.set_state(np.zeros((20, 2)), np.ones((20, 2)))
+        plant.step(np.full((20, 1), 0.5))
+    assert (plant.warnings > 0).all()
+    assert len(caplog.records) == 1
+    assert "MuJoCo warns: Nan, Inf or huge value in QACC" in caplog.text
+    assert re.match("MuJoCo warned [0-9]+ times, most often: Nan", mujoco_log.since(before))
+    assert mujoco_log.since(mujoco_log.counts) == ""
+    assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
+
+
+# ---- MuJoCo 4.0.0
+
+
+@pytest.mark.parametrize(
+    ("option", "joint", "wrong"),
+    [
+        ('jacobian="sparse"', 'limited="true" range="-1 1"', True),
+        ('jacobian="sparse"', 'frictionloss="1"', True),
+        ('jacobian="sparse"', "", False),
+        ('jacobian="dense"', 'limited="true" range="-1 1"', False),
+        ('jacobian="sparse" solver="CG"', 'limited="true" range="-1 1"', False),
+    ],
+)
+def test_only_a_sparse_jacobian_with_constraints_is_refused(option, joint, wrong):
+    model = mjcf.mujoco.MjModel.from_xml_string(
+        f'<mujoco><option {option}/><worldbody><body><joint type="slide" {joint}/>'
+        '<geom size="1" contype="0"/></body></worldbody></mujoco>'
+    )
+    assert bool(mjcf.wrong_physics(model, "4.0.0")) == wrong
+    assert mjcf.wrong_physics(model, "4.0.1") == ""
+    assert mjcf.wrong_physics(model, "3.17.0") == ""
+
+
+@pytest.mark.parametrize("name", hyrl_mj.task_names())
+def test_the_robots_of_this_package_have_a_dense_jacobian(name):
+    model = hyrl_mj.get_task(name).model
+    assert not mjcf.mujoco.mj_isSparse(model)
+    assert mjcf.wrong_physics(model, "4.0.0") == ""
