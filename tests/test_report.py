@@ -65,7 +65,7 @@ def plant(path, task, critical, partition, slack=0.2):
     write_config(run)
     with run.stage("train"):
         linear(task, 0.0).save(path / "policy.safetensors")
-        Arrivals(990, 1_000).save(path / "arrivals.json")
+        Arrivals(990, 0, 1_000).save(path / "arrivals.json")
     with run.stage("critical-set"):
         critical.save(path / "critical_set.npz")
     with run.stage("partition"):

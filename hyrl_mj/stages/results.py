@@ -21,15 +21,18 @@ class Arrivals:
     """From how many of its task's starts a policy arrives without noise, saved as `arrivals.json`.
 
     Attributes:
-        arrived: number of episodes that end at the set-point within the task's `max_steps`.
+        arrived: number of episodes that reach the goal within the task's `max_steps`, as in the game.
+        missed: those of them that end farther from the set-point than the task's `close`.
         episodes: number of episodes.
     """
 
     arrived: int
+    missed: int
     episodes: int
 
     def __str__(self) -> str:
-        return f"arrives from {self.arrived:,} of {self.episodes:,} of its starts without noise"
+        missed = f", in {self.missed:,} of them off the set-point" if self.missed else ""
+        return f"arrives from {self.arrived:,} of {self.episodes:,} starts without noise{missed}"
 
     @staticmethod
     def of(task: Task, policy: Policy) -> Arrivals:
@@ -37,8 +40,9 @@ class Arrivals:
         starts = task.starts(EPISODES, np.random.default_rng(0))
         settings = LoopSettings(vary=True, label="arrivals")
         run = closed_loop(task, PolicyController(policy), starts, settings=settings)
-        arrived = (run.outcome == Outcome.REACHED) & task.arrived(run.path[-1])
-        return Arrivals(int(arrived.sum()), len(starts))
+        arrived = run.outcome == Outcome.REACHED
+        missed = arrived & ~task.arrived(run.path[-1])
+        return Arrivals(int(arrived.sum()), int(missed.sum()), len(starts))
 
     def save(self, path: Path) -> None:
         """Writes `arrivals.json`."""

@@ -191,7 +191,10 @@ class Encoder:
 
 def check_whole(path: Path) -> None:
     """Raises `EncodingFailed` unless a file is a whole mp4 or gif, from its first to its last byte."""
-    content = path.read_bytes()
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise EncodingFailed(f"ffmpeg left no file ({error.strerror or error})") from error
     if path.suffix == ".gif":
         whole = content.startswith(b"GIF8") and content.endswith(b"\x3b")
     else:

@@ -1,0 +1,158 @@
+"""A run in odd surroundings: it goes on, leaves every file, and says in a sentence what it lacks."""
+
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from gl import needs_gl
+
+import hyrl_mj
+
+pytestmark = pytest.mark.slow  # a process for each run
+
+PACKAGE = Path(hyrl_mj.__file__).parents[1]
+COMMAND = shlex.join([sys.executable, "-m", "hyrl_mj.cli"])
+
+
+def shell(script, cwd=None, **environment):
+    """Run a line of bash, with $HYRL for the command line."""
+    kept = {name: value for name, value in os.environ.items() if name != "COLUMNS"}
+    return subprocess.run(
+        ["bash", "-c", f"set -o pipefail; {script.replace('$HYRL', COMMAND)}"],
+        env={**kept, "PYTHONPATH": str(PACKAGE), **environment},
+        cwd=cwd, capture_output=True, text=True, timeout=120, errors="replace",
+    )  # fmt: skip
+
+
+@pytest.fixture
+def folder(planted_circle, tmp_path):
+    """A copy of the planted run, whose video and page are still to be made."""
+    path = shutil.copytree(planted_circle[0].path, tmp_path / "run")
+    for page in path.glob("report.html"):
+        page.unlink()
+    return path
+
+
+def resume(path):
+    return f"$HYRL run unit_circle --preset smoke --out {path}"
+
+
+def assert_whole(path, done):
+    """The run has ended with its verdict, FAILED, and its page, which carries it."""
+    assert done.returncode == 1, done.stderr
+    assert "Traceback" not in done.stdout + done.stderr
+    assert hyrl_mj.load_run(path).verdict.word == "FAILED"
+    assert "FAILED" in (path / "report.html").read_text()
+    assert not list(path.rglob("*.partial*"))
+
+
+def sentences(text):
+    return [line for line in text.splitlines() if line.startswith("hyrl-mj: ")]
+
+
+# ---- streams
+
+
+@pytest.mark.parametrize(
+    ("streams", "said"),
+    [
+        (">&-", "standard output is closed"),
+        (">/dev/full", "No space left on device"),
+        ("| head -1", "the reader of standard output has gone"),
+    ],
+)
+def test_a_run_goes_on_where_its_output_cannot_be_read(folder, streams, said):
+    done = shell(f"{resume(folder)} {streams}", MUJOCO_GL="disable")
+    assert_whole(folder, done)
+    (sentence,) = sentences(done.stderr)
+    assert said in sentence
+
+
+@pytest.mark.parametrize("streams", ["2>&-", "2>/dev/full", "2>&1 >&- | cat", "<&- 2>&-"])
+def test_a_run_goes_on_where_its_errors_cannot_be_read(folder, streams):
+    done = shell(f"{resume(folder)} {streams}", MUJOCO_GL="disable")
+    assert_whole(folder, done)
+    assert "FAILED: " in done.stdout or "standard output is closed" in done.stdout
+
+
+def test_with_all_streams_closed_the_status_remains(folder):
+    assert_whole(folder, shell(f"{resume(folder)} <&- >&- 2>&-", MUJOCO_GL="disable"))
+    assert shell("$HYRL run unicycle >&- 2>&-").returncode == 2
+
+
+@pytest.mark.parametrize("streams", ["2>&-", "2>/dev/full"])
+def test_a_mistake_is_said_on_the_stream_that_is_left(streams):
+    done = shell(f"$HYRL run unicycle {streams}")
+    assert done.returncode == 2
+    (sentence,) = sentences(done.stdout)
+    assert "unknown task 'unicycle'" in sentence
+
+
+@pytest.mark.parametrize("command", ["list", "--help", "run --help"])
+def test_a_pipe_that_is_closed_early_gets_no_traceback(command):
+    done = shell(f"$HYRL {command} | true")
+    assert done.returncode == 0
+    assert len(done.stderr.splitlines()) <= 1
+    assert done.stderr.splitlines() == sentences(done.stderr)
+
+
+ASCII = {"LC_ALL": "C", "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
+
+
+@pytest.mark.parametrize("environment", [ASCII, {"PYTHONIOENCODING": "latin-1"}, {"LC_ALL": "xx"}])
+def test_a_terminal_that_knows_few_characters_gets_others(folder, tmp_path, environment):
+    path = folder.rename(tmp_path / "Läufe-走る")
+    done = shell(resume(shlex.quote(str(path))), **environment, MUJOCO_GL="disable")
+    assert_whole(path, done)
+    assert "run directory" in done.stdout
+    assert "won, own q0" in done.stdout
+
+
+@pytest.mark.parametrize("columns", ["1", "0", "7", "-3", "many", "100000"])
+def test_every_width_can_be_read(columns):
+    done = shell("$HYRL run --help", COLUMNS=columns)
+    assert done.returncode == 0, done.stderr
+    assert "--preset" in done.stdout
+    assert max(map(len, done.stdout.splitlines())) >= 50
+
+
+# ---- pictures and videos
+
+
+@needs_gl
+@pytest.mark.parametrize(
+    "script", ["exit 0", "exit 1", "cat >/dev/null", "for last; do :; done; echo x >$last"]
+)
+def test_with_a_broken_encoder_there_is_no_video_and_all_else(folder, tmp_path, script):
+    program = tmp_path / "ffmpeg"
+    program.write_text(f"#!/bin/sh\n{script}\n")
+    program.chmod(0o755)
+    done = shell(resume(folder), IMAGEIO_FFMPEG_EXE=str(program))
+    assert_whole(folder, done)
+    assert "replay: no video: " in done.stdout
+    assert "video at" not in done.stdout
+    assert not list(folder.glob("replay*"))
+
+
+@pytest.mark.parametrize("backend", ["disable", "osmesa", "glfw", "nonsense"])
+def test_without_gl_there_is_no_video_and_all_else(folder, backend):
+    done = shell(resume(folder), MUJOCO_GL=backend)
+    assert_whole(folder, done)
+    assert "replay: no video: " in done.stdout or (folder / "replay.mp4").stat().st_size > 10_000
+
+
+# ---- folders
+
+
+def test_a_working_directory_that_is_gone_is_named(tmp_path):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    done = shell(f"rmdir {gone}; $HYRL run unit_circle --preset smoke", cwd=gone)
+    assert done.returncode == 2
+    (sentence,) = sentences(done.stderr)
+    assert "the working directory cannot be found" in sentence
+    assert done.stderr.strip() == sentence
