@@ -118,7 +118,9 @@ class Streams:
 
     def _complain(self, text: str) -> None:
         """Says what went wrong on standard error, or on standard output if nobody reads the other."""
-        print(f"hyrl-mj: {text}", file=sys.stdout if self._is_deaf else sys.stderr, flush=True)
+        print(f"hyrl-mj: {text}", file=sys.stderr)
+        if self._is_deaf:
+            print(f"hyrl-mj: {text}", flush=True)
 
     def _problem(self, number: int) -> OSError | None:
         return self._raw[number].problem if number in self._raw else None

@@ -152,6 +152,7 @@ class _Case:
             yield f"HyRL wins every winnable start under the worst {self.noise}"
         elif not self.robustness.game and won >= NEARLY:
             counts = _by_kind(self.robustness, "hyrl")
+            counts.pop(NO_NOISE, None)
             arrived, total = (sum(column) for column in zip(*counts.values(), strict=True))
             yield f"HyRL arrives in {arrived:,} of {total:,} episodes, with {self.noise}"
 

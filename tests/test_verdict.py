@@ -1,0 +1,195 @@
+"""The verdict: its word follows from scores, episodes and what the stages know, one condition at a time."""
+
+import numpy as np
+import pytest
+from planted import one_way_policy
+
+from hyrl_mj import BadArtifact, artifacts
+from hyrl_mj.game import LIMIT, EpisodeCount, GameResult, Robustness, Score
+from hyrl_mj.game.result import Curve, LatticeSpacing, Profile
+from hyrl_mj.policies import PolicyController
+from hyrl_mj.simulation import simulate
+from hyrl_mj.stages import Arrivals, ModeResult, Retraining
+from hyrl_mj.verdict import FAILED, HELD, WEAK, WON, Verdict
+from hyrl_mj.viz.tables import print_verdict
+
+EPS = 0.1
+ALL, NO_ONE = Arrivals(1_000, 0, 1_000), Arrivals(0, 0, 1_000)
+HOLDS = Retraining((ModeResult(0, 1.0, 1), ModeResult(1, 1.0, 0)))
+
+
+def game(policy, hyrl, winnable=1.0, bounds=(0.0, EPS)):
+    """The result of a game, from the shares that are won at each bound."""
+    scores = {
+        who: tuple(
+            Score(eps, winnable, won, won, 1.0, 1.0, None)
+            for eps, won in zip(bounds, shares, strict=True)
+        )
+        for who, shares in (("policy", policy), ("hyrl", hyrl), (LIMIT, (1.0,) * len(bounds)))
+    }
+    result = GameResult(
+        False, LatticeSpacing((0.1,), True, (0.1,)), scores, {}, {}, Curve((), (), {}), Profile((), {})
+    )  # fmt: skip
+    return Robustness(bounds[-1], False, result, (), seed=0)
+
+
+def episodes(policy, hyrl, eps=EPS):
+    """Episodes in two regions, from the number of those out of 1,000 that arrive, by kind of noise."""
+
+    def counts(who, kind, won):
+        near = won * 400 // 1_000
+        parts = ("near M*", 400, near), ("elsewhere", 600, won - near)
+        for region, total, arrived in parts:
+            outcomes = {"reached": arrived, "crashed": total - arrived}
+            yield EpisodeCount(
+                kind, eps, False, who, region, total, outcomes, arrived / total, (0.0, 1.0)
+            )
+
+    both = (("policy", policy), ("hyrl", hyrl))
+    every = [
+        c for who, kinds in both for kind, won in kinds.items() for c in counts(who, kind, won)
+    ]
+    return Robustness(eps, False, None, tuple(every), seed=0)
+
+
+def word(circle, robustness, retraining=HOLDS, arrivals=ALL, bound=EPS):
+    return Verdict.of(circle, bound, robustness, retraining, arrivals).word
+
+
+# ---- where the game can be played
+
+
+@pytest.mark.parametrize(
+    ("policy", "hyrl", "expected"),
+    [
+        ((1.0, 0.9), (1.0, 1.0), WON),
+        ((1.0, 1.0), (1.0, 1.0), WON),
+        ((1.0, 0.9), (1.0, 0.9999), WEAK),
+        ((0.9, 0.8), (0.9, 0.95), WEAK),
+        ((1.0, 0.9), (0.9999, 0.99), FAILED),  # worse without noise
+        ((1.0, 0.9), (1.0, 0.9), FAILED),  # no better
+        ((1.0, 0.9), (1.0, 0.5), FAILED),
+        ((0.0, 0.0), (0.0, 0.0), FAILED),
+    ],
+)
+def test_the_word_of_a_game(circle, policy, hyrl, expected):
+    assert word(circle, game(policy, hyrl)) == expected
+
+
+def test_without_noise_all_that_counts_is_that_everything_is_won(circle):
+    assert word(circle, game((1.0,), (1.0,), bounds=(0.0,)), bound=0.0) == WON
+    assert word(circle, game((1.0,), (0.9,), bounds=(0.0,)), bound=0.0) == FAILED
+    assert word(circle, game((0.8,), (0.9,), bounds=(0.0,)), bound=0.0) == WEAK
+
+
+def test_everything_of_nothing_is_not_won(circle):
+    verdict = Verdict.of(circle, EPS, game((1.0, 1.0), (1.0, 1.0), winnable=0.0), HOLDS, ALL)
+    assert verdict.word == FAILED
+    assert "no start is winnable under noise of up to 0.1 rad on theta" in verdict.sentence
+
+
+def test_stage_6_has_given_up_where_a_mode_does_not_hold_its_set(circle):
+    lost = Retraining((ModeResult(0, 0.6, 3), ModeResult(1, 1.0, 1)))
+    verdict = Verdict.of(circle, EPS, game((1.0, 0.5), (1.0, 0.9)), lost, ALL)
+    assert verdict.word == FAILED
+    assert verdict.sentence == "stage 6 gave up on mode 0 (clockwise)"
+    assert any("60.00% of its set, after 3 trainings" in reason for reason in verdict.reasons)
+    assert word(circle, game((1.0, 0.5), (1.0, 0.9))) == WEAK
+    assert word(circle, game((1.0, 0.5), (1.0, 1.0)), lost) == WON, "the game has the last word"
+
+
+def test_a_policy_that_does_not_arrive_is_said_with_its_number(circle):
+    poor = Arrivals(430, 0, 1_000)
+    verdict = Verdict.of(circle, EPS, game((0.4, 0.4), (0.4, 0.4)), HOLDS, poor)
+    assert verdict.word == WEAK
+    assert "arrives from 430 of 1,000 starts without noise" in verdict.sentence
+
+
+def test_less_noise_than_the_run_s_is_not_enough_and_more_is(circle):
+    assert word(circle, game((1.0, 0.9), (1.0, 1.0), bounds=(0.0, 0.05))) == WEAK
+    verdict = Verdict.of(circle, EPS, game((1.0, 0.9), (1.0, 1.0), bounds=(0.0, 0.2)), HOLDS, ALL)
+    assert verdict.word == WON
+    assert "0.2 rad" in verdict.sentence
+
+
+# ---- where it cannot
+
+
+@pytest.mark.parametrize(
+    ("policy", "hyrl", "expected"),
+    [
+        ({"none": 1000, "uniform": 500}, {"none": 1000, "uniform": 1000}, HELD),
+        ({"none": 1000, "uniform": 500}, {"none": 1000, "uniform": 990}, HELD),
+        ({"none": 1000, "uniform": 500}, {"none": 1000, "uniform": 980}, WEAK),
+        ({"none": 1000, "uniform": 500}, {"none": 900, "uniform": 980}, FAILED),
+        ({"none": 1000, "uniform": 500}, {"none": 1000, "uniform": 500}, FAILED),
+        # The kind that stops most counts.
+        (
+            {"uniform": 900, "adversarial": 100},
+            {"uniform": 1000, "adversarial": 80},
+            FAILED,
+        ),
+        ({"none": 1000}, {"none": 1000}, WEAK),  # not examined under noise
+    ],
+)
+def test_the_word_of_episodes(circle, policy, hyrl, expected):
+    assert word(circle, episodes(policy, hyrl)) == expected
+
+
+def test_it_says_how_many_of_how_many(circle):
+    shares = {"none": 1000, "uniform": 998}
+    verdict = Verdict.of(circle, EPS, episodes(shares, shares), HOLDS, ALL)
+    assert verdict.word == HELD
+    assert "998 of 1,000 episodes" in verdict.sentence
+
+
+# ---- what is said, and kept
+
+
+def test_a_verdict_reads_as_a_sentence_with_reasons(circle, capsys):
+    class Planted:
+        verdict = Verdict.of(circle, EPS, game((1.0, 0.9), (1.0, 1.0), 0.9), HOLDS, ALL)
+
+    print_verdict(Planted)
+    first, *rest = capsys.readouterr().out.splitlines()
+    assert first == f"WON: HyRL wins every winnable start under the worst {NOISE}"
+    assert rest == [
+        f"- under {NOISE} 90.00% of the starts are winnable",
+        "- without noise HyRL wins 100% of the winnable starts, the policy 100%",
+        f"- under the worst {NOISE} HyRL wins 100% of the winnable starts, the policy 90.00%",
+        "- stage 1: the policy arrives from 1,000 of 1,000 starts without noise",
+        "- stage 6: the policy of mode 0 (clockwise) wins 100% of its set, after 1 training",
+        "- stage 6: the policy of mode 1 (counter-clockwise) wins 100% of its set, without a "
+        "training of its own",
+    ]
+
+
+NOISE = "noise of up to 0.1 rad on theta"
+
+
+@pytest.mark.parametrize("result", [Arrivals(3, 1, 10), HOLDS])
+def test_results_of_stages_survive_being_written(result, tmp_path):
+    path = tmp_path / "result.json"
+    result.save(path)
+    assert type(result).load(path) == result
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(BadArtifact, match=r"result\.json"):
+        type(result).load(path)
+
+
+def test_a_share_that_is_a_word_is_refused(tmp_path):
+    content = {"modes": [{"mode": 0, "won": "all", "attempts": 1}]}
+    artifacts.write_json(tmp_path / "retraining.json", content, "retraining")
+    with pytest.raises(BadArtifact, match=r"modes\.0\.won"):
+        Retraining.load(tmp_path / "retraining.json")
+
+
+def test_arrivals_are_those_of_simulations(vehicle):
+    policy = one_way_policy(vehicle, 1.0)  # it goes on beside the set-point
+    found = Arrivals.of(vehicle, policy)
+    arcs = simulate(
+        vehicle, PolicyController(policy), vehicle.starts(1_000, np.random.default_rng(0))
+    )
+    assert found.arrived == sum(arc.outcome == "reached" for arc in arcs)
+    assert found.missed == found.arrived > 500
+    assert f"in {found.missed:,} of them off the set-point" in str(found)
