@@ -22,7 +22,7 @@ LARGEST = 2**25
 # Rows that a model answers at a time: so many as were tried.
 ROWS = 1024
 # The longest that the trial may last [s], whose model may use the processor for four.
-LONGEST = 30
+LONGEST = 60
 INSTEAD = "in Python, give a function of your own that runs it"
 
 

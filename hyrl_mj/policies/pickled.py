@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from hyrl_mj.errors import BadArtifact
-
 # Limit on the pickled text around the numbers [bytes]: a network of ten layers takes a few kilobytes.
 LARGEST = 2**19
 _CONSTANTS = {
@@ -58,8 +56,7 @@ def read(content: bytes) -> Any:
     """Returns the content of a pickle: numbers, strings, bytes, tuples, lists, `Items` and `Call`s.
 
     Raises:
-        BadArtifact: it holds an instruction that numbers and tensors do not need.
-        ValueError, IndexError: it is damaged.
+        ValueError, IndexError, KeyError: it is damaged, or holds an instruction that numbers do not need.
     """
     stack: list[Any] = []
     memo: dict[int, Any] = {}
@@ -118,7 +115,7 @@ def _step(name: str, argument: Any, stack: list[Any]) -> None:
             into = stack[-1].items if isinstance(stack[-1], Call) else stack[-1]
             into.extend(zip(flat[::2], flat[1::2], strict=True))
         case _:
-            raise BadArtifact(f"it holds the instruction {name}, which numbers do not need")
+            raise ValueError(f"the pickle has the instruction {name}, which numbers do not need")
 
 
 def _to_mark(stack: list[Any]) -> list[Any]:

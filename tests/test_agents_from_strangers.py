@@ -1,0 +1,378 @@
+"""Zips from strangers are data: bombs end in a sentence, and what cannot be right is refused by name."""
+
+import base64
+import io
+import json
+import pickle
+import struct
+import sys
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import DQN, PPO, SAC
+from stable_baselines3.common.vec_env import VecNormalize
+from test_agents import (
+    Payload,
+    members,
+    packed,
+    rewritten,
+    saved,
+    state_of,
+    untrained,
+    with_tensors,
+)
+
+import hyrl_mj
+from hyrl_mj import BadArtifact, load_agent
+from hyrl_mj.envs.core import BatchedEnv
+from hyrl_mj.envs.sb3_env import TaskVecEnv
+from hyrl_mj.policies import pickled, sb3_zip, torch_file
+
+
+@pytest.fixture
+def agent(circle, tmp_path):
+    """A PPO agent on the unit circle."""
+    return saved(untrained(PPO, circle, net_arch=[8]), tmp_path)
+
+
+def refused(path, task, message):
+    with pytest.raises(BadArtifact, match=message) as error:
+        load_agent(path, task)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 800
+
+
+def with_metadata(path, **entries):
+    return rewritten(path, data=json.dumps(json.loads(members(path)["data"]) | entries))
+
+
+def compressed(path, **changes):
+    """The zip with some members changed and all of them compressed."""
+    content = members(path) | {n.replace("_pth", ".pth"): c for n, c in changes.items()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, data in content.items():
+            file.writestr(name, data)
+    return path
+
+
+# ---- sizes
+
+
+@pytest.mark.parametrize(("member", "limit"), [("policy_pth", 32), ("data", 4)])
+def test_a_member_that_unpacks_to_gigabytes_is_read_no_farther_than_its_limit(
+    member, limit, agent, circle
+):
+    compressed(agent, **{member: bytes(2**28)})
+    refused(agent, circle, f"unpacks to more than {limit} MiB")
+
+
+def test_what_the_directory_says_of_sizes_is_not_believed(agent, circle):
+    size = 2**28 + 0x12345
+    content = compressed(agent, policy_pth=bytes(size)).read_bytes()
+    assert content.count(struct.pack("<I", size)) == 2
+    for lie in (1000, 2**24):
+        agent.write_bytes(content.replace(struct.pack("<I", size), struct.pack("<I", lie)))
+        refused(agent, circle, "policy.pth|cannot be read")
+
+
+def test_a_directory_of_countless_members_is_refused(agent, circle):
+    with zipfile.ZipFile(agent, "a") as file:
+        for i in range(25_000):
+            file.writestr(zipfile.ZipInfo(str(i)), b"")
+    refused(agent, circle, "its directory takes more than 1 MiB")
+
+
+@pytest.mark.parametrize(
+    "data", ["[" * 10**6, '{"a":' * 10**5, "1" * 10**6, '{"a": ' + "[" * 3000 + "]" * 3000 + "}"]
+)
+def test_metadata_of_absurd_depth_are_refused(data, agent, circle):
+    refused(rewritten(agent, data=data), circle, "cannot be read")
+
+
+def test_texts_from_the_file_are_cut_in_messages(agent, circle):
+    long = "x" * 10**6
+    with_metadata(agent, policy_kwargs={"features_extractor_class": long})
+    refused(agent, circle, "features extractor of its own, xxx")
+    with_metadata(agent, policy_kwargs={}, action_space={"low": "1 " * 10**6, "high": "2 " * 10**6})
+    refused(agent, circle, r"its inputs lie in \[1, 2\] x .*\.\.\.")
+
+
+def with_pickle(path, content):
+    """The zip whose policy.pth holds another pickle."""
+    parts = members(io.BytesIO(members(path)["policy.pth"]))
+    name = next(name for name in parts if name.endswith("data.pkl"))
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as file:
+        for other, data in (parts | {name: content}).items():
+            file.writestr(other, data)
+    return rewritten(path, policy_pth=buffer.getvalue())
+
+
+DOUBLING = b")" + b"".join(b"q%ch%ch%c\x86" % (i, i, i) for i in range(100))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"\x80\x02" + DOUBLING + b".",
+        b"\x80\x02}" + DOUBLING + b"K\x01s.",  # as a key, whose hash would take for ever
+        b"\x80\x02}X\x01\x00\x00\x00a" + DOUBLING + b"s.",
+        b"\x80\x04" + DOUBLING + b"\x8c\x01a\x93.",  # as the name of a function
+        b"\x80\x02" + b"]" * 10**5 + b".",
+        b"\x80\x02" + b"(" * 10**5 + b".",
+        b"\x80\x02)" + b"\x85" * 10**5 + b".",
+        b"\x80\x02}(X\x01\x00\x00\x00a\x8b" + struct.pack("<i", 10**5) + b"\x7f" * 10**5 + b"u.",
+        b"\x80\x02.",
+        b"\x80\x02u.",
+        b"\x80\x02h\x05.",
+        b"cos\nsystem\nX\x04\x00\x00\x00true\x85R.",
+        b"(S'true'\nios\nsystem\n.",
+    ],
+)
+def test_a_pickle_that_would_grow_or_call_is_refused(content, agent, circle):
+    refused(with_pickle(agent, content), circle, "policy.pth")
+
+
+def test_pickles_are_read_without_unpickling(monkeypatch):
+    for name in ("load", "loads", "Unpickler"):
+        monkeypatch.setattr(pickle, name, None)
+    call = pickled.read(b"\x80\x02cos\nsystem\nX\x04\x00\x00\x00true\x85R.")
+    assert (call.function, call.arguments) == ("os.system", ("true",))
+
+
+@pytest.mark.parametrize("protocol", [3, 4, 5])
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.arange(6, dtype=np.float32).reshape(2, 3),
+        np.asfortranarray(np.arange(6.0).reshape(2, 3)),
+        np.arange(6, dtype=">f4").reshape(3, 2),
+        np.array([True, False]),
+    ],
+)
+def test_arrays_in_pickles_are_those_of_numpy(array, protocol):
+    np.testing.assert_array_equal(pickled.array(pickle.dumps(array, protocol)), array)
+
+
+def test_what_is_no_array_of_numbers_is_none(tmp_path):
+    for thing in ({"a": 1}, [1.0], np.array([{}, None]), np.array(["text"]), tmp_path):
+        assert pickled.array(pickle.dumps(thing)) is None
+    assert pickled.array(b"") is None
+
+
+@pytest.mark.parametrize(
+    "dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.int64, torch.bool]
+)
+def test_tensors_are_those_of_torch(dtype):
+    whole = (4 * torch.randn(6, 8)).to(dtype)
+    state = {"a": whole, "b": whole.T, "c": whole[1:3, ::2], "d": torch.zeros((), dtype=dtype)}
+    state["e"] = torch.zeros(0, 3, dtype=dtype)
+    found = torch_file.read_tensors(packed(state))
+    assert list(found) == list(state)
+    for name, tensor in state.items():
+        theirs = tensor.float() if tensor.is_floating_point() else tensor
+        np.testing.assert_array_equal(found[name], theirs.numpy())
+        assert found[name].shape == tensor.shape
+
+
+def test_tensors_are_read_without_torch(agent, circle, monkeypatch):
+    theirs = {name: tensor.numpy() for name, tensor in state_of(agent).items()}
+    monkeypatch.setitem(sys.modules, "torch", None)
+    ours = load_agent(agent, circle).weights
+    assert list(ours) == list(theirs)
+    for name, tensor in theirs.items():
+        np.testing.assert_array_equal(ours[name], tensor)
+
+
+@pytest.mark.parametrize("shape", [(2**30, 2**30), (2**60,), (1,) * 60, (-1, 5), (3, 3)], ids=str)
+def test_absurd_shapes_are_refused(shape, agent, circle):
+    """The shape of a tensor of 8 numbers is written over by hand."""
+    size = len(shape) * b"\x01"
+    assert size  # one step along each dimension
+    state = packed({"x": torch.arange(8.0)})
+    parts = members(io.BytesIO(state))
+    name = next(name for name in parts if name.endswith("data.pkl"))
+    old = pickle.dumps((8,), 2)[2:-1]
+    number = b"".join(pickle.dumps(n, 2)[2:-1] for n in shape)
+    assert parts[name].count(b"K\x08\x85") == 1, old
+    parts[name] = parts[name].replace(b"K\x08\x85", b"(" + number + b"t", 1)
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as file:
+        for other, data in parts.items():
+            file.writestr(other, data)
+    refused(rewritten(agent, policy_pth=buffer.getvalue()), circle, "policy.pth")
+
+
+# ---- what cannot be right
+
+
+class Renorm(torch.nn.Module):
+    """Has the tensors of the batch renormalisation in sb3_contrib's CrossQ."""
+
+    def __init__(self, n):
+        super().__init__()
+        for name in ("ra_mean", "ra_var"):
+            self.register_buffer(name, torch.ones(n))
+        self.register_buffer("steps", torch.tensor(0))
+        self.scale, self.bias = (torch.nn.Parameter(torch.ones(n)) for _ in range(2))
+
+
+def test_crossq_is_not_taken_for_sac(circle, tmp_path):
+    path = saved(untrained(SAC, circle, net_arch=[8, 8]), tmp_path)
+
+    def normalised(state):
+        layers = {0: Renorm(2), 3: Renorm(8)}
+        more = {
+            f"actor.latent_pi.{i}.{name}": tensor
+            for i, layer in layers.items()
+            for name, tensor in layer.state_dict().items()
+        }
+        moved = {n.replace("pi.2.", "pi.4.").replace("pi.0.", "pi.1."): t for n, t in state.items()}
+        return moved | more
+
+    refused(
+        with_tensors(path, normalised), circle, r"batch renormalisation .*\(ra_mean\).*CrossQ.*onnx"
+    )
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "name"),
+    [
+        (PPO, "mlp_extractor.policy_net.1.running_mean"),
+        (PPO, "mlp_extractor.policy_net.0.scale"),
+        (PPO, "action_net.gain"),
+        (PPO, "encoder.weight"),
+        (SAC, "actor.latent_pi.1.gain"),
+        (SAC, "actor.memory.weight"),
+        (SAC, "log_std"),
+        (DQN, "q_net.dueling.weight"),
+    ],
+)
+def test_a_tensor_that_the_policy_does_not_use_is_named(algorithm, name, tmp_path):
+    task = hyrl_mj.get_task("vehicle" if algorithm is DQN else "unit_circle")
+    path = saved(untrained(algorithm, task, net_arch=[8]), tmp_path)
+    load_agent(path, task)
+    for tensor in (torch.ones(8), torch.tensor(3)):
+        with_tensors(path, lambda state, tensor=tensor: {**state, name: tensor})
+        refused(path, task, f"no {algorithm.__name__.lower()} policy of SB3 has its tensors {name}")
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "low", "high"),
+    [
+        (PPO, "[-2.]", "[2.]"),
+        (SAC, "[-0.5]", "[0.5]"),
+        (PPO, "[-inf]", "[inf]"),
+        (PPO, "[0.]", "[1.]"),
+    ],
+)
+def test_an_agent_of_other_inputs_is_refused_with_both_ranges(
+    algorithm, low, high, circle, tmp_path
+):
+    path = saved(untrained(algorithm, circle, net_arch=[8]), tmp_path)
+    space = json.loads(members(path)["data"])["action_space"]
+    assert (space["low"], space["high"]) == ("[-1.]", "[1.]")
+    with_metadata(path, action_space=space | {"low": low, "high": high})
+    theirs = rf"\[{low[1:-1].rstrip('.')}, {high[1:-1].rstrip('.')}\]"
+    refused(path, circle, rf"{theirs}, those of unit_circle in \[-1, 1\]: .*RescaleAction")
+
+
+def test_an_agent_of_another_number_of_levels_is_refused(vehicle, tmp_path):
+    path = saved(untrained(DQN, vehicle, net_arch=[8]), tmp_path)
+    space = json.loads(members(path)["data"])["action_space"]
+    with_metadata(path, action_space=space | {"n": "7"})
+    refused(path, vehicle, "chooses among 7 levels of the input, vehicle has 5")
+
+
+def test_sbx_is_named(agent, circle):
+    about = json.loads(members(agent)["data"])
+    about["policy_class"] = {":type:": "<class 'abc.ABCMeta'>", "__module__": "sbx.ppo.policies"}
+    rewritten(agent, policy_pth=None, data=json.dumps(about))
+    refused(agent, circle, r"an agent of SBX.*JAX.*\.onnx.*function that calls model\.predict")
+
+
+# ---- VecNormalize
+
+
+def trained(task, algorithm, folder, n, seed, **options):
+    """A zip of an agent that was trained for a moment, under `VecNormalize(**options)` if there are any."""
+    env = TaskVecEnv(BatchedEnv(task, n, threads=1))
+    env.seed(seed)
+    if options:
+        env = VecNormalize(env, **options)
+    mine = (
+        {"n_steps": 25, "batch_size": 25, "n_epochs": 1}
+        if algorithm is PPO
+        else {"buffer_size": 500}
+    )
+    mine |= {} if algorithm is PPO else {"learning_starts": 10**6}
+    model = algorithm(
+        "MlpPolicy", env, seed=seed, device="cpu", policy_kwargs={"net_arch": [8]}, **mine
+    )
+    model.learn(75 * n)
+    return saved(model, folder)
+
+
+BOTH = [
+    (PPO, "unit_circle"),
+    (SAC, "unit_circle"),
+    (PPO, "vehicle"),
+    (DQN, "vehicle"),
+    (DQN, "rover"),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [1, 4])
+@pytest.mark.parametrize(("algorithm", "name"), BOTH)
+def test_an_agent_of_vecnormalize_is_refused(algorithm, name, n, tmp_path):
+    task = hyrl_mj.get_task(name)
+    path = trained(task, algorithm, tmp_path, n, 0, norm_obs=True)
+    refused(path, task, r"normalised observations \(VecNormalize\).*--vecnormalize FILE\.npz")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [1, 4])
+@pytest.mark.parametrize(("algorithm", "name"), BOTH)
+@pytest.mark.parametrize("options", [{}, {"norm_obs": False}], ids=["plain", "rewards only"])
+def test_an_agent_of_plain_observations_is_taken(algorithm, name, options, n, tmp_path):
+    task = hyrl_mj.get_task(name)
+    load_agent(trained(task, algorithm, tmp_path, n, 0, **options), task)
+
+
+@pytest.mark.slow
+def test_what_cannot_be_told_is_refused_with_the_way_out(tmp_path):
+    task = hyrl_mj.get_task("rover")
+    path = trained(task, PPO, tmp_path, 4, 0, norm_obs=False)
+    refused(
+        path, task, "nothing in it tells whether.*--vecnormalize FILE.npz.*also for norm_obs=False"
+    )
+    identity = {"mean": np.zeros(3), "var": np.ones(3), "clip": np.inf, "epsilon": 0}
+    np.savez(tmp_path / "identity.npz", **identity)
+    load_agent(path, task, vecnormalize=tmp_path / "identity.npz")
+
+
+@pytest.mark.slow
+def test_last_observations_that_cannot_be_read_say_nothing(circle, tmp_path):
+    executed = tmp_path / "executed"
+    payload = pickle.dumps(Payload(executed))
+    path = trained(circle, PPO, tmp_path, 1, 0, norm_obs=True)
+    about = json.loads(members(path)["data"])
+    for content in (payload, b"", b"\x80\x02" + DOUBLING + b".", b"\x80\x02" + b"]" * 10**5 + b"."):
+        entry = {":serialized:": base64.b64encode(content).decode()}
+        with_metadata(path, _last_obs=entry, _last_original_obs=about["_last_original_obs"])
+        load_agent(path, circle)
+    for text in ("no base64", 3, None):
+        load_agent(with_metadata(path, _last_obs={":serialized:": text}), circle)
+    assert not executed.exists()
+
+
+def test_limits_leave_room_for_large_mlps(circle, tmp_path):
+    path = saved(untrained(SAC, circle, net_arch=[512, 512]), tmp_path)
+    assert len(members(path)["policy.pth"]) > 5e6
+    load_agent(path, circle)
+    assert torch_file.LARGEST <= 2**25
+    assert sb3_zip.LARGEST_METADATA <= 2**22
