@@ -81,8 +81,16 @@ def test_a_process_that_hangs_is_ended_with_those_that_it_began(tmp_path):
         subprocess.run(["sleep", "60"], check=False)
 
     began = time.monotonic()
-    assert "hangs" in answered(work, tmp_path, seconds=0.5)
+    assert "hangs" in answered(work, tmp_path, seconds=0.2)
     assert time.monotonic() - began < 30
+
+
+def test_a_process_that_is_busy_for_ever_is_ended(tmp_path):
+    def work():
+        while True:
+            pass
+
+    assert "hangs" in answered(work, tmp_path, seconds=1)
 
 
 def test_a_signal_ends_a_process(tmp_path):
@@ -105,7 +113,7 @@ def test_memory_is_that_of_the_process(tmp_path):
     ],
 )
 def test_what_is_no_sentence_is_found(err, found):
-    assert found in Answer(2, "", err, 0.1, 1.0, False).broke()
+    assert found in Answer(2, "", err, (0.1, 0.1), 1.0, False).broke()
 
 
 def test_a_payload_leaves_its_mark(tmp_path):

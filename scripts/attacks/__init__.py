@@ -4,6 +4,7 @@ Everything is imported once. Each trial forks, so that it costs no import, leave
 memory is its own.
 """
 
+import math
 import os
 import resource
 import signal
@@ -20,6 +21,7 @@ from hyrl_mj import cli
 
 # What a payload leaves behind when it runs, in the folder of its trial.
 MARKER = "executed"
+PATIENCE = 4
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class Answer:
     Attributes:
         status: its exit status; the negative number of the signal that ended it.
         out, err: what it wrote.
-        seconds: how long it ran.
+        seconds: how long it ran, and how long it was busy.
         memory: the most memory that it had [MB].
         late: whether it ran over its time and was killed.
     """
@@ -50,7 +52,7 @@ class Answer:
     status: int
     out: str
     err: str
-    seconds: float
+    seconds: tuple[float, float]
     memory: float
     late: bool
 
@@ -63,7 +65,7 @@ class Answer:
         """Returns what is wrong with the answer of the command line, "" if nothing is."""
         text = self.out + self.err
         if self.late:
-            return f"hangs: still running after {self.seconds:.0f} s"
+            return f"hangs: still running after {self.seconds[0]:.0f} s"
         if "Traceback (most recent call last)" in text:
             return f"traceback: {self.err.strip().splitlines()[-1]}"
         if any(not c.isprintable() and c not in "\n\t" for c in text):
@@ -81,7 +83,7 @@ class Process:
     Args:
         work: what to do; an error that leaves it is a traceback.
         folder: its working directory.
-        seconds: after which it and its own processes are killed.
+        seconds: that it may be busy; after `PATIENCE` times as long it and its own processes are killed.
         sent: after how many seconds it is sent a signal, and which.
     """
 
@@ -97,6 +99,9 @@ class Process:
         self.began = time.monotonic()
         self.pid = os.fork()
         if not self.pid:
+            # On a machine that others use, too, a process may take longer than it is busy.
+            busy = math.ceil(seconds)
+            resource.setrlimit(resource.RLIMIT_CPU, (busy, busy + 5))
             _work(work, folder, *(file.fileno() for file in self.texts))
 
     def answer(self) -> Answer | None:
@@ -105,7 +110,7 @@ class Process:
         if self.sent and passed >= self.sent[0]:
             os.kill(self.pid, self.sent[1])
             self.sent = None
-        if passed > self.seconds:
+        if passed > PATIENCE * self.seconds:
             self.late = True
             _end(self.pid)
         ended, status, usage = os.wait4(self.pid, os.WNOHANG)
@@ -116,7 +121,9 @@ class Process:
         for file in self.texts:
             file.close()
         code = os.waitstatus_to_exitcode(status)
-        return Answer(code, *texts, passed, usage.ru_maxrss / 1024, self.late)
+        times = passed, usage.ru_utime + usage.ru_stime
+        late = self.late or code == -signal.SIGXCPU
+        return Answer(code, *texts, times, usage.ru_maxrss / 1024, late)
 
 
 def child(

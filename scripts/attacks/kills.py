@@ -19,7 +19,7 @@ def trials(material: Material, draw: Random, count: int) -> list[Trial]:
     (whole,) = material.do(folder, [RUN])
     found = []
     for number in range(count):
-        moment = whole.seconds * (number + draw.random()) / count
+        moment = whole.seconds[0] * (number + draw.random()) / count
         sent = SIGNALS[number % len(SIGNALS)]
         name = f"{sent.name} after {moment:.2f} s"
         found.append(Trial(name, partial(_killed, material, (moment, int(sent)))))

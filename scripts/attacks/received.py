@@ -100,14 +100,14 @@ def _run(material: Material, build: Callable[[Path, Path], None], most: float, f
 
 def _broke(work: Work, folder: Path, most: float, ended: tuple[int, ...] = (0, 1, 2)) -> str:
     """Returns what is wrong with an answer to a crafted file."""
-    answer = child(limited(work, LIMIT), folder, seconds=6 * SECONDS)
+    answer = child(limited(work, LIMIT), folder, seconds=3 * SECONDS)
     if broke := answer.broke(ended):
         return broke
     if answer.memory > most + MEMORY:
         return f"takes {answer.memory - most:.0f} MB more than an honest file"
     # An accepted file is worked with, which takes as long as it takes.
-    if answer.status == 2 and answer.seconds > SECONDS:
-        return f"takes {answer.seconds:.0f} s to be refused"
+    if answer.status == 2 and answer.seconds[1] > SECONDS:
+        return f"takes {answer.seconds[1]:.0f} s to be refused"
     return ""
 
 

@@ -111,7 +111,7 @@ def _attempt(material: Material, pair: tuple[str, ...], ffmpeg: str, folder: Pat
     folder.chmod(0o777)
     (folder / "ffmpeg").write_text(f"#!/bin/sh\n{ffmpeg}\n")
     (folder / "ffmpeg").chmod(0o755)
-    answer = child(partial(_run, pair), folder, seconds=120)
+    answer = child(partial(_run, pair), folder, seconds=30)
     Path(folder).chmod(0o777)
     broke = _judged(pair, answer) or _harmed(material, pair, folder)
     if broke:
