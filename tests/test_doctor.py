@@ -9,7 +9,8 @@ import imageio_ffmpeg
 import pytest
 from gl import needs_gl
 
-from hyrl_mj import doctor
+import hyrl_mj
+from hyrl_mj import doctor, mjcf
 from hyrl_mj.errors import NoRenderer
 
 
@@ -41,6 +42,14 @@ def test_a_healthy_machine(healthy):
     assert "cure" not in text
     assert "a rasteriser" in text
     assert lines[: len(doctor.DISTRIBUTIONS) + 1] == doctor.versions()[0]
+
+
+def test_it_names_this_package_and_the_version_of_mujoco_that_is_wrong(healthy, monkeypatch):
+    assert doctor.versions()[0][1].split() == ["hyrl-mj", hyrl_mj.__version__]
+    monkeypatch.setattr(mjcf, "WRONG_VERSION", mjcf.mujoco.__version__)
+    assert "sparse constraint Jacobian" in "\n".join(doctor.report()[0])
+    monkeypatch.setattr(mjcf, "WRONG_VERSION", "0.0")
+    assert "sparse" not in "\n".join(doctor.report()[0])
 
 
 def test_a_missing_distribution(healthy, monkeypatch):

@@ -1,6 +1,14 @@
 """The environments keep the conventions of Gymnasium and SB3, and all play the same episodes."""
 
+import copy
+import os
+import pickle
+import subprocess
+import sys
 import warnings
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -9,6 +17,7 @@ from gl import needs_gl
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
+import hyrl_mj
 from hyrl_mj import BadInput, Noise
 from hyrl_mj.envs.core import BatchedEnv, Domain
 from hyrl_mj.envs.gym_env import TaskEnv
@@ -336,7 +345,176 @@ def test_leaving_the_domain_ends_an_episode_with_its_own_reward(circle):
     assert results[2].reward[1] == pytest.approx(-1 / np.pi)
 
 
+# ---- copies
+
+
+def played(env, steps=30):
+    """Plays the same actions on any environment, and returns what it saw."""
+    env.action_space.seed(0)
+    seen = [env.step(env.action_space.sample()) for _ in range(steps)]
+    return np.concatenate([np.ravel(part) for step in seen for part in step[:4]])
+
+
+@pytest.mark.parametrize(
+    "copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"]
+)
+@pytest.mark.parametrize("build", [make, partial(make_vec, num_envs=3)], ids=["one", "many"])
+def test_a_copy_plays_on_as_the_original(task, build, copied):
+    env = build(task.name, noise=Noise("uniform", 0.1)).unwrapped
+    env.reset(seed=5)
+    played(env, 10)
+    twin = copied(env)
+    np.testing.assert_array_equal(played(twin), played(env))
+
+
+def test_a_copy_for_sb3_plays_on_as_the_original(vehicle):
+    env = sb3(vehicle, 3)
+    env.reset()
+    twin = pickle.loads(pickle.dumps(env))
+    for _ in range(70):
+        for a, b in zip(env.step([LEFT] * 3)[:3], twin.step([LEFT] * 3)[:3], strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_a_copy_of_a_task_from_a_file_finds_it_again(puck):
+    assert type(pickle.loads(pickle.dumps(puck))) is type(puck)
+    code = "import pickle, sys; print(pickle.load(sys.stdin.buffer).name)"
+    child = subprocess.run(
+        [sys.executable, "-c", code], input=pickle.dumps(puck), capture_output=True, check=True
+    )
+    assert child.stdout.decode().strip() == puck.name
+
+
+# ---- what cannot be used
+
+
+@pytest.mark.parametrize("noise", [0.1, "uniform", True, np.nan, [0.1]])
+def test_noise_without_its_kind_is_refused(noise):
+    for build in (make, partial(make_vec, num_envs=2)):
+        with pytest.raises(
+            BadInput, match=r'noise .* cannot be used: give a hyrl_mj\.Noise\("uniform"'
+        ):
+            build("vehicle", noise=noise)
+
+
+@pytest.mark.parametrize("options", [[1], "z", 5, {"Z": [0.0, 0.0]}, {1: 2}])
+def test_options_that_are_no_start_are_refused(options, vehicle):
+    for env in (make("vehicle"), make_vec("vehicle", 2)):
+        with pytest.raises(BadInput, match="option"):
+            env.reset(options=options)
+    with pytest.raises(BadInput, match="option"):
+        sb3(vehicle, 2).set_options(options)
+
+
+@pytest.mark.parametrize("action", [[], None, "left", [[1], [1, 2]], 1j, True, [[0.0]], 10**30])
+def test_an_action_of_another_kind_is_refused(action):
+    for name in IDS:
+        env = make(name).unwrapped
+        env.reset(seed=0)
+        before = env.core.plant.state
+        with pytest.raises(BadInput, match=f"cannot be used: {name} takes|cannot be used: give"):
+            env.step(action)
+        np.testing.assert_array_equal(env.core.plant.state, before)
+
+
+@pytest.mark.parametrize("actions", [[], 1, [1], [1, 1, 1], [[1, 1]], [0.5, 0.5], ["a", "b"]])
+def test_actions_of_another_number_are_refused(actions, vehicle):
+    for env in (make_vec("vehicle", 2), sb3(vehicle, 2)):
+        env.reset()
+        with pytest.raises(BadInput, match=r"actions? |input has shape"):
+            env.step(np.array(actions))
+
+
+@pytest.mark.parametrize("n", [1.5, 0, -1, True, "2", None, 10**12])
+def test_a_number_of_episodes_that_is_none_is_refused(n, vehicle):
+    with pytest.raises(BadInput, match=r"the number of episodes side by side .* an integer from 1"):
+        make_vec("vehicle", n)
+    with pytest.raises(BadInput, match="the number of episodes side by side"):
+        BatchedEnv(vehicle, n)
+
+
+def test_other_values_that_are_out_of_range_are_refused(vehicle):
+    for options in ({"max_steps": 0}, {"max_steps": 1.5}, {"threads": -1}, {"threads": "all"}):
+        with pytest.raises(BadInput, match="cannot be used: give an integer"):
+            BatchedEnv(vehicle, 2, **options)
+    with pytest.raises(BadInput, match="seed -1"):
+        BatchedEnv(vehicle, 2).seed(-1)
+    with pytest.raises(BadInput, match="unknown camera in model vehicle 'nowhere'"):
+        make("vehicle", camera="nowhere")
+    with pytest.raises(BadInput, match="'vehicle' cannot be used: give a BatchedEnv"):
+        TaskVecEnv("vehicle")
+
+
+def test_many_episodes_draw_no_pictures(vehicle):
+    with pytest.raises(BadInput, match="render_mode 'rgb_array' cannot be used with many episodes"):
+        make_vec("vehicle", 2, render_mode="rgb_array")
+    assert make_vec("vehicle", 2, render_mode=None).render() is None
+    assert sb3(vehicle, 2).get_images() == [None, None]
+
+
 # ---- pictures
+
+
+@needs_gl
+def test_a_copy_draws_its_own_pictures():
+    env = make("vehicle", render_mode="rgb_array").unwrapped
+    env.reset(options={"z": [0.0, 0.5]})
+    picture = env.render()
+    twin = copy.deepcopy(env)
+    env.close()
+    np.testing.assert_array_equal(twin.render(), picture)
+    twin.close()
+
+
+@needs_gl
+def test_only_the_thread_of_the_first_picture_draws():
+    env = make("vehicle", render_mode="rgb_array").unwrapped
+    env.reset(seed=0)
+    picture = env.render()
+    with ThreadPoolExecutor(1) as other:
+        with pytest.raises(BadInput, match="only be drawn by the thread that drew the first one"):
+            other.submit(env.render).result(timeout=30)
+        with pytest.raises(BadInput, match="only be drawn by the thread"):
+            other.submit(env.close).result(timeout=30)
+    np.testing.assert_array_equal(env.render(), picture)
+    env.close()
+
+
+FORKED = """
+import os, signal, sys, gymnasium, hyrl_mj
+
+env = gymnasium.make("hyrl_mj/ObstacleAvoidance-v0", render_mode="rgb_array")
+env.reset(seed=0)
+if sys.argv[1] == "after":
+    env.render()
+child = os.fork()
+if not child:
+    signal.alarm(30)
+    try:
+        print(env.render().shape, flush=True)
+    except hyrl_mj.NoRenderer as error:
+        print(error, flush=True)
+    env.close()
+    sys.exit(0)  # deletes all that there is
+print("ended with", os.waitpid(child, 0)[1])
+print(env.render().shape)
+"""
+
+
+@needs_gl
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+@pytest.mark.parametrize(
+    ("when", "says"), [("before", "(480, 640, 3)"), ("after", "was forked from")]
+)
+def test_a_forked_process_draws_or_says_why_not(when, says):
+    done = subprocess.run(
+        [sys.executable, "-c", FORKED, when], capture_output=True, text=True, timeout=90, check=False,
+        env={**os.environ, "PYTHONPATH": str(Path(hyrl_mj.__file__).parents[1])},
+    )  # fmt: skip
+    first, *rest = done.stdout.splitlines()
+    assert says in first, done.stderr
+    assert rest == ["ended with 0", "(480, 640, 3)"], done.stderr
 
 
 @needs_gl

@@ -1,5 +1,10 @@
 """The plants are the paper's equations, and never take what they cannot digest."""
 
+import copy
+import os
+import pickle
+import signal
+
 import mujoco
 import numpy as np
 import pytest
@@ -9,6 +14,7 @@ from hyrl_mj import mjcf
 from hyrl_mj.errors import BadInput
 from hyrl_mj.plant import Plant, joint_columns
 from hyrl_mj.task_tests import random_inputs
+from hyrl_mj.tasks import get_task
 from hyrl_mj.tasks.vehicle import Vehicle
 
 PAIRS = 10_000
@@ -227,7 +233,7 @@ ROCKET = """
 
 @pytest.fixture
 def rocket(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo writes its log into the working directory
+    monkeypatch.chdir(tmp_path)
     path = tmp_path / "rocket.xml"
     path.write_text(ROCKET)
     return Plant(mjcf.load(path), ("thrust",), 3)
@@ -277,3 +283,63 @@ def test_the_task_follows_the_geometry_of_its_mjcf():
     assert task.chart.high == (3.0, 1.1)
     np.testing.assert_allclose(task.distance_to_go(np.array([[0.0, 0.0]])), [2.5])
     np.testing.assert_allclose(task.input_levels[:, 0], [-2, -1, 0, 1, 2])
+
+
+# ---- copies, and forked processes
+
+
+def in_its_middle(task, threads):
+    """Returns a plant in the middle of its episodes, and inputs that go on."""
+    rng = np.random.default_rng(0)
+    plant = task.plant(5, threads)
+    plant.set_state(*task.state(task.starts(5, rng), rng))
+    inputs = [random_inputs(task, 5, rng) for _ in range(10)]
+    for u in inputs:
+        plant.step(u)
+    return plant, inputs
+
+
+def gone_on(plant, inputs):
+    for u in inputs:
+        plant.step(u)
+    return plant.state
+
+
+@pytest.mark.parametrize("name", ["vehicle", "rover"])
+@pytest.mark.parametrize(
+    "copied",
+    [copy.deepcopy, lambda plant: pickle.loads(pickle.dumps(plant))],
+    ids=["copy", "pickle"],
+)
+def test_a_copy_goes_on_to_the_bit(name, copied):
+    plant, inputs = in_its_middle(get_task(name), 2)
+    twin = copied(plant)
+    np.testing.assert_array_equal(twin.measurement, plant.measurement)
+    before = plant.state
+    after = gone_on(twin, inputs)
+    np.testing.assert_array_equal(plant.state, before, "the copy has a memory of its own")
+    np.testing.assert_array_equal(gone_on(plant, inputs), after)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_forked_process_goes_on_to_the_bit_and_ends(task, threads):
+    plant, inputs = in_its_middle(task, threads)
+    reader, writer = os.pipe()
+    child = os.fork()
+    if not child:  # a process that hangs is ended by its alarm
+        signal.alarm(20)
+        os.write(writer, gone_on(plant, inputs).tobytes())
+        plant = None  # deletes what it may not delete
+        os._exit(0)
+    os.close(writer)
+    with os.fdopen(reader, "rb") as pipe:
+        told = pipe.read()
+    assert os.waitpid(child, 0)[1] == 0
+    assert told == gone_on(plant, inputs).tobytes()
+
+
+@pytest.mark.parametrize("n", [0, -1, 1.5, True, None])
+def test_a_number_of_copies_that_is_none_is_refused(vehicle, n):
+    with pytest.raises(BadInput, match=r"the number of copies of a robot .* from 1 to"):
+        vehicle.plant(n)

@@ -1,12 +1,17 @@
 """Training improves the policy in seconds, is reproducible, and leaves logs and checkpoints."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+import hyrl_mj
 from hyrl_mj import BadInput, MlpPolicy, Noise
 from hyrl_mj.envs.core import BatchedEnv, Domain
 from hyrl_mj.learning import training
@@ -102,6 +107,40 @@ def test_threads_of_the_physics_do_not_matter(task, quick, monkeypatch):
         monkeypatch.setattr(training, "BatchedEnv", partial(BatchedEnv, threads=threads))
         policies.append(training.train(task, quick, seed=4, ground=noisy))
     assert_same_weights(*policies)
+
+
+TRAINED = """
+import hashlib, sys
+from dataclasses import replace
+import hyrl_mj
+from hyrl_mj.learning import preset, training
+
+name, algorithm, samples = sys.argv[1:]
+task = hyrl_mj.get_task(name)
+settings = replace(preset(task, "smoke", algorithm=algorithm).stage1, samples=int(samples))
+policy = training.train(task, settings, seed=4)
+weights = b"".join(policy.weights[name].tobytes() for name in sorted(policy.weights))
+print(hashlib.sha256(weights).hexdigest())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "words",
+    [("unit_circle", "ppo", "4096"), ("vehicle", "dqn", "2600"), ("unit_circle", "sac", "1500")],
+    ids=["ppo", "dqn", "sac"],
+)
+def test_cores_do_not_matter(words):
+    def trained(threads):
+        env = {"PYTHONPATH": str(Path(hyrl_mj.__file__).parents[1]), "OMP_NUM_THREADS": threads}
+        return subprocess.run(
+            [sys.executable, "-c", TRAINED, *words],
+            env=os.environ | env,
+            capture_output=True,
+            check=True,
+        ).stdout
+
+    assert trained("1") == trained("2") == trained("4")
 
 
 @pytest.mark.parametrize("fails", [False, True])

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from functools import cached_property
 from itertools import compress
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import mujoco
 import numpy as np
@@ -72,6 +72,9 @@ class Task(ABC):
     def __repr__(self) -> str:
         coordinates, inputs = ", ".join(self.chart.names), ", ".join(self.inputs)
         return f"<Task {self.name}: chart ({coordinates}), inputs ({inputs})>"
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return self  # nothing writes to it
 
     @cached_property
     def model(self) -> mujoco.MjModel:

@@ -3,6 +3,7 @@
 import importlib.util
 import inspect
 import sys
+from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
@@ -192,7 +193,13 @@ def _from_file(path: Path) -> type[Task]:
                 f"{path} must define one task, a subclass of hyrl_mj.Task with a name: it has {names}"
             )
         _FILES[path] = register(tasks[0])
+        # Another process finds the class by its file, not by the name of the module here.
+        _FILES[path].__reduce__ = _by_reference  # type: ignore[assignment]
     return _FILES[path]
+
+
+def _by_reference(task: Task) -> tuple[Callable[[str], Task], tuple[str]]:
+    return get_task, (reference(task),)
 
 
 def _run(path: Path) -> ModuleType:
