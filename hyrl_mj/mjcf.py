@@ -6,6 +6,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from hyrl_mj import mujoco_log
 from hyrl_mj.errors import BadInput, unknown
 
 # The version of MuJoCo that computes wrong constraint forces where the Jacobian is sparse.
@@ -28,8 +29,10 @@ def load(path: Path) -> mujoco.MjModel:
     """
     if not path.is_file():
         raise BadInput(f"there is no MJCF model at {path}")
+    mujoco_log.install()
     try:
-        return mujoco.MjModel.from_xml_path(str(path))
+        with mujoco_log.kept():  # a check says in which element a number is wrong
+            return mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise BadInput(f"MuJoCo cannot compile {path}: {reason}") from error

@@ -65,6 +65,7 @@ MISTAKES = {
     "a state that is nan": ((PY, "return z, np.stack", "return z * np.nan, np.stack"), "qpos that is not"),
     "a state that is no pair": ((PY, "return z, np.stack", "return np.stack"), "give a tuple"),
     "a miss that is nan": ((PY, r"np\.abs\(z\[:, 1\]\)", "np.nan * z[:, 1]"), r"miss\(\) gives nan at x"),
+    "misses that are complex": ((PY, r"np\.abs\(z\[:, 1\]\)", "z[:, 1] + 1j"), "array of real numbers"),
     "misses in columns": ((PY, r"np\.abs\(z\[:, 1\]\)", "np.abs(z)"), r"miss\(\) .*shape \(\d+, 2\)"),
     "one danger for all": ((PY, r"return -self\.clearance\(measured\)", "return 1.0"), r"danger\(\).*float"),
     "a sample of too many steps": ((XML, 'data="0.05"', 'data="100"'), "10,000 physics steps.*5,000"),

@@ -105,6 +105,10 @@ def _check_result(task: Task, name: str, args: tuple[Any, ...], result: Any) -> 
         raise BadInput(
             f"{name}() of the task {task.name} gives {given} for {n} row(s): give an array of shape {shape}"
         )
+    if result.dtype.kind not in "biuf":
+        raise BadInput(
+            f"{name}() of the task {task.name} gives {result.dtype}: give an array of real numbers"
+        )
     if name in OUTCOMES and n and not _are_outcomes(result):
         raise BadInput(
             f"{name}() of the task {task.name} gives {result.dtype} from {result.min()} to "

@@ -5,8 +5,11 @@ As a program it is `hyrl-mj` with such runs, for surroundings that only a new pr
     python scripts/attacks/small.py run unit_circle --preset smoke
 """
 
+import os
+import pwd
 from dataclasses import replace
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import hyrl_mj.learning.settings as settings
@@ -18,6 +21,8 @@ from hyrl_mj.viz.figures import FIGURES
 
 SIZE, FPS, LATTICE = (480, 160), 2, 240
 KEPT = {"policy", "robustness_curve"}  # of the figures
+# Set where the program has to run without the rights of root, in a folder that cannot be written.
+NOBODY = "ATTACK_AS_NOBODY"
 # What commands import when they need it.
 LATE = (
     "hyrl_mj.export",
@@ -57,6 +62,15 @@ def shorten() -> None:
     replay.render_replay = render_small
 
 
+def become_nobody() -> None:
+    """Gives up the rights of root, who may write everywhere."""
+    if os.getuid() == 0:
+        os.setuid(pwd.getpwnam("nobody").pw_uid)
+
+
 if __name__ == "__main__":
     shorten()
+    if os.environ.get(NOBODY):
+        Path().chmod(0o555)
+        become_nobody()
     cli.main()

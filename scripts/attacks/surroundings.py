@@ -1,7 +1,6 @@
 """Bad surroundings, each pair of them: training must not suffer, and a sentence says what is missing."""
 
 import os
-import pwd
 import resource
 import subprocess
 import sys
@@ -64,11 +63,8 @@ def full_disk() -> None:
 
 def read_only() -> None:
     """Nothing but temporary files can be written; root may write everywhere, and so becomes nobody."""
-    Path(TASK).mkdir()
-    Path(TASK).chmod(0o555)
     Path().chmod(0o555)
-    if os.getuid() == 0:
-        os.setuid(pwd.getpwnam("nobody").pw_uid)
+    small.become_nobody()
 
 
 def closed(fd: int) -> None:
@@ -116,8 +112,6 @@ def _attempt(material: Material, pair: tuple[str, ...], ffmpeg: str, folder: Pat
     broke = _judged(pair, answer) or _harmed(material, pair, folder)
     if broke:
         return broke
-    if "a read-only folder" in pair:
-        (folder / TASK).chmod(0o755)
     resumed = child(command(*RUN), folder)
     if broke := resumed.broke(ended=(0, 1)):
         return f"resumed: {broke}"
@@ -128,9 +122,13 @@ def _attempt(material: Material, pair: tuple[str, ...], ffmpeg: str, folder: Pat
 def _run(pair: tuple[str, ...]) -> None:
     """Sets the surroundings of this process, and runs."""
     # A read-only folder comes last: other surroundings write into it.
-    for name in sorted(pair, key=lambda name: name in ("a read-only folder", *DISK)):
-        CONDITIONS[name]()
-    if not FRESH & set(pair):
+    fresh = bool(FRESH & set(pair))
+    for name in sorted(pair, key=lambda name: name in DISK):
+        if fresh and name == "a read-only folder":
+            os.environ[small.NOBODY] = "yes"  # nobody may not read Python itself
+        else:
+            CONDITIONS[name]()
+    if not fresh:
         command(*RUN)()
         return
     words = [sys.executable, str(Path(small.__file__)), *RUN]
