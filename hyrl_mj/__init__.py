@@ -37,6 +37,7 @@ from hyrl_mj.stages import (
     make_partition,
 )
 from hyrl_mj.tasks import Learning, Mirror, Outcome, Scene, Task, get_task, register, task_names
+from hyrl_mj.verdict import Verdict
 
 __version__ = "0.1.0"
 __all__ = [
@@ -71,6 +72,7 @@ __all__ = [
     "Signal",
     "StateSet",
     "Task",
+    "Verdict",
     "closed_loop",
     "diagnose",
     "export_numpy",

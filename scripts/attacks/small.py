@@ -30,7 +30,6 @@ LATE = (
     "hyrl_mj.viz.diagnosis",
     "hyrl_mj.viz.report",
     "imageio_ffmpeg",
-    "mediapy",
     "pydantic",
     "stable_baselines3",
     "tensorboard",
