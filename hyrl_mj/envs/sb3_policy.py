@@ -24,6 +24,13 @@ class Sb3Policy:
     task: Task
     controller: Controller | Policy
 
+    def __post_init__(self) -> None:
+        if memory := getattr(as_controller(self.controller), "memory", 0):
+            raise BadInput(
+                f"the policy remembers {memory} measurements, and SB3 only passes on its mode: use "
+                "hyrl_mj.simulate or closed_loop, where it has its memory"
+            )
+
     def predict(
         self,
         observation: ArrayLike,
