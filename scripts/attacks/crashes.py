@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from random import Random
@@ -13,48 +13,44 @@ from attacks.material import RUN, TASK, Material
 from hyrl_mj import artifacts
 
 HORIZON = ("--horizon", "0.3")
-# Names of the copies, as "017_before_policy.json".
-COPIES = "{count:03}_{when}_{name}"
+# The commands that crash, by what they make; all but the first change a finished run.
+COMMANDS: dict[str, tuple[str, ...]] = {
+    "a run": RUN,
+    "a new horizon": ("extended-sets", TASK, *HORIZON),
+    "another examination": ("robustness", TASK, "--eps", "0.3"),
+}
+# Fewer trials than this are made with one of the commands.
+FEW = 20
 
 
 def trials(material: Material, draw: Random, count: int) -> list[Trial]:
-    """Returns a trial for each crash of three commands, or some of them."""
-    # The trials run side by side: what they compare with is made before.
-    material.finished()
-    material.finished(*HORIZON)
-    examined(material)
-    every = [
-        *_of_command(material, "a run", RUN, start=False, expected=_usual),
-        *_of_command(
-            material, "a new horizon", ("extended-sets", TASK, *HORIZON), True, _of_its_horizon
-        ),
-        *_of_command(
-            material, "another examination", ("robustness", TASK, "--eps", "0.3"), True, _examined
-        ),
-        Trial("a replay that fails after the sets changed", partial(_no_old_video, material)),
-    ]
+    """Returns a trial for each crash, or some of them."""
+    commands = [*COMMANDS] if count >= FEW else draw.sample([*COMMANDS], 1)
+    every = [Trial("a replay that fails after the sets changed", partial(_no_old_video, material))]
+    for what in commands:
+        # The trials run side by side: what they compare with is made before.
+        finished = {(): [material.finished()]}
+        if what == "a new horizon":
+            finished[HORIZON] = [material.finished(*HORIZON)]
+        elif what == "another examination":
+            finished[()].append(_examined(material))
+        every += [
+            Trial(f"{what}, crashed at {copy.name}", partial(_resumed, copy, finished))
+            for copy in _copies(material, what)
+        ]
     return every if count >= len(every) else draw.sample(every, count)
 
 
-Expected = Callable[[Material, Path], Iterator[Path]]
-
-
-def _of_command(
-    material: Material, what: str, words: tuple[str, ...], start: bool, expected: Expected
-) -> list[Trial]:
-    """Returns the trials of the crashes of one command, on nothing or (`start`) on a finished run."""
+def _copies(material: Material, what: str) -> list[Path]:
+    """Gives a command, and returns copies of what is on disk before and after every rename."""
     folder = material.folder / what.replace(" ", "_")
     folder.mkdir()
-    if start:
+    if COMMANDS[what] != RUN:
         material.copy(folder)
-    answer = child(lambda: _recorded(words, folder), folder, seconds=300)
+    answer = child(lambda: _recorded(COMMANDS[what], folder), folder, seconds=300)
     if broke := answer.broke(ended=(0, 1)):
-        raise SystemExit(f"hyrl-mj {' '.join(words)}: {broke}")
-    copies = sorted((folder / "copies").iterdir())
-    return [
-        Trial(f"{what}, crashed at {copy.name}", partial(_resumed, material, copy, expected))
-        for copy in copies
-    ]
+        raise SystemExit(f"hyrl-mj {' '.join(COMMANDS[what])}: {broke}")
+    return sorted((folder / "copies").iterdir())
 
 
 def _recorded(words: tuple[str, ...], folder: Path) -> None:
@@ -64,7 +60,7 @@ def _recorded(words: tuple[str, ...], folder: Path) -> None:
     def copied(when: str, path: Path) -> None:
         nonlocal count
         if (folder / TASK).is_dir():
-            name = COPIES.format(count=count, when=when, name=path.name)
+            name = f"{count:03}_{when}_{path.name}"
             logs = shutil.ignore_patterns("logs")
             shutil.copytree(folder / TASK, folder / "copies" / name / TASK, ignore=logs)
             count += 1
@@ -88,43 +84,24 @@ def _recorded(words: tuple[str, ...], folder: Path) -> None:
     command(*words)()
 
 
-def _resumed(material: Material, copy: Path, expected: Expected, folder: Path) -> str:
-    """Resumes a run where it crashed, and compares it with those that it may become."""
+def _resumed(copy: Path, finished: dict[tuple[str, ...], list[Path]], folder: Path) -> str:
+    """Resumes a run where it crashed, and compares it with those that it may become, by its options."""
     path = Path(shutil.copytree(copy / TASK, folder / TASK))
-    horizon = _horizon(path)
-    answer = child(command(*RUN, *horizon), folder)
+    config = path / "config.json"
+    options = HORIZON if config.exists() and '"horizon": 0.3' in config.read_text() else ()
+    answer = child(command(*RUN, *options), folder)
     if broke := answer.broke(ended=(0, 1)):
         return broke
-    wrong = [differences(path, other) for other in expected(material, path)]
+    wrong = [differences(path, other) for other in finished[options]]
     return "" if "" in wrong else f"not as an uninterrupted run: {min(wrong, key=len)}"
 
 
-def _horizon(path: Path) -> tuple[str, ...]:
-    """Returns the options that config.json calls for."""
-    config = path / "config.json"
-    return HORIZON if config.exists() and '"horizon": 0.3' in config.read_text() else ()
-
-
-def _usual(material: Material, path: Path) -> Iterator[Path]:
-    yield material.finished()
-
-
-def _of_its_horizon(material: Material, path: Path) -> Iterator[Path]:
-    yield material.finished(*_horizon(path))
-
-
-def _examined(material: Material, path: Path) -> Iterator[Path]:
-    """Yields the runs with the usual examination, and with the other one."""
-    yield material.finished()
-    yield examined(material)
-
-
-def examined(material: Material) -> Path:
+def _examined(material: Material) -> Path:
     """Returns a finished run that was examined at another bound, and resumed."""
     folder = material.folder / "material_examined"
-    if not folder.exists():
-        material.copy(folder)
-        material.do(folder, [("robustness", TASK, "--eps", "0.3"), RUN])
+    folder.mkdir()
+    material.copy(folder)
+    material.do(folder, [COMMANDS["another examination"], RUN])
     return folder / TASK
 
 

@@ -24,7 +24,7 @@ TRAINED = ("policy.safetensors", "mode_0.safetensors", "mode_1.safetensors", "ro
 def trials(material: Material, draw: Random, count: int) -> list[Trial]:
     """Returns a trial for each pair, or some of them."""
     material.finished()
-    pairs = list(combinations(CONDITIONS, 2))
+    pairs = [pair for pair in combinations(CONDITIONS, 2) if set(pair) != {"no GL", "broken GL"}]
     pairs = pairs if count >= len(pairs) else draw.sample(pairs, count)
     return [
         Trial(
@@ -39,13 +39,16 @@ def trials(material: Material, draw: Random, count: int) -> list[Trial]:
 
 
 def no_gl() -> None:
-    os.environ["MUJOCO_GL"] = "osmesa"
+    """EGL finds no driver, so that MuJoCo cannot even be imported with it."""
+    os.environ |= {"MUJOCO_GL": "egl", "__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent.json"}
     os.environ.pop("PYOPENGL_PLATFORM", None)  # MuJoCo has set it
 
 
 def broken_gl() -> None:
-    """EGL is there, and finds no driver."""
-    os.environ["__EGL_VENDOR_LIBRARY_FILENAMES"] = "/nonexistent.json"
+    """MuJoCo is imported, but there is no display to draw on."""
+    os.environ["MUJOCO_GL"] = "glfw"
+    for name in ("PYOPENGL_PLATFORM", "DISPLAY", "WAYLAND_DISPLAY"):
+        os.environ.pop(name, None)
 
 
 def no_ffmpeg() -> None:
@@ -97,7 +100,7 @@ CONDITIONS: dict[str, Callable[[], None]] = {
     "COLUMNS=1": narrow,
 }
 # What a process only learns when it starts.
-FRESH = {"no GL", "an ASCII locale"}
+FRESH = {"no GL", "broken GL", "an ASCII locale"}
 DISK = {"a full disk", "a read-only folder"}
 NO_VIDEO = {name for name in CONDITIONS if "GL" in name or "ffmpeg" in name}
 
