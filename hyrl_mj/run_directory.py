@@ -31,7 +31,15 @@ from hyrl_mj.tasks import Task, described_task, get_task, reference
 from hyrl_mj.verdict import Verdict
 
 # The packages whose versions `config.json` records.
-PACKAGES = ("hyrl-mj", "mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "imageio-ffmpeg")
+PACKAGES = (
+    "hyrl-mj",
+    "mujoco",
+    "gymnasium",
+    "stable-baselines3",
+    "torch",
+    "numpy",
+    "imageio-ffmpeg",
+)
 
 
 @dataclass(frozen=True)

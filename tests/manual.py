@@ -83,7 +83,8 @@ def call(words: list[str]) -> None:
     try:
         cli.main()
     except SystemExit as end:
-        if end.code:
+        # Status 1 of a short training is its verdict, FAILED.
+        if end.code and not (end.code == 1 and words[0] in TRAINING):
             raise AssertionError(f"hyrl-mj {shlex.join(words)}: status {end.code}") from end
 
 

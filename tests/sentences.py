@@ -1,6 +1,13 @@
 """What every sentence about a mistake must be."""
 
 
+def assert_has_ended(process):
+    """A whole run has ended by its verdict: FAILED has exit status 1, as most runs of preset smoke."""
+    failed = "\nFAILED: " in process.stdout
+    assert process.returncode == int(failed), process.stdout + process.stderr
+    assert "Traceback" not in process.stderr
+
+
 def assert_one_sentence_about(error, path):
     text = str(error.value)
     assert str(path) in text

@@ -12,6 +12,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gl import needs_gl
+from sentences import assert_has_ended
 
 import hyrl_mj
 from hyrl_mj import BadInput, Outcome
@@ -141,7 +142,7 @@ def command(*arguments, cwd, path=()):
 def test_a_robot_from_its_own_folder_goes_through_the_whole_pipeline(wasp, tmp_path):
     assert len(WASP_PY.strip().splitlines()) <= 90
     done = command("run", os.path.relpath(wasp, tmp_path), "--preset", "smoke", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    assert_has_ended(done)
     out = tmp_path / "runs" / "wasp"
     assert (out / "replay.mp4").stat().st_size > 10_000
     assert (out / "report.html").is_file()

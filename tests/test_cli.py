@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from gl import needs_gl
 from PIL import Image
+from sentences import assert_has_ended
 
 import hyrl_mj
 from hyrl_mj import cli
@@ -39,7 +40,7 @@ def finished(tmp_path_factory):
     """A whole run of the unit circle in the smoke preset, made by the command line."""
     path = tmp_path_factory.mktemp("runs") / "circle"
     done = call("run", "unit_circle", "--preset", "smoke", "--out", path)
-    assert done.returncode == 0, done.stderr
+    assert_has_ended(done)
     return path, done.stdout
 
 
@@ -84,7 +85,7 @@ def test_run_renders_the_replay(finished):
 def test_run_again_does_nothing_again(finished):
     before = contents(finished[0])
     again = call("run", "unit_circle", "--preset", "smoke", "--out", finished[0])
-    assert again.returncode == 0
+    assert_has_ended(again)
     assert again.stdout.count("done before") == len(STAGES)
     assert contents(finished[0]) == before
 
@@ -114,7 +115,7 @@ def test_a_new_horizon_is_used_and_kept(copied):
 def test_a_stage_that_was_cut_off_is_not_done(name, copied):
     (copied / name).unlink()
     again = call("run", "unit_circle", "--preset", "smoke", "--out", copied)
-    assert again.returncode == 0, again.stderr
+    assert_has_ended(again)
     stage = "retrain" if name.startswith("mode") else "simulate"
     assert f"{stage}: done before" not in again.stdout
     assert (copied / name).is_file()
@@ -127,7 +128,7 @@ def test_a_run_without_a_critical_set_has_one_mode_and_leaves_nothing_of_two(cop
     with run.stage("critical-set"):
         none.save(copied / "critical_set.npz")
     again = call("run", "unit_circle", "--preset", "smoke", "--out", copied)
-    assert again.returncode == 0, again.stderr
+    assert_has_ended(again)
     assert "no critical set found" in again.stdout
     assert "extended set everything" in again.stdout
     assert "of 5 of the paper's starts" in again.stdout
@@ -384,7 +385,7 @@ def test_without_gl_the_run_is_whole_and_says_why_there_is_no_video(copied):
         text=True,
         env={**os.environ, "MUJOCO_GL": "disable"},
     )
-    assert process.returncode == 0, process.stderr
+    assert_has_ended(process)
     assert "no video: " in process.stdout
     assert "apt-get install libegl1" in process.stdout
     assert "Traceback" not in process.stderr

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from gl import needs_gl
 from manual import LANGUAGES, PAGES, ROOT, SHORTER, blocks
+from sentences import assert_has_ended
 
 import hyrl_mj
 from hyrl_mj import cli
@@ -38,7 +39,7 @@ def call(*words, cwd, timeout=300):
         [sys.executable, *map(str, words)], cwd=cwd, env=os.environ | {"PYTHONPATH": path},
         capture_output=True, text=True, timeout=timeout,
     )  # fmt: skip
-    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    assert_has_ended(done)
     return done.stdout
 
 
