@@ -82,12 +82,12 @@ def twin_moves(lattice, controller, bound):
     return moves
 
 
-def twin_values(lattice, moves, rows):
-    """The game's value, layer by layer: what fails, or must have arrived, in k samples."""
+def twin_values(lattice, moves, rows, most=None):
+    """The game's value, layer by layer: what fails, or must have arrived, in k samples, at most `most`."""
     value = np.full((rows, lattice.places), NEVER)
     value[:, [*np.flatnonzero(lattice.failed), lattice.nodes + 1]] = LOST
     value[:, [*np.flatnonzero(lattice.arrived), lattice.nodes]] = 0
-    for k in count(1):
+    for k in count(1) if most is None else range(1, most + 1):
         lost = {s: LOST - k for s in moves if any(value[t] > NEVER for t in moves[s])}
         won = {s: k for s in moves if all(value[t] < NEVER for t in moves[s])}
         new = {s: v for s, v in (lost | won).items() if value[s] == NEVER}
@@ -95,6 +95,7 @@ def twin_values(lattice, moves, rows):
             return value
         for state, found in new.items():
             value[state] = found
+    return value
 
 
 def renamed(controller):
@@ -134,6 +135,11 @@ def test_the_game_is_its_slow_twin(vehicle, circle, name, counts, controller, bo
     assert moves.rows == len(loop.modes) + 1
     value = solve(moves)
     np.testing.assert_array_equal(value, twin_values(lattice, plain, moves.rows))
+    for most in (0, 1, 25):  # an episode's time
+        short = solve(moves, most)
+        np.testing.assert_array_equal(short, twin_values(lattice, plain, moves.rows, most))
+        within = (value <= most) | (value >= LOST - most)
+        np.testing.assert_array_equal(short, np.where(within, value, NEVER))
     assert len(np.unique(value)) > 10
     targets = np.split(moves.target, moves.counts.cumsum()[:-1])
     for state, target in zip(moves.state[::7], targets[::7], strict=True):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from planted import (
+    ChartPolicy,
     circle_controller,
     circle_policy,
     decisions,
@@ -129,6 +130,48 @@ def test_noise_beyond_what_was_prepared_is_refused(on_vehicle):
 def test_a_game_under_noise_that_hides_everything_is_refused(vehicle):
     with pytest.raises(BadInput, match=r"noise bound 1.5 hides the whole state space of vehicle"):
         Game(vehicle, halves(vehicle, 60), {}, 1.5)
+
+
+# ---- the time of an episode
+
+
+def test_won_is_what_arrives_before_the_episode_ends(circle):
+    def quarter(z):
+        return np.where(circle.chart.wrap(z) < PI, -0.25, 0.25)  # it takes 11 s for the longest way
+
+    loop = {"slow": PolicyController(ChartPolicy(circle, quarter))}
+    grid = Grid.with_cells(circle.chart, 503)  # a sample leads from node to node
+    game = Game(circle, halves(circle), loop, 0.1, grid=grid)
+    arcs = simulate(circle, loop["slow"], grid.nodes)
+    reached = np.array([arc.outcome == "reached" for arc in arcs])
+    assert 0.6 < reached.mean() < 0.8
+    value = game.value("slow", 0.0)[-1, :-2]
+    assert np.count_nonzero((value < NEVER) != reached) <= 2, "but for the border"
+    assert value[value < NEVER].max() == circle.max_steps
+    score = game.score("slow", 0.0)
+    assert score.won == score.won_any == pytest.approx(reached.mean(), abs=3 / len(reached))
+    assert score.time == score.time_any == circle.max_steps * circle.dt
+    np.testing.assert_array_equal(game.map("slow", 0.0) == WON, value < NEVER)
+    assert (game.map("slow", 0.0) == BEATEN).any(), "faster controllers arrive"
+    assert game.margin("slow") is None
+    named = {"policy": loop["slow"], "hyrl": loop["slow"]}
+    result, maps = examine(circle, np.empty((0, 1)), halves(circle), named, (0.0, 0.1), cells=503)
+    assert result.curve.wins["hyrl"].won[0] == score.won
+    assert (maps.map["hyrl"] == WON).mean() == result.scores["hyrl"][-1].won
+
+
+def test_what_nobody_reaches_in_time_is_not_winnable(circle):
+    class Hurried(type(circle)):
+        max_steps = 20  # 1 s, for up to 3.14 rad at 1 rad/s
+
+    task = Hurried()
+    loop = {"sign": PolicyController(circle_policy(task))}
+    game = Game(task, halves(task), loop, 0.1, grid=Grid.with_cells(task.chart, EXACT))
+    score, off = game.score("sign", 0.0), np.abs(task.error(game.lattice.grid.nodes))
+    assert score.winnable == pytest.approx((off <= 1.3).mean(), abs=0.01)
+    assert score.won == 1.0
+    assert game.score(LIMIT, 0.1).won == 1.0
+    assert game.map("sign", 0.1)[game.lattice.grid.nearest(np.array([[PI]]))[0]] == UNWINNABLE
 
 
 # ---- margins
