@@ -58,19 +58,34 @@ def open_zip(file: IO[bytes]) -> Iterator[ZipFile]:
         yield opened
 
 
-def read_member(file: ZipFile, name: str, limit: int) -> bytes:
-    """Returns the content of a member of a zip, if it is no longer than the limit [bytes].
+class _Limited(io.RawIOBase):
+    """A member of a zip of which no more is read than a limit, whatever its directory says."""
 
-    The sizes in the directory of the zip may be wrong, so only a little is unpacked at a time.
-    """
-    parts, size = [], 0
-    with file.open(name) as member:
-        while part := member.read(2**16):
-            parts.append(part)
-            size += len(part)
-            if size > limit:
-                raise BadArtifact(f"its {name} unpacks to more than {limit / 2**20:g} MiB")
-    return b"".join(parts)
+    def __init__(self, file: ZipFile, name: str, limit: int):
+        self._name, self._limit = name, limit
+        self._file, self.left = file.open(name), limit
+
+    def read(self, size: int | None = -1) -> bytes:
+        most = self.left + 1 if size is None or size < 0 else min(size, self.left + 1)
+        content = self._file.read(min(most, 2**16))
+        self.left -= len(content)
+        if self.left < 0:
+            limit = f"{self._limit / 2**20:g} MiB"
+            raise BadArtifact(f"its {self._name} unpacks to more than {limit}")
+        return content
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
+def read_member(file: ZipFile, name: str, limit: int) -> bytes:
+    """Returns the content of a member of a zip, if it is no longer than the limit [bytes]."""
+    content = bytearray()
+    with _Limited(file, name, limit) as member:
+        while part := member.read():
+            content += part
+    return bytes(content)
 
 
 def read_npz(path: Path, limit: int) -> dict[str, np.ndarray]:
@@ -78,7 +93,7 @@ def read_npz(path: Path, limit: int) -> dict[str, np.ndarray]:
     content = {}
     with open_zip(path.open("rb")) as file:
         for name in file.namelist():
-            member = read_member(file, name, limit)
-            limit -= len(member)
-            content[name.removesuffix(".npy")] = np.lib.format.read_array(io.BytesIO(member))
+            with _Limited(file, name, limit) as member:
+                content[name.removesuffix(".npy")] = np.lib.format.read_array(member)
+                limit = member.left
     return content

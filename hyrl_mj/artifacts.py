@@ -33,7 +33,9 @@ REMEDY = "run the stage that writes it again"
 
 
 # Limits on what is read [bytes], so that a crafted file cannot fill the memory.
-LARGEST_JSON, LARGEST = 2**24, 2**27
+LARGEST_JSON, LARGEST = 2**22, 2**27
+# Of a file of tensors, and of the names and shapes at its beginning.
+LARGEST_TENSORS, LARGEST_NAMES = 2**25 + 2**20, 2**20
 # The names of temporary files, which only a process that was killed leaves behind.
 TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.partial(\.\w+)?")
 # Called with each path before `replacing` writes it.
@@ -318,4 +320,7 @@ def write_tensors(path: Path, tensors: dict[str, np.ndarray]) -> None:
 def read_tensors(path: Path) -> dict[str, np.ndarray]:
     """Returns the tensors that `write_tensors` wrote."""
     with reading(path):
-        return load(read_limited(path))
+        content = read_limited(path, LARGEST_TENSORS)
+        if int.from_bytes(content[:8], "little") > LARGEST_NAMES:
+            raise BadArtifact(f"its names take more than {LARGEST_NAMES / 2**20:g} MiB")
+        return load(content)

@@ -25,7 +25,7 @@ from test_agents import (
 )
 
 import hyrl_mj
-from hyrl_mj import BadArtifact, load_agent
+from hyrl_mj import BadArtifact, artifacts, load_agent
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.envs.sb3_env import TaskVecEnv
 from hyrl_mj.policies import pickled, sb3_zip, torch_file
@@ -376,3 +376,70 @@ def test_limits_leave_room_for_large_mlps(circle, tmp_path):
     load_agent(path, circle)
     assert torch_file.LARGEST <= 2**25
     assert sb3_zip.LARGEST_METADATA <= 2**22
+
+
+# ---- safetensors
+
+
+def described(folder, header, data=b"", **about):
+    """A `.safetensors` file with a header, and its description beside it."""
+    text = header if isinstance(header, bytes) else json.dumps(header).encode()
+    (folder / "p.safetensors").write_bytes(struct.pack("<Q", len(text)) + text + data)
+    about = {"task": "unit_circle", "algorithm": "ppo", "activation": "tanh", **about}
+    artifacts.write_json(folder / "p.json", about, kind="policy")
+    return folder / "p.safetensors"
+
+
+def tensor(shape, start, end):
+    return {"dtype": "F32", "shape": shape, "data_offsets": [start, end]}
+
+
+@pytest.mark.parametrize(
+    ("header", "data", "message"),
+    [
+        ({f"t{i}": tensor([0], 0, 0) for i in range(30_000)}, b"", "names take more than 1 MiB"),
+        ({"a": tensor([2**40, 2**40], 0, 4)}, bytes(4), "cannot be read"),
+        ({"a": tensor([1] * 10_000, 0, 4)}, bytes(4), "cannot be read"),
+        ({f"t{i}": tensor([2], 0, 8) for i in range(9)}, bytes(8), "cannot be read"),
+        ({}, bytes(2**25 + 2**20), "larger than 33 MiB"),
+        (b'{"a":' + b"[" * 10**5, b"", "cannot be read"),
+    ],
+    ids=["many", "shape", "dimensions", "overlap", "large", "depth"],
+)
+def test_absurd_safetensors_are_refused(header, data, message, circle, tmp_path):
+    refused(described(tmp_path, header, data), circle, message)
+
+
+def test_a_header_that_lies_about_its_length_is_refused(circle, tmp_path):
+    path = described(tmp_path, {})
+    for length in (2**63, 2**40, 2**21):
+        path.write_bytes(struct.pack("<Q", length) + b"{}")
+        refused(path, circle, "names take more than 1 MiB")
+
+
+def test_a_description_names_a_task_by_its_name_only(circle, tmp_path):
+    network = load_agent(saved(untrained(PPO, circle, net_arch=[8]), tmp_path), circle)
+    network.save(tmp_path / "p.safetensors")
+    (tmp_path / "evil.py").write_text(f"open({str(tmp_path / 'executed')!r}, 'w')\n")
+    for name in (
+        str(tmp_path / "evil.py"),
+        "evil.py",
+        "evil",
+        "os:system",
+        3,
+        None,
+        ["unit_circle"],
+    ):
+        about = {"task": name, "algorithm": "ppo", "activation": "tanh"}
+        artifacts.write_json(tmp_path / "p.json", about, kind="policy")
+        for task in (circle, None):
+            with pytest.raises(BadArtifact, match=r"p\.json"):
+                hyrl_mj.MlpPolicy.load(tmp_path / "p.safetensors", task)
+        with pytest.raises(BadArtifact, match=r"p\.json"):
+            load_agent(tmp_path / "p.safetensors", circle)
+    for algorithm in ("evil:X", "os:system"):
+        about = {"task": "unit_circle", "algorithm": algorithm, "activation": "tanh"}
+        artifacts.write_json(tmp_path / "p.json", about, kind="policy")
+        with pytest.raises(BadArtifact, match="algorithm '.*' of the policy is unknown"):
+            load_agent(tmp_path / "p.safetensors", circle)
+    assert not (tmp_path / "executed").exists()

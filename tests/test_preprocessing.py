@@ -13,6 +13,7 @@ import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, Noise, load_agent, simulate
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.envs.sb3_env import TaskVecEnv
+from hyrl_mj.envs.sb3_policy import Sb3Policy
 from hyrl_mj.policies import (
     MlpPolicy,
     PolicyController,
@@ -319,3 +320,11 @@ def test_a_module_that_does_not_fit_is_named(circle, vehicle):
             hyrl_mj.from_callable(network, circle).act(measured)
     with pytest.raises(BadInput, match=r"preferences of shape \(n, 5\)"):
         hyrl_mj.from_callable(module(3, 4), vehicle).act(np.zeros((4, 2)))
+
+
+def test_sb3s_evaluation_refuses_a_policy_with_memory(circle, tmp_path):
+    _, path, needs = agent(PPO, circle, tmp_path, WRAPPED["stacked"])
+    policy = load_agent(path, circle, **needs)
+    with pytest.raises(BadInput, match="remembers 2 measurements"):
+        Sb3Policy(circle, policy)
+    Sb3Policy(circle, as_function(policy))
