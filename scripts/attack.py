@@ -67,15 +67,15 @@ ATTACKS = {
     "crashes": Attack(
         "crashed before and after every rename, then resumed", crashes.trials, 10_000, 8
     ),
-    "kills": Attack("killed at a random moment, then resumed", kills.trials, 50, 3),
+    "kills": Attack("killed at a random moment, then resumed", kills.trials, 50, 2),
     "artifacts": Attack("truncated, or one bit flipped", damage.trials, 80, 8),
-    "received": Attack("crafted files of a stranger", received.trials, 10_000, 14),
+    "received": Attack("crafted files of a stranger", received.trials, 10_000, 12),
     "configurations": Attack(
         "one setting changed, through every stage", configurations.trials, 200, 20
     ),
     "tasks": Attack("task file or MJCF with one mistake", tasks.trials, 120, 8),
     "writers": Attack("two and four writers, and a reader", writers.trials, 20, 1),
-    "surroundings": Attack("each pair of bad surroundings", surroundings.trials, 10_000, 3),
+    "surroundings": Attack("each pair of bad surroundings", surroundings.trials, 10_000, 2),
 }
 
 # The trials that are under way, for the forked processes that make them.

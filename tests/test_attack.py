@@ -107,8 +107,8 @@ def test_memory_is_that_of_the_process(tmp_path):
 @pytest.mark.parametrize(
     ("err", "found"),
     [
-        ("hyrl-mj: one\nhyrl-mj: two\n", "not one sentence"),
-        ("", "not one sentence"),
+        ("hyrl-mj: one\nhyrl-mj: two\n", r"not 1 sentence"),
+        ("", r"not 1 sentence"),
         ("hyrl-mj: \x1b[31mred\n", "control characters"),
     ],
 )

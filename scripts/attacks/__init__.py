@@ -61,8 +61,13 @@ class Answer:
         """The sentence of the command line."""
         return " ".join(line for line in self.err.splitlines() if line.startswith("hyrl-mj: "))
 
-    def broke(self, ended: tuple[int, ...] = (0, 1, 2)) -> str:
-        """Returns what is wrong with the answer of the command line, "" if nothing is."""
+    def broke(self, ended: tuple[int, ...] = (0, 1, 2), sentences: int = 1) -> str:
+        """Returns what is wrong with the answer of the command line, "" if nothing is.
+
+        Args:
+            ended: the exit statuses that it may have.
+            sentences: what it says on standard error if the status is 2.
+        """
         text = self.out + self.err
         if self.late:
             return f"hangs: still running after {self.seconds[0]:.0f} s"
@@ -72,8 +77,8 @@ class Answer:
             return f"control characters reach the terminal: {text!r}"
         if self.status not in ended:
             return f"exit status {self.status}: {(self.err or self.out).strip()[-300:]!r}"
-        if self.status == 2 and len(self.err.strip().splitlines()) != 1:
-            return f"not one sentence, but {self.err.strip()[-600:]!r}"
+        if self.status == 2 and len(self.err.strip().splitlines()) != sentences:
+            return f"not {sentences} sentence(s), but {self.err.strip()[-600:]!r}"
         return ""
 
 

@@ -141,11 +141,13 @@ def _run(pair: tuple[str, ...]) -> None:
 def _judged(pair: tuple[str, ...], answer: Answer) -> str:
     """Returns what is wrong with the answer: it must say once what is missing, where it can be said."""
     failed = set(pair) & DISK
-    if broke := answer.broke(ended=(1, 2) if failed else (0, 1)):
-        return broke
     out, err = "closed stdout" not in pair, "closed stderr" not in pair
-    if failed and err and answer.err.count("hyrl-mj: ") != 1:
-        return f"not one sentence about the disk, but {answer.err!r}"
+    # Nothing can be said to nobody; that nothing could be shown is said, too.
+    sentences = (2 - out) * err
+    if broke := answer.broke((1, 2) if failed else (0, 1), sentences):
+        return broke
+    if failed and answer.err.count("hyrl-mj: ") != sentences:
+        return f"not {sentences} sentence(s) about the disk, but {answer.err!r}"
     if not failed and out and set(pair) & NO_VIDEO and answer.out.count("replay: no video") != 1:
         return f"not one sentence about the video, but {answer.out!r}"
     if "video at" in answer.out and set(pair) & NO_VIDEO:
