@@ -31,11 +31,15 @@ def load(path: Path) -> mujoco.MjModel:
         raise BadInput(f"there is no MJCF model at {path}")
     mujoco_log.install()
     try:
-        with mujoco_log.kept():  # a check says in which element a number is wrong
-            return mujoco.MjModel.from_xml_path(str(path))
+        with mujoco_log.kept() as warnings:
+            model = mujoco.MjModel.from_xml_path(str(path))
+            reason = next((text for text in warnings.values() if "NaN" in text), None)
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise BadInput(f"MuJoCo cannot compile {path}: {reason}") from error
+    if reason:
+        raise BadInput(f"{path} cannot be used: {reason}")
+    return model
 
 
 def object_id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:

@@ -69,7 +69,7 @@ MISTAKES = {
     "misses in columns": ((PY, r"np\.abs\(z\[:, 1\]\)", "np.abs(z)"), r"miss\(\) .*shape \(\d+, 2\)"),
     "one danger for all": ((PY, r"return -self\.clearance\(measured\)", "return 1.0"), r"danger\(\).*float"),
     "a sample of too many steps": ((XML, 'data="0.05"', 'data="100"'), "10,000 physics steps.*5,000"),
-    "a sample that is not a time": ((XML, 'data="0.05"', 'data="nan"'), "sample_time .*nan cannot be used"),
+    "a sample that is not a time": ((XML, 'data="0.05"', 'data="nan"'), "XML contains a 'NaN'"),
     "a timestep of zero": ((XML, 'timestep="0.01"', 'timestep="0"'), "timestep .*0.0 cannot be used"),
     "a reward below its bound": ((PY, "worst_reward = 0.0", "worst_reward = 2.5"), "worst_reward is 2.5"),
     "a bound that is nan": ((PY, "worst_reward = 0.0", "worst_reward = np.nan"), "worst_reward nan"),
@@ -90,6 +90,11 @@ MISTAKES = {
     ),
     "a gear too large": ((XML, 'kv="12"', 'kv="12" gear="1e12"'), "breaks down under"),
     "a body pushed apart": ((XML, 'gravity="0 0 0"', 'gravity="1e12 0 0"'), "breaks down under"),
+    "noise on nothing": ((PY, r"noisy = .*\n", "noisy = (0, 0, 0, 0)\n"), "a share > 0"),
+    "a mirror that is no symmetry": ((PY, r"\(1, -1, -1\)", "(1, 1, 1)"), "mirror is no symmetry of it"),
+    "an input without effect": ((XML, 'kv="12"', 'kv="0"'), "input lateral changes nothing"),
+    "a link too heavy": ((XML, 'mass="1"', 'mass="1e300"'), "input lateral changes nothing"),
+    "a mass that is nan": ((XML, 'mass="1"', 'mass="nan"'), "XML contains a 'NaN'"),
     "a sparse Jacobian": ((XML, "<option", '<option jacobian="sparse"'), r'4\.0\.0.*jacobian="dense"'),
 }  # fmt: skip
 

@@ -13,7 +13,7 @@ from hyrl_mj.ranges import Integer, Number, Optional, Rule, Several, Text
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.registry import check_current
-from hyrl_mj.tasks.trial import try_extreme, try_random
+from hyrl_mj.tasks.trial import try_extreme, try_inputs, try_mirror, try_random
 
 # Number of starts that are tried.
 STARTS = 64
@@ -92,7 +92,10 @@ def _check_parts(task: Task) -> None:
         )
     _check_scene(task)
     shares = [float(share) if isinstance(share, bool) else share for share in task.noisy]
-    Several(Number(0, 1e6), d, 1_000).checked("noisy", shares)
+    if not any(Several(Number(0, 1e6), d, 1_000).checked("noisy", shares)):
+        raise BadInput(
+            f"noisy is {task.noisy}: give a share > 0 of the noise bound for one column or more"
+        )
 
 
 def _check_scene(task: Task) -> None:
@@ -140,6 +143,9 @@ def _check_model(task: Task) -> None:
     # The replay needs both.
     mjcf.object_id(model, mujoco.mjtObj.mjOBJ_SITE, task.scene.tracked)
     mjcf.object_id(model, mujoco.mjtObj.mjOBJ_CAMERA, task.scene.camera)
+    for name in ("key_qpos", "key_qvel", "key_ctrl", "body_mass", "body_inertia"):
+        if not np.isfinite(getattr(model, name)).all():
+            raise BadInput(f"{name} in {path.name} has values that are not finite: give numbers")
     for name, value in (("timestep", model.opt.timestep), ("sample_time", task.dt)):
         Number(0, LONGEST, above=True).checked(f"{name} in {path.name}", value)
     steps = task.dt / model.opt.timestep
@@ -193,6 +199,8 @@ def _check_starts(task: Task) -> None:
 
 def _check_episodes(task: Task) -> None:
     ends = np.append(try_random(task), try_extreme(task))
+    try_inputs(task)
+    try_mirror(task)
     z = task.starts(STARTS, np.random.default_rng(0))
     arrived = task.arrived(z)
     # Where the end says which runs have arrived, any start may be as near to the set-point as they are.

@@ -21,6 +21,11 @@ STARTS, NODES = 32, 128
 # Corners of the input limits that are tried, at most.
 CORNERS = 16
 
+# Samples after which an input must have changed something.
+EFFECT = 10
+# How far mirrored observations may be off, as a share of their range after a sample.
+ALIKE = 0.01
+
 # Number of the sample -> inputs (n, m).
 Inputs = Callable[[int], np.ndarray]
 
@@ -60,6 +65,58 @@ def try_extreme(task: Task) -> np.ndarray:
     return _play(task, places[place], inputs, "extreme")
 
 
+def try_inputs(task: Task) -> None:
+    """Raises `BadInput` if one of the inputs changes nothing that is measured."""
+    low, high = task.input_limits
+    rng = np.random.default_rng(0)
+    z = task.starts(STARTS, rng)
+    for i, name in enumerate(task.inputs):
+        seen = []
+        for limit in (low, high):
+            plant, u = task.plant(STARTS), np.tile((low + high) / 2, (STARTS, 1))
+            u[:, i] = limit[i]
+            plant.set_state(*task.state(z))
+            with mujoco_log.kept():  # the episodes tell more
+                for _ in range(min(EFFECT, _samples(task))):
+                    plant.step(u)
+            seen.append(plant.measurement)
+        if (np.abs(seen[1] - seen[0]) <= 1e-9).all():
+            raise BadInput(
+                f"its input {name} changes nothing that is measured: name another one, or give its actuator "
+                f"in {task.model_path.name} some strength"
+            )
+
+
+def try_mirror(task: Task) -> None:
+    """Raises `BadInput` if mirrored states under mirrored inputs do not lead to mirrored observations.
+
+    That can be told of a task with `measured`, from states that the chart alone determines.
+    """
+    if task.mirror is None or type(task).measured is Task.measured:
+        return
+    rng, seen = np.random.default_rng(0), np.array(task.mirror.observation)
+    z = task.starts(STARTS, rng)
+    plant = task.plant(STARTS)
+    plant.set_state(*task.state(z))
+    image = task.z(task.measured(task.observation(plant.measurement) * seen))
+    u = rng.uniform(*task.input_limits, (STARTS, len(task.inputs)))
+    after = []
+    for points, inputs in ((z, u), (image, u * task.mirror.inputs)):
+        plant.set_state(*task.state(points))
+        with mujoco_log.kept():
+            plant.step(np.clip(inputs, *task.input_limits))
+        after.append(task.observation(plant.measurement))
+    scale = np.maximum(np.ptp(after[0], axis=0), 1e-3)
+    off = np.abs(after[1] - after[0] * seen) / scale
+    if off.max() > ALIKE:
+        row = int(off.max(axis=1).argmax())
+        raise BadInput(
+            f"mirror is no symmetry of it: a sample from {task.chart.format(z[row])} is observed as "
+            f"{np.round(after[0][row], 4).tolist()}, and its image as {np.round(after[1][row], 4).tolist()}; "
+            "change its signs, or give none"
+        )
+
+
 def _samples(task: Task) -> int:
     """Returns the number of samples of a tried episode."""
     substeps = task.dt / task.model.opt.timestep
@@ -74,11 +131,9 @@ def _side_by_side(task: Task) -> int:
 
 def _nodes(task: Task) -> np.ndarray:
     """Returns the nodes (k, d) of a coarse grid of the chart, at which episodes go on."""
-    cells = next(
-        c
-        for c in range(NODES, 0, -1)
-        if len(Grid.with_cells(task.chart, c).nodes) <= NODES or c == 1
-    )
+    cells = 1
+    while np.prod(Grid.with_cells(task.chart, cells + 1).counts) <= NODES:
+        cells += 1
     nodes = Grid.with_cells(task.chart, cells).nodes
     nodes = nodes[np.random.default_rng(0).permutation(len(nodes))[:NODES]]
     plant = task.plant(len(nodes))
