@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from hyrl_mj import BadArtifact, BadInput, artifacts
+from hyrl_mj import BadArtifact, BadInput, artifacts, manifest
 from hyrl_mj.manifest import FILES, LOCK, NAME, Manifest, check_contents, locked
 
 SETTINGS = dict.fromkeys(FILES, "these")
@@ -193,3 +193,63 @@ def test_a_link_in_a_run_directory_is_refused(name, folder, tmp_path_factory):
     (folder / name).symlink_to(victim)
     with pytest.raises(BadArtifact, match=re.escape(f"{folder / name} is a link")):
         check_contents(folder)
+
+
+def test_a_lock_that_is_a_second_name_of_a_file_is_refused(tmp_path):
+    (tmp_path / "victim").write_text("mine")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / LOCK).hardlink_to(tmp_path / "victim")
+    with pytest.raises(BadArtifact, match=r"\.lock is a link"), locked(tmp_path / "run"):
+        pass
+    assert (tmp_path / "victim").read_text() == "mine"
+
+
+def test_folders_far_within_each_other_are_refused(tmp_path):
+    (tmp_path / "/".join("d" * 8)).mkdir(parents=True)
+    check_contents(tmp_path)
+    (tmp_path / "/".join("d" * 9)).mkdir()
+    with pytest.raises(BadArtifact, match="more than 8 folders within each other"):
+        check_contents(tmp_path)
+
+
+# ---- sizes
+
+
+def test_a_huge_file_is_not_read(folder):
+    with (folder / "critical_set.npz").open("wb") as file:
+        file.truncate(2**40)
+    with pytest.raises(BadArtifact, match=r"critical_set.npz is larger than \d+ MiB"):
+        Manifest(folder, SETTINGS).checked(folder / "critical_set.npz")
+    with (folder / NAME).open("wb") as file:
+        file.truncate(2**40)
+    with pytest.raises(BadArtifact, match=r"manifest.json is larger than any manifest: remove it"):
+        Manifest(folder, SETTINGS).is_done("train", "")
+
+
+# ---- order, and readers beside writers
+
+
+def test_the_same_stages_in_another_order_are_the_same_bytes(folder):
+    before = (folder / NAME).read_bytes()
+    write(folder, "train", "policy.json", "a")
+    assert (folder / NAME).read_bytes() == before
+
+
+@pytest.mark.parametrize("text", ["a", "other"])
+def test_a_reader_beside_a_writer_calls_no_file_damaged(text, folder, monkeypatch):
+    usual = manifest.digest
+
+    def written_meanwhile(*paths):
+        """A stage runs between the look into the manifest and the look into the file."""
+        monkeypatch.setattr(manifest, "digest", usual)
+        write(folder, "train", "policy.json", text)
+        return usual(*paths)
+
+    monkeypatch.setattr(manifest, "digest", written_meanwhile)
+    path = folder / "policy.json"
+    assert Manifest(folder, SETTINGS).checked(path) == path
+
+
+def test_a_file_that_nothing_vouches_for_is_not_believed(folder):
+    with pytest.raises(BadArtifact, match=r"notes.npz is no file that a run writes"):
+        Manifest(folder, SETTINGS).checked(folder / "arcs" / "notes.npz")

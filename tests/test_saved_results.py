@@ -7,6 +7,7 @@ from sentences import assert_one_sentence_about
 from hyrl_mj import BadArtifact, BadInput, CriticalSet, artifacts
 from hyrl_mj.game import Maps
 from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.simulation import HybridArc
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
 
@@ -134,3 +135,35 @@ def test_results_describe_themselves_in_a_line(grid_set):
     nowhere = np.empty((0, 2)), np.empty(0)
     sets = ExtendedSets((0,), (grid_set,), (grid_set.mask,), 0.3, 0.1, *nowhere)
     assert repr(sets) == "ExtendedSets(0: 53.8% of the chart, eps 0.1)"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"t": np.array(["a", "b"])},
+        {"t": np.array([0.0, np.nan])},
+        {"t": np.zeros(0)},
+        {"z": np.zeros((3, 1))},
+        {"z": np.zeros(2)},
+        {"q": np.array([0.5, 0.5])},
+        {"u": np.full((2, 1), "a")},
+    ],
+)
+def test_arrays_that_make_no_arc_are_refused(change, tmp_path):
+    table = np.zeros((2, 1))
+    parts = {"t": np.zeros(2), "j": np.zeros(2, int), "q": np.zeros(2, int)}
+    parts |= {"z": table, "measured": table, "u": table, "state": table}
+    texts = {"task": "vehicle", "controller": "policy", "outcome": "reached", "noise": "none"}
+    whole = HybridArc(**parts, **texts, bound=0.0)
+    assert whole.columns == (1, 1, 1)
+    artifacts.write_arrays(tmp_path / "a.npz", vars(whole) | change, HybridArc.KIND)
+    with pytest.raises(BadArtifact, match=r"a\.npz.*make no arc"):
+        HybridArc.load(tmp_path / "a.npz")
+
+
+def test_a_critical_set_that_is_not_finite_is_refused(tmp_path):
+    points = {"points": np.array([[np.inf, 0.0]]), "component": np.array([0])}
+    content = points | {"resolution": 0.1, "spacing": 0.1}
+    artifacts.write_arrays(tmp_path / "c.npz", content, CriticalSet.KIND)
+    with pytest.raises(BadArtifact, match="not finite"):
+        CriticalSet.load(tmp_path / "c.npz")
