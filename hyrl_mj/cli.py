@@ -328,7 +328,7 @@ def dispatch(words: Sequence[str]) -> None:
 def main() -> None:
     """The console script `hyrl-mj`."""
     streams = Streams()
-    progress.enabled = sys.stderr.isatty()
+    progress.enabled = streams.has_room_for_bars
     # Python would look for garbage among torch's modules for most of a second before it ends.
     atexit.register(gc.freeze)
     sys.exit(streams.run(lambda: dispatch(sys.argv[1:])))

@@ -20,6 +20,8 @@ from hyrl_mj.errors import BadInput, HyrlError, brief
 
 # A narrower terminal breaks the lines itself: libraries that lay out text cannot [columns].
 NARROWEST = 60
+# A bar on a narrower terminal would be a column of its pieces.
+NARROWEST_BAR = 30
 
 
 class _Raw(io.FileIO):
@@ -71,6 +73,14 @@ class Streams:
             errors="backslashreplace",
             line_buffering=True,
         )
+
+    @property
+    def has_room_for_bars(self) -> bool:
+        """Whether standard error is a terminal that is wide enough for progress bars."""
+        if not sys.stderr.isatty():
+            return False
+        width = os.get_terminal_size(sys.stderr.fileno()).columns
+        return width == 0 or width >= NARROWEST_BAR  # 0 where the terminal does not know
 
     def run(self, command: Callable[[], None]) -> int:
         """Runs a command, says what went wrong, and returns the exit status."""

@@ -1,10 +1,13 @@
 """A run in odd surroundings: it goes on, leaves every file, and says in a sentence what it lacks."""
 
+import fcntl
 import os
 import shlex
 import shutil
+import struct
 import subprocess
 import sys
+import termios
 from pathlib import Path
 
 import pytest
@@ -118,6 +121,20 @@ def test_every_width_can_be_read(columns):
     assert done.returncode == 0, done.stderr
     assert "--preset" in done.stdout
     assert max(map(len, done.stdout.splitlines())) >= 50
+
+
+@pytest.mark.parametrize(("columns", "shown"), [(1, False), (20, False), (0, True), (80, True)])
+def test_a_narrow_terminal_gets_no_bars(columns, shown):
+    ours, theirs = os.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+    code = "from hyrl_mj.streams import Streams; print(Streams().has_room_for_bars)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=theirs, text=True,
+        env={**os.environ, "PYTHONPATH": str(PACKAGE)}, timeout=60,
+    )  # fmt: skip
+    os.close(ours)
+    os.close(theirs)
+    assert done.stdout.strip() == str(shown)
 
 
 # ---- pictures and videos
