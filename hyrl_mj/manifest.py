@@ -282,6 +282,13 @@ def locked(folder: Path) -> Iterator[None]:
         lock.release()
 
 
+def may_hold_run(folder: Path) -> bool:
+    """Returns whether a folder holds a run, or only what a process left that was killed at once."""
+    names = {path.name for path in folder.iterdir()}
+    left = {name for name in names if name == LOCK or artifacts.TEMPORARY.fullmatch(name)}
+    return "config.json" in names or names == left
+
+
 def check_contents(folder: Path) -> None:
     """Raises `BadArtifact` if a run directory holds what leads out of it, or what no run has.
 

@@ -16,7 +16,7 @@ from hyrl_mj import artifacts, policies
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.game import Lattice, Robustness
 from hyrl_mj.learning import Settings, Training
-from hyrl_mj.manifest import FILES, LOCK, Manifest, check_contents, digest, locked
+from hyrl_mj.manifest import FILES, Manifest, check_contents, digest, locked, may_hold_run
 from hyrl_mj.policies import Agent, AnyPolicy, MlpPolicy, Policy
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.stages import (
@@ -333,7 +333,7 @@ def opened(path: str | Path, settings: Settings, policy: AnyPolicy | None = None
             names them.
     """
     path = Path(path)
-    if path.exists() and not (path.is_dir() and _may_hold_run(path)):
+    if path.exists() and not (path.is_dir() and may_hold_run(path)):
         raise BadInput(f"{path} exists and is not a run directory: choose another --out")
     with locked(path):
         run = Run(path, settings, policy)
@@ -346,9 +346,3 @@ def opened(path: str | Path, settings: Settings, policy: AnyPolicy | None = None
                 "choose another --out, give the same settings, or remove it"
             )
         yield run
-
-
-def _may_hold_run(folder: Path) -> bool:
-    """Returns whether a folder holds a run, or nothing."""
-    names = {path.name for path in folder.iterdir()}
-    return "config.json" in names or not names - {LOCK}

@@ -8,7 +8,7 @@ import threading
 import pytest
 
 from hyrl_mj import BadArtifact, BadInput, artifacts, manifest
-from hyrl_mj.manifest import FILES, LOCK, NAME, Manifest, check_contents, locked
+from hyrl_mj.manifest import FILES, LOCK, NAME, Manifest, check_contents, locked, may_hold_run
 
 SETTINGS = dict.fromkeys(FILES, "these")
 
@@ -180,6 +180,15 @@ def test_what_a_killed_writer_has_left_goes_and_nothing_else(tmp_path):
     with locked(tmp_path):
         pass
     assert sorted(path.name for path in tmp_path.iterdir()) == [LOCK, mine.name]
+
+
+def test_a_folder_of_a_writer_that_was_killed_at_once_may_hold_a_run(tmp_path):
+    assert may_hold_run(tmp_path)
+    for name in (LOCK, ".config.0123456789ab.partial.json"):
+        (tmp_path / name).write_text("half")
+    assert may_hold_run(tmp_path)
+    (tmp_path / "notes.txt").write_text("mine")
+    assert not may_hold_run(tmp_path)
 
 
 # ---- links
