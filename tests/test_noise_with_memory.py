@@ -132,6 +132,8 @@ def command_line(vehicle, monkeypatch, tmp_path):
     )
     opened = replace(parsing.KINDS[Run], read=lambda path: run)
     monkeypatch.setitem(parsing.KINDS, Run, opened)
+    monkeypatch.setattr(parsing, "load_run", lambda run, task=None: run)
+    monkeypatch.setattr(cli.pipeline, "as_stage", lambda run, name, work: work(run))
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["hyrl-mj", *arguments])
