@@ -38,7 +38,7 @@ PACKAGES = (
     "stable-baselines3",
     "torch",
     "numpy",
-    "imageio-ffmpeg",
+    "mediapy",
 )
 
 

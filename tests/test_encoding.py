@@ -51,19 +51,19 @@ def test_a_video_that_is_cut_off_anywhere_is_not_whole(tmp_path, suffix):
 
 LAST = "for last; do :; done; "  # the path of the video is the last argument
 PROGRAMS = {
-    "ends at once": ("exit 0", "ended with status 0|no whole"),
-    "fails at once": ("echo no such encoder >&2; exit 3", "status 3: no such encoder"),
-    "reads one frame": (f"head -c {WIDTH * HEIGHT * 3} >/dev/null", "status 0|no whole"),
+    "ends at once": ("exit 0", "Broken pipe|no whole"),
+    "fails at once": ("echo no such encoder >&2; exit 3", "no such encoder"),
+    "reads one frame": (f"head -c {WIDTH * HEIGHT * 3} >/dev/null", "Broken pipe|no whole"),
     "reads and writes nothing": ("cat >/dev/null", "left 0 bytes that are no whole mp4"),
     "writes other things": (LAST + 'cat >/dev/null; echo film >"$last"', "left 5 bytes"),
     "removes the file": (LAST + 'cat >/dev/null; rm "$last"', "left no file"),
-    "fails at the end": ("cat >/dev/null; echo disk full >&2; exit 1", "status 1: disk full"),
-    "is killed": ("cat >/dev/null; kill -9 $$", "status -9"),
+    "fails at the end": ("cat >/dev/null; echo disk full >&2; exit 1", "disk full"),
+    "is killed": ("cat >/dev/null; kill -9 $$", "Error writing"),
     "never reads": ("exec sleep 600", "took no frame for 1 s"),
     "never reads, in a child": ("sleep 600; true", "took no frame for 1 s"),
     "leaves a child that never reads": ("exec 3<&0; sleep 9 <&3 & exit 0", "took no frame for 1 s"),
     "never ends": ("cat >/dev/null; exec sleep 600", "wrote nothing for 1 s"),
-    "closes its input": ("exec <&-; sleep 600", "closed its input"),
+    "closes its input": ("exec <&-; sleep 600", "took no frame|Broken pipe"),
     "talks for ever": ("cat >/dev/null & exec yes some words >&2", "took no frame|wrote nothing"),
 }
 

@@ -1,21 +1,22 @@
-"""Videos, written frame by frame by ffmpeg, with one clear message where that fails."""
+"""Videos, written frame by frame by mediapy, with one clear message where that fails."""
 
 from __future__ import annotations
 
-import os
 import queue
-import signal
-import subprocess
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Thread
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hyrl_mj import artifacts
 from hyrl_mj.errors import NoRenderer, brief
+
+if TYPE_CHECKING:
+    import mediapy
 
 FFMPEG_CURE = (
     "check that the disk is writable and has room, and reinstall the encoder: "
@@ -23,13 +24,11 @@ FFMPEG_CURE = (
 )
 # The time for which ffmpeg may neither take a frame nor write [s], and how often that is looked at.
 PATIENCE, GLANCE = 30.0, 0.1
-LAST_WORDS = 2_000  # bytes of ffmpeg's messages that are kept
 # How a video is encoded, by its suffix: H.264 as browsers play it, or a GIF. More threads slow the drawing.
-ENCODERS = {
-    ".mp4": "-vcodec h264 -pix_fmt yuv420p -vb 0 -crf 20 -preset veryfast -threads 2 "
-    "-sws_flags fast_bilinear -movflags +faststart",
-    ".gif": "-vcodec gif -pix_fmt pal8 "
-    "-vf split[s0][s1];[s0]palettegen[p];[s1][p]paletteuse -f gif",
+H264 = "-preset veryfast -threads 2 -sws_flags fast_bilinear -movflags +faststart"
+ENCODERS: dict[str, dict[str, Any]] = {
+    ".mp4": {"codec": "h264", "crf": 20, "ffmpeg_args": H264},
+    ".gif": {"codec": "gif"},
 }
 
 
@@ -53,23 +52,22 @@ def video(
     """
     try:
         import imageio_ffmpeg
+        import mediapy
 
-        program = imageio_ffmpeg.get_ffmpeg_exe()
+        mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
     except (ImportError, RuntimeError) as error:
         raise _failed(path, brief(error)) from error
-    source = f"-f rawvideo -vcodec rawvideo -pix_fmt rgb24 -s {width}x{height} -r {fps} -i - -an"
-    options = f"-v error {source} {ENCODERS[path.suffix]} -y".split()
     with artifacts.replacing(path) as temporary:
+        options = ENCODERS[path.suffix]
+        encoder = Encoder(mediapy.VideoWriter(temporary, (height, width), fps=fps, **options))
         try:
-            encoder = Encoder([program, *options, str(temporary)], temporary)
-            try:
-                yield encoder.add
-                encoder.finish()
-            finally:
-                encoder.stop()
+            yield encoder.add
+            encoder.finish()
             check_whole(temporary)
         except EncodingFailed as error:
             raise _failed(path, str(error)) from error
+        finally:
+            encoder.stop()
 
 
 class EncodingFailed(Exception):
@@ -77,116 +75,78 @@ class EncodingFailed(Exception):
 
 
 class Encoder:
-    """A process of ffmpeg that is fed with frames, and watched: it may fail, or stop, at any moment.
+    """A writer that is fed by a thread of its own, and watched: ffmpeg may fail, or stop, at any moment.
 
     Args:
-        command: the program and its arguments.
-        path: of the file that it writes.
-
-    Raises:
-        EncodingFailed: it cannot be started.
+        writer: writes the video.
     """
 
-    def __init__(self, command: Sequence[str], path: Path):
-        pipe = subprocess.PIPE
-        try:
-            # In a session of its own, so that it can be ended with all of its children.
-            self._process = subprocess.Popen(
-                command, bufsize=0, stdin=pipe, stdout=subprocess.DEVNULL, stderr=pipe,
-                start_new_session=True,
-            )  # fmt: skip
-        except OSError as error:
-            raise EncodingFailed(brief(error)) from error
-        self._path, self._words = path, b""
+    def __init__(self, writer: mediapy.VideoWriter):
+        self._writer, self._problem = writer, ""
         # One frame goes to the encoder while the next is drawn.
-        self._frames: queue.Queue[bytes | None] = queue.Queue(1)
-        # No one waits for these threads, which can be held up for as long as the process lives.
+        self._frames: queue.Queue[np.ndarray | None] = queue.Queue(1)
+        # No one waits for this thread, which can be held up for as long as ffmpeg lives.
         self._feeding = Thread(target=self._feed, daemon=True)
-        self._listening = Thread(target=self._listen, daemon=True)
         self._feeding.start()
-        self._listening.start()
 
     def add(self, frame: np.ndarray) -> None:
         """Appends a frame (height, width, 3) uint8.
 
         Raises:
-            EncodingFailed: the process has ended, or takes no more frames.
+            EncodingFailed: ffmpeg has ended, or takes no more frames.
         """
-        self._put(frame.tobytes())
+        self._put(frame.copy())
 
     def finish(self) -> None:
         """Waits until all frames are encoded.
 
         Raises:
-            EncodingFailed: the process failed, or makes no progress.
+            EncodingFailed: ffmpeg failed, or makes no progress.
         """
         self._put(None)
         size, since = -1, time.monotonic()
-        while self._process.poll() is None:
+        while self._feeding.is_alive():
             if (now := self._size()) != size:
                 size, since = now, time.monotonic()
             if time.monotonic() > since + PATIENCE:
                 raise EncodingFailed(f"ffmpeg wrote nothing for {PATIENCE:g} s")
-            time.sleep(GLANCE)
-        if self._process.returncode:
-            raise self._ended()
+            self._feeding.join(GLANCE)
+        if self._problem:
+            raise EncodingFailed(self._problem)
 
     def stop(self) -> None:
-        """Ends the process, if it has not ended."""
-        if self._process.poll() is not None:
-            return
-        with suppress(OSError):
-            if hasattr(os, "killpg"):
-                os.killpg(self._process.pid, signal.SIGKILL)
-            else:
-                self._process.kill()
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(PATIENCE)
+        """Ends ffmpeg and the thread, if they have not ended."""
+        # mediapy has no way to give up, and waits for ffmpeg for ever.
+        process = getattr(self._writer, "_proc", None)
+        if process is not None and process.poll() is None:
+            process.kill()
+        with suppress(queue.Full):
+            self._frames.put_nowait(None)
 
-    def _put(self, frame: bytes | None) -> None:
-        """Hands a frame to the thread that feeds the process."""
+    def _put(self, frame: np.ndarray | None) -> None:
+        """Hands a frame to the thread."""
         patient_until = time.monotonic() + PATIENCE
         while time.monotonic() < patient_until:
             if not self._feeding.is_alive():
-                raise self._ended()
+                raise EncodingFailed(self._problem or "ffmpeg has ended")
             with suppress(queue.Full):
                 return self._frames.put(frame, timeout=GLANCE)
         raise EncodingFailed(f"ffmpeg took no frame for {PATIENCE:g} s")
 
     def _feed(self) -> None:
-        """Writes frames to the process until None comes, or it has ended."""
-        stdin = self._process.stdin
-        assert stdin
-        with suppress(OSError):
-            while (frame := self._frames.get()) is not None:
-                left = memoryview(frame)
-                while left:
-                    left = left[stdin.write(left) :]
-        with suppress(OSError):
-            stdin.close()
-
-    def _listen(self) -> None:
-        """Keeps the last words of the process."""
-        stderr = self._process.stderr
-        assert stderr
-        while words := stderr.read(LAST_WORDS):
-            self._words = (self._words + words)[-LAST_WORDS:]
+        """Writes frames until None comes, or ffmpeg has ended."""
+        try:
+            with self._writer as writer:
+                while (frame := self._frames.get()) is not None:
+                    writer.add_image(frame)
+        except Exception as error:  # whatever the writer raises when ffmpeg fails or is ended
+            self._problem = brief(error)
 
     def _size(self) -> int:
         """Returns the size of the file [bytes]."""
         with suppress(OSError):
-            return self._path.stat().st_size
+            return int(self._writer.path.stat().st_size)
         return 0
-
-    def _ended(self) -> EncodingFailed:
-        """Returns how the process has ended, with its last words."""
-        self._listening.join(1.0)
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(1.0)
-        words = " ".join(self._words.decode(errors="replace").split())
-        status = self._process.returncode
-        how = "closed its input" if status is None else f"ended with status {status}"
-        return EncodingFailed(f"ffmpeg {how}: {words[-300:]}" if words else f"ffmpeg {how}")
 
 
 def check_whole(path: Path) -> None:
