@@ -440,6 +440,6 @@ def test_a_description_names_a_task_by_its_name_only(circle, tmp_path):
     for algorithm in ("evil:X", "os:system"):
         about = {"task": "unit_circle", "algorithm": algorithm, "activation": "tanh"}
         artifacts.write_json(tmp_path / "p.json", about, kind="policy")
-        with pytest.raises(BadArtifact, match="algorithm '.*' of the policy is unknown"):
+        with pytest.raises(BadArtifact, match=r"algorithm '.*' of the policy is unknown"):
             load_agent(tmp_path / "p.safetensors", circle)
     assert not (tmp_path / "executed").exists()

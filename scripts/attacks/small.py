@@ -14,9 +14,11 @@ from typing import Any
 
 import hyrl_mj.learning.settings as settings
 import hyrl_mj.learning.training as training
+import hyrl_mj.stages.results as results
 import hyrl_mj.viz.figures.style as style
 import hyrl_mj.viz.replay as replay
 from hyrl_mj import cli
+from hyrl_mj.tasks.unit_circle import UnitCircle
 from hyrl_mj.viz.figures import FIGURES
 
 SIZE, FPS, LATTICE = (480, 160), 2, 240
@@ -44,13 +46,14 @@ def shorten() -> None:
     settings._LATTICE_SMOKE |= {1: LATTICE, 2: 60}
     settings._GRIDS |= {1: (24, 240), 2: (24, 48)}
     settings._GRIDS_DYNAMIC |= {1: (24, 240), 2: (16, 32)}
-    settings._SMOKE |= {"ppo": 8_192, "dqn": 3_000}
+    settings._SMOKE |= {"ppo": 4_096, "dqn": 3_000}
     settings._SMOKE_MODES = 4_096
-    training.CHECKPOINTS, training.EPISODES = 2, 64
+    training.CHECKPOINTS, training.EPISODES, results.EPISODES = 2, 64, 64
     style.DPI = 30
     style.STYLE["pdf.fonttype"] = 3
     for name in FIGURES.keys() - KEPT:
         del FIGURES[name]
+    UnitCircle.scene = replace(UnitCircle.scene, starts=UnitCircle.scene.starts[:2], time=1.0)
     render = replay.render_replay
 
     def render_small(
