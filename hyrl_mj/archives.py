@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
-from zipfile import ZipFile
+from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from hyrl_mj.errors import BadArtifact
 
 # Limit on the directory of a zip [bytes], of which every member takes fifty or more.
 LARGEST_DIRECTORY = 2**20
+
+# How members are packed: Python unpacks others, as LZMA, without a limit.
+PACKED = (ZIP_STORED, ZIP_DEFLATED)
 
 
 class _ShortReads(io.RawIOBase):
@@ -63,6 +66,8 @@ class _Limited(io.RawIOBase):
 
     def __init__(self, file: ZipFile, name: str, limit: int):
         self._name, self._limit = name, limit
+        if file.getinfo(name).compress_type not in PACKED:
+            raise BadArtifact(f"its {name} is packed in a way that such files never are")
         self._file, self.left = file.open(name), limit
 
     def read(self, size: int | None = -1) -> bytes:

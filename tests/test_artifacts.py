@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+import zipfile
 
 import numpy as np
 import pytest
@@ -208,3 +209,11 @@ def test_arrays_that_unpack_to_more_than_their_limit_are_refused(tmp_path, monke
     artifacts.write_arrays(tmp_path / "a.npz", {"x": np.zeros(2**16), "y": np.ones(3)}, "kind")
     found = artifacts.read_arrays(tmp_path / "a.npz", "kind")
     assert {name: array.shape for name, array in found.items()} == {"x": (2**16,), "y": (3,)}
+
+
+@pytest.mark.parametrize("packing", [zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])
+def test_an_npz_packed_in_a_way_that_python_unpacks_without_a_limit_is_refused(packing, tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", packing) as file:
+        file.writestr("a.npy", bytes(2**20))
+    with pytest.raises(BadArtifact, match=r"a\.npz: its a\.npy is packed in a way"):
+        artifacts.read_arrays(tmp_path / "a.npz", "thing")
