@@ -20,13 +20,19 @@ from hyrl_mj.errors import BadInput
 SCRIPTS = str(Path(__file__).parent.parent / "scripts")
 # Weaknesses that are planted, and the attacks that must find them.
 PLANTED = {
-    "kills": "from hyrl_mj.manifest import Manifest; Manifest.is_done = lambda *a: True",
+    "crashes": (
+        "import re; from hyrl_mj.manifest import FILES, Manifest\n"
+        "def there(self, stage, code):\n"
+        "    names = [path.relative_to(self.folder).as_posix() for path in self.folder.rglob('*')]\n"
+        "    return any(re.fullmatch(FILES[stage], name) for name in names)\n"
+        "Manifest.is_done = there"
+    ),
     "artifacts": "from hyrl_mj.manifest import Manifest; Manifest.checked = lambda self, path: path",
 }
 
 
 def attack(*words, weakness=""):
-    code = f"import sys; sys.path.insert(0, {SCRIPTS!r}); import attack; {weakness}\n"
+    code = f"import sys; sys.path.insert(0, {SCRIPTS!r}); import attack\n{weakness}\n"
     return subprocess.run(
         [sys.executable, "-c", f"{code}sys.exit(attack.main())", *words],
         capture_output=True,
