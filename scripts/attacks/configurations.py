@@ -7,7 +7,7 @@ from random import Random
 from typing import Any
 
 from attacks import Trial, child, command
-from attacks.crafted_runs import content_of, write
+from attacks.forgery import content_of, write
 from attacks.material import TASK, Material
 
 NAN, INF, HUGE, LONG = float("nan"), float("inf"), 2**40, "x" * 10**4

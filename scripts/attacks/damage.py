@@ -2,7 +2,7 @@
 
 from base64 import b64encode
 from collections import defaultdict
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from random import Random
 
@@ -10,6 +10,7 @@ import hyrl_mj
 from attacks import Answer, Trial, child, command, differences, files
 from attacks.material import RUN, TASK, Material
 from hyrl_mj.errors import HyrlError
+from hyrl_mj.run_directory import Run
 
 # Files whose damage no command can mend, because they say what the run is.
 FOUNDATION = ("config.json",)
@@ -89,8 +90,7 @@ def open_everything(path: Path) -> None:
     import sys
 
     run = None
-    results = ["task", "policy", "critical_set", "partition", "split", "extended_sets"]
-    results += ["controller", "robustness", "versions"]
+    results = [n for n, v in vars(Run).items() if isinstance(v, property | cached_property)]
     try:
         run = hyrl_mj.load_run(path)
         arcs = run.arc_paths()
