@@ -75,7 +75,7 @@ class Number:
     @property
     def allowed(self) -> str:
         if self.above:
-            return f"a number greater than {self.low:g}, up to {self.high:g}"
+            return f"a number > {self.low:g} and <= {self.high:g}"
         return f"a number from {self.low:g} to {self.high:g}"
 
 

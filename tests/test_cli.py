@@ -17,7 +17,7 @@ from PIL import Image
 from sentences import assert_has_ended
 
 import hyrl_mj
-from hyrl_mj import cli
+from hyrl_mj import cli, pipeline
 from hyrl_mj.pipeline import ExamineOptions, examination
 from hyrl_mj.pipeline.steps import STAGES
 from hyrl_mj.viz.figures import FIGURES
@@ -160,7 +160,7 @@ def test_without_a_latest_simulation_there_is_nothing_to_replay(copied):
     for left in (copied / "arcs").glob("latest_*"):
         left.unlink()
     done = call("replay", copied, "--starts", "latest", "--out", "x.mp4")
-    assert_one_sentence(done, "latest_policy.npz", "run the stage")
+    assert_one_sentence(done, "latest_policy.npz is missing", "simulate it again")
 
 
 @needs_gl
@@ -228,7 +228,7 @@ def test_an_interrupted_robustness_run_leaves_the_last_one(copied, monkeypatch):
 
     monkeypatch.setattr(examination, "noisy_episodes", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        examination.examine_run(hyrl_mj.load_run(copied), ExamineOptions(eps=0.2, episodes=10))
+        pipeline.examine_run(hyrl_mj.load_run(copied), ExamineOptions(eps=0.2, episodes=10))
     assert contents(copied) == before
 
 
@@ -419,5 +419,5 @@ def test_a_policy_of_another_task_is_refused(copied):
     policy = hyrl_mj.load_run(copied).policy
     description = copied / "policy.json"
     description.write_text(description.read_text().replace("unit_circle", "vehicle"))
-    assert_one_sentence(call("critical-set", copied), "vehicle")
+    assert_one_sentence(call("critical-set", copied), "policy.json was changed", "hyrl-mj train")
     assert np.isfinite(policy.act(np.zeros((1, 1)))).all()
