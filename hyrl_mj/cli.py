@@ -47,8 +47,9 @@ def new_task(name: str, *, folder: Path = Path()) -> None:
 def run(task: str, options: RunOptions) -> None:
     """Run all stages on a task, from training to the report.
 
-    An existing run directory is resumed: only what is missing is done. The run ends with a verdict: WON,
-    HELD, WEAK, or FAILED, which gives exit status 1.
+    An existing run directory is resumed: only what is missing is done.
+
+    The verdict is WON, HELD, WEAK, or FAILED, which gives exit status 1.
 
     Args:
         task: a task, see `hyrl-mj list`, or a Python file that defines one, see `hyrl-mj new-task`.
@@ -59,8 +60,9 @@ def run(task: str, options: RunOptions) -> None:
 def robustify(task: str, *, policy: Path, options: AgentOptions) -> None:
     """Make an agent robust that was trained elsewhere: all stages but the first.
 
-    An existing run directory is resumed: only what is missing is done. The run ends with a verdict, as that
-    of `hyrl-mj run`.
+    An existing run directory is resumed: only what is missing is done.
+
+    The verdict is WON, HELD, WEAK, or FAILED, which gives exit status 1.
 
     Args:
         task: a task, see `hyrl-mj list`, or a Python file that defines one.

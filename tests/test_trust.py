@@ -73,15 +73,14 @@ def test_a_policy_that_names_a_file_as_its_task_is_refused(received, evil, marke
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", ["stage1", "stage6"])
-def test_an_algorithm_that_a_run_names_is_not_imported(stage, received, evil, marker):
+def test_an_algorithm_that_a_run_names_is_not_imported(received, evil, marker):
     run = hyrl_mj.load_run(received)
-    foreign = replace(getattr(run.settings, stage), algorithm="evilmod:X")
-    write_config(Run(received, replace(run.settings, **{stage: foreign})))
+    foreign = replace(run.settings.stage1, algorithm="evilmod:X")
+    write_config(Run(received, replace(run.settings, stage1=foreign)))
     believe(received)
     open_everything(received)
     with pytest.raises(BadInput, match="from a module that you have not named before"):
-        run_stage(hyrl_mj.load_run(received), {"stage1": "train", "stage6": "retrain"}[stage])
+        run_stage(hyrl_mj.load_run(received), "train")
     assert not marker.exists()
 
 
@@ -144,7 +143,7 @@ def test_a_run_of_somebody_else_s_robot_opens_when_its_file_is_named(received, r
     assert "--task FILE" in refused.stderr
     other = call("report", received, "--task", robot)
     assert other.returncode == 2, "its policies are for another robot"
-    assert "does not fit" in other.stderr
+    assert "a grid of 2,880 cells" in other.stderr, "cells of a circle are too many for a plane"
     assert other.stderr.count("\n") == 1
 
 
