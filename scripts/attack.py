@@ -132,10 +132,12 @@ def main() -> int:
     chosen = options.only.split(",") if options.only else list(ATTACKS)
     if unknown := set(chosen) - ATTACKS.keys():
         parser.error(f"unknown attack {', '.join(unknown)}: choose some of {', '.join(ATTACKS)}")
+    small.import_late()
     small.shorten()
     results = []
     with scratch() as folder:
         os.environ |= {"TMPDIR": f"{folder}", "XDG_STATE_HOME": f"{folder}/state"}
+        os.environ["PYTHONPATH"] = str(Path(__file__).resolve().parents[1])  # of new processes
         tempfile.tempdir = str(folder)
         material = Material(folder)
         for name in chosen:
@@ -147,7 +149,8 @@ def main() -> int:
             for result in pool.imap_unordered(attempt, range(len(UNDER_WAY))):
                 results.append(result)
                 if options.verbose or result[2]:
-                    print(f"{result[0]}: {result[1]}: {result[2] or 'survived'}", file=sys.stderr)
+                    how = result[2] or f"survived in {result[3]:.1f} s"
+                    print(f"{result[0]}: {result[1]}: {how}", file=sys.stderr)
     results.sort(key=lambda result: chosen.index(result[0]))
     Console(width=None if sys.stdout.isatty() else 120).print(table(results))
     for name, trial, broke, _ in results:

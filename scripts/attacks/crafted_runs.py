@@ -103,7 +103,7 @@ def picture_bomb(folder: Path, path: Path) -> None:
     size = struct.pack(">LLBBBBB", 60_000, 60_000, 8, 0, 0, 0, 0)
     data = zlib.compress(bytes(60_001 * 100))
     whole = chunk(b"IHDR", size) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
-    replaced(path, "figures/overview.png", b"\x89PNG\r\n\x1a\n" + whole)
+    replaced(path, "figures/extended_sets.png", b"\x89PNG\r\n\x1a\n" + whole)
 
 
 def many_files(folder: Path, path: Path) -> None:
@@ -261,7 +261,7 @@ DIRECTORIES: dict[str, Callable[[Path, Path], None]] = {
         )
         for name, target in (
             ("arcs", "{victim}"), ("figures", "{victim}"), ("replay.mp4", "{victim}/secret.txt"),
-            ("figures/overview.png", "{victim}/secret.txt"), (".lock", "{victim}/secret.txt"),
+            ("figures/extended_sets.png", "{victim}/secret.txt"), (".lock", "{victim}/secret.txt"),
             ("manifest.json", "{victim}/secret.txt"), ("config.json", "{victim}/secret.txt"),
             ("logs", "{victim}"), (".report.partial.html", "{victim}/secret.txt"),
             ("report.html", "{victim}/new.html"), ("loop", "loop"), ("arcs/start0_policy.npz", "/etc/passwd"),

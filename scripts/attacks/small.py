@@ -21,8 +21,8 @@ from hyrl_mj import cli
 from hyrl_mj.tasks.unit_circle import UnitCircle
 from hyrl_mj.viz.figures import FIGURES
 
-SIZE, FPS, LATTICE = (480, 160), 2, 240
-KEPT = {"policy", "robustness_curve"}  # of the figures
+SIZE, FPS, LATTICE = (480, 160), 2, 120
+KEPT = {"extended_sets", "robustness_map"}  # of the figures
 # Set where the program has to run without the rights of root, in a folder that cannot be written.
 NOBODY = "ATTACK_AS_NOBODY"
 # What commands import when they need it.
@@ -31,29 +31,38 @@ LATE = (
     "hyrl_mj.viz.arcs",
     "hyrl_mj.viz.diagnosis",
     "hyrl_mj.viz.report",
+    "fontTools.subset",
     "imageio_ffmpeg",
-    "pydantic",
+    "matplotlib.pyplot",
+    "mediapy",
+    "mujoco.batch",
+    "pydantic.type_adapter",
+    "scipy.spatial",
     "stable_baselines3",
     "tensorboard",
     "torch._dynamo",
 )
 
 
-def shorten() -> None:
-    """Shortens preset smoke and the replays, in this process and those that it forks."""
+def import_late() -> None:
+    """Imports once what every forked process would import."""
     for name in LATE:
         import_module(name)
+
+
+def shorten() -> None:
+    """Shortens preset smoke and the replays, in this process and those that it forks."""
     settings._LATTICE_SMOKE |= {1: LATTICE, 2: 60}
     settings._GRIDS |= {1: (24, 240), 2: (24, 48)}
     settings._GRIDS_DYNAMIC |= {1: (24, 240), 2: (16, 32)}
-    settings._SMOKE |= {"ppo": 4_096, "dqn": 3_000}
-    settings._SMOKE_MODES = 4_096
+    settings._SMOKE |= {"ppo": 2_048, "dqn": 3_000}
+    settings._SMOKE_MODES = 2_048
     training.CHECKPOINTS, training.EPISODES, results.EPISODES = 2, 64, 64
     style.DPI = 30
     style.STYLE["pdf.fonttype"] = 3
     for name in FIGURES.keys() - KEPT:
         del FIGURES[name]
-    UnitCircle.scene = replace(UnitCircle.scene, starts=UnitCircle.scene.starts[:2], time=1.0)
+    UnitCircle.scene = replace(UnitCircle.scene, starts=UnitCircle.scene.starts[:2], time=0.5)
     render = replay.render_replay
 
     def render_small(
