@@ -110,7 +110,9 @@ def test_an_sb3_agent_is_diagnosed_and_then_made_robust(robust, dqn):
         assert f"{stage}: done before" in said
     after = contents(path)
     kept = before.keys() - {path / manifest.NAME}
-    assert {p: after[p] for p in kept} == {p: before[p] for p in kept}, "the diagnosis stays as it was"
+    assert {p: after[p] for p in kept} == {p: before[p] for p in kept}, (
+        "the diagnosis stays as it was"
+    )
     run = hyrl_mj.load_run(path)
     assert run.controller.modes == (0, 1)
     assert (path / "report.html").is_file()
