@@ -11,9 +11,11 @@ import errno
 import io
 import os
 import shutil
+import signal
 import sys
-from collections.abc import Callable
-from contextlib import suppress
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any, TextIO
 
 from hyrl_mj.errors import BadInput, HyrlError, brief
@@ -22,6 +24,10 @@ from hyrl_mj.errors import BadInput, HyrlError, brief
 NARROWEST = 60
 # A bar on a narrower terminal would be a column of its pieces.
 NARROWEST_BAR = 30
+# An interrupt can strike while one of Python's locks is taken, which is then waited for without end: after
+# this time the process ends by itself [s].
+GRACE = 5.0
+INTERRUPTED, INTERRUPTED_STATUS = "interrupted; finished work is kept, run again to resume", 130
 
 
 class _Raw(io.FileIO):
@@ -55,6 +61,7 @@ class Streams:
         if shutil.get_terminal_size().columns < NARROWEST:
             os.environ["COLUMNS"] = str(NARROWEST)
         self._raw: dict[int, _Raw] = {}
+        self._has_complained = False
         sys.stdout, sys.stderr = self._lasting(sys.stdout, 1), self._lasting(sys.stderr, 2)
 
     def _lasting(self, stream: TextIO | None, number: int) -> TextIO:
@@ -84,7 +91,8 @@ class Streams:
 
     def run(self, command: Callable[[], None]) -> int:
         """Runs a command, says what went wrong, and returns the exit status."""
-        status = self._status(command)
+        with self._interruptible():
+            status = self._status(command)
         with suppress(OSError):
             sys.stdout.flush()
         if self._closed[1]:
@@ -110,8 +118,8 @@ class Streams:
             self._complain(f"{error.strerror or brief(error)}{where}")
             return 1
         except KeyboardInterrupt:
-            self._complain("interrupted; finished work is kept, run again to resume")
-            return 130
+            self._complain(INTERRUPTED)
+            return INTERRUPTED_STATUS
         except SystemExit as error:
             return error.code if isinstance(error.code, int) else int(error.code is not None)
         except Exception as error:
@@ -119,6 +127,34 @@ class Streams:
                 self._complain(brief(error))
             raise
         return 0
+
+    @contextmanager
+    def _interruptible(self) -> Iterator[None]:
+        """Lets an interrupt end the process within `GRACE`, in the block and after it."""
+        usual = signal.getsignal(signal.SIGINT)
+        if (
+            usual is not signal.default_int_handler
+            or not hasattr(signal, "setitimer")
+            or threading.current_thread() is not threading.main_thread()
+        ):
+            yield
+            return
+        signal.signal(signal.SIGINT, self._interrupted)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, usual)
+
+    def _interrupted(self, *_: object) -> None:
+        signal.signal(signal.SIGALRM, self._give_up)
+        signal.setitimer(signal.ITIMER_REAL, GRACE)
+        raise KeyboardInterrupt
+
+    def _give_up(self, *_: object) -> None:
+        if not self._has_complained:
+            with suppress(OSError):
+                os.write(2, f"hyrl-mj: {INTERRUPTED}\n".encode())
+        os._exit(INTERRUPTED_STATUS)
 
     @property
     def _is_deaf(self) -> bool:
@@ -128,6 +164,7 @@ class Streams:
 
     def _complain(self, text: str) -> None:
         """Says what went wrong on standard error, or on standard output if nobody reads the other."""
+        self._has_complained = True
         print(f"hyrl-mj: {text}", file=sys.stderr)
         if self._is_deaf:
             print(f"hyrl-mj: {text}", flush=True)

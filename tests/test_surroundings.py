@@ -4,6 +4,7 @@ import fcntl
 import os
 import shlex
 import shutil
+import signal
 import struct
 import subprocess
 import sys
@@ -173,3 +174,37 @@ def test_a_working_directory_that_is_gone_is_named(tmp_path):
     (sentence,) = sentences(done.stderr)
     assert "the working directory cannot be found" in sentence
     assert done.stderr.strip() == sentence
+
+
+# An interrupt leaves a lock locked, which the end of the block then waits for.
+STUCK = """
+import threading, time
+from hyrl_mj.streams import Streams
+
+def command():
+    lock = threading.Lock()
+    try:
+        print("ready", flush=True)
+        time.sleep(60)
+    finally:
+        lock.acquire()
+        lock.acquire()
+
+raise SystemExit(Streams().run(command))
+"""
+
+
+def test_an_interrupt_ends_a_process_that_waits_for_ever():
+    process = subprocess.Popen(
+        [sys.executable, "-c", STUCK],
+        env=os.environ | {"PYTHONPATH": str(PACKAGE)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    assert process.stdout.readline() == "ready\n"
+    process.send_signal(signal.SIGINT)
+    _, complaints = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert complaints == "hyrl-mj: interrupted; finished work is kept, run again to resume\n"
