@@ -20,7 +20,7 @@ import numpy as np
 from safetensors.numpy import load, save
 
 from hyrl_mj import archives
-from hyrl_mj.errors import BadArtifact, BadInput, brief
+from hyrl_mj.errors import BadArtifact, BadInput, brief, has_controls
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
@@ -36,6 +36,8 @@ REMEDY = "run the stage that writes it again"
 LARGEST_JSON, LARGEST = 2**22, 2**27
 # Of a file of tensors, and of the names and shapes at its beginning.
 LARGEST_TENSORS, LARGEST_NAMES = 2**25 + 2**20, 2**20
+# Rows of an array that stands for a tuple, of which there is one for each mode.
+MOST_ROWS = 1_000
 # The names of temporary files, which only a process that was killed leaves behind.
 TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.partial(\.\w+)?")
 # Called with each path before `replacing` writes it.
@@ -105,10 +107,24 @@ def read_limited(path: Path, limit: int = LARGEST) -> bytes:
     return content
 
 
+def digest(*paths: Path) -> str:
+    """Returns the SHA-256 of the content of files."""
+    content = sha256()
+    for path in paths:
+        with path.open("rb") as file:
+            while part := file.read(2**20):
+                content.update(part)
+    return content.hexdigest()
+
+
 def write_json(path: Path, content: Any, kind: str) -> None:
     """Writes a mapping or a dataclass as a JSON object, with its kind, its version and its own SHA-256."""
     if is_dataclass(content) and not isinstance(content, type):
         content = asdict(content)
+    if (odd := next(_unprintable(content), None)) is not None:
+        raise BadInput(
+            f"{path} cannot hold {odd!r}, which has control characters: give another name"
+        )
     with replacing(path) as temporary:
         temporary.write_text(_json({"kind": kind, "version": VERSION, **content}), encoding="utf-8")
 
@@ -147,7 +163,7 @@ def read_json(
 
 def _unprintable(content: Any) -> Iterator[str]:
     """Yields each string with control characters in nested dictionaries and lists."""
-    if isinstance(content, str) and not content.isprintable():
+    if isinstance(content, str) and has_controls(content):
         yield content
     elif isinstance(content, dict):
         yield from _unprintable([*content, *content.values()])
@@ -278,14 +294,14 @@ def _unpacked(name: str, declared: Any, arrays: Mapping[str, np.ndarray], contex
     array = arrays[name]
     if (array.ndim == 0) != (declared in (int, float, str)):
         raise ValueError(f"an array of {array.ndim} dimensions does not fit")
-    if declared == tuple[int, ...]:
-        return tuple(int(value) for value in array)
-    if declared == tuple[np.ndarray, ...]:
-        return tuple(array)
+    if declared in (tuple[int, ...], tuple[np.ndarray, ...]):
+        if len(array) > MOST_ROWS:
+            raise ValueError(f"it has {len(array):,} rows, at most {MOST_ROWS:,} make sense")
+        return tuple(int(value) for value in array) if array.ndim == 1 else tuple(array)
     if declared is np.ndarray:
         return array
     value = declared(array.item())
-    if isinstance(value, str) and not value.isprintable():
+    if isinstance(value, str) and has_controls(value):
         raise ValueError("it holds control characters")
     return value
 

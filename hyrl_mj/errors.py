@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 from numbers import Integral, Real
 from pathlib import Path
+from unicodedata import category
 
 
 class HyrlError(Exception):
@@ -32,6 +33,11 @@ class BadArtifact(BadInput):
 
 class NoRenderer(HyrlError):
     """Off-screen rendering or video encoding is not possible on this machine."""
+
+
+def has_controls(text: str) -> bool:
+    """Returns whether a text has characters that control a terminal, or that no file can hold."""
+    return any(category(c) in ("Cc", "Cf", "Cs", "Zl", "Zp") for c in text)
 
 
 def printable(text: str) -> str:

@@ -14,12 +14,12 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
 from hyrl_mj import artifacts
+from hyrl_mj.artifacts import digest
 from hyrl_mj.errors import BadArtifact, BadInput
 
 NAME, LOCK = "manifest.json", ".lock"
@@ -76,13 +76,15 @@ class Manifest:
     Attributes:
         folder: the run directory.
         settings: SHA-256 of the present settings, by stage.
+        code: that of the task, as in `Entry`.
     """
 
     folder: Path
     settings: Mapping[str, str]
+    code: str = ""
 
     @contextmanager
-    def stage(self, stage: str, code: str) -> Iterator[None]:
+    def stage(self, stage: str) -> Iterator[None]:
         """Records a stage, which reads files with `checked` and writes its own in this block.
 
         Other files of the stage are removed at the end of the block. A block that writes nothing changes
@@ -90,7 +92,6 @@ class Manifest:
 
         Args:
             stage: one of `FILES`.
-            code: as in `Entry`.
 
         Raises:
             BadInput: another process works on the run directory, or it cannot be written.
@@ -117,20 +118,16 @@ class Manifest:
             outputs = {self._name(path): digest(path) for path in written}
             for path in self.folder.glob("**/*"):
                 name = self._name(path)
-                if re.fullmatch(FILES[stage], name) and name not in outputs:
+                if re.fullmatch(FILES[stage], name) and name not in outputs and path.is_file():
                     path.unlink()
-            entry = Entry(self.settings[stage], code, read, outputs)
+            entry = Entry(self.settings[stage], self.code, read, outputs)
             self._write(self._entries() | {stage: entry})
 
-    def is_done(self, stage: str, code: str) -> bool:
-        """Returns whether a stage is finished, with this code, and all of its files are to be believed."""
+    def is_done(self, stage: str) -> bool:
+        """Returns whether a stage is finished, and all of its files are to be believed."""
         entries = self._entries()
         entry = entries.get(stage)
-        return (
-            entry is not None
-            and entry.code == code
-            and not any(self._doubt(name, entries) for name in entry.outputs)
-        )
+        return entry is not None and not any(self._doubt(name, entries) for name in entry.outputs)
 
     def checked(self, path: Path) -> Path:
         """Returns the path of a file of the run directory itself, if the file is to be believed.
@@ -179,11 +176,11 @@ class Manifest:
         return "" if name in self._current(entries) else "is older than what it was made from"
 
     def _current(self, entries: Mapping[str, Entry]) -> dict[str, str]:
-        """Returns the SHA-256 of each file whose settings and inputs have not changed since."""
+        """Returns the SHA-256 of each file whose settings, code and inputs have not changed since."""
         current: dict[str, str] = {}
         for stage in FILES:  # each reads only files of stages before it
             entry = entries.get(stage)
-            if entry and entry.settings == self.settings[stage]:
+            if entry and (entry.settings, entry.code) == (self.settings[stage], self.code):
                 inputs = entry.inputs.items()
                 if all(current.get(name, "") == content for name, content in inputs):
                     current |= entry.outputs
@@ -217,16 +214,6 @@ class Manifest:
         artifacts.write_json(self.folder / NAME, _Stages(in_order), kind="manifest")
 
 
-def digest(*paths: Path) -> str:
-    """Returns the SHA-256 of the content of files."""
-    content = sha256()
-    for path in paths:
-        with path.open("rb") as file:
-            while part := file.read(2**20):
-                content.update(part)
-    return content.hexdigest()
-
-
 def _outputs(entries: Iterable[Entry]) -> dict[str, str]:
     """Returns the recorded SHA-256 of all files that stages wrote."""
     return {name: content for entry in entries for name, content in entry.outputs.items()}
@@ -235,9 +222,10 @@ def _outputs(entries: Iterable[Entry]) -> dict[str, str]:
 def _remedy(stage: str, folder: Path) -> str:
     if stage == "simulate --start":
         return f"simulate it again with hyrl-mj simulate {folder} --start ..."
-    return (
-        f"run the stage that writes it again, with hyrl-mj {stage} {folder} or by resuming the run"
-    )
+    resumed = "by giving the command again that made the run"
+    if stage in ("train", "diagnose"):
+        return f"run the stage {stage} again {resumed}"
+    return f"run the stage that writes it again, with hyrl-mj {stage} {folder} or {resumed}"
 
 
 @contextmanager
@@ -272,7 +260,7 @@ def locked(folder: Path) -> Iterator[None]:
             with suppress(OSError):
                 path.write_text(f"process {os.getpid()}, since {since}\n", encoding="utf-8")
             for left in folder.glob("**/.*"):  # by a process that was killed
-                if artifacts.TEMPORARY.fullmatch(left.name):
+                if artifacts.TEMPORARY.fullmatch(left.name) and left.is_file():
                     left.unlink(missing_ok=True)
         yield
     finally:
@@ -301,6 +289,10 @@ def check_contents(folder: Path) -> None:
             )
         for name in (*folders, *files):
             path = Path(root, name)
+            if not (path.is_symlink() or path.is_file() or path.is_dir()):
+                raise BadArtifact(
+                    f"{path} is no file: a run directory holds files and folders alone"
+                )
             if path.is_symlink() or (name == LOCK and path.is_file() and path.stat().st_nlink > 1):
                 raise BadArtifact(
                     f"{path} is a link, and a run directory holds none: put the file itself there"

@@ -13,7 +13,7 @@ from functools import cache
 from numbers import Integral, Real
 from typing import Any, Protocol, get_type_hints
 
-from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.errors import BadInput, has_controls, unknown
 
 
 class Rule(Protocol):
@@ -94,7 +94,7 @@ class Text:
     """A string that is not empty and has no control characters."""
 
     def checked(self, name: str, value: Any) -> str:
-        if not (isinstance(value, str) and value and value.isprintable()):
+        if not (isinstance(value, str) and value and not has_controls(value)):
             raise refused(name, value, "a text")
         return str(value)
 

@@ -16,7 +16,7 @@ from hyrl_mj import artifacts, policies
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.game import Lattice, Robustness
 from hyrl_mj.learning import Settings, Training
-from hyrl_mj.manifest import FILES, Manifest, check_contents, digest, locked, may_hold_run
+from hyrl_mj.manifest import FILES, Manifest, check_contents, locked, may_hold_run
 from hyrl_mj.policies import Agent, AnyPolicy, MlpPolicy, Policy
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.stages import (
@@ -88,26 +88,23 @@ class Run:
     @cached_property
     def manifest(self) -> Manifest:
         """The record of the stages that are finished."""
+        return Manifest(self.path, self.digests, self.task.code)
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """SHA-256 of the settings that each stage is made with."""
         values = asdict(self.settings)
         del values["task"]
         last = {stage: values | {"horizon": None} for stage in FILES} | {"extended-sets": values}
         texts = {stage: json.dumps(v, sort_keys=True, default=str) for stage, v in last.items()}
-        return Manifest(
-            self.path, {n: sha256(text.encode()).hexdigest() for n, text in texts.items()}
-        )
-
-    @property
-    def code(self) -> str:
-        """SHA-256 of the files that define a task of the user's; "" for a task of an installed package."""
-        source = self.task.source
-        return "" if source is None else digest(source, self.task.model_path)
+        return {name: sha256(text.encode()).hexdigest() for name, text in texts.items()}
 
     def stage(self, name: str) -> AbstractContextManager[None]:
         """Returns the block in which a stage reads its inputs from this run, and writes its files.
 
         A run remembers what it has read, so a stage takes a run of its own.
         """
-        return self.manifest.stage(name, self.code)
+        return self.manifest.stage(name)
 
     @property
     def agent(self) -> Agent | None:
@@ -211,7 +208,11 @@ class Run:
     @cached_property
     def robustness(self) -> Robustness:
         """The result of the examination under noise, from `robustness.json`."""
-        return Robustness.load(self._checked("robustness.json"))
+        path = self._checked("robustness.json")
+        robustness = Robustness.load(path)
+        with artifacts.reading(path):
+            robustness.check(("policy", "hyrl"))
+        return robustness
 
     @cached_property
     def arrivals(self) -> Arrivals:
@@ -254,6 +255,10 @@ class Run:
             raise BadArtifact(
                 f"{path} is an arc of {arc.task}, {self.path} a run of {task.name}: "
                 "simulate it again"
+            )
+        if arc.t[-1] > len(arc.t) * task.dt:
+            raise BadArtifact(
+                f"{path} has fewer samples than its {arc.t[-1]:g} s take: simulate it again"
             )
         return arc
 
@@ -298,9 +303,11 @@ def load_run(
     return Run(path, settings, policy)
 
 
-def write_config(run: Run) -> None:
-    """Writes `config.json`: every setting, and the versions of Python and the packages."""
-    versions = {name: version(name) for name in PACKAGES} | {"python": platform.python_version()}
+def write_config(run: Run, versions: dict[str, str] | None = None) -> None:
+    """Writes `config.json`: every setting, and the versions of Python and the packages, by default of now."""
+    if versions is None:
+        versions = {name: version(name) for name in PACKAGES}
+        versions["python"] = platform.python_version()
     artifacts.write_json(run.path / "config.json", Config(run.settings, versions), kind="run")
 
 
@@ -335,6 +342,8 @@ def opened(path: str | Path, settings: Settings, policy: AnyPolicy | None = None
     path = Path(path)
     if path.exists() and not (path.is_dir() and may_hold_run(path)):
         raise BadInput(f"{path} exists and is not a run directory: choose another --out")
+    if (path / "config.json").exists():
+        load_run(path, policy)  # nothing is written to the folder of another program
     with locked(path):
         run = Run(path, settings, policy)
         if not (path / "config.json").exists():

@@ -15,6 +15,8 @@ from hyrl_mj.errors import BadInput
 
 # The runs from more nodes than this do not fit into the memory of a small machine.
 MOST_NODES = 2**19
+# Sets on one grid, of which there is one for each mode.
+MOST_SETS = 1_000
 
 
 class StateSet(Protocol):
@@ -76,10 +78,17 @@ class Grid:
 
     @staticmethod
     def from_counts(chart: Chart, counts: np.ndarray) -> Grid:
-        """Returns a grid with `counts` (d,) nodes; raises `BadInput` if the chart has another dimension."""
+        """Returns a grid with `counts` (d,) nodes.
+
+        Raises:
+            BadInput: the chart has another dimension, or no grid has so many nodes.
+        """
         if len(counts) != chart.dimension:
             raise BadInput(f"a grid of {len(counts)} dimensions does not fit chart {chart.names}")
-        return Grid(chart, tuple(int(n) for n in counts))
+        numbers = tuple(int(n) for n in counts)
+        if min(numbers) < 2 or math.prod(numbers) > MOST_NODES:
+            raise BadInput(f"a grid of {numbers} nodes cannot be used: give 2 or more on each axis")
+        return Grid(chart, numbers)
 
     @cached_property
     def spacing(self) -> np.ndarray:
@@ -188,8 +197,13 @@ class GridSet(StateSet):
     @staticmethod
     def unpack(arrays: Mapping[str, np.ndarray], task: Any) -> tuple[GridSet, ...]:
         """Returns the sets from the arrays of `pack`, in the chart of a task."""
-        grid = Grid.from_counts(task.chart, arrays["grid_counts"])
-        return tuple(GridSet(grid, values) for values in arrays["signed_distance"])
+        grid, distances = (
+            Grid.from_counts(task.chart, arrays["grid_counts"]),
+            arrays["signed_distance"],
+        )
+        if len(distances) > MOST_SETS:
+            raise BadInput(f"{len(distances):,} sets are more than {MOST_SETS:,}")
+        return tuple(GridSet(grid, values) for values in distances)
 
     def __repr__(self) -> str:
         return f"GridSet({self.mask.mean():.1%} of {' x '.join(map(str, self.grid.counts))} nodes)"

@@ -10,16 +10,16 @@ from __future__ import annotations
 import json
 import os
 from contextlib import suppress
-from hashlib import sha256
 from pathlib import Path
 
-from hyrl_mj.artifacts import replacing
+from hyrl_mj.artifacts import digest, replacing
 from hyrl_mj.errors import BadInput
 
 
 def store() -> Path | None:
     """Returns the file of the records, after the XDG base directories; None without a home directory."""
-    if state := os.environ.get("XDG_STATE_HOME"):
+    state = os.environ.get("XDG_STATE_HOME", "")
+    if os.path.isabs(state):  # others are to be ignored
         return Path(state) / "hyrl_mj" / "code.json"
     try:
         return Path.home() / ".local" / "state" / "hyrl_mj" / "code.json"
@@ -30,7 +30,7 @@ def store() -> Path | None:
 def remember(path: Path) -> None:
     """Records that the user has named this file of code; without a place for records, nothing is kept."""
     file, records = store(), _records()
-    entry = {str(path.resolve()): _digest(path)}
+    entry = {str(path.resolve()): digest(path)}
     if file is None or records | entry == records:
         return
     with suppress(BadInput), replacing(file) as temporary:
@@ -39,11 +39,12 @@ def remember(path: Path) -> None:
 
 def is_known(path: Path) -> bool:
     """Returns whether this machine has run the file, as it is now, because the user named it."""
-    digest = _digest(path)
-    return digest is not None and _records().get(str(path.resolve())) == digest
+    # A file without a record is not even read: it may have no end.
+    known = _records().get(str(path.resolve()))
+    return known is not None and path.is_file() and known == digest(path)
 
 
-def _records() -> dict[str, str | None]:
+def _records() -> dict[str, str]:
     """Returns the hashes of the files by path; none where the records are missing or damaged."""
     file = store()
     try:
@@ -51,11 +52,3 @@ def _records() -> dict[str, str | None]:
     except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}
-
-
-def _digest(path: Path) -> str | None:
-    """Returns the SHA-256 of a file, None if it cannot be read."""
-    try:
-        return sha256(path.read_bytes()).hexdigest()
-    except OSError:
-        return None

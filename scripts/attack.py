@@ -65,11 +65,11 @@ class Attack:
 
 ATTACKS = {
     "crashes": Attack(
-        "crashed before and after every rename, then resumed", crashes.trials, 10_000, 8
+        "crashed before and after every rename, then resumed", crashes.trials, 10_000, 6
     ),
     "kills": Attack("killed at a random moment, then resumed", kills.trials, 50, 2),
-    "artifacts": Attack("truncated, or one bit flipped", damage.trials, 80, 8),
-    "received": Attack("crafted files of a stranger", received.trials, 100, 12),
+    "artifacts": Attack("truncated, or one bit flipped", damage.trials, 80, 6),
+    "received": Attack("crafted files of a stranger", received.trials, 100, 8),
     "configurations": Attack(
         "one setting changed, through every stage", configurations.trials, 200, 20
     ),

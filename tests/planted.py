@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from hyrl_mj.artifacts import digest
 from hyrl_mj.chart import Chart
-from hyrl_mj.manifest import FILES, Entry, digest
+from hyrl_mj.manifest import FILES, Entry, Manifest
 from hyrl_mj.run_directory import load_run
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.critical_set import CriticalSet
@@ -266,11 +267,11 @@ def sphere_policy(task, radius):
 def believe(path, task=None):
     """Records the files of a run directory as they are now, as if its stages had just written them."""
     run = load_run(path)
-    code = run.code if task is None else ""
+    code = run.task.code if task is None else ""
     files = {p.relative_to(path).as_posix(): digest(p) for p in path.rglob("*") if p.is_file()}
-    run.manifest._write(
+    Manifest(path, run.digests)._write(
         {
-            stage: Entry(run.manifest.settings[stage], code, {}, outputs)
+            stage: Entry(run.digests[stage], code, {}, outputs)
             for stage, names in FILES.items()
             if (outputs := {n: content for n, content in files.items() if re.fullmatch(names, n)})
         }

@@ -93,7 +93,7 @@ def test_run_again_does_nothing_again(finished):
 def test_a_stage_that_gives_the_same_again_leaves_those_after_it_done(copied):
     assert call("critical-set", copied).returncode == 0
     run = hyrl_mj.load_run(copied)
-    assert all(run.manifest.is_done(stage, run.code) for stage in STAGES), "it found the same again"
+    assert all(run.manifest.is_done(stage) for stage in STAGES), "it found the same again"
 
 
 def test_figures_are_drawn_again(copied):
@@ -108,7 +108,7 @@ def test_a_new_horizon_is_used_and_kept(copied):
     assert call("extended-sets", copied, "--horizon", "0.2").returncode == 0
     run = hyrl_mj.load_run(copied)
     assert run.settings.horizon == run.extended_sets.horizon == 0.2
-    assert not run.manifest.is_done("retrain", run.code)
+    assert not run.manifest.is_done("retrain")
 
 
 @pytest.mark.parametrize("name", ["mode_1.safetensors", "arcs/start0_hyrl_q1.npz"])

@@ -28,15 +28,15 @@ def put(path, text):
 
 
 def write(folder, stage, name, text, *inputs, settings=SETTINGS, code=""):
-    manifest = Manifest(folder, settings)
-    with manifest.stage(stage, code):
+    manifest = Manifest(folder, settings, code)
+    with manifest.stage(stage):
         for source in inputs:
             manifest.checked(folder / source)
         put(folder / name, text)
 
 
 def done(folder, settings=SETTINGS, code=""):
-    return [s for s in FILES if Manifest(folder, settings).is_done(s, code)]
+    return [s for s in FILES if Manifest(folder, settings, code).is_done(s)]
 
 
 def test_a_stage_is_done_when_its_files_are_those_that_it_wrote(folder):
@@ -75,7 +75,7 @@ def test_other_settings_or_code_make_a_stage_undone(folder):
 
 def test_a_stage_that_breaks_off_is_not_believed(folder):
     def break_off():
-        with Manifest(folder, SETTINGS).stage("train", ""):
+        with Manifest(folder, SETTINGS).stage("train"):
             put(folder / "policy.json", "half")
             raise RuntimeError
 
@@ -88,7 +88,7 @@ def test_a_stage_that_breaks_off_is_not_believed(folder):
 
 def test_a_stage_that_fails_before_it_writes_changes_nothing(folder):
     before = (folder / NAME).read_bytes()
-    with pytest.raises(RuntimeError), Manifest(folder, SETTINGS).stage("train", ""):
+    with pytest.raises(RuntimeError), Manifest(folder, SETTINGS).stage("train"):
         raise RuntimeError
     assert (folder / NAME).read_bytes() == before
     assert done(folder) == ["train", "critical-set", "partition"]
@@ -96,7 +96,7 @@ def test_a_stage_that_fails_before_it_writes_changes_nothing(folder):
 
 def test_a_file_that_a_stage_did_without_makes_it_out_of_date_once_it_is_there(folder):
     manifest = Manifest(folder, SETTINGS)
-    with manifest.stage("report", ""):
+    with manifest.stage("report"):
         assert not manifest.has(folder / "replay.mp4")
         assert manifest.has(folder / "partition.npz")
         put(folder / "report.html", "no video")
@@ -232,7 +232,7 @@ def test_a_huge_file_is_not_read(folder):
     with (folder / NAME).open("wb") as file:
         file.truncate(2**40)
     with pytest.raises(BadArtifact, match=r"manifest.json is larger than any manifest: remove it"):
-        Manifest(folder, SETTINGS).is_done("train", "")
+        Manifest(folder, SETTINGS).is_done("train")
 
 
 # ---- order, and readers beside writers

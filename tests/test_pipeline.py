@@ -29,7 +29,7 @@ def contents(path):
 
 
 def stages_done(run):
-    return [name for name in NAMES if run.manifest.is_done(name, run.code)]
+    return [name for name in NAMES if run.manifest.is_done(name)]
 
 
 # ---- whole runs

@@ -87,9 +87,13 @@ def test_a_file_with_such_a_setting_is_refused(settings, tmp_path, name, value, 
     content = {"settings": asdict(settings), "versions": {}}
     inner = content["settings"] if name in OF_RUNS else content["settings"]["stage1"]
     inner[name] = value
-    artifacts.write_json(tmp_path / "config.json", content, "run")
-    with pytest.raises(BadArtifact, match=r"start a new run|control characters") as refused:
+
+    def write_and_read():
+        artifacts.write_json(tmp_path / "config.json", content, "run")
         hyrl_mj.load_run(tmp_path)
+
+    with pytest.raises(BadInput, match=r"start a new run|control characters") as refused:
+        write_and_read()
     assert name in str(refused.value) or "control characters" in str(refused.value)
 
 

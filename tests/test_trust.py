@@ -1,18 +1,23 @@
 """Opening what somebody else has made executes nothing: code runs only where the user names it."""
 
+import os
 import re
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 from planted import believe
 from test_cli import call
 
 import hyrl_mj
-from hyrl_mj import BadArtifact, BadInput, artifacts, trust
+from hyrl_mj import BadArtifact, BadInput, HybridArc, artifacts, trust
+from hyrl_mj.manifest import check_contents
 from hyrl_mj.pipeline import run_stage
 from hyrl_mj.policies import algorithms
 from hyrl_mj.run_directory import Run, write_config
+from hyrl_mj.sets import GridSet
 from hyrl_mj.tasks import described_task
 
 EVIL = "import pathlib\npathlib.Path({marker!r}).touch()\n"
@@ -152,3 +157,81 @@ def python(code):
     import sys
 
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+
+
+# ---- what a stranger may try
+
+
+def test_a_file_without_a_record_is_not_even_read(tmp_path):
+    os.mkfifo(tmp_path / "endless.py")
+    assert not trust.is_known(tmp_path / "endless.py")
+
+
+def test_a_relative_place_for_records_is_ignored(monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", "here")
+    assert trust.store() == Path.home() / ".local" / "state" / "hyrl_mj" / "code.json"
+
+
+def test_a_pipe_in_a_run_directory_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "policy.json")
+    with pytest.raises(BadArtifact, match=r"policy.json is no file"):
+        check_contents(tmp_path)
+
+
+@pytest.mark.parametrize("counts", [[0], [1], [2**40]])
+def test_a_grid_that_no_run_has_is_refused(counts, circle):
+    arrays = {"grid_counts": np.array(counts), "signed_distance": np.empty((10**12, 0))}
+    with pytest.raises(BadInput, match="cannot be used"):
+        GridSet.unpack(arrays, circle)
+
+
+def test_more_sets_than_there_are_modes_are_refused(circle):
+    arrays = {"grid_counts": np.array([2]), "signed_distance": np.zeros((5_000, 2))}
+    with pytest.raises(BadInput, match="5,000 sets"):
+        GridSet.unpack(arrays, circle)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"j": np.array(["\x1b[31m", "1"])},
+        {"j": np.array([0, 10**15])},
+        {"j": np.array([0.0, 1.0])},
+        {"t": np.array([0.1, 0.0])},
+    ],
+)
+def test_an_arc_counts_its_jumps(change):
+    two = {"t": np.array([0.0, 0.1]), "j": np.array([0, 1]), "q": np.array([0, 1])}
+    table = dict.fromkeys(("z", "measured", "u", "state"), np.zeros((2, 1)))
+    words = {"task": "vehicle", "controller": "", "outcome": "", "noise": "none", "bound": 0.0}
+    HybridArc(**two, **table, **words)
+    with pytest.raises(BadInput, match="make no arc"):
+        HybridArc(**{**two, **change}, **table, **words)
+
+
+@pytest.fixture(scope="module")
+def examined(planted_circle, tmp_path_factory):
+    """A run directory with the result of the worst-case game."""
+    path = shutil.copytree(planted_circle[0].path, tmp_path_factory.mktemp("received") / "run")
+    return run_stage(hyrl_mj.load_run(path), "robustness", str).path
+
+
+@pytest.mark.parametrize(
+    "forge",
+    [
+        lambda content: content["game"]["scores"].pop("hyrl"),
+        lambda content: content["game"]["scores"].update(hyrl=[]),
+        lambda content: content["game"]["margin"].clear(),
+        lambda content: content["game"]["curve"].update(eps=[]),
+        lambda content: content.update(game=None),
+    ],
+)
+@pytest.mark.slow
+def test_forged_results_are_refused(forge, examined, tmp_path):
+    path = shutil.copytree(examined, tmp_path / "examined")
+    content = artifacts.read_json(path / "robustness.json", "robustness", dict)
+    forge(content)
+    artifacts.write_json(path / "robustness.json", content, "robustness")
+    believe(path)
+    with pytest.raises(BadArtifact, match=r"robustness.json: it"):
+        hyrl_mj.load_run(path).robustness  # noqa: B018

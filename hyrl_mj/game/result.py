@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -10,6 +11,7 @@ import numpy as np
 
 from hyrl_mj import artifacts
 from hyrl_mj.chart import Chart
+from hyrl_mj.errors import BadArtifact
 from hyrl_mj.sets import Grid
 
 # Name of the limit, a controller that is scored beside the examined ones.
@@ -140,6 +142,26 @@ class GameResult:
         """The names of the controllers, without the limit."""
         return tuple(name for name in self.scores if name != LIMIT)
 
+    def is_whole(self, controllers: Collection[str]) -> bool:
+        """Whether all tables have the same controllers, and as many rows as noise bounds."""
+        own, every = set(controllers), {*controllers, LIMIT}
+        names = own == set(self.margin) == set(self.miss_without_noise)
+        if not names or not every == set(self.scores) == set(self.curve.wins) == set(
+            self.profile.eps
+        ):
+            return False
+        columns = [
+            self.curve.winnable,
+            *(w for wins in self.curve.wins.values() for w in vars(wins).values()),
+        ]
+        return (
+            len({len(scores) for scores in self.scores.values()} - {0}) == 1
+            and all(self.scores.values())
+            and bool(self.curve.eps)
+            and all(len(c) == len(self.curve.eps) for c in [self.curve.winnable, *columns])
+            and all(len(eps) == len(self.profile.points) for eps in self.profile.eps.values())
+        )
+
     @property
     def lasting(self) -> bool:
         """Whether some run never ends, so that times and excursions are informative."""
@@ -177,6 +199,11 @@ class EpisodeCount:
     interval: tuple[float, float]
 
     @property
+    def is_whole(self) -> bool:
+        """Whether there are episodes, each of which has an outcome."""
+        return self.episodes > 0 and sum(self.outcomes.values()) == self.episodes
+
+    @property
     def lost(self) -> int:
         """The number of episodes that did not reach the set-point."""
         return self.episodes - self.outcomes.get("reached", 0)
@@ -199,6 +226,19 @@ class Robustness:
     game: GameResult | None
     episodes: tuple[EpisodeCount, ...]
     seed: int
+
+    def check(self, controllers: Collection[str]) -> None:
+        """Raises `BadArtifact` unless there are whole results of these controllers, as stages write them."""
+        if not (self.game or self.episodes):
+            raise BadArtifact("it holds neither a game nor episodes")
+        if self.game and not self.game.is_whole(controllers):
+            raise BadArtifact(f"its game is not one of {' and '.join(controllers)}")
+        kinds = {
+            name: {c.noise for c in self.episodes if c.controller == name} for name in controllers
+        }
+        known = all(c.controller in controllers and c.is_whole for c in self.episodes)
+        if not known or len(set(map(frozenset, kinds.values()))) > 1:
+            raise BadArtifact(f"its episodes are not those of {' and '.join(controllers)}")
 
     def __repr__(self) -> str:
         game = f"{self.game}, " if self.game else ""

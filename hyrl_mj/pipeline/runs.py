@@ -184,7 +184,7 @@ def extend_again(run: Run, horizon: float, say: Say = print) -> Run:
     with locked(run.path):
         with changed.stage("extended-sets"):
             extended_sets_stage(changed, lambda text: say(f"extended-sets: {text}"))
-        write_config(changed)
+        write_config(changed, run.versions)
     say(f"go on with {beginning(changed, run.path)}")
     return load_run(run.path, run.function)
 
@@ -194,7 +194,7 @@ def _run_all(run: Run, say: Say, stages: Iterable[str] = STAGES) -> Run:
     for stage in stages:
         if stage == "train" and run.agent:
             say(f"train: none, {run.agent} is given; it {run.arrivals}")
-        elif run.manifest.is_done(stage, run.code) and (stage != "robustness" or is_usual(run)):
+        elif run.manifest.is_done(stage) and (stage != "robustness" or is_usual(run)):
             say(f"{stage}: done before")
         else:
             run = run_stage(run, stage, say)
@@ -220,7 +220,7 @@ def _with_agent(task: str | Path, policy: AnyPolicy, options: AgentOptions) -> I
     function = external.policy if external.agent.algorithm == FUNCTION else None
     path = options.out or Path("runs") / f"{checked.name}_robust"
     with opened(path, settings, function) as run:
-        if not run.manifest.is_done("train", run.code):
+        if not run.manifest.is_done("train"):
             with run.stage("train"):
                 arrivals = Arrivals.of(checked, external.policy)
                 external.store(run.path)

@@ -32,7 +32,10 @@ from hyrl_mj.stages import (
     with_room,
 )
 from hyrl_mj.verdict import mode_sentence
-from hyrl_mj.viz import replay_sentence
+from hyrl_mj.viz import ReplayOptions, replay_sentence
+
+# Frames per second of the video with preset smoke, which only shows that a video can be made.
+SMOKE_FPS = 10
 
 
 def train_stage(run: Run, say: Say) -> None:
@@ -133,8 +136,11 @@ def replay_stage(run: Run, say: Say) -> None:
     from hyrl_mj.viz.arcs import replay_floor, replay_shows
     from hyrl_mj.viz.replay import render_replay
 
+    options = ReplayOptions(fps=SMOKE_FPS) if run.settings.preset == "smoke" else ReplayOptions()
     try:
-        render_replay(run.task, replay_shows(run), run.path / "replay.mp4", floor=replay_floor(run))
+        render_replay(
+            run.task, replay_shows(run), run.path / "replay.mp4", options, floor=replay_floor(run)
+        )
         say(f"video at {run.path / 'replay.mp4'}")
     except NoRenderer as error:
         say(f"no video: {error}")

@@ -43,10 +43,14 @@ def from_onnx(path: Path, task: Task, remedy: str, n_stack: int = 1) -> Function
     input_name, output_name = found["inputs"][0][0], found["outputs"][0]
 
     def function(observation: np.ndarray) -> np.ndarray:
-        rows = ROWS if takes_batches else 1
-        parts = [observation[i : i + rows] for i in range(0, len(observation), rows)]
+        n = len(observation)
+        # No other numbers of rows than were tried.
+        rows = ROWS if takes_batches and n > 1 else 1
+        whole = np.pad(observation, ((0, -n % rows), (0, 0)))
+        parts = [whole[i : i + rows] for i in range(0, len(whole), rows)]
         outputs = [session.run([output_name], {input_name: part})[0] for part in parts]
         actions = np.concatenate(outputs)
+        actions = actions[:n] if len(actions) == len(whole) else actions
         preferences = task.input_levels is not None and np.issubdtype(actions.dtype, np.floating)
         return preferred_levels(actions, task) if preferences else actions
 

@@ -136,9 +136,16 @@ def _try(answer: Any, columns: int, rows: int, one: bool) -> None:
         raise Refused("it answers the same observations otherwise the second time")
     if not first.shape or len(first) != rows:
         return  # reported with its shape where it is first used
+    one_by_one = [answer(observation[i : i + 1]) for i in range(SINGLY)]
     fewer = answer(np.ascontiguousarray(observation[:1:-2]))
+    if {len(part) for part in one_by_one} != {1} or len(fewer) != len(first[:1:-2]):
+        raise Refused("its number of answers is not that of the observations")
     # Sums in another order differ in their last digits.
-    same = np.isclose(fewer, first[:1:-2], rtol=1e-3, atol=1e-4, equal_nan=True)
+    found, expected = (
+        np.concatenate([*one_by_one, fewer]),
+        np.concatenate([first[:SINGLY], first[:1:-2]]),
+    )
+    same = np.isclose(found, expected, rtol=1e-3, atol=1e-4, equal_nan=True)
     if np.mean(same) < 0.99:
         raise Refused("its answer to an observation depends on the other observations of the batch")
 

@@ -66,9 +66,19 @@ class HybridArc(Saved):
         fits = all(np.shape(a) == (rows,) for a in (self.t, self.j, self.q))
         fits = fits and all(np.ndim(a) == 2 and len(a) == rows for a in tables.values())
         numbers = all(np.asarray(a).dtype.kind in "biuf" for a in (self.t, *tables.values()))
-        modes = np.issubdtype(np.asarray(self.q).dtype, np.integer)
-        if not (rows and fits and numbers and modes and np.isfinite(self.t).all()):
+        counts = all(np.issubdtype(np.asarray(a).dtype, np.integer) for a in (self.q, self.j))
+        if not (rows and fits and numbers and counts and np.isfinite(self.t).all()):
             raise BadInput("these arrays make no arc: give numbers in one row for each sample")
+        jumps = np.diff(self.j)
+        if (
+            self.t[0] < 0
+            or np.any(np.diff(self.t) < 0)
+            or self.j[0] != 0
+            or np.any(jumps * (jumps - 1))
+        ):
+            raise BadInput(
+                "these arrays make no arc: t must not fall, and j counts jumps from 0 on"
+            )
 
     @property
     def columns(self) -> tuple[int, int, int]:

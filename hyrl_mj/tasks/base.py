@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from hyrl_mj import mjcf
+from hyrl_mj.artifacts import digest
 from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput, check_bound
 from hyrl_mj.plant import Plant, input_limits
@@ -33,6 +34,7 @@ class Task(ABC):
     env_id: str
     #: the file that defines the task, None for one of this package
     source: Path | None = None
+    _digest: str = ""
     #: one line for `hyrl-mj list`
     description: str = ""
     #: coordinates of the critical set and of all sets
@@ -72,6 +74,19 @@ class Task(ABC):
     def __repr__(self) -> str:
         coordinates, inputs = ", ".join(self.chart.names), ", ".join(self.inputs)
         return f"<Task {self.name}: chart ({coordinates}), inputs ({inputs})>"
+
+    @cached_property
+    def code(self) -> str:
+        """SHA-256 of the files that define a task of the user's; "" for one of this package.
+
+        That of the Python file is taken once, because Python imports a file once.
+        """
+        if self.source is None:
+            return ""
+        kind = type(self)
+        if "_digest" not in vars(kind):
+            kind._digest = digest(self.source)
+        return f"{kind._digest[:32]}{digest(self.model_path)[:32]}"
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         return self  # nothing writes to it

@@ -52,8 +52,10 @@ def try_extreme(task: Task) -> np.ndarray:
         BadInput: as `try_random`.
     """
     rng = np.random.default_rng(0)
-    corners = np.array(list(product(*zip(*task.input_limits, strict=True), repeat=1)))
-    corners = corners[rng.permutation(len(corners))[:CORNERS]]
+    m = len(task.inputs)
+    every = 2**m <= CORNERS
+    upper = [*product((False, True), repeat=m)] if every else rng.random((CORNERS, m)) < 0.5
+    corners = np.where(upper, task.input_limits[1], task.input_limits[0])
     places = np.vstack([task.starts(STARTS, rng), task.scene.starts, _nodes(task)])
     chosen = rng.permutation(2 * len(corners) * len(places))[: _side_by_side(task)]
     place, corner, alternating = np.unravel_index(chosen, (len(places), len(corners), 2))
