@@ -67,7 +67,7 @@ ATTACKS = {
     "crashes": Attack(
         "crashed before and after every rename, then resumed", crashes.trials, 10_000, 6
     ),
-    "kills": Attack("killed at a random moment, then resumed", kills.trials, 50, 2),
+    "kills": Attack("killed at a random moment, then resumed", kills.trials, 50, 1),
     "artifacts": Attack("truncated, or one bit flipped", damage.trials, 80, 6),
     "received": Attack("crafted files of a stranger", received.trials, 100, 8),
     "configurations": Attack(
@@ -75,7 +75,7 @@ ATTACKS = {
     ),
     "tasks": Attack("task file or MJCF with one mistake", tasks.trials, 120, 8),
     "writers": Attack("two and four writers, and a reader", writers.trials, 20, 1),
-    "surroundings": Attack("each pair of bad surroundings", surroundings.trials, 10_000, 2),
+    "surroundings": Attack("each pair of bad surroundings", surroundings.trials, 10_000, 1),
 }
 
 # The trials that are under way, for the forked processes that make them.

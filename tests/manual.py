@@ -165,9 +165,11 @@ if __name__ == "__main__":
     # A viewer waits for a person, and the loops of a robot for the time to pass.
     import time
 
-    import hyrl_mj.viz.viewing
+    from hyrl_mj.learning import settings
+    from hyrl_mj.viz import viewing
 
-    hyrl_mj.viz.viewing.view = lambda *arguments: print("viewed", arguments[1])
+    settings._SMOKE |= {"sac": 3_000}
+    viewing.view = lambda *arguments: print("viewed", arguments[1])
     time.sleep = lambda seconds: None
     sys.path.insert(0, "")  # what a block has written can be imported
     run(Path(sys.argv[1]))

@@ -22,7 +22,7 @@ SCRIPTS = str(Path(__file__).parent.parent / "scripts")
 PLANTED = {
     "crashes": (
         "import re; from hyrl_mj.manifest import FILES, Manifest\n"
-        "def there(self, stage, code):\n"
+        "def there(self, stage):\n"
         "    names = [path.relative_to(self.folder).as_posix() for path in self.folder.rglob('*')]\n"
         "    return any(re.fullmatch(FILES[stage], name) for name in names)\n"
         "Manifest.is_done = there"

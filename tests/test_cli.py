@@ -419,5 +419,5 @@ def test_a_policy_of_another_task_is_refused(copied):
     policy = hyrl_mj.load_run(copied).policy
     description = copied / "policy.json"
     description.write_text(description.read_text().replace("unit_circle", "vehicle"))
-    assert_one_sentence(call("critical-set", copied), "policy.json was changed", "hyrl-mj train")
+    assert_one_sentence(call("critical-set", copied), "policy.json was changed", "the stage train")
     assert np.isfinite(policy.act(np.zeros((1, 1)))).all()

@@ -22,7 +22,9 @@ FEW = {"ppo": 8_192, "dqn": 4_000}
 
 
 @pytest.fixture
-def quick(task):
+def quick(task, monkeypatch):
+    monkeypatch.setattr(training, "CHECKPOINTS", 2)
+    monkeypatch.setattr(training, "EPISODES", 64)
     return replace(preset(task, "smoke").stage1, samples=FEW[task.learning.algorithm])
 
 
@@ -116,6 +118,7 @@ from pathlib import Path
 import hyrl_mj
 from hyrl_mj.learning import preset, training
 
+training.CHECKPOINTS, training.EPISODES = 2, 64
 name, algorithm, samples = sys.argv[1:]
 task = hyrl_mj.get_task(name)
 settings = replace(preset(task, "smoke", algorithm=algorithm).stage1, samples=int(samples))

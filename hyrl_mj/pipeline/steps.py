@@ -34,8 +34,8 @@ from hyrl_mj.stages import (
 from hyrl_mj.verdict import mode_sentence
 from hyrl_mj.viz import ReplayOptions, replay_sentence
 
-# Frames per second of the video with preset smoke, which only shows that a video can be made.
-SMOKE_FPS = 10
+# The video with preset smoke only shows that a video can be made.
+SMOKE = ReplayOptions(size=(640, 360), fps=10)
 
 
 def train_stage(run: Run, say: Say) -> None:
@@ -136,7 +136,7 @@ def replay_stage(run: Run, say: Say) -> None:
     from hyrl_mj.viz.arcs import replay_floor, replay_shows
     from hyrl_mj.viz.replay import render_replay
 
-    options = ReplayOptions(fps=SMOKE_FPS) if run.settings.preset == "smoke" else ReplayOptions()
+    options = SMOKE if run.settings.preset == "smoke" else ReplayOptions()
     try:
         render_replay(
             run.task, replay_shows(run), run.path / "replay.mp4", options, floor=replay_floor(run)
