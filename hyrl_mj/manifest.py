@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -289,11 +290,18 @@ def check_contents(folder: Path) -> None:
             )
         for name in (*folders, *files):
             path = Path(root, name)
-            if not (path.is_symlink() or path.is_file() or path.is_dir()):
+            try:
+                status = path.lstat()
+            except FileNotFoundError:  # a temporary file of another process
+                continue
+            kind = stat.S_IFMT(status.st_mode)
+            if kind not in (stat.S_IFREG, stat.S_IFDIR, stat.S_IFLNK):
                 raise BadArtifact(
                     f"{path} is no file: a run directory holds files and folders alone"
                 )
-            if path.is_symlink() or (name == LOCK and path.is_file() and path.stat().st_nlink > 1):
+            if kind == stat.S_IFLNK or (
+                name == LOCK and kind == stat.S_IFREG and status.st_nlink > 1
+            ):
                 raise BadArtifact(
                     f"{path} is a link, and a run directory holds none: put the file itself there"
                 )

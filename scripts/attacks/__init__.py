@@ -162,6 +162,8 @@ def _work(work: Callable[[], object], folder: Path, out: int, err: int) -> None:
             sys.stdout.flush()
     except SystemExit as end:
         status = end.code if isinstance(end.code, int) else int(end.code is not None)
+        if isinstance(end.code, str):
+            print(end.code, file=sys.stderr)
     except BaseException:
         traceback.print_exc()
     finally:
