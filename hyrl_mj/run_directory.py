@@ -32,14 +32,8 @@ from hyrl_mj.verdict import Verdict
 
 # The packages whose versions `config.json` records.
 PACKAGES = (
-    "hyrl-mj",
-    "mujoco",
-    "gymnasium",
-    "stable-baselines3",
-    "torch",
-    "numpy",
-    "mediapy",
-)
+    "hyrl-mj", "mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "mediapy",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -208,11 +202,7 @@ class Run:
     @cached_property
     def robustness(self) -> Robustness:
         """The result of the examination under noise, from `robustness.json`."""
-        path = self._checked("robustness.json")
-        robustness = Robustness.load(path)
-        with artifacts.reading(path):
-            robustness.check(("policy", "hyrl"))
-        return robustness
+        return Robustness.load(self._checked("robustness.json"), of=("policy", "hyrl"))
 
     @cached_property
     def arrivals(self) -> Arrivals:

@@ -250,14 +250,22 @@ class Robustness:
         artifacts.write_json(path, self, "robustness")
 
     @staticmethod
-    def load(path: Path) -> Robustness:
+    def load(path: Path, of: Collection[str] = ()) -> Robustness:
         """Reads what `save` wrote.
 
+        Args:
+            path: the file.
+            of: the controllers whose results it has to hold, if there are any.
+
         Raises:
-            BadArtifact: the file is missing, damaged, or of another version.
+            BadArtifact: the file is missing, damaged, of another version, or about other controllers.
         """
         remedy = "run hyrl-mj robustness RUN to write it again"
-        return artifacts.read_record(path, "robustness", Robustness, remedy)
+        robustness = artifacts.read_record(path, "robustness", Robustness, remedy)
+        if of:
+            with artifacts.reading(path):
+                robustness.check(of)
+        return robustness
 
 
 @dataclass(frozen=True)
