@@ -139,11 +139,20 @@ class Streams:
         ):
             yield
             return
+        hook = sys.unraisablehook
+
+        def without_interrupts(ignored: Any) -> None:
+            # One that strikes where Python ignores errors is lost, but for `_give_up`.
+            if not issubclass(ignored.exc_type, KeyboardInterrupt):
+                hook(ignored)
+
+        sys.unraisablehook = without_interrupts
         signal.signal(signal.SIGINT, self._interrupted)
         try:
             yield
         finally:
             signal.signal(signal.SIGINT, usual)
+            sys.unraisablehook = hook
 
     def _interrupted(self, *_: object) -> None:
         signal.signal(signal.SIGALRM, self._give_up)

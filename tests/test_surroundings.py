@@ -194,9 +194,28 @@ raise SystemExit(Streams().run(command))
 """
 
 
-def test_an_interrupt_ends_a_process_that_waits_for_ever():
+# An interrupt strikes where Python ignores errors, and the work goes on.
+DEAF = """
+import time
+from hyrl_mj.streams import Streams
+
+class Slow:
+    def __del__(self):
+        print("ready", flush=True)
+        time.sleep(60)
+
+def command():
+    Slow()
+    time.sleep(60)
+
+raise SystemExit(Streams().run(command))
+"""
+
+
+@pytest.mark.parametrize("program", [STUCK, DEAF])
+def test_an_interrupt_ends_a_process_whatever_it_strikes(program):
     process = subprocess.Popen(
-        [sys.executable, "-c", STUCK],
+        [sys.executable, "-c", program],
         env=os.environ | {"PYTHONPATH": str(PACKAGE)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
