@@ -164,7 +164,8 @@ def robustness(run: Run, options: ExamineOptions) -> None:
         raise BadInput(f"{option} is about the episodes: say how many, as in --episodes 100000")
     pipeline.examine_run(run, options)
     print_robustness(replace(run))
-    print(f"pictures in {run.path / 'figures'}")
+    if run.exact:
+        print(f"pictures in {run.path / 'figures'}")
 
 
 def replay(

@@ -35,14 +35,20 @@ class NoRenderer(HyrlError):
     """Off-screen rendering or video encoding is not possible on this machine."""
 
 
+def printable(text: str) -> str:
+    """Returns a text that cannot control a terminal, and that a file can hold.
+
+    Control and format characters, line separators and surrogates are written as escapes.
+    """
+    if text.isprintable():  # the usual case, without a look at each character
+        return text
+    controls = ("Cc", "Cf", "Cs", "Zl", "Zp")
+    return "".join(ascii(c)[1:-1] if category(c) in controls else c for c in text)
+
+
 def has_controls(text: str) -> bool:
     """Returns whether a text has characters that control a terminal, or that no file can hold."""
-    return any(category(c) in ("Cc", "Cf", "Cs", "Zl", "Zp") for c in text)
-
-
-def printable(text: str) -> str:
-    """Returns a text that cannot control a terminal: other characters than printable ones are escaped."""
-    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+    return printable(text) != text
 
 
 def unknown(what: str, value: object, allowed: Iterable[str]) -> BadInput:

@@ -332,11 +332,12 @@ def opened(path: str | Path, settings: Settings, policy: AnyPolicy | None = None
     path = Path(path)
     if path.exists() and not (path.is_dir() and may_hold_run(path)):
         raise BadInput(f"{path} exists and is not a run directory: choose another --out")
-    if (path / "config.json").exists():
-        load_run(path, policy)  # nothing is written to the folder of another program
+    config = path / "config.json"
+    if config.exists():
+        Config.load(config)  # nothing is written to the folder of another program
     with locked(path):
         run = Run(path, settings, policy)
-        if not (path / "config.json").exists():
+        if not config.exists():
             write_config(run)
         elif (run := load_run(path, policy)).settings != settings:
             differing = "; ".join(_differing(run.settings, settings))

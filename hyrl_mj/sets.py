@@ -10,13 +10,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from hyrl_mj.artifacts import MOST_ROWS
 from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput
 
 # The runs from more nodes than this do not fit into the memory of a small machine.
 MOST_NODES = 2**19
-# Sets on one grid, of which there is one for each mode.
-MOST_SETS = 1_000
 
 
 class StateSet(Protocol):
@@ -87,7 +86,10 @@ class Grid:
             raise BadInput(f"a grid of {len(counts)} dimensions does not fit chart {chart.names}")
         numbers = tuple(int(n) for n in counts)
         if min(numbers) < 2 or math.prod(numbers) > MOST_NODES:
-            raise BadInput(f"a grid of {numbers} nodes cannot be used: give 2 or more on each axis")
+            raise BadInput(
+                f"a grid of {numbers} nodes cannot be used: give 2 or more on each axis, and at most "
+                f"{MOST_NODES:,} in all"
+            )
         return Grid(chart, numbers)
 
     @cached_property
@@ -197,12 +199,10 @@ class GridSet(StateSet):
     @staticmethod
     def unpack(arrays: Mapping[str, np.ndarray], task: Any) -> tuple[GridSet, ...]:
         """Returns the sets from the arrays of `pack`, in the chart of a task."""
-        grid, distances = (
-            Grid.from_counts(task.chart, arrays["grid_counts"]),
-            arrays["signed_distance"],
-        )
-        if len(distances) > MOST_SETS:
-            raise BadInput(f"{len(distances):,} sets are more than {MOST_SETS:,}")
+        grid = Grid.from_counts(task.chart, arrays["grid_counts"])
+        distances = arrays["signed_distance"]
+        if len(distances) > MOST_ROWS:
+            raise BadInput(f"{len(distances):,} sets are more than {MOST_ROWS:,}")
         return tuple(GridSet(grid, values) for values in distances)
 
     def __repr__(self) -> str:

@@ -168,6 +168,7 @@ if __name__ == "__main__":
     from hyrl_mj.learning import settings
     from hyrl_mj.viz import viewing
 
+    # SAC's updates are slow, and no page shows what its policy has learned.
     settings._SMOKE |= {"sac": 3_000}
     viewing.view = lambda *arguments: print("viewed", arguments[1])
     time.sleep = lambda seconds: None

@@ -144,7 +144,7 @@ def test_cores_do_not_matter(words):
             check=True,
         ).stdout
 
-    assert trained("1") == trained("4")
+    assert trained("1") == trained("2") == trained("4")
 
 
 @pytest.mark.parametrize("fails", [False, True])

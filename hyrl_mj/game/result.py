@@ -144,22 +144,19 @@ class GameResult:
 
     def is_whole(self, controllers: Collection[str]) -> bool:
         """Whether all tables have the same controllers, and as many rows as noise bounds."""
-        own, every = set(controllers), {*controllers, LIMIT}
-        names = own == set(self.margin) == set(self.miss_without_noise)
-        if not names or not every == set(self.scores) == set(self.curve.wins) == set(
-            self.profile.eps
-        ):
+        examined = {*controllers}
+        if any(set(table) != examined for table in (self.margin, self.miss_without_noise)):
             return False
-        columns = [
-            self.curve.winnable,
-            *(w for wins in self.curve.wins.values() for w in vars(wins).values()),
-        ]
+        tables = (self.scores, self.curve.wins, self.profile.eps)
+        if any(set(table) != examined | {LIMIT} for table in tables):
+            return False
+        columns = [w for wins in self.curve.wins.values() for w in vars(wins).values()]
         return (
-            len({len(scores) for scores in self.scores.values()} - {0}) == 1
-            and all(self.scores.values())
-            and bool(self.curve.eps)
-            and all(len(c) == len(self.curve.eps) for c in [self.curve.winnable, *columns])
-            and all(len(eps) == len(self.profile.points) for eps in self.profile.eps.values())
+            all(self.scores.values())
+            and len(set(map(len, self.scores.values()))) == 1
+            and len(self.curve.eps) > 0
+            and set(map(len, [self.curve.winnable, *columns])) == {len(self.curve.eps)}
+            and set(map(len, self.profile.eps.values())) == {len(self.profile.points)}
         )
 
     @property

@@ -50,6 +50,7 @@ def from_onnx(path: Path, task: Task, remedy: str, n_stack: int = 1) -> Function
         parts = [whole[i : i + rows] for i in range(0, len(whole), rows)]
         outputs = [session.run([output_name], {input_name: part})[0] for part in parts]
         actions = np.concatenate(outputs)
+        # A wrong number of actions is kept: the policy's check names it.
         actions = actions[:n] if len(actions) == len(whole) else actions
         preferences = task.input_levels is not None and np.issubdtype(actions.dtype, np.floating)
         return preferred_levels(actions, task) if preferences else actions

@@ -69,13 +69,8 @@ class HybridArc(Saved):
         counts = all(np.issubdtype(np.asarray(a).dtype, np.integer) for a in (self.q, self.j))
         if not (rows and fits and numbers and counts and np.isfinite(self.t).all()):
             raise BadInput("these arrays make no arc: give numbers in one row for each sample")
-        jumps = np.diff(self.j)
-        if (
-            self.t[0] < 0
-            or np.any(np.diff(self.t) < 0)
-            or self.j[0] != 0
-            or np.any(jumps * (jumps - 1))
-        ):
+        rises = self.t[0] >= 0 and np.all(np.diff(self.t) >= 0)
+        if not (rises and self.j[0] == 0 and np.isin(np.diff(self.j), (0, 1)).all()):
             raise BadInput(
                 "these arrays make no arc: t must not fall, and j counts jumps from 0 on"
             )

@@ -12,6 +12,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from matplotlib.mathtext import MathTextParser
+
 import hyrl_mj.learning.settings as settings
 import hyrl_mj.learning.training as training
 import hyrl_mj.stages.results as results
@@ -33,14 +35,18 @@ LATE = (
     "hyrl_mj.viz.report",
     "fontTools.subset",
     "imageio_ffmpeg",
+    "matplotlib.backends.backend_pdf",
     "matplotlib.pyplot",
     "mediapy",
     "mujoco.batch",
+    "pydantic.dataclasses",
     "pydantic.type_adapter",
+    "scipy.sparse.linalg",
     "scipy.spatial",
     "stable_baselines3",
     "tensorboard",
     "torch._dynamo",
+    "typeguard",
 )
 
 
@@ -48,6 +54,7 @@ def import_late() -> None:
     """Imports once what every forked process would import."""
     for name in LATE:
         import_module(name)
+    MathTextParser("agg").parse("$x$")  # the first formula builds the grammar of all
 
 
 def shorten() -> None:
