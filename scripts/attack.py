@@ -69,7 +69,7 @@ ATTACKS = {
     ),
     "kills": Attack("killed at a random moment, then resumed", kills.trials, 50, 1),
     "artifacts": Attack("truncated, or one bit flipped", damage.trials, 80, 6),
-    "received": Attack("crafted files of a stranger", received.trials, 100, 8),
+    "received": Attack("crafted files of a stranger", received.trials, 60, 8),
     "configurations": Attack(
         "one setting changed, through every stage", configurations.trials, 200, 20
     ),

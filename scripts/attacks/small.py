@@ -62,8 +62,9 @@ def shorten() -> None:
     settings._LATTICE_SMOKE |= {1: LATTICE, 2: 60}
     settings._GRIDS |= {1: (24, 240), 2: (24, 48)}
     settings._GRIDS_DYNAMIC |= {1: (24, 240), 2: (16, 32)}
-    settings._SMOKE |= {"ppo": 2_048, "dqn": 3_000}
-    settings._SMOKE_MODES = 2_048
+    settings._PPO.options["n_steps"] = 8  # the least samples that are trained on are envs x n_steps
+    settings._SMOKE |= {"ppo": 1_024, "dqn": 3_000}
+    settings._SMOKE_MODES = 1_024
     training.CHECKPOINTS, training.EPISODES, results.EPISODES = 2, 64, 64
     style.DPI = 30
     style.STYLE["pdf.fonttype"] = 3
