@@ -11,7 +11,7 @@ from hyrl_mj.errors import BadArtifact, BadInput, HyrlError, NoRenderer
 from hyrl_mj.export import export_numpy, export_onnx
 from hyrl_mj.game import Game, Robustness, Score
 from hyrl_mj.learning import Settings
-from hyrl_mj.pipeline import AgentOptions, RunOptions, diagnose, robustify, run
+from hyrl_mj.pipeline import AgentOptions, RunOptions, SweepOptions, diagnose, robustify, run, sweep
 from hyrl_mj.policies import Controller, MlpPolicy, Policy, from_callable, load_agent
 from hyrl_mj.run_directory import Run, load_run
 from hyrl_mj.sets import StateSet
@@ -71,6 +71,7 @@ __all__ = [
     "Settings",
     "Signal",
     "StateSet",
+    "SweepOptions",
     "Task",
     "Verdict",
     "closed_loop",
@@ -90,5 +91,6 @@ __all__ = [
     "run",
     "simulate",
     "simulate_batch",
+    "sweep",
     "task_names",
 ]

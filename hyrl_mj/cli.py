@@ -13,12 +13,13 @@ from pathlib import Path
 from hyrl_mj import __version__, pipeline, progress
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.parsing import call, documented
-from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions
+from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions, SweepOptions
 from hyrl_mj.run_directory import Run
 from hyrl_mj.streams import Streams
+from hyrl_mj.sweeps import DONE
 from hyrl_mj.tasks import get_task, task_names, write_task
 from hyrl_mj.verdict import FAILED
-from hyrl_mj.viz import ReplayOptions, print_robustness, print_summary
+from hyrl_mj.viz import ReplayOptions, print_robustness, print_summary, print_sweep
 
 
 def list_tasks() -> None:
@@ -75,6 +76,31 @@ def finish(run: Run) -> None:
     """Prints the results of a whole run; if it FAILED, ends with exit status 1."""
     print_summary(run)
     if run.verdict.word == FAILED:
+        raise SystemExit(1)
+
+
+def sweep(
+    tasks: tuple[str, ...] = (), *, report: Path | None = None, options: SweepOptions
+) -> None:
+    """Make many runs side by side, over seeds, noise bounds and algorithms, and their tables.
+
+    What is done is not done again. It takes pip install "hyrl-mj[sweep]".
+
+    Args:
+        tasks: tasks, see `hyrl-mj list`, or Python files that define some; by default none, with --report.
+        report: make the tables of this sweep folder again from the runs that are there; by default off.
+    """
+    if report is not None:
+        if tasks:
+            raise BadInput(
+                "--report makes tables of the runs that are there: give no TASKS with it"
+            )
+        result, folder = pipeline.report(report), report
+    else:
+        result, folder = pipeline.sweep(tasks, options), Path(options.out)
+    print_sweep(result)
+    print(f"tables in {folder}/sweep.html, sweep.csv and sweep.json")
+    if any(row.state != DONE for row in result.rows):
         raise SystemExit(1)
 
 
@@ -275,6 +301,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "run": run,
     "robustify": robustify,
     "diagnose": diagnose,
+    "sweep": sweep,
     "train": stage_command("train", "Run stage 1 again: train the policy."),
     "critical-set": stage_command("critical-set", "Run stage 2 again: find the critical set."),
     "partition": stage_command("partition", "Run stage 3 again: partition the chart."),

@@ -44,6 +44,10 @@ FILES = {
 }
 
 
+class Busy(BadInput):
+    """Another process or thread works on the run directory."""
+
+
 @dataclass(frozen=True)
 class Entry:
     """What is recorded of a finished stage.
@@ -234,7 +238,8 @@ def locked(folder: Path) -> Iterator[None]:
     """Holds the lock of a run directory, which one thread of one process can hold, more than once.
 
     Raises:
-        BadInput: another process or thread works there; the message says which and since when.
+        Busy: another process or thread works there; the message says which and since when.
+        BadInput: the directory cannot be written.
     """
     path = folder.resolve() / LOCK
     check_contents(folder)
@@ -246,7 +251,7 @@ def locked(folder: Path) -> Iterator[None]:
         holder = ""
         with suppress(OSError, ValueError):
             holder = f" ({path.read_text(encoding='utf-8').strip()})"
-        raise BadInput(
+        raise Busy(
             f"another process is working on {folder}{holder}: wait until it ends, or choose another "
             "run directory"
         ) from None

@@ -10,8 +10,8 @@ import inspect
 import re
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass
-from itertools import pairwise
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass, replace
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
@@ -30,12 +30,14 @@ class Kind:
         meaning: what to give, for errors.
         read: returns the value of a word, or raises ValueError.
         show: returns the word of a default.
+        gather: returns the value of several words from what `read` returned for each; None for one word.
     """
 
     metavar: str
     meaning: str
     read: Callable[[str], Any]
     show: Callable[[Any], str] = str
+    gather: Callable[[tuple[Any, ...]], Any] | None = None
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -47,9 +49,34 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(","))
 
 
+def _numbers(text: str) -> tuple[float, ...]:
+    return tuple(map(float, text.split(",")))
+
+
+def _integers(text: str) -> tuple[int, ...]:
+    found: list[int] = []
+    for part in text.split(","):
+        first, dash, last = part.partition("-")
+        found += range(int(first), int(last if dash else first) + 1)
+        if dash and int(last) < int(first):
+            raise ValueError(text)
+    return tuple(found)
+
+
+def _change(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not (name and equals):
+        raise ValueError(text)
+    return name.strip(), value.strip()
+
+
+def _joined(parts: tuple[tuple[Any, ...], ...]) -> tuple[Any, ...]:
+    return tuple(chain(*parts))
+
+
 FLAG = Kind("", "no value", bool, lambda default: "off")
 RUN = Kind("RUN", "a run directory", Path)
-SEVERAL = Kind("NUMBER ...", "one or more numbers", float)  # the kind that takes several words
+NAMES = Kind("NAME,...", "names, separated by commas", _names, ",".join)
 KINDS: dict[Any, Kind] = {
     bool: FLAG,
     str: Kind("NAME", "a name", str),
@@ -58,8 +85,14 @@ KINDS: dict[Any, Kind] = {
     Path: Kind("PATH", "a path", Path),
     str | Path: Kind("PATH", "a path", Path),
     Run: RUN,
-    tuple[float, ...]: SEVERAL,
-    tuple[str, ...]: Kind("NAME,...", "names, separated by commas", _names, ",".join),
+    tuple[float, ...]: Kind(
+        "NUMBER ...", "one or more numbers", _numbers, "{0[0]:g}".format, _joined
+    ),
+    tuple[int, ...]: Kind(
+        "INTEGER,...", "integers or ranges, as 0-9 or 0,3,7-9", _integers, "{0[0]}".format
+    ),
+    tuple[str, ...]: NAMES,
+    dict[str, Any]: Kind("NAME=VALUE ...", "one or more NAME=VALUE", _change, str, dict),
     tuple[int, int]: Kind(
         "WIDTHxHEIGHT", "WIDTHxHEIGHT in pixels, as 640x480", _size, "{0[0]}x{0[1]}".format
     ),
@@ -102,7 +135,7 @@ class Argument:
         if self.kind is FLAG:
             return self.name, Annotated[bool, shown], False
         words = tyro.constructors.PrimitiveConstructorSpec[Any](
-            nargs="*" if self.kind is SEVERAL else 1,
+            nargs="*" if self.kind.gather else 1,
             metavar=self.title if self.positional else self.kind.metavar,
             instance_from_str=list,
             is_instance=lambda value: True,
@@ -121,7 +154,7 @@ class Argument:
         except ValueError:
             wrong = f"{self.title} {shlex.join(words)!r}"
             raise BadInput(f"{wrong} cannot be used: give {self.kind.meaning}") from None
-        return values if self.kind is SEVERAL else values[0]
+        return self.kind.gather(values) if self.kind.gather else values[0]
 
 
 # An option of each command that opens a run.
@@ -156,6 +189,8 @@ def arguments(function: Callable[..., Any], inside: bool = False) -> Iterator[Ar
         kind = next(KINDS[kind] for kind in KINDS if types[name] in (kind, kind | None))
         default = MISSING if parameter.default is parameter.empty else parameter.default
         positional = not inside and parameter.kind is not parameter.KEYWORD_ONLY
+        if positional and kind is NAMES:
+            kind = replace(kind, gather=_joined)
         yield Argument(name, kind, default, texts.get(name) or kind.meaning, positional)
 
 
@@ -181,6 +216,10 @@ def call(
         option = options.get(word.replace("_", "-"))
         if option and option.kind is not FLAG and following.startswith("--"):
             raise BadInput(f"{word} needs a value: give {option.kind.meaning}")
+        if option and option.kind.gather and words.count(word) > 1:
+            raise BadInput(
+                f"{word} is given twice: give it once, with {option.kind.meaning} after it"
+            )
     helping = "-h" in words or "--help" in words
     parsed: Any
     parsed, rest = tyro.cli(

@@ -7,7 +7,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from hyrl_mj import forked, mjcf, mujoco_log
+from hyrl_mj import cores, forked, mjcf, mujoco_log
 from hyrl_mj.errors import BadInput
 from hyrl_mj.ranges import Integer
 
@@ -80,7 +80,7 @@ class Plant:
         from mujoco.batch import Batch  # slow to import
 
         mujoco_log.install()
-        self._batch = Batch(self.model, self.n, self._threads)
+        self._batch = Batch(self.model, self.n, self._threads or cores.allowed)
         forked.own(self._batch)
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._ctrl = self._batch.bind("ctrl")

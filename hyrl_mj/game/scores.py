@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from hyrl_mj import cores
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.game import result
 from hyrl_mj.game.lattice import LATTICE, Lattice
@@ -282,6 +283,6 @@ def _in_threads(
     label: str, work: Callable[..., Any], calls: Sequence[tuple[Any, ...]]
 ) -> Iterator[Any]:
     """Yields the results of calls in their order, from threads: NumPy releases the interpreter's lock."""
-    with ThreadPoolExecutor(THREADS) as pool:
+    with ThreadPoolExecutor(min(THREADS, cores.count())) as pool:
         results = pool.map(lambda call: work(*call), calls)
         yield from progress_bar(results, label, "games", len(calls))

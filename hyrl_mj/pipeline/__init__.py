@@ -6,16 +6,20 @@
 from hyrl_mj.pipeline.examination import ExamineOptions
 from hyrl_mj.pipeline.runs import AgentOptions, RunOptions, diagnose, extend_again, robustify, run
 from hyrl_mj.pipeline.steps import as_stage, examine_run, run_stage
+from hyrl_mj.pipeline.sweep import SweepOptions, report, sweep
 
 __all__ = [
     "AgentOptions",
     "ExamineOptions",
     "RunOptions",
+    "SweepOptions",
     "as_stage",
     "diagnose",
     "examine_run",
     "extend_again",
+    "report",
     "robustify",
     "run",
     "run_stage",
+    "sweep",
 ]

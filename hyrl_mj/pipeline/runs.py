@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from hyrl_mj.errors import BadInput, unknown
-from hyrl_mj.learning import Settings, Training, preset
+from hyrl_mj.learning import Settings, Training, changed, preset
 from hyrl_mj.manifest import locked
 from hyrl_mj.pipeline.examination import is_usual
 from hyrl_mj.pipeline.steps import DIAGNOSIS, STAGES, extended_sets_stage, run_stage
@@ -40,6 +40,7 @@ class RunOptions:
             with the interface of SB3's, as sb3_contrib:TQC; by default the task's.
         horizon: time T of the backward propagation [s], in the paper 0.5 (unit_circle) and 0.3 (vehicle);
             by default the paper's with preset paper, otherwise the sets are sized to the noise.
+        set: settings to change, as they stand in config.json, such as stage1.samples=300000; by default none.
         out: the run directory; by default runs/TASK.
     """
 
@@ -48,6 +49,7 @@ class RunOptions:
     preset: str = "fast"
     algorithm: str | None = None
     horizon: float | None = None
+    set: dict[str, Any] = field(default_factory=dict)
     out: str | Path | None = None
 
 
@@ -83,7 +85,7 @@ class AgentOptions:
     out: str | Path | None = None
 
 
-Options = TypeVar("Options", RunOptions, AgentOptions)
+Options = TypeVar("Options")
 
 
 def complete(kind: type[Options], options: Options | None, changes: dict[str, Any]) -> Options:
@@ -96,13 +98,13 @@ def complete(kind: type[Options], options: Options | None, changes: dict[str, An
         options = kind()
     if not isinstance(options, kind):
         raise BadInput(f"options {options!r} cannot be used: give {kind.__name__}(...)")
-    names = [field.name for field in fields(kind)]
+    names = [field.name for field in fields(kind)]  # type: ignore[arg-type]
     for name, value in changes.items():
         if new := RENAMED.get(name):
             raise BadInput(f"the option {name} is now called {new}: give {new}={value!r}")
         if name not in names:
             raise unknown("option", name, names)
-    return replace(options, **changes)
+    return replace(options, **changes)  # type: ignore[type-var]
 
 
 def run(
@@ -121,12 +123,7 @@ def run(
     """
     options = complete(RunOptions, options, changes)
     checked = check_task(get_task(task))
-    settings = _settings(checked, options, algorithm=options.algorithm)
-    assert isinstance(settings.stage1, Training)
-    if settings.stage1.algorithm not in ALGORITHMS:
-        from hyrl_mj.learning.training import check_foreign
-
-        check_foreign(checked, settings.stage1)
+    settings = settings_of(checked, options)
     if options.algorithm is not None:
         algorithms.remember(options.algorithm)
     with opened(options.out or Path("runs") / checked.name, settings) as run:
@@ -199,6 +196,24 @@ def _run_all(run: Run, say: Say, stages: Iterable[str] = STAGES) -> Run:
         else:
             run = run_stage(run, stage, say)
     return run
+
+
+def settings_of(task: Task, options: RunOptions) -> Settings:
+    """Returns the settings of a run with these options.
+
+    Raises:
+        BadInput: a value that cannot be used.
+    """
+    settings = _settings(task, options, algorithm=options.algorithm)
+    if options.set:
+        settings = changed(settings, options.set)
+        settings.check(task)
+    assert isinstance(settings.stage1, Training)
+    if settings.stage1.algorithm not in ALGORITHMS:
+        from hyrl_mj.learning.training import check_foreign
+
+        check_foreign(task, settings.stage1)
+    return settings
 
 
 def _settings(task: Task, options: RunOptions | AgentOptions, **changes: Any) -> Settings:

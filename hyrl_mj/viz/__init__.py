@@ -6,6 +6,7 @@ matplotlib, Pillow or a GL library, so they are imported only where they are nee
 
 from hyrl_mj.viz.commands import beginning
 from hyrl_mj.viz.options import ReplayOptions
+from hyrl_mj.viz.sweep_tables import print_sweep
 from hyrl_mj.viz.tables import print_robustness, print_summary, replay_sentence, robustness_sentence
 
 __all__ = [
@@ -17,9 +18,11 @@ __all__ = [
     "figures",
     "print_robustness",
     "print_summary",
+    "print_sweep",
     "replay",
     "replay_sentence",
     "report",
     "robustness_sentence",
+    "sweep_page",
     "viewing",
 ]

@@ -221,30 +221,38 @@ def fill(template: str, run: Run, robustness: Robustness | None, **values: Any) 
     """Returns a page from its template, with the values that every page of a run shows."""
     task, game = run.task, robustness.game if robustness else None
     episodes = robustness.episodes if robustness else ()
-    environment = Environment(
+    return (
+        environment()
+        .get_template(template)
+        .render(
+            # A name that is not Unicode must not keep the page from being written.
+            name=os.fsencode(run.path.resolve().name).decode("utf-8", "replace"),
+            title=task_title(task),
+            task=task,
+            settings=run.settings,
+            agent=run.agent,
+            exact=run.exact,
+            critical=run.critical_set,
+            unit=task.noise_on()[1],
+            percent=tables.percent,
+            robustness=robustness,
+            game=game,
+            scores=tables.score_table(task, game) if game else None,
+            margins=tables.margin_table(task, game) if game else None,
+            episodes=tables.episode_table(task, episodes) if episodes else None,
+            **values,
+        )
+    )
+
+
+def environment() -> Environment:
+    """Returns the environment of all templates, which escapes what it fills in."""
+    return Environment(
         loader=PackageLoader("hyrl_mj"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-    )
-    return environment.get_template(template).render(
-        # A name that is not Unicode must not keep the page from being written.
-        name=os.fsencode(run.path.resolve().name).decode("utf-8", "replace"),
-        title=task_title(task),
-        task=task,
-        settings=run.settings,
-        agent=run.agent,
-        exact=run.exact,
-        critical=run.critical_set,
-        unit=task.noise_on()[1],
-        percent=tables.percent,
-        robustness=robustness,
-        game=game,
-        scores=tables.score_table(task, game) if game else None,
-        margins=tables.margin_table(task, game) if game else None,
-        episodes=tables.episode_table(task, episodes) if episodes else None,
-        **values,
     )
 
 
@@ -253,7 +261,7 @@ def film(path: Path, has: Callable[[Path], bool] = Path.is_file) -> Picture | No
     poster = path.with_suffix(".png")
     if not (has(path) and has(poster)):
         return None
-    return replace(_picture(poster, "replay", ""), video=_data(path, "video/mp4"))
+    return replace(_picture(poster, "replay", ""), video=data_uri(path.read_bytes(), "video/mp4"))
 
 
 def pictures(folder: Path, has: Callable[[Path], bool] = Path.is_file) -> list[Picture]:
@@ -268,9 +276,9 @@ def pictures(folder: Path, has: Callable[[Path], bool] = Path.is_file) -> list[P
 def _picture(path: Path, name: str, caption: str) -> Picture:
     with artifacts.reading(path), Image.open(path, formats=("PNG",)) as image:
         image.verify()
-        return Picture(name, _data(path, "image/png"), *image.size, caption)
+        return Picture(name, data_uri(path.read_bytes(), "image/png"), *image.size, caption)
 
 
-def _data(path: Path, kind: str) -> str:
-    """Returns a file as a data URI."""
-    return f"data:{kind};base64,{b64encode(path.read_bytes()).decode()}"
+def data_uri(content: bytes, kind: str) -> str:
+    """Returns the content of a file as a data URI."""
+    return f"data:{kind};base64,{b64encode(content).decode()}"

@@ -191,7 +191,7 @@ def print_summary(run: Run) -> None:
     """Prints the verdict, and the results of policy and hybrid controller in replays and worst case."""
     arcs = run.arcs()
     print_verdict(run)
-    _print(replay_table(run, arcs))
+    print_table(replay_table(run, arcs))
     print(run.critical_set.sentence(run.task))
     for q in run.extended_sets.modes:
         print(f"mode {run.task.scene.mode_name(q)}: {extent(run, q)}")
@@ -214,13 +214,13 @@ def print_robustness(run: Run) -> None:
     """Prints the scores of the worst-case game and the counts of the noisy episodes."""
     game, episodes = run.robustness.game, run.robustness.episodes
     if game is not None:
-        _print(score_table(run.task, game))
-        _print(margin_table(run.task, game))
+        print_table(score_table(run.task, game))
+        print_table(margin_table(run.task, game))
     if episodes:
-        _print(episode_table(run.task, episodes))
+        print_table(episode_table(run.task, episodes))
 
 
-def _print(table: Table) -> None:
+def print_table(table: Table) -> None:
     """Prints a table, every cell whole; on a terminal too narrow for its words, a line for each cell."""
     import rich.table  # slow to import, and --help does not need it
     from rich.console import Console

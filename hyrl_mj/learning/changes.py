@@ -1,0 +1,78 @@
+"""Single settings that a user changes, by their names in `config.json`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from typing import Any
+
+from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.learning.settings import Settings, Training
+
+STAGES = ("stage1", "stage6")
+# Settings that have options of their own.
+OPTIONS = {
+    "task": "TASK",
+    "preset": "--preset",
+    "seed": "--seed",
+    "noise": "--eps",
+    "horizon": "--horizon",
+    "stage1.algorithm": "--algorithm",
+}
+WORDS = {"True": True, "False": False, "None": None}
+
+
+def changed(settings: Settings, changes: Mapping[str, object]) -> Settings:
+    """Returns settings with some of them changed.
+
+    Args:
+        settings: of a preset.
+        changes: the new values by name, as "lattice", "stage1.samples" or "stage6.options.n_epochs"; a text
+            is read as JSON where it can be.
+
+    Raises:
+        BadInput: an unknown setting, a value that it cannot have, or a setting with an option of its own.
+    """
+    groups: dict[str, dict[str, Any]] = {}
+    known = dict(_leaves(settings))
+    for name, value in changes.items():
+        if name in OPTIONS:
+            raise BadInput(f"the setting {name} cannot be changed so: give it by {OPTIONS[name]}")
+        record, _, field = name.rpartition(".")
+        if name not in known and record not in [f"{stage}.options" for stage in STAGES]:
+            raise unknown("setting", name, known)
+        groups.setdefault(record, {})[field] = _value(value, known.get(name))
+    top = groups.pop("", {})
+    for stage in STAGES:
+        training, new = getattr(settings, stage), groups.get(stage, {})
+        if more := groups.get(f"{stage}.options"):
+            new["options"] = training.options | more
+        if new:
+            top[stage] = replace(training, **new)
+    return replace(settings, **top)
+
+
+def _leaves(record: Settings | Training, prefix: str = "") -> list[tuple[str, Any]]:
+    """Returns the settings that can be changed, with their values, by name."""
+    leaves: list[tuple[str, Any]] = []
+    for field in fields(record):
+        name, value = prefix + field.name, getattr(record, field.name)
+        if isinstance(value, Training):
+            leaves += _leaves(value, f"{name}.")
+        elif field.name == "options":
+            leaves += [(f"{name}.{option}", known) for option, known in value.items()]
+        elif name not in STAGES:
+            leaves.append((name, value))
+    return leaves
+
+
+def _value(value: object, present: object) -> object:
+    """Returns the value that a text stands for; 3e5 is an integer where the present value is one."""
+    if isinstance(value, str):
+        try:
+            value = json.loads(value)
+        except ValueError:
+            return WORDS.get(value, value)  # type: ignore[call-overload]
+    whole = isinstance(value, float) and value.is_integer() and type(present) is int
+    return int(value) if whole else value  # type: ignore[call-overload]

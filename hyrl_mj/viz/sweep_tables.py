@@ -1,0 +1,128 @@
+"""The results of a sweep as tables, for its page and the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from hyrl_mj.game import percent
+from hyrl_mj.sweeps import DONE, Row, Sweep, summary
+from hyrl_mj.viz.tables import Table, print_table
+
+
+@dataclass(frozen=True)
+class Column:
+    """A figure of `Row.figures`.
+
+    Attributes:
+        heading: of the column.
+        show: returns the text of a value.
+        least: whether the worst run has the least value; None for a figure that says nothing of it.
+    """
+
+    heading: str
+    show: Callable[[float], str]
+    least: bool | None = None
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}"
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.2f} s"
+
+
+# The figures in tables, the most important first: by these the worst run is found.
+COLUMNS = {
+    "winnable": Column("winnable starts", percent),
+    "policy_won": Column("RL policy won", percent),
+    "hyrl_won": Column("HyRL won, own q0", percent, True),
+    "hyrl_won_any": Column("HyRL won, any q0", percent, True),
+    "limit_won_any": Column("limit, any q0", percent),
+    "policy_margin": Column("RL policy, margin", _number),
+    "hyrl_margin": Column("HyRL, margin", _number, True),
+    "hyrl_time": Column("latest arrival, own q0", _seconds),
+    "hyrl_time_any": Column("latest arrival, any q0", _seconds, False),
+    "hyrl_excursion": Column("excursion", _number, False),
+    "hyrl_miss_without_noise": Column("HyRL off the set-point, no noise", _number, False),
+} | {
+    f"{who}_reached_{kind}": Column(f"{title} arrives, {kind} noise", percent, least)
+    for who, title, least in (("policy", "RL policy", None), ("hyrl", "HyRL", True))
+    for kind in ("none", "uniform", "alternating", "adversarial")
+}
+
+
+def shown(rows: Iterable[Row]) -> list[str]:
+    """Returns the names of the figures that some row has."""
+    there = {
+        name for row in rows for name, value in (row.figures or {}).items() if value is not None
+    }
+    return [name for name in COLUMNS if name in there]
+
+
+def summary_table(sweep: Sweep) -> Table:
+    """Returns median, least and greatest of each figure over the seeds: a row for each setting."""
+    names = shown(sweep.rows)
+    rows = []
+    for setting, group in sweep.groups().items():
+        done = [row for row in group if row.state == DONE]
+        verdicts = [row.verdict for row in done]
+        words = ", ".join(f"{verdicts.count(word)} {word}" for word in sorted({*verdicts}))
+        cells = [setting.title, f"{len(done)} of {len(group)}", words or "-"]
+        for name in names:
+            found = summary((row.figures or {}).get(name) for row in done)
+            cells.append("-" if found is None else _range(COLUMNS[name], *found))
+        rows.append(cells)
+    headings = ["setting", "runs", "verdicts", *(COLUMNS[name].heading for name in names)]
+    return Table("median over the seeds (least to greatest)", headings, rows)
+
+
+def run_table(group: Iterable[Row]) -> Table:
+    """Returns the figures of each run of a setting."""
+    group = [*group]
+    names = shown(group)
+    rows = []
+    for row in group:
+        values = [(row.figures or {}).get(name) for name in names]
+        cells = [
+            "-" if v is None else COLUMNS[n].show(v) for n, v in zip(names, values, strict=True)
+        ]
+        rows.append([str(row.seed), row.verdict or row.state, *cells, f"{row.seconds:.0f} s"])
+    headings = ["seed", "verdict", *(COLUMNS[name].heading for name in names), "time"]
+    return Table(group[0].setting.title, headings, rows)
+
+
+def worst(group: Iterable[Row]) -> Row | None:
+    """Returns the run of a setting with the worst figures; None if no run is done."""
+
+    def goodness(row: Row) -> list[float]:
+        figures = row.figures or {}
+        kept = [(figures.get(name), column.least) for name, column in COLUMNS.items()]
+        return [
+            # No margin means that some start is lost even without noise.
+            float("-inf") if value is None else value if least else -value
+            for value, least in kept
+            if least is not None
+        ]
+
+    return min((row for row in group if row.state == DONE), key=goodness, default=None)
+
+
+def markdown(table: Table) -> str:
+    """Returns a table to paste as Markdown."""
+    lines = [table.headings, ["---"] * len(table.headings), *table.rows]
+    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
+
+
+def print_sweep(sweep: Sweep) -> None:
+    """Prints the summary, and the runs that are not done."""
+    print_table(summary_table(sweep))
+    for row in sweep.rows:
+        if row.state != DONE:
+            print(f"{row.name}: {row.state}{f': {row.sentence}' if row.sentence else ''}")
+
+
+def _range(column: Column, median: float, least: float, greatest: float) -> str:
+    texts = [column.show(value) for value in (median, least, greatest)]
+    return texts[0] if texts[1] == texts[2] else f"{texts[0]} ({texts[1]} to {texts[2]})"
