@@ -36,6 +36,7 @@ def make(row: Row, options: RunOptions, share: int, journal: Any = None) -> Row:
         if journal is not None:
             journal.add.remote(row.name, text)
 
+    say("begins")
     try:
         finished = row.finished(_patient_run(row, options, say))
     except HyrlError as error:
