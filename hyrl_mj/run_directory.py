@@ -301,12 +301,15 @@ def write_config(run: Run, versions: dict[str, str] | None = None) -> None:
     artifacts.write_json(run.path / "config.json", Config(run.settings, versions), kind="run")
 
 
-def _differing(old: Settings, new: Settings) -> Iterator[str]:
+def _differing(old: Settings | Training, new: Settings | Training, of: str = "") -> Iterator[str]:
     """Yields a description of each setting that differs, by the name of its option."""
     for name, before in vars(old).items():
         now = getattr(new, name)
-        if before != now:
-            option = {"noise": "eps", "stage1": "policy"}.get(name, name)
+        trainings = isinstance(before, Training) and isinstance(now, Training)
+        if trainings and before.algorithm == now.algorithm:
+            yield from _differing(before, now, f"{name}.")
+        elif before != now:
+            option = of + {"noise": "eps", "stage1": "policy"}.get(name, name)
             old_text, new_text = _brief(before), _brief(now)
             change = f": {old_text} there, {new_text} given" if old_text != new_text else ""
             yield option + change
