@@ -217,7 +217,7 @@ def finished_run(path: Path) -> Run | None:
         return None
     try:
         run = load_run(path)
-        done = all(run.manifest.is_done(stage, run.code) for stage in STAGES)
+        done = all(run.manifest.is_done(stage) for stage in STAGES)
         usual = done and run.robustness.eps == run.settings.noise
     except BadArtifact:
         return None

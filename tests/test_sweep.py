@@ -160,9 +160,12 @@ def test_tables_show_median_least_and_greatest():
     rows = (row(0, hyrl_won=1.0), row(1, hyrl_won=0.5), row(2, hyrl_won=0.75), Row(CIRCLE, 3))
     sweep = Sweep(Common("fast", None, {}), rows)
     table = sweep_tables.summary_table(sweep)
-    assert table.rows == [["unit_circle, noise 0.1", "3 of 4", "3 WON", "75.00% (50.00% to 100%)"]]
+    assert table.headings == ["figure", "unit_circle, noise 0.1"]
+    assert table.rows == [
+        ["runs", "3 of 4"], ["verdicts", "3 WON"], ["HyRL won, own q0", "75.00% (50.00% to 100%)"],
+    ]  # fmt: skip
     assert sweep_tables.worst(rows).seed == 1
-    assert sweep_tables.markdown(table).splitlines()[1] == "| --- | --- | --- | --- |"
+    assert sweep_tables.markdown(table).splitlines()[1] == "| --- | --- |"
 
 
 def test_what_runs_say_reads_well_in_a_log():

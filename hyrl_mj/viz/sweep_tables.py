@@ -62,20 +62,25 @@ def shown(rows: Iterable[Row]) -> list[str]:
 
 
 def summary_table(sweep: Sweep) -> Table:
-    """Returns median, least and greatest of each figure over the seeds: a row for each setting."""
-    names = shown(sweep.rows)
-    rows = []
-    for setting, group in sweep.groups().items():
-        done = [row for row in group if row.state == DONE]
-        verdicts = [row.verdict for row in done]
-        words = ", ".join(f"{verdicts.count(word)} {word}" for word in sorted({*verdicts}))
-        cells = [setting.title, f"{len(done)} of {len(group)}", words or "-"]
-        for name in names:
-            found = summary((row.figures or {}).get(name) for row in done)
-            cells.append("-" if found is None else _range(COLUMNS[name], *found))
-        rows.append(cells)
-    headings = ["setting", "runs", "verdicts", *(COLUMNS[name].heading for name in names)]
-    return Table("median over the seeds (least to greatest)", headings, rows)
+    """Returns median, least and greatest of each figure over the seeds: a column for each setting."""
+    groups = sweep.groups()
+    done = {setting: [row for row in rows if row.state == DONE] for setting, rows in groups.items()}
+    rows = [
+        ["runs", *(f"{len(done[setting])} of {len(group)}" for setting, group in groups.items())],
+        ["verdicts", *(_verdicts(group) for group in done.values())],
+    ]
+    for name in shown(sweep.rows):
+        found = [summary((row.figures or {}).get(name) for row in group) for group in done.values()]
+        cells = ["-" if three is None else _range(COLUMNS[name], *three) for three in found]
+        rows.append([COLUMNS[name].heading, *cells])
+    title = "median over the seeds (least to greatest)"
+    return Table(title, ["figure", *(setting.title for setting in groups)], rows)
+
+
+def _verdicts(group: list[Row]) -> str:
+    """Returns how often each verdict was given."""
+    verdicts = [row.verdict for row in group]
+    return ", ".join(f"{verdicts.count(word)} {word}" for word in sorted({*verdicts})) or "-"
 
 
 def run_table(group: Iterable[Row]) -> Table:
