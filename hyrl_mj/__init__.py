@@ -7,6 +7,7 @@ package needs neither torch nor a GL library.
 
 from hyrl_mj import gl as gl  # first: imports mujoco, with a GL backend that exists here
 from hyrl_mj.chart import Chart
+from hyrl_mj.cores import using_pool
 from hyrl_mj.errors import BadArtifact, BadInput, HyrlError, NoRenderer
 from hyrl_mj.export import export_numpy, export_onnx
 from hyrl_mj.game import Game, Robustness, Score
@@ -93,4 +94,5 @@ __all__ = [
     "simulate_batch",
     "sweep",
     "task_names",
+    "using_pool",
 ]

@@ -1,9 +1,29 @@
-"""How many cores this process may use; results do not depend on it."""
+"""The cores that work is spread over: those of this process, and a pool of others. Results do not depend on them."""
+
+from __future__ import annotations
 
 import os
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import partial
+from typing import Any, Protocol, TypeVar
 
+from hyrl_mj import progress
+
+Job, Result = TypeVar("Job"), TypeVar("Result")
 # Set where several runs share a machine; 0 for all cores.
 allowed = 0
+
+
+class Pool(Protocol):
+    """Processes that work side by side, such as `ray.util.multiprocessing.Pool` or `multiprocessing.Pool`."""
+
+    def map(self, work: Callable[[Any], Any], jobs: Iterable[Any], /) -> Iterable[Any]:
+        """Returns the results of the jobs, in their order."""
+
+
+_POOL: ContextVar[Pool | None] = ContextVar("pool", default=None)
 
 
 def count() -> int:
@@ -13,3 +33,38 @@ def count() -> int:
     if hasattr(os, "sched_getaffinity"):  # on Linux
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+@contextmanager
+def using_pool(pool: Pool) -> Iterator[None]:
+    """Spreads bulk work in the block over a pool: noisy episodes, and stage 6 of several modes.
+
+    The results are those without a pool. Each process of the pool works with one core.
+
+    Args:
+        pool: has `map(function, jobs)`, as those of `ray.util.multiprocessing`, `multiprocessing` and
+            `concurrent.futures` have. The task must be one that its processes can load.
+    """
+    token = _POOL.set(pool)
+    try:
+        yield
+    finally:
+        _POOL.reset(token)
+
+
+def given() -> bool:
+    """Returns whether there is a pool."""
+    return _POOL.get() is not None
+
+
+def spread(work: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[Result]:
+    """Yields the results of jobs in their order: from the pool if there is one, else one after the other."""
+    pool = _POOL.get()
+    yield from map(work, jobs) if pool is None else pool.map(partial(_alone, work), jobs)
+
+
+def _alone(work: Callable[[Job], Result], job: Job) -> Result:
+    """Does a job in a process of a pool: on one core, and without a bar of progress among those of others."""
+    global allowed
+    allowed, progress.enabled = 1, False
+    return work(job)

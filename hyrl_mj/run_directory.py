@@ -15,7 +15,7 @@ from pathlib import Path
 from hyrl_mj import artifacts, policies
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.game import Lattice, Robustness
-from hyrl_mj.learning import Settings, Training
+from hyrl_mj.learning import Settings, differing
 from hyrl_mj.manifest import FILES, Manifest, check_contents, locked, may_hold_run
 from hyrl_mj.policies import Agent, AnyPolicy, MlpPolicy, Policy
 from hyrl_mj.simulation import HybridArc
@@ -301,27 +301,6 @@ def write_config(run: Run, versions: dict[str, str] | None = None) -> None:
     artifacts.write_json(run.path / "config.json", Config(run.settings, versions), kind="run")
 
 
-def _differing(old: Settings | Training, new: Settings | Training, of: str = "") -> Iterator[str]:
-    """Yields a description of each setting that differs, by the name of its option."""
-    for name, before in vars(old).items():
-        now = getattr(new, name)
-        trainings = isinstance(before, Training) and isinstance(now, Training)
-        if trainings and before.algorithm == now.algorithm:
-            yield from _differing(before, now, f"{name}.")
-        elif before != now:
-            option = of + {"noise": "eps", "stage1": "policy"}.get(name, name)
-            old_text, new_text = _brief(before), _brief(now)
-            change = f": {old_text} there, {new_text} given" if old_text != new_text else ""
-            yield option + change
-
-
-def _brief(setting: object) -> str:
-    """Returns a short description of the value of a setting."""
-    if isinstance(setting, Agent):
-        return f"{setting} of sha256 {setting.sha256[:8]}"
-    return f"training with {setting.algorithm}" if isinstance(setting, Training) else str(setting)
-
-
 @contextmanager
 def opened(path: str | Path, settings: Settings, policy: AnyPolicy | None = None) -> Iterator[Run]:
     """Opens the run directory at `path` with these settings, or creates it, and holds its lock in the block.
@@ -343,7 +322,7 @@ def opened(path: str | Path, settings: Settings, policy: AnyPolicy | None = None
         if not config.exists():
             write_config(run)
         elif (run := load_run(path, policy)).settings != settings:
-            differing = "; ".join(_differing(run.settings, settings))
+            differing = "; ".join(differing(run.settings, settings))
             raise BadInput(
                 f"{path} holds a run with other settings ({differing}): "
                 "choose another --out, give the same settings, or remove it"

@@ -3,20 +3,26 @@
 import csv
 import json
 import os
+import pickle
 import shutil
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import hyrl_mj
-from hyrl_mj import BadInput, sweeps
+from hyrl_mj import BadInput, cores, mjcf, progress, sweeps
 from hyrl_mj.learning import changed, preset
 from hyrl_mj.pipeline import cluster, report
 from hyrl_mj.pipeline.board import Board
+from hyrl_mj.policies import PolicyController
+from hyrl_mj.stages import Regions, episodes, noisy_episodes
 from hyrl_mj.sweeps import DONE, Common, Row, Setting, Sweep
 from hyrl_mj.viz import sweep_tables
 
@@ -184,17 +190,58 @@ def test_what_runs_say_reads_well_in_a_log():
 # ---- whole sweeps
 
 
+def listening():
+    """The addresses, as in /proc/net/tcp, at which the processes listen that belong to this one."""
+    parents = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            parents[int(folder.name)] = int(
+                (folder / "stat").read_text().rpartition(")")[2].split()[1]
+            )
+    own = {os.getpid()}
+    while more := {pid for pid, parent in parents.items() if parent in own} - own:
+        own |= more
+    sockets = set()
+    for pid in own:
+        with suppress(OSError):
+            sockets |= {os.readlink(path) for path in Path(f"/proc/{pid}/fd").iterdir()}
+    lines = [
+        line.split()
+        for table in ("tcp", "tcp6")
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]
+    ]
+    listens = "0A"
+    return {
+        words[1].split(":")[0]
+        for words in lines
+        if words[3] == listens and f"socket:[{words[9]}]" in sockets
+    }
+
+
 @pytest.fixture(scope="module")
 def swept(tmp_path_factory):
-    """A sweep over two seeds, and what it said."""
-    out, said = tmp_path_factory.mktemp("sweeps") / "sweep", []
-    result = hyrl_mj.sweep("unit_circle", seeds=(0, 1), out=out, say=said.append, **SMOKE)
-    return out, result, said
+    """A sweep over two seeds, what it said, and where its processes listened."""
+    out, said, addresses = tmp_path_factory.mktemp("sweeps") / "sweep", [], set()
+
+    def say(text):
+        said.append(text)
+        addresses.update(listening())
+
+    result = hyrl_mj.sweep("unit_circle", seeds=(0, 1), out=out, say=say, **SMOKE)
+    return out, result, said, addresses
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has /proc")
+def test_nobody_else_can_reach_it(swept):
+    loopback = {"0100007F", "0" * 24 + "01000000", "0000000000000000FFFF00000100007F"}
+    assert swept[3]
+    assert swept[3] <= loopback
 
 
 @pytest.mark.slow
 def test_a_sweep_makes_the_runs_that_are_made_one_by_one(swept, tmp_path):
-    out, result, said = swept
+    out, result, said, _ = swept
     assert [row.state for row in result.rows] == [DONE, DONE]
     assert any("unit_circle-0.1-1" in line and "retrain" in line for line in said)
     run = hyrl_mj.run("unit_circle", seed=1, out=tmp_path / "run", say=str, **SMOKE)
@@ -209,7 +256,7 @@ def test_a_sweep_makes_the_runs_that_are_made_one_by_one(swept, tmp_path):
 
 @pytest.mark.slow
 def test_what_is_done_is_not_done_again_and_tables_are_made_from_what_is_there(swept):
-    out, result, _ = swept
+    out, result, *_ = swept
     before = {path: path.read_bytes() for path in sorted(out.rglob("*")) if path.is_file()}
     said = []
     again = hyrl_mj.sweep("unit_circle", seeds=(0, 1), out=out, say=said.append, **SMOKE)
@@ -262,3 +309,76 @@ def test_a_run_directory_that_is_held_is_waited_for(monkeypatch, tmp_path):
     ended = cluster.make(Row(CIRCLE, 0), hyrl_mj.RunOptions(out=Path(tmp_path)), 1)
     assert (ended.state, ended.sentence) == ("stopped", "no more")
     assert len(tries) == 2
+
+
+# ---- a pool inside a run
+
+
+LOPSIDED = """
+from hyrl_mj.tasks.unit_circle import UnitCircle
+
+
+class Lopsided(UnitCircle):
+    name = "lopsided"
+    env_id = "hyrl_mj/Lopsided-v0"
+    mirror = None
+"""
+
+
+class Still:
+    """A policy that never moves."""
+
+    def act(self, measured):
+        return np.zeros((len(measured), 1))
+
+
+class Doubled:
+    """A pool of one process, this one, to which everything is sent as to another one."""
+
+    def __init__(self):
+        self.jobs = 0
+
+    def map(self, work, jobs):
+        for job in jobs:
+            self.jobs += 1
+            sent, what = pickle.loads(pickle.dumps((work, job)))
+            yield pickle.loads(pickle.dumps(sent(what)))
+
+
+@pytest.fixture
+def doubled(monkeypatch):
+    """Such a pool, after which this process uses its cores again."""
+    monkeypatch.setattr(cores, "allowed", 0)
+    monkeypatch.setattr(progress, "enabled", progress.enabled)
+    return Doubled()
+
+
+def test_episodes_are_the_same_with_a_pool(circle, doubled, monkeypatch):
+    monkeypatch.setattr(episodes, "BATCH", 64)
+    count = partial(
+        noisy_episodes,
+        circle,
+        Regions(np.array([[np.pi]])),
+        {"still": PolicyController(Still()), "other": PolicyController(Still())},
+        (hyrl_mj.Noise("uniform", 0.1), hyrl_mj.Noise("none", 0.1)),
+        150,
+    )
+    plain = count()
+    with hyrl_mj.using_pool(doubled):
+        assert count() == plain
+    assert doubled.jobs == 2 * 2 * 3
+    assert not cores.given()
+
+
+@pytest.mark.slow
+def test_a_run_is_the_same_with_a_pool(doubled, tmp_path):
+    """The lopsided circle has no mirror, so that its modes are trained side by side."""
+    task = tmp_path / "lopsided.py"
+    task.write_text(LOPSIDED)
+    shutil.copy(mjcf.models_dir() / "unit_circle.xml", tmp_path / "lopsided.xml")
+    plain = hyrl_mj.run(task, out=tmp_path / "plain", say=str, **SMOKE)
+    with hyrl_mj.using_pool(doubled):
+        pooled = hyrl_mj.run(task, out=tmp_path / "pooled", say=str, **SMOKE)
+    assert doubled.jobs == 2
+    for name in ("mode_0.safetensors", "mode_1.safetensors", "retraining.json"):
+        assert (pooled.path / name).read_bytes() == (plain.path / name).read_bytes()

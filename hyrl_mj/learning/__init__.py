@@ -3,7 +3,16 @@
 The modules `training`, `distillation` and `symmetry` import torch: import them only where they are needed.
 """
 
-from hyrl_mj.learning.changes import changed
+from hyrl_mj.learning.changes import changed, differing
 from hyrl_mj.learning.settings import Settings, Training, preset
 
-__all__ = ["Settings", "Training", "changed", "distillation", "preset", "symmetry", "training"]
+__all__ = [
+    "Settings",
+    "Training",
+    "changed",
+    "differing",
+    "distillation",
+    "preset",
+    "symmetry",
+    "training",
+]

@@ -1,14 +1,15 @@
-"""Single settings that a user changes, by their names in `config.json`."""
+"""Single settings that a user changes, by their names in `config.json`, and how settings differ."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
 from typing import Any
 
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.learning.settings import Settings, Training
+from hyrl_mj.policies import Agent
 
 STAGES = ("stage1", "stage6")
 # Settings that have options of their own.
@@ -76,3 +77,24 @@ def _value(value: object, present: object) -> object:
             return WORDS.get(value, value)  # type: ignore[call-overload]
     whole = isinstance(value, float) and value.is_integer() and type(present) is int
     return int(value) if whole else value  # type: ignore[call-overload]
+
+
+def differing(old: Settings | Training, new: Settings | Training, of: str = "") -> Iterator[str]:
+    """Yields a description of each setting that differs, by the name of its option."""
+    for name, before in vars(old).items():
+        now = getattr(new, name)
+        trainings = isinstance(before, Training) and isinstance(now, Training)
+        if trainings and before.algorithm == now.algorithm:
+            yield from differing(before, now, f"{name}.")
+        elif before != now:
+            option = of + {"noise": "eps", "stage1": "policy"}.get(name, name)
+            old_text, new_text = _brief(before), _brief(now)
+            change = f": {old_text} there, {new_text} given" if old_text != new_text else ""
+            yield option + change
+
+
+def _brief(setting: object) -> str:
+    """Returns a short description of the value of a setting."""
+    if isinstance(setting, Agent):
+        return f"{setting} of sha256 {setting.sha256[:8]}"
+    return f"training with {setting.algorithm}" if isinstance(setting, Training) else str(setting)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
-from hyrl_mj import mujoco_log
+from hyrl_mj import cores, mujoco_log
 from hyrl_mj.errors import BadInput, NoRenderer, unknown
 from hyrl_mj.game import Lattice, Limit, Robustness
+from hyrl_mj.learning import Settings
 from hyrl_mj.pipeline.examination import (
     USUAL,
     ExamineOptions,
@@ -18,12 +20,15 @@ from hyrl_mj.pipeline.examination import (
     examine_loops,
     examine_stage,
 )
-from hyrl_mj.policies import Agent, MlpPolicy, PolicyController, algorithms
+from hyrl_mj.policies import Agent, MlpPolicy, Policy, PolicyController, algorithms
 from hyrl_mj.progress import Say
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import Grid
 from hyrl_mj.stages import (
     Arrivals,
+    ExtendedSets,
+    ModeResult,
+    Partition,
     Retraining,
     boundary,
     extend,
@@ -31,6 +36,7 @@ from hyrl_mj.stages import (
     make_partition,
     with_room,
 )
+from hyrl_mj.tasks import Task
 from hyrl_mj.verdict import mode_sentence
 from hyrl_mj.viz import ReplayOptions, replay_sentence
 
@@ -91,25 +97,43 @@ def extended_sets_stage(run: Run, say: Say) -> None:
 
 def retrain_stage(run: Run, say: Say) -> None:
     """Stage 6: trains the policy of each mode."""
-    from hyrl_mj.stages.retraining import mode_ground, retrain, start_policy
-
     s, sets = run.settings, run.extended_sets
     algorithms.check_named(s.stage6.algorithm)
-    policies: dict[int, MlpPolicy] = {}
-    results = []
-    warm_start = partial(start_policy, run.steady, run.partition)
-    for q in sets.modes:
-        ground, log_dir = mode_ground(run.task, sets, q), run.path / "logs" / f"mode_{q}"
-        others = [*policies.values()]
-        policies[q], result = retrain(
-            ground, s.stage6, s.seed, warm_start=warm_start, others=others, log_dir=log_dir
-        )
-        results.append(result)
-    for q, policy in policies.items():
-        policy.save(run.path / f"mode_{q}.safetensors")
-    Retraining(tuple(results)).save(run.path / "retraining.json")
-    for result in results:
+    work = partial(_retrained, run.task, s, run.steady, run.partition, sets, run.path / "logs")
+    done: list[tuple[MlpPolicy, ModeResult]] = []
+    if run.task.mirror is None:
+        done += cores.spread(work, sets.modes)
+    else:  # the mirror image of the policy of one mode may do for the next
+        for q in sets.modes:
+            done.append(work(q, [policy for policy, _ in done]))
+    for policy, result in done:
+        policy.save(run.path / f"mode_{result.mode}.safetensors")
+    Retraining(tuple(result for _, result in done)).save(run.path / "retraining.json")
+    for _, result in done:
         say(mode_sentence(run.task, result))
+
+
+def _retrained(
+    task: Task,
+    settings: Settings,
+    policy: Policy,
+    partition: Partition,
+    sets: ExtendedSets,
+    logs: Path,
+    mode: int,
+    others: Iterable[MlpPolicy] = (),
+) -> tuple[MlpPolicy, ModeResult]:
+    """Trains the policy of one mode, which may happen in a process of a pool."""
+    from hyrl_mj.stages.retraining import mode_ground, retrain, start_policy
+
+    return retrain(
+        mode_ground(task, sets, mode),
+        settings.stage6,
+        settings.seed,
+        warm_start=partial(start_policy, policy, partition),
+        others=others,
+        log_dir=logs / f"mode_{mode}",
+    )
 
 
 def simulate_stage(run: Run, say: Say) -> None:

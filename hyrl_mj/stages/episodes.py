@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import product
 
 import numpy as np
 
+from hyrl_mj import cores
 from hyrl_mj.errors import BadInput, check_seed
 from hyrl_mj.game import EpisodeCount
+from hyrl_mj.plant import Plant
 from hyrl_mj.policies import Controller
 from hyrl_mj.progress import progress_bar
 from hyrl_mj.sets import Grid
@@ -103,29 +107,50 @@ def noisy_episodes(
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
     for noise in noises:
         task.check_noise(noise.bound, noise.everywhere)
-    total = count * len(noises) * len(controllers)
-    progress = progress_bar(None, "noisy episodes", "episodes", total)
-    ends: list[EpisodeCount] = []
+    pairs, firsts = list(product(noises, controllers)), range(0, count, BATCH)
+    batches = [
+        _Batch(task, regions, controllers[name], noise, seed, first, min(BATCH, count - first))
+        for (noise, name), first in product(pairs, firsts)
+    ]
     # The plants are used again: new ones for each batch would fragment the memory.
-    plants = {n: task.plant(n) for n in {min(BATCH, count), count % BATCH} - {0}}
-    for noise in noises:
-        for name, controller in controllers.items():
+    plants = {} if cores.given() else {n: task.plant(n) for n in {batch.n for batch in batches}}
+    ends: list[EpisodeCount] = []
+    with progress_bar(None, "noisy episodes", "episodes", count * len(pairs)) as progress:
+        ended = cores.spread(partial(_outcomes, plants), batches)
+        for noise, name in pairs:
             counts: dict[str, np.ndarray] = {}
-            for first in range(0, count, BATCH):
-                n = min(BATCH, count - first)
-                start_seed, noise_seed = np.random.SeedSequence([seed, first]).generate_state(2)
-                z0 = regions.draw(task, noise.bound, n, np.random.default_rng(start_seed))
-                settings = LoopSettings(vary=True, plant=plants[n], quiet=True)
-                runs = closed_loop(
-                    task, controller, z0, noise, seed=int(noise_seed), settings=settings
-                )
-                for region, inside in regions.split(task, noise.bound, z0).items():
-                    number = np.bincount(runs.outcome[inside], minlength=len(Outcome))
+            for first, outcomes in zip(firsts, ended):  # noqa: B905 - the next pair goes on
+                for region, number in outcomes.items():
                     counts[region] = counts.get(region, 0) + number
-                progress.update(n)
+                progress.update(min(BATCH, count - first))
             ends += [_count(noise, name, r, number) for r, number in counts.items() if number.any()]
-    progress.close()
     return tuple(ends)
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """Episodes that are simulated at once: the next `n` after the `first` of one noise and controller."""
+
+    task: Task
+    regions: Regions
+    controller: Controller
+    noise: Noise
+    seed: int
+    first: int
+    n: int
+
+
+def _outcomes(plants: Mapping[int, Plant], batch: _Batch) -> dict[str, np.ndarray]:
+    """Returns the number (outcomes,) of each outcome in a batch, by start region."""
+    task, noise, regions, n = batch.task, batch.noise, batch.regions, batch.n
+    seeds = np.random.SeedSequence([batch.seed, batch.first]).generate_state(2)
+    z0 = regions.draw(task, noise.bound, n, np.random.default_rng(seeds[0]))
+    settings = LoopSettings(vary=True, plant=plants.get(n), quiet=True)
+    runs = closed_loop(task, batch.controller, z0, noise, seed=int(seeds[1]), settings=settings)
+    return {
+        region: np.bincount(runs.outcome[inside], minlength=len(Outcome))
+        for region, inside in regions.split(task, noise.bound, z0).items()
+    }
 
 
 def _count(noise: Noise, name: str, region: str, outcomes: np.ndarray) -> EpisodeCount:
