@@ -1,4 +1,4 @@
-"""The cores that work is spread over: those of this process, and a pool of others. Results do not depend on them."""
+"""The cores that work is spread over, of this process and of a pool; results do not depend on them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from typing import Any, Protocol, TypeVar
 
 from hyrl_mj import progress
 
-Job, Result = TypeVar("Job"), TypeVar("Result")
+Job = TypeVar("Job")
+Result = TypeVar("Result")
 # Set where several runs share a machine; 0 for all cores.
 allowed = 0
 

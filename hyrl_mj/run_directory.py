@@ -322,9 +322,9 @@ def opened(path: str | Path, settings: Settings, policy: AnyPolicy | None = None
         if not config.exists():
             write_config(run)
         elif (run := load_run(path, policy)).settings != settings:
-            differing = "; ".join(differing(run.settings, settings))
+            differences = "; ".join(differing(run.settings, settings))
             raise BadInput(
-                f"{path} holds a run with other settings ({differing}): "
+                f"{path} holds a run with other settings ({differences}): "
                 "choose another --out, give the same settings, or remove it"
             )
         yield run

@@ -109,7 +109,7 @@ def test_bad_sweeps_make_nothing(tmp_path):
         ("unit_circle", {"set": {"latice": 1}}, "Did you mean 'lattice'"),
         ("unit_circle", {"cores": 0}, "cores 0 cannot be used"),
         ("unit_circle", {"memory": -1}, "memory -1 cannot be used"),
-        ("unit_circle", {"memory": 9_999.0}, "no machine has 1 cores"),
+        ("unit_circle", {"memory": 9_999.0}, "no machine has 2 cores"),
         ("unit_circle", {"address": "nowhere"}, "give HOST:PORT"),
         ("unit_circle", {"address": "127.0.0.1:1"}, "no Ray cluster answers at 127.0.0.1:1"),
     ):
@@ -375,7 +375,8 @@ def test_a_run_is_the_same_with_a_pool(doubled, tmp_path):
     """The lopsided circle has no mirror, so that its modes are trained side by side."""
     task = tmp_path / "lopsided.py"
     task.write_text(LOPSIDED)
-    shutil.copy(mjcf.models_dir() / "unit_circle.xml", tmp_path / "lopsided.xml")
+    shutil.copytree(mjcf.models_dir(), tmp_path, dirs_exist_ok=True)
+    (tmp_path / "unit_circle.xml").rename(tmp_path / "lopsided.xml")
     plain = hyrl_mj.run(task, out=tmp_path / "plain", say=str, **SMOKE)
     with hyrl_mj.using_pool(doubled):
         pooled = hyrl_mj.run(task, out=tmp_path / "pooled", say=str, **SMOKE)

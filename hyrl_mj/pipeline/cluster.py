@@ -116,13 +116,20 @@ def work(
                     yield replace(row, state=STOPPED, sentence=sentence)
 
 
-def imported() -> Any:
+def imported(alone: bool) -> Any:
     """Returns Ray, which then reports nothing to its makers.
+
+    Args:
+        alone: whether it is to work on this machine alone.
 
     Raises:
         BadInput: Ray is not installed.
     """
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    if (
+        alone
+    ):  # read when Ray is imported: on every system it then listens on the loopback interface
+        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
     # The core that a run asks for is a share of the machine, also where there is no GPU.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     try:
@@ -137,21 +144,25 @@ def imported() -> Any:
 @contextmanager
 def _started(address: str | None) -> Iterator[Any]:
     """Starts Ray on this machine, or connects to a cluster, and ends it after the block."""
-    ray = imported()
+    ray = imported(alone=address is None)
     if ray.is_initialized():  # by the user, who ends it as well
         yield ray
         return
     quiet: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
     if address is None:
-        # On the loopback interface alone, and without a web page.
         ray.init(
             "local",
             num_cpus=cores.count(),
             include_dashboard=False,
-            _node_ip_address="127.0.0.1",
             object_store_memory=100 * 2**20,
             **quiet,
         )
+        if (host := ray.util.get_node_ip_address()) not in ("127.0.0.1", "::1"):
+            ray.shutdown()
+            raise BadInput(
+                f"Ray was imported before this sweep and would listen on {host}, where others can reach it: "
+                "import it later, or start it yourself with ray.init()"
+            )
     else:
         _check_address(address)
         try:
