@@ -82,19 +82,17 @@ def finish(run: Run) -> None:
 def sweep(
     tasks: tuple[str, ...] = (), *, report: Path | None = None, options: SweepOptions
 ) -> None:
-    """Make many runs side by side, over seeds, noise bounds and algorithms, and their tables.
+    """Make many runs over seeds, noise bounds and algorithms, and their tables.
 
-    What is done is not done again. It takes pip install "hyrl-mj[sweep]".
+    What is done is not done again. It needs Ray: pip install "hyrl-mj[sweep]".
 
     Args:
         tasks: tasks, see `hyrl-mj list`, or Python files that define some; by default none, with --report.
         report: make the tables of this sweep folder again from the runs that are there; by default off.
     """
     if report is not None:
-        if tasks:
-            raise BadInput(
-                "--report makes tables of the runs that are there: give no TASKS with it"
-            )
+        if tasks or options != SweepOptions():
+            raise BadInput("--report makes tables of the runs that are there: give nothing else")
         result, folder = pipeline.report(report), report
     else:
         result, folder = pipeline.sweep(tasks, options), Path(options.out)

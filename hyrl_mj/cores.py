@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any, Protocol, TypeVar
 
 from hyrl_mj import progress
+from hyrl_mj.errors import BadInput
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -43,9 +44,17 @@ def using_pool(pool: Pool) -> Iterator[None]:
     The results are those without a pool. Each process of the pool works with one core.
 
     Args:
-        pool: has `map(function, jobs)`, as those of `ray.util.multiprocessing`, `multiprocessing` and
-            `concurrent.futures` have. The task must be one that its processes can load.
+        pool: processes with `map(function, jobs)`, as `ray.util.multiprocessing.Pool`, `multiprocessing.Pool`
+            and `concurrent.futures.ProcessPoolExecutor` have it. They must be able to load the task.
+
+    Raises:
+        BadInput: the pool has no such method.
     """
+    if not callable(getattr(pool, "map", None)):
+        raise BadInput(
+            f"{pool!r} is no pool of processes: give one with a method map(function, jobs), such as "
+            "multiprocessing.Pool()"
+        )
     token = _POOL.set(pool)
     try:
         yield
@@ -67,5 +76,9 @@ def spread(work: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[Resul
 def _alone(work: Callable[[Job], Result], job: Job) -> Result:
     """Does a job in a process of a pool: on one core, and without a bar of progress among those of others."""
     global allowed
+    before = allowed, progress.enabled
     allowed, progress.enabled = 1, False
-    return work(job)
+    try:
+        return work(job)
+    finally:
+        allowed, progress.enabled = before

@@ -60,8 +60,8 @@ def unknown(what: str, value: object, allowed: Iterable[str]) -> BadInput:
 
 
 def brief(error: BaseException) -> str:
-    """Returns the kind of an error and the beginning of its text, in one line."""
-    kind, text = type(error).__name__, " ".join(str(error).split())
+    """Returns the kind of an error and the beginning of its text, in one line that can be printed."""
+    kind, text = type(error).__name__, printable(" ".join(str(error).split()))
     return f"{kind}: {text if len(text) <= 160 else text[:157] + '...'}" if text else kind
 
 

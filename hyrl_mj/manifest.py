@@ -276,11 +276,13 @@ def locked(folder: Path) -> Iterator[None]:
         lock.release()
 
 
-def may_hold_run(folder: Path) -> bool:
-    """Returns whether a folder holds a run, or only what a process left that was killed at once."""
+def may_hold(folder: Path, name: str) -> bool:
+    """Returns whether a folder holds a file, or only what a process left that was killed at once."""
+    if not folder.is_dir():
+        return False
     names = {path.name for path in folder.iterdir()}
     left = {name for name in names if name == LOCK or artifacts.TEMPORARY.fullmatch(name)}
-    return "config.json" in names or names == left
+    return name in names or names == left
 
 
 def check_contents(folder: Path) -> None:

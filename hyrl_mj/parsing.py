@@ -46,7 +46,10 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _names(text: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in text.split(","))
+    names = tuple(name.strip() for name in text.split(","))
+    if not all(names):
+        raise ValueError(text)
+    return names
 
 
 def _numbers(text: str) -> tuple[float, ...]:
@@ -57,9 +60,10 @@ def _integers(text: str) -> tuple[int, ...]:
     found: list[int] = []
     for part in text.split(","):
         first, dash, last = part.partition("-")
-        found += range(int(first), int(last if dash else first) + 1)
-        if dash and int(last) < int(first):
+        more = range(int(first), int(last if dash else first) + 1)
+        if not 0 < len(more) <= LONGEST_RANGE:
             raise ValueError(text)
+        found += more
     return tuple(found)
 
 
@@ -68,6 +72,12 @@ def _change(text: str) -> tuple[str, str]:
     if not (name and equals):
         raise ValueError(text)
     return name.strip(), value.strip()
+
+
+def _changes(parts: tuple[tuple[str, str], ...]) -> dict[str, str]:
+    if len(dict(parts)) < len(parts):
+        raise ValueError(parts)
+    return dict(parts)
 
 
 def _joined(parts: tuple[tuple[Any, ...], ...]) -> tuple[Any, ...]:
@@ -92,12 +102,13 @@ KINDS: dict[Any, Kind] = {
         "INTEGER,...", "integers or ranges, as 0-9 or 0,3,7-9", _integers, "{0[0]}".format
     ),
     tuple[str, ...]: NAMES,
-    dict[str, Any]: Kind("NAME=VALUE ...", "one or more NAME=VALUE", _change, str, dict),
+    dict[str, Any]: Kind("NAME=VALUE ...", "NAME=VALUE, each NAME once", _change, str, _changes),
     tuple[int, int]: Kind(
         "WIDTHxHEIGHT", "WIDTHxHEIGHT in pixels, as 640x480", _size, "{0[0]}x{0[1]}".format
     ),
 }
 BY_DEFAULT = "; by default "
+LONGEST_RANGE = 10_000
 
 
 @dataclass(frozen=True)
@@ -149,12 +160,12 @@ class Argument:
         """Returns the value of its words, or raises `BadInput`."""
         try:
             values = tuple(map(self.kind.read, words))
+            return self.kind.gather(values) if self.kind.gather else values[0]
         except BadInput:
             raise
         except ValueError:
             wrong = f"{self.title} {shlex.join(words)!r}"
             raise BadInput(f"{wrong} cannot be used: give {self.kind.meaning}") from None
-        return self.kind.gather(values) if self.kind.gather else values[0]
 
 
 # An option of each command that opens a run.
@@ -212,13 +223,14 @@ def call(
     if any(argument.kind is RUN for argument in every):
         every.append(TASK)
     options = {argument.title: argument for argument in every if not argument.positional}
-    for word, following in pairwise([*words, "--"]):
-        option = options.get(word.replace("_", "-"))
-        if option and option.kind is not FLAG and following.startswith("--"):
+    titles = [word.partition("=")[0].replace("_", "-") for word in words]
+    for (word, following), title in zip(pairwise([*words, "--"]), titles, strict=True):
+        option = options.get(title)
+        if option and option.kind is not FLAG and "=" not in word and following.startswith("--"):
             raise BadInput(f"{word} needs a value: give {option.kind.meaning}")
-        if option and option.kind.gather and words.count(word) > 1:
+        if option and option.kind.gather and titles.count(title) > 1:
             raise BadInput(
-                f"{word} is given twice: give it once, with {option.kind.meaning} after it"
+                f"{title} is given twice: give it once, with {option.kind.meaning} after it"
             )
     helping = "-h" in words or "--help" in words
     parsed: Any

@@ -16,7 +16,7 @@ from hyrl_mj import artifacts, policies
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.game import Lattice, Robustness
 from hyrl_mj.learning import Settings, differing
-from hyrl_mj.manifest import FILES, Manifest, check_contents, locked, may_hold_run
+from hyrl_mj.manifest import FILES, Manifest, check_contents, locked, may_hold
 from hyrl_mj.policies import Agent, AnyPolicy, MlpPolicy, Policy
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.stages import (
@@ -220,6 +220,12 @@ class Run:
         facts = self.robustness, self.retraining, self.arrivals
         return Verdict.of(self.task, self.settings.noise, *facts)
 
+    @property
+    def is_examined_as_usual(self) -> bool:
+        """Whether the examination on disk is under the run's own noise, and not under another one."""
+        found = self.robustness
+        return found.eps == self.settings.noise and not found.everywhere
+
     @cached_property
     def versions(self) -> dict[str, str]:
         """The versions of Python and the packages when the run began."""
@@ -312,7 +318,7 @@ def opened(path: str | Path, settings: Settings, policy: AnyPolicy | None = None
             names them.
     """
     path = Path(path)
-    if path.exists() and not (path.is_dir() and may_hold_run(path)):
+    if path.exists() and not may_hold(path, "config.json"):
         raise BadInput(f"{path} exists and is not a run directory: choose another --out")
     config = path / "config.json"
     if config.exists():

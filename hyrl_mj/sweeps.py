@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Literal
 
 import numpy as np
 
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadArtifact, BadInput
-from hyrl_mj.game import LIMIT
-from hyrl_mj.manifest import FILES
+from hyrl_mj.game import LIMIT, Robustness
+from hyrl_mj.manifest import check_contents, may_hold
 from hyrl_mj.run_directory import Run, load_run
 
 NAME = "sweep.json"
 # States of a run.
-OPEN, DONE, STOPPED = "open", "done", "stopped"
-# The stages that have to be finished; the others are about single starts and agents.
-STAGES = [stage for stage in FILES if stage not in ("diagnose", "simulate --start")]
+OPEN: Final = "open"
+DONE: Final = "done"
+STOPPED: Final = "stopped"
+# The stages that have to be finished. Pictures are missing where nothing can be drawn.
+STAGES = ("train", "critical-set", "partition", "extended-sets", "retrain", "robustness", "report")
 
 
 @dataclass(frozen=True)
@@ -43,27 +45,15 @@ class Setting:
         parts = [Path(self.task).stem, self.algorithm, f"noise {self.eps:g}"]
         return ", ".join(filter(None, parts))
 
+    def __post_init__(self) -> None:
+        if Path(self.stem).name != self.stem:
+            raise BadInput(f"{self.stem!r} cannot be the name of a folder: give another algorithm")
+
     @property
     def stem(self) -> str:
         """The beginning of the names of its run directories, such as "vehicle-dqn-0.1"."""
         parts = [Path(self.task).stem, self.algorithm.replace(":", "_"), f"{self.eps:g}"]
         return "-".join(filter(None, parts))
-
-
-@dataclass(frozen=True)
-class Curve:
-    """What is won against the noise bound, in the worst-case game; empty where it cannot be played.
-
-    Attributes:
-        eps: the noise bounds.
-        policy, hyrl: share of the winnable starts that each controller wins, from its own start mode.
-        hyrl_any: that the hybrid controller wins from every start mode.
-    """
-
-    eps: tuple[float, ...] = ()
-    policy: tuple[float, ...] = ()
-    hyrl: tuple[float, ...] = ()
-    hyrl_any: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -78,39 +68,42 @@ class Row:
         verdict: the word of the verdict, "" if there is none.
         seconds: how long the stages took that this sweep has run [s].
         figures: the results by name; None where there is none.
-        curve: what is won against the noise bound.
     """
 
     setting: Setting
     seed: int
-    state: str = OPEN
+    state: Literal["open", "done", "stopped"] = OPEN
     sentence: str = ""
     verdict: str = ""
     seconds: float = 0.0
-    figures: dict[str, float | None] | None = None
-    curve: Curve = Curve()
+    figures: dict[str, float | None] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
         """The name of the run directory."""
         return f"{self.setting.stem}-{self.seed}"
 
-    def finished(self, run: Run) -> Row:
-        """Returns the row with the results of a finished run."""
-        verdict, curve = run.verdict, Curve()
-        if (game := run.robustness.game) is not None:
-            wins = game.curve.wins
-            curve = Curve(
-                game.curve.eps, wins["policy"].won, wins["hyrl"].won, wins["hyrl"].won_any
-            )
+    def on_disk(self, folder: Path) -> Row:
+        """Returns the row with what its run directory holds: its results if it is finished, else none."""
+        row = Row(self.setting, self.seed, seconds=self.seconds)
+        try:
+            run = finished_run(folder / self.name)
+        except BadInput as error:  # the task is in a file that may not be executed
+            return row.stopped(str(error))
+        if run is None:
+            return row
+        verdict = run.verdict
         return replace(
-            self,
+            row,
             state=DONE,
             sentence=verdict.sentence,
             verdict=verdict.word,
-            figures=_figures(run),
-            curve=curve,
+            figures=_figures(run.robustness),
         )
+
+    def stopped(self, sentence: str) -> Row:
+        """Returns the row without results, because of an error."""
+        return Row(self.setting, self.seed, STOPPED, sentence, seconds=self.seconds)
 
 
 @dataclass(frozen=True)
@@ -139,8 +132,9 @@ class Sweep:
         """Reads `sweep.json` in a folder.
 
         Raises:
-            BadArtifact: there is none, or it is damaged.
+            BadArtifact: there is none, it is damaged, or the folder holds a link.
         """
+        check_contents(folder)
         remedy = "give the folder of a sweep, or make one with hyrl-mj sweep TASK --out DIR"
         return artifacts.read_record(folder / NAME, "sweep", Sweep, remedy)
 
@@ -155,7 +149,7 @@ class Sweep:
 
     def write_csv(self, folder: Path) -> None:
         """Writes `sweep.csv`: a line for each run, with the names of the columns in the first."""
-        names = list(dict.fromkeys(name for row in self.rows for name in row.figures or {}))
+        names = list(dict.fromkeys(name for row in self.rows for name in row.figures))
         with (
             artifacts.replacing(folder / "sweep.csv") as temporary,
             temporary.open("w", newline="", encoding="utf-8") as file,
@@ -165,7 +159,7 @@ class Sweep:
             writer.writerow([*head, *names, "sentence"])
             for row in self.rows:
                 values = [row.seed, row.state, row.verdict, f"{row.seconds:.1f}"]
-                found = [(row.figures or {}).get(name) for name in names]
+                found = [row.figures.get(name) for name in names]
                 cells = ["" if value is None else f"{value:.6g}" for value in found]
                 writer.writerow([*asdict(row.setting).values(), *values, *cells, row.sentence])
 
@@ -183,58 +177,57 @@ def opened(folder: Path, common: Common, rows: Iterable[Row]) -> Sweep:
     Raises:
         BadInput: the folder holds something else, or a sweep with other settings.
     """
-    rows = tuple(rows)
     if not (folder / NAME).exists():
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if folder.exists() and not may_hold(folder, NAME):
             raise BadInput(
                 f"{folder} exists and is not the folder of a sweep: choose another --out"
             )
-        return Sweep(common, rows)
+        return Sweep(common, tuple(rows))
     there = Sweep.load(folder)
-    settings = {row.setting for row in rows}, {row.setting for row in there.rows}
-    if there.common != common or settings[0] != settings[1]:
-        differing = [
-            f"{name}: {old} there, {new} given"
-            for (name, old), new in zip(
-                asdict(there.common).items(), asdict(common).values(), strict=True
-            )
-            if old != new
-        ]
-        if settings[0] != settings[1]:
-            was, now = ("; ".join(sorted(s.title for s in group)) for group in settings[::-1])
-            differing.append(f"runs of {was} there, of {now} given")
-        raise BadInput(
-            f"{folder} holds a sweep with other settings ({', '.join(differing)}): choose another --out, "
-            "or give the same settings; more seeds can be added"
+    if there.common != common:
+        pairs = zip(asdict(there.common).items(), asdict(common).values(), strict=True)
+        differing = (
+            f"{name}: {old} there, {new} given" for (name, old), new in pairs if old != new
         )
-    names = {row.name for row in there.rows}
-    return replace(there, rows=there.rows + tuple(r for r in rows if r.name not in names))
+        raise BadInput(
+            f"{folder} holds a sweep with other settings ({'; '.join(differing)}): choose another --out, "
+            "or give the same settings; seeds, noise bounds, algorithms and tasks can be added"
+        )
+    known = {row.name: row for row in there.rows}
+    for row in rows:
+        if known.setdefault(row.name, row).setting != row.setting:
+            was, now = known[row.name].setting, row.setting
+            raise BadInput(
+                f"{folder} holds a run {row.name} of {was.task}, and one of {now.task} is given: choose "
+                "another --out"
+            )
+    return replace(there, rows=tuple(known.values()))
 
 
 def finished_run(path: Path) -> Run | None:
-    """Returns the run in a directory if all of its stages are finished and to be believed."""
+    """Returns the run in a directory if its stages are finished and to be believed.
+
+    Raises:
+        BadInput: the task is in a file that this machine has not executed before.
+    """
     if not (path / "config.json").is_file():
         return None
     try:
         run = load_run(path)
-        done = all(run.manifest.is_done(stage) for stage in STAGES)
-        usual = done and run.robustness.eps == run.settings.noise
+        done = all(run.manifest.is_done(stage) for stage in STAGES) and run.is_examined_as_usual
     except BadArtifact:
         return None
-    return run if usual else None
+    return run if done else None
 
 
-def _figures(run: Run) -> dict[str, float | None]:
+def _figures(robustness: Robustness) -> dict[str, float | None]:
     """Returns the results of a run by name."""
-    robustness = run.robustness
     if (game := robustness.game) is None:
-        least: dict[str, float | None] = {}
-        for who in ("policy", "hyrl"):
-            for count in robustness.episodes:
-                name = f"{who}_reached_{count.noise}"
-                if count.controller == who:
-                    least[name] = min(count.reached, least.get(name) or 1.0)
-        return least
+        least: dict[str, float] = {}
+        for count in robustness.episodes:
+            name = f"{count.controller}_reached_{count.noise}"
+            least[name] = min(count.reached, least.get(name, 1.0))
+        return {**least}
     figures: dict[str, float | None] = {"winnable": game.scores["hyrl"][-1].winnable}
     for i, when in ((0, "_without_noise"), (-1, "")):
         for who in ("policy", "hyrl", LIMIT):

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import hyrl_mj
 from hyrl_mj.policies import ALGORITHMS
+from hyrl_mj.sweeps import DONE
 from hyrl_mj.viz import print_sweep
 from hyrl_mj.viz.tables import arrivals
 
@@ -41,6 +42,9 @@ def main() -> int:
         )  # fmt: skip
         print_sweep(result)
         for row in result.rows:
+            if row.state != DONE:
+                lost.append(f"{row.name}: {row.sentence}")
+                continue
             run = hyrl_mj.load_run(options.out / task / row.name)
             won, total = arrivals(run, run.arcs(), policy=False)
             lost += [f"{row.name} wins {won} of {total} replays"] if won < total else []

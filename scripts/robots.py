@@ -23,7 +23,7 @@ from hyrl_mj import progress
 from hyrl_mj.policies import Controller, PolicyController
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.stages import Regions, noisy_episodes
-from hyrl_mj.sweeps import Row
+from hyrl_mj.sweeps import DONE, Row
 
 KINDS = ("alternating", "adversarial")
 # Starts for the comparison with the expert.
@@ -116,6 +116,8 @@ def main() -> int:
         table.add_column(heading)
     missed = 0
     for made in hyrl_mj.sweep(options.tasks, seeds=tuple(options.seeds), out=options.out).rows:
+        if made.state != DONE:
+            raise SystemExit(f"{made.name}: {made.sentence}")
         row = measure(made, options.episodes, options.out)
         missed += sum(cell.endswith("!") for cell in row)
         table.add_row(*row)

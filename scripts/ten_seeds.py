@@ -45,7 +45,7 @@ def main() -> int:
         f"{row.name}: {name} is {value}, not from {least:g} to {most:g}"
         for row in result.rows
         for name, (least, most) in targets(row.setting.task, options.eps).items()
-        if (value := (row.figures or {}).get(name)) is None or not least <= value <= most + TINY
+        if (value := row.figures.get(name)) is None or not least <= value <= most + TINY
     ]
     print("\n".join(missed) or "every figure meets its target")
     return int(bool(missed))

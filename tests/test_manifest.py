@@ -8,7 +8,7 @@ import threading
 import pytest
 
 from hyrl_mj import BadArtifact, BadInput, artifacts, manifest
-from hyrl_mj.manifest import FILES, LOCK, NAME, Manifest, check_contents, locked, may_hold_run
+from hyrl_mj.manifest import FILES, LOCK, NAME, Manifest, check_contents, locked, may_hold
 
 SETTINGS = dict.fromkeys(FILES, "these")
 
@@ -183,12 +183,12 @@ def test_what_a_killed_writer_has_left_goes_and_nothing_else(tmp_path):
 
 
 def test_a_folder_of_a_writer_that_was_killed_at_once_may_hold_a_run(tmp_path):
-    assert may_hold_run(tmp_path)
+    assert may_hold(tmp_path, "config.json")
     for name in (LOCK, ".config.0123456789ab.partial.json"):
         (tmp_path / name).write_text("half")
-    assert may_hold_run(tmp_path)
+    assert may_hold(tmp_path, "config.json")
     (tmp_path / "notes.txt").write_text("mine")
-    assert not may_hold_run(tmp_path)
+    assert not may_hold(tmp_path, "config.json")
 
 
 # ---- links

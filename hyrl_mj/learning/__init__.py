@@ -3,16 +3,19 @@
 The modules `training`, `distillation` and `symmetry` import torch: import them only where they are needed.
 """
 
-from hyrl_mj.learning.changes import changed, differing
+from hyrl_mj.learning.changes import STAGES, changed, changes, differing, setting_value
 from hyrl_mj.learning.settings import Settings, Training, preset
 
 __all__ = [
+    "STAGES",
     "Settings",
     "Training",
     "changed",
+    "changes",
     "differing",
     "distillation",
     "preset",
+    "setting_value",
     "symmetry",
     "training",
 ]

@@ -39,7 +39,9 @@ def changed(settings: Settings, changes: Mapping[str, object]) -> Settings:
     known = dict(_leaves(settings))
     for name, value in changes.items():
         if name in OPTIONS:
-            raise BadInput(f"the setting {name} cannot be changed so: give it by {OPTIONS[name]}")
+            raise BadInput(
+                f"the setting {name} has an option of its own: give it with {OPTIONS[name]}"
+            )
         record, _, field = name.rpartition(".")
         if name not in known and record not in [f"{stage}.options" for stage in STAGES]:
             raise unknown("setting", name, known)
@@ -68,15 +70,37 @@ def _leaves(record: Settings | Training, prefix: str = "") -> list[tuple[str, An
     return leaves
 
 
+def setting_value(value: object) -> object:
+    """Returns a value as JSON holds it; a text is read as JSON where it can be.
+
+    Raises:
+        BadInput: JSON cannot hold it.
+    """
+    try:
+        return json.loads(value if isinstance(value, str) else json.dumps(value))
+    except ValueError:
+        return WORDS.get(value, value)  # type: ignore[call-overload]
+    except TypeError:
+        raise BadInput(
+            f"a setting cannot be {value!r}: give a number, a text, a list or None"
+        ) from None
+
+
 def _value(value: object, present: object) -> object:
-    """Returns the value that a text stands for; 3e5 is an integer where the present value is one."""
-    if isinstance(value, str):
-        try:
-            value = json.loads(value)
-        except ValueError:
-            return WORDS.get(value, value)  # type: ignore[call-overload]
+    """Returns the value of a setting; 3e5 is an integer where the present value is one."""
+    value = setting_value(value)
     whole = isinstance(value, float) and value.is_integer() and type(present) is int
     return int(value) if whole else value  # type: ignore[call-overload]
+
+
+def changes(settings: Settings, of: Settings) -> dict[str, Any]:
+    """Returns what `changed` has to change of other settings to get these."""
+    before = dict(_leaves(of))
+    return {
+        name: value
+        for name, value in _leaves(settings)
+        if name not in OPTIONS and before.get(name) != value
+    }
 
 
 def differing(old: Settings | Training, new: Settings | Training, of: str = "") -> Iterator[str]:

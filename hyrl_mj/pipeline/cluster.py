@@ -7,7 +7,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -16,19 +16,20 @@ from hyrl_mj import cores
 from hyrl_mj.errors import BadInput, HyrlError, brief
 from hyrl_mj.manifest import Busy
 from hyrl_mj.pipeline.runs import RunOptions, run
-from hyrl_mj.sweeps import STOPPED, Row
+from hyrl_mj.sweeps import Row
 
 # Seconds within which an address must answer, and for which a killed process may keep a run directory.
 PATIENCE, HELD = 8.0, 30.0
 # How often the process of a run may die before the run is given up.
 DEATHS = 20
 POLL = 0.25  # [s]
+GB = 10**9
 # Receives a line about a run: its row, and the text.
 Tell = Callable[[Row, str], None]
 
 
 def make(row: Row, options: RunOptions, share: int, journal: Any = None) -> Row:
-    """Does a run with a share of the cores, and returns its row; errors end up in the row."""
+    """Does a run with a share of the cores; returns its row with the time that it took, or its error."""
     began = time.monotonic()
     cores.allowed = share
 
@@ -38,20 +39,21 @@ def make(row: Row, options: RunOptions, share: int, journal: Any = None) -> Row:
 
     say("begins")
     try:
-        finished = row.finished(_patient_run(row, options, say))
+        _patient_run(row, options, say)
     except HyrlError as error:
-        finished = replace(row, state=STOPPED, sentence=str(error))
+        row = row.stopped(str(error))
     except Exception as error:  # a run that fails does not stop the others
-        finished = replace(row, state=STOPPED, sentence=brief(error))
-    return replace(finished, seconds=row.seconds + time.monotonic() - began)
+        row = row.stopped(brief(error))
+    return replace(row, seconds=row.seconds + time.monotonic() - began)
 
 
-def _patient_run(row: Row, options: RunOptions, say: Callable[[str], None]) -> Any:
+def _patient_run(row: Row, options: RunOptions, say: Callable[[str], None]) -> None:
     """Runs, as soon as a process that was killed has let go of the run directory."""
     until = time.monotonic() + HELD
     while True:
         try:
-            return run(row.setting.task, options, say=say)
+            run(row.setting.task, options, say=say)
+            return
         except Busy:
             if time.monotonic() > until:
                 raise
@@ -75,34 +77,22 @@ class Journal:
 
 
 def work(
-    jobs: Sequence[tuple[Row, RunOptions]],
-    address: str | None,
-    share: int | None,
-    memory: float,
-    tell: Tell,
-) -> Iterator[Row]:
+    ray: Any, jobs: Sequence[tuple[Row, RunOptions]], share: int, memory: float, tell: Tell
+) -> Generator[Row, None, None]:
     """Does runs side by side, and yields the row of each when it ends.
 
     Args:
+        ray: see `started`.
         jobs: rows, and the options of their runs.
-        address: of a Ray cluster; None for this machine.
-        share: cores of each run; by default the cores of the machine divided by the runs.
+        share: cores of each run.
         memory: of each run [GB].
         tell: receives what runs say.
-
-    Raises:
-        BadInput: Ray is missing, the cluster does not answer, or no machine of it is large enough.
     """
-    with _started(address) as ray:
-        largest = max(node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"])
-        share = share or max(int(largest) // len(jobs), 1)
-        _check_room(ray, share, memory)
-        journal = ray.remote(Journal).options(num_cpus=0).remote()
-        remote = ray.remote(make).options(
-            num_cpus=share, memory=int(memory * 2**30), max_retries=DEATHS
-        )
-        rows = {row.name: row for row, _ in jobs}
-        pending = {remote.remote(row, options, share, journal): row for row, options in jobs}
+    journal = ray.remote(Journal).options(num_cpus=0, max_restarts=-1, max_task_retries=-1).remote()
+    remote = ray.remote(make).options(num_cpus=share, memory=int(memory * GB), max_retries=DEATHS)
+    rows = {row.name: row for row, _ in jobs}
+    pending = {remote.remote(row, options, share, journal): row for row, options in jobs}
+    try:
         while pending:
             done, _ = ray.wait([*pending], num_returns=len(pending), timeout=POLL)
             for name, text in ray.get(journal.take.remote()):
@@ -111,90 +101,101 @@ def work(
                 row = pending.pop(reference)
                 try:
                     yield ray.get(reference)
+                except ray.exceptions.WorkerCrashedError:
+                    yield row.stopped(f"its process died {DEATHS + 1} times")
                 except ray.exceptions.RayError as error:
-                    sentence = f"its process died {DEATHS + 1} times ({brief(error)})"
-                    yield replace(row, state=STOPPED, sentence=sentence)
+                    yield row.stopped(brief(getattr(error, "cause", None) or error))
+    except ray.exceptions.RayError as error:  # from the journal
+        raise BadInput(
+            f"the machines of the cluster do not work ({brief(error)}): give them the same versions of "
+            "Python, Ray and hyrl_mj"
+        ) from error
+    finally:
+        for reference in pending:
+            ray.cancel(reference, force=True)
 
 
-def imported(alone: bool) -> Any:
-    """Returns Ray, which then reports nothing to its makers.
+@contextmanager
+def started(address: str | None) -> Iterator[Any]:
+    """Yields Ray, started on this machine or connected to a cluster, and ends it after the block.
 
-    Args:
-        alone: whether it is to work on this machine alone.
+    Ray reports nothing to its makers. On one machine it listens on the loopback interface alone.
 
     Raises:
-        BadInput: Ray is not installed.
+        BadInput: Ray is not installed, cannot start, or does not answer at the address.
     """
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    if (
-        alone
-    ):  # read when Ray is imported: on every system it then listens on the loopback interface
-        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
-    # The core that a run asks for is a share of the machine, also where there is no GPU.
+    # Without it Ray warns about GPUs, which runs do not use.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    if address is None:  # read when Ray is imported: it then listens on the loopback interface
+        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
     try:
         import ray
     except ImportError as error:
         raise BadInput(
             'sweep needs Ray, which is not installed: pip install "hyrl-mj[sweep]"'
         ) from error
-    return ray
-
-
-@contextmanager
-def _started(address: str | None) -> Iterator[Any]:
-    """Starts Ray on this machine, or connects to a cluster, and ends it after the block."""
-    ray = imported(alone=address is None)
     if ray.is_initialized():  # by the user, who ends it as well
+        if address is not None:
+            raise BadInput(
+                f"Ray is at work in this process, so it cannot use {address}: leave the address out, or "
+                "call ray.shutdown() first"
+            )
         yield ray
         return
-    quiet: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
-    if address is None:
-        ray.init(
-            "local",
-            num_cpus=cores.count(),
-            include_dashboard=False,
-            object_store_memory=100 * 2**20,
-            **quiet,
-        )
-        if (host := ray.util.get_node_ip_address()) not in ("127.0.0.1", "::1"):
-            ray.shutdown()
-            raise BadInput(
-                f"Ray was imported before this sweep and would listen on {host}, where others can reach it: "
-                "import it later, or start it yourself with ray.init()"
-            )
-    else:
-        _check_address(address)
-        try:
-            ray.init(address, **quiet)
-        except Exception as error:  # Ray has many
-            raise _no_answer(address, brief(error)) from error
     try:
+        _start(ray, address)
         yield ray
     finally:
         ray.shutdown()
 
 
+def _start(ray: Any, address: str | None) -> None:
+    """Starts Ray on this machine, or connects to a cluster."""
+    quiet: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
+    if address is not None:
+        _check_address(address)
+    else:
+        quiet |= {"num_cpus": cores.count(), "include_dashboard": False}
+        quiet |= {"object_store_memory": 100 * 2**20}
+    try:
+        ray.init(address or "local", **quiet)
+    except Exception as error:  # Ray has many
+        if address is not None:
+            raise _no_answer(address, brief(error)) from error
+        raise BadInput(
+            f"Ray cannot start on this machine ({brief(error)}): make room in its folder for temporary "
+            "files, or make the runs one by one with hyrl-mj run"
+        ) from error
+    host = ray.util.get_node_ip_address()
+    if address is None and host not in ("127.0.0.1", "::1"):
+        raise BadInput(
+            f"Ray was imported before this sweep and would listen on {host}, where others can reach it: "
+            "import it later, or start it yourself with ray.init()"
+        )
+
+
 def _check_address(address: str) -> None:
     """Raises `BadInput` if no Ray cluster answers there within `PATIENCE`; Ray itself waits for minutes."""
     host, _, port = address.rpartition(":")
-    if not (host and port.isdigit()):
+    if not (host and port.isdecimal()):
         raise BadInput(f"the address {address!r} cannot be used: give HOST:PORT, as 10.0.0.1:6379")
     began = time.monotonic()
     try:
         socket.create_connection((host, int(port)), timeout=PATIENCE / 2).close()
-    except (OSError, OverflowError) as error:
+    except (OSError, OverflowError, ValueError) as error:
         raise _no_answer(address, brief(error)) from error
+    # Whether the versions are the same is said when Ray connects.
     words = [sys.executable, "-m", "ray.scripts.scripts", "health-check", "--address", address]
     try:
         left = PATIENCE - (time.monotonic() - began)
-        healthy = (
-            subprocess.run(words, capture_output=True, timeout=left, check=False).returncode == 0
+        subprocess.run(
+            [*words, "--skip-version-check"], capture_output=True, timeout=left, check=True
         )
     except subprocess.TimeoutExpired:
-        healthy = False
-    if not healthy:
-        raise _no_answer(address, "what listens there is no Ray cluster")
+        raise _no_answer(address, f"it does not answer within {PATIENCE:g} s") from None
+    except subprocess.CalledProcessError:
+        raise _no_answer(address, "what listens there is no Ray cluster") from None
 
 
 def _no_answer(address: str, why: str) -> BadInput:
@@ -204,15 +205,19 @@ def _no_answer(address: str, why: str) -> BadInput:
     )
 
 
-def _check_room(ray: Any, share: int, memory: float) -> None:
-    """Raises `BadInput` if no machine has room for a run, which would then wait for ever."""
+def share(ray: Any, runs: int, wanted: int | None, memory: float) -> int:
+    """Returns the cores of each run: those that are wanted, by default all cores divided by the runs.
+
+    Raises:
+        BadInput: no machine has room for a run with so many cores and so much memory [GB].
+    """
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-    if any(n.get("CPU", 0) >= share and n.get("memory", 0) >= memory * 2**30 for n in nodes):
-        return
-    found = "; ".join(
-        f"{n.get('CPU', 0):g} cores, {n.get('memory', 0) / 2**30:.1f} GB" for n in nodes
-    )
+    counts = [int(node.get("CPU", 0)) for node in nodes]
+    number = wanted or max(min(max(counts), sum(counts) // runs), 1)
+    if any(n.get("CPU", 0) >= number and n.get("memory", 0) >= memory * GB for n in nodes):
+        return number
+    found = "; ".join(f"{n.get('CPU', 0):g} and {n.get('memory', 0) / GB:.1f} GB" for n in nodes)
     raise BadInput(
-        f"no machine has {share} cores and {memory:g} GB free for a run (there are {found}): give fewer "
-        "--cores or less --memory"
+        f"no machine has {number} {'cores' if number > 1 else 'core'} and {memory:g} GB free for a run "
+        f"(there are {found}): give fewer --cores or less --memory"
     )

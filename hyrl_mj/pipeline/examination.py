@@ -94,12 +94,6 @@ def examine_loops(
     return Robustness(eps, everywhere, game, counts, seed), maps
 
 
-def is_usual(run: Run) -> bool:
-    """Returns whether the examination on disk is under the run's own noise, and not under another one."""
-    found = run.robustness
-    return found.eps == run.settings.noise and not found.everywhere
-
-
 def draw_robustness(run: Run, robustness: Robustness, maps: Maps, folder: Path) -> None:
     """Draws the maps and the curve of the game."""
     from hyrl_mj.viz import figures

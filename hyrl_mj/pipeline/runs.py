@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.learning import Settings, Training, changed, preset
 from hyrl_mj.manifest import locked
-from hyrl_mj.pipeline.examination import is_usual
 from hyrl_mj.pipeline.steps import DIAGNOSIS, STAGES, extended_sets_stage, run_stage
 from hyrl_mj.policies import ALGORITHMS, FUNCTION, AnyPolicy, algorithms, read_agent
 from hyrl_mj.progress import Say
@@ -191,7 +190,7 @@ def _run_all(run: Run, say: Say, stages: Iterable[str] = STAGES) -> Run:
     for stage in stages:
         if stage == "train" and run.agent:
             say(f"train: none, {run.agent} is given; it {run.arrivals}")
-        elif run.manifest.is_done(stage) and (stage != "robustness" or is_usual(run)):
+        elif run.manifest.is_done(stage) and (stage != "robustness" or run.is_examined_as_usual):
             say(f"{stage}: done before")
         else:
             run = run_stage(run, stage, say)

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-import json
+from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 from hyrl_mj import sweeps
-from hyrl_mj.errors import BadInput, check_seed
+from hyrl_mj.errors import BadInput, check_bound, check_seed
+from hyrl_mj.learning import setting_value
+from hyrl_mj.manifest import locked
 from hyrl_mj.pipeline import cluster
 from hyrl_mj.pipeline.board import Board
 from hyrl_mj.pipeline.runs import RunOptions, complete, settings_of
 from hyrl_mj.progress import Say
 from hyrl_mj.ranges import Integer, Number
-from hyrl_mj.sweeps import DONE, Common, Row, Setting, Sweep
+from hyrl_mj.sweeps import DONE, OPEN, STOPPED, Common, Row, Setting, Sweep
 from hyrl_mj.tasks import check_task, get_task, reference
 
 
@@ -50,6 +53,22 @@ class SweepOptions:
     address: str | None = None
     out: str | Path = Path("runs/sweep")
 
+    def __post_init__(self) -> None:
+        several = {
+            "seeds": tuple(map(check_seed, _several(self.seeds))),
+            "eps": tuple(map(check_bound, _several(self.eps))),
+            "algorithm": _several(self.algorithm),
+            "set": {name: setting_value(value) for name, value in self.set.items()},
+        }
+        for name, value in several.items():
+            object.__setattr__(self, name, value)  # the dataclass is frozen
+
+
+def _several(value: Any) -> tuple[Any, ...]:
+    """Returns some values, or the only one, as a tuple."""
+    one = isinstance(value, str | Path) or not isinstance(value, Iterable)
+    return (value,) if one else tuple(value)
+
 
 def sweep(
     tasks: str | Path | Iterable[str | Path],
@@ -73,31 +92,35 @@ def sweep(
         BadInput: a value that cannot be used, a folder with another sweep, or a cluster that does not answer.
     """
     options = complete(SweepOptions, options, changes)
-    names = [tasks] if isinstance(tasks, str | Path) else [*tasks]
-    jobs = {row.name: (row, one) for row, one in _jobs(names, options)}
+    jobs = {row.name: (row, one) for row, one in _jobs(_several(tasks), options)}
     folder = Path(options.out)
-    common = Common(options.preset, options.horizon, json.loads(json.dumps(options.set)))
-    result = sweeps.opened(folder, common, (row for row, _ in jobs.values()))
-    result.save(folder)
-    rows = [row for row in result.rows if row.name in jobs]
-    with Board(say, len(rows)) as board:
-        missing = []
+    common = Common(options.preset, options.horizon, options.set)
+    planned = [row for row, _ in jobs.values()]
+    result = sweeps.opened(folder, common, planned)
+    rows = [row.on_disk(folder) for row in result.rows if row.name in jobs]
+    missing = [(row, jobs[row.name][1]) for row in rows if row.state != DONE]
+    with ExitStack() as stack:
+        engine = None
+        if missing:  # nothing is written before Ray answers
+            engine = stack.enter_context(cluster.started(options.address))
+            share = cluster.share(engine, len(missing), options.cores, options.memory)
+        stack.enter_context(locked(folder))
+        result = sweeps.opened(folder, common, planned)
+        result.save(folder)
+        board = stack.enter_context(Board(say, len(rows)))
         for row in rows:
-            if (run := sweeps.finished_run(folder / row.name)) is None:
-                missing.append((row, jobs[row.name][1]))
-            else:
-                row = row.finished(run)
+            if row.state == DONE:
                 result = result.with_row(row)
                 board.end(row, "done before: ")
-        if missing:
-            ended = cluster.work(
-                missing, options.address, options.cores, options.memory, board.tell
-            )
-            for row in ended:
-                result = result.with_row(_on_disk(row, folder))
-                result.save(folder)
-                board.end(row)
-    write(result, folder)
+        if engine is not None:
+            memory = options.memory
+            with closing(cluster.work(engine, missing, share, memory, board.tell)) as ended:
+                for row in ended:
+                    row = row if row.state == STOPPED else _seen(row, folder)
+                    result = result.with_row(row)
+                    result.save(folder)
+                    board.end(row)
+        write(result, folder)
     return result
 
 
@@ -105,17 +128,18 @@ def report(folder: str | Path) -> Sweep:
     """Makes `sweep.csv` and `sweep.html` again from the run directories in the folder of a sweep.
 
     Raises:
-        BadArtifact: the folder holds no sweep.
+        BadArtifact: the folder holds no sweep, or a link.
+        BadInput: a sweep is at work there.
     """
     folder = Path(folder)
-    result = Sweep.load(folder)
-    for row in result.rows:
-        run = sweeps.finished_run(folder / row.name)
-        if run is not None:
-            result = result.with_row(row.finished(run))
-        elif row.state == DONE:
-            result = result.with_row(Row(row.setting, row.seed, seconds=row.seconds))
-    write(result, folder)
+    Sweep.load(folder)
+    with locked(folder):
+        result = Sweep.load(folder)
+        for row in result.rows:
+            found = row.on_disk(folder)
+            told = row.state == STOPPED and found.state == OPEN
+            result = result.with_row(row.stopped(row.sentence) if told else found)
+        write(result, folder)
     return result
 
 
@@ -128,12 +152,17 @@ def write(result: Sweep, folder: Path) -> None:
     write_page(result, folder)
 
 
-def _jobs(names: list[str | Path], options: SweepOptions) -> Iterator[tuple[Row, RunOptions]]:
+def _jobs(names: tuple[str | Path, ...], options: SweepOptions) -> Iterator[tuple[Row, RunOptions]]:
     """Yields an open row and the options of each run; every value is checked before anything is made."""
     _check(names, options)
     seen: set[str] = set()
     for name in names:
         task = check_task(get_task(name))
+        if task.source is None and type(task).__module__ == "__main__":
+            raise BadInput(
+                f"the task {task.name} is defined in this session alone, where the processes of a sweep do "
+                "not find it: write it into a Python file, and give that"
+            )
         for algorithm, eps in product(options.algorithm or (None,), options.eps):
             one = RunOptions(
                 eps=eps,
@@ -145,30 +174,33 @@ def _jobs(names: list[str | Path], options: SweepOptions) -> Iterator[tuple[Row,
             settings_of(task, one)
             setting = Setting(reference(task), algorithm or "", eps)
             if setting.stem in seen:
-                raise BadInput(f"{setting.title} is given twice: give each run once")
+                raise BadInput(
+                    f"two runs would be called {setting.stem}: give each run once, and task files of "
+                    "different names"
+                )
             seen.add(setting.stem)
             for seed in options.seeds:
                 row = Row(setting, seed)
                 yield row, replace(one, seed=seed, out=Path(options.out).resolve() / row.name)
 
 
-def _check(names: list[str | Path], options: SweepOptions) -> None:
-    """Raises `BadInput` for values that say nothing, or twice the same."""
+def _check(names: tuple[str | Path, ...], options: SweepOptions) -> None:
+    """Raises `BadInput` if there is nothing to do, a seed is given twice, or a share is out of range."""
     for what, values in (("task", names), ("seed", options.seeds), ("eps", options.eps)):
         if not values:
             raise BadInput(f"a sweep needs at least one {what}: give one or more")
-    for seed in options.seeds:
-        check_seed(seed)
-        if [*options.seeds].count(seed) > 1:
-            raise BadInput(f"the seed {seed} is given twice: give each seed once")
+    if twice := [seed for seed, count in Counter(options.seeds).items() if count > 1]:
+        raise BadInput(f"the seed {twice[0]} is given twice: give each seed once")
     if options.cores is not None:
         Integer(1, 1_024).checked("cores", options.cores)
     Number(0, 10_000, above=True).checked("memory", options.memory)
 
 
-def _on_disk(row: Row, folder: Path) -> Row:
-    """Returns a row, which tells of an error if this machine does not see its run directory."""
-    if row.state == DONE and not (folder / row.name).is_dir():
-        sentence = f"it was written where this machine does not see it: share {folder} between all machines"
-        return replace(Row(row.setting, row.seed), state=sweeps.STOPPED, sentence=sentence)
+def _seen(row: Row, folder: Path) -> Row:
+    """Returns the row of a finished run, as this machine sees its run directory."""
+    row = row.on_disk(folder)
+    if row.state == OPEN:
+        return row.stopped(
+            f"this machine does not see its results: share {folder} between all machines"
+        )
     return row

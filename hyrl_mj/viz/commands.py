@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from pathlib import Path
 
+from hyrl_mj import learning
 from hyrl_mj.game import Robustness
-from hyrl_mj.learning import preset
+from hyrl_mj.learning import STAGES, Settings, preset
 from hyrl_mj.policies import ALGORITHMS
 from hyrl_mj.run_directory import Run
 
@@ -35,6 +37,8 @@ def beginning(run: Run, out: Path | None = None) -> str:
         words += ["--algorithm", s.stage1.algorithm]
     if s.horizon is not None:
         words += ["--horizon", f"{s.horizon}"]
+    if not agent and (changes := _changes(run)):
+        words += ["--set", *(f"{name}={json.dumps(value)}" for name, value in changes.items())]
     if out is not None:
         words += ["--out", f"{out}"]
     return shlex.join(words)
@@ -55,13 +59,30 @@ def _examination(robustness: Robustness) -> str:
 
 
 def changed(run: Run) -> list[str]:
-    """Returns the names of the settings that differ from those of this version's preset."""
-    s, algorithm = run.settings, None if run.agent else run.settings.stage1.algorithm
-    known = algorithm is None or algorithm in ALGORITHMS
-    again = preset(
-        run.task, s.preset, noise=s.noise, seed=s.seed, horizon=s.horizon,
-        agent=run.agent, algorithm=algorithm if known else None,
-    )  # fmt: skip
-    # Another algorithm than SB3's is not imported, so its settings cannot be compared.
-    compared = [name for name in vars(s) if known or name not in ("stage1", "stage6")]
+    """Returns the names of the settings that the command does not repeat with this version."""
+    s, again = run.settings, _again(run)
+    if not run.agent:
+        again = learning.changed(again, _changes(run))
+    compared = [name for name in vars(s) if _is_known(run) or name not in STAGES]
     return [n.replace("_", " ") for n in compared if getattr(s, n) != getattr(again, n)]
+
+
+def _changes(run: Run) -> dict[str, object]:
+    """Returns the settings that differ from those of this version's preset, as --set takes them."""
+    every = learning.changes(run.settings, _again(run))
+    return {n: v for n, v in every.items() if _is_known(run) or n.partition(".")[0] not in STAGES}
+
+
+def _again(run: Run) -> Settings:
+    """Returns the settings of this version's preset with the options of a run."""
+    s = run.settings
+    algorithm = None if run.agent or not _is_known(run) else s.stage1.algorithm
+    return preset(
+        run.task, s.preset, noise=s.noise, seed=s.seed, horizon=s.horizon,
+        agent=run.agent, algorithm=algorithm,
+    )  # fmt: skip
+
+
+def _is_known(run: Run) -> bool:
+    """Whether the algorithm is SB3's own; another one is not imported, so its settings are not compared."""
+    return bool(run.agent) or run.settings.stage1.algorithm in ALGORITHMS

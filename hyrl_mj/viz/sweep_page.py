@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from io import BytesIO
 from pathlib import Path
 from urllib.parse import quote
@@ -12,16 +13,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
+from hyrl_mj.game import Curve
+from hyrl_mj.run_directory import load_run
 from hyrl_mj.sweeps import DONE, Row, Setting, Sweep
 from hyrl_mj.viz import sweep_tables as tables
 from hyrl_mj.viz.figures import style
 from hyrl_mj.viz.report import Picture, data_uri, environment, write
 
-# Curves: name in `Curve`, label, colour and line style.
+# Curves: controller, column of its `Wins`, label, colour and line style.
 LINES = (
-    ("policy", "RL policy", style.POLICY_COLOUR, "-"),
-    ("hyrl", "HyRL, own q0", style.mode_colour(0), "-"),
-    ("hyrl_any", "HyRL, any q0", style.mode_colour(0), "--"),
+    ("policy", "won", "RL policy", style.POLICY_COLOUR, "-"),
+    ("hyrl", "won", "HyRL, own q0", style.mode_colour(0), "-"),
+    ("hyrl", "won_any", "HyRL, any q0", style.mode_colour(0), "--"),
 )
 HEIGHT = 2.7  # [inches] of a row of panels
 
@@ -33,11 +36,12 @@ def write_page(sweep: Sweep, folder: Path) -> None:
         environment()
         .get_template("sweep.html")
         .render(
-            name=folder.resolve().name,
+            # A name that is not Unicode must not keep the page from being written.
+            name=os.fsencode(folder.resolve().name).decode("utf-8", "replace"),
             common=sweep.common,
             summary=(summary := tables.summary_table(sweep)),
             markdown=tables.markdown(summary),
-            picture=_picture(groups),
+            picture=_picture(groups, folder),
             groups=[
                 (setting, tables.run_table(rows), _links(rows), tables.worst(rows))
                 for setting, rows in groups.items()
@@ -50,18 +54,19 @@ def write_page(sweep: Sweep, folder: Path) -> None:
     write(folder / "sweep.html", page)
 
 
-def _links(rows: list[Row]) -> list[tuple[Row, str]]:
-    """Returns the finished runs with the addresses of their reports."""
-    return [(row, f"{quote(row.name)}/report.html") for row in rows if row.state == DONE]
+def _links(rows: list[Row]) -> dict[str, str]:
+    """Returns the addresses of the reports of the finished runs, by name."""
+    return {row.name: f"{quote(row.name)}/report.html" for row in rows if row.state == DONE}
 
 
-def _picture(groups: dict[Setting, list[Row]]) -> Picture | None:
+def _picture(groups: dict[Setting, list[Row]], folder: Path) -> Picture | None:
     """Returns the curves of all settings, or None where the worst-case game was not played."""
-    curves = {
-        setting: played
-        for setting, rows in groups.items()
-        if (played := [row for row in rows if row.curve.eps])
-    }
+    curves: dict[Setting, list[Curve]] = {}
+    for setting, rows in groups.items():
+        for row in rows:
+            game = load_run(folder / row.name).robustness.game if row.state == DONE else None
+            if game is not None:
+                curves.setdefault(setting, []).append(game.curve)
     if not curves:
         return None
     figure = draw_curves(curves)
@@ -76,16 +81,16 @@ def _picture(groups: dict[Setting, list[Row]]) -> Picture | None:
     return Picture("curves", data_uri(content.getvalue(), "image/png"), *size, caption)
 
 
-def draw_curves(curves: dict[Setting, list[Row]]) -> Figure:
+def draw_curves(curves: dict[Setting, list[Curve]]) -> Figure:
     """Draws a panel for each setting, with a band over its seeds for each controller."""
     columns = min(len(curves), style.COLUMNS)
     count = -(-len(curves) // columns)
     with matplotlib_style.context(["default", style.STYLE]):
         figure = Figure(figsize=(style.WIDTH, 0.8 + HEIGHT * count), layout="constrained")
         panels = figure.subplots(count, columns, squeeze=False, sharey=True).ravel()
-        for panel, (setting, rows) in zip(panels, curves.items(), strict=False):
-            _draw(panel, rows)
-            panel.set_title(f"{setting.title} ({len(rows)} seeds)")
+        for panel, (setting, group) in zip(panels, curves.items(), strict=False):
+            _draw(panel, group)
+            panel.set_title(f"{setting.title} ({len(group)} seeds)", parse_math=False)
             panel.axvline(
                 setting.eps, color=style.INK, linewidth=1, linestyle=(0, (1, 2)), zorder=1
             )
@@ -98,11 +103,12 @@ def draw_curves(curves: dict[Setting, list[Row]]) -> Figure:
     return figure
 
 
-def _draw(panel: Axes, rows: list[Row]) -> None:
+def _draw(panel: Axes, curves: list[Curve]) -> None:
     """Draws the median and the band of each controller."""
-    eps = np.array(rows[0].curve.eps)
-    for name, label, colour, dashes in LINES:
-        shares = 100 * np.array([getattr(row.curve, name) for row in rows])
+    eps = np.array(curves[0].eps)
+    alike = [curve.wins for curve in curves if curve.eps == curves[0].eps]
+    for who, column, label, colour, dashes in LINES:
+        shares = 100 * np.array([getattr(wins[who], column) for wins in alike])
         panel.fill_between(
             eps, shares.min(axis=0), shares.max(axis=0), color=colour, alpha=0.18, lw=0
         )

@@ -55,9 +55,7 @@ COLUMNS = {
 
 def shown(rows: Iterable[Row]) -> list[str]:
     """Returns the names of the figures that some row has."""
-    there = {
-        name for row in rows for name, value in (row.figures or {}).items() if value is not None
-    }
+    there = {name for row in rows for name, value in row.figures.items() if value is not None}
     return [name for name in COLUMNS if name in there]
 
 
@@ -70,7 +68,7 @@ def summary_table(sweep: Sweep) -> Table:
         ["verdicts", *(_verdicts(group) for group in done.values())],
     ]
     for name in shown(sweep.rows):
-        found = [summary((row.figures or {}).get(name) for row in group) for group in done.values()]
+        found = [summary(row.figures.get(name) for row in group) for group in done.values()]
         cells = ["-" if three is None else _range(COLUMNS[name], *three) for three in found]
         rows.append([COLUMNS[name].heading, *cells])
     title = "median over the seeds (least to greatest)"
@@ -89,7 +87,7 @@ def run_table(group: Iterable[Row]) -> Table:
     names = shown(group)
     rows = []
     for row in group:
-        values = [(row.figures or {}).get(name) for name in names]
+        values = [row.figures.get(name) for name in names]
         cells = [
             "-" if v is None else COLUMNS[n].show(v) for n, v in zip(names, values, strict=True)
         ]
@@ -102,8 +100,7 @@ def worst(group: Iterable[Row]) -> Row | None:
     """Returns the run of a setting with the worst figures; None if no run is done."""
 
     def goodness(row: Row) -> list[float]:
-        figures = row.figures or {}
-        kept = [(figures.get(name), column.least) for name, column in COLUMNS.items()]
+        kept = [(row.figures.get(name), column.least) for name, column in COLUMNS.items()]
         return [
             # No margin means that some start is lost even without noise.
             float("-inf") if value is None else value if least else -value
