@@ -92,13 +92,15 @@ def sweep(
     """
     if report is not None:
         if tasks or options != SweepOptions():
-            raise BadInput("--report makes tables of the runs that are there: give nothing else")
+            raise BadInput(
+                "--report DIR makes tables of the runs that are there: leave TASKS and other options out"
+            )
         result, folder = pipeline.report(report), report
     else:
         result, folder = pipeline.sweep(tasks, options), Path(options.out)
     print_sweep(result)
     print(f"tables in {folder}/sweep.html, sweep.csv and sweep.json")
-    if any(row.state != DONE for row in result.rows):
+    if any(row.state != DONE or row.verdict == FAILED for row in result.rows):
         raise SystemExit(1)
 
 

@@ -253,7 +253,7 @@ def locked(folder: Path) -> Iterator[None]:
             holder = f" ({path.read_text(encoding='utf-8').strip()})"
         raise Busy(
             f"another process is working on {folder}{holder}: wait until it ends, or choose another "
-            "run directory"
+            "folder"
         ) from None
     except OSError as error:
         raise BadInput(

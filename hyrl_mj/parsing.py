@@ -99,7 +99,10 @@ KINDS: dict[Any, Kind] = {
         "NUMBER ...", "one or more numbers", _numbers, "{0[0]:g}".format, _joined
     ),
     tuple[int, ...]: Kind(
-        "INTEGER,...", "integers or ranges, as 0-9 or 0,3,7-9", _integers, "{0[0]}".format
+        "INTEGER,...",
+        "integers or rising ranges, at most 1,000 in all, as 0-9 or 0,3,7-9",
+        _integers,
+        "{0[0]}".format,
     ),
     tuple[str, ...]: NAMES,
     dict[str, Any]: Kind("NAME=VALUE ...", "NAME=VALUE, each NAME once", _change, str, _changes),
@@ -108,7 +111,7 @@ KINDS: dict[Any, Kind] = {
     ),
 }
 BY_DEFAULT = "; by default "
-LONGEST_RANGE = 10_000
+LONGEST_RANGE = 1_000
 
 
 @dataclass(frozen=True)

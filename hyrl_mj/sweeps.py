@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import json
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -17,6 +19,7 @@ from hyrl_mj.manifest import check_contents, may_hold
 from hyrl_mj.run_directory import Run, load_run
 
 NAME = "sweep.json"
+MOST_RUNS = 1_000
 # States of a run.
 OPEN: Final = "open"
 DONE: Final = "done"
@@ -114,6 +117,12 @@ class Common:
     horizon: float | None
     set: dict[str, Any]
 
+    def texts(self) -> dict[str, str]:
+        """Returns the settings as they are typed, by option."""
+        horizon = "by default" if self.horizon is None else f"{self.horizon:g}"
+        changes = " ".join(f"{name}={json.dumps(value)}" for name, value in self.set.items())
+        return {"--preset": self.preset, "--horizon": horizon, "--set": changes or "nothing"}
+
 
 @dataclass(frozen=True)
 class Sweep:
@@ -126,6 +135,19 @@ class Sweep:
 
     common: Common
     rows: tuple[Row, ...]
+
+    def __repr__(self) -> str:
+        words = Counter(row.verdict or row.state for row in self.rows)
+        return f"Sweep({', '.join(f'{count} {word}' for word, count in sorted(words.items()))})"
+
+    def checked(self) -> Sweep:
+        """Returns the sweep itself; raises `BadInput` if it has more than `MOST_RUNS` runs."""
+        if len(self.rows) > MOST_RUNS:
+            raise BadInput(
+                f"a sweep makes at most {MOST_RUNS:,} runs, and this one would have {len(self.rows):,}: "
+                "divide it among several folders"
+            )
+        return self
 
     @staticmethod
     def load(folder: Path) -> Sweep:
@@ -177,18 +199,17 @@ def opened(folder: Path, common: Common, rows: Iterable[Row]) -> Sweep:
     Raises:
         BadInput: the folder holds something else, or a sweep with other settings.
     """
+    rows = tuple(rows)
     if not (folder / NAME).exists():
         if folder.exists() and not may_hold(folder, NAME):
             raise BadInput(
                 f"{folder} exists and is not the folder of a sweep: choose another --out"
             )
-        return Sweep(common, tuple(rows))
+        return Sweep(common, rows).checked()
     there = Sweep.load(folder)
     if there.common != common:
-        pairs = zip(asdict(there.common).items(), asdict(common).values(), strict=True)
-        differing = (
-            f"{name}: {old} there, {new} given" for (name, old), new in pairs if old != new
-        )
+        pairs = zip(there.common.texts().items(), common.texts().values(), strict=True)
+        differing = (f"{name} {old} there, {new} given" for (name, old), new in pairs if old != new)
         raise BadInput(
             f"{folder} holds a sweep with other settings ({'; '.join(differing)}): choose another --out, "
             "or give the same settings; seeds, noise bounds, algorithms and tasks can be added"
@@ -201,7 +222,7 @@ def opened(folder: Path, common: Common, rows: Iterable[Row]) -> Sweep:
                 f"{folder} holds a run {row.name} of {was.task}, and one of {now.task} is given: choose "
                 "another --out"
             )
-    return replace(there, rows=tuple(known.values()))
+    return replace(there, rows=tuple(known.values())).checked()
 
 
 def finished_run(path: Path) -> Run | None:

@@ -22,7 +22,7 @@ SHORTER = {
     'hyrl_mj.run("my_robot.py")': 'hyrl_mj.run("my_robot.py", preset="smoke")',
     "eps=0.1, seed=0)": 'eps=0.1, seed=0, preset="smoke")',
 }
-TRAINING = ("run", "robustify", "diagnose")
+TRAINING = ("run", "robustify", "diagnose", "sweep")
 EPISODES, FRAMES = "200", "4"
 # Scripts that have tests of their own; here their options are looked up.
 TESTED = ("scripts/benchmark.py", "scripts/reproduce_paper.py")

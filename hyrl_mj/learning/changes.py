@@ -16,7 +16,7 @@ STAGES = ("stage1", "stage6")
 OPTIONS = {
     "task": "TASK",
     "preset": "--preset",
-    "seed": "--seed",
+    "seed": "--seed, in a sweep --seeds",
     "noise": "--eps",
     "horizon": "--horizon",
     "stage1.algorithm": "--algorithm",
@@ -44,7 +44,8 @@ def changed(settings: Settings, changes: Mapping[str, object]) -> Settings:
             )
         record, _, field = name.rpartition(".")
         if name not in known and record not in [f"{stage}.options" for stage in STAGES]:
-            raise unknown("setting", name, known)
+            alike = [n for n in known if n.rpartition(".")[0] == record and n not in OPTIONS]
+            raise unknown("setting", name, alike or known)
         groups.setdefault(record, {})[field] = _value(value, known.get(name))
     top = groups.pop("", {})
     for stage in STAGES:
@@ -52,7 +53,10 @@ def changed(settings: Settings, changes: Mapping[str, object]) -> Settings:
         if more := groups.get(f"{stage}.options"):
             new["options"] = training.options | more
         if new:
-            top[stage] = replace(training, **new)
+            try:
+                top[stage] = replace(training, **new)
+            except BadInput as error:
+                raise BadInput(f"{stage}: {error}") from error
     return replace(settings, **top)
 
 

@@ -19,7 +19,7 @@ from hyrl_mj.pipeline.runs import RunOptions, run
 from hyrl_mj.sweeps import Row
 
 # Seconds within which an address must answer, and for which a killed process may keep a run directory.
-PATIENCE, HELD = 8.0, 30.0
+PATIENCE, HELD = 7.0, 30.0
 # How often the process of a run may die before the run is given up.
 DEATHS = 20
 POLL = 0.25  # [s]
@@ -164,8 +164,8 @@ def _start(ray: Any, address: str | None) -> None:
         if address is not None:
             raise _no_answer(address, brief(error)) from error
         raise BadInput(
-            f"Ray cannot start on this machine ({brief(error)}): make room in its folder for temporary "
-            "files, or make the runs one by one with hyrl-mj run"
+            f"Ray cannot start on this machine ({brief(error)}): see to it that there is room in "
+            "the folder for temporary files, or make the runs one by one with hyrl-mj run"
         ) from error
     host = ray.util.get_node_ip_address()
     if address is None and host not in ("127.0.0.1", "::1"):
@@ -178,8 +178,11 @@ def _start(ray: Any, address: str | None) -> None:
 def _check_address(address: str) -> None:
     """Raises `BadInput` if no Ray cluster answers there within `PATIENCE`; Ray itself waits for minutes."""
     host, _, port = address.rpartition(":")
-    if not (host and port.isdecimal()):
-        raise BadInput(f"the address {address!r} cannot be used: give HOST:PORT, as 10.0.0.1:6379")
+    if not (host and port.isdecimal() and 0 < int(port) < 2**16):
+        raise BadInput(
+            f"the address {address!r} cannot be used: give HOST:PORT with a port from 1 to 65535, as "
+            "10.0.0.1:6379"
+        )
     began = time.monotonic()
     try:
         socket.create_connection((host, int(port)), timeout=PATIENCE / 2).close()

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
-from itertools import product
+from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from hyrl_mj.pipeline.board import Board
 from hyrl_mj.pipeline.runs import RunOptions, complete, settings_of
 from hyrl_mj.progress import Say
 from hyrl_mj.ranges import Integer, Number
-from hyrl_mj.sweeps import DONE, OPEN, STOPPED, Common, Row, Setting, Sweep
+from hyrl_mj.sweeps import DONE, MOST_RUNS, OPEN, STOPPED, Common, Row, Setting, Sweep
 from hyrl_mj.tasks import check_task, get_task, reference
 
 
@@ -65,9 +66,12 @@ class SweepOptions:
 
 
 def _several(value: Any) -> tuple[Any, ...]:
-    """Returns some values, or the only one, as a tuple."""
+    """Returns some values, or the only one, as a tuple; raises `BadInput` for more than any sweep has."""
     one = isinstance(value, str | Path) or not isinstance(value, Iterable)
-    return (value,) if one else tuple(value)
+    values = (value,) if one else tuple(islice(value, MOST_RUNS + 1))
+    if len(values) > MOST_RUNS:
+        raise BadInput(f"a sweep makes at most {MOST_RUNS:,} runs: give fewer values")
+    return values
 
 
 def sweep(
@@ -100,12 +104,12 @@ def sweep(
     rows = [row.on_disk(folder) for row in result.rows if row.name in jobs]
     missing = [(row, jobs[row.name][1]) for row in rows if row.state != DONE]
     with ExitStack() as stack:
+        stack.enter_context(_held(folder))
+        result = sweeps.opened(folder, common, planned)  # what others have added meanwhile
         engine = None
-        if missing:  # nothing is written before Ray answers
+        if missing:
             engine = stack.enter_context(cluster.started(options.address))
             share = cluster.share(engine, len(missing), options.cores, options.memory)
-        stack.enter_context(locked(folder))
-        result = sweeps.opened(folder, common, planned)
         result.save(folder)
         board = stack.enter_context(Board(say, len(rows)))
         for row in rows:
@@ -122,6 +126,18 @@ def sweep(
                     board.end(row)
         write(result, folder)
     return result
+
+
+@contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """Holds the lock of a folder, and removes the folder if it was made for a sweep that was never begun."""
+    was_there = folder.exists()
+    try:
+        with locked(folder):
+            yield
+    finally:
+        if not was_there and not (folder / sweeps.NAME).exists():
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def report(folder: str | Path) -> Sweep:

@@ -47,9 +47,10 @@ COLUMNS = {
     "hyrl_excursion": Column("excursion", _number, False),
     "hyrl_miss_without_noise": Column("HyRL off the set-point, no noise", _number, False),
 } | {
-    f"{who}_reached_{kind}": Column(f"{title} arrives, {kind} noise", percent, least)
+    f"{who}_reached_{kind}": Column(f"{title} arrives, {word} noise", percent, least)
     for who, title, least in (("policy", "RL policy", None), ("hyrl", "HyRL", True))
     for kind in ("none", "uniform", "alternating", "adversarial")
+    for word in ("no" if kind == "none" else kind,)
 }
 
 
