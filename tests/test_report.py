@@ -23,6 +23,7 @@ from hyrl_mj import BadArtifact, BadInput, MlpPolicy, load_run
 from hyrl_mj.artifacts import replacing, write_json
 from hyrl_mj.learning.settings import preset
 from hyrl_mj.pipeline import ExamineOptions, examine_run, run_stage
+from hyrl_mj.policies import Agent
 from hyrl_mj.run_directory import Run, write_config
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages import Arrivals, ModeResult, Retraining
@@ -30,6 +31,8 @@ from hyrl_mj.stages.critical_set import CriticalSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.tasks import Scene, registry
+from hyrl_mj.viz.commands import beginning
+from hyrl_mj.viz.commands import changed as changed_settings
 from hyrl_mj.viz.encoding import video
 from hyrl_mj.viz.figures import CLASS_COLOURS
 from hyrl_mj.viz.report import render, write_report
@@ -323,7 +326,22 @@ def test_the_command_tells_what_is_not_the_default(copied):
     assert "differ in" not in text
     write_config(Run(copied, replace(settings, cells=99)))
     believe(copied)
-    assert "differ in: cells." in page_of(copied).text
+    text = page_of(copied).text
+    assert "--horizon 0.4 --set cells=99" in text
+    assert "differ in" not in text
+    # Settings of an algorithm of others cannot be compared, but that of the lattice can, and is repeated.
+    foreign = replace(settings.stage1, algorithm="mine:PPO")
+    other = Run(copied, replace(run.settings, stage1=foreign, cells=99))
+    assert beginning(other).endswith("--algorithm mine:PPO --set cells=99")
+    assert changed_settings(other) == []
+
+
+def test_what_the_command_does_not_repeat_is_named(copied):
+    agent = Agent("onnx", "agent.onnx", "0" * 64)
+    run = load_run(copied)
+    given = preset(run.task, "smoke", noise=0.1, agent=agent)
+    assert changed_settings(Run(copied, given)) == []
+    assert changed_settings(Run(copied, replace(given, cells=99))) == ["cells"]
 
 
 def test_the_same_artifacts_give_the_same_bytes(copied):

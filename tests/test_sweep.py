@@ -391,7 +391,7 @@ def test_a_cluster_of_two_machines_makes_runs_on_both(tmp_path):
 
 
 def test_a_machine_that_keeps_its_files_is_told_of(tmp_path):
-    from hyrl_mj.pipeline.sweep import _seen
+    from hyrl_mj.pipeline.sweeping import _seen
 
     kept = _seen(row(0), tmp_path)
     assert kept.state == "stopped"

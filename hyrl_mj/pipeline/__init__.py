@@ -6,7 +6,7 @@
 from hyrl_mj.pipeline.examination import ExamineOptions
 from hyrl_mj.pipeline.runs import AgentOptions, RunOptions, diagnose, extend_again, robustify, run
 from hyrl_mj.pipeline.steps import as_stage, examine_run, run_stage
-from hyrl_mj.pipeline.sweep import SweepOptions, report, sweep
+from hyrl_mj.pipeline.sweeping import SweepOptions, report, sweep
 
 __all__ = [
     "AgentOptions",
