@@ -69,11 +69,11 @@ ATTACKS = {
     ),
     "kills": Attack("killed at a random moment, then resumed", kills.trials, 50, 1),
     "artifacts": Attack("truncated, or one bit flipped", damage.trials, 80, 6),
-    "received": Attack("crafted files of a stranger", received.trials, 60, 8),
+    "received": Attack("crafted files of a stranger", received.trials, 60, 6),
     "configurations": Attack(
-        "one setting changed, through every stage", configurations.trials, 200, 20
+        "one setting changed, through every stage", configurations.trials, 200, 12
     ),
-    "tasks": Attack("task file or MJCF with one mistake", tasks.trials, 120, 8),
+    "tasks": Attack("task file or MJCF with one mistake", tasks.trials, 120, 6),
     "writers": Attack("two and four writers, and a reader", writers.trials, 20, 1),
     "surroundings": Attack("each pair of bad surroundings", surroundings.trials, 10_000, 1),
 }

@@ -66,7 +66,7 @@ def blocks(page: Path) -> list[Block]:
 def shortened(words: list[str]) -> list[str]:
     """A command of `hyrl-mj` that takes seconds: preset smoke, few episodes and frames."""
     words = list(words)
-    if words[0] in TRAINING and "--preset" not in words:
+    if words[0] in TRAINING and not {"--preset", "--report"} & {*words}:
         words += ["--preset", "smoke"]
     if "--episodes" in words:
         words[words.index("--episodes") + 1] = EPISODES

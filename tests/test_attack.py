@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+import unmeasured
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "scripts"))
 
@@ -35,6 +36,7 @@ def attack(*words, weakness=""):
     code = f"import sys; sys.path.insert(0, {SCRIPTS!r}); import attack\n{weakness}\n"
     return subprocess.run(
         [sys.executable, "-c", f"{code}sys.exit(attack.main())", *words],
+        env=unmeasured.environment(),
         capture_output=True,
         text=True,
         check=False,

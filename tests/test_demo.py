@@ -9,6 +9,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+import unmeasured
 from manual import PAGES, ROOT
 
 import hyrl_mj
@@ -56,8 +57,7 @@ def demo(tmp_path_factory):
             [*command, task, "--out", folder / task],
             cwd=ROOT,
             stdout=subprocess.DEVNULL,
-            # Nothing runs here that other tests do not run: its coverage is not measured.
-            env={k: v for k, v in os.environ.items() if not k.startswith("COVERAGE")},
+            env=unmeasured.environment(),
         )
         for task in TASKS
     ]

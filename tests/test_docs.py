@@ -9,6 +9,7 @@ import sys
 
 import numpy as np
 import pytest
+import unmeasured
 from gl import needs_gl
 from manual import LANGUAGES, PAGES, ROOT, SHORTER, blocks
 
@@ -35,7 +36,7 @@ def call(*words, cwd, timeout=300):
     """Run Python in a process of its own, with the checkout on its path."""
     path = os.pathsep.join((str(ROOT), os.environ.get("PYTHONPATH", "")))
     done = subprocess.run(
-        [sys.executable, *map(str, words)], cwd=cwd, env=os.environ | {"PYTHONPATH": path},
+        [sys.executable, *map(str, words)], cwd=cwd, env=unmeasured.environment(PYTHONPATH=path),
         capture_output=True, text=True, timeout=timeout,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr

@@ -1,6 +1,5 @@
 """Training improves the policy in seconds, is reproducible, and leaves logs and checkpoints."""
 
-import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import unmeasured
 
 import hyrl_mj
 from hyrl_mj import BadInput, MlpPolicy, Noise
@@ -134,10 +134,10 @@ for name, algorithm, samples in (
 @pytest.mark.slow
 def test_cores_do_not_matter():
     def trained(threads):
-        env = {"PYTHONPATH": str(Path(hyrl_mj.__file__).parents[1]), "OMP_NUM_THREADS": threads}
+        path = str(Path(hyrl_mj.__file__).parents[1])
         done = subprocess.run(
             [sys.executable, "-c", TRAINED],
-            env=os.environ | env,
+            env=unmeasured.environment(PYTHONPATH=path, OMP_NUM_THREADS=threads),
             capture_output=True,
             text=True,
             check=True,
