@@ -19,6 +19,7 @@ import tyro
 
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.run_directory import Run, load_run
+from hyrl_mj.sweeps import MOST_RUNS
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ def _integers(text: str) -> tuple[int, ...]:
     for part in text.split(","):
         first, dash, last = part.partition("-")
         more = range(int(first), int(last if dash else first) + 1)
-        if not 0 < len(more) <= LONGEST_RANGE:
+        if not 0 < len(more) <= MOST_RUNS:
             raise ValueError(text)
         found += more
     return tuple(found)
@@ -100,7 +101,7 @@ KINDS: dict[Any, Kind] = {
     ),
     tuple[int, ...]: Kind(
         "INTEGER,...",
-        "integers or rising ranges, at most 1,000 in all, as 0-9 or 0,3,7-9",
+        f"integers or rising ranges, at most {MOST_RUNS:,} in all, as 0-9 or 0,3,7-9",
         _integers,
         "{0[0]}".format,
     ),
@@ -111,7 +112,6 @@ KINDS: dict[Any, Kind] = {
     ),
 }
 BY_DEFAULT = "; by default "
-LONGEST_RANGE = 1_000
 
 
 @dataclass(frozen=True)

@@ -42,15 +42,15 @@ class Setting:
     algorithm: str
     eps: float
 
+    def __post_init__(self) -> None:
+        if Path(self.stem).name != self.stem:
+            raise BadInput(f"{self.stem!r} cannot be the name of a folder: give another algorithm")
+
     @property
     def title(self) -> str:
         """The setting in words, such as "vehicle, dqn, noise 0.1"."""
         parts = [Path(self.task).stem, self.algorithm, f"noise {self.eps:g}"]
         return ", ".join(filter(None, parts))
-
-    def __post_init__(self) -> None:
-        if Path(self.stem).name != self.stem:
-            raise BadInput(f"{self.stem!r} cannot be the name of a folder: give another algorithm")
 
     @property
     def stem(self) -> str:
