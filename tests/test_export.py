@@ -22,9 +22,9 @@ from hyrl_mj import BadInput, HybridController, MlpPolicy, export_numpy, export_
 from hyrl_mj.export import export
 from hyrl_mj.export.graph import write_graph
 from hyrl_mj.export.source import write_function
-from hyrl_mj.export.tracing import BATCH, trace
 from hyrl_mj.policies import ACTIVATIONS
 from hyrl_mj.sets import Everything, Grid, GridSet
+from hyrl_mj.tracing import BATCH, trace
 
 RNG = np.random.default_rng
 

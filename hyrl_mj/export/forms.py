@@ -13,12 +13,11 @@ import numpy as np
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadInput, brief, unknown
 from hyrl_mj.export.source import write_function
-from hyrl_mj.export.tracing import trace
-from hyrl_mj.export.vocabulary import BATCH
 from hyrl_mj.policies import ACTIVATIONS, MlpPolicy
 from hyrl_mj.sets import Everything, Grid, GridSet, StateSet
 from hyrl_mj.stages import ON_EDGE, HybridController
 from hyrl_mj.tasks import Task
+from hyrl_mj.tracing import BATCH, trace
 
 if TYPE_CHECKING:
     import onnx

@@ -9,8 +9,7 @@ import numpy as np
 import onnx
 from onnx import helper, numpy_helper
 
-from hyrl_mj.export.traced_array import Operation, Program, Traced, apply
-from hyrl_mj.export.vocabulary import BATCH, ELEMENTWISE
+from hyrl_mj.tracing import BATCH, ELEMENTWISE, Operation, Program, Traced, apply
 
 # The versions that the oldest supported onnxruntime reads.
 OPSET, IR_VERSION = 18, 8

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hyrl_mj.export.traced_array import Operation, Program
-from hyrl_mj.export.vocabulary import BATCH
+from hyrl_mj.tracing import BATCH, Operation, Program
 
 # Arrays with more elements than this are not written into the code.
 FEW = 16

@@ -39,6 +39,8 @@ class Lattice:
         after: (A, C, N) places around the end of one sample, the nearest first.
         arrived: (N,) bool, nodes at which an episode that ended there would be a success.
         failed: (N,) bool, nodes at which an episode ends without success.
+        hops: (A, d) how far one sample with each level moves the running nodes.
+        uneven: (d,) by how much more or less it moves some of them, along each coordinate.
     """
 
     task: Task
@@ -47,6 +49,8 @@ class Lattice:
     after: np.ndarray
     arrived: np.ndarray
     failed: np.ndarray
+    hops: np.ndarray
+    uneven: np.ndarray
 
     @property
     def nodes(self) -> int:
@@ -125,12 +129,16 @@ class Lattice:
         ends = np.empty((len(levels), *nodes.shape))
         fails = np.zeros((len(levels), len(nodes)), dtype=bool)
         arrives = np.zeros_like(fails)
+        hops, uneven = np.empty((len(levels), nodes.shape[1])), np.zeros(nodes.shape[1])
         for a, level in enumerate(progress_bar(levels, "tabulating the plant", "inputs")):
             plant.set_state(*task.state(nodes[alive]))
             plant.step(np.tile(level, (len(alive), 1)))
             measurement = plant.measurement
             ends[a] = nodes
             ends[a, alive] = task.z(measurement)
+            hop = grid.chart.difference(ends[a, alive], nodes[alive])
+            hops[a] = (hop.max(axis=0) + hop.min(axis=0)) / 2
+            uneven = np.maximum(uneven, np.ptp(hop, axis=0) / 2)
             fails[a, alive] = task.failed(measurement)
             arrives[a, alive] = task.ending(measurement) == Outcome.REACHED
         after = _around(grid, ends)
@@ -138,7 +146,7 @@ class Lattice:
         # A running episode that leaves the chart leaves the lattice: it counts as failed.
         after = np.where((fails | outside & ~arrives)[:, None], len(nodes) + 1, after)
         after = np.where(arrives[:, None], len(nodes), after)
-        return Lattice(task, grid, levels, after.astype(np.int32), arrived, failed)
+        return Lattice(task, grid, levels, after.astype(np.int32), arrived, failed, hops, uneven)
 
     def level_of(self, u: np.ndarray) -> np.ndarray:
         """Returns the levels (n,) int nearest to inputs (n, m).

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import count, product
+from typing import Protocol
 
 import numpy as np
 
@@ -109,6 +110,24 @@ def nodes_within(lattice: Lattice, bound: np.ndarray) -> np.ndarray:
     return np.floor(bound / lattice.grid.spacing + 1e-6).astype(int)
 
 
+class Places(Protocol):
+    """What the game is played on: N nodes or cells, then the places "arrived" and "failed".
+
+    `running`, `arrived` and `failed` (N,) bool are as for `Lattice`.
+    """
+
+    @property
+    def nodes(self) -> int: ...
+    @property
+    def places(self) -> int: ...
+    @property
+    def running(self) -> np.ndarray: ...
+    @property
+    def arrived(self) -> np.ndarray: ...
+    @property
+    def failed(self) -> np.ndarray: ...
+
+
 @dataclass(frozen=True)
 class Moves:
     """The adversary's moves: the states that each state can reach in one sample.
@@ -116,14 +135,14 @@ class Moves:
     States are numbered row * places + place.
 
     Attributes:
-        lattice: lattice of the places.
+        lattice: the places.
         rows: number of modes, plus one for runs that have not started yet.
         state: (S,) states that have moves.
         counts: (S,) number of moves of each state.
         target: (E,) states that the moves lead to.
     """
 
-    lattice: Lattice
+    lattice: Places
     rows: int
     state: np.ndarray
     counts: np.ndarray
@@ -131,7 +150,7 @@ class Moves:
 
     @staticmethod
     def gather(
-        lattice: Lattice, rows: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]
+        lattice: Places, rows: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]
     ) -> Moves:
         """Returns the moves, from each row's nodes (m,) ascending, next modes (m,) and places (m, C)."""
         state, counts, target = [], [], []

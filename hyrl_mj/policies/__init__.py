@@ -25,7 +25,14 @@ from hyrl_mj.policies.external import (
     reopen_agent,
 )
 from hyrl_mj.policies.functions import from_callable
-from hyrl_mj.policies.mlp import ACTIVATIONS, TORCH_NAMES, MlpPolicy, Policy, SampledPolicy
+from hyrl_mj.policies.mlp import (
+    ACTIVATIONS,
+    BLAS,
+    TORCH_NAMES,
+    MlpPolicy,
+    Policy,
+    SampledPolicy,
+)
 from hyrl_mj.policies.preprocessing import (
     Normalization,
     PreprocessedPolicy,
@@ -38,6 +45,7 @@ from hyrl_mj.policies.sb3_zip import infer_algorithm
 __all__ = [
     "ACTIVATIONS",
     "ALGORITHMS",
+    "BLAS",
     "FUNCTION",
     "ONNX",
     "STATISTICS",

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from hyrl_mj.errors import BadInput, brief
-from hyrl_mj.export.traced_array import Operation, Program, Traced, apply, take
-from hyrl_mj.export.vocabulary import BATCH, Untraceable
+from hyrl_mj.tracing.traced_array import Operation, Program, Traced, apply, take
+from hyrl_mj.tracing.vocabulary import BATCH, Untraceable
 
 # Packages whose code is not copied: it accepts no foreign arrays, or handles them itself.
 LEFT_AS_THEY_ARE = {*sys.stdlib_module_names, "numpy", "scipy", "mujoco", "torch"}
@@ -27,13 +27,19 @@ LEFT_AS_THEY_ARE = {*sys.stdlib_module_names, "numpy", "scipy", "mujoco", "torch
 NOT_COPIED = {"__init_subclass__", "__del__", "__abstractmethods__", "_abc_impl"}
 
 
-def trace(function: Callable[..., Any], samples: Mapping[str, np.ndarray], name: str) -> Program:
+def trace(
+    function: Callable[..., Any],
+    samples: Mapping[str, np.ndarray],
+    name: str,
+    purpose: str = "exported",
+) -> Program:
     """Returns the operations that a function does with its arguments.
 
     Args:
         function: takes arrays with one row for each row of the batch; returns one such array or a tuple.
         samples: for each argument `BATCH` rows of possible values.
         name: what messages call the function.
+        purpose: what messages say that the function cannot be.
 
     Raises:
         BadInput: the function cannot be traced.
@@ -43,15 +49,15 @@ def trace(function: Callable[..., Any], samples: Mapping[str, np.ndarray], name:
         with np.errstate(all="ignore"):
             results = _PrivateCopies().of(function)(*map(Traced, inputs))
     except Untraceable as error:
-        raise BadInput(f"{name} cannot be exported: it {error}") from error
+        raise BadInput(f"{name} cannot be {purpose}: it {error}") from error
     except Exception as error:  # code that gets another kind of array fails in many ways
         raise BadInput(
-            f"{name} cannot be exported: it raises {brief(error)} when its operations are traced; write "
+            f"{name} cannot be {purpose}: it raises {brief(error)} when its operations are traced; write "
             "it with NumPy's functions of arrays alone"
         ) from error
     results = results if isinstance(results, tuple) else (results,)
     if not all(isinstance(r, Traced) and r.shape[:1] == (BATCH,) for r in results):
-        raise BadInput(f"{name} cannot be exported: it must return one row for each row it gets")
+        raise BadInput(f"{name} cannot be {purpose}: it must return one row for each row it gets")
     return Program(inputs, tuple(result.operation for result in results))
 
 

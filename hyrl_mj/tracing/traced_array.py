@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from hyrl_mj.export.vocabulary import BATCH, COMPOSED, REDUCTIONS, UFUNCS, Untraceable
+from hyrl_mj.tracing.vocabulary import BATCH, COMPOSED, REDUCTIONS, UFUNCS, Untraceable
 
 # Operations that NumPy has as methods of arrays, or as functions with other arguments.
 EVALUATED: dict[str, Callable[..., Any]] = {
@@ -108,7 +108,7 @@ class Traced(NDArrayOperatorsMixin):
             raise AttributeError(name)
         function = getattr(np, {"flatten": "ravel"}.get(name, name), None)
         if function not in FUNCTIONS:
-            raise Untraceable(f"uses .{name} of an array, which has no exported form")
+            raise Untraceable(f"uses .{name} of an array, which cannot be traced")
         return partial(_call, function, self)
 
     T = property(transpose)
@@ -129,7 +129,7 @@ class Traced(NDArrayOperatorsMixin):
         if method != "__call__" or options or name not in UFUNCS | COMPOSED.keys():
             how = f".{method}" if method != "__call__" else ""
             how += f" with {', '.join(options)}" if options else ""
-            raise Untraceable(f"uses np.{name}{how}, which has no exported form")
+            raise Untraceable(f"uses np.{name}{how}, which cannot be traced")
         result = COMPOSED.get(name, partial(apply, name))(*inputs)
         if out is None:
             return result
@@ -140,7 +140,7 @@ class Traced(NDArrayOperatorsMixin):
     def __array_function__(self, function: Any, types: Any, args: Any, kwargs: Any) -> Any:
         if function not in FUNCTIONS:
             name = f"{function.__module__}.{function.__name__}".replace("numpy", "np", 1)
-            raise Untraceable(f"uses {name}, which has no exported form")
+            raise Untraceable(f"uses {name}, which cannot be traced")
         return _call(function, *args, **kwargs)
 
     def __getitem__(self, index: Any) -> Any:
@@ -210,7 +210,7 @@ def _call(function: Any, *args: Any, **kwargs: Any) -> Any:
         inspect.signature(replacement).bind(*args, **kwargs)
     except TypeError:
         raise Untraceable(
-            f"uses np.{function.__name__} with arguments that have no exported form"
+            f"uses np.{function.__name__} with arguments that cannot be traced"
         ) from None
     return replacement(*args, **kwargs)
 

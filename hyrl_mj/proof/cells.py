@@ -1,0 +1,187 @@
+"""Cells: the states between the nodes of a lattice, and the cells that one sample can lead to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from hyrl_mj.game import Lattice
+from hyrl_mj.proof.affine import Affine, Unbounded
+from hyrl_mj.proof.networks import bounds_of, program_of
+from hyrl_mj.tasks import Outcome, Task
+
+# Samples whose ends lie this close to the border of a cell, in cells after a whole episode, end on it.
+ON_BORDER = 1e-3
+# The plant has to move all states alike, up to this share of a cell.
+ALIKE = 1e-3
+
+
+@dataclass(frozen=True)
+class Cells:
+    """The closed cells between the nodes of a lattice, a covering of the chart.
+
+    The two places after the N cells are "arrived" and "failed", as for `Lattice`. Every state of a cell,
+    widened by `slack`, is one of the cell's states: rounding in the plant never leaves the covering.
+
+    Attributes:
+        lattice: the nodes.
+        counts: (d,) number of cells along each coordinate.
+        exact: (d,) bool, whether every sample moves cells onto cells, but for rounding.
+        slack: (d,) by how much the cells are widened [chart units].
+        arrived: (N,) bool, cells all of whose states are a success if the episode ends there.
+        failed: (N,) bool, cells some of whose states may end an episode without success.
+        slope, offset: (d, m), (d,) of the displacement in one sample, slope @ u + offset [chart units].
+        error: (d,) largest error of the displacement in one sample.
+        outside: (M...) int, places of the cells and of those around the chart, from `-margin` on.
+        margin: (d,) number of cells beyond the chart on either side of coordinates that are not periodic.
+    """
+
+    lattice: Lattice
+    counts: tuple[int, ...]
+    exact: np.ndarray
+    slack: np.ndarray
+    arrived: np.ndarray
+    failed: np.ndarray
+    slope: np.ndarray
+    offset: np.ndarray
+    error: np.ndarray
+    outside: np.ndarray
+    margin: np.ndarray
+
+    @property
+    def nodes(self) -> int:
+        """N, the number of cells."""
+        return int(np.prod(self.counts))
+
+    @property
+    def places(self) -> int:
+        """N + 2: the cells, "arrived" and "failed"."""
+        return self.nodes + 2
+
+    @cached_property
+    def running(self) -> np.ndarray:
+        """(N,) bool, the cells from which an episode goes on."""
+        return ~(self.arrived | self.failed)
+
+    @staticmethod
+    def of(lattice: Lattice) -> Cells:
+        """Returns the cells of a lattice.
+
+        Raises:
+            Unbounded: the plant does not move all states alike, or the end of an episode cannot be bounded.
+        """
+        task, grid = lattice.task, lattice.grid
+        if not _is_measured_directly(task):
+            raise Unbounded(
+                f"{task.name} computes its chart or its state in methods of its own, z() or state()"
+            )
+        periodic, h = np.array(task.chart.periodic), grid.spacing
+        slope, offset = _displacement(lattice)
+        off = np.abs(lattice.hops - lattice.levels @ slope.T - offset).max(axis=0)
+        error = 2 * (lattice.uneven + off)
+        if (error > ALIKE * h).any():
+            raise Unbounded(
+                f"the plant of {task.name} does not move all states alike: with the same input some move "
+                f"{error.max():.2g} farther than others"
+            )
+        # Where every sample moves cells onto cells, only rounding adds up over an episode.
+        cells = lattice.hops / h
+        drift = task.max_steps * (np.abs(cells - np.round(cells)) * h + error).max(axis=0)
+        exact = drift <= ON_BORDER * h
+        slack = np.where(exact, drift, error)
+        counts = np.array(grid.counts) - ~periodic
+        reach = np.ceil(np.abs(cells).max(axis=0) + 1).astype(int)
+        margin = np.where(periodic, 0, reach)
+        axes = [np.arange(-m, n + m) for m, n in zip(margin, counts, strict=True)]
+        index = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        boxes = Affine.box(grid.chart.low + h * (index.reshape(-1, len(h)) + 0.5), h / 2 + slack)
+        fails, arrives = (mask.reshape(index.shape[:-1]) for mask in _ends(lattice, boxes))
+        inside = ((index >= 0) & (index < counts)).all(axis=-1)
+        n = int(counts.prod())
+        outside = np.where(arrives, n, n + 1)
+        outside[inside] = np.arange(n)
+        shape = tuple(int(k) for k in counts)
+        return Cells(
+            lattice,
+            shape,
+            exact,
+            slack,
+            arrives[inside],
+            fails[inside],
+            slope,
+            offset,
+            error,
+            outside,
+            margin,
+        )
+
+    def shifts(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the first and last cell (..., d) that a cell can move onto, relative to itself.
+
+        Args:
+            low, high: (..., m) least and greatest inputs.
+        """
+        middle, half = (low + high) / 2, (high - low) / 2
+        centre = middle @ self.slope.T + self.offset
+        reach = half @ np.abs(self.slope).T + self.error
+        h = self.lattice.grid.spacing
+        near = np.where(self.exact, ON_BORDER, 0.0)
+        first = np.floor((centre - reach) / h + near).astype(int)
+        last = np.ceil((centre + reach) / h - near).astype(int)
+        return first, last
+
+    def after(self, shift: np.ndarray) -> np.ndarray:
+        """Returns the places (N,) of the cells after a shift (d,) by whole cells."""
+        axes = []
+        pairs = zip(shift, self.counts, self.margin, self.lattice.grid.chart.periodic, strict=True)
+        for by, n, margin, periodic in pairs:
+            at = np.arange(n) + by
+            axes.append(at % n if periodic else at + margin)
+        return np.asarray(self.outside[np.ix_(*axes)].ravel())
+
+    def all_corners(self, nodes: np.ndarray) -> np.ndarray:
+        """Returns the cells (N,) bool all of whose corners are among the nodes (nodes,) bool."""
+        grid = self.lattice.grid
+        mask = nodes.reshape(grid.counts)
+        for axis, periodic in enumerate(grid.chart.periodic):
+            mask = mask & np.roll(mask, -1, axis)
+            if not periodic:
+                mask = np.delete(mask, -1, axis)
+        return np.asarray(mask.ravel())
+
+    def middle(self, cells: np.ndarray) -> np.ndarray:
+        """Returns the chart points (n, d) in the middle of cells (n,)."""
+        index = np.stack(np.unravel_index(cells, self.counts), axis=-1)
+        grid = self.lattice.grid
+        return np.asarray(grid.chart.low + grid.spacing * (index + 0.5))
+
+
+def _is_measured_directly(task: Task) -> bool:
+    """Whether chart, measurement and positions of a task are the same numbers."""
+    kind = type(task)
+    return kind.z is Task.z and kind.state is Task.state
+
+
+def _displacement(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
+    """Returns slope (d, m) and offset (d,) of the displacement as a function of the input."""
+    levels = np.hstack([lattice.levels, np.ones((len(lattice.levels), 1))])
+    fit, *_ = np.linalg.lstsq(levels, lattice.hops, rcond=None)
+    return fit[:-1].T, fit[-1]
+
+
+def _ends(lattice: Lattice, boxes: Affine) -> tuple[np.ndarray, np.ndarray]:
+    """Returns where an episode may fail, and where it surely is a success: (n,) bool over boxes."""
+    task = lattice.task
+    found = []
+    for name in ("ending", "verdict"):
+        what = f"the method {name} of {task.name}"
+        found.append(bounds_of(program_of(task, getattr(task, name), what), what, boxes))
+    ending, verdict = found
+    assert isinstance(ending, Affine) and isinstance(verdict, Affine)
+    # The outcomes RUNNING, REACHED, and the failures are numbered in this order.
+    fails = ending.high > Outcome.REACHED + 0.5
+    reached = np.abs(ending.centre - Outcome.REACHED) + ending.radius < 0.5
+    success = np.abs(verdict.centre - Outcome.REACHED) + verdict.radius < 0.5
+    return fails, ~fails & (reached | success)

@@ -1,0 +1,78 @@
+"""The certificate: what a controller wins from every state and under every noise signal within the bound."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from hyrl_mj.game import Game, Moves, lasting, solve
+from hyrl_mj.policies import Controller
+from hyrl_mj.proof.affine import Unbounded
+from hyrl_mj.proof.answers import BoundedAnswers
+from hyrl_mj.proof.cells import Cells
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """The worst-case game on closed cells, with everything bounded against the controller.
+
+    From a cell the adversary may take any measurement in the cell widened by the noise, with any answer that
+    the controller can give there, and the cell moves onto all cells that it touches. What is won so is won
+    from every state of the cell, under every noise signal within the bound.
+
+    Attributes:
+        game: the game on the nodes.
+        cells: the cells between them.
+        answers: the bounded answers of the controllers that can be bounded, by name.
+        why_not: for the other controllers, what stopped it.
+    """
+
+    game: Game
+    cells: Cells | None
+    answers: Mapping[str, BoundedAnswers]
+    why_not: Mapping[str, str]
+
+    @staticmethod
+    def of(game: Game, controllers: Mapping[str, Controller]) -> Certificate:
+        """Returns the certificate of some controllers of a game."""
+        answers, why_not = {}, {}
+        try:
+            cells = Cells.of(game.lattice)
+        except Unbounded as error:
+            return Certificate(game, None, {}, dict.fromkeys(controllers, str(error)))
+        for name, controller in controllers.items():
+            try:
+                answers[name] = BoundedAnswers.of(cells, controller, game.bound(game.largest))
+            except Unbounded as error:
+                why_not[name] = str(error)
+        return Certificate(game, cells, answers, why_not)
+
+    def moves(self, name: str, eps: float) -> Moves:
+        """Returns the adversary's moves against a controller, from outside."""
+        cells, bound = self.cells, self.game.bound(eps)
+        assert cells is not None
+        rows = []
+        for row in self.answers[name].possible(bound):
+            nodes, modes, ends = [], [], []
+            for mode, shift, reached in row:
+                node = np.flatnonzero(reached & cells.running)
+                nodes.append(node)
+                modes.append(np.full(len(node), mode))
+                ends.append(cells.after(shift)[node])
+            node = np.concatenate(nodes)
+            order = np.argsort(node, kind="stable")
+            rows.append(
+                (node[order], np.concatenate(modes)[order], np.concatenate(ends)[order][:, None])
+            )
+        return Moves.gather(cells, rows)
+
+    def value(self, name: str, eps: float) -> np.ndarray:
+        """Returns the value (modes + 1, places) as `Game.value`, or more where less is known."""
+        return solve(self.moves(name, eps), self.game.task.max_steps)
+
+    def region(self, eps: float) -> np.ndarray:
+        """Returns the cells (N,) bool of the start region all of whose corners are winnable."""
+        assert self.cells is not None
+        return self.cells.all_corners(self.game.starts & self.game.winnable(eps))

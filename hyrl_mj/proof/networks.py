@@ -1,0 +1,222 @@
+"""Bounds of policies over boxes of measurements: which levels, or which inputs, they can give there.
+
+The network is bounded layer by layer by linear relaxations (DeepZ: Singh et al., Fast and Effective Robustness
+Certification, NeurIPS 2018), with the sides of the box as generators and an interval for everything else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from hyrl_mj import cores
+from hyrl_mj.errors import BadInput
+from hyrl_mj.policies import ACTIVATIONS, BLAS, MlpPolicy, Policy, PreprocessedPolicy
+from hyrl_mj.proof.affine import Affine, Unbounded
+from hyrl_mj.proof.rules import Truth, bounds
+from hyrl_mj.tasks import Task
+from hyrl_mj.tracing import BATCH, Program, trace
+
+# Boxes that go through a network at a time.
+CHUNK = 2048
+# Relative rounding error of numbers of 32 bits, in which networks are computed.
+ROUNDING = 2.0**-24
+# Points at which an activation is evaluated between two numbers, and the largest slope that any has.
+POINTS, STEEPEST = 17, 1.13
+# A layer's values in boxes: middle (n, k), generators (d, n, k) and remainder (n, k), as `Affine`.
+Relaxed = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def program_of(task: Task, function: Callable[[np.ndarray], np.ndarray], name: str) -> Program:
+    """Returns the operations of a method that takes measurements (n, p).
+
+    Raises:
+        Unbounded: its operations cannot be followed.
+    """
+    rng = np.random.default_rng(0)
+    z = rng.uniform(task.chart.low, task.chart.high, (BATCH, task.chart.dimension))
+    try:
+        return trace(function, {"measured": z}, name, "bounded")
+    except BadInput as error:
+        raise Unbounded(str(error)) from error
+
+
+def bounds_of(program: Program, name: str, boxes: Affine) -> Affine | Truth:
+    """Returns the result of a program over boxes; raises `Unbounded` with the name in its message."""
+    try:
+        return bounds(program, boxes)
+    except Unbounded as error:
+        raise Unbounded(f"{name} cannot be bounded: it {error}") from error
+
+
+@dataclass(frozen=True)
+class BoundedPolicy:
+    """A policy whose answers are bounded over boxes.
+
+    Attributes:
+        network: its multilayer perceptron.
+        seen: the operations from the measurement to what the network sees.
+    """
+
+    network: MlpPolicy
+    seen: Program
+
+    @staticmethod
+    def of(policy: Policy) -> BoundedPolicy:
+        """Returns the bounded form of a policy.
+
+        Raises:
+            Unbounded: it is no network, has memory, or its task's observation cannot be followed.
+        """
+        inner, normalize = policy, None
+        if isinstance(policy, PreprocessedPolicy) and policy.preprocessing.n_stack == 1:
+            inner, normalize = policy.policy, policy.preprocessing.normalization
+        if not isinstance(inner, MlpPolicy):
+            raise Unbounded(f"a policy that is a {type(policy).__name__} cannot be bounded")
+        task = inner.task
+
+        def seen(measured: np.ndarray) -> np.ndarray:
+            observation = task.observation(measured)
+            if normalize is None:
+                return observation
+            return normalize(observation.astype(np.float32))
+
+        return BoundedPolicy(inner, program_of(task, seen, _observation_of(task)))
+
+    def levels(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+        """Returns which levels the policy may choose in boxes: (n, levels) bool.
+
+        Args:
+            centre: (n, d) middle of each box.
+            half: (d,) half of its sides.
+        """
+        return _in_chunks(self._levels, centre, half)
+
+    def inputs(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+        """Returns the least and greatest inputs in boxes, as for `levels`: (n, 2, m)."""
+        return _in_chunks(self._inputs, centre, half)
+
+    def _levels(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+        middle, sides, rest = self._hidden(centre, half)
+        weight, bias = self.network.layers[-1]
+        k = len(bias)
+        first, second = np.divmod(np.arange(k * k), k)
+        # How much better the first level is than the second, at least.
+        by = (weight[first] - weight[second]).T
+        size = np.abs(middle) + np.abs(sides).sum(axis=0) + rest
+        error = _rounding(len(by)) * (np.abs(weight[first]) + np.abs(weight[second])).T
+        offset = bias[first] - bias[second]
+        least = middle @ by + offset - np.abs(sides @ by).sum(axis=0) - rest @ np.abs(by)
+        least -= size @ error + _rounding(1) * (np.abs(bias[first]) + np.abs(bias[second]))
+        worse = (least > 0).reshape(-1, k, k).any(axis=1)
+        return np.asarray(~worse)
+
+    def _inputs(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
+        middle, sides, rest = _linear(self._hidden(centre, half), *self.network.layers[-1])
+        radius = np.abs(sides).sum(axis=0) + rest
+        ends = np.stack([middle - radius, middle + radius], axis=1).astype(float)
+        low, high = self.network.task.input_limits
+        if self.network.output == "squash":
+            ends = low + (np.tanh(ends) + 1) / 2 * (high - low)
+        return np.clip(ends, low, high)
+
+    def _hidden(self, centre: np.ndarray, half: np.ndarray) -> Relaxed:
+        """Returns the last hidden layer in boxes: its middle, its generators and its remainder."""
+        task = self.network.task
+        seen = bounds_of(self.seen, _observation_of(task), Affine.box(centre, half))
+        assert isinstance(seen, Affine)
+        if np.isinf(seen.remainder).any():
+            raise Unbounded(f"{_observation_of(task)} cannot be bounded: it has no limit near some states")
+        x: Relaxed = (
+            seen.centre.astype(np.float32),
+            seen.generators.astype(np.float32),
+            seen.remainder.astype(np.float32),
+        )
+        relax = RELAXATIONS.get(self.network.activation) or _sampled(self.network.activation)
+        for weight, bias in self.network.layers[:-1]:
+            x = relax(_linear(x, weight, bias))
+        return x
+
+
+def _observation_of(task: Task) -> str:
+    return f"the method observation of {task.name}"
+
+
+def _in_chunks(
+    work: Callable[[np.ndarray, np.ndarray], np.ndarray], centre: np.ndarray, half: np.ndarray
+) -> np.ndarray:
+    parts = [centre[i : i + CHUNK] for i in range(0, len(centre), CHUNK)]
+    with BLAS.limit(limits=1, user_api="blas"), ThreadPoolExecutor(cores.count()) as pool:
+        return np.concatenate(list(pool.map(lambda part: work(part, half), parts)))
+
+
+def _rounding(terms: int) -> float:
+    """Returns a bound of the relative error of a sum of products, of the policy's and of ours."""
+    return 4 * (terms + 2) * ROUNDING
+
+
+def _linear(x: Relaxed, weight: np.ndarray, bias: np.ndarray) -> Relaxed:
+    """Returns a linear layer of weight (outputs, inputs); the remainder takes in the rounding errors."""
+    middle, sides, rest = x
+    size = np.abs(middle) + np.abs(sides).sum(axis=0)
+    error = _rounding(weight.shape[1])
+    rest = (rest * (1 + error) + error * size) @ np.abs(weight).T + error * np.abs(bias)
+    return middle @ weight.T + bias, sides @ weight.T, rest
+
+
+def _parallel(x: Relaxed, slope: np.ndarray, low: np.ndarray, high: np.ndarray) -> Relaxed:
+    """Returns an activation that lies between slope * x + low and slope * x + high."""
+    middle, sides, rest = x
+    error = 8 * ROUNDING * (1 + np.abs(low) + np.abs(high))
+    return (
+        slope * middle + (low + high) / 2,
+        slope * sides,
+        np.abs(slope) * rest + (high - low) / 2 + error,
+    )
+
+
+def _ends(x: Relaxed) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the least and the greatest value."""
+    middle, sides, rest = x
+    radius = np.abs(sides).sum(axis=0) + rest
+    return middle - radius, middle + radius
+
+
+def _relu(x: Relaxed) -> Relaxed:
+    low, high = _ends(x)
+    across = (low < 0) & (high > 0)
+    slope = np.where(across, high / np.where(across, high - low, 1), high > 0).astype(np.float32)
+    return _parallel(x, slope, np.zeros_like(low), np.where(across, -slope * low, 0))
+
+
+def _tanh(x: Relaxed) -> Relaxed:
+    low, high = _ends(x)
+    at_low, at_high = np.tanh(low), np.tanh(high)
+    # With the smallest slope between them, the distance from the line is greatest at the ends.
+    slope = np.maximum(np.minimum(1 - at_low**2, 1 - at_high**2) - 8 * ROUNDING, 0)
+    return _parallel(x, slope, at_low - slope * low, at_high - slope * high)
+
+
+def _sampled(name: str) -> Callable[[Relaxed], Relaxed]:
+    """Returns the relaxation of any activation, from its values at points and its steepest slope."""
+    activate = ACTIVATIONS[name]
+
+    def relax(x: Relaxed) -> Relaxed:
+        low, high = _ends(x)
+        width = high - low
+        rise = activate(high) - activate(low)
+        slope = np.where(width > 0, rise / np.where(width > 0, width, 1), 0)
+        shares = np.linspace(0, 1, POINTS, dtype=np.float32).reshape(-1, *[1] * low.ndim)
+        at = low + shares * width
+        off = activate(at) - slope * at
+        between = (STEEPEST + np.abs(slope)) * width / (2 * (POINTS - 1))
+        return _parallel(x, slope, off.min(axis=0) - between, off.max(axis=0) + between)
+
+    return relax
+
+
+RELAXATIONS: dict[str, Callable[[Relaxed], Relaxed]] = {"relu": _relu, "tanh": _tanh}

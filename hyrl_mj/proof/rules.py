@@ -1,0 +1,228 @@
+"""Bounds of traced NumPy code over boxes of arguments: a rule of affine arithmetic for each operation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hyrl_mj.proof import affine
+from hyrl_mj.proof.affine import Affine, Unbounded
+from hyrl_mj.tracing import BATCH, Operation, Program
+
+# Relative error of one operation on numbers of 64 and of 32 bits.
+ROUNDING = {"float64": 2.0**-52, "float32": 2.0**-23}
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Conditions that depend on the boxes.
+
+    Attributes:
+        surely: (n, ...) bool, true everywhere in the box.
+        possibly: (n, ...) bool, true somewhere in the box.
+    """
+
+    surely: np.ndarray
+    possibly: np.ndarray
+
+
+def bounds(program: Program, boxes: Affine) -> Affine | Truth:
+    """Returns the result of a program with one argument and one result over boxes.
+
+    Raises:
+        Unbounded: the program has an operation without a rule.
+    """
+    (argument,), (result,) = program.inputs, program.outputs
+    values: dict[Operation, Affine | Truth] = {argument: boxes}
+    n, d = boxes.centre.shape[0], len(boxes.generators)
+    with np.errstate(all="ignore"):
+        for operation in program.operations():
+            values[operation] = _apply(operation, values, n, d)
+    return values[result]
+
+
+def _apply(
+    operation: Operation, values: Mapping[Operation, Affine | Truth], n: int, d: int
+) -> Affine | Truth:
+    name, options = operation.name, dict(operation.options)
+    rule = RULES.get(name)
+    if rule is None:
+        raise Unbounded(f"uses np.{name}, for which there are no bounds")
+    if "shape" in options:
+        options["shape"] = tuple(n if k == BATCH else k for k in options["shape"])
+    operands = [values[o] if isinstance(o, Operation) else o for o in operation.operands]
+    if name == "multiply" and operands[0] is operands[1]:
+        operands, rule = operands[:1], affine.square
+    if name in LOGICAL:
+        return rule(*map(_truth, operands))
+    forms = [o if name in AS_THEY_ARE and _is_condition(o) else _form(o, d) for o in operands]
+    found: Affine | Truth = rule(*forms, **options)
+    if isinstance(found, Affine):
+        rounding = ROUNDING.get(operation.value.dtype.name, 0.0)
+        error = rounding * (np.abs(found.centre) + found.radius)
+        return affine.tidy(Affine(found.centre, found.generators, found.remainder + error))
+    return found
+
+
+def _form(x: Any, d: int) -> Affine:
+    """Returns an operand as an affine form."""
+    if isinstance(x, Affine):
+        return x
+    if isinstance(x, Truth):
+        return Affine.between(x.surely.astype(float), x.possibly.astype(float), d)
+    centre = np.asarray(x, dtype=float)
+    return Affine(centre, np.zeros((d, *centre.shape)), np.zeros(centre.shape))
+
+
+def _is_condition(x: Any) -> bool:
+    return isinstance(x, Truth) or np.asarray(x).dtype == bool
+
+
+def _truth(x: Any) -> Truth:
+    if isinstance(x, Truth):
+        return x
+    if isinstance(x, Affine):
+        return Truth((x.low > 0) | (x.high < 0), (x.radius > 0) | (x.centre != 0))
+    return Truth(np.asarray(x, dtype=bool), np.asarray(x, dtype=bool))
+
+
+# ---- conditions and shapes
+
+
+def _greater(a: Affine, b: Affine) -> Truth:
+    a, b = affine.pair(a, b)
+    return Truth(a.low > b.high, a.high > b.low)
+
+
+def _greater_equal(a: Affine, b: Affine) -> Truth:
+    a, b = affine.pair(a, b)
+    return Truth(a.low >= b.high, a.high >= b.low)
+
+
+def _equal(a: Affine, b: Affine) -> Truth:
+    a, b = affine.pair(a, b)
+    point = (a.radius == 0) & (b.radius == 0)
+    return Truth(point & (a.centre == b.centre), (a.low <= b.high) & (b.low <= a.high))
+
+
+def _where(condition: Any, a: Any, b: Any) -> Affine | Truth:
+    c = _truth(condition)
+    if not isinstance(a, Affine) and not isinstance(b, Affine):
+        a, b = _truth(a), _truth(b)
+        surely = np.where(c.surely, a.surely, np.where(c.possibly, a.surely & b.surely, b.surely))
+        possibly = np.where(
+            c.surely, a.possibly, np.where(c.possibly, a.possibly | b.possibly, b.possibly)
+        )
+        return Truth(surely, possibly)
+    d = len((a if isinstance(a, Affine) else b).generators)
+    a, b = affine.pair(_form(a, d), _form(b, d))
+    hull = Affine.between(np.minimum(a.low, b.low), np.maximum(a.high, b.high), d)
+    return affine.choose(c.surely, a, affine.choose(c.possibly, hull, b))
+
+
+def _astype(a: Any, dtype: str) -> Any:
+    if np.dtype(dtype).kind == "b":
+        return _truth(a)
+    if np.dtype(dtype).kind == "f" or not isinstance(a, Affine):
+        return a
+    return Affine.between(np.trunc(a.low), np.trunc(a.high), len(a.generators))
+
+
+def _concatenate(*parts: Affine, axis: int) -> Affine:
+    return Affine(
+        np.concatenate([part.centre for part in parts], axis),
+        np.concatenate([part.generators for part in parts], axis + 1),
+        np.concatenate([part.remainder for part in parts], axis),
+    )
+
+
+def _take(a: Affine, indices: Affine, axis: int) -> Affine:
+    if indices.radius.any():
+        raise Unbounded("looks up values by an index that depends on the state")
+    at = indices.centre.astype(int)
+    return a.each(lambda x: np.take(x, at, axis))
+
+
+def _reduced(name: str) -> Callable[..., Affine]:
+    function = getattr(np, name)
+
+    def rule(a: Affine, axis: Any, keepdims: bool) -> Affine:
+        low, high = (function(x, axis=axis, keepdims=keepdims) for x in (a.low, a.high))
+        return Affine.between(low, high, len(a.generators))
+
+    return rule
+
+
+# Operations on conditions, and operations that take conditions and numbers as they are.
+LOGICAL = ("logical_and", "logical_or", "logical_xor", "logical_not")
+AS_THEY_ARE = ("where", "astype", "any", "all")
+RULES: dict[str, Callable[..., Any]] = {
+    "add": affine.add,
+    "subtract": affine.subtract,
+    "negative": affine.negative,
+    "multiply": affine.multiply,
+    "divide": affine.divide,
+    "power": affine.raised,
+    "matmul": affine.matmul,
+    "sqrt": affine.sqrt,
+    "exp": affine.smooth(np.exp, np.exp, lambda _, high: np.exp(high), affine.rising(np.exp)),
+    "log": affine.smooth(
+        affine.logarithm,
+        lambda x: 1 / x,
+        lambda low, _: np.where(low > 0, low, 0.0) ** -2,
+        affine.rising(affine.logarithm),
+    ),
+    "sin": affine.smooth(np.sin, np.cos, lambda low, _: np.ones_like(low), affine.unit),
+    "cos": affine.smooth(
+        np.cos, lambda x: -np.sin(x), lambda low, _: np.ones_like(low), affine.unit
+    ),
+    "tanh": affine.smooth(
+        np.tanh,
+        lambda x: 1 - np.tanh(x) ** 2,
+        lambda low, _: np.full_like(low, 0.77),
+        affine.rising(np.tanh),
+    ),
+    "arctan": affine.arctan,
+    "arctan2": affine.arctan2,
+    "absolute": affine.absolute,
+    "sign": affine.stepwise(np.sign),
+    "floor": affine.stepwise(np.floor),
+    "ceil": affine.stepwise(np.ceil),
+    "rint": affine.stepwise(np.rint),
+    "maximum": affine.maximum,
+    "minimum": affine.minimum,
+    "remainder": affine.remainder,
+    "sum": affine.total,
+    "max": _reduced("max"),
+    "min": _reduced("min"),
+    "greater": _greater,
+    "greater_equal": _greater_equal,
+    "less": lambda a, b: _greater(b, a),
+    "less_equal": lambda a, b: _greater_equal(b, a),
+    "equal": _equal,
+    "isnan": lambda a: Truth(np.zeros(a.centre.shape, bool), np.isinf(a.remainder)),
+    "logical_and": lambda a, b: Truth(a.surely & b.surely, a.possibly & b.possibly),
+    "logical_or": lambda a, b: Truth(a.surely | b.surely, a.possibly | b.possibly),
+    "logical_not": lambda a: Truth(~a.possibly, ~a.surely),
+    "logical_xor": lambda a, b: Truth(
+        (a.surely & ~b.possibly) | (b.surely & ~a.possibly),
+        ~((a.surely & b.surely) | (~a.possibly & ~b.possibly)),
+    ),
+    "any": lambda a, **options: Truth(*(np.any(x, **options) for x in _sides(a))),
+    "all": lambda a, **options: Truth(*(np.all(x, **options) for x in _sides(a))),
+    "where": _where,
+    "astype": _astype,
+    "concatenate": _concatenate,
+    "reshape": lambda a, shape: a.each(lambda x: x.reshape(shape)),
+    "transpose": lambda a, axes: a.each(lambda x: x.transpose(axes)),
+    "take": _take,
+    "full": lambda a, shape, dtype: a.each(lambda x: np.broadcast_to(x, shape)),
+}
+
+
+def _sides(a: Any) -> tuple[np.ndarray, np.ndarray]:
+    a = _truth(a)
+    return a.surely, a.possibly
