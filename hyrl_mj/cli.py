@@ -50,7 +50,7 @@ def run(task: str, options: RunOptions) -> None:
 
     An existing run directory is resumed: only what is missing is done.
 
-    The verdict is WON, HELD, WEAK, or FAILED, which gives exit status 1.
+    The verdict is PROVED, WON, HELD, WEAK, or FAILED, which gives exit status 1.
 
     Args:
         task: a task, see `hyrl-mj list`, or a Python file that defines one, see `hyrl-mj new-task`.
@@ -63,7 +63,7 @@ def robustify(task: str, *, policy: Path, options: AgentOptions) -> None:
 
     An existing run directory is resumed: only what is missing is done.
 
-    The verdict is WON, HELD, WEAK, or FAILED, which gives exit status 1.
+    The verdict is PROVED, WON, HELD, WEAK, or FAILED, which gives exit status 1.
 
     Args:
         task: a task, see `hyrl-mj list`, or a Python file that defines one.
@@ -155,7 +155,7 @@ def simulate(
             starts of the paper's replays.
         q0: start mode; by default the controller selects it from the first measurement.
         noise: kind of noise: none, uniform, alternating, adversarial (looks a few samples ahead),
-            or worst (the signal with which the exact game is lost, or arrival is latest).
+            or worst (the signal with which the worst-case game is lost, or arrival is latest).
         eps: bound of the noise, in the units of the chart; by default the run's.
         time: time to simulate [s]; by default the task's.
         seed: seed of the noise.
@@ -211,7 +211,7 @@ def replay(
         starts: critical (the start on the critical set, once for each start mode), paper (all of the
             paper's at once), or latest (what `hyrl-mj simulate --start` simulated last).
         noise: kind of noise under which to simulate anew: none, uniform, alternating, adversarial (looks
-            a few samples ahead), or worst (of the exact game, for each controller); by default the
+            a few samples ahead), or worst (of the worst-case game, for each controller); by default the
             arcs of the run, under alternating noise.
         eps: bound of the noise, in the units of the chart; by default the run's.
     """

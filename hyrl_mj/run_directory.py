@@ -131,7 +131,7 @@ class Run:
 
     @property
     def exact(self) -> bool:
-        """Whether the exact game can be played: on a lattice, against a function of the measurement."""
+        """Whether the worst-case game can be played: on a lattice, against a function of the measurement."""
         return Lattice.possible(self.task) and not (self.agent and self.agent.why_no_function)
 
     def check_exact(self) -> None:
@@ -139,7 +139,7 @@ class Run:
         Lattice.check(self.task)
         if self.agent and self.agent.why_no_function:
             raise BadInput(
-                "the exact game takes a function of the measurement, which this policy is not "
+                "the worst-case game takes a function of the measurement, which this policy is not "
                 f"({self.agent.why_no_function}): use noisy episodes instead (hyrl-mj robustness RUN "
                 "--episodes N --noise adversarial)"
             )

@@ -249,15 +249,18 @@ def _figures(robustness: Robustness) -> dict[str, float | None]:
             name = f"{count.controller}_reached_{count.noise}"
             least[name] = min(count.reached, least.get(name, 1.0))
         return {**least}
-    figures: dict[str, float | None] = {"winnable": game.scores["hyrl"][-1].winnable}
+    last = game.scores["hyrl"][-1]
+    figures: dict[str, float | None] = {"open": last.open, "winnable": last.winnable}
     for i, when in ((0, "_without_noise"), (-1, "")):
         for who in ("policy", "hyrl", LIMIT):
             score = game.scores[who][i]
-            figures[f"{who}_won{when}"] = score.won
-            if who != "policy":
-                figures[f"{who}_won_any{when}"] = score.won_any
-    last = game.scores["hyrl"][-1]
+            kinds = ("won",) if who == LIMIT else ("won", "proved", "not_broken")
+            for kind in kinds:
+                figures[f"{who}_{kind}{when}"] = getattr(score, kind)
+                if who != "policy":
+                    figures[f"{who}_{kind}_any{when}"] = getattr(score, f"{kind}_any")
     figures |= {"hyrl_time": last.time, "hyrl_time_any": last.time_any}
+    figures |= {"hyrl_proved_time": last.proved_time, "hyrl_proved_time_any": last.proved_time_any}
     if last.excursion is not None:
         figures["hyrl_excursion"] = last.excursion
     for who, margin in game.margin.items():

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from hyrl_mj.game import Robustness, percent
+from hyrl_mj.game import NEARLY, Robustness, Score, percent
 from hyrl_mj.stages import Arrivals, ModeResult, Retraining
 from hyrl_mj.tasks import Task
 
-WON, HELD, WEAK, FAILED = "WON", "HELD", "WEAK", "FAILED"
-# The share that counts as nearly all.
-NEARLY = 0.99
+PROVED, WON, HELD, WEAK, FAILED = "PROVED", "WON", "HELD", "WEAK", "FAILED"
 # The kind of noise of episodes without noise.
 NO_NOISE = "none"
 
@@ -23,7 +21,9 @@ class Verdict:
     `word` is the first of these whose condition holds. To win is to arrive within the task's `max_steps`;
     nearly all are 99%.
 
-    - WON: the worst-case game can be played, and HyRL wins every winnable start at the run's noise bound.
+    - PROVED: HyRL is proved to win nearly all winnable starts, whatever the noise within the run's bound.
+    - WON: the worst-case game can be played, and of no winnable start a noise signal is known that beats
+      HyRL.
     - HELD: the game cannot be played, and HyRL arrives in nearly all episodes under each kind of noise.
     - FAILED: no start is winnable, or HyRL wins less than the policy without noise, or stage 6 gave up: for
       some mode no attempt gave a policy that wins nearly all of its set.
@@ -35,7 +35,7 @@ class Verdict:
     counts.
 
     Attributes:
-        word: "WON", "HELD", "WEAK" or "FAILED".
+        word: "PROVED", "WON", "HELD", "WEAK" or "FAILED".
         sentence: what decided.
         reasons: the results behind it, a sentence each.
     """
@@ -67,6 +67,7 @@ class Verdict:
         case = _Case(task, bound, robustness, retraining, arrivals)
         reasons = tuple(case.reasons())
         for word, grounds in (
+            (PROVED, case.proofs()),
             (WON if robustness.game else HELD, case.success()),
             (FAILED, case.failures()),
             (WEAK, case.weaknesses()),
@@ -78,7 +79,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class _Wins:
-    """What a controller wins: shares of the winnable starts, or of the episodes.
+    """What a controller is not known to lose: shares of the winnable starts, or of the episodes.
 
     Attributes:
         quiet: without noise, None if that was not examined.
@@ -93,8 +94,8 @@ class _Wins:
         """Returns what "policy" or "hyrl" wins."""
         if robustness.game:
             scores = robustness.game.scores[who]
-            quiet = [score.won for score in scores if score.eps == 0]
-            return _Wins(quiet[0] if quiet else None, scores[-1].won)
+            quiet = [score.not_broken for score in scores if score.eps == 0]
+            return _Wins(quiet[0] if quiet else None, scores[-1].not_broken)
         shares = {
             kind: arrived / episodes
             for kind, (arrived, episodes) in _by_kind(robustness, who).items()
@@ -143,13 +144,22 @@ class _Case:
         game = self.robustness.game
         return game.scores["hyrl"][-1].winnable if game else 1.0
 
+    def proofs(self) -> Iterator[str]:
+        """Yields why the run is PROVED, if it is."""
+        game = self.robustness.game
+        if not game or not self.examined or not self.winnable:
+            return
+        score = game.scores["hyrl"][-1]
+        if score.proved is not None and score.proved >= NEARLY:
+            yield f"whatever the {self.noise}, HyRL {_share(score)} of {self.whole}"
+
     def success(self) -> Iterator[str]:
         """Yields why the run is WON or HELD, if it is."""
         won = self.hyrl.noisy
         if not self.examined or not self.winnable or won is None:
             return
         if self.robustness.game and won == 1:
-            yield f"HyRL wins every winnable start under the worst {self.noise}"
+            yield f"HyRL lost none of {self.whole} that were tried under the worst {self.noise}"
         elif not self.robustness.game and won >= NEARLY:
             counts = _by_kind(self.robustness, "hyrl")
             counts.pop(NO_NOISE, None)
@@ -163,8 +173,8 @@ class _Case:
         policy, hyrl = self.policy.quiet, self.hyrl.quiet
         if policy is not None and hyrl is not None and hyrl < policy:
             yield (
-                f"without noise HyRL wins {percent(hyrl)} of {self.whole}, less than the policy "
-                f"({percent(policy)})"
+                f"without noise HyRL wins {percent(hyrl, surely=False)} of {self.whole}, less than the "
+                f"policy ({percent(policy, surely=False)})"
             )
         given_up = [result.mode for result in self.retraining.modes if result.won < NEARLY]
         if given_up:
@@ -197,16 +207,18 @@ class _Case:
     def _shares(self) -> Iterator[str]:
         """Yields what is won in the worst-case game."""
         if self.winnable < 1:
-            yield f"under {self.noise} {percent(self.winnable)} of the starts are winnable"
+            assert self.robustness.game
+            open_ = self.robustness.game.scores["hyrl"][-1].open
+            yield (
+                f"under {self.noise} this split can win {percent(self.winnable)} of the starts, of which "
+                f"{percent(open_)} are open to one who sees the state"
+            )
         assert self.robustness.game
         policy, hyrl = (self.robustness.game.scores[who] for who in ("policy", "hyrl"))
         for ours, theirs in zip(hyrl, policy, strict=True):
             if ours.eps in (0, self.robustness.eps):
                 when = f"under the worst {self.noise}" if ours.eps else "without noise"
-                yield (
-                    f"{when} HyRL wins {percent(ours.won)} of {self.whole}, the policy "
-                    f"{percent(theirs.won)}"
-                )
+                yield f"{when} HyRL {_share(ours)} of {self.whole}, the policy {_share(theirs)}"
 
     def _counts(self) -> Iterator[str]:
         """Yields the numbers of episodes that arrive, by kind of noise."""
@@ -215,6 +227,18 @@ class _Case:
             when = "without noise" if kind == NO_NOISE else f"under {kind} {self.noise}"
             theirs, _ = policy[kind]
             yield f"{when} HyRL arrives in {arrived:,} of {episodes:,} episodes, the policy in {theirs:,}"
+
+
+def _share(score: Score) -> str:
+    """Returns what is proved, and what is known to be lost."""
+    lost = f"known to lose {percent(1 - score.not_broken)}"
+    if score.not_broken == 1:
+        lost = "not known to lose any"
+    return (
+        f"is {lost}"
+        if score.proved is None
+        else f"is proved to win {percent(score.proved)} and {lost}"
+    )
 
 
 def _by_kind(robustness: Robustness, who: str) -> dict[str, tuple[int, int]]:

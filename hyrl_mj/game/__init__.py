@@ -1,7 +1,7 @@
 """The worst-case game: measurement noise within a bound plays against the closed loop.
 
 The plant is tabulated on a lattice of states, and the game is solved on it by backward recursion.
-`Game` scores controllers, `Limit` is what any controller could win, and `examine` returns a `GameResult`.
+`Game` scores controllers on the nodes, and `Limit` is what a split of the states could win.
 """
 
 from hyrl_mj.game.lattice import LATTICE, Lattice
@@ -10,31 +10,51 @@ from hyrl_mj.game.result import (
     BEATEN,
     LIMIT,
     MAP_CLASSES,
+    NEARLY,
     OVER,
+    UNCLEAR,
     UNWINNABLE,
     WON,
     WON_FROM_SOME,
     Curve,
     EpisodeCount,
     GameResult,
+    LatticeSpacing,
     Maps,
+    NodeScore,
+    Profile,
     Robustness,
     Score,
     Wins,
     percent,
 )
-from hyrl_mj.game.scores import LARGEST, Game, examine, worst_signal
-from hyrl_mj.game.solver import LOST, NEVER, Answers, Moves, lasting, noisy_moves, solve
+from hyrl_mj.game.scores import CURVE, LARGEST, Game, share, worst_signal
+from hyrl_mj.game.solver import (
+    FIRST,
+    LOST,
+    NEVER,
+    Answers,
+    Moves,
+    Places,
+    WorstNoise,
+    lasting,
+    noisy_moves,
+    solve,
+)
 
 __all__ = [
     "BEATEN",
+    "CURVE",
+    "FIRST",
     "LARGEST",
     "LATTICE",
     "LIMIT",
     "LOST",
     "MAP_CLASSES",
+    "NEARLY",
     "NEVER",
     "OVER",
+    "UNCLEAR",
     "UNWINNABLE",
     "WON",
     "WON_FROM_SOME",
@@ -44,17 +64,22 @@ __all__ = [
     "Game",
     "GameResult",
     "Lattice",
+    "LatticeSpacing",
     "Limit",
     "Maps",
     "Moves",
+    "NodeScore",
+    "Places",
+    "Profile",
     "Robustness",
     "Score",
     "Wins",
-    "examine",
+    "WorstNoise",
     "fewest_samples",
     "lasting",
     "noisy_moves",
     "percent",
+    "share",
     "solve",
     "worst_signal",
 ]

@@ -78,12 +78,12 @@ class Lattice:
         d = task.chart.dimension
         if d not in LATTICE:
             raise BadInput(
-                f"the exact game takes a chart of 1 or 2 dimensions, that of {task.name} has {d}: "
+                f"the worst-case game takes a chart of 1 or 2 dimensions, that of {task.name} has {d}: "
                 f"{REMEDY}"
             )
         if task.measurement_columns != d or task.model.nq != d or not task.kinematic:
             raise BadInput(
-                f"the exact game takes a plant that one sample maps from chart point to chart point, "
+                f"the worst-case game takes a plant that one sample maps from chart point to chart point, "
                 f"and {model_name(task.model)} has a larger state: {REMEDY}"
             )
 

@@ -1,13 +1,15 @@
-"""The limit beside every score of the worst-case game: what any controller could win.
+"""The limits beside every score of the worst-case game: what is open, and what a split can win.
 
-The limit is a controller that steers by the true state, but has to choose the way by the measurement. It
-picks the side of the first measurement, and from there follows each way as well as possible.
+Open is what one who sees the state can win. The limit of a split is a controller that steers by the true
+state, but has to choose the way by the measurement: it picks the side of the first measurement, and from
+there follows each way as well as possible.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -62,6 +64,14 @@ class Limit:
         hop = np.abs(moved[ends < lattice.nodes]).max(axis=0)
         sides = depth <= depth.min(axis=0) + ON_BOUNDARY
         return Limit(lattice, inside, sides, samples, level, hop)
+
+    @cached_property
+    def open(self) -> np.ndarray:
+        """(N,) bool, the nodes from which one who sees the state arrives in time, whichever way."""
+        lattice = self.lattice
+        after = lattice.after[:, :1]
+        samples, _ = fewest_samples(lattice, after, np.ones(after.shape, dtype=bool))
+        return samples <= lattice.task.max_steps
 
     def held(self, bound: np.ndarray) -> np.ndarray:
         """Returns the most samples until arrival if the side of the first measurement is held: (N,) int.

@@ -17,18 +17,26 @@ from hyrl_mj.sets import Grid
 # Name of the limit, a controller that is scored beside the examined ones.
 LIMIT = "limit"
 # Classes of the maps.
-WON, WON_FROM_SOME, BEATEN, UNWINNABLE, OVER = range(5)
+WON, WON_FROM_SOME, UNCLEAR, BEATEN, UNWINNABLE, OVER = range(6)
 MAP_CLASSES = (
-    "won from every start mode",
-    "won if the controller picks the start mode",
+    "proved to be won from every start mode",
+    "proved to be won if the controller picks the start mode",
+    "neither proved nor lost",
     "lost to the worst noise",
-    "not winnable",
+    "not winnable by this split",
     "over",
 )
+# A share of at least this much counts as nearly all.
+NEARLY = 0.99
 
 
-def percent(share: float) -> str:
-    """Returns a share in percent; only 1 is called 100%, and only 0 is called 0%."""
+def percent(share: float, surely: bool = True) -> str:
+    """Returns a share in percent; only 1 is called 100%, and only 0 is called 0%.
+
+    A share that is all, but was not proved (`surely`), is "all tried".
+    """
+    if share == 1 and not surely:
+        return "all tried"
     if share in (0, 1):
         return f"{100 * share:.0f}%"
     text = f"{100 * share:.2f}%"
@@ -36,12 +44,12 @@ def percent(share: float) -> str:
 
 
 @dataclass(frozen=True)
-class Score:
-    """What a controller wins in the worst case: it arrives before the episode's time is over.
+class NodeScore:
+    """What a controller wins on the nodes of the lattice: it arrives before the episode's time is over.
 
     Attributes:
         eps: bound of the noise.
-        winnable: share of the start region that can be won at all.
+        winnable: share of the start region that this split can win, by deciding the way from the measurement.
         won: share of the winnable starts that are won if the controller picks its start mode.
         won_any: share of the winnable starts that are won from every start mode.
         time, time_any: worst time to arrival [s] from the starts that are won.
@@ -58,16 +66,57 @@ class Score:
 
     def __repr__(self) -> str:
         values = {k: None if v is None else f"{v:.4g}" for k, v in vars(self).items()}
-        return f"Score({', '.join(f'{name}={value}' for name, value in values.items())})"
+        shown = ", ".join(f"{name}={value}" for name, value in values.items())
+        return f"{type(self).__name__}({shown})"
+
+
+@dataclass(frozen=True)
+class Score(NodeScore):
+    """What a controller wins on the nodes, what is proved between them, and what was really lost.
+
+    The shares below are of the winnable cells between the nodes: those of the start region all of whose
+    corners are winnable. Where a plant allows no cells, they are of the winnable nodes.
+
+    Attributes:
+        open: share of the start region that can be won by one who sees the state.
+        proved: share that is won if the controller picks its start mode, from every state and under every
+            noise signal within the bound; None if the controller could not be bounded.
+        proved_any: share that is won so from every start mode.
+        proved_time, proved_time_any: bounds of the time to arrival [s] from what is proved.
+        not_broken: share in which no start is known that is lost if the controller picks its start mode.
+            Each start that is known to be lost was lost on the plant, with its noise signal.
+        not_broken_any: share in which no start is known that is lost from some start mode.
+    """
+
+    open: float
+    proved: float | None
+    proved_any: float | None
+    proved_time: float | None
+    proved_time_any: float | None
+    not_broken: float
+    not_broken_any: float
+
+    __repr__ = NodeScore.__repr__
 
 
 @dataclass(frozen=True)
 class Wins:
-    """What a controller wins at each noise bound of a curve, as in `Score`."""
+    """What a controller wins at each noise bound of a curve.
+
+    Attributes:
+        won, won_any: shares of the winnable nodes that are won on the nodes of the lattice, if the
+            controller picks its start mode, and from every start mode.
+        proved, proved_any: shares of the winnable cells that are proved, as in `Score`; empty for a
+            controller that could not be bounded.
+        time_any: worst time to arrival [s] from the nodes that are won, from every start mode; None where
+            nothing is won.
+    """
 
     won: tuple[float, ...]
     won_any: tuple[float, ...]
-    time_any: tuple[float, ...]
+    proved: tuple[float, ...]
+    proved_any: tuple[float, ...]
+    time_any: tuple[float | None, ...]
 
 
 @dataclass(frozen=True)
@@ -105,11 +154,13 @@ class LatticeSpacing:
     Attributes:
         spacing: distance along each coordinate, in chart units.
         exact: whether every sample leads from node to node.
+        cells: whether the starts of the scores are cells.
         curve_spacing: distance on the lattice on which the curve is computed.
     """
 
     spacing: tuple[float, ...]
     exact: bool
+    cells: bool
     curve_spacing: tuple[float, ...]
 
 
@@ -121,8 +172,11 @@ class GameResult:
         everywhere: whether noise acts on all coordinates.
         lattice: spacing of the lattice.
         scores: for each controller and the limit, one at each noise bound.
-        margin: for each controller, the largest bound at which the whole winnable start region is won; None
-            if it is not even won without noise.
+        margin: for each controller, the largest bound at which all winnable nodes of the start region are
+            won; None if they are not even won without noise.
+        proved_margin: for each controller, the largest bound of the curve up to which nearly all winnable
+            starts (`NEARLY`) are proved; None if not even without noise.
+        why_not_proved: for each controller that could not be bounded, what stopped it.
         miss_without_noise: for each controller, the greatest distance from the set-point at the end of runs
             without noise.
         curve: what is won against the noise bound.
@@ -133,6 +187,8 @@ class GameResult:
     lattice: LatticeSpacing
     scores: dict[str, tuple[Score, ...]]
     margin: dict[str, float | None]
+    proved_margin: dict[str, float | None]
+    why_not_proved: dict[str, str]
     miss_without_noise: dict[str, float]
     curve: Curve
     profile: Profile
@@ -145,12 +201,13 @@ class GameResult:
     def is_whole(self, controllers: Collection[str]) -> bool:
         """Whether all tables have the same controllers, and as many rows as noise bounds."""
         examined = {*controllers}
-        if any(set(table) != examined for table in (self.margin, self.miss_without_noise)):
+        whole = (self.margin, self.proved_margin, self.miss_without_noise)
+        if any(set(table) != examined for table in whole) or not {*self.why_not_proved} <= examined:
             return False
         tables = (self.scores, self.curve.wins, self.profile.eps)
         if any(set(table) != examined | {LIMIT} for table in tables):
             return False
-        columns = [w for wins in self.curve.wins.values() for w in vars(wins).values()]
+        columns = [w for wins in self.curve.wins.values() for w in vars(wins).values() if w]
         return (
             all(self.scores.values())
             and len(set(map(len, self.scores.values()))) == 1
@@ -166,9 +223,9 @@ class GameResult:
 
     def __repr__(self) -> str:
         scores = {name: level[-1] for name, level in self.scores.items() if name != LIMIT}
-        shares = ", ".join(f"{name} {score.won:.2%}" for name, score in scores.items())
+        shares = ", ".join(f"{name} {score.not_broken:.2%}" for name, score in scores.items())
         eps = f" at eps {next(iter(scores.values())).eps:g}" if scores else ""
-        return f"GameResult(won{eps}: {shares})"
+        return f"GameResult(not broken{eps}: {shares})"
 
 
 @dataclass(frozen=True)

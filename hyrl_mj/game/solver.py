@@ -149,9 +149,7 @@ class Moves:
     target: np.ndarray
 
     @staticmethod
-    def gather(
-        lattice: Places, rows: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]
-    ) -> Moves:
+    def gather(lattice: Places, rows: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Moves:
         """Returns the moves, from each row's nodes (m,) ascending, next modes (m,) and places (m, C)."""
         state, counts, target = [], [], []
         for row, (node, mode, ends) in enumerate(rows):

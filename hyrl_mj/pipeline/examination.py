@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.game import BEATEN, WON, WON_FROM_SOME, EpisodeCount, Maps, Robustness, examine
+from hyrl_mj.game import OVER, UNWINNABLE, EpisodeCount, Maps, Robustness
 from hyrl_mj.policies import Controller
 from hyrl_mj.progress import Say
+from hyrl_mj.proof import examine
 from hyrl_mj.run_directory import Run
 from hyrl_mj.simulation import Noise
 from hyrl_mj.stages import Partition, Regions, noisy_episodes
@@ -86,7 +87,7 @@ def examine_loops(
             task, points, partition, loops, bounds, everywhere, run.settings.lattice
         )
         last = maps.map[[*loops][-1]]
-        winnable = maps.grid(task.chart), np.isin(last, (WON, WON_FROM_SOME, BEATEN))
+        winnable = maps.grid(task.chart), ~np.isin(last, (UNWINNABLE, OVER))
     counts: tuple[EpisodeCount, ...] = ()
     if count is not None:
         regions = Regions(points, winnable, options.near_critical)

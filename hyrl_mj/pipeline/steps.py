@@ -236,7 +236,7 @@ def run_stage(run: Run, name: str, say: Say = print) -> Run:
 def examine_run(run: Run, options: ExamineOptions = USUAL, say: Say = print) -> Robustness:
     """Examines policy and hybrid controller under noise, and writes `robustness.json` with its figures.
 
-    The exact game is played where possible; noisy episodes are added on request, or replace the game.
+    The worst-case game is played where possible; noisy episodes are added on request, or replace the game.
 
     Args:
         run: a run with its mode policies.

@@ -1,0 +1,11 @@
+"""What is proved of a controller: the worst-case game on closed cells, with its answers bounded from outside.
+
+`Certificate` proves what is won from every state and under every noise signal within a bound; `attack` finds
+signals that really win against the controller; `examine` returns both beside the game on the nodes.
+"""
+
+from hyrl_mj.proof.attack import Broken, attack
+from hyrl_mj.proof.certificate import Certificate
+from hyrl_mj.proof.examine import examine
+
+__all__ = ["Broken", "Certificate", "attack", "examine"]

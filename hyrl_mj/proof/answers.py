@@ -12,9 +12,8 @@ from hyrl_mj.policies import Controller, PolicyController
 from hyrl_mj.proof.affine import Unbounded
 from hyrl_mj.proof.cells import Cells
 from hyrl_mj.proof.networks import BoundedPolicy
-from hyrl_mj.sets import Everything, GridSet, StateSet
+from hyrl_mj.sets import Everything, Grid, GridSet, StateSet
 from hyrl_mj.stages import ON_EDGE, HybridController
-from hyrl_mj.tasks import Task
 
 # Boxes of measurements along one side of a cell, for coordinates with noise.
 FINE = 2
@@ -105,7 +104,9 @@ class Boxes:
         steep = 0.0
         for axis, periodic in enumerate(grid.chart.periodic):
             ring = np.take(values, [0], axis=axis)
-            rises = np.diff(values, axis=axis, append=ring) if periodic else np.diff(values, axis=axis)
+            rises = (
+                np.diff(values, axis=axis, append=ring) if periodic else np.diff(values, axis=axis)
+            )
             steep += float(np.abs(rises).max() / grid.spacing[axis] * self.cells.slack[axis])
         least = greatest = values
         for axis, n in enumerate(self.counts):
@@ -147,7 +148,9 @@ class Boxes:
 
 def _all(counts: np.ndarray) -> np.ndarray:
     """Returns all indices (n, d) of an array with `counts` (d,) entries along each axis."""
-    return np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), -1).reshape(-1, len(counts))
+    return np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), -1).reshape(
+        -1, len(counts)
+    )
 
 
 def _is_sharp(found: np.ndarray) -> np.ndarray:
@@ -157,7 +160,7 @@ def _is_sharp(found: np.ndarray) -> np.ndarray:
     return np.asarray((found[:, 0] == found[:, 1]).all(axis=1))
 
 
-def _interpolated(values: np.ndarray, axis: int, at: np.ndarray, grid: object) -> np.ndarray:
+def _interpolated(values: np.ndarray, axis: int, at: np.ndarray, grid: Grid) -> np.ndarray:
     """Returns values on the lines of a grid, interpolated linearly at points (k,) along an axis."""
     chart, counts = grid.chart, grid.counts[axis]
     index = (at - chart.low[axis]) / grid.spacing[axis]
@@ -237,12 +240,12 @@ def _shifts(boxes: Boxes, policy: BoundedPolicy) -> Iterator[tuple[np.ndarray, n
         first, last = cells.shifts(task.input_levels, task.input_levels)
         for shift in _between(first, last):
             leads = ((first <= shift) & (shift <= last)).all(axis=1)
-            yield shift, chosen[..., leads].any(axis=-1)
+            yield shift, np.asarray(chosen[..., leads].any(axis=-1))
         return
     ends = boxes.everywhere(policy.inputs)
     first, last = cells.shifts(ends[..., 0, :], ends[..., 1, :])
     for shift in _between(first.reshape(-1, first.shape[-1]), last.reshape(-1, last.shape[-1])):
-        yield shift, ((first <= shift) & (shift <= last)).all(axis=-1)
+        yield shift, np.asarray(((first <= shift) & (shift <= last)).all(axis=-1))
 
 
 def _between(first: np.ndarray, last: np.ndarray) -> Iterator[np.ndarray]:

@@ -151,6 +151,30 @@ class Cells:
                 mask = np.delete(mask, -1, axis)
         return np.asarray(mask.ravel())
 
+    def some_corner(self, nodes: np.ndarray) -> np.ndarray:
+        """Returns the cells (N,) bool with a corner among the nodes (nodes,) bool."""
+        return ~self.all_corners(~nodes)
+
+    def all_around(self, cells: np.ndarray) -> np.ndarray:
+        """Returns the nodes (nodes,) bool all of whose cells are among the cells (N,) bool."""
+        mask = cells.reshape(self.counts)
+        for axis, periodic in enumerate(self.lattice.grid.chart.periodic):
+            if periodic:
+                mask = mask & np.roll(mask, 1, axis)
+            else:
+                ends = [(1, 1) if a == axis else (0, 0) for a in range(mask.ndim)]
+                wide = np.pad(mask, ends, constant_values=True)
+                mask = np.delete(wide, 0, axis) & np.delete(wide, -1, axis)
+        return np.asarray(mask.ravel())
+
+    def place(self, z: np.ndarray) -> np.ndarray:
+        """Returns the place (n,) of chart points (n, d): its cell, or "arrived" or "failed" beyond."""
+        grid = self.lattice.grid
+        index = np.floor((grid.chart.wrap(z) - grid.chart.low) / grid.spacing).astype(int)
+        index = np.where(grid.chart.periodic, index % self.counts, index + self.margin)
+        index = np.clip(index, 0, np.array(self.outside.shape) - 1)
+        return self.outside[tuple(index.T)]
+
     def middle(self, cells: np.ndarray) -> np.ndarray:
         """Returns the chart points (n, d) in the middle of cells (n,)."""
         index = np.stack(np.unravel_index(cells, self.counts), axis=-1)
@@ -179,7 +203,8 @@ def _ends(lattice: Lattice, boxes: Affine) -> tuple[np.ndarray, np.ndarray]:
         what = f"the method {name} of {task.name}"
         found.append(bounds_of(program_of(task, getattr(task, name), what), what, boxes))
     ending, verdict = found
-    assert isinstance(ending, Affine) and isinstance(verdict, Affine)
+    assert isinstance(ending, Affine)
+    assert isinstance(verdict, Affine)
     # The outcomes RUNNING, REACHED, and the failures are numbered in this order.
     fails = ending.high > Outcome.REACHED + 0.5
     reached = np.abs(ending.centre - Outcome.REACHED) + ending.radius < 0.5

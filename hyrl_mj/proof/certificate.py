@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hyrl_mj.game import Game, Moves, lasting, solve
+from hyrl_mj.game import NEVER, Game, Moves, share, solve
 from hyrl_mj.policies import Controller
 from hyrl_mj.proof.affine import Unbounded
 from hyrl_mj.proof.answers import BoundedAnswers
@@ -73,6 +73,22 @@ class Certificate:
         return solve(self.moves(name, eps), self.game.task.max_steps)
 
     def region(self, eps: float) -> np.ndarray:
-        """Returns the cells (N,) bool of the start region all of whose corners are winnable."""
-        assert self.cells is not None
-        return self.cells.all_corners(self.game.starts & self.game.winnable(eps))
+        """Returns the winnable cells (N,) bool: those of the start region all of whose corners are winnable.
+
+        Without cells these are the winnable nodes.
+        """
+        nodes = self.game.starts & self.game.winnable(eps)
+        return nodes if self.cells is None else self.cells.all_corners(nodes)
+
+    def wins(self, name: str, eps: float) -> tuple[float, float, float, float]:
+        """Returns what is proved of a controller, and how fast.
+
+        Returns:
+            The share of the winnable cells that is won if the controller picks its start mode, the share
+            from every start mode, and bounds of the time to arrival [s] from both.
+        """
+        value, region = self.value(name, eps)[:, :-2], self.region(eps)
+        own, worst = value[-1, region], value[:-1, region].max(axis=0, initial=0)
+        latest, latest_any = (float(x[x < NEVER].max(initial=0)) for x in (own, worst))
+        dt = self.game.task.dt
+        return share(own < NEVER), share(worst < NEVER), latest * dt, latest_any * dt

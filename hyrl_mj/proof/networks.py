@@ -1,7 +1,7 @@
 """Bounds of policies over boxes of measurements: which levels, or which inputs, they can give there.
 
-The network is bounded layer by layer by linear relaxations (DeepZ: Singh et al., Fast and Effective Robustness
-Certification, NeurIPS 2018), with the sides of the box as generators and an interval for everything else.
+The network is bounded layer by layer by linear relaxations (DeepZ: Singh et al., Fast and Effective
+Robustness Certification, NeurIPS 2018), with the sides of the box as generators and an interval for the rest.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -130,7 +129,9 @@ class BoundedPolicy:
         seen = bounds_of(self.seen, _observation_of(task), Affine.box(centre, half))
         assert isinstance(seen, Affine)
         if np.isinf(seen.remainder).any():
-            raise Unbounded(f"{_observation_of(task)} cannot be bounded: it has no limit near some states")
+            raise Unbounded(
+                f"{_observation_of(task)} cannot be bounded: it has no limit near some states"
+            )
         x: Relaxed = (
             seen.centre.astype(np.float32),
             seen.generators.astype(np.float32),

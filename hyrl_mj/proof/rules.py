@@ -48,7 +48,7 @@ def _apply(
     operation: Operation, values: Mapping[Operation, Affine | Truth], n: int, d: int
 ) -> Affine | Truth:
     name, options = operation.name, dict(operation.options)
-    rule = RULES.get(name)
+    rule: Callable[..., Any] | None = RULES.get(name)
     if rule is None:
         raise Unbounded(f"uses np.{name}, for which there are no bounds")
     if "shape" in options:

@@ -17,7 +17,7 @@ from hyrl_mj.viz.section import Section
 
 STARTS = ("critical", "paper", "latest")  # of a replay
 OVERVIEW_RUNS = 12  # without noise; of an even number none starts in the middle
-WORST = "worst"  # the noise of the exact game; the registered kinds do without one
+WORST = "worst"  # the noise of the worst-case game; the registered kinds do without one
 
 
 def from_middle(task: Task, z: np.ndarray) -> np.ndarray:
@@ -46,7 +46,7 @@ def noisy_arcs(
     Args:
         run: with its mode policies.
         z0: starts.
-        noise: a registered kind, or "worst": the worst case of the exact game, for each controller.
+        noise: a registered kind, or "worst": the worst case of the worst-case game, for each controller.
         eps: bound of the noise, by default the run's.
         q0s: start modes of the hybrid controller; with None it picks its start mode.
         horizon: time [s], by default the task's.

@@ -27,9 +27,11 @@ from hyrl_mj.viz.figures.style import task_title
 CONTROLLERS = ("policy", "hyrl")  # the columns of the numbers
 # What the classes of the maps mean, in the order of MAP_CLASSES.
 MEANINGS = (
-    "Whatever the noise does, in whichever mode the controller starts, the run ends well.",
+    "Whatever the noise does, in whichever mode the controller starts, the run ends well. This is proved for "
+    "all states around.",
     "Whatever the noise does, the run ends well if the controller picks its start mode from the first "
-    "measurement. Started in the other mode it can be lost.",
+    "measurement, which is proved. Started in the other mode it may be lost.",
+    "No noise that makes the run fail was found on the nodes, but that there is none is not proved.",
     "Some noise within the bound makes the run fail, although it could be won.",
     "Decided by what is measured, neither way can be held against the worst noise.",
     "Nothing is left to be decided: an obstacle, the edge of the arena, or the goal.",
@@ -132,14 +134,22 @@ def _game_numbers(run: Run, game: GameResult) -> list[Number]:
     scores = [game.scores[who][-1] for who in CONTROLLERS]
     noise = f"worst noise on {where} up to {scores[0].eps:g} {unit}"
     limit = f"{noise}; the limit is {tables.percent(game.scores[LIMIT][-1].won_any)}"
-    won = [tables.percent(s.won) for s in scores]
-    won_any = [tables.percent(s.won_any) for s in scores]
+    lost = [tables.percent(1 - s.not_broken) for s in scores]
     margins = [tables.margin_text(game.margin[who], unit) for who in CONTROLLERS]
     worst = f"the margin: worst noise on {where}"
     numbers = [
-        Number("winnable starts won", won, noise),
-        Number("winnable starts won from every start mode", won_any, limit),
-        Number("noise up to which all of them are won", margins, worst),
+        Number(
+            "winnable starts proved to be won",
+            [tables.proved_text(s.proved) for s in scores],
+            noise,
+        ),
+        Number("winnable starts known to be lost", lost, f"{noise}; each was lost on the plant"),
+        Number(
+            "winnable starts proved to be won from every start mode",
+            [tables.proved_text(s.proved_any) for s in scores],
+            limit,
+        ),
+        Number("noise up to which no node is lost", margins, worst),
     ]
     if game.lasting:
         off = [f"{tables.excursion_text(s.excursion)} {unit}" for s in scores]

@@ -23,8 +23,8 @@ from hyrl_mj.viz.report import Picture, data_uri, environment, write
 # Curves: controller, column of its `Wins`, label, colour and line style.
 LINES = (
     ("policy", "won", "RL policy", style.POLICY_COLOUR, "-"),
-    ("hyrl", "won", "HyRL, own q0", style.mode_colour(0), "-"),
-    ("hyrl", "won_any", "HyRL, any q0", style.mode_colour(0), "--"),
+    ("hyrl", "proved", "HyRL proved, own q0", style.mode_colour(0), "-"),
+    ("hyrl", "proved_any", "HyRL proved, any q0", style.mode_colour(0), "--"),
 )
 HEIGHT = 2.7  # [inches] of a row of panels
 

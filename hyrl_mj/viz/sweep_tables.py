@@ -33,17 +33,25 @@ def _seconds(value: float) -> str:
     return f"{value:.2f} s"
 
 
+def _tried(value: float) -> str:
+    return percent(value, surely=False)
+
+
 # The figures in tables, the most important first: by these the worst run is found.
 COLUMNS = {
+    "open": Column("open starts", percent),
     "winnable": Column("winnable starts", percent),
-    "policy_won": Column("RL policy won", percent),
-    "hyrl_won": Column("HyRL won, own q0", percent, True),
-    "hyrl_won_any": Column("HyRL won, any q0", percent, True),
+    "policy_proved": Column("RL policy proved", percent),
+    "policy_not_broken": Column("RL policy not broken", _tried),
+    "hyrl_proved": Column("HyRL proved, own q0", percent, True),
+    "hyrl_not_broken": Column("HyRL not broken, own q0", _tried, True),
+    "hyrl_proved_any": Column("HyRL proved, any q0", percent, True),
+    "hyrl_not_broken_any": Column("HyRL not broken, any q0", _tried, True),
     "limit_won_any": Column("limit, any q0", percent),
     "policy_margin": Column("RL policy, margin", _number),
     "hyrl_margin": Column("HyRL, margin", _number, True),
-    "hyrl_time": Column("latest arrival, own q0", _seconds),
-    "hyrl_time_any": Column("latest arrival, any q0", _seconds, False),
+    "hyrl_proved_time": Column("latest arrival proved, own q0", _seconds),
+    "hyrl_proved_time_any": Column("latest arrival proved, any q0", _seconds, False),
     "hyrl_excursion": Column("excursion", _number, False),
     "hyrl_miss_without_noise": Column("HyRL off the set-point, no noise", _number, False),
 } | {

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hyrl_mj.game import LIMIT, EpisodeCount, GameResult, Robustness, percent
+from hyrl_mj.game import LIMIT, NEARLY, EpisodeCount, GameResult, Robustness, percent
 from hyrl_mj.run_directory import Run
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
@@ -91,20 +91,31 @@ def replay_sentence(run: Run, arcs: Arcs) -> str:
 def score_table(task: Task, game: GameResult) -> Table:
     """Returns the scores of the worst-case game: a row for each noise bound and controller."""
     where, unit = task.noise_on(game.everywhere)
-    headings = [f"noise on {where} [{unit}]", "winnable starts", "controller"]
-    headings += ["won, own q0", "won, any q0"]
+    headings = [f"noise on {where} [{unit}]", "open", "winnable", "controller"]
+    headings += ["proved, own q0", "not broken, own q0", "proved, any q0", "not broken, any q0"]
     if game.lasting:
         headings += ["latest arrival, own q0", "latest, any q0", f"excursion [{unit}]"]
     rows = []
     for level in zip(*game.scores.values(), strict=True):
         for who, score in zip(game.scores, level, strict=True):
-            row = [f"{score.eps:g}", percent(score.winnable), NAMES[who]]
-            row += [percent(score.won), percent(score.won_any)]
+            row = [f"{score.eps:g}", percent(score.open), percent(score.winnable), NAMES[who]]
+            for proved, whole in (
+                (score.proved, score.not_broken),
+                (score.proved_any, score.not_broken_any),
+            ):
+                row += [proved_text(proved), percent(whole, surely=False)]
             if game.lasting:
-                row += [_seconds(score.time, score.won), _seconds(score.time_any, score.won_any)]
+                times = (score.time, score.proved_time), (score.time_any, score.proved_time_any)
+                for (time, bound), won in zip(times, (score.won, score.won_any), strict=True):
+                    row.append(_seconds(bound or time, won))
                 row.append(excursion_text(None if who == LIMIT else score.excursion))
             rows.append(row)
-    return Table(f"{task.name}: worst case over all noise signals, exact game", headings, rows)
+    return Table(f"{task.name}: worst case over all noise signals", headings, rows)
+
+
+def proved_text(share: float | None) -> str:
+    """Returns a proved share; "-" of a controller that could not be bounded."""
+    return "-" if share is None else percent(share)
 
 
 def margin_table(task: Task, game: GameResult) -> Table:
@@ -113,10 +124,16 @@ def margin_table(task: Task, game: GameResult) -> Table:
     units = ", ".join(dict.fromkeys(task.chart.units))
     off = f"off the set-point at most, no noise [{units}]"
     rows = [
-        [NAMES[who], margin_text(margin, unit), f"{game.miss_without_noise[who]:.3f}"]
+        [
+            NAMES[who],
+            margin_text(margin, unit),
+            margin_text(game.proved_margin[who], unit),
+            f"{game.miss_without_noise[who]:.3f}",
+        ]
         for who, margin in game.margin.items()
     ]
-    headings = ["controller", "all winnable starts are won up to noise", off]
+    nearly = f"{100 * NEARLY:.0f}%"
+    headings = ["controller", "no node is lost up to noise", f"{nearly} is proved up to noise", off]
     return Table(f"{task.name}: margins", headings, rows)
 
 
@@ -152,10 +169,15 @@ def robustness_sentence(robustness: Robustness) -> str:
             parts.append(f"{NAMES[who]} reaches in {percent(least)} or more")
         return ", ".join(parts)
     policy, hyrl = (robustness.game.scores[who][-1] for who in ("policy", "hyrl"))
-    return (
-        f"worst case at noise {hyrl.eps:g}: the policy wins {percent(policy.won)} of the winnable "
-        f"starts, HyRL {percent(hyrl.won)}, from every q0 {percent(hyrl.won_any)}"
-    )
+    shares = [
+        f"{NAMES[who]} {proved_text(proved)} proved and {percent(1 - whole)} lost{how}"
+        for who, proved, whole, how in (
+            ("policy", policy.proved, policy.not_broken, ""),
+            ("hyrl", hyrl.proved, hyrl.not_broken, ""),
+            ("hyrl", hyrl.proved_any, hyrl.not_broken_any, " if any q0 is given"),
+        )
+    ]
+    return f"worst case at noise {hyrl.eps:g}, of the winnable starts: {', '.join(shares)}"
 
 
 # ---- sets
@@ -216,6 +238,8 @@ def print_robustness(run: Run) -> None:
     if game is not None:
         print_table(score_table(run.task, game))
         print_table(margin_table(run.task, game))
+        for who, why in game.why_not_proved.items():
+            print(f"{NAMES[who]} is not proved: {why}")
     if episodes:
         print_table(episode_table(run.task, episodes))
 

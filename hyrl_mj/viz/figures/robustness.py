@@ -11,7 +11,7 @@ from matplotlib.colors import ListedColormap, NoNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle, Wedge
 
-from hyrl_mj.game import LIMIT, MAP_CLASSES, OVER, UNWINNABLE, Wins
+from hyrl_mj.game import LIMIT, MAP_CLASSES, OVER, Score, Wins
 from hyrl_mj.sets import Grid
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.figures import charts, style
@@ -20,9 +20,8 @@ from hyrl_mj.viz.figures.shown import ShownGame
 from hyrl_mj.viz.tables import NAMES, percent
 
 # Of MAP_CLASSES, in their order; colour-blind readers can tell them apart, too.
-CLASS_COLOURS = ("#7cc0e8", "#f2c530", style.mode_colour(1), "#5c2a6b", style.GREY)
+CLASS_COLOURS = ("#7cc0e8", "#f2c530", "#d9d2c5", style.mode_colour(1), "#5c2a6b", style.GREY)
 SENTENCES = dict(enumerate(MAP_CLASSES)) | {
-    UNWINNABLE: "not winnable, whatever the controller",
     OVER: "over: obstacle, or the run has ended",
 }
 # Radius of the dots of M*: inside the ring, where they hide no class.
@@ -58,15 +57,21 @@ def draw_robustness_map(shown: ShownGame, path: Path | None = None) -> Figure:
             draw(panel, shown, grid, maps.map[name])
             panel.set_title(NAMES.get(name, name), fontsize=11, fontweight="bold", pad=36)
             score = max(result.scores[name], key=lambda score: score.eps)
-            won, won_any = percent(score.won), percent(score.won_any)
-            modes = (
-                "from every start mode" if won == won_any else f"{won_any} from every start mode"
-            )
-            style.note_above(panel, f"{won} of the winnable starts won,\n{modes}", 0.5, 6)
+            style.note_above(panel, _note(score), 0.5, 6)
         for panel in panels[len(names) :]:
             panel.set_axis_off()
         style.legend(figure)
     return figure
+
+
+def _note(score: Score) -> str:
+    """Returns what is proved and what is lost, in two lines."""
+    lost = f"{percent(1 - score.not_broken)} known to be lost"
+    if score.proved is None or score.proved_any is None:
+        return f"{lost},\nnothing proved"
+    own, some = percent(score.proved), percent(score.proved_any)
+    modes = "" if own == some else f" ({some} from every start mode)"
+    return f"{own} of the winnable starts proved{modes},\n{lost}"
 
 
 def _panel_height(task: Task) -> float:
@@ -134,21 +139,20 @@ def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
         rows: Looks = {"nrows": len(heights), "height_ratios": heights}
         panels = figure.subplots(sharex=True, squeeze=False, **rows).ravel()
         shares, limit = panels[0], curve.wins[LIMIT]
-        _won(shares, "limit of any controller", eps, limit, LIMIT_LOOKS, LIMIT_DASHED)
+        _won(shares, "limit of this split", eps, limit, LIMIT_LOOKS, LIMIT_DASHED)
         for name, number in numbers.items():
             looks, dashed = _looks(number), _dashed(number)
             _won(shares, NAMES.get(name, name), eps, curve.wins[name], looks, dashed)
-        label = "winnable share of the start region"
+        label = "share of the start region that this split can win"
         shares.plot(eps, 100 * np.array(curve.winnable), color=style.PALE, linewidth=1, label=label)
         _margins(shares, shown, numbers, unit)
-        shares.set(ylabel="winnable starts that are won [%]", yticks=range(0, 101, 20))
+        shares.set(ylabel="winnable starts [%]", yticks=range(0, 101, 20))
         if result.lasting:
             for name, number in numbers.items():
                 wins = curve.wins[name]
                 looks = _looks(number) | ({} if _same(wins) else _dashed(number))
-                times = np.where(np.array(wins.won_any) > 0, wins.time_any, np.nan)
-                panels[1].plot(eps, times, **looks)
-            panels[1].set_ylabel("worst time to arrival,\nstarts that are won [s]")
+                panels[1].plot(eps, np.array(wins.time_any, dtype=float), **looks)
+            panels[1].set_ylabel("worst time to arrival,\nnodes that are won [s]")
         for panel in panels:
             panel.axvline(run_eps, color=style.INK, linewidth=1, linestyle=(0, (1, 2)), zorder=1)
             style.grid_lines(panel)
@@ -162,17 +166,28 @@ def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
 
 
 def _won(panel: Axes, title: str, eps: np.ndarray, wins: Wins, looks: Looks, dashed: Looks) -> None:
-    """Draws what is won, and dashed what is won from every start mode if that differs."""
+    """Draws what is proved, and dashed what is proved from every start mode if that differs.
+
+    Between it and what is won on the nodes lies the gap. Of a controller that could not be bounded, and of
+    the limit, what is won on the nodes is drawn.
+    """
+    proved = bool(wins.proved)
+    own, some = (wins.proved, wins.proved_any) if proved else (wins.won, wins.won_any)
+    title = f"{title}, proved" if proved else title
     label = title if _same(wins) else f"{title}, picks the start mode"
-    panel.plot(eps, 100 * np.array(wins.won), label=label, **looks)
+    panel.plot(eps, 100 * np.array(own), label=label, **looks)
+    if proved:
+        gap: Looks = {"color": looks["color"], "alpha": 0.18, "linewidth": 0}
+        panel.fill_between(eps, 100 * np.array(own), 100 * np.array(wins.won), **gap)
     if not _same(wins):
         label = f"{title}, from every start mode"
-        panel.plot(eps, 100 * np.array(wins.won_any), label=label, **looks | dashed)
+        panel.plot(eps, 100 * np.array(some), label=label, **looks | dashed)
 
 
 def _same(wins: Wins) -> bool:
     """Returns whether the start mode makes no difference."""
-    return bool(np.allclose(wins.won, wins.won_any, atol=1e-9))
+    pairs = (wins.won, wins.won_any), (wins.proved, wins.proved_any)
+    return all(np.allclose(own, some, atol=1e-9) for own, some in pairs)
 
 
 def _looks(number: int) -> Looks:
@@ -211,5 +226,5 @@ def _margins(panel: Axes, shown: ShownGame, numbers: dict[str, int], unit: str) 
             panel.plot([], [], linestyle="none", label=f"{label}: none")
             continue
         looks = _looks(number) | {"marker": "v", "linestyle": "none", "markevery": None}
-        label += f": all is won up to {margin:.3g} {unit}"
+        label += f": no node is lost up to {margin:.3g} {unit}"
         panel.plot([margin], [TOP + ROW * row], label=label, **looks)

@@ -1,0 +1,141 @@
+"""The attack on what is not proved: noise signals that really beat a controller, each tried on the plant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from hyrl_mj.game import FIRST, NEVER, Game
+from hyrl_mj.policies import Controller
+from hyrl_mj.proof.certificate import Certificate
+from hyrl_mj.simulation import NOT_STARTED, LoopSettings, Sample, Signal, closed_loop
+from hyrl_mj.tasks import Outcome
+
+# Measurements along each noisy coordinate among which the noise between the nodes chooses.
+CANDIDATES = 33
+# Cells without a verdict in which a start is attacked, for each start mode.
+MOST_CELLS = 512
+
+
+@dataclass(frozen=True)
+class Broken:
+    """The starts from which a controller was really beaten.
+
+    Attributes:
+        own: (N,) bool, cells with such a start if the controller picks its start mode; nodes without cells.
+        some: (N,) bool, as `own`, from some start mode.
+    """
+
+    own: np.ndarray
+    some: np.ndarray
+
+
+def attack(
+    certificate: Certificate, name: str, controller: Controller, eps: float, seed: int = 0
+) -> Broken:
+    """Attacks a controller wherever it is not proved to win, and returns where it lost.
+
+    From the nodes that are lost in the game its adversary gives the noise. Cells that are neither proved nor
+    lost at a corner are attacked from a start inside: at each sample the noise tries measurements in its
+    range, and takes the answer that leads to the worst state.
+
+    Args:
+        certificate: what is proved.
+        name: the name of the controller.
+        controller: the controller.
+        eps: the noise bound.
+        seed: seed of the starts inside of cells.
+    """
+    game, cells = certificate.game, certificate.cells
+    value = game.value(name, eps)
+    region = game.starts & game.winnable(eps)
+    lost = (value[:, :-2] >= NEVER) & region
+    noise = game.worst_noise(name, eps) if lost.any() else None
+    nodes = np.zeros_like(lost)
+    for row, mode in enumerate((*controller.modes, None)):
+        at = np.flatnonzero(lost[row])
+        if noise is not None and len(at):
+            starts = game.lattice.grid.nodes[at]
+            nodes[row, at] = _beaten(game, controller, starts, mode, noise)
+    if cells is None:
+        return Broken(nodes[-1], np.asarray(nodes.any(axis=0)))
+    broken = np.stack([cells.some_corner(row) for row in nodes])
+    if name in certificate.answers:
+        outer = certificate.value(name, eps)
+        inside = CellNoise(certificate, controller, outer, value, game.bound(eps))
+        rng = np.random.default_rng(seed)
+        unclear = (outer[:, :-2] >= NEVER) & certificate.region(eps) & ~broken
+        for row, mode in enumerate((*controller.modes, None)):
+            at = np.flatnonzero(unclear[row])
+            if len(at):
+                at = rng.choice(at, min(len(at), MOST_CELLS), replace=False)
+                off = rng.uniform(-0.5, 0.5, (len(at), len(cells.counts)))
+                starts = cells.middle(at) + off * game.lattice.grid.spacing
+                broken[row, at] = _beaten(game, controller, starts, mode, inside)
+    return Broken(broken[-1], np.asarray(broken.any(axis=0)))
+
+
+def _beaten(
+    game: Game, controller: Controller, starts: np.ndarray, mode: int | None, noise: Signal
+) -> np.ndarray:
+    """Returns from which starts (n, d) the noise beats the controller on the plant: (n,) bool."""
+    modes = None if mode is None else np.full(len(starts), mode)
+    settings = LoopSettings(quiet=True)
+    run = closed_loop(game.task, controller, starts, noise, modes, settings=settings)
+    return np.asarray(run.outcome != Outcome.REACHED)
+
+
+class CellNoise(Signal):
+    """Noise that looks one sample ahead, and leads to the state of which the least is known for good.
+
+    A state that is lost at the nearest node is worse than one that is only not proved.
+
+    Args:
+        certificate: gives the cells.
+        controller: the controller that it acts against.
+        outer: (modes + 1, places) value of the certificate.
+        inner: (modes + 1, places) value of the game on nodes.
+        bound: (d,) noise bound.
+    """
+
+    kind = "cells"
+    needs_controller = True
+
+    def __init__(
+        self,
+        certificate: Certificate,
+        controller: Controller,
+        outer: np.ndarray,
+        inner: np.ndarray,
+        bound: np.ndarray,
+    ):
+        assert certificate.cells is not None
+        self.bound, self._cells, self._controller = (
+            float(bound.max()),
+            certificate.cells,
+            controller,
+        )
+        self._outer, self._inner = outer, inner
+        steps = [np.linspace(-b, b, CANDIDATES if b else 1) for b in bound]
+        candidates = np.array([*product(*steps)])
+        # Among equals the largest noise comes first.
+        self._candidates = candidates[np.argsort(-np.abs(candidates).sum(axis=1), kind="stable")]
+
+    def sample(self, now: Sample) -> np.ndarray:
+        cells, k = self._cells, len(self._candidates)
+        true = now.measurement
+        measured = (true[:, None] + self._candidates).reshape(-1, true.shape[1])
+        q = np.repeat(now.q, k)
+        fresh = q == NOT_STARTED
+        if fresh.any():
+            q[fresh] = self._controller.initial_mode(measured[fresh])
+        u, after = self._controller.step(q, measured)
+        ends = np.repeat(true, k, axis=0) + u @ cells.slope.T + cells.offset
+        mode = np.searchsorted(self._controller.modes, after)
+        node = cells.lattice.grid.nearest(ends)
+        inner = self._inner[mode, node]
+        outer = self._outer[mode, cells.place(ends)]
+        worst = np.where((inner > NEVER) & (outer >= NEVER), FIRST + inner, outer)
+        return self._candidates[worst.reshape(-1, k).argmax(axis=1)]

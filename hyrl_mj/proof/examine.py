@@ -1,0 +1,213 @@
+"""The examination of controllers in the worst case: what is proved, what is lost, margins, curve and maps."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from hyrl_mj import cores
+from hyrl_mj.game import (
+    CURVE,
+    LARGEST,
+    LATTICE,
+    LIMIT,
+    NEARLY,
+    NEVER,
+    UNCLEAR,
+    WON,
+    WON_FROM_SOME,
+    Curve,
+    Game,
+    GameResult,
+    Lattice,
+    LatticeSpacing,
+    Maps,
+    NodeScore,
+    Profile,
+    Score,
+    Wins,
+    share,
+)
+from hyrl_mj.policies import Controller
+from hyrl_mj.progress import progress_bar
+from hyrl_mj.proof.attack import Broken, attack
+from hyrl_mj.proof.certificate import Certificate
+from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.simulation import LoopSettings, closed_loop
+from hyrl_mj.tasks import Task
+
+# Approximate number of episodes without noise.
+QUIET_EPISODES = 4000
+# Games that are solved at the same time; each takes tens of megabytes.
+THREADS = 4
+
+
+def examine(
+    task: Task,
+    points: np.ndarray,
+    parts: Iterable[GridSet],
+    controllers: Mapping[str, Controller],
+    bounds: tuple[float, ...],
+    everywhere: bool = False,
+    cells: int | None = None,
+) -> tuple[GameResult, Maps]:
+    """Plays the game: scores at some noise bounds, margins, the curve over all bounds, and the maps.
+
+    Args:
+        task: the robot and its problem.
+        points: (N, d) points of M*, along which the margin is profiled.
+        parts: M_i of each mode.
+        controllers: controllers by name.
+        bounds: noise bounds of the scores; the maps are drawn for the last.
+        everywhere: whether noise acts on all coordinates.
+        cells: number of lattice cells along the longest side of the chart, by default the finest lattice.
+            In the plane the curve is computed on a lattice of half as many.
+    """
+    for eps in bounds:
+        task.check_noise(eps, everywhere)
+    Lattice.check(task)
+    cells = cells or LATTICE[task.chart.dimension]
+    parts = tuple(parts)
+    grid = Grid.with_cells(task.chart, cells)
+    fine = Game(task, parts, controllers, max(*bounds, LARGEST), everywhere, grid)
+    certificate = Certificate.of(fine, controllers)
+    names = [*controllers, LIMIT]
+    games = [(name, eps) for eps in bounds for name in names]
+    results = list(_in_threads("worst-case scores", fine.score, games))
+    tried = [(certificate, name, controllers[name], eps) for name, eps in games if name != LIMIT]
+    broken = dict(
+        zip([g for g in games if g[0] != LIMIT], _in_threads("attacks", attack, tried), strict=True)
+    )
+    scores = {
+        name: tuple(
+            _score(certificate, name, found, broken.get((name, found.eps)))
+            for found in results[i :: len(names)]
+        )
+        for i, name in enumerate(names)
+    }
+    bounds_won = _in_threads("margins", fine.margin, [(name,) for name in controllers])
+    margins = dict(zip(controllers, bounds_won, strict=True))
+    classes = {name: _map(certificate, name, bounds[-1]) for name in controllers}
+    maps = Maps(bounds[-1], np.array(grid.counts), classes)
+    coarse, roughly = fine, certificate
+    if task.chart.dimension == 2:
+        half = Grid.with_cells(task.chart, cells // 2)
+        coarse = Game(task, parts, controllers, LARGEST, everywhere, half)
+        roughly = Certificate.of(coarse, controllers)
+    curve, profile = _sweep(roughly, names, points)
+    spacing, curve_spacing = (tuple(g.lattice.grid.spacing.tolist()) for g in (fine, coarse))
+    has_cells = certificate.cells is not None
+    lattice = LatticeSpacing(spacing, fine.lattice.exact, has_cells, curve_spacing)
+    proved = {name: _proved_margin(curve, curve.wins[name]) for name in controllers}
+    misses, why_not = _misses(coarse, controllers), dict(certificate.why_not)
+    result = GameResult(
+        everywhere, lattice, scores, margins, proved, why_not, misses, curve, profile
+    )
+    return result, maps
+
+
+def _score(certificate: Certificate, name: str, nodes: NodeScore, broken: Broken | None) -> Score:
+    """Returns the score of a controller, or of the limit, from that on the nodes."""
+    game, eps = certificate.game, nodes.eps
+    open_ = share(game.limit.open[game.starts])
+    if broken is None:
+        own, some = nodes.won, nodes.won_any
+    else:
+        region = certificate.region(eps)
+        own, some = share(~broken.own[region]), share(~broken.some[region])
+    proved = certificate.wins(name, eps) if name in certificate.answers else (None,) * 4
+    return Score(**vars(nodes), open=open_, **_named(*proved), not_broken=own, not_broken_any=some)
+
+
+def _named(own: Any, any_: Any, time: Any, time_any: Any) -> dict[str, Any]:
+    return {"proved": own, "proved_any": any_, "proved_time": time, "proved_time_any": time_any}
+
+
+def _map(certificate: Certificate, name: str, eps: float) -> np.ndarray:
+    """Returns the class (N,) of every node; what is won counts as proved if all cells around it are."""
+    classes = certificate.game.map(name, eps)
+    won = np.isin(classes, (WON, WON_FROM_SOME))
+    some = every = np.zeros_like(won)
+    if name in certificate.answers and certificate.cells is not None:
+        value, cells = certificate.value(name, eps)[:, :-2], certificate.cells
+        some, every = (
+            cells.all_around(wins | ~cells.running)
+            for wins in (value[-1] < NEVER, (value < NEVER).all(axis=0))
+        )
+    classes[won] = np.where(every, WON, np.where(some, WON_FROM_SOME, UNCLEAR))[won]
+    return classes
+
+
+def _sweep(certificate: Certificate, names: list[str], points: np.ndarray) -> tuple[Curve, Profile]:
+    """Returns the curve over `CURVE`, and the profile of the noise that points (N, d) of M* bear."""
+    game = certificate.game
+    task, dt = game.task, game.task.dt
+    along = points[task.may_start(points)]
+    at = game.lattice.grid.nearest(along)
+    winnable: list[float] = []
+    rows: dict[str, list[tuple[float, float, float | None]]] = {name: [] for name in names}
+    holds = {name: np.ones(len(along), dtype=bool) for name in names}
+    borne = {name: np.full(len(along), np.nan) for name in names}
+    games = [(name, eps) for eps in CURVE for name in names]
+    values = _in_threads("worst-case curve", game.value, games)
+    for eps in CURVE:
+        region = game.starts & game.winnable(eps)
+        winnable.append(float(region.sum() / max(game.starts.sum(), 1)))
+        for name in names:
+            value = next(values)[:, :-2]
+            own, worst = value[-1], value[:-1].max(axis=0)
+            won = worst[region & (worst < NEVER)]
+            time_any = float(won.max() * dt) if len(won) else None
+            rows[name].append((share(own[region] < NEVER), share(worst[region] < NEVER), time_any))
+            holds[name] &= own[at] < NEVER
+            borne[name][holds[name]] = eps
+    profile = Profile(
+        points=tuple(tuple(point) for point in along.tolist()),
+        eps={k: tuple(None if np.isnan(x) else float(x) for x in v) for k, v in borne.items()},
+    )
+    proofs = [(name, eps) for name in certificate.answers for eps in CURVE]
+    found = list(_in_threads("proofs", certificate.wins, proofs))
+    proved = {
+        name: found[i * len(CURVE) : (i + 1) * len(CURVE)]
+        for i, name in enumerate(certificate.answers)
+    }
+    wins = {}
+    for name, row in rows.items():
+        own, some, *_ = zip(*proved[name], strict=True) if name in proved else ((), ())
+        won, won_any, times = zip(*row, strict=True)
+        wins[name] = Wins(won, won_any, own, some, times)
+    return Curve(CURVE, tuple(winnable), wins), profile
+
+
+def _proved_margin(curve: Curve, wins: Wins) -> float | None:
+    """Returns the largest bound of the curve up to which nearly all winnable starts are proved."""
+    margin = None
+    for eps, proved in zip(curve.eps, wins.proved, strict=False):
+        if proved < NEARLY:
+            break
+        margin = eps
+    return margin
+
+
+def _misses(game: Game, controllers: Mapping[str, Controller]) -> dict[str, float]:
+    """Returns each controller's greatest distance from the set-point at the end of runs without noise."""
+    task = game.task
+    starts = game.lattice.grid.nodes[game.starts & game.winnable(0.0)]
+    if not len(starts):
+        return dict.fromkeys(controllers, 0.0)
+    starts = starts[:: max(len(starts) // QUIET_EPISODES, 1)]
+    quiet = LoopSettings(quiet=True)
+    return {
+        name: float(task.miss(closed_loop(task, loop, starts, settings=quiet).path[-1]).max())
+        for name, loop in controllers.items()
+    }
+
+
+def _in_threads(
+    label: str, work: Callable[..., Any], calls: Sequence[tuple[Any, ...]]
+) -> Iterator[Any]:
+    """Yields the results of calls in their order, from threads: NumPy releases the interpreter's lock."""
+    with ThreadPoolExecutor(min(THREADS, cores.count())) as pool:
+        results = pool.map(lambda call: work(*call), calls)
+        yield from progress_bar(results, label, "games", len(calls))
