@@ -210,8 +210,8 @@ class _Case:
             assert self.robustness.game
             open_ = self.robustness.game.scores["hyrl"][-1].open
             yield (
-                f"under {self.noise} this split can win {percent(self.winnable)} of the starts, of which "
-                f"{percent(open_)} are open to one who sees the state"
+                f"under {self.noise} this split can win {percent(self.winnable)} of the starts; to one who "
+                f"sees the state {percent(open_)} are open"
             )
         assert self.robustness.game
         policy, hyrl = (self.robustness.game.scores[who] for who in ("policy", "hyrl"))

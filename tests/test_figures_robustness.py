@@ -8,6 +8,7 @@ import pytest
 from figure_parts import EPS, size_of, where
 from matplotlib.figure import Figure
 from PIL import Image
+from scored import SPACING, score
 
 import hyrl_mj
 from hyrl_mj import BadInput
@@ -15,15 +16,14 @@ from hyrl_mj.game.result import (
     BEATEN,
     LIMIT,
     MAP_CLASSES,
+    UNCLEAR,
     UNWINNABLE,
     WON,
     WON_FROM_SOME,
     Curve,
     GameResult,
-    LatticeSpacing,
     Maps,
     Profile,
-    Score,
     Wins,
 )
 from hyrl_mj.game.scores import CURVE
@@ -41,21 +41,30 @@ def coarse(monkeypatch):
     monkeypatch.setattr(style, "DPI", 100)
 
 
+def wins_of(won, won_any, times):
+    """What a controller wins; a hundredth less is proved."""
+    proved = [tuple(np.maximum(share - 0.01, 0)) for share in (won, won_any)]
+    return Wins(tuple(won), tuple(won_any), *proved, tuple(times))
+
+
 def game_of(names, excursion=None, margin=0.05):
     """What `examine` returns, for controllers that lose more and more."""
     eps = np.array(CURVE)
     fall = np.clip(1.2 - 4 * eps, 0, 1)
     wins = {
-        name: Wins(tuple(fall), tuple(fall if name == "policy" else 0.9 * fall), tuple(3 * fall))
-        for name in names
+        name: wins_of(fall, fall if name == "policy" else 0.9 * fall, 3 * fall) for name in names
     }
-    wins[LIMIT] = Wins((1.0,) * len(eps), tuple(1 - 0.3 * eps), (3.0,) * len(eps))
-    scores = {name: (Score(EPS, 0.9, 0.8, 0.72, 3.0, 3.0, excursion),) for name in names}
+    wins[LIMIT] = Wins((1.0,) * len(eps), tuple(1 - 0.3 * eps), (), (), (3.0,) * len(eps))
+    scores = {
+        name: (score(EPS, 0.9, 0.8, 0.72, proved=0.7, excursion=excursion),) for name in names
+    }
     return GameResult(
         everywhere=False,
-        lattice=LatticeSpacing((0.1,), True, (0.1,)),
-        scores=scores | {LIMIT: (Score(EPS, 0.9, 1.0, 1.0, 3.0, 3.0, None),)},
+        lattice=SPACING,
+        scores=scores | {LIMIT: (score(EPS, 0.9, 1.0, 1.0),)},
         margin=dict.fromkeys(names, margin),
+        proved_margin=dict.fromkeys(names, margin),
+        why_not_proved={},
         miss_without_noise=dict.fromkeys(names, 0.0),
         curve=Curve(CURVE, tuple(1 - 0.2 * eps), wins),
         profile=Profile((), {}),
@@ -86,7 +95,7 @@ def draw_curve(task, result, path=None):
 
 @pytest.mark.parametrize("task", [CIRCLE, VEHICLE], ids=lambda task: task.name)
 def test_each_class_that_occurs_has_its_colour(tmp_path, task):
-    occurring = (WON, WON_FROM_SOME, BEATEN)
+    occurring = (WON, WON_FROM_SOME, UNCLEAR)
     path, names = tmp_path / "figures" / "map.png", ("policy", "hyrl")
     maps = maps_of(task, names, lambda z: np.arange(len(z)) % 40 // 14)
     critical = critical_of(task.scene.starts[2])

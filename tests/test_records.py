@@ -4,6 +4,7 @@ import json
 from dataclasses import asdict, dataclass, replace
 
 import pytest
+from scored import SPACING, score
 from sentences import assert_one_sentence_about
 
 import hyrl_mj
@@ -13,10 +14,8 @@ from hyrl_mj.game.result import (
     Curve,
     EpisodeCount,
     GameResult,
-    LatticeSpacing,
     Profile,
     Robustness,
-    Score,
     Wins,
 )
 from hyrl_mj.learning import preset
@@ -112,14 +111,18 @@ def test_a_config_is_what_was_set(tmp_path, circle):
 
 GAME = GameResult(
     everywhere=False,
-    lattice=LatticeSpacing((0.1, 0.1), True, (0.2, 0.2)),
+    lattice=SPACING,
     scores={
-        "policy": (Score(0.1, 0.98, 0.92, 0.9, 3.0, 3.0, None),),
-        LIMIT: (Score(0.1, 0.98, 1.0, 0.97, 3.0, 3.0, 0.1),),
+        "policy": (score(0.1, 0.98, 0.92, 0.9, proved=0.91),),
+        LIMIT: (score(0.1, 0.98, 1.0, 0.97, excursion=0.1),),
     },
     margin={"policy": None},
+    proved_margin={"policy": None},
+    why_not_proved={},
     miss_without_noise={"policy": 0.025},
-    curve=Curve((0.0, 0.1), (1.0, 0.98), {"policy": Wins((1.0, 0.9), (1.0, 0.9), (3.0, 3.0))}),
+    curve=Curve(
+        (0.0, 0.1), (1.0, 0.98), {"policy": Wins((1.0, 0.9), (1.0, 0.9), (), (), (3.0, None))}
+    ),
     profile=Profile(((0.0, 0.1),), {"policy": (None,)}),
 )
 COUNT = EpisodeCount(
@@ -138,8 +141,9 @@ def test_scores_margins_and_episodes_are_where_readers_of_the_file_expect_them(t
     ROBUSTNESS.save(tmp_path / "r.json")
     content = json.loads((tmp_path / "r.json").read_text())
     game = content["game"]
-    names = ["eps", "winnable", "won", "won_any", "time", "time_any", "excursion"]
-    assert list(game["scores"]["policy"][0]) == names
+    names = ["eps", "winnable", "won", "won_any", "time", "time_any", "excursion", "open"]
+    names += ["proved", "proved_any", "proved_time", "proved_time_any"]
+    assert list(game["scores"]["policy"][0]) == [*names, "not_broken", "not_broken_any"]
     assert game["margin"] == {"policy": None}
     assert game["miss_without_noise"] == {"policy": 0.025}
     assert content["episodes"] == [asdict(COUNT) | {"interval": [0.1, 0.7]}]
@@ -158,10 +162,11 @@ def test_a_file_of_version_0_1_ends_in_one_sentence(tmp_path):
 
 def test_results_describe_themselves_in_a_line():
     assert repr(ROBUSTNESS) == (
-        "Robustness(eps 0.1, GameResult(won at eps 0.1: policy 92.00%), 4 episodes)"
+        "Robustness(eps 0.1, GameResult(not broken at eps 0.1: policy 92.00%), 4 episodes)"
     )
-    score = (
-        "Score(eps=0.1, winnable=0.98, won=0.92, won_any=0.9, time=3, time_any=3, excursion=None)"
+    told = repr(GAME.scores["policy"][0])
+    assert told.startswith(
+        "Score(eps=0.1, winnable=0.98, won=0.92, won_any=0.9, time=3, time_any=3"
     )
-    assert repr(GAME.scores["policy"][0]) == score
+    assert "excursion=None, open=1, proved=0.91" in told
     assert (GAME.controllers, GAME.lasting, COUNT.lost) == (("policy",), True, 3)

@@ -31,6 +31,7 @@ from hyrl_mj.stages.critical_set import CriticalSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.tasks import Scene, registry
+from hyrl_mj.viz import tables
 from hyrl_mj.viz.commands import beginning
 from hyrl_mj.viz.commands import changed as changed_settings
 from hyrl_mj.viz.encoding import video
@@ -245,8 +246,10 @@ def test_the_scores_are_those_of_the_game(copied):
     page, run = page_of(copied), load_run(copied)
     game = run.robustness.game
     for who in ("policy", "hyrl"):
-        assert f"{100 * game.scores[who][-1].won:.2f}%" in page.numbers[0]
-        assert f"{100 * game.scores[who][-1].won_any:.2f}%" in page.numbers[1]
+        last = game.scores[who][-1]
+        assert tables.proved_text(last.proved) in page.numbers[0]
+        assert f"{100 * (1 - last.not_broken):.2f}%" in page.numbers[1]
+        assert tables.proved_text(last.proved_any) in page.numbers[2]
     rows = page.table("Worst case")
     names = {"policy": "RL policy", "hyrl": "HyRL", "limit": "limit"}
     for who, name in names.items():
@@ -256,18 +259,29 @@ def test_the_scores_are_those_of_the_game(copied):
                 for row in rows
                 if row["controller"] == name and float(next(iter(row.values()))) == score.eps
             ]
-            shares = {"winnable starts": "winnable", "won, own q0": "won", "won, any q0": "won_any"}
+            shares = {"open": "open", "winnable": "winnable"}
+            for which in ("own", "any"):
+                end = "_any" * (which == "any")
+                shares[f"proved, {which} q0"] = f"proved{end}"
+                shares[f"not broken, {which} q0"] = f"not_broken{end}"
             for heading, key in shares.items():
-                shown = float(row[heading].strip("<>%"))
-                assert shown == pytest.approx(100 * getattr(score, key), abs=0.0101)
+                value = getattr(score, key)
+                assert (row[heading] == "-") == (value is None)
+                if value is not None:
+                    shown = float(row[heading].strip("<>%"))
+                    assert shown == pytest.approx(100 * value, abs=0.0101)
             if score.excursion is not None:
-                assert row["latest arrival, own q0"] == f"{score.time:.2f} s"
-                assert row["latest, any q0"] == f"{score.time_any:.2f} s"
+                own, some = (
+                    (score.proved_time or score.time),
+                    (score.proved_time_any or score.time_any),
+                )
+                assert row["latest arrival, own q0"] == f"{own:.2f} s"
+                assert row["latest, any q0"] == f"{some:.2f} s"
             if score.excursion is not None and who != "limit":
                 assert float(row["excursion [rad]"]) == pytest.approx(score.excursion, abs=1e-3)
     for row, (who, margin) in zip(page.table("Margins"), game.margin.items(), strict=True):
         assert row["controller"] == names[who]
-        shown = row["all winnable starts are won up to noise"]
+        shown = row["no node is lost up to noise"]
         unit = run.task.chart.units[0]
         assert shown == ("none" if margin is None else f"{margin:.3g} {unit}")
         (off,) = [float(cell) for heading, cell in row.items() if "no noise" in heading]

@@ -200,12 +200,12 @@ def row(seed, **figures):
 
 
 def test_tables_show_median_least_and_greatest():
-    rows = (row(0, hyrl_won=1.0), row(1, hyrl_won=0.5), row(2, hyrl_won=0.75), Row(CIRCLE, 3))
+    rows = (*(row(i, hyrl_proved=x) for i, x in enumerate((1.0, 0.5, 0.75))), Row(CIRCLE, 3))
     sweep = Sweep(Common("fast", None, {}), rows)
     table = sweep_tables.summary_table(sweep)
     assert table.headings == ["figure", "unit_circle, noise 0.1"]
     assert table.rows == [
-        ["runs", "3 of 4"], ["verdicts", "3 WON"], ["HyRL won, own q0", "75.00% (50.00% to 100%)"],
+        ["runs", "3 of 4"], ["verdicts", "3 WON"], ["HyRL proved, own q0", "75.00% (50.00% to 100%)"],
     ]  # fmt: skip
     assert sweep_tables.worst(rows).seed == 1
     assert sweep_tables.markdown(table).splitlines()[1] == "| --- | --- |"

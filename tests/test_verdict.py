@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 from planted import one_way_policy
+from scored import SPACING, score
 
 from hyrl_mj import BadArtifact, artifacts
-from hyrl_mj.game import LIMIT, EpisodeCount, GameResult, Robustness, Score
-from hyrl_mj.game.result import Curve, LatticeSpacing, Profile
+from hyrl_mj.game import LIMIT, Curve, EpisodeCount, GameResult, Profile, Robustness
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import simulate
 from hyrl_mj.stages import Arrivals, ModeResult, Retraining
-from hyrl_mj.verdict import FAILED, HELD, WEAK, WON, Verdict
+from hyrl_mj.verdict import FAILED, HELD, PROVED, WEAK, WON, Verdict
 from hyrl_mj.viz.tables import print_verdict
 
 EPS = 0.1
@@ -18,17 +18,17 @@ ALL, NO_ONE = Arrivals(1_000, 0, 1_000), Arrivals(0, 0, 1_000)
 HOLDS = Retraining((ModeResult(0, 1.0, 1), ModeResult(1, 1.0, 0)))
 
 
-def game(policy, hyrl, winnable=1.0, bounds=(0.0, EPS)):
-    """The result of a game, from the shares that are won at each bound."""
+def game(policy, hyrl, winnable=1.0, bounds=(0.0, EPS), proved=None):
+    """The result of a game, from the shares that are won at each bound, and what is proved of HyRL."""
     scores = {
         who: tuple(
-            Score(eps, winnable, won, won, 1.0, 1.0, None)
+            score(eps, winnable, won, won, proved=proved if who == "hyrl" else None)
             for eps, won in zip(bounds, shares, strict=True)
         )
         for who, shares in (("policy", policy), ("hyrl", hyrl), (LIMIT, (1.0,) * len(bounds)))
     }
     result = GameResult(
-        False, LatticeSpacing((0.1,), True, (0.1,)), scores, {}, {}, Curve((), (), {}), Profile((), {})
+        False, SPACING, scores, {}, {}, {}, {}, Curve((), (), {}), Profile((), {})
     )  # fmt: skip
     return Robustness(bounds[-1], False, result, (), seed=0)
 
@@ -74,6 +74,36 @@ def word(circle, robustness, retraining=HOLDS, arrivals=ALL, bound=EPS):
 )
 def test_the_word_of_a_game(circle, policy, hyrl, expected):
     assert word(circle, game(policy, hyrl)) == expected
+
+
+@pytest.mark.parametrize(
+    ("hyrl", "proved", "expected"),
+    [
+        (1.0, 1.0, PROVED),
+        (1.0, 0.99, PROVED),
+        (0.995, 0.992, PROVED),
+        (1.0, 0.98, WON),
+        (0.995, 0.98, WEAK),
+    ],
+)
+def test_what_is_proved_of_nearly_all_winnable_starts_has_the_first_word(
+    circle, hyrl, proved, expected
+):
+    assert word(circle, game((1.0, 0.9), (1.0, hyrl), proved=proved)) == expected
+    less = game((1.0, 0.9), (1.0, hyrl), bounds=(0.0, 0.05), proved=proved)
+    assert word(circle, less) == WEAK, "the run's bound is 0.1"
+
+
+def test_a_proof_is_told_with_what_is_known_to_be_lost(circle):
+    found = Verdict.of(circle, EPS, game((1.0, 0.9), (1.0, 0.999), proved=0.995), HOLDS, ALL)
+    assert str(found) == (
+        f"PROVED: whatever the {NOISE}, HyRL is proved to win 99.50% and known to lose 0.10% of the "
+        "winnable starts"
+    )
+    whole = Verdict.of(circle, EPS, game((1.0, 0.9), (1.0, 1.0), proved=1.0), HOLDS, ALL)
+    assert whole.sentence.endswith(
+        "is proved to win 100% and not known to lose any of the winnable starts"
+    )
 
 
 def test_without_noise_all_that_counts_is_that_everything_is_won(circle):
@@ -152,11 +182,15 @@ def test_a_verdict_reads_as_a_sentence_with_reasons(circle, capsys):
 
     print_verdict(Planted)
     first, *rest = capsys.readouterr().out.splitlines()
-    assert first == f"WON: HyRL wins every winnable start under the worst {NOISE}"
+    assert first == (
+        f"WON: HyRL lost none of the winnable starts that were tried under the worst {NOISE}"
+    )
     assert rest == [
-        f"- under {NOISE} 90.00% of the starts are winnable",
-        "- without noise HyRL wins 100% of the winnable starts, the policy 100%",
-        f"- under the worst {NOISE} HyRL wins 100% of the winnable starts, the policy 90.00%",
+        f"- under {NOISE} this split can win 90.00% of the starts; to one who sees the state 100% are open",
+        "- without noise HyRL is not known to lose any of the winnable starts, the policy is not known to "
+        "lose any",
+        f"- under the worst {NOISE} HyRL is not known to lose any of the winnable starts, the policy is "
+        "known to lose 10.00%",
         "- stage 1: the policy arrives from 1,000 of 1,000 starts without noise",
         "- stage 6: the policy of mode 0 (clockwise) wins 100% of its set, after 1 training",
         "- stage 6: the policy of mode 1 (counter-clockwise) wins 100% of its set, without a "

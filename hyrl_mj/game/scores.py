@@ -50,6 +50,7 @@ class Game:
         task.check_noise(largest, everywhere)
         self.lattice = Lattice.of(task, grid)
         self.limit = Limit.of(self.lattice, parts)
+        self._values: dict[tuple[str, float], np.ndarray] = {}
         most = self.bound(largest)
         self.answers = {
             name: Answers.of(self.lattice, as_controller(loop), most)
@@ -83,7 +84,8 @@ class Game:
 
         Only what happens within an episode counts: a value below `NEVER` is at most the task's `max_steps`.
         """
-        return self._value(name, self.moves(name, eps), eps)
+        known = self._values.get((name, eps))
+        return self._value(name, self.moves(name, eps), eps) if known is None else known
 
     def winnable(self, eps: float) -> np.ndarray:
         """Returns the nodes (N,) bool where holding the way of the first measurement wins in time."""
@@ -112,6 +114,7 @@ class Game:
         if name == LIMIT:  # it holds the mode that it picks by the first measurement
             held = self.limit.held(self.bound(eps))
             value[-1, :-2] = np.where(held <= self.task.max_steps, held, NEVER)
+        self._values[name, eps] = value
         return value
 
     def map(self, name: str, eps: float) -> np.ndarray:
@@ -124,10 +127,14 @@ class Game:
         classes[~self.lattice.running] = result.OVER
         return classes
 
-    def margin(self, name: str) -> float | None:
-        """Returns the largest noise bound at which the whole winnable start region is won, by bisection.
+    def margin(self, name: str, near: tuple[float, float] | None = None) -> float | None:
+        """Returns the largest noise bound at which all winnable nodes of the start region are won.
 
-        The bound is exact to one cell of the lattice; None if some of the region is lost without noise.
+        It is found by bisection to one cell of the lattice; None if some nodes are lost without noise.
+
+        Args:
+            name: the controller.
+            near: bounds between which it probably lies, to begin with.
         """
         cell = float(self.lattice.grid.spacing[self.bound(1.0) > 0].min())
 
@@ -135,11 +142,16 @@ class Game:
             own = self.value(name, cells * cell)[-1, :-2]
             return bool((own[self.starts & self.winnable(cells * cell)] < NEVER).all())
 
-        low, high = 0, int(self.largest / cell + 1e-6)
+        last = int(self.largest / cell + 1e-6)
+        low, high = (min(round(eps / cell), last) for eps in near or (0.0, self.largest))
         if not all_won(low):
-            return None
-        if all_won(high):
-            return high * cell
+            low, high = 0, low
+            if not low < high or not all_won(low):
+                return None
+        elif all_won(high):
+            low, high = high, last
+            if all_won(high):
+                return high * cell
         while high - low > 1:
             middle = (low + high) // 2
             low, high = (middle, high) if all_won(middle) else (low, middle)

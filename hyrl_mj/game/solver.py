@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import count, product
 from typing import Protocol
 
@@ -27,6 +28,8 @@ BESIDE = 1e-4
 NEVER = 1 << 20
 LOST = 1 << 21
 FIRST = 1 << 22  # greater than all values
+# Measurements that the worst noise compares at once, which limits the memory.
+AT_ONCE = 1 << 17
 
 
 @dataclass(frozen=True)
@@ -148,6 +151,19 @@ class Moves:
     counts: np.ndarray
     target: np.ndarray
 
+    @cached_property
+    def backward(self) -> tuple[np.ndarray, np.ndarray]:
+        """States (E,) that have a move, by its target, and where those of each target begin (states + 1,)."""
+        from scipy.sparse import csr_array  # slow to import
+
+        n = self.rows * self.lattice.places
+        counts = np.zeros(n + 1, dtype=np.int64)
+        counts[self.state + 1] = self.counts
+        ones = np.ones(len(self.target), dtype=np.int8)
+        forward = csr_array((ones, self.target, np.cumsum(counts)), shape=(n, n))
+        by_target = forward.tocsc()
+        return by_target.indices, by_target.indptr
+
     @staticmethod
     def gather(lattice: Places, rows: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Moves:
         """Returns the moves, from each row's nodes (m,) ascending, next modes (m,) and places (m, C)."""
@@ -196,22 +212,32 @@ def solve(moves: Moves, samples: int | None = None) -> np.ndarray:
     value[:, :-2][:, lattice.arrived] = 0
     value[:, -2], value[:, -1] = 0, LOST
     flat = value.ravel()
-    state, counts, target = moves.state, moves.counts, moves.target
+    before, first = moves.backward
+    waiting = np.zeros(flat.size, dtype=np.int32)  # moves that have not arrived yet
+    waiting[moves.state] = moves.counts
+    new = np.flatnonzero(flat != NEVER)
     # The k-th pass finds the states that fail or arrive in k samples.
-    for _ in count() if samples is None else range(samples):
-        undecided = flat[state] == NEVER
-        target = target[np.repeat(undecided, counts)]
-        state, counts = state[undecided], counts[undecided]
-        if not len(state):
-            break
-        after = flat[target]
-        after += np.sign(NEVER - after)  # one sample more
-        worst = np.maximum.reduceat(after, np.append(0, np.cumsum(counts)[:-1]))
-        if (worst == NEVER).all():
-            break
+    for k in count(1) if samples is None else range(1, samples + 1):
+        lost = flat[new] > NEVER
+        failing, arriving = (_entries(before, first, part) for part in (new[lost], new[~lost]))
         # Each state gets its value once: at the earliest failure, or when all its moves have arrived.
-        flat[state] = worst
+        failing = failing[flat[failing] == NEVER]
+        flat[failing] = LOST - k
+        np.subtract.at(waiting, arriving, 1)
+        arriving = arriving[(waiting[arriving] == 0) & (flat[arriving] == NEVER)]
+        flat[arriving] = k
+        new = np.unique(np.concatenate([failing, arriving]))
+        if not len(new):
+            break
     return value
+
+
+def _entries(values: np.ndarray, first: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Returns the values of some rows, one after the other; row i holds values[first[i] : first[i + 1]]."""
+    counts = first[rows + 1] - first[rows]
+    skipped = np.cumsum(counts) - counts
+    at = np.arange(counts.sum()) + np.repeat(first[rows] - skipped, counts)
+    return np.asarray(values[at])
 
 
 def lasting(moves: Moves, start: np.ndarray | None = None) -> np.ndarray:
@@ -262,24 +288,28 @@ class WorstNoise(Signal):
         self._shifts = shifts[np.argsort(-np.abs(shifts).sum(axis=1), kind="stable")]
 
     def sample(self, now: Sample) -> np.ndarray:
+        rows = max(AT_ONCE // len(self._shifts), 1)
+        parts = range(0, len(now.q), rows)
+        return np.concatenate(
+            [self._worst(now.measurement[i : i + rows], now.q[i : i + rows]) for i in parts]
+        )
+
+    def _worst(self, true: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """Returns the worst noise (n, d) in true states (n, d) and modes (n,)."""
         answers, lattice = self._answers, self._answers.lattice
         grid, modes = lattice.grid, answers.modes
-        true, q = now.measurement, now.q
         place = grid.nearest(true)
         at = np.stack(np.unravel_index(place, grid.counts), axis=-1)
-        row = np.where(q == NOT_STARTED, len(modes), np.searchsorted(modes, q))
-        worst, chosen = np.full(len(true), -1), np.zeros_like(true)
-        for shift in self._shifts:
-            near = at + shift
-            node = np.where(grid.chart.periodic, near % grid.counts, near + answers.pad)
-            level, mode = np.divmod(answers.index[(row, *node.T)], len(modes))
-            ends = mode[:, None], lattice.after[level, :, place]
-            value, settled = self._any[ends].max(axis=1), self._settled[ends].max(axis=1)
-            counts = answers.settled[(row, *node.T)] | (shift == 0).all()
-            value = np.where(counts & (settled >= NEVER), FIRST + settled, value)
-            better = value > worst
-            worst = np.where(better, value, worst)
-            chosen[better] = near[better]
+        row = np.where(q == NOT_STARTED, len(modes), np.searchsorted(modes, q))[:, None]
+        near = at[:, None] + self._shifts
+        node = np.where(grid.chart.periodic, near % grid.counts, near + answers.pad)
+        entry = (row, *np.moveaxis(node, -1, 0))
+        level, mode = np.divmod(answers.index[entry], len(modes))
+        ends = mode[..., None], lattice.after[level, :, place[:, None]]
+        value, settled = self._any[ends].max(axis=-1), self._settled[ends].max(axis=-1)
+        counts = answers.settled[entry] | (self._shifts == 0).all(axis=1)
+        value = np.where(counts & (settled >= NEVER), FIRST + settled, value)
+        chosen = near[np.arange(len(near)), value.argmax(axis=1)]
         measured = grid.chart.low + grid.spacing * chosen
         noise = grid.chart.difference(measured, grid.chart.wrap(true))
-        return np.clip(noise, -self._bound, self._bound)
+        return np.asarray(np.clip(noise, -self._bound, self._bound))

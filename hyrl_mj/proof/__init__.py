@@ -4,8 +4,8 @@
 signals that really win against the controller; `examine` returns both beside the game on the nodes.
 """
 
-from hyrl_mj.proof.attack import Broken, attack
 from hyrl_mj.proof.certificate import Certificate
-from hyrl_mj.proof.examine import examine
+from hyrl_mj.proof.counterexamples import Broken, attack
+from hyrl_mj.proof.examination import examine
 
 __all__ = ["Broken", "Certificate", "attack", "examine"]

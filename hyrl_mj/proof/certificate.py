@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -33,6 +33,7 @@ class Certificate:
     cells: Cells | None
     answers: Mapping[str, BoundedAnswers]
     why_not: Mapping[str, str]
+    _values: dict[tuple[str, float], np.ndarray] = field(default_factory=dict, repr=False)
 
     @staticmethod
     def of(game: Game, controllers: Mapping[str, Controller]) -> Certificate:
@@ -70,7 +71,9 @@ class Certificate:
 
     def value(self, name: str, eps: float) -> np.ndarray:
         """Returns the value (modes + 1, places) as `Game.value`, or more where less is known."""
-        return solve(self.moves(name, eps), self.game.task.max_steps)
+        if (name, eps) not in self._values:
+            self._values[name, eps] = solve(self.moves(name, eps), self.game.task.max_steps)
+        return self._values[name, eps]
 
     def region(self, eps: float) -> np.ndarray:
         """Returns the winnable cells (N,) bool: those of the start region all of whose corners are winnable.

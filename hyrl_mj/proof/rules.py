@@ -53,9 +53,9 @@ def _apply(
         raise Unbounded(f"uses np.{name}, for which there are no bounds")
     if "shape" in options:
         options["shape"] = tuple(n if k == BATCH else k for k in options["shape"])
-    operands = [values[o] if isinstance(o, Operation) else o for o in operation.operands]
-    if name == "multiply" and operands[0] is operands[1]:
-        operands, rule = operands[:1], affine.square
+    operands: list[Any] = [values[o] if isinstance(o, Operation) else o for o in operation.operands]
+    if name == "multiply" and operands[0] is operands[1] and isinstance(operands[0], Affine):
+        return affine.square(operands[0])
     if name in LOGICAL:
         return rule(*map(_truth, operands))
     forms = [o if name in AS_THEY_ARE and _is_condition(o) else _form(o, d) for o in operands]

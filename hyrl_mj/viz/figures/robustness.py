@@ -20,7 +20,7 @@ from hyrl_mj.viz.figures.shown import ShownGame
 from hyrl_mj.viz.tables import NAMES, percent
 
 # Of MAP_CLASSES, in their order; colour-blind readers can tell them apart, too.
-CLASS_COLOURS = ("#7cc0e8", "#f2c530", "#d9d2c5", style.mode_colour(1), "#5c2a6b", style.GREY)
+CLASS_COLOURS = ("#7cc0e8", "#f2c530", "#009e73", style.mode_colour(1), "#5c2a6b", style.GREY)
 SENTENCES = dict(enumerate(MAP_CLASSES)) | {
     OVER: "over: obstacle, or the run has ended",
 }

@@ -14,9 +14,9 @@ from hyrl_mj.simulation import NOT_STARTED, LoopSettings, Sample, Signal, closed
 from hyrl_mj.tasks import Outcome
 
 # Measurements along each noisy coordinate among which the noise between the nodes chooses.
-CANDIDATES = 33
+CANDIDATES = 17
 # Cells without a verdict in which a start is attacked, for each start mode.
-MOST_CELLS = 512
+MOST_CELLS = 128
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,14 @@ def attack(
         seed: seed of the starts inside of cells.
     """
     game, cells = certificate.game, certificate.cells
+    # With one mode the controller cannot pick another one.
+    modes = (*controller.modes, None) if len(controller.modes) > 1 else (None,)
     value = game.value(name, eps)
     region = game.starts & game.winnable(eps)
-    lost = (value[:, :-2] >= NEVER) & region
+    lost = (value[-len(modes) :, :-2] >= NEVER) & region
     noise = game.worst_noise(name, eps) if lost.any() else None
     nodes = np.zeros_like(lost)
-    for row, mode in enumerate((*controller.modes, None)):
+    for row, mode in enumerate(modes):
         at = np.flatnonzero(lost[row])
         if noise is not None and len(at):
             starts = game.lattice.grid.nodes[at]
@@ -66,8 +68,8 @@ def attack(
         outer = certificate.value(name, eps)
         inside = CellNoise(certificate, controller, outer, value, game.bound(eps))
         rng = np.random.default_rng(seed)
-        unclear = (outer[:, :-2] >= NEVER) & certificate.region(eps) & ~broken
-        for row, mode in enumerate((*controller.modes, None)):
+        unclear = (outer[-len(modes) :, :-2] >= NEVER) & certificate.region(eps) & ~broken
+        for row, mode in enumerate(modes):
             at = np.flatnonzero(unclear[row])
             if len(at):
                 at = rng.choice(at, min(len(at), MOST_CELLS), replace=False)

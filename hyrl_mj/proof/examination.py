@@ -31,14 +31,16 @@ from hyrl_mj.game import (
 )
 from hyrl_mj.policies import Controller
 from hyrl_mj.progress import progress_bar
-from hyrl_mj.proof.attack import Broken, attack
 from hyrl_mj.proof.certificate import Certificate
+from hyrl_mj.proof.counterexamples import Broken, attack
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import Task
 
 # Approximate number of episodes without noise.
-QUIET_EPISODES = 4000
+QUIET_EPISODES = 1000
+# The most lattice cells along the longest side for the curve, by the dimension of the chart.
+CURVE_CELLS = {1: 3_000, 2: 240}
 # Games that are solved at the same time; each takes tens of megabytes.
 THREADS = 4
 
@@ -62,7 +64,7 @@ def examine(
         bounds: noise bounds of the scores; the maps are drawn for the last.
         everywhere: whether noise acts on all coordinates.
         cells: number of lattice cells along the longest side of the chart, by default the finest lattice.
-            In the plane the curve is computed on a lattice of half as many.
+            The curve is computed with no more than `CURVE_CELLS`.
     """
     for eps in bounds:
         task.check_noise(eps, everywhere)
@@ -86,16 +88,13 @@ def examine(
         )
         for i, name in enumerate(names)
     }
-    bounds_won = _in_threads("margins", fine.margin, [(name,) for name in controllers])
-    margins = dict(zip(controllers, bounds_won, strict=True))
     classes = {name: _map(certificate, name, bounds[-1]) for name in controllers}
     maps = Maps(bounds[-1], np.array(grid.counts), classes)
-    coarse, roughly = fine, certificate
-    if task.chart.dimension == 2:
-        half = Grid.with_cells(task.chart, cells // 2)
-        coarse = Game(task, parts, controllers, LARGEST, everywhere, half)
-        roughly = Certificate.of(coarse, controllers)
-    curve, profile = _sweep(roughly, names, points)
+    fewer = Grid.with_cells(task.chart, min(cells, CURVE_CELLS[task.chart.dimension]))
+    coarse = Game(task, parts, controllers, LARGEST, everywhere, fewer)
+    curve, profile = _sweep(Certificate.of(coarse, controllers), names, points)
+    likely = [(name, _last_won(curve, curve.wins[name])) for name in controllers]
+    margins = dict(zip(controllers, _in_threads("margins", fine.margin, likely), strict=True))
     spacing, curve_spacing = (tuple(g.lattice.grid.spacing.tolist()) for g in (fine, coarse))
     has_cells = certificate.cells is not None
     lattice = LatticeSpacing(spacing, fine.lattice.exact, has_cells, curve_spacing)
@@ -178,6 +177,12 @@ def _sweep(certificate: Certificate, names: list[str], points: np.ndarray) -> tu
         won, won_any, times = zip(*row, strict=True)
         wins[name] = Wins(won, won_any, own, some, times)
     return Curve(CURVE, tuple(winnable), wins), profile
+
+
+def _last_won(curve: Curve, wins: Wins) -> tuple[float, float]:
+    """Returns the bounds of the curve between which some nodes begin to be lost."""
+    lost = next((i for i, won in enumerate(wins.won) if won < 1), len(curve.eps) - 1)
+    return curve.eps[max(lost - 1, 0)], curve.eps[lost]
 
 
 def _proved_margin(curve: Curve, wins: Wins) -> float | None:
