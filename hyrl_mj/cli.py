@@ -212,7 +212,8 @@ def replay(
             paper's at once), or latest (what `hyrl-mj simulate --start` simulated last).
         noise: kind of noise under which to simulate anew: none, uniform, alternating, adversarial (looks
             a few samples ahead), or worst (of the worst-case game, for each controller); by default the
-            arcs of the run, under alternating noise.
+            arcs of the run, which are under alternating noise, and from the critical set under the
+            strongest noise that is known for each controller.
         eps: bound of the noise, in the units of the chart; by default the run's.
     """
     from hyrl_mj.viz.arcs import replay_floor, replay_shows

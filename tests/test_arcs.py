@@ -18,12 +18,13 @@ def run(vehicle):
     policy, controller = sign_policy(vehicle), ideal_controller(vehicle, clear=1.004)
     return SimpleNamespace(
         task=vehicle,
-        settings=SimpleNamespace(noise=0.1, seed=0),
+        settings=SimpleNamespace(noise=0.1, seed=0, lattice=480),
         controller=controller,
         loops={"policy": PolicyController(policy), "hyrl": controller},
         critical_set=decisions(vehicle),
         split=halves(vehicle),
         check_exact=lambda: None,
+        exact=True,
         policy_title="RL policy (DQN)",
         extended_sets=SimpleNamespace(modes=(0, 1)),
     )
@@ -69,6 +70,11 @@ def test_the_worst_noise_lasts_as_long_as_the_run_and_keeps_the_bound_that_was_a
 def test_shows_are_one_for_each_mode_or_all_of_the_paper_s_at_once(run):
     arcs = replay_arcs(run)
     assert len(arcs) == 6 * 3
+    # The start on M* meets the strongest noise that is known for each controller.
+    assert {arc.noise for (start, _), arc in arcs.items() if start != "critical"} == {"alternating"}
+    assert {arc.noise for (start, _), arc in arcs.items() if start == "critical"} == {"worst"}
+    assert arcs["critical", "policy"].outcome == "crashed"
+    assert {arcs["critical", f"hyrl_q{q}"].outcome for q in (0, 1)} == {"reached"}
     shows = replay_shows(run, "critical", "none")
     assert [show.hybrid[0].q[0] for show in shows] == [0, 1]
     assert all(len(show.policy) == len(show.hybrid) == 1 for show in shows)

@@ -4,7 +4,7 @@ The plant is tabulated on a lattice of states, and the game is solved on it by b
 `Game` scores controllers on the nodes, and `Limit` is what a split of the states could win.
 """
 
-from hyrl_mj.game.lattice import LATTICE, Lattice
+from hyrl_mj.game.lattice import CURVE_CELLS, LATTICE, Lattice
 from hyrl_mj.game.limit import Limit, fewest_samples
 from hyrl_mj.game.result import (
     BEATEN,
@@ -45,6 +45,7 @@ from hyrl_mj.game.solver import (
 __all__ = [
     "BEATEN",
     "CURVE",
+    "CURVE_CELLS",
     "FIRST",
     "LARGEST",
     "LATTICE",

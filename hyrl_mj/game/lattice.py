@@ -18,6 +18,8 @@ from hyrl_mj.tasks import Outcome, Task
 
 # Cells along the longest side of the game's lattice, by the dimension of the chart.
 LATTICE = {1: 12_000, 2: 480}
+# The most cells where the game is played many times, or for an estimate.
+CURVE_CELLS = {1: 3_000, 2: 240}
 # A sample that ends this close to a node, in cells, ends on it.
 ON_NODE = 1e-3
 # Transitions of the largest lattice, each of which takes about 100 bytes while they are tabulated.

@@ -185,14 +185,16 @@ def diagnose_stage(run: Run, say: Say) -> None:
 
     folder = run.path / diagnosis.FOLDER
     robustness, maps = examine_loops(run, {"policy": PolicyController(run.policy)}, run.partition)
-    arc = diagnosis.worst_arc(run)
+    losses = diagnosis.losses_of(run)
+    arc = diagnosis.worst_arc(run, losses)
     figures.draw_all(figures.shown_policy(run, arc or diagnosis.usual_arc(run)), folder)
     if maps is not None:
         draw_robustness(run, robustness, maps, folder)
     diagnosis.write_worst(run, arc, say)
     robustness.save(folder / "robustness.json")
-    diagnosis.write_page(run, robustness, arc)
-    for sentence in diagnosis.sentences(run, robustness, arc):
+    results = diagnosis.sentences(run, robustness, arc, losses)
+    diagnosis.write_page(run, robustness, arc, results)
+    for sentence in results:
         say(sentence)
     say(f"page at {run.path / diagnosis.PAGE}")
 

@@ -9,6 +9,7 @@ import numpy as np
 from hyrl_mj import cores
 from hyrl_mj.game import (
     CURVE,
+    CURVE_CELLS,
     LARGEST,
     LATTICE,
     LIMIT,
@@ -39,8 +40,6 @@ from hyrl_mj.tasks import Task
 
 # Approximate number of episodes without noise.
 QUIET_EPISODES = 1000
-# The most lattice cells along the longest side for the curve, by the dimension of the chart.
-CURVE_CELLS = {1: 3_000, 2: 240}
 # Games that are solved at the same time; each takes tens of megabytes.
 THREADS = 4
 

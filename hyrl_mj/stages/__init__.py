@@ -8,6 +8,7 @@ from hyrl_mj.stages.critical_set import CriticalSet, critical_points, find_criti
 from hyrl_mj.stages.episodes import Regions, noisy_episodes
 from hyrl_mj.stages.extended_sets import ExtendedSets, extend
 from hyrl_mj.stages.hybrid import ON_EDGE, HybridController
+from hyrl_mj.stages.losses import Losses, sort_losses
 from hyrl_mj.stages.partition import Partition, boundary, make_partition, with_room
 from hyrl_mj.stages.results import Arrivals, ModeResult, Retraining
 
@@ -17,6 +18,7 @@ __all__ = [
     "CriticalSet",
     "ExtendedSets",
     "HybridController",
+    "Losses",
     "ModeResult",
     "Partition",
     "Regions",
@@ -28,5 +30,6 @@ __all__ = [
     "make_partition",
     "noisy_episodes",
     "retraining",
+    "sort_losses",
     "with_room",
 ]

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from hyrl_mj.errors import BadInput, unknown
-from hyrl_mj.game import LARGEST, Game, worst_signal
+from hyrl_mj.game import Game, worst_signal
 from hyrl_mj.policies import Policy
 from hyrl_mj.run_directory import Run
+from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, noise_kinds, samples, simulate_batch
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.replay import Floor, Show
@@ -17,6 +18,7 @@ from hyrl_mj.viz.section import Section
 
 STARTS = ("critical", "paper", "latest")  # of a replay
 OVERVIEW_RUNS = 12  # without noise; of an even number none starts in the middle
+PAPER = "alternating"  # the noise of the paper
 WORST = "worst"  # the noise of the worst-case game; the registered kinds do without one
 
 
@@ -66,7 +68,8 @@ def noisy_arcs(
     game = None
     if noise == WORST:
         run.check_exact()
-        game = Game(task, run.split, run.loops, max(bound, LARGEST))
+        grid = Grid.with_cells(task.chart, run.settings.lattice)
+        game = Game(task, run.split, run.loops, bound, grid=grid)
     arcs = {}
     for name, loop in run.loops.items():
         for q0 in q0s if name == "hyrl" else (None,):
@@ -88,13 +91,23 @@ def replay_starts(run: Run) -> dict[str, np.ndarray]:
 
 
 def replay_arcs(
-    run: Run, noise: str = "alternating", eps: float | None = None
+    run: Run, noise: str | None = None, eps: float | None = None
 ) -> dict[tuple[str, str], HybridArc]:
-    """Simulates the replays by start and controller, by default under the paper's noise."""
+    """Simulates the replays by start and controller.
+
+    By default the noise is the paper's, and on M* the strongest that is known for each controller.
+    """
     starts, modes, seed = replay_starts(run), run.controller.modes, run.settings.seed
-    z0 = np.array([*starts.values()], dtype=float)
-    arcs = noisy_arcs(run, z0, noise, eps, modes, run.task.scene.time, seed)
-    return {(start, who): arc for who in arcs for start, arc in zip(starts, arcs[who], strict=True)}
+    arcs: dict[tuple[str, str], HybridArc] = {}
+    strongest = WORST if run.exact else PAPER
+    for on_critical, usual in ((False, PAPER), (True, strongest)):
+        chosen = {name: z for name, z in starts.items() if (name == "critical") == on_critical}
+        if chosen:
+            z0 = np.array([*chosen.values()], dtype=float)
+            found = noisy_arcs(run, z0, noise or usual, eps, modes, run.task.scene.time, seed)
+            for who, several in found.items():
+                arcs |= {(start, who): arc for start, arc in zip(chosen, several, strict=True)}
+    return arcs
 
 
 def replay_shows(
@@ -107,7 +120,7 @@ def replay_shows(
         starts: "critical" for the start on M*, once for each start mode; "paper" for all of the paper's
             starts at once; "latest" for the arcs of the last `hyrl-mj simulate --start`.
         noise: the kind of noise of a new simulation; by default the arcs on disk are played.
-        eps: the bound of a new simulation, by default the run's.
+        eps: the bound of a new simulation, by default the run's; without `noise` that of `replay_arcs`.
 
     Raises:
         BadInput: a value that cannot be used.
@@ -122,7 +135,7 @@ def replay_shows(
             )
         policy, hybrid = ([run.arc(run.latest_path(who))] for who in ("policy", "hyrl"))
         return [Show(policy, hybrid, run.policy_title)]
-    arcs = replay_arcs(run, noise or "alternating", eps) if is_new else run.arcs()
+    arcs = replay_arcs(run, noise, eps) if is_new else run.arcs()
     names = dict.fromkeys(name for name, _ in arcs)
     modes = [f"hyrl_q{q}" for q in run.extended_sets.modes]
     if starts == "paper":
@@ -163,5 +176,5 @@ def policy_start_arcs(task: Task, policy: Policy, eps: float, seed: int) -> list
 
     The task may be a section's.
     """
-    starts, noise = task.scene.policy_starts, Noise("alternating", eps)
+    starts, noise = task.scene.policy_starts, Noise(PAPER, eps)
     return simulate_batch(task, policy, starts, noise, horizon=task.scene.time, seed=seed)

@@ -7,11 +7,12 @@ from collections.abc import Callable
 import numpy as np
 
 from hyrl_mj.errors import NoRenderer
-from hyrl_mj.game import NEVER, Game, Robustness, worst_signal
+from hyrl_mj.game import CURVE_CELLS, Game, Robustness, worst_signal
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, simulate_batch
+from hyrl_mj.stages import Losses, sort_losses
 from hyrl_mj.verdict import NO_NOISE
 from hyrl_mj.viz.arcs import critical_start, from_middle, replay_floor
 from hyrl_mj.viz.commands import beginning
@@ -26,21 +27,28 @@ TRIED = 64  # lost starts that are simulated, the nearest to the middle of the r
 REPLAY = ReplayOptions(size=(960, 720))  # of the policy alone
 
 
-def worst_arc(run: Run) -> HybridArc | None:
+def losses_of(run: Run) -> Losses | None:
+    """Returns why the policy loses starts, where the game can be played."""
+    if not run.exact:
+        return None
+    cells = min(run.settings.lattice, CURVE_CELLS[run.task.chart.dimension])
+    return sort_losses(run.task, run.steady, run.partition, run.settings.noise, cells)
+
+
+def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
     """Returns a run that the policy loses, or None if no such run was found.
 
-    Where the game can be played its adversary gives the noise; otherwise the noise is adversarial, from
-    drawn starts of the task.
+    Where the game can be played its adversary gives the noise, from the starts of the more frequent kind of
+    losses first; otherwise the noise is adversarial, from drawn starts of the task.
     """
     task, eps, loop = run.task, run.settings.noise, PolicyController(run.policy)
-    if run.exact:
-        grid = Grid.with_cells(task.chart, run.settings.lattice)
-        game = Game(task, run.partition, {"policy": loop}, eps, grid=grid)
-        own = game.value("policy", eps)[-1, :-2]
-        z0 = game.lattice.grid.nodes[game.starts & game.winnable(eps) & (own >= NEVER)]
-        z0 = z0[np.argsort(from_middle(task, z0), kind="stable")[:TRIED]]
+    if losses is not None:
+        kinds = sorted((losses.grazing, losses.undecided), key=len, reverse=True)
+        z0 = np.vstack([z[np.argsort(from_middle(task, z), kind="stable")[:TRIED]] for z in kinds])
         if not len(z0):
             return None
+        grid = Grid.with_cells(task.chart, run.settings.lattice)
+        game = Game(task, run.partition, {"policy": loop}, eps, grid=grid)
         noise: AnyNoise = worst_signal(game, "policy", loop, z0, eps)
     else:
         z0, noise = task.starts(TRIED, np.random.default_rng(0)), Noise("adversarial", eps)
@@ -75,19 +83,28 @@ def write_worst(run: Run, arc: HybridArc | None, say: Callable[[str], None]) -> 
         say(f"no video: {error}")
 
 
-def sentences(run: Run, robustness: Robustness, arc: HybridArc | None) -> list[str]:
-    """Returns the results in sentences: the critical set, what noise costs, the margin, the worst run."""
+def sentences(
+    run: Run, robustness: Robustness, arc: HybridArc | None, losses: Losses | None
+) -> list[str]:
+    """Returns the results in sentences: the critical set, what noise costs and why, the margin, a run."""
     eps, task = robustness.eps, run.task
     where, unit = task.noise_on(robustness.everywhere)
     results = [f"it {run.arrivals}", run.critical_set.sentence(task)]
     noise = f"noise on {where} of up to {eps:g} {unit}"
     if robustness.game is not None:
-        lost = percent(1 - robustness.game.scores["policy"][-1].won)
+        score = robustness.game.scores["policy"][-1]
+        lost = percent(1 - score.not_broken)
         results.append(f"the worst {noise} makes it lose {lost} of the starts that can be won")
+        if score.proved is not None:
+            results.append(f"it is proved to win {percent(score.proved)} of them")
+        if losses is not None:
+            results.append(losses.sentence())
         if (margin := robustness.game.margin["policy"]) is None:
-            results.append("it does not win all of them even without noise")
+            results.append("on the nodes it does not win all of them even without noise")
         else:
-            results.append(f"it wins all of them up to noise {margin_text(margin, unit)}")
+            results.append(
+                f"on the nodes it wins all of them up to noise {margin_text(margin, unit)}"
+            )
     else:
         if run.agent and run.agent.why_no_function:
             why = run.agent.why_no_function
@@ -103,8 +120,8 @@ def sentences(run: Run, robustness: Robustness, arc: HybridArc | None) -> list[s
     return [*results, f"from {start} {end}"]
 
 
-def write_page(run: Run, robustness: Robustness, arc: HybridArc | None) -> None:
-    """Writes the page.
+def write_page(run: Run, robustness: Robustness, arc: HybridArc | None, results: list[str]) -> None:
+    """Writes the page, with the results in sentences.
 
     Raises:
         BadArtifact: a picture on it is damaged.
@@ -115,7 +132,7 @@ def write_page(run: Run, robustness: Robustness, arc: HybridArc | None) -> None:
         "diagnosis.html",
         run,
         robustness,
-        sentences=sentences(run, robustness, arc),
+        sentences=results,
         arc=arc,
         video=film(folder / "worst.mp4"),
         pictures=pictures(folder),

@@ -58,7 +58,8 @@ def replay_table(run: Run, arcs: Arcs) -> Table:
         endings = [_ending(task, arcs[start, who]) for who in columns]
         rows.append([f"{point} on M*" if start == "critical" else point, *endings])
     headings = [f"start ({', '.join(task.chart.names)}) in {units}", *columns.values()]
-    return Table(f"{task.name}: alternating noise {s.noise:g}, seed {s.seed}", headings, rows)
+    noise = f"alternating noise {s.noise:g}{', on M* the strongest known' if run.exact else ''}"
+    return Table(f"{task.name}: {noise}, seed {s.seed}", headings, rows)
 
 
 def _ending(task: Task, arc: HybridArc) -> Ending:

@@ -1,0 +1,68 @@
+"""Why a policy loses starts to noise: it cannot decide, or it passes closer than the noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hyrl_mj.game import NEVER, Game
+from hyrl_mj.policies import Policy, PolicyController
+from hyrl_mj.sets import Grid, within_reach
+from hyrl_mj.stages.partition import Partition, longest_hop, neighbourhood, part_policies
+from hyrl_mj.tasks import Task
+
+
+@dataclass(frozen=True)
+class Losses:
+    """The winnable starts that a policy loses in the worst-case game, by what would cure it.
+
+    Attributes:
+        undecided: (n, d) starts that are won if the policy holds the way of its first measurement: noise
+            makes it change its mind at M*. Hysteresis cures that.
+        grazing: (n, d) starts that are lost all the same: on its way the policy comes so close to where it
+            fails that noise does the rest. Training under noise cures that.
+    """
+
+    undecided: np.ndarray
+    grazing: np.ndarray
+
+    def sentence(self) -> str:
+        """Returns both shares, and what to do."""
+        n, total = len(self.undecided), len(self.undecided) + len(self.grazing)
+        if not total:
+            return "it loses none of them on the nodes"
+        return (
+            f"of {total:,} lost nodes it would win {n:,} if it held the way of its first measurement "
+            f"({100 * n / total:.0f}%: noise at M* keeps it undecided, hysteresis cures that), and loses "
+            f"{total - n:,} all the same ({100 - 100 * n / total:.0f}%: it passes closer than the noise, "
+            "training under noise cures that); hyrl-mj robustify does both"
+        )
+
+
+def sort_losses(task: Task, policy: Policy, partition: Partition, eps: float, cells: int) -> Losses:
+    """Sorts the winnable starts that a policy loses to the worst noise.
+
+    Each part's policy pi_i (paper, Step 4) plays the game alone. A start is won by holding the way if all
+    pi_i win that the first measurement can select.
+
+    Args:
+        task: the robot and its problem.
+        policy: the policy, a function of the measurement.
+        partition: M_i, from stage 3.
+        eps: the noise bound.
+        cells: lattice cells along the longest side.
+    """
+    near = neighbourhood(partition.grid, eps, longest_hop(task, policy, partition.grid))
+    pis = part_policies(task, policy, partition, near)
+    loops = {f"part {i}": PolicyController(pi) for i, pi in enumerate(pis)}
+    grid = Grid.with_cells(task.chart, cells)
+    game = Game(task, partition, {"policy": PolicyController(policy), **loops}, eps, grid=grid)
+    lost = game.starts & game.winnable(eps) & (game.value("policy", eps)[-1, :-2] >= NEVER)
+    held = np.ones(len(lost), dtype=bool)
+    window = np.ceil(game.bound(eps) / grid.spacing).astype(int)
+    for name, side in zip(loops, game.limit.sides, strict=True):
+        selected = within_reach(side.reshape(grid.counts), window, task.chart.periodic).ravel()
+        held &= ~selected | (game.value(name, eps)[-1, :-2] < NEVER)
+    nodes = grid.nodes
+    return Losses(nodes[lost & held], nodes[lost & ~held])
