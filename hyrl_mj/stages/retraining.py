@@ -64,7 +64,7 @@ def retrain(
     settings: Training,
     seed: int,
     *,
-    warm_start: Callable[[ModeGround, Training, int], MlpPolicy | None] | None = None,
+    warm_start: WarmStart | None = None,
     others: Iterable[MlpPolicy] = (),
     log_dir: Path | None = None,
 ) -> tuple[MlpPolicy, ModeResult]:
@@ -115,9 +115,15 @@ def retrain(
     return best, ModeResult(mode, ground.won(best), trainings)
 
 
-def mode_ground(task: Task, extended: ExtendedSets, mode: int) -> ModeGround:
+# Returns the policy that a mode's first attempt continues from, given its ground, settings and a seed.
+WarmStart = Callable[["ModeGround", Training, int], MlpPolicy | None]
+
+
+def mode_ground(
+    task: Task, extended: ExtendedSets, mode: int, parts: Partition | None = None
+) -> ModeGround:
     """Returns the ground of a mode, judged by the worst-case game if possible, otherwise by episodes."""
-    return (ByGame if game.Lattice.possible(task) else ByEpisodes)(task, extended, mode)
+    return (ByGame if game.Lattice.possible(task) else ByEpisodes)(task, extended, mode, parts)
 
 
 class ModeGround(ABC):
@@ -129,6 +135,7 @@ class ModeGround(ABC):
         task: the robot and its problem.
         extended: M_ext_i and W_i.
         mode: the mode.
+        parts: M_i, the parts that were extended; by default the mode earns its reward everywhere.
 
     Attributes:
         bound: (d,) largest error of a measured chart point, along each coordinate.
@@ -138,8 +145,11 @@ class ModeGround(ABC):
     noise: Noise
     settled = 0.0  # scores count from the beginning
 
-    def __init__(self, task: Task, extended: ExtendedSets, mode: int):
+    def __init__(
+        self, task: Task, extended: ExtendedSets, mode: int, parts: Partition | None = None
+    ):
         self.task, self.extended, self.mode = task, extended, mode
+        self.part = None if parts is None else parts.parts[parts.modes.index(mode)]
         self.bound = task.noise_in_chart(extended.noise)
         index = extended.modes.index(mode)
         self.within = extended.sets[index].dilated_by_box(self.bound)
@@ -172,10 +182,15 @@ class ModeGround(ABC):
         """Returns the share that a policy wins, as in `ModeResult`."""
 
     def domain(self, gamma: float) -> Domain:
-        """Returns the domain of training; leaving it costs the worst reward for ever."""
+        """Returns the domain of training; leaving it costs the worst reward for ever.
+
+        Beyond its part a mode earns nothing: there the task's reward leads to the other way, and it could
+        pay to creep or to stay at the edge of the set, because the detour is long and returns are discounted.
+        """
         caution = self.extended.noise * np.array(self.task.noisy, dtype=float)
         exit_reward = self.task.worst_reward / (1 - gamma)
-        return Domain(self.starts, self.within.contains, exit_reward, caution)
+        earns = None if self.part is None else self.part.contains
+        return Domain(self.starts, self.within.contains, exit_reward, caution, earns)
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draws n starts (n, d): where the game is lost, where the task starts, and all over."""
@@ -209,8 +224,10 @@ class ByGame(ModeGround):
     enough: Score = (0.0, -1.0)
     noise = Noise()  # the game finds the worst
 
-    def __init__(self, task: Task, extended: ExtendedSets, mode: int):
-        super().__init__(task, extended, mode)
+    def __init__(
+        self, task: Task, extended: ExtendedSets, mode: int, parts: Partition | None = None
+    ):
+        super().__init__(task, extended, mode, parts)
         self.lattice = game.Lattice.of(task, self.grid)
         after = self.lattice.after
         inside = np.append(self.within.mask, [True, False])[after]
@@ -269,8 +286,10 @@ class ByEpisodes(ModeGround):
 
     enough: Score = (float(len(JUDGES)), 0.0)
 
-    def __init__(self, task: Task, extended: ExtendedSets, mode: int):
-        super().__init__(task, extended, mode)
+    def __init__(
+        self, task: Task, extended: ExtendedSets, mode: int, parts: Partition | None = None
+    ):
+        super().__init__(task, extended, mode, parts)
         self.noise = Noise("uniform", extended.noise)
         depth = np.stack([s.values for s in extended.sets])
         deepest = GridSet.from_mask(self.grid, depth.argmin(axis=0) == extended.modes.index(mode))
