@@ -257,9 +257,27 @@ def test_episodes_tell_policies_apart(puck, puck_sets):
     # As close as it gets without noise, but not with it.
     grazing = ground(round_it(puck, 1.0, clear=0.6))
     good = ground(round_it(puck, 1.0))
-    assert wrong < grazing < good == ground.enough
+    assert wrong < grazing < ground.enough <= good
     assert grazing[0] == 3, "chance does not find it, the adversary does"
     assert not len(ground.lost)
+
+
+@pytest.mark.slow
+def test_a_policy_that_parks_off_the_goal_is_not_good_enough(puck, puck_sets):
+    precise = round_it(puck, 1.0)
+    ground = ByEpisodes(puck, puck_sets, 0, policy=precise)
+    # It goes the same way, and then to a place beside the set-point that counts as arrived.
+    off = ground.allowed + 0.05
+    assert off < puck.close
+    parking = ChartPolicy(
+        puck,
+        lambda z: np.where(z[:, :1] < 1.8, precise.rule(z), np.clip(3 * (off - z[:, 1:]), -1, 1)),
+    )
+    assert ground.won(parking) == ground.won(precise) == 1.0
+    assert ByEpisodes(puck, puck_sets, 0)(parking) >= ground.enough
+    score = ground(parking)
+    assert score < ground.enough <= ground(precise)
+    assert -score[1] * ground.allowed == pytest.approx(off, abs=0.06)
 
 
 @pytest.mark.slow

@@ -102,7 +102,7 @@ def retrain_stage(run: Run, say: Say) -> None:
 
     s, sets = run.settings, run.extended_sets
     algorithms.check_named(s.stage6.algorithm)
-    ground_of = partial(mode_ground, run.task, sets, parts=run.split)
+    ground_of = partial(mode_ground, run.task, sets, parts=run.split, policy=run.steady)
     warm_start = partial(start_policy, run.steady, run.partition)
     work = partial(_retrained, s, ground_of, warm_start, run.path / "logs")
     done: list[tuple[MlpPolicy, ModeResult]] = []
