@@ -319,9 +319,9 @@ class ByEpisodes(ModeGround):
         """Returns `allowed`, by the runs of the stage-1 policy that arrive, if there are any."""
         precision, close, done = self.task.precision, self.task.close, range(0, EPISODES, BATCH)
         batches = [self._play(policy, JUDGES[0], k) for k in done] if policy else []
-        reached = max((miss[won].max(initial=0.0) for won, miss in batches), default=0.0)
-        least = min(precision, MISS_SHARE * close if reached else close)
-        return max(ALLOWED_MISS * float(reached), least)
+        ends = np.concatenate([np.empty(0), *(miss[won] for won, miss in batches)])
+        least = min(precision, MISS_SHARE * close if len(ends) else close)
+        return max(ALLOWED_MISS * float(ends.max(initial=0.0)), least)
 
     def score(self, policy: MlpPolicy) -> Score:
         farthest = 0.0
