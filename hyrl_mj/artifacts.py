@@ -195,7 +195,9 @@ def parsed(content: Mapping[str, Any], record: type[Record], remedy: str = REMED
         problems = error.errors(include_url=False, include_input=False)
     else:
         # Files are written with every field: a default would hide that one is missing.
-        if missing := next(_missing(asdict(value), content), None):
+        later = getattr(record, "LATER", ())  # those that earlier versions did not write
+        lacking = (name for name in _missing(asdict(value), content) if name not in later)
+        if missing := next(lacking, None):
             raise BadArtifact(
                 f"it has no {missing}, so it is damaged or of another version: {remedy}"
             )

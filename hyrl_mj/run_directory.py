@@ -11,6 +11,7 @@ from functools import cached_property
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
+from typing import ClassVar
 
 from hyrl_mj import artifacts, policies
 from hyrl_mj.errors import BadArtifact, BadInput
@@ -45,6 +46,8 @@ class Config:
         versions: the versions of Python and the packages when the run began.
     """
 
+    LATER: ClassVar = ("settings.everywhere",)
+
     settings: Settings
     versions: dict[str, str]
 
@@ -74,10 +77,14 @@ class Run:
 
     @cached_property
     def task(self) -> Task:
-        """The task; raises `BadInput` if the settings do not fit it."""
+        """The task, noisy on all coordinates if the run is made for that.
+
+        Raises:
+            BadInput: the settings do not fit it.
+        """
         task = described_task(self.settings.task)
         self.settings.check(task)
-        return task
+        return task.noisy_everywhere() if self.settings.everywhere else task
 
     @cached_property
     def manifest(self) -> Manifest:
@@ -89,6 +96,8 @@ class Run:
         """SHA-256 of the settings that each stage is made with."""
         values = asdict(self.settings)
         del values["task"]
+        if not values["everywhere"]:
+            del values["everywhere"]  # as in earlier versions
         last = {stage: values | {"horizon": None} for stage in FILES} | {"extended-sets": values}
         texts = {stage: json.dumps(v, sort_keys=True, default=str) for stage, v in last.items()}
         return {name: sha256(text.encode()).hexdigest() for name, text in texts.items()}
@@ -224,7 +233,8 @@ class Run:
     def is_examined_as_usual(self) -> bool:
         """Whether the examination on disk is under the run's own noise, and not under another one."""
         found = self.robustness
-        return found.eps == self.settings.noise and not found.everywhere
+        own = self.settings
+        return (found.eps, found.everywhere) == (own.noise, own.everywhere)
 
     @cached_property
     def versions(self) -> dict[str, str]:

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, ClassVar, Final, Literal
 
 import numpy as np
 
@@ -116,12 +116,19 @@ class Common:
     preset: str
     horizon: float | None
     set: dict[str, Any]
+    everywhere: bool = False
 
     def texts(self) -> dict[str, str]:
         """Returns the settings as they are typed, by option."""
         horizon = "by default" if self.horizon is None else f"{self.horizon:g}"
         changes = " ".join(f"{name}={json.dumps(value)}" for name, value in self.set.items())
-        return {"--preset": self.preset, "--horizon": horizon, "--set": changes or "nothing"}
+        everywhere = "given" if self.everywhere else "not given"
+        return {
+            "--preset": self.preset,
+            "--horizon": horizon,
+            "--all-coordinates": everywhere,
+            "--set": changes or "nothing",
+        }
 
 
 @dataclass(frozen=True)
@@ -132,6 +139,8 @@ class Sweep:
         common: the settings that all runs share.
         rows: the runs.
     """
+
+    LATER: ClassVar = ("common.everywhere",)
 
     common: Common
     rows: tuple[Row, ...]

@@ -112,6 +112,22 @@ def test_the_overlap_is_never_narrower_than_the_noise(vehicle_sets, x):
     assert overlap(vehicle_sets[0.1], x) >= 0.1 - 2e-3
 
 
+def test_noise_on_all_coordinates_asks_for_room_along_each(vehicle, vehicle_sets):
+    case = Case(vehicle.noisy_everywhere(), sign_policy(vehicle), 60, 120)
+    sets, usual, eps = case.extend(0.3, 0.1), vehicle_sets[0.1], 0.1
+    for members, ordinary, part, wins in zip(
+        sets.sets, usual.sets, case.partition.parts, sets.winning, strict=True
+    ):
+        off = part.dilated_by_box(np.array([eps, eps]))
+        assert members.mask[part.mask].all()
+        assert members.mask[off.mask].all()
+        # Elsewhere no error within the bound, along x and y, leads out of where the mode wins.
+        for z in members.grid.nodes[members.mask & ~off.mask]:
+            near = z + eps * np.array([[i, j] for i in (-1, 0, 1) for j in (-1, 0, 1)])
+            assert wins[members.grid.nearest(near)].all()
+        assert np.count_nonzero(members.mask & ~ordinary.mask & ~off.mask) == 0
+
+
 def test_the_set_point_and_what_lies_behind_the_obstacle_is_in_every_set(vehicle_sets):
     z = np.array([[3.0, 0.0], [2.9, 0.1], [2.4, -0.5], [2.0, 1.0]])
     for sets in vehicle_sets.values():

@@ -6,12 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planted import circle_policy
+from planted import circle_policy, decisions, halves
+from test_report import plant
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput
 from hyrl_mj.pipeline import ExamineOptions, examine_run, extend_again, run_stage
 from hyrl_mj.pipeline.steps import STAGES
+from hyrl_mj.viz.arcs import noisy_arcs
+from hyrl_mj.viz.commands import beginning, commands
 
 pytestmark = pytest.mark.slow  # a planted run goes through all later stages
 
@@ -154,6 +157,27 @@ def test_a_horizon_that_cannot_be_used_changes_nothing(run):
     with pytest.raises(BadInput, match=r"horizon -1\.0"):
         extend_again(run, -1.0)
     assert contents(run.path) == before
+
+
+def test_a_run_made_for_noise_on_all_coordinates_is_examined_so(vehicle, tmp_path, monkeypatch):
+    path = tmp_path / "run"
+    plant(path, vehicle, decisions(vehicle), halves(vehicle, 60), noise=0.05, everywhere=True)
+    run = hyrl_mj.load_run(path)
+    assert run.task.noisy == (True, True)
+    assert hyrl_mj.get_task("vehicle").noisy == (False, True)
+    sets = run_stage(run, "extended-sets", lambda text: None).extended_sets
+    assert sets.noise == 0.05
+    robustness = examine_run(run, say=lambda text: None)
+    assert robustness.everywhere
+    assert run.is_examined_as_usual
+    assert "noise of up to 0.05 m on x and y" in " ".join(run.verdict.reasons)
+    assert beginning(run).endswith("--eps 0.05 --seed 0 --preset smoke --all-coordinates")
+    assert commands(run, robustness) == [beginning(run)]
+    # The noise of a replay acts on both coordinates.
+    (arc,) = noisy_arcs(run, np.array([[0.0, 0.1]]), "uniform", q0s=(0,), horizon=0.2)["hyrl_q0"]
+    off = arc.measured[:-1] - arc.z[:-1]
+    assert (np.abs(off) > 0).all()
+    assert np.abs(off).max() <= 0.05
 
 
 def test_episodes_are_added_on_demand(run):

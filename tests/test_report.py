@@ -63,9 +63,9 @@ def linear(task, bias):
     return MlpPolicy(task, task.learning.algorithm, "relu", weights)
 
 
-def plant(path, task, critical, partition, slack=0.2):
+def plant(path, task, critical, partition, slack=0.2, **settings):
     """All but what noise can do, the replays and the video."""
-    run = Run(path, preset(task, "smoke"))
+    run = Run(path, replace(preset(task, "smoke"), **settings))
     write_config(run)
     with run.stage("train"):
         linear(task, 0.0).save(path / "policy.safetensors")

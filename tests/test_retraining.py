@@ -4,15 +4,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planted import ChartPolicy, ideal_controller, one_way_policy
+from planted import (
+    ChartPolicy,
+    decisions,
+    halves,
+    homing_policy,
+    ideal_controller,
+    one_way_policy,
+)
 
 from hyrl_mj import closed_loop
+from hyrl_mj.envs import BatchedEnv
 from hyrl_mj.envs.core import cautious_reward
+from hyrl_mj.game import Game
 from hyrl_mj.learning import symmetry, training
 from hyrl_mj.learning.settings import preset
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.stages.extended_sets import ExtendedSets
+from hyrl_mj.stages.extended_sets import ExtendedSets, extend
+from hyrl_mj.stages.hybrid import HybridController
 from hyrl_mj.stages.retraining import BATCH, ByEpisodes, ByGame, retrain
 
 # ---- where modes are trained
@@ -48,6 +58,72 @@ def test_a_mode_that_leaves_its_set_pays_for_ever(vehicle, circle, vehicle_sets)
     whole = GridSet.from_mask(grid, np.ones(60, dtype=bool))
     sets = ExtendedSets((0,), (whole,), (whole.mask,), 0.5, 0.1, np.empty((0, 1)), np.empty(0))
     assert ByGame(circle, sets, 0).domain(gamma=0.9).exit_reward == pytest.approx(-10.0)
+
+
+# ---- the way beyond the mode's part
+
+
+def circle_sets(circle, eps, cells=720):
+    """The parts of the circle, and the sets of stage 5 for noise eps."""
+    parts, points = halves(circle, cells), decisions(circle).points
+    return parts, extend(circle, homing_policy(circle), points, parts, eps)
+
+
+def discounted(circle, domain, start, u, gamma=0.95):
+    """The discounted return of an episode from a start [rad] with a constant input."""
+    env = BatchedEnv(circle, 1, domain=domain)
+    env.reset(z=np.array([[start]]))
+    total, weight = 0.0, 1.0
+    for _ in range(circle.max_steps):
+        result = env.step(np.array([[u]]))
+        total += weight * result.reward[0]
+        weight *= gamma
+        if result.done[0]:
+            break
+    return total
+
+
+@pytest.mark.parametrize("eps", [0.05, 0.15, 0.25, 0.29])
+def test_it_pays_to_go_back_from_the_farthest_edge(circle, eps):
+    parts, sets = circle_sets(circle, eps)
+    domain = ByGame(circle, sets, 0, parts).domain(gamma=0.95)
+    edge = sets.sets[0].pieces()[0][1] + eps - 0.06  # a little inside
+    assert domain.contains(np.array([[edge]])).all()
+    assert edge > np.pi + 3 * eps - 0.06
+    back, stay = (discounted(circle, domain, edge, u) for u in (-1.0, 0.0))
+    assert back > stay + 0.5
+
+
+def test_only_in_its_part_does_a_mode_earn_the_reward_of_the_task(circle):
+    parts, sets = circle_sets(circle, 0.25)
+    here, beyond, common = np.pi - 1.0, np.pi + 0.5, 0.1
+    for mode, sign in ((0, 1.0), (1, -1.0)):
+        domain = ByGame(circle, sets, mode, parts).domain(gamma=0.95)
+        z = np.array([[np.pi + sign * (x - np.pi)] for x in (here, beyond, common)])
+        env = BatchedEnv(circle, 3, domain=domain)
+        env.reset(z=z)
+        still = np.zeros((3, 1))
+        expected = cautious_reward(circle, z, still, domain.caution)
+        expected[1] = circle.worst_reward
+        np.testing.assert_allclose(env.step(still).reward, expected, atol=1e-6)
+        assert expected[2] > expected[0] > expected[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("eps", [0.05, 0.15, 0.25])
+def test_the_modes_of_the_circle_settle_as_early_as_can_be_at_any_noise(circle, eps):
+    # No controller settles within 0.3 rad of the set-point under greater noise than that.
+    parts, sets = circle_sets(circle, eps, cells=2880)
+    settings = preset(circle, "fast", noise=eps).stage6
+    first, result = retrain(ByGame(circle, sets, 0, parts), settings, seed=1)
+    second, _ = retrain(ByGame(circle, sets, 1, parts), settings, seed=1, others=[first])
+    flow_sets = dict(zip(sets.modes, sets.sets, strict=True))
+    controller = HybridController(circle, {0: first, 1: second}, flow_sets)
+    game = Game(circle, parts, {"hyrl": controller}, eps, grid=parts.grid)
+    ours, limit = game.score("hyrl", eps), game.score("limit", eps)
+    assert result.won == ours.won == ours.won_any == 1.0
+    assert ours.time <= 1.05 * limit.time + 0.1
+    assert ours.time_any <= 1.05 * limit.time_any + 0.1
 
 
 # ---- the judge of stage 6
@@ -181,9 +257,27 @@ def test_episodes_tell_policies_apart(puck, puck_sets):
     # As close as it gets without noise, but not with it.
     grazing = ground(round_it(puck, 1.0, clear=0.6))
     good = ground(round_it(puck, 1.0))
-    assert wrong < grazing < good == ground.enough
+    assert wrong < grazing < ground.enough <= good
     assert grazing[0] == 3, "chance does not find it, the adversary does"
     assert not len(ground.lost)
+
+
+@pytest.mark.slow
+def test_a_policy_that_parks_off_the_goal_is_not_good_enough(puck, puck_sets):
+    precise = round_it(puck, 1.0)
+    ground = ByEpisodes(puck, puck_sets, 0, policy=precise)
+    # It goes the same way, and then to a place beside the set-point that counts as arrived.
+    off = ground.allowed + 0.05
+    assert off < puck.close
+    parking = ChartPolicy(
+        puck,
+        lambda z: np.where(z[:, :1] < 1.8, precise.rule(z), np.clip(3 * (off - z[:, 1:]), -1, 1)),
+    )
+    assert ground.won(parking) == ground.won(precise) == 1.0
+    assert ByEpisodes(puck, puck_sets, 0)(parking) >= ground.enough
+    score = ground(parking)
+    assert score < ground.enough <= ground(precise)
+    assert -score[1] * ground.allowed == pytest.approx(off, abs=0.06)
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import inspect
 import json
 import math
 from dataclasses import asdict, fields, replace
+from hashlib import sha256
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from hyrl_mj.game import Lattice
 from hyrl_mj.learning import Settings, Training, preset, training
 from hyrl_mj.learning.options import OPTIONS, OWN
 from hyrl_mj.policies import algorithms
-from hyrl_mj.run_directory import Config
+from hyrl_mj.run_directory import Config, Run
 from hyrl_mj.sets import MOST_NODES, Grid
 
 NAN, INF = math.nan, math.inf
@@ -39,6 +40,7 @@ OF_RUNS = {
     "lattice": ([-1, 10**7, 0.5], "an integer from 0 to"),
     "resolution": ([0, -1, NAN, 2, 1e-9, "1"], "a number from 1e-06 to 1"),
     "search": (["rod", 1, []], "rods, outcome"),
+    "everywhere": ([1, "yes", None], "True or False"),
 }
 OF_TRAININGS = {
     "algorithm": ([False, None, "sarsa", ""], "algorithm|a text"),
@@ -108,6 +110,21 @@ def test_a_file_without_a_setting_is_refused(settings, tmp_path, where):
     artifacts.write_json(tmp_path / "config.json", content, "run")
     with pytest.raises(BadArtifact, match=f"it has no settings.{where}"):
         hyrl_mj.load_run(tmp_path)
+
+
+def test_a_file_of_before_noise_on_all_coordinates_still_loads(settings, tmp_path):
+    content = {"settings": asdict(settings), "versions": {}}
+    del content["settings"]["everywhere"]
+    artifacts.write_json(tmp_path / "config.json", content, "run")
+    run = hyrl_mj.load_run(tmp_path)
+    assert run.settings == settings
+    # Its stages stay done: their digests are those of before.
+    values = content["settings"] | {"horizon": None}
+    del values["task"]
+    text = json.dumps(values, sort_keys=True, default=str)
+    assert run.digests["train"] == sha256(text.encode()).hexdigest()
+    other = Run(tmp_path, replace(settings, everywhere=True))
+    assert other.digests["train"] != run.digests["train"]
 
 
 def test_numbers_of_numpy_become_plain_ones_that_a_file_can_hold(settings, tmp_path):

@@ -134,6 +134,8 @@ def test_another_sweep_is_refused_and_more_seeds_are_taken(tmp_path):
         BadInput, match=r"a run unit_circle-0\.1-0 of unit_circle, and one of /elsewhere"
     ):
         sweeps.opened(tmp_path, common, [Row(replace(CIRCLE, task="/elsewhere/unit_circle.py"), 0)])
+    with pytest.raises(BadInput, match="--all-coordinates not given there, given given"):
+        sweeps.opened(tmp_path, replace(common, everywhere=True), rows)
     more = sweeps.opened(tmp_path, common, [Row(CIRCLE, 1), Row(replace(CIRCLE, eps=0.2), 1)])
     names = ["unit_circle-0.1-0", "unit_circle-0.1-1", "unit_circle-0.2-1"]
     assert [row.name for row in more.rows] == names

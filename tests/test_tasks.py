@@ -1,5 +1,6 @@
 """Every registered task is whole and consistent; the paper's two have the paper's numbers."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -32,6 +33,20 @@ def test_its_mirror_image_earns_the_same_reward(task):
     np.testing.assert_array_equal(task.ending(image), task.ending(z))
     signs = np.array(task.mirror.observation)
     np.testing.assert_allclose(task.observation(image), task.observation(z) * signs, atol=1e-12)
+
+
+def test_a_task_can_be_noisy_on_all_coordinates(vehicle, puck):
+    for task in (vehicle, puck):
+        before = task.noisy
+        everywhere = task.noisy_everywhere()
+        again = pickle.loads(pickle.dumps(everywhere))  # as a process of a pool gets it
+        for noisy in (everywhere, again):
+            assert noisy.noisy == (True,) * len(before)
+            np.testing.assert_array_equal(
+                noisy.noise_in_chart(0.1), task.noise_in_chart(0.1, everywhere=True)
+            )
+        assert task.noisy == before != everywhere.noisy
+        assert pickle.loads(pickle.dumps(task)).noisy == before
 
 
 def test_bad_measurements_are_refused(task):

@@ -27,12 +27,14 @@ class Domain:
         contains: (n, d) -> (n,) bool; an episode ends where it leaves the domain.
         exit_reward: reward for leaving the domain.
         caution: (p,) largest error of a measurement: if given, the reward is `cautious_reward`.
+        earns: (n, d) -> (n,) bool; elsewhere every step is worth the task's worst reward.
     """
 
     starts: Callable[[int, np.random.Generator], np.ndarray]
     contains: Callable[[np.ndarray], np.ndarray]
     exit_reward: float
     caution: np.ndarray | None = None
+    earns: Callable[[np.ndarray], np.ndarray] | None = None
 
 
 @dataclass(frozen=True)
@@ -142,7 +144,10 @@ class BatchedEnv:
         if self.domain is not None:
             if (caution := self.domain.caution) is not None:
                 reward = np.minimum(reward, cautious_reward(self.task, measured, u, caution))
-            left = ~terminated & ~self.domain.contains(self.task.z(measurement))
+            z = self.task.z(measurement)
+            if self.domain.earns is not None:
+                reward = np.where(self.domain.earns(z), reward, self.task.worst_reward)
+            left = ~terminated & ~self.domain.contains(z)
             reward[left] = self.domain.exit_reward
             terminated = terminated | left
             outcome[left] = Outcome.OUT_OF_BOUNDS

@@ -19,8 +19,11 @@ OPTIONS = {
     "seed": "--seed, in a sweep --seeds",
     "noise": "--eps",
     "horizon": "--horizon",
+    "everywhere": "--all-coordinates",
     "stage1.algorithm": "--algorithm",
 }
+# Names of options that differ from those of their settings.
+NAMES = {"noise": "eps", "stage1": "policy", "everywhere": "all_coordinates"}
 WORDS = {"True": True, "False": False, "None": None}
 
 
@@ -115,7 +118,7 @@ def differing(old: Settings | Training, new: Settings | Training, of: str = "") 
         if trainings and before.algorithm == now.algorithm:
             yield from differing(before, now, f"{name}.")
         elif before != now:
-            option = of + {"noise": "eps", "stage1": "policy"}.get(name, name)
+            option = of + NAMES.get(name, name)
             old_text, new_text = _brief(before), _brief(now)
             change = f": {old_text} there, {new_text} given" if old_text != new_text else ""
             yield option + change

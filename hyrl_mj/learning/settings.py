@@ -106,6 +106,7 @@ class Settings:
         lattice: lattice cells along the longest side for the worst-case game.
         resolution: length of the last rods, as a share of the first.
         search: search method for critical points, "rods" or "outcome".
+        everywhere: whether the noise acts on all coordinates, not only on the task's noisy ones.
     """
 
     task: Annotated[str, Text()]
@@ -120,6 +121,7 @@ class Settings:
     lattice: Annotated[int, Integer(0, 10**6)]
     resolution: Annotated[float, Number(1e-6, 1)] = 1 / 32
     search: Annotated[str, OneOf(SEARCHES)] = "rods"
+    everywhere: Annotated[bool, Flag()] = False
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -133,7 +135,7 @@ class Settings:
 
     def check(self, task: Task) -> None:
         """Raises `BadInput` if a value does not fit the task: its chart, its episodes, or its inputs."""
-        task.check_noise(self.noise)
+        task.check_noise(self.noise, self.everywhere)
         longest = task.max_steps * task.dt
         if self.horizon is not None and self.horizon > longest:
             raise BadInput(

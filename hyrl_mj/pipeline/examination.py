@@ -33,7 +33,7 @@ class ExamineOptions:
             case can be computed exactly, on charts of one or two dimensions.
         noise: kinds of noise in the episodes; by default none,uniform,alternating,adversarial.
         all_coordinates: add noise to every coordinate of the measurement, not only to the noisy ones of the
-            task.
+            task; always, if the run was made so.
         near_critical: start all episodes within twice the bound of the critical set.
         seed: seed of starts and noise of the episodes.
     """
@@ -73,7 +73,8 @@ def examine_loops(
     """
     task, points = run.task, run.critical_set.points
     eps = run.settings.noise if options.eps is None else options.eps
-    everywhere, count, seed = options.all_coordinates, options.episodes, options.seed
+    everywhere = options.all_coordinates or run.settings.everywhere
+    count, seed = options.episodes, options.seed
     task.check_noise(eps, everywhere)
     if count is None and not run.exact:
         count = EPISODES_SMOKE if run.settings.preset == "smoke" else EPISODES

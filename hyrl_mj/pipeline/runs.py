@@ -39,6 +39,7 @@ class RunOptions:
             with the interface of SB3's, as sb3_contrib:TQC; by default the task's.
         horizon: time T of the backward propagation [s], in the paper 0.5 (unit_circle) and 0.3 (vehicle);
             by default the paper's with preset paper, otherwise the sets are sized to the noise.
+        all_coordinates: noise on every coordinate of the measurement, not only on the noisy ones of the task.
         set: settings to change, as they stand in config.json, such as stage1.samples=300000; by default none.
         out: the run directory; by default runs/TASK.
     """
@@ -48,6 +49,7 @@ class RunOptions:
     preset: str = "fast"
     algorithm: str | None = None
     horizon: float | None = None
+    all_coordinates: bool = False
     set: dict[str, Any] = field(default_factory=dict)
     out: str | Path | None = None
 
@@ -70,6 +72,7 @@ class AgentOptions:
         preset: fast, paper or smoke, as for `hyrl-mj run`.
         horizon: time T of the backward propagation [s]; by default the paper's with preset paper, otherwise
             the sets are sized to the noise.
+        all_coordinates: noise on every coordinate of the measurement, not only on the noisy ones of the task.
         out: the run directory; by default runs/TASK_robust.
     """
 
@@ -81,6 +84,7 @@ class AgentOptions:
     seed: int = 0
     preset: str = "fast"
     horizon: float | None = None
+    all_coordinates: bool = False
     out: str | Path | None = None
 
 
@@ -218,7 +222,10 @@ def settings_of(task: Task, options: RunOptions) -> Settings:
 def _settings(task: Task, options: RunOptions | AgentOptions, **changes: Any) -> Settings:
     """Returns the settings of the preset that options name."""
     eps, seed, horizon = options.eps, options.seed, options.horizon
-    return preset(task, options.preset, noise=eps, seed=seed, horizon=horizon, **changes)
+    settings = preset(task, options.preset, noise=eps, seed=seed, horizon=horizon, **changes)
+    settings = replace(settings, everywhere=options.all_coordinates)
+    settings.check(task)
+    return settings
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from threadpoolctl import threadpool_limits
 
@@ -20,15 +21,13 @@ from hyrl_mj.pipeline.examination import (
     examine_loops,
     examine_stage,
 )
-from hyrl_mj.policies import Agent, MlpPolicy, Policy, PolicyController, algorithms
+from hyrl_mj.policies import Agent, MlpPolicy, PolicyController, algorithms
 from hyrl_mj.progress import Say
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import Grid
 from hyrl_mj.stages import (
     Arrivals,
-    ExtendedSets,
     ModeResult,
-    Partition,
     Retraining,
     boundary,
     extend,
@@ -36,9 +35,11 @@ from hyrl_mj.stages import (
     make_partition,
     with_room,
 )
-from hyrl_mj.tasks import Task
 from hyrl_mj.verdict import mode_sentence
 from hyrl_mj.viz import ReplayOptions, replay_sentence
+
+if TYPE_CHECKING:
+    from hyrl_mj.stages.retraining import ModeGround, WarmStart
 
 # The video with preset smoke only shows that a video can be made.
 SMOKE = ReplayOptions(size=(640, 360), fps=10)
@@ -97,9 +98,13 @@ def extended_sets_stage(run: Run, say: Say) -> None:
 
 def retrain_stage(run: Run, say: Say) -> None:
     """Stage 6: trains the policy of each mode."""
+    from hyrl_mj.stages.retraining import mode_ground, start_policy
+
     s, sets = run.settings, run.extended_sets
     algorithms.check_named(s.stage6.algorithm)
-    work = partial(_retrained, run.task, s, run.steady, run.partition, sets, run.path / "logs")
+    ground_of = partial(mode_ground, run.task, sets, parts=run.split, policy=run.steady)
+    warm_start = partial(start_policy, run.steady, run.partition)
+    work = partial(_retrained, s, ground_of, warm_start, run.path / "logs")
     done: list[tuple[MlpPolicy, ModeResult]] = []
     if run.task.mirror is None:
         done += cores.spread(work, sets.modes)
@@ -114,23 +119,21 @@ def retrain_stage(run: Run, say: Say) -> None:
 
 
 def _retrained(
-    task: Task,
     settings: Settings,
-    policy: Policy,
-    partition: Partition,
-    sets: ExtendedSets,
+    ground_of: Callable[[int], ModeGround],
+    warm_start: WarmStart,
     logs: Path,
     mode: int,
     others: Iterable[MlpPolicy] = (),
 ) -> tuple[MlpPolicy, ModeResult]:
     """Trains the policy of one mode, which may happen in a process of a pool."""
-    from hyrl_mj.stages.retraining import mode_ground, retrain, start_policy
+    from hyrl_mj.stages.retraining import retrain
 
     return retrain(
-        mode_ground(task, sets, mode),
+        ground_of(mode),
         settings.stage6,
         settings.seed,
-        warm_start=partial(start_policy, policy, partition),
+        warm_start=warm_start,
         others=others,
         log_dir=logs / f"mode_{mode}",
     )

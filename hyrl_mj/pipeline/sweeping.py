@@ -34,6 +34,7 @@ class SweepOptions:
         algorithm: the algorithms of stage 1, as dqn,ppo; by default the task's.
         preset: fast, paper or smoke, as for `hyrl-mj run`.
         horizon: time T of the backward propagation [s]; by default as for `hyrl-mj run`.
+        all_coordinates: noise on every coordinate of the measurement, not only on the noisy ones of the task.
         set: settings to change in all runs, as stage1.samples=300000; by default none.
         cores: cores of each run; by default the cores of the machine divided by the number of runs, at
             least one.
@@ -48,6 +49,7 @@ class SweepOptions:
     algorithm: tuple[str, ...] = ()
     preset: str = "fast"
     horizon: float | None = None
+    all_coordinates: bool = False
     set: dict[str, Any] = field(default_factory=dict)
     cores: int | None = None
     memory: float = 1.5
@@ -98,7 +100,7 @@ def sweep(
     options = complete(SweepOptions, options, changes)
     jobs = {row.name: (row, one) for row, one in _jobs(_several(tasks), options)}
     folder = Path(options.out)
-    common = Common(options.preset, options.horizon, options.set)
+    common = Common(options.preset, options.horizon, options.set, options.all_coordinates)
     planned = [row for row, _ in jobs.values()]
     result = sweeps.opened(folder, common, planned)
     rows = [row.on_disk(folder) for row in result.rows if row.name in jobs]
@@ -185,6 +187,7 @@ def _jobs(names: tuple[str | Path, ...], options: SweepOptions) -> Iterator[tupl
                 preset=options.preset,
                 algorithm=algorithm,
                 horizon=options.horizon,
+                all_coordinates=options.all_coordinates,
                 set=options.set,
             )
             settings_of(task, one)

@@ -34,6 +34,11 @@ ALLOWED_DELAY = 0.03
 # episodes for each kind, and how many run at once. Most policies are bad and fail in the first batch.
 JUDGES = ("none", "uniform", "alternating", "adversarial")
 EPISODES, BATCH = 256, 64
+# There, a policy may end this many times as far off the set-point as the stage-1 policy, because it goes the
+# long way, too; or by this share of the distance that counts as arrived.
+ALLOWED_MISS, MISS_SHARE = 2.0, 0.25
+# Returns the policy that the first attempt continues from, by the ground of the mode, settings and a seed.
+WarmStart = Callable[["ModeGround", Training, int], MlpPolicy | None]
 
 
 def start_policy(
@@ -64,7 +69,7 @@ def retrain(
     settings: Training,
     seed: int,
     *,
-    warm_start: Callable[[ModeGround, Training, int], MlpPolicy | None] | None = None,
+    warm_start: WarmStart | None = None,
     others: Iterable[MlpPolicy] = (),
     log_dir: Path | None = None,
 ) -> tuple[MlpPolicy, ModeResult]:
@@ -115,9 +120,16 @@ def retrain(
     return best, ModeResult(mode, ground.won(best), trainings)
 
 
-def mode_ground(task: Task, extended: ExtendedSets, mode: int) -> ModeGround:
+def mode_ground(
+    task: Task,
+    extended: ExtendedSets,
+    mode: int,
+    parts: Partition | None = None,
+    policy: Policy | None = None,
+) -> ModeGround:
     """Returns the ground of a mode, judged by the worst-case game if possible, otherwise by episodes."""
-    return (ByGame if game.Lattice.possible(task) else ByEpisodes)(task, extended, mode)
+    kind = ByGame if game.Lattice.possible(task) else ByEpisodes
+    return kind(task, extended, mode, parts, policy)
 
 
 class ModeGround(ABC):
@@ -129,6 +141,8 @@ class ModeGround(ABC):
         task: the robot and its problem.
         extended: M_ext_i and W_i.
         mode: the mode.
+        parts: M_i, the parts that were extended; by default the mode earns its reward everywhere.
+        policy: the stage-1 policy, or the agent, which shows how close to the set-point a run can end.
 
     Attributes:
         bound: (d,) largest error of a measured chart point, along each coordinate.
@@ -138,8 +152,16 @@ class ModeGround(ABC):
     noise: Noise
     settled = 0.0  # scores count from the beginning
 
-    def __init__(self, task: Task, extended: ExtendedSets, mode: int):
+    def __init__(
+        self,
+        task: Task,
+        extended: ExtendedSets,
+        mode: int,
+        parts: Partition | None = None,
+        policy: Policy | None = None,
+    ):
         self.task, self.extended, self.mode = task, extended, mode
+        self.part = None if parts is None else parts.parts[parts.modes.index(mode)]
         self.bound = task.noise_in_chart(extended.noise)
         index = extended.modes.index(mode)
         self.within = extended.sets[index].dilated_by_box(self.bound)
@@ -156,6 +178,11 @@ class ModeGround(ABC):
         self.early = early if len(early) else self.nodes
         self.lost, self._weight = np.empty(0, dtype=int), np.empty(0)
         self._latest: tuple[MlpPolicy, Score] | None = None
+        self._prepare(policy)
+
+    @abstractmethod
+    def _prepare(self, policy: Policy | None) -> None:
+        """Prepares the judge."""
 
     def __call__(self, policy: MlpPolicy) -> Score:
         """Returns the score of a policy. Later starts are drawn where the latest policy has lost."""
@@ -172,10 +199,15 @@ class ModeGround(ABC):
         """Returns the share that a policy wins, as in `ModeResult`."""
 
     def domain(self, gamma: float) -> Domain:
-        """Returns the domain of training; leaving it costs the worst reward for ever."""
+        """Returns the domain of training; leaving it costs the worst reward for ever.
+
+        Beyond its part a mode earns nothing: there the task's reward leads to the other way, and it could
+        pay to creep or to stay at the edge of the set, because the detour is long and returns are discounted.
+        """
         caution = self.extended.noise * np.array(self.task.noisy, dtype=float)
         exit_reward = self.task.worst_reward / (1 - gamma)
-        return Domain(self.starts, self.within.contains, exit_reward, caution)
+        earns = None if self.part is None else self.part.contains
+        return Domain(self.starts, self.within.contains, exit_reward, caution, earns)
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draws n starts (n, d): where the game is lost, where the task starts, and all over."""
@@ -209,9 +241,8 @@ class ByGame(ModeGround):
     enough: Score = (0.0, -1.0)
     noise = Noise()  # the game finds the worst
 
-    def __init__(self, task: Task, extended: ExtendedSets, mode: int):
-        super().__init__(task, extended, mode)
-        self.lattice = game.Lattice.of(task, self.grid)
+    def _prepare(self, policy: Policy | None) -> None:
+        self.lattice = game.Lattice.of(self.task, self.grid)
         after = self.lattice.after
         inside = np.append(self.within.mask, [True, False])[after]
         fewest, _ = game.fewest_samples(self.lattice, after, inside)
@@ -261,44 +292,59 @@ class ByEpisodes(ModeGround):
 
     The episodes start where the hybrid controller may select the mode. Without noise all have to arrive at
     the set-point, under noise all have to survive. The score is the number of kinds of noise, in the order of
-    `JUDGES`, that stop no episode, then minus the share of episodes that the next kind stops.
+    `JUDGES`, that stop no episode, then minus the share of episodes that the next kind stops; if none is
+    stopped, minus the largest distance from the set-point at the end without noise, as a multiple of
+    `allowed`.
 
     Attributes:
         judged: (n, d) starts of the episodes.
+        allowed: allowed distance from the set-point at the end of episodes without noise [chart units].
     """
 
-    enough: Score = (float(len(JUDGES)), 0.0)
+    enough: Score = (float(len(JUDGES)), -1.0)
 
-    def __init__(self, task: Task, extended: ExtendedSets, mode: int):
-        super().__init__(task, extended, mode)
-        self.noise = Noise("uniform", extended.noise)
-        depth = np.stack([s.values for s in extended.sets])
-        deepest = GridSet.from_mask(self.grid, depth.argmin(axis=0) == extended.modes.index(mode))
+    def _prepare(self, policy: Policy | None) -> None:
+        self.noise = Noise("uniform", self.extended.noise)
+        depth = np.stack([s.values for s in self.extended.sets])
+        own = depth.argmin(axis=0) == self.extended.modes.index(self.mode)
+        deepest = GridSet.from_mask(self.grid, own)
         picked = deepest.dilated_by_box(self.bound).mask[self.early]
         rng = np.random.default_rng(0)
         first = rng.choice(self.early[picked] if picked.any() else self.early, EPISODES)
         self.judged = self._around(first, rng)
-        self._plant = task.plant(BATCH)
+        self._plant = self.task.plant(BATCH)
+        self.allowed = self._allowed(policy)
+
+    def _allowed(self, policy: Policy | None) -> float:
+        """Returns `allowed`, by the runs of the stage-1 policy that arrive, if there are any."""
+        precision, close, done = self.task.precision, self.task.close, range(0, EPISODES, BATCH)
+        batches = [self._play(policy, JUDGES[0], k) for k in done] if policy else []
+        ends = np.concatenate([np.empty(0), *(miss[won] for won, miss in batches)])
+        least = min(precision, MISS_SHARE * close if len(ends) else close)
+        return max(ALLOWED_MISS * float(ends.max(initial=0.0)), least)
 
     def score(self, policy: MlpPolicy) -> Score:
+        farthest = 0.0
         for survived, kind in enumerate(JUDGES):
             for done in range(0, EPISODES, BATCH):
-                won = self._play(policy, kind, done)
+                won, miss = self._play(policy, kind, done)
+                farthest = max(farthest, miss.max()) if kind == JUDGES[0] else farthest
                 lost = self.grid.nearest(self.judged[done : done + BATCH][~won])
                 self._remember(lost, np.ones(len(lost)))
                 if len(lost):
                     return float(survived), -len(lost) / (done + BATCH)
-        return self.enough
+        return float(len(JUDGES)), -farthest / self.allowed
 
     def won(self, policy: MlpPolicy) -> float:
         batches = product(JUDGES, range(0, EPISODES, BATCH))
-        return float(np.mean([self._play(policy, kind, done) for kind, done in batches]))
+        return float(np.mean([self._play(policy, kind, done)[0] for kind, done in batches]))
 
-    def _play(self, policy: MlpPolicy, kind: str, done: int) -> np.ndarray:
-        """Returns which of the episodes of one batch are won: (BATCH,) bool."""
+    def _play(self, policy: Policy, kind: str, done: int) -> tuple[np.ndarray, np.ndarray]:
+        """Returns which episodes of one batch are won, and how far off they end: (BATCH,), (BATCH,)."""
         settings = LoopSettings(plant=self._plant, vary=True, quiet=True)
         starts, noise = self.judged[done : done + BATCH], Noise(kind, self.extended.noise)
         loop = PolicyController(policy)
         run = closed_loop(self.task, loop, starts, noise, seed=done, settings=settings)
-        won = run.outcome == Outcome.REACHED
-        return np.asarray(won & self.task.arrived(run.path[-1]) if kind == "none" else won)
+        ends, won = run.path[-1], run.outcome == Outcome.REACHED
+        won = won & self.task.arrived(ends) if kind == JUDGES[0] else won
+        return won, self.task.miss(ends)

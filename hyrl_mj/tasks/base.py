@@ -269,6 +269,12 @@ class Task(ABC):
         d = self.chart.dimension
         return bound * (np.ones(d) if everywhere else np.array(self.noisy[:d], dtype=float))
 
+    def noisy_everywhere(self) -> Self:
+        """Returns this task with noise of the whole bound on every column of the measurement."""
+        task = object.__new__(type(self))
+        vars(task).update(vars(self), noisy=(True,) * len(self.noisy))
+        return task
+
     def noise_on(self, everywhere: bool = False) -> tuple[str, str]:
         """Returns the chart coordinates that noise acts on, and their unit: "x and y", "m"."""
         noisy = self.noise_in_chart(1.0, everywhere) > 0

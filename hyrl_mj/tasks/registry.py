@@ -198,8 +198,9 @@ def _from_file(path: Path) -> type[Task]:
     return _FILES[path]
 
 
-def _by_reference(task: Task) -> tuple[Callable[[str], Task], tuple[str]]:
-    return get_task, (reference(task),)
+def _by_reference(task: Task) -> tuple[Callable[[str], Task], tuple[str], dict[str, object]]:
+    own = {name: value for name, value in vars(task).items() if name == "noisy"}
+    return get_task, (reference(task),), own
 
 
 def _run(path: Path) -> ModuleType:

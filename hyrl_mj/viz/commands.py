@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 from hyrl_mj import learning
@@ -16,7 +17,7 @@ from hyrl_mj.run_directory import Run
 def commands(run: Run, robustness: Robustness | None) -> list[str]:
     """Returns the commands that repeat the run, and its examination if that had options of its own."""
     r, lines = robustness, [beginning(run)]
-    if r and (r.episodes or r.everywhere or r.eps != run.settings.noise):
+    if r and (r.episodes or not run.is_examined_as_usual):
         lines.append(_examination(r))
     return lines
 
@@ -26,6 +27,7 @@ def beginning(run: Run, out: Path | None = None) -> str:
     s, agent = run.settings, run.agent
     if agent and not agent.source:
         rest = "" if s.horizon is None else f", horizon={s.horizon}"
+        rest += ", all_coordinates=True" if s.everywhere else ""
         rest += "" if out is None else f", out={str(out)!r}"
         return (
             f"hyrl_mj.robustify({s.task!r}, policy, eps={s.noise}, seed={s.seed}, "
@@ -37,6 +39,8 @@ def beginning(run: Run, out: Path | None = None) -> str:
         words += ["--algorithm", s.stage1.algorithm]
     if s.horizon is not None:
         words += ["--horizon", f"{s.horizon}"]
+    if s.everywhere:
+        words.append("--all-coordinates")
     if not agent and (changes := _changes(run)):
         words += ["--set", *(f"{name}={json.dumps(value)}" for name, value in changes.items())]
     if out is not None:
@@ -77,10 +81,11 @@ def _again(run: Run) -> Settings:
     """Returns the settings of this version's preset with the options of a run."""
     s = run.settings
     algorithm = None if run.agent or not _is_known(run) else s.stage1.algorithm
-    return preset(
+    again = preset(
         run.task, s.preset, noise=s.noise, seed=s.seed, horizon=s.horizon,
         agent=run.agent, algorithm=algorithm,
     )  # fmt: skip
+    return replace(again, everywhere=s.everywhere)
 
 
 def _is_known(run: Run) -> bool:

@@ -100,7 +100,9 @@ def _enlarge(whole: Axes, near: Axes, shown: ShownRun) -> None:
         drawn.set_clip_on(True)  # marks outside this panel would show beside it
     # The width is drawn at the middle one of M*'s points.
     middle = points[np.argsort(points.sum(axis=1))[len(points) // 2]]
-    axis = int(np.argmax(task.noise_in_chart(1.0)))
+    # Of the noisy coordinates, that across M*.
+    noisy = task.noise_in_chart(1.0) > 0
+    axis = int(np.where(noisy, np.ptp(points, axis=0), np.inf).argmin())
     step = eps * np.eye(2)[axis]
     ends = np.stack([middle - step, middle + step]).T
     looks: dict[str, Any] = {"color": style.RED, "linewidth": 2, "markersize": 9, "zorder": 4}
