@@ -207,6 +207,40 @@ class EpisodeCount:
 
 
 @dataclass(frozen=True)
+class AttackCount:
+    """From how many starts an attack made one controller lose, by a search for noise signals.
+
+    Attributes:
+        controller: name of the controller.
+        eps, everywhere: the bound of the noise, and whether it acts on all columns of the measurement.
+        starts: number of starts that were attacked.
+        lost: number of those for which a signal was found under which the run does not reach the set-point.
+        interval: 95% interval of the share that is lost (Wilson).
+        rounds: number of rounds of the search.
+        seconds: the time that was given for them [s]; None if their number was.
+        start: (d,) the start of the strongest signal: of the earliest failure, or where nothing is lost of
+            the run with the greatest danger.
+        outcome: how the run from there ends.
+    """
+
+    controller: str
+    eps: float
+    everywhere: bool
+    starts: int
+    lost: int
+    interval: tuple[float, float]
+    rounds: int
+    seconds: float | None
+    start: tuple[float, ...]
+    outcome: str
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether there are starts, and no more of them are lost than there are."""
+        return 0 <= self.lost <= self.starts and self.starts > 0 and self.rounds > 0
+
+
+@dataclass(frozen=True)
 class Robustness:
     """The result of an examination under noise, saved as `robustness.json`.
 
@@ -215,7 +249,8 @@ class Robustness:
         everywhere: whether noise acts on all columns of the measurement.
         game: result of the worst-case game, if it can be played exactly.
         episodes: counts of noisy episodes.
-        seed: seed of the starts and the noise of these episodes.
+        seed: seed of the starts and the noise of these episodes and attacks.
+        attacks: counts of the attack, one for each controller, if there was one.
     """
 
     eps: float
@@ -223,6 +258,7 @@ class Robustness:
     game: GameResult | None
     episodes: tuple[EpisodeCount, ...]
     seed: int
+    attacks: tuple[AttackCount, ...] = ()
 
     def check(self, controllers: Collection[str]) -> None:
         """Raises `BadArtifact` unless there are whole results of these controllers, as stages write them."""
@@ -236,6 +272,9 @@ class Robustness:
         known = all(c.controller in controllers and c.is_whole for c in self.episodes)
         if not known or len(set(map(frozenset, kinds.values()))) > 1:
             raise BadArtifact(f"its episodes are not those of {' and '.join(controllers)}")
+        attacked = [count.controller for count in self.attacks if count.is_whole]
+        if self.attacks and attacked != [*controllers]:
+            raise BadArtifact(f"its attacks are not those of {' and '.join(controllers)}")
 
     def __repr__(self) -> str:
         game = f"{self.game}, " if self.game else ""
