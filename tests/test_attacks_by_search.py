@@ -18,9 +18,8 @@ from hyrl_mj import BadInput, Noise, Outcome, Recorded, Sample, cores, simulate
 from hyrl_mj.game import NEVER, Game
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.sets import Grid
-from hyrl_mj.simulation import closed_loop
-from hyrl_mj.simulation.programmes import Programmes, Rules
-from hyrl_mj.stages.attack import Budget, attack, attack_starts
+from hyrl_mj.simulation import Programmes, Rules, closed_loop
+from hyrl_mj.stages.attacks import Budget, attack, attack_starts
 
 EPS = 0.1
 ON_THE_LEFT = np.array([[0.0, 1.0], [0.05, 1.0], [0.1, 1.0], [0.0, 1.02]])
@@ -30,8 +29,8 @@ ON_THE_LEFT = np.array([[0.0, 1.0], [0.05, 1.0], [0.1, 1.0], [0.0, 1.02]])
 class Lock:
     """A controller of the vehicle that only one order of noise opens, from a start at y = 1.
 
-    A measurement above 1.05 at x = 0.5 to 0.7 opens it, another one from x = 0.8 on closes it again; after one
-    below 0.95 at x = 1.6 to 1.8 it leaves the arena if it is open.
+    A measurement above 1.05 at x = 0.5 to 0.7 opens it, and another one from x = 0.8 on closes it again. If
+    it is open, it leaves the arena after a measurement below 0.95 at x = 1.6 to 1.8.
     """
 
     modes = (0, 1, 2)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -297,7 +297,12 @@ class Robustness:
             BadArtifact: the file is missing, damaged, of another version, or about other controllers.
         """
         remedy = "run hyrl-mj robustness RUN to write it again"
-        robustness = artifacts.read_record(path, "robustness", Robustness, remedy)
+
+        def record(content: dict[str, Any]) -> Robustness:
+            # Before there were attacks, files had no field for them.
+            return artifacts.parsed({"attacks": [], **content}, Robustness, remedy)
+
+        robustness = artifacts.read_json(path, "robustness", record, remedy)
         if of:
             with artifacts.reading(path):
                 robustness.check(of)

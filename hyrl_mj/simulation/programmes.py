@@ -77,7 +77,8 @@ def _directions(noisy: np.ndarray) -> np.ndarray:
     These are zero, both ends and their halves of one column; zero and the ends of two or three, in all
     combinations; and with more columns each of them alone, and all together.
     """
-    columns, count = np.flatnonzero(noisy), np.count_nonzero(noisy)
+    columns = np.flatnonzero(noisy)
+    count = len(columns)
     if count <= 3:
         factors = (0.0, 1.0, -1.0, 0.5, -0.5) if count == 1 else (0.0, 1.0, -1.0)
         table = np.array(list(product(factors, repeat=count)))
@@ -90,7 +91,9 @@ def _directions(noisy: np.ndarray) -> np.ndarray:
 
 
 class Programmes(Signal):
-    """A programme of rules for each of n runs: a rule for each segment of time, the last for all that follows.
+    """A programme of rules for each of n runs: a rule for each segment of time.
+
+    The last rule holds for all that follows.
 
     It serves one closed loop, and remembers what it saw there.
 
@@ -176,7 +179,9 @@ class Programmes(Signal):
                 value = direction * u[:, :, column]
             noise[rows[mine]] = self.rules.candidates[value[:, mine].argmax(axis=0)]
 
-    def _observe(self, true: np.ndarray, rows: np.ndarray, u: np.ndarray, jumped: np.ndarray) -> None:
+    def _observe(
+        self, true: np.ndarray, rows: np.ndarray, u: np.ndarray, jumped: np.ndarray
+    ) -> None:
         """Notes what the runs `rows` (r,) meet in states of measurements (r, p), and their answers (r, m)."""
         self.danger[rows] = np.maximum(self.danger[rows], self.task.danger(true))
         self.rewards[rows] += self.task.reward(true, u)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import count
 
@@ -18,9 +19,16 @@ from hyrl_mj.errors import BadInput, check_seed
 from hyrl_mj.game import AttackCount
 from hyrl_mj.policies import Controller
 from hyrl_mj.progress import progress_bar
-from hyrl_mj.simulation import HybridArc, LoopSettings, Noise, Recorded, closed_loop, simulate_batch
-from hyrl_mj.simulation.programmes import Programmes, Rules
-from hyrl_mj.stages.critical_set import distance_to
+from hyrl_mj.simulation import (
+    HybridArc,
+    LoopSettings,
+    Noise,
+    Programmes,
+    Recorded,
+    Rules,
+    closed_loop,
+    simulate_batch,
+)
 from hyrl_mj.stages.episodes import Regions
 from hyrl_mj.tasks import Outcome, Task
 
@@ -76,12 +84,14 @@ class Attack:
 
     Attributes:
         count: from how many starts it loses.
-        arcs: the run from each start under the strongest signal that is known there.
+        signal: the strongest signal that is known for each start.
+        arcs: the run from each start under its signal.
         strongest: index of the start of the strongest signal: of the earliest failure, or where nothing is
             lost of the run with the greatest danger.
     """
 
     count: AttackCount
+    signal: Recorded
     arcs: tuple[HybridArc, ...]
     strongest: int
 
@@ -94,11 +104,19 @@ def attack_starts(task: Task, points: np.ndarray, bound: float, n: int, seed: in
     check_seed(seed)
     rng = np.random.default_rng([seed, 2])
     near = np.empty((0, task.chart.dimension))
-    try:
+    with suppress(BadInput):  # where no start lies near M*
         near = Regions(points, near=True).draw(task, bound, n // 2, rng)
-    except BadInput:
-        pass  # no start lies near M*
     return np.vstack([near, task.starts(n - len(near), rng)])
+
+
+def shown_arcs(attacks: Mapping[str, Attack]) -> dict[str, HybridArc]:
+    """Returns the arc of each controller from one start under its own strongest signal from there.
+
+    The start is that of the strongest signal against the last controller that loses any, or if none does
+    against the last one.
+    """
+    losing = [found for found in attacks.values() if found.count.lost] or [*attacks.values()]
+    return {name: found.arcs[losing[-1].strongest] for name, found in attacks.items()}
 
 
 def attack(
@@ -275,4 +293,4 @@ class _Search:
             start=tuple(map(float, self.starts[strongest])),
             outcome=arcs[strongest].outcome,
         )
-        return Attack(count, tuple(arcs), strongest)
+        return Attack(count, recorded, tuple(arcs), strongest)
