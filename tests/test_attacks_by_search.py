@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from planted import (
+    ChartPolicy,
     circle_controller,
     circle_policy,
     decisions,
@@ -209,7 +210,7 @@ def test_rules_stay_within_the_bound_of_each_column(vehicle, shares, candidates,
     assert not rules.candidates[0].any()
     assert (np.abs(rules.candidates) <= EPS * np.array(shares) + 1e-15).all()
     constant = np.array([wish is None for wish in rules.wishes]) & ~rules.alternates
-    assert constant.sum() == ends + 1  # and none
+    assert constant.sum() == ends + 2  # none, and the one that simulates ahead
     assert rules.alternates.sum() == ends / 2
     assert not rules.fixed[rules.nothing].any()
 
@@ -244,3 +245,15 @@ def test_wishes_pick_the_answers_that_they_name(vehicle):
     # Just above the axis the policy steers to the left, and noise can make it steer to the right.
     np.testing.assert_array_equal(u[[0, 3, 4, 5], 0], [-1.0, 1.0, -1.0, 0.0])
     assert Noise("none", 0.1).against(vehicle, loop).shares.tolist() == [0.0, 1.0]
+
+
+def test_the_rule_that_simulates_ahead_gives_adversarial_noise(puck):
+    loop = PolicyController(ChartPolicy(puck, lambda z: np.clip(-3 * z[:, 1:2], -1.0, 1.0)))
+    starts = puck.starts(6, np.random.default_rng(0))
+    shares = np.array(puck.noisy, dtype=float)
+    rules = Rules(puck, loop, EPS, shares)
+    signal = Programmes(puck, loop, rules, np.full((6, 1), rules.ahead), segment=1)
+    ruled = closed_loop(puck, loop, starts, signal)
+    adversarial = closed_loop(puck, loop, starts, Noise("adversarial", EPS))
+    np.testing.assert_array_equal(ruled.path, adversarial.path)
+    assert np.abs(np.array(signal.values)).max() == EPS

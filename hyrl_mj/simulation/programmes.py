@@ -8,6 +8,7 @@ from typing import Self
 import numpy as np
 
 from hyrl_mj.policies import Controller, answer, nothing_past
+from hyrl_mj.simulation.lookahead import Lookahead
 from hyrl_mj.simulation.noise import NOT_STARTED, Sample, Signal
 from hyrl_mj.tasks import Outcome, Task
 
@@ -28,6 +29,7 @@ class Rules:
     - reverse: the answer that differs most from the one before.
     - jump, stay: as contrary, but before all else with another mode, or with the same.
     - to the lower or upper end of an input.
+    - ahead: not asked but simulated, the noise of `Lookahead`, which takes far longer than the others.
 
     Args:
         task, controller: of the closed loop.
@@ -40,6 +42,7 @@ class Rules:
         fixed: (rules, p) noise of the rules that are no wishes; zero for the others.
         alternates: (rules,) bool, whether the sign of this noise alternates.
         wishes: for each rule its wish: None, a word, or the column and direction to steer to.
+        lookahead: gives the noise of the rule `ahead`.
     """
 
     def __init__(self, task: Task, controller: Controller, bound: float, shares: np.ndarray):
@@ -56,11 +59,12 @@ class Rules:
         first_noise = ends[np.arange(len(ends)), (ends != 0).argmax(axis=1)]
         alternating = ends[first_noise > 0]
         no_noise = np.zeros((len(wishes), len(shares)))
-        # The wishes come first: they break the most.
-        self.fixed = np.vstack([no_noise, alternating, ends, no_noise[:1]])
+        # Searches try the rules in this order: wishes break the most, and episodes have alternating noise.
+        self.fixed = np.vstack([no_noise, ends, alternating, no_noise[:2]])
         self.alternates = np.zeros(len(self.fixed), dtype=bool)
-        self.alternates[len(wishes) :][: len(alternating)] = True
+        self.alternates[len(wishes) + len(ends) : -2] = True
         self.wishes = [*wishes, *[None] * (len(self.fixed) - len(wishes))]
+        self.lookahead = Lookahead(bound, shares).against(task, controller)
 
     def __len__(self) -> int:
         return len(self.fixed)
@@ -68,6 +72,11 @@ class Rules:
     @property
     def nothing(self) -> int:
         """The rule without noise."""
+        return len(self) - 2
+
+    @property
+    def ahead(self) -> int:
+        """The rule that simulates ahead, which is the last one."""
         return len(self) - 1
 
 
@@ -140,6 +149,10 @@ class Programmes(Signal):
         noise[rows] = self.rules.fixed[rule] * sign[:, None]
         past = nothing_past(self.controller, *true.shape) if now.past is None else now.past
         self._fulfil(noise, rows, rule, now, past)
+        if len(mine := rows[rule == self.rules.ahead]):
+            runs = now.rows[mine]
+            part = Sample(runs, now.k[mine], true[mine], now.q[mine], now.plant, past[mine])
+            noise[mine] = self.rules.lookahead.sample(part)
         u, q = self._answers(true[rows] + noise[rows], now.q[rows], past[rows])
         self._observe(true[rows], rows, u, q != now.q[rows])
         self.values.append(noise)

@@ -38,10 +38,13 @@ LONGEST, MOST_ROUNDS = 86_400.0, 100_000
 STARTS = 200
 # Segments of a programme, each of the same time; together as long as a run without noise.
 SEGMENTS = 10
-# Programmes that are tried in a round from each start; of these, programmes that won from starts nearby.
-POPULATION, COPIED = 8, 2
-# What programmes are looked for that do not win yet: danger on the way, late arrival, dithering.
+# What is looked for in programmes that do not win yet: danger on the way, late arrival, dithering.
 GOALS = 3
+# Programmes that are tried in a round from each start: some that won from starts nearby, and one a goal.
+COPIED = 1
+POPULATION = COPIED + GOALS
+# The round that tries the noise of `Lookahead`, which takes longer than others.
+LOOKS_AHEAD = 4
 # The best programmes so far, for each start and goal, that new ones are drawn from; and the share of the
 # segments that take any rule instead.
 ELITES, EXPLORE = 3, 0.25
@@ -131,9 +134,9 @@ def attack(
     """Searches for noise signals that make closed loops fail.
 
     Each round tries `POPULATION` signals from every start of every controller that nothing has broken yet.
-    The first rounds hold each rule of `Rules` throughout. Later ones follow programmes that vary and join
-    the best so far, and those that won from starts nearby. The coordinates outside the chart begin at their
-    usual values.
+    The first rounds hold each rule of `Rules` throughout, the fourth that which simulates ahead. Later ones
+    follow programmes that vary and join the best so far, and those that won from starts nearby. The
+    coordinates outside the chart begin at their usual values.
 
     Args:
         task: the robot and its problem.
@@ -212,13 +215,15 @@ class _Search:
         elite, segment = rng.integers(ELITES, size=shape), np.arange(SEGMENTS)
         drawn = self._elites[rows[:, None, None], goal, elite, segment]
         explores = rng.random(shape) < EXPLORE
-        programmes = np.where(explores, rng.integers(len(self.rules), size=shape), drawn)
+        programmes = np.where(explores, rng.integers(self.rules.ahead, size=shape), drawn)
         held = np.arange(self.rules.nothing)[(number - 1) * POPULATION : number * POPULATION]
         programmes[:, : len(held)] = held[:, None]
         lost = np.flatnonzero(~self.open)
         for row, mine in zip(rows, programmes[:, len(held) :][:, :COPIED], strict=True):
             copies = self._from_nearby(row, lost)[: len(mine)]
             mine[: len(copies)] = np.reshape(copies, (-1, SEGMENTS))
+        if number == LOOKS_AHEAD:
+            programmes[:, -1] = self.rules.ahead
         return programmes
 
     def _from_nearby(self, row: int, lost: np.ndarray) -> list[np.ndarray]:
