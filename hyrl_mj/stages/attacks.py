@@ -11,14 +11,12 @@ import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import count
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput, check_seed
 from hyrl_mj.game import AttackCount
 from hyrl_mj.policies import Controller
-from hyrl_mj.progress import progress_bar
 from hyrl_mj.simulation import (
     HybridArc,
     LoopSettings,
@@ -59,7 +57,7 @@ class Budget:
     The rounds are the same in both cases: the time only decides how many of them are done. At least one is.
 
     Attributes:
-        seconds: no round begins after this time [s].
+        seconds: time [s]; a round that would take longer than what is left of it does not begin.
         rounds: number of rounds.
     """
 
@@ -162,14 +160,15 @@ def attack(
         for name, loop in controllers.items()
     }
     rounds = 0
-    with progress_bar(None, "attack", "rounds", budget.rounds) as progress:
-        for rounds in count(1):
-            for search in searches.values():
-                search.round(rounds)
-            progress.update()
-            late = budget.seconds is not None and time.monotonic() - began >= budget.seconds
-            if late or rounds == budget.rounds or not any(s.open.any() for s in searches.values()):
-                break
+    while any(search.open.any() for search in searches.values()) or not rounds:
+        rounds, before = rounds + 1, time.monotonic()
+        for search in searches.values():
+            search.round(rounds)
+        now = time.monotonic()
+        # The next round will take about as long as this one.
+        late = budget.seconds is not None and 2 * now - before - began > budget.seconds
+        if late or rounds == budget.rounds:
+            break
     return {
         name: search.result(name, everywhere, rounds, budget.seconds)
         for name, search in searches.items()
@@ -189,6 +188,7 @@ class _Search:
     ):
         self.task, self.controller, self.starts = task, controller, starts
         self.rules, self.seed = rules, seed
+        self._label = "attack, without noise"
         n, self.segment = len(starts), task.max_steps
         self.open = np.ones(n, dtype=bool)
         self.signals = np.zeros((task.max_steps, n, rules.fixed.shape[1]))
@@ -203,7 +203,7 @@ class _Search:
 
     def round(self, number: int) -> None:
         """Tries some programmes from each open start; the rounds are numbered from 1."""
-        rows = np.flatnonzero(self.open)
+        rows, self._label = np.flatnonzero(self.open), f"attack, round {number}"
         if len(rows):
             self._try(rows, self._population(rows, number))
 
@@ -253,7 +253,7 @@ class _Search:
     def _simulate(self, rows: np.ndarray, programmes: np.ndarray) -> np.ndarray:
         """Simulates a programme from each of the starts `rows` (k,), and returns the lengths (k,)."""
         signal = Programmes(self.task, self.controller, self.rules, programmes, self.segment)
-        settings = LoopSettings(quiet=True)
+        settings = LoopSettings(label=self._label)
         run = closed_loop(self.task, self.controller, self.starts[rows], signal, settings=settings)
         lost = run.outcome != Outcome.REACHED
         mean = signal.rewards / np.maximum(run.length, 1)
