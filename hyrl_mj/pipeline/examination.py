@@ -49,8 +49,8 @@ class ExamineOptions:
         seed: seed of starts and noise of the episodes and of the attack.
         attack_seconds: time [s] of an attack, a search for noise that makes policy and hybrid controller
             fail; by default a few rounds where the worst case cannot be computed, else none.
-        attack_rounds: number of rounds of the attack instead of a time, as an earlier one was told to have
-            had, which repeats it; by default the time decides.
+        attack_rounds: number of rounds of the attack instead of a time, which repeats an earlier one of as
+            many; by default the time decides.
     """
 
     eps: float | None = None

@@ -32,8 +32,6 @@ from hyrl_mj.tasks import Outcome, Task
 
 # The longest attack [s], a day, and the most rounds.
 LONGEST, MOST_ROUNDS = 86_400.0, 100_000
-# Starts of an attack.
-STARTS = 200
 # Segments of a programme, each of the same time; together as long as a run without noise.
 SEGMENTS = 10
 # What is looked for in programmes that do not win yet: danger on the way, late arrival, dithering.
@@ -161,12 +159,12 @@ def attack(
     }
     rounds = 0
     while any(search.open.any() for search in searches.values()) or not rounds:
-        rounds, before = rounds + 1, time.monotonic()
+        rounds, before = rounds + 1, time.monotonic() - began
         for search in searches.values():
             search.round(rounds)
-        now = time.monotonic()
+        after = time.monotonic() - began
         # The next round will take about as long as this one.
-        late = budget.seconds is not None and 2 * now - before - began > budget.seconds
+        late = budget.seconds is not None and after + (after - before) > budget.seconds
         if late or rounds == budget.rounds:
             break
     return {
