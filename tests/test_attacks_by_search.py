@@ -202,7 +202,7 @@ def test_half_of_the_starts_lie_near_the_critical_set(vehicle):
 
 @pytest.mark.parametrize(
     ("shares", "candidates", "ends"),
-    [((0.0, 1.0), 5, 2), ((1.0, 0.5), 9, 4), ((1.0, 1.0, 1.0), 27, 8), ((1.0,) * 5, 13, 12)],
+    [((0.0, 1.0), 9, 2), ((1.0, 0.5), 25, 4), ((1.0, 1.0, 1.0), 27, 8), ((1.0,) * 5, 13, 12)],
 )
 def test_rules_stay_within_the_bound_of_each_column(vehicle, shares, candidates, ends):
     rules = Rules(vehicle, Lock(), EPS, np.array(shares))

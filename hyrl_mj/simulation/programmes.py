@@ -83,14 +83,15 @@ class Rules:
 def _directions(noisy: np.ndarray) -> np.ndarray:
     """Returns the candidates (c, p) as shares of the bound, for the noisy columns (p,) bool.
 
-    These are zero, both ends and their halves of one column; zero and the ends of two or three, in all
-    combinations; and with more columns each of them alone, and all together.
+    These are all combinations of zero and the ends, of one or two columns of their halves too, and of one of
+    the quarters; with more than three columns the ends of each alone, and of all together.
     """
     columns = np.flatnonzero(noisy)
     count = len(columns)
     if count <= 3:
-        factors = (0.0, 1.0, -1.0, 0.5, -0.5) if count == 1 else (0.0, 1.0, -1.0)
-        table = np.array(list(product(factors, repeat=count)))
+        factors = (0.0, 1.0, -1.0, 0.5, -0.5, 0.25, -0.25, 0.75, -0.75)
+        some = factors[: {1: 9, 2: 5}.get(count, 3)]
+        table = np.array(list(product(some, repeat=count)))
     else:
         one = np.vstack([np.ones((1, count)), np.eye(count)])
         table = np.vstack([np.zeros((1, count)), one, -one])
