@@ -31,7 +31,7 @@ KINDS = ("none", "uniform", "alternating", "adversarial")
 EPISODES, EPISODES_SMOKE = 1_000, 200
 # Starts and rounds of the attack on such a run.
 ATTACKED, ATTACKED_SMOKE = 200, 40
-ROUNDS, ROUNDS_SMOKE = 3, 1
+ROUNDS, ROUNDS_SMOKE = 2, 1
 
 
 @dataclass(frozen=True)
