@@ -155,7 +155,8 @@ def simulate(
             starts of the paper's replays.
         q0: start mode; by default the controller selects it from the first measurement.
         noise: kind of noise: none, uniform, alternating, adversarial (looks a few samples ahead),
-            or worst (the signal with which the worst-case game is lost, or arrival is latest).
+            attack (the strongest signal that a search finds), or worst (the signal with which the worst-case
+            game is lost, or arrival is latest).
         eps: bound of the noise, in the units of the chart; by default the run's.
         time: time to simulate [s]; by default the task's.
         seed: seed of the noise.
@@ -208,12 +209,13 @@ def replay(
     Args:
         out: the mp4 or gif to write, with its last frame as a png of the same name, or a png alone; by
             default replay.mp4 in the run directory.
-        starts: critical (the start on the critical set, once for each start mode), paper (all of the
+        starts: critical (the start on the critical set, once for each start mode; where no game can be
+            played, the strongest signals of the attack), paper (all of the
             paper's at once), or latest (what `hyrl-mj simulate --start` simulated last).
         noise: kind of noise under which to simulate anew: none, uniform, alternating, adversarial (looks
-            a few samples ahead), or worst (of the worst-case game, for each controller); by default the
-            arcs of the run, which are under alternating noise, and from the critical set under the
-            strongest noise that is known for each controller.
+            a few samples ahead), attack (the strongest signal that a search finds, for each controller),
+            or worst (of the worst-case game, for each controller); by default the arcs of the run, which
+            are under alternating noise, and from the critical set under the strongest noise that is known.
         eps: bound of the noise, in the units of the chart; by default the run's.
     """
     from hyrl_mj.viz.arcs import replay_floor, replay_shows

@@ -268,6 +268,16 @@ class Run:
             )
         return arc
 
+    def attack_path(self, controller: str) -> Path:
+        """Returns the file of the strongest signal of the attack on "policy" or "hyrl"."""
+        return self.path / "arcs" / f"attack_{controller}.npz"
+
+    def attack_arcs(self) -> dict[str, HybridArc]:
+        """Returns the strongest signals of the attack by controller, {} if there was none."""
+        paths = {name: self.attack_path(name) for name in ("policy", "hyrl")}
+        has = [self.manifest.has(path) for path in paths.values()]
+        return {name: self.arc(path) for name, path in paths.items()} if all(has) else {}
+
     def latest_path(self, controller: str) -> Path:
         """Returns the file of the latest simulation from the user's own start."""
         return self.path / "arcs" / f"latest_{controller}.npz"

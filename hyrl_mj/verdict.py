@@ -24,7 +24,8 @@ class Verdict:
     - PROVED: HyRL is proved to win nearly all winnable starts, whatever the noise within the run's bound.
     - WON: the worst-case game can be played, and of no winnable start a noise signal is known that beats
       HyRL.
-    - HELD: the game cannot be played, and HyRL arrives in nearly all episodes under each kind of noise.
+    - HELD: the game cannot be played, HyRL arrives in nearly all episodes under each kind of noise, and the
+      attack, if there was one, breaks it from nearly no start.
     - FAILED: no start is winnable, or HyRL wins less than the policy without noise, or stage 6 gave up: for
       some mode no attempt gave a policy that wins nearly all of its set.
     - WEAK: HyRL wins more than the policy under noise, or the policy does not arrive from nearly all of its
@@ -32,7 +33,7 @@ class Verdict:
     - FAILED: none of these. HyRL loses, and is no better than the policy.
 
     In the game, HyRL picks its start mode. In episodes, the kind of noise that stops a controller most often
-    counts.
+    counts; the attack is one of these kinds.
 
     Attributes:
         word: "PROVED", "WON", "HELD", "WEAK" or "FAILED".
@@ -101,7 +102,9 @@ class _Wins:
             for kind, (arrived, episodes) in _by_kind(robustness, who).items()
         }
         quiet_share = shares.pop(NO_NOISE, None)
-        return _Wins(quiet_share, min(shares.values()) if shares else None)
+        attacked = [1 - c.lost / c.starts for c in robustness.attacks if c.controller == who]
+        under_noise = [*shares.values(), *attacked]
+        return _Wins(quiet_share, min(under_noise) if under_noise else None)
 
 
 @dataclass(frozen=True)
@@ -163,8 +166,10 @@ class _Case:
         elif not self.robustness.game and won >= NEARLY:
             counts = _by_kind(self.robustness, "hyrl")
             counts.pop(NO_NOISE, None)
-            arrived, total = (sum(column) for column in zip(*counts.values(), strict=True))
-            yield f"HyRL arrives in {arrived:,} of {total:,} episodes, with {self.noise}"
+            arrived, total = (sum(column) for column in zip(*counts.values(), (0, 0), strict=True))
+            if total:
+                yield f"HyRL arrives in {arrived:,} of {total:,} episodes, with {self.noise}"
+            yield from self._attacked("hyrl")
 
     def failures(self) -> Iterator[str]:
         """Yields why the run FAILED, if it did for sure."""
@@ -187,8 +192,10 @@ class _Case:
             yield f"the policy {self.arrivals}"
         policy, hyrl = self.policy.noisy, self.hyrl.noisy
         if policy is not None and hyrl is not None and hyrl > policy:
+            attacked = self.robustness.attacks and not self.robustness.game
+            whole = f"{self.whole} or attacked starts" if attacked else self.whole
             yield (
-                f"HyRL wins {percent(hyrl)} of {self.whole} under {self.noise}, not all, but more "
+                f"HyRL wins {percent(hyrl)} of {whole} under {self.noise}, not all, but more "
                 f"than the policy ({percent(policy)})"
             )
         if not self.examined:
@@ -227,6 +234,19 @@ class _Case:
             when = "without noise" if kind == NO_NOISE else f"under {kind} {self.noise}"
             theirs, _ = policy[kind]
             yield f"{when} HyRL arrives in {arrived:,} of {episodes:,} episodes, the policy in {theirs:,}"
+        yield from self._attacked("hyrl", "policy")
+
+    def _attacked(self, *controllers: str) -> Iterator[str]:
+        """Yields in one sentence from how many starts the attack, if any, breaks these controllers."""
+        names = {"hyrl": "HyRL", "policy": "the policy"}
+        found = {c.controller: c for c in self.robustness.attacks}
+        breaks = [
+            f"{names[who]} from {found[who].lost:,} of {found[who].starts:,} starts"
+            for who in controllers
+            if who in found
+        ]
+        if breaks:
+            yield f"the attack breaks {', '.join(breaks)}"
 
 
 def _share(score: Score) -> str:

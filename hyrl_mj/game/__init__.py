@@ -4,6 +4,7 @@ The plant is tabulated on a lattice of states, and the game is solved on it by b
 `Game` scores controllers on the nodes, and `Limit` is what a split of the states could win.
 """
 
+from hyrl_mj.game.counts import AttackCount, EpisodeCount
 from hyrl_mj.game.lattice import CURVE_CELLS, LATTICE, Lattice
 from hyrl_mj.game.limit import Limit, fewest_samples
 from hyrl_mj.game.result import (
@@ -17,7 +18,6 @@ from hyrl_mj.game.result import (
     WON,
     WON_FROM_SOME,
     Curve,
-    EpisodeCount,
     GameResult,
     LatticeSpacing,
     Maps,
@@ -60,6 +60,7 @@ __all__ = [
     "WON",
     "WON_FROM_SOME",
     "Answers",
+    "AttackCount",
     "Curve",
     "EpisodeCount",
     "Game",

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from hyrl_mj import artifacts
 from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadArtifact
+from hyrl_mj.game.counts import AttackCount, EpisodeCount
 from hyrl_mj.sets import Grid
 
 # Name of the limit, a controller that is scored beside the examined ones.
@@ -229,41 +230,6 @@ class GameResult:
 
 
 @dataclass(frozen=True)
-class EpisodeCount:
-    """How the noisy episodes of one kind of noise, one controller and one start region ended.
-
-    Attributes:
-        noise, eps, everywhere: the noise: its kind, its bound, and whether it acts on all coordinates.
-        controller: name of the controller.
-        region: start region of the episodes: "near M*", "elsewhere" or "not winnable".
-        episodes: number of episodes.
-        outcomes: number of episodes with each outcome.
-        reached: share of the episodes that reached the set-point.
-        interval: 95% interval of this share (Wilson).
-    """
-
-    noise: str
-    eps: float
-    everywhere: bool
-    controller: str
-    region: str
-    episodes: int
-    outcomes: dict[str, int]
-    reached: float
-    interval: tuple[float, float]
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether there are episodes, each of which has an outcome."""
-        return self.episodes > 0 and sum(self.outcomes.values()) == self.episodes
-
-    @property
-    def lost(self) -> int:
-        """The number of episodes that did not reach the set-point."""
-        return self.episodes - self.outcomes.get("reached", 0)
-
-
-@dataclass(frozen=True)
 class Robustness:
     """The result of an examination under noise, saved as `robustness.json`.
 
@@ -272,7 +238,8 @@ class Robustness:
         everywhere: whether noise acts on all columns of the measurement.
         game: result of the worst-case game, if it can be played exactly.
         episodes: counts of noisy episodes.
-        seed: seed of the starts and the noise of these episodes.
+        seed: seed of the starts and the noise of these episodes and attacks.
+        attacks: counts of the attack, one for each controller, if there was one.
     """
 
     eps: float
@@ -280,6 +247,7 @@ class Robustness:
     game: GameResult | None
     episodes: tuple[EpisodeCount, ...]
     seed: int
+    attacks: tuple[AttackCount, ...] = ()
 
     def check(self, controllers: Collection[str]) -> None:
         """Raises `BadArtifact` unless there are whole results of these controllers, as stages write them."""
@@ -293,6 +261,9 @@ class Robustness:
         known = all(c.controller in controllers and c.is_whole for c in self.episodes)
         if not known or len(set(map(frozenset, kinds.values()))) > 1:
             raise BadArtifact(f"its episodes are not those of {' and '.join(controllers)}")
+        attacked = [count.controller for count in self.attacks if count.is_whole]
+        if self.attacks and attacked != [*controllers]:
+            raise BadArtifact(f"its attacks are not those of {' and '.join(controllers)}")
 
     def __repr__(self) -> str:
         game = f"{self.game}, " if self.game else ""
@@ -315,7 +286,12 @@ class Robustness:
             BadArtifact: the file is missing, damaged, of another version, or about other controllers.
         """
         remedy = "run hyrl-mj robustness RUN to write it again"
-        robustness = artifacts.read_record(path, "robustness", Robustness, remedy)
+
+        def record(content: dict[str, Any]) -> Robustness:
+            # Before there were attacks, files had no field for them.
+            return artifacts.parsed({"attacks": [], **content}, Robustness, remedy)
+
+        robustness = artifacts.read_json(path, "robustness", record, remedy)
         if of:
             with artifacts.reading(path):
                 robustness.check(of)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +14,25 @@ from hyrl_mj.progress import Say
 from hyrl_mj.proof import examine
 from hyrl_mj.run_directory import Run
 from hyrl_mj.simulation import Noise
-from hyrl_mj.stages import Partition, Regions, noisy_episodes
+from hyrl_mj.stages import (
+    Attack,
+    Budget,
+    Partition,
+    Regions,
+    attack,
+    attack_starts,
+    noisy_episodes,
+    shown_arcs,
+)
 from hyrl_mj.viz import robustness_sentence
 
 # The kinds of noise in episodes by default.
 KINDS = ("none", "uniform", "alternating", "adversarial")
 # Noisy episodes of a run whose worst case cannot be computed; fewer with preset smoke.
 EPISODES, EPISODES_SMOKE = 1_000, 200
+# Starts and rounds of the attack on such a run.
+ATTACKED, ATTACKED_SMOKE = 200, 40
+ROUNDS, ROUNDS_SMOKE = 2, 1
 
 
 @dataclass(frozen=True)
@@ -35,7 +47,11 @@ class ExamineOptions:
         all_coordinates: add noise to every coordinate of the measurement, not only to the noisy ones of the
             task; always, if the run was made so.
         near_critical: start all episodes within twice the bound of the critical set.
-        seed: seed of starts and noise of the episodes.
+        seed: seed of starts and noise of the episodes and of the attack.
+        attack_seconds: time [s] of an attack, a search for noise that makes policy and hybrid controller
+            fail; by default a few rounds where the worst case cannot be computed, else none.
+        attack_rounds: number of rounds of the attack instead of a time, which repeats an earlier one of as
+            many; by default the time decides.
     """
 
     eps: float | None = None
@@ -44,6 +60,19 @@ class ExamineOptions:
     all_coordinates: bool = False
     near_critical: bool = False
     seed: int = 0
+    attack_seconds: float | None = None
+    attack_rounds: int | None = None
+
+    def budget(self, run: Run) -> Budget | None:
+        """Returns how long a run is attacked, or None if it is not.
+
+        Raises:
+            BadInput: an impossible time or number of rounds, or both.
+        """
+        if self.attack_seconds is None and self.attack_rounds is None:
+            rounds = ROUNDS_SMOKE if run.settings.preset == "smoke" else ROUNDS
+            return None if run.exact else Budget(rounds=rounds)
+        return Budget(self.attack_seconds, self.attack_rounds)
 
 
 USUAL = ExamineOptions()
@@ -51,7 +80,14 @@ USUAL = ExamineOptions()
 
 def examine_stage(run: Run, say: Say, options: ExamineOptions = USUAL) -> None:
     """Examines policy and hybrid controller under noise; all files are written at the end."""
+    budget = options.budget(run)  # a wrong one is refused before the work
     robustness, maps = examine_loops(run, run.loops, run.split, options)
+    if budget is not None:
+        attacks = attack_loops(run, run.loops, budget, options)
+        counts = tuple(found.count for found in attacks.values())
+        robustness = replace(robustness, attacks=counts)
+        for name, arc in shown_arcs(attacks).items():
+            arc.save(run.attack_path(name))
     if maps is not None:
         draw_robustness(run, robustness, maps, run.path / "figures")
         maps.save(run.path / "robustness.npz")
@@ -94,6 +130,16 @@ def examine_loops(
         regions = Regions(points, winnable, options.near_critical)
         counts = noisy_episodes(task, regions, loops, noises, count, seed)
     return Robustness(eps, everywhere, game, counts, seed), maps
+
+
+def attack_loops(
+    run: Run, loops: dict[str, Controller], budget: Budget, options: ExamineOptions
+) -> dict[str, Attack]:
+    """Attacks controllers by name, from the same starts."""
+    task, eps = run.task, run.settings.noise if options.eps is None else options.eps
+    n = ATTACKED_SMOKE if run.settings.preset == "smoke" else ATTACKED
+    starts = attack_starts(task, run.critical_set.points, eps, n, options.seed)
+    return attack(task, loops, starts, eps, budget, options.all_coordinates, options.seed)
 
 
 def draw_robustness(run: Run, robustness: Robustness, maps: Maps, folder: Path) -> None:

@@ -20,6 +20,7 @@ from hyrl_mj.simulation.noise import (
     register_noise,
     signal_for,
 )
+from hyrl_mj.simulation.programmes import Programmes, Rules
 from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop, ways
 
 __all__ = [
@@ -28,8 +29,10 @@ __all__ = [
     "HybridArc",
     "LoopSettings",
     "Noise",
+    "Programmes",
     "Recorded",
     "Rollout",
+    "Rules",
     "Sample",
     "Signal",
     "closed_loop",

@@ -24,7 +24,7 @@ class Lookahead(Signal):
     is simulated for `AHEAD` samples, the first with the candidate noise and the others without noise.
 
     Candidates on each noisy column are both ends of the bound, their halves and zero; with more than two
-    such columns the ends and zero.
+    such columns, or two and inertia, the ends and zero.
 
     Attributes:
         samples: number of samples by which the closed loop is simulated ahead.
@@ -35,12 +35,10 @@ class Lookahead(Signal):
     task: Task
     controller: Controller
     samples: int
+    _candidates: np.ndarray
 
     def __init__(self, bound: float, shares: np.ndarray):
         super().__init__(bound, shares)
-        factors = (0.0, -1.0, 1.0, -0.5, 0.5) if np.count_nonzero(shares) <= 2 else (0.0, -1.0, 1.0)
-        choices = product(*[factors if share else (0.0,) for share in shares])
-        self._candidates = bound * np.array(list(choices)) * shares
         self._ahead: Plant | None = None
 
     def against(self, task: Task, controller: Controller | None) -> Self:
@@ -48,6 +46,10 @@ class Lookahead(Signal):
         assert controller is not None
         signal.task, signal.controller = task, controller
         signal.samples = 1 if task.kinematic else AHEAD
+        fine = np.count_nonzero(self.shares) <= (2 if task.kinematic else 1)
+        factors = (0.0, -1.0, 1.0, -0.5, 0.5) if fine else (0.0, -1.0, 1.0)
+        choices = product(*[factors if share else (0.0,) for share in self.shares])
+        signal._candidates = self.bound * np.array(list(choices)) * self.shares
         return signal
 
     def sample(self, now: Sample) -> np.ndarray:

@@ -4,6 +4,7 @@ Stage 2 is `find_critical_set`, stage 3 `make_partition`, stages 4 and 5 `extend
 `retraining.retrain`, and stage 7 `HybridController`. `retraining` imports torch: import it where needed.
 """
 
+from hyrl_mj.stages.attacks import Attack, Budget, attack, attack_starts, shown_arcs
 from hyrl_mj.stages.critical_set import CriticalSet, critical_points, find_critical_set
 from hyrl_mj.stages.episodes import Regions, noisy_episodes
 from hyrl_mj.stages.extended_sets import ExtendedSets, extend
@@ -15,6 +16,8 @@ from hyrl_mj.stages.results import Arrivals, ModeResult, Retraining
 __all__ = [
     "ON_EDGE",
     "Arrivals",
+    "Attack",
+    "Budget",
     "CriticalSet",
     "ExtendedSets",
     "HybridController",
@@ -23,6 +26,8 @@ __all__ = [
     "Partition",
     "Regions",
     "Retraining",
+    "attack",
+    "attack_starts",
     "boundary",
     "critical_points",
     "extend",
@@ -30,6 +35,7 @@ __all__ = [
     "make_partition",
     "noisy_episodes",
     "retraining",
+    "shown_arcs",
     "sort_losses",
     "with_room",
 ]

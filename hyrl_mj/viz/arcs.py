@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.game import Game, worst_signal
-from hyrl_mj.policies import Policy
+from hyrl_mj.policies import Controller, Policy
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, noise_kinds, samples, simulate_batch
+from hyrl_mj.stages import Budget, attack
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.replay import Floor, Show
 from hyrl_mj.viz.section import Section
@@ -20,6 +22,8 @@ STARTS = ("critical", "paper", "latest")  # of a replay
 OVERVIEW_RUNS = 12  # without noise; of an even number none starts in the middle
 PAPER = "alternating"  # the noise of the paper
 WORST = "worst"  # the noise of the worst-case game; the registered kinds do without one
+ATTACK = "attack"  # the strongest noise that a search finds
+ROUNDS = 4  # of this search
 
 
 def from_middle(task: Task, z: np.ndarray) -> np.ndarray:
@@ -48,7 +52,8 @@ def noisy_arcs(
     Args:
         run: with its mode policies.
         z0: starts.
-        noise: a registered kind, or "worst": the worst case of the worst-case game, for each controller.
+        noise: a registered kind; "worst": that of the worst-case game, for each controller; or "attack": the
+            strongest signal that a short search finds, for each controller.
         eps: bound of the noise, by default the run's.
         q0s: start modes of the hybrid controller; with None it picks its start mode.
         horizon: time [s], by default the task's.
@@ -61,7 +66,7 @@ def noisy_arcs(
         BadInput: a value that cannot be used, or a worst case that cannot be played exactly.
     """
     task = run.task  # first: the file of a user's task may register noise
-    if noise not in (kinds := (*noise_kinds(), WORST)):
+    if noise not in (kinds := (*noise_kinds(), WORST, ATTACK)):
         raise unknown("noise", noise, kinds)
     bound = task.check_noise(run.settings.noise if eps is None else eps)
     steps = None if horizon is None else samples(task, horizon)
@@ -74,13 +79,34 @@ def noisy_arcs(
     for name, loop in run.loops.items():
         for q0 in q0s if name == "hyrl" else (None,):
             signal: AnyNoise
-            if game is None:
+            if noise == ATTACK:
+                begun = loop if q0 is None else _Begun(loop, q0)
+                signal = attack(task, {name: begun}, z0, bound, Budget(rounds=ROUNDS))[name].signal
+            elif game is None:
                 signal = Noise(noise, bound)
             else:
                 signal = worst_signal(game, name, loop, z0, bound, q0, steps)
             key = name if q0 is None else f"{name}_q{q0}"
             arcs[key] = simulate_batch(task, loop, z0, signal, q0, horizon, seed)
     return arcs
+
+
+@dataclass(frozen=True)
+class _Begun:
+    """A controller with modes that begins in the mode `q0`, whatever it measures first."""
+
+    controller: Controller
+    q0: int
+
+    @property
+    def modes(self) -> tuple[int, ...]:
+        return self.controller.modes
+
+    def initial_mode(self, measured: np.ndarray) -> np.ndarray:
+        return np.full(len(measured), self.q0)
+
+    def step(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self.controller.step(q, measured)
 
 
 def replay_starts(run: Run) -> dict[str, np.ndarray]:
@@ -110,6 +136,14 @@ def replay_arcs(
     return arcs
 
 
+def attack_replay(run: Run) -> dict[str, HybridArc]:
+    """Returns the arcs that the replay of a run plays whose worst case cannot be computed.
+
+    These are the strongest signals of the attack; {} if the run was not attacked, or has a game.
+    """
+    return {} if run.exact else run.attack_arcs()
+
+
 def replay_shows(
     run: Run, starts: str = "critical", noise: str | None = None, eps: float | None = None
 ) -> list[Show]:
@@ -117,7 +151,8 @@ def replay_shows(
 
     Args:
         run: with its arcs.
-        starts: "critical" for the start on M*, once for each start mode; "paper" for all of the paper's
+        starts: "critical" for the start on M*, once for each start mode, or where no game can be played for
+            the strongest signals of the attack; "paper" for all of the paper's
             starts at once; "latest" for the arcs of the last `hyrl-mj simulate --start`.
         noise: the kind of noise of a new simulation; by default the arcs on disk are played.
         eps: the bound of a new simulation, by default the run's; without `noise` that of `replay_arcs`.
@@ -135,6 +170,8 @@ def replay_shows(
             )
         policy, hybrid = ([run.arc(run.latest_path(who))] for who in ("policy", "hyrl"))
         return [Show(policy, hybrid, run.policy_title)]
+    if starts == "critical" and not is_new and (attacked := attack_replay(run)):
+        return [Show([attacked["policy"]], [attacked["hyrl"]], run.policy_title)]
     arcs = replay_arcs(run, noise, eps) if is_new else run.arcs()
     names = dict.fromkeys(name for name, _ in arcs)
     modes = [f"hyrl_q{q}" for q in run.extended_sets.modes]

@@ -17,7 +17,7 @@ from hyrl_mj.run_directory import Run
 def commands(run: Run, robustness: Robustness | None) -> list[str]:
     """Returns the commands that repeat the run, and its examination if that had options of its own."""
     r, lines = robustness, [beginning(run)]
-    if r and (r.episodes or not run.is_examined_as_usual):
+    if r and (r.episodes or r.attacks or not run.is_examined_as_usual):
         lines.append(_examination(r))
     return lines
 
@@ -58,6 +58,9 @@ def _examination(robustness: Robustness) -> str:
         kinds = list(dict.fromkeys(c.noise for c in counts))
         one = [c for c in counts if (c.noise, c.controller) == (kinds[0], "hyrl")]
         command += ["--episodes", f"{sum(c.episodes for c in one)}", "--noise", ",".join(kinds)]
+    if robustness.attacks:
+        command += ["--attack-rounds", f"{robustness.attacks[0].rounds}"]
+    if counts or robustness.attacks:
         command += ["--seed", f"{robustness.seed}"]
     return shlex.join(command)
 

@@ -20,6 +20,7 @@ from hyrl_mj.policies import Agent, MlpPolicy
 from hyrl_mj.run_directory import Run
 from hyrl_mj.verdict import NO_NOISE
 from hyrl_mj.viz import tables
+from hyrl_mj.viz.arcs import attack_replay
 from hyrl_mj.viz.commands import changed, commands
 from hyrl_mj.viz.figures import CLASS_COLOURS, FIGURES
 from hyrl_mj.viz.figures.style import task_title
@@ -96,6 +97,7 @@ def render(run: Run) -> str:
         pictures=pictures(run.path / "figures", has),
         arcs=arcs,
         arrivals=arrived,
+        attacked=bool(attack_replay(run)),
         verdict=run.verdict if robustness and all(map(has, facts)) else None,
         numbers=_numbers(run, robustness, arrived),
         replays=arcs and tables.replay_table(run, arcs),
@@ -121,6 +123,11 @@ def _numbers(
         numbers += _game_numbers(run, robustness.game)
     elif robustness:
         numbers += _episode_numbers(robustness.episodes)
+    if robustness and robustness.attacks:
+        attacks = robustness.attacks
+        shares = [tables.percent(c.lost / c.starts) for c in attacks]
+        note = f"of {attacks[0].starts} starts, {attacks[0].rounds} rounds of search"
+        numbers.append(Number("starts from which the attack breaks it", shares, note))
     if arrived:
         counts = [f"{count} of {total}" for count, total in arrived.values()]
         note = f"the paper's starts, alternating noise {run.settings.noise:g}"
@@ -231,6 +238,7 @@ def fill(template: str, run: Run, robustness: Robustness | None, **values: Any) 
     """Returns a page from its template, with the values that every page of a run shows."""
     task, game = run.task, robustness.game if robustness else None
     episodes = robustness.episodes if robustness else ()
+    attacks = robustness.attacks if robustness else ()
     return (
         environment()
         .get_template(template)
@@ -250,6 +258,7 @@ def fill(template: str, run: Run, robustness: Robustness | None, **values: Any) 
             scores=tables.score_table(task, game) if game else None,
             margins=tables.margin_table(task, game) if game else None,
             episodes=tables.episode_table(task, episodes) if episodes else None,
+            attacks=tables.attack_table(task, attacks) if attacks else None,
             **values,
         )
     )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hyrl_mj.game import LIMIT, NEARLY, EpisodeCount, GameResult, Robustness, percent
+from hyrl_mj.game import LIMIT, NEARLY, AttackCount, EpisodeCount, GameResult, Robustness, percent
 from hyrl_mj.run_directory import Run
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
@@ -161,6 +161,27 @@ def episode_table(task: Task, counts: Sequence[EpisodeCount]) -> Table:
     return Table(f"{task.name}: noisy episodes", headings, rows)
 
 
+def attack_table(task: Task, counts: Sequence[AttackCount]) -> Table:
+    """Returns from how many starts the attack found a signal that makes controllers lose: a row for each."""
+    where, unit = task.noise_on(counts[0].everywhere)
+    rows = []
+    for c in counts:
+        low, high = (percent(share) for share in c.interval)
+        row = [NAMES[c.controller], f"{c.starts:,}", f"{c.lost:,}", percent(c.lost / c.starts)]
+        row += [f"{low} - {high}", f"{c.rounds:,}"]
+        rows.append([*row, f"{c.outcome.replace('_', ' ')} from {_point(np.array(c.start))}"])
+    headings = ("controller", "starts", "lost", "share", "95%", "rounds", "strongest signal")
+    title = f"{task.name}: attack, a search for noise on {where} of up to {counts[0].eps:g} {unit}"
+    return Table(title, headings, rows)
+
+
+def attack_sentence(counts: Sequence[AttackCount]) -> str:
+    """Returns what the attack breaks in one line."""
+    return "the attack breaks " + ", ".join(
+        f"{NAMES[c.controller]} from {c.lost:,} of {c.starts:,} starts" for c in counts
+    )
+
+
 def robustness_sentence(robustness: Robustness) -> str:
     """Returns the most important scores in one line."""
     if robustness.game is None:
@@ -168,6 +189,8 @@ def robustness_sentence(robustness: Robustness) -> str:
         for who in ("policy", "hyrl"):
             least = min(c.reached for c in robustness.episodes if c.controller == who)
             parts.append(f"{NAMES[who]} reaches in {percent(least)} or more")
+        if robustness.attacks:
+            parts.append(attack_sentence(robustness.attacks))
         return ", ".join(parts)
     policy, hyrl = (robustness.game.scores[who][-1] for who in ("policy", "hyrl"))
     shares = [
@@ -243,6 +266,8 @@ def print_robustness(run: Run) -> None:
             print(f"{NAMES[who]} is not proved: {why}")
     if episodes:
         print_table(episode_table(run.task, episodes))
+    if attacks := run.robustness.attacks:
+        print_table(attack_table(run.task, attacks))
 
 
 def print_table(table: Table) -> None:

@@ -1,0 +1,259 @@
+"""The search for noise signals finds those that are planted, and reports only what is lost again."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from planted import (
+    ChartPolicy,
+    circle_controller,
+    circle_policy,
+    decisions,
+    halves,
+    ideal_controller,
+    one_way_policy,
+    sign_policy,
+)
+
+from hyrl_mj import BadInput, Noise, Outcome, Recorded, Sample, cores, simulate
+from hyrl_mj.game import NEVER, Game
+from hyrl_mj.policies import PolicyController
+from hyrl_mj.sets import Grid
+from hyrl_mj.simulation import Programmes, Rules, closed_loop
+from hyrl_mj.stages.attacks import Budget, attack, attack_starts
+
+EPS = 0.1
+ON_THE_LEFT = np.array([[0.0, 1.0], [0.05, 1.0], [0.1, 1.0], [0.0, 1.02]])
+
+
+@dataclass(frozen=True)
+class Lock:
+    """A controller of the vehicle that only one order of noise opens, from a start at y = 1.
+
+    A measurement above 1.05 at x = 0.5 to 0.7 opens it, and another one from x = 0.8 on closes it again. If
+    it is open, it leaves the arena after a measurement below 0.95 at x = 1.6 to 1.8.
+    """
+
+    modes = (0, 1, 2)
+
+    def initial_mode(self, measured):
+        return np.zeros(len(measured), dtype=int)
+
+    def step(self, q, measured):
+        x, y = measured.T
+        high, low = y > 1.05, y < 0.95
+        following = np.where((q == 0) & (x > 0.49) & (x < 0.71) & high, 1, q)
+        following = np.where((q == 1) & (x > 0.79) & high, 0, following)
+        following = np.where((q == 1) & (x > 1.59) & (x < 1.81) & low, 2, following)
+        return np.where(following == 2, 1.0, 0.0)[:, None], following
+
+
+def on(task, controller, starts, rounds=2, **options):
+    return attack(task, {"it": controller}, starts, EPS, Budget(rounds=rounds), **options)["it"]
+
+
+# ---- what is found
+
+
+def test_all_that_the_game_loses_is_lost_and_nothing_that_is_won_by_far(vehicle):
+    sign = PolicyController(sign_policy(vehicle))
+    grid = Grid.with_cells(vehicle.chart, 240)
+    game = Game(vehicle, halves(vehicle), {"sign": sign}, 0.2, grid=grid)
+    nodes = game.lattice.grid.nodes[game.starts]
+    lost = game.value("sign", EPS)[-1, :-2][game.starts] >= NEVER
+    rng = np.random.default_rng(0)
+    picked = np.concatenate([rng.permutation(np.flatnonzero(side))[:30] for side in (lost, ~lost)])
+    found = on(vehicle, sign, nodes[picked])
+    broken = np.array([arc.outcome != "reached" for arc in found.arcs])
+    np.testing.assert_array_equal(broken, lost[picked])
+    assert found.count.lost == lost[picked].sum() == 30
+
+
+def test_a_run_that_only_stalls_is_lost(circle):
+    starts = np.array([[np.pi], [np.pi - 0.05], [1.0]])
+    found = on(circle, PolicyController(circle_policy(circle)), starts)
+    assert [arc.outcome for arc in found.arcs] == ["stalled", "stalled", "reached"]
+    assert found.strongest in (0, 1)
+
+
+def test_an_order_of_noise_is_found_that_no_rule_gives_alone(vehicle):
+    held = on(vehicle, Lock(), ON_THE_LEFT, rounds=2)
+    assert held.count.lost == 0
+    found = on(vehicle, Lock(), ON_THE_LEFT, rounds=40)
+    assert found.count.lost == len(ON_THE_LEFT)
+    assert {arc.outcome for arc in found.arcs} == {"out_of_bounds"}
+    assert found.arcs[found.strongest].t[-1] == min(arc.t[-1] for arc in found.arcs)
+
+
+def test_what_cannot_be_beaten_is_not(vehicle, circle):
+    starts = np.random.default_rng(0).uniform((0.0, -0.1), (0.2, 0.1), (20, 2))
+    left = on(vehicle, PolicyController(one_way_policy(vehicle, clear=1.004)), starts, rounds=4)
+    assert left.count.lost == 0
+    assert left.count.interval[0] == 0
+    assert 0.1 < left.count.interval[1] < 0.2  # of 20 starts
+    assert {arc.outcome for arc in left.arcs} == {"reached"}
+    around = on(circle, circle_controller(circle), np.array([[np.pi], [3.0], [3.3]]), rounds=4)
+    assert around.count.lost == 0
+
+
+def test_where_nothing_is_lost_the_greatest_danger_is_the_strongest(vehicle):
+    starts = np.array([[0.0, 0.5], [0.3, 0.0], [0.0, 0.9]])
+    found = on(vehicle, PolicyController(one_way_policy(vehicle, clear=1.004)), starts)
+    clearance = [vehicle.clearance(arc.z).min() for arc in found.arcs]
+    assert found.strongest == np.argmin(clearance)
+    assert found.count.start == tuple(starts[found.strongest])
+
+
+def test_the_strongest_signals_make_a_run_lose_alone_too(vehicle):
+    starts = np.array([[0.0, 0.03], [0.3, 0.0], [0.0, 0.9]])
+    loop = PolicyController(sign_policy(vehicle))
+    for start, arc in zip(starts, on(vehicle, loop, starts).arcs, strict=True):
+        noise = arc.measured[:-1] - arc.z[:-1]
+        assert (arc.noise, arc.bound) == ("attack", EPS)
+        assert np.abs(noise).max() <= EPS + 1e-12
+        assert not noise[:, 0].any()  # the vehicle's noise acts on y
+        again = simulate(vehicle, loop, start, Recorded(noise[:, None], EPS))
+        assert again.outcome == arc.outcome
+        np.testing.assert_allclose(again.z, arc.z, atol=1e-9)
+
+
+def test_the_hybrid_controller_may_be_attacked_in_its_choice_of_a_mode(vehicle):
+    """With an overlap narrower than the noise, some signal keeps the mode changing."""
+    starts = np.array([[0.1, 0.0], [0.2, 0.01]])
+    narrow = on(vehicle, ideal_controller(vehicle, overlap=0.02, clear=1.004), starts)
+    wide = on(vehicle, ideal_controller(vehicle, overlap=0.154, clear=1.004), starts, rounds=4)
+    assert (narrow.count.lost, wide.count.lost) == (2, 0)
+
+
+# ---- budgets
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_same_rounds_give_the_same_on_any_number_of_threads(vehicle, monkeypatch, threads):
+    monkeypatch.setattr(cores, "allowed", threads)
+    first = on(vehicle, Lock(), ON_THE_LEFT, rounds=4, seed=3)
+    monkeypatch.setattr(cores, "allowed", 0)
+    second = on(vehicle, Lock(), ON_THE_LEFT, rounds=4, seed=3)
+    assert first.count == second.count
+    for one, two in zip(first.arcs, second.arcs, strict=True):
+        np.testing.assert_array_equal(one.measured, two.measured)
+
+
+def test_seconds_only_decide_how_many_rounds_are_done(vehicle):
+    loop = {"it": Lock()}
+    timed = attack(vehicle, loop, ON_THE_LEFT, EPS, Budget(seconds=0.3))["it"]
+    counted = attack(vehicle, loop, ON_THE_LEFT, EPS, Budget(rounds=timed.count.rounds))["it"]
+    assert (timed.count.seconds, counted.count.seconds) == (0.3, None)
+    assert timed.count.lost == counted.count.lost
+    for one, two in zip(timed.arcs, counted.arcs, strict=True):
+        np.testing.assert_array_equal(one.measured, two.measured)
+
+
+def test_the_seed_decides_what_is_tried(vehicle):
+    one, two = (on(vehicle, Lock(), ON_THE_LEFT, rounds=6, seed=seed) for seed in (0, 1))
+    signals = [np.concatenate([arc.measured for arc in found.arcs]) for found in (one, two)]
+    assert signals[0].shape != signals[1].shape or not np.array_equal(*signals, equal_nan=True)
+
+
+def test_no_round_is_done_once_all_is_lost(vehicle):
+    loop = PolicyController(sign_policy(vehicle))
+    assert on(vehicle, loop, np.array([[0.3, 0.0]]), rounds=50).count.rounds == 1
+
+
+@pytest.mark.parametrize(
+    ("budget", "message"),
+    [
+        ({"seconds": 0.0}, "an attack cannot last 0 s: give a time > 0 and <= 86400 s"),
+        ({"seconds": -3.0}, "cannot last -3 s"),
+        ({"seconds": float("nan")}, "cannot last nan s"),
+        ({"seconds": float("inf")}, "cannot last inf s"),
+        ({"seconds": 1e6}, "cannot last 1e\\+06 s"),
+        ({"rounds": 0}, "an attack cannot have 0 rounds: give a number from 1"),
+        ({"rounds": 10**9}, "cannot have 1000000000 rounds"),
+        ({}, "a time or a number of rounds: give one of the two"),
+        ({"rounds": 1, "seconds": 1.0}, "give one of the two"),
+    ],
+)
+def test_an_impossible_budget_is_refused(budget, message):
+    with pytest.raises(BadInput, match=message):
+        Budget(**budget)
+
+
+def test_starts_and_bounds_that_make_no_sense_are_refused(vehicle):
+    with pytest.raises(BadInput, match="hides the whole state space"):
+        attack(vehicle, {"it": Lock()}, ON_THE_LEFT, 9.0, Budget(rounds=1))
+    with pytest.raises(BadInput, match="outside"):
+        on(vehicle, Lock(), np.array([[9.0, 0.0]]), rounds=1)
+
+
+# ---- starts and rules
+
+
+def test_half_of_the_starts_lie_near_the_critical_set(vehicle):
+    points = decisions(vehicle).points
+    starts = attack_starts(vehicle, points, EPS, 100, seed=0)
+    near = np.abs(starts[:, 1]) <= 2 * EPS + 1e-9
+    assert near[:50].all()
+    assert 2 < near[50:].sum() < 25
+    assert vehicle.may_start(starts).all()
+    np.testing.assert_array_equal(starts, attack_starts(vehicle, points, EPS, 100, seed=0))
+    assert len(attack_starts(vehicle, np.empty((0, 2)), EPS, 100, seed=0)) == 100
+
+
+@pytest.mark.parametrize(
+    ("shares", "candidates", "ends"),
+    [((0.0, 1.0), 9, 2), ((1.0, 0.5), 25, 4), ((1.0, 1.0, 1.0), 27, 8), ((1.0,) * 5, 13, 12)],
+)
+def test_rules_stay_within_the_bound_of_each_column(vehicle, shares, candidates, ends):
+    rules = Rules(vehicle, Lock(), EPS, np.array(shares))
+    assert rules.candidates.shape == (candidates, len(shares))
+    assert not rules.candidates[0].any()
+    assert (np.abs(rules.candidates) <= EPS * np.array(shares) + 1e-15).all()
+    constant = np.array([wish is None for wish in rules.wishes]) & ~rules.alternates
+    assert constant.sum() == ends + 2  # none, and the one that simulates ahead
+    assert rules.alternates.sum() == ends / 2
+    assert not rules.fixed[rules.nothing].any()
+
+
+def test_rules_are_held_for_their_segments(vehicle):
+    loop = PolicyController(one_way_policy(vehicle))
+    rules = Rules(vehicle, loop, EPS, np.array([0.0, 1.0]))
+    plus, minus = (
+        next(i for i in range(len(rules)) if not rules.alternates[i] and rules.fixed[i, 1] == value)
+        for value in (EPS, -EPS)
+    )
+    swings = int(np.flatnonzero(rules.alternates)[0])
+    signal = Programmes(vehicle, loop, rules, np.array([[plus, minus, swings]]), segment=3)
+    run = closed_loop(vehicle, loop, np.array([[0.0, 1.0]]), signal)
+    assert run.outcome[0] == Outcome.REACHED
+    expected = [EPS] * 3 + [-EPS] * 3 + [EPS, -EPS, EPS, -EPS]
+    np.testing.assert_allclose([noise[0, 1] for noise in signal.values[:10]], expected)
+
+
+def test_wishes_pick_the_answers_that_they_name(vehicle):
+    loop = PolicyController(sign_policy(vehicle))
+    rules = Rules(vehicle, loop, EPS, np.array([0.0, 1.0]))
+    assert rules.wishes[:5] == ["contrary", "straight", "reverse", (0, 1), (0, -1)]
+    starts = np.array([[0.0, 0.05]] * 5 + [[0.0, 0.95]])
+    programmes = np.array([[0], [1], [2], [3], [4], [1]])
+    signal = Programmes(vehicle, loop, rules, programmes, segment=1)
+    plant = vehicle.plant(len(starts))
+    plant.set_state(*vehicle.state(starts))
+    n = len(starts)
+    now = Sample(np.arange(n), np.zeros(n, int), plant.measurement, np.zeros(n, int), plant)
+    u, _ = loop.step(now.q, now.measurement + signal.sample(now))
+    # Just above the axis the policy steers to the left, and noise can make it steer to the right.
+    np.testing.assert_array_equal(u[[0, 3, 4, 5], 0], [-1.0, 1.0, -1.0, 0.0])
+    assert Noise("none", 0.1).against(vehicle, loop).shares.tolist() == [0.0, 1.0]
+
+
+def test_the_rule_that_simulates_ahead_gives_adversarial_noise(puck):
+    loop = PolicyController(ChartPolicy(puck, lambda z: np.clip(-3 * z[:, 1:2], -1.0, 1.0)))
+    starts = puck.starts(6, np.random.default_rng(0))
+    shares = np.array(puck.noisy, dtype=float)
+    rules = Rules(puck, loop, EPS, shares)
+    signal = Programmes(puck, loop, rules, np.full((6, 1), rules.ahead), segment=1)
+    ruled = closed_loop(puck, loop, starts, signal)
+    adversarial = closed_loop(puck, loop, starts, Noise("adversarial", EPS))
+    np.testing.assert_array_equal(ruled.path, adversarial.path)
+    assert np.abs(np.array(signal.values)).max() == EPS

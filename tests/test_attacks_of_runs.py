@@ -1,0 +1,190 @@
+"""The attack on a run: what is written, read, printed, played and judged."""
+
+import shutil
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+from planted import decisions, halves
+from test_report import Page, plant
+from test_verdict import ALL, EPS, HOLDS, episodes
+
+import hyrl_mj
+from hyrl_mj import BadArtifact, BadInput, artifacts, load_run
+from hyrl_mj.game import AttackCount, Robustness
+from hyrl_mj.pipeline import ExamineOptions, examine_run, run_stage
+from hyrl_mj.run_directory import Run
+from hyrl_mj.verdict import FAILED, HELD, WEAK, Verdict
+from hyrl_mj.viz.arcs import noisy_arcs, replay_shows
+from hyrl_mj.viz.commands import commands
+from hyrl_mj.viz.report import render
+from hyrl_mj.viz.tables import attack_table, print_robustness, robustness_sentence
+
+FEW = {"episodes": 20, "noise": ("uniform",)}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def without_game():
+    """The vehicle as a robot whose worst case cannot be computed."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Run, "exact", False)
+        yield
+
+
+@pytest.fixture(scope="module")
+def examined(tmp_path_factory):
+    path, task = tmp_path_factory.mktemp("attacked") / "vehicle", hyrl_mj.get_task("vehicle")
+    run = plant(path, task, decisions(task), halves(task, 60))
+    examine_run(run, ExamineOptions(**FEW), say=str)
+    run_stage(load_run(path), "simulate", say=str)
+    return path
+
+
+@pytest.fixture
+def copied(examined, tmp_path):
+    return shutil.copytree(examined, tmp_path / "vehicle")
+
+
+def attacked(policy, hyrl, starts=200):
+    """The counts of an attack."""
+    return tuple(
+        AttackCount(who, EPS, False, starts, lost, (0.0, 1.0), 3, None, (0.0, 0.05), "crashed")
+        for who, lost in (("policy", policy), ("hyrl", hyrl))
+    )
+
+
+# ---- the examination
+
+
+def test_a_run_without_a_game_is_attacked_by_default(examined):
+    policy, hyrl = load_run(examined).robustness.attacks
+    assert (policy.controller, hyrl.controller) == ("policy", "hyrl")
+    assert (policy.rounds, policy.starts, policy.seconds) == (1, 40, None)
+    assert hyrl.starts == 40
+    assert policy.interval[0] <= policy.lost / 40 <= policy.interval[1]
+    assert policy.lost > 0
+
+
+def test_a_run_with_a_game_is_attacked_only_on_request(examined, monkeypatch):
+    monkeypatch.setattr(Run, "exact", True)
+    run = load_run(examined)
+    assert ExamineOptions().budget(run) is None
+    assert ExamineOptions(attack_seconds=2.0).budget(run).seconds == 2.0
+    assert ExamineOptions(attack_rounds=5).budget(run).rounds == 5
+
+
+def test_the_rounds_of_a_time_repeat_it(copied):
+    timed = examine_run(load_run(copied), ExamineOptions(**FEW, attack_seconds=0.2), say=str)
+    files = {path: path.read_bytes() for path in sorted((copied / "arcs").glob("attack_*"))}
+    assert len(files) == 2
+    rounds = timed.attacks[0].rounds
+    again = examine_run(load_run(copied), ExamineOptions(**FEW, attack_rounds=rounds), say=str)
+    assert [c.lost for c in again.attacks] == [c.lost for c in timed.attacks]
+    assert {path: path.read_bytes() for path in files} == files
+    assert f"--attack-rounds {rounds} --seed 0" in commands(load_run(copied), again)[-1]
+
+
+@pytest.mark.parametrize("options", [{"attack_seconds": 0.0}, {"attack_rounds": -1}])
+def test_an_impossible_budget_is_refused_before_any_work(copied, options):
+    before = {path: path.read_bytes() for path in copied.rglob("*") if path.is_file()}
+    with pytest.raises(BadInput, match="an attack cannot"):
+        examine_run(load_run(copied), ExamineOptions(**options), say=str)
+    assert {path: path.read_bytes() for path in copied.rglob("*") if path.is_file()} == before
+
+
+# ---- the record
+
+
+def test_a_record_without_attacks_is_read(examined, tmp_path):
+    content = asdict(load_run(examined).robustness)
+    assert len(content.pop("attacks")) == 2
+    path = tmp_path / "robustness.json"
+    artifacts.write_json(path, content, "robustness")
+    assert "attacks" not in path.read_text()
+    old = Robustness.load(path, of=("policy", "hyrl"))
+    assert old.attacks == ()
+    assert old.episodes == load_run(examined).robustness.episodes
+
+
+@pytest.mark.parametrize(
+    "attacks", [attacked(1, 1)[:1], attacked(201, 0), attacked(-1, 0), attacked(0, 0, starts=0)]
+)
+def test_a_record_of_half_an_attack_is_refused(tmp_path, attacks):
+    both = episodes({"uniform": 1000}, {"uniform": 1000})
+    path = tmp_path / "robustness.json"
+    Robustness(EPS, False, None, both.episodes, 0, attacks).save(path)
+    with pytest.raises(BadArtifact, match="its attacks are not those of policy and hyrl"):
+        Robustness.load(path, of=("policy", "hyrl"))
+
+
+# ---- what is shown
+
+
+def test_the_table_and_the_sentence_tell_what_is_lost(vehicle, examined, capsys):
+    run = load_run(examined)
+    table = attack_table(vehicle, attacked(91, 2))
+    assert table.rows[0][:4] == ["RL policy", "200", "91", "45.50%"]
+    assert table.rows[1][-2:] == ["3", "crashed from (0.000, 0.050)"]
+    lost = [count.lost for count in run.robustness.attacks]
+    said = f"the attack breaks RL policy from {lost[0]} of 40 starts, HyRL from {lost[1]} of 40"
+    assert said in robustness_sentence(run.robustness)
+    print_robustness(run)
+    assert "attack, a search for noise on y of up to 0.1 m" in capsys.readouterr().out
+
+
+def test_the_replay_plays_the_strongest_signals_from_one_start(examined):
+    (show,) = replay_shows(load_run(examined))
+    (policy,), (hyrl,) = show.policy, show.hybrid
+    assert (policy.noise, hyrl.noise) == ("attack", "attack")
+    np.testing.assert_array_equal(policy.z[0], hyrl.z[0])
+    assert (policy.controller, hyrl.controller) == ("policy", "hyrl")
+    assert policy.outcome != "reached"
+    assert len(replay_shows(load_run(examined), noise="uniform")) == 2, "one for each mode"
+
+
+def test_the_replay_of_a_run_with_a_game_is_as_ever(examined, monkeypatch):
+    monkeypatch.setattr(Run, "exact", True)
+    shows = replay_shows(load_run(examined))
+    assert [show.policy[0].noise for show in shows] == ["alternating"] * 2
+
+
+def test_the_page_has_the_numbers_and_the_table(examined):
+    page = Page(render(load_run(examined)))
+    rows = page.table("The attack")
+    assert [row["controller"] for row in rows] == ["RL policy", "HyRL"]
+    assert rows[0]["lost"] == f"{load_run(examined).robustness.attacks[0].lost}"
+    assert any("the attack breaks it" in number for number in page.numbers)
+
+
+def test_a_start_of_ones_own_is_attacked_in_each_mode(examined):
+    run = load_run(examined)
+    arcs = noisy_arcs(run, np.array([[0.1, 0.01]]), "attack", q0s=(0, 1))
+    assert set(arcs) == {"policy", "hyrl_q0", "hyrl_q1"}
+    assert {arc.noise for (arc,) in arcs.values()} == {"attack"}
+    assert [arcs[f"hyrl_q{q}"][0].q[0] for q in (0, 1)] == [0, 1]
+    assert arcs["policy"][0].outcome != "reached"
+
+
+# ---- the verdict
+
+
+@pytest.mark.parametrize(
+    ("lost", "expected"),
+    [((91, 0), HELD), ((91, 2), HELD), ((91, 3), WEAK), ((3, 3), FAILED), ((0, 50), FAILED)],
+)
+def test_held_takes_that_the_attack_breaks_nearly_nothing(circle, lost, expected):
+    every = {"none": 1000, "uniform": 1000}
+    found = episodes(every, every)
+    robustness = Robustness(EPS, False, None, found.episodes, 0, attacked(*lost))
+    verdict = Verdict.of(circle, EPS, robustness, HOLDS, ALL)
+    assert verdict.word == expected
+    said = f"the attack breaks HyRL from {lost[1]} of 200 starts"
+    assert f"{said}, the policy from {lost[0]} of 200 starts" in verdict.reasons
+    assert (said in verdict.sentence) == (expected == HELD)
+
+
+def test_the_attack_alone_may_be_the_noise(circle):
+    found = episodes({"none": 1000}, {"none": 1000})
+    robustness = Robustness(EPS, False, None, found.episodes, 0, attacked(9, 0))
+    verdict = Verdict.of(circle, EPS, robustness, HOLDS, ALL)
+    assert str(verdict) == "HELD: the attack breaks HyRL from 0 of 200 starts"
