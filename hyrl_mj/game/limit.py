@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import count
 
 import numpy as np
 
 from hyrl_mj.game.lattice import Lattice
-from hyrl_mj.game.solver import NEVER, Moves, nodes_within
+from hyrl_mj.game.solver import NEVER, Moves, by_target, entries, nodes_within
 from hyrl_mj.sets import GridSet, within_reach
 
 # Parts whose depths differ by no more than this meet there [chart units].
@@ -124,17 +125,29 @@ def fewest_samples(
     Returns:
         (N,) int samples, `NEVER` where there is no way, and (N,) int, the level to take.
     """
+    levels, corners, n = after.shape
     samples = np.full(lattice.places, NEVER)
     samples[:-2][lattice.arrived] = 0
     samples[-2] = 0
     level = np.zeros(lattice.nodes, dtype=int)
-    open_ = np.flatnonzero(lattice.running & ~lattice.arrived)
-    while len(open_):
-        by_level = np.where(allowed[..., open_], samples[after[..., open_]], NEVER).max(axis=1)
-        best, fewest = by_level.argmin(axis=0), by_level.min(axis=0)
-        done = fewest < NEVER
-        if not done.any():
+    open_ = lattice.running & ~lattice.arrived
+    usable = allowed.all(axis=1) & open_
+    # A transition is number level * n + node; it leads on once all of its corners are reached.
+    transition = np.broadcast_to(np.arange(levels * n).reshape(levels, 1, n), after.shape)
+    used = np.broadcast_to(usable[:, None], after.shape)
+    before, first = by_target(after[used], transition[used], lattice.places)
+    waiting = np.full(levels * n, corners, dtype=np.int8)
+    new = np.flatnonzero(samples == 0)
+    for k in count(1):
+        reaching = entries(before, first, new)
+        np.subtract.at(waiting, reaching, 1)
+        by_level, node = np.divmod(reaching[waiting[reaching] == 0], n)
+        fresh = samples[node] == NEVER
+        by_level, node = by_level[fresh], node[fresh]
+        if not len(node):
             break
-        samples[open_[done]], level[open_[done]] = fewest[done] + 1, best[done]
-        open_ = open_[~done]
+        level[node] = levels
+        np.minimum.at(level, node, by_level)
+        samples[node] = k
+        new = np.unique(node)
     return samples[:-2], level

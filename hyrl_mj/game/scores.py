@@ -50,6 +50,7 @@ class Game:
         task.check_noise(largest, everywhere)
         self.lattice = Lattice.of(task, grid)
         self.limit = Limit.of(self.lattice, parts)
+        self._noises: dict[tuple[str, float], WorstNoise] = {}
         self._values: dict[tuple[str, float], np.ndarray] = {}
         most = self.bound(largest)
         self.answers = {
@@ -159,7 +160,9 @@ class Game:
 
     def worst_noise(self, name: str, eps: float) -> WorstNoise:
         """Returns the adversary's noise, to simulate with."""
-        return WorstNoise(self.answers[name], self.bound(eps))
+        if (name, eps) not in self._noises:
+            self._noises[name, eps] = WorstNoise(self.answers[name], self.bound(eps))
+        return self._noises[name, eps]
 
 
 def share(won: np.ndarray) -> float:

@@ -154,15 +154,8 @@ class Moves:
     @cached_property
     def backward(self) -> tuple[np.ndarray, np.ndarray]:
         """States (E,) that have a move, by its target, and where those of each target begin (states + 1,)."""
-        from scipy.sparse import csr_array  # slow to import
-
-        n = self.rows * self.lattice.places
-        counts = np.zeros(n + 1, dtype=np.int64)
-        counts[self.state + 1] = self.counts
-        ones = np.ones(len(self.target), dtype=np.int8)
-        forward = csr_array((ones, self.target, np.cumsum(counts)), shape=(n, n))
-        by_target = forward.tocsc()
-        return by_target.indices, by_target.indptr
+        states = np.repeat(self.state, self.counts)
+        return by_target(self.target, states, self.rows * self.lattice.places)
 
     @staticmethod
     def gather(lattice: Places, rows: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Moves:
@@ -219,7 +212,7 @@ def solve(moves: Moves, samples: int | None = None) -> np.ndarray:
     # The k-th pass finds the states that fail or arrive in k samples.
     for k in count(1) if samples is None else range(1, samples + 1):
         lost = flat[new] > NEVER
-        failing, arriving = (_entries(before, first, part) for part in (new[lost], new[~lost]))
+        failing, arriving = (entries(before, first, part) for part in (new[lost], new[~lost]))
         # Each state gets its value once: at the earliest failure, or when all its moves have arrived.
         failing = failing[flat[failing] == NEVER]
         flat[failing] = LOST - k
@@ -232,7 +225,19 @@ def solve(moves: Moves, samples: int | None = None) -> np.ndarray:
     return value
 
 
-def _entries(values: np.ndarray, first: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def by_target(
+    target: np.ndarray, source: np.ndarray, targets: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the sources (E,) of transitions by their targets (E,), and where those of each begin."""
+    from scipy.sparse import csr_array  # slow to import
+
+    n = len(target)
+    ones, one_each = np.ones(n, dtype=np.int8), np.arange(n + 1)
+    sorted_ = csr_array((ones, target, one_each), shape=(n, targets)).tocsc()
+    return source[sorted_.indices], sorted_.indptr
+
+
+def entries(values: np.ndarray, first: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Returns the values of some rows, one after the other; row i holds values[first[i] : first[i + 1]]."""
     counts = first[rows + 1] - first[rows]
     skipped = np.cumsum(counts) - counts
@@ -286,30 +291,35 @@ class WorstNoise(Signal):
         shifts = np.array(list(product(*[range(-w, w + 1) for w in window])))
         # Among equals the largest noise comes first, for states between the nodes.
         self._shifts = shifts[np.argsort(-np.abs(shifts).sum(axis=1), kind="stable")]
+        # For every row and node the number of the worst shift, -1 where it has not been needed yet.
+        self._worst = np.full((len(answers.index), answers.lattice.nodes), -1, dtype=np.int32)
 
     def sample(self, now: Sample) -> np.ndarray:
-        rows = max(AT_ONCE // len(self._shifts), 1)
-        parts = range(0, len(now.q), rows)
-        return np.concatenate(
-            [self._worst(now.measurement[i : i + rows], now.q[i : i + rows]) for i in parts]
-        )
+        answers, grid = self._answers, self._answers.lattice.grid
+        true, modes = now.measurement, answers.modes
+        place = grid.nearest(true)
+        row = np.where(now.q == NOT_STARTED, len(modes), np.searchsorted(modes, now.q))
+        unknown = self._worst[row, place] < 0
+        states = np.unique(row[unknown] * answers.lattice.nodes + place[unknown])
+        few = max(AT_ONCE // len(self._shifts), 1)
+        for i in range(0, len(states), few):
+            rows, places = np.divmod(states[i : i + few], answers.lattice.nodes)
+            self._worst[rows, places] = self._find(rows, places)
+        at = np.stack(np.unravel_index(place, grid.counts), axis=-1)
+        measured = grid.chart.low + grid.spacing * (at + self._shifts[self._worst[row, place]])
+        noise = grid.chart.difference(measured, grid.chart.wrap(true))
+        return np.clip(noise, -self._bound, self._bound)
 
-    def _worst(self, true: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Returns the worst noise (n, d) in true states (n, d) and modes (n,)."""
+    def _find(self, row: np.ndarray, place: np.ndarray) -> np.ndarray:
+        """Returns the numbers (n,) of the worst shifts at nodes `place` (n,), in rows (n,)."""
         answers, lattice = self._answers, self._answers.lattice
         grid, modes = lattice.grid, answers.modes
-        place = grid.nearest(true)
-        at = np.stack(np.unravel_index(place, grid.counts), axis=-1)
-        row = np.where(q == NOT_STARTED, len(modes), np.searchsorted(modes, q))[:, None]
-        near = at[:, None] + self._shifts
+        near = np.stack(np.unravel_index(place, grid.counts), axis=-1)[:, None] + self._shifts
         node = np.where(grid.chart.periodic, near % grid.counts, near + answers.pad)
-        entry = (row, *np.moveaxis(node, -1, 0))
+        entry = (row[:, None], *np.moveaxis(node, -1, 0))
         level, mode = np.divmod(answers.index[entry], len(modes))
         ends = mode[..., None], lattice.after[level, :, place[:, None]]
         value, settled = self._any[ends].max(axis=-1), self._settled[ends].max(axis=-1)
         counts = answers.settled[entry] | (self._shifts == 0).all(axis=1)
         value = np.where(counts & (settled >= NEVER), FIRST + settled, value)
-        chosen = near[np.arange(len(near)), value.argmax(axis=1)]
-        measured = grid.chart.low + grid.spacing * chosen
-        noise = grid.chart.difference(measured, grid.chart.wrap(true))
-        return np.asarray(np.clip(noise, -self._bound, self._bound))
+        return np.asarray(value.argmax(axis=1))

@@ -104,7 +104,8 @@ def score_table(task: Task, game: GameResult) -> Table:
                 (score.proved, score.not_broken),
                 (score.proved_any, score.not_broken_any),
             ):
-                row += [proved_text(proved), percent(whole, surely=False)]
+                known = "all" if who == LIMIT and whole == 1 else percent(whole, surely=False)
+                row += [proved_text(proved), known]
             if game.lasting:
                 times = (score.time, score.proved_time), (score.time_any, score.proved_time_any)
                 for (time, bound), won in zip(times, (score.won, score.won_any), strict=True):
