@@ -189,7 +189,7 @@ def smooth(
     curvature: Callable[[np.ndarray, np.ndarray], np.ndarray],
     extremes: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
 ) -> Callable[[Affine], Affine]:
-    """Returns the rule of a smooth function: its tangent in the centre, or its extremes if these are closer.
+    """Returns the rule of a smooth function: its tangent in the centre, or its extremes if that tells less.
 
     Args:
         value: the function.
@@ -204,8 +204,9 @@ def smooth(
         rest = np.abs(by) * a.remainder + curvature(a.low, a.high) * r * r / 2
         tangent = Affine(value(a.centre), by * a.generators, rest)
         interval = Affine.between(*extremes(a.low, a.high), len(a.generators))
-        closer = tangent.radius < interval.radius  # false where it is not a number
-        return choose(closer, tangent, interval)
+        # The tangent keeps how the value depends on the box; false where it is not a number.
+        keeps = rest < interval.radius
+        return choose(keeps, tangent, interval)
 
     return rule
 

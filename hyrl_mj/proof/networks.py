@@ -24,8 +24,8 @@ from hyrl_mj.tracing import BATCH, Program, trace
 CHUNK = 2048
 # Relative rounding error of numbers of 32 bits, in which networks are computed.
 ROUNDING = 2.0**-24
-# Points at which an activation is evaluated between two numbers, and the largest slope that any has.
-POINTS, STEEPEST = 17, 1.13
+# Points at which a curved activation is evaluated between two numbers.
+POINTS = 9
 # A layer's values in boxes: middle (n, k), generators (d, n, k) and remainder (n, k), as `Affine`.
 Relaxed = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -137,7 +137,7 @@ class BoundedPolicy:
             seen.generators.astype(np.float32),
             seen.remainder.astype(np.float32),
         )
-        relax = RELAXATIONS.get(self.network.activation) or _sampled(self.network.activation)
+        relax = RELAXATIONS[self.network.activation]
         for weight, bias in self.network.layers[:-1]:
             x = relax(_linear(x, weight, bias))
         return x
@@ -187,11 +187,17 @@ def _ends(x: Relaxed) -> tuple[np.ndarray, np.ndarray]:
     return middle - radius, middle + radius
 
 
-def _relu(x: Relaxed) -> Relaxed:
-    low, high = _ends(x)
-    across = (low < 0) & (high > 0)
-    slope = np.where(across, high / np.where(across, high - low, 1), high > 0).astype(np.float32)
-    return _parallel(x, slope, np.zeros_like(low), np.where(across, -slope * low, 0))
+def _kinked(leak: float) -> Callable[[Relaxed], Relaxed]:
+    """Returns the relaxation of max(x, leak * x): its chord, and the parallel through the kink."""
+
+    def relax(x: Relaxed) -> Relaxed:
+        low, high = _ends(x)
+        across = (low < 0) & (high > 0)
+        chord = (high - leak * low) / np.where(across, high - low, 1)
+        slope = np.where(across, chord, np.where(high > 0, 1, leak)).astype(np.float32)
+        return _parallel(x, slope, np.zeros_like(low), np.where(across, low * (leak - slope), 0))
+
+    return relax
 
 
 def _tanh(x: Relaxed) -> Relaxed:
@@ -202,8 +208,12 @@ def _tanh(x: Relaxed) -> Relaxed:
     return _parallel(x, slope, at_low - slope * low, at_high - slope * high)
 
 
-def _sampled(name: str) -> Callable[[Relaxed], Relaxed]:
-    """Returns the relaxation of any activation, from its values at points and its steepest slope."""
+def _curved(name: str, curvature: float) -> Callable[[Relaxed], Relaxed]:
+    """Returns the relaxation of an activation by its chord, from its values at points between the ends.
+
+    Between neighbouring points it leaves their chord by the largest second derivative times their squared
+    distance, over 8, at most.
+    """
     activate = ACTIVATIONS[name]
 
     def relax(x: Relaxed) -> Relaxed:
@@ -214,10 +224,19 @@ def _sampled(name: str) -> Callable[[Relaxed], Relaxed]:
         shares = np.linspace(0, 1, POINTS, dtype=np.float32).reshape(-1, *[1] * low.ndim)
         at = low + shares * width
         off = activate(at) - slope * at
-        between = (STEEPEST + np.abs(slope)) * width / (2 * (POINTS - 1))
+        between = curvature * (width / (POINTS - 1)) ** 2 / 8
         return _parallel(x, slope, off.min(axis=0) - between, off.max(axis=0) + between)
 
     return relax
 
 
-RELAXATIONS: dict[str, Callable[[Relaxed], Relaxed]] = {"relu": _relu, "tanh": _tanh}
+# By activation; the numbers are the largest magnitudes of their second derivatives.
+RELAXATIONS: dict[str, Callable[[Relaxed], Relaxed]] = {
+    "relu": _kinked(0.0),
+    "leaky_relu": _kinked(0.01),
+    "tanh": _tanh,
+    "elu": _curved("elu", 1.0),
+    "silu": _curved("silu", 0.5),
+    "gelu": _curved("gelu", 0.8),
+    "sigmoid": _curved("sigmoid", 0.0963),
+}

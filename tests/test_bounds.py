@@ -1,0 +1,284 @@
+"""Bounds over boxes: whatever code, network or set says inside of a box lies within what was bounded."""
+
+import numpy as np
+import pytest
+from planted import AnalyticSet
+from test_export import WHOLE
+
+from hyrl_mj.game import Lattice
+from hyrl_mj.policies import (
+    ACTIVATIONS,
+    MlpPolicy,
+    Normalization,
+    PreprocessedPolicy,
+    Preprocessing,
+)
+from hyrl_mj.proof.affine import Affine, Unbounded
+from hyrl_mj.proof.answers import Boxes
+from hyrl_mj.proof.cells import Cells
+from hyrl_mj.proof.networks import BoundedPolicy
+from hyrl_mj.proof.rules import RULES, Truth, bounds
+from hyrl_mj.sets import Everything, Grid, GridSet
+from hyrl_mj.tasks import Outcome, get_task
+from hyrl_mj.tracing import BATCH, trace
+
+RNG = np.random.default_rng
+# Functions of the export that have no bounds, and what their messages name.
+REFUSED = {
+    "remainder": "remainder with a divisor",
+    "negative divisor": "remainder with a divisor",
+    "sqrt and power": "the exponent 0.3",
+    "argmax": "argmax",
+    "take": "looks up values",
+}
+
+
+def inside(centre, half, rng, draws=20):
+    """Points in boxes, their corners among them."""
+    for draw in range(draws):
+        shares = rng.uniform(-1, 1, centre.shape)
+        yield centre + half * (np.sign(shares) if draw % 4 == 0 else shares)
+
+
+def check(function, centre, half, rng):
+    """Asserts that a function stays within its bounds over boxes; returns these."""
+    program = trace(function, {"x": rng.normal(size=(BATCH, centre.shape[1]))}, "f", "bounded")
+    found = bounds(program, Affine.box(centre, half))
+    for x in inside(centre, half, rng):
+        with np.errstate(all="ignore"):
+            y = np.asarray(function(x))
+            if isinstance(found, Truth):
+                assert not (y & ~found.possibly).any()
+                assert not (~y & found.surely).any()
+            else:
+                slack = 1e-9 * (1 + np.abs(y))
+                assert not ((y < found.low - slack) | (y > found.high + slack)).any()
+    return found
+
+
+@pytest.mark.parametrize("name", [name for name in WHOLE if name not in REFUSED])
+@pytest.mark.parametrize("size", [0.01, 0.5])
+def test_code_stays_within_its_bounds(name, size):
+    rng = RNG(0)
+    check(WHOLE[name], rng.normal(size=(200, 3)), np.full(3, size), rng)
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_code_without_bounds_is_refused_with_its_operation(name):
+    program = trace(WHOLE[name], {"x": RNG(0).normal(size=(BATCH, 3))}, "f")
+    with pytest.raises(Unbounded, match=REFUSED[name]):
+        bounds(program, Affine.box(np.ones((5, 3)), np.ones(3)))
+
+
+def test_there_is_a_rule_for_every_operation_that_is_not_refused():
+    from hyrl_mj.tracing.vocabulary import REDUCTIONS, UFUNCS
+
+    others = {"where", "astype", "concatenate", "reshape", "transpose", "take", "full"}
+    assert {*UFUNCS, *REDUCTIONS, *others} - RULES.keys() == {"argmax", "argmin"}
+
+
+@pytest.mark.parametrize("name", ["vehicle", "unit_circle", "rover", "quadrotor"])
+@pytest.mark.parametrize("method", ["observation", "ending", "verdict", "z"])
+def test_tasks_stay_within_their_bounds(name, method):
+    task, rng = get_task(name), RNG(1)
+    p = task.measurement_columns
+    low, high = (np.resize(end, p) for end in (task.chart.low, task.chart.high))
+    check(getattr(task, method), rng.uniform(low, high, (500, p)), np.full(p, 0.003), rng)
+
+
+def test_what_is_left_of_a_smooth_function_falls_with_the_square_of_the_box(vehicle):
+    rng = RNG(0)
+    centre = rng.uniform((0, 0.9), (1, 1.4), (200, 2))
+    rests = [
+        check(vehicle.observation, centre, np.full(2, half), rng).remainder[:, 0].max()
+        for half in (0.02, 0.01, 0.005)
+    ]
+    assert rests[0] / rests[1] == pytest.approx(4, rel=0.1)
+    assert rests[1] / rests[2] == pytest.approx(4, rel=0.1)
+
+
+# ---- networks
+
+
+def network(task, activation="tanh", hidden=16, outputs=None, seed=0, scale=2.0):
+    """A network with random weights."""
+    rng, k = RNG(seed), len(task.observation_low)
+    n = outputs or (len(task.inputs) if task.input_levels is None else len(task.input_levels))
+    sizes = {
+        "mlp_extractor.policy_net.0": (hidden, k),
+        "mlp_extractor.policy_net.2": (hidden, hidden),
+    }
+    weights = {}
+    for stem, (rows, columns) in (sizes | {"action_net": (n, hidden)}).items():
+        normal = rng.normal(size=(rows, columns)) * scale / np.sqrt(columns)
+        weights[f"{stem}.weight"] = normal.astype(np.float32)
+        weights[f"{stem}.bias"] = rng.normal(size=rows).astype(np.float32)
+    return MlpPolicy(task, "ppo", activation, weights)
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize("size", [0.002, 0.1])
+def test_the_levels_that_a_network_chooses_in_a_box_are_among_those_that_are_possible(
+    vehicle, activation, size
+):
+    policy, rng = network(vehicle, activation), RNG(0)
+    centre = rng.uniform(vehicle.chart.low, vehicle.chart.high, (300, 2))
+    possible = BoundedPolicy.of(policy).levels(centre, np.full(2, size))
+    chosen = np.zeros_like(possible)
+    for x in inside(centre, size, rng, 60):
+        u = policy.act(x)[:, 0]
+        level = np.abs(u[:, None] - vehicle.input_levels[:, 0]).argmin(axis=1)
+        chosen[np.arange(len(u)), level] = True
+    assert not (chosen & ~possible).any()
+    if size < 0.01:
+        assert (possible.sum(axis=1) == 1).mean() > 0.9, "small boxes have one answer"
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_the_inputs_that_a_network_gives_in_a_box_lie_between_its_ends(circle, activation):
+    policy, rng = network(circle, activation), RNG(0)
+    centre = rng.uniform(0, 2 * np.pi, (300, 1))
+    for half in (0.001, 0.05):
+        low, high = np.moveaxis(BoundedPolicy.of(policy).inputs(centre, np.array([half])), 1, 0)
+        for x in inside(centre, half, rng):
+            u = policy.act(x)
+            assert ((low <= u) & (u <= high)).all()
+    # The ends are no farther apart than the policy is steep, but for a remainder.
+    steep = np.abs(np.diff(policy.act(np.linspace(0, 2 * np.pi, 20_000)[:, None])[:, 0])).max()
+    narrow = np.ptp(BoundedPolicy.of(policy).inputs(centre, np.array([1e-3])), axis=1).max()
+    assert narrow <= 2.5 * steep * 1e-3 / (np.pi / 20_000) + 1e-4
+
+
+def test_a_normalised_observation_is_bounded_too(vehicle):
+    statistics = Normalization(np.array([1.0, 2.0, 0.1]), np.array([0.5, 0.7, 0.2]), 1.5)
+    policy = PreprocessedPolicy(network(vehicle), Preprocessing(statistics))
+    rng = RNG(0)
+    centre = rng.uniform(vehicle.chart.low, vehicle.chart.high, (300, 2))
+    possible = BoundedPolicy.of(policy).levels(centre, np.full(2, 0.02))
+    for x in inside(centre, 0.02, rng):
+        level = np.abs(policy.act(x) - vehicle.input_levels[:, 0]).argmin(axis=1)
+        assert possible[np.arange(len(x)), level].all()
+
+
+def test_what_is_no_network_is_refused(vehicle):
+    with pytest.raises(Unbounded, match="a policy that is a PreprocessedPolicy"):
+        BoundedPolicy.of(PreprocessedPolicy(network(vehicle), Preprocessing(None, 2)))
+
+
+@pytest.mark.parametrize("operation", ["sort", "argmax"])
+def test_an_observation_without_bounds_is_told_with_its_operation(vehicle, operation):
+    class Ordered(type(vehicle)):
+        def observation(self, measured):
+            return getattr(np, operation)(measured, axis=1).reshape(len(measured), -1)[
+                :, :1
+            ] * np.ones(3)
+
+    policy = network(vehicle)
+    object.__setattr__(policy, "task", Ordered())
+    message = rf"the method observation of vehicle cannot be bounded: it uses np\.{operation}"
+    with pytest.raises(Unbounded, match=message):
+        BoundedPolicy.of(policy).levels(np.zeros((3, 2)), np.full(2, 0.1))
+
+
+# ---- sets and cells
+
+
+@pytest.fixture(scope="module")
+def cells(vehicle):
+    return Cells.of(Lattice.of(vehicle, Grid.with_cells(vehicle.chart, 120)))
+
+
+@pytest.fixture(scope="module")
+def ring(circle):
+    return Cells.of(Lattice.of(circle, Grid.with_cells(circle.chart, 600)))
+
+
+def test_the_distances_of_a_set_in_a_box_are_those_of_points_in_it(vehicle, circle, cells, ring):
+    for task, of, count in ((vehicle, cells, 70), (vehicle, cells, 400), (circle, ring, 2880)):
+        grid, rng = Grid.with_cells(task.chart, count), RNG(2)
+        near = np.abs(grid.nodes - grid.nodes[len(grid.nodes) // 3]).max(axis=1) < 0.4
+        members = GridSet.from_mask(grid, near ^ (rng.random(len(grid.nodes)) < 0.01))
+        boxes = Boxes.of(of, task.noise_in_chart(0.1))
+        least, greatest = boxes.distances(members)
+        index = np.stack(np.unravel_index(np.arange(least.size), boxes.counts), axis=-1)
+        for _ in range(20):
+            z = boxes.low + boxes.step * (index + rng.uniform(0, 1, index.shape))
+            found = members.signed_distance(z).reshape(least.shape)
+            assert (least <= found).all()
+            assert (found <= greatest).all()
+        assert np.median(greatest - least) < 3 * np.linalg.norm(boxes.step), "and no farther apart"
+    with pytest.raises(Unbounded, match="a AnalyticSet cannot be bounded"):
+        boxes.distances(AnalyticSet(np.sin))
+    assert np.isneginf(boxes.distances(Everything())[1]).all()
+
+
+@pytest.mark.parametrize("which", ["vehicle", "unit_circle"])
+def test_a_cell_moves_onto_cells_that_hold_whatever_the_plant_does(which, cells, ring):
+    of, rng = (cells if which == "vehicle" else ring), RNG(3)
+    task, n = of.lattice.task, 4_000
+    start = rng.choice(np.flatnonzero(of.running), n)
+    z = of.middle(start) + rng.uniform(-0.5, 0.5, (n, len(of.counts))) * of.lattice.grid.spacing
+    low, high = task.input_limits
+    u = rng.uniform(low, high, (n, len(low)))
+    if task.input_levels is not None:
+        u = task.input_levels[rng.integers(len(task.input_levels), size=n)]
+    plant = task.plant(n)
+    plant.set_state(*task.state(z))
+    plant.step(u)
+    after = plant.measurement
+    first, last = of.shifts(u, u)
+    assert (last - first <= (0 if which == "vehicle" else 1)).all(), "and onto no other"
+    ending = task.ending(after)
+    for k in range(n):
+        shifts = {tuple(first[k]), tuple(last[k])}
+        places = {int(of.after(np.array(shift))[start[k]]) for shift in shifts}
+        if ending[k] == Outcome.RUNNING and task.chart.contains(after[k : k + 1])[0]:
+            assert int(of.place(after[k : k + 1])[0]) in places
+        elif ending[k] == Outcome.REACHED:
+            assert places == {of.nodes}
+        else:
+            assert places <= {of.nodes + 1} | set(np.flatnonzero(of.failed).tolist())
+
+
+def test_cells_fail_where_any_of_their_states_does(cells):
+    task, rng = cells.lattice.task, RNG(4)
+    for cell in rng.choice(cells.nodes, 300, replace=False):
+        off = rng.uniform(-0.5, 0.5, (200, 2)) * cells.lattice.grid.spacing
+        ends = task.ending(cells.middle(np.array([cell])) + off)
+        assert cells.failed[cell] or (ends <= Outcome.REACHED).all()
+    share = cells.failed.mean()
+    nodes = cells.lattice.failed.mean()
+    assert nodes < share < nodes + 0.06
+
+
+def test_corners_and_neighbours_of_cells(cells, ring):
+    for of in (cells, ring):
+        nodes = np.ones(of.lattice.nodes, dtype=bool)
+        nodes[7] = False
+        touched = np.flatnonzero(of.some_corner(~nodes))
+        assert (~of.all_corners(nodes) == of.some_corner(~nodes)).all()
+        assert len(touched) == 2
+        distance = of.lattice.grid.chart.difference(of.middle(touched), of.lattice.grid.nodes[7])
+        np.testing.assert_allclose(np.abs(distance), np.tile(of.lattice.grid.spacing / 2, (2, 1)))
+        all_but = np.ones(of.nodes, dtype=bool)
+        all_but[touched[0]] = False
+        around = np.flatnonzero(~of.all_around(all_but))
+        assert 7 in around
+        assert len(around) == 2 ** len(of.counts)
+
+
+def test_a_plant_that_moves_states_differently_is_refused(vehicle):
+    lattice = Lattice.of(vehicle, Grid.with_cells(vehicle.chart, 60))
+    object.__setattr__(lattice, "uneven", np.array([0.01, 0.0]))
+    with pytest.raises(Unbounded, match="does not move all states alike"):
+        Cells.of(lattice)
+
+
+def test_a_chart_that_is_not_the_position_is_refused(vehicle):
+    class Moved(type(vehicle)):
+        def z(self, measured):
+            return 1.0 * measured[:, :2]
+
+    lattice = Lattice.of(Moved(), Grid.with_cells(vehicle.chart, 60))
+    with pytest.raises(Unbounded, match=r"computes its chart .* z\(\) or state\(\)"):
+        Cells.of(lattice)
