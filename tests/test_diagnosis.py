@@ -79,7 +79,9 @@ def test_without_noise_nothing_is_lost(run):
     # Its files were made with other settings, so they are not read again.
     results = ("policy", "critical_set", "partition")
     vars(quiet).update({name: getattr(run, name) for name in results})
-    assert diagnosis.worst_arc(quiet) is None
+    losses = diagnosis.losses_of(quiet)
+    assert diagnosis.worst_arc(quiet, losses) is None
+    assert losses.sentence() == "it loses none of them on the nodes"
 
 
 def test_the_usual_arc_begins_on_the_critical_set_under_alternating_noise(run):

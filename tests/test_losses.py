@@ -1,0 +1,47 @@
+"""Why starts are lost: indecision that holding the way cures, or passing closer than the noise."""
+
+import numpy as np
+import pytest
+from planted import ChartPolicy, halves, pass_on, sign_policy
+
+from hyrl_mj.game import NEVER, Game
+from hyrl_mj.policies import PolicyController
+from hyrl_mj.sets import Grid
+from hyrl_mj.stages import sort_losses
+
+EPS, CELLS = 0.1, 120
+
+
+def lost_by(task, policy):
+    grid = Grid.with_cells(task.chart, CELLS)
+    game = Game(task, halves(task), {"policy": PolicyController(policy)}, EPS, grid=grid)
+    own = game.value("policy", EPS)[-1, :-2]
+    return grid.nodes[game.starts & game.winnable(EPS) & (own >= NEVER)]
+
+
+def grazing_policy(task):
+    """Goes left everywhere, and passes the pillar by less than the noise."""
+    return ChartPolicy(task, lambda z: pass_on(1.0, z[:, 1], 0.76))
+
+
+def test_a_policy_that_only_cannot_decide_is_cured_by_hysteresis(vehicle):
+    policy = sign_policy(vehicle)
+    losses = sort_losses(vehicle, policy, halves(vehicle), EPS, CELLS)
+    assert len(losses.undecided) == len(lost_by(vehicle, policy)) > 20
+    assert not len(losses.grazing)
+    assert np.abs(losses.undecided[:, 1]).max() <= 3 * EPS, "around the axis"
+    assert "(100%: noise at M* keeps it undecided, hysteresis cures that)" in losses.sentence()
+
+
+def test_a_policy_that_passes_too_close_is_not(vehicle):
+    policy = grazing_policy(vehicle)
+    losses = sort_losses(vehicle, policy, halves(vehicle), EPS, CELLS)
+    assert len(losses.undecided) + len(losses.grazing) == len(lost_by(vehicle, policy))
+    assert len(losses.grazing) > 5 * len(losses.undecided)
+    assert "it passes closer than the noise" in losses.sentence()
+
+
+@pytest.mark.parametrize("eps", [0.0])
+def test_without_noise_nothing_is_lost(vehicle, eps):
+    losses = sort_losses(vehicle, sign_policy(vehicle), halves(vehicle), eps, CELLS)
+    assert losses.sentence() == "it loses none of them on the nodes"
