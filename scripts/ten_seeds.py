@@ -20,13 +20,15 @@ TINY = 1e-6  # to which the plants are right
 def targets(task: str, eps: float) -> dict[str, tuple[float, float]]:
     """Returns the least and the greatest value of each figure that a run must show."""
     if task == "vehicle":
-        own = 0.999 if eps <= 0.1 else 0.995
-        wanted = {"hyrl_won": (own, 1.0), "hyrl_won_without_noise": (own, 1.0)}
+        own = 0.995 if eps <= 0.1 else 0.99
+        wanted = {"hyrl_proved": (own, 1.0), "hyrl_not_broken": (own, 1.0)}
+        wanted["hyrl_not_broken_without_noise"] = (0.999, 1.0)
         wanted["hyrl_miss_without_noise"] = (0.0, 0.05)
-        return wanted | ({"hyrl_won_any": (0.95, 1.0)} if eps <= 0.1 else {})
-    wanted = {"hyrl_won_any": (1.0, 1.0), "hyrl_won_any_without_noise": (1.0, 1.0)}
+        return wanted | ({"hyrl_proved_any": (0.945, 1.0)} if eps <= 0.1 else {})
+    wanted = {"hyrl_proved_any": (1.0, 1.0), "hyrl_proved_any_without_noise": (1.0, 1.0)}
     wanted["hyrl_excursion"] = (0.0, 0.12 if eps <= 0.1 else 0.22)
-    return wanted | ({"hyrl_time": (0.0, 3.1), "hyrl_time_any": (0.0, 3.4)} if eps <= 0.1 else {})
+    times = {"hyrl_proved_time": (0.0, 3.1), "hyrl_proved_time_any": (0.0, 3.4)}
+    return wanted | (times if eps <= 0.1 else {})
 
 
 def main() -> int:

@@ -9,8 +9,7 @@ from planted import halves, ideal_controller, sign_policy
 from hyrl_mj import HybridController, MlpPolicy, Noise
 from hyrl_mj.game import NEVER, OVER, UNCLEAR, WON, WON_FROM_SOME, Game
 from hyrl_mj.policies import PolicyController
-from hyrl_mj.proof import Certificate, attack, examine
-from hyrl_mj.proof.counterexamples import CellNoise
+from hyrl_mj.proof import CellNoise, Certificate, attack, examine
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import Outcome

@@ -5,7 +5,7 @@ signals that really win against the controller; `examine` returns both beside th
 """
 
 from hyrl_mj.proof.certificate import Certificate
-from hyrl_mj.proof.counterexamples import Broken, attack
+from hyrl_mj.proof.counterexamples import Broken, CellNoise, attack
 from hyrl_mj.proof.examination import examine
 
-__all__ = ["Broken", "Certificate", "attack", "examine"]
+__all__ = ["Broken", "CellNoise", "Certificate", "attack", "examine"]

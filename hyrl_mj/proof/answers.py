@@ -10,7 +10,7 @@ import numpy as np
 
 from hyrl_mj.policies import Controller, PolicyController
 from hyrl_mj.proof.affine import Unbounded
-from hyrl_mj.proof.cells import Cells
+from hyrl_mj.proof.cells import TINY, Cells
 from hyrl_mj.proof.networks import BoundedPolicy
 from hyrl_mj.sets import Everything, Grid, GridSet, StateSet
 from hyrl_mj.stages import ON_EDGE, HybridController
@@ -129,7 +129,7 @@ class Boxes:
         periodic = self.cells.lattice.grid.chart.periodic
         for axis, n in enumerate(self.cells.counts):
             fine = int(self.fine[axis])
-            reach = int(np.ceil(bound[axis] / self.step[axis] - 1e-6))
+            reach = int(np.ceil(bound[axis] / self.step[axis] - TINY))
             if periodic[axis]:
                 reach = min(reach, n * fine // 2 + 1)
                 pads = [(reach, reach) if a == axis else (0, 0) for a in range(mask.ndim)]

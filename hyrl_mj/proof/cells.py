@@ -14,6 +14,8 @@ from hyrl_mj.tasks import Outcome, Task
 
 # Samples whose ends lie this close to the border of a cell, in cells after a whole episode, end on it.
 ON_BORDER = 1e-3
+# Rounding of what is counted in cells.
+TINY = 1e-9
 # The plant has to move all states alike, up to this share of a cell.
 ALIKE = 1e-3
 
@@ -90,7 +92,7 @@ class Cells:
         cells = lattice.hops / h
         drift = task.max_steps * (np.abs(cells - np.round(cells)) * h + error).max(axis=0)
         exact = drift <= ON_BORDER * h
-        slack = np.where(exact, drift, error)
+        slack = np.where(exact, drift, error) + 2 * TINY * h
         counts = np.array(grid.counts) - ~periodic
         reach = np.ceil(np.abs(cells).max(axis=0) + 1).astype(int)
         margin = np.where(periodic, 0, reach)

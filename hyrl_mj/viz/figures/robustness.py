@@ -55,7 +55,7 @@ def draw_robustness_map(shown: ShownGame, path: Path | None = None) -> Figure:
             charts.legend_field(panels[0], SENTENCES[k], CLASS_COLOURS[k])
         for panel, name in zip(panels, names, strict=False):
             draw(panel, shown, grid, maps.map[name])
-            panel.set_title(NAMES.get(name, name), fontsize=11, fontweight="bold", pad=36)
+            panel.set_title(NAMES.get(name, name), fontsize=11, fontweight="bold", pad=50)
             score = max(result.scores[name], key=lambda score: score.eps)
             style.note_above(panel, _note(score), 0.5, 6)
         for panel in panels[len(names) :]:
@@ -65,13 +65,13 @@ def draw_robustness_map(shown: ShownGame, path: Path | None = None) -> Figure:
 
 
 def _note(score: Score) -> str:
-    """Returns what is proved and what is lost, in two lines."""
+    """Returns what is proved and what is lost of the winnable starts, in three lines."""
     lost = f"{percent(1 - score.not_broken)} known to be lost"
     if score.proved is None or score.proved_any is None:
-        return f"{lost},\nnothing proved"
+        return f"of the winnable starts\nnothing is proved,\n{lost}"
     own, some = percent(score.proved), percent(score.proved_any)
-    modes = "" if own == some else f" ({some} from every start mode)"
-    return f"{own} of the winnable starts proved{modes},\n{lost}"
+    modes = "from every start mode" if own == some else f"{some} from every start mode"
+    return f"{own} of the winnable starts proved,\n{modes},\n{lost}"
 
 
 def _panel_height(task: Task) -> float:
@@ -177,7 +177,8 @@ def _won(panel: Axes, title: str, eps: np.ndarray, wins: Wins, looks: Looks, das
     label = title if _same(wins) else f"{title}, picks the start mode"
     panel.plot(eps, 100 * np.array(own), label=label, **looks)
     if proved:
-        gap: Looks = {"color": looks["color"], "alpha": 0.18, "linewidth": 0}
+        label = "gap to what is won on the nodes"
+        gap: Looks = {"color": looks["color"], "alpha": 0.18, "linewidth": 0, "label": label}
         panel.fill_between(eps, 100 * np.array(own), 100 * np.array(wins.won), **gap)
     if not _same(wins):
         label = f"{title}, from every start mode"
