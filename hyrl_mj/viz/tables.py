@@ -104,7 +104,9 @@ def score_table(task: Task, game: GameResult) -> Table:
                 (score.proved, score.not_broken),
                 (score.proved_any, score.not_broken_any),
             ):
-                known = "all" if who == LIMIT and whole == 1 else percent(whole, surely=False)
+                known = percent(whole, surely=proved == 1)
+                if who == LIMIT and whole == 1:
+                    known = "all"
                 row += [proved_text(proved), known]
             if game.lasting:
                 times = (score.time, score.proved_time), (score.time_any, score.proved_time_any)
