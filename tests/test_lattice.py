@@ -10,9 +10,10 @@ from planted import Cube
 import hyrl_mj
 from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput
+from hyrl_mj.game import lattice as lattice_module
 from hyrl_mj.game.lattice import Lattice
 from hyrl_mj.sets import Grid
-from hyrl_mj.tasks import Outcome
+from hyrl_mj.tasks import Outcome, get_task
 
 
 @pytest.fixture(scope="module")
@@ -184,3 +185,25 @@ def test_the_level_of_an_input_is_its_own_or_the_nearest(lattices, around_circle
     u = np.random.default_rng(0).uniform(-1, 1, (500, 1))
     off = np.abs(around_circle.levels[around_circle.level_of(u)] - u)
     np.testing.assert_allclose(off[:, 0], np.abs(around_circle.levels[:, 0] - u).min(axis=1))
+
+
+@pytest.mark.parametrize("name", ["vehicle", "unit_circle"])
+def test_a_plant_that_moves_all_states_alike_is_stepped_from_few(name, monkeypatch):
+    task = get_task(name)
+    grid = Grid.with_cells(task.chart, 150)
+    monkeypatch.setattr(lattice_module, "SAMPLE", 20)
+    few = Lattice.of(task, grid)
+    monkeypatch.setattr(lattice_module, "SAMPLE", 10**9)
+    every = Lattice.of(task, grid)
+    np.testing.assert_array_equal(few.after, every.after)
+    np.testing.assert_allclose(few.hops, every.hops, atol=1e-12)
+    np.testing.assert_allclose(every.uneven, 0, atol=1e-12)
+
+
+def test_where_some_states_move_differently_all_are_stepped(vehicle, monkeypatch):
+    monkeypatch.setattr(lattice_module, "ALIKE", -1.0)
+    monkeypatch.setattr(lattice_module, "SAMPLE", 20)
+    grid = Grid.with_cells(vehicle.chart, 60)
+    stepped = Lattice.of(vehicle, grid)
+    monkeypatch.undo()
+    np.testing.assert_array_equal(stepped.after, Lattice.of(vehicle, grid).after)

@@ -16,11 +16,12 @@ from planted import (
 
 from hyrl_mj import make_partition
 from hyrl_mj.game.lattice import Lattice
-from hyrl_mj.game.limit import Limit
+from hyrl_mj.game.limit import Limit, fewest_samples
 from hyrl_mj.game.scores import LIMIT, Game
 from hyrl_mj.game.solver import NEVER, solve
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid
+from hyrl_mj.tasks import get_task
 
 PI = np.pi
 # From the axis the pillar can be passed only if x <= this.
@@ -188,3 +189,31 @@ def test_no_planted_controller_beats_the_limit(game, eps):
         assert (value[-1] < NEVER)[game.starts].mean() <= limit.winnable + 1e-12
         # Noise may bring a run early, but not the latest of all.
         assert score.won < 1 or score.time >= limit.time
+
+
+def plain_samples(lattice, after, allowed):
+    """The fewest samples to arrival, one pass over all transitions after the other."""
+    samples = np.full(lattice.places, NEVER)
+    samples[:-2][lattice.arrived] = 0
+    samples[-2] = 0
+    level = np.zeros(lattice.nodes, dtype=int)
+    while True:
+        by_level = np.where(allowed, samples[after], NEVER).max(axis=1)
+        fewest = by_level.min(axis=0)
+        fresh = lattice.running & (samples[:-2] == NEVER) & (fewest < NEVER)
+        if not fresh.any():
+            return samples[:-2], level
+        samples[:-2][fresh] = fewest[fresh] + 1
+        level[fresh] = by_level.argmin(axis=0)[fresh]
+
+
+@pytest.mark.parametrize(("name", "cells"), [("vehicle", 60), ("vehicle", 47), ("unit_circle", 90)])
+@pytest.mark.parametrize("share", [1.0, 0.6])
+def test_the_fewest_samples_are_those_of_a_plain_twin(name, cells, share):
+    task = get_task(name)
+    lattice = Lattice.of(task, Grid.with_cells(task.chart, cells))
+    allowed = np.random.default_rng(0).random(lattice.after.shape) < share
+    samples, level = fewest_samples(lattice, lattice.after, allowed)
+    expected, levels = plain_samples(lattice, lattice.after, allowed)
+    np.testing.assert_array_equal(samples, expected)
+    np.testing.assert_array_equal(level[expected < NEVER], levels[expected < NEVER])

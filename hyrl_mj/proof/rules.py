@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from hyrl_mj.errors import brief
 from hyrl_mj.proof import affine
 from hyrl_mj.proof.affine import Affine, Unbounded
 from hyrl_mj.tracing import BATCH, Operation, Program
@@ -40,7 +41,12 @@ def bounds(program: Program, boxes: Affine) -> Affine | Truth:
     n, d = boxes.centre.shape[0], len(boxes.generators)
     with np.errstate(all="ignore"):
         for operation in program.operations():
-            values[operation] = _apply(operation, values, n, d)
+            try:
+                values[operation] = _apply(operation, values, n, d)
+            except (ValueError, TypeError, IndexError) as error:  # shapes that no rule has foreseen
+                raise Unbounded(
+                    f"uses np.{operation.name} in a way for which there are no bounds ({brief(error)})"
+                ) from error
     return values[result]
 
 
