@@ -178,8 +178,8 @@ class _Case:
         policy, hyrl = self.policy.quiet, self.hyrl.quiet
         if policy is not None and hyrl is not None and hyrl < policy:
             yield (
-                f"without noise HyRL wins {percent(hyrl, surely=False)} of {self.whole}, less than the "
-                f"policy ({percent(policy, surely=False)})"
+                f"without noise HyRL loses {percent(1 - hyrl)} of {self.whole}, more than the policy "
+                f"({percent(1 - policy)})"
             )
         given_up = [result.mode for result in self.retraining.modes if result.won < NEARLY]
         if given_up:
@@ -195,8 +195,8 @@ class _Case:
             attacked = self.robustness.attacks and not self.robustness.game
             whole = f"{self.whole} or attacked starts" if attacked else self.whole
             yield (
-                f"HyRL wins {percent(hyrl)} of {whole} under {self.noise}, not all, but more "
-                f"than the policy ({percent(policy)})"
+                f"HyRL loses {percent(1 - hyrl)} of {whole} under {self.noise}, but fewer than the policy "
+                f"({percent(1 - policy)})"
             )
         if not self.examined:
             yield (

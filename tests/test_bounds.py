@@ -1,5 +1,7 @@
 """Bounds over boxes: whatever code, network or set says inside of a box lies within what was bounded."""
 
+import copy
+
 import numpy as np
 import pytest
 from planted import AnalyticSet
@@ -74,7 +76,7 @@ def test_there_is_a_rule_for_every_operation_that_is_not_refused():
     from hyrl_mj.tracing.vocabulary import REDUCTIONS, UFUNCS
 
     others = {"where", "astype", "concatenate", "reshape", "transpose", "take", "full"}
-    assert {*UFUNCS, *REDUCTIONS, *others} - RULES.keys() == {"argmax", "argmin"}
+    assert {*UFUNCS, *REDUCTIONS, *others} - RULES.keys() == {"argmax", "argmin", "arctan"}
 
 
 @pytest.mark.parametrize("name", ["vehicle", "unit_circle", "rover", "quadrotor"])
@@ -280,5 +282,47 @@ def test_a_chart_that_is_not_the_position_is_refused(vehicle):
             return 1.0 * measured[:, :2]
 
     lattice = Lattice.of(Moved(), Grid.with_cells(vehicle.chart, 60))
-    with pytest.raises(Unbounded, match=r"computes its chart .* z\(\) or state\(\)"):
+    with pytest.raises(
+        Unbounded, match=r"computes its chart, measurement or state in methods of its own"
+    ):
         Cells.of(lattice)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"observation": lambda self, measured: np.hstack([measured, measured])},
+            "tells whole turns of theta apart",
+        ),
+        ({"measure": lambda self, sensors: sensors + 0.1}, "in methods of its own"),
+    ],
+)
+def test_a_circle_that_cannot_be_covered_by_cells_is_told_why(circle, change, message):
+    task = type("Changed", (type(circle),), change)()
+    lattice = Lattice.of(task, Grid.with_cells(task.chart, 60))
+    with pytest.raises(Unbounded, match=message):
+        Cells.of(lattice)
+
+
+def test_constraints_have_to_be_switched_off(vehicle):
+    class Constrained(type(vehicle)):
+        @property
+        def model(self):
+            model = copy.copy(super().model)
+            model.opt.disableflags = 0
+            return model
+
+    lattice = Lattice.of(Constrained(), Grid.with_cells(vehicle.chart, 60))
+    with pytest.raises(Unbounded, match='<flag constraint="disable"/>'):
+        Cells.of(lattice)
+
+
+def test_the_inputs_of_a_box_move_cells_wherever_some_of_them_does(circle):
+    """On a lattice on which full speed moves nodes onto nodes, speeds in between do not."""
+    ring = Cells.of(Lattice.of(circle, Grid.with_cells(circle.chart, 1_256)))
+    assert not ring.exact.any()
+    first, last = ring.shifts(np.array([[0.3001]]), np.array([[0.3001]]))
+    h = ring.lattice.grid.spacing[0]
+    assert first[0, 0] * h <= 0.3001 * circle.dt <= last[0, 0] * h
+    assert last[0, 0] > first[0, 0]

@@ -221,3 +221,36 @@ def test_an_examination_carries_what_is_proved(vehicle):
     proved = np.isin(classes, (WON, WON_FROM_SOME))
     game = Game(vehicle, halves(vehicle), loops, EPS, grid=maps.grid(vehicle.chart))
     assert (proved <= np.isin(game.map("hyrl", EPS), (WON, WON_FROM_SOME))).all()
+
+
+def test_where_runs_never_end_what_is_proved_stays_at_the_set_point(circle):
+    loops = {"policy": PolicyController(turning(circle))}
+    grid = Grid.with_cells(circle.chart, 1_000)
+    game = Game(circle, halves(circle), loops, 0.35, grid=grid)
+    certificate = Certificate.of(game, loops)
+    own, *_ = certificate.wins("policy", 0.05)
+    assert own > 0.9
+    cells, value = certificate.cells, certificate.value("policy", 0.05)[-1, :-2]
+    at = np.flatnonzero(value < NEVER)[::7]
+    settings = LoopSettings(quiet=True, steps=400)
+    noise = CellNoise(
+        certificate, loops["policy"], certificate.value("policy", 0.05), game.value("policy", 0.05),
+        game.bound(0.05),
+    )  # fmt: skip
+    run = closed_loop(circle, loops["policy"], cells.middle(at), noise, settings=settings)
+    assert (circle.miss(run.path[-1]) <= circle.close).all(), "long after the end of an episode"
+    # More noise than the set-point is wide can lead any run away from it again.
+    assert certificate.wins("policy", 0.35) == (0.0, 0.0, 0.0, 0.0)
+
+
+def test_nothing_is_proved_of_a_start_region_that_is_thinner_than_a_cell(vehicle):
+    class Line(type(vehicle)):
+        start_low, start_high = (0.0, -1.0), (0.0, 1.0)
+
+    task, loops = Line(), {"hyrl": hybrid(vehicle)}
+    game = Game(task, halves(task), loops, EPS, grid=Grid.with_cells(task.chart, 60))
+    certificate = Certificate.of(game, loops)
+    assert certificate.wins("hyrl", EPS) == (0.0, 0.0, 0.0, 0.0)
+    result, _ = examine(task, np.empty((0, 2)), halves(task), loops, (EPS,), cells=60)
+    score = result.scores["hyrl"][0]
+    assert (score.proved, score.not_broken) == (0.0, score.won)

@@ -105,7 +105,7 @@ def test_what_is_said_is_on_the_page(diagnosed):
     unit = run.task.chart.units[-1]
     for words in (
         "critical set of 1 piece",
-        f"noise on {name} of up to 0.1 {unit} makes it lose",
+        f"signals of noise on {name} of up to 0.1 {unit} are known that make it lose",
         "it wins all of them up to noise 0.02",
         "under worst noise",
     ):

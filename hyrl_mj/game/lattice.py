@@ -47,6 +47,7 @@ class Lattice:
         failed: (N,) bool, nodes at which an episode ends without success.
         hops: (A, d) how far one sample with each level moves the running nodes.
         uneven: (d,) by how much more or less it moves some of them, along each coordinate.
+        direct: whether measurement, chart point and position are the same numbers.
     """
 
     task: Task
@@ -57,6 +58,7 @@ class Lattice:
     failed: np.ndarray
     hops: np.ndarray
     uneven: np.ndarray
+    direct: bool
 
     @property
     def nodes(self) -> int:
@@ -149,7 +151,9 @@ class Lattice:
         # A running episode that leaves the chart leaves the lattice: it counts as failed.
         after = np.where((fails | outside & ~arrives)[:, None], len(nodes) + 1, after)
         after = np.where(arrives[:, None], len(nodes), after)
-        return Lattice(task, grid, levels, after.astype(np.int32), arrived, failed, hops, uneven)
+        return Lattice(
+            task, grid, levels, after.astype(np.int32), arrived, failed, hops, uneven, direct
+        )
 
     def level_of(self, u: np.ndarray) -> np.ndarray:
         """Returns the levels (n,) int nearest to inputs (n, m).

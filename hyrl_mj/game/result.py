@@ -34,7 +34,7 @@ NEARLY = 0.99
 def percent(share: float, surely: bool = True) -> str:
     """Returns a share in percent; only 1 is called 100%, and only 0 is called 0%.
 
-    A share that is all, but was not proved (`surely`), is "all tried".
+    A share of 1 that was not proved (`surely` is false) is written "all tried".
     """
     if share == 1 and not surely:
         return "all tried"

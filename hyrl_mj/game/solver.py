@@ -189,7 +189,9 @@ def noisy_moves(answers: Answers, bound: np.ndarray, settled_only: bool = False)
     return Moves.gather(lattice, rows)
 
 
-def solve(moves: Moves, samples: int | None = None) -> np.ndarray:
+def solve(
+    moves: Moves, samples: int | None = None, arrived: np.ndarray | None = None
+) -> np.ndarray:
     """Returns the value of every state by backward recursion: (rows, places) int.
 
     An episode is over where it arrives. A state from which it may neither fail nor arrive is worth `NEVER`.
@@ -198,12 +200,15 @@ def solve(moves: Moves, samples: int | None = None) -> np.ndarray:
         moves: the adversary's moves.
         samples: duration of an episode; what happens later does not count. By default, episodes have no
             time limit.
+        arrived: (rows, N) bool, further states that count as arrived.
     """
     lattice = moves.lattice
     value = np.full((moves.rows, lattice.places), NEVER, dtype=np.int32)
     value[:, :-2][:, lattice.failed] = LOST
     value[:, :-2][:, lattice.arrived] = 0
     value[:, -2], value[:, -1] = 0, LOST
+    if arrived is not None:
+        value[:, :-2][arrived] = 0
     flat = value.ravel()
     before, first = moves.backward
     waiting = np.zeros(flat.size, dtype=np.int32)  # moves that have not arrived yet

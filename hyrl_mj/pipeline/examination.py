@@ -139,7 +139,8 @@ def attack_loops(
     task, eps = run.task, run.settings.noise if options.eps is None else options.eps
     n = ATTACKED_SMOKE if run.settings.preset == "smoke" else ATTACKED
     starts = attack_starts(task, run.critical_set.points, eps, n, options.seed)
-    return attack(task, loops, starts, eps, budget, options.all_coordinates, options.seed)
+    everywhere = options.all_coordinates or run.settings.everywhere
+    return attack(task, loops, starts, eps, budget, everywhere, options.seed)
 
 
 def draw_robustness(run: Run, robustness: Robustness, maps: Maps, folder: Path) -> None:

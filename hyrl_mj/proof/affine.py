@@ -129,20 +129,13 @@ def multiply(a: Affine, b: Affine) -> Affine:
     return Affine(
         a.centre * b.centre,
         a.centre * b.generators + b.centre * a.generators,
-        _product(np.abs(a.centre), b.remainder)
-        + _product(np.abs(b.centre), a.remainder)
-        + _product(a.radius, b.radius),
+        np.abs(a.centre) * b.remainder + np.abs(b.centre) * a.remainder + a.radius * b.radius,
     )
-
-
-def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Returns a b, and 0 where one of them is 0, even if the other is infinite."""
-    return np.where((a == 0) | (b == 0), 0.0, a * b)
 
 
 def square(a: Affine) -> Affine:
     r = a.radius
-    remainder = 2 * _product(np.abs(a.centre), a.remainder) + r * r / 2
+    remainder = 2 * np.abs(a.centre) * a.remainder + r * r / 2
     return Affine(a.centre**2 + r * r / 2, 2 * a.centre * a.generators, remainder)
 
 
@@ -171,6 +164,8 @@ def _one(a: Affine) -> Affine:
 def matmul(a: Affine, b: Affine) -> Affine:
     if b.radius.any() and a.radius.any():
         raise Unbounded("multiplies matrices that both depend on the state")
+    if max(a.centre.ndim, b.centre.ndim) > 2:
+        raise Unbounded("multiplies stacks of matrices")
     if b.radius.any():
         return Affine(a.centre @ b.centre, a.centre @ b.generators, np.abs(a.centre) @ b.remainder)
     return Affine(a.centre @ b.centre, a.generators @ b.centre, a.remainder @ np.abs(b.centre))
@@ -241,9 +236,6 @@ _reciprocal = smooth(
     ),
     _inverse_extremes,
 )
-arctan = smooth(
-    np.arctan, lambda x: 1 / (1 + x * x), lambda low, _: np.full_like(low, 0.65), rising(np.arctan)
-)
 
 
 def absolute(a: Affine) -> Affine:
@@ -298,6 +290,8 @@ def remainder(a: Affine, b: Affine) -> Affine:
     a, b = pair(a, b)
     if b.radius.any() or not (b.centre > 0).all():
         raise Unbounded("uses np.remainder with a divisor that is not a positive constant")
+    rounding = 1e-15 * (np.abs(a.centre) + a.radius + b.centre)
+    a = Affine(a.centre, a.generators, a.remainder + rounding)
     turns = np.floor(a.low / b.centre)
     moved = Affine(a.centre - turns * b.centre, a.generators, a.remainder)
     whole = Affine.between(

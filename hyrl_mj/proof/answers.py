@@ -17,6 +17,8 @@ from hyrl_mj.stages import ON_EDGE, HybridController
 
 # Boxes of measurements along one side of a cell, for coordinates with noise.
 FINE = 2
+# The most cells that one sample can lead to; each takes a mask of all boxes.
+MOST_SHIFTS = 512
 # The answers are first bounded in blocks of so many boxes along each side.
 BLOCK = 8
 
@@ -250,7 +252,12 @@ def _shifts(boxes: Boxes, policy: BoundedPolicy) -> Iterator[tuple[np.ndarray, n
 
 def _between(first: np.ndarray, last: np.ndarray) -> Iterator[np.ndarray]:
     """Yields all shifts (d,) from the least of the first (n, d) to the greatest of the last (n, d)."""
-    ranges = zip(first.min(axis=0), last.max(axis=0) + 1, strict=True)
+    ranges = [*zip(first.min(axis=0), last.max(axis=0) + 1, strict=True)]
+    if (number := int(np.prod([b - a for a, b in ranges]))) > MOST_SHIFTS:
+        raise Unbounded(
+            f"one sample can lead to {number:,} different cells, more than {MOST_SHIFTS}: give fewer cells "
+            "(`lattice` in the settings)"
+        )
     yield from map(np.array, product(*(range(a, b) for a, b in ranges)))
 
 

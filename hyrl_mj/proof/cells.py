@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import mujoco
 import numpy as np
 
 from hyrl_mj.game import Lattice
 from hyrl_mj.proof.affine import Affine, Unbounded
 from hyrl_mj.proof.networks import bounds_of, program_of
+from hyrl_mj.proof.rules import as_form
 from hyrl_mj.tasks import Outcome, Task
 
 # Samples whose ends lie this close to the border of a cell, in cells after a whole episode, end on it.
@@ -27,12 +29,16 @@ class Cells:
     The two places after the N cells are "arrived" and "failed", as for `Lattice`. Every state of a cell,
     widened by `slack`, is one of the cell's states: rounding in the plant never leaves the covering.
 
+    A run has arrived for good where it ends as a success. Where it does not end, it has to be able to stay
+    in cells that would be a success at the end of an episode.
+
     Attributes:
         lattice: the nodes.
         counts: (d,) number of cells along each coordinate.
         exact: (d,) bool, whether every sample moves cells onto cells, but for rounding.
         slack: (d,) by how much the cells are widened [chart units].
-        arrived: (N,) bool, cells all of whose states are a success if the episode ends there.
+        arrived: (N,) bool, cells all of whose states end an episode as a success.
+        success: (N,) bool, cells all of whose states are a success if the episode is cut off there.
         failed: (N,) bool, cells some of whose states may end an episode without success.
         slope, offset: (d, m), (d,) of the displacement in one sample, slope @ u + offset [chart units].
         error: (d,) largest error of the displacement in one sample.
@@ -45,6 +51,7 @@ class Cells:
     exact: np.ndarray
     slack: np.ndarray
     arrived: np.ndarray
+    success: np.ndarray
     failed: np.ndarray
     slope: np.ndarray
     offset: np.ndarray
@@ -75,14 +82,20 @@ class Cells:
             Unbounded: the plant does not move all states alike, or the end of an episode cannot be bounded.
         """
         task, grid = lattice.task, lattice.grid
-        if not _is_measured_directly(task):
+        if not lattice.direct or not _is_measured_directly(task):
             raise Unbounded(
-                f"{task.name} computes its chart or its state in methods of its own, z() or state()"
+                f"{task.name} computes its chart, measurement or state in methods of its own"
             )
+        if not task.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT:
+            raise Unbounded(
+                f"contacts and other constraints could move {task.name} between the nodes otherwise than on "
+                'them: if it needs none, switch them off in its MJCF with <flag constraint="disable"/>'
+            )
+        _check_periods(task)
         periodic, h = np.array(task.chart.periodic), grid.spacing
         slope, offset = _displacement(lattice)
         off = np.abs(lattice.hops - lattice.levels @ slope.T - offset).max(axis=0)
-        error = 2 * (lattice.uneven + off)
+        error = 2 * (lattice.uneven + off + _carried(lattice))
         if (error > ALIKE * h).any():
             raise Unbounded(
                 f"the plant of {task.name} does not move all states alike: with the same input some move "
@@ -91,32 +104,42 @@ class Cells:
         # Where every sample moves cells onto cells, only rounding adds up over an episode.
         cells = lattice.hops / h
         drift = task.max_steps * (np.abs(cells - np.round(cells)) * h + error).max(axis=0)
-        exact = drift <= ON_BORDER * h
+        # Between levels, inputs lead to places between those of the levels.
+        still = ~np.abs(slope).any(axis=1) | (task.input_levels is not None)
+        exact = (drift <= ON_BORDER * h) & still
         slack = np.where(exact, drift, error) + 2 * TINY * h
         counts = np.array(grid.counts) - ~periodic
         reach = np.ceil(np.abs(cells).max(axis=0) + 1).astype(int)
         margin = np.where(periodic, 0, reach)
         axes = [np.arange(-m, n + m) for m, n in zip(margin, counts, strict=True)]
         index = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-        boxes = Affine.box(grid.chart.low + h * (index.reshape(-1, len(h)) + 0.5), h / 2 + slack)
-        fails, arrives = (mask.reshape(index.shape[:-1]) for mask in _ends(lattice, boxes))
+        centre, half = grid.chart.low + h * (index.reshape(-1, len(h)) + 0.5), h / 2 + slack
+        fails, ends, success = _ends(task, Affine.box(centre, half))
+        # Beyond the chart the episode has to end as a success now, or after whatever comes next.
+        low, high = lattice.hops.min(axis=0), lattice.hops.max(axis=0)
+        next_half = half + (high - low) / 2 + error
+        _, next_ends, _ = _ends(task, Affine.box(centre + (low + high) / 2, next_half))
+        arrives = ends | success & next_ends
+        fails, ends, success, arrives = (
+            mask.reshape(index.shape[:-1]) for mask in (fails, ends, success, arrives)
+        )
         inside = ((index >= 0) & (index < counts)).all(axis=-1)
         n = int(counts.prod())
         outside = np.where(arrives, n, n + 1)
         outside[inside] = np.arange(n)
-        shape = tuple(int(k) for k in counts)
         return Cells(
-            lattice,
-            shape,
-            exact,
-            slack,
-            arrives[inside],
-            fails[inside],
-            slope,
-            offset,
-            error,
-            outside,
-            margin,
+            lattice=lattice,
+            counts=tuple(int(k) for k in counts),
+            exact=exact,
+            slack=slack,
+            arrived=ends[inside],
+            success=success[inside],
+            failed=fails[inside],
+            slope=slope,
+            offset=offset,
+            error=error,
+            outside=outside,
+            margin=margin,
         )
 
     def shifts(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -197,18 +220,50 @@ def _displacement(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
     return fit[:-1].T, fit[-1]
 
 
-def _ends(lattice: Lattice, boxes: Affine) -> tuple[np.ndarray, np.ndarray]:
-    """Returns where an episode may fail, and where it surely is a success: (n,) bool over boxes."""
-    task = lattice.task
+def _ends(task: Task, boxes: Affine) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns where an episode may fail, surely ends as a success, or is one if cut off: (n,) bool each."""
     found = []
     for name in ("ending", "verdict"):
         what = f"the method {name} of {task.name}"
-        found.append(bounds_of(program_of(task, getattr(task, name), what), what, boxes))
+        outcome = bounds_of(program_of(task, getattr(task, name), what), what, boxes)
+        found.append(as_form(outcome, len(boxes.generators)))
     ending, verdict = found
-    assert isinstance(ending, Affine)
-    assert isinstance(verdict, Affine)
     # The outcomes RUNNING, REACHED, and the failures are numbered in this order.
     fails = ending.high > Outcome.REACHED + 0.5
-    reached = np.abs(ending.centre - Outcome.REACHED) + ending.radius < 0.5
-    success = np.abs(verdict.centre - Outcome.REACHED) + verdict.radius < 0.5
-    return fails, ~fails & (reached | success)
+    reached, success = (
+        np.abs(form.centre - Outcome.REACHED) + form.radius < 0.5 for form in (ending, verdict)
+    )
+    return fails, reached & ~fails, (reached | success) & ~fails
+
+
+def _carried(lattice: Lattice) -> np.ndarray:
+    """Returns by how much the input before changes the displacement in one sample, at most: (d,)."""
+    task, grid = lattice.task, lattice.grid
+    before = np.unique(lattice.levels[[0, -1]], axis=0)
+    first, then = (
+        np.repeat(before, len(lattice.levels), axis=0),
+        np.tile(lattice.levels, (len(before), 1)),
+    )
+    start = grid.nodes[np.flatnonzero(lattice.running)[:1]]
+    plant = task.plant(len(first))
+    plant.set_state(*task.state(np.repeat(start, len(first), axis=0)))
+    plant.step(first)
+    middle = plant.measurement
+    plant.step(then)
+    hops = plant.measurement - middle
+    return np.asarray(np.abs(hops - np.tile(lattice.hops, (len(before), 1))).max(axis=0))
+
+
+def _check_periods(task: Task) -> None:
+    """Raises `Unbounded` if a method of a task tells whole turns of a periodic coordinate apart."""
+    chart, rng = task.chart, np.random.default_rng(0)
+    z = rng.uniform(chart.low, chart.high, (1_000, chart.dimension))
+    for axis in np.flatnonzero(chart.periodic):
+        for turns in (-1, 1, 7):
+            turned = z + turns * chart.sides * (np.arange(chart.dimension) == axis)
+            for name in ("observation", "ending", "verdict"):
+                method = getattr(task, name)
+                if not np.allclose(method(turned), method(z), rtol=0, atol=1e-6):
+                    raise Unbounded(
+                        f"the method {name} of {task.name} tells whole turns of {chart.names[axis]} apart"
+                    )

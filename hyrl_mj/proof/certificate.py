@@ -70,10 +70,31 @@ class Certificate:
         return Moves.gather(cells, rows)
 
     def value(self, name: str, eps: float) -> np.ndarray:
-        """Returns the value (modes + 1, places) as `Game.value`, or more where less is known."""
+        """Returns an upper bound of the value of the closed loop (modes + 1, places), as `Game.value`."""
         if (name, eps) not in self._values:
-            self._values[name, eps] = solve(self.moves(name, eps), self.game.task.max_steps)
+            moves = self.moves(name, eps)
+            staying = self._staying(moves)
+            self._values[name, eps] = solve(moves, self.game.task.max_steps, staying)
         return self._values[name, eps]
+
+    def _staying(self, moves: Moves) -> np.ndarray:
+        """Returns from which states a run stays in cells of success, or ends as one: (rows, N) bool."""
+        cells = self.cells
+        assert cells is not None
+        over = np.append(cells.arrived, [True, False])
+        stays = np.append(cells.success & ~cells.arrived, [False, False])
+        inside = np.tile(stays, (moves.rows, 1)).ravel()
+        good = inside | np.tile(over, (moves.rows, 1)).ravel()
+        has_moves = np.zeros(inside.size, dtype=bool)
+        has_moves[moves.state] = True
+        inside &= has_moves
+        begin = np.append(0, np.cumsum(moves.counts)[:-1])
+        while True:
+            good = inside | np.tile(over, (moves.rows, 1)).ravel()
+            leaves = ~np.logical_and.reduceat(good[moves.target], begin) & inside[moves.state]
+            if not leaves.any():
+                return inside.reshape(moves.rows, -1)[:, :-2]
+            inside[moves.state[leaves]] = False
 
     def region(self, eps: float) -> np.ndarray:
         """Returns the winnable cells (N,) bool: those of the start region all of whose corners are winnable.
@@ -88,9 +109,11 @@ class Certificate:
 
         Returns:
             The share of the winnable cells that is won if the controller picks its start mode, the share
-            from every start mode, and bounds of the time to arrival [s] from both.
+            from every start mode, and bounds of the time to arrival [s] from both; zeros without such cells.
         """
         value, region = self.value(name, eps)[:, :-2], self.region(eps)
+        if not region.any():  # nothing is winnable, or the start region is thinner than a cell
+            return 0.0, 0.0, 0.0, 0.0
         own, worst = value[-1, region], value[:-1, region].max(axis=0, initial=0)
         latest, latest_any = (float(x[x < NEVER].max(initial=0)) for x in (own, worst))
         dt = self.game.task.dt

@@ -35,11 +35,11 @@ class Broken:
 def attack(
     certificate: Certificate, name: str, controller: Controller, eps: float, seed: int = 0
 ) -> Broken:
-    """Attacks a controller wherever it is not proved to win, and returns where it lost.
+    """Attacks a controller where it may lose, and returns where it lost.
 
     From the nodes that are lost in the game its adversary gives the noise. Cells that are neither proved nor
-    lost at a corner are attacked from a start inside: at each sample the noise tries measurements in its
-    range, and takes the answer that leads to the worst state.
+    lost at a corner, up to `MOST_CELLS` of them for each start mode, are attacked from a start inside: at
+    each sample the noise tries measurements in its range, and takes the answer that leads to the worst state.
 
     Args:
         certificate: what is proved.
@@ -90,9 +90,9 @@ def _beaten(
 
 
 class CellNoise(Signal):
-    """Noise that looks one sample ahead, and leads to the state of which the least is known for good.
+    """Noise that looks one sample ahead, and leads to the worst state.
 
-    A state that is lost at the nearest node is worse than one that is only not proved.
+    Worst is a state that is lost at the nearest node, then one that is not proved, then the latest to arrive.
 
     Args:
         certificate: gives the cells.
@@ -126,10 +126,16 @@ class CellNoise(Signal):
         self._candidates = candidates[np.argsort(-np.abs(candidates).sum(axis=1), kind="stable")]
 
     def sample(self, now: Sample) -> np.ndarray:
+        noise = np.zeros_like(now.measurement)
+        running = self._cells.lattice.task.ending(now.measurement) == Outcome.RUNNING
+        noise[running] = self._worst(now.measurement[running], now.q[running])
+        return noise
+
+    def _worst(self, true: np.ndarray, modes: np.ndarray) -> np.ndarray:
+        """Returns the worst of the candidates in true states (n, d) and modes (n,): (n, d)."""
         cells, k = self._cells, len(self._candidates)
-        true = now.measurement
         measured = (true[:, None] + self._candidates).reshape(-1, true.shape[1])
-        q = np.repeat(now.q, k)
+        q = np.repeat(modes, k)
         fresh = q == NOT_STARTED
         if fresh.any():
             q[fresh] = self._controller.initial_mode(measured[fresh])

@@ -30,7 +30,7 @@ from hyrl_mj.game import (
     Wins,
     share,
 )
-from hyrl_mj.policies import Controller
+from hyrl_mj.policies import BLAS, Controller
 from hyrl_mj.progress import progress_bar
 from hyrl_mj.proof.certificate import Certificate
 from hyrl_mj.proof.counterexamples import Broken, attack
@@ -114,6 +114,8 @@ def _score(certificate: Certificate, name: str, nodes: NodeScore, broken: Broken
     else:
         region = certificate.region(eps)
         own, some = share(~broken.own[region]), share(~broken.some[region])
+        if not region.any():  # a start region thinner than a cell
+            own, some = nodes.won, nodes.won_any
     proved = certificate.wins(name, eps) if name in certificate.answers else (None,) * 4
     return Score(**vars(nodes), open=open_, **_named(*proved), not_broken=own, not_broken_any=some)
 
@@ -130,7 +132,7 @@ def _map(certificate: Certificate, name: str, eps: float) -> np.ndarray:
     if name in certificate.answers and certificate.cells is not None:
         value, cells = certificate.value(name, eps)[:, :-2], certificate.cells
         some, every = (
-            cells.all_around(wins | ~cells.running)
+            cells.all_around(wins | ~cells.running) & ~cells.all_around(~(wins & cells.running))
             for wins in (value[-1] < NEVER, (value < NEVER).all(axis=0))
         )
     classes[won] = np.where(every, WON, np.where(some, WON_FROM_SOME, UNCLEAR))[won]
@@ -212,6 +214,8 @@ def _in_threads(
     label: str, work: Callable[..., Any], calls: Sequence[tuple[Any, ...]]
 ) -> Iterator[Any]:
     """Yields the results of calls in their order, from threads: NumPy releases the interpreter's lock."""
-    with ThreadPoolExecutor(min(THREADS, cores.count())) as pool:
+    threads = min(THREADS, cores.count())
+    # One limit for all threads: those within would undo each other's.
+    with BLAS.limit(limits=1, user_api="blas"), ThreadPoolExecutor(threads) as pool:
         results = pool.map(lambda call: work(*call), calls)
         yield from progress_bar(results, label, "games", len(calls))

@@ -16,7 +16,7 @@ from hyrl_mj import cores
 from hyrl_mj.errors import BadInput
 from hyrl_mj.policies import ACTIVATIONS, BLAS, MlpPolicy, Policy, PreprocessedPolicy
 from hyrl_mj.proof.affine import Affine, Unbounded
-from hyrl_mj.proof.rules import Truth, bounds
+from hyrl_mj.proof.rules import Truth, as_form, bounds
 from hyrl_mj.tasks import Task
 from hyrl_mj.tracing import BATCH, Program, trace
 
@@ -119,6 +119,8 @@ class BoundedPolicy:
         radius = np.abs(sides).sum(axis=0) + rest
         ends = np.stack([middle - radius, middle + radius], axis=1).astype(float)
         low, high = self.network.task.input_limits
+        unknown = np.isnan(ends).any(axis=1)[:, None]
+        ends = np.where(unknown, np.array([[-np.inf], [np.inf]]), ends)
         if self.network.output == "squash":
             ends = low + (np.tanh(ends) + 1) / 2 * (high - low)
         return np.clip(ends, low, high)
@@ -127,7 +129,7 @@ class BoundedPolicy:
         """Returns the last hidden layer in boxes: its middle, its generators and its remainder."""
         task = self.network.task
         seen = bounds_of(self.seen, _observation_of(task), Affine.box(centre, half))
-        assert isinstance(seen, Affine)
+        seen = as_form(seen, centre.shape[1])
         if np.isinf(seen.remainder).any():
             raise Unbounded(
                 f"{_observation_of(task)} cannot be bounded: it has no limit near some states"

@@ -13,8 +13,10 @@ from hyrl_mj.proof import affine
 from hyrl_mj.proof.affine import Affine, Unbounded
 from hyrl_mj.tracing import BATCH, Operation, Program
 
-# Relative error of one operation on numbers of 64 and of 32 bits.
-ROUNDING = {"float64": 2.0**-52, "float32": 2.0**-23}
+# Rounding errors of NumPy's functions and of ours, in units in the last place.
+ROUNDING = 8
+# Operations whose rounding errors go with their operands, not with their result.
+ADDING = ("add", "subtract", "sum", "matmul")
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,16 +66,30 @@ def _apply(
         return affine.square(operands[0])
     if name in LOGICAL:
         return rule(*map(_truth, operands))
-    forms = [o if name in AS_THEY_ARE and _is_condition(o) else _form(o, d) for o in operands]
+    forms = [o if name in AS_THEY_ARE and _is_condition(o) else as_form(o, d) for o in operands]
     found: Affine | Truth = rule(*forms, **options)
     if isinstance(found, Affine):
-        rounding = ROUNDING.get(operation.value.dtype.name, 0.0)
-        error = rounding * (np.abs(found.centre) + found.radius)
+        error = _rounding(operation, found, forms)
         return affine.tidy(Affine(found.centre, found.generators, found.remainder + error))
     return found
 
 
-def _form(x: Any, d: int) -> Affine:
+def _rounding(operation: Operation, found: Affine, operands: list[Any]) -> np.ndarray:
+    """Returns the largest rounding error (n, ...) of an operation, of NumPy's and of ours."""
+    if operation.value.dtype.kind != "f":
+        return np.zeros(found.centre.shape)
+    size = np.abs(found.centre) + found.radius
+    if operation.name in ADDING:
+        sizes = [
+            Affine(s := np.abs(o.centre) + o.radius, 0 * o.generators, 0 * s) for o in operands
+        ]
+        terms = max(2, *(int(np.prod(o.centre.shape[1:], dtype=int)) for o in operands))
+        whole = RULES["add" if operation.name == "subtract" else operation.name]
+        size = terms * whole(*sizes, **operation.options).centre
+    return np.asarray(ROUNDING * np.finfo(operation.value.dtype).eps * size)
+
+
+def as_form(x: Any, d: int) -> Affine:
     """Returns an operand as an affine form."""
     if isinstance(x, Affine):
         return x
@@ -124,7 +140,7 @@ def _where(condition: Any, a: Any, b: Any) -> Affine | Truth:
         )
         return Truth(surely, possibly)
     d = len((a if isinstance(a, Affine) else b).generators)
-    a, b = affine.pair(_form(a, d), _form(b, d))
+    a, b = affine.pair(as_form(a, d), as_form(b, d))
     hull = Affine.between(np.minimum(a.low, b.low), np.maximum(a.high, b.high), d)
     return affine.choose(c.surely, a, affine.choose(c.possibly, hull, b))
 
@@ -132,7 +148,10 @@ def _where(condition: Any, a: Any, b: Any) -> Affine | Truth:
 def _astype(a: Any, dtype: str) -> Any:
     if np.dtype(dtype).kind == "b":
         return _truth(a)
-    if np.dtype(dtype).kind == "f" or not isinstance(a, Affine):
+    kind = np.dtype(dtype)
+    if kind.kind == "u" or (kind.kind == "i" and kind.itemsize < 4):
+        raise Unbounded(f"makes numbers of the type {dtype}, which wrap")
+    if kind.kind == "f" or not isinstance(a, Affine):
         return a
     return Affine.between(np.trunc(a.low), np.trunc(a.high), len(a.generators))
 
@@ -191,7 +210,6 @@ RULES: dict[str, Callable[..., Any]] = {
         lambda low, _: np.full_like(low, 0.77),
         affine.rising(np.tanh),
     ),
-    "arctan": affine.arctan,
     "arctan2": affine.arctan2,
     "absolute": affine.absolute,
     "sign": affine.stepwise(np.sign),
@@ -209,7 +227,8 @@ RULES: dict[str, Callable[..., Any]] = {
     "less": lambda a, b: _greater(b, a),
     "less_equal": lambda a, b: _greater_equal(b, a),
     "equal": _equal,
-    "isnan": lambda a: Truth(np.zeros(a.centre.shape, bool), np.isinf(a.remainder)),
+    # An affine form does not tell what is no number.
+    "isnan": lambda a: Truth(np.zeros(a.centre.shape, bool), np.ones(a.centre.shape, bool)),
     "logical_and": lambda a, b: Truth(a.surely & b.surely, a.possibly & b.possibly),
     "logical_or": lambda a, b: Truth(a.surely | b.surely, a.possibly | b.possibly),
     "logical_not": lambda a: Truth(~a.possibly, ~a.surely),
@@ -225,7 +244,7 @@ RULES: dict[str, Callable[..., Any]] = {
     "reshape": lambda a, shape: a.each(lambda x: x.reshape(shape)),
     "transpose": lambda a, axes: a.each(lambda x: x.transpose(axes)),
     "take": _take,
-    "full": lambda a, shape, dtype: a.each(lambda x: np.broadcast_to(x, shape)),
+    "full": lambda a, shape, dtype: _astype(a.each(lambda x: np.broadcast_to(x, shape)), dtype),
 }
 
 

@@ -47,7 +47,7 @@ def noisy_arcs(
     horizon: float | None = None,
     seed: int = 0,
 ) -> dict[str, list[HybridArc]]:
-    """Simulates policy and hybrid controller from starts (n, d) under the same noise.
+    """Simulates policy and hybrid controller from starts (n, d) under one kind of noise.
 
     Args:
         run: with its mode policies.
@@ -63,7 +63,7 @@ def noisy_arcs(
         For each start an arc of "policy", of "hyrl_q0" and so on, and of "hyrl" for a mode of its own.
 
     Raises:
-        BadInput: a value that cannot be used, or a worst case that cannot be played exactly.
+        BadInput: a value that cannot be used, or a worst case that cannot be played.
     """
     task = run.task  # first: the file of a user's task may register noise
     if noise not in (kinds := (*noise_kinds(), WORST, ATTACK)):
@@ -121,7 +121,7 @@ def replay_arcs(
 ) -> dict[tuple[str, str], HybridArc]:
     """Simulates the replays by start and controller.
 
-    By default the noise is the paper's, and on M* the strongest that is known for each controller.
+    By default the noise is the paper's, and on M* the worst where a game can be played.
     """
     starts, modes, seed = replay_starts(run), run.controller.modes, run.settings.seed
     arcs: dict[tuple[str, str], HybridArc] = {}

@@ -94,7 +94,9 @@ def sentences(
     if robustness.game is not None:
         score = robustness.game.scores["policy"][-1]
         lost = percent(1 - score.not_broken)
-        results.append(f"the worst {noise} makes it lose {lost} of the starts that can be won")
+        results.append(
+            f"signals of {noise} are known that make it lose {lost} of the winnable starts"
+        )
         if score.proved is not None:
             results.append(f"it is proved to win {percent(score.proved)} of them")
         if losses is not None:
