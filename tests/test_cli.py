@@ -212,7 +212,13 @@ def test_simulate_prints_both_ends(finished):
 def test_robustness_prints_the_worst_case_and_the_episodes(copied):
     done = call("robustness", copied, "--episodes", "300", "--noise", "uniform,adversarial")
     assert done.returncode == 0, done.stderr
-    for words in ("exact game", "limit", "margins", "uniform 0.1", "adversarial 0.1"):
+    for words in (
+        "worst case over all noise",
+        "limit",
+        "margins",
+        "uniform 0.1",
+        "adversarial 0.1",
+    ):
         assert words in done.stdout
     robustness = hyrl_mj.load_run(copied).robustness
     assert [score.eps for score in robustness.game.scores["hyrl"]] == [0.0, 0.05, 0.1]

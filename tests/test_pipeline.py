@@ -184,7 +184,7 @@ def test_episodes_are_added_on_demand(run):
     before, said = run.robustness, []
     examine_run(run, ExamineOptions(eps=0.05, noise=("uniform",), episodes=20), said.append)
     assert hyrl_mj.load_run(run.path).robustness != before
-    assert said[-1].startswith("worst case at noise 0.05: ")
+    assert said[-1].startswith("worst case at noise 0.05, of the winnable starts: ")
 
 
 @pytest.mark.parametrize(

@@ -104,7 +104,7 @@ def circle_run(tmp_path_factory):
 def test_an_sb3_agent_is_diagnosed_and_then_made_robust(robust, dqn):
     path, diagnosed, before, said = robust
     assert "critical set of" in diagnosed
-    assert "of the starts that can be won" in diagnosed
+    assert "of the winnable starts" in diagnosed
     assert f"{dqn} (DQN) is given" in said
     for stage in ("critical-set", "partition"):
         assert f"{stage}: done before" in said

@@ -113,7 +113,7 @@ def test_a_terminal_that_knows_few_characters_gets_others(folder, tmp_path, envi
     done = shell(resume(shlex.quote(str(path))), **environment, MUJOCO_GL="disable")
     assert_whole(path, done)
     assert "run directory" in done.stdout
-    assert "won, own q0" in done.stdout
+    assert "proved, own" in done.stdout
 
 
 @pytest.mark.parametrize("columns", ["1", "0", "7", "-3", "many", "100000"])

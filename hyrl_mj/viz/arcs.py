@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hyrl_mj.errors import BadInput, unknown
-from hyrl_mj.game import Game, worst_signal
+from hyrl_mj.game import CURVE_CELLS, Game, worst_signal
 from hyrl_mj.policies import Controller, Policy
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import Grid
@@ -73,7 +73,8 @@ def noisy_arcs(
     game = None
     if noise == WORST:
         run.check_exact()
-        grid = Grid.with_cells(task.chart, run.settings.lattice)
+        cells = max(run.settings.lattice, CURVE_CELLS[task.chart.dimension])
+        grid = Grid.with_cells(task.chart, cells)
         game = Game(task, run.split, run.loops, bound, grid=grid)
     arcs = {}
     for name, loop in run.loops.items():
