@@ -240,11 +240,7 @@ class _Case:
         """Yields in one sentence from how many starts the attack, if any, breaks these controllers."""
         names = {"hyrl": "HyRL", "policy": "the policy"}
         found = {c.controller: c for c in self.robustness.attacks}
-        breaks = [
-            f"{names[who]} from {found[who].lost:,} of {found[who].starts:,} starts"
-            for who in controllers
-            if who in found
-        ]
+        breaks = [f"{names[who]} from {found[who].broken}" for who in controllers if who in found]
         if breaks:
             yield f"the attack breaks {', '.join(breaks)}"
 

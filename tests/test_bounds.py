@@ -162,6 +162,19 @@ def test_a_normalised_observation_is_bounded_too(vehicle):
         assert possible[np.arange(len(x)), level].all()
 
 
+def test_the_observation_of_a_task_that_builds_on_another_is_bounded(vehicle):
+    class Own(type(vehicle)):
+        def observation(self, measured):
+            return super().observation(measured) * 1.0
+
+    policy, own = network(vehicle), network(vehicle)
+    object.__setattr__(own, "task", Own())
+    centre = RNG(0).uniform(vehicle.chart.low, vehicle.chart.high, (300, 2))
+    expected, found = (BoundedPolicy.of(p).levels(centre, np.full(2, 0.02)) for p in (policy, own))
+    assert not (expected & ~found).any()
+    assert (expected != found).mean() < 0.01
+
+
 def test_what_is_no_network_is_refused(vehicle):
     with pytest.raises(Unbounded, match="a policy that is a PreprocessedPolicy"):
         BoundedPolicy.of(PreprocessedPolicy(network(vehicle), Preprocessing(None, 2)))

@@ -69,6 +69,11 @@ class AttackCount:
     outcome: str
 
     @property
+    def broken(self) -> str:
+        """From how many starts it loses, as "3 of 200 starts"."""
+        return f"{self.lost:,} of {self.starts:,} starts"
+
+    @property
     def is_whole(self) -> bool:
         """Whether there are starts, and no more of them are lost than there are."""
         return 0 <= self.lost <= self.starts and self.starts > 0 and self.rounds > 0

@@ -105,8 +105,8 @@ class Cells:
         cells = lattice.hops / h
         drift = task.max_steps * (np.abs(cells - np.round(cells)) * h + error).max(axis=0)
         # Between levels, inputs lead to places between those of the levels.
-        still = ~np.abs(slope).any(axis=1) | (task.input_levels is not None)
-        exact = (drift <= ON_BORDER * h) & still
+        on_levels = (task.input_levels is not None) | ~slope.any(axis=1)
+        exact = (drift <= ON_BORDER * h) & on_levels
         slack = np.where(exact, drift, error) + 2 * TINY * h
         counts = np.array(grid.counts) - ~periodic
         reach = np.ceil(np.abs(cells).max(axis=0) + 1).astype(int)

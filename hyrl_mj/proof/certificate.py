@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,6 +13,15 @@ from hyrl_mj.policies import Controller
 from hyrl_mj.proof.affine import Unbounded
 from hyrl_mj.proof.answers import BoundedAnswers
 from hyrl_mj.proof.cells import Cells
+
+
+class Proved(NamedTuple):
+    """What is proved of a controller at a noise bound, as in `Score`; None of one that is not bounded."""
+
+    proved: float | None = None
+    proved_any: float | None = None
+    proved_time: float | None = None
+    proved_time_any: float | None = None
 
 
 @dataclass(frozen=True)
@@ -83,15 +93,13 @@ class Certificate:
         assert cells is not None
         over = np.append(cells.arrived, [True, False])
         stays = np.append(cells.success & ~cells.arrived, [False, False])
-        inside = np.tile(stays, (moves.rows, 1)).ravel()
-        good = inside | np.tile(over, (moves.rows, 1)).ravel()
-        has_moves = np.zeros(inside.size, dtype=bool)
-        has_moves[moves.state] = True
-        inside &= has_moves
+        over, stays = (np.tile(mask, moves.rows) for mask in (over, stays))
+        inside = np.zeros(stays.size, dtype=bool)
+        inside[moves.state] = stays[moves.state]
         begin = np.append(0, np.cumsum(moves.counts)[:-1])
         while True:
-            good = inside | np.tile(over, (moves.rows, 1)).ravel()
-            leaves = ~np.logical_and.reduceat(good[moves.target], begin) & inside[moves.state]
+            good = (inside | over)[moves.target]
+            leaves = ~np.logical_and.reduceat(good, begin) & inside[moves.state]
             if not leaves.any():
                 return inside.reshape(moves.rows, -1)[:, :-2]
             inside[moves.state[leaves]] = False
@@ -104,17 +112,12 @@ class Certificate:
         nodes = self.game.starts & self.game.winnable(eps)
         return nodes if self.cells is None else self.cells.all_corners(nodes)
 
-    def wins(self, name: str, eps: float) -> tuple[float, float, float, float]:
-        """Returns what is proved of a controller, and how fast.
-
-        Returns:
-            The share of the winnable cells that is won if the controller picks its start mode, the share
-            from every start mode, and bounds of the time to arrival [s] from both; zeros without such cells.
-        """
+    def wins(self, name: str, eps: float) -> Proved:
+        """Returns what is proved of a controller; zeros where no cell is winnable."""
         value, region = self.value(name, eps)[:, :-2], self.region(eps)
         if not region.any():  # nothing is winnable, or the start region is thinner than a cell
-            return 0.0, 0.0, 0.0, 0.0
+            return Proved(0.0, 0.0, 0.0, 0.0)
         own, worst = value[-1, region], value[:-1, region].max(axis=0, initial=0)
         latest, latest_any = (float(x[x < NEVER].max(initial=0)) for x in (own, worst))
         dt = self.game.task.dt
-        return share(own < NEVER), share(worst < NEVER), latest * dt, latest_any * dt
+        return Proved(share(own < NEVER), share(worst < NEVER), latest * dt, latest_any * dt)

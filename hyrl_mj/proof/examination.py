@@ -32,7 +32,7 @@ from hyrl_mj.game import (
 )
 from hyrl_mj.policies import BLAS, Controller
 from hyrl_mj.progress import progress_bar
-from hyrl_mj.proof.certificate import Certificate
+from hyrl_mj.proof.certificate import Certificate, Proved
 from hyrl_mj.proof.counterexamples import Broken, attack
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import LoopSettings, closed_loop
@@ -116,12 +116,8 @@ def _score(certificate: Certificate, name: str, nodes: NodeScore, broken: Broken
         own, some = share(~broken.own[region]), share(~broken.some[region])
         if not region.any():  # a start region thinner than a cell
             own, some = nodes.won, nodes.won_any
-    proved = certificate.wins(name, eps) if name in certificate.answers else (None,) * 4
-    return Score(**vars(nodes), open=open_, **_named(*proved), not_broken=own, not_broken_any=some)
-
-
-def _named(own: Any, any_: Any, time: Any, time_any: Any) -> dict[str, Any]:
-    return {"proved": own, "proved_any": any_, "proved_time": time, "proved_time_any": time_any}
+    proved = certificate.wins(name, eps) if name in certificate.answers else Proved()
+    return Score(**vars(nodes), open=open_, **proved._asdict(), not_broken=own, not_broken_any=some)
 
 
 def _map(certificate: Certificate, name: str, eps: float) -> np.ndarray:

@@ -58,11 +58,13 @@ class BoundedPolicy:
 
     Attributes:
         network: its multilayer perceptron.
-        seen: the operations from the measurement to what the network sees.
+        observation: the operations from the measurement to the observation.
+        normalization: those from the observation to what the network sees; None if it sees just that.
     """
 
     network: MlpPolicy
-    seen: Program
+    observation: Program
+    normalization: Program | None = None
 
     @staticmethod
     def of(policy: Policy) -> BoundedPolicy:
@@ -77,14 +79,12 @@ class BoundedPolicy:
         if not isinstance(inner, MlpPolicy):
             raise Unbounded(f"a policy that is a {type(policy).__name__} cannot be bounded")
         task = inner.task
-
-        def seen(measured: np.ndarray) -> np.ndarray:
-            observation = task.observation(measured)
-            if normalize is None:
-                return observation
-            return normalize(observation.astype(np.float32))
-
-        return BoundedPolicy(inner, program_of(task, seen, _observation_of(task)))
+        observation = program_of(task, task.observation, _observation_of(task))
+        if normalize is None:
+            return BoundedPolicy(inner, observation)
+        (result,) = observation.outputs
+        seen = result.value.astype(np.float32)
+        return BoundedPolicy(inner, observation, trace(normalize, {"x": seen}, "it", "bounded"))
 
     def levels(self, centre: np.ndarray, half: np.ndarray) -> np.ndarray:
         """Returns which levels the policy may choose in boxes: (n, levels) bool.
@@ -128,8 +128,13 @@ class BoundedPolicy:
     def _hidden(self, centre: np.ndarray, half: np.ndarray) -> Relaxed:
         """Returns the last hidden layer in boxes: its middle, its generators and its remainder."""
         task = self.network.task
-        seen = bounds_of(self.seen, _observation_of(task), Affine.box(centre, half))
+        seen = bounds_of(self.observation, _observation_of(task), Affine.box(centre, half))
         seen = as_form(seen, centre.shape[1])
+        if self.normalization is not None:
+            # The network sees the observation in single precision.
+            rounding = 2 * ROUNDING * (np.abs(seen.centre) + seen.radius)
+            seen = Affine(seen.centre, seen.generators, seen.remainder + rounding)
+            seen = as_form(bounds_of(self.normalization, "VecNormalize", seen), centre.shape[1])
         if np.isinf(seen.remainder).any():
             raise Unbounded(
                 f"{_observation_of(task)} cannot be bounded: it has no limit near some states"

@@ -181,7 +181,7 @@ def attack_table(task: Task, counts: Sequence[AttackCount]) -> Table:
 def attack_sentence(counts: Sequence[AttackCount]) -> str:
     """Returns what the attack breaks in one line."""
     return "the attack breaks " + ", ".join(
-        f"{NAMES[c.controller]} from {c.lost:,} of {c.starts:,} starts" for c in counts
+        f"{NAMES[c.controller]} from {c.broken}" for c in counts
     )
 
 
