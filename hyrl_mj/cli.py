@@ -191,7 +191,7 @@ def robustness(run: Run, options: ExamineOptions) -> None:
         raise BadInput(f"{option} is about the episodes: say how many, as in --episodes 100000")
     pipeline.examine_run(run, options)
     print_robustness(replace(run))
-    if run.exact:
+    if run.why_no_game is None:
         print(f"pictures in {run.path / 'figures'}")
 
 

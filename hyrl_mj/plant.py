@@ -167,15 +167,7 @@ class Plant:
             BadInput: a wrong shape, a value that is not finite, or one outside the input limits.
         """
         self._wake()
-        u, rows = self._inputs(u, ids), self._rows(ids)
-        if self._control is None:
-            self._advance(self._controls(u), ids, self.substeps)
-            return
-        for left in reversed(range(self.substeps)):
-            ctrl = self._control(u, self._qpos[rows], self._qvel[rows])
-            ctrl = _checked("control", ctrl, self.model.nu, rows)
-            ctrl = np.clip(ctrl, self._ctrl_low, self._ctrl_high)
-            self._advance(ctrl, ids, 1, sense=not left)
+        self._sample(self._inputs(u, ids), ids)
 
     def step_backward(self, u: np.ndarray, ids: np.ndarray | None = None) -> None:
         """Reverses `step`: one sample of x' = -f(x, u), for plants with kinematic actuators only.
@@ -189,13 +181,14 @@ class Plant:
                 "velocity actuator with kv >= 1e6 on every degree of freedom, one to one"
             )
         self._wake()
-        self._advance(-self._controls(self._inputs(u, ids)), ids, self.substeps)
+        self._sample(self._inputs(u, ids), ids, sign=-1)
 
     @property
     def invertible(self) -> bool:
-        """Whether each degree of freedom follows its own velocity actuator."""
-        if self._control is not None:
-            return False
+        """Whether each degree of freedom follows its own velocity actuator.
+
+        An inner loop may give these their speeds, from the inputs and the positions.
+        """
         model = self.model
         driven = sorted(model.actuator_trnid[:, 0])
         follows = -model.actuator_biasprm[:, 2] >= 1e6
@@ -221,6 +214,18 @@ class Plant:
                 f"[{self.low[column]:g}, {self.high[column]:g}] of the MJCF"
             )
         return np.clip(u, self.low, self.high)
+
+    def _sample(self, u: np.ndarray, ids: np.ndarray | None, sign: int = 1) -> None:
+        """Advances the copies by one sample under checked inputs; sign -1 reverses all controls."""
+        if self._control is None:
+            self._advance(sign * self._controls(u), ids, self.substeps)
+            return
+        rows = self._rows(ids)
+        for left in reversed(range(self.substeps)):
+            ctrl = self._control(u, self._qpos[rows], self._qvel[rows])
+            ctrl = _checked("control", ctrl, self.model.nu, rows)
+            ctrl = sign * np.clip(ctrl, self._ctrl_low, self._ctrl_high)
+            self._advance(ctrl, ids, 1, sense=not left)
 
     def _controls(self, u: np.ndarray) -> np.ndarray:
         """Returns the controls of all actuators (k, nu) for inputs (k, m)."""

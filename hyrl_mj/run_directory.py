@@ -15,10 +15,11 @@ from typing import ClassVar
 
 from hyrl_mj import artifacts, policies
 from hyrl_mj.errors import BadArtifact, BadInput
-from hyrl_mj.game import Lattice, Robustness
+from hyrl_mj.game import Lattice, Robustness, lattice_grid
 from hyrl_mj.learning import Settings, differing
 from hyrl_mj.manifest import FILES, Manifest, check_contents, locked, may_hold
 from hyrl_mj.policies import Agent, AnyPolicy, MlpPolicy, Policy
+from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.stages import (
     Arrivals,
@@ -138,20 +139,27 @@ class Run:
         """
         return policies.as_function(self.policy)
 
+    @cached_property
+    def why_no_game(self) -> str | None:
+        """Why the worst-case game cannot be played against the policy, None if it can be."""
+        if why := Lattice.why_not(self.task) or Lattice.why_not(self.task, self.lattice_grid):
+            return why
+        if self.agent and self.agent.why_no_function:
+            return (
+                "the worst-case game takes a function of the measurement, which this policy is not "
+                f"({self.agent.why_no_function})"
+            )
+        return None
+
     @property
     def exact(self) -> bool:
-        """Whether the worst-case game can be played: on a lattice, against a function of the measurement."""
-        return Lattice.possible(self.task) and not (self.agent and self.agent.why_no_function)
+        """Whether the game can be played, and is more than an estimate."""
+        return self.why_no_game is None and Lattice.decides(self.task, self.lattice_grid)
 
-    def check_exact(self) -> None:
-        """Raises `BadInput` unless `exact`."""
-        Lattice.check(self.task)
-        if self.agent and self.agent.why_no_function:
-            raise BadInput(
-                "the worst-case game takes a function of the measurement, which this policy is not "
-                f"({self.agent.why_no_function}): use noisy episodes instead (hyrl-mj robustness RUN "
-                "--episodes N --noise adversarial)"
-            )
+    @property
+    def lattice_grid(self) -> Grid:
+        """The nodes of the game's lattice."""
+        return lattice_grid(self.task, self.settings.lattice)
 
     @property
     def policy_files(self) -> list[Path]:

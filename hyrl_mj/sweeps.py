@@ -252,7 +252,7 @@ def finished_run(path: Path) -> Run | None:
 
 def _figures(robustness: Robustness) -> dict[str, float | None]:
     """Returns the results of a run by name."""
-    if (game := robustness.game) is None:
+    if (game := robustness.deciding) is None:
         least: dict[str, float] = {}
         for count in robustness.episodes:
             name = f"{count.controller}_reached_{count.noise}"

@@ -69,7 +69,7 @@ class Verdict:
         reasons = tuple(case.reasons())
         for word, grounds in (
             (PROVED, case.proofs()),
-            (WON if robustness.game else HELD, case.success()),
+            (WON if robustness.deciding else HELD, case.success()),
             (FAILED, case.failures()),
             (WEAK, case.weaknesses()),
         ):
@@ -93,8 +93,8 @@ class _Wins:
     @staticmethod
     def of(robustness: Robustness, who: str) -> _Wins:
         """Returns what "policy" or "hyrl" wins."""
-        if robustness.game:
-            scores = robustness.game.scores[who]
+        if robustness.deciding:
+            scores = robustness.deciding.scores[who]
             quiet = [score.not_broken for score in scores if score.eps == 0]
             return _Wins(quiet[0] if quiet else None, scores[-1].not_broken)
         shares = {
@@ -134,7 +134,7 @@ class _Case:
     @property
     def whole(self) -> str:
         """What shares are shares of."""
-        return "the winnable starts" if self.robustness.game else "the episodes"
+        return "the winnable starts" if self.robustness.deciding else "the episodes"
 
     @property
     def examined(self) -> bool:
@@ -144,12 +144,12 @@ class _Case:
     @property
     def winnable(self) -> float:
         """The share of the starts that can be won under the noise."""
-        game = self.robustness.game
+        game = self.robustness.deciding
         return game.scores["hyrl"][-1].winnable if game else 1.0
 
     def proofs(self) -> Iterator[str]:
         """Yields why the run is PROVED, if it is."""
-        game = self.robustness.game
+        game = self.robustness.deciding
         if not game or not self.examined or not self.winnable:
             return
         score = game.scores["hyrl"][-1]
@@ -161,9 +161,9 @@ class _Case:
         won = self.hyrl.noisy
         if not self.examined or not self.winnable or won is None:
             return
-        if self.robustness.game and won == 1:
+        if self.robustness.deciding and won == 1:
             yield f"HyRL lost none of {self.whole} that were tried under the worst {self.noise}"
-        elif not self.robustness.game and won >= NEARLY:
+        elif not self.robustness.deciding and won >= NEARLY:
             counts = _by_kind(self.robustness, "hyrl")
             counts.pop(NO_NOISE, None)
             arrived, total = (sum(column) for column in zip(*counts.values(), (0, 0), strict=True))
@@ -192,7 +192,7 @@ class _Case:
             yield f"the policy {self.arrivals}"
         policy, hyrl = self.policy.noisy, self.hyrl.noisy
         if policy is not None and hyrl is not None and hyrl > policy:
-            attacked = self.robustness.attacks and not self.robustness.game
+            attacked = self.robustness.attacks and not self.robustness.deciding
             whole = f"{self.whole} or attacked starts" if attacked else self.whole
             yield (
                 f"HyRL loses {percent(1 - hyrl)} of {whole} under {self.noise}, but fewer than the policy "
@@ -206,7 +206,7 @@ class _Case:
 
     def reasons(self) -> Iterator[str]:
         """Yields the results behind the verdict."""
-        yield from self._shares() if self.robustness.game else self._counts()
+        yield from self._shares() if self.robustness.deciding else self._counts()
         yield f"stage 1: the policy {self.arrivals}"
         for result in self.retraining.modes:
             yield f"stage 6: {mode_sentence(self.task, result)}"
@@ -214,14 +214,14 @@ class _Case:
     def _shares(self) -> Iterator[str]:
         """Yields what is won in the worst-case game."""
         if self.winnable < 1:
-            assert self.robustness.game
-            open_ = self.robustness.game.scores["hyrl"][-1].open
+            assert self.robustness.deciding
+            open_ = self.robustness.deciding.scores["hyrl"][-1].open
             yield (
                 f"under {self.noise} this split can win {percent(self.winnable)} of the starts; to one who "
                 f"sees the state {percent(open_)} are open"
             )
-        assert self.robustness.game
-        policy, hyrl = (self.robustness.game.scores[who] for who in ("policy", "hyrl"))
+        assert self.robustness.deciding
+        policy, hyrl = (self.robustness.deciding.scores[who] for who in ("policy", "hyrl"))
         for ours, theirs in zip(hyrl, policy, strict=True):
             if ours.eps in (0, self.robustness.eps):
                 when = f"under the worst {self.noise}" if ours.eps else "without noise"
@@ -235,6 +235,13 @@ class _Case:
             theirs, _ = policy[kind]
             yield f"{when} HyRL arrives in {arrived:,} of {episodes:,} episodes, the policy in {theirs:,}"
         yield from self._attacked("hyrl", "policy")
+        if game := self.robustness.game:
+            policy_lost, lost = (1 - game.scores[who][-1].not_broken for who in ("policy", "hyrl"))
+            yield (
+                f"the worst-case game on nodes, here an estimate, finds noise that beats HyRL from "
+                f"{percent(lost)} of the starts that it calls winnable, and the policy from "
+                f"{percent(policy_lost)}"
+            )
 
     def _attacked(self, *controllers: str) -> Iterator[str]:
         """Yields in one sentence from how many starts the attack, if any, breaks these controllers."""

@@ -15,7 +15,7 @@ from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.critical_set import CriticalSet
 from hyrl_mj.stages.hybrid import HybridController
 from hyrl_mj.stages.partition import Partition
-from hyrl_mj.tasks import Outcome, Scene, Task
+from hyrl_mj.tasks import Learning, Outcome, Scene, Task
 
 
 def euler(task, z, u):
@@ -194,6 +194,33 @@ CUBE = """
 """
 
 
+UNICYCLE = """
+<mujoco model="unicycle">
+  <option timestep="0.01" integrator="implicitfast" gravity="0 0 0">
+    <flag contact="disable" constraint="disable"/>
+  </option>
+  <custom>
+    <numeric name="sample_time" data="0.05"/>
+    <numeric name="turn_rate" data="-2 2"/>
+  </custom>
+  <worldbody>
+    <body>
+      <joint name="x" type="slide" axis="1 0 0"/>
+      <joint name="y" type="slide" axis="0 1 0"/>
+      <joint name="heading" type="hinge" axis="0 0 1"/>
+      <geom size="0.1" mass="1"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <velocity joint="x" kv="1e6"/>
+    <velocity joint="y" kv="1e6"/>
+    <velocity joint="heading" kv="1e6"/>
+  </actuator>
+  <sensor><jointpos joint="x"/><jointpos joint="y"/><jointpos joint="heading"/></sensor>
+</mujoco>
+"""
+
+
 class Cube(Task):
     """A point that moves at will in a cube; runs differ by whether a level rises or falls.
 
@@ -276,3 +303,60 @@ def believe(path, task=None):
             if (outputs := {n: content for n, content in files.items() if re.fullmatch(names, n)})
         }
     )
+
+
+class Unicycle(Task):
+    """A rover reduced to kinematics: it drives through a corridor at 1 m/s, and gives its turn rate.
+
+    Its chart of three dimensions is its whole state; an inner loop gives the actuators their speeds.
+    """
+
+    name = "unicycle"
+    description = "planted"
+    chart = Chart(
+        ("x", "y", "heading"), ("m", "m", "rad"), (0, -1, -1.4), (2, 1, 1.4), (False,) * 3
+    )
+    inputs = ("turn_rate",)
+    noisy = (False, True, 0.5)
+    max_steps = 80
+    start_low, start_high = (0.0, -0.8, -1.0), (0.4, 0.8, 1.0)
+    scene = Scene(starts=((0.0, 0.0, 0.0),), time=3.0, mode_names=("left", "right"))
+    learning = Learning(levels=5)
+
+    def __init__(self):
+        self.model = mujoco.MjModel.from_xml_string(UNICYCLE)
+
+    def control(self, u, qpos, qvel):
+        return np.column_stack([np.cos(qpos[:, 2]), np.sin(qpos[:, 2]), u])
+
+    def observation(self, measured):
+        return measured
+
+    def reward(self, measurement, u):
+        return np.zeros(len(measurement))
+
+    def ending(self, measurement):
+        ends = np.full(len(measurement), Outcome.RUNNING)
+        ends[measurement[:, 0] >= 2] = Outcome.REACHED
+        ends[(np.abs(measurement[:, 1:]) >= (1, 1.4)).any(axis=1)] = Outcome.OUT_OF_BOUNDS
+        return ends
+
+    def verdict(self, measurement):
+        return np.full(len(measurement), Outcome.STALLED)
+
+    def miss(self, z):
+        return np.abs(z[:, 1])
+
+    def direction(self, path):
+        return np.where(path[-1, :, 1] > 0, 0, 1)
+
+
+def steering_policy(task, gain=2.0):
+    """Turns a unicycle towards the middle of the corridor, at the nearest of its levels."""
+
+    def rule(z):
+        wanted = np.clip(-gain * (z[:, 1] + z[:, 2]), *np.ravel(task.input_limits))
+        nearest = np.abs(wanted[:, None] - task.input_levels[:, 0]).argmin(axis=1)
+        return task.input_levels[nearest]
+
+    return ChartPolicy(task, rule)

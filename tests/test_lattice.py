@@ -136,9 +136,9 @@ def test_the_circle_s_nodes_have_arrived_within_the_band(around_circle):
 # ---- what it refuses
 
 
-def test_a_chart_of_three_dimensions_is_refused():
-    cube = Cube(lambda z: z[:, 0])
-    with pytest.raises(BadInput, match=r"1 or 2 dimensions, that of cube has 3.*--episodes"):
+def test_a_chart_of_four_dimensions_is_refused():
+    cube = Cube(lambda z: z[:, 0], d=4)
+    with pytest.raises(BadInput, match=r"1 to 3 dimensions, that of cube has 4.*--episodes"):
         Lattice.of(cube)
     assert not Lattice.possible(cube)
 

@@ -1,5 +1,7 @@
 """The verdict: its word follows from scores, episodes and what the stages know, one condition at a time."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from planted import one_way_policy
@@ -92,6 +94,19 @@ def test_what_is_proved_of_nearly_all_winnable_starts_has_the_first_word(
     assert word(circle, game((1.0, 0.9), (1.0, hyrl), proved=proved)) == expected
     less = game((1.0, 0.9), (1.0, hyrl), bounds=(0.0, 0.05), proved=proved)
     assert word(circle, less) == WEAK, "the run's bound is 0.1"
+
+
+def test_a_game_that_is_an_estimate_stands_beside_the_episodes_that_decide(circle):
+    estimate = game((1.0, 0.4), (1.0, 0.998)).game
+    rough = replace(estimate, lattice=replace(SPACING, spacing=(0.1, 0.1, 0.1)))
+    assert rough.estimate
+    assert not estimate.estimate
+    counted = episodes({"none": 990, "adversarial": 500}, {"none": 1_000, "adversarial": 1_000})
+    found = Verdict.of(circle, EPS, replace(counted, game=rough), HOLDS, ALL)
+    assert found.word == HELD
+    (told,) = [reason for reason in found.reasons if "estimate" in reason]
+    assert "beats HyRL from 0.20%" in told
+    assert "the policy from 60.00%" in told
 
 
 def test_a_proof_is_told_with_what_is_known_to_be_lost(circle):

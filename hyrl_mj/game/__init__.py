@@ -5,8 +5,9 @@ The plant is tabulated on a lattice of states, and the game is solved on it by b
 """
 
 from hyrl_mj.game.counts import AttackCount, EpisodeCount
-from hyrl_mj.game.lattice import CURVE_CELLS, LATTICE, Lattice
+from hyrl_mj.game.lattice import EPISODES_INSTEAD, Lattice
 from hyrl_mj.game.limit import Limit, fewest_samples
+from hyrl_mj.game.resolution import CURVE_CELLS, LATTICE, lattice_grid
 from hyrl_mj.game.result import (
     BEATEN,
     LIMIT,
@@ -46,6 +47,7 @@ __all__ = [
     "BEATEN",
     "CURVE",
     "CURVE_CELLS",
+    "EPISODES_INSTEAD",
     "FIRST",
     "LARGEST",
     "LATTICE",
@@ -79,6 +81,7 @@ __all__ = [
     "WorstNoise",
     "fewest_samples",
     "lasting",
+    "lattice_grid",
     "noisy_moves",
     "percent",
     "share",

@@ -11,22 +11,26 @@ import mujoco
 import numpy as np
 
 from hyrl_mj.errors import BadInput
+from hyrl_mj.game.resolution import (
+    LATTICE,
+    MOST_TRANSITIONS,
+    corner_hops,
+    lattice_grid,
+    level_counts,
+    resolves,
+)
 from hyrl_mj.mjcf import model_name
 from hyrl_mj.progress import progress_bar
 from hyrl_mj.sets import Grid
 from hyrl_mj.tasks import Outcome, Task
 
-# Cells along the longest side of the game's lattice, by the dimension of the chart.
-LATTICE = {1: 12_000, 2: 480}
-# The most cells where the game is played many times, or for an estimate.
-CURVE_CELLS = {1: 3_000, 2: 240}
 # A sample that ends this close to a node, in cells, ends on it.
 ON_NODE = 1e-3
-# Transitions of the largest lattice, each of which takes about 100 bytes while they are tabulated.
-MOST_TRANSITIONS = 2**24
 # Nodes from which a plant is stepped that moves all of them alike, up to this distance [chart units].
 SAMPLE, ALIKE = 1_000, 1e-9
-REMEDY = "use noisy episodes instead (hyrl-mj robustness RUN --episodes N --noise adversarial)"
+EPISODES_INSTEAD = (
+    "use noisy episodes instead (hyrl-mj robustness RUN --episodes N --noise adversarial)"
+)
 
 
 @dataclass(frozen=True)
@@ -35,14 +39,16 @@ class Lattice:
 
     Two more places follow the N nodes: number N is "arrived", N + 1 is "failed". A sample that ends between
     nodes leads to all nodes around its end, and the adversary chooses among them: the lattice errs to the
-    adversary's side, by less than a cell a sample.
+    adversary's side, by less than a cell a sample. In three dimensions that would lose every run. There a
+    sample leads to one of these nodes, drawn so that it is right on average, and the game is an estimate.
 
     Attributes:
         task: the robot and its problem.
         grid: the nodes.
         levels: (A, m) inputs: a discrete task's levels; for continuous inputs as many as lead to different
             nodes in one sample.
-        after: (A, C, N) places around the end of one sample, the nearest first.
+        after: (A, C, N) places around the end of one sample, the nearest first; one of them, C = 1, where
+            the game is an estimate.
         arrived: (N,) bool, nodes at which an episode that ended there would be a success.
         failed: (N,) bool, nodes at which an episode ends without success.
         hops: (A, d) how far one sample with each level moves the running nodes.
@@ -75,45 +81,62 @@ class Lattice:
         """(N,) bool, the nodes at which an episode goes on."""
         return self.task.ending(self.grid.nodes) == Outcome.RUNNING
 
-    @cached_property
+    @property
     def exact(self) -> bool:
-        """Whether every sample leads from node to node."""
-        return self.after.shape[1] == 1
+        """Whether every sample under every possible input leads from node to node."""
+        on_nodes = not self.estimate and self.after.shape[1] == 1
+        return on_nodes and self.task.input_levels is not None
+
+    @property
+    def estimate(self) -> bool:
+        """Whether what is won on the nodes is an estimate, which may err to either side."""
+        return self.grid.chart.dimension > 2
 
     @staticmethod
-    def check(task: Task) -> None:
-        """Raises `BadInput` unless the game can be played on a lattice of this task's chart."""
+    def why_not(task: Task, grid: Grid | None = None) -> str | None:
+        """Returns why the game cannot be played on nodes of this task's chart, None if it can be."""
         d = task.chart.dimension
         if d not in LATTICE:
-            raise BadInput(
-                f"the worst-case game takes a chart of 1 or 2 dimensions, that of {task.name} has {d}: "
-                f"{REMEDY}"
-            )
+            return f"the worst-case game takes a chart of 1 to 3 dimensions, that of {task.name} has {d}"
         if task.measurement_columns != d or task.model.nq != d or not task.kinematic:
-            raise BadInput(
-                f"the worst-case game takes a plant that one sample maps from chart point to chart point, "
-                f"and {model_name(task.model)} has a larger state: {REMEDY}"
+            return (
+                "the worst-case game takes a plant that one sample maps from chart point to chart point, "
+                f"and {model_name(task.model)} has a larger state"
             )
+        if grid is None or resolves(task, grid):
+            return None
+        sides = " by ".join(f"{side:.3g}" for side in grid.spacing)
+        return (
+            f"the worst-case game would hold {task.name} in its place, because no sample moves it by a "
+            f"whole cell of the lattice, {sides}"
+        )
+
+    @staticmethod
+    def check(task: Task, grid: Grid | None = None) -> None:
+        """Raises `BadInput` unless the game can be played on nodes of this task's chart."""
+        if why := Lattice.why_not(task, grid):
+            raise BadInput(f"{why}: {EPISODES_INSTEAD}")
 
     @staticmethod
     def possible(task: Task) -> bool:
-        """Returns whether the game can be played on a lattice of this task's chart."""
-        try:
-            Lattice.check(task)
-        except BadInput:
-            return False
-        return True
+        """Returns whether the game can be played on nodes of this task's chart."""
+        return Lattice.why_not(task) is None
+
+    @staticmethod
+    def decides(task: Task, grid: Grid) -> bool:
+        """Returns whether what is won on these nodes is good enough to train and to design by."""
+        return task.chart.dimension < 3 and Lattice.why_not(task, grid) is None
 
     @staticmethod
     def of(task: Task, grid: Grid | None = None) -> Lattice:
-        """Returns the lattice of a task, by default of 12,000 cells along a line or 480 x 480 in the plane.
+        """Returns the lattice of a task, by default the finest: 12,000 cells along a line, 480 in the plane.
 
         Raises:
-            BadInput: the plant's state is more than the chart, the chart has three dimensions, or the
-                lattice is too coarse, or too fine for the memory.
+            BadInput: the plant's state is more than the chart, or the chart has more than three dimensions,
+                or the lattice is too coarse, or too fine for the memory.
         """
         Lattice.check(task)
-        grid = grid or Grid.with_cells(task.chart, LATTICE[task.chart.dimension])
+        grid = grid or lattice_grid(task)
         nodes = grid.nodes
         plant = task.plant(len(nodes))
         plant.set_state(*task.state(nodes))
@@ -127,33 +150,25 @@ class Lattice:
                 f"a lattice of {len(nodes):,} nodes has none at which {task.name} goes on: give "
                 "more cells (`lattice` in the settings)"
             )
-        levels = _levels(task, grid, nodes[alive])
+        levels = _levels(task, grid)
         if len(levels) * len(nodes) > MOST_TRANSITIONS:
             raise BadInput(
                 f"a lattice of {len(nodes):,} nodes and {len(levels):,} inputs does not fit into the memory: "
                 "give fewer cells (`lattice` in the settings)"
             )
         direct = bool((measurement == nodes).all())
-        ends = np.empty((len(levels), *nodes.shape))
-        fails = np.zeros((len(levels), len(nodes)), dtype=bool)
-        arrives = np.zeros_like(fails)
+        ends = _Ends(grid, len(levels))
         hops, uneven = np.empty((len(levels), nodes.shape[1])), np.zeros(nodes.shape[1])
         for a, measurement in enumerate(_one_sample_on(task, nodes[alive], levels, direct)):
-            ends[a] = nodes
-            ends[a, alive] = task.z(measurement)
-            hop = grid.chart.difference(ends[a, alive], nodes[alive])
+            z = task.z(measurement)
+            hop = grid.chart.difference(z, nodes[alive])
             hops[a] = (hop.max(axis=0) + hop.min(axis=0)) / 2
             uneven = np.maximum(uneven, np.ptp(hop, axis=0) / 2)
-            fails[a, alive] = task.failed(measurement)
-            arrives[a, alive] = task.ending(measurement) == Outcome.REACHED
-        after = _around(grid, ends)
-        outside = ~task.chart.contains(ends)
-        # A running episode that leaves the chart leaves the lattice: it counts as failed.
-        after = np.where((fails | outside & ~arrives)[:, None], len(nodes) + 1, after)
-        after = np.where(arrives[:, None], len(nodes), after)
-        return Lattice(
-            task, grid, levels, after.astype(np.int32), arrived, failed, hops, uneven, direct
-        )
+            arrives = task.ending(measurement) == Outcome.REACHED
+            # A running episode that leaves the chart leaves the lattice: it counts as failed.
+            fails = task.failed(measurement) | ~task.chart.contains(z) & ~arrives
+            ends.add(a, alive, z, np.select([fails, arrives], [len(nodes) + 1, len(nodes)], -1))
+        return Lattice(task, grid, levels, ends.after, arrived, failed, hops, uneven, direct)
 
     def level_of(self, u: np.ndarray) -> np.ndarray:
         """Returns the levels (n,) int nearest to inputs (n, m).
@@ -207,34 +222,52 @@ def _one_sample_on(
         yield after
 
 
-def _levels(task: Task, grid: Grid, nodes: np.ndarray) -> np.ndarray:
+def _levels(task: Task, grid: Grid) -> np.ndarray:
     """Returns inputs (A, m); continuous ones so dense that neighbours lead at most a cell apart."""
     if task.input_levels is not None:
         return task.input_levels
     low, high = task.input_limits
-    plant, axes = task.plant(2), []
-    for i in range(len(low)):
-        u = np.tile((low + high) / 2, (2, 1))
-        u[:, i] = low[i], high[i]
-        plant.set_state(*task.state(nodes[[0, 0]]))
-        plant.step(u)
-        ends = task.z(plant.measurement)
-        cells = np.abs((ends[1] - ends[0]) / grid.spacing).max()
-        axes.append(np.linspace(low[i], high[i], int(np.ceil(cells)) + 1))
-    return np.array(list(product(*axes)))
+    counts = level_counts(task, grid, corner_hops(task))
+    return np.array(list(product(*map(np.linspace, low, high, counts))))
 
 
-def _around(grid: Grid, ends: np.ndarray) -> np.ndarray:
-    """Returns the nodes around points (A, N, d), the nearest first: (A, C, N) flat indices."""
-    index = (grid.chart.wrap(ends) - grid.chart.low) / grid.spacing
-    nearest = np.round(index)
-    other = nearest + np.where(np.abs(index - nearest) <= ON_NODE, 0, np.sign(index - nearest))
-    between = (other != nearest).any(axis=(0, 1))
-    corners = product(*[(0, 1) if b else (0,) for b in between])
-    counts = np.array(grid.counts)
-    around = []
-    for corner in corners:
-        at = np.where(corner, other, nearest).astype(int)
-        at = np.where(grid.chart.periodic, at % counts, np.clip(at, 0, counts - 1))
-        around.append(np.ravel_multi_index(tuple(np.moveaxis(at, -1, 0)), grid.counts))
-    return np.stack(around, axis=1)
+class _Ends:
+    """The places to which the samples of all nodes lead, level by level."""
+
+    def __init__(self, grid: Grid, levels: int):
+        d, nodes = len(grid.counts), len(grid.nodes)
+        self._grid = grid
+        self._rng = np.random.default_rng(0) if d > 2 else None
+        # Which of the two nodes along each coordinate a corner takes.
+        self._corners = [(0,) * d] if self._rng else list(product((0, 1), repeat=d))
+        self._between = np.zeros(d, dtype=bool)
+        self._after = np.empty((levels, len(self._corners), nodes), dtype=np.int32)
+        self._after[:] = np.arange(nodes)
+
+    def add(self, level: int, nodes: np.ndarray, z: np.ndarray, ended: np.ndarray) -> None:
+        """Adds the ends z (n, d) of the samples of some nodes (n,).
+
+        `ended` (n,) int is the place where a sample ends the episode, otherwise -1.
+        """
+        grid = self._grid
+        index = (grid.chart.wrap(z) - grid.chart.low) / grid.spacing
+        near = np.round(index)
+        far = near + np.where(np.abs(index - near) <= ON_NODE, 0, np.sign(index - near))
+        self._between |= (far != near).any(axis=0)
+        if self._rng:
+            near = np.where(self._rng.random(index.shape) < np.abs(index - near), far, near)
+        counts = np.array(grid.counts)
+        strides = np.append(np.cumprod(counts[:0:-1])[::-1], 1)
+        around = [
+            np.where(grid.chart.periodic, at % counts, np.clip(at, 0, counts - 1)) * strides
+            for at in (near.astype(int), far.astype(int))
+        ]
+        for c, corner in enumerate(self._corners):
+            place = sum(around[which][:, axis] for axis, which in enumerate(corner))
+            self._after[level, c, nodes] = np.where(ended < 0, place, ended)
+
+    @property
+    def after(self) -> np.ndarray:
+        """(A, C, N) places, without corners that repeat others."""
+        needed = [not (np.array(corner) > self._between).any() for corner in self._corners]
+        return self._after if all(needed) else self._after[:, needed]

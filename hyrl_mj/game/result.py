@@ -195,6 +195,11 @@ class GameResult:
     profile: Profile
 
     @property
+    def estimate(self) -> bool:
+        """Whether it is an estimate, because the lattice has three dimensions."""
+        return len(self.lattice.spacing) > 2
+
+    @property
     def controllers(self) -> tuple[str, ...]:
         """The names of the controllers, without the limit."""
         return tuple(name for name in self.scores if name != LIMIT)
@@ -248,6 +253,11 @@ class Robustness:
     episodes: tuple[EpisodeCount, ...]
     seed: int
     attacks: tuple[AttackCount, ...] = ()
+
+    @property
+    def deciding(self) -> GameResult | None:
+        """The game, if it is more than an estimate."""
+        return None if self.game is None or self.game.estimate else self.game
 
     def check(self, controllers: Collection[str]) -> None:
         """Raises `BadArtifact` unless there are whole results of these controllers, as stages write them."""

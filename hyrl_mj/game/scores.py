@@ -7,13 +7,14 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.game import result
+from hyrl_mj.game.estimates import WorstEstimate
 from hyrl_mj.game.lattice import Lattice
 from hyrl_mj.game.limit import Limit
 from hyrl_mj.game.result import LIMIT, NodeScore
 from hyrl_mj.game.solver import NEVER, Answers, Moves, WorstNoise, lasting, noisy_moves, solve
 from hyrl_mj.policies import Controller, Policy, as_controller
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.simulation import LoopSettings, Recorded, closed_loop
+from hyrl_mj.simulation import LoopSettings, Recorded, Signal, closed_loop
 from hyrl_mj.tasks import Task
 
 # The largest noise bound of the curve, and its bounds [chart units].
@@ -33,7 +34,7 @@ class Game:
         grid: nodes of the lattice, by default the finest.
 
     Raises:
-        BadInput: the chart has three dimensions, the plant's state is more than the chart, or a controller
+        BadInput: the chart has four dimensions, the plant's state is more than the chart, or a controller
             gives inputs that cannot be applied.
     """
 
@@ -50,7 +51,7 @@ class Game:
         task.check_noise(largest, everywhere)
         self.lattice = Lattice.of(task, grid)
         self.limit = Limit.of(self.lattice, parts)
-        self._noises: dict[tuple[str, float], WorstNoise] = {}
+        self._noises: dict[tuple[str, float], Signal] = {}
         self._values: dict[tuple[str, float], np.ndarray] = {}
         most = self.bound(largest)
         self.answers = {
@@ -158,10 +159,15 @@ class Game:
             low, high = (middle, high) if all_won(middle) else (low, middle)
         return low * cell
 
-    def worst_noise(self, name: str, eps: float) -> WorstNoise:
+    def worst_noise(self, name: str, eps: float) -> Signal:
         """Returns the adversary's noise, to simulate with."""
         if (name, eps) not in self._noises:
-            self._noises[name, eps] = WorstNoise(self.answers[name], self.bound(eps))
+            answers, bound = self.answers[name], self.bound(eps)
+            self._noises[name, eps] = (
+                WorstEstimate(self.lattice, answers.modes, self.value(name, eps), bound)
+                if self.lattice.estimate
+                else WorstNoise(answers, bound)
+            )
         return self._noises[name, eps]
 
 

@@ -28,7 +28,7 @@ BESIDE = 1e-4
 NEVER = 1 << 20
 LOST = 1 << 21
 FIRST = 1 << 22  # greater than all values
-# Measurements that the worst noise compares at once, which limits the memory.
+# Measurements that are answered or compared at once, which limits the memory.
 AT_ONCE = 1 << 17
 
 
@@ -77,10 +77,15 @@ class Answers:
                 raise BadInput(f"the controller went to mode {after[unknown][0]}, it has {modes}")
             return lattice.level_of(u) * len(modes) + np.searchsorted(modes, after)
 
+        def answers_of(q: int | None, points: np.ndarray) -> np.ndarray:
+            """As `answer`, for any number of points."""
+            parts = [points[i : i + AT_ONCE] for i in range(0, len(points), AT_ONCE)]
+            return np.concatenate([answer(q, part) for part in parts])
+
         answers, all_settled = [], []
         beside = BESIDE * grid.spacing * np.eye(len(axes))[bound > 0]
         for q in (*modes, None):
-            index = answer(q, measured.reshape(-1, len(axes))).reshape(measured.shape[:-1])
+            index = answers_of(q, measured.reshape(-1, len(axes))).reshape(measured.shape[:-1])
             settled = np.ones(index.shape, dtype=bool)
             at = np.nonzero(_borders(index, grid.chart.periodic))
             if len(at[0]) and len(beside):
@@ -109,8 +114,14 @@ def _borders(index: np.ndarray, periodic: tuple[bool, ...]) -> np.ndarray:
 
 
 def nodes_within(lattice: Lattice, bound: np.ndarray) -> np.ndarray:
-    """Returns the number of nodes within noise bounds (d,) on either side: (d,) int."""
-    return np.floor(bound / lattice.grid.spacing + 1e-6).astype(int)
+    """Returns the number of nodes within noise bounds (d,) on either side: (d,) int.
+
+    Where the game is an estimate this is the nearest number, and at least 1 for a coordinate with noise.
+    """
+    cells = bound / lattice.grid.spacing
+    if lattice.estimate:
+        return np.where(bound > 0, np.maximum(np.round(cells), 1), 0).astype(int)
+    return np.floor(cells + 1e-6).astype(int)
 
 
 class Places(Protocol):

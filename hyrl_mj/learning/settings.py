@@ -103,7 +103,8 @@ class Settings:
         stage6: training of each mode's policy (stage 6).
         cells: grid cells along the longest side of the chart; cells are square in chart units.
         rods: grid points along the longest side from which the search for critical points starts.
-        lattice: lattice cells along the longest side for the worst-case game.
+        lattice: lattice cells along the longest side for the worst-case game, fewer where these do not fit
+            into the memory; 0 for the usual number.
         resolution: length of the last rods, as a share of the first.
         search: search method for critical points, "rods" or "outcome".
         everywhere: whether the noise acts on all coordinates, not only on the task's noisy ones.
@@ -145,11 +146,10 @@ class Settings:
         trainings = [t for t in (self.stage1, self.stage6) if isinstance(t, Training)]
         for name in {training.algorithm for training in trainings} & set(ALGORITHMS):
             algorithms.check(name, task.name, task.learning.levels)
-        counts = [self.cells, self.rods]
-        if task.chart.dimension in LATTICE:
-            counts.append(CELLS.checked("lattice", self.lattice))
-        for count in counts:
+        for count in (self.cells, self.rods):
             Grid.with_cells(task.chart, count)
+        if self.lattice and task.chart.dimension < 3:
+            Grid.with_cells(task.chart, CELLS.checked("lattice", self.lattice))
 
 
 # Stage 1 of preset fast, by algorithm, for continuous inputs and for levels.
@@ -265,7 +265,7 @@ _SMOKE_MODES = 8_192
 _GRIDS = {1: (120, 2880), 2: (120, 240), 3: (24, 48), 4: (8, 16)}
 _GRIDS_DYNAMIC = {1: (120, 720), 2: (40, 96), 3: (16, 30), 4: (8, 12)}
 # Cells of the worst-case game's lattice in a smoke run.
-_LATTICE_SMOKE = {1: 1_200, 2: 120}
+_LATTICE_SMOKE = {1: 1_200, 2: 120, 3: 60}
 
 
 def preset(

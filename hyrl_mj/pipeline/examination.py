@@ -25,6 +25,7 @@ from hyrl_mj.stages import (
     shown_arcs,
 )
 from hyrl_mj.viz import robustness_sentence
+from hyrl_mj.viz.section import Section
 
 # The kinds of noise in episodes by default.
 KINDS = ("none", "uniform", "alternating", "adversarial")
@@ -42,7 +43,7 @@ class ExamineOptions:
     Attributes:
         eps: bound of the noise, in the units of the chart; by default the run's.
         episodes: noisy episodes for each kind of noise and each controller; by default none where the worst
-            case can be computed exactly, on charts of one or two dimensions.
+            case can be computed and not only estimated, on charts of one or two dimensions.
         noise: kinds of noise in the episodes; by default none,uniform,alternating,adversarial.
         all_coordinates: add noise to every coordinate of the measurement, not only to the noisy ones of the
             task; always, if the run was made so.
@@ -76,6 +77,22 @@ class ExamineOptions:
 
 
 USUAL = ExamineOptions()
+
+
+def examination_plan(run: Run) -> str:
+    """Returns how a run will be examined, and why not in another way, before anything is trained."""
+    if run.why_no_game:
+        return f"by noisy episodes and an attack, because {run.why_no_game}"
+    grid, wanted = run.lattice_grid, run.settings.lattice
+    nodes = f"{' x '.join(map(str, grid.counts))} nodes"
+    if max(grid.counts) < wanted:
+        nodes += f" (fewer than {wanted:,} on a side, which would not fit into the memory)"
+    if run.exact:
+        return f"by the worst-case game on {nodes}"
+    return (
+        f"by noisy episodes and an attack, and by the worst-case game on {nodes}, which is an estimate on a "
+        "chart of three dimensions"
+    )
 
 
 def examine_stage(run: Run, say: Say, options: ExamineOptions = USUAL) -> None:
@@ -118,13 +135,14 @@ def examine_loops(
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
     noises = tuple(Noise(kind, eps, everywhere) for kind in options.noise or KINDS)
     game, maps, winnable = None, None, None
-    if run.exact:
+    if run.why_no_game is None:
         bounds = tuple(dict.fromkeys((0.0, eps / 2, eps)))
         game, maps = examine(
             task, points, partition, loops, bounds, everywhere, run.settings.lattice
         )
-        last = maps.map[[*loops][-1]]
-        winnable = maps.grid(task.chart), ~np.isin(last, (UNWINNABLE, OVER))
+        if run.exact:
+            last = maps.map[[*loops][-1]]
+            winnable = maps.grid(task.chart), ~np.isin(last, (UNWINNABLE, OVER))
     counts: tuple[EpisodeCount, ...] = ()
     if count is not None:
         regions = Regions(points, winnable, options.near_critical)
@@ -148,5 +166,7 @@ def draw_robustness(run: Run, robustness: Robustness, maps: Maps, folder: Path) 
     from hyrl_mj.viz import figures
 
     assert robustness.game is not None
-    shown = figures.ShownGame(run.task, run.critical_set, robustness.game, maps)
+    section = Section(run.task)
+    critical = section.critical_set(run)
+    shown = figures.ShownGame(section, critical, robustness.game, section.maps(maps))
     figures.draw_all(shown, folder)

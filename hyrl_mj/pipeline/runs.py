@@ -6,7 +6,7 @@ the end of an entry is the default that `--help` shows.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.learning import Settings, Training, changed, preset
 from hyrl_mj.manifest import locked
+from hyrl_mj.pipeline.examination import examination_plan
 from hyrl_mj.pipeline.steps import DIAGNOSIS, STAGES, extended_sets_stage, run_stage
 from hyrl_mj.policies import ALGORITHMS, FUNCTION, AnyPolicy, algorithms, read_agent
 from hyrl_mj.progress import Say
@@ -189,8 +190,10 @@ def extend_again(run: Run, horizon: float, say: Say = print) -> Run:
     return load_run(run.path, run.function)
 
 
-def _run_all(run: Run, say: Say, stages: Iterable[str] = STAGES) -> Run:
+def _run_all(run: Run, say: Say, stages: Collection[str] = STAGES) -> Run:
     """Runs the stages that are not done."""
+    if "robustness" in stages:
+        say(f"the run will be examined {examination_plan(run)}")
     for stage in stages:
         if stage == "train" and run.agent:
             say(f"train: none, {run.agent} is given; it {run.arrivals}")

@@ -24,7 +24,6 @@ from hyrl_mj.pipeline.examination import (
 from hyrl_mj.policies import Agent, MlpPolicy, PolicyController, algorithms
 from hyrl_mj.progress import Say
 from hyrl_mj.run_directory import Run
-from hyrl_mj.sets import Grid
 from hyrl_mj.stages import (
     Arrivals,
     ModeResult,
@@ -84,8 +83,8 @@ def extended_sets_stage(run: Run, say: Say) -> None:
     s, task = run.settings, run.task
     points, split, ways = run.critical_set.points, run.partition, None
     if run.agent:
-        if Lattice.possible(task):
-            lattice = Lattice.of(task, Grid.with_cells(task.chart, s.lattice))
+        if Lattice.possible(task) and Lattice.decides(task, run.lattice_grid):
+            lattice = Lattice.of(task, run.lattice_grid)
             ways = Limit.of(lattice, split)
             split = with_room(task, run.steady, split, ways, s.noise)
             ways = Limit.of(lattice, split)

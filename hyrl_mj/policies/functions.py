@@ -105,9 +105,11 @@ def _of_arrays(module: Any, task: Task) -> Callable[[np.ndarray], np.ndarray]:
 
 def preferred_levels(preferences: np.ndarray, task: Task) -> np.ndarray:
     """Returns the preferred levels (n,) int for preferences (n, levels)."""
-    if preferences.ndim != 2 or preferences.shape[1] != task.learning.levels:
+    assert task.input_levels is not None
+    levels = len(task.input_levels)
+    if preferences.ndim != 2 or preferences.shape[1] != levels:
         raise BadInput(
-            f"{task.name} takes preferences of shape (n, {task.learning.levels}) or integers (n,), got "
+            f"{task.name} takes preferences of shape (n, {levels}) or integers (n,), got "
             f"{preferences.dtype} of shape {preferences.shape}"
         )
     if not np.isfinite(preferences).all():

@@ -291,8 +291,8 @@ def check_kind(task: Task, levels: bool) -> None:
     if levels == (task.input_levels is not None):
         return
     gives = "chooses among discrete levels" if levels else "gives continuous inputs"
-    n = task.learning.levels
-    takes = "continuous inputs" if n is None else f"one of {n} discrete levels"
+    ours = task.input_levels
+    takes = "continuous inputs" if ours is None else f"one of {len(ours)} discrete levels"
     raise BadArtifact(f"the network {gives}, the task {task.name} takes {takes}")
 
 

@@ -34,10 +34,10 @@ def check_inputs(about: Mapping[str, Any], task: Task) -> None:
     space = about.get("action_space")
     if not isinstance(space, dict):
         return
-    levels, n = task.learning.levels, _numbers(space, "n")
-    if n is not None and levels is not None and n.tolist() != [levels]:
+    levels, n = task.input_levels, _numbers(space, "n")
+    if n is not None and levels is not None and n.tolist() != [len(levels)]:
         raise BadArtifact(
-            f"it chooses among {n[0]:g} levels of the input, {task.name} has {levels}: train it for these"
+            f"it chooses among {n[0]:g} levels, {task.name} has {len(levels)}: train it for these"
         )
     low, high = _numbers(space, "low"), _numbers(space, "high")
     if low is None or high is None or levels is not None:

@@ -37,9 +37,10 @@ def attack(
 ) -> Broken:
     """Attacks a controller where it may lose, and returns where it lost.
 
-    From the nodes that are lost in the game its adversary gives the noise. Cells that are neither proved nor
-    lost at a corner, up to `MOST_CELLS` of them for each start mode, are attacked from a start inside: at
-    each sample the noise tries measurements in its range, and takes the answer that leads to the worst state.
+    From the nodes that are lost in the game its adversary gives the noise; where the game is an estimate,
+    from all nodes. Cells that are neither proved nor lost at a corner, up to `MOST_CELLS` of them for each
+    start mode, are attacked from a start inside: at each sample the noise tries measurements in its range,
+    and takes the answer that leads to the worst state.
 
     Args:
         certificate: what is proved.
@@ -53,7 +54,8 @@ def attack(
     modes = (*controller.modes, None) if len(controller.modes) > 1 else (None,)
     value = game.value(name, eps)
     region = game.starts & game.winnable(eps)
-    lost = (value[-len(modes) :, :-2] >= NEVER) & region
+    # Where the game is an estimate, it may call nodes won that are lost.
+    lost = ((value[-len(modes) :, :-2] >= NEVER) | game.lattice.estimate) & region
     noise = game.worst_noise(name, eps) if lost.any() else None
     nodes = np.zeros_like(lost)
     for row, mode in enumerate(modes):

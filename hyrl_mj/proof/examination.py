@@ -11,7 +11,6 @@ from hyrl_mj.game import (
     CURVE,
     CURVE_CELLS,
     LARGEST,
-    LATTICE,
     LIMIT,
     NEARLY,
     NEVER,
@@ -28,13 +27,14 @@ from hyrl_mj.game import (
     Profile,
     Score,
     Wins,
+    lattice_grid,
     share,
 )
 from hyrl_mj.policies import BLAS, Controller
 from hyrl_mj.progress import progress_bar
 from hyrl_mj.proof.certificate import Certificate, Proved
 from hyrl_mj.proof.counterexamples import Broken, attack
-from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.sets import GridSet
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import Task
 
@@ -51,7 +51,7 @@ def examine(
     controllers: Mapping[str, Controller],
     bounds: tuple[float, ...],
     everywhere: bool = False,
-    cells: int | None = None,
+    cells: int = 0,
 ) -> tuple[GameResult, Maps]:
     """Plays the game: scores at some noise bounds, margins, the curve over all bounds, and the maps.
 
@@ -62,15 +62,14 @@ def examine(
         controllers: controllers by name.
         bounds: noise bounds of the scores; the maps are drawn for the last.
         everywhere: whether noise acts on all coordinates.
-        cells: number of lattice cells along the longest side of the chart, by default the finest lattice.
-            The curve is computed with no more than `CURVE_CELLS`.
+        cells: number of lattice cells along the longest side of the chart, as in `lattice_grid`. The curve is
+            computed with no more than `CURVE_CELLS`.
     """
     for eps in bounds:
         task.check_noise(eps, everywhere)
-    Lattice.check(task)
-    cells = cells or LATTICE[task.chart.dimension]
-    parts = tuple(parts)
-    grid = Grid.with_cells(task.chart, cells)
+    parts, most = tuple(parts), CURVE_CELLS[task.chart.dimension]
+    grid = lattice_grid(task, cells)
+    Lattice.check(task, grid)
     fine = Game(task, parts, controllers, max(*bounds, LARGEST), everywhere, grid)
     certificate = Certificate.of(fine, controllers)
     names = [*controllers, LIMIT]
@@ -89,7 +88,7 @@ def examine(
     }
     classes = {name: _map(certificate, name, bounds[-1]) for name in controllers}
     maps = Maps(bounds[-1], np.array(grid.counts), classes)
-    fewer = Grid.with_cells(task.chart, min(cells, CURVE_CELLS[task.chart.dimension]))
+    fewer = lattice_grid(task, cells, most)
     coarse = Game(task, parts, controllers, LARGEST, everywhere, fewer)
     curve, profile = _sweep(Certificate.of(coarse, controllers), names, points)
     likely = [(name, _last_won(curve, curve.wins[name])) for name in controllers]

@@ -128,7 +128,7 @@ def mode_ground(
     policy: Policy | None = None,
 ) -> ModeGround:
     """Returns the ground of a mode, judged by the worst-case game if possible, otherwise by episodes."""
-    kind = ByGame if game.Lattice.possible(task) else ByEpisodes
+    kind = ByGame if game.Lattice.decides(task, extended.sets[0].grid) else ByEpisodes
     return kind(task, extended, mode, parts, policy)
 
 

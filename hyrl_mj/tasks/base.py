@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from functools import cached_property
-from itertools import compress
+from itertools import compress, product
 from pathlib import Path
 from typing import Any, Self
 
@@ -114,10 +114,17 @@ class Task(ABC):
 
     @cached_property
     def input_levels(self) -> np.ndarray | None:
-        """The inputs of a discrete task, (levels, m); None for continuous inputs."""
-        low, high = self.input_limits
+        """The inputs of a discrete task, (levels, m); None for continuous inputs.
+
+        With several inputs these are all combinations of their levels; the last input varies fastest.
+        """
         levels = self.learning.levels
-        return None if levels is None else np.linspace(low, high, levels)
+        if levels is None:
+            return None
+        axes = [
+            np.linspace(low, high, levels) for low, high in zip(*self.input_limits, strict=True)
+        ]
+        return np.array(list(product(*axes)))
 
     @cached_property
     def set_point(self) -> np.ndarray | None:

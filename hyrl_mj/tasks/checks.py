@@ -17,6 +17,8 @@ from hyrl_mj.tasks.trial import try_extreme, try_inputs, try_mirror, try_random
 
 # Number of starts that are tried.
 STARTS = 64
+# Most combinations of the levels of the inputs.
+MOST_LEVELS = 1_000
 # Most physics steps of a sample.
 SUBSTEPS = 5_000
 # What the values of a task's attributes may be.
@@ -116,10 +118,10 @@ def _check_training(task: Task) -> None:
         raise unknown("search", learning.search, SEARCHES)
     Number(0, LONGEST, above=True).checked("learning.horizon", learning.horizon)
     Optional(Integer(1, 1_000)).checked("learning.levels", learning.levels)
-    if learning.levels is not None and (learning.levels < 2 or len(task.inputs) > 1):
+    if learning.levels is not None and not 2 <= learning.levels ** len(task.inputs) <= MOST_LEVELS:
         raise BadInput(
-            f"{learning.levels} levels of {len(task.inputs)} input(s) cannot be used: give 2 or more of a "
-            "single input, or none"
+            f"{learning.levels} levels of each of {len(task.inputs)} input(s) cannot be used: give 2 or "
+            f"more, with at most {MOST_LEVELS:,} combinations, or none"
         )
     if task.mirror is not None and not isinstance(task.mirror, Mirror):
         raise BadInput(f"mirror is {task.mirror!r}: give a hyrl_mj.Mirror(...), or None")

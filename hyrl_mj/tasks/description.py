@@ -77,7 +77,7 @@ class Learning:
     Attributes:
         algorithm: an algorithm of SB3, as "ppo", or "module:Class"; by default "dqn" where the input has
             levels, else "ppo".
-        levels: number of equally spaced levels of the single input; None for continuous inputs.
+        levels: number of equally spaced levels of each input; None for continuous inputs.
         search: the search for the critical set, by "rods" or by "outcome"; see `find_critical_set`.
         horizon: the paper's horizon T of the backward propagation [s].
     """

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from hyrl_mj.errors import BadInput, unknown
-from hyrl_mj.game import CURVE_CELLS, Game, worst_signal
+from hyrl_mj.game import CURVE_CELLS, EPISODES_INSTEAD, Game, lattice_grid, worst_signal
 from hyrl_mj.policies import Controller, Policy
 from hyrl_mj.run_directory import Run
-from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, noise_kinds, samples, simulate_batch
 from hyrl_mj.stages import Budget, attack
 from hyrl_mj.tasks import Task
@@ -72,9 +71,10 @@ def noisy_arcs(
     steps = None if horizon is None else samples(task, horizon)
     game = None
     if noise == WORST:
-        run.check_exact()
+        if why := run.why_no_game:
+            raise BadInput(f"{why}: {EPISODES_INSTEAD}")
         cells = max(run.settings.lattice, CURVE_CELLS[task.chart.dimension])
-        grid = Grid.with_cells(task.chart, cells)
+        grid = lattice_grid(task, cells)
         game = Game(task, run.split, run.loops, bound, grid=grid)
     arcs = {}
     for name, loop in run.loops.items():

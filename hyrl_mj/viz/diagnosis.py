@@ -10,7 +10,6 @@ from hyrl_mj.errors import NoRenderer
 from hyrl_mj.game import CURVE_CELLS, Game, Robustness, worst_signal
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.run_directory import Run
-from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, simulate_batch
 from hyrl_mj.stages import Losses, sort_losses
 from hyrl_mj.verdict import NO_NOISE
@@ -47,7 +46,7 @@ def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
         z0 = np.vstack([z[np.argsort(from_middle(task, z), kind="stable")[:TRIED]] for z in kinds])
         if not len(z0):
             return None
-        grid = Grid.with_cells(task.chart, run.settings.lattice)
+        grid = run.lattice_grid
         game = Game(task, run.partition, {"policy": loop}, eps, grid=grid)
         noise: AnyNoise = worst_signal(game, "policy", loop, z0, eps)
     else:
@@ -91,8 +90,8 @@ def sentences(
     where, unit = task.noise_on(robustness.everywhere)
     results = [f"it {run.arrivals}", run.critical_set.sentence(task)]
     noise = f"noise on {where} of up to {eps:g} {unit}"
-    if robustness.game is not None:
-        score = robustness.game.scores["policy"][-1]
+    if robustness.deciding is not None:
+        score = robustness.deciding.scores["policy"][-1]
         lost = percent(1 - score.not_broken)
         results.append(
             f"signals of {noise} are known that make it lose {lost} of the winnable starts"
@@ -101,7 +100,7 @@ def sentences(
             results.append(f"it is proved to win {percent(score.proved)} of them")
         if losses is not None:
             results.append(losses.sentence())
-        if (margin := robustness.game.margin["policy"]) is None:
+        if (margin := robustness.deciding.margin["policy"]) is None:
             results.append("on the nodes it does not win all of them even without noise")
         else:
             results.append(

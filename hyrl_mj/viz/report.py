@@ -119,8 +119,8 @@ def _numbers(
 ) -> list[Number]:
     """Returns the key scores."""
     numbers: list[Number] = []
-    if robustness and robustness.game:
-        numbers += _game_numbers(run, robustness.game)
+    if robustness and robustness.deciding:
+        numbers += _game_numbers(run, robustness.deciding)
     elif robustness:
         numbers += _episode_numbers(robustness.episodes)
     if robustness and robustness.attacks:
@@ -255,6 +255,7 @@ def fill(template: str, run: Run, robustness: Robustness | None, **values: Any) 
             percent=tables.percent,
             robustness=robustness,
             game=game,
+            deciding=robustness.deciding if robustness else None,
             scores=tables.score_table(task, game) if game else None,
             margins=tables.margin_table(task, game) if game else None,
             episodes=tables.episode_table(task, episodes) if episodes else None,

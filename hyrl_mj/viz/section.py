@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from hyrl_mj.chart import Chart
+from hyrl_mj.game import Maps
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import HybridArc
@@ -125,6 +126,15 @@ class Section(Task):
         winning = tuple(wins[at] for wins in extended.winning)
         narrow, room = np.empty((0, 2)), np.empty(0)
         return replace(extended, sets=sets, winning=winning, narrow=narrow, room=room)
+
+    def maps(self, maps: Maps) -> Maps:
+        """Returns the classes of the nodes nearest to the section."""
+        if not self.cut:
+            return maps
+        nodes = Grid.from_counts(self.chart, maps.grid_counts[:2]).nodes
+        at = maps.grid(self.whole.chart).nearest(self.lift(nodes))
+        classes = {name: values[at] for name, values in maps.map.items()}
+        return Maps(maps.eps, maps.grid_counts[:2], classes)
 
     def arc(self, arc: HybridArc) -> HybridArc:
         """Returns an arc with the section's coordinates."""

@@ -114,7 +114,8 @@ def score_table(task: Task, game: GameResult) -> Table:
                     row.append(_seconds(bound or time, won))
                 row.append(excursion_text(None if who == LIMIT else score.excursion))
             rows.append(row)
-    return Table(f"{task.name}: worst case over all noise signals", headings, rows)
+    estimated = ", an estimate" if game.estimate else ""
+    return Table(f"{task.name}: worst case over all noise signals{estimated}", headings, rows)
 
 
 def proved_text(share: float | None) -> str:
@@ -187,7 +188,7 @@ def attack_sentence(counts: Sequence[AttackCount]) -> str:
 
 def robustness_sentence(robustness: Robustness) -> str:
     """Returns the most important scores in one line."""
-    if robustness.game is None:
+    if robustness.deciding is None:
         parts = []
         for who in ("policy", "hyrl"):
             least = min(c.reached for c in robustness.episodes if c.controller == who)
@@ -195,7 +196,7 @@ def robustness_sentence(robustness: Robustness) -> str:
         if robustness.attacks:
             parts.append(attack_sentence(robustness.attacks))
         return ", ".join(parts)
-    policy, hyrl = (robustness.game.scores[who][-1] for who in ("policy", "hyrl"))
+    policy, hyrl = (robustness.deciding.scores[who][-1] for who in ("policy", "hyrl"))
     shares = [
         f"{NAMES[who]} {proved_text(proved)} proved and {percent(1 - whole)} lost{how}"
         for who, proved, whole, how in (
