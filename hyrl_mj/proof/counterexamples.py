@@ -10,13 +10,23 @@ import numpy as np
 from hyrl_mj.game import FIRST, NEVER, Game
 from hyrl_mj.policies import Controller
 from hyrl_mj.proof.certificate import Certificate
-from hyrl_mj.simulation import NOT_STARTED, LoopSettings, Sample, Signal, closed_loop
+from hyrl_mj.simulation import (
+    NOT_STARTED,
+    AnyNoise,
+    LoopSettings,
+    Noise,
+    Sample,
+    Signal,
+    closed_loop,
+)
 from hyrl_mj.tasks import Outcome
 
 # Measurements along each noisy coordinate among which the noise between the nodes chooses.
 CANDIDATES = 17
 # Cells without a verdict in which a start is attacked, for each start mode.
 MOST_CELLS = 128
+# Nodes from which a controller is attacked where the game is an estimate, for each start mode.
+MOST_NODES = 1_000
 
 
 @dataclass(frozen=True)
@@ -26,10 +36,12 @@ class Broken:
     Attributes:
         own: (N,) bool, cells with such a start if the controller picks its start mode; nodes without cells.
         some: (N,) bool, as `own`, from some start mode.
+        tried: (N,) bool, cells or nodes that were examined.
     """
 
     own: np.ndarray
     some: np.ndarray
+    tried: np.ndarray
 
 
 def attack(
@@ -37,10 +49,11 @@ def attack(
 ) -> Broken:
     """Attacks a controller where it may lose, and returns where it lost.
 
-    From the nodes that are lost in the game its adversary gives the noise; where the game is an estimate,
-    from all nodes. Cells that are neither proved nor lost at a corner, up to `MOST_CELLS` of them for each
-    start mode, are attacked from a start inside: at each sample the noise tries measurements in its range,
-    and takes the answer that leads to the worst state.
+    From the nodes that are lost in the game its adversary gives the noise. Where the game is an estimate, up
+    to `MOST_NODES` nodes are attacked, won or lost, and adversarial noise is tried, too. Cells that are
+    neither proved nor lost at a corner, up to `MOST_CELLS` of them for each start mode, are attacked from a
+    start inside: at each sample the noise tries measurements in its range, and takes the answer that leads
+    to the worst state.
 
     Args:
         certificate: what is proved.
@@ -54,22 +67,27 @@ def attack(
     modes = (*controller.modes, None) if len(controller.modes) > 1 else (None,)
     value = game.value(name, eps)
     region = game.starts & game.winnable(eps)
-    # Where the game is an estimate, it may call nodes won that are lost.
-    lost = ((value[-len(modes) :, :-2] >= NEVER) | game.lattice.estimate) & region
-    noise = game.worst_noise(name, eps) if lost.any() else None
-    nodes = np.zeros_like(lost)
-    for row, mode in enumerate(modes):
-        at = np.flatnonzero(lost[row])
-        if noise is not None and len(at):
+    attacked, tried, rng = value[-len(modes) :, :-2] >= NEVER, region, np.random.default_rng(seed)
+    if game.lattice.estimate:
+        tried, every = np.zeros_like(region), np.flatnonzero(region)
+        tried[rng.choice(every, min(len(every), MOST_NODES), replace=False)] = True
+        attacked = np.ones_like(attacked)
+    attacked &= tried
+    noises: list[AnyNoise] = [game.worst_noise(name, eps)] if attacked.any() else []
+    if noises and game.lattice.estimate:
+        noises.append(Noise("adversarial", eps, game.everywhere))
+    nodes = np.zeros_like(attacked)
+    for noise, (row, mode) in product(noises, enumerate(modes)):
+        at = np.flatnonzero(attacked[row] & ~nodes[row])
+        if len(at):
             starts = game.lattice.grid.nodes[at]
             nodes[row, at] = _beaten(game, controller, starts, mode, noise)
     if cells is None:
-        return Broken(nodes[-1], np.asarray(nodes.any(axis=0)))
+        return Broken(nodes[-1], np.asarray(nodes.any(axis=0)), tried)
     broken = np.stack([cells.some_corner(row) for row in nodes])
     if name in certificate.answers:
         outer = certificate.value(name, eps)
         inside = CellNoise(certificate, controller, outer, value, game.bound(eps))
-        rng = np.random.default_rng(seed)
         unclear = (outer[-len(modes) :, :-2] >= NEVER) & certificate.region(eps) & ~broken
         for row, mode in enumerate(modes):
             at = np.flatnonzero(unclear[row])
@@ -78,11 +96,12 @@ def attack(
                 off = rng.uniform(-0.5, 0.5, (len(at), len(cells.counts)))
                 starts = cells.middle(at) + off * game.lattice.grid.spacing
                 broken[row, at] = _beaten(game, controller, starts, mode, inside)
-    return Broken(broken[-1], np.asarray(broken.any(axis=0)))
+    everywhere = np.ones(cells.nodes, dtype=bool)
+    return Broken(broken[-1], np.asarray(broken.any(axis=0)), everywhere)
 
 
 def _beaten(
-    game: Game, controller: Controller, starts: np.ndarray, mode: int | None, noise: Signal
+    game: Game, controller: Controller, starts: np.ndarray, mode: int | None, noise: AnyNoise
 ) -> np.ndarray:
     """Returns from which starts (n, d) the noise beats the controller on the plant: (n,) bool."""
     modes = None if mode is None else np.full(len(starts), mode)

@@ -63,7 +63,8 @@ def examine(
         bounds: noise bounds of the scores; the maps are drawn for the last.
         everywhere: whether noise acts on all coordinates.
         cells: number of lattice cells along the longest side of the chart, as in `lattice_grid`. The curve is
-            computed with no more than `CURVE_CELLS`.
+            computed with no more than `CURVE_CELLS`; where the game is an estimate it goes through the
+            scores, and there are no margins.
     """
     for eps in bounds:
         task.check_noise(eps, everywhere)
@@ -88,11 +89,15 @@ def examine(
     }
     classes = {name: _map(certificate, name, bounds[-1]) for name in controllers}
     maps = Maps(bounds[-1], np.array(grid.counts), classes)
-    fewer = lattice_grid(task, cells, most)
-    coarse = Game(task, parts, controllers, LARGEST, everywhere, fewer)
-    curve, profile = _sweep(Certificate.of(coarse, controllers), names, points)
-    likely = [(name, _last_won(curve, curve.wins[name])) for name in controllers]
-    margins = dict(zip(controllers, _in_threads("margins", fine.margin, likely), strict=True))
+    if fine.lattice.estimate:  # a coarser lattice would estimate nothing
+        coarse, margins = fine, dict.fromkeys(controllers)
+        curve, profile = _known(bounds, scores), Profile((), dict.fromkeys(names, ()))
+    else:
+        fewer = lattice_grid(task, cells, most)
+        coarse = Game(task, parts, controllers, LARGEST, everywhere, fewer)
+        curve, profile = _sweep(Certificate.of(coarse, controllers), names, points)
+        likely = [(name, _last_won(curve, curve.wins[name])) for name in controllers]
+        margins = dict(zip(controllers, _in_threads("margins", fine.margin, likely), strict=True))
     spacing, curve_spacing = (tuple(g.lattice.grid.spacing.tolist()) for g in (fine, coarse))
     has_cells = certificate.cells is not None
     lattice = LatticeSpacing(spacing, fine.lattice.exact, has_cells, curve_spacing)
@@ -111,7 +116,7 @@ def _score(certificate: Certificate, name: str, nodes: NodeScore, broken: Broken
     if broken is None:
         own, some = nodes.won, nodes.won_any
     else:
-        region = certificate.region(eps)
+        region = certificate.region(eps) & broken.tried
         own, some = share(~broken.own[region]), share(~broken.some[region])
         if not region.any():  # a start region thinner than a cell
             own, some = nodes.won, nodes.won_any
@@ -173,6 +178,17 @@ def _sweep(certificate: Certificate, names: list[str], points: np.ndarray) -> tu
         won, won_any, times = zip(*row, strict=True)
         wins[name] = Wins(won, won_any, own, some, times)
     return Curve(CURVE, tuple(winnable), wins), profile
+
+
+def _known(bounds: tuple[float, ...], scores: Mapping[str, tuple[Score, ...]]) -> Curve:
+    """Returns the curve through the scores at some bounds, of what is not broken."""
+    wins = {}
+    for name, level in scores.items():
+        pairs = zip(*((s.not_broken, s.not_broken_any) for s in level), strict=True)
+        own, some = pairs
+        wins[name] = Wins(own, some, (), (), tuple(s.time_any for s in level))
+    winnable = tuple(score.winnable for score in next(iter(scores.values())))
+    return Curve(bounds, winnable, wins)
 
 
 def _last_won(curve: Curve, wins: Wins) -> tuple[float, float]:

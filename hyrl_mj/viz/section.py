@@ -85,6 +85,9 @@ class Section(Task):
     def miss(self, z: np.ndarray) -> np.ndarray:
         return self.whole.miss(self.lift(z))
 
+    def noise_on(self, everywhere: bool = False) -> tuple[str, str]:
+        return self.whole.noise_on(everywhere)
+
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         return self.whole.starts(n, rng)[:, :2]
 

@@ -265,7 +265,8 @@ def print_robustness(run: Run) -> None:
     game, episodes = run.robustness.game, run.robustness.episodes
     if game is not None:
         print_table(score_table(run.task, game))
-        print_table(margin_table(run.task, game))
+        if not game.estimate:
+            print_table(margin_table(run.task, game))
         for who, why in game.why_not_proved.items():
             print(f"{NAMES[who]} is not proved: {why}")
     if episodes:

@@ -97,6 +97,8 @@ def names(task: Task, shows: type[ShownPolicy | ShownGame]) -> tuple[str, ...]:
 def draw_all(shown: ShownPolicy | ShownGame, folder: Path) -> tuple[str, ...]:
     """Writes every figure of a value into a folder, and returns their names."""
     drawn = names(shown.task, type(shown))
+    if isinstance(shown, ShownGame) and shown.result.estimate:  # of a few bounds there is no curve
+        drawn = tuple(name for name in drawn if name != "robustness_curve")
     for name in drawn:
         FIGURES[name].draw(shown, folder / f"{name}.png")
     return drawn
