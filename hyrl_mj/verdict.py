@@ -23,7 +23,7 @@ class Verdict:
 
     - PROVED: HyRL is proved to win nearly all winnable starts, whatever the noise within the run's bound.
     - WON: the worst-case game can be played, and of no winnable start a noise signal is known that beats
-      HyRL.
+      HyRL, from the attack, if there was one, either.
     - HELD: the game cannot be played, HyRL arrives in nearly all episodes under each kind of noise, and the
       attack, if there was one, breaks it from nearly no start.
     - FAILED: no start is winnable, or HyRL wins less than the policy without noise, or stage 6 gave up: for
@@ -93,16 +93,16 @@ class _Wins:
     @staticmethod
     def of(robustness: Robustness, who: str) -> _Wins:
         """Returns what "policy" or "hyrl" wins."""
+        attacked = [1 - c.lost / c.starts for c in robustness.attacks if c.controller == who]
         if robustness.deciding:
             scores = robustness.deciding.scores[who]
             quiet = [score.not_broken for score in scores if score.eps == 0]
-            return _Wins(quiet[0] if quiet else None, scores[-1].not_broken)
+            return _Wins(quiet[0] if quiet else None, min(scores[-1].not_broken, *attacked, 1.0))
         shares = {
             kind: arrived / episodes
             for kind, (arrived, episodes) in _by_kind(robustness, who).items()
         }
         quiet_share = shares.pop(NO_NOISE, None)
-        attacked = [1 - c.lost / c.starts for c in robustness.attacks if c.controller == who]
         under_noise = [*shares.values(), *attacked]
         return _Wins(quiet_share, min(under_noise) if under_noise else None)
 
@@ -192,8 +192,9 @@ class _Case:
             yield f"the policy {self.arrivals}"
         policy, hyrl = self.policy.noisy, self.hyrl.noisy
         if policy is not None and hyrl is not None and hyrl > policy:
-            attacked = self.robustness.attacks and not self.robustness.deciding
-            whole = f"{self.whole} or attacked starts" if attacked else self.whole
+            whole = self.whole
+            if self.robustness.attacks:
+                whole = f"{whole} or of those attacked"
             yield (
                 f"HyRL loses {percent(1 - hyrl)} of {whole} under {self.noise}, but fewer than the policy "
                 f"({percent(1 - policy)})"
@@ -226,6 +227,7 @@ class _Case:
             if ours.eps in (0, self.robustness.eps):
                 when = f"under the worst {self.noise}" if ours.eps else "without noise"
                 yield f"{when} HyRL {_share(ours)} of {self.whole}, the policy {_share(theirs)}"
+        yield from self._attacked("hyrl", "policy")
 
     def _counts(self) -> Iterator[str]:
         """Yields the numbers of episodes that arrive, by kind of noise."""
@@ -279,4 +281,7 @@ def mode_sentence(task: Task, result: ModeResult) -> str:
     trainings = f"{result.attempts} training{'' if result.attempts == 1 else 's'}"
     how = f"after {trainings}" if result.attempts else "without a training of its own"
     mode = f"the policy of mode {task.scene.mode_name(result.mode)}"
-    return f"{mode} wins {percent(result.won)} of its set, {how}"
+    won = (
+        "all of its set that was tried" if result.won == 1 else f"{percent(result.won)} of its set"
+    )
+    return f"{mode} wins {won}, {how}"

@@ -21,6 +21,7 @@ from hyrl_mj.policies import PolicyController
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import Programmes, Rules, closed_loop
 from hyrl_mj.stages.attacks import Budget, attack, attack_starts
+from hyrl_mj.stages.episodes import Regions
 
 EPS = 0.1
 ON_THE_LEFT = np.array([[0.0, 1.0], [0.05, 1.0], [0.1, 1.0], [0.0, 1.02]])
@@ -191,13 +192,26 @@ def test_starts_and_bounds_that_make_no_sense_are_refused(vehicle):
 
 def test_half_of_the_starts_lie_near_the_critical_set(vehicle):
     points = decisions(vehicle).points
-    starts = attack_starts(vehicle, points, EPS, 100, seed=0)
+    starts = attack_starts(vehicle, Regions(points), EPS, 100, seed=0)
     near = np.abs(starts[:, 1]) <= 2 * EPS + 1e-9
     assert near[:50].all()
     assert 2 < near[50:].sum() < 25
     assert vehicle.may_start(starts).all()
-    np.testing.assert_array_equal(starts, attack_starts(vehicle, points, EPS, 100, seed=0))
-    assert len(attack_starts(vehicle, np.empty((0, 2)), EPS, 100, seed=0)) == 100
+    np.testing.assert_array_equal(starts, attack_starts(vehicle, Regions(points), EPS, 100, seed=0))
+    assert len(attack_starts(vehicle, Regions(np.empty((0, 2))), EPS, 100, seed=0)) == 100
+
+
+def test_only_starts_are_attacked_all_of_whose_nodes_are_winnable(vehicle):
+    grid = Grid.with_cells(vehicle.chart, 60)
+    above = grid.nodes[:, 1] > 0.1 + 1e-9  # the lowest of these nodes lie at 0.15
+    regions = Regions(np.array([[0.0, 0.0]]), (grid, above))
+    starts = attack_starts(vehicle, regions, EPS, 100, seed=0)
+    assert starts[:, 1].min() >= 0.15 - 1e-9
+    assert starts[:, 1].min() < 0.2
+    assert (np.linalg.norm(starts[:50], axis=1) <= 2 * EPS).all()
+    parts = regions.split(vehicle, EPS, np.array([[0.0, 0.149], [0.0, 0.151], [0.0, 0.8]]))
+    assert parts["not winnable"].tolist() == [True, False, False]
+    assert parts["near M*"].tolist() == [False, True, False]
 
 
 @pytest.mark.parametrize(

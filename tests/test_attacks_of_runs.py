@@ -27,7 +27,7 @@ FEW = {"episodes": 20, "noise": ("uniform",)}
 def without_game():
     """The vehicle as a robot whose worst case cannot be computed."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Run, "exact", False)
+        patch.setattr(Run, "why_no_game", "it is not wanted here")
         yield
 
 
@@ -66,7 +66,7 @@ def test_a_run_without_a_game_is_attacked_by_default(examined):
 
 
 def test_a_run_with_a_game_is_attacked_only_on_request(examined, monkeypatch):
-    monkeypatch.setattr(Run, "exact", True)
+    monkeypatch.setattr(Run, "why_no_game", None)
     run = load_run(examined)
     assert ExamineOptions().budget(run) is None
     assert ExamineOptions(attack_seconds=2.0).budget(run).seconds == 2.0
@@ -143,7 +143,7 @@ def test_the_replay_plays_the_strongest_signals_from_one_start(examined):
 
 
 def test_the_replay_of_a_run_with_a_game_is_as_ever(examined, monkeypatch):
-    monkeypatch.setattr(Run, "exact", True)
+    monkeypatch.setattr(Run, "why_no_game", None)
     shows = replay_shows(load_run(examined))
     assert [show.policy[0].noise for show in shows] == ["alternating"] * 2
 

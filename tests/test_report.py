@@ -293,7 +293,7 @@ def test_episodes_and_replays_are_those_of_the_run(finished):
     for row, record in zip(page.table("episodes"), run.robustness.episodes, strict=True):
         assert row["episodes"] == f"{record.episodes:,}"
         assert row["noise"].startswith("uniform 0.1 ")
-        reached = float(row["reached"].strip("<>%"))
+        reached = 100 if row["reached"] == "all tried" else float(row["reached"].strip("<>%"))
         assert reached == pytest.approx(100 * record.reached, abs=0.0101)
     rows = page.table("How the replays ended")
     assert len(rows) == 6
@@ -429,8 +429,13 @@ class Rover(Cube):
         super().__init__(lambda z: z[:, 0])
 
 
-def test_in_three_dimensions_episodes_stand_in_for_the_game(tmp_path, monkeypatch):
+@pytest.mark.parametrize("game", [True, False])
+def test_in_three_dimensions_the_game_is_an_estimate_beside_the_episodes(
+    tmp_path, monkeypatch, game
+):
     monkeypatch.setitem(registry._REGISTRY, "cube", Rover)
+    if not game:
+        monkeypatch.setattr(Run, "why_no_game", "it is not wanted here")
     task, path = Rover(), tmp_path / "cube"
     grid = Grid.with_cells(task.chart, 6)
     up = grid.nodes[:, 0] >= 0
@@ -440,9 +445,11 @@ def test_in_three_dimensions_episodes_stand_in_for_the_game(tmp_path, monkeypatc
     run_stage(run, "simulate", say=str)
     examine_run(run, ExamineOptions(episodes=50), say=str)
     page = page_of(path)
-    assert "The chart of this task has 3, its plant 3: noisy episodes stand in for it" in page.text
     assert len(page.table("episodes")) == len(run.robustness.episodes)
-    assert "winnable" not in page.text
+    assert ("Rounding makes this an estimate" in page.text) == game
+    assert ("winnable" in page.text) == game
+    assert ("stand in for the worst case: it is not wanted here." in page.text) != game
+    assert "Margins" not in page.tables
 
 
 # ---- what goes wrong

@@ -8,7 +8,7 @@ from planted import one_way_policy
 from scored import SPACING, score
 
 from hyrl_mj import BadArtifact, artifacts
-from hyrl_mj.game import LIMIT, Curve, EpisodeCount, GameResult, Profile, Robustness
+from hyrl_mj.game import LIMIT, AttackCount, Curve, EpisodeCount, GameResult, Profile, Robustness
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import simulate
 from hyrl_mj.stages import Arrivals, ModeResult, Retraining
@@ -109,6 +109,20 @@ def test_a_game_that_is_an_estimate_stands_beside_the_episodes_that_decide(circl
     assert "the policy from 60.00%" in told
 
 
+def test_what_only_the_attack_finds_counts_beside_the_game(circle):
+    won = game((1.0, 0.9), (1.0, 1.0))
+    assert word(circle, won) == WON
+    counts = tuple(
+        AttackCount(who, EPS, False, 200, lost, (0.0, 1.0), 3, None, (0.0,), "crashed")
+        for who, lost in (("policy", 150), ("hyrl", 3))
+    )
+    attacked = replace(won, attacks=counts)
+    found = Verdict.of(circle, EPS, attacked, HOLDS, ALL)
+    assert found.word == WEAK
+    assert "HyRL loses 1.50%" in found.sentence
+    assert any("the attack breaks HyRL from 3 of 200 starts" in r for r in found.reasons)
+
+
 def test_a_proof_is_told_with_what_is_known_to_be_lost(circle):
     found = Verdict.of(circle, EPS, game((1.0, 0.9), (1.0, 0.999), proved=0.995), HOLDS, ALL)
     assert str(found) == (
@@ -207,8 +221,8 @@ def test_a_verdict_reads_as_a_sentence_with_reasons(circle, capsys):
         f"- under the worst {NOISE} HyRL is not known to lose any of the winnable starts, the policy is "
         "known to lose 10.00%",
         "- stage 1: the policy arrives from 1,000 of 1,000 starts without noise",
-        "- stage 6: the policy of mode 0 (clockwise) wins 100% of its set, after 1 training",
-        "- stage 6: the policy of mode 1 (counter-clockwise) wins 100% of its set, without a "
+        "- stage 6: the policy of mode 0 (clockwise) wins all of its set that was tried, after 1 training",
+        "- stage 6: the policy of mode 1 (counter-clockwise) wins all of its set that was tried, without a "
         "training of its own",
     ]
 

@@ -13,6 +13,7 @@ from hyrl_mj.policies import Controller
 from hyrl_mj.progress import Say
 from hyrl_mj.proof import examine
 from hyrl_mj.run_directory import Run
+from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import Noise
 from hyrl_mj.stages import (
     Attack,
@@ -100,7 +101,8 @@ def examine_stage(run: Run, say: Say, options: ExamineOptions = USUAL) -> None:
     budget = options.budget(run)  # a wrong one is refused before the work
     robustness, maps = examine_loops(run, run.loops, run.split, options)
     if budget is not None:
-        attacks = attack_loops(run, run.loops, budget, options)
+        regions = Regions(run.critical_set.points, _winnable(run, maps))
+        attacks = attack_loops(run, run.loops, regions, budget, options)
         counts = tuple(found.count for found in attacks.values())
         robustness = replace(robustness, attacks=counts)
         for name, arc in shown_arcs(attacks).items():
@@ -134,29 +136,38 @@ def examine_loops(
     if count is not None and count < 1:
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
     noises = tuple(Noise(kind, eps, everywhere) for kind in options.noise or KINDS)
-    game, maps, winnable = None, None, None
+    game, maps = None, None
     if run.why_no_game is None:
         bounds = tuple(dict.fromkeys((0.0, eps / 2, eps)))
         game, maps = examine(
             task, points, partition, loops, bounds, everywhere, run.settings.lattice
         )
-        if run.exact:
-            last = maps.map[[*loops][-1]]
-            winnable = maps.grid(task.chart), ~np.isin(last, (UNWINNABLE, OVER))
     counts: tuple[EpisodeCount, ...] = ()
     if count is not None:
-        regions = Regions(points, winnable, options.near_critical)
+        regions = Regions(points, _winnable(run, maps), options.near_critical)
         counts = noisy_episodes(task, regions, loops, noises, count, seed)
     return Robustness(eps, everywhere, game, counts, seed), maps
 
 
+def _winnable(run: Run, maps: Maps | None) -> tuple[Grid, np.ndarray] | None:
+    """Returns the game's nodes with those (N,) bool that are winnable, None where that is not known."""
+    if maps is None or not run.exact:
+        return None
+    classes = [*maps.map.values()][-1]  # of the hybrid controller
+    return maps.grid(run.task.chart), ~np.isin(classes, (UNWINNABLE, OVER))
+
+
 def attack_loops(
-    run: Run, loops: dict[str, Controller], budget: Budget, options: ExamineOptions
+    run: Run,
+    loops: dict[str, Controller],
+    regions: Regions,
+    budget: Budget,
+    options: ExamineOptions,
 ) -> dict[str, Attack]:
     """Attacks controllers by name, from the same starts."""
     task, eps = run.task, run.settings.noise if options.eps is None else options.eps
     n = ATTACKED_SMOKE if run.settings.preset == "smoke" else ATTACKED
-    starts = attack_starts(task, run.critical_set.points, eps, n, options.seed)
+    starts = attack_starts(task, regions, eps, n, options.seed)
     everywhere = options.all_coordinates or run.settings.everywhere
     return attack(task, loops, starts, eps, budget, everywhere, options.seed)
 

@@ -64,10 +64,10 @@ def attack(
     """
     game, cells = certificate.game, certificate.cells
     # With one mode the controller cannot pick another one.
-    modes = (*controller.modes, None) if len(controller.modes) > 1 else (None,)
-    value = game.value(name, eps)
+    modes = np.array([*(controller.modes if len(controller.modes) > 1 else ()), NOT_STARTED])
+    value, rng = game.value(name, eps), np.random.default_rng(seed)
     region = game.starts & game.winnable(eps)
-    attacked, tried, rng = value[-len(modes) :, :-2] >= NEVER, region, np.random.default_rng(seed)
+    attacked, tried = value[-len(modes) :, :-2] >= NEVER, region
     if game.lattice.estimate:
         tried, every = np.zeros_like(region), np.flatnonzero(region)
         tried[rng.choice(every, min(len(every), MOST_NODES), replace=False)] = True
@@ -77,11 +77,10 @@ def attack(
     if noises and game.lattice.estimate:
         noises.append(Noise("adversarial", eps, game.everywhere))
     nodes = np.zeros_like(attacked)
-    for noise, (row, mode) in product(noises, enumerate(modes)):
-        at = np.flatnonzero(attacked[row] & ~nodes[row])
-        if len(at):
-            starts = game.lattice.grid.nodes[at]
-            nodes[row, at] = _beaten(game, controller, starts, mode, noise)
+    for noise in noises:
+        row, at = np.nonzero(attacked & ~nodes)
+        starts = game.lattice.grid.nodes[at]
+        nodes[row, at] = _beaten(game, controller, starts, modes[row], noise)
     if cells is None:
         return Broken(nodes[-1], np.asarray(nodes.any(axis=0)), tried)
     broken = np.stack([cells.some_corner(row) for row in nodes])
@@ -89,22 +88,24 @@ def attack(
         outer = certificate.value(name, eps)
         inside = CellNoise(certificate, controller, outer, value, game.bound(eps))
         unclear = (outer[-len(modes) :, :-2] >= NEVER) & certificate.region(eps) & ~broken
-        for row, mode in enumerate(modes):
-            at = np.flatnonzero(unclear[row])
-            if len(at):
-                at = rng.choice(at, min(len(at), MOST_CELLS), replace=False)
-                off = rng.uniform(-0.5, 0.5, (len(at), len(cells.counts)))
-                starts = cells.middle(at) + off * game.lattice.grid.spacing
-                broken[row, at] = _beaten(game, controller, starts, mode, inside)
+        chosen = np.zeros_like(unclear)
+        for cells_of_mode, mask in zip(map(np.flatnonzero, unclear), chosen, strict=True):
+            few = min(len(cells_of_mode), MOST_CELLS)
+            mask[rng.choice(cells_of_mode, few, replace=False)] = True
+        row, at = np.nonzero(chosen)
+        off = rng.uniform(-0.5, 0.5, (len(at), len(cells.counts)))
+        starts = cells.middle(at) + off * game.lattice.grid.spacing
+        broken[row, at] = _beaten(game, controller, starts, modes[row], inside)
     everywhere = np.ones(cells.nodes, dtype=bool)
     return Broken(broken[-1], np.asarray(broken.any(axis=0)), everywhere)
 
 
 def _beaten(
-    game: Game, controller: Controller, starts: np.ndarray, mode: int | None, noise: AnyNoise
+    game: Game, controller: Controller, starts: np.ndarray, modes: np.ndarray, noise: AnyNoise
 ) -> np.ndarray:
-    """Returns from which starts (n, d) the noise beats the controller on the plant: (n,) bool."""
-    modes = None if mode is None else np.full(len(starts), mode)
+    """Returns from which starts (n, d), in modes (n,), the noise beats the controller: (n,) bool."""
+    if not len(starts):
+        return np.zeros(0, dtype=bool)
     settings = LoopSettings(quiet=True)
     run = closed_loop(game.task, controller, starts, noise, modes, settings=settings)
     return np.asarray(run.outcome != Outcome.REACHED)

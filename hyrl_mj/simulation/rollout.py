@@ -77,7 +77,8 @@ def closed_loop(
         controller: the controller that closes the loop.
         z0: (n, d) starts, chart points.
         noise: noise on the measurement; none by default.
-        q0: (n,) start modes; by default the controller picks them from the first measurement.
+        q0: (n,) start modes; where they are `NOT_STARTED`, which is the default, the controller picks them
+            from the first measurement.
         seed: seed of the noise; the same seed and n give the same signals whatever the controller.
         settings: duration, direction and what to record.
 
@@ -108,8 +109,8 @@ def closed_loop(
             break
         now = Sample(np.arange(n), np.full(n, k), measurement, q, plant, past)
         measured = measurement + signal.sample(now)
-        if k == 0 and q0 is None:
-            q[:] = controller.initial_mode(measured)
+        if k == 0 and (fresh := q == NOT_STARTED).any():
+            q[fresh] = controller.initial_mode(measured[fresh])
             first_mode = q.copy()
         before, u = q.copy(), np.full((n, len(task.inputs)), np.nan)
         u[active], q[active] = answer(controller, q[active], measured[active], past[active])

@@ -10,7 +10,7 @@ import math
 import time
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,10 +40,12 @@ GOALS = 3
 COPIED = 1
 POPULATION = COPIED + GOALS
 # The round that tries the noise of `Lookahead`, which takes longer than others.
-LOOKS_AHEAD = 4
+LOOKS_AHEAD = 2
 # The best programmes so far, for each start and goal, that new ones are drawn from; and the share of the
 # segments that take any rule instead.
 ELITES, EXPLORE = 3, 0.25
+# How often starts that are not winnable are drawn again.
+MOST_DRAWS = 100
 # Runs that are simulated at once, which limits the memory.
 BATCH = 4_096
 
@@ -95,17 +97,28 @@ class Attack:
     strongest: int
 
 
-def attack_starts(task: Task, points: np.ndarray, bound: float, n: int, seed: int) -> np.ndarray:
-    """Returns n starts (n, d): half of them within twice the bound of M* with its `points` (N, d).
+def attack_starts(task: Task, regions: Regions, bound: float, n: int, seed: int) -> np.ndarray:
+    """Returns n starts (n, d): half of them within twice the bound of M*.
 
-    The others are drawn as the task draws them; so are all where M* is empty or far from the starts.
+    The others are drawn as the task draws them; so are all where M* is empty or far from the starts. Where
+    it is known which starts are winnable, the others are left out, unless hardly one is winnable.
     """
     check_seed(seed)
     rng = np.random.default_rng([seed, 2])
+
+    def drawn(where: Regions, count: int) -> np.ndarray:
+        z = where.draw(task, bound, count, rng)
+        for _ in range(MOST_DRAWS):
+            lost = ~regions.may_win(z)
+            if not lost.any():
+                break
+            z[lost] = where.draw(task, bound, int(lost.sum()), rng)
+        return z
+
     near = np.empty((0, task.chart.dimension))
     with suppress(BadInput):  # where no start lies near M*
-        near = Regions(points, near=True).draw(task, bound, n // 2, rng)
-    return np.vstack([near, task.starts(n - len(near), rng)])
+        near = drawn(replace(regions, near=True), n // 2)
+    return np.vstack([near, drawn(replace(regions, near=False), n - len(near))])
 
 
 def shown_arcs(attacks: Mapping[str, Attack]) -> dict[str, HybridArc]:
@@ -130,7 +143,7 @@ def attack(
     """Searches for noise signals that make closed loops fail.
 
     Each round tries `POPULATION` signals from every start of every controller that nothing has broken yet.
-    The first rounds hold each rule of `Rules` throughout, the fourth that which simulates ahead. Later ones
+    The first rounds hold each rule of `Rules` throughout, the second that which simulates ahead. Later ones
     follow programmes that vary and join the best so far, and those that won from starts nearby. The
     coordinates outside the chart begin at their usual values.
 

@@ -32,7 +32,8 @@ class Regions:
 
     Attributes:
         points: (N, d) of M*; starts within twice the noise bound of M* are one region.
-        winnable: a grid and (N,) bool, which of its nodes are winnable; the other starts are one region.
+        winnable: a grid and (N,) bool, which of its nodes are winnable. A start is winnable if all nodes
+            around it are; the other starts are one region.
         near: whether all episodes start within twice the noise bound of M*.
     """
 
@@ -69,9 +70,15 @@ class Regions:
         near = self._close(task, bound, z0)
         if self.winnable is None:
             return {"near M*": near, "elsewhere": ~near}
-        grid, winnable = self.winnable
-        won = winnable[grid.nearest(z0)]
+        won = self.may_win(z0)
         return {"near M*": near & won, "elsewhere": ~near & won, "not winnable": ~won}
+
+    def may_win(self, z: np.ndarray) -> np.ndarray:
+        """Returns whether starts (n, d) are winnable, or may be for all that is known: (n,) bool."""
+        if self.winnable is None:
+            return np.ones(len(z), dtype=bool)
+        grid, winnable = self.winnable
+        return np.asarray(grid.interpolate(winnable.astype(float), z) > 1 - 1e-9)
 
     def _close(self, task: Task, bound: float, z: np.ndarray) -> np.ndarray:
         """Returns whether starts (n, d) lie within twice the noise bound of M*: (n,) bool."""

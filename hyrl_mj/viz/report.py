@@ -125,7 +125,7 @@ def _numbers(
         numbers += _episode_numbers(robustness.episodes)
     if robustness and robustness.attacks:
         attacks = robustness.attacks
-        shares = [tables.percent(c.lost / c.starts) for c in attacks]
+        shares = [tables.percent(c.lost / c.starts, surely=False) for c in attacks]
         note = f"of {attacks[0].starts} starts, {attacks[0].rounds} rounds of search"
         numbers.append(Number("starts from which the attack breaks it", shares, note))
     if arrived:
@@ -175,7 +175,8 @@ def _episode_numbers(counts: Sequence[EpisodeCount]) -> list[Number]:
             for who in CONTROLLERS
         ]
         what = f"episodes that reach the set-point, starts {region}"
-        numbers.append(Number(what, list(map(tables.percent, least)), note))
+        shares = [tables.percent(share, surely=False) for share in least]
+        numbers.append(Number(what, shares, note))
     return numbers
 
 
@@ -250,6 +251,7 @@ def fill(template: str, run: Run, robustness: Robustness | None, **values: Any) 
             settings=run.settings,
             agent=run.agent,
             exact=run.exact,
+            why_no_game=run.why_no_game,
             critical=run.critical_set,
             unit=task.noise_on()[1],
             percent=tables.percent,

@@ -159,7 +159,11 @@ def episode_table(task: Task, counts: Sequence[EpisodeCount]) -> Table:
         (low, high), (_, unit) = c.interval, task.noise_on(c.everywhere)
         outcomes = ", ".join(f"{k.replace('_', ' ')} {v:,}" for k, v in c.outcomes.items())
         row = [f"{c.noise} {c.eps:g} {unit}", NAMES[c.controller], c.region]
-        row += [f"{c.episodes:,}", percent(c.reached), f"{percent(low)} - {percent(high)}"]
+        row += [
+            f"{c.episodes:,}",
+            percent(c.reached, surely=False),
+            f"{percent(low)} - {percent(high)}",
+        ]
         rows.append([*row, outcomes])
     headings = ("noise", "controller", "starts", "episodes", "reached", "95%", "outcomes")
     return Table(f"{task.name}: noisy episodes", headings, rows)
@@ -171,7 +175,8 @@ def attack_table(task: Task, counts: Sequence[AttackCount]) -> Table:
     rows = []
     for c in counts:
         low, high = (percent(share) for share in c.interval)
-        row = [NAMES[c.controller], f"{c.starts:,}", f"{c.lost:,}", percent(c.lost / c.starts)]
+        row = [NAMES[c.controller], f"{c.starts:,}", f"{c.lost:,}"]
+        row.append(percent(c.lost / c.starts, surely=False))
         row += [f"{low} - {high}", f"{c.rounds:,}"]
         rows.append([*row, f"{c.outcome.replace('_', ' ')} from {_point(np.array(c.start))}"])
     headings = ("controller", "starts", "lost", "share", "95%", "rounds", "strongest signal")
@@ -192,7 +197,8 @@ def robustness_sentence(robustness: Robustness) -> str:
         parts = []
         for who in ("policy", "hyrl"):
             least = min(c.reached for c in robustness.episodes if c.controller == who)
-            parts.append(f"{NAMES[who]} reaches in {percent(least)} or more")
+            share = "all" if least == 1 else f"{percent(least)} or more of the"
+            parts.append(f"{NAMES[who]} reaches in {share} episodes")
         if robustness.attacks:
             parts.append(attack_sentence(robustness.attacks))
         return ", ".join(parts)
