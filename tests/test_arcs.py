@@ -23,7 +23,7 @@ def run(vehicle):
         loops={"policy": PolicyController(policy), "hyrl": controller},
         critical_set=decisions(vehicle),
         split=halves(vehicle),
-        check_exact=lambda: None,
+        why_no_game=None,
         exact=True,
         policy_title="RL policy (DQN)",
         extended_sets=SimpleNamespace(modes=(0, 1)),
