@@ -15,7 +15,7 @@ from itertools import count
 import numpy as np
 
 from hyrl_mj.game.lattice import Lattice
-from hyrl_mj.game.solver import NEVER, Moves, by_target, entries, nodes_within
+from hyrl_mj.game.solver import NEVER, Moves, by_target, count_down, entries, nodes_within
 from hyrl_mj.sets import GridSet, within_reach
 
 # Parts whose depths differ by no more than this meet there [chart units].
@@ -140,7 +140,7 @@ def fewest_samples(
     new = np.flatnonzero(samples == 0)
     for k in count(1):
         reaching = entries(before, first, new)
-        np.subtract.at(waiting, reaching, 1)
+        count_down(waiting, reaching)
         by_level, node = np.divmod(reaching[waiting[reaching] == 0], n)
         fresh = samples[node] == NEVER
         by_level, node = by_level[fresh], node[fresh]
