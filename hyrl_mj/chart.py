@@ -62,6 +62,13 @@ class Chart:
         delta = np.subtract(a, b)
         return np.where(self.periodic, delta - self.sides * np.round(delta / self.sides), delta)
 
+    def near(self, z: np.ndarray, to: np.ndarray) -> np.ndarray:
+        """Returns points z (n, d) with periodic coordinates brought next to points `to` (n, d)."""
+        if not any(self.periodic):
+            return z
+        turns = np.round(np.subtract(to, z) / self.sides)
+        return np.where(self.periodic, z + turns * self.sides, z)
+
     def contains(self, z: np.ndarray) -> np.ndarray:
         """Returns (n,) bool: whether points (n, d) lie in the charted box."""
         inside = (z >= self.low) & (z <= self.high)

@@ -62,3 +62,13 @@ def test_a_point_is_named_with_its_units():
 @pytest.mark.parametrize("angle", [-1e-300, -1e-17, 2 * PI, -2 * PI, np.nextafter(2 * PI, 0)])
 def test_a_tiny_angle_below_the_seam_is_not_the_end_of_the_period(angle):
     assert 0 <= CHARTS["ring"].wrap(np.array([[angle]]))[0, 0] < 2 * PI
+
+
+def test_points_are_brought_next_to_others_by_whole_periods():
+    chart = Chart(("x", "a"), ("m", "rad"), (0.0, -np.pi), (1.0, np.pi), (False, True))
+    z = np.array([[0.3, 3.1], [0.3, -3.1], [7.0, 0.5]])
+    to = np.array([[0.0, 3.0], [0.0, 9.4], [0.0, -25.0]])
+    near = chart.near(z, to)
+    np.testing.assert_array_equal(near[:, 0], z[:, 0])
+    np.testing.assert_allclose(near[:, 1], [3.1, -3.1 + 4 * np.pi, 0.5 - 8 * np.pi])
+    assert near[0, 1] == z[0, 1], "a point that is near stays the same to the bit"

@@ -13,7 +13,8 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.game import lattice as lattice_module
 from hyrl_mj.game.lattice import Lattice
 from hyrl_mj.sets import Grid
-from hyrl_mj.tasks import Outcome, get_task
+from hyrl_mj.tasks import Outcome, Task, get_task
+from hyrl_mj.tasks.vehicle import Vehicle
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +94,26 @@ def test_leaving_the_chart_is_a_failure(vehicle):
     left, straight = (lattice.after[k, 0, lattice.grid.nearest([[0.5, 1.0]])[0]] for k in (-1, 2))
     assert left == lattice.nodes + 1
     np.testing.assert_allclose(lattice.grid.nodes[straight], [0.55, 1.0])
+
+
+class Alley(Vehicle):
+    """A set-point that is a line, with the verdict of `Task`: close to the line is close enough."""
+
+    close = 0.3
+
+    def miss(self, z):
+        return np.abs(z[:, 1])
+
+
+Alley.verdict = Task.verdict
+
+
+def test_where_episodes_end_as_a_success_to_be_close_to_the_set_point_is_not_enough():
+    alley = Alley()
+    lattice = Lattice.of(alley, Grid.with_cells(alley.chart, 60))
+    assert (alley.verdict(np.array([[0.5, 0.0]])) == Outcome.REACHED).all()
+    assert not lattice.arrived.any()
+    assert (lattice.after == lattice.nodes).any(), "the samples over the line arrive"
 
 
 # ---- unit circle: between nodes, all the way round

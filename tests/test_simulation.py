@@ -9,6 +9,7 @@ from planted import (
     ChartPolicy,
     circle_policy,
     euler,
+    halves,
     ideal_controller,
     one_way_policy,
     sign_policy,
@@ -25,7 +26,11 @@ from hyrl_mj import (
     simulate,
     simulate_batch,
 )
+from hyrl_mj.game import Game, worst_signal
 from hyrl_mj.policies.controllers import PolicyController
+from hyrl_mj.sets import Grid
+from hyrl_mj.stages.critical_set import find_critical_set
+from hyrl_mj.tasks.unit_circle import UnitCircle
 
 ALTERNATING = Noise("alternating", 0.1)
 
@@ -239,6 +244,28 @@ def test_angles_are_not_wrapped(circle):
     arc = simulate(circle, circle_policy(circle), np.array([6.0]), horizon=1.0)
     assert np.abs(np.diff(arc.z[:, 0])).max() < 0.051
     assert arc.z[:, 0].max() > 2 * np.pi
+
+
+class Phase(UnitCircle):
+    """The circle, whose pointer is measured through an angle between -pi and pi."""
+
+    def measure(self, sensors):
+        return np.arctan2(np.sin(sensors), np.cos(sensors))
+
+
+def test_a_phase_that_passes_pi_is_not_wrapped_either(circle):
+    phase, policy = Phase(), circle_policy(circle, critical=2.0)
+    plain, arc = (simulate(task, policy, 2.5, horizon=3.0) for task in (circle, phase))
+    np.testing.assert_allclose(arc.z, plain.z, atol=1e-12)
+    assert arc.z.max() > np.pi > arc.z.min(), "it passes the seam"
+    found = [find_critical_set(task, policy, 40, 0.1, "outcome") for task in (circle, phase)]
+    np.testing.assert_allclose(*(critical.points for critical in found), atol=1e-9)
+    # The worst noise is recorded as noise, not as noise and a turn.
+    controllers = {"policy": PolicyController(policy)}
+    grid = Grid.with_cells(phase.chart, 300)
+    game = Game(phase, halves(circle), controllers, 0.3, grid=grid)
+    signal = worst_signal(game, "policy", controllers["policy"], np.array([[3.0]]), 0.3)
+    assert np.abs(signal.values).max() <= 0.3 + 1e-9
 
 
 def test_one_start_gives_one_arc_and_several_a_list(vehicle):

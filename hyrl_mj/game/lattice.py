@@ -49,7 +49,8 @@ class Lattice:
             nodes in one sample.
         after: (A, C, N) places around the end of one sample, the nearest first; one of them, C = 1, where
             the game is an estimate.
-        arrived: (N,) bool, nodes at which an episode that ended there would be a success.
+        arrived: (N,) bool, nodes at which an episode ends as a success, or is one if it is cut off there.
+            Where episodes end as a success, only a `verdict` of the task's own counts of the latter.
         failed: (N,) bool, nodes at which an episode ends without success.
         hops: (A, d) how far one sample with each level moves the running nodes.
         uneven: (d,) by how much more or less it moves some of them, along each coordinate.
@@ -142,8 +143,7 @@ class Lattice:
         plant.set_state(*task.state(nodes))
         measurement = plant.measurement
         ending, failed = task.ending(measurement), task.failed(measurement)
-        success = task.verdict(measurement) == Outcome.REACHED
-        arrived = (ending == Outcome.REACHED) | ~failed & success
+        arrived = ending == Outcome.REACHED
         alive = np.flatnonzero(ending == Outcome.RUNNING)
         if not len(alive):
             raise BadInput(
@@ -168,7 +168,12 @@ class Lattice:
             # A running episode that leaves the chart leaves the lattice: it counts as failed.
             fails = task.failed(measurement) | ~task.chart.contains(z) & ~arrives
             ends.add(a, alive, z, np.select([fails, arrives], [len(nodes) + 1, len(nodes)], -1))
-        return Lattice(task, grid, levels, ends.after, arrived, failed, hops, uneven, direct)
+        after = ends.after
+        # Where episodes end as a success, to be near the set-point is not one, unless the task says so.
+        ends_well = arrived.any() or (after == len(nodes)).any()
+        if not ends_well or type(task).verdict is not Task.verdict:
+            arrived |= ~failed & (task.verdict(plant.measurement) == Outcome.REACHED)
+        return Lattice(task, grid, levels, after, arrived, failed, hops, uneven, direct)
 
     def level_of(self, u: np.ndarray) -> np.ndarray:
         """Returns the levels (n,) int nearest to inputs (n, m).

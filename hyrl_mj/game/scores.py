@@ -196,7 +196,11 @@ def worst_signal(
     rollout = closed_loop(game.task, loop, z0, noise, modes, settings=settings)
     if not len(rollout.measured):  # all runs are over where they start
         return Recorded(np.zeros((1, len(z0), game.task.measurement_columns)), eps, kind="worst")
-    rows = zip(rollout.measured, rollout.path[:-1], strict=True)
+    chart = game.task.chart
+    rows = [
+        (measured, chart.near(z, game.task.z(measured)))
+        for measured, z in zip(rollout.measured, rollout.path[:-1], strict=True)
+    ]
     true = np.stack([game.task.with_z(measured, z) for measured, z in rows])
     values = np.where(np.isnan(rollout.u).any(axis=-1)[..., None], 0.0, rollout.measured - true)
     return Recorded(values, eps, kind="worst")

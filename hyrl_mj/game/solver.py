@@ -243,7 +243,9 @@ def solve(
 
 def count_down(waiting: np.ndarray, at: np.ndarray) -> None:
     """Subtracts 1 from `waiting` for each entry of `at`, also where entries repeat."""
-    np.subtract.at(waiting, at, waiting.dtype.type(1))  # a number of another type takes forty times as long
+    np.subtract.at(
+        waiting, at, waiting.dtype.type(1)
+    )  # a number of another type takes forty times as long
 
 
 def once(values: np.ndarray, stamp: np.ndarray) -> np.ndarray:

@@ -98,7 +98,7 @@ def closed_loop(
     outcome = np.full(n, Outcome.RUNNING) if backward else task.outcome(measurement, plant.unstable)
     length = np.zeros(n, dtype=int)
     path = np.empty((limit + 1, n, task.chart.dimension))
-    path[0] = task.z(measurement)
+    path[0] = task.chart.near(task.z(measurement), z0)
     first_mode = q.copy()
     shapes = {"before": (), "q": (), "measured": (len(task.noisy),), "u": (len(task.inputs),)}
     kept: dict[str, list[np.ndarray]] = {name: [] for name in shapes}
@@ -118,7 +118,7 @@ def closed_loop(
         (plant.step_backward if backward else plant.step)(u[active], active)
         measurement, last, lost = plant.measurement, measurement, plant.unstable
         measurement[lost] = last[lost]  # the last one before the simulation became unstable
-        path[k + 1] = task.z(measurement)
+        path[k + 1] = task.chart.near(task.z(measurement), path[k])
         length[active] = k + 1
         if not backward:
             outcome[active] = task.outcome(measurement[active], lost[active])

@@ -54,7 +54,8 @@ class Track:
             self._qpos[i] = data.qpos
         # Noise moves the chart's coordinates of a position, and leaves the others as they are.
         rows = np.isfinite(arc.measured).all(axis=1)
-        noise = task.state(task.z(arc.measured[rows]))[0] - task.state(arc.z[rows])[0]
+        measured = task.chart.near(task.z(arc.measured[rows]), arc.z[rows])
+        noise = task.state(measured)[0] - task.state(arc.z[rows])[0]
         self._measured = np.full_like(self._qpos, np.nan)
         self._measured[rows] = self._qpos[rows] + noise
         self.points = marks.tracked_points(task, self._qpos)
