@@ -9,7 +9,18 @@ import numpy as np
 import pytest
 from planted import decisions, ideal_controller, sign_policy
 
-from hyrl_mj import BadInput, HybridArc, Noise, Run, Signal, cli, parsing, register_noise, simulate
+from hyrl_mj import (
+    BadInput,
+    HybridArc,
+    Noise,
+    Run,
+    Signal,
+    cli,
+    commands,
+    parsing,
+    register_noise,
+    simulate,
+)
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.simulation.noise import _KINDS
@@ -133,7 +144,7 @@ def command_line(vehicle, monkeypatch, tmp_path):
     opened = replace(parsing.KINDS[Run], read=lambda path: run)
     monkeypatch.setitem(parsing.KINDS, Run, opened)
     monkeypatch.setattr(parsing, "load_run", lambda run, task=None: run)
-    monkeypatch.setattr(cli.pipeline, "as_stage", lambda run, name, work: work(run))
+    monkeypatch.setattr(commands.pipeline, "as_stage", lambda run, name, work: work(run))
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["hyrl-mj", *arguments])

@@ -15,7 +15,8 @@ from hyrl_mj.game import Lattice
 from hyrl_mj.learning import Settings, Training, preset, training
 from hyrl_mj.learning.options import OPTIONS, OWN
 from hyrl_mj.policies import algorithms
-from hyrl_mj.run_directory import Config, Run
+from hyrl_mj.run_config import Config
+from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import MOST_NODES, Grid
 
 NAN, INF = math.nan, math.inf
@@ -152,7 +153,7 @@ def test_leaving_a_mode_for_ever_needs_a_discount(settings):
     [
         ({"noise": 3.2}, "hides the whole state space of unit_circle"),
         ({"horizon": 8.0}, r"horizon 8 s.*at most 7\.5 s, the length of an episode of unit_circle"),
-        ({"lattice": 0}, "lattice 0 cannot be used"),
+        ({"lattice": 10**6}, "has 1,000,000 nodes: give fewer cells"),
         ({"cells": 10**6}, "has 1,000,000 nodes: give fewer cells"),
         ({"rods": 10**6}, "has 1,000,000 nodes: give fewer cells"),
         ({"stage1": {"algorithm": "dqn"}}, "dqn needs levels of the input"),

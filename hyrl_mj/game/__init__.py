@@ -4,6 +4,7 @@ The plant is tabulated on a lattice of states, and the game is solved on it by b
 `Game` scores controllers on the nodes, and `Limit` is what a split of the states could win.
 """
 
+from hyrl_mj.game.adversary import WorstNoise
 from hyrl_mj.game.counts import AttackCount, EpisodeCount
 from hyrl_mj.game.lattice import EPISODES_INSTEAD, Lattice
 from hyrl_mj.game.limit import Limit, fewest_samples
@@ -37,7 +38,6 @@ from hyrl_mj.game.solver import (
     Answers,
     Moves,
     Places,
-    WorstNoise,
     lasting,
     noisy_moves,
     solve,

@@ -7,11 +7,11 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.game import result
-from hyrl_mj.game.estimates import WorstEstimate
+from hyrl_mj.game.adversary import WorstEstimate, WorstNoise
 from hyrl_mj.game.lattice import Lattice
 from hyrl_mj.game.limit import Limit
 from hyrl_mj.game.result import LIMIT, NodeScore
-from hyrl_mj.game.solver import NEVER, Answers, Moves, WorstNoise, lasting, noisy_moves, solve
+from hyrl_mj.game.solver import NEVER, Answers, Moves, lasting, noisy_moves, solve
 from hyrl_mj.policies import Controller, Policy, as_controller
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import LoopSettings, Recorded, Signal, closed_loop

@@ -26,7 +26,6 @@ from hyrl_mj.stages import (
     shown_arcs,
 )
 from hyrl_mj.viz import robustness_sentence
-from hyrl_mj.viz.section import Section
 
 # The kinds of noise in episodes by default.
 KINDS = ("none", "uniform", "alternating", "adversarial")
@@ -177,7 +176,5 @@ def draw_robustness(run: Run, robustness: Robustness, maps: Maps, folder: Path) 
     from hyrl_mj.viz import figures
 
     assert robustness.game is not None
-    section = Section(run.task)
-    critical = section.critical_set(run)
-    shown = figures.ShownGame(section, critical, robustness.game, section.maps(maps))
+    shown = figures.shown_game(run, robustness.game, maps)
     figures.draw_all(shown, folder)

@@ -9,6 +9,7 @@ from importlib import import_module
 from pkgutil import iter_modules
 
 from hyrl_mj.simulation.arc import HybridArc, samples, simulate, simulate_batch
+from hyrl_mj.simulation.lookahead import Lookahead
 from hyrl_mj.simulation.noise import (
     NOT_STARTED,
     AnyNoise,
@@ -27,6 +28,7 @@ __all__ = [
     "NOT_STARTED",
     "AnyNoise",
     "HybridArc",
+    "Lookahead",
     "LoopSettings",
     "Noise",
     "Programmes",

@@ -90,8 +90,7 @@ class Lookahead(Signal):
 
         `past` (k, memory, p) are the measurements up to these answers.
         """
-        ahead = self._ahead = self._ahead or self.task.plant(BATCH)
-        rows = np.arange(len(answers))
+        ahead, rows = self._copies(), np.arange(len(answers))
         worst = np.full(len(answers), -np.inf)
         ahead.set_state(qpos, qvel, rows)
         for _ in range(self.samples):
@@ -110,6 +109,11 @@ class Lookahead(Signal):
             answers = np.column_stack(self._act(after, q, past))
             past = remembering(past, after)
         return worst
+
+    def _copies(self) -> Plant:
+        """Returns the copies of the robot that are simulated ahead."""
+        self._ahead = self._ahead or self.task.plant(BATCH)
+        return self._ahead
 
     def _act(
         self, measured: np.ndarray, q: np.ndarray, past: np.ndarray

@@ -21,6 +21,7 @@ from hyrl_mj.viz.figures.robustness import CLASS_COLOURS as CLASS_COLOURS
 from hyrl_mj.viz.figures.robustness import draw_robustness_curve, draw_robustness_map
 from hyrl_mj.viz.figures.runs import draw_runs
 from hyrl_mj.viz.figures.shown import ShownGame, ShownPolicy, ShownRun
+from hyrl_mj.viz.figures.shown import shown_game as shown_game
 from hyrl_mj.viz.figures.shown import shown_policy as shown_policy
 from hyrl_mj.viz.figures.shown import shown_run as shown_run
 

@@ -97,6 +97,12 @@ def shown_policy(run: Run, noisy: HybridArc) -> ShownPolicy:
     )
 
 
+def shown_game(run: Run, result: GameResult, maps: Maps) -> ShownGame:
+    """Returns what the figures of a run's game show."""
+    section = Section(run.task)
+    return ShownGame(section, section.critical_set(run), result, section.maps(maps))
+
+
 def shown_run(run: Run) -> ShownRun:
     """Returns what the figures of a run show; its replays have been simulated."""
     arcs, sets = run.arcs(), Section(run.task).extended_sets(run.extended_sets)

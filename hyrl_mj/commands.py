@@ -1,0 +1,315 @@
+"""The commands of `hyrl-mj`, a function for each: its parameters are the options, its docstring the help."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from hyrl_mj import pipeline
+from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions, SweepOptions
+from hyrl_mj.run_directory import Run
+from hyrl_mj.sweeps import DONE
+from hyrl_mj.tasks import get_task, task_names, write_task
+from hyrl_mj.verdict import FAILED
+from hyrl_mj.viz import ReplayOptions, print_robustness, print_summary, print_sweep
+
+
+def list_tasks() -> None:
+    """List the tasks."""
+    for name in task_names():
+        try:
+            task = get_task(name)
+            print(f"{name:14} {task.env_id:30} {task.description}")
+        except BadInput as error:  # a broken task of another package
+            print(f"{name:14} {error}")
+
+
+def new_task(name: str, *, folder: Path = Path()) -> None:
+    """Write a task of your own to start from: NAME.py, NAME.xml and test_NAME.py.
+
+    Args:
+        name: the name of the task and of its files: letters, digits and _.
+        folder: the folder to write to.
+    """
+    paths = write_task(name, folder)
+    print(f"wrote {', '.join(map(str, paths))}")
+    print(f"try them with python -m pytest {paths[-1]}, after pip install pytest")
+    print(f"then run all stages with hyrl-mj run {paths[0]}")
+
+
+def run(task: str, options: RunOptions) -> None:
+    """Run all stages on a task, from training to the report.
+
+    An existing run directory is resumed: only what is missing is done.
+
+    The verdict is PROVED, WON, HELD, WEAK, or FAILED, which gives exit status 1.
+
+    Args:
+        task: a task, see `hyrl-mj list`, or a Python file that defines one, see `hyrl-mj new-task`.
+    """
+    finish(pipeline.run(task, options))
+
+
+def robustify(task: str, *, policy: Path, options: AgentOptions) -> None:
+    """Make an agent robust that was trained elsewhere: all stages but the first.
+
+    An existing run directory is resumed: only what is missing is done.
+
+    The verdict is PROVED, WON, HELD, WEAK, or FAILED, which gives exit status 1.
+
+    Args:
+        task: a task, see `hyrl-mj list`, or a Python file that defines one.
+        policy: the agent, a .zip that SB3's model.save wrote, an .onnx file, or a .safetensors file.
+    """
+    finish(pipeline.robustify(task, policy, options))
+
+
+def finish(run: Run) -> None:
+    """Prints the results of a whole run; if it FAILED, ends with exit status 1."""
+    print_summary(run)
+    if run.verdict.word == FAILED:
+        raise SystemExit(1)
+
+
+def sweep(
+    tasks: tuple[str, ...] = (), *, report: Path | None = None, options: SweepOptions
+) -> None:
+    """Make many runs over seeds, noise bounds and algorithms, and their tables.
+
+    What is done is not done again. It needs Ray: pip install "hyrl-mj[sweep]".
+
+    Args:
+        tasks: tasks, see `hyrl-mj list`, or Python files that define some; by default none, with --report.
+        report: make the tables of this sweep folder again from the runs that are there; by default off.
+    """
+    if report is not None:
+        if tasks or options != SweepOptions():
+            raise BadInput(
+                "--report DIR makes tables of the runs that are there: leave TASKS and other options out"
+            )
+        result, folder = pipeline.report(report), report
+    else:
+        result, folder = pipeline.sweep(tasks, options), Path(options.out)
+    print_sweep(result)
+    print(f"tables in {folder}/sweep.html, sweep.csv and sweep.json")
+    if any(row.state != DONE or row.verdict == FAILED for row in result.rows):
+        raise SystemExit(1)
+
+
+def diagnose(task: str, *, policy: Path, options: AgentOptions) -> None:
+    """Find out what noise can do to an agent: critical set, losses, margin.
+
+    Nothing is trained; `hyrl-mj robustify` continues in the same run directory.
+
+    Args:
+        task: a task, see `hyrl-mj list`, or a Python file that defines one.
+        policy: the agent, a .zip that SB3's model.save wrote, an .onnx file, or a .safetensors file.
+    """
+    pipeline.diagnose(task, policy, options)
+
+
+def stage_command(name: str, help_text: str) -> Callable[..., None]:
+    """Returns the subcommand that runs one stage again from what is on disk."""
+
+    def command(run: Run) -> None:
+        pipeline.run_stage(run, name)
+
+    command.__doc__ = help_text
+    return command
+
+
+def extended_sets(run: Run, *, horizon: float | None = None) -> None:
+    """Run stages 4 and 5 again: extend the parts over the critical set.
+
+    Args:
+        horizon: a new time T of the backward propagation [s]; by default the run's.
+    """
+    if horizon is None:
+        pipeline.run_stage(run, "extended-sets")
+    else:
+        pipeline.extend_again(run, horizon)
+
+
+def simulate(
+    run: Run,
+    *,
+    start: tuple[float, ...] | None = None,
+    q0: int | None = None,
+    noise: str = "alternating",
+    eps: float | None = None,
+    time: float | None = None,
+    seed: int = 0,
+) -> None:
+    """Simulate policy and controller; without --start, the paper's replays.
+
+    Args:
+        start: start in chart coordinates, as x y [m] (vehicle) or theta [rad] (unit_circle); by default the
+            starts of the paper's replays.
+        q0: start mode; by default the controller selects it from the first measurement.
+        noise: kind of noise: none, uniform, alternating, adversarial (looks a few samples ahead),
+            attack (the strongest signal that a search finds), or worst (the signal with which the worst-case
+            game is lost, or arrival is latest).
+        eps: bound of the noise, in the units of the chart; by default the run's.
+        time: time to simulate [s]; by default the task's.
+        seed: seed of the noise.
+    """
+    from hyrl_mj.viz.arcs import noisy_arcs
+
+    if start is None:
+        if (q0, noise, eps, time, seed) != (None, "alternating", None, None, 0):
+            raise BadInput("--q0, --noise, --eps, --time and --seed need a --start")
+        print_summary(pipeline.run_stage(run, "simulate"))
+        return
+    z0 = run.task.chart.check([start], run.task.name)
+
+    def work(run: Run) -> None:
+        arcs = noisy_arcs(run, z0, noise, eps, (q0,), time, seed)
+        for name, (arc,) in zip(("policy", "hyrl"), arcs.values(), strict=True):
+            arc.save(run.latest_path(name))
+            end = run.task.chart.format(arc.z[-1])
+            print(f"{name:7} {arc.outcome:14} t = {arc.t[-1]:.2f} s, {arc.j[-1]} jumps, {end}")
+
+    pipeline.as_stage(run, "simulate --start", work)
+    print(f"saved as {run.path / 'arcs'}/latest_*.npz")
+
+
+def robustness(run: Run, options: ExamineOptions) -> None:
+    """Find out what noise can do: worst-case game, margins, and episodes in bulk.
+
+    Writes robustness.json and the figures of a map and a curve, as PNG and PDF.
+    """
+    if options.episodes is None and run.exact and (options.noise or options.near_critical):
+        option = "--noise" if options.noise else "--near-critical"
+        raise BadInput(f"{option} is about the episodes: say how many, as in --episodes 100000")
+    pipeline.examine_run(run, options)
+    print_robustness(replace(run))
+    if run.why_no_game is None:
+        print(f"pictures in {run.path / 'figures'}")
+
+
+def replay(
+    run: Run,
+    *,
+    out: Path | None = None,
+    starts: str = "critical",
+    noise: str | None = None,
+    eps: float | None = None,
+    options: ReplayOptions,
+) -> None:
+    """Render policy and controller under the same noise, as a video or a picture.
+
+    Args:
+        out: the mp4 or gif to write, with its last frame as a png of the same name, or a png alone; by
+            default replay.mp4 in the run directory.
+        starts: critical (the start on the critical set, once for each start mode; where no game can be
+            played, the strongest signals of the attack), paper (all of the
+            paper's at once), or latest (what `hyrl-mj simulate --start` simulated last).
+        noise: kind of noise under which to simulate anew: none, uniform, alternating, adversarial (looks
+            a few samples ahead), attack (the strongest signal that a search finds, for each controller),
+            or worst (of the worst-case game, for each controller); by default the arcs of the run, which
+            are under alternating noise, and from the critical set under the strongest noise that is known.
+        eps: bound of the noise, in the units of the chart; by default the run's.
+    """
+    from hyrl_mj.viz.arcs import replay_floor, replay_shows
+    from hyrl_mj.viz.replay import render_replay
+
+    usual_out = run.path / "replay.mp4"
+    usual = ReplayOptions(camera=options.camera, size=options.size, fps=options.fps)
+    if out is None and (starts, noise, eps, options) != ("critical", None, None, usual):
+        # The report describes replay.mp4 as a run makes it.
+        raise BadInput("another replay than that of the run needs an --out, as in --out mine.mp4")
+
+    def work(run: Run) -> None:
+        shows = replay_shows(run, starts, noise, eps)
+        render_replay(run.task, shows, out or usual_out, options, floor=replay_floor(run))
+
+    if out is None:
+        pipeline.as_stage(run, "replay", work)
+    else:
+        work(run)
+    out = out or usual_out
+    print(f"{'picture' if out.suffix == '.png' else 'video'} at {out}")
+
+
+def view(run: Run, *, arc: str = "critical_hyrl_q0", port: int = 0) -> None:
+    """Replay an arc in MuJoCo's viewer, or in a browser where there is no display.
+
+    The viewer for a browser takes pip install "hyrl-mj[view]". Ctrl+C ends it.
+
+    Args:
+        arc: the name of a file in the folder arcs of the run.
+        port: port of the web viewer, which only this machine can reach, or 0 for the first free one from
+            8080 on.
+    """
+    from hyrl_mj.viz.viewing import view
+
+    paths = {path.stem: path for path in sorted((run.path / "arcs").glob("*.npz"))}
+    if arc not in paths:
+        raise unknown("arc", arc, paths)
+    view(run.task, run.arc(paths[arc]), port)
+
+
+def report(run: Run, *, out: Path | None = None) -> None:
+    """Write one page with all results of a run, and how to repeat it.
+
+    The page opens in any browser, without a network, and can be printed.
+
+    Args:
+        out: the html to write; by default report.html in the run directory.
+    """
+    from hyrl_mj.viz.report import write_report
+
+    if out is None:
+        pipeline.run_stage(run, "report")
+    else:
+        write_report(run, out)
+        print(f"page at {out}")
+
+
+def export(run: Run, *, to: str, out: Path) -> None:
+    """Write the hybrid controller of a run so that it works without hyrl_mj.
+
+    Args:
+        to: onnx (one file, q and measured in, u and q_next out; -1 as the first q), or numpy (a folder
+            with controller.py and controller.npz, which need NumPy alone).
+        out: the file or the folder to write.
+    """
+    from hyrl_mj.export import export
+
+    export(run.controller, to, out)
+    print(f"controller at {out}")
+
+
+def doctor() -> None:
+    """Say whether this machine can train, render and encode, and what it lacks."""
+    from hyrl_mj.doctor import report
+
+    lines, healthy = report()
+    print("\n".join(lines))
+    if not healthy:
+        raise SystemExit(1)
+
+
+COMMANDS: dict[str, Callable[..., None]] = {
+    "list": list_tasks,
+    "new-task": new_task,
+    "run": run,
+    "robustify": robustify,
+    "diagnose": diagnose,
+    "sweep": sweep,
+    "train": stage_command("train", "Run stage 1 again: train the policy."),
+    "critical-set": stage_command("critical-set", "Run stage 2 again: find the critical set."),
+    "partition": stage_command("partition", "Run stage 3 again: partition the chart."),
+    "extended-sets": extended_sets,
+    "retrain": stage_command("retrain", "Run stage 6 again: train the policy of each mode."),
+    "robustness": robustness,
+    "simulate": simulate,
+    "figures": stage_command("figures", "Draw the paper's figures of a run again, as PNG and PDF."),
+    "replay": replay,
+    "view": view,
+    "report": report,
+    "export": export,
+    "doctor": doctor,
+}
