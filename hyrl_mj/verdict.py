@@ -22,10 +22,10 @@ class Verdict:
     nearly all are 99%.
 
     - PROVED: HyRL is proved to win nearly all winnable starts, whatever the noise within the run's bound.
-    - WON: the worst-case game can be played, and of no winnable start a noise signal is known that beats
+    - WON: the worst-case game decides, and of no winnable start a noise signal is known that beats
       HyRL, from the attack, if there was one, either.
-    - HELD: the game cannot be played, HyRL arrives in nearly all episodes under each kind of noise, and the
-      attack, if there was one, breaks it from nearly no start.
+    - HELD: the game cannot be played or is an estimate, HyRL arrives in nearly all episodes under each kind
+      of noise, and the attack, if there was one, breaks it from nearly no start.
     - FAILED: no start is winnable, or HyRL wins less than the policy without noise, or stage 6 gave up: for
       some mode no attempt gave a policy that wins nearly all of its set.
     - WEAK: HyRL wins more than the policy under noise, or the policy does not arrive from nearly all of its
@@ -241,7 +241,7 @@ class _Case:
             policy_lost, lost = (1 - game.scores[who][-1].not_broken for who in ("policy", "hyrl"))
             yield (
                 f"the worst-case game on nodes, here an estimate, finds noise that beats HyRL from "
-                f"{percent(lost)} of the starts that it calls winnable, and the policy from "
+                f"{percent(lost)} of the starts that were tried, and the policy from "
                 f"{percent(policy_lost)}"
             )
 

@@ -20,7 +20,7 @@ from hyrl_mj.game import NEVER, Game
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import Programmes, Rules, closed_loop
-from hyrl_mj.stages.attacks import Budget, attack, attack_starts
+from hyrl_mj.stages.attacks import POPULATION, Budget, _Search, attack, attack_starts
 from hyrl_mj.stages.episodes import Regions
 
 EPS = 0.1
@@ -212,6 +212,28 @@ def test_only_starts_are_attacked_all_of_whose_nodes_are_winnable(vehicle):
     parts = regions.split(vehicle, EPS, np.array([[0.0, 0.149], [0.0, 0.151], [0.0, 0.8]]))
     assert parts["not winnable"].tolist() == [True, False, False]
     assert parts["near M*"].tolist() == [False, True, False]
+
+
+def test_where_hardly_a_start_is_winnable_fewer_are_attacked(vehicle):
+    grid = Grid.with_cells(vehicle.chart, 60)
+    far = Regions(np.array([[0.0, 0.0]]), (grid, grid.nodes[:, 1] > 0.6))
+    starts = attack_starts(vehicle, far, EPS, 100, seed=0)
+    assert len(starts) == 100
+    assert starts[:, 1].min() > 0.6, "none near M*, where nothing is winnable"
+    none = Regions(np.array([[0.0, 0.0]]), (grid, np.zeros(len(grid.nodes), dtype=bool)))
+    assert len(attack_starts(vehicle, none, EPS, 100, seed=0)) == 100
+
+
+def test_the_first_rounds_hold_every_rule(vehicle):
+    loop = PolicyController(sign_policy(vehicle))
+    rules = Rules(vehicle, loop, EPS, np.array([0.0, 1.0]))
+    search = _Search(vehicle, loop, np.array([[0.0, 0.5]]), rules, seed=0)
+    rounds = range(1, 2 + len(rules) // POPULATION)
+    held = np.concatenate([search._population(np.array([0]), k)[0] for k in rounds])
+    constant = {int(row[0]) for row in held if (row == row[0]).all()}
+    assert {*range(rules.nothing), rules.ahead} <= constant
+    second = search._population(np.array([0]), 2)[0]
+    assert (second == rules.ahead).all(axis=1).any(), "two rounds are usual, and look ahead"
 
 
 @pytest.mark.parametrize(

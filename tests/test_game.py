@@ -5,6 +5,8 @@ from itertools import count, pairwise, product
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from planted import (
     circle_controller,
     circle_policy,
@@ -20,7 +22,16 @@ from hyrl_mj import HybridController, Noise, simulate
 from hyrl_mj.errors import BadInput
 from hyrl_mj.game.lattice import ON_NODE, Lattice
 from hyrl_mj.game.scores import Game, worst_signal
-from hyrl_mj.game.solver import LOST, NEVER, Answers, lasting, noisy_moves, solve
+from hyrl_mj.game.solver import (
+    LOST,
+    NEVER,
+    Answers,
+    count_down,
+    lasting,
+    noisy_moves,
+    once,
+    solve,
+)
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid
 from hyrl_mj.tasks import Outcome
@@ -30,6 +41,21 @@ PI = np.pi
 EXACT = 754
 # From the axis the pillar can be passed only if x <= this.
 LAST_CHANCE = 1.5 - 0.751 * np.sqrt(2)
+
+
+# ---- pieces of the solver
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.integers(0, 20), max_size=200))
+def test_counting_down_and_taking_each_once_are_their_plain_twins(values):
+    at = np.array(values, dtype=int)
+    waiting, plain = np.full(21, 300, np.int32), np.full(21, 300, np.int32)
+    count_down(waiting, at)
+    np.subtract.at(plain, at, 1)
+    np.testing.assert_array_equal(waiting, plain)
+    stamp = np.random.default_rng(0).integers(0, 200, 21).astype(np.int32)
+    np.testing.assert_array_equal(np.sort(once(at, stamp)), np.unique(at))
 
 
 # ---- a slow plain twin

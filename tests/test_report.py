@@ -448,7 +448,7 @@ def test_in_three_dimensions_the_game_is_an_estimate_beside_the_episodes(
     assert len(page.table("episodes")) == len(run.robustness.episodes)
     assert ("Rounding makes this an estimate" in page.text) == game
     assert ("winnable" in page.text) == game
-    assert ("stand in for the worst case: it is not wanted here." in page.text) != game
+    assert ("stand in for the worst case, because it is not wanted here." in page.text) != game
     assert "Margins" not in page.tables
 
 

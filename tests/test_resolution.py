@@ -5,21 +5,29 @@ import re
 from pathlib import Path
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
-from planted import Cube, Unicycle, steering_policy
+from planted import UNICYCLE, ChartPolicy, Cube, Unicycle, steering_policy
 
 import hyrl_mj
+from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput
-from hyrl_mj.game import Game, Lattice, lattice_grid, resolution
-from hyrl_mj.game.resolution import corner_hops, level_counts, longest, resolves
+from hyrl_mj.game import Game, Lattice, curve_grid, lattice_grid, resolution
+from hyrl_mj.game import lattice as lattice_module
+from hyrl_mj.game.resolution import level_counts, longest, probed_hops, resolves
 from hyrl_mj.game.solver import NEVER, nodes_within
 from hyrl_mj.learning import preset
 from hyrl_mj.pipeline.examination import examination_plan
 from hyrl_mj.policies import PolicyController
+from hyrl_mj.proof import examine
+from hyrl_mj.proof.affine import Unbounded
+from hyrl_mj.proof.cells import Cells
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import LoopSettings, closed_loop
+from hyrl_mj.stages import ExtendedSets
+from hyrl_mj.stages.retraining import ByEpisodes, ByGame, mode_ground
 from hyrl_mj.tasks import Learning, Outcome
 from hyrl_mj.viz.section import Section
 
@@ -56,9 +64,9 @@ def test_two_inputs_get_as_many_cells_as_fit(monkeypatch, levels):
     plane = Cube(lambda z: z[:, 0], d=2)
     plane.learning = Learning(levels=levels)
     finest = lattice_grid(plane)
-    monkeypatch.setattr(resolution, "MOST_TRANSITIONS", 2**20)
+    monkeypatch.setattr(resolution, "FITTING", 2**20)
     fewer = lattice_grid(plane)
-    inputs = math.prod(level_counts(plane, fewer, corner_hops(plane)))
+    inputs = math.prod(level_counts(plane, fewer, probed_hops(plane)))
     assert fewer.counts < finest.counts
     assert 0.8 * 2**20 < len(fewer.nodes) * inputs <= 2**20
     assert len(Lattice.of(plane, fewer).levels) == inputs
@@ -82,7 +90,7 @@ def test_inputs_between_the_levels_of_the_lattice_are_not_exact():
 
 
 def test_cells_are_longer_along_a_coordinate_that_changes_faster(unicycle):
-    grid, hops = lattice_grid(unicycle, 40), longest(corner_hops(unicycle))
+    grid, hops = lattice_grid(unicycle, 40), longest(probed_hops(unicycle))
     np.testing.assert_allclose(hops, [0.05, 0.05, 0.1], rtol=0.02)
     np.testing.assert_allclose(grid.spacing / hops, 1.0, rtol=0.05)
 
@@ -90,13 +98,97 @@ def test_cells_are_longer_along_a_coordinate_that_changes_faster(unicycle):
 def test_a_lattice_that_holds_the_robot_in_its_place_is_refused(vehicle):
     coarse = Grid.with_cells(vehicle.chart, 40)
     assert not resolves(vehicle, coarse)
-    with pytest.raises(BadInput, match=r"hold vehicle in its place.*0\.075 by 0\.075.*--episodes"):
+    with pytest.raises(
+        BadInput, match=r"no sample moves vehicle.*0\.075 m by 0\.075 m.*--episodes"
+    ):
         Lattice.check(vehicle, coarse)
     assert not Lattice.decides(vehicle, coarse)
     assert Lattice.decides(vehicle, Grid.with_cells(vehicle.chart, 60))
 
 
+def test_the_curve_takes_more_cells_where_a_sample_is_too_short_for_its_own(vehicle, monkeypatch):
+    assert curve_grid(vehicle).counts == (241, 241)
+    monkeypatch.setitem(resolution.CURVE_CELLS, 2, 40)
+    assert curve_grid(vehicle, 120).counts == (121, 121)
+
+
+def test_stage_6_asks_episodes_where_two_inputs_do_not_fit(monkeypatch):
+    plane = Cube(lambda z: z[:, 0], d=2)
+    plane.start_low, plane.start_high = (-0.5, -0.5), (0.5, 0.5)
+    grid = Grid.with_cells(plane.chart, 120)
+    part = GridSet.from_mask(grid, np.ones(len(grid.nodes), dtype=bool))
+    sets = ExtendedSets((0,), (part,), (part.mask,), 0.1, 0.1, np.empty((0, 2)), np.empty(0))
+    assert type(mode_ground(plane, sets, 0)) is ByGame
+    monkeypatch.setattr(lattice_module, "MOST_TRANSITIONS", 1_000)
+    assert type(mode_ground(plane, sets, 0)) is ByEpisodes
+
+
 # ---- an inner loop on velocity actuators
+
+
+class Course(Unicycle):
+    """The input is the course: that by the least input is the same as by the greatest."""
+
+    chart = Chart(("x", "y"), ("m", "m"), (-1.0, -1.0), (1.0, 1.0), (False, False))
+    noisy = (True, True)
+    learning = Learning()
+
+    def __init__(self):
+        joint = '      <joint name="heading" type="hinge" axis="0 0 1"/>\n'
+        xml = UNICYCLE.replace(joint, "").replace('<velocity joint="heading" kv="1e6"/>', "")
+        xml = xml.replace('<jointpos joint="heading"/>', "").replace('"-2 2"', '"-3.14159 3.14159"')
+        self.model = mujoco.MjModel.from_xml_string(xml)
+
+    def control(self, u, qpos, qvel):
+        return np.column_stack([np.cos(u), np.sin(u)])
+
+    def ending(self, measurement):
+        away = np.abs(measurement).max(axis=1)
+        return np.where(away >= 0.9, Outcome.REACHED, Outcome.RUNNING)
+
+
+class Sluggish(Course):
+    """The inner loop limits the acceleration, so that speeds matter."""
+
+    def control(self, u, qpos, qvel):
+        wanted = np.column_stack([np.cos(u), np.sin(u)])
+        return qvel + np.clip(wanted - qvel, -0.1, 0.1)
+
+
+class Docked(Course):
+    """The inner loop stops the robot in one place."""
+
+    def control(self, u, qpos, qvel):
+        docked = np.linalg.norm(qpos - (0.31, 0.17), axis=1, keepdims=True) < 0.02
+        return np.where(docked, 0.0, super().control(u, qpos, qvel))
+
+
+def test_inputs_that_an_inner_loop_bends_are_tabulated_in_between():
+    course = Course()
+    lattice = Lattice.of(course, lattice_grid(course, 60))
+    assert len(lattice.levels) > 6
+    assert np.ptp(lattice.hops, axis=0).min() > 0.09, "it goes every way"
+
+
+def test_an_inner_loop_that_depends_on_the_place_is_tabulated_everywhere():
+    docked = Docked()
+    lattice = Lattice.of(docked, lattice_grid(docked, 240))
+    held = np.linalg.norm(lattice.grid.nodes - (0.31, 0.17), axis=1) < 0.015
+    assert held.any()
+    stays = (lattice.after[:, 0] == np.arange(lattice.nodes)).all(axis=0)
+    assert stays[held].all()
+
+
+def test_nothing_is_proved_of_a_robot_with_an_inner_loop():
+    course = Course()
+    with pytest.raises(Unbounded, match="an inner loop"):
+        Cells.of(Lattice.of(course, lattice_grid(course, 60)))
+
+
+def test_an_inner_loop_with_a_memory_makes_no_kinematic_robot():
+    assert Course().kinematic
+    assert not Sluggish().kinematic
+    assert not Lattice.possible(Sluggish())
 
 
 def test_a_robot_whose_inner_loop_gives_speeds_runs_backward(unicycle):
@@ -152,6 +244,27 @@ def test_the_estimate_agrees_with_runs_of_the_plant(unicycle):
     worst = closed_loop(unicycle, loop, grid.nodes[starts], noise, settings=quiet)
     lost = arrived.mean() - (worst.outcome == Outcome.REACHED).mean()
     assert lost > 0.5 * (won.mean() - (game.value("policy", 0.1)[-1, starts] < NEVER).mean()) > 0.05
+
+
+def test_in_three_dimensions_nothing_is_proved_and_only_what_was_tried_is_not_broken():
+    cube = Cube(lambda z: z[:, 0])
+    cube.start_low, cube.start_high = (-0.5,) * 3, (0.5,) * 3
+    cube.ending = lambda m: np.where(m[:, 0] >= 0.9, Outcome.REACHED, Outcome.RUNNING)
+    cube.verdict = lambda m: np.full(len(m), Outcome.STALLED)
+    still = PolicyController(ChartPolicy(cube, lambda z: np.zeros_like(z)))
+    goes = PolicyController(ChartPolicy(cube, lambda z: np.ones_like(z) * (1.0, 0.0, 0.0)))
+    cube.max_steps = 40
+    grid = lattice_grid(cube, 40)
+    parts = [GridSet.from_mask(grid, np.ones(len(grid.nodes), dtype=bool))]
+    loops = {"policy": still, "hyrl": goes}
+    result, _ = examine(cube, np.empty((0, 3)), parts, loops, (0.0, 0.1), cells=40)
+    assert result.estimate
+    assert [score.not_broken for score in result.scores["policy"]] == [0.0, 0.0]
+    assert [score.not_broken for score in result.scores["hyrl"]] == [1.0, 1.0]
+    assert all(score.proved is None for score in result.scores["hyrl"])
+    assert "three dimensions" in result.why_not_proved["hyrl"]
+    assert result.curve.eps == (0.0, 0.1)
+    assert result.margin == {"policy": None, "hyrl": None}
 
 
 def test_how_a_run_will_be_examined_is_said_first(unicycle):

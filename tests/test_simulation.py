@@ -29,6 +29,7 @@ from hyrl_mj import (
 from hyrl_mj.game import Game, worst_signal
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid
+from hyrl_mj.simulation import NOT_STARTED, Programmes, Rules
 from hyrl_mj.stages.critical_set import find_critical_set
 from hyrl_mj.tasks.unit_circle import UnitCircle
 
@@ -238,6 +239,31 @@ def test_the_horizon_cuts_an_arc(circle):
     assert arc.t[-1] == pytest.approx(0.5)
     np.testing.assert_allclose(arc.z[:, 0], 2.0 - arc.t, atol=1e-6)
     assert arc.outcome == "stalled"
+
+
+@pytest.mark.parametrize("kind", ["uniform", "adversarial", "worst", "attack"])
+def test_some_runs_may_have_a_start_mode_and_others_pick_theirs(vehicle, kind):
+    loop = ideal_controller(vehicle)
+    starts = np.array([[0.0, 0.02], [0.0, -0.02], [0.1, 0.3], [0.0, 0.0]])
+    modes = np.array([NOT_STARTED, 1, NOT_STARTED, 0])
+    if kind == "worst":
+        grid = Grid.with_cells(vehicle.chart, 60)
+        noise = Game(vehicle, halves(vehicle), {"hyrl": loop}, 0.1, grid=grid).worst_noise(
+            "hyrl", 0.1
+        )
+    elif kind == "attack":
+        rules = Rules(vehicle, loop, 0.1, np.array([0.0, 1.0]))
+        noise = Programmes(vehicle, loop, rules, np.zeros((4, 1), dtype=int), segment=5)
+    else:
+        noise = Noise(kind, 0.1)
+    mixed = closed_loop(vehicle, loop, starts, noise, modes)
+    own = closed_loop(vehicle, loop, starts, noise)
+    given = closed_loop(vehicle, loop, starts, noise, np.array([0, 1, 0, 0]))
+    for i, alone in enumerate((own, given, own, given)):
+        assert mixed.q0[i] == alone.q0[i]
+        assert mixed.outcome[i] == alone.outcome[i]
+        n = mixed.length[i] + 1
+        np.testing.assert_array_equal(mixed.path[:n, i], alone.path[:n, i])
 
 
 def test_angles_are_not_wrapped(circle):

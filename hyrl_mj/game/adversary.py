@@ -107,8 +107,9 @@ class WorstEstimate(Lookahead):
         ahead.set_state(qpos, qvel, rows)
         ahead.step(answers[:, :-1], rows)
         measured = ahead.measurement[rows]
+        lost = task.failed(measured) | ~grid.chart.contains(task.z(measured))
         worth = np.full(len(rows), np.inf)
         for mode, values in zip(self._modes, self._worth, strict=False):
-            at = (answers[:, -1] == mode) & ~task.failed(measured)
+            at = (answers[:, -1] == mode) & ~lost
             worth[at] = grid.interpolate(values[:-2], task.z(measured[at]))
         return np.where(task.ending(measured) == Outcome.REACHED, 0.0, worth)

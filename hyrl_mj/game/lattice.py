@@ -14,10 +14,12 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.game.resolution import (
     LATTICE,
     MOST_TRANSITIONS,
-    corner_hops,
     lattice_grid,
     level_counts,
+    longest,
+    probed_hops,
     resolves,
+    transitions,
 )
 from hyrl_mj.mjcf import model_name
 from hyrl_mj.progress import progress_bar
@@ -28,6 +30,8 @@ from hyrl_mj.tasks import Outcome, Task
 ON_NODE = 1e-3
 # Nodes from which a plant is stepped that moves all of them alike, up to this distance [chart units].
 SAMPLE, ALIKE = 1_000, 1e-9
+# States that are drawn to find out whether an episode can end as a success.
+DRAWN = 20_000
 EPISODES_INSTEAD = (
     "use noisy episodes instead (hyrl-mj robustness RUN --episodes N --noise adversarial)"
 )
@@ -49,8 +53,8 @@ class Lattice:
             nodes in one sample.
         after: (A, C, N) places around the end of one sample, the nearest first; one of them, C = 1, where
             the game is an estimate.
-        arrived: (N,) bool, nodes at which an episode ends as a success, or is one if it is cut off there.
-            Where episodes end as a success, only a `verdict` of the task's own counts of the latter.
+        arrived: (N,) bool, nodes at which an episode ends as a success. Also those at which one that is cut
+            off is a success, if the task has a `verdict` of its own or its episodes never end as a success.
         failed: (N,) bool, nodes at which an episode ends without success.
         hops: (A, d) how far one sample with each level moves the running nodes.
         uneven: (d,) by how much more or less it moves some of them, along each coordinate.
@@ -104,13 +108,18 @@ class Lattice:
                 "the worst-case game takes a plant that one sample maps from chart point to chart point, "
                 f"and {model_name(task.model)} has a larger state"
             )
-        if grid is None or resolves(task, grid):
+        if grid is None:
             return None
-        sides = " by ".join(f"{side:.3g}" for side in grid.spacing)
-        return (
-            f"the worst-case game would hold {task.name} in its place, because no sample moves it by a "
-            f"whole cell of the lattice, {sides}"
-        )
+        if transitions(task, grid, probed_hops(task)) > MOST_TRANSITIONS:
+            return f"a lattice of {len(grid.nodes):,} nodes with all inputs does not fit into the memory"
+        if not resolves(task, grid):
+            pairs = zip(grid.spacing, task.chart.units, strict=True)
+            sides = " by ".join(f"{side:.3g} {unit}" for side, unit in pairs)
+            return (
+                f"no sample moves {task.name} by a whole cell of the lattice ({sides}), and rounding would "
+                "hold it in its place"
+            )
+        return None
 
     @staticmethod
     def check(task: Task, grid: Grid | None = None) -> None:
@@ -169,8 +178,8 @@ class Lattice:
             fails = task.failed(measurement) | ~task.chart.contains(z) & ~arrives
             ends.add(a, alive, z, np.select([fails, arrives], [len(nodes) + 1, len(nodes)], -1))
         after = ends.after
-        # Where episodes end as a success, to be near the set-point is not one, unless the task says so.
-        ends_well = arrived.any() or (after == len(nodes)).any()
+        ends_well = arrived.any() or (after == len(nodes)).any() or _ends_well(task)
+        # Then to be near the set-point is not enough, unless the task says so.
         if not ends_well or type(task).verdict is not Task.verdict:
             arrived |= ~failed & (task.verdict(plant.measurement) == Outcome.REACHED)
         return Lattice(task, grid, levels, after, arrived, failed, hops, uneven, direct)
@@ -203,15 +212,26 @@ class Lattice:
         return level
 
 
+def _ends_well(task: Task) -> bool:
+    """Returns whether some episode ends as a success, in the chart or one sample beyond."""
+    chart, rng = task.chart, np.random.default_rng(0)
+    beyond = np.where(chart.periodic, 0.0, longest(probed_hops(task)))
+    z = rng.uniform(chart.low - beyond, chart.high + beyond, (DRAWN, chart.dimension))
+    plant = task.plant(DRAWN)
+    plant.set_state(*task.state(z))
+    return bool((task.ending(plant.measurement) == Outcome.REACHED).any())
+
+
 def _one_sample_on(
     task: Task, nodes: np.ndarray, levels: np.ndarray, direct: bool
 ) -> Iterator[np.ndarray]:
     """Yields for each level the measurements (n, p) one sample after the nodes (n, d).
 
-    Without contacts and other constraints nothing depends on where a robot without inertia is. If the
-    measurement is the position itself (`direct`), and some of the nodes move alike, all move like these.
+    Without contacts, other constraints and an inner loop nothing depends on where a robot without inertia
+    is. If the measurement is the position itself (`direct`), and some of the nodes move alike, all do.
     """
-    free = bool(task.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT) and direct
+    unconstrained = bool(task.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    free = direct and unconstrained and not task.has_inner_loop
     few = nodes[:: max(len(nodes) // SAMPLE, 1)] if free else nodes
     plant = task.plant(len(few))
     for level in progress_bar(levels, "tabulating the plant", "inputs"):
@@ -232,7 +252,7 @@ def _levels(task: Task, grid: Grid) -> np.ndarray:
     if task.input_levels is not None:
         return task.input_levels
     low, high = task.input_limits
-    counts = level_counts(task, grid, corner_hops(task))
+    counts = level_counts(task, grid, probed_hops(task))
     return np.array(list(product(*map(np.linspace, low, high, counts))))
 
 

@@ -7,6 +7,7 @@ from itertools import product
 
 import numpy as np
 
+from hyrl_mj.errors import BadInput
 from hyrl_mj.sets import MOST_NODES, Grid
 from hyrl_mj.tasks import Task
 
@@ -14,12 +15,16 @@ from hyrl_mj.tasks import Task
 LATTICE = {1: 12_000, 2: 480, 3: 160}
 # The most cells where the game is played many times, or for an estimate.
 CURVE_CELLS = {1: 3_000, 2: 240, 3: 80}
-# Transitions of the largest lattice: the whole game takes up to 200 bytes for each.
-MOST_TRANSITIONS = 2**23
+# Transitions of the lattice that is chosen: the whole game takes up to 200 bytes for each. A lattice that
+# is asked for may have twice as many.
+FITTING = 2**23
+MOST_TRANSITIONS = 2 * FITTING
 # Share of the cells that is left where a lattice is too large.
 FEWER = 0.97
-# States from which a plant is stepped to find out how far it moves.
-PROBES = 200
+# States from which a plant is stepped to find out how far it moves, and values of each of m inputs. Without
+# an inner loop the distance is linear in the inputs.
+PROBES, ENDS = 200, 2
+VALUES = {1: 17, 2: 9, 3: 5}
 
 
 def lattice_grid(task: Task, cells: int = 0, most: int | None = None) -> Grid:
@@ -32,49 +37,61 @@ def lattice_grid(task: Task, cells: int = 0, most: int | None = None) -> Grid:
         task: the robot and its problem.
         cells: cells along the longest side, 0 for the usual number.
         most: if given, no more cells than this.
+
+    Raises:
+        BadInput: the chart has more than three dimensions.
     """
-    cells = cells or LATTICE[task.chart.dimension]
-    cells = cells if most is None else min(cells, most)
-    hops = corner_hops(task)
     chart, sides = task.chart, task.chart.sides
+    if chart.dimension not in LATTICE:
+        raise BadInput(f"no lattice has {chart.dimension} dimensions: give a chart of at most 3")
+    cells = cells or LATTICE[chart.dimension]
+    cells = cells if most is None else min(cells, most)
+    hops = probed_hops(task)
     if chart.dimension > 2:
         sides = sides / np.maximum(longest(hops), sides / cells)
     while True:
         number = np.maximum(np.round(cells * sides / sides.max()).astype(int), 2)
         grid = Grid(chart, tuple(int(k) for k in number + ~np.array(chart.periodic)))
-        nodes = math.prod(grid.counts)
-        transitions = nodes * math.prod(level_counts(task, grid, hops))
-        if (nodes <= MOST_NODES and transitions <= MOST_TRANSITIONS) or cells <= 2:
+        fits = math.prod(grid.counts) <= MOST_NODES and transitions(task, grid, hops) <= FITTING
+        if fits or cells <= 2:
             return grid
         cells = int(cells * FEWER)
 
 
-def corner_hops(task: Task) -> np.ndarray:
-    """Returns how far one sample moves the robot under its least and greatest inputs.
+def curve_grid(task: Task, cells: int = 0) -> Grid:
+    """Returns the nodes of a lattice of at most `CURVE_CELLS`, of more where a sample is too short for it."""
+    coarse = lattice_grid(task, cells, CURVE_CELLS[task.chart.dimension])
+    return coarse if resolves(task, coarse) else lattice_grid(task, cells)
+
+
+def probed_hops(task: Task) -> np.ndarray:
+    """Returns how far one sample moves the robot, from states all over the chart under many inputs.
 
     Returns:
-        (2,) * m + (`PROBES`, d), from states all over the chart.
+        Values of each of the m inputs..., `PROBES` states, d coordinates.
     """
     low, high = task.input_limits
+    m, levels = len(low), task.learning.levels
+    values = levels or (VALUES.get(m, 3) if task.has_inner_loop else ENDS)
     rng, chart = np.random.default_rng(0), task.chart
     z = rng.uniform(chart.low, chart.high, (PROBES, chart.dimension))
     plant, hops = task.plant(PROBES), []
-    for u in product(*zip(low, high, strict=True)):
+    for u in product(*np.linspace(low, high, values).T):
         plant.set_state(*task.state(z))
         before = task.z(plant.measurement)
         plant.step(np.tile(u, (PROBES, 1)))
         hops.append(chart.difference(task.z(plant.measurement), before))
-    return np.array(hops).reshape(*(2,) * len(low), PROBES, chart.dimension)
+    return np.array(hops).reshape(*(values,) * m, PROBES, chart.dimension)
 
 
 def longest(hops: np.ndarray) -> np.ndarray:
-    """Returns the greatest distance (d,) of one sample along each coordinate, from `corner_hops`."""
+    """Returns the greatest distance (d,) of one sample along each coordinate, from `probed_hops`."""
     return np.asarray(np.abs(hops).reshape(-1, hops.shape[-1]).max(axis=0))
 
 
 def resolves(task: Task, grid: Grid) -> bool:
     """Returns whether one sample can move the robot by a cell: otherwise rounding holds it in its place."""
-    return bool((longest(corner_hops(task)) >= grid.spacing * (1 - 1e-6)).any())
+    return bool((longest(probed_hops(task)) >= grid.spacing * (1 - 1e-6)).any())
 
 
 def level_counts(task: Task, grid: Grid, hops: np.ndarray) -> tuple[int, ...]:
@@ -84,6 +101,12 @@ def level_counts(task: Task, grid: Grid, hops: np.ndarray) -> tuple[int, ...]:
         return (task.learning.levels,) * m
     counts = []
     for i in range(m):
-        reach = np.abs(np.diff(hops, axis=i)).reshape(-1, hops.shape[-1]).max(axis=0)
+        steps = np.abs(np.diff(hops, axis=i)).reshape(-1, hops.shape[-1]).max(axis=0)
+        reach = steps * (hops.shape[i] - 1)
         counts.append(int(np.ceil((reach / grid.spacing).max() - 1e-9)) + 1)
     return tuple(counts)
+
+
+def transitions(task: Task, grid: Grid, hops: np.ndarray) -> int:
+    """Returns the number of nodes times that of levels."""
+    return math.prod(grid.counts) * math.prod(level_counts(task, grid, hops))

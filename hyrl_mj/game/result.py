@@ -106,7 +106,7 @@ class Wins:
 
     Attributes:
         won, won_any: shares of the winnable nodes that are won on the nodes of the lattice, if the
-            controller picks its start mode, and from every start mode.
+            controller picks its start mode, and from every start mode; of an estimate what is not broken.
         proved, proved_any: shares of the winnable cells that are proved, as in `Score`; empty for a
             controller that could not be bounded.
         time_any: worst time to arrival [s] from the nodes that are won, from every start mode; None where
@@ -241,7 +241,7 @@ class Robustness:
     Attributes:
         eps: bound of the noise.
         everywhere: whether noise acts on all columns of the measurement.
-        game: result of the worst-case game, if it can be played exactly.
+        game: result of the worst-case game, if it can be played.
         episodes: counts of noisy episodes.
         seed: seed of the starts and the noise of these episodes and attacks.
         attacks: counts of the attack, one for each controller, if there was one.

@@ -10,6 +10,7 @@ from hyrl_mj.game import result
 from hyrl_mj.game.adversary import WorstEstimate, WorstNoise
 from hyrl_mj.game.lattice import Lattice
 from hyrl_mj.game.limit import Limit
+from hyrl_mj.game.resolution import lattice_grid
 from hyrl_mj.game.result import LIMIT, NodeScore
 from hyrl_mj.game.solver import NEVER, Answers, Moves, lasting, noisy_moves, solve
 from hyrl_mj.policies import Controller, Policy, as_controller
@@ -34,8 +35,8 @@ class Game:
         grid: nodes of the lattice, by default the finest.
 
     Raises:
-        BadInput: the chart has four dimensions, the plant's state is more than the chart, or a controller
-            gives inputs that cannot be applied.
+        BadInput: the chart has more than three dimensions, the plant's state is more than the chart, or a
+            controller gives inputs that cannot be applied.
     """
 
     def __init__(
@@ -49,6 +50,9 @@ class Game:
     ):
         self.task, self.everywhere, self.largest = task, everywhere, largest
         task.check_noise(largest, everywhere)
+        if grid is None:
+            Lattice.check(task)
+            Lattice.check(task, grid := lattice_grid(task))
         self.lattice = Lattice.of(task, grid)
         self.limit = Limit.of(self.lattice, parts)
         self._noises: dict[tuple[str, float], Signal] = {}

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from hyrl_mj.errors import BadInput, check_bound, check_seed, unknown
-from hyrl_mj.game import LATTICE
+from hyrl_mj.game import LATTICE, Lattice
 from hyrl_mj.learning.options import check_options
 from hyrl_mj.policies import ACTIVATIONS, ALGORITHMS, Agent, algorithms
 from hyrl_mj.ranges import (
@@ -311,7 +311,9 @@ def preset(
         # Rods miss a part of M* if the agent goes straight on for some samples before it picks a way.
         search="outcome" if agent else task.learning.search,
         rods=rods,
-        lattice=(_LATTICE_SMOKE if name == "smoke" else LATTICE).get(dimension, 0),
+        lattice=(_LATTICE_SMOKE if name == "smoke" else LATTICE).get(dimension, 0)
+        if dimension < 3 or Lattice.possible(task)
+        else 0,
     )
     settings.check(task)
     return settings

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.game import OVER, UNWINNABLE, EpisodeCount, Maps, Robustness
+from hyrl_mj.game import LATTICE, OVER, UNWINNABLE, EpisodeCount, Maps, Robustness
 from hyrl_mj.policies import Controller
 from hyrl_mj.progress import Say
 from hyrl_mj.proof import examine
@@ -83,7 +83,8 @@ def examination_plan(run: Run) -> str:
     """Returns how a run will be examined, and why not in another way, before anything is trained."""
     if run.why_no_game:
         return f"by noisy episodes and an attack, because {run.why_no_game}"
-    grid, wanted = run.lattice_grid, run.settings.lattice
+    grid = run.lattice_grid
+    wanted = run.settings.lattice or LATTICE[run.task.chart.dimension]
     nodes = f"{' x '.join(map(str, grid.counts))} nodes"
     if max(grid.counts) < wanted:
         nodes += f" (fewer than {wanted:,} on a side, which would not fit into the memory)"

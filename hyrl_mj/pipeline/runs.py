@@ -192,7 +192,7 @@ def extend_again(run: Run, horizon: float, say: Say = print) -> Run:
 
 def _run_all(run: Run, say: Say, stages: Collection[str] = STAGES) -> Run:
     """Runs the stages that are not done."""
-    if "robustness" in stages:
+    if "robustness" in stages and not run.manifest.is_done("robustness"):
         say(f"the run will be examined {examination_plan(run)}")
     for stage in stages:
         if stage == "train" and run.agent:

@@ -91,6 +91,10 @@ class Cells:
                 f"contacts and other constraints could move {task.name} between the nodes otherwise than on "
                 'them: if it needs none, switch them off in its MJCF with <flag constraint="disable"/>'
             )
+        if task.has_inner_loop:
+            raise Unbounded(
+                f"an inner loop (`control`) stands between the inputs of {task.name} and its speeds"
+            )
         _check_periods(task)
         periodic, h = np.array(task.chart.periodic), grid.spacing
         slope, offset = _displacement(lattice)

@@ -9,6 +9,7 @@ import numpy as np
 
 from hyrl_mj.game import FIRST, NEVER, Game
 from hyrl_mj.policies import Controller
+from hyrl_mj.proof.cells import Cells
 from hyrl_mj.proof.certificate import Certificate
 from hyrl_mj.simulation import (
     NOT_STARTED,
@@ -26,7 +27,7 @@ CANDIDATES = 17
 # Cells without a verdict in which a start is attacked, for each start mode.
 MOST_CELLS = 128
 # Nodes from which a controller is attacked where the game is an estimate, for each start mode.
-MOST_NODES = 1_000
+ATTACKED_NODES = 1_000
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ def attack(
     """Attacks a controller where it may lose, and returns where it lost.
 
     From the nodes that are lost in the game its adversary gives the noise. Where the game is an estimate, up
-    to `MOST_NODES` nodes are attacked, won or lost, and adversarial noise is tried, too. Cells that are
+    to `ATTACKED_NODES` nodes are attacked, won or lost, and adversarial noise is tried, too. Cells that are
     neither proved nor lost at a corner, up to `MOST_CELLS` of them for each start mode, are attacked from a
     start inside: at each sample the noise tries measurements in its range, and takes the answer that leads
     to the worst state.
@@ -70,7 +71,7 @@ def attack(
     attacked, tried = value[-len(modes) :, :-2] >= NEVER, region
     if game.lattice.estimate:
         tried, every = np.zeros_like(region), np.flatnonzero(region)
-        tried[rng.choice(every, min(len(every), MOST_NODES), replace=False)] = True
+        tried[rng.choice(every, min(len(every), ATTACKED_NODES), replace=False)] = True
         attacked = np.ones_like(attacked)
     attacked &= tried
     noises: list[AnyNoise] = [game.worst_noise(name, eps)] if attacked.any() else []
@@ -88,16 +89,27 @@ def attack(
         outer = certificate.value(name, eps)
         inside = CellNoise(certificate, controller, outer, value, game.bound(eps))
         unclear = (outer[-len(modes) :, :-2] >= NEVER) & certificate.region(eps) & ~broken
-        chosen = np.zeros_like(unclear)
-        for cells_of_mode, mask in zip(map(np.flatnonzero, unclear), chosen, strict=True):
-            few = min(len(cells_of_mode), MOST_CELLS)
-            mask[rng.choice(cells_of_mode, few, replace=False)] = True
-        row, at = np.nonzero(chosen)
-        off = rng.uniform(-0.5, 0.5, (len(at), len(cells.counts)))
-        starts = cells.middle(at) + off * game.lattice.grid.spacing
+        chosen = [
+            (np.full(min(len(of_mode), MOST_CELLS), row), *_inside(cells, of_mode, rng))
+            for row, of_mode in enumerate(map(np.flatnonzero, unclear))
+        ]
+        row, at, starts = (np.concatenate(parts) for parts in zip(*chosen, strict=True))
         broken[row, at] = _beaten(game, controller, starts, modes[row], inside)
-    everywhere = np.ones(cells.nodes, dtype=bool)
-    return Broken(broken[-1], np.asarray(broken.any(axis=0)), everywhere)
+    all_cells = np.ones(cells.nodes, dtype=bool)
+    return Broken(broken[-1], np.asarray(broken.any(axis=0)), all_cells)
+
+
+def _inside(
+    cells: Cells, of_mode: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns up to `MOST_CELLS` of some cells (n,), and a point inside of each: (k,), (k, d)."""
+    at = (
+        rng.choice(of_mode, min(len(of_mode), MOST_CELLS), replace=False)
+        if len(of_mode)
+        else of_mode
+    )
+    off = rng.uniform(-0.5, 0.5, (len(at), len(cells.counts)))
+    return at, cells.middle(at) + off * cells.lattice.grid.spacing
 
 
 def _beaten(

@@ -9,7 +9,6 @@ import numpy as np
 from hyrl_mj import cores
 from hyrl_mj.game import (
     CURVE,
-    CURVE_CELLS,
     LARGEST,
     LIMIT,
     NEARLY,
@@ -27,6 +26,7 @@ from hyrl_mj.game import (
     Profile,
     Score,
     Wins,
+    curve_grid,
     lattice_grid,
     share,
 )
@@ -68,10 +68,11 @@ def examine(
     """
     for eps in bounds:
         task.check_noise(eps, everywhere)
-    parts, most = tuple(parts), CURVE_CELLS[task.chart.dimension]
-    grid = lattice_grid(task, cells)
+    Lattice.check(task)
+    parts, grid = tuple(parts), lattice_grid(task, cells)
     Lattice.check(task, grid)
-    fine = Game(task, parts, controllers, max(*bounds, LARGEST), everywhere, grid)
+    largest = max(bounds) if task.chart.dimension > 2 else max(*bounds, LARGEST)
+    fine = Game(task, parts, controllers, largest, everywhere, grid)
     certificate = Certificate.of(fine, controllers)
     names = [*controllers, LIMIT]
     games = [(name, eps) for eps in bounds for name in names]
@@ -93,8 +94,7 @@ def examine(
         coarse, margins = fine, dict.fromkeys(controllers)
         curve, profile = _known(bounds, scores), Profile((), dict.fromkeys(names, ()))
     else:
-        fewer = lattice_grid(task, cells, most)
-        coarse = Game(task, parts, controllers, LARGEST, everywhere, fewer)
+        coarse = Game(task, parts, controllers, LARGEST, everywhere, curve_grid(task, cells))
         curve, profile = _sweep(Certificate.of(coarse, controllers), names, points)
         likely = [(name, _last_won(curve, curve.wins[name])) for name in controllers]
         margins = dict(zip(controllers, _in_threads("margins", fine.margin, likely), strict=True))
@@ -184,8 +184,7 @@ def _known(bounds: tuple[float, ...], scores: Mapping[str, tuple[Score, ...]]) -
     """Returns the curve through the scores at some bounds, of what is not broken."""
     wins = {}
     for name, level in scores.items():
-        pairs = zip(*((s.not_broken, s.not_broken_any) for s in level), strict=True)
-        own, some = pairs
+        own, some = zip(*((s.not_broken, s.not_broken_any) for s in level), strict=True)
         wins[name] = Wins(own, some, (), (), tuple(s.time_any for s in level))
     winnable = tuple(score.winnable for score in next(iter(scores.values())))
     return Curve(bounds, winnable, wins)

@@ -1,4 +1,4 @@
-"""An attack on closed loops: a search for noise signals that make them fail, where no game can be played.
+"""An attack on closed loops: a search for noise signals that make them fail, where no game decides.
 
 The search goes over programmes of simple rules by the cross-entropy method. What it reports as lost has been
 lost again under the recorded signal, which knows nothing of the loop any more.
@@ -39,12 +39,13 @@ GOALS = 3
 # Programmes that are tried in a round from each start: some that won from starts nearby, and one a goal.
 COPIED = 1
 POPULATION = COPIED + GOALS
-# The round that tries the noise of `Lookahead`, which takes longer than others.
-LOOKS_AHEAD = 2
+# The place, among the rules that the first rounds hold throughout, of the noise of `Lookahead`. It takes
+# longer than others, and two rounds are usual.
+LOOKS_AHEAD = 2 * POPULATION - 1
 # The best programmes so far, for each start and goal, that new ones are drawn from; and the share of the
 # segments that take any rule instead.
 ELITES, EXPLORE = 3, 0.25
-# How often starts that are not winnable are drawn again.
+# How often starts are drawn until enough of them are winnable.
 MOST_DRAWS = 100
 # Runs that are simulated at once, which limits the memory.
 BATCH = 4_096
@@ -101,24 +102,26 @@ def attack_starts(task: Task, regions: Regions, bound: float, n: int, seed: int)
     """Returns n starts (n, d): half of them within twice the bound of M*.
 
     The others are drawn as the task draws them; so are all where M* is empty or far from the starts. Where
-    it is known which starts are winnable, the others are left out, unless hardly one is winnable.
+    it is known which starts are winnable, only these are taken: fewer than n if they are rare. If none is
+    found, all starts are taken.
     """
     check_seed(seed)
     rng = np.random.default_rng([seed, 2])
 
     def drawn(where: Regions, count: int) -> np.ndarray:
-        z = where.draw(task, bound, count, rng)
-        for _ in range(MOST_DRAWS):
-            lost = ~regions.may_win(z)
-            if not lost.any():
+        kept = np.empty((0, task.chart.dimension))
+        for _ in range(MOST_DRAWS if count else 0):
+            z = where.draw(task, bound, count, rng)
+            kept = np.vstack([kept, z[regions.may_win(z)]])
+            if len(kept) >= count:
                 break
-            z[lost] = where.draw(task, bound, int(lost.sum()), rng)
-        return z
+        return kept[:count]
 
     near = np.empty((0, task.chart.dimension))
     with suppress(BadInput):  # where no start lies near M*
         near = drawn(replace(regions, near=True), n // 2)
-    return np.vstack([near, drawn(replace(regions, near=False), n - len(near))])
+    starts = np.vstack([near, drawn(replace(regions, near=False), n - len(near))])
+    return starts if len(starts) else task.starts(n, rng)
 
 
 def shown_arcs(attacks: Mapping[str, Attack]) -> dict[str, HybridArc]:
@@ -143,7 +146,8 @@ def attack(
     """Searches for noise signals that make closed loops fail.
 
     Each round tries `POPULATION` signals from every start of every controller that nothing has broken yet.
-    The first rounds hold each rule of `Rules` throughout, the second that which simulates ahead. Later ones
+    The first rounds hold each rule of `Rules` throughout, the second among others that which simulates ahead.
+    Later ones
     follow programmes that vary and join the best so far, and those that won from starts nearby. The
     coordinates outside the chart begin at their usual values.
 
@@ -227,14 +231,14 @@ class _Search:
         drawn = self._elites[rows[:, None, None], goal, elite, segment]
         explores = rng.random(shape) < EXPLORE
         programmes = np.where(explores, rng.integers(self.rules.ahead, size=shape), drawn)
-        held = np.arange(self.rules.nothing)[(number - 1) * POPULATION : number * POPULATION]
+        rules = np.arange(self.rules.nothing)
+        rules = np.insert(rules, min(LOOKS_AHEAD, len(rules)), self.rules.ahead)
+        held = rules[(number - 1) * POPULATION : number * POPULATION]
         programmes[:, : len(held)] = held[:, None]
         lost = np.flatnonzero(~self.open)
         for row, mine in zip(rows, programmes[:, len(held) :][:, :COPIED], strict=True):
             copies = self._from_nearby(row, lost)[: len(mine)]
             mine[: len(copies)] = np.reshape(copies, (-1, SEGMENTS))
-        if number == LOOKS_AHEAD:
-            programmes[:, -1] = self.rules.ahead
         return programmes
 
     def _from_nearby(self, row: int, lost: np.ndarray) -> list[np.ndarray]:

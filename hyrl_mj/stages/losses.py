@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hyrl_mj.game import NEVER, Game, lattice_grid
+from hyrl_mj.game import NEVER, Game, curve_grid
 from hyrl_mj.policies import Policy, PolicyController
 from hyrl_mj.sets import within_reach
 from hyrl_mj.stages.partition import Partition, longest_hop, neighbourhood, part_policies
@@ -51,12 +51,12 @@ def sort_losses(task: Task, policy: Policy, partition: Partition, eps: float, ce
         policy: the policy, a function of the measurement.
         partition: M_i, from stage 3.
         eps: the noise bound.
-        cells: lattice cells along the longest side.
+        cells: lattice cells along the longest side, as in `curve_grid`.
     """
     near = neighbourhood(partition.grid, eps, longest_hop(task, policy, partition.grid))
     pis = part_policies(task, policy, partition, near)
     loops = {f"part {i}": PolicyController(pi) for i, pi in enumerate(pis)}
-    grid = lattice_grid(task, cells)
+    grid = curve_grid(task, cells)
     game = Game(task, partition, {"policy": PolicyController(policy), **loops}, eps, grid=grid)
     lost = game.starts & game.winnable(eps) & (game.value("policy", eps)[-1, :-2] >= NEVER)
     held = np.ones(len(lost), dtype=bool)

@@ -17,6 +17,9 @@ from hyrl_mj.plant import Plant, input_limits
 from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.guard import guard
 
+# States in which an inner loop is tried with and without speed.
+TRIED = 50
+
 
 class Task(ABC):
     """A robot and its problem: the base class of the files in `hyrl_mj/tasks`.
@@ -143,8 +146,23 @@ class Task(ABC):
 
     @cached_property
     def kinematic(self) -> bool:
-        """Whether the robot follows its inputs without inertia, so that it can be run backward."""
-        return self.plant(1).invertible
+        """Whether the robot follows its inputs without inertia, so that it can be run backward.
+
+        An inner loop must give the speeds from the inputs and the positions alone; that is tried out.
+        """
+        plant = self.plant(TRIED)
+        if not plant.invertible or not self.has_inner_loop:
+            return plant.invertible
+        rng = np.random.default_rng(0)
+        qpos, _ = self.state(
+            rng.uniform(self.chart.low, self.chart.high, (TRIED, self.chart.dimension))
+        )
+        u, qvel = (
+            rng.uniform(*self.input_limits, (TRIED, len(self.inputs))),
+            rng.normal(size=qpos.shape),
+        )
+        still = self.control(u, qpos, np.zeros_like(qvel))
+        return bool(np.allclose(self.control(u, qpos, qvel), still, rtol=0, atol=1e-9))
 
     def check_measurement(self, measured: np.ndarray) -> np.ndarray:
         """Returns a measurement as a float array (n, p).

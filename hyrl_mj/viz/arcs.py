@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hyrl_mj.errors import BadInput, unknown
-from hyrl_mj.game import CURVE_CELLS, EPISODES_INSTEAD, Game, lattice_grid, worst_signal
+from hyrl_mj.game import CURVE_CELLS, EPISODES_INSTEAD, LATTICE, Game, lattice_grid, worst_signal
 from hyrl_mj.policies import Controller, Policy
 from hyrl_mj.run_directory import Run
 from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, noise_kinds, samples, simulate_batch
@@ -73,7 +73,8 @@ def noisy_arcs(
     if noise == WORST:
         if why := run.why_no_game:
             raise BadInput(f"{why}: {EPISODES_INSTEAD}")
-        cells = max(run.settings.lattice, CURVE_CELLS[task.chart.dimension])
+        usual = LATTICE[task.chart.dimension]
+        cells = max(run.settings.lattice or usual, CURVE_CELLS[task.chart.dimension])
         grid = lattice_grid(task, cells)
         game = Game(task, run.split, run.loops, bound, grid=grid)
     arcs = {}
@@ -122,7 +123,7 @@ def replay_arcs(
 ) -> dict[tuple[str, str], HybridArc]:
     """Simulates the replays by start and controller.
 
-    By default the noise is the paper's, and on M* the worst where a game can be played.
+    By default the noise is the paper's, and on M* the worst where a game decides.
     """
     starts, modes, seed = replay_starts(run), run.controller.modes, run.settings.seed
     arcs: dict[tuple[str, str], HybridArc] = {}
@@ -152,7 +153,7 @@ def replay_shows(
 
     Args:
         run: with its arcs.
-        starts: "critical" for the start on M*, once for each start mode, or where no game can be played for
+        starts: "critical" for the start on M*, once for each start mode, or where no game decides for
             the strongest signals of the attack; "paper" for all of the paper's
             starts at once; "latest" for the arcs of the last `hyrl-mj simulate --start`.
         noise: the kind of noise of a new simulation; by default the arcs on disk are played.

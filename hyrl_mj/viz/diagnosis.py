@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from hyrl_mj.errors import NoRenderer
-from hyrl_mj.game import CURVE_CELLS, Game, Robustness, worst_signal
+from hyrl_mj.game import Game, Robustness, worst_signal
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.run_directory import Run
 from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, simulate_batch
@@ -27,17 +27,17 @@ REPLAY = ReplayOptions(size=(960, 720))  # of the policy alone
 
 
 def losses_of(run: Run) -> Losses | None:
-    """Returns why the policy loses starts, where the game can be played."""
+    """Returns why the policy loses starts, where the game decides."""
     if not run.exact:
         return None
-    cells = min(run.settings.lattice, CURVE_CELLS[run.task.chart.dimension])
-    return sort_losses(run.task, run.steady, run.partition, run.settings.noise, cells)
+    s = run.settings
+    return sort_losses(run.task, run.steady, run.partition, s.noise, s.lattice)
 
 
 def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
     """Returns a run that the policy loses, or None if no such run was found.
 
-    Where the game can be played its adversary gives the noise, from the starts of the more frequent kind of
+    Where the game decides its adversary gives the noise, from the starts of the more frequent kind of
     losses first; otherwise the noise is adversarial, from drawn starts of the task.
     """
     task, eps, loop = run.task, run.settings.noise, PolicyController(run.policy)

@@ -64,7 +64,7 @@ def _picture(groups: dict[Setting, list[Row]], folder: Path) -> Picture | None:
     curves: dict[Setting, list[Curve]] = {}
     for setting, rows in groups.items():
         for row in rows:
-            game = load_run(folder / row.name).robustness.game if row.state == DONE else None
+            game = load_run(folder / row.name).robustness.deciding if row.state == DONE else None
             if game is not None:
                 curves.setdefault(setting, []).append(game.curve)
     if not curves:

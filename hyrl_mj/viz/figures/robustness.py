@@ -48,7 +48,8 @@ def draw_robustness_map(shown: ShownGame, path: Path | None = None) -> Figure:
     rows = -(-len(names) // style.COLUMNS)
     draw = _ring if charts.is_ring(task) else _box
     where, unit = task.noise_on(result.everywhere)
-    title = f"the worst noise on {where} up to eps = {maps.eps:g} {unit}"
+    estimated = ", an estimate" if result.estimate else ""
+    title = f"the worst noise on {where} up to eps = {maps.eps:g} {unit}{estimated}"
     with style.drawing(path, 1.6 + rows * _panel_height(task), task, title) as figure:
         panels = figure.subplots(rows, columns, squeeze=False).ravel()
         for k in np.unique(np.concatenate([maps.map[name] for name in names])):
