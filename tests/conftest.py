@@ -62,7 +62,7 @@ def planted_circle(tmp_path_factory):
 
     As on a machine that cannot draw: there is no video.
     """
-    from planted import decisions, halves
+    from planted import FEW_CELLS, decisions, halves
     from test_report import plant
 
     def no_renderer(*arguments, **options):
@@ -70,10 +70,10 @@ def planted_circle(tmp_path_factory):
 
     task, said = hyrl_mj.get_task("unit_circle"), []
     path = tmp_path_factory.mktemp("planted") / "unit_circle"
-    plant(path, task, decisions(task), halves(task))
+    plant(path, task, decisions(task), halves(task), **FEW_CELLS)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hyrl_mj.viz.replay.render_replay", no_renderer)
-        run = hyrl_mj.run("unit_circle", preset="smoke", out=path, say=said.append)
+        run = hyrl_mj.run("unit_circle", preset="smoke", set=FEW_CELLS, out=path, say=said.append)
     return run, said
 
 

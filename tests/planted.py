@@ -17,6 +17,9 @@ from hyrl_mj.stages.hybrid import HybridController
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.tasks import Learning, Outcome, Scene, Task
 
+# Settings of a smoke run on the circle whose worst-case game takes two seconds.
+FEW_CELLS = {"lattice": 240}
+
 
 def euler(task, z, u):
     """One sample of the paper's equations, S + f(S, A) dt: chart points (n, d), inputs (n, 1)."""

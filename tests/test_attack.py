@@ -146,6 +146,7 @@ def test_run_directories_are_compared_by_their_bytes(tmp_path):
     assert differences(one, other) == text
 
 
+@pytest.mark.slow
 def test_unknown_attacks_are_named():
     answer = attack("--only", "attacks")
     assert answer.returncode == 2

@@ -76,6 +76,7 @@ def played(game, loop, starts, noise, modes=None, seed=0):
     return run.outcome == Outcome.REACHED
 
 
+@pytest.mark.slow
 def test_no_noise_beats_what_is_proved(certified):
     game, loops, certificate = certified
     rng, cells, n = np.random.default_rng(0), certificate.cells, 3_000
@@ -107,6 +108,7 @@ def test_what_the_game_loses_at_a_corner_is_never_proved(certified):
                 assert not (touched & cells & certificate.cells.running).any()
 
 
+@pytest.mark.slow
 def test_the_gap_closes_as_the_cells_become_smaller(vehicle):
     loops, gaps = {"hyrl": hybrid(vehicle)}, []
     for cells in (120, 240, 480):
@@ -198,6 +200,7 @@ def test_what_cannot_be_bounded_is_attacked_all_the_same(vehicle):
     assert (none.region(EPS) == (game.starts & game.winnable(EPS))).all()
 
 
+@pytest.mark.slow
 def test_an_examination_carries_what_is_proved(vehicle):
     loops = {"policy": PolicyController(sideways(vehicle, 1, 1.1)), "hyrl": hybrid(vehicle)}
     result, maps = examine(

@@ -100,6 +100,7 @@ def test_a_program_that_does_something_else_ends_in_a_sentence(tmp_path, program
     assert list(path.parent.iterdir()) == [path]
 
 
+@pytest.mark.slow
 def test_a_slow_program_is_waited_for_as_long_as_it_makes_progress(tmp_path, program):
     real = shlex.quote(REAL)
     program(f'sleep 0.6; {real} "$@"; status=$?; sleep 0.6; exit $status')

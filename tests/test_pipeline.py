@@ -1,5 +1,6 @@
 """The pipeline does what is missing from a run directory, and one stage again where it is told to."""
 
+import json
 import os
 import shutil
 from dataclasses import replace
@@ -55,6 +56,13 @@ def test_what_the_stages_leave(planted_circle):
     assert arcs <= left
     assert {"robustness.json", "robustness.npz", "figures/overview.pdf", "report.html"} <= left
     assert not [name for name in left if "partial" in name or name.startswith("replay")]
+
+
+def test_config_and_page_hold_the_version_of_this_package(planted_circle):
+    run, _ = planted_circle
+    versions = json.loads((run.path / "config.json").read_text())["versions"]
+    assert versions["hyrl-mj"] == hyrl_mj.__version__
+    assert hyrl_mj.__version__ in (run.path / "report.html").read_text()
 
 
 def test_what_cannot_be_drawn_is_tried_again(planted_circle):

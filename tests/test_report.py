@@ -21,6 +21,7 @@ from planted import Cube, believe, decisions, halves
 
 from hyrl_mj import BadArtifact, BadInput, MlpPolicy, load_run
 from hyrl_mj.artifacts import replacing, write_json
+from hyrl_mj.learning import settings as presets
 from hyrl_mj.learning.settings import preset
 from hyrl_mj.pipeline import ExamineOptions, examine_run, run_stage
 from hyrl_mj.policies import Agent
@@ -100,6 +101,15 @@ def film(path):
                 add(frame)
         with replacing(path / "replay.png") as temporary:
             Image.fromarray(frame).save(temporary)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def coarse():
+    """The game of preset smoke on few cells: the page tells what it says, however coarse it is."""
+    with pytest.MonkeyPatch.context() as patch:
+        for dimension, cells in ((1, 240), (2, 60), (3, 40)):
+            patch.setitem(presets._LATTICE_SMOKE, dimension, cells)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -427,9 +437,10 @@ class Rover(Cube):
 
     def __init__(self):
         super().__init__(lambda z: z[:, 0])
+        self.noisy = (True, False, False)
 
 
-@pytest.mark.parametrize("game", [True, False])
+@pytest.mark.parametrize("game", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_in_three_dimensions_the_game_is_an_estimate_beside_the_episodes(
     tmp_path, monkeypatch, game
 ):

@@ -86,6 +86,7 @@ def test_a_run_of_another_task_is_refused(tmp_path):
         script.opened(tmp_path, "unit_circle")
 
 
+@pytest.mark.slow
 def test_the_papers_seven_figures_are_written(tmp_path):
     circle, vehicle = (planted_run(hyrl_mj.get_task(t)) for t in ("unit_circle", "vehicle"))
     script.draw(circle, vehicle, tmp_path)

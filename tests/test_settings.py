@@ -264,10 +264,3 @@ def test_weights_that_are_not_finite_end_a_training(circle, settings, monkeypatc
     monkeypatch.setattr("stable_baselines3.PPO.train", spoiled)
     with pytest.raises(BadInput, match=r"its weights are not finite|broke off"):
         training.train(circle, settings.stage1, 0)
-
-
-def test_a_config_holds_the_version_of_this_package(settings, planted_circle):
-    run, _ = planted_circle
-    versions = json.loads((run.path / "config.json").read_text())["versions"]
-    assert versions["hyrl-mj"] == hyrl_mj.__version__
-    assert hyrl_mj.__version__ in (run.path / "report.html").read_text()

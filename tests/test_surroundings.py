@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from gl import needs_gl
+from planted import FEW_CELLS
 
 import hyrl_mj
 
@@ -42,7 +43,8 @@ def folder(planted_circle, tmp_path):
 
 
 def resume(path):
-    return f"$HYRL run unit_circle --preset smoke --out {path}"
+    settings = " ".join(f"{name}={value}" for name, value in FEW_CELLS.items())
+    return f"$HYRL run unit_circle --preset smoke --set {settings} --out {path}"
 
 
 def assert_whole(path, done):

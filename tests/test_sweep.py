@@ -83,6 +83,7 @@ def test_settings_that_cannot_be_changed(name, value, message, circle):
 # ---- the plan
 
 
+@pytest.mark.slow
 def test_bad_sweeps_make_nothing(tmp_path):
     out = tmp_path / "sweep"
     for tasks, changes, message in (
@@ -110,6 +111,7 @@ def test_bad_sweeps_make_nothing(tmp_path):
         assert not out.exists()
 
 
+@pytest.mark.slow
 def test_ranges_of_seeds_on_the_command_line(tmp_path):
     for seeds in ("9-0", "", "a", "1-", "0-9-2", "0-99999999999"):
         done = call("sweep", "unit_circle", "--seeds", seeds, "--out", tmp_path / "sweep")
