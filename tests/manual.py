@@ -1,7 +1,7 @@
 """The blocks of README and the manual, and how each is run: python tests/manual.py PAGE runs those of a page.
 
-Blocks run in order in the current folder, which should hold finished runs of preset smoke. What would take
-minutes is shortened, and what needs a network, root or a person at the screen is checked without running it;
+Blocks run in order in the current folder, which should hold a finished run; without a PAGE it is made. What would
+take minutes is shortened, and what needs a network, root or a person at the screen is checked without running it;
 `SHORTER` and `instead` say how.
 """
 
@@ -17,8 +17,11 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 LANGUAGES = ("bash", "python", "toml")
+# Settings of the runs of a sweep, which are made in processes that `shorten` does not reach.
+TINY = {"stage1.samples": 4096, "stage6.samples": 4096, "lattice": 240, "cells": 240}
 # Python that would train for a minute.
 SHORTER = {
+    'preset="smoke", out="runs/circle_seeds")': f'preset="smoke", out="runs/circle_seeds", set={TINY})',
     'hyrl_mj.run("my_robot.py")': 'hyrl_mj.run("my_robot.py", preset="smoke")',
     "eps=0.1, seed=0)": 'eps=0.1, seed=0, preset="smoke")',
 }
@@ -68,6 +71,8 @@ def shortened(words: list[str]) -> list[str]:
     words = list(words)
     if words[0] in TRAINING and not {"--preset", "--report"} & {*words}:
         words += ["--preset", "smoke"]
+    if words[0] == "sweep" and "--report" not in words:
+        words += ["--set", *(f"{name}={value}" for name, value in TINY.items())]
     if "--episodes" in words:
         words[words.index("--episodes") + 1] = EPISODES
     if words[0] == "replay":
@@ -145,6 +150,17 @@ def run_command(words: list[str]) -> None:
             raise AssertionError(f"nothing says how to run {shlex.join(words)}")
 
 
+def shorten() -> None:
+    """Shortens preset smoke further, in this process: no page shows what its policies have learned."""
+    from hyrl_mj.learning import settings
+
+    settings._SMOKE |= {"ppo": 4_096, "dqn": 4_000, "sac": 1_500}
+    settings._SMOKE_MODES = 4_096
+    settings._GRIDS |= {1: (120, 720), 2: (60, 120)}
+    settings._GRIDS_DYNAMIC |= {2: (24, 48)}
+    settings._LATTICE_SMOKE |= {1: 240, 2: 60}
+
+
 def run(page: Path) -> None:
     """Run the blocks of a page. Those of Python share their names, as the cells of a notebook."""
     space: dict[str, object] = {"__name__": "__main__"}
@@ -165,12 +181,13 @@ if __name__ == "__main__":
     # A viewer waits for a person, and the loops of a robot for the time to pass.
     import time
 
-    from hyrl_mj.learning import settings
     from hyrl_mj.viz import viewing
 
-    # SAC's updates are slow, and no page shows what its policy has learned.
-    settings._SMOKE |= {"sac": 3_000}
+    shorten()
     viewing.view = lambda *arguments: print("viewed", arguments[1])
     time.sleep = lambda seconds: None
     sys.path.insert(0, "")  # what a block has written can be imported
-    run(Path(sys.argv[1]))
+    if sys.argv[1:]:
+        run(Path(sys.argv[1]))
+    else:
+        call(shortened(["run", "vehicle"]))
