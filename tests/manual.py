@@ -1,8 +1,8 @@
 """The blocks of README and the manual, and how each is run: python tests/manual.py PAGE runs those of a page.
 
-Blocks run in order in the current folder, which should hold a finished run; without a PAGE it is made. What would
-take minutes is shortened, and what needs a network, root or a person at the screen is checked without running it;
-`SHORTER` and `instead` say how.
+Blocks run in order in the current folder, which should hold a finished run; without a PAGE it is made. What
+would take minutes is shortened, and what needs a network, root or a person at the screen is checked without
+running it; `SHORTER` and `instead` say how.
 """
 
 import re
@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 LANGUAGES = ("bash", "python", "toml")
 # Settings of the runs of a sweep, which are made in processes that `shorten` does not reach.
-TINY = {"stage1.samples": 4096, "stage6.samples": 4096, "lattice": 240, "cells": 240}
+TINY = {"stage1.samples": 4096, "stage6.samples": 4096, "lattice": 130, "cells": 240}
 # Python that would train for a minute.
 SHORTER = {
     'preset="smoke", out="runs/circle_seeds")': f'preset="smoke", out="runs/circle_seeds", set={TINY})',
@@ -158,7 +158,7 @@ def shorten() -> None:
     settings._SMOKE_MODES = 4_096
     settings._GRIDS |= {1: (120, 720), 2: (60, 120)}
     settings._GRIDS_DYNAMIC |= {2: (24, 48)}
-    settings._LATTICE_SMOKE |= {1: 240, 2: 60}
+    settings._LATTICE_SMOKE |= {1: 130, 2: 60}
 
 
 def run(page: Path) -> None:

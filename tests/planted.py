@@ -18,7 +18,7 @@ from hyrl_mj.stages.partition import Partition
 from hyrl_mj.tasks import Learning, Outcome, Scene, Task
 
 # Settings of a smoke run on the circle whose worst-case game takes two seconds.
-FEW_CELLS = {"lattice": 240}
+FEW_CELLS = {"lattice": 130}
 
 
 def euler(task, z, u):

@@ -24,6 +24,9 @@ from hyrl_mj.viz.figures import FIGURES
 
 pytestmark = pytest.mark.slow  # whole runs, and a process for each command
 
+# A run whose training and worst-case game are short.
+SMOKE = ("--preset", "smoke", "--set", "stage1.samples=8192", "lattice=130", "cells=720")
+
 
 def call(*arguments):
     """Run the command line in a process of its own."""
@@ -39,7 +42,7 @@ def call(*arguments):
 def finished(tmp_path_factory):
     """A whole run of the unit circle in the smoke preset, made by the command line."""
     path = tmp_path_factory.mktemp("runs") / "circle"
-    done = call("run", "unit_circle", "--preset", "smoke", "--out", path)
+    done = call("run", "unit_circle", *SMOKE, "--out", path)
     assert_has_ended(done)
     return path, done.stdout
 
@@ -84,7 +87,7 @@ def test_run_renders_the_replay(finished):
 @needs_gl
 def test_run_again_does_nothing_again(finished):
     before = contents(finished[0])
-    again = call("run", "unit_circle", "--preset", "smoke", "--out", finished[0])
+    again = call("run", "unit_circle", *SMOKE, "--out", finished[0])
     assert_has_ended(again)
     assert again.stdout.count("done before") == len(STAGES)
     assert contents(finished[0]) == before
@@ -114,7 +117,7 @@ def test_a_new_horizon_is_used_and_kept(copied):
 @pytest.mark.parametrize("name", ["mode_1.safetensors", "arcs/start0_hyrl_q1.npz"])
 def test_a_stage_that_was_cut_off_is_not_done(name, copied):
     (copied / name).unlink()
-    again = call("run", "unit_circle", "--preset", "smoke", "--out", copied)
+    again = call("run", "unit_circle", *SMOKE, "--out", copied)
     assert_has_ended(again)
     stage = "retrain" if name.startswith("mode") else "simulate"
     assert f"{stage}: done before" not in again.stdout
@@ -127,7 +130,7 @@ def test_a_run_without_a_critical_set_has_one_mode_and_leaves_nothing_of_two(cop
     none = replace(run.critical_set, points=np.empty((0, 1)), component=np.zeros(0, dtype=int))
     with run.stage("critical-set"):
         none.save(copied / "critical_set.npz")
-    again = call("run", "unit_circle", "--preset", "smoke", "--out", copied)
+    again = call("run", "unit_circle", *SMOKE, "--out", copied)
     assert_has_ended(again)
     assert "no critical set found" in again.stdout
     assert "extended set everything" in again.stdout
@@ -135,7 +138,7 @@ def test_a_run_without_a_critical_set_has_one_mode_and_leaves_nothing_of_two(cop
     assert hyrl_mj.load_run(copied).controller.modes == (0,)
     left = {p.name for p in [*copied.glob("mode_*"), *(copied / "arcs").iterdir()]}
     assert not {n for n in left if "critical" in n or "1." in n.replace("start1", "")}
-    again = call("run", "unit_circle", "--preset", "smoke", "--out", copied)
+    again = call("run", "unit_circle", *SMOKE, "--out", copied)
     assert again.stdout.count("done before") == len(STAGES)
 
 
@@ -343,9 +346,9 @@ def test_a_folder_that_is_no_run(tmp_path):
 
 
 def test_other_settings_do_not_overwrite_a_run(finished):
-    done = call("run", "unit_circle", "--preset", "smoke", "--seed", "7", "--out", finished[0])
+    done = call("run", "unit_circle", *SMOKE, "--seed", "7", "--out", finished[0])
     assert_one_sentence(done, "seed: 0 there, 7 given")
-    done = call("run", "unit_circle", "--preset", "smoke", "--eps", "0.2", "--out", finished[0])
+    done = call("run", "unit_circle", *SMOKE, "--eps", "0.2", "--out", finished[0])
     assert_one_sentence(done, "eps: 0.1 there, 0.2 given")
 
 
@@ -382,8 +385,7 @@ def test_without_gl_the_run_is_whole_and_says_why_there_is_no_video(copied):
             "hyrl_mj.cli",
             "run",
             "unit_circle",
-            "--preset",
-            "smoke",
+            *SMOKE,
             "--out",
             copied,
         ],

@@ -17,18 +17,29 @@ import numpy as np
 import pytest
 
 import hyrl_mj
-from hyrl_mj import BadArtifact, BadInput, artifacts, cores, mjcf, pipeline, progress, sweeps
+from hyrl_mj import (
+    BadArtifact,
+    BadInput,
+    NoRenderer,
+    artifacts,
+    cores,
+    mjcf,
+    pipeline,
+    progress,
+    sweeps,
+)
 from hyrl_mj.learning import changed, preset
 from hyrl_mj.pipeline import cluster, report
 from hyrl_mj.pipeline.board import Board
 from hyrl_mj.policies import PolicyController
+from hyrl_mj.run_directory import Run, write_config
 from hyrl_mj.stages import Regions, episodes, noisy_episodes
 from hyrl_mj.sweeps import DONE, Common, Row, Setting, Sweep
 from hyrl_mj.viz import commands, sweep_tables
 
 CIRCLE = Setting("unit_circle", "", 0.1)
 # Runs of some seconds, without pictures that can be seen.
-TINY = {"stage1.samples": 4096, "stage6.samples": 4096, "lattice": 120, "cells": 240}
+TINY = {"stage1.samples": 4096, "stage6.samples": 4096, "lattice": 130, "cells": 240}
 SMOKE = {"preset": "smoke", "set": TINY}
 
 
@@ -272,6 +283,16 @@ def swept(tmp_path_factory):
     return out, result, said, addresses
 
 
+def unfinished(swept, folder):
+    """A copy of the sweep whose runs have still to render and to write their pages."""
+    shutil.copytree(swept[0], folder)
+    for run in folder.glob("unit_circle-*"):
+        for name in ("replay.mp4", "report.html"):
+            (run / name).unlink(missing_ok=True)
+    Sweep(Common("smoke", None, TINY), tuple(Row(CIRCLE, seed) for seed in (0, 1))).save(folder)
+    return folder
+
+
 @pytest.mark.slow
 def test_a_changed_setting_stands_in_the_run_and_in_the_message_about_another(swept):
     run = hyrl_mj.load_run(swept[0] / "unit_circle-0.1-0")
@@ -293,7 +314,11 @@ def test_nobody_else_can_reach_it(swept):
 
 
 @pytest.mark.slow
-def test_a_sweep_makes_the_runs_that_are_made_one_by_one(swept, tmp_path):
+def test_a_sweep_makes_the_runs_that_are_made_one_by_one(swept, tmp_path, monkeypatch):
+    def no_renderer(*arguments, **options):
+        raise NoRenderer("no GL library here")
+
+    monkeypatch.setattr("hyrl_mj.viz.replay.render_replay", no_renderer)
     out, result, said, _ = swept
     assert [row.state for row in result.rows] == [DONE, DONE]
     assert any("unit_circle-0.1-1" in line and "retrain" in line for line in said)
@@ -329,10 +354,9 @@ def test_what_is_done_is_not_done_again_and_tables_are_made_from_what_is_there(s
 
 
 @pytest.mark.slow
-def test_a_run_that_fails_does_not_stop_the_others(tmp_path):
-    broken = tmp_path / "sweep" / "unit_circle-0.1-0"
-    rows = [Row(CIRCLE, seed) for seed in (0, 1)]
-    Sweep(Common("smoke", None, TINY), tuple(rows)).save(tmp_path / "sweep")
+def test_a_run_that_fails_does_not_stop_the_others(swept, tmp_path):
+    broken = unfinished(swept, tmp_path / "sweep") / "unit_circle-0.1-0"
+    shutil.rmtree(broken)
     broken.write_text("a file where the run directory should be")
     result = hyrl_mj.sweep("unit_circle", seeds=(0, 1), out=tmp_path / "sweep", say=str, **SMOKE)
     assert [row.state for row in result.rows] == ["stopped", DONE]
@@ -365,7 +389,8 @@ def raylet_of_workers():
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="Ray has no clusters elsewhere, nor /proc")
-def test_a_cluster_of_two_machines_makes_runs_on_both(tmp_path):
+def test_a_cluster_of_two_machines_makes_runs_on_both(swept, tmp_path):
+    unfinished(swept, tmp_path / "sweep")
     pipe = subprocess.PIPE
     with subprocess.Popen(
         [sys.executable, "-c", RAYLETS], stdin=pipe, stdout=pipe, text=True
@@ -486,7 +511,11 @@ def test_modes_are_the_same_with_a_pool(doubled, tmp_path):
     task.write_text(LOPSIDED)
     shutil.copytree(mjcf.models_dir(), tmp_path, dirs_exist_ok=True)
     (tmp_path / "unit_circle.xml").rename(tmp_path / "lopsided.xml")
-    plain = hyrl_mj.run(task, out=tmp_path / "plain", say=str, **SMOKE)
+    plain = Run(tmp_path / "plain", changed(preset(hyrl_mj.get_task(task), "smoke"), TINY))
+    plain.path.mkdir()
+    write_config(plain)
+    for stage in ("train", "critical-set", "partition", "extended-sets", "retrain"):
+        plain = pipeline.run_stage(plain, stage, str)
     pooled = hyrl_mj.load_run(shutil.copytree(plain.path, tmp_path / "pooled"))
     (pooled.path / "mode_0.safetensors").unlink()
     with hyrl_mj.using_pool(doubled):

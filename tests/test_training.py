@@ -118,7 +118,7 @@ from pathlib import Path
 import hyrl_mj
 from hyrl_mj.learning import preset, training
 
-training.CHECKPOINTS, training.EPISODES = 2, 64
+training.CHECKPOINTS, training.EPISODES = 2, 16
 for name, algorithm, samples in (
     ("unit_circle", "ppo", 4096), ("vehicle", "dqn", 2600), ("unit_circle", "sac", 1500)
 ):

@@ -16,6 +16,7 @@ from matplotlib.mathtext import MathTextParser
 
 import hyrl_mj.learning.settings as settings
 import hyrl_mj.learning.training as training
+import hyrl_mj.proof.examination as examination
 import hyrl_mj.stages.results as results
 import hyrl_mj.viz.figures.style as style
 import hyrl_mj.viz.replay as replay
@@ -23,7 +24,8 @@ from hyrl_mj import cli
 from hyrl_mj.tasks.unit_circle import UnitCircle
 from hyrl_mj.viz.figures import FIGURES
 
-SIZE, FPS, LATTICE = (480, 160), 2, 120
+SIZE, FPS = (480, 160), 2
+LATTICE = 130  # about the least with cells no longer than a sample on the circle
 KEPT = {"extended_sets", "robustness_map"}  # of the figures
 # Set where the program has to run without the rights of root, in a folder that cannot be written.
 NOBODY = "ATTACK_AS_NOBODY"
@@ -65,6 +67,7 @@ def shorten() -> None:
     settings._PPO.options["n_steps"] = 8  # the least samples that are trained on are envs x n_steps
     settings._SMOKE |= {"ppo": 1_024, "dqn": 3_000}
     settings._SMOKE_MODES = 1_024
+    examination.CURVE = examination.CURVE[::8]
     training.CHECKPOINTS, training.EPISODES, results.EPISODES = 2, 64, 64
     style.DPI = 30
     style.STYLE["pdf.fonttype"] = 3
