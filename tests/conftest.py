@@ -77,6 +77,18 @@ def planted_circle(tmp_path_factory):
     return run, said
 
 
+@pytest.fixture(scope="module")
+def few_cells():
+    """While the tests of a file run, the game of a smoke run on the circle has few cells."""
+    from planted import FEW_CELLS
+
+    from hyrl_mj.learning import settings
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(settings._LATTICE_SMOKE, 1, FEW_CELLS["lattice"])
+        yield
+
+
 # The files that take longest, in this order, each more than half a minute.
 LONGEST = ("docs", "demo", "sweep", "cli", "attack", "robustify", "surroundings", "algorithms")
 LONGEST += ("training", "retraining", "any_robot")

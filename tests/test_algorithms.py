@@ -10,6 +10,7 @@ import pytest
 import hyrl_mj
 from hyrl_mj import BadInput, cli
 from hyrl_mj.envs.core import BatchedEnv
+from hyrl_mj.learning import training
 from hyrl_mj.learning.settings import PRESETS, preset
 from hyrl_mj.learning.training import build, check_foreign, evaluate, export, threads, train
 from hyrl_mj.policies import ALGORITHMS, algorithms
@@ -161,7 +162,9 @@ def test_it_trains_a_policy_that_answers_as_sb3_does(algorithm, name):
 
 @pytest.mark.parametrize(("algorithm", "name"), [c for c in CAN if c[0] not in ("ppo", "dqn")])
 @pytest.mark.slow
-def test_the_seed_fixes_the_policy(algorithm, name):
+def test_the_seed_fixes_the_policy(algorithm, name, monkeypatch):
+    monkeypatch.setattr(training, "CHECKPOINTS", 2)
+    monkeypatch.setattr(training, "EPISODES", 64)
     task = hyrl_mj.get_task(name)
     first, again, other = (train(task, quick(task, algorithm), seed).weights for seed in (4, 4, 5))
     assert first.keys() == again.keys()
@@ -327,7 +330,7 @@ def test_a_whole_run_names_its_algorithm_and_keeps_to_it(tmp_path, monkeypatch, 
                 raise
         return capsys.readouterr().out
 
-    whole = ("run", "unit_circle", "--preset", "smoke", "--out", out)
+    whole = ("run", "unit_circle", "--preset", "smoke", "--set", "lattice=130", "--out", out)
     said = hyrl(*whole, "--algorithm", "td3")
     assert "policy (TD3)" in said
     settings = json.loads((out / "config.json").read_text())["settings"]

@@ -10,6 +10,8 @@ import hyrl_mj
 from hyrl_mj import HybridArc, NoRenderer
 from hyrl_mj.viz import diagnosis
 
+pytestmark = pytest.mark.slow  # a diagnosis of each task
+
 EPS = 0.1
 PLANTED = {"unit_circle": homing_policy, "vehicle": sign_policy}
 
@@ -18,9 +20,7 @@ def no_renderer(*arguments, **options):
     raise NoRenderer("no GL library here")
 
 
-@pytest.fixture(
-    scope="module", params=["unit_circle", pytest.param("vehicle", marks=pytest.mark.slow)]
-)
+@pytest.fixture(scope="module", params=["unit_circle", "vehicle"])
 def diagnosed(request, tmp_path_factory):
     """The diagnosis of a policy that decides at pi, or on y = 0: the run, and what was said.
 

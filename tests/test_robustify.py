@@ -93,7 +93,7 @@ def robust(dqn, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def circle_run(tmp_path_factory):
+def circle_run(few_cells, tmp_path_factory):
     """A whole run on a function."""
     path = tmp_path_factory.mktemp("runs") / "circle"
     return hyrl_mj.robustify("unit_circle", off_centre, out=path, **SMOKE)
@@ -229,7 +229,7 @@ def test_another_agent_does_not_overwrite_a_run(circle_run):
     assert contents(circle_run.path) == before
 
 
-def test_an_onnx_file_is_kept_in_the_run(circle, tmp_path):
+def test_an_onnx_file_is_kept_in_the_run(few_cells, circle, tmp_path):
     path = onnx_file(tmp_path, np.array([[0.0, -9.0]]), np.zeros(1))
     run = hyrl_mj.diagnose("unit_circle", path, out=tmp_path / "run", **SMOKE)
     assert run.critical_set.points == pytest.approx(np.pi, abs=0.05)
@@ -292,7 +292,7 @@ def test_episodes_stand_in_for_the_game_where_the_policy_draws(circle, tmp_path)
         noisy_arcs(run, np.zeros((1, 1)), "worst")
 
 
-def test_without_a_critical_set_one_policy_is_trained_under_noise(circle, tmp_path):
+def test_without_a_critical_set_one_policy_is_trained_under_noise(few_cells, tmp_path):
     said = []
     run = hyrl_mj.robustify("unit_circle", one_way, out=tmp_path, preset="smoke", say=said.append)
     assert any("no critical set found at this resolution (grid " in line for line in said)
