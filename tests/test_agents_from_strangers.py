@@ -284,7 +284,7 @@ def test_an_agent_of_another_number_of_levels_is_refused(vehicle, tmp_path):
     path = saved(untrained(DQN, vehicle, net_arch=[8]), tmp_path)
     space = json.loads(members(path)["data"])["action_space"]
     with_metadata(path, action_space=space | {"n": "7"})
-    refused(path, vehicle, "chooses among 7 levels of the input, vehicle has 5")
+    refused(path, vehicle, "chooses among 7 levels, vehicle has 5")
 
 
 def test_sbx_is_named(agent, circle):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 from dataclasses import replace
 
@@ -40,7 +41,8 @@ def stages_done(run):
 
 
 def test_a_run_goes_on_where_it_was_left(planted_circle):
-    run, said = planted_circle
+    run, (plan, *said) = planted_circle
+    assert re.fullmatch(r"the run will be examined by the worst-case game on \d+ nodes", plan)
     stages = [line.partition(":")[0] for line in said]
     assert list(dict.fromkeys(stages)) == NAMES
     assert said[:5] == [f"{name}: done before" for name in NAMES[:5]]
