@@ -73,10 +73,36 @@ def examine(
     Lattice.check(task, grid)
     largest = max(bounds) if task.chart.dimension > 2 else max(*bounds, LARGEST)
     fine = Game(task, parts, controllers, largest, everywhere, grid)
-    certificate = Certificate.of(fine, controllers)
     names = [*controllers, LIMIT]
+    scores, maps, has_cells, why_not = _scores(fine, names, controllers, bounds)
+    if fine.lattice.estimate:  # a coarser lattice would estimate nothing
+        coarse, margins = fine, dict.fromkeys(controllers)
+        curve, profile = _known(bounds, scores), Profile((), dict.fromkeys(names, ()))
+    else:
+        coarse = Game(task, parts, controllers, LARGEST, everywhere, curve_grid(task, cells))
+        curve, profile = _sweep(Certificate.of(coarse, controllers), names, points)
+        likely = [(name, _last_won(curve, curve.wins[name])) for name in controllers]
+        margins = dict(zip(controllers, _in_threads("margins", fine.margin, likely), strict=True))
+    spacing, curve_spacing = (tuple(g.lattice.grid.spacing.tolist()) for g in (fine, coarse))
+    lattice = LatticeSpacing(spacing, fine.lattice.exact, has_cells, curve_spacing)
+    proved = {name: _proved_margin(curve, curve.wins[name]) for name in controllers}
+    misses = _misses(coarse, controllers)
+    result = GameResult(
+        everywhere, lattice, scores, margins, proved, why_not, misses, curve, profile
+    )
+    return result, maps
+
+
+def _scores(
+    game: Game,
+    names: list[str],
+    controllers: Mapping[str, Controller],
+    bounds: tuple[float, ...],
+) -> tuple[dict[str, tuple[Score, ...]], Maps, bool, dict[str, str]]:
+    """Returns scores and maps, whether there are cells, and what stopped a proof, by controller."""
+    certificate = Certificate.of(game, controllers)
     games = [(name, eps) for eps in bounds for name in names]
-    results = list(_in_threads("worst-case scores", fine.score, games))
+    results = list(_in_threads("worst-case scores", game.score, games))
     tried = [(certificate, name, controllers[name], eps) for name, eps in games if name != LIMIT]
     broken = dict(
         zip([g for g in games if g[0] != LIMIT], _in_threads("attacks", attack, tried), strict=True)
@@ -89,24 +115,8 @@ def examine(
         for i, name in enumerate(names)
     }
     classes = {name: _map(certificate, name, bounds[-1]) for name in controllers}
-    maps = Maps(bounds[-1], np.array(grid.counts), classes)
-    if fine.lattice.estimate:  # a coarser lattice would estimate nothing
-        coarse, margins = fine, dict.fromkeys(controllers)
-        curve, profile = _known(bounds, scores), Profile((), dict.fromkeys(names, ()))
-    else:
-        coarse = Game(task, parts, controllers, LARGEST, everywhere, curve_grid(task, cells))
-        curve, profile = _sweep(Certificate.of(coarse, controllers), names, points)
-        likely = [(name, _last_won(curve, curve.wins[name])) for name in controllers]
-        margins = dict(zip(controllers, _in_threads("margins", fine.margin, likely), strict=True))
-    spacing, curve_spacing = (tuple(g.lattice.grid.spacing.tolist()) for g in (fine, coarse))
-    has_cells = certificate.cells is not None
-    lattice = LatticeSpacing(spacing, fine.lattice.exact, has_cells, curve_spacing)
-    proved = {name: _proved_margin(curve, curve.wins[name]) for name in controllers}
-    misses, why_not = _misses(coarse, controllers), dict(certificate.why_not)
-    result = GameResult(
-        everywhere, lattice, scores, margins, proved, why_not, misses, curve, profile
-    )
-    return result, maps
+    maps = Maps(bounds[-1], np.array(game.lattice.grid.counts), classes)
+    return scores, maps, certificate.cells is not None, dict(certificate.why_not)
 
 
 def _score(certificate: Certificate, name: str, nodes: NodeScore, broken: Broken | None) -> Score:
