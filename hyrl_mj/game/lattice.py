@@ -110,9 +110,10 @@ class Lattice:
             )
         if grid is None:
             return None
-        if transitions(task, grid, probed_hops(task)) > MOST_TRANSITIONS:
+        hops = probed_hops(task)
+        if transitions(task, grid, hops) > MOST_TRANSITIONS:
             return f"a lattice of {len(grid.nodes):,} nodes with all inputs does not fit into the memory"
-        if not resolves(task, grid):
+        if not resolves(grid, hops):
             pairs = zip(grid.spacing, task.chart.units, strict=True)
             sides = " by ".join(f"{side:.3g} {unit}" for side, unit in pairs)
             return (

@@ -13,7 +13,7 @@ from hyrl_mj.tasks import Task
 
 # Cells along the longest side of the game's lattice, by the dimension of the chart.
 LATTICE = {1: 12_000, 2: 480, 3: 160}
-# The most cells where the game is played many times, or for an estimate.
+# The most cells where the game is played many times.
 CURVE_CELLS = {1: 3_000, 2: 240, 3: 80}
 # Transitions of the lattice that is chosen: the whole game takes up to 200 bytes for each. A lattice that
 # is asked for may have twice as many.
@@ -61,7 +61,7 @@ def lattice_grid(task: Task, cells: int = 0, most: int | None = None) -> Grid:
 def curve_grid(task: Task, cells: int = 0) -> Grid:
     """Returns the nodes of a lattice of at most `CURVE_CELLS`, of more where a sample is too short for it."""
     coarse = lattice_grid(task, cells, CURVE_CELLS[task.chart.dimension])
-    return coarse if resolves(task, coarse) else lattice_grid(task, cells)
+    return coarse if resolves(coarse, probed_hops(task)) else lattice_grid(task, cells)
 
 
 def probed_hops(task: Task) -> np.ndarray:
@@ -89,9 +89,9 @@ def longest(hops: np.ndarray) -> np.ndarray:
     return np.asarray(np.abs(hops).reshape(-1, hops.shape[-1]).max(axis=0))
 
 
-def resolves(task: Task, grid: Grid) -> bool:
+def resolves(grid: Grid, hops: np.ndarray) -> bool:
     """Returns whether one sample can move the robot by a cell: otherwise rounding holds it in its place."""
-    return bool((longest(probed_hops(task)) >= grid.spacing * (1 - 1e-6)).any())
+    return bool((longest(hops) >= grid.spacing * (1 - 1e-6)).any())
 
 
 def level_counts(task: Task, grid: Grid, hops: np.ndarray) -> tuple[int, ...]:
