@@ -25,6 +25,8 @@ class Chart:
         low, high: (d,) ends of the charted box; for a periodic coordinate one period.
         periodic: (d,) whether a coordinate lives on a circle.
         section: of a chart that is cut out of a larger one, where: "heading = 0 rad".
+        scale: (d,) by how much a coordinate changes over a distance of one: all distances are between points
+            divided by it. By default 1 each. Sensible is the share of the noise bound that acts on it.
     """
 
     names: tuple[str, ...]
@@ -33,6 +35,11 @@ class Chart:
     high: tuple[float, ...]
     periodic: tuple[bool, ...]
     section: str = ""
+    scale: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not len(self.scale):
+            object.__setattr__(self, "scale", (1.0,) * len(self.names))
 
     @property
     def dimension(self) -> int:
@@ -48,6 +55,11 @@ class Chart:
         """Length of the charted box along each coordinate (d,)."""
         return np.subtract(self.high, self.low)
 
+    @cached_property
+    def scaled_sides(self) -> np.ndarray:
+        """Length of the charted box along each coordinate (d,), in scaled units."""
+        return self.sides / self.scale
+
     def wrap(self, z: np.ndarray) -> np.ndarray:
         """Returns points (n, d) with periodic coordinates brought into [low, high); z itself without any."""
         if not any(self.periodic):
@@ -61,6 +73,10 @@ class Chart:
         """Returns a - b (n, d), the short way round in periodic coordinates."""
         delta = np.subtract(a, b)
         return np.where(self.periodic, delta - self.sides * np.round(delta / self.sides), delta)
+
+    def distance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Returns how far points a and b (..., d) are apart (...), the short way round, in scaled units."""
+        return np.asarray(np.linalg.norm(self.difference(a, b) / self.scale, axis=-1))
 
     def near(self, z: np.ndarray, to: np.ndarray) -> np.ndarray:
         """Returns points z (n, d) with periodic coordinates brought next to points `to` (n, d)."""
@@ -101,16 +117,19 @@ class Chart:
         return z
 
     def tree(self, points: np.ndarray) -> cKDTree:
-        """Returns a search tree of points (n, d) that heeds the periods; query it with `in_box` points."""
+        """Returns a search tree of points (n, d) that heeds periods and scale; query it with `in_box`."""
         from scipy.spatial import cKDTree  # slow to import
 
         # Coordinates that are not periodic get a box so large that its other side is never near.
-        size = np.where(self.periodic, self.sides, 1e6 * self.sides)
+        size = np.where(self.periodic, self.scaled_sides, 1e6 * self.scaled_sides)
         return cKDTree(self.in_box(points), boxsize=size)
 
     def in_box(self, z: np.ndarray) -> np.ndarray:
-        """Returns points (n, d) in the coordinates of `tree`, which are never negative."""
-        return self.wrap(z) - self.origin + np.where(self.periodic, 0.0, 1e3 * self.sides)
+        """Returns points (n, d) in the coordinates of `tree`, which are scaled and never negative."""
+        inside = self.wrap(z) - self.origin + np.where(self.periodic, 0.0, 1e3 * self.sides)
+        turned = inside / self.scale
+        # Rounding may bring a point just below a period onto it.
+        return np.where(self.periodic & (turned >= self.scaled_sides), 0.0, turned)
 
     def format(self, z: np.ndarray) -> str:
         """Returns the text of a point (d,): "x = 0.1 m, y = -0.2 m"."""

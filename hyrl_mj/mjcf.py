@@ -1,5 +1,6 @@
 """MJCF models: compiles them and reads their geometry, so that it is written down nowhere else."""
 
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
@@ -8,6 +9,9 @@ import numpy as np
 
 from hyrl_mj import mujoco_log
 from hyrl_mj.errors import BadInput, unknown
+
+# Positions (n, nq) of the joints -> positions (n, k, 3) [m] or poses (n, k, 7) of the mocap bodies.
+Mocap = Callable[[np.ndarray], np.ndarray]
 
 # The version of MuJoCo that computes wrong constraint forces where the Jacobian is sparse.
 WRONG_VERSION = "4.0.0"
@@ -88,9 +92,29 @@ def geom_pos(model: mujoco.MjModel, name: str) -> np.ndarray:
     return model.geom_pos[object_id(model, mujoco.mjtObj.mjOBJ_GEOM, name)].copy()
 
 
+def geom_positions(model: mujoco.MjModel, ids: list[int]) -> np.ndarray:
+    """Returns the positions of geoms (k,) in the world, with all joints at their references: (k, 3) [m]."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    return data.geom_xpos[ids].copy()
+
+
+def geoms_move(model: mujoco.MjModel, ids: list[int]) -> bool:
+    """Returns whether one of the geoms (k,) can move: by a joint, or with a mocap body."""
+    bodies = model.geom_bodyid[ids]
+    driven = model.body_mocapid[model.body_rootid[bodies]] >= 0
+    return bool((driven | (model.body_weldid[bodies] != 0)).any())
+
+
 def geom_size(model: mujoco.MjModel, name: str) -> np.ndarray:
     """Returns the sizes of a geom, for a cylinder (radius, half height, 0): (3,) [m]."""
     return model.geom_size[object_id(model, mujoco.mjtObj.mjOBJ_GEOM, name)].copy()
+
+
+def obstacles(model: mujoco.MjModel) -> list[str]:
+    """Returns the names of the obstacles: all geoms whose names begin with "obstacle"."""
+    kind = mujoco.mjtObj.mjOBJ_GEOM
+    return [name for name in names(model, kind) if name.startswith("obstacle")]
 
 
 def numeric(model: mujoco.MjModel, name: str, size: int) -> np.ndarray:
@@ -106,6 +130,49 @@ def numeric(model: mujoco.MjModel, name: str, size: int) -> np.ndarray:
             f"numeric {name} of {model_name(model)} has {count} value(s): give it {size}"
         )
     return np.array(model.numeric_data[first : first + size])
+
+
+def mocap_poses(model: mujoco.MjModel, mocap: Mocap, qpos: np.ndarray) -> np.ndarray:
+    """Returns the poses (n, k, 7) of the k mocap bodies at positions qpos (n, nq) of the joints.
+
+    A pose is a position [m] and a quaternion; bodies of which only positions are given keep their
+    orientation.
+
+    Raises:
+        BadInput: a wrong shape, or a value that is not finite.
+    """
+    poses = np.asarray(mocap(qpos), dtype=float)
+    shapes = [(len(qpos), model.nmocap, columns) for columns in (3, 7)]
+    if poses.shape not in shapes:
+        raise BadInput(
+            f"mocap() gives shape {poses.shape}, and {model_name(model)} has {model.nmocap} mocap body(s): "
+            f"give their positions, {shapes[0]}, or their poses, {shapes[1]}"
+        )
+    if not np.isfinite(poses).all():
+        row = int(np.argwhere(~np.isfinite(poses))[0][0])
+        raise BadInput(f"mocap() gives {poses[row].tolist()} at qpos {qpos[row].tolist()}")
+    if poses.shape[2] == 3:
+        turned = np.broadcast_to(mocap_frames(model)[:, 3:], (*poses.shape[:2], 4))
+        poses = np.concatenate([poses, turned], axis=2)
+    return poses
+
+
+def mocap_frames(model: mujoco.MjModel) -> np.ndarray:
+    """Returns the poses (k, 7) that the MJCF gives the mocap bodies."""
+    bodies = np.flatnonzero(model.body_mocapid >= 0)
+    bodies = bodies[np.argsort(model.body_mocapid[bodies])]
+    return np.hstack([model.body_pos[bodies], model.body_quat[bodies]])
+
+
+def place(
+    model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray, mocap: Mocap | None = None
+) -> None:
+    """Puts all bodies where they are at positions qpos (nq,) of the joints."""
+    data.qpos[:] = qpos
+    if model.nmocap and mocap is not None:
+        poses = mocap_poses(model, mocap, np.asarray(qpos, dtype=float)[None])[0]
+        data.mocap_pos[:], data.mocap_quat[:] = poses[:, :3], poses[:, 3:]
+    mujoco.mj_kinematics(model, data)
 
 
 def sample_time(model: mujoco.MjModel) -> float:

@@ -32,6 +32,8 @@ class Plant:
         n: number of copies.
         threads: threads of the physics, 0 for all cores. Results do not depend on it.
         measure: computes the measurement from the sensor values; by default the sensor values.
+        mocap: computes the poses of the mocap bodies from the positions of the joints, see
+            `mjcf.mocap_poses`, at every physics step; by default they stay where the MJCF puts them.
         control: inner loop that computes the controls of all actuators from u and the true state, at every
             physics step; they are clipped to each actuator's ctrlrange. `inputs` are then names of MJCF
             numerics that hold the limits of u.
@@ -49,11 +51,13 @@ class Plant:
         *,
         measure: Measure = lambda sensors: sensors,
         control: Control | None = None,
+        mocap: mjcf.Mocap | None = None,
     ):
         if problem := mjcf.wrong_physics(model):
             raise BadInput(problem)
         n = Integer(1, MOST).checked("the number of copies of a robot", n)
         self.n, self._threads, self._measure, self._control = n, threads, measure, control
+        self._mocap = mocap if model.nmocap else None
         self.model = copy.copy(model)
         # A bad state has to stay visible: MuJoCo would reset it and only count a warning. Inputs are
         # checked here, and clamping would prevent backward steps.
@@ -73,6 +77,7 @@ class Plant:
         if self._joints is None:
             self._stage = mujoco.mjtStage(int(self.model.sensor_needstage.max()))
         self._open()
+        self._drive(np.arange(n))
         self._initial = self._batch.state[0].copy()
 
     def _open(self, state: np.ndarray | None = None) -> None:
@@ -84,15 +89,20 @@ class Plant:
         forked.own(self._batch)
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._ctrl = self._batch.bind("ctrl")
+        self._mocap_pos, self._mocap_quat = map(self._batch.bind, ("mocap_pos", "mocap_quat"))
+        self._geom_positions: np.ndarray | None = None
         if self._joints is None:
             self._sensors = self._batch.bind("sensordata")
         if state is not None:
             self._batch.state[:] = state
-            if self._joints is None:
+            if self._stage != mujoco.mjtStage.mjSTAGE_NONE:
                 self._batch.forward(None, self._stage)
 
     def __getstate__(self) -> dict[str, Any]:
-        of_batch = ("_batch", "_qpos", "_qvel", "_ctrl", "_sensors")
+        of_batch = (
+            "_batch", "_qpos", "_qvel", "_ctrl", "_sensors", "_mocap_pos", "_mocap_quat",
+            "_geom_positions",
+        )  # fmt: skip
         return {k: v for k, v in vars(self).items() if k not in of_batch} | {"_state": self.state}
 
     def __setstate__(self, values: dict[str, Any]) -> None:
@@ -135,6 +145,18 @@ class Plant:
         """MuJoCo's whole state, rows of `mjSTATE_INTEGRATION`: (n, nstate), a copy."""
         return self._batch.state.copy()
 
+    def geom_positions(self, ids: Sequence[int]) -> np.ndarray:
+        """Returns the positions of geoms in the world: (n, k, 3) [m], or (1, k, 3) if none of them moves."""
+        ids = list(ids)
+        if not mjcf.geoms_move(self.model, ids):
+            return mjcf.geom_positions(self.model, ids)[None]
+        if self._geom_positions is None:  # from now on they are computed after each step
+            self._geom_positions = self._batch.bind("geom_xpos")
+            if self._stage == mujoco.mjtStage.mjSTAGE_NONE:
+                self._stage = mujoco.mjtStage.mjSTAGE_POS
+            self._batch.forward(None, self._stage)
+        return self._geom_positions[:, ids]
+
     def set_state(
         self, qpos: np.ndarray, qvel: np.ndarray | None = None, ids: np.ndarray | None = None
     ) -> None:
@@ -157,7 +179,8 @@ class Plant:
         self._qpos[rows], self._qvel[rows] = qpos, qvel
         self._ctrl[rows] = self._held
         self._unstable[rows] = False
-        if self._joints is None:
+        self._drive(rows)
+        if self._stage != mujoco.mjtStage.mjSTAGE_NONE:
             self._batch.forward(ids, self._stage)
 
     def step(self, u: np.ndarray, ids: np.ndarray | None = None) -> None:
@@ -217,29 +240,36 @@ class Plant:
 
     def _sample(self, u: np.ndarray, ids: np.ndarray | None, sign: int = 1) -> None:
         """Advances the copies by one sample under checked inputs; sign -1 reverses all controls."""
-        if self._control is None:
-            self._advance(sign * self._controls(u), ids, self.substeps)
+        if self._control is None and self._mocap is None:
+            self._advance(sign * self._controls(u, ids), ids, self.substeps)
             return
-        rows = self._rows(ids)
         for left in reversed(range(self.substeps)):
-            ctrl = self._control(u, self._qpos[rows], self._qvel[rows])
-            ctrl = _checked("control", ctrl, self.model.nu, rows)
-            ctrl = sign * np.clip(ctrl, self._ctrl_low, self._ctrl_high)
-            self._advance(ctrl, ids, 1, sense=not left)
+            self._advance(sign * self._controls(u, ids), ids, 1, sense=not left)
 
-    def _controls(self, u: np.ndarray) -> np.ndarray:
+    def _controls(self, u: np.ndarray, ids: np.ndarray | None) -> np.ndarray:
         """Returns the controls of all actuators (k, nu) for inputs (k, m)."""
-        ctrl = np.tile(self._held, (len(u), 1))
-        ctrl[:, self._columns] = u
-        return ctrl
+        if self._control is None:
+            ctrl = np.tile(self._held, (len(u), 1))
+            ctrl[:, self._columns] = u
+            return ctrl
+        rows = self._rows(ids)
+        ctrl = self._control(u, self._qpos[rows], self._qvel[rows])
+        ctrl = _checked("control", ctrl, self.model.nu, rows)
+        return np.clip(ctrl, self._ctrl_low, self._ctrl_high)
+
+    def _drive(self, rows: np.ndarray) -> None:
+        """Puts the mocap bodies of the copies `rows` (k,) where their joints' positions say."""
+        if self._mocap is not None:
+            poses = mjcf.mocap_poses(self.model, self._mocap, self._qpos[rows])
+            self._mocap_pos[rows], self._mocap_quat[rows] = poses[..., :3], poses[..., 3:]
 
     def _advance(
         self, ctrl: np.ndarray, ids: np.ndarray | None, substeps: int, sense: bool = True
     ) -> None:
         self._ctrl[self._rows(ids)] = ctrl
-        # Sensors are computed only where they will be read.
-        stage = self._stage if sense else mujoco.mjtStage.mjSTAGE_NONE
-        self._batch.step(ids, substeps, stage)
+        # Sensors are computed only where they will be read, and after the mocap bodies have moved.
+        sense_now = sense and self._mocap is None
+        self._batch.step(ids, substeps, self._stage if sense_now else mujoco.mjtStage.mjSTAGE_NONE)
         mujoco_log.say()
         # MuJoCo's own criterion of a bad state: NaN, infinite, or beyond mjMAXVAL.
         for values in (self._qpos, self._qvel):
@@ -248,8 +278,12 @@ class Plant:
                 bad = np.flatnonzero(~valid.all(axis=1))
                 self._unstable[bad] = True
                 self._batch.state[bad] = self._initial
-                if self._joints is None:
+                if self._stage != mujoco.mjtStage.mjSTAGE_NONE:
                     self._batch.forward(bad, self._stage)
+        if self._mocap is not None:
+            self._drive(self._rows(ids))
+            if sense and self._stage != mujoco.mjtStage.mjSTAGE_NONE:
+                self._batch.forward(ids, self._stage)
 
 
 def actuator_columns(model: mujoco.MjModel, names: Sequence[str]) -> list[int]:

@@ -129,6 +129,7 @@ class SceneRenderer:
         width, height: size of the picture [pixels].
         geoms: number of geoms that the scene has room for.
         canvas: canvas of this model, at least as large; by default a new one, which takes 0.1 s.
+        mocap: where the mocap bodies are, see `mjcf.mocap_poses`; by default they stay.
 
     Raises:
         BadInput, NoRenderer: as `Canvas`.
@@ -141,7 +142,9 @@ class SceneRenderer:
         height: int,
         geoms: int = GEOMS,
         canvas: Canvas | None = None,
+        mocap: mjcf.Mocap | None = None,
     ):
+        self._mocap = mocap
         self._own, self.canvas = canvas is None, canvas or Canvas(model, width, height)
         self.model, self.width, self.height = model, width, height
         self.data = mujoco.MjData(self.model)
@@ -274,8 +277,7 @@ class SceneRenderer:
         self._shown = seen
 
     def _move(self, qpos: np.ndarray) -> None:
-        self.data.qpos[:] = qpos
-        mujoco.mj_kinematics(self.model, self.data)
+        mjcf.place(self.model, self.data, qpos, self._mocap)
         mujoco.mj_camlight(self.model, self.data)
 
 

@@ -26,7 +26,7 @@ class Config:
         versions: the versions of Python and the packages when the run began.
     """
 
-    LATER: ClassVar = ("settings.everywhere",)
+    LATER: ClassVar = ("settings.everywhere", "settings.stage1.spread", "settings.stage6.spread")
 
     settings: Settings
     versions: dict[str, str]

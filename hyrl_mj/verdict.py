@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from hyrl_mj.game import NEARLY, Robustness, Score, percent
@@ -183,8 +183,8 @@ class _Case:
             )
         given_up = [result.mode for result in self.retraining.modes if result.won < NEARLY]
         if given_up:
-            modes = " and ".join(map(self.task.scene.mode_name, given_up))
-            yield f"stage 6 gave up on mode {modes}"
+            modes = listed([self.task.mode_name(mode) for mode in given_up])
+            yield f"stage 6 gave up on mode{'s' * (len(given_up) > 1)} {modes}"
 
     def weaknesses(self) -> Iterator[str]:
         """Yields why the run is WEAK, if it is."""
@@ -280,8 +280,13 @@ def mode_sentence(task: Task, result: ModeResult) -> str:
     """Returns how well the policy of a mode holds its set."""
     trainings = f"{result.attempts} training{'' if result.attempts == 1 else 's'}"
     how = f"after {trainings}" if result.attempts else "without a training of its own"
-    mode = f"the policy of mode {task.scene.mode_name(result.mode)}"
+    mode = f"the policy of mode {task.mode_name(result.mode)}"
     won = (
         "all of its set that was tried" if result.won == 1 else f"{percent(result.won)} of its set"
     )
     return f"{mode} wins {won}, {how}"
+
+
+def listed(words: Sequence[str]) -> str:
+    """Returns "a, b and c"."""
+    return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))

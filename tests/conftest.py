@@ -82,10 +82,10 @@ def few_cells():
     """While the tests of a file run, the game of a smoke run on the circle has few cells."""
     from planted import FEW_CELLS
 
-    from hyrl_mj.learning import settings
+    from hyrl_mj.learning import presets
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(settings._LATTICE_SMOKE, 1, FEW_CELLS["lattice"])
+        patch.setitem(presets._LATTICE_SMOKE, 1, FEW_CELLS["lattice"])
         yield
 
 

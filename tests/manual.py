@@ -152,13 +152,13 @@ def run_command(words: list[str]) -> None:
 
 def shorten() -> None:
     """Shortens preset smoke further, in this process: no page shows what its policies have learned."""
-    from hyrl_mj.learning import settings
+    from hyrl_mj.learning import presets
 
-    settings._SMOKE |= {"ppo": 4_096, "dqn": 4_000, "sac": 1_500}
-    settings._SMOKE_MODES = 4_096
-    settings._GRIDS |= {1: (120, 720), 2: (60, 120)}
-    settings._GRIDS_DYNAMIC |= {2: (24, 48)}
-    settings._LATTICE_SMOKE |= {1: 130, 2: 60}
+    presets._SMOKE |= {"ppo": 4_096, "dqn": 4_000, "sac": 1_500}
+    presets._SMOKE_MODES = 4_096
+    presets._GRIDS |= {1: (120, 720), 2: (60, 120)}
+    presets._GRIDS_DYNAMIC |= {2: (24, 48)}
+    presets._LATTICE_SMOKE |= {1: 130, 2: 60}
 
 
 def run(page: Path) -> None:

@@ -174,7 +174,7 @@ def ideal_controller(task, overlap=0.15, clear=0.9):
     )
 
 
-# ---- a task with a chart of three or four dimensions
+# ---- a task with a chart of three to six dimensions
 
 CUBE = """
 <mujoco model="cube">
@@ -229,7 +229,8 @@ class Cube(Task):
 
     Args:
         level: chart points (n, d) -> (n,).
-        d: its dimension, at most 4.
+        d: its dimension, at most 6.
+        noisy: share of the noise on each coordinate; by default 1.
     """
 
     name = "cube"
@@ -237,12 +238,14 @@ class Cube(Task):
     scene = Scene(starts=(), time=0.6, mode_names=("up", "down"))
     max_steps = 12
 
-    def __init__(self, level, d=3):
-        self.level, self.noisy, names = level, (True,) * d, "abce"[:d]
+    def __init__(self, level, d=3, noisy=None):
+        self.level, self.noisy, names = level, noisy or (True,) * d, "abcefg"[:d]
         self.chart = Chart(tuple(names), ("m",) * d, (-1.0,) * d, (1.0,) * d, (False,) * d)
         self.inputs = tuple(f"v{name}" for name in names)
-        axes = ("1 0 0", "0 1 0", "0 0 1", "1 1 1")
-        joint = '<joint name="{}" type="slide" axis="{}"/>'
+        axes = ("1 0 0", "0 1 0", "0 0 1", "1 1 1", "1 -1 0", "0 1 -1")
+        # An armature keeps the inertia of joints that are not independent regular.
+        inertia = "" if d < 5 else 'armature="1" '
+        joint = '<joint name="{}" type="slide" ' + inertia + 'axis="{}"/>'
         velocity = '<velocity name="v{0}" joint="{0}" kv="1e9" ctrlrange="-1 1"/>'
         parts = {
             "JOINTS": [joint.format(name, axis) for name, axis in zip(names, axes, strict=False)],
@@ -277,6 +280,58 @@ class Cube(Task):
 
     def direction(self, path):
         return np.where(self.level(path[-1]) > self.level(path[0]), 0, 1)
+
+
+# Slope of the level in the hall, and half the height of the hall.
+TILT, HALL = np.array([1.0, 0.5, 0.0, -0.3, 0.0, 0.0]), 0.9
+
+
+def hall_level(z):
+    """A curved level (...,) of points (..., 6)."""
+    return z @ TILT + 0.3 * z[..., 4] ** 2 - 0.1 * np.sin(2 * z[..., 2]) - 0.1
+
+
+def hall_slope(z):
+    """The slope (n, 6) of the level at points (n, 6)."""
+    slope = np.tile(TILT, (len(z), 1))
+    slope[:, 4] += 0.6 * z[:, 4]
+    slope[:, 2] -= 0.2 * np.cos(2 * z[:, 2])
+    return slope
+
+
+def hall_distance(z):
+    """The distance (n,) of points (n, 6) from the level 0, to first order."""
+    return hall_level(z) / np.linalg.norm(hall_slope(z), axis=1)
+
+
+class Hall(Cube):
+    """A cube of six dimensions, three of them noisy, that is left where its level is high or low."""
+
+    name = "hall"
+
+    def __init__(self, d=6):
+        super().__init__(hall_level, d, (1.0, 1.0, 1.0, 0.0, 0.0, 0.0)[:d])
+
+    def ending(self, measurement):
+        out = np.abs(self.level(measurement)) >= HALL
+        return np.where(out, Outcome.REACHED, Outcome.RUNNING)
+
+    def verdict(self, measurement):
+        return np.full(len(measurement), Outcome.REACHED)
+
+    def direction(self, path):
+        return np.where(self.level(path[-1]) >= 0, 0, 1)
+
+
+def hall_policy(task, side=None):
+    """Up or down the level along the noisy coordinates, by its sign, or always to one side (+1 up)."""
+    along = TILT * np.array([1, 1, 1, 0, 0, 0]) / np.linalg.norm(TILT[:3])
+
+    def rule(z):
+        sign = np.where(task.level(z) >= 0, 1.0, -1.0) if side is None else np.full(len(z), side)
+        return sign[:, None] * along
+
+    return ChartPolicy(task, rule)
 
 
 def plane_policy(task, normal, parting):

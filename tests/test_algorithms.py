@@ -11,7 +11,8 @@ import hyrl_mj
 from hyrl_mj import BadInput, cli
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.learning import training
-from hyrl_mj.learning.settings import PRESETS, preset
+from hyrl_mj.learning.presets import preset
+from hyrl_mj.learning.settings import PRESETS
 from hyrl_mj.learning.training import build, check_foreign, evaluate, export, threads, train
 from hyrl_mj.policies import ALGORITHMS, algorithms
 

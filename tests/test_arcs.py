@@ -7,7 +7,7 @@ import pytest
 from planted import decisions, halves, ideal_controller, sign_policy
 
 from hyrl_mj import BadArtifact, BadInput, Run
-from hyrl_mj.learning.settings import preset
+from hyrl_mj.learning.presets import preset
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.viz.arcs import noisy_arcs, replay_arcs, replay_shows, replay_starts
 

@@ -13,6 +13,9 @@ CHARTS = {
     "line": Chart(("x",), ("m",), (-1.0,), (1.0,), (False,)),
     "ring": Chart(("theta",), ("rad",), (0.0,), (2 * PI,), (True,)),
     "tube": Chart(("theta", "y"), ("rad", "m"), (-PI, -1.0), (PI, 2.0), (True, False)),
+    "scaled": Chart(
+        ("theta", "y"), ("rad", "m"), (-PI, -1.0), (PI, 2.0), (True, False), scale=(0.5, 3)
+    ),
 }
 BOTH = st.sampled_from(list(CHARTS.values())).flatmap(
     lambda chart: st.tuples(st.just(chart), points(chart), points(chart))
@@ -44,7 +47,7 @@ def test_a_difference_leads_from_one_point_to_the_other_the_short_way(case):
 def test_its_search_tree_measures_the_short_way(case):
     chart, a, b = case
     distance, _ = chart.tree(a).query(chart.in_box(b))
-    plain = np.linalg.norm(chart.difference(b[:, None], a[None]), axis=2).min(axis=1)
+    plain = np.linalg.norm(chart.difference(b[:, None], a[None]) / chart.scale, axis=2).min(axis=1)
     np.testing.assert_allclose(distance, plain, atol=1e-9)
 
 
@@ -53,6 +56,13 @@ def test_a_periodic_coordinate_contains_every_angle(case):
     chart, z, _ = case
     inside = ((z >= chart.low) & (z <= chart.high))[:, ~np.array(chart.periodic)].all(axis=1)
     np.testing.assert_array_equal(chart.contains(z), inside)
+
+
+def test_distances_are_between_points_divided_by_the_scale():
+    chart = CHARTS["scaled"]
+    a, b = np.array([[PI - 0.1, 0.0], [0.0, 0.0]]), np.array([[0.1 - PI, 0.0], [0.0, 1.5]])
+    np.testing.assert_allclose(chart.distance(a, b), [0.4, 0.5])
+    assert CHARTS["tube"].scale == (1.0, 1.0)
 
 
 def test_a_point_is_named_with_its_units():

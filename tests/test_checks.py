@@ -36,6 +36,18 @@ ENDED, THEN = r"        return ends\n", "\n\n    def measured"
 CROSSED = r"ends\[measured\[:, 0\] >= self\.set_point\[0\]\] = Outcome\.REACHED"
 MISTAKES = {
     "no start to replay": ((PY, r"starts=\(.*\)\),? time", "starts=(), time"), "scene.starts is empty"),
+    "a chart of seven coordinates": (
+        (PY, r"Chart\(\(.*\)", 'Chart(tuple("abcdefg"), *4 * [(1,) * 7])'),
+        r"its chart has 7 coordinates \(a, b, c, d, e, f, g\): give at most 6, those in which the decision",
+    ),
+    "a scale of too few numbers": (
+        (PY, r"\(False, False\)\)", "(False, False), scale=(1,))"),
+        r"its chart has 2 name\(s\) and 1 value\(s\) of scale: give 2",
+    ),
+    "a scale of nothing": (
+        (PY, r"\(False, False\)\)", "(False, False), scale=(1, 0))"),
+        r"its chart has the scale \(1, 0\): give finite numbers > 0",
+    ),
     "a limit that is a float": ((PY, "max_steps = 70", "max_steps = 70.0"), "max_steps 70.0 cannot be"),
     "a limit of no samples": ((PY, "max_steps = 70", "max_steps = 0"), "integer from 1 to 100,000"),
     "a limit that is true": ((PY, "max_steps = 70", "max_steps = True"), "max_steps True cannot be"),

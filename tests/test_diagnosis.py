@@ -103,10 +103,12 @@ def test_what_is_said_is_on_the_page(diagnosed):
     sentences = said[first + 1 : -1]
     name = {"unit_circle": "theta", "vehicle": "y"}[run.task.name]
     unit = run.task.chart.units[-1]
+    # The game of the vehicle has nodes on y = 0, where this policy decides.
+    margin = {"unit_circle": "0.02", "vehicle": "0 m"}[run.task.name]
     for words in (
         "critical set of 1 piece",
         f"signals of noise on {name} of up to 0.1 {unit} are known that make it lose",
-        "it wins all of them up to noise 0.02",
+        f"it wins all of them up to noise {margin}",
         "under worst noise",
     ):
         assert any(words in sentence for sentence in sentences)

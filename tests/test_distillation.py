@@ -8,7 +8,7 @@ from planted import homing_policy, one_way_policy
 
 from hyrl_mj.learning import distillation
 from hyrl_mj.learning.distillation import distil, fits
-from hyrl_mj.learning.settings import preset
+from hyrl_mj.learning.presets import preset
 from hyrl_mj.learning.training import build, export
 
 

@@ -8,13 +8,14 @@ import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from runpy import run_path
 from types import ModuleType
 
 import numpy as np
 import onnxruntime
 import pytest
 from numpy import empty
-from planted import AnalyticSet, Cube, ideal_controller, random_states
+from planted import AnalyticSet, Cube, Hall, ideal_controller, random_states
 from scipy import special
 
 import hyrl_mj
@@ -23,7 +24,7 @@ from hyrl_mj.export import export
 from hyrl_mj.export.graph import write_graph
 from hyrl_mj.export.source import write_function
 from hyrl_mj.policies import ACTIVATIONS
-from hyrl_mj.sets import Everything, Grid, GridSet
+from hyrl_mj.sets import Cloud, Everything, Grid, GridSet
 from hyrl_mj.tracing import BATCH, trace
 
 RNG = np.random.default_rng
@@ -112,11 +113,12 @@ def test_batches_of_any_size(n, task, exported):
     assert_same(controller, exported(controller), random_states(task, n, RNG(2)))
 
 
-def test_three_modes_jump_to_the_deepest(circle, exported):
-    controller = planted(circle, modes=(1, 4, 7))
+@pytest.mark.parametrize("modes", [(1, 4, 7), (1, 4, 6, 9), (0, 1, 3, 7, 32)])
+def test_three_modes_and_more_jump_to_the_deepest(modes, circle, exported):
+    controller = planted(circle, modes=modes)
     _, q, after = assert_same(controller, exported(controller), random_states(circle, 2000, RNG(0)))
     assert {(a, b) for a, b in zip(q, after, strict=True) if a != b} == {
-        (a, b) for a in (1, 4, 7) for b in (1, 4, 7) if a != b
+        (a, b) for a in modes for b in modes if a != b
     }
 
 
@@ -155,6 +157,26 @@ def test_charts_of_more_dimensions(d, exported):
         cube, {q: network(cube, q) for q in (0, 1)}, dict(enumerate(held))
     )
     assert_same(controller, exported(controller), random_states(cube, 2000, RNG(0)) * 1.2)
+
+
+def test_sets_on_scattered_nodes_go_to_numpy(tmp_path):
+    hall = Hall()
+    hall.observation_low, hall.observation_high = (-1.0,) * 6, (1.0,) * 6
+    cloud = Cloud.even(hall.chart, 2_000, np.array(hall.noisy))
+    lower = GridSet.from_mask(cloud, hall.level(cloud.nodes) <= 0)
+    sets = {0: (~lower).dilated(0.1), 1: lower.dilated(0.1)}
+    controller = HybridController(hall, {q: network(hall, q) for q in (0, 1)}, sets)
+    module, _ = export_numpy(controller, tmp_path)
+    exported = run_path(str(module))
+    measured = random_states(hall, 300, RNG(0)) * 1.1
+    q = RNG(1).choice(2, 300)
+    for found, right in zip(
+        exported["step"](q, measured), controller.step(q, measured), strict=True
+    ):
+        np.testing.assert_allclose(found, right, atol=1e-5)
+    assert (exported["step"](q, measured)[1] != q).mean() > 0.2
+    with pytest.raises(BadInput, match="export to numpy instead"):
+        export_onnx(controller, tmp_path / "hall.onnx")
 
 
 def test_one_mode_without_an_edge(circle, exported):

@@ -10,6 +10,7 @@ from planted import AnalyticSet, ChartPolicy, ideal_controller, random_states
 import hyrl_mj
 from hyrl_mj import BadInput, HybridController
 from hyrl_mj.sets import Everything
+from hyrl_mj.stages import ON_EDGE
 
 
 def constant(task, value):
@@ -48,7 +49,9 @@ def test_it_jumps_exactly_on_the_jump_set(two, z):
     for q in two.modes:
         modes = np.full(len(z), q)
         _, after = two.step(modes, z)
-        np.testing.assert_array_equal(after != modes, two.jump_set(q).contains(z))
+        inside = np.abs(two.flow_sets[q].signed_distance(z)) > ON_EDGE
+        jumps = two.jump_set(q).contains(z)
+        np.testing.assert_array_equal((after != modes)[inside], jumps[inside])
 
 
 def test_on_the_edge_it_flows(two):

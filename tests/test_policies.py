@@ -9,7 +9,7 @@ from planted import random_states
 from threadpoolctl import threadpool_limits
 
 from hyrl_mj import BadArtifact, BadInput, MlpPolicy, artifacts
-from hyrl_mj.learning.settings import preset
+from hyrl_mj.learning.presets import preset
 from hyrl_mj.learning.training import build, export
 
 

@@ -10,7 +10,7 @@ import hyrl_mj
 from hyrl_mj import Outcome
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.simulation.rollout import LoopSettings, closed_loop
-from hyrl_mj.tasks.quadrotor import rotation
+from hyrl_mj.tasks.flight import rotation
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "scripts"))
 
@@ -81,10 +81,10 @@ def test_its_thrust_has_limits(quadrotor):
     low, high = quadrotor.model.actuator_ctrlrange.T
     rng = np.random.default_rng(0)
     thrust, torque = rng.uniform(0, 12, 500), rng.normal(size=(500, 3)) * [0.3, 0.3, 0.02]
-    shared = quadrotor.share_out(thrust, torque)
+    shared = quadrotor.rotors.share_out(thrust, torque)
     assert (shared >= low - 1e-9).all()
     assert (shared <= high + 1e-9).all()
-    wanted = np.column_stack([thrust, torque]) @ quadrotor.mixer.T
+    wanted = np.column_stack([thrust, torque]) @ quadrotor.rotors.mixer.T
     within = ((wanted >= low) & (wanted <= high)).all(axis=1)
     assert 20 < within.sum() < 480
     np.testing.assert_allclose(shared[within], wanted[within])
@@ -98,7 +98,7 @@ def test_its_thrust_has_limits(quadrotor):
 
 def test_its_mixer_gives_the_torques_that_are_asked_for(quadrotor):
     wanted = np.array([8.0, 0.1, -0.2, 0.03])
-    thrust = quadrotor.mixer @ wanted
+    thrust = quadrotor.rotors.mixer @ wanted
     arms = [
         quadrotor.model.site(n).pos
         for n in ("front_left", "back_left", "back_right", "front_right")

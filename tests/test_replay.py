@@ -33,6 +33,7 @@ from hyrl_mj.viz.replay.marks import (
     OVERLAP,
     POLICY_COLOUR,
     Floor,
+    Floors,
     bar,
     disc,
     tracked_points,
@@ -294,7 +295,8 @@ def test_critical_set_and_overlap_lie_on_the_floor(jump):
     none = (np.empty((0, 2)), np.empty(0))
     extended = ExtendedSets((0, 1), sets, (won, won), 0.3, 0.1, *none)
     floor = Floor.of(TASK, decisions(TASK), halves(TASK, 120), extended)
-    picture, pixel = drawn([Track(TASK, jump)], 0.0, size=(640, 640), floor=floor)
+    floors = Floors(TASK.chart, None, (floor,))
+    picture, pixel = drawn([Track(TASK, jump)], 0.0, size=(640, 640), floor=floors)
     plain, _ = drawn([Track(TASK, jump)], 0.0, size=(640, 640))
     for point, colour in (
         ([0.2, -0.15, 0], OVERLAP),

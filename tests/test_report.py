@@ -21,8 +21,8 @@ from planted import Cube, believe, decisions, halves
 
 from hyrl_mj import BadArtifact, BadInput, MlpPolicy, load_run
 from hyrl_mj.artifacts import replacing, write_json
-from hyrl_mj.learning import settings as presets
-from hyrl_mj.learning.settings import preset
+from hyrl_mj.learning import presets
+from hyrl_mj.learning.presets import preset
 from hyrl_mj.pipeline import ExamineOptions, examine_run, run_stage
 from hyrl_mj.policies import Agent
 from hyrl_mj.run_directory import Run, write_config

@@ -10,7 +10,7 @@ from figure_parts import arcs_of, controller_of, policy_of, sets_of
 from planted import decisions, halves
 
 import hyrl_mj
-from hyrl_mj.learning.settings import preset
+from hyrl_mj.learning.presets import preset
 from hyrl_mj.run_directory import Run, write_config
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "reproduce_paper.py"

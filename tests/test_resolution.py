@@ -27,7 +27,7 @@ from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.stages import ExtendedSets
-from hyrl_mj.stages.retraining import ByEpisodes, ByGame, mode_ground
+from hyrl_mj.stages.grounds import ByEpisodes, ByGame, mode_ground
 from hyrl_mj.tasks import Learning, Outcome
 from hyrl_mj.viz.section import Section
 

@@ -18,12 +18,13 @@ from hyrl_mj.envs import BatchedEnv
 from hyrl_mj.envs.core import cautious_reward
 from hyrl_mj.game import Game
 from hyrl_mj.learning import symmetry, training
-from hyrl_mj.learning.settings import preset
+from hyrl_mj.learning.presets import preset
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets, extend
+from hyrl_mj.stages.grounds import BATCH, ByEpisodes, ByGame
 from hyrl_mj.stages.hybrid import HybridController
-from hyrl_mj.stages.retraining import BATCH, ByEpisodes, ByGame, retrain
+from hyrl_mj.stages.retraining import retrain
 
 # ---- where modes are trained
 
@@ -187,6 +188,26 @@ def test_a_policy_that_ends_far_off_is_not_good_enough(vehicle, left):
     assert -score[1] * vehicle.precision >= 1.0
 
 
+@pytest.mark.parametrize(
+    ("wide", "few", "suffices"), [(0.02, 0.05, True), (0.08, 0.05, False), (0.02, 1e-4, False)]
+)
+def test_a_few_states_at_which_the_mode_is_never_selected_may_be_lost(
+    vehicle, left, monkeypatch, wide, few, suffices
+):
+    """About x = 0.2 m it goes the wrong way; y >= -0.1 m are selected."""
+    monkeypatch.setattr("hyrl_mj.stages.grounds.FEW", few)
+    right = one_way_policy(vehicle, 1.0, clear=1.0)
+
+    def rule(z):
+        return np.where(np.abs(z[:, :1] - 0.2) < wide, -1.0, right.rule(z))
+
+    policy = ChartPolicy(vehicle, rule)
+    assert left(policy) < left.enough
+    assert (left.grid.nodes[left.lost, 1].max() < -0.1) == (wide == 0.02)
+    assert 1e-4 < len(left.lost) / len(left.nodes) < 0.05
+    assert left.suffices(policy) == suffices
+
+
 def test_training_goes_on_where_the_game_is_lost(vehicle, left):
     left(one_way_policy(vehicle, 1.0, clear=0.8))
     rng = np.random.default_rng(0)
@@ -278,6 +299,25 @@ def test_a_policy_that_parks_off_the_goal_is_not_good_enough(puck, puck_sets):
     score = ground(parking)
     assert score < ground.enough <= ground(precise)
     assert -score[1] * ground.allowed == pytest.approx(off, abs=0.06)
+
+
+@pytest.mark.slow
+def test_a_task_may_say_how_far_off_is_good_enough(puck, puck_sets, monkeypatch):
+    precise = round_it(puck, 1.0)
+    usual = ByEpisodes(puck, puck_sets, 0, policy=precise).allowed
+    for precision, expected in ((3 * usual, 3 * usual), (1e-3, usual)):
+        monkeypatch.setattr(puck, "precision", precision)
+        allowed = ByEpisodes(puck, puck_sets, 0, policy=precise).allowed
+        assert allowed <= expected + 1e-12
+        assert (allowed > usual) == (precision > usual)
+    assert allowed > 1e-3, "twice as far off as the stage-1 policy is allowed in any case"
+
+
+@pytest.mark.slow
+def test_the_share_won_of_a_good_policy_is_that_of_its_score(puck, puck_sets):
+    ground = ByEpisodes(puck, puck_sets, 0)
+    assert ground.won(round_it(puck, 1.0)) == 1.0
+    assert 0.0 < ground.won(round_it(puck, 1.0, clear=0.6)) < 1.0
 
 
 @pytest.mark.slow

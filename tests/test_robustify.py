@@ -24,12 +24,14 @@ from hyrl_mj.envs.sb3_env import TaskVecEnv
 from hyrl_mj.game.lattice import Lattice
 from hyrl_mj.game.limit import Limit
 from hyrl_mj.learning import training
-from hyrl_mj.learning.settings import Settings, preset
+from hyrl_mj.learning.presets import preset
+from hyrl_mj.learning.settings import Settings
 from hyrl_mj.pipeline.steps import STAGES
 from hyrl_mj.policies.external import read_agent, reopen_agent
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages import Partition, boundary, with_room
-from hyrl_mj.stages.retraining import ByGame, mode_ground, retrain, start_policy
+from hyrl_mj.stages.grounds import ByGame, mode_ground
+from hyrl_mj.stages.retraining import retrain, start_policy
 from hyrl_mj.viz.arcs import noisy_arcs
 
 pytestmark = pytest.mark.slow  # whole runs on agents

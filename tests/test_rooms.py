@@ -14,7 +14,7 @@ import pytest
 from planted import random_states
 
 import hyrl_mj
-from hyrl_mj.learning.settings import preset
+from hyrl_mj.learning.presets import preset
 from hyrl_mj.learning.training import build, export
 
 PACKAGE = Path(hyrl_mj.__file__).parent

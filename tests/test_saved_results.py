@@ -39,11 +39,12 @@ def test_a_partition_comes_back(tmp_path, vehicle, grid_set):
 
 def test_extended_sets_come_back(tmp_path, vehicle, grid_set):
     masks = grid_set.mask, ~grid_set.mask
-    narrow, room = np.array([[0.3, 0.0]]), np.array([0.1])
-    sets = ExtendedSets((0, 1), (grid_set, ~grid_set), masks, 0.3, 0.1, narrow, room)
+    narrow = np.array([[0.3, 0.0]]), np.array([0.1]), np.array([[0, 1]])
+    sets = ExtendedSets((0, 1), (grid_set, ~grid_set), masks, 0.3, 0.1, *narrow)
     sets.save(tmp_path / "e.npz")
     back = ExtendedSets.load(tmp_path / "e.npz", vehicle)
     assert (back.modes, back.horizon, back.noise) == ((0, 1), 0.3, 0.1)
+    np.testing.assert_array_equal(back.between, [[0, 1]])
     for loaded, kept in zip(back.sets, sets.sets, strict=True):
         np.testing.assert_array_equal(loaded.values, kept.values)
     for loaded, kept in zip(back.winning, sets.winning, strict=True):

@@ -47,7 +47,7 @@ def ball(cube):
 
 def test_a_ball_becomes_a_disc(section, ball):
     extended = ExtendedSets(
-        (0,), (ball,), (ball.mask,), 0.3, 0.1, np.zeros((1, 3)), np.array([0.1])
+        (0,), (ball,), (ball.mask,), 0.3, 0.1, np.zeros((1, 3)), np.array([0.1]), np.array([[0, 0]])
     )
     cut, part = (
         section.extended_sets(extended),
@@ -65,7 +65,7 @@ def test_a_ball_becomes_a_disc(section, ball):
 def test_its_critical_set_is_searched_for_in_the_plane(cube, section, monkeypatch):
     policy = sphere_policy(cube, RADIUS)
     whole = find_critical_set(cube, policy, 8, 1 / 4)
-    settings = SimpleNamespace(rods=20, resolution=1 / 16)
+    settings = SimpleNamespace(rods=20, resolution=1 / 16, noise=0.1)
     run = SimpleNamespace(critical_set=whole, steady=policy, settings=settings)
     monkeypatch.setattr(section_module, "CELLS", 20)
     found = section.critical_set(run)

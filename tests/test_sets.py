@@ -198,6 +198,28 @@ def test_cells_are_square_and_periods_have_no_double_node():
     assert Grid.with_cells(TUBE, 60).counts == (60, 20)
 
 
+def test_the_scale_makes_cells_square_and_decides_what_is_nearest():
+    chart = Chart(("x", "v"), ("m", "m/s"), (0, 0), (1, 4), (False, False), scale=(1, 4))
+    grid = Grid.with_cells(chart, 10)
+    assert grid.counts == (11, 11)
+    lower = GridSet.from_mask(grid, grid.nodes @ [1, -0.25] <= 1e-9)  # x <= v / 4
+    outside = np.array([[0.8, 1.6]])
+    # At 45 degrees in scaled units, to a cell.
+    assert lower.signed_distance(outside) == pytest.approx(0.4 / np.sqrt(2), abs=0.1)
+    np.testing.assert_allclose(lower.project(outside), [[0.6, 2.4]], atol=0.11)
+    np.testing.assert_allclose(lower.dilated_by_box(np.array([0.2, 0])).values[0], -0.2, atol=0.1)
+
+
+def test_the_edge_lies_half_way_between_nodes_of_long_cells():
+    room = Chart(("x", "y"), ("m", "m"), (0, 0), (1, 1), (False, False))
+    grid = Grid(room, (3, 41))
+    for axis, middle in ((0, 0.25), (1, 0.4875)):
+        part = GridSet.from_mask(grid, grid.nodes[:, axis] <= middle)
+        z = np.full((2, 2), 0.5)
+        z[:, axis] = middle - 1e-3, middle + 1e-3
+        np.testing.assert_array_equal(part.contains(z), [True, False])
+
+
 def test_interpolation_is_exact_for_linear_functions():
     grid, z = Grid.with_cells(PLANE, 12), points(PLANE)
     slopes = np.array([2.0, -3.0])
@@ -245,7 +267,7 @@ def test_the_nearest_node_is_the_nearest(case):
 def test_a_grid_of_another_dimension_or_size_is_refused():
     with pytest.raises(BadInput, match="2 dimensions"):
         Grid.from_counts(LINE, np.array([3, 3]))
-    with pytest.raises(BadInput, match=r"\(5,\).*\(3,\)"):
+    with pytest.raises(BadInput, match=r"\(5,\).*3 nodes"):
         GridSet(Grid(LINE, (3,)), np.zeros(5))
 
 

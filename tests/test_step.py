@@ -8,7 +8,7 @@ import pytest
 from planted import ChartPolicy, random_states
 
 from hyrl_mj import HybridController
-from hyrl_mj.learning.settings import preset
+from hyrl_mj.learning.presets import preset
 from hyrl_mj.learning.training import build, export
 from hyrl_mj.sets import Grid, GridSet
 

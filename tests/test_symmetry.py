@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from hyrl_mj.learning import symmetry
-from hyrl_mj.learning.settings import preset
+from hyrl_mj.learning.presets import preset
 from hyrl_mj.learning.training import build, export, threads
 
 

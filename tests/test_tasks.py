@@ -19,8 +19,19 @@ PI = np.pi
 # ---- every task
 
 
-def test_both_tasks_are_registered():
-    assert {"unit_circle", "vehicle"} <= set(hyrl_mj.task_names())
+def test_the_tasks_of_this_package_are_registered():
+    robots = {
+        "unit_circle",
+        "vehicle",
+        "rover",
+        "quadrotor",
+        "slalom",
+        "gaps",
+        "gate",
+        "arm",
+        "beam",
+    }
+    assert robots <= set(hyrl_mj.task_names())
 
 
 def test_its_mirror_image_earns_the_same_reward(task):
@@ -83,7 +94,7 @@ def test_a_scene_fills_in_what_is_left_out():
 
 
 def test_the_default_algorithm_depends_on_the_levels():
-    assert [Learning().algorithm, Learning(levels=5).algorithm] == ["ppo", "dqn"]
+    assert [Learning().algorithm, Learning(levels=5).algorithm] == ["ppo", "ppo"]
     assert Learning("a2c", levels=5).algorithm == "a2c"
     assert (Learning().search, Learning().horizon) == ("outcome", 0.5)
 

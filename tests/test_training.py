@@ -15,7 +15,7 @@ import hyrl_mj
 from hyrl_mj import BadInput, MlpPolicy, Noise
 from hyrl_mj.envs.core import BatchedEnv, Domain
 from hyrl_mj.learning import training
-from hyrl_mj.learning.settings import preset
+from hyrl_mj.learning.presets import preset
 
 # Samples of the quickest training that still updates the networks several times.
 FEW = {"ppo": 8_192, "dqn": 4_000}

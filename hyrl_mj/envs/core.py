@@ -20,19 +20,22 @@ MOST = 2**20
 
 @dataclass(frozen=True)
 class Domain:
-    """A part of the state space that training is restricted to (paper, Step 6).
+    """Where the episodes of a training start, and to which part of the state space they are restricted.
+
+    The paper's Step 6 restricts the training of a mode.
 
     Attributes:
         starts: draws n chart points (n, d) with a generator.
-        contains: (n, d) -> (n,) bool; an episode ends where it leaves the domain.
-        exit_reward: reward for leaving the domain.
+        contains: (n, d) -> (n,) bool; an episode ends where it leaves the domain. By default it may go
+            anywhere.
+        exit_reward: with `contains`, reward for leaving the domain, and for failing in it.
         caution: (p,) largest error of a measurement: if given, the reward is `cautious_reward`.
         earns: (n, d) -> (n,) bool; elsewhere every step is worth the task's worst reward.
     """
 
     starts: Callable[[int, np.random.Generator], np.ndarray]
-    contains: Callable[[np.ndarray], np.ndarray]
-    exit_reward: float
+    contains: Callable[[np.ndarray], np.ndarray] | None = None
+    exit_reward: float = 0.0
     caution: np.ndarray | None = None
     earns: Callable[[np.ndarray], np.ndarray] | None = None
 
@@ -147,10 +150,12 @@ class BatchedEnv:
             z = self.task.z(measurement)
             if self.domain.earns is not None:
                 reward = np.where(self.domain.earns(z), reward, self.task.worst_reward)
-            left = ~terminated & ~self.domain.contains(z)
-            reward[left] = self.domain.exit_reward
-            terminated = terminated | left
-            outcome[left] = Outcome.OUT_OF_BOUNDS
+            if self.domain.contains is not None:
+                left = ~terminated & ~self.domain.contains(z)
+                # A failure costs as much: else it would end a way that costs something, and pay.
+                reward[left | (terminated & (outcome != Outcome.REACHED))] = self.domain.exit_reward
+                terminated = terminated | left
+                outcome[left] = Outcome.OUT_OF_BOUNDS
         check_finite(self.task, "reward", reward, measurement)
         truncated = ~terminated & (self.samples >= self.max_steps)
         if truncated.any():

@@ -96,7 +96,8 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         if self._renderer is None:
             from hyrl_mj.rendering import SceneRenderer
 
-            self._renderer = SceneRenderer(self.core.task.model, *self._size)
+            task = self.core.task
+            self._renderer = SceneRenderer(task.model, *self._size, mocap=task.mocap)
         self._renderer.place(self.core.plant.qpos[0], self._camera)
         return self._renderer.draw()
 

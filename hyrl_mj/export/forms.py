@@ -14,7 +14,7 @@ from hyrl_mj import artifacts
 from hyrl_mj.errors import BadInput, brief, unknown
 from hyrl_mj.export.source import write_function
 from hyrl_mj.policies import ACTIVATIONS, MlpPolicy
-from hyrl_mj.sets import Everything, Grid, GridSet, StateSet
+from hyrl_mj.sets import Cloud, Everything, Grid, GridSet, StateSet
 from hyrl_mj.stages import ON_EDGE, HybridController
 from hyrl_mj.tasks import Task
 from hyrl_mj.tracing import BATCH, trace
@@ -76,6 +76,12 @@ def export_onnx(controller: HybridController, path: str | Path) -> Path:
             onnxruntime are missing.
     """
     path = Path(path)
+    sets = [*controller.flow_sets.values(), *(controller.starts or {}).values()]
+    if any(isinstance(s, GridSet) and isinstance(s.grid, Cloud) for s in sets):
+        raise BadInput(
+            f"the sets of {controller.task.name} lie on scattered nodes, which an ONNX graph does not "
+            "search: export to numpy instead"
+        )
     try:
         import onnx  # noqa: F401
         import onnxruntime
@@ -153,7 +159,7 @@ def _arrays(controller: HybridController, networks: list[MlpPolicy]) -> dict[str
     low, high = task.input_limits
     arrays: dict[str, Any] = {
         "modes": np.array(controller.modes, dtype=np.int64), "on_edge": ON_EDGE, "chart_low": chart.origin,
-        "chart_sides": chart.sides, "chart_periodic": chart.periodic,
+        "chart_sides": chart.sides, "chart_periodic": chart.periodic, "chart_scale": chart.scale,
         "input_low": low, "input_high": high,
     }  # fmt: skip
     if task.input_levels is not None:
@@ -165,8 +171,8 @@ def _arrays(controller: HybridController, networks: list[MlpPolicy]) -> dict[str
         for kind, state_set in sets.items():
             on_grid = _grid_set(state_set, task, f"{kind} set of mode {q}")
             arrays[f"{kind}_{k}"] = on_grid.values
-            arrays[f"{kind}_{k}_counts"] = on_grid.grid.counts
-            arrays[f"{kind}_{k}_spacing"] = on_grid.grid.spacing
+            more = on_grid.grid.exported(on_grid.values)
+            arrays |= {f"{kind}_{k}_{name}": array for name, array in more.items()}
         arrays[f"layers_{k}"] = len(networks[k].layers)
         for i, (weight, bias) in enumerate(networks[k].layers):
             arrays[f"weight_{k}_{i}"], arrays[f"bias_{k}_{i}"] = weight, bias
@@ -174,7 +180,7 @@ def _arrays(controller: HybridController, networks: list[MlpPolicy]) -> dict[str
 
 
 def _grid_set(state_set: StateSet, task: Task, what: str) -> GridSet:
-    """Returns a set on a grid; `what` names it in messages."""
+    """Returns a set on a grid or on scattered nodes; `what` names it in messages."""
     if isinstance(state_set, GridSet) and state_set.grid.chart == task.chart:
         return state_set
     if isinstance(state_set, Everything):

@@ -8,7 +8,7 @@ from hyrl_mj.game.adversary import WorstNoise
 from hyrl_mj.game.counts import AttackCount, EpisodeCount
 from hyrl_mj.game.lattice import EPISODES_INSTEAD, Lattice
 from hyrl_mj.game.limit import Limit, fewest_samples
-from hyrl_mj.game.resolution import CURVE_CELLS, LATTICE, curve_grid, lattice_grid
+from hyrl_mj.game.resolution import CURVE_CELLS, LATTICE, aligned_cells, curve_grid, lattice_grid
 from hyrl_mj.game.result import (
     BEATEN,
     LIMIT,
@@ -79,6 +79,7 @@ __all__ = [
     "Score",
     "Wins",
     "WorstNoise",
+    "aligned_cells",
     "curve_grid",
     "fewest_samples",
     "lasting",

@@ -23,7 +23,7 @@ from hyrl_mj.game.resolution import (
 )
 from hyrl_mj.mjcf import model_name
 from hyrl_mj.progress import progress_bar
-from hyrl_mj.sets import Grid
+from hyrl_mj.sets import Cloud, Grid, Nodes
 from hyrl_mj.tasks import Outcome, Task
 
 # A sample that ends this close to a node, in cells, ends on it.
@@ -134,8 +134,10 @@ class Lattice:
         return Lattice.why_not(task) is None
 
     @staticmethod
-    def decides(task: Task, grid: Grid) -> bool:
+    def decides(task: Task, grid: Nodes) -> bool:
         """Returns whether what is won on these nodes is good enough to train and to design by."""
+        if isinstance(grid, Cloud):
+            return False
         return task.chart.dimension < 3 and Lattice.why_not(task, grid) is None
 
     @staticmethod

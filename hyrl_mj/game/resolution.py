@@ -24,14 +24,19 @@ FEWER = 0.97
 # States from which a plant is stepped to find out how far it moves, and values of each of m inputs. Without
 # an inner loop the distance is linear in the inputs.
 PROBES, ENDS = 200, 2
+# Distances that differ by less than this share of a chart's side are the same. To align nodes with hops, the
+# number of cells changes by this share at most.
+SAME, SHIFTED = 1e-6, 0.4
 VALUES = {1: 17, 2: 9, 3: 5}
 
 
 def lattice_grid(task: Task, cells: int = 0, most: int | None = None) -> Grid:
     """Returns the nodes of a task's lattice, or of a coarser one if these do not fit into the memory.
 
-    Cells are square in chart units. On a chart of three dimensions, whose coordinates have different units,
-    the sides of the cells are to each other as the distances that one sample moves the robot.
+    Cells are about square in chart units: where every sample moves the robot by a multiple of some distance
+    along a coordinate, and the side of the chart is one, too, samples lead from node to node. On a chart
+    of three dimensions, whose coordinates have different units, the sides of the cells are to each other
+    as the distances that one sample moves the robot.
 
     Args:
         task: the robot and its problem.
@@ -49,12 +54,17 @@ def lattice_grid(task: Task, cells: int = 0, most: int | None = None) -> Grid:
     hops = probed_hops(task)
     if chart.dimension > 2:
         sides = sides / np.maximum(longest(hops), sides / cells)
+    hop_counts = common_hops(task, hops)
     while True:
         number = np.maximum(np.round(cells * sides / sides.max()).astype(int), 2)
-        grid = Grid(chart, tuple(int(k) for k in number + ~np.array(chart.periodic)))
-        fits = math.prod(grid.counts) <= MOST_NODES and transitions(task, grid, hops) <= FITTING
-        if fits or cells <= 2:
-            return grid
+        # Samples that lead from node to node are worth a few cells more or less.
+        aligned = np.round(number / hop_counts).astype(int) * hop_counts
+        aligned = np.where(np.abs(aligned - number) <= SHIFTED * number, aligned, number)
+        for counts in (aligned, number):
+            grid = Grid(chart, tuple(int(k) for k in counts + ~np.array(chart.periodic)))
+            fits = math.prod(grid.counts) <= MOST_NODES and transitions(task, grid, hops) <= FITTING
+            if fits or cells <= 2:
+                return grid
         cells = int(cells * FEWER)
 
 
@@ -82,6 +92,44 @@ def probed_hops(task: Task) -> np.ndarray:
         plant.step(np.tile(u, (PROBES, 1)))
         hops.append(chart.difference(task.z(plant.measurement), before))
     return np.array(hops).reshape(*(values,) * m, PROBES, chart.dimension)
+
+
+def aligned_cells(task: Task, cells: int) -> int:
+    """Returns the number of square cells along the longest side, near `cells`, that samples cross whole.
+
+    It is `cells` itself if there is none.
+    """
+    sides, counts = task.chart.sides, common_hops(task, probed_hops(task))
+    steps = (sides / counts)[counts > 1]
+    for count in sorted(range(cells // 2, 2 * cells), key=lambda n: abs(np.log(n / cells))):
+        across = steps / (sides.max() / count)
+        if (np.abs(across - np.round(across)) < SAME * count).all() and (across > 0.5).all():
+            return count
+    return cells
+
+
+def common_hops(task: Task, hops: np.ndarray) -> np.ndarray:
+    """Returns how many of the longest distance that divides all hops a side of the chart holds: (d,) int.
+
+    It is 1 where nothing divides them all, or the chart's side is no multiple of it.
+    """
+    counts: list[int] = []
+    if task.chart.dimension > 2:
+        return np.ones(task.chart.dimension, dtype=int)
+    flat = hops.reshape(-1, hops.shape[-1])
+    for along, side in zip(flat.T, task.chart.sides, strict=True):
+        exact = SAME * side
+        if task.learning.levels is None and np.ptp(along) > exact:
+            counts.append(1)  # between its extremes an input leads anywhere
+            continue
+        step = 0.0
+        for value in np.unique(np.abs(along)):
+            while value > exact:  # Euclid's algorithm
+                step, value = value, abs(step - value * np.round(step / value))
+        count = side / step if step else 1.0
+        whole = round(count)
+        counts.append(whole if abs(count - whole) * step < exact else 1)
+    return np.array(counts)
 
 
 def longest(hops: np.ndarray) -> np.ndarray:

@@ -4,7 +4,8 @@ The modules `training`, `distillation` and `symmetry` import torch: import them 
 """
 
 from hyrl_mj.learning.changes import STAGES, changed, changes, differing, setting_value
-from hyrl_mj.learning.settings import Settings, Training, preset
+from hyrl_mj.learning.presets import preset
+from hyrl_mj.learning.settings import Settings, Training
 
 __all__ = [
     "STAGES",
@@ -15,6 +16,7 @@ __all__ = [
     "differing",
     "distillation",
     "preset",
+    "presets",
     "setting_value",
     "symmetry",
     "training",

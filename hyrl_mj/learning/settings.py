@@ -1,12 +1,9 @@
-"""The settings of a run, in frozen dataclasses, and their presets: fast, paper and smoke."""
+"""The settings of a run, in frozen dataclasses; `presets` makes them."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated, Any
 
-import numpy as np
-
 from hyrl_mj.errors import BadInput, check_bound, check_seed, unknown
-from hyrl_mj.game import LATTICE, Lattice
 from hyrl_mj.learning.options import check_options
 from hyrl_mj.policies import ACTIVATIONS, ALGORITHMS, Agent, algorithms
 from hyrl_mj.ranges import (
@@ -21,8 +18,8 @@ from hyrl_mj.ranges import (
     Text,
     check_fields,
 )
-from hyrl_mj.sets import Grid
-from hyrl_mj.tasks import SEARCHES, Task, reference
+from hyrl_mj.sets import Grid, covering
+from hyrl_mj.tasks import SEARCHES, Task
 
 PRESETS = ("fast", "paper", "smoke")
 
@@ -46,6 +43,10 @@ class Training:
         gamma: discount factor.
         symmetric: whether the network respects the task's mirror symmetry, if it has one. The weights are
             used twice, and the policy has twice the width.
+        spread: whether the kinks of the first layer are spread over the observations of the whole chart at
+            first, and do not all pass through the origin.
+        rehearse: share of the episodes that start anywhere on the chart, half of them where the latest
+            policy lost, and not where the task starts (stage 1 only).
         warm_start: whether the first attempt continues from the policy of stage 1 (stage 6 only): DQN from
             its weights, PPO from its distilled actions on the mode's part. A Gaussian policy of small spread
             does not explore the other way any more.
@@ -66,6 +67,8 @@ class Training:
     anneal: Annotated[bool, Flag()]
     gamma: Annotated[float, Number(0, 1, above=True)]
     symmetric: Annotated[bool, Flag()]
+    spread: Annotated[bool, Flag()] = False
+    rehearse: Annotated[float, Number(0, 1)] = 0.0
     warm_start: Annotated[bool, Flag()] = False
     episode: Annotated[int | None, Optional(Integer(1, LONGEST))] = None
     attempts: Annotated[int, Integer(1, 1_000)] = 1
@@ -101,8 +104,10 @@ class Settings:
         horizon: time T of the backward propagation [s]; None to size the sets to the noise.
         stage1: training of the first policy (stage 1), or the agent in its place.
         stage6: training of each mode's policy (stage 6).
-        cells: grid cells along the longest side of the chart; cells are square in chart units.
-        rods: grid points along the longest side from which the search for critical points starts.
+        cells: grid cells along the longest side of the chart, square in scaled units. In three dimensions the
+            nodes of this grid are shared out by the noise; in more there are `cells`**4 scattered nodes.
+        rods: grid points along the longest side from which the search for critical points starts; in more
+            than three dimensions there are `rods`**4 scattered ones.
         lattice: lattice cells along the longest side for the worst-case game, fewer where these do not fit
             into the memory; 0 for the usual number.
         resolution: length of the last rods, as a share of the first.
@@ -147,205 +152,6 @@ class Settings:
         for name in {training.algorithm for training in trainings} & set(ALGORITHMS):
             algorithms.check(name, task.name, task.learning.levels)
         for count in (self.cells, self.rods):
-            Grid.with_cells(task.chart, count)
+            covering(task.chart, count)
         if self.lattice and task.chart.dimension < 3:
             Grid.with_cells(task.chart, CELLS.checked("lattice", self.lattice))
-
-
-# Stage 1 of preset fast, by algorithm, for continuous inputs and for levels.
-# Episodes are short for tasks that start all over the chart: the first second decides the way.
-_PPO = Training(
-    algorithm="ppo",
-    samples=160_000,
-    envs=128,
-    hidden=(64, 64),
-    activation="tanh",
-    learning_rate=3e-3,
-    anneal=True,
-    gamma=0.98,
-    symmetric=True,
-    episode=20,
-    options={"n_steps": 32, "batch_size": 1024, "n_epochs": 8},
-)
-_A2C = replace(
-    _PPO,
-    algorithm="a2c",
-    options={"n_steps": 16, "normalize_advantage": True, "use_rms_prop": False},
-)
-# A gradient step takes milliseconds and a sample hardly anything: many samples for each step.
-_TD3 = replace(
-    _PPO,
-    algorithm="td3",
-    samples=48_000,
-    envs=32,
-    activation="relu",
-    gamma=0.95,
-    action_noise=0.3,
-    options={
-        "buffer_size": 100_000,
-        "learning_starts": 1_000,
-        "batch_size": 256,
-        "train_freq": 1,
-        "gradient_steps": 1,
-        "tau": 0.02,
-    },
-)
-_DDPG = replace(_TD3, algorithm="ddpg")
-_SAC = replace(_TD3, algorithm="sac", action_noise=0.0, options={**_TD3.options, "ent_coef": 0.02})
-_CONTINUOUS = {"ppo": _PPO, "a2c": _A2C, "sac": _SAC, "td3": _TD3, "ddpg": _DDPG}
-_PPO_LEVELS = replace(
-    _PPO,
-    samples=200_000,
-    activation="relu",
-    gamma=0.9664,
-    episode=None,
-    options={**_PPO.options, "ent_coef": 0.02, "gae_lambda": 0.95},
-)
-_A2C_LEVELS = replace(
-    _PPO_LEVELS,
-    algorithm="a2c",
-    samples=300_000,
-    envs=32,
-    gamma=0.95,
-    options={**_A2C.options, "n_steps": 8, "ent_coef": 0.01, "gae_lambda": 0.9},
-)
-_DQN = replace(
-    _PPO_LEVELS,
-    algorithm="dqn",
-    samples=150_000,
-    envs=64,
-    learning_rate=1e-3,
-    options={
-        "buffer_size": 200_000,
-        "learning_starts": 2_000,
-        "batch_size": 256,
-        "train_freq": 1,
-        "gradient_steps": 4,
-        "target_update_interval": 3_000,
-        "n_steps": 5,
-        "exploration_initial_eps": 1.0,
-        "exploration_fraction": 0.5,
-        "exploration_final_eps": 0.05,
-    },
-)
-_LEVELS = {"ppo": _PPO_LEVELS, "a2c": _A2C_LEVELS, "dqn": _DQN}
-# The paper's training, and its algorithms.
-_PAPER = replace(
-    _DQN,
-    algorithm="ppo",
-    samples=1_000_000,
-    envs=1,
-    learning_rate=1.946e-4,
-    anneal=False,
-    symmetric=False,
-    options={},
-)
-_PAPERS = ("ppo", "dqn")
-# Samples of preset smoke.
-_SMOKE = {"ppo": 24_576, "a2c": 65_536, "dqn": 10_000, "sac": 12_000, "td3": 12_000, "ddpg": 12_000}
-# Stage 6, for every algorithm of stage 1. The modes of a discrete task are trained by PPO, too: the returns
-# of the ways differ by less than the error of a freely trained value function.
-_MODES_CONTINUOUS = replace(
-    _PPO, samples=320_000, activation="relu", gamma=0.95, symmetric=False, episode=40, attempts=3
-)
-_MODES_DISCRETE = replace(
-    _MODES_CONTINUOUS,
-    samples=400_000,
-    gamma=0.9,
-    episode=None,
-    options={**_PPO.options, "ent_coef": 0.003, "gae_lambda": 0.9},
-)
-_MODES_PAPER_CONTINUOUS = replace(
-    _PAPER, samples=100_000, hidden=(112, 112), learning_rate=3.45e-4, gamma=0.9637
-)
-_MODES_PAPER_DISCRETE = replace(_PAPER, algorithm="dqn", samples=300_000, warm_start=True)
-_SMOKE_MODES = 8_192
-# Grid points along the longest side of the chart, by its dimension, for the search of M* and for the sets;
-# fewer for plants with dynamics, whose samples are slower to simulate.
-_GRIDS = {1: (120, 2880), 2: (120, 240), 3: (24, 48), 4: (8, 16)}
-_GRIDS_DYNAMIC = {1: (120, 720), 2: (40, 96), 3: (16, 30), 4: (8, 12)}
-# Cells of the worst-case game's lattice in a smoke run.
-_LATTICE_SMOKE = {1: 1_200, 2: 120, 3: 60}
-
-
-def preset(
-    task: Task,
-    name: str = "fast",
-    *,
-    noise: float = 0.1,
-    seed: int = 0,
-    horizon: float | None = None,
-    agent: Agent | None = None,
-    algorithm: str | None = None,
-) -> Settings:
-    """Returns the settings of a preset.
-
-    Args:
-        task: the robot and its problem.
-        name: "fast", "paper" (the paper's training), or "smoke" (seconds, to check that all stages run).
-        noise: bound eps of the measurement noise that the controller has to survive.
-        seed: seed of all random numbers.
-        horizon: time T of the backward propagation [s]; by default the sets are sized to the noise, and
-            preset "paper" takes the paper's T.
-        agent: agent in place of stage 1; the training of the modes then continues from it.
-        algorithm: algorithm of stage 1, by default the task's.
-
-    Raises:
-        BadInput: an unknown preset, or a value that cannot be used.
-    """
-    if name not in PRESETS:
-        raise unknown("preset", name, PRESETS)
-    stage1 = agent or _stage1(task, name, algorithm or task.learning.algorithm)
-    stage6 = _stage6(task, name, stage1.algorithm)
-    dimension = task.chart.dimension
-    rods, cells = (_GRIDS if task.kinematic else _GRIDS_DYNAMIC)[min(dimension, 4)]
-    settings = Settings(
-        task=reference(task),
-        preset=name,
-        seed=seed,
-        noise=noise,
-        horizon=task.learning.horizon if horizon is None and name == "paper" else horizon,
-        stage1=stage1,
-        stage6=replace(stage6, warm_start=True) if agent else stage6,
-        cells=cells,
-        # Rods miss a part of M* if the agent goes straight on for some samples before it picks a way.
-        search="outcome" if agent else task.learning.search,
-        rods=rods,
-        lattice=(_LATTICE_SMOKE if name == "smoke" else LATTICE).get(dimension, 0)
-        if dimension < 3 or Lattice.possible(task)
-        else 0,
-    )
-    settings.check(task)
-    return settings
-
-
-def _stage1(task: Task, name: str, algorithm: str) -> Training:
-    """Returns the training of stage 1 with an algorithm."""
-    levels = task.learning.levels
-    algorithms.check(algorithm, task.name, levels)
-    known = algorithms.sb3_relative(algorithm, levels)
-    if name == "paper" and known not in _PAPERS:
-        raise BadInput(
-            f"preset 'paper' has no {algorithm}, the paper trained with {' and '.join(_PAPERS)}: "
-            "choose preset fast or smoke"
-        )
-    training = _PAPER if name == "paper" else (_CONTINUOUS if levels is None else _LEVELS)[known]
-    if name == "smoke":
-        training = replace(training, samples=_SMOKE[known])
-    if np.any(np.subtract(task.start_high, task.start_low) < task.chart.sides - 1e-9):
-        # Episodes are not cut short: states outside the start region are only met late in an episode.
-        training = replace(training, episode=None)
-    options = training.options
-    if known != algorithm:
-        options = algorithms.accepted_options(algorithm, options)
-    return replace(training, algorithm=algorithm, options=options)
-
-
-def _stage6(task: Task, name: str, algorithm: str) -> Training:
-    """Returns the training of stage 6 after stage 1 with an algorithm."""
-    continuous = task.learning.levels is None
-    if name == "paper":
-        training = _MODES_PAPER_CONTINUOUS if continuous else _MODES_PAPER_DISCRETE
-        return replace(training, warm_start=training.warm_start and training.algorithm == algorithm)
-    training = _MODES_CONTINUOUS if continuous else _MODES_DISCRETE
-    return replace(training, samples=_SMOKE_MODES, attempts=1) if name == "smoke" else training

@@ -19,7 +19,9 @@ from hyrl_mj.envs import BatchedEnv, Domain
 from hyrl_mj.envs.sb3_env import TaskVecEnv
 from hyrl_mj.errors import BadInput, HyrlError, brief
 from hyrl_mj.learning import symmetry
+from hyrl_mj.learning.rehearsal import Rehearsal
 from hyrl_mj.learning.settings import Training
+from hyrl_mj.learning.spread import spread_kinks
 from hyrl_mj.policies import (
     ALGORITHMS,
     TORCH_NAMES,
@@ -62,7 +64,7 @@ class Ground(Protocol):
     settled: float
 
     def domain(self, gamma: float) -> Domain | None:
-        """Returns the part of the state space that episodes are restricted to, for a discount gamma."""
+        """Returns where episodes start and stay, for a discount gamma; None for the task's starts."""
 
     def __call__(self, policy: MlpPolicy) -> Score:
         """Returns the score of a policy; higher is better, compared from left to right."""
@@ -92,7 +94,7 @@ def train(
     Raises:
         BadInput: settings that SB3 cannot train with, or a training whose weights grow without bound.
     """
-    ground = ground or TaskGround(task, settings.gamma)
+    ground = ground or TaskGround(task, settings.gamma, rehearse=settings.rehearse)
     domain = ground.domain(settings.gamma)
     model = build(task, settings, seed, noise=ground.noise, domain=domain, start_from=start_from)
     if log_dir is not None:
@@ -168,6 +170,8 @@ def build(
                 f"training with {settings.algorithm} cannot go on from this {start_from.algorithm} "
                 "policy, because its networks differ: start a new training"
             ) from error
+    if settings.spread and start_from is None:
+        spread_kinks(model.policy, task, seed)
     if settings.symmetric and start_from is None and task.mirror is not None:
         symmetry.impose(model.policy, task)
     return model
@@ -260,21 +264,26 @@ class TaskGround:
     """All starts of a task, where a policy is judged on the same episodes every time.
 
     The score is the share of episodes that end at the set-point, then the mean return discounted by `gamma`,
-    both averaged over the kinds of noise in `JUDGES`, with the bound of the `noise` during training.
+    both averaged over the kinds of noise in `JUDGES`, with the bound of the `noise` during training. A share
+    `rehearse` of the training's episodes starts anywhere, also where the latest policy lost.
     """
 
     enough: Score = (np.inf,)
     settled = 0.5  # an untrained policy can score well by chance
 
-    def __init__(self, task: Task, gamma: float, noise: Noise | None = None):
+    def __init__(self, task: Task, gamma: float, noise: Noise | None = None, rehearse: float = 0.0):
         self.noise, self._task, self._gamma = noise or Noise(), task, gamma
         bound = self.noise.bound
         self._noises = [Noise(kind, bound) for kind in JUDGES] if bound else [Noise()]
+        self._rehearsal = Rehearsal(task, rehearse) if rehearse else None
 
-    def domain(self, gamma: float) -> None:
-        """Returns None: episodes are not restricted."""
+    def domain(self, gamma: float) -> Domain | None:
+        """Returns where episodes start if not where the task starts; they are not restricted."""
+        return Domain(self._rehearsal.starts) if self._rehearsal else None
 
     def __call__(self, policy: MlpPolicy) -> Score:
+        if self._rehearsal:
+            self._rehearsal.update(policy)
         results = [evaluate(self._task, policy, n, None, self._gamma) for n in self._noises]
         success, returns = np.mean(results, axis=0)
         return float(success), float(returns)

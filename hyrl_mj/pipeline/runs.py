@@ -20,6 +20,7 @@ from hyrl_mj.pipeline.steps import DIAGNOSIS, STAGES, extended_sets_stage, run_s
 from hyrl_mj.policies import ALGORITHMS, FUNCTION, AnyPolicy, algorithms, read_agent
 from hyrl_mj.progress import Say
 from hyrl_mj.run_directory import Run, load_run, opened, write_config
+from hyrl_mj.sets import coarseness
 from hyrl_mj.stages import Arrivals
 from hyrl_mj.tasks import Task, check_task, get_task
 from hyrl_mj.viz import beginning
@@ -194,6 +195,11 @@ def _run_all(run: Run, say: Say, stages: Collection[str] = STAGES) -> Run:
     """Runs the stages that are not done."""
     if "robustness" in stages and not run.manifest.is_done("robustness"):
         say(f"the run will be examined {examination_plan(run)}")
+    s = run.settings
+    if "partition" in stages and not run.manifest.is_done("partition"):
+        bounds = run.task.noise_in_chart(s.noise, s.everywhere)
+        if sentence := coarseness(run.task.chart, s.cells, bounds):
+            say(sentence)
     for stage in stages:
         if stage == "train" and run.agent:
             say(f"train: none, {run.agent} is given; it {run.arrivals}")

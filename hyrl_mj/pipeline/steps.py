@@ -38,7 +38,8 @@ from hyrl_mj.verdict import mode_sentence
 from hyrl_mj.viz import ReplayOptions, replay_sentence
 
 if TYPE_CHECKING:
-    from hyrl_mj.stages.retraining import ModeGround, WarmStart
+    from hyrl_mj.stages.grounds import ModeGround
+    from hyrl_mj.stages.retraining import WarmStart
 
 # The video with preset smoke only shows that a video can be made.
 SMOKE = ReplayOptions(size=(640, 360), fps=10)
@@ -66,14 +67,15 @@ def train_stage(run: Run, say: Say) -> None:
 def critical_set_stage(run: Run, say: Say) -> None:
     """Stage 2: finds the critical set."""
     s = run.settings
-    critical = find_critical_set(run.task, run.steady, s.rods, s.resolution, s.search)
+    critical = find_critical_set(run.task, run.steady, s.rods, s.resolution, s.search, s.noise)
     critical.save(run.path / "critical_set.npz")
     say(critical.sentence(run.task))
 
 
 def partition_stage(run: Run, say: Say) -> None:
     """Stage 3: partitions the chart."""
-    partition = make_partition(run.task, run.steady, run.critical_set.points, run.settings.cells)
+    s = run.settings
+    partition = make_partition(run.task, run.steady, run.critical_set.points, s.cells, s.noise)
     partition.save(run.path / "partition.npz")
     say(partition.sentence(run.task))
 
@@ -97,7 +99,8 @@ def extended_sets_stage(run: Run, say: Say) -> None:
 
 def retrain_stage(run: Run, say: Say) -> None:
     """Stage 6: trains the policy of each mode."""
-    from hyrl_mj.stages.retraining import mode_ground, start_policy
+    from hyrl_mj.stages.grounds import mode_ground
+    from hyrl_mj.stages.retraining import start_policy
 
     s, sets = run.settings, run.extended_sets
     algorithms.check_named(s.stage6.algorithm)

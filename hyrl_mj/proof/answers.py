@@ -102,7 +102,7 @@ class Boxes:
             return nowhere, nowhere
         if not isinstance(members, GridSet):
             raise Unbounded(f"a {type(members).__name__} cannot be bounded: give sets on grids")
-        grid, values = members.grid, members.values.reshape(members.grid.counts)
+        grid, values = members.regular, members.values.reshape(members.regular.counts)
         steep = 0.0
         for axis, periodic in enumerate(grid.chart.periodic):
             ring = np.take(values, [0], axis=axis)

@@ -21,8 +21,9 @@ from hyrl_mj.simulation.noise import (
     register_noise,
     signal_for,
 )
+from hyrl_mj.simulation.passing import Passing, windings
 from hyrl_mj.simulation.programmes import Programmes, Rules
-from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop, ways
+from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop
 
 __all__ = [
     "NOT_STARTED",
@@ -31,6 +32,7 @@ __all__ = [
     "Lookahead",
     "LoopSettings",
     "Noise",
+    "Passing",
     "Programmes",
     "Recorded",
     "Rollout",
@@ -44,7 +46,7 @@ __all__ = [
     "signal_for",
     "simulate",
     "simulate_batch",
-    "ways",
+    "windings",
 ]
 
 for _module in iter_modules(__path__, f"{__name__}."):

@@ -8,6 +8,7 @@ from hyrl_mj.plant import Plant
 from hyrl_mj.policies import Controller, answer, nothing_past, remembering
 from hyrl_mj.progress import progress_bar
 from hyrl_mj.simulation.noise import NOT_STARTED, AnyNoise, Sample, signal_for
+from hyrl_mj.simulation.passing import Follower, Passing
 from hyrl_mj.tasks import Outcome, Task
 
 
@@ -18,6 +19,7 @@ class LoopSettings:
     Attributes:
         steps: number of samples, by default the task's limit.
         backward: simulate x' = -f(x, u); such runs end with the last sample only.
+        passing: whether to follow how the runs pass the obstacles.
         record: whether to keep modes, measurements, inputs and states.
         vary: whether to draw the coordinates outside the chart at random, as in training.
         plant: n copies of the task's robot to use again; by default new ones.
@@ -27,6 +29,7 @@ class LoopSettings:
 
     steps: int | None = None
     backward: bool = False
+    passing: bool = False
     record: bool = False
     vary: bool = False
     plant: Plant | None = None
@@ -48,6 +51,7 @@ class Rollout:
         measured: (K, n, p) noisy measurements.
         u: (K, n, m) inputs.
         state: (K + 1, n, nstate) MuJoCo's states.
+        passing: how the runs pass the obstacles; None without `passing` in the settings.
     """
 
     path: np.ndarray
@@ -59,6 +63,7 @@ class Rollout:
     measured: np.ndarray
     u: np.ndarray
     state: np.ndarray
+    passing: Passing | None = None
 
 
 def closed_loop(
@@ -103,6 +108,7 @@ def closed_loop(
     shapes = {"before": (), "q": (), "measured": (len(task.noisy),), "u": (len(task.inputs),)}
     kept: dict[str, list[np.ndarray]] = {name: [] for name in shapes}
     states = [plant.state] if record else []
+    follower = Follower(task, plant) if settings.passing else None
     for k in progress_bar(range(limit), settings.label, "samples", quiet=settings.quiet):
         active = np.flatnonzero(outcome == Outcome.RUNNING)
         if not len(active):
@@ -120,6 +126,8 @@ def closed_loop(
         measurement[lost] = last[lost]  # the last one before the simulation became unstable
         path[k + 1] = task.chart.near(task.z(measurement), path[k])
         length[active] = k + 1
+        if follower is not None:
+            follower.follow(active[~lost[active]])
         if not backward:
             outcome[active] = task.outcome(measurement[active], lost[active])
         if record:
@@ -132,9 +140,7 @@ def closed_loop(
     arrays = {k: np.array(values).reshape(-1, n, *shapes[k]) for k, values in kept.items()}
     arrays |= {k: arrays[k].astype(int) for k in ("before", "q")}
     path = path[: length.max() + 1]
-    return Rollout(path, length, outcome, first_mode, **arrays, state=np.array(states))
-
-
-def ways(task: Task, rollout: Rollout) -> np.ndarray:
-    """Returns which way each run went, (n,) int as `Task.direction`; -1 for an unstable one."""
-    return np.where(rollout.outcome == Outcome.UNSTABLE, -1, task.direction(rollout.path))
+    passing = None if follower is None else follower.passing
+    return Rollout(
+        path, length, outcome, first_mode, **arrays, state=np.array(states), passing=passing
+    )

@@ -1,7 +1,8 @@
 """The stages of HyRL after training (paper, Section IV-C): a function and a result for each.
 
 Stage 2 is `find_critical_set`, stage 3 `make_partition`, stages 4 and 5 `extend`, stage 6
-`retraining.retrain`, and stage 7 `HybridController`. `retraining` imports torch: import it where needed.
+`retraining.retrain`, and stage 7 `HybridController`. `retraining` and `grounds` import torch: import them
+where needed.
 """
 
 from hyrl_mj.stages.attacks import Attack, Budget, attack, attack_starts, shown_arcs
@@ -32,6 +33,7 @@ __all__ = [
     "critical_points",
     "extend",
     "find_critical_set",
+    "grounds",
     "make_partition",
     "noisy_episodes",
     "retraining",

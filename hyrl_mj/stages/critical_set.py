@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from hyrl_mj.artifacts import Saved
 from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput, unknown
-from hyrl_mj.policies import Policy, PolicyController
-from hyrl_mj.sets import Grid
-from hyrl_mj.simulation import LoopSettings, Rollout, closed_loop, ways
+from hyrl_mj.policies import Policy
+from hyrl_mj.sets import Nodes, covering, surface_distance
+from hyrl_mj.stages.search import critical_points
+from hyrl_mj.stages.ways import WayRuns, policy_runs, usable, way_runs
 from hyrl_mj.tasks import SEARCHES, Task
 
 # Samples simulated from both ends of a rod: enough for runs to part, too few to pass an obstacle.
@@ -31,8 +32,8 @@ class CriticalSet(Saved):
     Attributes:
         points: (N, d) chart points.
         component: (N,) index of the connected piece of M* that each point belongs to.
-        resolution: length of the shortest rods, in chart units; M* is known to half of it.
-        spacing: distance between the grid points that the search started from, in chart units.
+        resolution: length of the shortest rods, in scaled units; M* is known to half of it.
+        spacing: distance between the grid points that the search started from, in scaled units.
     """
 
     KIND: ClassVar[str] = "critical set"
@@ -77,16 +78,22 @@ class CriticalSet(Saved):
 def ranges(chart: Chart, points: np.ndarray, resolution: float) -> str:
     """Returns the range of points (N, d) along each coordinate: "x 0 to 0.45 m, y 0.1 m"."""
     ends = zip(chart.names, chart.units, points.min(axis=0), points.max(axis=0), strict=True)
+    fine = resolution / 100 or 1e-12  # what is hardly off 0 is 0
     return ", ".join(
         f"{name} {a:.4g} to {b:.4g} {unit}"
         if b - a > resolution
-        else f"{name} {(a + b) / 2:.4g} {unit}"
+        else f"{name} {round((a + b) / 2 / fine) * fine + 0.0:.4g} {unit}"
         for name, unit, a, b in ends
     )
 
 
 def find_critical_set(
-    task: Task, policy: Policy, cells: int, resolution: float, method: str = "rods"
+    task: Task,
+    policy: Policy,
+    cells: int,
+    resolution: float,
+    method: str = "rods",
+    noise: float = 0.0,
 ) -> CriticalSet:
     """Searches for the critical set M*: property (*) and equation (8) of the paper.
 
@@ -104,6 +111,7 @@ def find_critical_set(
         cells: grid points along the longest side of the chart from which the search starts.
         resolution: length of the shortest rods, as a share of the first.
         method: "rods" or "outcome".
+        noise: bound eps of the measurement noise; "outcome" finds M* across failures up to 4 eps wide.
 
     Returns:
         The critical set; it may be empty.
@@ -113,23 +121,18 @@ def find_critical_set(
     """
     if method not in SEARCHES:
         raise unknown("method", method, SEARCHES)
-    grid = Grid.with_cells(task.chart, cells)
+    grid = covering(task.chart, cells)
     if method == "rods":
         centres = _by_rods(task, policy, grid, resolution)
     else:
         pairs = grid.neighbours()
-        centres = critical_points(task, policy, grid.nodes, pairs, grid.cell, resolution)
+        centres = critical_points(task, policy, grid.nodes, pairs, grid.cell, resolution, noise)
     points = np.unique(task.chart.wrap(centres), axis=0)
     component = _pieces(task, points, LINK * grid.cell)
     return CriticalSet(points, component, resolution * grid.cell, grid.cell)
 
 
-def policy_runs(task: Task, policy: Policy, z0: np.ndarray, **settings: Any) -> Rollout:
-    """Simulates a policy without noise from starts z0 (n, d); `settings` are those of `LoopSettings`."""
-    return closed_loop(task, PolicyController(policy), z0, settings=LoopSettings(**settings))
-
-
-def _by_rods(task: Task, policy: Policy, grid: Grid, resolution: float) -> np.ndarray:
+def _by_rods(task: Task, policy: Policy, grid: Nodes, resolution: float) -> np.ndarray:
     """Returns the centres (N, d) of the shortest rods that part."""
     d = task.chart.dimension
     centre = np.repeat(grid.nodes, d, axis=0)
@@ -143,73 +146,13 @@ def _by_rods(task: Task, policy: Policy, grid: Grid, resolution: float) -> np.nd
         offset = np.eye(d)[axis] * length[:, None] / 4
         centre = np.vstack([centre - offset, centre + offset])
         axis, length = np.tile(axis, 2), np.tile(length / 2, 2)
+    if not len(centre):
+        return centre
     ends = _ends(task, centre, axis, length).reshape(-1, d)
-    return centre[_differ(*np.split(_final_ways(task, policy, ends), 2))]
-
-
-def critical_points(
-    task: Task,
-    policy: Policy,
-    nodes: np.ndarray,
-    neighbours: tuple[np.ndarray, np.ndarray],
-    cell: float,
-    resolution: float,
-) -> np.ndarray:
-    """Searches by outcome: returns middles (N, d) between close starts whose runs go different ways.
-
-    Args:
-        task, policy, resolution: as in `find_critical_set`.
-        nodes: (n, d) starts.
-        neighbours: (k,), (k,) indices of starts that lie next to each other.
-        cell: the greatest distance between two neighbours.
-    """
-    at_node = _final_ways(task, policy, nodes)
-    first, second = neighbours
-    pair = _differ(at_node[first], at_node[second])
-    first, second = first[pair], second[pair]
-    a, way_a, way_b = nodes[first], at_node[first], at_node[second]
-    b = a + task.chart.difference(nodes[second], a)
-    length = cell
-    while len(a) and length > resolution * cell * (1 + 1e-9):
-        middle = (a + b) / 2
-        way = _final_ways(task, policy, middle)
-        near_a = (way == way_a)[:, None]
-        a, b = np.where(near_a, middle, a), np.where(near_a, b, middle)
-        way_b = np.where(near_a[:, 0], way_b, way)
-        # From the middle, nothing may be left to decide: such pairs are dropped.
-        decides, length = way >= 0, length / 2
-        a, b, way_a, way_b = a[decides], b[decides], way_a[decides], way_b[decides]
-    return ((a + b) / 2)[_go_apart(task, policy, a, b, cell)]
-
-
-def _final_ways(task: Task, policy: Policy, z: np.ndarray) -> np.ndarray:
-    """Returns the way (n,) that the run from each start z (n, d) finally goes; -1 without a decision."""
-    if not len(z):
-        return np.zeros(0, dtype=int)
-    return ways(task, policy_runs(task, policy, z))
-
-
-def _differ(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Returns whether two runs decide for different ways: (n,) bool."""
-    return (first != second) & (first >= 0) & (second >= 0)
-
-
-def _go_apart(task: Task, policy: Policy, a: np.ndarray, b: np.ndarray, far: float) -> np.ndarray:
-    """Returns whether runs from a and b (n, d) get farther apart than `far` while both last: (n,) bool.
-
-    Two runs that crash into a pillar on either side of its middle do not go apart, and neither do two that
-    chatter around the same point: the longest hop of each run in one sample does not count.
-    """
-    n = len(a)
-    if not n:
-        return np.zeros(0, dtype=bool)
-    rollout = policy_runs(task, policy, np.vstack([a, b]))
-    moved = rollout.path - rollout.path[0]
-    apart = np.linalg.norm(moved[:, :n] - moved[:, n:], axis=2)
-    last = np.minimum(rollout.length[:n], rollout.length[n:])
-    apart[np.arange(len(apart))[:, None] > last] = 0.0
-    hop = np.linalg.norm(np.diff(rollout.path, axis=0), axis=2).max(axis=0)
-    return np.asarray(apart.max(axis=0) > far + hop[:n] + hop[n:])
+    runs = WayRuns.of(task, way_runs(task, policy, ends))
+    first, second = np.split(np.arange(2 * len(centre)), 2)
+    works = usable(runs)
+    return centre[runs[first].differ(runs[second]) & works[first] & works[second]]
 
 
 def _ends(task: Task, centre: np.ndarray, axis: np.ndarray, length: np.ndarray) -> np.ndarray:
@@ -228,8 +171,9 @@ def _part(task: Task, policy: Policy, a: np.ndarray, b: np.ndarray) -> np.ndarra
     # If one run ends early, by a crash for instance, the two are compared at its last sample.
     last = np.minimum(rollout.length[:n], rollout.length[n:])
     moved = rollout.path[np.tile(last, 2), np.arange(2 * n)] - rollout.path[0]
+    moved = moved / task.chart.scale
     displacement = np.linalg.norm(moved[:n], axis=1) + np.linalg.norm(moved[n:], axis=1)
-    rod = b - a
+    rod = (b - a) / task.chart.scale
     growth = np.linalg.norm(rod + moved[n:] - moved[:n], axis=1) - np.linalg.norm(rod, axis=1)
     return growth > np.maximum(PARTING * displacement, 1e-9)
 
@@ -259,7 +203,12 @@ def check_points(task: Task, points: np.ndarray) -> np.ndarray:
 
 
 def distance_to(task: Task, points: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Returns the distance (n,) of z (n, d) to points (N, d) of M*, in chart units; inf without points."""
+    """Returns the distance (n,) of z (n, d) to points (N, d) of M*, in scaled units; inf without points.
+
+    In charts of more than three dimensions M* is the surface through its points.
+    """
     if not len(points):
         return np.full(len(z), np.inf)
+    if task.chart.dimension > 3:
+        return surface_distance(task.chart, points, z)
     return task.chart.tree(points).query(task.chart.in_box(z))[0]

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
 
 from hyrl_mj.artifacts import Saved
+from hyrl_mj.errors import BadInput
 from hyrl_mj.game import Limit
 from hyrl_mj.policies import Policy
-from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.stages.critical_set import check_points, distance_to, policy_runs, ranges
+from hyrl_mj.sets import Cloud, Grid, GridSet
+from hyrl_mj.stages.critical_set import check_points, distance_to
+from hyrl_mj.stages.meeting import least_room, narrow_sentence
 from hyrl_mj.stages.partition import (
     Partition,
     PartPolicy,
@@ -22,6 +24,7 @@ from hyrl_mj.stages.partition import (
     open_ways,
     part_policies,
 )
+from hyrl_mj.stages.ways import policy_runs
 from hyrl_mj.tasks import Outcome, Task
 
 # A horizon is long enough when the propagated sets fill this share of the overlap that the noise needs.
@@ -30,6 +33,8 @@ FILLED = 0.995
 GAP_CELLS = 1.5
 # The longest horizon that is tried [s].
 LONGEST_HORIZON = 2.0
+# No longer horizon is tried once the sets have not gained for this time [s].
+PATIENCE = 0.5
 
 
 @dataclass(frozen=True)
@@ -42,8 +47,10 @@ class ExtendedSets(Saved):
         winning: W_i as (N,) bool over the grid's nodes, from where pi_i reaches the set-point.
         horizon: time T of the backward propagation [s]; 0 without propagation.
         noise: bound eps of the measurement noise that the sets are made for.
-        narrow: (K, d) points of M* where the noise needs more room than a mode has.
-        room: (K,) room across M* at these points, in chart units; 2 eps are needed.
+        points: (K, d) points of M* where modes meet, and the way of one of them is open.
+        room: (K,) how far across M* two modes that meet there both win, in the unit of the noise; 2 eps are
+            needed.
+        between: (K, 2) the numbers of these two modes: of all that meet there those with the least room.
     """
 
     KIND: ClassVar[str] = "extended sets"
@@ -53,30 +60,51 @@ class ExtendedSets(Saved):
     winning: tuple[np.ndarray, ...]
     horizon: float
     noise: float
-    narrow: np.ndarray
+    points: np.ndarray
     room: np.ndarray
+    between: np.ndarray = field(default_factory=lambda: np.empty((0, 2), dtype=int))
 
     def __post_init__(self) -> None:
         check_sets(self.modes, self.sets, self.winning)
+        k = len(self.points)
+        if self.room.shape != (k,) or self.between.shape != (k, 2):
+            raise BadInput(
+                f"room of shape {self.room.shape} between modes of shape {self.between.shape} does not fit "
+                f"{k} points of M*: give ({k},) and ({k}, 2)"
+            )
 
     def __repr__(self) -> str:
-        shares = [f"{q}: {m.mask.mean():.1%}" for q, m in zip(self.modes, self.sets, strict=True)]
+        shares = [f"{q}: {m.share:.1%}" for q, m in zip(self.modes, self.sets, strict=True)]
         return f"ExtendedSets({', '.join(shares)} of the chart, eps {self.noise:g})"
 
     def sentence(self, task: Task) -> str:
         """Returns a one-line description."""
         if len(self.sets) < 2:
             return "one mode, whose set is the whole chart"
-        share = (self.sets[0] & self.sets[1]).mask.mean()
         reach = f"T = {self.horizon:.2g} s" if self.horizon else "as far as the ways are open"
-        text = f"{len(self.sets)} extended sets, {reach}, the first two share {100 * share:.1f}% of the chart"
-        if not len(self.narrow):
-            return text
-        return (
-            f"{text}; no overlap can be wide enough for noise {self.noise:g} at "
-            f"{ranges(task.chart, self.narrow, 1e-3)}: {2 * self.noise:g} of room are needed there and as "
-            f"little as {self.room.min():.2g} is left"
+        text = f"{len(self.sets)} extended sets, {reach}{self._shared()}"
+        narrow = narrow_sentence(
+            task, self.points, self.between, self.room, self.narrow, self.noise
         )
+        return f"{text}; {narrow}" if narrow else text
+
+    @property
+    def narrow(self) -> np.ndarray:
+        """Whether the noise needs more room than two modes have at each of the points: (K,) bool."""
+        return np.asarray(self.room < 2 * self.noise - self.sets[0].grid.cell)
+
+    def _shared(self) -> str:
+        """Returns how much of the chart the sets of modes that meet share."""
+        sets = dict(zip(self.modes, self.sets, strict=True))
+        pairs = np.unique(self.between, axis=0).tolist()
+        shares = [100 * (sets[a] & sets[b]).share for a, b in pairs]
+        if not shares:
+            return ""
+        if len(self.sets) == 2:
+            return f", which share {shares[0]:.1f}% of the chart"
+        least, most = min(shares), max(shares)
+        much = f"{least:.1f}%" if most - least < 0.05 else f"{least:.1f} to {most:.1f}%"
+        return f", those of two modes that meet share {much} of the chart"
 
 
 def extend(
@@ -114,7 +142,7 @@ def extend(
     points = check_points(task, points)
     grid, parts = partition.grid, partition.parts
     eps, hop = task.noise_in_chart(noise), longest_hop(task, policy, grid)
-    near = neighbourhood(grid, noise, hop)
+    near = neighbourhood(partition, noise, hop)
     pis = part_policies(task, policy, partition, near)
     wanted = [part.dilated_by_box(2 * eps + hop * (task.noise_in_chart(1.0) > 0)) for part in parts]
     # The extended sets lie among these candidates.
@@ -133,12 +161,14 @@ def extend(
     ]
     # Only M* has to be covered: where parts meet elsewhere, as at the set-point, nothing is left to decide.
     off = distance_to(task, points, grid.nodes)
-    around = off <= float(np.linalg.norm(2 * eps + hop))
+    around = off <= float(np.linalg.norm((2 * eps + hop) / task.chart.scale))
     propagated = horizon or 0.0
     if len(parts) > 1 and (ways is None or horizon is not None):
+        # The cells that backward runs visit are those of a grid.
+        backward = task.kinematic and isinstance(grid, Grid)
         reach = [
             _backward_reach(task, pi, part, part.mask & (off <= near))
-            if task.kinematic
+            if backward
             else _forward_reach(task, pi, part, part.mask & (off <= near), candidate)
             for pi, part, candidate in zip(pis, parts, candidates, strict=True)
         ]
@@ -146,13 +176,8 @@ def extend(
             (w & room).mask & ~part.mask & around
             for w, room, part in zip(wanted, roomy, parts, strict=True)
         ]
-        longest = round(LONGEST_HORIZON / task.dt)
-        for k in [max(round(horizon / task.dt), 1)] if horizon else range(1, longest + 1):
-            reached = [part | within(k) for part, within in zip(parts, reach, strict=True)]
-            pairs = zip(reached, goals, strict=True)
-            filled = [r.mask[goal].mean() for r, goal in pairs if goal.any()]
-            if min(filled, default=1.0) >= FILLED:
-                break
+        k = max(round(horizon / task.dt), 1) if horizon else _shortest(task, reach, goals)
+        reached = [part | within(k) for part, within in zip(parts, reach, strict=True)]
         propagated = horizon or k * task.dt
         if horizon is None:
             reached = [r & w for r, w in zip(reached, wanted, strict=True)]
@@ -162,19 +187,54 @@ def extend(
         (r & room) | part.dilated_by_box(eps)
         for r, room, part in zip(reached, roomy, parts, strict=True)
     )
-    narrow, room = _narrow(task, points, grid, winning, eps)
-    return ExtendedSets(partition.modes, sets, winning, propagated, noise, narrow, room)
+    rows, pair, room = least_room(points, parts, winning, eps)
+    between = np.array(partition.modes)[pair]
+    return ExtendedSets(
+        partition.modes, sets, winning, propagated, noise, points[rows], 2 * noise * room, between
+    )
+
+
+def _shortest(task: Task, reach: list[Callable[[int], GridSet]], goals: list[np.ndarray]) -> int:
+    """Returns the least number of samples with which every set fills its goal (N,) bool.
+
+    What some set never reaches does not count, as a corner behind the place where three parts meet.
+    """
+    most, best = [0] * len(goals), 1
+    for k in range(1, round(LONGEST_HORIZON / task.dt) + 1):
+        pairs = zip(reach, goals, strict=True)
+        filled = [int(np.count_nonzero(within(k).mask[goal])) for within, goal in pairs]
+        if all(n >= FILLED * goal.sum() for n, goal in zip(filled, goals, strict=True)):
+            return k
+        if any(n > before for n, before in zip(filled, most, strict=True)):
+            most, best = np.maximum(filled, most).tolist(), k
+        if k * task.dt > PATIENCE + best * task.dt:
+            break
+    return best
 
 
 def _part_wins(
     task: Task, pi: PartPolicy, partition: Partition, part: GridSet, candidates: np.ndarray
 ) -> np.ndarray:
-    """Returns W_i: the nodes (N,) bool among the candidates (N,) from which pi_i reaches the set-point."""
-    wins = partition.succeeds & part.mask
+    """Returns W_i: the nodes (N,) bool among the candidates (N,) from which pi_i arrives by its own way.
+
+    Past obstacles, a run from outside M_i goes another way if it first enters M_i where parts overlap.
+    """
+    arrives = partition.succeeds & part.mask
+    wins = arrives.copy()
     outside = np.flatnonzero(candidates & ~part.mask)
     if len(outside):
         rollout = policy_runs(task, pi, part.grid.nodes[outside], label="extended sets")
         wins[outside] = rollout.outcome == Outcome.REACHED
+        if task.gives_direction:
+            return wins
+        shared = np.sum([other.mask for other in partition.parts], axis=0) > 1
+        entered, elsewhere = np.zeros((2, len(outside)), dtype=bool)
+        for z in rollout.path[1:]:
+            at = part.grid.nearest(z)
+            enters = ~entered & arrives[at]
+            elsewhere |= enters & shared[at]
+            entered |= enters
+        wins[outside] &= ~elsewhere
     return wins
 
 
@@ -185,14 +245,20 @@ def _backward_reach(
 
     X_i are the states that backward runs reach from the rim (N,) bool, the nodes of M_i near M*.
     """
-    grid, gap = part.grid, GAP_CELLS * part.grid.cell
+    grid, gap = part.regular, GAP_CELLS * part.grid.cell
     nodes = grid.nodes[rim]
+    path = nodes[None]
 
     def within(samples: int) -> GridSet:
+        nonlocal path
         visited = np.zeros(len(grid.nodes), dtype=bool)
         if len(nodes):
-            runs = policy_runs(task, pi, nodes, steps=samples, backward=True, label="backward")
-            z = _between_samples(runs.path, grid)
+            if len(path) <= samples:  # more than asked for: longer times are asked for in turn
+                steps = max(samples, 2 * len(path))
+                path = policy_runs(
+                    task, pi, nodes, steps=steps, backward=True, label="backward"
+                ).path
+            z = _between_samples(path[: samples + 1], grid)
             visited[grid.nearest(z[task.chart.contains(z)])] = True
         # A closing, together with M_i, fills the gaps between the samples.
         wide = GridSet.from_mask(grid, visited | part.mask).dilated(gap)
@@ -204,7 +270,10 @@ def _backward_reach(
 def _forward_reach(
     task: Task, pi: PartPolicy, part: GridSet, rim: np.ndarray, candidates: np.ndarray
 ) -> Callable[[int], GridSet]:
-    """As `_backward_reach`, but X_i are the candidates (N,) whose forward runs enter M_i on the rim (N,)."""
+    """As `_backward_reach`, but X_i are the candidates (N,) whose forward runs enter M_i on the rim (N,).
+
+    Scattered nodes lie too far apart for a rim: there X_i are all candidates whose runs enter M_i.
+    """
     grid = part.grid
     outside = np.flatnonzero(candidates & ~part.mask)
     arrival = np.full(len(grid.nodes), np.inf)
@@ -213,9 +282,11 @@ def _forward_reach(
         rollout = policy_runs(task, pi, grid.nodes[outside], steps=longest, label="forward")
         under_way = np.ones(len(outside), dtype=bool)
         for k, z in enumerate(rollout.path[1:], 1):
-            enters = under_way & part.contains(z)
-            arrival[outside[enters & rim[grid.nearest(z)]]] = k
-            under_way &= ~enters
+            rows = np.flatnonzero(under_way)
+            rows = rows[part.contains(z[rows])]
+            on_rim = rows if isinstance(grid, Cloud) else rows[rim[grid.nearest(z[rows])]]
+            arrival[outside[on_rim]] = k
+            under_way[rows] = False
     return lambda samples: GridSet.from_mask(grid, part.mask | (arrival <= samples))
 
 
@@ -226,27 +297,3 @@ def _between_samples(path: np.ndarray, grid: Grid) -> np.ndarray:
     shares = np.arange(count)[:, None, None, None] / count
     d = path.shape[-1]
     return np.concatenate([(path[:-1] + shares * hops).reshape(-1, d), path[-1]])
-
-
-def _narrow(
-    task: Task, points: np.ndarray, grid: Grid, winning: tuple[np.ndarray, ...], eps: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the points (K, d) of M* where some mode wins, but the room (K,) is less than 2 eps (d,).
-
-    The room is the distance to either side of M* over which all modes win.
-    """
-    shares = np.arange(0.0, 1.0 + 1e-9, 0.02)
-    reach = 2 * eps.max(initial=0.0)
-    if not len(points) or not reach or len(winning) < 2:
-        return np.empty((0, task.chart.dimension)), np.empty(0)
-    room = np.full(len(points), reach)
-    directions = np.vstack([np.diag(2 * eps), -np.diag(2 * eps)])
-    for direction in directions[directions.any(axis=1)]:
-        line = grid.nearest((points[:, None] + shares[:, None] * direction).reshape(-1, len(eps)))
-        for wins in winning:
-            succeeds = wins[line].reshape(len(points), -1)
-            first_loss = np.where(succeeds.all(axis=1), len(shares), succeeds.argmin(axis=1))
-            room = np.minimum(room, np.maximum(first_loss - 1, 0) * 0.02 * reach)
-    someone = np.any([wins[grid.nearest(points)] for wins in winning], axis=0)
-    narrow = someone & (room < reach - grid.cell)
-    return points[narrow], room[narrow]

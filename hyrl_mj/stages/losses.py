@@ -53,7 +53,7 @@ def sort_losses(task: Task, policy: Policy, partition: Partition, eps: float, ce
         eps: the noise bound.
         cells: lattice cells along the longest side, as in `curve_grid`.
     """
-    near = neighbourhood(partition.grid, eps, longest_hop(task, policy, partition.grid))
+    near = neighbourhood(partition, eps, longest_hop(task, policy, partition.grid))
     pis = part_policies(task, policy, partition, near)
     loops = {f"part {i}": PolicyController(pi) for i, pi in enumerate(pis)}
     grid = curve_grid(task, cells)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -12,13 +12,16 @@ from hyrl_mj.artifacts import Saved
 from hyrl_mj.errors import BadInput
 from hyrl_mj.game import NEVER, Limit
 from hyrl_mj.policies import Policy
-from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.simulation import ways
-from hyrl_mj.stages.critical_set import check_points, policy_runs
-from hyrl_mj.tasks import Outcome, Task
+from hyrl_mj.sets import GridSet, Nodes, resolving
+from hyrl_mj.stages.critical_set import check_points
+from hyrl_mj.stages.search import WEDGE
+from hyrl_mj.stages.ways import LEAST_SHARE, WayRuns, Ways, policy_runs, way_runs
+from hyrl_mj.tasks import ANY, Outcome, Task, number_of
 
 # The neighbourhood of M* is at least this many cells wide, and as wide as the longest hop in one sample.
-NEIGHBOURHOOD_CELLS = 4
+# Of more than two parts some are wedges: without a wide neighbourhood they begin far from M*, where a policy
+# goes straight on because it is clear of the obstacle.
+NEIGHBOURHOOD_CELLS, CELLS_OF_WEDGES = 4, 1.5
 
 
 @dataclass(frozen=True)
@@ -26,12 +29,14 @@ class Partition(Saved):
     """The parts M_i (paper, Step 3).
 
     States from which nothing is left to decide (beyond the obstacle, at the set-point) belong to every
-    part.
+    part. Those from which a run fails belong to the parts of the nearest one from which it arrives.
 
     Attributes:
         modes: the modes.
         parts: M_i of each mode, in the same order.
         succeeds: (N,) bool, the grid's nodes from which the stage-1 policy reaches the set-point.
+        dropped: ways that too few of the nodes go to be modes.
+        unparted: without a critical set, the ways that runs go all the same.
     """
 
     KIND: ClassVar[str] = "partition"
@@ -39,29 +44,48 @@ class Partition(Saved):
     modes: tuple[int, ...]
     parts: tuple[GridSet, ...]
     succeeds: np.ndarray
+    dropped: tuple[int, ...] = ()
+    unparted: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         check_sets(self.modes, self.parts, (self.succeeds,))
 
     def __repr__(self) -> str:
-        shares = [f"{q}: {p.mask.mean():.1%}" for q, p in zip(self.modes, self.parts, strict=True)]
-        return f"Partition({', '.join(shares)} of {' x '.join(map(str, self.grid.counts))} nodes)"
+        shares = [f"{q}: {p.share:.1%}" for q, p in zip(self.modes, self.parts, strict=True)]
+        return f"Partition({', '.join(shares)} of {self.grid})"
 
     def __iter__(self) -> Iterator[GridSet]:
         return iter(self.parts)
 
     @property
-    def grid(self) -> Grid:
-        """The grid of the parts."""
+    def grid(self) -> Nodes:
+        """The nodes of the parts: a grid or a cloud."""
         return self.parts[0].grid
 
     def sentence(self, task: Task) -> str:
         """Returns a one-line description."""
         shares = ", ".join(
-            f"{task.scene.mode_name(q)} {100 * part.mask.mean():.0f}%"
+            f"{task.mode_name(q)} {100 * part.share:.0f}%"
             for q, part in zip(self.modes, self.parts, strict=True)
         )
-        return f"share of the chart by mode: {shares}"
+        notes = ""
+        if self.dropped:
+            rare = ", ".join(map(task.mode_name, self.dropped))
+            notes += f"; less than {LEAST_SHARE:.0%} goes {rare}: no mode"
+        if self.unparted:
+            found = ", ".join(map(task.mode_name, self.unparted))
+            notes += (
+                f"; runs go {found}, but no critical set was found between these ways, so that they are no "
+                f"modes: if the policy fails over more than {WEDGE:g} eps between them, train it longer"
+            )
+        if len(self.modes) > 1 and (unseen := self._unseen(task)):
+            notes += f"; no run that arrives goes {', '.join(map(task.mode_name, unseen))}"
+        return f"share of the chart by mode: {shares}{notes}"
+
+    def _unseen(self, task: Task) -> list[int]:
+        """Returns the ways that the task's scene names and that no run goes."""
+        named = task.scene.mode_names if task.gives_direction or len(task.obstacles) == 1 else ()
+        return [q for q in range(len(named)) if q not in (*self.modes, *self.dropped)]
 
 
 def check_sets(
@@ -75,26 +99,40 @@ def check_sets(
         raise BadInput(f"sets and masks of shapes {shapes} do not lie on one grid")
 
 
-def make_partition(task: Task, policy: Policy, points: np.ndarray, cells: int) -> Partition:
+def make_partition(
+    task: Task, policy: Policy, points: np.ndarray, cells: int, noise: float = 0.0
+) -> Partition:
     """Splits the nodes of a grid by the way that the closed loop goes from each (paper, Step 3).
 
-    If M* is empty, there is one part, of mode 0, that holds the whole chart.
+    If M* is empty, there is one part that holds the whole chart: of mode 0, or past several obstacles of the
+    mode of any way.
 
     Args:
         task: gives chart, plant, and the way of a run.
         policy: the stage-1 policy.
         points: (N, d) of M*, from stage 2.
-        cells: cells of the grid along the longest side of the chart.
+        cells: cells of the grid along the longest side of the chart, if they were square.
+        noise: bound eps of the measurement noise; in charts of three and more dimensions the nodes lie close
+            enough to tell states apart that it does, as far as `cells` allows.
     """
     points = check_points(task, points)
-    grid = Grid.with_cells(task.chart, cells)
-    rollout = policy_runs(task, policy, grid.nodes, label="partition")
-    way = ways(task, rollout)
-    if not len(points):
-        way = np.full_like(way, -1)
-    modes = tuple(int(q) for q in np.unique(way[way >= 0])) or (0,)
-    parts = tuple(GridSet.from_mask(grid, (way == q) | (way < 0)) for q in modes)
-    return Partition(modes, parts, rollout.outcome == Outcome.REACHED)
+    grid = resolving(task.chart, cells, points, task.noise_in_chart(max(noise, 1e-6)))
+    rollout = way_runs(task, policy, grid.nodes, "partition")
+    runs = WayRuns.of(task, rollout)
+    ways = Ways.of(task, runs, grid.neighbours())
+    modes = ways.modes if len(points) else ()
+    members = ways.members(runs)
+    works = np.flatnonzero(ways.works(runs))
+    failed = np.flatnonzero(~ways.works(runs))
+    if modes and len(failed):
+        nearest = task.chart.tree(grid.nodes[works]).query(task.chart.in_box(grid.nodes[failed]))[1]
+        members[failed] = members[works[nearest]]
+    masks = members.T if modes else np.ones((1, len(grid.nodes)), dtype=bool)
+    parts = tuple(GridSet.from_mask(grid, mask) for mask in masks)
+    unparted = () if modes or len(ways.modes) < 2 else ways.modes
+    alone = 0 if ways.end.size < 2 else int(number_of(np.full((1, ways.end.size), ANY))[0])
+    succeeds = rollout.outcome == Outcome.REACHED
+    return Partition(modes or (alone,), parts, succeeds, ways.dropped, unparted)
 
 
 def with_room(
@@ -127,10 +165,10 @@ def with_room(
     parts = tuple(
         GridSet.from_mask(grid, np.where(moved, best == i, mask)) for i, mask in enumerate(masks)
     )
-    return Partition(partition.modes, parts, partition.succeeds)
+    return replace(partition, parts=parts)
 
 
-def open_ways(limit: Limit, grid: Grid) -> tuple[np.ndarray, ...]:
+def open_ways(limit: Limit, grid: Nodes) -> tuple[np.ndarray, ...]:
     """Returns the nodes (N,) bool of a grid from which each mode's way is open."""
     at = limit.lattice.grid.nearest(grid.nodes)
     return tuple(samples[at] < NEVER for samples in limit.samples)
@@ -175,12 +213,14 @@ def part_policies(
     return tuple(PartPolicy(task, policy, part.eroded(near)) for part in partition.parts)
 
 
-def neighbourhood(grid: Grid, noise: float, hop: np.ndarray) -> float:
+def neighbourhood(partition: Partition, noise: float, hop: np.ndarray) -> float:
     """Returns the width of the neighbourhood of M*: the noise, some cells, or one sample's hop (d,)."""
-    return max(noise, NEIGHBOURHOOD_CELLS * grid.cell, float(np.linalg.norm(hop)))
+    grid = partition.grid
+    cells = NEIGHBOURHOOD_CELLS if len(partition.parts) <= 2 else CELLS_OF_WEDGES
+    return max(noise, cells * grid.cell, float(np.linalg.norm(hop / grid.chart.scale)))
 
 
-def longest_hop(task: Task, policy: Policy, grid: Grid) -> np.ndarray:
+def longest_hop(task: Task, policy: Policy, grid: Nodes) -> np.ndarray:
     """Returns the longest hop (d,) of the closed loop in one sample, along each coordinate."""
     path = policy_runs(task, policy, grid.nodes, steps=1).path
     return np.asarray(np.abs(path[-1] - path[0]).max(axis=0))

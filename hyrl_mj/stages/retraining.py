@@ -2,41 +2,19 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from itertools import product
 from pathlib import Path
 
 import numpy as np
 
-from hyrl_mj import game
-from hyrl_mj.envs import Domain
 from hyrl_mj.learning import Training, symmetry
 from hyrl_mj.learning.distillation import distil, fits
 from hyrl_mj.learning.training import Score, train
-from hyrl_mj.policies import ALGORITHMS, MlpPolicy, Policy, PolicyController
-from hyrl_mj.sets import GridSet
-from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
-from hyrl_mj.stages.extended_sets import ExtendedSets
+from hyrl_mj.policies import ALGORITHMS, MlpPolicy, Policy
+from hyrl_mj.stages.grounds import ModeGround
 from hyrl_mj.stages.partition import Partition, longest_hop, neighbourhood, part_policies
 from hyrl_mj.stages.results import ModeResult
-from hyrl_mj.tasks import Outcome, Task
 
-# If the game is lost from some states, this share of the training episodes starts there.
-LOST_SHARE = 0.2
-# Of the other episodes, this share starts where the task starts, the rest anywhere in the mode's domain.
-TASK_SHARE = 0.7
-# States that lose in k samples are drawn in proportion to k to this power: they are learned backward.
-URGENCY = -1.5
-# The latest arrival may take this share longer than the fewest samples possible.
-ALLOWED_DELAY = 0.03
-# Where the worst case cannot be computed: the kinds of noise that judge a policy, the mildest first, the
-# episodes for each kind, and how many run at once. Most policies are bad and fail in the first batch.
-JUDGES = ("none", "uniform", "alternating", "adversarial")
-EPISODES, BATCH = 256, 64
-# There, a policy may end this many times as far off the set-point as the stage-1 policy, because it goes the
-# long way, too; or by this share of the distance that counts as arrived.
-ALLOWED_MISS, MISS_SHARE = 2.0, 0.25
 # Returns the policy that the first attempt continues from, by the ground of the mode, settings and a seed.
 WarmStart = Callable[["ModeGround", Training, int], MlpPolicy | None]
 
@@ -59,7 +37,7 @@ def start_policy(
     task, grid = ground.task, partition.grid
     if not ALGORITHMS[settings.algorithm].is_actor_critic:
         return policy if isinstance(policy, MlpPolicy) and fits(task, settings, policy) else None
-    near = neighbourhood(grid, ground.extended.noise, longest_hop(task, policy, grid))
+    near = neighbourhood(partition, ground.extended.noise, longest_hop(task, policy, grid))
     pi = part_policies(task, policy, partition, near)[partition.modes.index(ground.mode)]
     return distil(task, pi, ground.starts, settings, seed)
 
@@ -95,7 +73,7 @@ def retrain(
     task, mode = ground.task, ground.mode
     if task.mirror is not None:
         for image in (symmetry.mirrored(other) for other in others):
-            if ground(image) >= ground.enough:
+            if ground.suffices(image):
                 return image, ModeResult(mode, ground.won(image), 0)
     tried: list[tuple[Score, MlpPolicy]] = []
     trainings = 0
@@ -106,7 +84,7 @@ def retrain(
             warm = warm_start(ground, settings, draw)
         if warm is not None:
             tried.append((ground(warm), warm))
-            if tried[-1][0] >= ground.enough:
+            if ground.suffices(warm):
                 break
         label = f"mode {mode}, attempt {attempt + 1}" if attempt else f"mode {mode}"
         trained = train(
@@ -114,237 +92,7 @@ def retrain(
         )
         trainings += 1
         tried.append((ground(trained), trained))
-        if tried[-1][0] >= ground.enough:
+        if ground.suffices(trained):
             break
     best = max(tried, key=lambda result: result[0])[1]
     return best, ModeResult(mode, ground.won(best), trainings)
-
-
-def mode_ground(
-    task: Task,
-    extended: ExtendedSets,
-    mode: int,
-    parts: Partition | None = None,
-    policy: Policy | None = None,
-) -> ModeGround:
-    """Returns the ground of a mode, judged by the worst-case game if possible, otherwise by episodes."""
-    kind = ByGame if game.Lattice.decides(task, extended.sets[0].grid) else ByEpisodes
-    return kind(task, extended, mode, parts, policy)
-
-
-class ModeGround(ABC):
-    """Where one mode has to win: draws starts from it, and scores policies (a `Ground` of `train`).
-
-    These are all states whose measurement can lie in M_ext_i and from which the mode can still succeed.
-
-    Args:
-        task: the robot and its problem.
-        extended: M_ext_i and W_i.
-        mode: the mode.
-        parts: M_i, the parts that were extended; by default the mode earns its reward everywhere.
-        policy: the stage-1 policy, or the agent, which shows how close to the set-point a run can end.
-
-    Attributes:
-        bound: (d,) largest error of a measured chart point, along each coordinate.
-    """
-
-    enough: Score
-    noise: Noise
-    settled = 0.0  # scores count from the beginning
-
-    def __init__(
-        self,
-        task: Task,
-        extended: ExtendedSets,
-        mode: int,
-        parts: Partition | None = None,
-        policy: Policy | None = None,
-    ):
-        self.task, self.extended, self.mode = task, extended, mode
-        self.part = None if parts is None else parts.parts[parts.modes.index(mode)]
-        self.bound = task.noise_in_chart(extended.noise)
-        index = extended.modes.index(mode)
-        self.within = extended.sets[index].dilated_by_box(self.bound)
-        self.grid = self.within.grid
-        within = self.within.mask
-        plant = task.plant(len(self.grid.nodes))
-        plant.set_state(*task.state(self.grid.nodes))
-        alive = task.ending(plant.measurement) == Outcome.RUNNING
-        # Where the stage-1 policy never succeeds, training may still find a way.
-        wins = extended.winning[index]
-        self.wanted = within & alive & (wins if (within & alive & wins).any() else True)
-        self.nodes = np.flatnonzero(self.wanted)
-        early = self.nodes[task.may_start(self.grid.nodes[self.nodes])]
-        self.early = early if len(early) else self.nodes
-        self.lost, self._weight = np.empty(0, dtype=int), np.empty(0)
-        self._latest: tuple[MlpPolicy, Score] | None = None
-        self._prepare(policy)
-
-    @abstractmethod
-    def _prepare(self, policy: Policy | None) -> None:
-        """Prepares the judge."""
-
-    def __call__(self, policy: MlpPolicy) -> Score:
-        """Returns the score of a policy. Later starts are drawn where the latest policy has lost."""
-        if self._latest is None or self._latest[0] is not policy:
-            self._latest = policy, self.score(policy)
-        return self._latest[1]
-
-    @abstractmethod
-    def score(self, policy: MlpPolicy) -> Score:
-        """Computes the score of a policy, and remembers where it lost."""
-
-    @abstractmethod
-    def won(self, policy: MlpPolicy) -> float:
-        """Returns the share that a policy wins, as in `ModeResult`."""
-
-    def domain(self, gamma: float) -> Domain:
-        """Returns the domain of training; leaving it costs the worst reward for ever.
-
-        Beyond its part a mode earns nothing: there the task's reward leads to the other way, and it could
-        pay to creep or to stay at the edge of the set, because the detour is long and returns are discounted.
-        """
-        caution = self.extended.noise * np.array(self.task.noisy, dtype=float)
-        exit_reward = self.task.worst_reward / (1 - gamma)
-        earns = None if self.part is None else self.part.contains
-        return Domain(self.starts, self.within.contains, exit_reward, caution, earns)
-
-    def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Draws n starts (n, d): where the game is lost, where the task starts, and all over."""
-        early = rng.random(n) < TASK_SHARE
-        at = np.where(early, rng.choice(self.early, n), rng.choice(self.nodes, n))
-        if len(self.lost):
-            lost = rng.choice(self.lost, n, p=self._weight)
-            at = np.where(rng.random(n) < LOST_SHARE, lost, at)
-        return self._around(at, rng)
-
-    def _around(self, at: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Draws points (n, d) in the cells around the nodes of indices `at` (n,)."""
-        nodes, chart = self.grid.nodes[at], self.task.chart
-        z = nodes + rng.uniform(-0.5, 0.5, nodes.shape) * self.grid.spacing
-        return np.where(chart.periodic, z, np.clip(z, chart.low, chart.high))
-
-    def _remember(self, lost: np.ndarray, weight: np.ndarray) -> None:
-        """Keeps the lost nodes (k,), and the weights (k,) with which starts are drawn from them."""
-        self.lost, self._weight = lost, weight / max(weight.sum(), 1e-300)
-
-
-class ByGame(ModeGround):
-    """Judges by the worst-case game, which has to be won from every state.
-
-    The score is minus the share of lost states, then minus the larger of delay and miss, each as a multiple
-    of its limit. The delay is how much longer the latest arrival takes than the fewest samples possible. The
-    miss is how far from the set-point, beyond the noise bound, noise can keep a run for ever; if runs end, it
-    is how far from the set-point they end without noise.
-    """
-
-    enough: Score = (0.0, -1.0)
-    noise = Noise()  # the game finds the worst
-
-    def _prepare(self, policy: Policy | None) -> None:
-        self.lattice = game.Lattice.of(self.task, self.grid)
-        after = self.lattice.after
-        inside = np.append(self.within.mask, [True, False])[after]
-        fewest, _ = game.fewest_samples(self.lattice, after, inside)
-        self.fewest = int(fewest[self.nodes][fewest[self.nodes] < game.NEVER].max(initial=0))
-
-    def score(self, policy: MlpPolicy) -> Score:
-        answers = game.Answers.of(self.lattice, PolicyController(policy), self.bound)
-        moves = game.noisy_moves(answers, self.bound)
-        value = game.solve(moves)[0, :-2]
-        lost = np.flatnonzero(self.wanted & (value >= game.NEVER))
-        samples = np.where(value > game.NEVER, game.LOST - value, self.task.max_steps)[lost]
-        self._remember(lost, np.maximum(samples, 1.0) ** URGENCY)
-        if len(lost):
-            return -len(lost) / len(self.nodes), -np.inf
-        delay = value[self.nodes].max() / max(self.fewest, 1) - 1
-        miss = self._miss(answers, moves)
-        return 0.0, -float(max(delay / ALLOWED_DELAY, miss / self.task.precision))
-
-    def won(self, policy: MlpPolicy) -> float:
-        answers = game.Answers.of(self.lattice, PolicyController(policy), self.bound)
-        moves = game.noisy_moves(answers, self.bound)
-        value = game.solve(moves, self.task.max_steps)[0, :-2]
-        return float((value[self.nodes] < game.NEVER).mean())
-
-    def _miss(self, answers: game.Answers, moves: game.Moves) -> float:
-        """Returns the miss, from the answers of a policy and the moves of the noise."""
-        grid, after = self.lattice.grid, self.lattice.after
-        still = game.lasting(moves, self.wanted)
-        if still.any():
-            return float(self.task.miss(grid.nodes[still]).max() - self.bound.max())
-        # Follow the runs without noise to their last nodes on the chart; the next sample ends most of them.
-        # The answers of a controller with one mode are levels.
-        level = answers.index[0][answers.middle].ravel()
-        last = self.early
-        for _ in range(self.task.max_steps):
-            place = after[level[last], 0, last]
-            last = np.unique(np.where(place < self.lattice.nodes, place, last))
-        plant = self.task.plant(len(last))
-        plant.set_state(*self.task.state(grid.nodes[last]))
-        plant.step(self.lattice.levels[level[last]])
-        ends = np.vstack([grid.nodes[last], self.task.z(plant.measurement)])
-        return float(self.task.miss(ends).max())
-
-
-class ByEpisodes(ModeGround):
-    """Judges by noisy episodes, where the worst case cannot be computed.
-
-    The episodes start where the hybrid controller may select the mode. Without noise all have to arrive at
-    the set-point, under noise all have to survive. The score is the number of kinds of noise, in the order of
-    `JUDGES`, that stop no episode, then minus the share of episodes that the next kind stops; if none is
-    stopped, minus the largest distance from the set-point at the end without noise, as a multiple of
-    `allowed`.
-
-    Attributes:
-        judged: (n, d) starts of the episodes.
-        allowed: allowed distance from the set-point at the end of episodes without noise [chart units].
-    """
-
-    enough: Score = (float(len(JUDGES)), -1.0)
-
-    def _prepare(self, policy: Policy | None) -> None:
-        self.noise = Noise("uniform", self.extended.noise)
-        depth = np.stack([s.values for s in self.extended.sets])
-        own = depth.argmin(axis=0) == self.extended.modes.index(self.mode)
-        deepest = GridSet.from_mask(self.grid, own)
-        picked = deepest.dilated_by_box(self.bound).mask[self.early]
-        rng = np.random.default_rng(0)
-        first = rng.choice(self.early[picked] if picked.any() else self.early, EPISODES)
-        self.judged = self._around(first, rng)
-        self._plant = self.task.plant(BATCH)
-        self.allowed = self._allowed(policy)
-
-    def _allowed(self, policy: Policy | None) -> float:
-        """Returns `allowed`, by the runs of the stage-1 policy that arrive, if there are any."""
-        precision, close, done = self.task.precision, self.task.close, range(0, EPISODES, BATCH)
-        batches = [self._play(policy, JUDGES[0], k) for k in done] if policy else []
-        ends = np.concatenate([np.empty(0), *(miss[won] for won, miss in batches)])
-        least = min(precision, MISS_SHARE * close if len(ends) else close)
-        return max(ALLOWED_MISS * float(ends.max(initial=0.0)), least)
-
-    def score(self, policy: MlpPolicy) -> Score:
-        farthest = 0.0
-        for survived, kind in enumerate(JUDGES):
-            for done in range(0, EPISODES, BATCH):
-                won, miss = self._play(policy, kind, done)
-                farthest = max(farthest, miss.max()) if kind == JUDGES[0] else farthest
-                lost = self.grid.nearest(self.judged[done : done + BATCH][~won])
-                self._remember(lost, np.ones(len(lost)))
-                if len(lost):
-                    return float(survived), -len(lost) / (done + BATCH)
-        return float(len(JUDGES)), -farthest / self.allowed
-
-    def won(self, policy: MlpPolicy) -> float:
-        batches = product(JUDGES, range(0, EPISODES, BATCH))
-        return float(np.mean([self._play(policy, kind, done)[0] for kind, done in batches]))
-
-    def _play(self, policy: Policy, kind: str, done: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns which episodes of one batch are won, and how far off they end: (BATCH,), (BATCH,)."""
-        settings = LoopSettings(plant=self._plant, vary=True, quiet=True)
-        starts, noise = self.judged[done : done + BATCH], Noise(kind, self.extended.noise)
-        loop = PolicyController(policy)
-        run = closed_loop(self.task, loop, starts, noise, seed=done, settings=settings)
-        ends, won = run.path[-1], run.outcome == Outcome.REACHED
-        won = won & self.task.arrived(ends) if kind == JUDGES[0] else won
-        return won, self.task.miss(ends)

@@ -11,10 +11,23 @@ from hyrl_mj.tasks.base import Task, at_levels
 from hyrl_mj.tasks.checks import check_task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.guard import check_finite
+from hyrl_mj.tasks.obstacles import (
+    ANY,
+    LEFT,
+    RIGHT,
+    number_of,
+    pattern_of,
+    sides,
+    way_name,
+    wrapped,
+)
 from hyrl_mj.tasks.registry import described_task, get_task, reference, register, task_names
 from hyrl_mj.tasks.scaffold import write_task
 
 __all__ = [
+    "ANY",
+    "LEFT",
+    "RIGHT",
     "SEARCHES",
     "Learning",
     "Mirror",
@@ -26,9 +39,14 @@ __all__ = [
     "check_task",
     "described_task",
     "get_task",
+    "number_of",
+    "pattern_of",
     "reference",
     "register",
+    "sides",
     "task_names",
+    "way_name",
+    "wrapped",
     "write_task",
 ]
 

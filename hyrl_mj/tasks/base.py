@@ -16,6 +16,14 @@ from hyrl_mj.errors import BadInput, check_bound
 from hyrl_mj.plant import Plant, input_limits
 from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.guard import guard
+from hyrl_mj.tasks.obstacles import (
+    ANY,
+    islands,
+    number_of,
+    pattern_of,
+    sides_of_paths,
+    way_name,
+)
 
 # States in which an inner loop is tried with and without speed.
 TRIED = 50
@@ -142,7 +150,10 @@ class Task(ABC):
     def plant(self, n: int, threads: int = 0) -> Plant:
         """Returns n copies of the robot, stepped by a number of threads, 0 for one on every core."""
         control = self.control if self.has_inner_loop else None
-        return Plant(self.model, self.inputs, n, threads, measure=self.measure, control=control)
+        return Plant(
+            self.model, self.inputs, n, threads,
+            measure=self.measure, control=control, mocap=self.mocap,
+        )  # fmt: skip
 
     @cached_property
     def kinematic(self) -> bool:
@@ -195,6 +206,16 @@ class Task(ABC):
         is none. A task that has one gives names of MJCF numerics as `inputs`; they hold the limits.
         """
         return u
+
+    def mocap(self, qpos: np.ndarray) -> np.ndarray:
+        """Returns where the k mocap bodies are while the joints are at positions qpos (n, nq).
+
+        These are positions (n, k, 3) [m], or poses (n, k, 7) that end in a quaternion, in the order of the
+        MJCF. By default the bodies stay. A body that moves by itself follows a joint that a constant rate
+        turns, as a clock; `state` sets this joint, and a sensor measures it.
+        """
+        frames = mjcf.mocap_frames(self.model)
+        return np.broadcast_to(frames, (len(qpos), *frames.shape))
 
     @property
     def has_inner_loop(self) -> bool:
@@ -266,10 +287,10 @@ class Task(ABC):
         return self.miss(z) <= self.close
 
     def miss(self, z: np.ndarray) -> np.ndarray:
-        """Returns the distance (n,) of the last chart points (n, d) from the set-point [chart units]."""
+        """Returns the distance (n,) of the last chart points (n, d) from the set-point [scaled units]."""
         if self.set_point is None:
             raise BadInput(f"{self.name} has no set_point: give it one, or a miss() of its own")
-        return np.asarray(np.linalg.norm(self.chart.difference(z, self.set_point), axis=1))
+        return self.chart.distance(z, self.set_point)
 
     def danger(self, measurement: np.ndarray) -> np.ndarray:
         """Returns the danger (n,) of measurements (n, p), which adversarial noise maximises.
@@ -323,26 +344,55 @@ class Task(ABC):
             )
         return float(bound)
 
-    def direction(self, path: np.ndarray) -> np.ndarray:
-        """Returns which way runs went, by default on which side of the geom "obstacle" they passed.
+    #: the axes of the world (0 x, 1 y, 2 z) that span the plane of `where`
+    plane: tuple[int, int] = (0, 1)
 
-        The side is seen along the line from the start to the nearest point; the first two coordinates of the
-        chart are then the robot's position in the plane.
+    def where(self, measured: np.ndarray) -> np.ndarray:
+        """Returns the positions (n, 2) in the plane in which runs pass the obstacles [m].
+
+        By default these are the first two coordinates of the chart.
+        """
+        return self.z(measured)[:, :2]
+
+    @cached_property
+    def obstacles(self) -> dict[str, int]:
+        """The obstacles that runs pass, by name, each with the id of a geom; see `islands`."""
+        return islands(self.model)
+
+    @property
+    def gives_direction(self) -> bool:
+        """Whether the task says itself, by `direction`, which way runs go."""
+        return type(self).direction is not Task.direction
+
+    def direction(self, path: np.ndarray) -> np.ndarray:
+        """Returns which way runs went: a task that defines this method numbers its ways itself.
+
+        By default a way passes each obstacle between start and end on its left or on its right, as the
+        angles tell through which runs turn about the obstacles. The stages follow these angles during the
+        simulation; this method does so from a path of chart points, with all else at its usual values.
 
         Args:
             path: (K + 1, n, d) chart points over time, not wrapped; a run that ended stays put.
 
         Returns:
-            (n,) int: the mode whose way the run went, -1 where there was nothing to decide; by default 0
-            for the left and 1 for the right side, -1 for runs that only leave the obstacle behind.
+            (n,) int: the mode whose way the run went, -1 where there was nothing to decide.
         """
-        path, centre = path[..., :2], mjcf.geom_pos(self.model, "obstacle")[:2]
-        nearest = np.linalg.norm(path - centre, axis=2).argmin(axis=0)
-        way = path[nearest, np.arange(path.shape[1])] - path[0]
-        to_centre = centre - path[0]
-        # A run that passes on the left has the obstacle on its right.
-        right = way[:, 0] * to_centre[:, 1] - way[:, 1] * to_centre[:, 0] > 0
-        return np.where(nearest == 0, -1, right.astype(int))
+        z = path.reshape(-1, path.shape[2])
+        plant = self.plant(len(z))
+        plant.set_state(*self.state(z))
+        places = self.where(plant.measurement).reshape(*path.shape[:2], 2)
+        centres = plant.geom_positions(list(self.obstacles.values()))[..., list(self.plane)]
+        if len(centres) == len(z):  # some of them move
+            centres = centres.reshape(*path.shape[:2], -1, 2)
+        pattern = sides_of_paths(places, centres)
+        return np.where((pattern == ANY).all(axis=1), ANY, number_of(pattern))
+
+    def mode_name(self, mode: int) -> str:
+        """Returns the number of a mode with its name: "0 (left)", "1 (right of a, left of b)"."""
+        names = [] if self.gives_direction else list(self.obstacles)
+        if self.gives_direction or (self.scene.mode_names and len(names) == 1):
+            return self.scene.mode_name(mode)
+        return f"{mode} ({way_name(pattern_of(mode, len(names)), names)})"
 
 
 def at_levels(task: Task, actions: np.ndarray) -> np.ndarray:

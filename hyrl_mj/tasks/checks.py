@@ -10,10 +10,11 @@ from hyrl_mj import mjcf
 from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput, brief, line_in, unknown
 from hyrl_mj.ranges import Integer, Number, Optional, Rule, Several, Text
+from hyrl_mj.sets import MOST_DIMENSIONS
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.registry import check_current
-from hyrl_mj.tasks.trial import try_extreme, try_inputs, try_mirror, try_random
+from hyrl_mj.tasks.trial import try_extreme, try_inputs, try_mirror, try_random, try_where
 
 # Number of starts that are tried.
 STARTS = 64
@@ -47,6 +48,8 @@ def check_task(task: Task) -> Task:
         _check_parts(task)
         _check_training(task)
         _check_model(task)
+        if not task.gives_direction:
+            _check_ways(task)
         _check_starts(task)
         _check_episodes(task)
     except BadInput as error:
@@ -68,11 +71,18 @@ def _check_parts(task: Task) -> None:
     for name, rule in RULES.items():
         rule.checked(name, getattr(task, name))
     chart, d = task.chart, task.chart.dimension
-    for name in ("units", "low", "high", "periodic"):
+    if d > MOST_DIMENSIONS:
+        raise BadInput(
+            f"its chart has {d} coordinates ({', '.join(chart.names)}): give at most {MOST_DIMENSIONS}, "
+            "those in which the decision is made; the measurement may have more"
+        )
+    for name in ("units", "low", "high", "periodic", "scale"):
         if (count := len(getattr(chart, name))) != d:
             raise BadInput(f"its chart has {d} name(s) and {count} value(s) of {name}: give {d}")
     if not (np.isfinite(chart.sides).all() and (chart.sides > 0).all()):
         raise BadInput("its chart has a side that is not positive: give low < high, both finite")
+    if not (np.isfinite(chart.scale).all() and np.greater(chart.scale, 0).all()):
+        raise BadInput(f"its chart has the scale {chart.scale}: give finite numbers > 0")
     for name in ("start_low", "start_high"):
         if (count := len(getattr(task, name))) != d:
             raise BadInput(f"{name} has {count} value(s): its chart takes {d}")
@@ -108,6 +118,8 @@ def _check_scene(task: Task) -> None:
         task.chart.check(start, task.name)
     Number(0, LONGEST, above=True).checked("scene.time", scene.time)
     names = scene.mode_names
+    if not names and not task.gives_direction:  # named after the obstacles
+        return
     if isinstance(names, str) or len(names) < 2 or not all(isinstance(n, str) for n in names):
         raise BadInput(f"scene.mode_names is {names!r}: name two or more")
 
@@ -142,6 +154,10 @@ def _check_model(task: Task) -> None:
         raise BadInput(
             f"its input limits are {low} and {high} in {path.name}: give finite ones, low < high"
         )
+    if type(task).mocap is not Task.mocap and not model.nmocap:
+        raise BadInput(
+            f'it has a mocap() and {path.name} has no mocap body: give a body of the world mocap="true"'
+        )
     # The replay needs both.
     mjcf.object_id(model, mujoco.mjtObj.mjOBJ_SITE, task.scene.tracked)
     mjcf.object_id(model, mujoco.mjtObj.mjOBJ_CAMERA, task.scene.camera)
@@ -175,6 +191,8 @@ def _check_starts(task: Task) -> None:
         raise BadInput(f"it starts outside its chart, at {point}: change one of them")
     plant = task.plant(STARTS)
     plant.set_state(*task.state(z, np.random.default_rng(1)))
+    if task.model.nmocap:
+        _check_mocap(task, plant.qpos)
     measurement = plant.measurement
     if measurement.shape != (STARTS, p):
         raise BadInput(
@@ -199,10 +217,40 @@ def _check_starts(task: Task) -> None:
         )
 
 
+def _check_ways(task: Task) -> None:
+    """Raises `BadInput` unless ways past the obstacles of the MJCF can be told apart in the task's plane."""
+    own = "or give the task a direction() of its own"
+    if not task.obstacles:
+        raise BadInput(
+            f'{task.model_path.name} has no obstacle: begin the name of a geom with "obstacle", {own}'
+        )
+    if len(set(task.plane)) != 2 or not set(task.plane) <= {0, 1, 2}:
+        raise BadInput(f"plane is {task.plane!r}: give two of the axes 0 (x), 1 (y) and 2 (z)")
+    if type(task).where is Task.where and task.chart.dimension < 2:
+        raise BadInput(
+            f"its chart has one coordinate ({task.chart.names[0]}), and ways past obstacles are told apart "
+            f"in a plane: give the task a where(measured), {own}"
+        )
+
+
+def _check_mocap(task: Task, qpos: np.ndarray) -> None:
+    """Raises `BadInput` unless mocap() gives each row of positions (n, nq) poses that depend on it alone."""
+    poses = mjcf.mocap_poses(task.model, task.mocap, qpos)
+    backward = mjcf.mocap_poses(task.model, task.mocap, qpos[::-1])[::-1]
+    if not np.allclose(poses, backward, rtol=0, atol=1e-9):
+        row = int(np.abs(poses - backward).max(axis=(1, 2)).argmax())
+        raise BadInput(
+            f"mocap() puts the bodies at {poses[row].tolist()} and then at {backward[row].tolist()} for the "
+            f"same qpos {qpos[row].tolist()}: let it depend on qpos alone, each row on its own"
+        )
+
+
 def _check_episodes(task: Task) -> None:
     ends = np.append(try_random(task), try_extreme(task))
     try_inputs(task)
     try_mirror(task)
+    if not task.gives_direction:
+        try_where(task)
     z = task.starts(STARTS, np.random.default_rng(0))
     arrived = task.arrived(z)
     # Where the end says which runs have arrived, any start may be as near to the set-point as they are.

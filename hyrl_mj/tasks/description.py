@@ -1,8 +1,9 @@
 """The values that describe a task: how episodes end, its mirror symmetry, its scene, its training."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import Any
 
 # The searches for the critical set.
 SEARCHES = ("rods", "outcome")
@@ -44,7 +45,8 @@ class Scene:
     Attributes:
         starts: (k, d) chart points from which the replayed runs start.
         time: how long runs are shown [s].
-        mode_names: what the runs of each mode do, in the order of the modes, as ("left", "right").
+        mode_names: what the runs of each mode do, in the order of the modes, as ("left", "right"); by
+            default they are named after the obstacles, as "left of a, right of b".
         policy_starts: (l, d) chart points from which the figure of the policy draws runs, by default
             `starts`.
         title: the task's name in figures, by default its `name` in words.
@@ -54,7 +56,7 @@ class Scene:
 
     starts: Sequence[Sequence[float]]
     time: float
-    mode_names: Sequence[str]
+    mode_names: Sequence[str] = ()
     policy_starts: Sequence[Sequence[float]] = ()
     title: str = ""
     camera: str = "overhead"
@@ -75,18 +77,18 @@ class Learning:
     """Defaults of a task's training and of the stages after it; a run's settings can differ.
 
     Attributes:
-        algorithm: an algorithm of SB3, as "ppo", or "module:Class"; by default "dqn" where the input has
-            levels, else "ppo".
+        algorithm: an algorithm of SB3, as "dqn", or "module:Class".
         levels: number of equally spaced levels of each input; None for continuous inputs.
         search: the search for the critical set, by "rods" or by "outcome"; see `find_critical_set`.
         horizon: the paper's horizon T of the backward propagation [s].
+        training: fields of `Training` in which stage 1 with this algorithm differs from preset fast, as
+            {"samples": 1_000_000, "hidden": (256, 256)}; preset smoke has its own number of samples.
+        modes: the same of stage 6, which trains one policy for each mode, as {"gamma": 0.97}.
     """
 
-    algorithm: str = ""
+    algorithm: str = "ppo"
     levels: int | None = None
     search: str = "outcome"
     horizon: float = 0.5
-
-    def __post_init__(self) -> None:
-        if not self.algorithm:
-            object.__setattr__(self, "algorithm", "ppo" if self.levels is None else "dqn")
+    training: Mapping[str, Any] = field(default_factory=dict)
+    modes: Mapping[str, Any] = field(default_factory=dict)

@@ -36,14 +36,15 @@ COLUMNS = {
     "miss": "",
     "danger": "",
     "direction": "",
+    "where": "plane",
 }
 # Methods whose results have other shapes.
-PASSED_ON = ("measure", "state", "control")
+PASSED_ON = ("measure", "state", "control", "mocap")
 # Methods whose results have to be finite wherever they are asked for.
 FINITE = ("z", "with_z", "observation")
 OUTCOMES = ("ending", "verdict")
 # Methods of chart points; the other ones take measurements, or what no chart point can be told from.
-OF_POINTS, UNPLACED = ("state", "arrived", "miss"), ("measure", "measured", "control")
+OF_POINTS, UNPLACED = ("state", "arrived", "miss"), ("measure", "measured", "control", "mocap")
 # The most rows that are tried one by one in search of the one that raises an error.
 TRIED = 4_096
 

@@ -34,7 +34,7 @@ class Rover(PillarTask):
         time=5.0,
         mode_names=("left", "right"),
     )
-    learning = Learning(levels=5)
+    learning = Learning(algorithm="dqn", levels=5)
     mirror = Mirror((1, -1, -1), (-1,))
     close = 0.3
     observation_low = (-5.0, -3.0, -np.pi)

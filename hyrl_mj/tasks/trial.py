@@ -23,6 +23,8 @@ CORNERS = 16
 
 # Samples after which an input must have changed something.
 EFFECT = 10
+# Places in the plane that spread no wider than this, as a share of their length, lie on a line.
+ON_A_LINE = 1e-6
 # How far mirrored observations may be off, as a share of their range after a sample.
 ALIKE = 0.01
 
@@ -87,6 +89,29 @@ def try_inputs(task: Task) -> None:
                 f"its input {name} changes nothing that is measured: name another one, or give its actuator "
                 f"in {task.model_path.name} some strength"
             )
+
+
+def try_where(task: Task) -> None:
+    """Raises `BadInput` if where() puts all states of the chart, and those soon after, on a line."""
+    rng = np.random.default_rng(0)
+    z = rng.uniform(task.chart.low, task.chart.high, (STARTS, task.chart.dimension))
+    plant, places = task.plant(STARTS), []
+    plant.set_state(*task.state(z))
+    with mujoco_log.kept():
+        for _ in range(min(EFFECT, _samples(task)) + 1):
+            places.append(task.where(plant.measurement))
+            plant.step(rng.uniform(*task.input_limits, (STARTS, len(task.inputs))))
+    if not (finite := np.isfinite(places[0]).all(axis=1)).all():
+        row = int(np.argmin(finite))
+        raise BadInput(f"where() gives {places[0][row].tolist()} at {task.chart.format(z[row])}")
+    all_places = np.concatenate(places)
+    along, across = np.linalg.svd(all_places - all_places.mean(axis=0), compute_uv=False)
+    if across <= ON_A_LINE * max(along, 1e-6):
+        shape = "on a line" if along > 1e-6 else "at one place"
+        raise BadInput(
+            f"where() puts all states of the chart {shape}, as {places[0][0].tolist()}: give two coordinates "
+            "of a plane that change with the state, or give the task a direction() of its own"
+        )
 
 
 def try_mirror(task: Task) -> None:
@@ -169,7 +194,8 @@ def _play(task: Task, z: np.ndarray, inputs: Inputs, kind: str) -> np.ndarray:
         measurement = plant.measurement
         outcome[active] = task.outcome(measurement[active], np.zeros(len(active), dtype=bool))
         _check_step(task, measurement[active], u[active], outcome[active], sample)
-        path.append(np.where((outcome == Outcome.RUNNING)[:, None], task.z(measurement), path[-1]))
+        z = task.chart.near(task.z(measurement), path[-1])
+        path.append(np.where((outcome == Outcome.RUNNING)[:, None], z, path[-1]))
     _check_end(task, np.array(path), plant.measurement)
     return outcome
 
@@ -207,9 +233,12 @@ def _check_observation(task: Task, measurement: np.ndarray, sample: int) -> None
 
 def _check_end(task: Task, path: np.ndarray, measurement: np.ndarray) -> None:
     """Tries the methods that judge a whole episode, on paths (K + 1, n, d)."""
-    ways = set(np.unique(task.direction(path)).tolist())
-    if not ways <= {-1, *range(len(task.scene.mode_names))}:
-        raise BadInput(f"direction() gives {sorted(ways)}: give -1 or an index of scene.mode_names")
+    if task.gives_direction:
+        ways = set(np.unique(task.direction(path)).tolist())
+        if not ways <= {-1, *range(len(task.scene.mode_names))}:
+            raise BadInput(
+                f"direction() gives {sorted(ways)}: give -1 or an index of scene.mode_names"
+            )
     task.arrived(path[-1])
     task.verdict(measurement)
     for name, values in (("miss", task.miss(path[-1])), ("danger", task.danger(measurement))):

@@ -34,7 +34,10 @@ class UnitCircle(Task):
             for x, y in ((-0.81, 0.59), (-0.95, -0.31), (-1.0, 0.0))
         ),
     )
-    learning = Learning(search="rods")
+    learning = Learning(
+        search="rods",
+        training={"samples": 160_000, "hidden": (64, 64), "spread": False, "rehearse": 0.0},
+    )
     mirror = Mirror((1, -1), (-1,))
     observation_low, observation_high = (-1.0, -1.0), (1.0, 1.0)
 

@@ -38,7 +38,7 @@ class Vehicle(PillarTask):
         mode_names=("left", "right"),
         policy_starts=((0.0, -0.15), (0.0, 0.0), (0.0, 0.15)),
     )
-    learning = Learning(levels=5, search="rods", horizon=0.3)
+    learning = Learning(algorithm="dqn", levels=5, search="rods", horizon=0.3)
     mirror = Mirror((1, 1, -1), (-1,))
 
     @cached_property

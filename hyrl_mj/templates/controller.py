@@ -15,7 +15,9 @@ with np.load(__file__.rpartition(".")[0] + ".npz", allow_pickle=False) as file:
 
 MODES = ARRAYS["modes"]
 LOW, SIDES, PERIODIC = (ARRAYS[f"chart_{name}"] for name in ("low", "sides", "periodic"))
+SCALE = ARRAYS["chart_scale"]
 NO_MODE = -1  # stands for "in no mode yet"
+LEAST = 1e-9  # least weight of a scattered node
 
 # ---- the task: the export replaces this part
 TASK = "name"
@@ -112,7 +114,32 @@ def distances(z, kind):
 
 
 def signed_distance(z, name):
-    """Returns the distance (n,) of points (n, d) to the edge of a set, negative inside, from its grid."""
+    """Returns the distance (n,) of points (n, d) to the edge of a set, negative inside."""
+    return scattered(z, name) if f"{name}_nodes" in ARRAYS else on_grid(z, name)
+
+
+def scattered(z, name):
+    """Returns `signed_distance` from scattered nodes.
+
+    The nearest nodes continue their distances along their slopes, and count by their closeness.
+    """
+    nodes, slopes, count = (ARRAYS[f"{name}_{part}"] for part in ("nodes", "slopes", "nearest"))
+    found = np.empty(len(z))
+    for i, point in enumerate(z):
+        away = point - nodes
+        away = np.where(PERIODIC, away - SIDES * np.round(away / SIDES), away) / SCALE
+        distance = np.sqrt((away**2).sum(axis=1))
+        near = np.argpartition(distance, count - 1)[:count]
+        distance, radius = distance[near], distance[near].max()
+        # The farthest has no weight: values do not jump where another one takes its place.
+        weight = ((radius - distance) / np.maximum(distance, LEAST * radius)) ** 2 + LEAST
+        values = ARRAYS[name][near] + (slopes[near] * away[near]).sum(axis=1)
+        found[i] = (weight * values).sum() / weight.sum()
+    return found
+
+
+def on_grid(z, name):
+    """Returns `signed_distance` from the nodes of a grid."""
     counts, spacing = ARRAYS[f"{name}_counts"], ARRAYS[f"{name}_spacing"]
     last = np.where(PERIODIC, np.inf, counts - 1)
     index = np.minimum(np.maximum((z - LOW) / spacing, 0), last)

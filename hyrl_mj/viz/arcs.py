@@ -14,8 +14,8 @@ from hyrl_mj.run_directory import Run
 from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, noise_kinds, samples, simulate_batch
 from hyrl_mj.stages import Budget, attack
 from hyrl_mj.tasks import Task
-from hyrl_mj.viz.replay import Floor, Show
-from hyrl_mj.viz.section import Section
+from hyrl_mj.viz.replay import Floor, Floors, Show
+from hyrl_mj.viz.section import critical_sets, sections
 
 STARTS = ("critical", "paper", "latest")  # of a replay
 OVERVIEW_RUNS = 12  # without noise; of an even number none starts in the middle
@@ -164,38 +164,43 @@ def replay_shows(
     """
     if starts not in STARTS:
         raise unknown("starts", starts, STARTS)
-    is_new = noise is not None or eps is not None
+    is_new, modes = noise is not None or eps is not None, run.extended_sets.modes
     if starts == "latest":
         if is_new:
             raise BadInput(
                 "the latest simulation has its noise: give --noise and --eps to simulate"
             )
         policy, hybrid = ([run.arc(run.latest_path(who))] for who in ("policy", "hyrl"))
-        return [Show(policy, hybrid, run.policy_title)]
+        return [Show(policy, hybrid, run.policy_title, modes)]
     if starts == "critical" and not is_new and (attacked := attack_replay(run)):
-        return [Show([attacked["policy"]], [attacked["hyrl"]], run.policy_title)]
+        return [Show([attacked["policy"]], [attacked["hyrl"]], run.policy_title, modes)]
     arcs = replay_arcs(run, noise, eps) if is_new else run.arcs()
     names = dict.fromkeys(name for name, _ in arcs)
-    modes = [f"hyrl_q{q}" for q in run.extended_sets.modes]
+    loops = [f"hyrl_q{q}" for q in modes]
     if starts == "paper":
         names.pop("critical", None)
         policy = [arcs[name, "policy"] for name in names]
-        hybrid = [arcs[name, mode] for name in names for mode in modes]
-        return [Show(policy, hybrid, run.policy_title)]
+        hybrid = [arcs[name, loop] for name in names for loop in loops]
+        return [Show(policy, hybrid, run.policy_title, modes)]
     name = "critical" if "critical" in names else next(iter(names))
     policy = [arcs[name, "policy"]]
-    return [Show(policy, [arcs[name, mode]], run.policy_title) for mode in modes]
+    return [Show(policy, [arcs[name, loop]], run.policy_title, modes) for loop in loops]
 
 
-def replay_floor(run: Run, overlap: bool = True) -> Floor:
-    """Returns the marks on the floor of a replay, in the section of the task's chart."""
-    section = Section(run.task)
-    return Floor.of(
-        section,
-        section.critical_set(run),
-        section.partition(run.split if overlap else run.partition),
-        section.extended_sets(run.extended_sets) if overlap else None,
-    )
+def replay_floor(run: Run, overlap: bool = True) -> Floors:
+    """Returns the marks on the floor of a replay, in sections of the task's chart."""
+    axis, cuts = sections(run.task)
+    parts = run.split if overlap else run.partition
+    floors = [
+        Floor.of(
+            cut,
+            critical,
+            cut.partition(parts),
+            cut.extended_sets(run.extended_sets) if overlap else None,
+        )
+        for cut, critical in zip(cuts, critical_sets(run, cuts), strict=True)
+    ]
+    return Floors(run.task.chart, axis, tuple(floors))
 
 
 def overview_arcs(task: Task, policy: Policy) -> list[HybridArc]:

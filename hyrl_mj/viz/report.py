@@ -18,7 +18,7 @@ from hyrl_mj.game import LIMIT, MAP_CLASSES, EpisodeCount, GameResult, Robustnes
 from hyrl_mj.learning import Training
 from hyrl_mj.policies import Agent, MlpPolicy
 from hyrl_mj.run_directory import Run
-from hyrl_mj.verdict import NO_NOISE
+from hyrl_mj.verdict import NO_NOISE, listed
 from hyrl_mj.viz import tables
 from hyrl_mj.viz.arcs import attack_replay
 from hyrl_mj.viz.commands import changed, commands
@@ -91,7 +91,8 @@ def render(run: Run) -> str:
         "report.html",
         run,
         robustness,
-        modes=[task.scene.mode_name(q) for q in run.controller.modes],
+        modes=[task.mode_name(q) for q in run.controller.modes],
+        listed=listed,
         worst=task.noise_on(bool(robustness and robustness.everywhere)),
         video=film(run.path / "replay.mp4", has),
         pictures=pictures(run.path / "figures", has),
@@ -188,7 +189,7 @@ def _stages(
 ) -> list[tuple[str, str]]:
     """Returns the result of each stage in a sentence."""
     task, s, modes = run.task, run.settings, run.extended_sets.modes
-    reach = "; ".join(f"mode {task.scene.mode_name(q)}: {tables.extent(run, q)}" for q in modes)
+    reach = "; ".join(f"mode {task.mode_name(q)}: {tables.extent(run, q)}" for q in modes)
     attempts = f"up to {s.stage6.attempts} times " if s.stage6.attempts > 1 else ""
     retrained = f"a policy for each of {len(modes)} modes: {s.stage6.title}"
     if isinstance(s.stage1, Agent):

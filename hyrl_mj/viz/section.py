@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from operator import attrgetter
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from hyrl_mj.chart import Chart
 from hyrl_mj.game import Maps
@@ -16,8 +18,12 @@ from hyrl_mj.simulation import HybridArc
 from hyrl_mj.stages import CriticalSet, ExtendedSets, Partition, critical_points
 from hyrl_mj.tasks import Task
 
+# Sections over the period of a coordinate.
+SECTIONS = 24
 # Least number of cells along the longest side in the search for the critical points of a section.
 CELLS = 40
+# Nodes along each side of a section through sets on scattered nodes.
+CELLS_OF_CLOUD = 96
 
 
 def _of_whole(name: str) -> Any:
@@ -28,8 +34,11 @@ def _of_whole(name: str) -> Any:
 class Section(Task):
     """A task on the plane of its chart's first two coordinates, in which results are drawn.
 
-    The other coordinates have the values of the scene's first start; all else is that of the whole task.
-    A chart of one or two dimensions stays whole.
+    All else is that of the whole task. A chart of one or two dimensions stays whole.
+
+    Args:
+        whole: the task.
+        rest: (d - 2,) values of the other coordinates, by default those of the scene's first start.
 
     Attributes:
         whole: the task.
@@ -41,19 +50,23 @@ class Section(Task):
     precision, close, learning = _of_whole("precision"), _of_whole("close"), _of_whole("learning")
     model, plant, measure = _of_whole("model"), _of_whole("plant"), _of_whole("measure")
     control, has_inner_loop = _of_whole("control"), _of_whole("has_inner_loop")
+    mocap = _of_whole("mocap")
     input_units, input_limits = _of_whole("input_units"), _of_whole("input_limits")
     observation, measured = _of_whole("observation"), _of_whole("measured")
     reward, danger = _of_whole("reward"), _of_whole("danger")
+    where, plane, obstacles = _of_whole("where"), _of_whole("plane"), _of_whole("obstacles")
+    gives_direction, mode_name = _of_whole("gives_direction"), _of_whole("mode_name")
     ending, verdict = _of_whole("ending"), _of_whole("verdict")
 
-    def __init__(self, whole: Task):
+    def __init__(self, whole: Task, rest: ArrayLike | None = None):
         chart, scene = whole.chart, whole.scene
         self.whole, self.cut = whole, chart.dimension > 2
-        self.rest = np.array(scene.starts[0][2:], dtype=float)
+        self.rest = np.array(scene.starts[0][2:] if rest is None else rest, dtype=float)
         where = zip(chart.names[2:], self.rest, chart.units[2:], strict=True)
         place = ", ".join(f"{name} = {value:g} {unit}" for name, value, unit in where)
         low, high, periodic = chart.low[:2], chart.high[:2], chart.periodic[:2]
-        self.chart = Chart(chart.names[:2], chart.units[:2], low, high, periodic, place)
+        names, units, scale = chart.names[:2], chart.units[:2], chart.scale[:2]
+        self.chart = Chart(names, units, low, high, periodic, place, scale)
         self.start_low, self.start_high = whole.start_low[:2], whole.start_high[:2]
         starts, policy_starts = (
             tuple(z[:2] for z in points) for points in (scene.starts, scene.policy_starts)
@@ -103,14 +116,7 @@ class Section(Task):
 
     def critical_set(self, run: Run) -> CriticalSet:
         """Returns M* of a run, searched for by outcome in the section."""
-        if not (self.cut and len(run.critical_set.points)):
-            return run.critical_set
-        resolution = run.settings.resolution
-        grid = Grid.with_cells(self.chart, max(run.settings.rods, CELLS))
-        nodes, rods = self.lift(grid.nodes), grid.neighbours()
-        points = critical_points(self.whole, run.steady, nodes, rods, grid.cell, resolution)[:, :2]
-        one_piece = np.zeros(len(points), dtype=int)
-        return CriticalSet(points, one_piece, resolution * grid.cell, grid.cell)
+        return critical_sets(run, [self])[0]
 
     def partition(self, partition: Partition) -> Partition:
         """Returns the parts."""
@@ -127,8 +133,10 @@ class Section(Task):
         sets = tuple(self._set(members) for members in extended.sets)
         at = extended.sets[0].grid.nearest(self.lift(sets[0].grid.nodes))
         winning = tuple(wins[at] for wins in extended.winning)
-        narrow, room = np.empty((0, 2)), np.empty(0)
-        return replace(extended, sets=sets, winning=winning, narrow=narrow, room=room)
+        points, room, between = np.empty((0, 2)), np.empty(0), np.empty((0, 2), dtype=int)
+        return replace(
+            extended, sets=sets, winning=winning, points=points, room=room, between=between
+        )
 
     def maps(self, maps: Maps) -> Maps:
         """Returns the classes of the nodes nearest to the section."""
@@ -144,5 +152,43 @@ class Section(Task):
         return replace(arc, z=arc.z[:, :2]) if self.cut else arc
 
     def _set(self, members: GridSet) -> GridSet:
-        grid = Grid(self.chart, members.grid.counts[:2])
+        whole = members.grid
+        counts = whole.counts[:2] if isinstance(whole, Grid) else (CELLS_OF_CLOUD,) * 2
+        grid = Grid(self.chart, counts)
         return GridSet(grid, members.signed_distance(self.lift(grid.nodes)))
+
+
+def sections(task: Task) -> tuple[int | None, list[Section]]:
+    """Returns the number of the chart's first periodic coordinate after two, and sections over its period.
+
+    Without such a coordinate there is one section, that of the scene's first start.
+    """
+    turning = [i for i in range(2, task.chart.dimension) if task.chart.periodic[i]]
+    if not turning:
+        return None, [Section(task)]
+    axis, rest = turning[0], np.tile(task.scene.starts[0][2:], (SECTIONS, 1))
+    rest[:, axis - 2] = (
+        task.chart.low[axis] + np.arange(SECTIONS) / SECTIONS * task.chart.sides[axis]
+    )
+    return axis, [Section(task, values) for values in rest]
+
+
+def critical_sets(run: Run, cuts: Sequence[Section]) -> list[CriticalSet]:
+    """Returns M* of a run in sections of one chart, searched for by outcome in all of them at once."""
+    if not (cuts[0].cut and len(run.critical_set.points)):
+        return [run.critical_set] * len(cuts)
+    resolution, noise = run.settings.resolution, run.settings.noise
+    grid = Grid.with_cells(cuts[0].chart, max(run.settings.rods, CELLS))
+    nodes = np.vstack([cut.lift(grid.nodes) for cut in cuts])
+    firsts = len(grid.nodes) * np.arange(len(cuts))[:, None]
+    first, second = ((firsts + ends).ravel() for ends in grid.neighbours())
+    rods = first, second
+    whole = cuts[0].whole
+    points = critical_points(whole, run.steady, nodes, rods, grid.cell, resolution, noise)
+    found = []
+    for cut in cuts:
+        # A point between two nodes of a section lies in it.
+        inside = points[(np.abs(points[:, 2:] - cut.rest) < 1e-9).all(axis=1), :2]
+        one_piece = np.zeros(len(inside), dtype=int)
+        found.append(CriticalSet(inside, one_piece, resolution * grid.cell, grid.cell))
+    return found

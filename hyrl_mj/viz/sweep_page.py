@@ -16,6 +16,7 @@ from PIL import Image
 from hyrl_mj.game import Curve
 from hyrl_mj.run_directory import load_run
 from hyrl_mj.sweeps import DONE, Row, Setting, Sweep
+from hyrl_mj.viz import colours
 from hyrl_mj.viz import sweep_tables as tables
 from hyrl_mj.viz.figures import style
 from hyrl_mj.viz.report import Picture, data_uri, environment, write
@@ -23,8 +24,8 @@ from hyrl_mj.viz.report import Picture, data_uri, environment, write
 # Curves: controller, column of its `Wins`, label, colour and line style.
 LINES = (
     ("policy", "won", "RL policy", style.POLICY_COLOUR, "-"),
-    ("hyrl", "proved", "HyRL proved, own q0", style.mode_colour(0), "-"),
-    ("hyrl", "proved_any", "HyRL proved, any q0", style.mode_colour(0), "--"),
+    ("hyrl", "proved", "HyRL proved, own q0", colours.MODES[0], "-"),
+    ("hyrl", "proved_any", "HyRL proved, any q0", colours.MODES[0], "--"),
 )
 HEIGHT = 2.7  # [inches] of a row of panels
 

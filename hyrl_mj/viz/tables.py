@@ -14,6 +14,8 @@ from hyrl_mj.tasks import Task
 
 # No table is wider [columns].
 WIDEST = 10_000
+# With more modes than these, headings hold their numbers alone.
+NAMED = 2
 NAMES = {"policy": "RL policy", "hyrl": "HyRL", LIMIT: "limit"}
 
 
@@ -50,7 +52,8 @@ def replay_table(run: Run, arcs: Arcs) -> Table:
     task, s = run.task, run.settings
     columns = {"policy": f"policy ({s.stage1.title})"}
     for q in run.extended_sets.modes:
-        columns[f"hyrl_q{q}"] = f"HyRL, q0 = {task.scene.mode_name(q)}"
+        name = task.mode_name(q) if len(run.extended_sets.modes) <= NAMED else q
+        columns[f"hyrl_q{q}"] = f"HyRL, q0 = {name}"
     units = ", ".join(dict.fromkeys(task.chart.units))
     rows: list[list[str | Ending]] = []
     for start in dict.fromkeys(start for start, _ in arcs):
@@ -250,7 +253,7 @@ def print_summary(run: Run) -> None:
     print_table(replay_table(run, arcs))
     print(run.critical_set.sentence(run.task))
     for q in run.extended_sets.modes:
-        print(f"mode {run.task.scene.mode_name(q)}: {extent(run, q)}")
+        print(f"mode {run.task.mode_name(q)}: {extent(run, q)}")
     print(replay_sentence(run, arcs))
     print_robustness(run)
     print(f"run directory {run.path}")

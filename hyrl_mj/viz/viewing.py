@@ -17,6 +17,7 @@ from typing import Any
 
 import mujoco
 
+from hyrl_mj import mjcf
 from hyrl_mj.errors import BadInput
 from hyrl_mj.gl import has_display
 from hyrl_mj.progress import Say
@@ -69,7 +70,7 @@ def play(track: Track, model: mujoco.MjModel, data: mujoco.MjData, viewer: Any) 
 def show(track: Track, model: mujoco.MjModel, data: mujoco.MjData, t: float) -> None:
     """Sets the data to the state of an arc at the time t [s], or at its end after that."""
     data.time = t
-    data.qpos[:] = track.qpos(min(t, track.end))
+    mjcf.place(model, data, track.qpos(min(t, track.end)), track.task.mocap)
     mujoco.mj_forward(model, data)
 
 

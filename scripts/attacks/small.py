@@ -14,13 +14,13 @@ from typing import Any
 
 from matplotlib.mathtext import MathTextParser
 
-import hyrl_mj.learning.settings as settings
 import hyrl_mj.learning.training as training
 import hyrl_mj.proof.examination as examination
 import hyrl_mj.stages.results as results
 import hyrl_mj.viz.figures.style as style
 import hyrl_mj.viz.replay as replay
 from hyrl_mj import cli
+from hyrl_mj.learning import presets
 from hyrl_mj.tasks.unit_circle import UnitCircle
 from hyrl_mj.viz.figures import FIGURES
 
@@ -61,12 +61,13 @@ def import_late() -> None:
 
 def shorten() -> None:
     """Shortens preset smoke and the replays, in this process and those that it forks."""
-    settings._LATTICE_SMOKE |= {1: LATTICE, 2: 60}
-    settings._GRIDS |= {1: (24, 240), 2: (24, 48)}
-    settings._GRIDS_DYNAMIC |= {1: (24, 240), 2: (16, 32)}
-    settings._PPO.options["n_steps"] = 8  # the least samples that are trained on are envs x n_steps
-    settings._SMOKE |= {"ppo": 1_024, "dqn": 3_000}
-    settings._SMOKE_MODES = 1_024
+    presets._LATTICE_SMOKE |= {1: LATTICE, 2: 60}
+    presets._GRIDS |= {1: (24, 240), 2: (24, 48)}
+    presets._GRIDS_DYNAMIC |= {1: (24, 240), 2: (16, 32)}
+    # The least number of samples that PPO trains on is envs x n_steps.
+    presets._SMALL.options["n_steps"] = 8
+    presets._SMOKE |= {"ppo": 1_024, "dqn": 3_000}
+    presets._SMOKE_MODES = 1_024
     examination.CURVE = examination.CURVE[::8]
     training.CHECKPOINTS, training.EPISODES, results.EPISODES = 2, 64, 64
     style.DPI = 30

@@ -27,7 +27,7 @@ class MyRobot(hyrl_mj.Task):
     scene = Scene(
         starts=((0.0, -0.15), (0.0, 0.0), (0.0, 0.15)), time=3.2, mode_names=("left", "right")
     )
-    # What trains it by default: DQN, because the input has levels.
+    # What trains it by default: PPO, which chooses among levels of the input.
     learning = Learning(levels=5, horizon=0.3)
     # Mirrored observations call for mirrored inputs.
     mirror = Mirror(observation=(1, -1, -1), inputs=(-1,))

@@ -75,7 +75,7 @@ def plane(panel: Axes, task: Task) -> None:
 
 def region(panel: Axes, members: GridSet, face: str, edge: str | None = None, **looks: Any) -> None:
     """Fills a set in a plane, and draws its outline if that has a colour."""
-    grid, inside = members.grid, members.mask
+    grid, inside = members.regular, members.mask
     x, y = grid.nodes.reshape(*grid.counts, 2).transpose(2, 1, 0)
     values = members.values.reshape(grid.counts).T
     if inside.any():

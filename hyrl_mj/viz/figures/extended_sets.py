@@ -37,9 +37,9 @@ def draw_extended_sets(shown: ShownRun, path: Path | None = None) -> Figure:
     enlarged = not ring and len(shown.critical.points) > 0 and sets.noise > 0
     with style.drawing(path, 5.6, task, title) as figure:
         panels = figure.subplots(1, 1 + enlarged, squeeze=False).ravel()
-        for mode in sets.modes:
-            label = f"$M^{{ext}}_{mode}$, of mode {task.scene.mode_name(mode)}"
-            colour, tint = style.mode_colour(mode), style.mode_tint(mode)
+        for i, mode in enumerate(sets.modes):
+            label = f"$M^{{ext}}_{{{mode}}}$, of mode {task.mode_name(mode)}"
+            colour, tint = style.mode_colour(i), style.mode_tint(i)
             charts.legend_field(panels[0], label, colour if ring else tint, colour)
         if shared.any():
             charts.legend_field(panels[0], "in several of them", SHARED, SHARED)
@@ -56,8 +56,8 @@ def _set_rings(panel: Axes, shown: ShownRun, shared: np.ndarray) -> None:
     task, sets = shown.task, shown.sets
     charts.arcs(panel, task, shared.astype(int), (None, SHARED), OUTER, CORE)
     width = (OUTER - CORE - GAP) / len(sets.sets)
-    for i, (mode, members) in enumerate(zip(sets.modes, sets.sets, strict=True)):
-        outer, colour = OUTER - GAP - i * width, style.mode_colour(mode)
+    for i, members in enumerate(sets.sets):
+        outer, colour = OUTER - GAP - i * width, style.mode_colour(i)
         inside = members.mask.astype(int)
         charts.arcs(panel, task, inside, (None, colour), outer, outer - width + GAP)
         # The first set's ends are written outside the rings, the others' inside, one below the other.
@@ -79,11 +79,11 @@ def _ends(panel: Axes, task: Task, members: GridSet, radius: float, colour: str)
 def _set_plane(panel: Axes, shown: ShownRun, shared: np.ndarray) -> None:
     """Fills the sets in a plane, with outlines."""
     task, sets = shown.task, shown.sets
-    for mode, members in zip(sets.modes, sets.sets, strict=True):
-        charts.region(panel, members, style.mode_tint(mode))
+    for i, members in enumerate(sets.sets):
+        charts.region(panel, members, style.mode_tint(i))
     charts.region(panel, GridSet.from_mask(sets.sets[0].grid, shared), SHARED)
-    for mode, members in zip(sets.modes, sets.sets, strict=True):
-        charts.region(panel, members, "none", style.mode_colour(mode), zorder=2)
+    for i, members in enumerate(sets.sets):
+        charts.region(panel, members, "none", style.mode_colour(i), zorder=2)
     charts.plane(panel, task)
     charts.dots(panel, shown.critical.points)
 

@@ -36,8 +36,11 @@ def draw_overview(shown: ShownPolicy, path: Path | None = None) -> Figure:
     with style.drawing(path, 7.6, task, title) as figure:
         panel = figure.subplots()
         panel.set_title(style.noise_label(task, arc.noise, arc.bound))
-        for mode in shown.partition.modes:
-            charts.legend_field(panel, f"only in the part $M_{mode}$", style.mode_tint(mode))
+        for i, mode in enumerate(shown.partition.modes):
+            part = f"only in the part $M_{{{mode}}}$"
+            if len(shown.partition.modes) > style.NAMED:  # names are said here, once
+                part = f"only in $M_{{{mode}}}$, of mode {task.mode_name(mode)}"
+            charts.legend_field(panel, part, style.mode_tint(i))
         if charts.is_ring(task):
             _spirals(panel, shown)
         else:
@@ -50,9 +53,9 @@ def _field(panel: Axes, shown: ShownPolicy) -> None:
     """Draws the overview of a plane."""
     task, partition, arc = shown.task, shown.partition, shown.noisy
     owners = _owners(partition)
-    for i, mode in enumerate(partition.modes):
+    for i in range(len(partition.modes)):
         part = GridSet.from_mask(partition.grid, owners == i)
-        charts.region(panel, part, style.mode_tint(mode))
+        charts.region(panel, part, style.mode_tint(i))
     view = runs.make_view(panel, task)
     _noiseless_runs(panel, shown, view)
     eps = task.noise_in_chart(arc.bound)
@@ -90,7 +93,7 @@ def _spirals(panel: Axes, shown: ShownPolicy) -> None:
     """Draws the overview of a ring, time outward."""
     task, partition, arc = shown.task, shown.partition, shown.noisy
     seconds = task.scene.time
-    tints = [style.mode_tint(mode) for mode in partition.modes]
+    tints = [style.mode_tint(i) for i in range(len(partition.modes))]
     charts.arcs(panel, task, _owners(partition), [*tints, None], OUTER, CORE)
     charts.ring(panel, task, (OUTER, CORE), f",\ntime outward:\n0 to {seconds:g} s")
     view = runs.spiral_view(task, seconds)
@@ -107,8 +110,9 @@ def _spirals(panel: Axes, shown: ShownPolicy) -> None:
 def _noiseless_runs(panel: Axes, shown: ShownPolicy, view: View) -> None:
     """Draws the runs without noise, with arrowheads."""
     looks = {"linewidth": 1.3, "zorder": 3}
+    brief = len(shown.partition.modes) > style.NAMED
     for arc in shown.noiseless:
-        drawn = runs.chosen_way(panel, shown.task, view, arc, "without noise: ", **looks)
+        drawn = runs.chosen_way(panel, shown, view, arc, "without noise: ", brief, **looks)
         row = len(arc.t) // ARROW
         points = view.points(arc.t[row : row + 2], arc.z[row : row + 2])
         if len(points) < 2 or (np.abs(points[1] - points[0]) > view.longest).any():
@@ -152,7 +156,7 @@ def _paper_runs(panel: Axes, shown: ShownPolicy) -> None:
     panel.set_title(style.noise_label(task, first.noise, first.bound).replace(", ", ",\n"))
     view = runs.make_view(panel, task)
     for arc in shown.paper:
-        runs.chosen_way(panel, task, view, arc, linewidth=2.0)
+        runs.chosen_way(panel, shown, view, arc, linewidth=2.0)
         runs.ends(panel, task, view, arc)
     charts.set_point_lines(panel, task)
 

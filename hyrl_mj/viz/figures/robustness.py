@@ -14,20 +14,21 @@ from matplotlib.patches import Rectangle, Wedge
 from hyrl_mj.game import LIMIT, MAP_CLASSES, OVER, Score, Wins
 from hyrl_mj.sets import Grid
 from hyrl_mj.tasks import Task
+from hyrl_mj.viz import colours
 from hyrl_mj.viz.figures import charts, style
 from hyrl_mj.viz.figures.charts import INNER, OUTER, TICK
 from hyrl_mj.viz.figures.shown import ShownGame
 from hyrl_mj.viz.tables import NAMES, percent
 
 # Of MAP_CLASSES, in their order; colour-blind readers can tell them apart, too.
-CLASS_COLOURS = ("#7cc0e8", "#f2c530", "#009e73", style.mode_colour(1), "#5c2a6b", style.GREY)
+CLASS_COLOURS = ("#7cc0e8", "#f2c530", "#009e73", colours.MODES[1], "#5c2a6b", style.GREY)
 SENTENCES = dict(enumerate(MAP_CLASSES)) | {
     OVER: "over: obstacle, or the run has ended",
 }
 # Radius of the dots of M*: inside the ring, where they hide no class.
 CRITICAL = 0.6
 # Of the curves: ink as the policy's path in the replay, then blue, purple and vermilion.
-CURVE_COLOURS = (style.POLICY_COLOUR, *(style.mode_colour(i) for i in (0, 2, 1)))
+CURVE_COLOURS = (style.POLICY_COLOUR, colours.MODES[0], "#aa4499", colours.MODES[1])
 LIMIT_COLOUR = "#a9dcc9"
 Looks = dict[str, Any]
 # The limit of any controller is broad and pale, so that curves on it can be seen.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,13 +13,16 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from hyrl_mj.simulation import HybridArc
-from hyrl_mj.tasks import Task
+from hyrl_mj.tasks import ANY, Task, pattern_of
+from hyrl_mj.viz.colours import place
 from hyrl_mj.viz.figures import charts, style
-from hyrl_mj.viz.figures.shown import ShownRun
-from hyrl_mj.viz.figures.style import INK, PALE, PAPER, POLICY_COLOUR, RED, mode_colour
+from hyrl_mj.viz.figures.shown import ShownPolicy, ShownRun
+from hyrl_mj.viz.figures.style import INK, NAMED, PALE, PAPER, POLICY_COLOUR, RED, mode_colour
 
 # Radius at which spirals begin; they end at 1.
 CORE = 0.4
+# Planes beside each other.
+ACROSS = 4
 # What the legend calls the end of a run, by its outcome, where "end: outcome" is not clear.
 ENDS = {"running": "end, not there yet", "out_of_bounds": "end: out of bounds"}
 
@@ -90,24 +93,56 @@ def end(panel: Axes, task: Task, view: View, arc: HybridArc) -> None:
 
 
 def chosen_way(
-    panel: Axes, task: Task, view: View, arc: HybridArc, prefix: str = "", **looks: Any
+    panel: Axes,
+    shown: ShownPolicy,
+    view: View,
+    arc: HybridArc,
+    prefix: str = "",
+    brief: bool = False,
+    **looks: Any,
 ) -> Line2D:
-    """Draws a policy's run in the colour of the mode whose way it goes; `prefix` begins the label."""
-    mode = int(task.direction(arc.z[:, None])[0])
-    colour, label = mode_colour(mode), f"way of mode {task.scene.mode_name(mode)}"
+    """Draws a policy's run in the colour of the mode whose way it goes.
+
+    The label begins with `prefix`; a `brief` one leaves the name of the mode out.
+    """
+    task, modes = shown.task, shown.partition.modes
+    going = modes_of(task, modes, int(task.direction(arc.z[:, None])[0]))
     if arc.outcome != "reached":
-        colour, label = POLICY_COLOUR, "neither way"
-    elif mode < 0:
-        colour, label = PALE, "nothing to decide"
+        colour, label = POLICY_COLOUR, "neither way" if len(modes) < 3 else "no way to the end"
+    elif len(going) == 1:
+        mode = going[0]
+        colour = mode_colour(place(mode, modes))
+        label = f"way of mode {mode if brief else task.mode_name(mode)}"
+    else:
+        colour, label = PALE, "nothing to decide" if going else "way of no mode"
     return line(panel, view, arc.t, arc.z, color=colour, label=prefix + label, **looks)
 
 
-def hybrid_way(panel: Axes, task: Task, view: View, arc: HybridArc) -> None:
+def modes_of(task: Task, modes: Sequence[int], way: int) -> list[int]:
+    """Returns which of a run's modes a way belongs to: `way` as `Task.direction` numbers it.
+
+    A way along which some obstacle is passed on either side belongs to several.
+    """
+    if way in modes or way < 0:
+        return [mode for mode in modes if way in (mode, ANY)]
+    if task.gives_direction:
+        return []
+    number = len(task.obstacles)
+    pattern = pattern_of(way, number)
+    patterns = np.array([pattern_of(mode, number) for mode in modes])
+    agree = (patterns == pattern) | (patterns == ANY) | (pattern == ANY)
+    return [mode for mode, fits in zip(modes, agree.all(axis=1), strict=True) if fits]
+
+
+def hybrid_way(panel: Axes, task: Task, view: View, arc: HybridArc, modes: Sequence[int]) -> None:
     """Draws a run of the hybrid controller in the colours of its modes, with marks at its jumps."""
     for j in range(arc.j[-1] + 1):
         rows = arc.j == j
         mode = int(arc.q[rows][0])
-        looks = {"color": mode_colour(mode), "label": f"HyRL in mode {task.scene.mode_name(mode)}"}
+        looks = {
+            "color": mode_colour(place(mode, modes)),
+            "label": f"HyRL in mode {task.mode_name(mode)}",
+        }
         line(panel, view, arc.t[rows], arc.z[rows], linewidth=2.0, **looks)
     for row in np.flatnonzero(np.diff(arc.j)).tolist():
         # Small and on top, so that a jump at the start shows in its circle.
@@ -117,31 +152,39 @@ def hybrid_way(panel: Axes, task: Task, view: View, arc: HybridArc) -> None:
 def draw_runs(shown: ShownRun, path: Path | None = None) -> Figure:
     """Draws the hybrid controller and the policy under the same noise, a column for each start mode.
 
-    Of a chart with two coordinates the paths are shown in its plane, else each coordinate over time.
+    Of a chart with two coordinates the paths are shown in its plane, at most four beside each other; else
+    each coordinate over time.
     Only the paper's starts ("start0", ...) are drawn.
     """
     task, replays, policy_title = shown.whole, shown.replays, shown.policy_title
     loops = list(dict.fromkeys(who for _, who in replays if who != "policy"))
     starts = list(dict.fromkeys(start for start, _ in replays if start.startswith("start")))
-    rows = 1 if task.chart.dimension == 2 else task.chart.dimension
+    plane, count = task.chart.dimension == 2, len(loops)
+    rows = -(-count // ACROSS) if plane else task.chart.dimension
+    columns = -(-count // rows) if plane else count
     first = replays[starts[0], "policy"]
     noise = style.noise_label(task, first.noise, first.bound)
     title = f"HyRL and {policy_title}\nunder the same {noise}"
     thin = {"color": POLICY_COLOUR, "linewidth": 1.0, "zorder": 4}
     with style.drawing(path, 1.6 + 3.4 * rows, task, title) as figure:
-        panels = figure.subplots(rows, len(loops), sharex=True, sharey="row", squeeze=False)
-        for (coordinate, column), panel in np.ndenumerate(panels):
+        panels = figure.subplots(rows, columns, sharex=True, sharey="row", squeeze=False)
+        for (row, column), panel in np.ndenumerate(panels):
+            coordinate, loop = (0, row * columns + column) if plane else (row, column)
+            if loop >= count:
+                panel.set_axis_off()
+                continue
             view = make_view(panel, task, coordinate)
             for start in starts:
-                hybrid, policy = replays[start, loops[column]], replays[start, "policy"]
-                hybrid_way(panel, task, view, hybrid)
+                hybrid, policy = replays[start, loops[loop]], replays[start, "policy"]
+                hybrid_way(panel, task, view, hybrid, shown.sets.modes)
                 ends(panel, task, view, hybrid)
                 line(panel, view, policy.t, policy.z, label=policy_title, **thin)
                 ends(panel, task, view, policy)
             charts.set_point_lines(panel, task, coordinate)
             if coordinate == 0:
-                mode = int(loops[column].removeprefix("hyrl_q"))
-                panel.set_title(f"started in q0 = {task.scene.mode_name(mode)}", fontweight="bold")
+                mode = int(loops[loop].removeprefix("hyrl_q"))
+                name = task.mode_name(mode) if count <= NAMED else mode
+                panel.set_title(f"started in q0 = {name}", fontweight="bold")
             panel.label_outer()
         style.legend(figure, by_label=True)
     return figure

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from fractions import Fraction
@@ -12,22 +13,25 @@ import numpy as np
 from matplotlib import style
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from hyrl_mj import artifacts
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz import colours
+from hyrl_mj.viz.tables import NAMED as NAMED
 
 DPI = 200  # [pixels/inch]
 WIDTH, PAD = 7.8, 0.1  # [inches] of a figure, and of the margin around it
 COLUMNS = 2  # panels beside each other, and columns of a legend
+LETTERS = 105  # of the longest labels of a legend's columns together; with more there is one column
 INK, PAPER, PALE = colours.INK, colours.WHITE, "#8b919b"
 GREY = "#dcdee2"  # states at which a run is over
 POLICY_COLOUR, RED, PALE_RED = colours.POLICY, colours.BAD, "#f4c9c7"
 GREEN = colours.GOOD  # of the set-point
-# The colours of the modes, mixed with white.
-_TINTS = ("#d6e8f3", "#fbe4d3", "#f1dcee", "#e1f2fb")
+# The share of colour in a tint; the rest is white.
+TINT = 0.22
 # Colour and width of lines over a map: a white edge, then the line.
 CASING = ((PAPER, 2.8), (INK, 1.4))
 _IN_INK = ("axes.edgecolor", "text.color", "axes.labelcolor", "xtick.color", "ytick.color")
@@ -42,14 +46,15 @@ STYLE = dict.fromkeys(_IN_INK, INK) | {
 }
 
 
-def mode_colour(mode: int) -> str:
-    """Returns the colour of a mode, as in the replay."""
-    return colours.MODES[mode % len(colours.MODES)]
+def mode_colour(place: int) -> str:
+    """Returns the colour of the first (0), second, ... mode of a run, as in the replay; 8 differ."""
+    return colours.MODES[place % len(colours.MODES)]
 
 
-def mode_tint(mode: int) -> str:
-    """Returns a pale shade of the colour of a mode, for areas."""
-    return _TINTS[mode % len(_TINTS)]
+def mode_tint(place: int) -> str:
+    """Returns a pale shade of the colour of the first (0), second, ... mode of a run, for areas."""
+    red, green, blue = (1 - TINT * (1 - share) for share in to_rgb(mode_colour(place)))
+    return to_hex((red, green, blue))
 
 
 @contextmanager
@@ -101,9 +106,20 @@ def legend(figure: Figure, by_label: bool = False, **looks: Any) -> None:
     for panel in figure.axes:
         artists, labels = panel.get_legend_handles_labels()
         entries |= dict(zip(labels, artists, strict=True))
-    order = sorted(entries) if by_label else list(entries)
+    order = sorted(entries, key=_in_order) if by_label else list(entries)
     artists = [entries[label] for label in order]
-    figure.legend(artists, order, loc="outside lower center", ncols=COLUMNS, **looks)
+    rows = -(-len(order) // COLUMNS)
+    widths = [
+        max(map(len, order[i : i + rows]), default=0) for i in range(0, len(order), rows or 1)
+    ]
+    columns = COLUMNS if sum(widths) <= LETTERS else 1
+    figure.legend(artists, order, loc="outside lower center", ncols=columns, **looks)
+
+
+def _in_order(label: str) -> list[tuple[bool, int, str]]:
+    """Returns a key by which labels are sorted like words, and numbers in them by their size."""
+    parts = re.split(r"(\d+)", label)
+    return [(part.isdigit(), int(part) if part.isdigit() else 0, part) for part in parts]
 
 
 # ---- labels

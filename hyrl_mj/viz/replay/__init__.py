@@ -14,14 +14,14 @@ from hyrl_mj.progress import progress_bar
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.encoding import ENCODERS, video
 from hyrl_mj.viz.options import ReplayOptions
-from hyrl_mj.viz.replay.marks import Floor
+from hyrl_mj.viz.replay.marks import Floor, Floors
 from hyrl_mj.viz.replay.screen import LAYOUTS, Screen, Show
 
 FASTEST, SLOWEST_MOTION = 240, 100  # frames/s, and times slower than real time
 FORMATS = (*ENCODERS, ".png")
 DEFAULTS = ReplayOptions()
 
-__all__ = ["Floor", "Show", "render_replay"]
+__all__ = ["Floor", "Floors", "Show", "render_replay"]
 
 
 def render_replay(
@@ -30,7 +30,7 @@ def render_replay(
     path: Path,
     options: ReplayOptions = DEFAULTS,
     *,
-    floor: Floor | None = None,
+    floor: Floors | None = None,
 ) -> None:
     """Writes a video that plays shows one after the other, with a poster beside it; or the poster alone.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from hyrl_mj.simulation import HybridArc
-from hyrl_mj.viz.colours import RGB
+from hyrl_mj.viz.colours import RGB, light
 from hyrl_mj.viz.replay.marks import BAD, GOOD, INK, OPEN, PAPER, WHITE
 from hyrl_mj.viz.replay.panel import Track
 
@@ -65,9 +66,10 @@ class Layout:
     def above(self, title: str, arc: HybridArc) -> np.ndarray:
         """Returns the bar with title and noise: (bar, width, 3)."""
         line = _Line(self)
-        line.words(title, INK, large=True)
         quiet = arc.noise == "none" or arc.bound == 0
-        line.at_right("no noise" if quiet else f"{arc.noise} noise, eps = {arc.bound:g}")
+        noise = "no noise" if quiet else f"{arc.noise} noise, eps = {arc.bound:g}"
+        line.words(line.fitting(title, self.fonts[1].getlength(noise), large=True), INK, large=True)
+        line.at_right(noise)
         return line.pixels
 
     def below(self, groups: Groups, t: float) -> np.ndarray:
@@ -81,8 +83,9 @@ class Layout:
             if len(tracks) == 1 and tracks[0].modes:
                 arc, row = tracks[0].arc, tracks[0].arc.at(t)
                 line.words(f"j = {arc.j[row]}", INK, room="j = 00")
-                mode = tracks[0].task.scene.mode_name(int(arc.q[row]))
-                line.badge(f"q = {mode}", tracks[0].colour(row))
+                room = self.fonts[1].getlength(OUTCOMES[_outcome(tracks[0])][0]) + self.text
+                mode = tracks[0].task.mode_name(int(arc.q[row]))
+                line.badge(line.fitting(f"q = {mode}", room), tracks[0].colour(row))
             ended = Counter(_outcome(track) for track in tracks if t >= track.end)
             for outcome, number in sorted(ended.items()):
                 words, colour = OUTCOMES[outcome]
@@ -108,6 +111,12 @@ class _Line:
         """The bar: (height, width, 3) uint8."""
         return np.asarray(self._image)
 
+    def fitting(self, words: str, beside: float, *, large: bool = False) -> str:
+        """Returns words without what is in brackets, if they leave too little room [pixels] beside them."""
+        font = self._large if large else self._small
+        ends = self._x + font.getlength(words) + beside + 2 * self._gap
+        return words if ends <= self._image.width else re.sub(r" \(.*\)", "", words)
+
     def words(self, words: str, colour: RGB, *, large: bool = False, room: str = "") -> None:
         """Writes words, which take at least as much room as the text `room`."""
         font = self._large if large else self._small
@@ -115,11 +124,12 @@ class _Line:
         self._x += max(font.getlength(words), font.getlength(room)) + self._gap
 
     def badge(self, words: str, colour: RGB) -> None:
-        """Writes white words on a coloured plate."""
+        """Writes words on a coloured plate: white ones, or dark ones if it is light."""
         pad, half = self._gap / 3, 0.75 * self._gap
         end = self._x + self._small.getlength(words) + 2 * pad
         self._draw.rectangle((self._x, self._middle - half, end, self._middle + half), colour)
-        self._draw.text((self._x + pad, self._middle), words, WHITE, self._small, anchor="lm")
+        ink = INK if light(colour) else WHITE
+        self._draw.text((self._x + pad, self._middle), words, ink, self._small, anchor="lm")
         self._x = end + self._gap / 2
 
     def at_right(self, words: str) -> None:

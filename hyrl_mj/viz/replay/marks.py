@@ -10,6 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 from hyrl_mj import mjcf
+from hyrl_mj.chart import Chart
 from hyrl_mj.stages import CriticalSet, ExtendedSets, Partition
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz import colours
@@ -95,8 +96,7 @@ def tracked_points(task: Task, qpos: np.ndarray) -> np.ndarray:
     data, points = mujoco.MjData(task.model), np.empty((len(qpos), 3))
     site = mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_SITE, task.scene.tracked)
     for point, position in zip(points, qpos, strict=True):
-        data.qpos[:] = position
-        mujoco.mj_kinematics(task.model, data)
+        mjcf.place(task.model, data, position, task.mocap)
         point[:] = data.site_xpos[site]
     return points
 
@@ -143,6 +143,28 @@ class Floor:
             disc(scene, point, CRITICAL_RADIUS, ON_SETS, CRITICAL)
 
 
+@dataclass(frozen=True)
+class Floors:
+    """The marks on the floor over time: one set for each of equally spaced values of a periodic coordinate.
+
+    Attributes:
+        chart: the task's.
+        axis: number of the coordinate; None if the marks stay.
+        floors: the marks at each value, from the coordinate's lower end on.
+    """
+
+    chart: Chart
+    axis: int | None
+    floors: tuple[Floor, ...]
+
+    def at(self, z: np.ndarray) -> Floor:
+        """Returns the marks at the value that is nearest to that of a chart point (d,)."""
+        if self.axis is None:
+            return self.floors[0]
+        turns = (z[self.axis] - self.chart.low[self.axis]) / self.chart.sides[self.axis]
+        return self.floors[round(float(turns) * len(self.floors)) % len(self.floors)]
+
+
 def on_floor(task: Task, points: np.ndarray) -> np.ndarray:
     """Returns the points (n, 3) [m] on the floor below robots that fly; those of others unchanged."""
     floor = mujoco.mj_name2id(task.model, mujoco.mjtObj.mjOBJ_GEOM, "floor")
@@ -161,7 +183,7 @@ def _strips(
 
     Where the ways have joined again all sets overlap, and no strip is drawn.
     """
-    grid = extended.sets[0].grid
+    grid = extended.sets[0].regular
     if not len(critical.points):
         return
     joined = np.sum([part.contains(grid.nodes) for part in partition.parts], axis=0) > 1

@@ -15,7 +15,7 @@ from hyrl_mj.errors import BadArtifact
 from hyrl_mj.rendering import GEOMS, Box, Canvas, SceneRenderer
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
-from hyrl_mj.viz.colours import RGB
+from hyrl_mj.viz.colours import RGB, place
 from hyrl_mj.viz.replay import marks
 
 PATH_WIDTH, BOUND_WIDTH, START_RADIUS, JUMP_RADIUS, CROSS = 0.032, 0.05, 0.035, 0.055, 0.075  # [m]
@@ -28,13 +28,19 @@ FAILED = ("crashed", "out_of_bounds", "stalled", "unstable")
 class Track:
     """An arc with the robot's position at each sample, ready to be drawn.
 
+    Args:
+        task: the robot and its problem.
+        arc: of this task.
+        modes: all modes of the run, which share out the colours.
+
     Raises:
         BadArtifact: the arc is of another task, or its states do not fit the task's model.
     """
 
-    def __init__(self, task: Task, arc: HybridArc):
+    def __init__(self, task: Task, arc: HybridArc, modes: Sequence[int] = (0, 1)):
         self.task, self.arc, self.end = task, arc, float(arc.t[-1])
         self.modes = arc.controller != "policy"
+        self._of = modes
         if arc.task != task.name:
             raise BadArtifact(
                 f"an arc of {arc.task} cannot be replayed in the scene of {task.name}"
@@ -67,12 +73,18 @@ class Track:
 
     def colour(self, row: int) -> RGB:
         """Returns the colour of the path from a row on."""
+        if not self.modes:
+            return marks.POLICY_COLOUR
         colours = marks.MODE_COLOURS
-        return colours[self.arc.q[row] % len(colours)] if self.modes else marks.POLICY_COLOUR
+        return colours[place(int(self.arc.q[row]), self._of) % len(colours)]
 
     def qpos(self, t: float) -> np.ndarray:
         """Returns the robot's position (nq,) at time t [s], interpolated between samples."""
         return self._at(t, self._qpos)
+
+    def z(self, t: float) -> np.ndarray:
+        """Returns the chart point (d,) at time t [s]."""
+        return self._at(t, self.arc.z)
 
     def point(self, t: float) -> np.ndarray:
         """Returns the position (3,) [m] of the tracked site at time t [s]."""
@@ -84,7 +96,7 @@ class Track:
 
     def bounds(self, t: float) -> list[np.ndarray]:
         """Returns a line (k, 3) [m] for each noisy coordinate: the points that may be measured."""
-        z, qpos = self._at(t, self.arc.z), self.qpos(t)
+        z, qpos = self.z(t), self.qpos(t)
         noise = self.task.noise_in_chart(self.arc.bound)
         share = np.linspace(-1, 1, BOUND_PIECES + 1)[:, None]
         lines = [z + share * noise * (np.arange(len(z)) == i) for i in np.flatnonzero(noise)]
@@ -119,7 +131,7 @@ class Panel:
         width: int,
         height: int,
         camera: str,
-        floor: marks.Floor | None = None,
+        floors: marks.Floors | None = None,
     ):
         self._tracks, self._camera = tracks, camera
         number = mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
@@ -127,19 +139,31 @@ class Panel:
         self._rests = fixed and task.model.cam_bodyid[number] == 0
         # A bar for each row, and all else in the scene, with room to spare.
         geoms = sum(len(track.arc.t) for track in tracks) + GEOMS * (1 + len(tracks))
-        self._renderer = SceneRenderer(task.model, width, height, geoms, canvas)
+        self._renderer = SceneRenderer(task.model, width, height, geoms, canvas, task.mocap)
+        self._floors, self._last = floors, max(tracks, key=lambda track: track.end)
+        self._begin(self._floor_at(0.0))
+
+    def _begin(self, floor: marks.Floor | None) -> None:
+        """Draws anew what stays: the marks on the floor, and where the tracks start."""
+        self._floor = floor
         self._renderer.clear()
         scene = self._renderer.scene
         if floor:
             floor.draw(scene)
-        for track in tracks:
+        for track in self._tracks:
             marks.disc(scene, track.points[0], START_RADIUS, marks.ON_TOP, marks.INK)
         self._renderer.keep()
-        self._drawn = [_Drawn() for _ in tracks]
+        self._drawn = [_Drawn() for _ in self._tracks]
+
+    def _floor_at(self, t: float) -> marks.Floor | None:
+        """Returns the marks on the floor at time t [s], by the track that lasts longest."""
+        return None if self._floors is None else self._floors.at(self._last.z(t))
 
     def draw(self, t: float, picture: np.ndarray) -> None:
         """Changes the picture (height, width, 3) of the last call to that of time t [s]."""
         renderer = self._renderer
+        if (floor := self._floor_at(t)) is not self._floor:
+            self._begin(floor)
         times = [min(t, track.end) for track in self._tracks]
         if all(now <= drawn.t for now, drawn in zip(times, self._drawn, strict=True)):
             return

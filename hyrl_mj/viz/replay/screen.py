@@ -15,7 +15,7 @@ from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.options import ReplayOptions
 from hyrl_mj.viz.replay.captions import Layout
-from hyrl_mj.viz.replay.marks import Floor
+from hyrl_mj.viz.replay.marks import Floors
 from hyrl_mj.viz.replay.panel import Panel, Track
 
 LAYOUTS = ("side-by-side", "overlay")
@@ -34,11 +34,13 @@ class Show:
         policy: arcs of the stage-1 policy.
         hybrid: arcs of the hybrid controller; none to show the policy alone.
         title: of the policy, as "RL policy (DQN)".
+        modes: all modes of the run, which share out the colours.
     """
 
     policy: Sequence[HybridArc]
     hybrid: Sequence[HybridArc] = ()
     title: str = "RL policy"
+    modes: Sequence[int] = (0, 1)
 
 
 class Screen:
@@ -50,18 +52,18 @@ class Screen:
     """
 
     def __init__(
-        self, task: Task, show: Show, options: ReplayOptions, camera: str, floor: Floor | None
+        self, task: Task, show: Show, options: ReplayOptions, camera: str, floor: Floors | None
     ):
         self._task, self._camera, self._floor = task, camera, floor
         policy = {show.title: [Track(task, arc) for arc in show.policy]}
-        hybrid = {"HyRL": [Track(task, arc) for arc in show.hybrid]}
+        hybrid = {"HyRL": [Track(task, arc, show.modes) for arc in show.hybrid]}
         self._tracks = [*policy[show.title], *hybrid["HyRL"]]
         self._panels = {show.title: policy}
         if show.hybrid and options.layout == "overlay":
             self._panels = {f"{show.title} and HyRL": policy | hybrid}
         elif show.hybrid:
             modes = {int(arc.q[0]) for arc in show.hybrid}
-            where = "each mode" if len(modes) > 1 else f"q = {task.scene.mode_name(*modes)}"
+            where = "each mode" if len(modes) > 1 else f"q = {task.mode_name(*modes)}"
             self._panels[f"HyRL, started in {where}"] = hybrid
         size, least = options.size, (len(self._panels) * SMALLEST[0], SMALLEST[1])
         if any(n % 2 or not small <= n <= LARGEST for n, small in zip(size, least, strict=True)):

@@ -1,0 +1,28 @@
+"""Sets in a task's chart, by their signed distance in scaled units: negative inside, positive outside.
+
+A `GridSet` holds it at the nodes of a `Grid`, or of a `Cloud`, whose nodes are scattered over a chart of many
+dimensions; `covering` and `resolving` say which of them a chart gets.
+"""
+
+from hyrl_mj.sets.choice import MOST_DIMENSIONS, coarseness, covering, resolving
+from hyrl_mj.sets.clouds import MOST_NODES, Cloud
+from hyrl_mj.sets.grids import Grid, within_reach
+from hyrl_mj.sets.members import Complement, Everything, GridSet, Nodes, StateSet
+from hyrl_mj.sets.planes import surface_distance
+
+__all__ = [
+    "MOST_DIMENSIONS",
+    "MOST_NODES",
+    "Cloud",
+    "Complement",
+    "Everything",
+    "Grid",
+    "GridSet",
+    "Nodes",
+    "StateSet",
+    "coarseness",
+    "covering",
+    "resolving",
+    "surface_distance",
+    "within_reach",
+]

@@ -1,0 +1,165 @@
+"""Where on M* which modes meet, how much room there is for noise, and what to say of a lack of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+
+from hyrl_mj.chart import Chart
+from hyrl_mj.sets import Cloud, GridSet, Nodes
+from hyrl_mj.stages.critical_set import ranges
+from hyrl_mj.tasks import Task
+
+# How far around a point of M* parts are looked at, in cells.
+AROUND = 1.5
+# The room is found to this share of what the noise needs.
+STEP = 0.02
+# No more pieces of M* than these are spelled out.
+SPELLED = 3
+
+
+def meetings(points: np.ndarray, parts: Sequence[GridSet]) -> np.ndarray:
+    """Returns which parts meet at points (N, d) of M*: (N, Q, Q) bool, symmetric.
+
+    Two parts meet at a point if each holds a state around it that the other does not hold. Parts that are the
+    same there, or of which one holds all that the other does, leave nothing to decide between them.
+    """
+    return _apart(_inside(points, parts))
+
+
+def _apart(inside: np.ndarray) -> np.ndarray:
+    """Returns which of the parts that hold states `inside` (N, Q, k) bool meet: (N, Q, Q) bool."""
+    alone = [(inside[:, [i]] & ~inside).any(axis=2) for i in range(inside.shape[1])]
+    return np.stack(alone, axis=1) & np.stack(alone, axis=2)
+
+
+def _inside(points: np.ndarray, parts: Sequence[GridSet]) -> np.ndarray:
+    """Returns whether parts hold the states around points (N, d) of M*: (N, Q, k) bool."""
+    z = (points[:, None] + _around(parts[0].grid)).reshape(-1, points.shape[1])
+    return np.stack([part.contains(z).reshape(len(points), -1) for part in parts], axis=1)
+
+
+def _around(grid: Nodes) -> np.ndarray:
+    """Returns the steps (k, d) from a point to those around it: of a cloud, along each noisy coordinate."""
+    d = grid.chart.dimension
+    if isinstance(grid, Cloud):
+        along = np.diag(AROUND * grid.cell * grid.shares * grid.chart.scale)
+        return np.vstack([np.zeros(d), along, -along])
+    return AROUND * grid.spacing * np.array(list(product((-1, 0, 1), repeat=d)))
+
+
+def rooms(
+    points: np.ndarray, grid: Nodes, winning: Sequence[np.ndarray], eps: np.ndarray
+) -> np.ndarray:
+    """Returns the room (N, Q) of each mode around points (N, d) of M*, as a share of 2 eps; at most 1.
+
+    The room is the distance to either side along the noisy coordinates over which the mode wins.
+
+    Args:
+        points: of M*.
+        grid: the nodes.
+        winning: (M,) bool over the nodes for each mode, from where it wins.
+        eps: (d,) noise bound on each coordinate.
+    """
+    shares = np.arange(0.0, 1.0 + 1e-9, STEP)
+    room = np.ones((len(points), len(winning)))
+    directions = np.vstack([np.diag(2 * eps), -np.diag(2 * eps)])
+    for direction in directions[directions.any(axis=1)]:
+        line = grid.nearest((points[:, None] + shares[:, None] * direction).reshape(-1, len(eps)))
+        for k, wins in enumerate(winning):
+            succeeds = wins[line].reshape(len(points), -1)
+            first_loss = np.where(succeeds.all(axis=1), len(shares), succeeds.argmin(axis=1))
+            room[:, k] = np.minimum(room[:, k], np.maximum(first_loss - 1, 0) * STEP)
+    return room
+
+
+def least_room(
+    points: np.ndarray, parts: Sequence[GridSet], winning: Sequence[np.ndarray], eps: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns where modes meet of which one wins, and the two that have the least room there.
+
+    Args:
+        points: (N, d) of M*.
+        parts: M_i of each mode.
+        winning: as in `rooms`.
+        eps: (d,) noise bound on each coordinate.
+
+    Returns:
+        The rows (K,) of the points, the indices (K, 2) of the two modes, and the lesser room (K,) of them, as
+        a share of 2 eps.
+    """
+    if not len(points) or len(parts) < 2:
+        return np.empty(0, dtype=int), np.empty((0, 2), dtype=int), np.empty(0)
+    grid = parts[0].grid
+    wins = np.stack([wins[grid.nearest(points)] for wins in winning], axis=1)
+    inside = _inside(points, parts)
+    meet = _apart(inside) & (wins[:, :, None] | wins[:, None])
+    rows = np.flatnonzero(meet.any(axis=(1, 2)))
+    if not len(rows):
+        return rows, np.empty((0, 2), dtype=int), np.empty(0)
+    room = rooms(points[rows], grid, winning, eps)
+    best = room.copy()
+    # Modes whose parts are the same around a point are one there, with the room of the best of them.
+    inside = inside[rows]
+    for i in range(len(parts)):
+        same = (inside == inside[:, [i]]).all(axis=2)
+        best[:, i] = np.where(same, room, 0.0).max(axis=1)
+    of_pair = np.where(meet[rows], np.minimum(best[:, :, None], best[:, None]), np.inf)
+    # Of pairs with the same room that which meets at most points, with its modes in order.
+    of_pair -= STEP / 2 * meet.mean(axis=0)
+    pair = of_pair.reshape(-1, len(parts) ** 2).argmin(axis=1)
+    pairs = np.stack(np.divmod(pair, len(parts)), axis=1)
+    return rows, pairs, np.take_along_axis(best, pairs, axis=1).min(axis=1)
+
+
+def narrow_sentence(
+    task: Task,
+    points: np.ndarray,
+    between: np.ndarray,
+    room: np.ndarray,
+    narrow: np.ndarray,
+    eps: float,
+) -> str:
+    """Returns between which modes nobody can change over in time, and where; "" if that is nowhere.
+
+    Args:
+        task: names the modes.
+        points: (N, d) of M*.
+        between: (N, 2) the numbers of two modes that meet there.
+        room: (N,) that they have, in the unit of the noise.
+        narrow: (N,) bool, whether the noise needs more.
+        eps: bound of the noise.
+    """
+    if not narrow.any():
+        return ""
+    unit = task.noise_on()[1]
+    pairs, counts = np.unique(between[narrow], axis=0, return_counts=True)
+    said = []
+    for pair in pairs[np.argsort(-counts, kind="stable")][:SPELLED]:
+        here = (between == pair).all(axis=1)
+        first, second = map(task.mode_name, pair.tolist())
+        left = room[here & narrow].min()
+        place = _where(task.chart, points[here], narrow[here])
+        said.append(
+            f"between {first} and {second} nobody can change over safely {place}: "
+            f"{2 * eps:g} {unit} of room are needed, and as little as {left:.2g} is left"
+        )
+    if more := len(pairs) - len(said):
+        said.append(f"nor in places between {more} other pair{'s' * (more > 1)} of modes")
+    return "; ".join(said)
+
+
+def _where(chart: Chart, points: np.ndarray, narrow: np.ndarray) -> str:
+    """Returns the place of the narrow (N,) ones of points (N, d): "from x = 0.4 m on"."""
+    if narrow.all():
+        return f"at all of {ranges(chart, points, 1e-3)}"
+    axis = int((np.ptp(points, axis=0) / chart.scale).argmax())
+    along, name, unit = points[:, axis], chart.names[axis], chart.units[axis]
+    first, last = along[narrow].min(), along[narrow].max()
+    if not chart.periodic[axis] and (narrow == (along >= first)).all():
+        return f"from {name} = {first:.3g} {unit} on"
+    if not chart.periodic[axis] and (narrow == (along <= last)).all():
+        return f"up to {name} = {last:.3g} {unit}"
+    return f"in places at {ranges(chart, points[narrow], 1e-3)}"

@@ -1,0 +1,240 @@
+"""Which ways runs go: by the angles through which they turn about obstacles, or by a task's `direction`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hyrl_mj.errors import BadInput
+from hyrl_mj.policies import Policy, PolicyController
+from hyrl_mj.simulation import LoopSettings, Passing, Rollout, closed_loop, windings
+from hyrl_mj.tasks import ANY, LEFT, RIGHT, Outcome, Task, number_of, sides, wrapped
+
+# If a smaller share of the runs arrives, the policy has hardly learned, and all runs show ways.
+ARRIVING = 0.1
+# A way that fewer of the chart's nodes go is no mode, and the most modes of a controller.
+LEAST_SHARE, MOST_MODES = 0.01, 32
+
+
+@dataclass(frozen=True)
+class WayRuns:
+    """The ways of n runs without noise.
+
+    Attributes:
+        alive: (n,) bool, whether the start does not end an episode at once.
+        arrived: (n,) bool, whether the run arrives.
+        shows: (n,) bool, whether the run shows a way: it arrives, or the task itself gives its direction and
+            it does not fail either.
+        stable: (n,) bool, whether the physics of the run is.
+        direction: (n,) int, the ways that the task itself gives, `ANY` without one; None if it gives none.
+        passing: how the runs pass the obstacles, if the task gives no ways.
+    """
+
+    alive: np.ndarray
+    arrived: np.ndarray
+    shows: np.ndarray
+    stable: np.ndarray
+    direction: np.ndarray | None
+    passing: Passing | None
+
+    @staticmethod
+    def of(task: Task, rollout: Rollout) -> WayRuns:
+        """Returns the ways of the runs of a rollout, of `way_runs`."""
+        outcome = rollout.outcome
+        arrived = outcome == Outcome.REACHED
+        late = (outcome == Outcome.STALLED) | (outcome == Outcome.RUNNING)
+        return WayRuns(
+            rollout.length > 0,
+            arrived,
+            arrived | (late & task.gives_direction),
+            outcome != Outcome.UNSTABLE,
+            task.direction(rollout.path) if task.gives_direction else None,
+            rollout.passing,
+        )
+
+    def __len__(self) -> int:
+        return len(self.arrived)
+
+    @property
+    def arriving(self) -> bool:
+        """Whether enough runs arrive to show the ways: `ARRIVING` of those that have something to decide."""
+        counted = self.alive & self.stable
+        if self.direction is not None:
+            counted = counted & (self.direction != ANY)
+        return bool(counted.any() and self.arrived[counted].mean() >= ARRIVING)
+
+    def __getitem__(self, rows: np.ndarray) -> WayRuns:
+        return WayRuns(
+            self.alive[rows],
+            self.arrived[rows],
+            self.shows[rows],
+            self.stable[rows],
+            None if self.direction is None else self.direction[rows],
+            None if self.passing is None else self.passing[rows],
+        )
+
+    def with_rows(self, rows: np.ndarray, other: WayRuns) -> WayRuns:
+        """Returns these runs with others (k,) in the rows (k,)."""
+        at = np.arange(len(self))
+        at[rows] = len(self) + np.arange(len(rows))
+        both: WayRuns = _joined(self, other)
+        return both[at]
+
+    def differ(self, other: WayRuns) -> np.ndarray:
+        """Returns whether runs go another way than those of another: (n,) bool.
+
+        They do if both have decided, or if the loop along one and back along the other winds about an
+        obstacle.
+        """
+        if self.direction is not None and other.direction is not None:
+            a, b = self.direction, other.direction
+            return np.asarray((a != b) & (a != ANY) & (b != ANY))
+        assert self.passing is not None
+        assert other.passing is not None
+        return np.asarray(windings(self.passing, other.passing).any(axis=1))
+
+
+def _joined(a: Any, b: Any) -> Any:
+    """Returns the rows of two runs, one after the other."""
+    if a is None or isinstance(a, np.ndarray):
+        return None if a is None else np.concatenate([a, b])
+    return type(a)(*(_joined(getattr(a, name), getattr(b, name)) for name in vars(a)))
+
+
+def policy_runs(task: Task, policy: Policy, z0: np.ndarray, **settings: Any) -> Rollout:
+    """Simulates a policy without noise from starts z0 (n, d); `settings` are those of `LoopSettings`."""
+    return closed_loop(task, PolicyController(policy), z0, settings=LoopSettings(**settings))
+
+
+def way_runs(task: Task, policy: Policy, z: np.ndarray, label: str = "simulating") -> Rollout:
+    """Returns the runs of a policy from starts z (n, d) without noise, which show the ways that it goes."""
+    return policy_runs(task, policy, z, passing=not task.gives_direction, label=label)
+
+
+@dataclass(frozen=True)
+class Ways:
+    """The modes of a policy: the patterns of the ways that its runs go.
+
+    A pattern holds, for each obstacle, whether it is passed on its `LEFT`, on its `RIGHT`, or `ANY` of them:
+    an obstacle says nothing if all runs pass it on the same side, or if it does not lie between the start
+    and the end of a run. A state belongs to every mode that agrees with its pattern.
+
+    Attributes:
+        patterns: (Q, K) the pattern of each mode; a task's own direction is a pattern of one.
+        modes: their numbers.
+        dropped: numbers of the ways that less than `LEAST_SHARE` of the nodes go.
+        end: (K,) the usual bearing of the end of a run from each obstacle [rad].
+        half: (K,) an obstacle lies between start and end if they are seen from it at more than this angle: a
+            right one (Thales), or less where the ways part at a smaller one [rad].
+        decides: (K,) bool, whether runs pass the obstacle on both sides.
+        arriving: whether enough runs arrive; if not, all show a way.
+    """
+
+    patterns: np.ndarray
+    modes: tuple[int, ...]
+    dropped: tuple[int, ...]
+    end: np.ndarray
+    half: np.ndarray
+    decides: np.ndarray
+    arriving: bool
+
+    @staticmethod
+    def of(task: Task, runs: WayRuns, neighbours: tuple[np.ndarray, np.ndarray]) -> Ways:
+        """Returns the ways of runs from all nodes of a chart.
+
+        They are those of the runs that arrive; if hardly any does, those of all runs.
+
+        Args:
+            task: the robot and its problem.
+            runs: (n,) of the nodes.
+            neighbours: (k,), (k,) indices of nodes that lie next to each other.
+
+        Raises:
+            BadInput: there are more than `MOST_MODES` ways.
+        """
+        counted = runs.arrived if runs.arriving else runs.stable
+        end = half = np.empty(0)
+        decides = np.ones(1, dtype=bool)
+        if (passing := runs.passing) is not None:
+            last = passing.last[counted]
+            end = np.arctan2(np.sin(last).sum(axis=0), np.cos(last).sum(axis=0))
+            first, second = neighbours
+            both = counted[first] & counted[second]
+            first, second = first[both], second[both]
+            part = windings(passing[first], passing[second]) != 0
+            angle = np.abs(_angles(passing, end))
+            least = np.where(part, np.minimum(angle[first], angle[second]), np.inf)
+            half = np.minimum(least.min(axis=0, initial=np.inf), np.pi / 2)
+            seen = sides(_angles(passing, end), half)[counted]
+            decides = (seen == LEFT).any(axis=0) & (seen == RIGHT).any(axis=0)
+        found = Ways(np.empty((0, len(decides)), dtype=int), (), (), end, half, decides, True)
+        patterns = found.of_runs(runs)[counted]
+        kept, dropped = _modes(patterns, LEAST_SHARE * len(runs))
+        if len(kept) > MOST_MODES:
+            raise BadInput(
+                f"{task.name} has {len(kept)} ways, and a controller has at most {MOST_MODES} modes: "
+                "train it in a smaller part of the scene, or give it a direction() that tells fewer apart"
+            )
+        numbers = (
+            [kept[:, 0], dropped[:, 0]] if passing is None else [*map(number_of, (kept, dropped))]
+        )
+        order = np.argsort(numbers[0])
+        modes, gone = (tuple(int(q) for q in values) for values in (numbers[0][order], numbers[1]))
+        return Ways(kept[order], modes, gone, end, half, decides, runs.arriving)
+
+    def of_runs(self, runs: WayRuns) -> np.ndarray:
+        """Returns the patterns (n, K) of runs."""
+        if runs.direction is not None:
+            return runs.direction[:, None]
+        assert runs.passing is not None
+        angle = _angles(runs.passing, self.end)
+        return np.where(self.decides, sides(angle, self.half), ANY)
+
+    def works(self, runs: WayRuns) -> np.ndarray:
+        """Returns the runs (n,) bool that show the way of a mode, or nothing to decide."""
+        shows = runs.shows if self.arriving else runs.stable
+        return np.asarray(shows & self.members(runs).any(axis=1))
+
+    def members(self, runs: WayRuns) -> np.ndarray:
+        """Returns the modes that runs belong to: (n, Q) bool, none for runs of a way that is no mode."""
+        patterns = self.of_runs(runs)[:, None]
+        agree = (patterns == self.patterns) | (patterns == ANY) | (self.patterns == ANY)
+        return np.asarray(agree.all(axis=2))
+
+
+def usable(runs: WayRuns) -> np.ndarray:
+    """Returns the runs (n,) bool that show ways; all of them if hardly any arrives."""
+    return runs.shows if runs.arriving else runs.stable
+
+
+def _angles(passing: Passing, end: np.ndarray) -> np.ndarray:
+    """Returns the angles (n, K) from the end to the start, followed back along the run [rad]."""
+    return np.asarray(wrapped(passing.last - end) - passing.turned)
+
+
+def _modes(patterns: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the patterns (Q, K) of the modes, and those (R, K) that are gone fewer than `least` times.
+
+    Modes are the patterns of which no other one says more.
+    """
+    rows, counts = np.unique(patterns, axis=0, return_counts=True)
+    decided = rows != ANY
+    rows, counts = rows[decided.any(axis=1)], counts[decided.any(axis=1)]
+    dropped: list[np.ndarray] = []
+    while True:
+        modes = [i for i, row in enumerate(rows) if not _less_than_others(row, rows)]
+        rare = [i for i in modes if counts[i] < least]
+        if not rare:
+            return rows[modes], np.reshape(dropped, (-1, patterns.shape[1])).astype(int)
+        rarest = min(rare, key=lambda i: counts[i])
+        dropped.append(rows[rarest])
+        rows, counts = np.delete(rows, rarest, axis=0), np.delete(counts, rarest)
+
+
+def _less_than_others(pattern: np.ndarray, patterns: np.ndarray) -> bool:
+    """Returns whether one of the patterns (n, K) says all that a pattern (K,) says, and more."""
+    says = pattern != ANY
+    same = (patterns[:, says] == pattern[says]).all(axis=1)
+    return bool((same & ((patterns != ANY).sum(axis=1) > says.sum())).any())

@@ -1,0 +1,101 @@
+"""What a task's runs pass: the obstacles of its MJCF, and the numbers and names of the ways past them."""
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from hyrl_mj import mjcf
+from hyrl_mj.errors import BadInput
+
+LEFT, RIGHT, ANY = 0, 1, -1
+# A way past more obstacles has no number.
+MOST_OBSTACLES = 30
+SIDES = ("left", "right")
+
+
+def islands(model: mujoco.MjModel) -> dict[str, int]:
+    """Returns the obstacles by name, each with the id of a geom that stands for it.
+
+    These are the geoms whose names begin with "obstacle". Those that touch each other, as the walls of a
+    maze, are one obstacle, of the name of the first. The name is what follows "obstacle".
+
+    Raises:
+        BadInput: there are more than `MOST_OBSTACLES`.
+    """
+    geoms = mjcf.obstacles(model)
+    ids = [mjcf.object_id(model, mujoco.mjtObj.mjOBJ_GEOM, name) for name in geoms]
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    first = list(range(len(ids)))  # of each geom, the first one of its island
+    for i, geom in enumerate(ids):
+        for k in range(i):
+            if first[k] != first[i] and _touch(model, data, geom, ids[k]):
+                low, high = sorted((first[i], first[k]))
+                first = [low if one == high else one for one in first]
+    kept = sorted(set(first))
+    if len(kept) > MOST_OBSTACLES:
+        raise BadInput(
+            f"{mjcf.model_name(model)} has {len(kept)} obstacles, and ways are told apart past at most "
+            f"{MOST_OBSTACLES}: give the task a direction() of its own"
+        )
+    return {geoms[i].removeprefix("obstacle").lstrip("_ "): ids[i] for i in kept}
+
+
+def _touch(model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int) -> bool:
+    """Returns whether two geoms that do not move touch each other."""
+    if mjcf.geoms_move(model, [a, b]):
+        return False
+    return bool(mujoco.mj_geomDistance(model, data, a, b, 1e-3, None) <= 1e-6)
+
+
+def wrapped(angle: np.ndarray) -> np.ndarray:
+    """Returns angles in [-pi, pi) [rad]."""
+    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
+
+
+def sides(angle: np.ndarray, half: np.ndarray | float = np.pi / 2) -> np.ndarray:
+    """Returns the side on which runs pass obstacles: `LEFT`, `RIGHT` or `ANY`, (n, K) int.
+
+    Args:
+        angle: (n, K) at which the start of a run is seen from an obstacle, counted from the end of the run
+            and followed back along it [rad].
+        half: the obstacle lies between start and end if this angle is no smaller [rad]; by default a right
+            one: it lies in the circle over start and end.
+    """
+    return np.where(np.abs(angle) < half, ANY, np.where(angle > 0, LEFT, RIGHT))
+
+
+def sides_of_paths(path: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """Returns the sides (n, K) on which paths (S, n, 2) pass obstacles at centres (K, 2) or (S, n, K, 2)."""
+    away = path[:, :, None] - centres
+    bearing = np.arctan2(away[..., 1], away[..., 0])
+    return sides(-wrapped(np.diff(bearing, axis=0)).sum(axis=0))
+
+
+def number_of(pattern: np.ndarray) -> np.ndarray:
+    """Returns the numbers (n,) int of patterns (n, K) of `LEFT`, `RIGHT` and `ANY`.
+
+    Bit k is set where obstacle k is passed on the right, bit K + k where any side will do. The way to the
+    left of a single obstacle has the number 0, that to its right 1.
+    """
+    bits = 1 << np.arange(2 * pattern.shape[1])
+    return np.asarray(np.hstack([pattern == RIGHT, pattern == ANY]) @ bits)
+
+
+def pattern_of(number: int, obstacles: int) -> np.ndarray:
+    """Returns the pattern (K,) of a number, for K obstacles: the inverse of `number_of`."""
+    bits = (number >> np.arange(2 * obstacles)) & 1
+    return np.where(bits[obstacles:], ANY, np.where(bits[:obstacles], RIGHT, LEFT))
+
+
+def way_name(pattern: np.ndarray, names: Sequence[str]) -> str:
+    """Returns the name of a way: "left" past a single obstacle, else "left of a, right of b"."""
+    if len(names) == 1:
+        return "either side" if pattern[0] == ANY else SIDES[pattern[0]]
+    sides = [
+        f"{SIDES[side]} of {name or 'the obstacle'}"
+        for side, name in zip(pattern, names, strict=True)
+        if side != ANY
+    ]
+    return ", ".join(sides) or "any way"

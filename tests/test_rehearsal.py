@@ -1,0 +1,102 @@
+"""Rehearsal: starts anywhere on the chart, and more of them where the latest policy lost."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fields import Field
+from planted import ChartPolicy
+
+import hyrl_mj
+from hyrl_mj.learning import rehearsal
+from hyrl_mj.learning.presets import preset
+from hyrl_mj.learning.rehearsal import Rehearsal, running_points
+from hyrl_mj.learning.training import TaskGround, build, train
+
+POST = {"": (2, 0, 0.5)}
+
+
+@pytest.fixture
+def field():
+    return Field(POST)
+
+
+def straight(task):
+    """Straight ahead: into the post from |y| < 0.5 and x < 2."""
+    return ChartPolicy(task, lambda z: np.tile([1.0, 0.0], (len(z), 1)))
+
+
+def among_starts(task, z):
+    return task.may_start(z)
+
+
+def in_front(z):
+    """Where straight ahead is lost, and another way is open."""
+    return (np.abs(z[:, 1]) < 0.5) & (z[:, 0] < 1.2)
+
+
+def test_a_share_of_the_episodes_starts_anywhere_outside_obstacles(field):
+    rng = np.random.default_rng(0)
+    z = Rehearsal(field, 0.4).starts(20_000, rng)
+    elsewhere = z[~among_starts(field, z)]
+    box = field.chart.sides.prod()
+    inside = np.prod(np.subtract(field.start_high, field.start_low)) / (box - np.pi * 0.25)
+    assert len(elsewhere) / len(z) == pytest.approx(0.4 * (1 - inside), abs=0.02)
+    assert (np.hypot(z[:, 0] - 2, z[:, 1]) > 0.5).all()
+    assert elsewhere[:, 0].max() > 3.8, "the whole chart"
+
+
+def test_half_of_these_start_where_the_latest_policy_lost(field):
+    drawn = Rehearsal(field, 1.0)
+    rng = np.random.default_rng(0)
+    usual = in_front(drawn.starts(20_000, rng)).mean()
+    drawn.update(straight(field))
+    late = in_front(drawn.starts(20_000, rng)).mean()
+    assert late > usual + 0.25
+    always = ChartPolicy(field, lambda z: np.stack([np.ones(len(z)), np.sign(z[:, 1])], axis=1))
+    drawn.update(always)
+    assert in_front(drawn.starts(20_000, rng)).mean() < usual, "only the last policy counts"
+
+
+def test_what_is_lost_late_is_rehearsed_more_often(field):
+    drawn = Rehearsal(field, 1.0)
+    drawn.update(straight(field))
+    rng = np.random.default_rng(0)
+    x = (z := drawn.starts(40_000, rng))[in_front(z), 0]
+    far, close = ((x > a) & (x < a + 0.4) for a in (0.1, 1.0))
+    assert far.sum() > 1.5 * close.sum()
+
+
+def test_a_policy_that_wins_everything_leaves_nothing_to_rehearse(field):
+    field = Field({"": (9, 9, 0.1)})
+    drawn = Rehearsal(field, 0.5)
+    drawn.update(straight(field))
+    assert drawn.starts(100, np.random.default_rng(0)).shape == (100, 2)
+
+
+def test_where_every_episode_ends_at_once_all_points_count(field, monkeypatch):
+    monkeypatch.setattr(type(field), "ending", lambda self, m: np.full(len(m), 2))
+    assert len(running_points(field, 50, np.random.default_rng(0))) == 50
+
+
+def test_a_training_rehearses_what_its_checkpoints_lose(monkeypatch):
+    task = hyrl_mj.get_task("gaps")
+    tried = []
+    update = Rehearsal.update
+    monkeypatch.setattr(rehearsal, "TRIED", 64)
+    monkeypatch.setattr(Rehearsal, "update", lambda self, p: (tried.append(p), update(self, p)))
+    settings = preset(task, "smoke").stage1
+    assert settings.rehearse == 0.3
+    settings = replace(settings, samples=8_192, envs=64)
+    train(task, settings, 0)
+    assert len(tried) > 1
+    env = build(task, settings, 0, domain=TaskGround(task, 0.9, rehearse=1.0).domain(0.9)).env.core
+    env.reset()
+    assert not task.may_start(env.z).all()
+
+
+@pytest.mark.parametrize("name", ["unit_circle", "vehicle", "rover", "quadrotor"])
+def test_tuned_robots_start_where_their_task_starts(name):
+    task = hyrl_mj.get_task(name)
+    assert preset(task).stage1.rehearse == 0
+    assert TaskGround(task, 0.9).domain(0.9) is None
