@@ -22,8 +22,8 @@ from scipy.spatial import cKDTree
 import hyrl_mj
 from hyrl_mj import progress
 from hyrl_mj.game import Lattice
+from hyrl_mj.simulation import WayRuns, way_runs
 from hyrl_mj.stages import Budget, Regions, attack, noisy_episodes
-from hyrl_mj.stages.ways import WayRuns, way_runs
 from hyrl_mj.tasks import ANY, LEFT, RIGHT, pattern_of
 from hyrl_mj.tasks.posts import PostsTask
 

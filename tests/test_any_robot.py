@@ -18,7 +18,7 @@ import hyrl_mj
 from hyrl_mj import BadInput, Outcome
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.policies.controllers import PolicyController
-from hyrl_mj.stages.ways import WayRuns, usable, way_runs
+from hyrl_mj.simulation import WayRuns, way_runs
 from hyrl_mj.tasks import registry
 from hyrl_mj.tasks.checks import check_task
 from hyrl_mj.tasks.registry import reference
@@ -442,7 +442,7 @@ def test_a_simulation_that_breaks_down_ends_its_episode_alone(tmp_path, monkeypa
     assert rollout.length[1] == 1
     np.testing.assert_array_equal(rollout.path[1:, 1], rollout.path[:-1, 1])
     runs = WayRuns.of(task, rollout)
-    assert usable(runs).tolist() == [True, False, True]
+    assert runs.usable.tolist() == [True, False, True]
     assert runs[np.array([0])].differ(runs[np.array([2])]).tolist() == [True]
     calm = hyrl_mj.closed_loop(task, PolicyController(Push()), z0[[0, 2]])
     np.testing.assert_array_equal(rollout.path[:, [0, 2]], calm.path)

@@ -1,4 +1,4 @@
-"""Rehearsal: starts anywhere on the chart, and more of them where the latest policy lost."""
+"""Rehearsal: starts anywhere on the chart, more of them where the latest policy lost or decided."""
 
 from dataclasses import replace
 
@@ -26,6 +26,16 @@ def straight(task):
     return ChartPolicy(task, lambda z: np.tile([1.0, 0.0], (len(z), 1)))
 
 
+def over_the_top(task):
+    """Always past the left of the post, from wherever a run starts."""
+
+    def inputs(z):
+        clear = (z[:, 1] > 0.6) | (z[:, 0] > 2.6)
+        return np.stack([clear, ~clear], axis=1).astype(float)
+
+    return ChartPolicy(task, inputs)
+
+
 def among_starts(task, z):
     return task.may_start(z)
 
@@ -46,16 +56,33 @@ def test_a_share_of_the_episodes_starts_anywhere_outside_obstacles(field):
     assert elsewhere[:, 0].max() > 3.8, "the whole chart"
 
 
-def test_half_of_these_start_where_the_latest_policy_lost(field):
+def test_many_of_these_start_where_the_latest_policy_lost(field):
     drawn = Rehearsal(field, 1.0)
     rng = np.random.default_rng(0)
     usual = in_front(drawn.starts(20_000, rng)).mean()
     drawn.update(straight(field))
     late = in_front(drawn.starts(20_000, rng)).mean()
     assert late > usual + 0.25
-    always = ChartPolicy(field, lambda z: np.stack([np.ones(len(z)), np.sign(z[:, 1])], axis=1))
-    drawn.update(always)
+    field.max_steps = 200
+    drawn.update(over_the_top(field))
     assert in_front(drawn.starts(20_000, rng)).mean() < usual, "only the last policy counts"
+
+
+def test_many_of_these_start_where_the_latest_policy_goes_two_ways(field):
+    drawn = Rehearsal(field, 1.0)
+    rng = np.random.default_rng(0)
+    at = 0.7
+
+    def decides_there(z):
+        return (np.abs(z[:, 1] - at) < 0.1) & (z[:, 0] < 1.8)
+
+    usual = decides_there(drawn.starts(20_000, rng)).mean()
+    away = ChartPolicy(field, lambda z: np.stack([np.ones(len(z)), np.sign(z[:, 1] - at)], axis=1))
+    drawn.update(away)
+    assert decides_there(drawn.starts(20_000, rng)).mean() > usual + 0.25
+    field.max_steps = 200
+    drawn.update(over_the_top(field))
+    assert decides_there(drawn.starts(20_000, rng)).mean() < usual + 0.02, "only the last policy"
 
 
 def test_what_is_lost_late_is_rehearsed_more_often(field):
@@ -86,7 +113,7 @@ def test_a_training_rehearses_what_its_checkpoints_lose(monkeypatch):
     monkeypatch.setattr(rehearsal, "TRIED", 64)
     monkeypatch.setattr(Rehearsal, "update", lambda self, p: (tried.append(p), update(self, p)))
     settings = preset(task, "smoke").stage1
-    assert settings.rehearse == 0.3
+    assert settings.rehearse == 0.4
     settings = replace(settings, samples=8_192, envs=64)
     train(task, settings, 0)
     assert len(tried) > 1

@@ -53,7 +53,7 @@ _DDPG = replace(_TD3, algorithm="ddpg")
 _SAC = replace(_TD3, algorithm="sac", action_noise=0.0, options={**_TD3.options, "ent_coef": 0.02})
 # What learns a scene that nobody has tuned it for: a wide network whose first layer sees all of the chart,
 # and episodes all over it.
-_WIDE: dict[str, Any] = {"samples": 500_000, "hidden": (128, 128), "spread": True, "rehearse": 0.3}
+_WIDE: dict[str, Any] = {"samples": 500_000, "hidden": (128, 128), "spread": True, "rehearse": 0.4}
 _CONTINUOUS = {
     "ppo": replace(_SMALL, **_WIDE),
     "a2c": _A2C,

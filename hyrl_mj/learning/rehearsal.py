@@ -1,22 +1,27 @@
-"""Starts all over the chart: what a policy lately lost is rehearsed."""
+"""Starts all over the chart, more of them where a policy lately lost, and where it lately decided."""
 
 import numpy as np
 
-from hyrl_mj.policies import Policy, PolicyController
-from hyrl_mj.simulation import LoopSettings, closed_loop
+from hyrl_mj.policies import Policy
+from hyrl_mj.simulation import WayRuns, way_runs
 from hyrl_mj.tasks import Outcome, Task
 
-# Of the episodes that start anywhere, the share that starts where the latest policy lost.
-LOST_SHARE = 0.5
+# Of the episodes that start anywhere, the share that starts where the latest policy lost, and the share that
+# starts where it decides.
+LOST_SHARE, DECIDING_SHARE = 0.4, 0.4
 # Chart points that starts are drawn from, and that a policy is tried from.
 POINTS, TRIED = 16_384, 2_048
+# A policy decides between a point that it is tried from and one of so many nearest ones.
+NEIGHBOURS = 4
 
 
 class Rehearsal:
-    """Draws the starts of a training: some of them anywhere on the chart, and where the policy lately lost.
+    """Draws the starts of a training: some of them anywhere, and where the policy lately lost or decided.
 
     From its own starts a policy that has learned to pass an obstacle early is never close in front of it
     again, and does not learn to get away from there: between two ways it keeps a wedge in which it crashes.
+    And where two ways meet, it goes the wrong one of them until it has often seen both from next to each
+    other.
 
     Args:
         task: the robot and its problem.
@@ -26,30 +31,42 @@ class Rehearsal:
     def __init__(self, task: Task, share: float):
         self._task, self._share = task, share
         self._points = running_points(task, POINTS, np.random.default_rng(0))
-        self._lost = self._points[:0]
+        self._lost = self._deciding = self._points[:0]
         self._weight, self._tried = np.empty(0), 0
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draws n starts (n, d)."""
         z = self._points[rng.integers(len(self._points), size=n)]
+        which = rng.random((n, 1))
         if len(self._lost):
             lost = self._lost[rng.choice(len(self._lost), n, p=self._weight)]
-            z = np.where(rng.random((n, 1)) < LOST_SHARE, lost, z)
+            z = np.where(which < LOST_SHARE, lost, z)
+        if len(self._deciding):
+            deciding = self._deciding[rng.integers(len(self._deciding), size=n)]
+            z = np.where(which > 1 - DECIDING_SHARE, deciding, z)
         return np.where(rng.random((n, 1)) < self._share, z, self._task.starts(n, rng))
 
     def update(self, policy: Policy) -> None:
-        """Notes from where a policy loses; what it loses late counts more, as it is easier to mend."""
+        """Notes where a policy loses and decides; what it loses late counts more, as it is easier to mend."""
         at = np.arange(self._tried, self._tried + TRIED) % len(self._points)
         self._tried += TRIED
         z = self._points[at]
-        run = closed_loop(
-            self._task, PolicyController(policy), z, settings=LoopSettings(quiet=True)
-        )
+        run = way_runs(self._task, policy, z, quiet=True)
         lost = (
             (run.outcome != Outcome.REACHED) & (run.outcome != Outcome.UNSTABLE) & (run.length > 0)
         )
         self._lost, weight = z[lost], run.length[lost].astype(float)
         self._weight = weight / max(weight.sum(), 1.0)
+        self._deciding = self._between(z, WayRuns.of(self._task, run))
+
+    def _between(self, z: np.ndarray, runs: WayRuns) -> np.ndarray:
+        """Returns the middles (k, d) between neighbours among z (n, d) from which runs go different ways."""
+        chart = self._task.chart
+        near = chart.tree(z).query(chart.in_box(z), NEIGHBOURS + 1)[1][:, 1:]
+        first, second = np.repeat(np.arange(len(z)), NEIGHBOURS), near.ravel()
+        part = runs.shows[first] & runs.shows[second] & runs[first].differ(runs[second])
+        a, b = z[first[part]], z[second[part]]
+        return chart.wrap(a + chart.difference(b, a) / 2)
 
 
 def running_points(task: Task, n: int, rng: np.random.Generator) -> np.ndarray:

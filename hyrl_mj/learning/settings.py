@@ -45,8 +45,9 @@ class Training:
             used twice, and the policy has twice the width.
         spread: whether the kinks of the first layer are spread over the observations of the whole chart at
             first, and do not all pass through the origin.
-        rehearse: share of the episodes that start anywhere on the chart, half of them where the latest
-            policy lost, and not where the task starts (stage 1 only).
+        rehearse: share of the episodes that start anywhere on the chart, and not where the task starts: two
+            fifths of them where the latest policy lost, and two fifths where it decided between ways
+            (stage 1 only).
         warm_start: whether the first attempt continues from the policy of stage 1 (stage 6 only): DQN from
             its weights, PPO from its distilled actions on the mode's part. A Gaussian policy of small spread
             does not explore the other way any more.

@@ -265,7 +265,7 @@ class TaskGround:
 
     The score is the share of episodes that end at the set-point, then the mean return discounted by `gamma`,
     both averaged over the kinds of noise in `JUDGES`, with the bound of the `noise` during training. A share
-    `rehearse` of the training's episodes starts anywhere, also where the latest policy lost.
+    `rehearse` of the training's episodes starts anywhere, also where the latest policy lost or decided.
     """
 
     enough: Score = (np.inf,)

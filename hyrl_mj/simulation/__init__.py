@@ -24,6 +24,7 @@ from hyrl_mj.simulation.noise import (
 from hyrl_mj.simulation.passing import Passing, windings
 from hyrl_mj.simulation.programmes import Programmes, Rules
 from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop
+from hyrl_mj.simulation.way_runs import WayRuns, policy_runs, way_runs
 
 __all__ = [
     "NOT_STARTED",
@@ -39,13 +40,16 @@ __all__ = [
     "Rules",
     "Sample",
     "Signal",
+    "WayRuns",
     "closed_loop",
     "noise_kinds",
+    "policy_runs",
     "register_noise",
     "samples",
     "signal_for",
     "simulate",
     "simulate_batch",
+    "way_runs",
     "windings",
 ]
 

@@ -12,8 +12,8 @@ from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import Nodes, covering, surface_distance
+from hyrl_mj.simulation import WayRuns, policy_runs, way_runs
 from hyrl_mj.stages.search import critical_points
-from hyrl_mj.stages.ways import WayRuns, policy_runs, usable, way_runs
 from hyrl_mj.tasks import SEARCHES, Task
 
 # Samples simulated from both ends of a rod: enough for runs to part, too few to pass an obstacle.
@@ -151,7 +151,7 @@ def _by_rods(task: Task, policy: Policy, grid: Nodes, resolution: float) -> np.n
     ends = _ends(task, centre, axis, length).reshape(-1, d)
     runs = WayRuns.of(task, way_runs(task, policy, ends))
     first, second = np.split(np.arange(2 * len(centre)), 2)
-    works = usable(runs)
+    works = runs.usable
     return centre[runs[first].differ(runs[second]) & works[first] & works[second]]
 
 

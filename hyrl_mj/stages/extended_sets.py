@@ -13,6 +13,7 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.game import Limit
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import Cloud, Grid, GridSet
+from hyrl_mj.simulation import policy_runs
 from hyrl_mj.stages.critical_set import check_points, distance_to
 from hyrl_mj.stages.meeting import least_room, narrow_sentence
 from hyrl_mj.stages.partition import (
@@ -24,7 +25,6 @@ from hyrl_mj.stages.partition import (
     open_ways,
     part_policies,
 )
-from hyrl_mj.stages.ways import policy_runs
 from hyrl_mj.tasks import Outcome, Task
 
 # A horizon is long enough when the propagated sets fill this share of the overlap that the noise needs.

@@ -13,9 +13,10 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.game import NEVER, Limit
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import GridSet, Nodes, resolving
+from hyrl_mj.simulation import WayRuns, policy_runs, way_runs
 from hyrl_mj.stages.critical_set import check_points
 from hyrl_mj.stages.search import WEDGE
-from hyrl_mj.stages.ways import LEAST_SHARE, WayRuns, Ways, policy_runs, way_runs
+from hyrl_mj.stages.ways import LEAST_SHARE, Ways
 from hyrl_mj.tasks import ANY, Outcome, Task, number_of
 
 # The neighbourhood of M* is at least this many cells wide, and as wide as the longest hop in one sample.
@@ -117,7 +118,7 @@ def make_partition(
     """
     points = check_points(task, points)
     grid = resolving(task.chart, cells, points, task.noise_in_chart(max(noise, 1e-6)))
-    rollout = way_runs(task, policy, grid.nodes, "partition")
+    rollout = way_runs(task, policy, grid.nodes, label="partition")
     runs = WayRuns.of(task, rollout)
     ways = Ways.of(task, runs, grid.neighbours())
     modes = ways.modes if len(points) else ()

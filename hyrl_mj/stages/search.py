@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from hyrl_mj.policies import Policy, PolicyController
-from hyrl_mj.simulation import Sample, Signal, closed_loop
-from hyrl_mj.stages.ways import WayRuns, Ways, policy_runs, way_runs
+from hyrl_mj.simulation import Sample, Signal, WayRuns, closed_loop, policy_runs, way_runs
+from hyrl_mj.stages.ways import Ways
 from hyrl_mj.tasks import Outcome, Task
 
 # M* is found across failures up to this many noise bounds wide: the noise can push a run there.
@@ -33,7 +33,7 @@ def critical_points(
         neighbours: (k,), (k,) indices of starts that lie next to each other.
         cell: the usual distance between two neighbours, in scaled units.
     """
-    runs = WayRuns.of(task, way_runs(task, policy, nodes, "critical set"))
+    runs = WayRuns.of(task, way_runs(task, policy, nodes, label="critical set"))
     ways = Ways.of(task, runs, neighbours)
     works = ways.works(runs)
     if not works.any():
