@@ -122,7 +122,8 @@ def instead(words: list[str]) -> bool:
         case ["python", script, *options] if script in TESTED:  # minutes
             text = (ROOT / script).read_text(encoding="utf-8")
             assert all(f'"{option}"' in text for option in options if option.startswith("--"))
-        case ["hyrl-mj", "run", "rover" | "quadrotor" as task]:  # a minute, even with preset smoke
+        # A minute, even with preset smoke.
+        case ["hyrl-mj", "run", "rover" | "quadrotor" | "slalom" as task, *_]:
             from hyrl_mj import task_names
 
             assert task in task_names()
