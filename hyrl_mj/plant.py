@@ -37,6 +37,7 @@ class Plant:
         control: inner loop that computes the controls of all actuators from u and the true state, at every
             physics step; they are clipped to each actuator's ctrlrange. `inputs` are then names of MJCF
             numerics that hold the limits of u.
+        steady: whether the inner loop depends on u alone, so that its controls hold for a whole sample.
 
     Raises:
         BadInput: the model has no such inputs, or this version of MuJoCo simulates it wrongly.
@@ -52,12 +53,14 @@ class Plant:
         measure: Measure = lambda sensors: sensors,
         control: Control | None = None,
         mocap: mjcf.Mocap | None = None,
+        steady: bool = False,
     ):
         if problem := mjcf.wrong_physics(model):
             raise BadInput(problem)
         n = Integer(1, MOST).checked("the number of copies of a robot", n)
         self.n, self._threads, self._measure, self._control = n, threads, measure, control
         self._mocap = mocap if model.nmocap else None
+        self._steady = control is None or steady
         self.model = copy.copy(model)
         # A bad state has to stay visible: MuJoCo would reset it and only count a warning. Inputs are
         # checked here, and clamping would prevent backward steps.
@@ -240,7 +243,7 @@ class Plant:
 
     def _sample(self, u: np.ndarray, ids: np.ndarray | None, sign: int = 1) -> None:
         """Advances the copies by one sample under checked inputs; sign -1 reverses all controls."""
-        if self._control is None and self._mocap is None:
+        if self._steady and self._mocap is None:
             self._advance(sign * self._controls(u, ids), ids, self.substeps)
             return
         for left in reversed(range(self.substeps)):

@@ -205,9 +205,9 @@ def cautious_reward(
     clear of what noise could hide, without noise in training.
     """
     shares = (-1.0, -0.5, 0.0, 0.5, 1.0) if np.count_nonzero(caution) <= 2 else (-1.0, 0.0, 1.0)
-    worst = np.full(len(measured), np.inf)
-    for signs in product(*[shares if c else (0.0,) for c in caution]):
-        state = measured + signs * caution
-        reward = np.where(task.failed(state), task.worst_reward, task.reward(state, u))
-        worst = np.minimum(worst, reward)
-    return worst
+    signs = np.array(list(product(*[shares if c else (0.0,) for c in caution])))
+    # All states in one call: each method takes as long for a few rows as for many.
+    states = (measured + (signs * caution)[:, None]).reshape(-1, measured.shape[1])
+    reward = task.reward(states, np.tile(u, (len(signs), 1)))
+    reward = np.where(task.failed(states), task.worst_reward, reward)
+    return np.asarray(reward.reshape(len(signs), -1).min(axis=0))

@@ -68,6 +68,8 @@ class Task(ABC):
     precision: float = np.inf
     #: distance from the set-point up to which a state counts as arrived [chart units]
     close: float = 0.2
+    #: whether `control` depends on the inputs alone: it is then asked once for all physics steps of a sample
+    steady_control: bool = False
     #: the mirror symmetry of observation, inputs and reward, if there is one (paper, Section IV-B)
     mirror: Mirror | None = None
     #: bounds of the observation (k,), (k,), noise included
@@ -152,7 +154,7 @@ class Task(ABC):
         control = self.control if self.has_inner_loop else None
         return Plant(
             self.model, self.inputs, n, threads,
-            measure=self.measure, control=control, mocap=self.mocap,
+            measure=self.measure, control=control, mocap=self.mocap, steady=self.steady_control,
         )  # fmt: skip
 
     @cached_property

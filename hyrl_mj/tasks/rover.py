@@ -35,6 +35,7 @@ class Rover(PillarTask):
         mode_names=("left", "right"),
     )
     learning = Learning(algorithm="dqn", levels=5)
+    steady_control = True
     mirror = Mirror((1, -1, -1), (-1,))
     close = 0.3
     observation_low = (-5.0, -3.0, -np.pi)
