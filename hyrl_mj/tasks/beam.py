@@ -13,16 +13,17 @@ from hyrl_mj.tasks.registry import register
 
 # Least and largest upward thrust that the inner loop commands, as shares of the weight.
 LIFT = (0.4, 1.6)
-# Distance from the beam within which the reward is less [m]; room to the side that is worth going for [m].
+# Distance from the beam and from the edge of the arena within which the reward is less [m]; room to the side
+# that is worth going for [m].
 NEAR, ROOM = 0.3, 0.25
 # Weights of the reward: of arriving (in samples), of the distance to the nearest side [1/m] and the inputs
 # [s/m] until the beam is passed, of the distance from the middle behind it [1/m], of being near.
-FINISH, BLOCKED, EFFORT, OFF, BESIDE = 10, 0.6, 0.1, 0.5, 0.5
+FINISH, BLOCKED, EFFORT, OFF, BESIDE = 10, 0.8, 0.05, 0.5, 0.5
 # Largest speed of a start to the side and upward [m/s].
 START_DRIFT = 0.1
 # A start has this time [s] more than it takes to clear the beam at full speed to the nearest side: enough for
 # the next side, too, where noise has picked the wrong one.
-TO_SPARE = 0.85
+TO_SPARE = 0.95
 
 
 @register
@@ -111,8 +112,15 @@ class Beam(Task):
         outside = np.maximum(np.abs(measured[:, :3] - centre) - half, 0.0)
         return np.linalg.norm(outside, axis=1) - mjcf.geom_size(self.model, "hull")[0]
 
+    def to_edge(self, measured: np.ndarray) -> np.ndarray:
+        """Returns the distance from the sides of the arena, and from its top and bottom: (n,) [m]."""
+        low, high = np.array(self.chart.low[1:]), np.array(self.chart.high[1:])
+        inside = np.minimum(measured[:, 1:3] - low, high - measured[:, 1:3])
+        return np.asarray(inside.min(axis=1))
+
     def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
-        near = BESIDE * np.clip(1 - self.clearance(measurement) / NEAR, 0.0, 1.0)
+        free = np.minimum(self.clearance(measurement), self.to_edge(measurement))
+        near = BESIDE * np.clip(1 - free / NEAR, 0.0, 1.0)
         # Before the beam it pays to get clear of it on the nearest side, at once: a crash far ahead is
         # discounted, and a pull to the middle would make every way as good as the nearest.
         to_go = self.to_side(measurement, ROOM).min(axis=1).clip(0.0)
