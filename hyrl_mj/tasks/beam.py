@@ -38,7 +38,13 @@ class Beam(Task):
     start_low, start_high = (0.0, -0.7, 0.9), (1.8, 0.7, 2.3)
     scene = Scene(
         starts=tuple(
-            (0.0, y, 1.6 + z) for y, z in ((-0.1, 0.1), (0.05, 0.06), (0.0, 0.0), (0.1, -0.1))
+            (x, y, 1.6 + z)
+            for x, y, z in (
+                (0.1, -0.03, 0.02),
+                (0.25, 0.2, -0.2),
+                (0.4, 0.3, 0.27),
+                (0.5, -0.38, -0.34),
+            )
         ),
         time=3.2,
         mode_names=("left", "above", "right", "below"),
