@@ -98,7 +98,7 @@ def test_beside_the_beam_and_behind_it_nothing_is_left_to_decide(beam):
 
 
 def test_who_does_not_decide_crashes_and_who_misses_the_gate_does_not_arrive(beam):
-    z = [[0.0, 0.0, 1.6], [0.0, 0.9, 1.6], [3.2, 0.3, 1.6]]
+    z = [[0.0, 0.0, 1.6], [0.0, 1.25, 1.6], [3.2, 0.3, 1.6]]
     outcome = fly(beam, Constant(0, 0), z).outcome
     assert outcome.tolist() == [Outcome.CRASHED, Outcome.OUT_OF_BOUNDS, Outcome.REACHED]
 
@@ -112,7 +112,7 @@ def test_its_starts_have_time_to_pass_the_beam(beam):
 
 def test_arriving_pays_more_than_missing_the_gate(beam):
     gate, off = np.zeros((1, 6)), np.zeros((1, 6))
-    gate[0, :3], off[0, :3] = beam.set_point, np.add(beam.set_point, [0, 0.6, 0])
+    gate[0, :3], off[0, :3] = beam.set_point, np.add(beam.set_point, [0, 1.25, 0])
     still = np.zeros((1, 2))
     assert beam.reward(gate, still)[0] >= 10 > beam.reward(off, still)[0] == beam.worst_reward
 

@@ -22,7 +22,7 @@ from hyrl_mj.learning.presets import preset
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets, extend
-from hyrl_mj.stages.grounds import BATCH, ByEpisodes, ByGame
+from hyrl_mj.stages.grounds import BATCHES, ByEpisodes, ByGame
 from hyrl_mj.stages.hybrid import HybridController
 from hyrl_mj.stages.retraining import retrain
 
@@ -274,7 +274,7 @@ def test_episodes_tell_policies_apart(puck, puck_sets):
     ground = ByEpisodes(puck, puck_sets, 0)
     wrong = ground(one_way_policy(puck, 1.0))
     assert wrong[0] == 0, "it never comes back to the set-point"
-    assert len(ground.lost) == round(-wrong[1] * BATCH) > 0
+    assert len(ground.lost) == round(-wrong[1] * BATCHES[0]) > 0
     # As close as it gets without noise, but not with it.
     grazing = ground(round_it(puck, 1.0, clear=0.6))
     good = ground(round_it(puck, 1.0))

@@ -27,10 +27,11 @@ URGENCY = -1.5
 ALLOWED_DELAY = 0.03
 # Share of a mode's states that may be lost where the mode is never selected.
 FEW = 1e-3
-# Where the worst case cannot be computed: the kinds of noise that judge a policy, the mildest first, the
-# episodes for each kind, and how many run at once. Most policies are bad and fail in the first batch.
+# Where the worst case cannot be computed: the kinds of noise that judge a policy, the mildest first, and how
+# many episodes of each kind run at once. Most policies are bad and fail in the first batch; all batches are
+# so many episodes that a policy that loses a few in a thousand is found out.
 JUDGES = ("none", "uniform", "alternating", "adversarial")
-EPISODES, BATCH = 256, 64
+BATCHES = (64, 64, 128, 256, 512)
 # There, a policy may end this many times as far off the set-point as the stage-1 policy, because it goes the
 # long way, too; or by this share of the distance that counts as arrived.
 ALLOWED_MISS, MISS_SHARE = 2.0, 0.25
@@ -244,15 +245,16 @@ class ByEpisodes(ModeGround):
         self.noise = Noise("uniform", self.extended.noise)
         picked = self._selected[self.early]
         rng = np.random.default_rng(0)
-        first = rng.choice(self.early[picked] if picked.any() else self.early, EPISODES)
+        first = rng.choice(self.early[picked] if picked.any() else self.early, sum(BATCHES))
         self.judged = self._around(first, rng)
-        self._plant = self.task.plant(BATCH)
+        self._batches = np.split(np.arange(len(self.judged)), np.cumsum(BATCHES)[:-1])
+        self._plants = {n: self.task.plant(n) for n in set(BATCHES)}
         self.allowed = self._allowed(policy)
 
     def _allowed(self, policy: Policy | None) -> float:
         """Returns `allowed`, by the runs of the stage-1 policy that arrive, if there are any."""
-        precision, close, done = self.task.precision, self.task.close, range(0, EPISODES, BATCH)
-        batches = [self._play(policy, JUDGES[0], k) for k in done] if policy else []
+        precision, close = self.task.precision, self.task.close
+        batches = [self._play(policy, JUDGES[0], b) for b in self._batches] if policy else []
         ends = np.concatenate([np.empty(0), *(miss[won] for won, miss in batches)])
         usual = MISS_SHARE * close if len(ends) else close
         least = precision if np.isfinite(precision) else usual
@@ -261,27 +263,27 @@ class ByEpisodes(ModeGround):
     def score(self, policy: MlpPolicy) -> Score:
         farthest = 0.0
         for survived, kind in enumerate(JUDGES):
-            for done in range(0, EPISODES, BATCH):
-                won, miss = self._play(policy, kind, done)
+            for batch in self._batches:
+                won, miss = self._play(policy, kind, batch)
                 farthest = max(farthest, miss.max()) if kind == JUDGES[0] else farthest
-                lost = self.grid.nearest(self.judged[done : done + BATCH][~won])
+                lost = self.grid.nearest(self.judged[batch][~won])
                 self._remember(lost, np.ones(len(lost)))
                 if len(lost):
-                    return float(survived), -len(lost) / (done + BATCH)
+                    return float(survived), -len(lost) / (batch[-1] + 1)
         return float(len(JUDGES)), -farthest / self.allowed
 
     def won(self, policy: MlpPolicy) -> float:
         if self(policy)[0] == len(JUDGES):
             return 1.0  # the same episodes
-        batches = product(JUDGES, range(0, EPISODES, BATCH))
-        return float(np.mean([self._play(policy, kind, done)[0] for kind, done in batches]))
+        plays = product(JUDGES, self._batches)
+        return float(np.concatenate([self._play(policy, *play)[0] for play in plays]).mean())
 
-    def _play(self, policy: Policy, kind: str, done: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns which episodes of one batch are won, and how far off they end: (BATCH,), (BATCH,)."""
-        settings = LoopSettings(plant=self._plant, vary=True, quiet=True)
-        starts, noise = self.judged[done : done + BATCH], Noise(kind, self.extended.noise)
-        loop = PolicyController(policy)
-        run = closed_loop(self.task, loop, starts, noise, seed=done, settings=settings)
+    def _play(self, policy: Policy, kind: str, batch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns which episodes `batch` (k,) are won, and how far off they end: (k,), (k,)."""
+        settings = LoopSettings(plant=self._plants[len(batch)], vary=True, quiet=True)
+        noise, loop = Noise(kind, self.extended.noise), PolicyController(policy)
+        seed, starts = int(batch[0]), self.judged[batch]
+        run = closed_loop(self.task, loop, starts, noise, seed=seed, settings=settings)
         ends, won = run.path[-1], run.outcome == Outcome.REACHED
         won = won & self.task.arrived(ends) if kind == JUDGES[0] else won
         return won, self.task.miss(ends)

@@ -13,16 +13,17 @@ from hyrl_mj.tasks.registry import register
 
 # Least and largest upward thrust that the inner loop commands, as shares of the weight.
 LIFT = (0.4, 1.6)
-# Distance from the beam within which the reward is less [m]; room to the side that is worth going for [m].
-NEAR, ROOM = 0.3, 0.1
+# Distance from the beam and from the edge of the arena within which the reward is less [m]; room to the side
+# that is worth going for [m].
+NEAR, ROOM = 0.3, 0.25
 # Weights of the reward: of arriving (in samples), of the distance to the nearest side [1/m] and the inputs
 # [s/m] until the beam is passed, of the distance from the middle behind it [1/m], of being near.
-FINISH, BLOCKED, EFFORT, OFF, BESIDE = 10, 0.4, 0.1, 0.5, 0.5
+FINISH, BLOCKED, EFFORT, OFF, BESIDE = 10, 0.8, 0.05, 0.5, 0.5
 # Largest speed of a start to the side and upward [m/s].
 START_DRIFT = 0.1
 # A start has this time [s] more than it takes to clear the beam at full speed to the nearest side: enough for
 # the next side, too, where noise has picked the wrong one.
-TO_SPARE = 1.1
+TO_SPARE = 0.95
 
 
 @register
@@ -32,22 +33,28 @@ class Beam(Task):
     inputs, input_units = ("lateral_velocity", "climb_rate"), ("m/s", "m/s")
     # Columns of the measurement: x, y, z, speeds to the side and upward, touching beam or floor.
     noisy = (1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
-    max_steps = 80
+    max_steps = 64
     worst_reward = 0.0
-    start_low, start_high = (0.0, -0.8, 0.8), (1.8, 0.8, 2.4)
+    start_low, start_high = (0.0, -0.7, 0.9), (1.8, 0.7, 2.3)
     scene = Scene(
         starts=tuple(
-            (0.0, y, 1.6 + z) for y, z in ((-0.1, 0.1), (0.05, 0.06), (0.0, 0.0), (0.1, -0.1))
+            (x, y, 1.6 + z)
+            for x, y, z in (
+                (0.1, -0.03, 0.02),
+                (0.25, 0.2, -0.2),
+                (0.4, 0.3, 0.27),
+                (0.5, -0.38, -0.34),
+            )
         ),
-        time=3.8,
+        time=3.2,
         mode_names=("left", "above", "right", "below"),
         camera="three_quarter",
     )
-    # The way lasts 80 samples, and only the last one tells whether a mode arrives.
+    # The way lasts 60 samples, and only the last one tells whether a mode arrives.
     learning = Learning(levels=3, algorithm="ppo", modes={"gamma": 0.96, "samples": 240_000})
     mirror = Mirror((1, -1, 1, -1, 1), (-1, 1))
     # The opening of the gate, and where in it 0.1 m are left on every side [m].
-    close, precision = 0.5, 0.4
+    close, precision = 1.2, 1.1
     observation_low, observation_high = (-5.0, -4.0, -4.0, -6.0, -6.0), (5.0, 4.0, 4.0, 6.0, 6.0)
 
     @cached_property
@@ -111,8 +118,15 @@ class Beam(Task):
         outside = np.maximum(np.abs(measured[:, :3] - centre) - half, 0.0)
         return np.linalg.norm(outside, axis=1) - mjcf.geom_size(self.model, "hull")[0]
 
+    def to_edge(self, measured: np.ndarray) -> np.ndarray:
+        """Returns the distance from the sides of the arena, and from its top and bottom: (n,) [m]."""
+        low, high = np.array(self.chart.low[1:]), np.array(self.chart.high[1:])
+        inside = np.minimum(measured[:, 1:3] - low, high - measured[:, 1:3])
+        return np.asarray(inside.min(axis=1))
+
     def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
-        near = BESIDE * np.clip(1 - self.clearance(measurement) / NEAR, 0.0, 1.0)
+        free = np.minimum(self.clearance(measurement), self.to_edge(measurement))
+        near = BESIDE * np.clip(1 - free / NEAR, 0.0, 1.0)
         # Before the beam it pays to get clear of it on the nearest side, at once: a crash far ahead is
         # discounted, and a pull to the middle would make every way as good as the nearest.
         to_go = self.to_side(measurement, ROOM).min(axis=1).clip(0.0)
