@@ -11,6 +11,7 @@ import hyrl_mj
 from hyrl_mj import Outcome
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.simulation.rollout import LoopSettings, closed_loop
+from hyrl_mj.tasks.trial import try_control
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "scripts"))
 
@@ -53,6 +54,27 @@ def test_it_stands_on_two_wheels_and_a_caster(rover):
     for i, force in enumerate(forces):
         mujoco.mj_contactForce(model, data, i, force)
     assert forces[:, 0].sum() == pytest.approx(weight, rel=0.02)
+
+
+def test_wheels_that_are_asked_once_a_sample_turn_as_those_that_are_asked_at_every_step(rover):
+    once, often = rover.plant(3), rover.plant(3)
+    often._steady = False
+    for plant in (once, often):
+        plant.set_state(
+            *rover.state(np.array([[0.0, 0.1, 0.2], [0.5, 0.0, 0.0], [1.0, -0.3, -0.4]]))
+        )
+        for u in (1.0, -1.0, 0.3):
+            plant.step(np.full((3, 1), u))
+    np.testing.assert_array_equal(once.measurement, often.measurement)
+
+
+def test_wheels_that_depend_on_the_state_are_asked_at_every_step(rover):
+    class Slipping(type(rover)):
+        def control(self, u, qpos, qvel):
+            return super().control(u, qpos, qvel) * (1 - 0.1 * qvel[:, :1])
+
+    with pytest.raises(hyrl_mj.BadInput, match=r"steady_control .* other controls"):
+        try_control(Slipping())
 
 
 def test_it_drives_straight_at_its_speed(rover):

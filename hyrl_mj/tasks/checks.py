@@ -9,12 +9,19 @@ from numpy.typing import ArrayLike
 from hyrl_mj import mjcf
 from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput, brief, line_in, unknown
-from hyrl_mj.ranges import Integer, Number, Optional, Rule, Several, Text
+from hyrl_mj.ranges import Flag, Integer, Number, Optional, Rule, Several, Text
 from hyrl_mj.sets import MOST_DIMENSIONS
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.registry import check_current
-from hyrl_mj.tasks.trial import try_extreme, try_inputs, try_mirror, try_random, try_where
+from hyrl_mj.tasks.trial import (
+    try_control,
+    try_extreme,
+    try_inputs,
+    try_mirror,
+    try_random,
+    try_where,
+)
 
 # Number of starts that are tried.
 STARTS = 64
@@ -28,6 +35,7 @@ RULES: dict[str, Rule] = {
     "worst_reward": Number(-1e9, 1e9),
     "precision": Number(0, np.inf, above=True),
     "close": Number(0, np.inf, above=True),
+    "steady_control": Flag(),
     "inputs": Several(Text(), 1, 100),
     "input_units": Several(Text(), 0, 100),
 }
@@ -248,6 +256,7 @@ def _check_mocap(task: Task, qpos: np.ndarray) -> None:
 def _check_episodes(task: Task) -> None:
     ends = np.append(try_random(task), try_extreme(task))
     try_inputs(task)
+    try_control(task)
     try_mirror(task)
     if not task.gives_direction:
         try_where(task)

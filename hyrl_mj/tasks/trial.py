@@ -91,6 +91,22 @@ def try_inputs(task: Task) -> None:
             )
 
 
+def try_control(task: Task) -> None:
+    """Raises `BadInput` if an inner loop that should depend on the inputs alone depends on the state."""
+    if not (task.has_inner_loop and task.steady_control):
+        return
+    rng = np.random.default_rng(0)
+    z = rng.uniform(task.chart.low, task.chart.high, (STARTS, task.chart.dimension))
+    u = rng.uniform(*task.input_limits, (STARTS, len(task.inputs)))
+    qpos, qvel = task.state(z, rng)
+    qvel = rng.normal(size=(STARTS, task.model.nv)) if qvel is None else qvel
+    if not np.array_equal(task.control(u, qpos, qvel), task.control(u, qpos[::-1], qvel[::-1])):
+        raise BadInput(
+            "steady_control is True, but control() gives other controls for the same inputs at another "
+            "state: leave steady_control out"
+        )
+
+
 def try_where(task: Task) -> None:
     """Raises `BadInput` if where() puts all states of the chart, and those soon after, on a line."""
     rng = np.random.default_rng(0)
