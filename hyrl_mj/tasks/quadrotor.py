@@ -34,9 +34,11 @@ class Quadrotor(PillarTask):
         time=3.4,
         mode_names=("left", "right"),
     )
-    learning = Learning(algorithm="dqn", levels=5)
+    # The way lasts 60 samples and more, and only the last one tells whether a mode arrives.
+    learning = Learning(algorithm="dqn", levels=5, modes={"gamma": 0.95})
     mirror = Mirror((1, -1, -1, -1), (-1,))
-    close = 0.4
+    # The opening of the gate, and where in it 0.1 m are left on both sides [m].
+    close, precision = 0.4, 0.3
     observation_low = (-5.0, -4.0, -6.0, -1.0)
     observation_high = (5.0, 4.0, 6.0, 1.0)
 

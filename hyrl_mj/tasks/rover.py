@@ -34,7 +34,8 @@ class Rover(PillarTask):
         time=5.0,
         mode_names=("left", "right"),
     )
-    learning = Learning(algorithm="dqn", levels=5)
+    # The way lasts 80 samples and more, and only the last one tells whether a mode arrives.
+    learning = Learning(algorithm="dqn", levels=5, modes={"gamma": 0.95})
     steady_control = True
     mirror = Mirror((1, -1, -1), (-1,))
     close = 0.3
