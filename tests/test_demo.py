@@ -21,6 +21,8 @@ CONTROLLERS = ("policy", "hyrl", "limit")
 NUMBERS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 # Finished runs of `scripts/demo`, in whose place new ones are made by default.
 FOLDER = "HYRL_MJ_DEMO_RUNS"
+# How much the shares that the attack finds may differ between processors, in percent of the starts.
+SEARCHED = 0.05
 
 
 def test_the_readme_says_what_the_demo_file_says():
@@ -101,6 +103,18 @@ def written(row, who, game, unit):
     return percent(value, surely=name.startswith("proved") or proved == 1)
 
 
+def same(found, expected, searched):
+    """Whether two figures are the same; what was searched for depends on the processor in its last digits.
+
+    The attack follows millions of runs: where BLAS adds in another order, some of them end otherwise. With
+    its kernels for Sandybridge, SkylakeX, Haswell and Zen the policy of the vehicle is not broken from
+    91.735, 91.759 and twice 91.763% of the starts.
+    """
+    if searched and found.endswith("%") and expected.endswith("%"):
+        return abs(float(found[:-1]) - float(expected[:-1])) <= SEARCHED
+    return found == expected
+
+
 @pytest.mark.slow
 def test_the_demo_gives_these_numbers(demo):
     if has_other_weights(demo):
@@ -112,9 +126,10 @@ def test_the_demo_gives_these_numbers(demo):
         return
     for row in DEMO["table"]:
         unit = hyrl_mj.get_task(row["task"]).chart.units[0]
-        expected = {who: row[who] for who in CONTROLLERS}
         game = game_of(demo, row["task"])
-        assert {who: written(row, who, game, unit) for who in CONTROLLERS} == expected, row
+        for who in CONTROLLERS:
+            found, searched = written(row, who, game, unit), row["value"].startswith("not_broken")
+            assert same(found, row[who], searched), (row, who, found)
 
 
 @pytest.mark.slow
