@@ -50,7 +50,7 @@ class Section(Task):
     precision, close, learning = _of_whole("precision"), _of_whole("close"), _of_whole("learning")
     model, plant, measure = _of_whole("model"), _of_whole("plant"), _of_whole("measure")
     control, has_inner_loop = _of_whole("control"), _of_whole("has_inner_loop")
-    mocap = _of_whole("mocap")
+    mocap, steady_control = _of_whole("mocap"), _of_whole("steady_control")
     input_units, input_limits = _of_whole("input_units"), _of_whole("input_limits")
     observation, measured = _of_whole("observation"), _of_whole("measured")
     reward, danger = _of_whole("reward"), _of_whole("danger")
