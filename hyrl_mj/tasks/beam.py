@@ -144,10 +144,7 @@ class Beam(Task):
         ends[at_gate] = np.where(
             self.arrived(position[at_gate]), Outcome.REACHED, Outcome.OUT_OF_BOUNDS
         )
-        low, high = self.chart.low[1:], self.chart.high[1:]
-        ends[((position[:, 1:] <= low) | (position[:, 1:] >= high)).any(axis=1)] = (
-            Outcome.OUT_OF_BOUNDS
-        )
+        ends[self.to_edge(measurement) <= 0] = Outcome.OUT_OF_BOUNDS
         ends[(touching > 0) | (self.clearance(measurement) <= 0)] = Outcome.CRASHED
         return ends
 

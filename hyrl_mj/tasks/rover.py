@@ -34,8 +34,7 @@ class Rover(PillarTask):
         time=5.0,
         mode_names=("left", "right"),
     )
-    # The way lasts 80 samples and more, and only the last one tells whether a mode arrives.
-    learning = Learning(algorithm="dqn", levels=5, modes={"gamma": 0.95})
+    learning = Learning(algorithm="dqn", levels=5)
     steady_control = True
     mirror = Mirror((1, -1, -1), (-1,))
     close = 0.3
