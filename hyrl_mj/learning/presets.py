@@ -53,7 +53,15 @@ _DDPG = replace(_TD3, algorithm="ddpg")
 _SAC = replace(_TD3, algorithm="sac", action_noise=0.0, options={**_TD3.options, "ent_coef": 0.02})
 # What learns a scene that nobody has tuned it for: a wide network whose first layer sees all of the chart,
 # and episodes all over it.
-_WIDE: dict[str, Any] = {"samples": 500_000, "hidden": (128, 128), "spread": True, "rehearse": 0.4}
+_WIDE: dict[str, Any] = {
+    "samples": 500_000,
+    "hidden": (128, 128),
+    "spread": True,
+    "normalize": True,
+    "rehearse": 0.4,
+}
+# A mirror symmetry doubles the width, see `Training.symmetric`; a scene without one has twice as much to learn.
+_WITHOUT_MIRROR = {"hidden": (192, 192)}
 _CONTINUOUS = {
     "ppo": replace(_SMALL, **_WIDE),
     "a2c": _A2C,
@@ -200,6 +208,8 @@ def _stage1(task: Task, name: str, algorithm: str) -> Training:
             "choose preset fast or smoke"
         )
     training = _PAPER if name == "paper" else (_CONTINUOUS if levels is None else _LEVELS)[known]
+    if name != "paper" and known == "ppo" and task.mirror is None:
+        training = replace(training, **_WITHOUT_MIRROR)
     if name != "paper" and algorithm == task.learning.algorithm:
         training = replace(training, **task.learning.training)
     if name == "smoke":

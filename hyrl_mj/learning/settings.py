@@ -45,6 +45,8 @@ class Training:
             used twice, and the policy has twice the width.
         spread: whether the kinks of the first layer are spread over the observations of the whole chart at
             first, and do not all pass through the origin.
+        normalize: whether rewards are divided by the standard deviation of the return so far, as SB3's
+            `VecNormalize` does. Without it, PPO learns slowly from returns that are far from 1.
         rehearse: share of the episodes that start anywhere on the chart, and not where the task starts: two
             fifths of them where the latest policy lost, and two fifths where it decided between ways
             (stage 1 only).
@@ -69,6 +71,7 @@ class Training:
     gamma: Annotated[float, Number(0, 1, above=True)]
     symmetric: Annotated[bool, Flag()]
     spread: Annotated[bool, Flag()] = False
+    normalize: Annotated[bool, Flag()] = False
     rehearse: Annotated[float, Number(0, 1)] = 0.0
     warm_start: Annotated[bool, Flag()] = False
     episode: Annotated[int | None, Optional(Integer(1, LONGEST))] = None

@@ -12,6 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from threadpoolctl import threadpool_limits
 from torch import nn
 
@@ -134,7 +135,10 @@ def build(
     hidden = settings.hidden if start_from is None else start_from.hidden
     activation = settings.activation if start_from is None else start_from.activation
     rate = settings.learning_rate
-    env = BatchedEnv(task, settings.envs, noise=noise, domain=domain, max_steps=settings.episode)
+    core = BatchedEnv(task, settings.envs, noise=noise, domain=domain, max_steps=settings.episode)
+    env: VecEnv = TaskVecEnv(core)
+    if settings.normalize:
+        env = VecNormalize(env, norm_obs=False, clip_reward=np.inf, gamma=settings.gamma)
     options = dict(settings.options)
     if settings.action_noise:
         m = len(task.inputs)
@@ -144,7 +148,7 @@ def build(
         with threads(FOR_BUILDING):
             model = kind(
                 "MlpPolicy",
-                TaskVecEnv(env),
+                env,
                 seed=seed,
                 device="cpu",
                 gamma=settings.gamma,
@@ -269,9 +273,10 @@ class TaskGround:
     """
 
     enough: Score = (np.inf,)
-    settled = 0.5  # an untrained policy can score well by chance
 
     def __init__(self, task: Task, gamma: float, noise: Noise | None = None, rehearse: float = 0.0):
+        # An untrained policy can score well by chance; but where it loses has to be known early.
+        self.settled = 0.1 if rehearse else 0.5
         self.noise, self._task, self._gamma = noise or Noise(), task, gamma
         bound = self.noise.bound
         self._noises = [Noise(kind, bound) for kind in JUDGES] if bound else [Noise()]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from itertools import product
 
 import numpy as np
 
@@ -28,10 +27,16 @@ ALLOWED_DELAY = 0.03
 # Share of a mode's states that may be lost where the mode is never selected.
 FEW = 1e-3
 # Where the worst case cannot be computed: the kinds of noise that judge a policy, the mildest first, and how
-# many episodes of each kind run at once. Most policies are bad and fail in the first batch; all batches are
-# so many episodes that a policy that loses a few in a thousand is found out.
+# many episodes of each kind are in a batch. Most policies are bad and fail in the first batch; all batches
+# are so many episodes that a policy that loses a few in a thousand is found out. The last kind looks ahead,
+# which takes ten times as long and needs fewer episodes to show a weakness: it plays the first batches only.
 JUDGES = ("none", "uniform", "alternating", "adversarial")
-BATCHES = (64, 64, 128, 256, 512)
+BATCHES, AHEAD_BATCHES = (64, 64, 128, 256, 512), 3
+PLAYS = [
+    (batch, kind)
+    for batch in range(len(BATCHES))
+    for kind in JUDGES[: None if batch < AHEAD_BATCHES else -1]
+]
 # There, a policy may end this many times as far off the set-point as the stage-1 policy, because it goes the
 # long way, too; or by this share of the distance that counts as arrived.
 ALLOWED_MISS, MISS_SHARE = 2.0, 0.25
@@ -229,17 +234,17 @@ class ByEpisodes(ModeGround):
     """Judges by noisy episodes, where the worst case cannot be computed.
 
     The episodes start where the hybrid controller may select the mode. Without noise all have to arrive at
-    the set-point, under noise all have to survive. The score is the number of kinds of noise, in the order of
-    `JUDGES`, that stop no episode, then minus the share of episodes that the next kind stops; if none is
-    stopped, minus the largest distance from the set-point at the end without noise, as a multiple of
-    `allowed`.
+    the set-point, under noise all have to survive. Each batch is played with its kinds of noise before the
+    next batch, see `PLAYS`. The score is the number of plays that stop no episode, then minus the share of
+    episodes that the next play stops; if none is stopped, minus the largest distance from the set-point at
+    the end without noise, as a multiple of `allowed`.
 
     Attributes:
         judged: (n, d) starts of the episodes.
         allowed: allowed distance from the set-point at the end of episodes without noise [chart units].
     """
 
-    enough: Score = (float(len(JUDGES)), -1.0)
+    enough: Score = (float(len(PLAYS)), -1.0)
 
     def _prepare(self, policy: Policy | None) -> None:
         self.noise = Noise("uniform", self.extended.noise)
@@ -254,7 +259,8 @@ class ByEpisodes(ModeGround):
     def _allowed(self, policy: Policy | None) -> float:
         """Returns `allowed`, by the runs of the stage-1 policy that arrive, if there are any."""
         precision, close = self.task.precision, self.task.close
-        batches = [self._play(policy, JUDGES[0], b) for b in self._batches] if policy else []
+        plays = [play for play in PLAYS if play[1] == JUDGES[0]] if policy else []
+        batches = [self._play(policy, *play) for play in plays]
         ends = np.concatenate([np.empty(0), *(miss[won] for won, miss in batches)])
         usual = MISS_SHARE * close if len(ends) else close
         least = precision if np.isfinite(precision) else usual
@@ -262,27 +268,26 @@ class ByEpisodes(ModeGround):
 
     def score(self, policy: MlpPolicy) -> Score:
         farthest = 0.0
-        for survived, kind in enumerate(JUDGES):
-            for batch in self._batches:
-                won, miss = self._play(policy, kind, batch)
-                farthest = max(farthest, miss.max()) if kind == JUDGES[0] else farthest
-                lost = self.grid.nearest(self.judged[batch][~won])
-                self._remember(lost, np.ones(len(lost)))
-                if len(lost):
-                    return float(survived), -len(lost) / (batch[-1] + 1)
-        return float(len(JUDGES)), -farthest / self.allowed
+        for survived, (batch, kind) in enumerate(PLAYS):
+            won, miss = self._play(policy, batch, kind)
+            farthest = max(farthest, miss.max()) if kind == JUDGES[0] else farthest
+            lost = self.grid.nearest(self.judged[self._batches[batch]][~won])
+            self._remember(lost, np.ones(len(lost)))
+            if len(lost):
+                return float(survived), -len(lost) / len(won)
+        return self.enough[0], -farthest / self.allowed
 
     def won(self, policy: MlpPolicy) -> float:
-        if self(policy)[0] == len(JUDGES):
+        if self(policy)[0] == self.enough[0]:
             return 1.0  # the same episodes
-        plays = product(JUDGES, self._batches)
-        return float(np.concatenate([self._play(policy, *play)[0] for play in plays]).mean())
+        return float(np.concatenate([self._play(policy, *play)[0] for play in PLAYS]).mean())
 
-    def _play(self, policy: Policy, kind: str, batch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns which episodes `batch` (k,) are won, and how far off they end: (k,), (k,)."""
-        settings = LoopSettings(plant=self._plants[len(batch)], vary=True, quiet=True)
+    def _play(self, policy: Policy, batch: int, kind: str) -> tuple[np.ndarray, np.ndarray]:
+        """Returns which episodes of a batch are won (k,), and how far off they end (k,)."""
+        rows = self._batches[batch]
+        settings = LoopSettings(plant=self._plants[len(rows)], vary=True, quiet=True)
         noise, loop = Noise(kind, self.extended.noise), PolicyController(policy)
-        seed, starts = int(batch[0]), self.judged[batch]
+        seed, starts = int(rows[0]), self.judged[rows]
         run = closed_loop(self.task, loop, starts, noise, seed=seed, settings=settings)
         ends, won = run.path[-1], run.outcome == Outcome.REACHED
         won = won & self.task.arrived(ends) if kind == JUDGES[0] else won
