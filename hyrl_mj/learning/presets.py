@@ -9,6 +9,7 @@ from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.game import LATTICE, Lattice, aligned_cells
 from hyrl_mj.learning.settings import PRESETS, Settings, Training
 from hyrl_mj.policies import Agent, algorithms
+from hyrl_mj.sets import enough_cells
 from hyrl_mj.tasks import Task, reference
 
 # Stage 1 of preset fast, by algorithm, for continuous inputs and for levels.
@@ -60,8 +61,8 @@ _WIDE: dict[str, Any] = {
     "normalize": True,
     "rehearse": 0.4,
 }
-# A mirror symmetry doubles the width, see `Training.symmetric`; a scene without one has twice as much to learn.
-_WITHOUT_MIRROR = {"hidden": (192, 192)}
+# A mirror symmetry doubles the width, see `Training.symmetric`, and halves what there is to learn.
+_WITHOUT_MIRROR: dict[str, Any] = {"hidden": (192, 192)}
 _CONTINUOUS = {
     "ppo": replace(_SMALL, **_WIDE),
     "a2c": _A2C,
@@ -140,6 +141,9 @@ _SMOKE_MODES = 8_192
 # the sets; fewer for plants with dynamics, whose samples are slower to simulate.
 _GRIDS = {1: (120, 2880), 2: (120, 240), 3: (24, 48), 4: (11, 13)}
 _GRIDS_DYNAMIC = {1: (120, 720), 2: (40, 96), 3: (16, 30), 4: (8, 11)}
+# In three dimensions these have as many more cells for the sets as the noise needs, up to so many; most of
+# their nodes are not simulated.
+_MOST_CELLS = 88
 # Cells of the worst-case game's lattice in a smoke run.
 _LATTICE_SMOKE = {1: 1_200, 2: 120, 3: 60}
 
@@ -177,6 +181,8 @@ def preset(
     rods, cells = (_GRIDS if task.kinematic else _GRIDS_DYNAMIC)[min(dimension, 4)]
     if task.kinematic and dimension == 2:
         cells = aligned_cells(task, cells)
+    if not task.kinematic and dimension == 3 and name != "smoke":
+        cells = enough_cells(task.chart, task.noise_in_chart(noise), cells, _MOST_CELLS)
     settings = Settings(
         task=reference(task),
         preset=name,

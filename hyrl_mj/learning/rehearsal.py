@@ -9,8 +9,9 @@ from hyrl_mj.tasks import Outcome, Task
 # Of the episodes that start anywhere, the share that starts where the latest policy lost, and the share that
 # starts where it decides.
 LOST_SHARE, DECIDING_SHARE = 0.4, 0.4
-# Chart points that starts are drawn from, and that a policy is tried from.
-POINTS, TRIED = 16_384, 2_048
+# Chart points that starts are drawn from, and that a policy is tried from: fewer for plants with dynamics,
+# whose samples are slower to simulate.
+POINTS, TRIED, TRIED_DYNAMIC = 16_384, 2_048, 256
 # A policy decides between a point that it is tried from and one of so many nearest ones.
 NEIGHBOURS = 4
 
@@ -33,6 +34,7 @@ class Rehearsal:
         self._points = running_points(task, POINTS, np.random.default_rng(0))
         self._lost = self._deciding = self._points[:0]
         self._weight, self._tried = np.empty(0), 0
+        self._count = TRIED if task.kinematic else TRIED_DYNAMIC
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draws n starts (n, d)."""
@@ -48,8 +50,8 @@ class Rehearsal:
 
     def update(self, policy: Policy) -> None:
         """Notes where a policy loses and decides; what it loses late counts more, as it is easier to mend."""
-        at = np.arange(self._tried, self._tried + TRIED) % len(self._points)
-        self._tried += TRIED
+        at = np.arange(self._tried, self._tried + self._count) % len(self._points)
+        self._tried += self._count
         z = self._points[at]
         run = way_runs(self._task, policy, z, quiet=True)
         lost = (

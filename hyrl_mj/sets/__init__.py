@@ -4,7 +4,7 @@ A `GridSet` holds it at the nodes of a `Grid`, or of a `Cloud`, whose nodes are 
 dimensions; `covering` and `resolving` say which of them a chart gets.
 """
 
-from hyrl_mj.sets.choice import MOST_DIMENSIONS, coarseness, covering, resolving
+from hyrl_mj.sets.choice import MOST_DIMENSIONS, coarseness, covering, enough_cells, resolving
 from hyrl_mj.sets.clouds import MOST_NODES, Cloud
 from hyrl_mj.sets.grids import Grid, within_reach
 from hyrl_mj.sets.members import Complement, Everything, GridSet, Nodes, StateSet
@@ -22,6 +22,7 @@ __all__ = [
     "StateSet",
     "coarseness",
     "covering",
+    "enough_cells",
     "resolving",
     "surface_distance",
     "within_reach",

@@ -74,6 +74,22 @@ def resolving(chart: Chart, cells: int, points: np.ndarray, noise: np.ndarray) -
     return Cloud.even(chart, half, nodes.shares).beside(points, half, reach, BESIDE * away)
 
 
+def enough_cells(chart: Chart, noise: np.ndarray, least: int, most: int) -> int:
+    """Returns the least number of cells for `covering` that are short enough for the noise (d,).
+
+    They are at most half of the noise bound long on each noisy coordinate. There are at least `least` and at
+    most `most` cells.
+    """
+    noisy = noise > 0
+    for cells in range(least, most):
+        nodes = covering(chart, cells, noise)
+        if isinstance(nodes, Cloud):
+            return least
+        if (nodes.spacing[noisy] <= SHARE * noise[noisy] * (1 + 1e-9)).all():
+            return cells
+    return most
+
+
 def coarseness(chart: Chart, cells: int, noise: np.ndarray) -> str | None:
     """Returns a sentence if cells of the sets are longer than the noise (d,) on some coordinate, or None."""
     nodes = covering(chart, cells, noise)

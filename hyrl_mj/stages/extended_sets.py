@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache, partial
 from typing import ClassVar
 
 import numpy as np
@@ -13,7 +14,7 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.game import Limit
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import Cloud, Grid, GridSet
-from hyrl_mj.simulation import policy_runs
+from hyrl_mj.simulation import Rollout, policy_runs
 from hyrl_mj.stages.critical_set import check_points, distance_to
 from hyrl_mj.stages.meeting import least_room, narrow_sentence
 from hyrl_mj.stages.partition import (
@@ -25,6 +26,7 @@ from hyrl_mj.stages.partition import (
     open_ways,
     part_policies,
 )
+from hyrl_mj.stages.refinement import spread
 from hyrl_mj.tasks import Outcome, Task
 
 # A horizon is long enough when the propagated sets fill this share of the overlap that the noise needs.
@@ -125,7 +127,8 @@ def extend(
 
         M_ext_i = ((M_i u X_i) n (W_i eroded by eps)) u (M_i dilated by eps)
 
-    Erosion and dilation act along the noisy coordinates.
+    Erosion and dilation act along the noisy coordinates. For a plant with dynamics the dilation is by the
+    longest hop in one sample more.
 
     Args:
         task: gives plant and chart.
@@ -148,10 +151,24 @@ def extend(
     # The extended sets lie among these candidates.
     radius = 3 * noise + near + (0.0 if horizon is None else horizon / task.dt * near)
     candidates = [part.dilated(radius).mask for part in parts]
+    # Only M* has to be covered: where parts meet elsewhere, as at the set-point, nothing is left to decide.
+    off = distance_to(task, points, grid.nodes)
+    around = off <= float(np.linalg.norm((2 * eps + hop) / task.chart.scale))
+    # The cells that backward runs visit are those of a grid.
+    backward = task.kinematic and isinstance(grid, Grid)
+    rims = [part.mask & (off <= near) for part in parts]
+    # The same runs from outside of a part tell from where its way succeeds, and when they enter the part.
+    told = [
+        cache(partial(
+            spread, task, grid, candidate & ~part.mask, points, radius,
+            partial(_outside, task, pi, partition, part, None if backward else rim), 2,
+        ))
+        for pi, part, rim, candidate in zip(pis, parts, rims, candidates, strict=True)
+    ]  # fmt: skip
     if ways is None:
         winning = tuple(
-            _part_wins(task, pi, partition, part, candidate)
-            for pi, part, candidate in zip(pis, parts, candidates, strict=True)
+            (partition.succeeds & part.mask) | (known()[:, 0] > 0)
+            for part, known in zip(parts, told, strict=True)
         )
     else:
         winning = open_ways(ways, grid)
@@ -159,18 +176,13 @@ def extend(
         GridSet.from_mask(grid, wins | ~candidate).eroded_by_box(eps)
         for wins, candidate in zip(winning, candidates, strict=True)
     ]
-    # Only M* has to be covered: where parts meet elsewhere, as at the set-point, nothing is left to decide.
-    off = distance_to(task, points, grid.nodes)
-    around = off <= float(np.linalg.norm((2 * eps + hop) / task.chart.scale))
     propagated = horizon or 0.0
     if len(parts) > 1 and (ways is None or horizon is not None):
-        # The cells that backward runs visit are those of a grid.
-        backward = task.kinematic and isinstance(grid, Grid)
         reach = [
-            _backward_reach(task, pi, part, part.mask & (off <= near))
+            _backward_reach(task, pi, part, rim)
             if backward
-            else _forward_reach(task, pi, part, part.mask & (off <= near), candidate)
-            for pi, part, candidate in zip(pis, parts, candidates, strict=True)
+            else _forward_reach(part, known()[:, 2])
+            for pi, part, rim, known in zip(pis, parts, rims, told, strict=True)
         ]
         goals = [
             (w & room).mask & ~part.mask & around
@@ -183,8 +195,11 @@ def extend(
             reached = [r & w for r, w in zip(reached, wanted, strict=True)]
     else:
         reached = wanted if horizon is None else list(parts)
+    # With inertia a run goes on for a sample before the new mode tells: chattering would cross a set that is
+    # just as wide as the noise.
+    wide = eps if task.kinematic else eps + hop * (eps > 0)
     sets = tuple(
-        (r & room) | part.dilated_by_box(eps)
+        (r & room) | part.dilated_by_box(wide)
         for r, room, part in zip(reached, roomy, parts, strict=True)
     )
     rows, pair, room = least_room(points, parts, winning, eps)
@@ -212,30 +227,64 @@ def _shortest(task: Task, reach: list[Callable[[int], GridSet]], goals: list[np.
     return best
 
 
-def _part_wins(
-    task: Task, pi: PartPolicy, partition: Partition, part: GridSet, candidates: np.ndarray
+def _outside(
+    task: Task,
+    pi: PartPolicy,
+    partition: Partition,
+    part: GridSet,
+    rim: np.ndarray | None,
+    rows: np.ndarray,
 ) -> np.ndarray:
-    """Returns W_i: the nodes (N,) bool among the candidates (N,) from which pi_i arrives by its own way.
+    """Returns what is known of nodes `rows` (k,) by the runs of pi_i from those outside of M_i: (k, 3).
 
-    Past obstacles, a run from outside M_i goes another way if it first enters M_i where parts overlap.
+    These are whether they belong to W_i, from where pi_i arrives by its own way, whether the runs enter M_i
+    on the rim (N,) bool, and after how many samples, infinite for others. Past obstacles, a run from outside
+    M_i goes another way if it first enters M_i where parts overlap. Scattered nodes lie too far apart for a
+    rim: there it counts wherever the runs enter M_i. Without a rim, only W_i is asked for.
     """
     arrives = partition.succeeds & part.mask
-    wins = arrives.copy()
-    outside = np.flatnonzero(candidates & ~part.mask)
+    entry = np.full(len(rows), np.inf)
+    wins = arrives[rows]
+    if rim is not None:
+        entry[part.mask[rows] & rim[rows]] = 1.0  # of those beside them
+    outside = np.flatnonzero(~part.mask[rows])
     if len(outside):
-        rollout = policy_runs(task, pi, part.grid.nodes[outside], label="extended sets")
+        nodes = part.grid.nodes[rows[outside]]
+        rollout = policy_runs(task, pi, nodes, label="extended sets")
         wins[outside] = rollout.outcome == Outcome.REACHED
-        if task.gives_direction:
-            return wins
-        shared = np.sum([other.mask for other in partition.parts], axis=0) > 1
-        entered, elsewhere = np.zeros((2, len(outside)), dtype=bool)
-        for z in rollout.path[1:]:
-            at = part.grid.nearest(z)
-            enters = ~entered & arrives[at]
-            elsewhere |= enters & shared[at]
-            entered |= enters
-        wins[outside] &= ~elsewhere
-    return wins
+        if not task.gives_direction:
+            wins[outside] &= ~_elsewhere(partition, part, arrives, rollout)
+        if rim is not None:
+            entry[outside] = _entries(task, part, rim, rollout)
+    return np.column_stack([wins, np.isfinite(entry), entry])
+
+
+def _elsewhere(
+    partition: Partition, part: GridSet, arrives: np.ndarray, rollout: Rollout
+) -> np.ndarray:
+    """Returns the runs (k,) bool that enter M_i, where pi_i `arrives` (N,), first where parts overlap."""
+    shared = np.sum([other.mask for other in partition.parts], axis=0) > 1
+    entered, elsewhere = np.zeros((2, len(rollout.outcome)), dtype=bool)
+    for z in rollout.path[1:]:
+        at = part.grid.nearest(z)
+        enters = ~entered & arrives[at]
+        elsewhere |= enters & shared[at]
+        entered |= enters
+    return elsewhere
+
+
+def _entries(task: Task, part: GridSet, rim: np.ndarray, rollout: Rollout) -> np.ndarray:
+    """Returns after how many samples runs enter M_i on the rim (N,) bool: (k,), infinite for the others."""
+    entry = np.full(len(rollout.outcome), np.inf)
+    under_way = np.ones(len(entry), dtype=bool)
+    longest = round(LONGEST_HORIZON / task.dt)
+    for k, z in enumerate(rollout.path[1 : longest + 1], 1):
+        rows = np.flatnonzero(under_way)
+        rows = rows[part.contains(z[rows])]
+        on_rim = rows if isinstance(part.grid, Cloud) else rows[rim[part.grid.nearest(z[rows])]]
+        entry[on_rim] = k
+        under_way[rows] = False
+    return entry
 
 
 def _backward_reach(
@@ -267,27 +316,13 @@ def _backward_reach(
     return within
 
 
-def _forward_reach(
-    task: Task, pi: PartPolicy, part: GridSet, rim: np.ndarray, candidates: np.ndarray
-) -> Callable[[int], GridSet]:
-    """As `_backward_reach`, but X_i are the candidates (N,) whose forward runs enter M_i on the rim (N,).
+def _forward_reach(part: GridSet, entry: np.ndarray) -> Callable[[int], GridSet]:
+    """As `_backward_reach`, but X_i are the nodes whose forward runs enter M_i on its rim.
 
-    Scattered nodes lie too far apart for a rim: there X_i are all candidates whose runs enter M_i.
+    `entry` (N,) is after how many samples they do, not above zero where that is not known.
     """
-    grid = part.grid
-    outside = np.flatnonzero(candidates & ~part.mask)
-    arrival = np.full(len(grid.nodes), np.inf)
-    if len(outside):
-        longest = round(LONGEST_HORIZON / task.dt)
-        rollout = policy_runs(task, pi, grid.nodes[outside], steps=longest, label="forward")
-        under_way = np.ones(len(outside), dtype=bool)
-        for k, z in enumerate(rollout.path[1:], 1):
-            rows = np.flatnonzero(under_way)
-            rows = rows[part.contains(z[rows])]
-            on_rim = rows if isinstance(grid, Cloud) else rows[rim[grid.nearest(z[rows])]]
-            arrival[outside[on_rim]] = k
-            under_way[rows] = False
-    return lambda samples: GridSet.from_mask(grid, part.mask | (arrival <= samples))
+    entry = np.where(entry > 0, entry, np.inf)
+    return lambda samples: GridSet.from_mask(part.grid, part.mask | (entry <= samples))
 
 
 def _between_samples(path: np.ndarray, grid: Grid) -> np.ndarray:

@@ -37,6 +37,8 @@ PLAYS = [
     for batch in range(len(BATCHES))
     for kind in JUDGES[: None if batch < AHEAD_BATCHES else -1]
 ]
+# So many starts are drawn for each episode; those too close to where the mode cannot succeed are left out.
+SPARE = 4
 # There, a policy may end this many times as far off the set-point as the stage-1 policy, because it goes the
 # long way, too; or by this share of the distance that counts as arrived.
 ALLOWED_MISS, MISS_SHARE = 2.0, 0.25
@@ -249,9 +251,12 @@ class ByEpisodes(ModeGround):
     def _prepare(self, policy: Policy | None) -> None:
         self.noise = Noise("uniform", self.extended.noise)
         picked = self._selected[self.early]
-        rng = np.random.default_rng(0)
-        first = rng.choice(self.early[picked] if picked.any() else self.early, sum(BATCHES))
-        self.judged = self._around(first, rng)
+        rng, episodes = np.random.default_rng(0), sum(BATCHES)
+        first = rng.choice(self.early[picked] if picked.any() else self.early, SPARE * episodes)
+        z = self._around(first, rng)
+        # A start may be lost for any policy if not all nodes around it are wanted.
+        sure = np.flatnonzero(self.grid.interpolate(self.wanted.astype(float), z) > 1 - 1e-9)
+        self.judged = z[np.resize(sure if len(sure) else np.arange(len(z)), episodes)]
         self._batches = np.split(np.arange(len(self.judged)), np.cumsum(BATCHES)[:-1])
         self._plants = {n: self.task.plant(n) for n in set(BATCHES)}
         self.allowed = self._allowed(policy)
@@ -259,8 +264,8 @@ class ByEpisodes(ModeGround):
     def _allowed(self, policy: Policy | None) -> float:
         """Returns `allowed`, by the runs of the stage-1 policy that arrive, if there are any."""
         precision, close = self.task.precision, self.task.close
-        plays = [play for play in PLAYS if play[1] == JUDGES[0]] if policy else []
-        batches = [self._play(policy, *play) for play in plays]
+        plays = [play for play in PLAYS if play[1] == JUDGES[0]]
+        batches = [self._play(policy, *play) for play in plays] if policy else []
         ends = np.concatenate([np.empty(0), *(miss[won] for won, miss in batches)])
         usual = MISS_SHARE * close if len(ends) else close
         least = precision if np.isfinite(precision) else usual

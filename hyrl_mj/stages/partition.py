@@ -15,9 +15,10 @@ from hyrl_mj.policies import Policy
 from hyrl_mj.sets import GridSet, Nodes, resolving
 from hyrl_mj.simulation import WayRuns, policy_runs, way_runs
 from hyrl_mj.stages.critical_set import check_points
+from hyrl_mj.stages.refinement import spread, thinned
 from hyrl_mj.stages.search import WEDGE
 from hyrl_mj.stages.ways import LEAST_SHARE, Ways
-from hyrl_mj.tasks import ANY, Outcome, Task, number_of
+from hyrl_mj.tasks import ANY, Task, number_of
 
 # The neighbourhood of M* is at least this many cells wide, and as wide as the longest hop in one sample.
 # Of more than two parts some are wedges: without a wide neighbourhood they begin far from M*, where a policy
@@ -118,13 +119,22 @@ def make_partition(
     """
     points = check_points(task, points)
     grid = resolving(task.chart, cells, points, task.noise_in_chart(max(noise, 1e-6)))
-    rollout = way_runs(task, policy, grid.nodes, label="partition")
-    runs = WayRuns.of(task, rollout)
-    ways = Ways.of(task, runs, grid.neighbours())
+    simulated, neighbours = thinned(task, grid)
+    first = WayRuns.of(task, way_runs(task, policy, grid.nodes[simulated], label="partition"))
+    ways = Ways.of(task, first, neighbours)
     modes = ways.modes if len(points) else ()
-    members = ways.members(runs)
-    works = np.flatnonzero(ways.works(runs))
-    failed = np.flatnonzero(~ways.works(runs))
+
+    def tell(rows: np.ndarray) -> np.ndarray:
+        """Returns the modes of nodes, whether their runs work, and whether they arrive: (k, Q + 2)."""
+        runs = first
+        if not np.array_equal(rows, simulated):
+            runs = WayRuns.of(task, way_runs(task, policy, grid.nodes[rows], label="partition"))
+        return np.column_stack([ways.members(runs), ways.works(runs), runs.arrived])
+
+    everywhere, columns = np.ones(grid.size, dtype=bool), len(ways.modes) + 2
+    known = spread(task, grid, everywhere, points, WEDGE * noise, tell, columns).astype(bool)
+    members, succeeds = known[:, :-2], known[:, -1]
+    works, failed = np.flatnonzero(known[:, -2]), np.flatnonzero(~known[:, -2])
     if modes and len(failed):
         nearest = task.chart.tree(grid.nodes[works]).query(task.chart.in_box(grid.nodes[failed]))[1]
         members[failed] = members[works[nearest]]
@@ -132,7 +142,6 @@ def make_partition(
     parts = tuple(GridSet.from_mask(grid, mask) for mask in masks)
     unparted = () if modes or len(ways.modes) < 2 else ways.modes
     alone = 0 if ways.end.size < 2 else int(number_of(np.full((1, ways.end.size), ANY))[0])
-    succeeds = rollout.outcome == Outcome.REACHED
     return Partition(modes or (alone,), parts, succeeds, ways.dropped, unparted)
 
 
@@ -223,5 +232,6 @@ def neighbourhood(partition: Partition, noise: float, hop: np.ndarray) -> float:
 
 def longest_hop(task: Task, policy: Policy, grid: Nodes) -> np.ndarray:
     """Returns the longest hop (d,) of the closed loop in one sample, along each coordinate."""
-    path = policy_runs(task, policy, grid.nodes, steps=1).path
+    nodes = grid.nodes[thinned(task, grid)[0]]
+    path = policy_runs(task, policy, nodes, steps=1).path
     return np.asarray(np.abs(path[-1] - path[0]).max(axis=0))

@@ -21,7 +21,7 @@ START_TILT = 0.05
 @register
 class Quadrotor(PillarTask):
     name = "quadrotor"
-    description = "fly past a pillar on its left or on its right (DQN)"
+    description = "fly past a pillar on its left or on its right (PPO)"
     coordinates, units, largest = ("x", "y", "drift"), ("m", "m", "m/s"), (FASTEST,)
     inputs, input_units = ("lateral_velocity",), ("m/s",)
     # Columns of the measurement: x, y, velocity to the side, tilt to the side, touching pillar or floor.
@@ -35,7 +35,11 @@ class Quadrotor(PillarTask):
         mode_names=("left", "right"),
     )
     # The way lasts 60 samples and more, and only the last one tells whether a mode arrives.
-    learning = Learning(algorithm="dqn", levels=5, modes={"gamma": 0.95})
+    learning = Learning(
+        levels=5,
+        training={"samples": 200_000, "hidden": (64, 64)},
+        modes={"gamma": 0.95},
+    )
     mirror = Mirror((1, -1, -1, -1), (-1,))
     # The opening of the gate, and where in it 0.1 m are left on both sides [m].
     close, precision = 0.4, 0.3

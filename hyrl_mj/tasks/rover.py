@@ -21,7 +21,7 @@ START_RATE = 0.3
 @register
 class Rover(PillarTask):
     name = "rover"
-    description = "drive on wheels past a pillar on its left or on its right (DQN)"
+    description = "drive on wheels past a pillar on its left or on its right (PPO)"
     coordinates, units, largest = ("x", "y", "heading"), ("m", "m", "rad"), (ASTRAY,)
     inputs, input_units = ("turn_rate",), ("rad/s",)
     # Columns of the measurement: x, y, heading, rate of turn, touching the pillar.
@@ -34,7 +34,7 @@ class Rover(PillarTask):
         time=5.0,
         mode_names=("left", "right"),
     )
-    learning = Learning(algorithm="dqn", levels=5)
+    learning = Learning(levels=5, training={"samples": 200_000, "hidden": (64, 64)})
     steady_control = True
     mirror = Mirror((1, -1, -1), (-1,))
     close = 0.3
