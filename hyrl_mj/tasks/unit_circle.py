@@ -36,7 +36,13 @@ class UnitCircle(Task):
     )
     learning = Learning(
         search="rods",
-        training={"samples": 160_000, "hidden": (64, 64), "spread": False, "rehearse": 0.0},
+        training={
+            "samples": 160_000,
+            "hidden": (64, 64),
+            "spread": False,
+            "normalize": False,
+            "rehearse": 0.0,
+        },
     )
     mirror = Mirror((1, -1), (-1,))
     observation_low, observation_high = (-1.0, -1.0), (1.0, 1.0)
