@@ -22,7 +22,7 @@ from hyrl_mj.learning.presets import preset
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets, extend
-from hyrl_mj.stages.grounds import BATCHES, ByEpisodes, ByGame
+from hyrl_mj.stages.grounds import BATCHES, JUDGES, ByEpisodes, ByGame
 from hyrl_mj.stages.hybrid import HybridController
 from hyrl_mj.stages.retraining import retrain
 
@@ -339,3 +339,32 @@ def test_a_mirror_image_is_taken_there_too(puck, puck_sets, monkeypatch):
     found, _ = retrain(ByEpisodes(puck, puck_sets, 1), settings, seed=0, others=[other])
     for name, weight in symmetry.mirrored(other).weights.items():
         np.testing.assert_array_equal(found.weights[name], weight)
+
+
+@pytest.mark.slow
+def test_they_start_where_all_nodes_around_can_be_won(puck, puck_sets):
+    winning = (
+        puck_sets.winning[0] & (puck_sets.sets[0].grid.nodes[:, 0] < 0.7),
+        puck_sets.winning[1],
+    )
+    ground = ByEpisodes(puck, replace(puck_sets, winning=winning), 0)
+    nodes, spacing = ground.grid.nodes, ground.grid.spacing
+    assert len(ground.judged) == sum(BATCHES)
+    for z in ground.judged:
+        around = (np.abs(nodes - z) < spacing - 1e-9).all(axis=1)
+        assert around.any()
+        assert ground.wanted[around].all()
+
+
+@pytest.mark.slow
+def test_the_noise_that_looks_ahead_plays_the_first_batches_alone(puck, puck_sets, monkeypatch):
+    ground, played = ByEpisodes(puck, puck_sets, 0), dict.fromkeys(JUDGES, 0)
+    play = ground._play
+
+    def counted(policy, batch, kind):
+        played[kind] += BATCHES[batch]
+        return play(policy, batch, kind)
+
+    monkeypatch.setattr(ground, "_play", counted)
+    assert ground(round_it(puck, 1.0)) >= ground.enough
+    assert played == dict.fromkeys(JUDGES[:3], 1_024) | {"adversarial": 256}

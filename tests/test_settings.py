@@ -54,6 +54,7 @@ OF_TRAININGS = {
     "gamma": ([0, 1.1, NAN, "0.9"], "> 0 and <= 1"),
     "symmetric": ([0, None], "True or False"),
     "spread": ([0, None], "True or False"),
+    "normalize": ([0, None], "True or False"),
     "rehearse": ([-0.1, 1.5, NAN, "half"], "a number from 0 to 1"),
     "warm_start": ([0, None], "True or False"),
     "episode": ([0, -3, 2.5, True], "an integer from 1 to"),

@@ -215,3 +215,40 @@ def test_training_ends_when_a_policy_is_good_enough(vehicle):
     ground = Counted(vehicle, settings.gamma)
     training.train(vehicle, settings, seed=0, ground=ground)
     assert ground.asked == 2
+
+
+def rewards_seen(task, settings):
+    """The rewards that the algorithm gets in 300 samples of 16 episodes, after 200 others."""
+    env = training.build(task, settings, seed=0).get_env()
+    env.seed(0)
+    env.reset()
+    rng = np.random.default_rng(0)
+    actions = rng.integers(len(task.input_levels), size=(500, env.num_envs))
+    return np.array([env.step(action)[1] for action in actions])[200:]
+
+
+def test_normalised_rewards_do_not_depend_on_the_unit_of_the_reward(vehicle, monkeypatch):
+    settings = replace(preset(vehicle).stage1, envs=16, normalize=True)
+    plain = rewards_seen(vehicle, replace(settings, normalize=False))
+    small = rewards_seen(vehicle, settings)
+    reward = type(vehicle).reward
+    monkeypatch.setattr(vehicle, "reward", lambda *args: 1_000 * reward(vehicle, *args))
+    large = rewards_seen(vehicle, settings)
+    np.testing.assert_allclose(large, small, rtol=1e-2)
+    assert np.corrcoef(plain.ravel(), small.ravel())[0, 1] > 0.99
+    assert np.abs(small).max() < 1
+
+
+def test_a_task_without_a_mirror_gets_a_wider_network():
+    settings = {name: preset(hyrl_mj.get_task(name)).stage1 for name in ("gaps", "slalom")}
+    assert settings["gaps"].hidden == (128, 128)
+    assert settings["slalom"].hidden == (192, 192)
+    assert all(s.normalize for s in settings.values())
+    assert preset(hyrl_mj.get_task("slalom"), "paper", algorithm="ppo").stage1.hidden != (192, 192)
+
+
+@pytest.mark.parametrize("name", ["unit_circle", "vehicle"])
+def test_the_papers_problems_learn_from_plain_rewards(name):
+    settings = preset(hyrl_mj.get_task(name))
+    assert not settings.stage1.normalize
+    assert not settings.stage6.normalize

@@ -90,6 +90,9 @@ class Quadrotor(PillarTask):
         return np.asarray(np.linalg.norm(measured[:, :2] - self.obstacle, axis=1) - radii)
 
     def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
+        x, y = measurement[:, :2].T
         near = np.clip(1 - self.clearance(measurement) / NEAR, 0.0, 1.0)
-        reward = np.maximum(3 - np.abs(measurement[:, 1]) - near, 0.0)
+        # Before the pillar y is free: else the middle would pay, and who gets there from one side passes on
+        # the other.
+        reward = np.maximum(3 - np.where(x < self.obstacle[0], 0.0, np.abs(y)) - near, 0.0)
         return np.where(self.failed(measurement), 0.0, reward)

@@ -11,9 +11,8 @@ from hyrl_mj.tasks.registry import register
 
 # Largest heading [rad], and distance from the pillar within which the reward is less [m].
 ASTRAY, NEAR = 1.4, 0.25
-# Weights of the reward: of arriving (in samples), of the distance off the middle before the pillar [1/m],
-# of the heading [1/rad2].
-FINISH, BEFORE, TURNED = 10, 0.5, 0.15
+# Weights of the reward: of arriving (in samples), and of the heading [1/rad2].
+FINISH, TURNED = 10, 0.15
 # Largest rate of turn of a start [rad/s].
 START_RATE = 0.3
 
@@ -96,8 +95,9 @@ class Rover(PillarTask):
     def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
         x, y, heading = measurement[:, :3].T
         near = np.clip(1 - self.clearance(measurement) / NEAR, 0.0, 1.0)
-        # A full weight before the pillar would draw the rover to the middle, where it decides late.
-        off = np.abs(y) * np.where(x < self.obstacle[0], BEFORE, 1.0) + TURNED * heading**2
+        # Before the pillar y is free: else the middle would pay, and who gets there from one side passes on
+        # the other.
+        off = np.where(x < self.obstacle[0], 0.0, np.abs(y)) + TURNED * heading**2
         reward = np.maximum(3 - off - near, 0.0)
         # Arriving must pay more than going on in detours.
         reward = np.where(x >= self.set_point[0], FINISH * reward, reward)
