@@ -22,7 +22,7 @@ from hyrl_mj.learning.presets import preset
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets, extend
-from hyrl_mj.stages.grounds import BATCHES, JUDGES, ByEpisodes, ByGame
+from hyrl_mj.stages.grounds import BATCHES, ByEpisodes, ByGame
 from hyrl_mj.stages.hybrid import HybridController
 from hyrl_mj.stages.retraining import retrain
 
@@ -354,17 +354,3 @@ def test_they_start_where_all_nodes_around_can_be_won(puck, puck_sets):
         around = (np.abs(nodes - z) < spacing - 1e-9).all(axis=1)
         assert around.any()
         assert ground.wanted[around].all()
-
-
-@pytest.mark.slow
-def test_the_noise_that_looks_ahead_plays_the_first_batches_alone(puck, puck_sets, monkeypatch):
-    ground, played = ByEpisodes(puck, puck_sets, 0), dict.fromkeys(JUDGES, 0)
-    play = ground._play
-
-    def counted(policy, batch, kind):
-        played[kind] += BATCHES[batch]
-        return play(policy, batch, kind)
-
-    monkeypatch.setattr(ground, "_play", counted)
-    assert ground(round_it(puck, 1.0)) >= ground.enough
-    assert played == dict.fromkeys(JUDGES[:3], 1_024) | {"adversarial": 256}

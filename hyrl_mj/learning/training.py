@@ -67,6 +67,9 @@ class Ground(Protocol):
     def domain(self, gamma: float) -> Domain | None:
         """Returns where episodes start and stay, for a discount gamma; None for the task's starts."""
 
+    def see(self, policy: MlpPolicy) -> None:
+        """Looks at a policy whose score does not count yet."""
+
     def __call__(self, policy: MlpPolicy) -> Score:
         """Returns the score of a policy; higher is better, compared from left to right."""
 
@@ -273,10 +276,9 @@ class TaskGround:
     """
 
     enough: Score = (np.inf,)
+    settled = 0.5  # an untrained policy can score well by chance
 
     def __init__(self, task: Task, gamma: float, noise: Noise | None = None, rehearse: float = 0.0):
-        # An untrained policy can score well by chance; but where it loses has to be known early.
-        self.settled = 0.1 if rehearse else 0.5
         self.noise, self._task, self._gamma = noise or Noise(), task, gamma
         bound = self.noise.bound
         self._noises = [Noise(kind, bound) for kind in JUDGES] if bound else [Noise()]
@@ -286,9 +288,13 @@ class TaskGround:
         """Returns where episodes start if not where the task starts; they are not restricted."""
         return Domain(self._rehearsal.starts) if self._rehearsal else None
 
-    def __call__(self, policy: MlpPolicy) -> Score:
+    def see(self, policy: MlpPolicy) -> None:
+        """Notes where a policy loses and decides, for the starts of later episodes."""
         if self._rehearsal:
             self._rehearsal.update(policy)
+
+    def __call__(self, policy: MlpPolicy) -> Score:
+        self.see(policy)
         results = [evaluate(self._task, policy, n, None, self._gamma) for n in self._noises]
         success, returns = np.mean(results, axis=0)
         return float(success), float(returns)
@@ -327,9 +333,11 @@ class _Watch(BaseCallback):
             )
         if self._log_dir is not None:
             policy.save(self._log_dir / "checkpoint.safetensors")
-        if self.num_timesteps >= self._settled:
-            score = self._ground(policy)
-            for i, value in enumerate(score):
-                self.logger.record(f"eval/score_{i}", value)
-            if score > self.best_score:
-                self.best_score, self.best = score, policy
+        if self.num_timesteps < self._settled:
+            self._ground.see(policy)
+            return
+        score = self._ground(policy)
+        for i, value in enumerate(score):
+            self.logger.record(f"eval/score_{i}", value)
+        if score > self.best_score:
+            self.best_score, self.best = score, policy

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from itertools import product
 
 import numpy as np
 
@@ -28,15 +29,10 @@ ALLOWED_DELAY = 0.03
 FEW = 1e-3
 # Where the worst case cannot be computed: the kinds of noise that judge a policy, the mildest first, and how
 # many episodes of each kind are in a batch. Most policies are bad and fail in the first batch; all batches
-# are so many episodes that a policy that loses a few in a thousand is found out. The last kind looks ahead,
-# which takes ten times as long and needs fewer episodes to show a weakness: it plays the first batches only.
+# are so many episodes that a policy that loses a few in a thousand is found out.
 JUDGES = ("none", "uniform", "alternating", "adversarial")
-BATCHES, AHEAD_BATCHES = (64, 64, 128, 256, 512), 3
-PLAYS = [
-    (batch, kind)
-    for batch in range(len(BATCHES))
-    for kind in JUDGES[: None if batch < AHEAD_BATCHES else -1]
-]
+BATCHES = (64, 64, 128, 256, 512)
+PLAYS = list(product(range(len(BATCHES)), JUDGES))
 # So many starts are drawn for each episode; those too close to where the mode cannot succeed are left out.
 SPARE = 4
 # There, a policy may end this many times as far off the set-point as the stage-1 policy, because it goes the
@@ -107,6 +103,9 @@ class ModeGround(ABC):
     @abstractmethod
     def _prepare(self, policy: Policy | None) -> None:
         """Prepares the judge."""
+
+    def see(self, policy: MlpPolicy) -> None:
+        """Does nothing: all scores count."""
 
     def __call__(self, policy: MlpPolicy) -> Score:
         """Returns the score of a policy. Later starts are drawn where the latest policy has lost."""
@@ -236,8 +235,8 @@ class ByEpisodes(ModeGround):
     """Judges by noisy episodes, where the worst case cannot be computed.
 
     The episodes start where the hybrid controller may select the mode. Without noise all have to arrive at
-    the set-point, under noise all have to survive. Each batch is played with its kinds of noise before the
-    next batch, see `PLAYS`. The score is the number of plays that stop no episode, then minus the share of
+    the set-point, under noise all have to survive. Each batch is played with all kinds of noise in `JUDGES`
+    before the next batch. The score is the number of plays that stop no episode, then minus the share of
     episodes that the next play stops; if none is stopped, minus the largest distance from the set-point at
     the end without noise, as a multiple of `allowed`.
 
