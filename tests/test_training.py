@@ -252,3 +252,26 @@ def test_the_papers_problems_learn_from_plain_rewards(name):
     settings = preset(hyrl_mj.get_task(name))
     assert not settings.stage1.normalize
     assert not settings.stage6.normalize
+
+
+def test_a_ground_sees_a_policy_from_the_first_checkpoint_and_scores_it_after_half(
+    vehicle, monkeypatch
+):
+    calls = []
+
+    class Ground(training.TaskGround):
+        def see(self, policy):
+            calls.append("seen")
+
+        def __call__(self, policy):
+            calls.append("scored")
+            return (0.0,)
+
+    monkeypatch.setattr(training, "CHECKPOINTS", 8)
+    settings = preset(vehicle, "smoke", algorithm="ppo").stage1
+    settings = replace(settings, samples=8_192, envs=16, hidden=(8, 8))
+    training.train(vehicle, settings, 0, ground=Ground(vehicle, 0.9))
+    half = calls.index("scored")
+    assert half == 3
+    assert set(calls[:half]) == {"seen"}
+    assert set(calls[half:]) == {"scored"}

@@ -105,7 +105,8 @@ class ModeGround(ABC):
         """Prepares the judge."""
 
     def see(self, policy: MlpPolicy) -> None:
-        """Does nothing: all scores count."""
+        """Notes where a policy loses, as its score does."""
+        self(policy)
 
     def __call__(self, policy: MlpPolicy) -> Score:
         """Returns the score of a policy. Later starts are drawn where the latest policy has lost."""
