@@ -214,10 +214,11 @@ def _stage1(task: Task, name: str, algorithm: str) -> Training:
             "choose preset fast or smoke"
         )
     training = _PAPER if name == "paper" else (_CONTINUOUS if levels is None else _LEVELS)[known]
-    if name != "paper" and known == "ppo" and task.mirror is None:
-        training = replace(training, **_WITHOUT_MIRROR)
-    if name != "paper" and algorithm == task.learning.algorithm:
-        training = replace(training, **task.learning.training)
+    if name != "paper":
+        if known == "ppo" and task.mirror is None:
+            training = replace(training, **_WITHOUT_MIRROR)
+        if algorithm == task.learning.algorithm:
+            training = replace(training, **task.learning.training)
     if name == "smoke":
         training = replace(training, samples=_SMOKE[known])
     if np.any(np.subtract(task.start_high, task.start_low) < task.chart.sides - 1e-9):
