@@ -9,7 +9,9 @@ import pytest
 import hyrl_mj
 from hyrl_mj import Outcome
 from hyrl_mj.policies.controllers import PolicyController
+from hyrl_mj.sets import Grid
 from hyrl_mj.simulation.rollout import LoopSettings, closed_loop
+from hyrl_mj.stages.partition import longest_hop
 from hyrl_mj.tasks.flight import rotation
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "scripts"))
@@ -126,3 +128,29 @@ def test_an_expert_survives_from_every_start(quadrotor):
     z = quadrotor.starts(300, np.random.default_rng(0))
     won = [fly(quadrotor, Expert(quadrotor, s), z).outcome == Outcome.REACHED for s in (1, -1)]
     assert np.any(won, axis=0).all()
+
+
+@pytest.fixture(scope="module")
+def around_the_pillar(quadrotor):
+    """One sample from starts all around the pillar, that touch it or do not."""
+    x, y = np.meshgrid(np.linspace(2.2, 3.8, 33), np.linspace(-0.8, 0.8, 33))
+    drift = np.resize([-1.2, -0.4, 0.4, 1.2], x.size)
+    z0 = np.stack([x.ravel(), y.ravel(), drift], axis=1)
+    begun = quadrotor.clearance(quadrotor.with_z(np.zeros((len(z0), 5)), z0)) <= 0
+    return fly(quadrotor, Constant(0.0), z0[~begun], steps=1)
+
+
+def test_a_collision_is_seen_at_the_next_sample(around_the_pillar):
+    runs = around_the_pillar
+    hit = np.abs(runs.path[1, :, 2] - runs.path[0, :, 2]) > 0.1
+    assert hit.sum() > 20
+    assert (runs.outcome[hit] == Outcome.CRASHED).all()
+
+
+def test_a_collision_is_no_hop_of_the_closed_loop(quadrotor, around_the_pillar):
+    runs = around_the_pillar
+    assert np.abs(runs.path[1, :, 2] - runs.path[0, :, 2]).max() > 0.4
+    grid = Grid(quadrotor.chart, (41, 41, 9))
+    hop = longest_hop(quadrotor, Constant(1.2), grid)
+    assert hop[2] < 0.1
+    assert hop[:2] == pytest.approx([0.1, 0.06], abs=0.005)

@@ -22,8 +22,9 @@ from hyrl_mj.learning.presets import preset
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets, extend
-from hyrl_mj.stages.grounds import BATCHES, ByEpisodes, ByGame
+from hyrl_mj.stages.grounds import BATCHES, PLAYS, PLAYS_OF_IMAGE, ByEpisodes, ByGame
 from hyrl_mj.stages.hybrid import HybridController
+from hyrl_mj.stages.results import ModeResult
 from hyrl_mj.stages.retraining import retrain
 
 # ---- where modes are trained
@@ -117,7 +118,7 @@ def test_the_modes_of_the_circle_settle_as_early_as_can_be_at_any_noise(circle, 
     parts, sets = circle_sets(circle, eps, cells=2880)
     settings = preset(circle, "fast", noise=eps).stage6
     first, result = retrain(ByGame(circle, sets, 0, parts), settings, seed=1)
-    second, _ = retrain(ByGame(circle, sets, 1, parts), settings, seed=1, others=[first])
+    second, _ = retrain(ByGame(circle, sets, 1, parts), settings, seed=1, others=[(first, result)])
     flow_sets = dict(zip(sets.modes, sets.sets, strict=True))
     controller = HybridController(circle, {0: first, 1: second}, flow_sets)
     game = Game(circle, parts, {"hyrl": controller}, eps, grid=parts.grid)
@@ -222,6 +223,10 @@ def test_training_goes_on_where_the_game_is_lost(vehicle, left):
 # ---- the mirror image of another mode's policy
 
 
+# A policy that wins half of its own mode.
+HALF = ModeResult(0, 0.5, 1)
+
+
 @pytest.fixture
 def quick(vehicle):
     return replace(preset(vehicle, "smoke").stage6, samples=4_096)
@@ -235,7 +240,7 @@ def test_a_mirror_image_that_will_do_is_taken(vehicle, vehicle_sets, quick, monk
     other = untrained(vehicle, quick)
     image = symmetry.mirrored(other)
     monkeypatch.setattr(ByGame, "score", lambda ground, policy: (0.0, -0.5))
-    found, _ = retrain(ByGame(vehicle, vehicle_sets, 1), quick, seed=0, others=[other])
+    found, _ = retrain(ByGame(vehicle, vehicle_sets, 1), quick, seed=0, others=[(other, HALF)])
     for name, weight in image.weights.items():
         np.testing.assert_array_equal(found.weights[name], weight)
 
@@ -246,7 +251,7 @@ def test_one_that_will_not_do_is_not_taken(vehicle, vehicle_sets, quick):
     other = untrained(vehicle, quick)
     assert ByGame(vehicle, vehicle_sets, 1)(symmetry.mirrored(other)) < (0.0, -1.0)
     alone, _ = retrain(ByGame(vehicle, vehicle_sets, 1), quick, seed=0)
-    found, _ = retrain(ByGame(vehicle, vehicle_sets, 1), quick, seed=0, others=[other])
+    found, _ = retrain(ByGame(vehicle, vehicle_sets, 1), quick, seed=0, others=[(other, HALF)])
     for name, weight in alone.weights.items():
         np.testing.assert_array_equal(found.weights[name], weight)
 
@@ -336,9 +341,32 @@ def test_a_mirror_image_is_taken_there_too(puck, puck_sets, monkeypatch):
     settings = replace(preset(puck, "smoke").stage6, samples=4_096)
     other = training.export(training.build(puck, settings, seed=0), puck)
     monkeypatch.setattr(ByEpisodes, "score", lambda ground, policy: ground.enough)
-    found, _ = retrain(ByEpisodes(puck, puck_sets, 1), settings, seed=0, others=[other])
+    found, _ = retrain(ByEpisodes(puck, puck_sets, 1), settings, seed=0, others=[(other, HALF)])
     for name, weight in symmetry.mirrored(other).weights.items():
         np.testing.assert_array_equal(found.weights[name], weight)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("won", "plays"), [(0.5, len(PLAYS)), (1.0, len(PLAYS_OF_IMAGE))])
+def test_the_image_of_a_policy_that_wins_all_is_judged_by_fewer_episodes(
+    puck, puck_sets, monkeypatch, won, plays
+):
+    ground, played = ByEpisodes(puck, puck_sets, 1), []
+
+    def play(ground, policy, batch, kind):
+        played.append((batch, kind))
+        return np.ones(BATCHES[batch], dtype=bool), np.zeros(BATCHES[batch])
+
+    monkeypatch.setattr(ByEpisodes, "_play", play)
+    assert ground.won_by_image(object(), won) == 1.0
+    assert played == PLAYS[:plays]
+
+
+@pytest.mark.slow
+def test_an_image_that_loses_is_not_taken(puck, puck_sets):
+    ground = ByEpisodes(puck, puck_sets, 0)
+    assert ground.won_by_image(round_it(puck, 1.0), 1.0) == 1.0
+    assert ground.won_by_image(round_it(puck, 1.0, clear=0.6), 1.0) is None
 
 
 @pytest.mark.slow

@@ -112,7 +112,7 @@ def retrain_stage(run: Run, say: Say) -> None:
         done += cores.spread(work, sets.modes)
     else:  # the mirror image of the policy of one mode may do for the next
         for q in sets.modes:
-            done.append(work(q, [policy for policy, _ in done]))
+            done.append(work(q, tuple(done)))
     for policy, result in done:
         policy.save(run.path / f"mode_{result.mode}.safetensors")
     Retraining(tuple(result for _, result in done)).save(run.path / "retraining.json")
@@ -126,7 +126,7 @@ def _retrained(
     warm_start: WarmStart,
     logs: Path,
     mode: int,
-    others: Iterable[MlpPolicy] = (),
+    others: Iterable[tuple[MlpPolicy, ModeResult]] = (),
 ) -> tuple[MlpPolicy, ModeResult]:
     """Trains the policy of one mode, which may happen in a process of a pool."""
     from hyrl_mj.stages.retraining import retrain

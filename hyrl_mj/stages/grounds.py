@@ -33,11 +33,13 @@ FEW = 1e-3
 JUDGES = ("none", "uniform", "alternating", "adversarial")
 BATCHES = (64, 64, 128, 256, 512)
 PLAYS = list(product(range(len(BATCHES)), JUDGES))
+# The mirror image of a policy that wins all of its own mode has been judged there, so fewer plays tell.
+PLAYS_OF_IMAGE = PLAYS[: 3 * len(JUDGES)]
 # So many starts are drawn for each episode; those too close to where the mode cannot succeed are left out.
 SPARE = 4
 # There, a policy may end this many times as far off the set-point as the stage-1 policy, because it goes the
 # long way, too; or by this share of the distance that counts as arrived.
-ALLOWED_MISS, MISS_SHARE = 2.0, 0.25
+ALLOWED_MISS, MISS_SHARE = 2.0, 0.75
 
 
 def mode_ground(
@@ -121,6 +123,13 @@ class ModeGround(ABC):
         its mode.
         """
         return self(policy) >= self.enough or self._loses_elsewhere()
+
+    def won_by_image(self, image: MlpPolicy, won: float) -> float | None:
+        """Returns the share that a mirror image wins; None if it is too little.
+
+        The policy that it is the image of wins the share `won` in its own mode.
+        """
+        return self.won(image) if self.suffices(image) else None
 
     def _loses_elsewhere(self) -> bool:
         """Returns whether the latest policy lost nothing where its mode may be selected."""
@@ -272,15 +281,24 @@ class ByEpisodes(ModeGround):
         return max(ALLOWED_MISS * float(ends.max(initial=0.0)), least)
 
     def score(self, policy: MlpPolicy) -> Score:
+        return self._score(policy, PLAYS)
+
+    def won_by_image(self, image: MlpPolicy, won: float) -> float | None:
+        if won < 1:
+            return super().won_by_image(image, won)
+        enough = float(len(PLAYS_OF_IMAGE)), self.enough[1]
+        return won if self._score(image, PLAYS_OF_IMAGE) >= enough else None
+
+    def _score(self, policy: MlpPolicy, plays: list[tuple[int, str]]) -> Score:
         farthest = 0.0
-        for survived, (batch, kind) in enumerate(PLAYS):
+        for survived, (batch, kind) in enumerate(plays):
             won, miss = self._play(policy, batch, kind)
             farthest = max(farthest, miss.max()) if kind == JUDGES[0] else farthest
             lost = self.grid.nearest(self.judged[self._batches[batch]][~won])
             self._remember(lost, np.ones(len(lost)))
             if len(lost):
                 return float(survived), -len(lost) / len(won)
-        return self.enough[0], -farthest / self.allowed
+        return float(len(plays)), -farthest / self.allowed
 
     def won(self, policy: MlpPolicy) -> float:
         if self(policy)[0] == self.enough[0]:

@@ -18,7 +18,7 @@ from hyrl_mj.stages.critical_set import check_points
 from hyrl_mj.stages.refinement import spread, thinned
 from hyrl_mj.stages.search import WEDGE
 from hyrl_mj.stages.ways import LEAST_SHARE, Ways
-from hyrl_mj.tasks import ANY, Task, number_of
+from hyrl_mj.tasks import ANY, Outcome, Task, number_of
 
 # The neighbourhood of M* is at least this many cells wide, and as wide as the longest hop in one sample.
 # Of more than two parts some are wedges: without a wide neighbourhood they begin far from M*, where a policy
@@ -231,7 +231,13 @@ def neighbourhood(partition: Partition, noise: float, hop: np.ndarray) -> float:
 
 
 def longest_hop(task: Task, policy: Policy, grid: Nodes) -> np.ndarray:
-    """Returns the longest hop (d,) of the closed loop in one sample, along each coordinate."""
+    """Returns the longest hop (d,) of the closed loop in one sample, along each coordinate.
+
+    A collision can change velocities by more than any input does: runs that crash at once do not count,
+    unless all do.
+    """
     nodes = grid.nodes[thinned(task, grid)[0]]
-    path = policy_runs(task, policy, nodes, steps=1).path
-    return np.asarray(np.abs(path[-1] - path[0]).max(axis=0))
+    rollout = policy_runs(task, policy, nodes, steps=1)
+    hops = np.abs(rollout.path[-1] - rollout.path[0])
+    goes_on = ~np.isin(rollout.outcome, (Outcome.CRASHED, Outcome.UNSTABLE))
+    return np.asarray((hops[goes_on] if goes_on.any() else hops).max(axis=0))

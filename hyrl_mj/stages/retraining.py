@@ -48,7 +48,7 @@ def retrain(
     seed: int,
     *,
     warm_start: WarmStart | None = None,
-    others: Iterable[MlpPolicy] = (),
+    others: Iterable[tuple[MlpPolicy, ModeResult]] = (),
     log_dir: Path | None = None,
 ) -> tuple[MlpPolicy, ModeResult]:
     """Trains the policy of one mode (paper, Step 6).
@@ -63,7 +63,8 @@ def retrain(
         seed: seed of all random numbers; each mode and attempt derives its own from it.
         warm_start: returns the policy that the first attempt continues from, if `settings.warm_start` is
             set; see `start_policy`.
-        others: policies of other modes; a mirror image of one is used if it is good enough for this mode.
+        others: policies of other modes, and how their trainings ended; a mirror image of one is used if it is
+            good enough for this mode.
         log_dir: folder of logs and checkpoints.
 
     Returns:
@@ -72,9 +73,11 @@ def retrain(
     """
     task, mode = ground.task, ground.mode
     if task.mirror is not None:
-        for image in (symmetry.mirrored(other) for other in others):
-            if ground.suffices(image):
-                return image, ModeResult(mode, ground.won(image), 0)
+        for other, result in others:
+            image = symmetry.mirrored(other)
+            won = ground.won_by_image(image, result.won)
+            if won is not None:
+                return image, ModeResult(mode, won, 0)
     tried: list[tuple[Score, MlpPolicy]] = []
     trainings = 0
     for attempt in range(settings.attempts):
