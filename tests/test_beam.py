@@ -140,3 +140,12 @@ def test_each_part_s_policy_wins_on_its_side_of_the_beam_from_beyond_its_edges(b
     # All that the noise needs, as far as the cells of the grid tell.
     assert np.mean(sets.room[early] > 2 * eps - sets.sets[0].grid.cell) >= 0.85
     assert np.median(sets.room[early]) == pytest.approx(2 * eps)
+
+
+def test_the_edge_of_the_arena_is_a_danger_where_it_is_near(beam):
+    def danger(y):
+        return beam.danger(np.array([[1.0, y, 1.6, 0.0, 0.0, 0.0]]))[0]
+
+    # Far from it the beam counts alone; it is as far from there.
+    assert danger(0.1) == danger(0.0) == pytest.approx(-0.99)
+    assert danger(0.0) < danger(1.15) < danger(1.25) < 0.0

@@ -315,7 +315,7 @@ def test_a_task_may_say_how_far_off_is_good_enough(puck, puck_sets, monkeypatch)
         allowed = ByEpisodes(puck, puck_sets, 0, policy=precise).allowed
         assert allowed <= expected + 1e-12
         assert (allowed > usual) == (precision > usual)
-    assert allowed > 1e-3, "twice as far off as the stage-1 policy is allowed in any case"
+    assert allowed > 1e-3, "as far off as the stage-1 policy is allowed in any case"
 
 
 @pytest.mark.slow

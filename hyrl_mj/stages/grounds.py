@@ -37,8 +37,8 @@ PLAYS = list(product(range(len(BATCHES)), JUDGES))
 PLAYS_OF_IMAGE = PLAYS[: 3 * len(JUDGES)]
 # So many starts are drawn for each episode; those too close to where the mode cannot succeed are left out.
 SPARE = 4
-# There, a policy may end this many times as far off the set-point as the stage-1 policy, because it goes the
-# long way, too; or by this share of the distance that counts as arrived.
+# There, unless the task has a precision, a policy may end this many times as far off the set-point as the
+# stage-1 policy, because it goes the long way, too; or by this share of the distance that counts as arrived.
 ALLOWED_MISS, MISS_SHARE = 2.0, 0.75
 
 
@@ -276,9 +276,10 @@ class ByEpisodes(ModeGround):
         plays = [play for play in PLAYS if play[1] == JUDGES[0]]
         batches = [self._play(policy, *play) for play in plays] if policy else []
         ends = np.concatenate([np.empty(0), *(miss[won] for won, miss in batches)])
-        usual = MISS_SHARE * close if len(ends) else close
-        least = precision if np.isfinite(precision) else usual
-        return max(ALLOWED_MISS * float(ends.max(initial=0.0)), least)
+        farthest = float(ends.max(initial=0.0))
+        if np.isfinite(precision):
+            return max(farthest, precision)
+        return max(ALLOWED_MISS * farthest, MISS_SHARE * close if len(ends) else close)
 
     def score(self, policy: MlpPolicy) -> Score:
         return self._score(policy, PLAYS)

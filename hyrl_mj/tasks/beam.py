@@ -21,6 +21,8 @@ NEAR, ROOM = 0.3, 0.25
 FINISH, BLOCKED, EFFORT, OFF, BESIDE = 10, 0.8, 0.05, 0.5, 0.5
 # Largest speed of a start to the side and upward [m/s].
 START_DRIFT = 0.1
+# For the danger, a distance from the edge of the arena counts as so many times that distance from the beam.
+EDGE = 4.0
 # A start has this time [s] more than it takes to clear the beam at full speed to the nearest side: enough for
 # the next side, too, where noise has picked the wrong one.
 TO_SPARE = 0.95
@@ -53,8 +55,8 @@ class Beam(Task):
     # The way lasts 60 samples, and only the last one tells whether a mode arrives.
     learning = Learning(levels=3, algorithm="ppo", modes={"gamma": 0.96, "samples": 240_000})
     mirror = Mirror((1, -1, 1, -1, 1), (-1, 1))
-    # The opening of the gate, and where in it 0.1 m are left on every side [m].
-    close, precision = 1.2, 1.1
+    # The opening of the gate, and where in it 0.2 m are left on every side [m].
+    close, precision = 1.2, 1.0
     observation_low, observation_high = (-5.0, -4.0, -4.0, -6.0, -6.0), (5.0, 4.0, 4.0, 6.0, 6.0)
 
     @cached_property
@@ -174,7 +176,8 @@ class Beam(Task):
         return drawn[:n]
 
     def danger(self, measurement: np.ndarray) -> np.ndarray:
-        return -self.clearance(measurement)
+        # Where it is near, the edge of the arena is as dangerous.
+        return -np.minimum(self.clearance(measurement), EDGE * self.to_edge(measurement))
 
     def direction(self, path: np.ndarray) -> np.ndarray:
         """Returns the side of the beam on which runs passed: the quarter of the angle about the axis.
