@@ -4,7 +4,7 @@
     python scripts/many_ways.py runs/gaps-0 --episodes 10000
 
 Episodes start near the critical set. A point of the critical set counts as confirmed if the runs from one
-cell to either side of it, along a noisy coordinate, go different ways. Among posts it is also compared with
+cell to either side of it, along some coordinate, go different ways. Among posts it is also compared with
 where two ways are worth the same to an optimal controller, by dynamic programming.
 """
 
@@ -34,8 +34,7 @@ def confirmed(run: hyrl_mj.Run) -> float:
     """Returns the share of the points of M* between runs that go different ways."""
     task, critical = run.task, run.critical_set
     parted = np.zeros(len(critical.points), dtype=bool)
-    for i in np.flatnonzero(task.noise_in_chart(1.0)):
-        aside = np.eye(task.chart.dimension)[i] * critical.spacing * task.chart.scale[i]
+    for aside in np.diag(np.multiply(critical.spacing, task.chart.scale)):
         first, second = (
             WayRuns.of(task, way_runs(task, run.steady, task.chart.wrap(critical.points + way)))
             for way in (aside, -aside)
