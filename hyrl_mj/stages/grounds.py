@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
@@ -281,16 +282,7 @@ class ByEpisodes(ModeGround):
             return max(farthest, precision)
         return max(ALLOWED_MISS * farthest, MISS_SHARE * close if len(ends) else close)
 
-    def score(self, policy: MlpPolicy) -> Score:
-        return self._score(policy, PLAYS)
-
-    def won_by_image(self, image: MlpPolicy, won: float) -> float | None:
-        if won < 1:
-            return super().won_by_image(image, won)
-        enough = float(len(PLAYS_OF_IMAGE)), self.enough[1]
-        return won if self._score(image, PLAYS_OF_IMAGE) >= enough else None
-
-    def _score(self, policy: MlpPolicy, plays: list[tuple[int, str]]) -> Score:
+    def score(self, policy: MlpPolicy, plays: Sequence[tuple[int, str]] = PLAYS) -> Score:
         farthest = 0.0
         for survived, (batch, kind) in enumerate(plays):
             won, miss = self._play(policy, batch, kind)
@@ -300,6 +292,12 @@ class ByEpisodes(ModeGround):
             if len(lost):
                 return float(survived), -len(lost) / len(won)
         return float(len(plays)), -farthest / self.allowed
+
+    def won_by_image(self, image: MlpPolicy, won: float) -> float | None:
+        if won < 1:
+            return super().won_by_image(image, won)
+        enough = float(len(PLAYS_OF_IMAGE)), self.enough[1]
+        return won if self.score(image, PLAYS_OF_IMAGE) >= enough else None
 
     def won(self, policy: MlpPolicy) -> float:
         if self(policy)[0] == self.enough[0]:
