@@ -74,10 +74,10 @@ class Plant:
         self._ctrl_low, self._ctrl_high = ranges.T
         self._held = model.key_ctrl[0].copy() if model.nkey else np.zeros(model.nu)
         self._unstable = np.zeros(n, dtype=bool)
-        # Sensors of joints are read from the state; MuJoCo has to compute others after each step.
-        self._joints = joint_columns(self.model)
+        # Some sensors are read from the state; MuJoCo has to compute others after each step.
+        self._columns_of_state = state_columns(self.model)
         self._stage = mujoco.mjtStage.mjSTAGE_NONE
-        if self._joints is None:
+        if self._columns_of_state is None:
             self._stage = mujoco.mjtStage(int(self.model.sensor_needstage.max()))
         self._open()
         self._drive(np.arange(n))
@@ -94,7 +94,7 @@ class Plant:
         self._ctrl = self._batch.bind("ctrl")
         self._mocap_pos, self._mocap_quat = map(self._batch.bind, ("mocap_pos", "mocap_quat"))
         self._geom_positions: np.ndarray | None = None
-        if self._joints is None:
+        if self._columns_of_state is None:
             self._sensors = self._batch.bind("sensordata")
         if state is not None:
             self._batch.state[:] = state
@@ -116,9 +116,9 @@ class Plant:
     @property
     def measurement(self) -> np.ndarray:
         """The current measurement without noise: (n, p), a copy."""
-        if self._joints is None:
+        if self._columns_of_state is None:
             return self._measure(self._sensors.copy())
-        return self._measure(self._batch.state[:, self._joints])
+        return self._measure(self._batch.state[:, self._columns_of_state])
 
     @property
     def unstable(self) -> np.ndarray:
@@ -318,21 +318,51 @@ def input_limits(
     return ranges[:, 0], ranges[:, 1]
 
 
-def joint_columns(model: mujoco.MjModel) -> np.ndarray | None:
-    """Returns the columns (p,) of a state (mjSTATE_INTEGRATION) that the sensors measure.
+def state_columns(model: mujoco.MjModel) -> np.ndarray | None:
+    """Returns the columns (s,) of a state (mjSTATE_INTEGRATION) that the sensors measure.
 
-    Returns None unless each sensor is the unmodified position or velocity of a joint.
+    Returns None unless each sensor is unmodified, and measures the position or velocity of a joint, or that,
+    the orientation or the rates of turn of a body with a free joint.
     """
-    kind, joint = model.sensor_type, model.sensor_objid
-    of_pos = kind == mujoco.mjtSensor.mjSENS_JOINTPOS
-    of_vel = kind == mujoco.mjtSensor.mjSENS_JOINTVEL
-    settings = (model.sensor_cutoff, model.sensor_delay, model.sensor_interval)
-    if not (of_pos | of_vel).all() or any(values.any() for values in settings):
+    if any(v.any() for v in (model.sensor_cutoff, model.sensor_delay, model.sensor_interval)):
         return None
+    columns = [_columns_of(model, sensor) for sensor in range(model.nsensor)]
+    return None if None in columns else np.array([c for some in columns if some for c in some], int)
+
+
+def _columns_of(model: mujoco.MjModel, sensor: int) -> range | None:
+    """Returns the columns of a state that a sensor measures, None if it measures something else."""
+    kinds, types = mujoco.mjtSensor, mujoco.mjtObj
     # The state begins with time, qpos and qvel.
     qpos = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_TIME)
     qvel = qpos + model.nq
-    return np.where(of_pos, qpos + model.jnt_qposadr[joint], qvel + model.jnt_dofadr[joint])
+    kind, measured = kinds(model.sensor_type[sensor]), model.sensor_objid[sensor]
+    if kind in (kinds.mjSENS_JOINTPOS, kinds.mjSENS_JOINTVEL):
+        joint, after, count = measured, 0, 1
+    else:
+        of_frames = {
+            kinds.mjSENS_FRAMEPOS: (0, 3),
+            kinds.mjSENS_FRAMEQUAT: (3, 4),
+            kinds.mjSENS_FRAMELINVEL: (0, 3),
+            kinds.mjSENS_GYRO: (3, 3),
+        }
+        body = measured
+        of = types(model.sensor_objtype[sensor])
+        if of == types.mjOBJ_SITE:
+            turned = (model.site_quat[measured] != [1, 0, 0, 0]).any()
+            if turned or (kind != kinds.mjSENS_GYRO and model.site_pos[measured].any()):
+                return None
+            body = model.site_bodyid[measured]
+        elif of != types.mjOBJ_XBODY:
+            return None
+        joint = model.body_jntadr[body]
+        free = joint >= 0 and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE
+        if kind not in of_frames or not free or model.sensor_refid[sensor] >= 0:
+            return None
+        after, count = of_frames[kind]
+    of_position = kind in (kinds.mjSENS_JOINTPOS, kinds.mjSENS_FRAMEPOS, kinds.mjSENS_FRAMEQUAT)
+    first = qpos + model.jnt_qposadr[joint] if of_position else qvel + model.jnt_dofadr[joint]
+    return range(first + after, first + after + count)
 
 
 def _checked(name: str, values: np.ndarray, columns: int, rows: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from planted import euler, random_states
 
 from hyrl_mj import mjcf
 from hyrl_mj.errors import BadInput
-from hyrl_mj.plant import Plant, joint_columns
+from hyrl_mj.plant import Plant, state_columns
 from hyrl_mj.task_tests import random_inputs
 from hyrl_mj.tasks import get_task
 from hyrl_mj.tasks.vehicle import Vehicle
@@ -76,10 +76,12 @@ PENDULUM = """
   <option timestep="0.01"/>
   <custom><numeric name="sample_time" data="0.02"/></custom>
   <worldbody>
-    <body>
+    <body name="ball">
       <freejoint name="free"/>
       <geom size="0.1" mass="1"/>
-      <body pos="0.3 0 0">
+      <site name="middle"/>
+      <site name="turned" euler="10 0 0"/>
+      <body name="rod" pos="0.3 0 0">
         <joint name="hinge" axis="0 1 0"/>
         <geom name="bob" size="0.05" pos="0.3 0 0" mass="0.2"/>
         <site name="tip" pos="0.3 0 0"/>
@@ -98,6 +100,14 @@ PENDULUM = """
         ('<jointpos joint="hinge"/><jointvel joint="hinge"/>', True),
         ('<jointvel joint="hinge"/>', True),
         ('<jointpos joint="hinge" cutoff="0.01"/>', False),
+        ('<framequat objtype="xbody" objname="ball"/><jointpos joint="hinge"/>', True),
+        ('<framepos objtype="site" objname="middle"/><gyro site="middle"/>', True),
+        ('<framelinvel objtype="xbody" objname="ball"/>', True),
+        ('<framelinvel objtype="body" objname="ball"/>', False),
+        ('<framepos objtype="xbody" objname="rod"/>', False),
+        ('<framepos objtype="xbody" objname="ball" reftype="site" refname="tip"/>', False),
+        ('<framexaxis objtype="xbody" objname="ball"/>', False),
+        ('<gyro site="turned"/>', False),
         ('<jointpos joint="hinge"/><framepos objtype="site" objname="tip"/>', False),
         ('<framelinvel objtype="site" objname="tip"/><jointvel joint="hinge"/>', False),
         ('<accelerometer site="tip"/>', False),
@@ -105,7 +115,7 @@ PENDULUM = """
 )
 def test_the_measurement_is_what_the_sensors_give_now(sensors, read_from_the_state):
     model = mujoco.MjModel.from_xml_string(PENDULUM.replace("SENSORS", sensors))
-    assert (joint_columns(model) is not None) == read_from_the_state
+    assert (state_columns(model) is not None) == read_from_the_state
     plant, data = Plant(model, ("push",), 3), mujoco.MjData(model)
     qpos = np.tile([0, 0, 0, 1, 0, 0, 0, 0.4], (3, 1))
     plant.set_state(qpos, np.random.default_rng(0).normal(size=(3, 7)))
@@ -116,7 +126,7 @@ def test_the_measurement_is_what_the_sensors_give_now(sensors, read_from_the_sta
         for state, measured in zip(plant.state, plant.measurement, strict=True):
             mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
             mujoco.mj_forward(model, data)
-            np.testing.assert_array_equal(measured, data.sensordata)
+            np.testing.assert_allclose(measured, data.sensordata, rtol=0, atol=1e-12)
 
 
 def test_only_the_addressed_copies_move(vehicle):

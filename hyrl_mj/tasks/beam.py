@@ -33,8 +33,8 @@ class Beam(Task):
     name = "beam"
     description = "fly past the end of a beam: above, below, on its left or on its right (PPO)"
     inputs, input_units = ("lateral_velocity", "climb_rate"), ("m/s", "m/s")
-    # Columns of the measurement: x, y, z, speeds to the side and upward, touching beam or floor.
-    noisy = (1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
+    # Columns of the measurement: x, y, z, speeds to the side and upward.
+    noisy = (1.0, 1.0, 1.0, 0.0, 0.0)
     max_steps = 64
     worst_reward = 0.0
     start_low, start_high = (0.0, -0.7, 0.9), (1.8, 0.7, 2.3)
@@ -92,7 +92,7 @@ class Beam(Task):
         return float(mjcf.numeric(self.model, "speed", 1)[0])
 
     def measure(self, sensors: np.ndarray) -> np.ndarray:
-        return sensors[:, [0, 1, 2, 4, 5, 9]]
+        return sensors[:, [0, 1, 2, 4, 5]]
 
     def control(self, u: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         velocity = np.column_stack([np.full(len(u), self.speed), u])
@@ -111,8 +111,7 @@ class Beam(Task):
         return np.hstack([measured[:, :3] - self.set_point, measured[:, 3:5]])
 
     def measured(self, observation: np.ndarray) -> np.ndarray:
-        unseen = np.zeros((len(observation), 1))
-        return np.hstack([observation[:, :3] + self.set_point, observation[:, 3:], unseen])
+        return np.hstack([observation[:, :3] + self.set_point, observation[:, 3:]])
 
     def clearance(self, measured: np.ndarray) -> np.ndarray:
         """Returns the distance of the hull from the beam: (n,) [m]."""
@@ -140,14 +139,14 @@ class Beam(Task):
         return np.where(self.failed(measurement), 0.0, reward)
 
     def ending(self, measurement: np.ndarray) -> np.ndarray:
-        position, touching = measurement[:, :3], measurement[:, 5]
+        position = measurement[:, :3]
         ends = np.full(len(measurement), Outcome.RUNNING)
         at_gate = position[:, 0] >= self.set_point[0]
         ends[at_gate] = np.where(
             self.arrived(position[at_gate]), Outcome.REACHED, Outcome.OUT_OF_BOUNDS
         )
         ends[self.to_edge(measurement) <= 0] = Outcome.OUT_OF_BOUNDS
-        ends[(touching > 0) | (self.clearance(measurement) <= 0)] = Outcome.CRASHED
+        ends[self.clearance(measurement) <= 0] = Outcome.CRASHED
         return ends
 
     def miss(self, z: np.ndarray) -> np.ndarray:

@@ -14,8 +14,7 @@ from hyrl_mj.tasks.description import Outcome
 class PillarTask(Task):
     """A task whose MJCF has the geom "obstacle", and the sites "set_point" and "arena".
 
-    Chart and measurement begin with x and y. The last column of the measurement is positive where the robot
-    touches the pillar.
+    Chart and measurement begin with x and y.
     """
 
     #: names and units of the chart's coordinates, and the largest magnitude of each one after x and y
@@ -50,11 +49,11 @@ class PillarTask(Task):
         """Returns the distance of the robot from the pillar: (n,) [m]."""
 
     def ending(self, measurement: np.ndarray) -> np.ndarray:
-        x, y, touching = measurement[:, [0, 1, -1]].T
+        x, y = measurement[:, :2].T
         ends = np.full(len(measurement), Outcome.RUNNING)
         ends[x >= self.set_point[0]] = Outcome.REACHED
         ends[np.abs(y) >= self.chart.high[1]] = Outcome.OUT_OF_BOUNDS
-        ends[(touching > 0) | (self.clearance(measurement) <= 0)] = Outcome.CRASHED
+        ends[self.clearance(measurement) <= 0] = Outcome.CRASHED
         return ends
 
     def miss(self, z: np.ndarray) -> np.ndarray:

@@ -5,8 +5,8 @@ from functools import cached_property
 import numpy as np
 
 from hyrl_mj import mjcf
-from hyrl_mj.tasks.description import Learning, Mirror, Scene
-from hyrl_mj.tasks.flight import Rotors
+from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.flight import Rotors, rotation
 from hyrl_mj.tasks.pillar import PillarTask
 from hyrl_mj.tasks.registry import register
 
@@ -24,7 +24,7 @@ class Quadrotor(PillarTask):
     description = "fly past a pillar on its left or on its right (PPO)"
     coordinates, units, largest = ("x", "y", "drift"), ("m", "m", "m/s"), (FASTEST,)
     inputs, input_units = ("lateral_velocity",), ("m/s",)
-    # Columns of the measurement: x, y, velocity to the side, tilt to the side, touching pillar or floor.
+    # Columns of the measurement: x, y, velocity to the side, tilt to the side, height.
     noisy = (1.0, 1.0, 0.0, 0.0, 0.0)
     max_steps = 80
     worst_reward = 0.0
@@ -58,7 +58,8 @@ class Quadrotor(PillarTask):
         return Rotors(self.model, LIFT)
 
     def measure(self, sensors: np.ndarray) -> np.ndarray:
-        return sensors[:, [0, 1, 4, 7, 9]]
+        tilt = rotation(sensors[:, 6:10])[:, 1, 2]
+        return np.column_stack([sensors[:, [0, 1, 4]], tilt, sensors[:, 2]])
 
     def control(self, u: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         speed, height = self.cruise
@@ -81,8 +82,8 @@ class Quadrotor(PillarTask):
         return np.hstack([self.obstacle[0] - measured[:, :1], measured[:, 1:4]])
 
     def measured(self, observation: np.ndarray) -> np.ndarray:
-        unseen = np.zeros((len(observation), 1))
-        return np.hstack([self.obstacle[0] - observation[:, :1], observation[:, 1:], unseen])
+        height = np.full((len(observation), 1), self.cruise[1])  # no network reads it
+        return np.hstack([self.obstacle[0] - observation[:, :1], observation[:, 1:], height])
 
     def clearance(self, measured: np.ndarray) -> np.ndarray:
         """Returns the distance of the hull from the pillar: (n,) [m]."""
@@ -96,3 +97,9 @@ class Quadrotor(PillarTask):
         # the other.
         reward = np.maximum(3 - np.where(x < self.obstacle[0], 0.0, np.abs(y)) - near, 0.0)
         return np.where(self.failed(measurement), 0.0, reward)
+
+    def ending(self, measurement: np.ndarray) -> np.ndarray:
+        ends = super().ending(measurement)
+        on_floor = measurement[:, 4] <= mjcf.geom_size(self.model, "hull")[0]
+        ends[on_floor] = Outcome.CRASHED
+        return ends

@@ -6,6 +6,7 @@ import numpy as np
 
 from hyrl_mj import mjcf
 from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.flight import rotation
 from hyrl_mj.tasks.pillar import PillarTask
 from hyrl_mj.tasks.registry import register
 
@@ -23,8 +24,8 @@ class Rover(PillarTask):
     description = "drive on wheels past a pillar on its left or on its right (PPO)"
     coordinates, units, largest = ("x", "y", "heading"), ("m", "m", "rad"), (ASTRAY,)
     inputs, input_units = ("turn_rate",), ("rad/s",)
-    # Columns of the measurement: x, y, heading, rate of turn, touching the pillar.
-    noisy = (0.0, 1.0, 0.5, 0.0, 0.0)
+    # Columns of the measurement: x, y, heading, rate of turn.
+    noisy = (0.0, 1.0, 0.5, 0.0)
     max_steps = 110
     worst_reward = 0.0
     start_low, start_high = (0.0, -0.6, -0.3), (0.3, 0.6, 0.3)
@@ -52,8 +53,9 @@ class Rover(PillarTask):
         return float(mjcf.numeric(self.model, "speed", 1)[0])
 
     def measure(self, sensors: np.ndarray) -> np.ndarray:
-        heading = np.arctan2(sensors[:, 4], sensors[:, 3])
-        return np.column_stack([sensors[:, :2], heading, sensors[:, 8], sensors[:, 9]])
+        axes = rotation(sensors[:, 3:7])
+        heading = np.arctan2(axes[:, 1, 0], axes[:, 0, 0])
+        return np.column_stack([sensors[:, :2], heading, sensors[:, 9]])
 
     def control(self, u: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         return self.rates(u[:, 0])
@@ -81,7 +83,7 @@ class Rover(PillarTask):
         return np.hstack([ahead, measured[:, 1:3]])
 
     def measured(self, observation: np.ndarray) -> np.ndarray:
-        unseen = np.zeros((len(observation), 2))
+        unseen = np.zeros((len(observation), 1))
         return np.hstack([self.obstacle[0] - observation[:, :1], observation[:, 1:], unseen])
 
     def clearance(self, measured: np.ndarray) -> np.ndarray:
