@@ -16,6 +16,18 @@ Mocap = Callable[[np.ndarray], np.ndarray]
 # The version of MuJoCo that computes wrong constraint forces where the Jacobian is sparse.
 WRONG_VERSION = "4.0.0"
 
+# Sensors whose values are entries of the state: which entries of the joint, the first one and their number.
+_OF_POSITION = {
+    mujoco.mjtSensor.mjSENS_JOINTPOS: (0, 1),
+    mujoco.mjtSensor.mjSENS_FRAMEPOS: (0, 3),
+    mujoco.mjtSensor.mjSENS_FRAMEQUAT: (3, 4),
+}
+_OF_VELOCITY = {
+    mujoco.mjtSensor.mjSENS_JOINTVEL: (0, 1),
+    mujoco.mjtSensor.mjSENS_FRAMELINVEL: (0, 3),
+    mujoco.mjtSensor.mjSENS_GYRO: (3, 3),
+}
+
 
 def models_dir() -> Path:
     """Returns the folder of the MJCF files: in the installed package, else beside it in the checkout."""
@@ -207,3 +219,52 @@ def _constrained(model: mujoco.MjModel) -> bool:
     limited = model.jnt_limited.any() or model.tendon_limited.any()
     rubbing = model.dof_frictionloss.any() or model.tendon_frictionloss.any()
     return bool(model.neq or model.npair or touching or limited or rubbing)
+
+
+def state_columns(model: mujoco.MjModel) -> np.ndarray | None:
+    """Returns the columns (s,) of a state (mjSTATE_INTEGRATION) that the sensors measure.
+
+    Returns None unless each sensor is unmodified, and measures the position or velocity of a joint, or that,
+    the orientation or the rates of turn of a body with a free joint.
+    """
+    if any(v.any() for v in (model.sensor_cutoff, model.sensor_delay, model.sensor_interval)):
+        return None
+    columns = [_columns_of(model, sensor) for sensor in range(model.nsensor)]
+    return None if None in columns else np.array([c for some in columns if some for c in some], int)
+
+
+def _columns_of(model: mujoco.MjModel, sensor: int) -> range | None:
+    """Returns the columns of a state that a sensor measures, None if it measures something else."""
+    kind, joint = mujoco.mjtSensor(model.sensor_type[sensor]), _measured_joint(model, sensor)
+    # The state begins with time, qpos and qvel.
+    qpos = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_TIME)
+    qvel = qpos + model.nq
+    if joint is None or kind not in {**_OF_POSITION, **_OF_VELOCITY}:
+        return None
+    if kind in _OF_POSITION:
+        of_joint, (first, count) = qpos + model.jnt_qposadr[joint], _OF_POSITION[kind]
+    else:
+        of_joint, (first, count) = qvel + model.jnt_dofadr[joint], _OF_VELOCITY[kind]
+    return range(of_joint + first, of_joint + first + count)
+
+
+def _measured_joint(model: mujoco.MjModel, sensor: int) -> int | None:
+    """Returns the joint that a sensor measures, or whose body, if it is free; None without such a joint."""
+    kind, measured = mujoco.mjtObj(model.sensor_objtype[sensor]), int(model.sensor_objid[sensor])
+    if kind == mujoco.mjtObj.mjOBJ_JOINT:
+        return measured
+    body = measured
+    if kind == mujoco.mjtObj.mjOBJ_SITE:
+        body = model.site_bodyid[measured]
+        turned = (model.site_quat[measured] != [1, 0, 0, 0]).any()
+        # All points of a body turn at the same rate.
+        away = model.site_pos[measured].any() and (
+            model.sensor_type[sensor] != mujoco.mjtSensor.mjSENS_GYRO
+        )
+        if turned or away:
+            return None
+    elif kind != mujoco.mjtObj.mjOBJ_XBODY:
+        return None
+    joint = int(model.body_jntadr[body])
+    free = joint >= 0 and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE
+    return joint if free and model.sensor_refid[sensor] < 0 else None

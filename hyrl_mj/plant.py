@@ -75,7 +75,7 @@ class Plant:
         self._held = model.key_ctrl[0].copy() if model.nkey else np.zeros(model.nu)
         self._unstable = np.zeros(n, dtype=bool)
         # Some sensors are read from the state; MuJoCo has to compute others after each step.
-        self._columns_of_state = state_columns(self.model)
+        self._columns_of_state = mjcf.state_columns(self.model)
         self._stage = mujoco.mjtStage.mjSTAGE_NONE
         if self._columns_of_state is None:
             self._stage = mujoco.mjtStage(int(self.model.sensor_needstage.max()))
@@ -316,53 +316,6 @@ def input_limits(
     else:
         ranges = np.array([mjcf.numeric(model, name, 2) for name in inputs])
     return ranges[:, 0], ranges[:, 1]
-
-
-def state_columns(model: mujoco.MjModel) -> np.ndarray | None:
-    """Returns the columns (s,) of a state (mjSTATE_INTEGRATION) that the sensors measure.
-
-    Returns None unless each sensor is unmodified, and measures the position or velocity of a joint, or that,
-    the orientation or the rates of turn of a body with a free joint.
-    """
-    if any(v.any() for v in (model.sensor_cutoff, model.sensor_delay, model.sensor_interval)):
-        return None
-    columns = [_columns_of(model, sensor) for sensor in range(model.nsensor)]
-    return None if None in columns else np.array([c for some in columns if some for c in some], int)
-
-
-def _columns_of(model: mujoco.MjModel, sensor: int) -> range | None:
-    """Returns the columns of a state that a sensor measures, None if it measures something else."""
-    kinds, types = mujoco.mjtSensor, mujoco.mjtObj
-    # The state begins with time, qpos and qvel.
-    qpos = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_TIME)
-    qvel = qpos + model.nq
-    kind, measured = kinds(model.sensor_type[sensor]), model.sensor_objid[sensor]
-    if kind in (kinds.mjSENS_JOINTPOS, kinds.mjSENS_JOINTVEL):
-        joint, after, count = measured, 0, 1
-    else:
-        of_frames = {
-            kinds.mjSENS_FRAMEPOS: (0, 3),
-            kinds.mjSENS_FRAMEQUAT: (3, 4),
-            kinds.mjSENS_FRAMELINVEL: (0, 3),
-            kinds.mjSENS_GYRO: (3, 3),
-        }
-        body = measured
-        of = types(model.sensor_objtype[sensor])
-        if of == types.mjOBJ_SITE:
-            turned = (model.site_quat[measured] != [1, 0, 0, 0]).any()
-            if turned or (kind != kinds.mjSENS_GYRO and model.site_pos[measured].any()):
-                return None
-            body = model.site_bodyid[measured]
-        elif of != types.mjOBJ_XBODY:
-            return None
-        joint = model.body_jntadr[body]
-        free = joint >= 0 and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE
-        if kind not in of_frames or not free or model.sensor_refid[sensor] >= 0:
-            return None
-        after, count = of_frames[kind]
-    of_position = kind in (kinds.mjSENS_JOINTPOS, kinds.mjSENS_FRAMEPOS, kinds.mjSENS_FRAMEQUAT)
-    first = qpos + model.jnt_qposadr[joint] if of_position else qvel + model.jnt_dofadr[joint]
-    return range(first + after, first + after + count)
 
 
 def _checked(name: str, values: np.ndarray, columns: int, rows: np.ndarray) -> np.ndarray:

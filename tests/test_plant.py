@@ -12,7 +12,7 @@ from planted import euler, random_states
 
 from hyrl_mj import mjcf
 from hyrl_mj.errors import BadInput
-from hyrl_mj.plant import Plant, state_columns
+from hyrl_mj.plant import Plant
 from hyrl_mj.task_tests import random_inputs
 from hyrl_mj.tasks import get_task
 from hyrl_mj.tasks.vehicle import Vehicle
@@ -115,7 +115,7 @@ PENDULUM = """
 )
 def test_the_measurement_is_what_the_sensors_give_now(sensors, read_from_the_state):
     model = mujoco.MjModel.from_xml_string(PENDULUM.replace("SENSORS", sensors))
-    assert (state_columns(model) is not None) == read_from_the_state
+    assert (mjcf.state_columns(model) is not None) == read_from_the_state
     plant, data = Plant(model, ("push",), 3), mujoco.MjData(model)
     qpos = np.tile([0, 0, 0, 1, 0, 0, 0, 0.4], (3, 1))
     plant.set_state(qpos, np.random.default_rng(0).normal(size=(3, 7)))
