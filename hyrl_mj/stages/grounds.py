@@ -34,6 +34,8 @@ FEW = 1e-3
 JUDGES = ("none", "uniform", "alternating", "adversarial")
 BATCHES = (64, 64, 128, 256, 512)
 PLAYS = list(product(range(len(BATCHES)), JUDGES))
+# Some episodes lost in a thousand may be missed, but not if the noise is so many times as large as the bound.
+MARGIN = 1.2
 # The mirror image of a policy that wins all of its own mode has been judged there, so fewer plays tell.
 PLAYS_OF_IMAGE = PLAYS[: 3 * len(JUDGES)]
 # So many starts are drawn for each episode; those too close to where the mode cannot succeed are left out.
@@ -73,6 +75,7 @@ class ModeGround(ABC):
 
     enough: Score
     noise: Noise
+    margin = 1.0  # noise of so many times the bound has to be survived
     settled = 0.0  # scores count from the beginning
 
     def __init__(
@@ -157,7 +160,7 @@ class ModeGround(ABC):
         Beyond its part a mode earns nothing: there the task's reward leads to the other way, and it could
         pay to creep or to stay at the edge of the set, because the detour is long and returns are discounted.
         """
-        caution = self.extended.noise * np.array(self.task.noisy, dtype=float)
+        caution = self.margin * self.extended.noise * np.array(self.task.noisy, dtype=float)
         exit_reward = self.task.worst_reward / (1 - gamma)
         earns = None if self.part is None else self.part.contains
         return Domain(self.starts, self.within.contains, exit_reward, caution, earns)
@@ -246,10 +249,10 @@ class ByEpisodes(ModeGround):
     """Judges by noisy episodes, where the worst case cannot be computed.
 
     The episodes start where the hybrid controller may select the mode. Without noise all have to arrive at
-    the set-point, under noise all have to survive. Each batch is played with all kinds of noise in `JUDGES`
-    before the next batch. The score is the number of plays that stop no episode, then minus the share of
-    episodes that the next play stops; if none is stopped, minus the largest distance from the set-point at
-    the end without noise, as a multiple of `allowed`.
+    the set-point, under noise of `MARGIN` times the bound all have to survive. Each batch is played with all
+    kinds of noise in `JUDGES` before the next batch. The score is the number of plays that stop no episode,
+    then minus the share of episodes that the next play stops; if none is stopped, minus the largest distance
+    from the set-point at the end without noise, as a multiple of `allowed`.
 
     Attributes:
         judged: (n, d) starts of the episodes.
@@ -257,9 +260,10 @@ class ByEpisodes(ModeGround):
     """
 
     enough: Score = (float(len(PLAYS)), -1.0)
+    margin = MARGIN
 
     def _prepare(self, policy: Policy | None) -> None:
-        self.noise = Noise("uniform", self.extended.noise)
+        self.noise = Noise("uniform", self.margin * self.extended.noise)
         picked = self._selected[self.early]
         rng, episodes = np.random.default_rng(0), sum(BATCHES)
         first = rng.choice(self.early[picked] if picked.any() else self.early, SPARE * episodes)
@@ -308,7 +312,7 @@ class ByEpisodes(ModeGround):
         """Returns which episodes of a batch are won (k,), and how far off they end (k,)."""
         rows = self._batches[batch]
         settings = LoopSettings(plant=self._plants[len(rows)], vary=True, quiet=True)
-        noise, loop = Noise(kind, self.extended.noise), PolicyController(policy)
+        noise, loop = Noise(kind, self.noise.bound), PolicyController(policy)
         seed, starts = int(rows[0]), self.judged[rows]
         run = closed_loop(self.task, loop, starts, noise, seed=seed, settings=settings)
         ends, won = run.path[-1], run.outcome == Outcome.REACHED

@@ -15,7 +15,7 @@ from hyrl_mj.tasks.registry import register
 LIFT = (0.4, 1.6)
 # Distance from the beam and from the edge of the arena within which the reward is less [m]; room to the side
 # that is worth going for [m].
-NEAR, ROOM = 0.3, 0.25
+NEAR, ROOM = 0.32, 0.32
 # Weights of the reward: of arriving (in samples), of the distance to the nearest side [1/m] and the inputs
 # [s/m] until the beam is passed, of the distance from the middle behind it [1/m], of being near.
 FINISH, BLOCKED, EFFORT, OFF, BESIDE = 10, 0.8, 0.05, 0.5, 0.5
@@ -77,9 +77,9 @@ class Beam(Task):
 
     @cached_property
     def passed(self) -> float:
-        """Where the hull has left the beam behind: x [m]."""
+        """Where the hull has left the beam behind, with room to spare: x [m]."""
         centre, half = self.beam
-        return float(centre[0] + half[0] + mjcf.geom_size(self.model, "hull")[0])
+        return float(centre[0] + half[0] + mjcf.geom_size(self.model, "hull")[0] + ROOM)
 
     @cached_property
     def rotors(self) -> Rotors:
@@ -181,11 +181,14 @@ class Beam(Task):
     def direction(self, path: np.ndarray) -> np.ndarray:
         """Returns the side of the beam on which runs passed: the quarter of the angle about the axis.
 
-        0 is on the left, 1 above, 2 on the right and 3 below; -1 for starts beside the beam or behind it.
+        0 is on the left, 1 above, 2 on the right and 3 below; -1 for starts beside the beam or behind it, and
+        for those that clear it at a corner, both to the side and in height.
         """
         centre, half = self.beam
         passing = np.abs(path[..., 0] - centre[0]).argmin(axis=0)
         y, z = (path[passing, np.arange(path.shape[1]), 1:] - centre[1:]).T
         quarter = np.round(np.arctan2(z, y) / (np.pi / 2)).astype(int) % 4
-        hull = mjcf.geom_size(self.model, "hull")[0]
-        return np.where(path[0, :, 0] < centre[0] - half[0] - hull, quarter, -1)
+        hull, start = mjcf.geom_size(self.model, "hull")[0], path[0]
+        at_corner = (self.to_side(start) <= 0).all(axis=1)
+        open_ways = (start[:, 0] < centre[0] - half[0] - hull) & ~at_corner
+        return np.where(open_ways, quarter, -1)
