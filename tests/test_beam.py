@@ -97,6 +97,13 @@ def test_beside_the_beam_and_behind_it_nothing_is_left_to_decide(beam):
     assert beam.direction(rollout.path).tolist() == [-1, -1, -1]
 
 
+def test_who_clears_a_corner_of_the_beam_has_nothing_to_decide(beam):
+    z = [[0.5, 0.7, 2.3], [0.5, 0.7, 2.2], [0.5, -0.6, 0.9], [0.5, -0.7, 0.9]]
+    rollout = fly(beam, Constant(0, 0), z)
+    assert (rollout.outcome == Outcome.REACHED).all()
+    assert beam.direction(rollout.path).tolist() == [-1, 0, 3, -1]
+
+
 def test_who_does_not_decide_crashes_and_who_misses_the_gate_does_not_arrive(beam):
     z = [[0.0, 0.0, 1.6], [0.0, 1.25, 1.6], [3.2, 0.3, 1.6]]
     outcome = fly(beam, Constant(0, 0), z).outcome

@@ -289,6 +289,14 @@ def test_episodes_tell_policies_apart(puck, puck_sets):
 
 
 @pytest.mark.slow
+def test_a_policy_that_just_survives_the_noise_is_not_good_enough(puck, puck_sets, monkeypatch):
+    narrowly = round_it(puck, 1.0, clear=0.7)
+    assert not ByEpisodes(puck, puck_sets, 0).suffices(narrowly)
+    monkeypatch.setattr(ByEpisodes, "margin", 1.0)
+    assert ByEpisodes(puck, puck_sets, 0).suffices(narrowly)
+
+
+@pytest.mark.slow
 def test_a_policy_that_parks_off_the_goal_is_not_good_enough(puck, puck_sets):
     precise = round_it(puck, 1.0)
     ground = ByEpisodes(puck, puck_sets, 0, policy=precise)
