@@ -15,7 +15,7 @@ from hyrl_mj.tasks.registry import register
 LIFT = (0.4, 1.6)
 # Distance from the beam and from the edge of the arena within which the reward is less [m]; room to the side
 # that is worth going for [m].
-NEAR, ROOM = 0.32, 0.32
+NEAR, ROOM = 0.3, 0.25
 # Weights of the reward: of arriving (in samples), of the distance to the nearest side [1/m] and the inputs
 # [s/m] until the beam is passed, of the distance from the middle behind it [1/m], of being near.
 FINISH, BLOCKED, EFFORT, OFF, BESIDE = 10, 0.8, 0.05, 0.5, 0.5
@@ -77,9 +77,9 @@ class Beam(Task):
 
     @cached_property
     def passed(self) -> float:
-        """Where the hull has left the beam behind, with room to spare: x [m]."""
+        """Where the hull has left the beam behind: x [m]."""
         centre, half = self.beam
-        return float(centre[0] + half[0] + mjcf.geom_size(self.model, "hull")[0] + ROOM)
+        return float(centre[0] + half[0] + mjcf.geom_size(self.model, "hull")[0])
 
     @cached_property
     def rotors(self) -> Rotors:
