@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -17,7 +18,7 @@ from hyrl_mj.game.solver import (
     noisy_moves,
     solve,
 )
-from hyrl_mj.simulation import NOT_STARTED, Lookahead, Sample, Signal
+from hyrl_mj.simulation import NOT_STARTED, Ahead, Lookahead, Sample, Signal
 from hyrl_mj.tasks import Outcome
 
 
@@ -87,6 +88,7 @@ class WorstEstimate(Lookahead):
     """
 
     kind = "worst"
+    farthest = 1
 
     def __init__(
         self, lattice: Lattice, modes: tuple[int, ...], value: np.ndarray, bound: np.ndarray
@@ -99,17 +101,16 @@ class WorstEstimate(Lookahead):
         worth = [3 - samples, samples]
         self._worth = np.select([value > NEVER, value < NEVER], worth, 1.5)
 
-    def _danger(
-        self, qpos: np.ndarray, qvel: np.ndarray, answers: np.ndarray, past: np.ndarray
-    ) -> np.ndarray:
+    def _simulate(self, begun: Ahead, past: np.ndarray, samples: int) -> Ahead:
         task, grid = self._lattice.task, self._lattice.grid
-        ahead, rows = self._copies(), np.arange(len(answers))
-        ahead.set_state(qpos, qvel, rows)
-        ahead.step(answers[:, :-1], rows)
-        measured = ahead.measurement[rows]
+        answers, rows = begun.answers, np.arange(len(begun.answers))
+        plant = self._placed(begun.state)
+        plant.step(answers[:, :-1], rows)
+        measured = plant.measurement[rows]
         lost = task.failed(measured) | ~grid.chart.contains(task.z(measured))
         worth = np.full(len(rows), np.inf)
         for mode, values in zip(self._modes, self._worth, strict=False):
             at = (answers[:, -1] == mode) & ~lost
             worth[at] = grid.interpolate(values[:-2], task.z(measured[at]))
-        return np.where(task.ending(measured) == Outcome.REACHED, 0.0, worth)
+        worth = np.where(task.ending(measured) == Outcome.REACHED, 0.0, worth)
+        return replace(begun, danger=worth[:, None])

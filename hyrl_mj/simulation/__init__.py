@@ -9,7 +9,7 @@ from importlib import import_module
 from pkgutil import iter_modules
 
 from hyrl_mj.simulation.arc import HybridArc, samples, simulate, simulate_batch
-from hyrl_mj.simulation.lookahead import Lookahead
+from hyrl_mj.simulation.lookahead import Ahead, Lookahead
 from hyrl_mj.simulation.noise import (
     NOT_STARTED,
     AnyNoise,
@@ -28,6 +28,7 @@ from hyrl_mj.simulation.way_runs import WayRuns, policy_runs, way_runs
 
 __all__ = [
     "NOT_STARTED",
+    "Ahead",
     "AnyNoise",
     "HybridArc",
     "Lookahead",

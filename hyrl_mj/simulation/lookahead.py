@@ -1,5 +1,8 @@
 """Adversarial noise that simulates the closed loop ahead before it chooses."""
 
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
 from itertools import product
 from typing import Self
 
@@ -16,6 +19,31 @@ AHEAD = 6
 BATCH = 2_048
 
 
+@dataclass
+class Ahead:
+    """What k simulations ahead show, and how they could go on.
+
+    Attributes:
+        danger: (k, samples) the danger after each sample; -inf after the end of a simulation.
+        state: (k, nq + nv) the state after the last sample.
+        answers: (k, m + 1) the controller's inputs and mode in that state.
+        goes_on: (k,) bool, whether the simulation has not ended.
+    """
+
+    danger: np.ndarray
+    state: np.ndarray
+    answers: np.ndarray
+    goes_on: np.ndarray
+
+    def __getitem__(self, rows: np.ndarray | slice) -> Ahead:
+        return Ahead(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def put(self, rows: np.ndarray, other: Ahead) -> None:
+        """Takes over other simulations (r,) as those of indices `rows` (r,)."""
+        for field in fields(self):
+            getattr(self, field.name)[rows] = getattr(other, field.name)
+
+
 @register_noise
 class Lookahead(Signal):
     """The noise that leads into the greatest danger, by the task's own measure of it.
@@ -26,38 +54,47 @@ class Lookahead(Signal):
     Candidates on each noisy column are both ends of the bound, their halves and zero; with more than two
     such columns, or two and inertia, the ends and zero.
 
+    What was simulated for the noise that was chosen is at the next sample the simulation without noise, but
+    for its last sample.
+
     Attributes:
         samples: number of samples by which the closed loop is simulated ahead.
     """
 
     kind = "adversarial"
     needs_controller = True
+    farthest = AHEAD
     task: Task
     controller: Controller
     samples: int
     _candidates: np.ndarray
+    _kept: Ahead
 
     def __init__(self, bound: float, shares: np.ndarray):
         super().__init__(bound, shares)
-        self._ahead: Plant | None = None
+        self._copies: Plant | None = None
 
     def against(self, task: Task, controller: Controller | None) -> Self:
         signal = super().against(task, controller)
         assert controller is not None
         signal.task, signal.controller = task, controller
-        signal.samples = 1 if task.kinematic else AHEAD
+        signal.samples = 1 if task.kinematic else self.farthest
         fine = np.count_nonzero(self.shares) <= (2 if task.kinematic else 1)
         factors = (0.0, -1.0, 1.0, -0.5, 0.5) if fine else (0.0, -1.0, 1.0)
         choices = product(*[factors if share else (0.0,) for share in self.shares])
         signal._candidates = self.bound * np.array(list(choices)) * self.shares
         return signal
 
+    def reset(self, n: int, rng: np.random.Generator) -> None:
+        super().reset(n, rng)
+        self._kept_at = np.full(n, -2)  # the sample at which something was kept of each run
+
     def sample(self, now: Sample) -> np.ndarray:
         """Returns the most dangerous noise; among equals zero comes first, then the largest noise."""
         true, chosen = now.measurement, np.zeros_like(now.measurement)
         unstable = now.plant.unstable[now.rows]
         running = np.flatnonzero(self.task.outcome(true, unstable) == Outcome.RUNNING)
-        q = now.q[running]
+        q, rows, k = now.q[running], now.rows[running], now.k[running]
         past = nothing_past(self.controller, *true.shape) if now.past is None else now.past
         past = past[running]
         answers = np.stack(
@@ -71,49 +108,81 @@ class Lookahead(Signal):
             for i in range(len(answers))
         ]
         candidate, at = np.nonzero(differs & ~np.stack(repeated))
-        rows = now.rows[running[at]]
-        qpos, qvel = now.plant.qpos[rows], now.plant.qvel[rows]
+        state = np.hstack([now.plant.qpos[rows], now.plant.qvel[rows]])
+        runs = Ahead(
+            np.full((len(at), self.samples), -np.inf),
+            state[at],
+            answers[candidate, at],
+            np.ones(len(at), dtype=bool),
+        )
+        known = (candidate == 0) & (self._kept_at[rows] == k - 1)[at]
+        if known.any():
+            runs.put(np.flatnonzero(known), self._kept[rows[at[known]]])
+            runs.danger[known] = np.roll(runs.danger[known], -1, axis=1)
+            runs.danger[known, -1] = -np.inf
+        measured = true[running[at]] + self._candidates[candidate]
+        known_past = remembering(past[at], measured)
+        for some, samples in ((~known, self.samples), (known & runs.goes_on, 1)):
+            some = np.flatnonzero(some)
+            for first in range(0, len(some), BATCH):
+                batch = some[first : first + BATCH]
+                ahead = self._simulate(runs[batch], known_past[batch], samples)
+                ahead.danger = np.hstack(
+                    [runs.danger[batch, : self.samples - samples], ahead.danger]
+                )
+                runs.put(batch, ahead)
         danger = np.full(answers.shape[:2], -np.inf)
-        for first in range(0, len(at), BATCH):
-            batch = slice(first, first + BATCH)
-            entries = candidate[batch], at[batch]
-            measured = true[running[at[batch]]] + self._candidates[candidate[batch]]
-            known = remembering(past[at[batch]], measured)
-            danger[entries] = self._danger(qpos[batch], qvel[batch], answers[entries], known)
-        chosen[running] = self._candidates[danger.argmax(axis=0)]
+        danger[candidate, at] = runs.danger.max(axis=1)
+        best = danger.argmax(axis=0)
+        chosen[running] = self._candidates[best]
+        self._keep(now, rows[at], k[at], runs, candidate == best[at])
         return chosen
 
-    def _danger(
-        self, qpos: np.ndarray, qvel: np.ndarray, answers: np.ndarray, past: np.ndarray
-    ) -> np.ndarray:
-        """Returns the greatest danger (k,) after answers (k, m + 1), inputs and mode, in k states.
+    def _keep(
+        self, now: Sample, rows: np.ndarray, k: np.ndarray, runs: Ahead, chosen: np.ndarray
+    ) -> None:
+        """Keeps the `chosen` (k,) bool of the simulations of the plant's `rows` (k,) at samples (k,)."""
+        if self.samples == 1 or (now.past is not None and now.past.shape[1]):
+            return
+        if (self._kept_at < 0).all():
+            self._kept = Ahead(
+                *(np.zeros((now.plant.n, *v.shape[1:]), v.dtype) for v in vars(runs).values())
+            )
+        self._kept_at[rows[chosen]] = k[chosen]
+        self._kept.put(rows[chosen], runs[chosen])
+
+    def _simulate(self, begun: Ahead, past: np.ndarray, samples: int) -> Ahead:
+        """Simulates from the states of `begun` (k,), with its answers first, over so many samples.
 
         `past` (k, memory, p) are the measurements up to these answers.
         """
-        ahead, rows = self._copies(), np.arange(len(answers))
-        worst = np.full(len(answers), -np.inf)
-        ahead.set_state(qpos, qvel, rows)
-        for _ in range(self.samples):
+        plant = self._placed(begun.state)
+        answers, rows = begun.answers, np.arange(len(begun.answers))
+        danger, next_answers = np.full((len(rows), samples), -np.inf), begun.answers.copy()
+        for sample in range(samples):
             u, q = answers[:, :-1], answers[:, -1].astype(int)
-            ahead.step(u, rows)
-            after = ahead.measurement[rows]
-            outcome = self.task.outcome(after, ahead.unstable[rows])
+            plant.step(u, rows)
+            after = plant.measurement[rows]
+            outcome = self.task.outcome(after, plant.unstable[rows])
             goes_on = outcome == Outcome.RUNNING
             failed = ~goes_on & (outcome != Outcome.REACHED)
-            danger = np.where(failed, np.inf, self.task.danger(after))
-            worst[rows] = np.maximum(worst[rows], danger)
+            danger[rows, sample] = np.where(failed, np.inf, self.task.danger(after))
             rows = rows[goes_on]
             if not len(rows):
                 break
             after, q, past = after[goes_on], q[goes_on], past[goes_on]
             answers = np.column_stack(self._act(after, q, past))
             past = remembering(past, after)
-        return worst
+        next_answers[rows] = answers[: len(rows)]
+        end = np.hstack([plant.qpos, plant.qvel])[: len(danger)]
+        return Ahead(danger, end, next_answers, np.isin(np.arange(len(danger)), rows))
 
-    def _copies(self) -> Plant:
-        """Returns the copies of the robot that are simulated ahead."""
-        self._ahead = self._ahead or self.task.plant(BATCH)
-        return self._ahead
+    def _placed(self, state: np.ndarray) -> Plant:
+        """Returns copies of the robot, the first k of them in states (k, nq + nv)."""
+        self._copies = self._copies or self.task.plant(BATCH)
+        nq = self._copies.model.nq
+        self._copies.set_state(state[:, :nq], state[:, nq:], np.arange(len(state)))
+        return self._copies
 
     def _act(
         self, measured: np.ndarray, q: np.ndarray, past: np.ndarray

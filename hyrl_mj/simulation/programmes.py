@@ -138,6 +138,10 @@ class Programmes(Signal):
     def against(self, task: Task, controller: Controller | None) -> Self:
         return self
 
+    def reset(self, n: int, rng: np.random.Generator) -> None:
+        super().reset(n, rng)
+        self.rules.lookahead.reset(n, rng)
+
     def sample(self, now: Sample) -> np.ndarray:
         true, noise = now.measurement, np.zeros_like(now.measurement)
         rows = np.flatnonzero(
