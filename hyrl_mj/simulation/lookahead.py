@@ -108,45 +108,58 @@ class Lookahead(Signal):
             for i in range(len(answers))
         ]
         candidate, at = np.nonzero(differs & ~np.stack(repeated))
-        state = np.hstack([now.plant.qpos[rows], now.plant.qvel[rows]])
-        runs = Ahead(
-            np.full((len(at), self.samples), -np.inf),
-            state[at],
-            answers[candidate, at],
-            np.ones(len(at), dtype=bool),
-        )
-        known = (candidate == 0) & (self._kept_at[rows] == k - 1)[at]
-        if known.any():
-            runs.put(np.flatnonzero(known), self._kept[rows[at[known]]])
-            runs.danger[known] = np.roll(runs.danger[known], -1, axis=1)
-            runs.danger[known, -1] = -np.inf
-        measured = true[running[at]] + self._candidates[candidate]
-        known_past = remembering(past[at], measured)
-        for some, samples in ((~known, self.samples), (known & runs.goes_on, 1)):
-            some = np.flatnonzero(some)
-            for first in range(0, len(some), BATCH):
-                batch = some[first : first + BATCH]
-                ahead = self._simulate(runs[batch], known_past[batch], samples)
-                ahead.danger = np.hstack(
-                    [runs.danger[batch, : self.samples - samples], ahead.danger]
-                )
-                runs.put(batch, ahead)
+        past = remembering(past[at], true[running[at]] + self._candidates[candidate])
+        runs = self._ahead(now.plant, rows[at], k[at], candidate, answers[candidate, at], past)
         danger = np.full(answers.shape[:2], -np.inf)
         danger[candidate, at] = runs.danger.max(axis=1)
         best = danger.argmax(axis=0)
         chosen[running] = self._candidates[best]
-        self._keep(now, rows[at], k[at], runs, candidate == best[at])
+        if self.samples > 1 and not past.shape[1]:
+            self._keep(now.plant.n, rows[at], k[at], runs, candidate == best[at])
         return chosen
 
+    def _ahead(
+        self,
+        plant: Plant,
+        rows: np.ndarray,
+        k: np.ndarray,
+        candidate: np.ndarray,
+        answers: np.ndarray,
+        past: np.ndarray,
+    ) -> Ahead:
+        """Returns the simulations of candidates (c,) from the states of a plant's `rows` (c,).
+
+        Args:
+            plant, rows: as above.
+            k: (c,) the number of the sample.
+            candidate: (c,) indices of the candidates.
+            answers: (c, m + 1) the controller's answers to them, inputs and mode.
+            past: (c, memory, p) the measurements up to these answers.
+        """
+        state = np.hstack([plant.qpos[rows], plant.qvel[rows]])
+        danger = np.full((len(rows), self.samples), -np.inf)
+        runs = Ahead(danger, state, answers, np.ones(len(rows), dtype=bool))
+        known = (candidate == 0) & (self._kept_at[rows] == k - 1)
+        if known.any():
+            kept = self._kept[rows[known]]
+            kept.danger = np.hstack([kept.danger[:, 1:], np.full((len(kept.danger), 1), -np.inf)])
+            runs.put(np.flatnonzero(known), kept)
+        for some, samples in ((~known, self.samples), (known & runs.goes_on, 1)):
+            numbers = np.flatnonzero(some)
+            for first in range(0, len(numbers), BATCH):
+                batch = numbers[first : first + BATCH]
+                later = self._simulate(runs[batch], past[batch], samples)
+                later.danger = np.hstack([runs.danger[batch, :-samples], later.danger])
+                runs.put(batch, later)
+        return runs
+
     def _keep(
-        self, now: Sample, rows: np.ndarray, k: np.ndarray, runs: Ahead, chosen: np.ndarray
+        self, n: int, rows: np.ndarray, k: np.ndarray, runs: Ahead, chosen: np.ndarray
     ) -> None:
-        """Keeps the `chosen` (k,) bool of the simulations of the plant's `rows` (k,) at samples (k,)."""
-        if self.samples == 1 or (now.past is not None and now.past.shape[1]):
-            return
+        """Keeps the `chosen` (c,) bool of simulations (c,), for `rows` (c,) of n runs at samples k (c,)."""
         if (self._kept_at < 0).all():
             self._kept = Ahead(
-                *(np.zeros((now.plant.n, *v.shape[1:]), v.dtype) for v in vars(runs).values())
+                *(np.zeros((n, *values.shape[1:]), values.dtype) for values in vars(runs).values())
             )
         self._kept_at[rows[chosen]] = k[chosen]
         self._kept.put(rows[chosen], runs[chosen])
