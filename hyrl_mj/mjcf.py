@@ -221,11 +221,22 @@ def _constrained(model: mujoco.MjModel) -> bool:
     return bool(model.neq or model.npair or touching or limited or rubbing)
 
 
+def quaternion_columns(model: mujoco.MjModel) -> list[slice]:
+    """Returns the columns of qpos that are quaternions: those of free joints and of balls."""
+    after = {mujoco.mjtJoint.mjJNT_FREE: 3, mujoco.mjtJoint.mjJNT_BALL: 0}
+    firsts = [
+        int(address) + after[mujoco.mjtJoint(kind)]
+        for kind, address in zip(model.jnt_type, model.jnt_qposadr, strict=True)
+        if mujoco.mjtJoint(kind) in after
+    ]
+    return [slice(first, first + 4) for first in firsts]
+
+
 def state_columns(model: mujoco.MjModel) -> np.ndarray | None:
     """Returns the columns (s,) of a state (mjSTATE_INTEGRATION) that the sensors measure.
 
-    Returns None unless each sensor is unmodified, and measures the position or velocity of a joint, or that,
-    the orientation or the rates of turn of a body with a free joint.
+    Returns None unless each sensor is unmodified and measures the position or velocity of a joint, or the
+    position, orientation, velocity or rates of turn of a body with a free joint.
     """
     if any(v.any() for v in (model.sensor_cutoff, model.sensor_delay, model.sensor_interval)):
         return None

@@ -18,6 +18,8 @@ Control = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 MOST = 2**24  # copies
 # Tolerated excess over an input limit: float32 policies have rounding errors.
 INPUT_TOLERANCE = 1e-6
+# Quaternions whose length differs from 1 by no more are left as they are.
+UNIT_TOLERANCE = 1e-9
 
 
 class Plant:
@@ -76,6 +78,7 @@ class Plant:
         self._unstable = np.zeros(n, dtype=bool)
         # Some sensors are read from the state; MuJoCo has to compute others after each step.
         self._columns_of_state = mjcf.state_columns(self.model)
+        self._quaternions = mjcf.quaternion_columns(self.model)
         self._stage = mujoco.mjtStage.mjSTAGE_NONE
         if self._columns_of_state is None:
             self._stage = mujoco.mjtStage(int(self.model.sensor_needstage.max()))
@@ -180,6 +183,10 @@ class Plant:
         qvel = _checked("qvel", qvel, self.model.nv, rows)
         self._batch.state[rows] = self._initial  # time, activations and warm starts, too
         self._qpos[rows], self._qvel[rows] = qpos, qvel
+        for columns in self._quaternions:
+            norm = np.linalg.norm(qpos[:, columns], axis=1, keepdims=True)
+            if (np.abs(norm - 1) > UNIT_TOLERANCE).any():  # MuJoCo takes quaternions of any length
+                self._qpos[rows, columns] = qpos[:, columns] / np.maximum(norm, mujoco.mjMINVAL)
         self._ctrl[rows] = self._held
         self._unstable[rows] = False
         self._drive(rows)

@@ -117,7 +117,8 @@ def test_the_measurement_is_what_the_sensors_give_now(sensors, read_from_the_sta
     model = mujoco.MjModel.from_xml_string(PENDULUM.replace("SENSORS", sensors))
     assert (mjcf.state_columns(model) is not None) == read_from_the_state
     plant, data = Plant(model, ("push",), 3), mujoco.MjData(model)
-    qpos = np.tile([0, 0, 0, 1, 0, 0, 0, 0.4], (3, 1))
+    # A quaternion may have any length.
+    qpos = np.outer([1, 2, 1], [0, 0, 0, 0.8, 0, 0.6, 0, 0.4])
     plant.set_state(qpos, np.random.default_rng(0).normal(size=(3, 7)))
     rows = np.array([0, 2])
     for u in (None, 0.3, -0.7):
