@@ -35,8 +35,10 @@ def code(page):
 def call(*words, cwd, timeout=300):
     """Run Python in a process of its own, with the checkout on its path."""
     path = os.pathsep.join((str(ROOT), os.environ.get("PYTHONPATH", "")))
+    # Ray starts a cluster of its own: one that a test beside this one has started may end at any time.
+    environment = unmeasured.environment(PYTHONPATH=path, RAY_ADDRESS="local")
     done = subprocess.run(
-        [sys.executable, *map(str, words)], cwd=cwd, env=unmeasured.environment(PYTHONPATH=path),
+        [sys.executable, *map(str, words)], cwd=cwd, env=environment,
         capture_output=True, text=True, timeout=timeout,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
