@@ -296,6 +296,14 @@ def test_a_policy_that_just_survives_the_noise_is_not_good_enough(puck, puck_set
     assert ByEpisodes(puck, puck_sets, 0).suffices(narrowly)
 
 
+def test_the_judge_s_noise_never_hides_the_chart(puck, puck_sets):
+    share = puck.noise_in_chart(1.0)[1]
+    limit = puck.chart.sides[1] / (2 * share)
+    for noise in (0.1, 0.95 * limit):
+        ground = ByEpisodes(puck, replace(puck_sets, noise=noise), 0)
+        assert noise < puck.check_noise(ground.noise.bound) <= 1.2 * noise + 1e-12
+
+
 @pytest.mark.slow
 def test_a_policy_that_parks_off_the_goal_is_not_good_enough(puck, puck_sets):
     precise = round_it(puck, 1.0)

@@ -263,6 +263,9 @@ class ByEpisodes(ModeGround):
     margin = MARGIN
 
     def _prepare(self, policy: Policy | None) -> None:
+        with np.errstate(divide="ignore"):
+            most = (self.task.chart.sides / (2 * self.bound)).min()
+        self.margin = min(self.margin, (1 + most) / 2)  # noise must not hide the whole chart
         self.noise = Noise("uniform", self.margin * self.extended.noise)
         picked = self._selected[self.early]
         rng, episodes = np.random.default_rng(0), sum(BATCHES)
