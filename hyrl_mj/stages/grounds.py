@@ -38,6 +38,10 @@ PLAYS = list(product(range(len(BATCHES)), JUDGES))
 MARGIN = 1.2
 # The mirror image of a policy that wins all of its own mode has been judged there, so fewer plays tell.
 PLAYS_OF_IMAGE = PLAYS[: 3 * len(JUDGES)]
+# The plays by which policies are compared that are not expected to win them all, and how much less a mirror
+# image may win.
+SHARED = [play for play in PLAYS[:16] if play[1] != "adversarial"]
+ALIKE = 0.02
 # So many starts are drawn for each episode; those too close to where the mode cannot succeed are left out.
 SPARE = 4
 # There, unless the task has a precision, a policy may end this many times as far off the set-point as the
@@ -53,6 +57,8 @@ def mode_ground(
     policy: Policy | None = None,
 ) -> ModeGround:
     """Returns the ground of a mode, judged by the worst-case game if possible, otherwise by episodes."""
+    if task.for_mode(mode) is not task:
+        return ByShare(task, extended, mode, parts, policy)
     kind = ByGame if game.Lattice.decides(task, extended.sets[0].grid) else ByEpisodes
     return kind(task, extended, mode, parts, policy)
 
@@ -86,8 +92,10 @@ class ModeGround(ABC):
         parts: Partition | None = None,
         policy: Policy | None = None,
     ):
-        self.task, self.extended, self.mode = task, extended, mode
-        self.part = None if parts is None else parts.parts[parts.modes.index(mode)]
+        self.task, self.extended, self.mode = task.for_mode(mode), extended, mode
+        own = self.task is not task
+        self.part = None if parts is None or own else parts.parts[parts.modes.index(mode)]
+        self.shares = tuple(float(share) for share in task.noisy)
         self.bound = task.noise_in_chart(extended.noise)
         index = extended.modes.index(mode)
         self.within = extended.sets[index].dilated_by_box(self.bound)
@@ -160,7 +168,7 @@ class ModeGround(ABC):
         Beyond its part a mode earns nothing: there the task's reward leads to the other way, and it could
         pay to creep or to stay at the edge of the set, because the detour is long and returns are discounted.
         """
-        caution = self.margin * self.extended.noise * np.array(self.task.noisy, dtype=float)
+        caution = self.margin * self.extended.noise * np.array(self.shares)
         exit_reward = self.task.worst_reward / (1 - gamma)
         earns = None if self.part is None else self.part.contains
         return Domain(self.starts, self.within.contains, exit_reward, caution, earns)
@@ -316,8 +324,41 @@ class ByEpisodes(ModeGround):
         rows = self._batches[batch]
         settings = LoopSettings(plant=self._plants[len(rows)], vary=True, quiet=True)
         noise, loop = Noise(kind, self.noise.bound), PolicyController(policy)
-        seed, starts = int(rows[0]), self.judged[rows]
-        run = closed_loop(self.task, loop, starts, noise, seed=seed, settings=settings)
+        seed, starts, task = int(rows[0]), self.judged[rows], self.task.with_noise(self.shares)
+        run = closed_loop(task, loop, starts, noise, seed=seed, settings=settings)
         ends, won = run.path[-1], run.outcome == Outcome.REACHED
         won = won & self.task.arrived(ends) if kind == JUDGES[0] else won
         return won, self.task.miss(ends)
+
+
+class ByShare(ByEpisodes):
+    """Judges by the share of noisy episodes that are won, for a task with a reward for each mode.
+
+    Such a task is trained from all of its starts, because its reward leads the mode's own way from anywhere.
+    It may draw episodes that no policy wins. The score is the share that is won in the plays `SHARED`.
+    """
+
+    enough: Score = (1.0,)
+    settled = 0.5
+
+    def see(self, policy: MlpPolicy) -> None:
+        """Does nothing: a training draws many times as many episodes as it is judged by."""
+
+    def domain(self, gamma: float) -> Domain:
+        """Returns the domain of training: all starts of the task, whose reward leads the mode's own way."""
+        caution = self.margin * self.extended.noise * np.array(self.shares)
+        return Domain(self.task.starts, caution=caution)
+
+    def score(self, policy: MlpPolicy, plays: Sequence[tuple[int, str]] = PLAYS) -> Score:
+        won = [self._play(policy, batch, kind)[0] for batch, kind in SHARED]
+        return (float(np.concatenate(won).mean()),)
+
+    def suffices(self, policy: MlpPolicy) -> bool:
+        return True  # another training would draw other episodes, and win about as many
+
+    def won_by_image(self, image: MlpPolicy, won: float) -> float | None:
+        share = self.score(image)[0]
+        return share if share >= won - ALIKE else None
+
+    def won(self, policy: MlpPolicy) -> float:
+        return self(policy)[0]

@@ -10,7 +10,9 @@ from pkgutil import iter_modules
 from hyrl_mj.tasks.base import Task, at_levels
 from hyrl_mj.tasks.checks import check_task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.field import CLEAR, Field, FieldTask
 from hyrl_mj.tasks.guard import check_finite
+from hyrl_mj.tasks.layouts import Layouts, length, only_post, posts_of
 from hyrl_mj.tasks.obstacles import (
     ANY,
     LEFT,
@@ -26,9 +28,13 @@ from hyrl_mj.tasks.scaffold import write_task
 
 __all__ = [
     "ANY",
+    "CLEAR",
     "LEFT",
     "RIGHT",
     "SEARCHES",
+    "Field",
+    "FieldTask",
+    "Layouts",
     "Learning",
     "Mirror",
     "Outcome",
@@ -39,8 +45,11 @@ __all__ = [
     "check_task",
     "described_task",
     "get_task",
+    "length",
     "number_of",
+    "only_post",
     "pattern_of",
+    "posts_of",
     "reference",
     "register",
     "sides",

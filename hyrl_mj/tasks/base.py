@@ -1,6 +1,7 @@
 """The task: a plant with a measurement, a chart, an observation, a reward, an end and starts."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from functools import cached_property
 from itertools import compress, product
 from pathlib import Path
@@ -317,10 +318,22 @@ class Task(ABC):
         d = self.chart.dimension
         return bound * (np.ones(d) if everywhere else np.array(self.noisy[:d], dtype=float))
 
+    def for_mode(self, mode: int) -> Self:
+        """Returns the task as stage 6 trains the policy of a mode on it, by default the task itself.
+
+        A task whose reward can tell the ways apart returns a copy that rewards the way of the mode, wherever
+        the robot is. Otherwise a mode earns its reward on its own part of the chart only.
+        """
+        return self
+
     def noisy_everywhere(self) -> Self:
         """Returns this task with noise of the whole bound on every column of the measurement."""
+        return self.with_noise((True,) * len(self.noisy))
+
+    def with_noise(self, shares: Sequence[float]) -> Self:
+        """Returns this task with other shares (p,) of the noise bound on the columns of the measurement."""
         task = object.__new__(type(self))
-        vars(task).update(vars(self), noisy=(True,) * len(self.noisy))
+        vars(task).update(vars(self), noisy=tuple(shares))
         return task
 
     def noise_on(self, everywhere: bool = False) -> tuple[str, str]:

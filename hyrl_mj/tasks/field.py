@@ -1,0 +1,353 @@
+"""Fields: drive to a goal past a post, with policies that serve any number of posts.
+
+The chart is the frame of one post: its origin is the post, and its first axis points to the goal. What a
+policy learns there holds for every post of a field that it is told to pass.
+"""
+
+from copy import copy
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+
+from hyrl_mj import mjcf
+from hyrl_mj.chart import Chart
+from hyrl_mj.tasks.base import Task
+from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.layouts import OF_POST, POSE, TURN, Layouts, length, posts_of
+from hyrl_mj.tasks.obstacles import LEFT, RIGHT, wrapped
+from hyrl_mj.tasks.registry import register
+
+# What the layouts of a training are drawn from: radii of the post, distances of the goal from its surface
+# [m], and its greatest speed [m/s]. Shares of the posts stand still, and come towards the goal.
+RADII, TO_GOAL, FASTEST = (0.3, 0.9), (0.5, 8.0), 0.4
+STANDING, BLOCKING = 0.4, 0.2
+DRAWN = 4_096
+# Distance of the robot's middle from a post's surface at which the shortest way passes it [m].
+CLEAR = 0.3
+# Distance from a post's surface within which the reward is less, and by how much at most [m].
+NEAR, GRAZING = 0.15, 2.0
+# A post this close to the goal leaves no room to arrive [m].
+TAKEN = 0.4
+# Distance from a post on the goal up to which a robot waits for it to go [m].
+WAITING = 1.0
+# What a crash costs: more than any way round.
+CRASH = -100.0
+# What driving backward at full speed costs, more than standing.
+REVERSE = 1.0
+# Shares of the noise bound on x, y and heading under which modes are trained: more than they have to bear.
+TRAINED = (1.5, 1.5, 2.5)
+# What turning the other way costs at full rate, where more than a right angle is left.
+WRONG = 3.0
+# Share of the layouts whose post leaves no room at the goal.
+ON_GOAL = 0.1
+# Time that a moving post leaves the robot at the start, at least [s].
+HEADWAY = 0.8
+# What both trainings share.
+PPO: dict[str, Any] = {
+    "hidden": (64, 64),
+    "activation": "tanh",
+    "spread": True,
+    "normalize": True,
+    "rehearse": 0.0,
+    "options": {
+        "n_steps": 32,
+        "batch_size": 1024,
+        "n_epochs": 8,
+        "ent_coef": 0.005,
+        "gae_lambda": 0.95,
+    },
+}
+# How far ahead the way of a moving post counts [s].
+PROJECTED = 2.0
+
+
+def way_round(
+    to_post: np.ndarray, to_goal: np.ndarray, radius: np.ndarray, side: np.ndarray | int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns where the shortest way to the goal past a disc begins, and how long it is.
+
+    Args:
+        to_post, to_goal: (n, 2) from the robot to the middle of the disc and to the goal [m].
+        radius: (n,) of the disc [m].
+        side: (n,) or one, on which side of the disc the way passes, `LEFT` or `RIGHT`.
+
+    Returns:
+        (n,) direction of the way [rad]; (n,) its length [m].
+    """
+    sign = np.where(np.equal(side, LEFT), 1.0, -1.0)
+    away, far = length(to_post), length(to_goal)
+    from_post = to_goal - to_post
+    goal_away = length(from_post)
+    # Where robot or goal is inside of the disc, the way follows a smaller one.
+    deep = np.maximum(1 - away / radius, 0.0)
+    radius = np.minimum(np.minimum(radius, goal_away), np.maximum(away, 1e-9))
+    bearing, goal = (np.arctan2(v[:, 1], v[:, 0]) for v in (to_post, to_goal))
+    # The angle to turn about the disc, against the clock on its right.
+    turn = sign * (
+        np.arctan2(-to_post[:, 1], -to_post[:, 0]) - np.arctan2(from_post[:, 1], from_post[:, 0])
+    )
+    own, end = np.arccos(radius / away.clip(1e-9)), np.arccos(radius / goal_away.clip(1e-9))
+    free = np.abs(wrapped(turn)) <= own + end
+    # Inside of the disc the way leads out of it, the more so the deeper it is.
+    half = np.pi / 2 - own + np.minimum(deep, 0.5) * np.pi
+    direction = np.where(free, goal, bearing + sign * half)
+    legs = np.sqrt(away**2 - radius**2) + np.sqrt(goal_away**2 - radius**2)
+    around = radius * np.maximum(turn % (2 * np.pi) - own - end, 0.0)
+    return direction, np.where(free, far, legs + around)
+
+
+def turns_to(angle: np.ndarray, sense: np.ndarray) -> np.ndarray:
+    """Returns by how much to turn for headings that are off by angles (...) [rad].
+
+    A turn of more than a right angle goes the way of `sense` (...): 1 against the clock, -1 with it, 0 the
+    shorter way.
+    """
+    offset = sense * np.pi / 2
+    return wrapped(angle - offset) + offset
+
+
+class FieldTask(Task):
+    """A robot among round posts, which stand or move.
+
+    Its measurement (n, 5 + 5 K) is the pose x, y, heading [m, m, rad], x and y of the goal [m], and of each
+    post x, y [m], their velocities [m/s], and its radius [m]. The posts follow the tracks of `layouts`: the
+    state holds a clock, and the number of the layout.
+    """
+
+    inputs, input_units = ("forward_speed", "turn_rate"), ("m/s", "rad/s")
+    layouts: Layouts
+
+    @cached_property
+    def noisy(self) -> tuple[float, ...]:  # type: ignore[override]
+        return (1.0, 1.0, 0.5, 0.0, 0.0, *([0.0] * OF_POST * self.layouts.posts))
+
+    @cached_property
+    def body(self) -> float:
+        """Radius of the robot [m]."""
+        return float(mjcf.geom_size(self.model, "hull")[0])
+
+    @cached_property
+    def reached(self) -> float:
+        """Distance from the goal at which the robot has arrived [m]."""
+        return float(mjcf.numeric(self.model, "reached", 1)[0])
+
+    def measure(self, sensors: np.ndarray) -> np.ndarray:
+        clock, number = sensors[:, 3], np.rint(sensors[:, 4]).astype(int)
+        posts = np.empty((len(sensors), self.layouts.posts, OF_POST))
+        posts[..., :2] = self.layouts.positions(number, clock)
+        posts[..., 2:4] = self.layouts.velocities(number, clock)
+        posts[..., 4] = self.layouts.radii[number]
+        return np.hstack(
+            [sensors[:, :3], self.layouts.goals[number], posts.reshape(len(sensors), -1)]
+        )
+
+    def control(self, u: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        speed, heading = u[:, 0], qpos[:, 2]
+        ahead = speed * np.cos(heading), speed * np.sin(heading)
+        return np.stack([*ahead, u[:, 1], np.ones(len(u)), np.zeros(len(u))], axis=1)
+
+    def mocap(self, qpos: np.ndarray) -> np.ndarray:
+        flat = self.layouts.positions(np.rint(qpos[:, 4]).astype(int), qpos[:, 3])
+        return np.concatenate([flat, np.zeros_like(flat[..., :1])], axis=2)
+
+    def clearances(self, measured: np.ndarray) -> np.ndarray:
+        """Returns the distances (n, K) [m] of the robot's hull from the posts."""
+        posts = posts_of(measured)
+        return length(posts[..., :2] - measured[:, None, :2]) - posts[..., 4] - self.body
+
+    def to_goal(self, measured: np.ndarray) -> np.ndarray:
+        """Returns the ways (n, 2) from the robot to the goal [m]."""
+        return measured[:, 3:5] - measured[:, :2]
+
+    def ending(self, measurement: np.ndarray) -> np.ndarray:
+        ends = np.full(len(measurement), Outcome.RUNNING)
+        ends[length(self.to_goal(measurement)) <= self.reached] = Outcome.REACHED
+        ends[self.clearances(measurement).min(axis=1) <= 0] = Outcome.CRASHED
+        return ends
+
+    def verdict(self, measurement: np.ndarray) -> np.ndarray:
+        # A robot that waits because a post stands on the goal has done what it can.
+        return np.where(self.taken(measurement), Outcome.REACHED, Outcome.STALLED)
+
+    def taken(self, measurement: np.ndarray) -> np.ndarray:
+        """Returns (n,) bool: whether a post leaves no room at the goal."""
+        posts = posts_of(measurement)
+        away = length(posts[..., :2] - measurement[:, None, 3:5])
+        return np.asarray((away < posts[..., 4] + TAKEN).any(axis=1))
+
+    def danger(self, measurement: np.ndarray) -> np.ndarray:
+        return -self.clearances(measurement).min(axis=1)
+
+
+@register
+class Field(FieldTask):
+    name = "field"
+    description = "drive to a goal among posts, with policies trained on one (PPO)"
+    max_steps = 300
+    worst_reward = -8.0
+    start_low, start_high = (-4.0, -3.0, -np.pi), (3.0, 3.0, np.pi)
+    scene = Scene(
+        starts=tuple((-3.0, y, 0.0) for y in (-0.3, -0.1, 0.0, 0.1, 0.3)),
+        time=8.0,
+        mode_names=("left", "right"),
+    )
+    learning = Learning(
+        levels=5,
+        training={**PPO, "samples": 500_000, "learning_rate": 1e-3, "gamma": 0.98, "episode": 60},
+        modes={**PPO, "samples": 600_000, "learning_rate": 2e-3, "gamma": 0.99, "episode": 120},
+    )
+    mirror = Mirror((1, -1, 1, 1, -1, 1, 1, 1, -1, 1, -1, -1, 1, -1, -1, 1), (1, -1))
+    precision, close = 0.1, 0.1
+    observation_low = (-1.2,) * 16
+    observation_high = (1.2,) * 16
+    side: int | None = None
+
+    @cached_property
+    def chart(self) -> Chart:  # type: ignore[override]
+        return Chart(
+            ("along", "across", "heading"), ("m", "m", "rad"), self.start_low, self.start_high,
+            (False, False, True), scale=(1.0, 1.0, 0.5),
+        )  # fmt: skip
+
+    @cached_property
+    def layouts(self) -> Layouts:  # type: ignore[override]
+        """Layouts with one post, by the room that it needs; the usual one is the last."""
+        rng = np.random.default_rng(0)
+        radii = rng.uniform(*RADII, DRAWN)
+        distance = rng.uniform(*TO_GOAL, DRAWN)
+        on_goal = rng.uniform(-RADII[0] / 2, TO_GOAL[0], DRAWN)
+        distance = np.where(rng.random(DRAWN) < ON_GOAL, on_goal, distance)
+        speed = np.where(rng.random(DRAWN) < STANDING, 0.0, rng.uniform(0, FASTEST, DRAWN))
+        course = rng.uniform(-np.pi, np.pi, DRAWN)
+        # Some posts come towards the goal.
+        course = np.where(rng.random(DRAWN) < BLOCKING, rng.normal(0, 0.3, DRAWN), course)
+        order = np.argsort(radii + HEADWAY * speed)
+        radii, distance, speed, course = (x[order] for x in (radii, distance, speed, course))
+        radii[-1], distance[-1], speed[-1] = 0.5, 3.0, 0.0
+        first = np.stack([-radii - distance, np.zeros(DRAWN)], axis=1)
+        slope = speed[:, None] * np.stack([np.cos(course), np.sin(course)], axis=1)
+        tracks = np.stack([first, first + 100 * slope], axis=1)[:, :, None]
+        return Layouts(tracks, radii[:, None], np.zeros((DRAWN, 2)), interval=100.0)
+
+    @cached_property
+    def noisy(self) -> tuple[float, ...]:  # type: ignore[override]
+        return (*super().noisy, 0.0)
+
+    def measure(self, sensors: np.ndarray) -> np.ndarray:
+        # A mode is trained with both senses of turning, by turns.
+        sense = np.zeros(len(sensors))
+        if self.side is not None:
+            sense = 1 - 2 * (np.rint(sensors[:, 4]) % 2)
+        return np.hstack([super().measure(sensors), sense[:, None]])
+
+    def state(
+        self, z: np.ndarray, rng: np.random.Generator | None = None
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        number = np.full(len(z), DRAWN - 1)
+        if rng is not None:  # a post that leaves the robot room to act
+            fits = np.maximum(np.searchsorted(self._needs, length(z[:, :2]) - self.body - 0.05), 1)
+            number = (rng.random(len(z)) * fits).astype(int)
+        post = self.layouts.tracks[number, 0, 0]
+        nothing = np.zeros(len(z))
+        return np.column_stack([z[:, :2] + post, z[:, 2], nothing, number]), None
+
+    @cached_property
+    def _needs(self) -> np.ndarray:
+        """How far each layout's post reaches within a moment (F - 1,), growing [m]."""
+        speed = length(self.layouts.velocities(np.arange(DRAWN), np.zeros(DRAWN)))[:, 0]
+        return (self.layouts.radii[:, 0] + HEADWAY * speed)[:-1]
+
+    def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        z = super().starts(n, rng)
+        inside = length(z[:, :2]) < RADII[0] + self.body + 0.1
+        while inside.any():
+            z[inside] = super().starts(int(inside.sum()), rng)
+            inside = length(z[:, :2]) < RADII[0] + self.body + 0.1
+        return z
+
+    def z(self, measured: np.ndarray) -> np.ndarray:
+        axis, away = self._frame(measured)
+        turned = wrapped(measured[:, 2] - np.arctan2(axis[:, 1], axis[:, 0]))
+        along = (away * axis).sum(axis=1)
+        across = away[:, 1] * axis[:, 0] - away[:, 0] * axis[:, 1]
+        return np.stack([along, across, turned], axis=1)
+
+    def with_z(self, measured: np.ndarray, z: np.ndarray) -> np.ndarray:
+        (x, y), post = self._frame(measured)[0].T, measured[:, POSE : POSE + 2]
+        places = post + np.stack([z[:, 0] * x - z[:, 1] * y, z[:, 0] * y + z[:, 1] * x], axis=1)
+        return np.hstack([places, (z[:, 2] + np.arctan2(y, x))[:, None], measured[:, 3:]])
+
+    def _frame(self, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the direction (n, 2) from the post to the goal, and that (n, 2) to the robot [m]."""
+        post = measured[:, POSE : POSE + 2]
+        axis = measured[:, 3:5] - post
+        axis = axis / np.maximum(length(axis), 1e-9)[:, None]
+        return axis, measured[:, :2] - post
+
+    def where(self, measured: np.ndarray) -> np.ndarray:
+        return measured[:, :2]
+
+    def observation(self, measured: np.ndarray) -> np.ndarray:
+        heading, goal, post = measured[:, 2], self.to_goal(measured), posts_of(measured)[:, 0]
+        to_post = post[:, :2] - measured[:, :2]
+        directions, lengths = self.directions(measured)
+        left, right = (directions - heading[:, None]).T
+        turns = turns_to(directions - heading[:, None], measured[:, TURN : TURN + 1])
+        cos, sin = np.cos(heading), np.sin(heading)
+
+        def turned(v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return v[:, 0] * cos + v[:, 1] * sin, v[:, 1] * cos - v[:, 0] * sin
+
+        far, away = length(goal), length(to_post)
+        (goal_x, goal_y), (post_x, post_y) = turned(goal), turned(to_post)
+        speed_x, speed_y = turned(post[:, 2:4])
+        room = np.maximum(away - post[:, 4], 0.0)
+        columns = [
+            goal_x / np.maximum(far, 1e-6), goal_y / np.maximum(far, 1e-6), far / (0.5 + far),
+            post_x / np.maximum(away, 1e-6), post_y / np.maximum(away, 1e-6), room / (0.5 + room),
+            post[:, 4], speed_x, speed_y,
+            (np.cos(left) + np.cos(right)) / 2, (np.sin(left) + np.sin(right)) / 2,
+            (np.cos(left) - np.cos(right)) / 2, (np.sin(left) - np.sin(right)) / 2,
+            np.tanh(lengths[:, 0] - lengths[:, 1]),
+            (turns[:, 0] + turns[:, 1]) / 8, (turns[:, 0] - turns[:, 1]) / 8,
+        ]  # fmt: skip
+        return np.stack(columns, axis=1)
+
+    def directions(self, measurement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns directions (n, 2) [rad] and lengths (n, 2) [m] of the ways left and right of the post."""
+        post, goal = posts_of(measurement)[:, 0], self.to_goal(measurement)
+        to_post = post[:, :2] - measurement[:, :2]
+        radius = post[:, 4] + CLEAR
+        soon = np.clip(length(to_post) - radius, 0.0, PROJECTED)[:, None]
+        to_post = to_post + soon * post[:, 2:4]
+        ways = [way_round(to_post, goal, radius, side) for side in (LEFT, RIGHT)]
+        directions, lengths = zip(*ways, strict=True)
+        return np.stack(directions, axis=1), np.stack(lengths, axis=1)
+
+    def for_mode(self, mode: int) -> Self:
+        task = copy(self)
+        vars(task).update(side=mode, noisy=(*TRAINED, *self.noisy[len(TRAINED) :]))
+        return task
+
+    def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
+        directions, lengths = self.directions(measurement)
+        side = lengths.argmin(axis=1) if self.side is None else np.full(len(u), self.side)
+        direction = directions[np.arange(len(u)), side]
+        progress = np.maximum(u[:, 0], 0.0) * np.cos(direction - measurement[:, 2])
+        near = np.clip(1 - self.clearances(measurement).min(axis=1) / NEAR, 0.0, 1.0)
+        # What is behind the robot may be another post than the one that it knows of.
+        backward = REVERSE * np.maximum(-u[:, 0], 0.0)
+        turn = turns_to(direction - measurement[:, 2], measurement[:, TURN])
+        wrong = np.where(np.abs(turn) > np.pi / 2, np.maximum(-np.sign(turn) * u[:, 1], 0.0), 0.0)
+        # Where a post stands on the goal, waiting in front of it costs nothing.
+        waits = self.taken(measurement) & (self.clearances(measurement).min(axis=1) < WAITING)
+        base = np.where(waits, 0.0, progress - 1)
+        reward = base - WRONG * wrong - backward - GRAZING * near
+        return np.where(self.ending(measurement) == Outcome.CRASHED, CRASH, reward)
+
+    def arrived(self, z: np.ndarray) -> np.ndarray:
+        return np.ones(len(z), dtype=bool)  # episodes end there
+
+    def miss(self, z: np.ndarray) -> np.ndarray:
+        return np.zeros(len(z))

@@ -1,0 +1,78 @@
+"""Layouts of posts: where round posts stand or move, and where the goal is, for many fields at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+# Columns of a measurement before those of the posts: x, y, heading, and x and y of the goal. Columns of each
+# post: x, y, their velocities, and its radius.
+POSE, OF_POST = 5, 5
+# The column after a single post: the sense in which to turn round.
+TURN = POSE + OF_POST
+# Where the posts are that a field has fewer of than others: so far away that nothing depends on them [m].
+ABSENT = 1e3
+
+
+@dataclass(frozen=True)
+class Layouts:
+    """F fields with K posts each, which follow tracks.
+
+    Attributes:
+        tracks: (F, S, K, 2) positions of the posts at equally spaced times from 0 on [m]; the tracks are
+            straight in between, and end in standstill.
+        radii: (F, K) [m].
+        goals: (F, 2) [m].
+        interval: time between two positions of a track [s].
+    """
+
+    tracks: np.ndarray
+    radii: np.ndarray
+    goals: np.ndarray
+    interval: float = 1.0
+
+    @property
+    def posts(self) -> int:
+        """K, the number of posts of a field."""
+        return self.radii.shape[1]
+
+    def __len__(self) -> int:
+        return len(self.radii)
+
+    def positions(self, number: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """Returns the positions (n, K, 2) [m] of the posts of fields (n,) at times (n,) [s]."""
+        first, share, slope = self._segment(number, time)
+        return np.asarray(first + share[:, None, None] * slope)
+
+    def velocities(self, number: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """Returns the velocities (n, K, 2) [m/s] of the posts of fields (n,) from times (n,) [s] on."""
+        return self._segment(number, time)[2] / self.interval
+
+    def _segment(
+        self, number: np.ndarray, time: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns where segments of the tracks begin, what share of them is over, and where they lead."""
+        last = self.tracks.shape[1] - 1
+        # A clock that counts samples is off by its rounding errors.
+        at = np.maximum(time / self.interval, 0.0)
+        k = np.minimum((at + 1e-6).astype(int), last)
+        first = self.tracks[number, k]
+        return first, at - k, self.tracks[number, np.minimum(k + 1, last)] - first
+
+
+def posts_of(measured: np.ndarray) -> np.ndarray:
+    """Returns the posts (n, K, 5) of measurements (n, 5 + 5 K): x, y, their velocities, radius."""
+    posts = (measured.shape[1] - POSE) // OF_POST
+    return measured[:, POSE : POSE + OF_POST * posts].reshape(len(measured), posts, OF_POST)
+
+
+def only_post(measured: np.ndarray, post: np.ndarray) -> np.ndarray:
+    """Returns measurements (n, 10) without all posts but one each (n,)."""
+    return np.hstack([measured[:, :POSE], posts_of(measured)[np.arange(len(post)), post]])
+
+
+def length(vector: np.ndarray) -> np.ndarray:
+    """Returns the lengths (...) of vectors (..., 2)."""
+    x, y = vector[..., 0], vector[..., 1]
+    return np.asarray(np.sqrt(x * x + y * y))

@@ -1,0 +1,149 @@
+"""Fields: layouts of posts, the ways round them, and which post is in focus."""
+
+import numpy as np
+import pytest
+
+import hyrl_mj
+from hyrl_mj.fields import FocusController, decoded, encoded
+from hyrl_mj.fields.focus import Seen, choose
+from hyrl_mj.tasks import LEFT, RIGHT, Layouts
+from hyrl_mj.tasks.field import turns_to, way_round
+
+
+@pytest.fixture(scope="module")
+def field():
+    return hyrl_mj.get_task("field")
+
+
+def measured(pose, posts, goal=(0.0, 0.0)):
+    """Returns one measurement; the posts are (x, y, radius), or (x, y, vx, vy, radius)."""
+    full = [p if len(p) == 5 else (*p[:2], 0.0, 0.0, p[2]) for p in posts]
+    return np.array([[*pose, *goal, *np.ravel(full)]])
+
+
+def chosen(pose, posts, focus=-1, side=-1):
+    pair = choose(Seen.of(measured(pose, posts)), np.array([focus]), np.array([side]))
+    return int(pair.focus[0]), int(pair.side[0])
+
+
+def test_posts_follow_their_tracks():
+    tracks = np.array([[[[0.0, 0.0]], [[1.0, 0.0]], [[1.0, 2.0]]]])
+    layouts = Layouts(tracks, np.array([[0.5]]), np.zeros((1, 2)), interval=2.0)
+    times = np.array([0.0, 1.0, 2.0, 3.0, 9.0])
+    number = np.zeros(5, dtype=int)
+    places = layouts.positions(number, times)[:, 0]
+    np.testing.assert_allclose(places, [[0, 0], [0.5, 0], [1, 0], [1, 1], [1, 2]])
+    speeds = layouts.velocities(number, times)[:, 0]
+    np.testing.assert_allclose(speeds, [[0.5, 0], [0.5, 0], [0, 1], [0, 1], [0, 0]])
+
+
+def test_the_posts_of_the_plant_are_where_its_measurement_says(field):
+    plant, rng = field.plant(50), np.random.default_rng(0)
+    plant.set_state(*field.state(field.starts(50, rng), rng))
+    before = plant.measurement
+    for _ in range(20):
+        plant.step(np.tile([[0.5, 0.3]], (50, 1)))
+    after = plant.measurement
+    np.testing.assert_allclose(after[:, 5:7], before[:, 5:7] + before[:, 7:9], atol=1e-5)
+    seen = plant.geom_positions(list(field.obstacles.values()))[:, 0, :2]
+    np.testing.assert_allclose(seen, after[:, 5:7], atol=1e-6)
+
+
+def test_the_way_round_a_disc_is_the_shortest_on_its_side():
+    rng = np.random.default_rng(0)
+    robot, goal = rng.uniform(-4, 4, (2, 400, 2))
+    radius = rng.uniform(0.3, 0.9, 400)
+    away = np.minimum(*(np.linalg.norm(p, axis=1) for p in (robot, goal)))
+    robot, goal, radius = (x[away > radius + 0.05] for x in (robot, goal, radius))
+    both = [way_round(-robot, goal - robot, radius, side) for side in (LEFT, RIGHT)]
+    # A polygon around the disc, and the straight way if it is free.
+    t = np.linspace(0, 1, 2_000)[:, None, None]
+    straight = np.linalg.norm(robot + t * (goal - robot), axis=2).min(axis=0) >= radius
+    direct = np.linalg.norm(goal - robot, axis=1)
+    for direction, length in both:
+        np.testing.assert_allclose(length[straight], direct[straight])
+        assert (length[~straight] > direct[~straight]).all()
+        # A step along the way makes it shorter by its length.
+        ahead = robot + 1e-4 * np.stack([np.cos(direction), np.sin(direction)], axis=1)
+        side = LEFT if direction is both[0][0] else RIGHT
+        _, after = way_round(-ahead, goal - ahead, radius, side)
+        near = np.abs(length - after - 1e-4) < 1e-6
+        assert near.mean() > 0.99
+    ends = [np.array([-2.0, 0.0]), np.array([2.0, 0.0])]
+    (left, _), (right, _) = (
+        way_round(-ends[0][None], (ends[1] - ends[0])[None], np.array([1.0]), side)
+        for side in (LEFT, RIGHT)
+    )
+    assert (left[0], right[0]) == pytest.approx((np.pi / 6, -np.pi / 6))
+
+
+def test_a_sense_of_turning_holds_beyond_a_right_angle():
+    angles = np.array([0.5, -0.5, 2.5, -2.5, 3.1, -3.1])
+    turns = turns_to(angles, np.ones(6))
+    np.testing.assert_allclose(turns, [0.5, -0.5, 2.5, 2 * np.pi - 2.5, 3.1, 2 * np.pi - 3.1])
+    np.testing.assert_allclose(turns_to(angles, np.zeros(6)), angles)
+
+
+def test_the_post_that_blocks_the_way_first_is_in_focus():
+    posts = [(-2.0, 0.1, 0.5), (-4.0, 0.2, 0.5), (-3.0, 3.0, 0.5)]
+    assert chosen((-7.0, 0.0, 0.0), posts) == (1, RIGHT)
+    assert chosen((-7.0, 0.4, 0.0), posts) == (1, LEFT)
+    assert chosen((-3.0, 0.0, 0.0), posts) == (0, RIGHT)
+
+
+def test_posts_without_room_between_them_are_passed_on_the_same_side():
+    wall = [(-3.0, y, 0.5) for y in (-1.1, 0.0, 1.1, 2.2)]
+    # The way leads past an end of the wall, on which its last post is in focus.
+    assert chosen((-6.0, 0.3, 0.0), wall) == (0, RIGHT)
+    assert chosen((-6.0, 1.2, 0.0), wall) == (3, LEFT)
+    apart = [(x, 2 * y, r) for x, y, r in wall]
+    assert chosen((-6.0, 0.3, 0.0), apart)[0] == 1
+
+
+def test_noise_does_not_change_focus_and_side():
+    rng = np.random.default_rng(0)
+    posts = [(-2.0, 0.7, 0.5), (-2.0, -0.7, 0.5), (-4.0, 0.0, 0.5)]
+    for x in np.linspace(-6.0, -4.8, 5):
+        first = chosen((x, 0.0, 0.0), posts)
+        for noise in rng.uniform(-1, 1, (20, 3)) * (0.1, 0.1, 0.05):
+            assert chosen(np.array([x, 0.0, 0.0]) + noise, posts, *first) == first
+
+
+def test_modes_hold_focus_side_and_sense(field):
+    modes = np.arange(48)
+    np.testing.assert_array_equal(encoded(*decoded(modes)), modes)
+    focus, side, sense = decoded(modes)
+    assert set(focus) == set(range(12))
+    assert set(side) == {LEFT, RIGHT}
+    assert set(sense) == {1, -1}
+
+
+class Straight:
+    """Drives ahead, and remembers what it saw."""
+
+    def act(self, measured):
+        self.seen = measured
+        return np.tile([1.0, 0.0], (len(measured), 1))
+
+
+def test_a_policy_sees_the_post_in_focus_alone(field):
+    policies = {LEFT: Straight(), RIGHT: Straight()}
+    controller = FocusController(field, field, policies)
+    seen = measured((-7.0, 0.4, 0.0), [(-2.0, 0.1, 0.5), (-4.0, 0.2, 0.6)])
+    u, q = controller.step(controller.initial_mode(seen), seen)
+    focus, side, _ = decoded(q)
+    assert (focus[0], side[0]) == (1, LEFT)
+    np.testing.assert_allclose(policies[LEFT].seen[0, :10], [-7, 0.4, 0, 0, 0, -4, 0.2, 0, 0, 0.6])
+    np.testing.assert_allclose(u, [[1.0, 0.0]])
+
+
+def test_the_reward_of_a_mode_leads_its_own_way(field):
+    place = np.array([[-3.0, 0.0, 0.0, 0, 0, -1.5, 0, 0, 0, 0.5, 1.0]])
+    turned = np.array([0.5, -0.5])
+    seen = np.repeat(place, 2, axis=0)
+    seen[:, 2] = turned
+    u = np.tile([1.0, 0.0], (2, 1))
+    left, right = (field.for_mode(mode).reward(seen, u) for mode in (LEFT, RIGHT))
+    assert left[0] > left[1]
+    assert right[0] < right[1]
+    np.testing.assert_allclose(left, right[::-1])
