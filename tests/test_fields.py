@@ -118,6 +118,21 @@ def test_modes_hold_focus_side_and_sense(field):
     assert set(sense) == {1, -1}
 
 
+def test_an_unknown_mode_is_refused(field):
+    controller = FocusController(field, field, {LEFT: Straight(), RIGHT: Straight()})
+    with pytest.raises(hyrl_mj.BadInput, match="mode 4 is unknown"):
+        controller.step(np.array([4]), measured((-7.0, 0.4, 0.0), [(-2.0, 0.1, 0.5)]))
+
+
+class OfPosts:
+    """A field of K posts, as far as a controller asks for it."""
+
+    inputs = ("forward_speed", "turn_rate")
+
+    def __init__(self, posts):
+        self.layouts = Layouts(np.zeros((1, 1, posts, 2)), np.ones((1, posts)), np.zeros((1, 2)))
+
+
 class Straight:
     """Drives ahead, and remembers what it saw."""
 
@@ -128,7 +143,7 @@ class Straight:
 
 def test_a_policy_sees_the_post_in_focus_alone(field):
     policies = {LEFT: Straight(), RIGHT: Straight()}
-    controller = FocusController(field, field, policies)
+    controller = FocusController(OfPosts(2), field, policies)
     seen = measured((-7.0, 0.4, 0.0), [(-2.0, 0.1, 0.5), (-4.0, 0.2, 0.6)])
     u, q = controller.step(controller.initial_mode(seen), seen)
     focus, side, _ = decoded(q)

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from hyrl_mj.fields.focus import Seen, at, choose, turn_sense
-from hyrl_mj.policies import Policy
+from hyrl_mj.policies import Policy, check_modes
 from hyrl_mj.tasks import Field, FieldTask, only_post, wrapped
 
 # Modes of a post: two sides, with two senses of turning each.
@@ -44,8 +44,12 @@ class FocusController:
         return self._next(measured, nothing, nothing, np.zeros(len(measured)))[0]
 
     def step(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns inputs (n, m) and next modes (n,) for modes (n,) and measurements (n, p)."""
-        q_next, seen = self._next(measured, *decoded(q))
+        """Returns inputs (n, m) and next modes (n,) for modes (n,) and measurements (n, p).
+
+        Raises:
+            BadInput: a mode that the field does not have, or a measurement that is not finite.
+        """
+        q_next, seen = self._next(measured, *decoded(check_modes(q, self.modes)))
         _, side, _ = decoded(q_next)
         u = np.empty((len(q), len(self.task.inputs)))
         for number, policy in self.policies.items():

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hyrl_mj.tasks import CLEAR, LEFT, RIGHT, length, posts_of, wrapped
+from hyrl_mj.tasks import CLEAR, LEFT, PROJECTED, RIGHT, length, posts_of, wrapped
 
 # By how much the disc of the post in focus is wider than that of others: what keeps the focus [m].
 WIDER = 0.2
@@ -26,8 +26,6 @@ CLOSE, KEPT = 0.2, 0.15
 GLANCES, GLANCE = 4, 0.25
 # Where nothing blocks the way, the side changes when the post is so far on its other side [m].
 ASIDE = 0.35
-# The longest time over which moving posts are projected [s].
-PROJECTED = 2.0
 # A turn about less than this angle has a side of its own [rad].
 TURNED = 2.0
 

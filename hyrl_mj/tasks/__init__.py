@@ -10,7 +10,7 @@ from pkgutil import iter_modules
 from hyrl_mj.tasks.base import Task, at_levels
 from hyrl_mj.tasks.checks import check_task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
-from hyrl_mj.tasks.field import CLEAR, Field, FieldTask
+from hyrl_mj.tasks.field import CLEAR, PROJECTED, Field, FieldTask
 from hyrl_mj.tasks.guard import check_finite
 from hyrl_mj.tasks.layouts import Layouts, length, only_post, posts_of
 from hyrl_mj.tasks.obstacles import (
@@ -30,6 +30,7 @@ __all__ = [
     "ANY",
     "CLEAR",
     "LEFT",
+    "PROJECTED",
     "RIGHT",
     "SEARCHES",
     "Field",

@@ -335,13 +335,14 @@ class Field(FieldTask):
         side = lengths.argmin(axis=1) if self.side is None else np.full(len(u), self.side)
         direction = directions[np.arange(len(u)), side]
         progress = np.maximum(u[:, 0], 0.0) * np.cos(direction - measurement[:, 2])
-        near = np.clip(1 - self.clearances(measurement).min(axis=1) / NEAR, 0.0, 1.0)
+        clearance = self.clearances(measurement).min(axis=1)
+        near = np.clip(1 - clearance / NEAR, 0.0, 1.0)
         # What is behind the robot may be another post than the one that it knows of.
         backward = REVERSE * np.maximum(-u[:, 0], 0.0)
         turn = turns_to(direction - measurement[:, 2], measurement[:, TURN])
         wrong = np.where(np.abs(turn) > np.pi / 2, np.maximum(-np.sign(turn) * u[:, 1], 0.0), 0.0)
         # Where a post stands on the goal, waiting in front of it costs nothing.
-        waits = self.taken(measurement) & (self.clearances(measurement).min(axis=1) < WAITING)
+        waits = self.taken(measurement) & (clearance < WAITING)
         base = np.where(waits, 0.0, progress - 1)
         reward = base - WRONG * wrong - backward - GRAZING * near
         return np.where(self.ending(measurement) == Outcome.CRASHED, CRASH, reward)

@@ -11,8 +11,6 @@ import numpy as np
 POSE, OF_POST = 5, 5
 # The column after a single post: the sense in which to turn round.
 TURN = POSE + OF_POST
-# Where the posts are that a field has fewer of than others: so far away that nothing depends on them [m].
-ABSENT = 1e3
 
 
 @dataclass(frozen=True)
