@@ -8,6 +8,7 @@ from pathlib import Path
 
 from hyrl_mj import pipeline
 from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.fields import DriveOptions
 from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions, SweepOptions
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sweeps import DONE
@@ -233,6 +234,31 @@ def replay(
     print(f"{'picture' if out.suffix == '.png' else 'video'} at {out}")
 
 
+def drive(
+    run: Run,
+    *,
+    field: Path,
+    out: Path | None = None,
+    shown: tuple[int, ...] | None = None,
+    options: DriveOptions,
+    how: ReplayOptions,
+) -> None:
+    """Drive through a field of posts with the policy and with HyRL, and render it.
+
+    RUN is a run of the task field. Without --out nothing is written.
+
+    Args:
+        field: the JSON file of the field: goal, posts and starts.
+        out: the mp4 or gif to write, with its last frame as a png of the same name, or a png alone; by
+            default none.
+        shown: numbers of the starts to render, the first of them in the png; by default all, one after the
+            other.
+    """
+    from hyrl_mj.viz import drives
+
+    drives.drive_run(run, field, options, out, how, shown)
+
+
 def view(run: Run, *, arc: str = "critical_hyrl_q0", port: int = 0) -> None:
     """Replay an arc in MuJoCo's viewer, or in a browser where there is no display.
 
@@ -308,6 +334,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "simulate": simulate,
     "figures": stage_command("figures", "Draw the paper's figures of a run again, as PNG and PDF."),
     "replay": replay,
+    "drive": drive,
     "view": view,
     "report": report,
     "export": export,

@@ -16,7 +16,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
-LANGUAGES = ("bash", "python", "toml")
+LANGUAGES = ("bash", "python", "toml", "json")
 # Settings of the runs of a sweep, which are made in processes that `shorten` does not reach.
 TINY = {"stage1.samples": 4096, "stage6.samples": 4096, "lattice": 130, "cells": 240}
 # Python that would train for a minute.
@@ -122,8 +122,14 @@ def instead(words: list[str]) -> bool:
         case ["python", script, *options] if script in TESTED:  # minutes
             text = (ROOT / script).read_text(encoding="utf-8")
             assert all(f'"{option}"' in text for option in options if option.startswith("--"))
+        case ["hyrl-mj", "drive", _, "--field", file, *_]:  # it needs a field that was trained
+            from hyrl_mj.fields import cautions, check_passable, read_field
+
+            field = read_field(file)
+            check_passable(field, 0.1)
+            assert cautions(field, 0.1) == []
         # A minute, even with preset smoke.
-        case ["hyrl-mj", "run", "rover" | "quadrotor" | "slalom" as task, *_]:
+        case ["hyrl-mj", "run", "field" | "rover" | "quadrotor" | "slalom" as task, *_]:
             from hyrl_mj import task_names
 
             assert task in task_names()
@@ -176,6 +182,8 @@ def run(page: Path) -> None:
             for long, short in SHORTER.items():
                 text = text.replace(long, short)
             exec(compile("\n" * (block.line - 1) + text, block.page, "exec"), space)
+        elif block.language == "json":
+            Path("field.json").write_text(block.text)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,16 @@
 """Fields: layouts of posts, the ways round them, and which post is in focus."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import hyrl_mj
-from hyrl_mj.fields import FocusController, decoded, encoded
+from hyrl_mj.fields import Driving, FocusController, decoded, encoded
 from hyrl_mj.fields.focus import Seen, choose
-from hyrl_mj.tasks import LEFT, RIGHT, Layouts
+from hyrl_mj.fields.guard import guarded, speed_bounds
+from hyrl_mj.simulation import LoopSettings, Noise, Recorded, closed_loop
+from hyrl_mj.tasks import LEFT, RIGHT, Layouts, Outcome
 from hyrl_mj.tasks.field import turns_to, way_round
 
 
@@ -22,7 +26,7 @@ def measured(pose, posts, goal=(0.0, 0.0)):
 
 
 def chosen(pose, posts, focus=-1, side=-1):
-    pair = choose(Seen.of(measured(pose, posts)), np.array([focus]), np.array([side]))
+    pair = choose(Seen.of(measured(pose, posts)), np.array([focus]), np.array([side]), 0.28)
     return int(pair.focus[0]), int(pair.side[0])
 
 
@@ -118,38 +122,107 @@ def test_modes_hold_focus_side_and_sense(field):
     assert set(sense) == {1, -1}
 
 
-def test_an_unknown_mode_is_refused(field):
-    controller = FocusController(field, field, {LEFT: Straight(), RIGHT: Straight()})
-    with pytest.raises(hyrl_mj.BadInput, match="mode 4 is unknown"):
-        controller.step(np.array([4]), measured((-7.0, 0.4, 0.0), [(-2.0, 0.1, 0.5)]))
-
-
-class OfPosts:
-    """A field of K posts, as far as a controller asks for it."""
-
-    inputs = ("forward_speed", "turn_rate")
-
-    def __init__(self, posts):
-        self.layouts = Layouts(np.zeros((1, 1, posts, 2)), np.ones((1, posts)), np.zeros((1, 2)))
-
-
 class Straight:
     """Drives ahead, and remembers what it saw."""
 
-    def act(self, measured):
-        self.seen = measured
-        return np.tile([1.0, 0.0], (len(measured), 1))
+    def inputs(self, observation):
+        self.seen = observation
+        return np.tile([1.0, 0.0], (len(observation), 1))
+
+
+def drive_of(field, posts, goal=(0.0, 0.0), **options):
+    """A field of standing posts (x, y, radius), as a task."""
+    posts = np.array(posts, dtype=float)
+    layouts = Layouts(posts[None, None, :, :2], posts[None, :, 2], np.array([goal]))
+    return Driving(field, layouts, **options)
+
+
+def straight(field, posts, noise=0.1, **options):
+    """A controller of such a task, with policies that drive ahead."""
+    task = drive_of(field, posts, **options)
+    return FocusController(task, field, {LEFT: Straight(), RIGHT: Straight()}, noise)
+
+
+def test_wrong_modes_and_measurements_are_refused(field):
+    controller = straight(field, [(-2.0, 0.1, 0.5)])
+    seen = measured((-7.0, 0.4, 0.0), [(-2.0, 0.1, 0.5)])
+    with pytest.raises(hyrl_mj.BadInput, match="mode 4 is unknown"):
+        controller.step(np.array([4]), seen)
+    with pytest.raises(hyrl_mj.BadInput, match="shape"):
+        controller.step(np.array([0]), seen[:, :9])
+    with pytest.raises(hyrl_mj.BadInput, match="finite"):
+        controller.initial_mode(np.full_like(seen, np.nan))
 
 
 def test_a_policy_sees_the_post_in_focus_alone(field):
-    policies = {LEFT: Straight(), RIGHT: Straight()}
-    controller = FocusController(OfPosts(2), field, policies)
-    seen = measured((-7.0, 0.4, 0.0), [(-2.0, 0.1, 0.5), (-4.0, 0.2, 0.6)])
+    posts = [(-2.0, 0.1, 0.5), (-4.0, 0.2, 0.6)]
+    controller = straight(field, posts)
+    seen = measured((-7.0, 0.4, 0.0), posts)
     u, q = controller.step(controller.initial_mode(seen), seen)
-    focus, side, _ = decoded(q)
+    focus, side, sense = decoded(q)
     assert (focus[0], side[0]) == (1, LEFT)
-    np.testing.assert_allclose(policies[LEFT].seen[0, :10], [-7, 0.4, 0, 0, 0, -4, 0.2, 0, 0, 0.6])
+    alone = np.hstack([measured((-7.0, 0.4, 0.0), posts[1:]), sense[:, None]])
+    np.testing.assert_allclose(controller.policies[LEFT].seen, field.observation(alone))
     np.testing.assert_allclose(u, [[1.0, 0.0]])
+
+
+def test_the_first_side_can_be_chosen(field):
+    posts = [(-2.0, 0.1, 0.5), (-4.0, 0.2, 0.6)]
+    seen = measured((-7.0, 0.4, 0.0), posts)
+    for side in (LEFT, RIGHT):
+        q = straight(field, posts).on_side(side).initial_mode(seen)
+        focus, chosen_side, _ = decoded(q)
+        assert (focus[0], chosen_side[0]) == (1, side)
+
+
+def test_the_guard_keeps_robots_off_posts_whatever_the_noise(field):
+    rng, noise = np.random.default_rng(0), 0.1
+    posts = [(-2.0, 0.0, 0.5), (0.0, 1.7, 0.9), (0.3, -1.4, 0.3), (-3.0, 2.0, 0.4)]
+    controller = straight(field, posts, noise)
+    task, n = controller.task, 400
+    z = np.column_stack([rng.uniform(-4, 2, (4 * n, 2)), rng.uniform(-np.pi, np.pi, 4 * n)])
+    places = np.array(posts)
+    room = np.linalg.norm(z[:, None, :2] - places[:, :2], axis=2) - places[:, 2]
+    z = z[room.min(axis=1) > 0.3][:n]
+    for kind in ("uniform", "alternating", "bias"):
+        settings = LoopSettings(quiet=True)
+        given = Noise(kind, noise) if kind != "bias" else away_from(task, z, places, noise)
+        run = closed_loop(task, controller, z, given, settings=settings)
+        assert not (run.outcome == Outcome.CRASHED).any()
+    free = replace(controller, noise=-10.0)
+    run = closed_loop(task, free, z, None, settings=LoopSettings(quiet=True))
+    assert (run.outcome == Outcome.CRASHED).sum() > n / 8
+
+
+def away_from(task, z, places, noise):
+    """Returns noise that always shows the robot farther from the post ahead of it than it is."""
+    heading = np.stack([np.cos(z[:, 2]), np.sin(z[:, 2])], axis=1)
+    signal = np.zeros((task.max_steps, len(z), task.measurement_columns))
+    signal[:, :, :2] = -noise * np.sign(heading)
+    return Recorded(signal, noise, "bias")
+
+
+def test_between_two_posts_that_are_too_near_a_robot_stands(field):
+    seen = Seen.of(measured((0, 0, 0.0), [(0.6, 0.3, 0.4), (0.6, -0.3, 0.4)]))
+    least, most = speed_bounds(seen, 0.1, 0.15, -1.0, 1.0)
+    assert most[0] == 0
+    assert least[0] < 0
+    u = guarded(np.array([[1.0, -1.0]]), np.array([0.1]), np.array([1]), 1.0, (least, most))
+    np.testing.assert_allclose(u, [[0.0, -1.0]])
+
+
+def test_a_robot_with_its_back_to_its_way_turns_round(field):
+    free = np.array([-1.0]), np.array([1.0])
+    u = guarded(np.array([[0.5, -1.0]]), np.array([-3.0]), np.array([1]), 1.0, free)
+    np.testing.assert_allclose(u, [[0.0, 1.0]])
+    ahead = guarded(np.array([[-1.0, 0.2]]), np.array([0.0]), np.array([1]), 1.0, free)
+    np.testing.assert_allclose(ahead, [[0.3, 0.2]])
+
+
+def test_a_robot_retreats_from_a_post_that_comes(field):
+    seen = Seen.of(measured((0, 0, 0.0), [(0.8, 0.0, -0.4, 0.0, 0.5)]))
+    _, most = speed_bounds(seen, 0.1, 0.1, -1.0, 1.0)
+    assert -0.5 < most[0] < 0
 
 
 def test_the_reward_of_a_mode_leads_its_own_way(field):

@@ -6,14 +6,14 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from runpy import run_path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from hyrl_mj import artifacts
 from hyrl_mj.errors import BadInput, brief, unknown
 from hyrl_mj.export.source import write_function
-from hyrl_mj.policies import ACTIVATIONS, MlpPolicy
+from hyrl_mj.policies import ACTIVATIONS, Controller, MlpPolicy
 from hyrl_mj.sets import Cloud, Everything, Grid, GridSet, StateSet
 from hyrl_mj.stages import ON_EDGE, HybridController
 from hyrl_mj.tasks import Task
@@ -23,18 +23,31 @@ if TYPE_CHECKING:
     import onnx
 
 TEMPLATE = Path(__file__).parents[1] / "templates" / "controller.py"
-# The task's part of the template begins and ends with these.
+# The task's part of the template begins and ends with these; the rest of a controller that is no
+# `HybridController` begins where the template's own does.
 BEGIN, END = "# ---- the task", "# ---- the controller\n"
+REST = "LOW, SIDES, PERIODIC ="
 # Sizes of the batches on which an exported form is compared with the controller; the share of rows in which
 # rounding may decide differently between two levels or modes; the allowed error of other inputs [share of
 # their range].
 CHECKED, TIES, CLOSE = (1, 7, 1000), 0.002, 1e-5
 # The signed distance of a set without an edge: deeper than any other, and finite.
 DEEPEST = -1e300
+
+
+class Traceable(Controller, Protocol):
+    """A controller whose step is written in NumPy's functions of arrays, such as `FocusController`."""
+
+    task: Task
+
+    def answer(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Does `step` without checks and branches, in the initial mode where q (n,) is -1."""
+
+
 Step = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
-def export_numpy(controller: HybridController, folder: str | Path) -> list[Path]:
+def export_numpy(controller: HybridController | Traceable, folder: str | Path) -> list[Path]:
     """Writes a controller as controller.py and controller.npz, which need NumPy alone; returns their paths.
 
     The module has `step(q, measured) -> (u, q_next)` and `initial_mode(measured)`, as the controller does.
@@ -60,7 +73,7 @@ def export_numpy(controller: HybridController, folder: str | Path) -> list[Path]
     return [folder / source.name for source in written]
 
 
-def export_onnx(controller: HybridController, path: str | Path) -> Path:
+def export_onnx(controller: HybridController | Traceable, path: str | Path) -> Path:
     """Writes a controller as one ONNX file, and returns its path: modes, sets and the jump rule in one graph.
 
     Its inputs are q (n,) int64 and measured (n, p) float64, its outputs u (n, m) float64 and q_next (n,)
@@ -76,7 +89,9 @@ def export_onnx(controller: HybridController, path: str | Path) -> Path:
             onnxruntime are missing.
     """
     path = Path(path)
-    sets = [*controller.flow_sets.values(), *(controller.starts or {}).values()]
+    sets: list[StateSet] = []
+    if isinstance(controller, HybridController):
+        sets = [*controller.flow_sets.values(), *(controller.starts or {}).values()]
     if any(isinstance(s, GridSet) and isinstance(s.grid, Cloud) for s in sets):
         raise BadInput(
             f"the sets of {controller.task.name} lie on scattered nodes, which an ONNX graph does not "
@@ -112,7 +127,7 @@ def export_onnx(controller: HybridController, path: str | Path) -> Path:
 FORMS: dict[str, Callable[..., Any]] = {"onnx": export_onnx, "numpy": export_numpy}
 
 
-def export(controller: HybridController, form: str, out: Path) -> None:
+def export(controller: HybridController | Traceable, form: str, out: Path) -> None:
     """Writes a controller in one of `FORMS`.
 
     Raises:
@@ -123,17 +138,41 @@ def export(controller: HybridController, form: str, out: Path) -> None:
     FORMS[form](controller, out)
 
 
-def _write(controller: HybridController, folder: Path) -> tuple[Path, Path]:
+def _write(controller: HybridController | Traceable, folder: Path) -> tuple[Path, Path]:
     """Writes controller.py and controller.npz."""
-    networks = [_network(controller, q) for q in controller.modes]
-    arrays = _arrays(controller, networks)
     text = TEMPLATE.read_text(encoding="utf-8")
-    begin, end = text.index(BEGIN), text.index(END)
-    task_part = _task_part(controller.task, networks, arrays)
+    begin, end, rest = text.index(BEGIN), text.index(END), text.index(REST)
+    if isinstance(controller, HybridController):
+        networks = [_network(controller, q) for q in controller.modes]
+        arrays = _arrays(controller, networks)
+        text = text[:begin] + _task_part(controller.task, networks, arrays) + text[end:]
+    else:
+        arrays = {"modes": np.array(controller.modes, dtype=np.int64)}
+        task_part = _constants(controller.task) + "\n\n\n"
+        text = text[:begin] + task_part + text[end:rest] + _traced_step(controller, arrays)
     path = folder / TEMPLATE.name
-    path.write_text(text[:begin] + task_part + text[end:], encoding="utf-8")
+    path.write_text(text, encoding="utf-8")
     artifacts.write_arrays(path.with_suffix(".npz"), arrays, kind="controller")
     return path, path.with_suffix(".npz")
+
+
+def _traced_step(controller: Traceable, arrays: dict[str, np.ndarray]) -> str:
+    """Returns the function `answer` of a controller that is written in NumPy's functions of arrays."""
+    task, rng = controller.task, np.random.default_rng(0)
+    q, measured = rng.choice((*controller.modes, -1), BATCH), _measurements(task, BATCH, rng)
+    what = f"the controller of {task.name}"
+    answer = trace(controller.answer, {"q": q, "measured": measured}, what)
+    sentence = "Does `step` without checks; where q is -1, begins in the initial mode."
+    finite = """
+
+
+def answer(q, measured):
+    \"""Does `moves`. Where a measurement is not finite, q stays and u is NaN.\"""
+    finite = np.isfinite(measured).all(axis=1)
+    u, q_next = moves(q, np.where(finite[:, None], measured, 0.0))
+    return np.where(finite[:, None], u, np.nan), np.where(finite, q_next, q)
+"""
+    return write_function("moves", sentence, answer, arrays) + finite
 
 
 def _network(controller: HybridController, q: int) -> MlpPolicy:
@@ -194,23 +233,14 @@ def _grid_set(state_set: StateSet, task: Task, what: str) -> GridSet:
 
 def _task_part(task: Task, networks: list[MlpPolicy], arrays: dict[str, np.ndarray]) -> str:
     """Returns the task's part of the template; large constants go to `arrays`."""
-    units = task.input_units or ("",) * len(task.inputs)
-    inputs = tuple(f"{i} [{u}]" if u else i for i, u in zip(task.inputs, units, strict=True))
     activations = [network.activation for network in networks]
     measured = {"measured": _measurements(task, BATCH, np.random.default_rng(0))}
     x = {"x": np.linspace(-3, 3, BATCH, dtype=np.float32)[:, None]}
     z = trace(task.z, measured, f"the method z of {task.name}")
     observation = trace(task.observation, measured, f"the method observation of {task.name}")
-    constants = [
-        f"{BEGIN} {task.name}",
-        f"TASK = {task.name!r}",
-        f"SAMPLE_TIME = {task.dt!r}  # [s]",
-        f"MEASUREMENT_COLUMNS = {task.measurement_columns}",
-        f"INPUTS = {inputs!r}",
-        f"OUTPUTS = {tuple(network.output for network in networks)!r}",
-    ]
+    outputs = f"OUTPUTS = {tuple(network.output for network in networks)!r}"
     parts = [
-        "\n".join(constants),
+        f"{_constants(task)}\n{outputs}",
         write_function("chart_point", "Returns chart points (n, d).", z, arrays),
         write_function("observation", "Returns observations (n, k).", observation, arrays),
     ]
@@ -220,7 +250,20 @@ def _task_part(task: Task, networks: list[MlpPolicy], arrays: dict[str, np.ndarr
     return "\n\n\n".join([*parts, f"ACTIVATIONS = [{', '.join(activations)}]\n\n"])
 
 
-def _graph(controller: HybridController, module: dict[str, Any]) -> onnx.ModelProto:
+def _constants(task: Task) -> str:
+    units = task.input_units or ("",) * len(task.inputs)
+    inputs = tuple(f"{i} [{u}]" if u else i for i, u in zip(task.inputs, units, strict=True))
+    lines = [
+        f"{BEGIN} {task.name}",
+        f"TASK = {task.name!r}",
+        f"SAMPLE_TIME = {task.dt!r}  # [s]",
+        f"MEASUREMENT_COLUMNS = {task.measurement_columns}",
+        f"INPUTS = {inputs!r}",
+    ]
+    return "\n".join(lines)
+
+
+def _graph(controller: HybridController | Traceable, module: dict[str, Any]) -> onnx.ModelProto:
     """Returns the function `answer` of an exported controller.py, a namespace, as a graph."""
     from hyrl_mj.export.graph import write_graph
 
@@ -244,7 +287,7 @@ def _measurements(task: Task, n: int, rng: np.random.Generator) -> np.ndarray:
     return plant.measurement + rng.uniform(-0.1, 0.1, (n, task.measurement_columns))
 
 
-def _check(controller: HybridController, step: Step, form: str) -> None:
+def _check(controller: HybridController | Traceable, step: Step, form: str) -> None:
     """Raises `BadInput` where a form does not do what the controller does."""
     task, rng, wrong = controller.task, np.random.default_rng(1), 0
     refusal = (

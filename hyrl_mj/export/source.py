@@ -29,11 +29,11 @@ def write_function(
     Args:
         name: the name of the function.
         sentence: its docstring.
-        program: with one input and one output.
+        program: its inputs are the arguments; with several outputs the function returns a tuple.
         arrays: receives constants that are too large for a line, under names that begin with `name`.
     """
-    (argument,), (result,) = program.inputs, program.outputs
-    names = {argument: argument.operands[0]}
+    arguments = [argument.operands[0] for argument in program.inputs]
+    names = dict(zip(program.inputs, arguments, strict=True))
 
     def write(x: Any) -> str:
         if isinstance(x, Operation):
@@ -46,12 +46,13 @@ def write_function(
 
     body, operations = [], program.operations()
     if any(BATCH in operation.options.get("shape", ()) for operation in operations):
-        body.append(f"n = len({argument.operands[0]})")
+        body.append(f"n = len({arguments[0]})")
     for number, operation in enumerate(operations):
         body.append(f"v{number} = {_expression(operation, write)}")
         names[operation] = f"v{number}"
-    head = [f"def {name}({argument.operands[0]}):", f'"""{sentence}"""']
-    return "\n    ".join([*head, *body, f"return {names[result]}"])
+    head = [f"def {name}({', '.join(arguments)}):", f'"""{sentence}"""']
+    results = ", ".join(names[result] for result in program.outputs)
+    return "\n    ".join([*head, *body, f"return {results}"])
 
 
 def _expression(operation: Operation, write: Callable[[Any], str]) -> str:

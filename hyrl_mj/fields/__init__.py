@@ -1,5 +1,36 @@
 """Fields: a controller that passes any number of posts, with two policies that were trained on one."""
 
-from hyrl_mj.fields.controller import FocusController, decoded, encoded
+from hyrl_mj.fields.controller import FocusController, controllers
+from hyrl_mj.fields.drives import (
+    DriveOptions,
+    Drives,
+    changes,
+    drive,
+    ending,
+    least_clearance,
+    noise_cautions,
+)
+from hyrl_mj.fields.driving import Driving, Shares
+from hyrl_mj.fields.files import FieldFile, read_field
+from hyrl_mj.fields.modes import decoded, encoded
+from hyrl_mj.fields.survey import cautions, check_passable
 
-__all__ = ["FocusController", "decoded", "encoded"]
+__all__ = [
+    "DriveOptions",
+    "Drives",
+    "Driving",
+    "FieldFile",
+    "FocusController",
+    "Shares",
+    "cautions",
+    "changes",
+    "check_passable",
+    "controllers",
+    "decoded",
+    "drive",
+    "encoded",
+    "ending",
+    "least_clearance",
+    "noise_cautions",
+    "read_field",
+]

@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from hyrl_mj.fields.focus import Seen, at, choose, turn_sense
-from hyrl_mj.policies import Policy, check_modes
-from hyrl_mj.tasks import Field, FieldTask, only_post, wrapped
+from hyrl_mj.fields.driving import Driving
+from hyrl_mj.fields.focus import Seen, choose, turn_sense
+from hyrl_mj.fields.guard import guarded, margin, speed_bounds
+from hyrl_mj.fields.modes import MODES_OF_POST, NO_MODE, decoded, encoded
+from hyrl_mj.policies import (
+    Controller,
+    ObservationPolicy,
+    PolicyController,
+    check_modes,
+)
+from hyrl_mj.tasks import LEFT, RIGHT, Field, FieldTask, only_post, wrapped
 
-# Modes of a post: two sides, with two senses of turning each.
-MODES_OF_POST = 4
+# The swing of measurements without noise: decisions must not follow rounding errors [m].
+LEAST_SWING = 0.1
 
 
 @dataclass(frozen=True)
@@ -27,59 +35,116 @@ class FocusController:
         task: the field.
         local: the task on which the policies were trained.
         policies: the policy of each side.
+        noise: largest error of a measured coordinate [m] that the guard keeps away from posts for.
+        first_side: the side on which the first post in focus is passed; None for the shorter way.
     """
 
     task: FieldTask
     local: Field
-    policies: Mapping[int, Policy]
+    policies: Mapping[int, ObservationPolicy]
+    noise: float
+    first_side: int | None = None
 
     @cached_property
     def modes(self) -> tuple[int, ...]:
         """The modes, in ascending order."""
         return tuple(range(MODES_OF_POST * self.task.layouts.posts))
 
+    @cached_property
+    def swing(self) -> float:
+        """How far two measurements of the same place can be from each other [m], or a little more."""
+        return max(2 * float(np.sqrt(2.0)) * self.noise, LEAST_SWING)
+
+    @cached_property
+    def speeds(self) -> tuple[float, float]:
+        """Limits of the forward speed [m/s]."""
+        low, high = self.task.input_limits
+        return float(low[0]), float(high[0])
+
+    def on_side(self, side: int) -> FocusController:
+        """Returns this controller with the side on which it passes the first post in focus."""
+        return replace(self, first_side=side)
+
     def initial_mode(self, measured: np.ndarray) -> np.ndarray:
-        """Returns the modes (n,) to start in, from the first measurements (n, p)."""
-        nothing = np.full(len(measured), -1)
-        return self._next(measured, nothing, nothing, np.zeros(len(measured)))[0]
+        """Returns the modes (n,) to start in, from the first measurements (n, p).
+
+        Raises:
+            BadInput: a wrong shape, or a measurement that is not finite.
+        """
+        measured = self.task.check_measurement(measured)
+        return self.answer(np.full(len(measured), NO_MODE), measured)[1]
 
     def step(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns inputs (n, m) and next modes (n,) for modes (n,) and measurements (n, p).
 
         Raises:
-            BadInput: a mode that the field does not have, or a measurement that is not finite.
+            BadInput: a mode that the field does not have, a wrong shape, or a measurement that is not finite.
         """
-        q_next, seen = self._next(measured, *decoded(check_modes(q, self.modes)))
-        _, side, _ = decoded(q_next)
-        u = np.empty((len(q), len(self.task.inputs)))
-        for number, policy in self.policies.items():
-            rows = side == number
-            if rows.any():
-                u[rows] = policy.act(seen[rows])
-        return u, q_next
+        return self.answer(check_modes(q, self.modes), self.task.check_measurement(measured))
 
-    def _next(
-        self, measured: np.ndarray, focus: np.ndarray, side: np.ndarray, sense: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the modes (n,) after those of before, and what the policies see (n, 11)."""
-        pair = choose(Seen.of(measured), focus, side)
-        view = alone(measured, pair.focus, sense)
-        directions, _ = self.local.directions(view)
-        turn = wrapped(at(directions, pair.side) - measured[:, 2])
-        view[:, -1] = turn_sense(turn, sense)
-        return encoded(pair.focus, pair.side, view[:, -1]), view
+    def answer(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Does `step` without checks and without branches, so that it can be exported.
 
-
-def alone(measured: np.ndarray, focus: np.ndarray, sense: np.ndarray) -> np.ndarray:
-    """Returns measurements (n, 11) of the posts in focus (n,) alone, with senses of turning (n,)."""
-    return np.hstack([only_post(measured, focus), sense[:, None]])
-
-
-def encoded(focus: np.ndarray, side: np.ndarray, sense: np.ndarray) -> np.ndarray:
-    """Returns the modes (n,) of posts in focus (n,), sides (n,) and senses of turning (n,)."""
-    return MODES_OF_POST * focus + 2 * side + (sense < 0)
+        The mode -1 stands for none: the answer begins in the initial mode.
+        """
+        seen, (focus, side, sense) = Seen.of(measured), decoded(q)
+        pair = choose(seen, focus, side, self.swing, margin(self.task.body, self.noise))
+        side = pair.side
+        if self.first_side is not None:
+            side = np.where(q < 0, self.first_side, side)
+        view = only_post(measured, pair.focus)
+        directions, lengths = self.local.directions(view)
+        direction = np.where(side == LEFT, directions[:, 0], directions[:, 1])
+        turn = wrapped(direction - view[:, 2])
+        sense = turn_sense(turn, sense)
+        view = np.hstack([view, sense[:, None]])
+        observed = self.local.observed(view, directions, lengths)
+        left, right = (self.policies[number].inputs(observed) for number in (LEFT, RIGHT))
+        u = np.where((side == LEFT)[:, None], left, right)
+        bounds = speed_bounds(seen, self.task.body, self.noise, *self.speeds)
+        u = guarded(u, turn, sense, float(self.task.input_limits[1][1]), bounds)
+        return u, encoded(pair.focus, side, sense)
 
 
-def decoded(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns focus (n,), side (n,) and sense of turning (n,) of modes (n,)."""
-    return q // MODES_OF_POST, q // 2 % 2, 1 - 2 * (q % 2)
+@dataclass(frozen=True)
+class WithoutMemory:
+    """A policy that was trained on one post, in a field: it sees the post that would be in focus at first.
+
+    Attributes:
+        task: the field.
+        local: the task on which the policy was trained.
+        policy: such as the stage-1 policy.
+    """
+
+    task: FieldTask
+    local: Field
+    policy: ObservationPolicy
+
+    def act(self, measured: np.ndarray) -> np.ndarray:
+        """Returns inputs (n, m) for measurements (n, p).
+
+        Raises:
+            BadInput: a wrong shape, or a measurement that is not finite.
+        """
+        measured = self.task.check_measurement(measured)
+        nothing = np.full(len(measured), -1)
+        view = only_post(measured, choose(Seen.of(measured), nothing, nothing).focus)
+        return self.policy.inputs(
+            self.local.observation(np.hstack([view, np.zeros_like(view[:, :1])]))
+        )
+
+
+def controllers(
+    task: Driving,
+    policy: ObservationPolicy,
+    policies: Mapping[int, ObservationPolicy],
+    noise: float,
+) -> dict[str, Controller]:
+    """Returns the controllers of a field by name: the stage-1 policy alone, and the hybrid controller.
+
+    The noise [m] is what the hybrid controller has to bear.
+    """
+    return {
+        "policy": PolicyController(WithoutMemory(task, task.local, policy)),
+        "hyrl": FocusController(task, task.local, policies, noise),
+    }

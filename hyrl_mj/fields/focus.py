@@ -6,33 +6,38 @@ The way to the goal bends around the posts that block it. The focus is the post 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from hyrl_mj.tasks import CLEAR, LEFT, PROJECTED, RIGHT, length, posts_of, wrapped
 
-# By how much the disc of the post in focus is wider than that of others: what keeps the focus [m].
-WIDER = 0.2
 # Posts that leave less room between them than this are one obstacle [m].
 ROOM = 0.3
 # How many posts the way may bend around one after the other before the focus is found.
 BENDS = 4
-# Where nothing blocks the way, a post that is this near comes into focus, if it is so much nearer than the
-# one in focus [m].
-NEARBY, NEARER = 0.7, 0.45
-# A robot at full speed comes so close to a post, within the next second, before the post takes the focus; and
-# the post that has it keeps it for so much longer [m].
-CLOSE, KEPT = 0.2, 0.15
+# Where nothing blocks the way, a post that is this near comes into focus [m].
+NEARBY = 0.7
+# A robot at full speed comes so close to a post, within the next second, before the post takes the focus [m].
+CLOSE = 0.3
 GLANCES, GLANCE = 4, 0.25
-# Where nothing blocks the way, the side changes when the post is so far on its other side [m].
-ASIDE = 0.35
+# The guard holds a robot back that is less than this farther from a post than its margin, and heads for it:
+# the cosine of the angle between its heading and the post's direction is greater than this [m], [1].
+HOLDING, AHEAD = 0.05, 0.0
+# Obstacles are followed over 2 to the power of this many posts.
+LINKS = 4
 # A turn about less than this angle has a side of its own [rad].
 TURNED = 2.0
 
 
-def at(values: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Returns values (n, K, ...) at indices (n,): (n, ...)."""
-    return values[np.arange(len(index)), index]
+def pick(values: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Returns those values (n, K, ...) (n, ...) of which own (n, K) tells."""
+    return np.where(own if values.ndim == 2 else own[:, :, None], values, 0).sum(axis=1)
+
+
+def only(index: np.ndarray, count: int) -> np.ndarray:
+    """Returns which of so many posts has an index (n,): (n, count) bool."""
+    return np.arange(count) == index[:, None]
 
 
 @dataclass(frozen=True)
@@ -61,10 +66,15 @@ class Seen:
             posts[..., :2], posts[..., 2:4], posts[..., 4],
         )  # fmt: skip
 
-    @property
+    @cached_property
     def away(self) -> np.ndarray:
         """From the robot to the posts (n, K, 2) [m]."""
         return self.centre - self.place[:, None]
+
+    @cached_property
+    def room(self) -> np.ndarray:
+        """From the robot's middle to the posts' surfaces (n, K) [m]."""
+        return length(self.away) - self.radius
 
 
 def approach(seen: Seen, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -82,7 +92,7 @@ def approach(seen: Seen, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return length(away - relative * when[..., None]), when
 
 
-def tangent(away: np.ndarray, radius: np.ndarray, side: np.ndarray) -> np.ndarray:
+def tangent(away: np.ndarray, radius: np.ndarray, side: np.ndarray | int) -> np.ndarray:
     """Returns the ways (..., 2) to where the tangents past discs touch them, for sides (...)."""
     far = np.maximum(length(away), 1e-9)
     half = np.arcsin(np.minimum(radius / far, 1.0))
@@ -96,10 +106,11 @@ def clusters(seen: Seen) -> np.ndarray:
     away = seen.centre[:, :, None] - seen.centre[:, None]
     going = seen.speed[:, :, None] - seen.speed[:, None]
     apart = np.minimum(length(away), length(away + PROJECTED / 2 * going))
-    joined = apart - seen.radius[:, :, None] - seen.radius[:, None] < ROOM
-    for _ in range(4):  # each time over twice as many posts in between
-        joined = (joined[:, :, :, None] & joined[:, None]).any(axis=2)
-    return joined
+    near = apart - seen.radius[:, :, None] - seen.radius[:, None] < ROOM
+    joined = near.astype(np.float32)
+    for _ in range(LINKS):  # each time over twice as many posts in between
+        joined = np.minimum(joined @ joined, np.float32(1))
+    return joined > 0
 
 
 @dataclass(frozen=True)
@@ -124,52 +135,60 @@ class Bend(Pair):
 
 
 def shorter_side(
-    seen: Seen, post: np.ndarray, joined: np.ndarray, radius: np.ndarray, target: np.ndarray
+    seen: Seen, post: np.ndarray, mine: np.ndarray, radius: np.ndarray, target: np.ndarray
 ) -> np.ndarray:
-    """Returns the sides (n,) on which ways to targets (n, 2) past posts (n,) are shorter.
+    """Returns the sides (n,) on which ways to targets (n, 2) past posts are shorter.
 
-    Posts that are one obstacle with these are passed on the same side.
+    Args:
+        seen: what was measured.
+        post: (n, K) bool, the post.
+        mine: (n, K) bool, the posts that are one obstacle with it, and are passed on the same side.
+        radius: (n, K) of the discs to pass [m].
+        target: (n, 2) [m].
     """
-    away = seen.away
-    rows = np.arange(len(post))
-    mine = joined[rows, post]
+    away, count = seen.away, post.shape[1]
     bearing = np.arctan2(away[..., 1], away[..., 0])
     half = np.arcsin(np.minimum(radius / np.maximum(length(away), 1e-9), 1.0))
+    off = wrapped(bearing - pick(bearing, post)[:, None])
     lengths = []
     for side, sign in ((LEFT, 1.0), (RIGHT, -1.0)):
-        angle = sign * wrapped(bearing - at(bearing, post)[:, None]) + half
-        last = np.where(mine, angle, -np.inf).argmax(axis=1)
-        leg = tangent(at(away, last), at(radius, last), np.full(len(post), side))
+        last = only(np.where(mine, sign * off + half, -np.inf).argmax(axis=1), count)
+        leg = tangent(pick(away, last), pick(radius, last), side)
         lengths.append(length(leg) + length(target - seen.place - leg))
     return np.where(lengths[0] <= lengths[1], LEFT, RIGHT)
 
 
-def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray) -> Bend:
-    """Returns where ways bend first, after a focus (n,) and side (n,) of before, -1 for none."""
+def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float) -> Bend:
+    """Returns where ways bend first.
+
+    Args:
+        seen: what was measured.
+        focus, side: (n,) of before, -1 for none.
+        wider: by how much the disc of the post in focus is wider than others [m].
+    """
     n, count = seen.radius.shape
-    own = np.arange(count) == focus[:, None]
-    radius = seen.radius + CLEAR + WIDER * own
-    room = length(seen.away) - seen.radius
+    radius = seen.radius + CLEAR + wider * only(focus, count)
+    room = seen.room
     joined = clusters(seen)
     target, passed = seen.goal, np.zeros((n, count), dtype=bool)
-    best, best_side = np.full(n, -1), np.zeros(n, dtype=int)
-    more = np.ones(n, dtype=bool)
-    rows = np.arange(n)
+    best, best_side = np.full(n, -1), np.full(n, LEFT)
     for _ in range(BENDS):
         near, when = approach(seen, target)
         ahead = (seen.away * (target - seen.place)[:, None]).sum(axis=2) > 0
-        blocks = (near < radius) & ahead & ~passed & more[:, None]
+        blocks = (near < radius) & ahead & ~passed
         more = blocks.any(axis=1)
-        if not more.any():
+        if isinstance(more, np.ndarray) and not more.any():  # an export does not know
             break
         post = np.where(blocks, room, np.inf).argmin(axis=1)
-        together = joined[rows, post, np.maximum(best, 0)] & (best >= 0)
-        way = np.where(together, best_side, shorter_side(seen, post, joined, radius, target))
+        own = only(post, count)
+        mine = (joined & own[:, :, None]).any(axis=1)
+        together = (mine & only(best, count)).any(axis=1)
+        way = np.where(together, best_side, shorter_side(seen, own, mine, radius, target))
         way = np.where(post == focus, side, way)
         best, best_side = np.where(more, post, best), np.where(more, way, best_side)
-        passed = passed | ((np.arange(count) == post[:, None]) & more[:, None])
-        soon = np.minimum(at(when, post), PROJECTED)[:, None]
-        leg = tangent(at(seen.away, post) + soon * at(seen.speed, post), at(radius, post), way)
+        passed = passed | (own & more[:, None])
+        soon = np.minimum(pick(when, own), PROJECTED)[:, None]
+        leg = tangent(pick(seen.away, own) + soon * pick(seen.speed, own), pick(radius, own), way)
         target = np.where(more[:, None], seen.place + leg, target)
     return Bend(best, best_side, target, passed)
 
@@ -193,39 +212,62 @@ def least_room(seen: Seen, target: np.ndarray) -> np.ndarray:
 
 
 def side_of_way(seen: Seen, post: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Returns how far (n,) posts (n,) are to the right of the ways to targets (n, 2) [m]."""
-    way, away = target - seen.place, at(seen.away, post)
+    """Returns how far (n,) posts (n, K) bool are to the right of the ways to targets (n, 2) [m]."""
+    way, away = target - seen.place, pick(seen.away, post)
     across = way[:, 1] * away[:, 0] - way[:, 0] * away[:, 1]
     return across / np.maximum(length(way), 1e-9)
 
 
-def choose(seen: Seen, focus: np.ndarray, side: np.ndarray) -> Pair:
-    """Returns the pairs of focus and side, for those of before, -1 for none."""
+def ahead_of(seen: Seen, post: np.ndarray) -> np.ndarray:
+    """Returns the cosines (n,) of the angles between headings and the ways to posts (n, K) bool."""
+    away = pick(seen.away, post)
+    ahead = away[:, 0] * np.cos(seen.heading) + away[:, 1] * np.sin(seen.heading)
+    return ahead / np.maximum(length(away), 1e-9)
+
+
+def choose(
+    seen: Seen, focus: np.ndarray, side: np.ndarray, swing: float = 0.0, margin: float = 0.0
+) -> Pair:
+    """Returns the pairs of focus and side.
+
+    Args:
+        seen: what was measured.
+        focus, side: (n,) of before, -1 for none.
+        swing: how far two measurements of the same place can be from each other [m]. What decides changes
+            by more than that before another decision follows.
+        margin: distance from the posts' surfaces at which the guard holds the robot back [m].
+    """
     count = seen.radius.shape[1]
-    bend = first_bend(seen, focus, side)
+    # The difference of two distances changes by twice as much as either.
+    nearer = wider = 2 * swing
+    bend = first_bend(seen, focus, side, wider)
     free = bend.focus < 0
     # Nothing blocks the way.
-    room = length(seen.away) - seen.radius
+    room = seen.room
     nearest = room.argmin(axis=1)
     known = np.maximum(focus, 0)
-    least = at(room, nearest)
-    nearer = (focus < 0) | ((least < NEARBY) & (at(room, known) > least + NEARER))
-    idle = np.where(nearer, nearest, known)
-    right_of = side_of_way(seen, idle, seen.goal)
-    same = (idle == focus) & (np.where(side == LEFT, right_of, -right_of) > -ASIDE)
-    idle_side = np.where(same, side, np.where(right_of > 0, LEFT, RIGHT))
+    own = only(known, count)
+    least, room_of_known = room.min(axis=1), pick(room, own)
+    other = (focus < 0) | ((least < NEARBY) & (room_of_known > least + nearer))
+    idle = np.where(other, nearest, known)
+    right_of = side_of_way(seen, only(idle, count), seen.goal)
+    idle_side = np.where(idle == focus, side, np.where(right_of > 0, LEFT, RIGHT))
     best = np.where(free, idle, bend.focus)
     best_side = np.where(free, idle_side, bend.side)
     # What is too close on the way.
-    least = least_room(seen, bend.target) - CLOSE - KEPT * (np.arange(count) == focus[:, None])
-    close = least.argmin(axis=1)
+    close_by = least_room(seen, bend.target) - CLOSE - swing * only(focus, count)
+    close = close_by.argmin(axis=1)
     # The post in focus keeps it while it matters, unless another one that does is nearer.
-    matters = at(bend.around, known) | (at(least, known) < 0)
-    urgent = (at(least, close) < 0) & (close != best)
-    close_side = np.where(side_of_way(seen, close, bend.target) > 0, LEFT, RIGHT)
+    matters = ((bend.around | (close_by < 0)) & own).any(axis=1)
+    urgent = (close_by.min(axis=1) < 0) & (close != best)
+    close_side = np.where(side_of_way(seen, only(close, count), bend.target) > 0, LEFT, RIGHT)
     close_side = np.where(close == focus, side, close_side)
     best, best_side = np.where(urgent, close, best), np.where(urgent, close_side, best_side)
-    kept = (focus >= 0) & matters & (at(room, best) > at(room, known) - NEARER)
+    apart = pick(room, only(best, count)) - room_of_known
+    kept = (focus >= 0) & matters & (apart > -nearer)
+    # A post that holds the robot back takes the focus, or the robot would stand there for ever.
+    held = (pick(room, only(best, count)) < margin + HOLDING) & (apart < 0)
+    kept = kept & ~(held & (ahead_of(seen, only(best, count)) > AHEAD))
     return Pair(np.where(kept, focus, best), np.where(kept, side, best_side))
 
 

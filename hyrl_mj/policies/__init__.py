@@ -30,6 +30,7 @@ from hyrl_mj.policies.mlp import (
     BLAS,
     TORCH_NAMES,
     MlpPolicy,
+    ObservationPolicy,
     Policy,
     SampledPolicy,
 )
@@ -55,6 +56,7 @@ __all__ = [
     "Controller",
     "MlpPolicy",
     "Normalization",
+    "ObservationPolicy",
     "Policy",
     "PolicyController",
     "PreprocessedPolicy",

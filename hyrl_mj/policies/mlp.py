@@ -192,7 +192,7 @@ class MlpPolicy(ObservationPolicy):
     def _chosen(self, outputs: np.ndarray) -> np.ndarray:
         """Returns inputs (n, m) for the outputs of the last layer."""
         if self.task.input_levels is not None:
-            return self.task.input_levels[outputs.argmax(axis=1)]
+            return np.take(self.task.input_levels, outputs.argmax(axis=1), axis=0)
         u, (low, high) = outputs.astype(float), self.task.input_limits
         if self._algorithm.squashed:
             u = low + (np.tanh(u) + 1) / 2 * (high - low)
@@ -209,7 +209,8 @@ class MlpPolicy(ObservationPolicy):
     def _run(self, observation: np.ndarray, last: Layer) -> np.ndarray:
         """Returns the output of `last` on top of the hidden layers, for observations (n, k)."""
         observation = observation.astype(np.float32)
-        if len(observation) <= 1:
+        # A trace takes all rows at once.
+        if len(observation) <= 1 or not isinstance(observation, np.ndarray):
             return self._forward(observation, last)
         parts = range(0, len(observation), CHUNK)
         with BLAS.limit(limits=1, user_api="blas"):

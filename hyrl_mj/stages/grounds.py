@@ -40,7 +40,7 @@ MARGIN = 1.2
 PLAYS_OF_IMAGE = PLAYS[: 3 * len(JUDGES)]
 # The plays by which policies are compared that are not expected to win them all, and how much less a mirror
 # image may win.
-SHARED = [play for play in PLAYS[:16] if play[1] != "adversarial"]
+SHARED = [play for play in PLAYS[-len(JUDGES) :] if play[1] != "adversarial"]
 ALIKE = 0.02
 # So many starts are drawn for each episode; those too close to where the mode cannot succeed are left out.
 SPARE = 4
@@ -339,7 +339,7 @@ class ByShare(ByEpisodes):
     """
 
     enough: Score = (1.0,)
-    settled = 0.5
+    settled = 0.75
 
     def see(self, policy: MlpPolicy) -> None:
         """Does nothing: a training draws many times as many episodes as it is judged by."""

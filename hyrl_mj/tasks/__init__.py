@@ -10,9 +10,9 @@ from pkgutil import iter_modules
 from hyrl_mj.tasks.base import Task, at_levels
 from hyrl_mj.tasks.checks import check_task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
-from hyrl_mj.tasks.field import CLEAR, PROJECTED, Field, FieldTask
+from hyrl_mj.tasks.field import CLEAR, FASTEST, PROJECTED, RADII, TAKEN, Field, FieldTask
 from hyrl_mj.tasks.guard import check_finite
-from hyrl_mj.tasks.layouts import Layouts, length, only_post, posts_of
+from hyrl_mj.tasks.layouts import POSE, Layouts, length, only_post, posts_of
 from hyrl_mj.tasks.obstacles import (
     ANY,
     LEFT,
@@ -29,10 +29,14 @@ from hyrl_mj.tasks.scaffold import write_task
 __all__ = [
     "ANY",
     "CLEAR",
+    "FASTEST",
     "LEFT",
+    "POSE",
     "PROJECTED",
+    "RADII",
     "RIGHT",
     "SEARCHES",
+    "TAKEN",
     "Field",
     "FieldTask",
     "Layouts",

@@ -409,6 +409,14 @@ class Task(ABC):
             return self.scene.mode_name(mode)
         return f"{mode} ({way_name(pattern_of(mode, len(names)), names)})"
 
+    def colour_of(self, mode: int, modes: Sequence[int]) -> int:
+        """Returns which of the colours replays draw a mode in: by default its place among all modes."""
+        return sorted(modes).index(mode)
+
+    def tinted(self, mode: int) -> tuple[str, ...]:
+        """Returns the names of the geoms that replays draw in the colour of a mode, by default none."""
+        return ()
+
 
 def at_levels(task: Task, actions: np.ndarray) -> np.ndarray:
     """Returns the inputs (n, m) of a discrete task for the numbers of its levels (n,) int.

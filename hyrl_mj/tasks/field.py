@@ -14,34 +14,36 @@ from hyrl_mj import mjcf
 from hyrl_mj.chart import Chart
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.field_robots import FieldRobot, Unicycle
 from hyrl_mj.tasks.layouts import OF_POST, POSE, TURN, Layouts, length, posts_of
 from hyrl_mj.tasks.obstacles import LEFT, RIGHT, wrapped
 from hyrl_mj.tasks.registry import register
 
 # What the layouts of a training are drawn from: radii of the post, distances of the goal from its surface
 # [m], and its greatest speed [m/s]. Shares of the posts stand still, and come towards the goal.
-RADII, TO_GOAL, FASTEST = (0.3, 0.9), (0.5, 8.0), 0.4
+RADII, TO_GOAL, FASTEST = (0.3, 0.9), (0.35, 8.0), 0.4
 STANDING, BLOCKING = 0.4, 0.2
 DRAWN = 4_096
 # Distance of the robot's middle from a post's surface at which the shortest way passes it [m].
-CLEAR = 0.3
+CLEAR = 0.35
 # Distance from a post's surface within which the reward is less, and by how much at most [m].
-NEAR, GRAZING = 0.15, 2.0
+NEAR, GRAZING = 0.2, 2.0
 # A post this close to the goal leaves no room to arrive [m].
-TAKEN = 0.4
+TAKEN = 0.25
 # Distance from a post on the goal up to which a robot waits for it to go [m].
 WAITING = 1.0
 # What a crash costs: more than any way round.
 CRASH = -100.0
 # What driving backward at full speed costs, more than standing.
-REVERSE = 1.0
+REVERSE = 3.0
 # Shares of the noise bound on x, y and heading under which modes are trained: more than they have to bear.
 TRAINED = (1.5, 1.5, 2.5)
 # What turning the other way costs at full rate, where more than a right angle is left.
 WRONG = 3.0
 # Share of the layouts whose post leaves no room at the goal.
 ON_GOAL = 0.1
-# Time that a moving post leaves the robot at the start, at least [s].
+# What the post leaves the robot at the start, at least: this room [m], for so long [s].
+ROOM = 0.05
 HEADWAY = 0.8
 # What both trainings share.
 PPO: dict[str, Any] = {
@@ -117,6 +119,7 @@ class FieldTask(Task):
 
     inputs, input_units = ("forward_speed", "turn_rate"), ("m/s", "rad/s")
     layouts: Layouts
+    robot: FieldRobot
 
     @cached_property
     def noisy(self) -> tuple[float, ...]:  # type: ignore[override]
@@ -125,7 +128,7 @@ class FieldTask(Task):
     @cached_property
     def body(self) -> float:
         """Radius of the robot [m]."""
-        return float(mjcf.geom_size(self.model, "hull")[0])
+        return float(mjcf.geom_size(self.model, self.robot.hull)[0])
 
     @cached_property
     def reached(self) -> float:
@@ -133,22 +136,22 @@ class FieldTask(Task):
         return float(mjcf.numeric(self.model, "reached", 1)[0])
 
     def measure(self, sensors: np.ndarray) -> np.ndarray:
-        clock, number = sensors[:, 3], np.rint(sensors[:, 4]).astype(int)
+        sensed = self.robot.sensed(sensors)
+        clock, number = sensed[:, 3], np.rint(sensed[:, 4]).astype(int)
         posts = np.empty((len(sensors), self.layouts.posts, OF_POST))
         posts[..., :2] = self.layouts.positions(number, clock)
         posts[..., 2:4] = self.layouts.velocities(number, clock)
         posts[..., 4] = self.layouts.radii[number]
         return np.hstack(
-            [sensors[:, :3], self.layouts.goals[number], posts.reshape(len(sensors), -1)]
+            [sensed[:, :3], self.layouts.goals[number], posts.reshape(len(sensed), -1)]
         )
 
     def control(self, u: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        speed, heading = u[:, 0], qpos[:, 2]
-        ahead = speed * np.cos(heading), speed * np.sin(heading)
-        return np.stack([*ahead, u[:, 1], np.ones(len(u)), np.zeros(len(u))], axis=1)
+        return self.robot.control(u, qpos, qvel)
 
     def mocap(self, qpos: np.ndarray) -> np.ndarray:
-        flat = self.layouts.positions(np.rint(qpos[:, 4]).astype(int), qpos[:, 3])
+        clock, number = qpos[:, -2], np.rint(qpos[:, -1]).astype(int)
+        flat = self.layouts.positions(number, clock)
         return np.concatenate([flat, np.zeros_like(flat[..., :1])], axis=2)
 
     def clearances(self, measured: np.ndarray) -> np.ndarray:
@@ -168,7 +171,8 @@ class FieldTask(Task):
 
     def verdict(self, measurement: np.ndarray) -> np.ndarray:
         # A robot that waits because a post stands on the goal has done what it can.
-        return np.where(self.taken(measurement), Outcome.REACHED, Outcome.STALLED)
+        waits = self.taken(measurement) & (self.clearances(measurement).min(axis=1) < WAITING)
+        return np.where(waits, Outcome.REACHED, Outcome.STALLED)
 
     def taken(self, measurement: np.ndarray) -> np.ndarray:
         """Returns (n,) bool: whether a post leaves no room at the goal."""
@@ -183,9 +187,10 @@ class FieldTask(Task):
 @register
 class Field(FieldTask):
     name = "field"
+    robot = Unicycle()
     description = "drive to a goal among posts, with policies trained on one (PPO)"
     max_steps = 300
-    worst_reward = -8.0
+    worst_reward = -10.0
     start_low, start_high = (-4.0, -3.0, -np.pi), (3.0, 3.0, np.pi)
     scene = Scene(
         starts=tuple((-3.0, y, 0.0) for y in (-0.3, -0.1, 0.0, 0.1, 0.3)),
@@ -195,12 +200,12 @@ class Field(FieldTask):
     learning = Learning(
         levels=5,
         training={**PPO, "samples": 500_000, "learning_rate": 1e-3, "gamma": 0.98, "episode": 60},
-        modes={**PPO, "samples": 600_000, "learning_rate": 2e-3, "gamma": 0.99, "episode": 120},
+        modes={**PPO, "samples": 1_000_000, "learning_rate": 2e-3, "gamma": 0.99, "episode": 120},
     )
-    mirror = Mirror((1, -1, 1, 1, -1, 1, 1, 1, -1, 1, -1, -1, 1, -1, -1, 1), (1, -1))
+    mirror = Mirror((1, -1, 1, 1, -1, 1, 1, 1, 1, -1, 1, -1, -1, 1, -1, -1, 1), (1, -1))
     precision, close = 0.1, 0.1
-    observation_low = (-1.2,) * 16
-    observation_high = (1.2,) * 16
+    observation_low = (-1.2,) * 17
+    observation_high = (1.2,) * 17
     side: int | None = None
 
     @cached_property
@@ -238,7 +243,7 @@ class Field(FieldTask):
         # A mode is trained with both senses of turning, by turns.
         sense = np.zeros(len(sensors))
         if self.side is not None:
-            sense = 1 - 2 * (np.rint(sensors[:, 4]) % 2)
+            sense = 1 - 2 * (np.rint(self.robot.sensed(sensors)[:, 4]) % 2)
         return np.hstack([super().measure(sensors), sense[:, None]])
 
     def state(
@@ -246,11 +251,10 @@ class Field(FieldTask):
     ) -> tuple[np.ndarray, np.ndarray | None]:
         number = np.full(len(z), DRAWN - 1)
         if rng is not None:  # a post that leaves the robot room to act
-            fits = np.maximum(np.searchsorted(self._needs, length(z[:, :2]) - self.body - 0.05), 1)
+            fits = np.maximum(np.searchsorted(self._needs, length(z[:, :2]) - self.body - ROOM), 1)
             number = (rng.random(len(z)) * fits).astype(int)
         post = self.layouts.tracks[number, 0, 0]
-        nothing = np.zeros(len(z))
-        return np.column_stack([z[:, :2] + post, z[:, 2], nothing, number]), None
+        return self.robot.state(np.column_stack([z[:, :2] + post, z[:, 2]]), number)
 
     @cached_property
     def _needs(self) -> np.ndarray:
@@ -260,10 +264,12 @@ class Field(FieldTask):
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         z = super().starts(n, rng)
-        inside = length(z[:, :2]) < RADII[0] + self.body + 0.1
+        # Starts hold for the usual layout, too.
+        least = self.layouts.radii[-1, 0] + self.body + ROOM
+        inside = length(z[:, :2]) < least
         while inside.any():
             z[inside] = super().starts(int(inside.sum()), rng)
-            inside = length(z[:, :2]) < RADII[0] + self.body + 0.1
+            inside = length(z[:, :2]) < least
         return z
 
     def z(self, measured: np.ndarray) -> np.ndarray:
@@ -289,9 +295,14 @@ class Field(FieldTask):
         return measured[:, :2]
 
     def observation(self, measured: np.ndarray) -> np.ndarray:
+        return self.observed(measured, *self.directions(measured))
+
+    def observed(
+        self, measured: np.ndarray, directions: np.ndarray, lengths: np.ndarray
+    ) -> np.ndarray:
+        """Returns the observations (n, 17) of measurements, with what `directions` gives for them."""
         heading, goal, post = measured[:, 2], self.to_goal(measured), posts_of(measured)[:, 0]
         to_post = post[:, :2] - measured[:, :2]
-        directions, lengths = self.directions(measured)
         left, right = (directions - heading[:, None]).T
         turns = turns_to(directions - heading[:, None], measured[:, TURN : TURN + 1])
         cos, sin = np.cos(heading), np.sin(heading)
@@ -303,10 +314,12 @@ class Field(FieldTask):
         (goal_x, goal_y), (post_x, post_y) = turned(goal), turned(to_post)
         speed_x, speed_y = turned(post[:, 2:4])
         room = np.maximum(away - post[:, 4], 0.0)
+        # Whether the post leaves room at the goal: no noise of the robot's pose acts on that.
+        at_goal = np.maximum(length(post[:, :2] - measured[:, 3:5]) - post[:, 4], 0.0)
         columns = [
             goal_x / np.maximum(far, 1e-6), goal_y / np.maximum(far, 1e-6), far / (0.5 + far),
             post_x / np.maximum(away, 1e-6), post_y / np.maximum(away, 1e-6), room / (0.5 + room),
-            post[:, 4], speed_x, speed_y,
+            post[:, 4], at_goal / (0.5 + at_goal), speed_x, speed_y,
             (np.cos(left) + np.cos(right)) / 2, (np.sin(left) + np.sin(right)) / 2,
             (np.cos(left) - np.cos(right)) / 2, (np.sin(left) - np.sin(right)) / 2,
             np.tanh(lengths[:, 0] - lengths[:, 1]),

@@ -2,6 +2,7 @@
 
 from functools import cached_property
 
+import mujoco
 import numpy as np
 
 from hyrl_mj import mjcf
@@ -16,6 +17,39 @@ ASTRAY, NEAR = 1.4, 0.25
 FINISH, TURNED = 10, 0.15
 # Largest rate of turn of a start [rad/s].
 START_RATE = 0.3
+
+
+def wheels_of(model: mujoco.MjModel) -> tuple[float, float]:
+    """Returns the radius of a rover's wheel, and half the distance between the two [m]."""
+    radius = float(mjcf.geom_size(model, "left_tyre")[0])
+    return radius, float(model.body("left_wheel").pos[1])
+
+
+def wheel_rates(
+    speed: np.ndarray | float, turn: np.ndarray, radius: float, half: float
+) -> np.ndarray:
+    """Returns rates (n, 2) of the left and the right wheel [rad/s].
+
+    Args:
+        speed: (n,) or one, speed ahead [m/s].
+        turn: (n,) rate of turn [rad/s].
+        radius: of a wheel [m].
+        half: half the distance between the two wheels [m].
+    """
+    return np.stack([speed - turn * half, speed + turn * half], axis=1) / radius
+
+
+def heading_of(attitude: np.ndarray) -> np.ndarray:
+    """Returns the headings (n,) [rad] of quaternions (n, 4)."""
+    axes = rotation(attitude)
+    return np.asarray(np.arctan2(axes[:, 1, 0], axes[:, 0, 0]))
+
+
+def positions(pose: np.ndarray, height: float) -> np.ndarray:
+    """Returns positions (n, 9) of a rover's joints for poses x, y, heading (n, 3) [m, m, rad]."""
+    (x, y, heading), nothing = pose.T, np.zeros(len(pose))
+    turned = [np.cos(heading / 2), nothing, nothing, np.sin(heading / 2)]
+    return np.stack([x, y, np.full(len(pose), height), *turned, nothing, nothing], axis=1)
 
 
 @register
@@ -44,8 +78,7 @@ class Rover(PillarTask):
     @cached_property
     def wheels(self) -> tuple[float, float, float]:
         """Radius of a wheel, half the distance between the two [m], speed of the rover [m/s]."""
-        radius = float(mjcf.geom_size(self.model, "left_tyre")[0])
-        return radius, float(self.model.body("left_wheel").pos[1]), self.speed
+        return *wheels_of(self.model), self.speed
 
     @cached_property
     def speed(self) -> float:
@@ -53,9 +86,7 @@ class Rover(PillarTask):
         return float(mjcf.numeric(self.model, "speed", 1)[0])
 
     def measure(self, sensors: np.ndarray) -> np.ndarray:
-        axes = rotation(sensors[:, 3:7])
-        heading = np.arctan2(axes[:, 1, 0], axes[:, 0, 0])
-        return np.column_stack([sensors[:, :2], heading, sensors[:, 9]])
+        return np.column_stack([sensors[:, :2], heading_of(sensors[:, 3:7]), sensors[:, 9]])
 
     def control(self, u: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         return self.rates(u[:, 0])
@@ -63,17 +94,14 @@ class Rover(PillarTask):
     def rates(self, turn: np.ndarray) -> np.ndarray:
         """Returns rates (n, 2) of both wheels [rad/s] that turn the rover at rates (n,) [rad/s]."""
         radius, half, speed = self.wheels
-        return np.stack([speed - turn * half, speed + turn * half], axis=1) / radius
+        return wheel_rates(speed, turn, radius, half)
 
     def state(
         self, z: np.ndarray, rng: np.random.Generator | None = None
     ) -> tuple[np.ndarray, np.ndarray | None]:
         turn = np.zeros(len(z)) if rng is None else rng.uniform(-1, 1, len(z)) * START_RATE
-        x, y, heading = z.T
-        nothing = np.zeros(len(z))
-        height = np.full(len(z), self.model.body("rover").pos[2])
-        turned = [np.cos(heading / 2), nothing, nothing, np.sin(heading / 2)]
-        qpos = np.stack([x, y, height, *turned, nothing, nothing], axis=1)
+        heading, nothing = z[:, 2], np.zeros(len(z))
+        qpos = positions(z, float(self.model.body("rover").pos[2]))
         ahead = [self.speed * np.cos(heading), self.speed * np.sin(heading), nothing]
         qvel = np.column_stack([*ahead, nothing, nothing, turn, self.rates(turn)])
         return qpos, qvel

@@ -14,10 +14,7 @@ with np.load(__file__.rpartition(".")[0] + ".npz", allow_pickle=False) as file:
     ARRAYS = {name: file[name] for name in file.files}
 
 MODES = ARRAYS["modes"]
-LOW, SIDES, PERIODIC = (ARRAYS[f"chart_{name}"] for name in ("low", "sides", "periodic"))
-SCALE = ARRAYS["chart_scale"]
 NO_MODE = -1  # stands for "in no mode yet"
-LEAST = 1e-9  # least weight of a scattered node
 
 # ---- the task: the export replaces this part
 TASK = "name"
@@ -80,6 +77,11 @@ def checked(measured):
     if not np.isfinite(measured).all():
         raise ValueError("a measurement is not finite")
     return measured
+
+
+LOW, SIDES, PERIODIC = (ARRAYS[f"chart_{name}"] for name in ("low", "sides", "periodic"))
+SCALE = ARRAYS["chart_scale"]
+LEAST = 1e-9  # least weight of a scattered node
 
 
 def answer(q, measured):

@@ -101,7 +101,7 @@ class _PrivateCopies:
     """Copies of functions, and of the functions and methods that they call, with `REPLACEMENTS`.
 
     Methods are copied of the object whose bound method is copied, and of objects of this package, such as
-    charts. Methods of other objects run as they are.
+    charts, also of those in dictionaries that are their attributes. Methods of other objects run as they are.
     """
 
     def __init__(self) -> None:
@@ -181,7 +181,9 @@ class _PrivateCopies:
         stand_in: Any = object.__new__(type("StandIn", (last,), members))
         self._keep(original, stand_in)
         attributes = getattr(original, "__dict__", {})
-        vars(stand_in).update({name: self.of(value) for name, value in attributes.items()})
+        for name, value in attributes.items():
+            parts = {k: self.of(v) for k, v in value.items()} if type(value) is dict else value
+            vars(stand_in)[name] = self.of(parts)
         return stand_in
 
 

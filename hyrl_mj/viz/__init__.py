@@ -1,6 +1,6 @@
 """Pictures, videos, tables and pages of the results of a run.
 
-The modules `arcs`, `diagnosis`, `encoding`, `figures`, `replay`, `report` and `viewing` import
+The modules `arcs`, `diagnosis`, `drives`, `encoding`, `figures`, `replay`, `report` and `viewing` import
 matplotlib, Pillow or a GL library, so they are imported only where they are needed.
 """
 
@@ -14,6 +14,7 @@ __all__ = [
     "arcs",
     "beginning",
     "diagnosis",
+    "drives",
     "encoding",
     "figures",
     "print_robustness",

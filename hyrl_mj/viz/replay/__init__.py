@@ -21,7 +21,7 @@ FASTEST, SLOWEST_MOTION = 240, 100  # frames/s, and times slower than real time
 FORMATS = (*ENCODERS, ".png")
 DEFAULTS = ReplayOptions()
 
-__all__ = ["Floor", "Floors", "Show", "render_replay"]
+__all__ = ["Floor", "Floors", "Show", "check_replay", "render_replay"]
 
 
 def render_replay(
@@ -47,10 +47,26 @@ def render_replay(
         BadInput: nothing to play, or a value that cannot be used.
         NoRenderer: there is no GL library or no video encoder.
     """
-    if path.suffix not in FORMATS:
-        raise BadInput(f"{path} is no replay: give a name that ends in one of {', '.join(FORMATS)}")
+    check_replay(task, path, options)
+    camera = options.camera or task.scene.camera
     if not shows or not all(show.policy for show in shows):
         raise BadInput("there is nothing to replay: give shows with arcs of the policy")
+    screens = [Screen(task, show, options, camera, floor) for show in shows]
+    poster = screens[0].poster()
+    if path.suffix in ENCODERS:
+        times = [screen.times(options.fps, options.slow_motion) for screen in screens]
+        frames = chain.from_iterable(map(Screen.frames, screens, times))
+        with video(path, *options.size, options.fps) as add:
+            for frame in progress_bar(frames, "rendering", "frames", sum(map(len, times))):
+                add(frame)
+    with artifacts.replacing(path.with_suffix(".png")) as temporary:
+        poster.save(temporary)
+
+
+def check_replay(task: Task, path: Path, options: ReplayOptions) -> None:
+    """Raises `BadInput` if no replay of a task can be written to a path with these options."""
+    if path.suffix not in FORMATS:
+        raise BadInput(f"{path} is no replay: give a name that ends in one of {', '.join(FORMATS)}")
     if options.layout not in LAYOUTS:
         raise unknown("layout", options.layout, LAYOUTS)
     if not 1 <= options.fps <= FASTEST:
@@ -62,13 +78,3 @@ def render_replay(
         )
     camera = options.camera or task.scene.camera
     mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
-    screens = [Screen(task, show, options, camera, floor) for show in shows]
-    poster = screens[0].poster()
-    if path.suffix in ENCODERS:
-        times = [screen.times(options.fps, options.slow_motion) for screen in screens]
-        frames = chain.from_iterable(map(Screen.frames, screens, times))
-        with video(path, *options.size, options.fps) as add:
-            for frame in progress_bar(frames, "rendering", "frames", sum(map(len, times))):
-                add(frame)
-    with artifacts.replacing(path.with_suffix(".png")) as temporary:
-        poster.save(temporary)

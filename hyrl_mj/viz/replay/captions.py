@@ -82,7 +82,8 @@ class Layout:
                 line.words(title, INK)
             if len(tracks) == 1 and tracks[0].modes:
                 arc, row = tracks[0].arc, tracks[0].arc.at(t)
-                line.words(f"j = {arc.j[row]}", INK, room="j = 00")
+                jumps = int((tracks[0].jumps <= row).sum())
+                line.words(f"j = {jumps}", INK, room="j = 00")
                 room = self.fonts[1].getlength(OUTCOMES[_outcome(tracks[0])][0]) + self.text
                 mode = tracks[0].task.mode_name(int(arc.q[row]))
                 line.badge(line.fitting(f"q = {mode}", room), tracks[0].colour(row))

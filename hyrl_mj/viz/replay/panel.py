@@ -12,14 +12,16 @@ import numpy as np
 
 from hyrl_mj import mjcf
 from hyrl_mj.errors import BadArtifact
-from hyrl_mj.rendering import GEOMS, Box, Canvas, SceneRenderer
+from hyrl_mj.rendering import GEOMS, HIDDEN, Box, Canvas, SceneRenderer
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
-from hyrl_mj.viz.colours import RGB, place
+from hyrl_mj.viz.colours import RGB
 from hyrl_mj.viz.replay import marks
 
 PATH_WIDTH, BOUND_WIDTH, START_RADIUS, JUMP_RADIUS, CROSS = 0.032, 0.05, 0.035, 0.055, 0.075  # [m]
 BOUND_PIECES, GHOST_ALPHA = 4, 0.35
+# Marks are larger where a picture shows more than this across [m].
+WIDE = 6.0
 # The part that is redrawn is this much larger than what has moved [pixels].
 MARGIN = 2
 FAILED = ("crashed", "out_of_bounds", "stalled", "unstable")
@@ -68,15 +70,23 @@ class Track:
 
     @cached_property
     def jumps(self) -> np.ndarray:
-        """Rows right after a jump."""
-        return np.flatnonzero(np.diff(self.arc.j) > 0) + 1
+        """Rows right after a jump to a mode of another name; other jumps are not shown."""
+        rows = np.flatnonzero(np.diff(self.arc.j) > 0) + 1
+        names = {q: self.task.mode_name(q) for q in map(int, np.unique(self.arc.q))}
+        kept = [names[int(self.arc.q[row - 1])] != names[int(self.arc.q[row])] for row in rows]
+        return rows[np.array(kept, dtype=bool)]
 
     def colour(self, row: int) -> RGB:
         """Returns the colour of the path from a row on."""
         if not self.modes:
             return marks.POLICY_COLOUR
         colours = marks.MODE_COLOURS
-        return colours[place(int(self.arc.q[row]), self._of) % len(colours)]
+        return colours[self.task.colour_of(int(self.arc.q[row]), self._of) % len(colours)]
+
+    def tinted(self, row: int) -> frozenset[int]:
+        """Returns the ids of the geoms that have the colour of the path from a row on."""
+        names = self.task.tinted(int(self.arc.q[row])) if self.modes else ()
+        return frozenset(self.task.model.geom(name).id for name in names)
 
     def qpos(self, t: float) -> np.ndarray:
         """Returns the robot's position (nq,) at time t [s], interpolated between samples."""
@@ -141,7 +151,18 @@ class Panel:
         geoms = sum(len(track.arc.t) for track in tracks) + GEOMS * (1 + len(tracks))
         self._renderer = SceneRenderer(task.model, width, height, geoms, canvas, task.mocap)
         self._floors, self._last = floors, max(tracks, key=lambda track: track.end)
+        self._larger = self._scale()
         self._begin(self._floor_at(0.0))
+
+    def _scale(self) -> float:
+        """Returns by how much marks are larger than usual, so that they are seen in a wide field."""
+        if not self._rests:
+            return 1.0
+        self._renderer.look(self._tracks[0].qpos(0.0), self._camera)
+        points = np.vstack([track.points for track in self._tracks])
+        _, scale = self._renderer.project(points)
+        shown = min(self._renderer.width, self._renderer.height) / scale
+        return max(float(np.median(shown)) / WIDE, 1.0)
 
     def _begin(self, floor: marks.Floor | None) -> None:
         """Draws anew what stays: the marks on the floor, and where the tracks start."""
@@ -151,7 +172,7 @@ class Panel:
         if floor:
             floor.draw(scene)
         for track in self._tracks:
-            marks.disc(scene, track.points[0], START_RADIUS, marks.ON_TOP, marks.INK)
+            marks.disc(scene, track.points[0], self._larger * START_RADIUS, marks.ON_TOP, marks.INK)
         self._renderer.keep()
         self._drawn = [_Drawn() for _ in self._tracks]
 
@@ -191,9 +212,9 @@ class Panel:
             self._segment(track, row, track.points[row + 1])
         for row in track.jumps[(track.jumps > first) & (track.jumps <= last)]:
             height = marks.ON_TOP + marks.THICKNESS
-            marks.disc(scene, track.points[row], JUMP_RADIUS, height, marks.INK)
-            above = height + marks.THICKNESS
-            marks.disc(scene, track.points[row], 0.6 * JUMP_RADIUS, above, marks.WHITE)
+            radius, above = self._larger * JUMP_RADIUS, height + marks.THICKNESS
+            marks.disc(scene, track.points[row], radius, height, marks.INK)
+            marks.disc(scene, track.points[row], 0.6 * radius, above, marks.WHITE)
         return track.points[first : last + 1]
 
     def _segment(self, track: Track, row: int, end: np.ndarray) -> None:
@@ -202,29 +223,36 @@ class Panel:
         # as long as half the width close the gaps at bends.
         height = marks.ON_PATH + 2e-4 * (track.arc.j[row] % 20)
         start, colour = track.points[row], track.colour(row)
-        marks.bar(self._renderer.scene, start, end, colour, PATH_WIDTH, height, PATH_WIDTH / 2)
+        width = self._larger * PATH_WIDTH
+        marks.bar(self._renderer.scene, start, end, colour, width, height, width / 2)
 
     def _robot(self, track: Track, t: float, path: np.ndarray) -> Box:
         """Adds the robot, its ghost and the noise bound to the scene; returns where all is seen."""
         renderer, scene = self._renderer, self._renderer.scene
-        first, point = scene.ngeom, track.point(t)
-        self._segment(track, track.arc.at(t), point)
-        renderer.add_robot(track.qpos(t))
+        first, point, row = scene.ngeom, track.point(t), track.arc.at(t)
+        self._segment(track, row, point)
+        tinted = track.tinted(row)
+        robot = [scene.geoms[number] for number in renderer.add_robot(track.qpos(t))]
+        for geom in robot:
+            if geom.objid in tinted:
+                geom.rgba[:3] = np.array(track.colour(row)) / 255
         if t < track.end and track.arc.bound > 0:
             for line in track.bounds(t):
                 for start, end in pairwise(line):
                     marks.bar(scene, start, end, marks.BOUND, BOUND_WIDTH, marks.ON_BOUND)
             if np.isfinite(ghost := track.measured(t)).all():
-                for number in renderer.add_robot(ghost):
+                for geom, number in zip(robot, renderer.add_robot(ghost), strict=True):
                     scene.geoms[number].rgba[3] = GHOST_ALPHA
                     scene.geoms[number].transparent = 1
+                    if np.array_equal(geom.pos, scene.geoms[number].pos):  # noise does not move it
+                        scene.geoms[number].type = HIDDEN
         if t >= track.end and track.arc.outcome in FAILED:
             for side in ((CROSS, CROSS, 0.0), (CROSS, -CROSS, 0.0)):
-                ends = point - side, point + side
-                marks.bar(scene, *ends, marks.BAD, PATH_WIDTH, marks.ON_TOP + 0.18)
+                ends = point - self._larger * np.array(side), point + self._larger * np.array(side)
+                marks.bar(scene, *ends, marks.BAD, self._larger * PATH_WIDTH, marks.ON_TOP + 0.18)
         geoms = scene.geoms[first : scene.ngeom]
         points = np.vstack([path, *[geom.pos for geom in geoms]])
-        radii = [JUMP_RADIUS] * len(path) + [renderer.reach(geom) for geom in geoms]
+        radii = [self._larger * JUMP_RADIUS] * len(path) + [renderer.reach(geom) for geom in geoms]
         low, high = renderer.extent(points, np.array(radii))
         size = (renderer.width, renderer.height)
         left, top = np.floor(low.min(axis=0) - MARGIN).clip(0, size).astype(int)

@@ -1,0 +1,208 @@
+"""Drives: both controllers go through a field from its starts, under the same noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from hyrl_mj.errors import BadInput, check_bound, check_seed
+from hyrl_mj.fields.controller import controllers
+from hyrl_mj.fields.driving import Driving, Shares
+from hyrl_mj.fields.files import FieldFile
+from hyrl_mj.fields.modes import decoded
+from hyrl_mj.policies import MlpPolicy, ObservationPolicy
+from hyrl_mj.simulation import HybridArc, Noise, simulate_batch
+from hyrl_mj.stages import Budget, attack
+from hyrl_mj.tasks import POSE, Field, length
+
+# How close a robot without noise comes to the goal [m], and the rounds of the attack.
+REACHED, ROUNDS = 0.1, 4
+# Columns of a measurement: x, heading, and x and its velocity of the first post.
+COLUMNS = (0, 2, POSE, POSE + 2)
+
+
+@dataclass(frozen=True)
+class DriveOptions:
+    """The noise on what a robot measures while it drives through a field.
+
+    Attributes:
+        noise: kind of noise: none, uniform, alternating, or adversarial (looks a few samples ahead).
+        eps: bound of the noise on the robot's position [m]; by default the run's.
+        eps_heading: bound of the noise on its heading [rad]; by default half the number of --eps.
+        eps_posts: bound of the noise on the posts' positions [m].
+        eps_speeds: bound of the noise on the posts' velocities [m/s].
+        seed: seed of the noise and of the attack.
+        attack: also search for the noise that is worst for each controller.
+    """
+
+    noise: str = "alternating"
+    eps: float | None = None
+    eps_heading: float | None = None
+    eps_posts: float = 0.0
+    eps_speeds: float = 0.0
+    seed: int = 0
+    attack: bool = False
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Bounds of the noise on position [m] and heading [rad] of the robot, and on positions [m] and velocities
+    [m/s] of the posts.
+    """
+
+    place: float
+    heading: float
+    posts: float
+    speeds: float
+
+    @staticmethod
+    def trained(local: Field, noise: float) -> Bounds:
+        """Returns the bounds that policies were made for, on a task with a bound of the noise [m]."""
+        return Bounds(*(noise * float(local.noisy[column]) for column in COLUMNS))
+
+    @staticmethod
+    def of(options: DriveOptions, trained: Bounds) -> Bounds:
+        """Returns the bounds that options stand for; `trained` are those that the policies were made for.
+
+        Raises:
+            BadInput: a bound is negative or not finite, or no heading could be told from another.
+        """
+        place = check_bound(trained.place if options.eps is None else options.eps)
+        heading = place / 2 if options.eps_heading is None else check_bound(options.eps_heading)
+        if heading >= np.pi:
+            raise BadInput(
+                f"noise bound {heading:g} rad hides the heading: give an --eps-heading below {np.pi:.3g}"
+            )
+        return Bounds(
+            place, heading, check_bound(options.eps_posts), check_bound(options.eps_speeds)
+        )
+
+    @property
+    def largest(self) -> float:
+        """The bound that the others are shares of: that on the position, unless it is 0."""
+        return self.place or max(self.heading, self.posts, self.speeds)
+
+    @property
+    def shares(self) -> Shares:
+        """Which part of `largest` acts on what is measured."""
+        whole = self.largest or 1.0
+        parts = (self.place, self.heading, self.posts, self.speeds)
+        return Shares(*(part / whole for part in parts))
+
+    def __str__(self) -> str:
+        parts = {
+            f"{self.place:g} m": self.place,
+            f"{self.heading:g} rad": self.heading,
+            f"{self.posts:g} m on the posts": self.posts,
+            f"{self.speeds:g} m/s on their velocities": self.speeds,
+        }
+        return ", ".join(text for text, bound in parts.items() if bound) or "0 m"
+
+
+@dataclass(frozen=True)
+class Drives:
+    """Runs through a field: an arc for each start, by controller, "policy" and "hyrl".
+
+    Attributes:
+        task: the field with its robot.
+        bounds: of the noise.
+        arcs: under the noise of the options.
+        attacked: under the worst noise that was found for each controller and start; {} if none was looked
+            for.
+    """
+
+    task: Driving
+    bounds: Bounds
+    arcs: Mapping[str, list[HybridArc]]
+    attacked: Mapping[str, list[HybridArc]]
+
+
+def drive(
+    local: Field,
+    policy: MlpPolicy,
+    policies: Mapping[int, ObservationPolicy],
+    made_for: float,
+    field: FieldFile,
+    options: DriveOptions = DriveOptions(),
+) -> Drives:
+    """Drives through a field from all its starts, with the stage-1 policy alone and with HyRL.
+
+    Args:
+        local: the task on which the policies were trained.
+        policy: of stage 1.
+        policies: of each side.
+        made_for: bound of the noise that they were made for [m].
+        field: posts, goal and starts.
+        options: the noise.
+
+    Raises:
+        BadInput: a noise or a seed that cannot be used.
+    """
+    check_seed(options.seed)
+    bounds = Bounds.of(options, Bounds.trained(local, made_for))
+    if options.attack and not bounds.largest:
+        raise BadInput("--attack looks for the worst noise within bounds: give an --eps > 0")
+    reached = REACHED + bounds.place
+    task = Driving(local, field.layouts, bounds.shares, reached, field.time, field.starts)
+    noise = Noise(options.noise, bounds.largest)
+    loops = controllers(task, policy, policies, made_for)
+    arcs = {
+        name: simulate_batch(task, loop, field.starts, noise, seed=options.seed)
+        for name, loop in loops.items()
+    }
+    attacked = {}
+    if options.attack:
+        budget = Budget(rounds=ROUNDS)
+        found = attack(task, loops, field.starts, bounds.largest, budget, seed=options.seed)
+        attacked = {name: [*one.arcs] for name, one in found.items()}
+    return Drives(task, bounds, arcs, attacked)
+
+
+def ending(task: Driving, arc: HybridArc) -> str:
+    """Returns how a run ended: "arrived", "waited" near a goal that a post stood on, "crashed", "stalled"."""
+    if arc.outcome == "reached":
+        near = length(arc.z[-1, :2] - task.layouts.goals[0]) <= task.reached + 1e-9
+        return "arrived" if near else "waited"
+    return arc.outcome.replace("_", " ")
+
+
+def changes(arc: HybridArc) -> int:
+    """Returns how often a run changed the post in focus, or the side on which it is passed."""
+    focus, side, *_ = decoded(arc.q)
+    return int(((np.diff(focus) != 0) | (np.diff(side) != 0)).sum())
+
+
+def least_clearance(task: Driving, arc: HybridArc) -> float:
+    """Returns the least distance of the robot's hull from a post at the samples [m]; negative in a post."""
+    layouts, number = task.layouts, np.zeros(len(arc.t), dtype=int)
+    posts = layouts.positions(number, arc.t)
+    away = length(posts - arc.z[:, None, :2]) - layouts.radii[0] - task.body
+    return float(away.min())
+
+
+def noise_cautions(local: Field, made_for: float, options: DriveOptions) -> list[str]:
+    """Returns a sentence about each bound that is greater than that which the policies were made for.
+
+    `local` and `made_for` are as in `drive`.
+    """
+    if options.noise == "none" and not options.attack:
+        return []
+    trained = Bounds.trained(local, made_for)
+    bounds = Bounds.of(options, trained)
+    names = {
+        "place": ("the robot's position", "m"),
+        "heading": ("its heading", "rad"),
+        "posts": ("the posts' positions", "m"),
+        "speeds": ("the posts' velocities", "m/s"),
+    }
+    texts = []
+    for name, (what, unit) in names.items():
+        bound, usual = getattr(bounds, name), getattr(trained, name)
+        if bound > usual * (1 + 1e-9):
+            texts.append(
+                f"noise of {bound:g} {unit} on {what} is more than the {usual:g} {unit} that the run was "
+                "made for"
+            )
+    return texts

@@ -1,0 +1,175 @@
+"""Drives through a field, as tables and as replays."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from hyrl_mj.errors import BadInput, printable
+from hyrl_mj.fields import (
+    DriveOptions,
+    Drives,
+    cautions,
+    changes,
+    check_passable,
+    drive,
+    ending,
+    least_clearance,
+    noise_cautions,
+    read_field,
+)
+from hyrl_mj.policies import MlpPolicy, ObservationPolicy
+from hyrl_mj.run_directory import Run
+from hyrl_mj.simulation import HybridArc
+from hyrl_mj.tasks import LEFT, RIGHT, Field
+from hyrl_mj.viz.options import ReplayOptions
+from hyrl_mj.viz.replay import Show, check_replay, render_replay
+from hyrl_mj.viz.tables import NAMES, Table, print_table
+
+ARRIVED = ("arrived", "waited")
+USUAL = ReplayOptions()
+
+
+def drive_tables(drives: Drives, noise: str, seed: int) -> list[Table]:
+    """Returns how the runs ended, a row for each start; under the worst noise, too, if it was looked for."""
+    posts = drives.task.layouts.posts
+    what = f"{posts} post{'s' * (posts != 1)}"
+    named = "no noise" if noise == "none" else f"{noise} noise of {drives.bounds}"
+    tables = [_table(drives, drives.arcs, f"{what}: {named}, seed {seed}")]
+    if drives.attacked:
+        title = f"{what}: the worst noise of up to {drives.bounds} that a search found for each"
+        tables.append(_table(drives, drives.attacked, title))
+    return tables
+
+
+def _table(drives: Drives, arcs: Mapping[str, Sequence[HybridArc]], title: str) -> Table:
+    task, rows = drives.task, []
+    for number, (policy, hyrl) in enumerate(zip(*arcs.values(), strict=True)):
+        x, y, heading = hyrl.z[0]
+        row = [f"{number}", f"{x:.2f} m, {y:.2f} m, {heading:.2f} rad"]
+        for arc in (policy, hyrl):
+            row += [f"{ending(task, arc)} {arc.t[-1]:.2f} s", f"{least_clearance(task, arc):.2f} m"]
+        rows.append([*row, f"{changes(hyrl)}"])
+    both = [title for name in arcs for title in (NAMES[name], "least clearance")]
+    return Table(title, ["", "start", *both, "changes of focus or side"], rows)
+
+
+def drive_sentences(drives: Drives) -> list[str]:
+    """Returns from how many starts the controllers arrive, a sentence for each table."""
+    whole = [_arrivals(drives, drives.arcs)]
+    if drives.attacked:
+        whole.append(f"under the worst noise that was found {_arrivals(drives, drives.attacked)}")
+    return whole
+
+
+def _arrivals(drives: Drives, arcs: Mapping[str, Sequence[HybridArc]]) -> str:
+    counts = {
+        name: sum(ending(drives.task, arc) in ARRIVED for arc in several)
+        for name, several in arcs.items()
+    }
+    starts = len(arcs["hyrl"])
+    return (
+        f"RL policy arrives from {counts['policy']} of {starts} starts, HyRL from {counts['hyrl']}"
+    )
+
+
+def drive_shows(drives: Drives, title: str, starts: Sequence[int] | None = None) -> list[Show]:
+    """Returns a show of each start, under the worst noise if it was looked for.
+
+    Args:
+        drives: what is shown.
+        title: of the policy, as "RL policy (PPO)".
+        starts: numbers of the starts, by default all.
+    """
+    arcs = drives.attacked or drives.arcs
+    count = len(arcs["hyrl"])
+    return [
+        Show([arcs["policy"][i]], [arcs["hyrl"][i]], f"{title}, start {i}")
+        for i in (range(count) if starts is None else starts)
+    ]
+
+
+def drive_run(
+    run: Run,
+    path: Path,
+    options: DriveOptions,
+    out: Path | None = None,
+    how: ReplayOptions = USUAL,
+    shown: Sequence[int] | None = None,
+) -> Drives:
+    """Drives through the field of a file with the controllers of a run, prints how it went, and renders it.
+
+    What the policies were not made for is logged as a warning.
+
+    Args:
+        run: of the task `field`, whose both sides have a policy.
+        path: the JSON file of the field.
+        options: the noise.
+        out: the video or picture to write; by default none.
+        how: how the replay is rendered.
+        shown: numbers of the starts that it shows, by default all.
+
+    Raises:
+        BadInput: a file, a run or an option that cannot be used.
+        NoRenderer: there is no GL library or no video encoder.
+    """
+    if how.layout != "side-by-side":
+        raise BadInput(
+            f"layout {how.layout!r} cannot show a drive, in which posts may move: choose side-by-side"
+        )
+    if out is None and (shown is not None or how != USUAL):
+        raise BadInput("what is rendered needs a file to write: give --out, as in --out drive.mp4")
+    local, policy, policies = _parts(run)
+    field = read_field(path)
+    check_passable(field, local.body)
+    if out is not None:
+        check_replay(local, out, how)
+        _check_shown(shown, len(field.starts))
+    made_for = run.settings.noise
+    for caution in (*cautions(field, local.body), *noise_cautions(local, made_for, options)):
+        logging.getLogger("hyrl_mj").warning("warning: %s", printable(caution))
+    drives = drive(local, policy, policies, made_for, field, options)
+    for table in drive_tables(drives, options.noise, options.seed):
+        print_table(table)
+    for sentence in drive_sentences(drives):
+        print(sentence)
+    if out is not None:
+        render_replay(drives.task, drive_shows(drives, run.policy_title, shown), out, how)
+        print(f"{'picture' if out.suffix == '.png' else 'video'} at {out}")
+    return drives
+
+
+def _parts(run: Run) -> tuple[Field, MlpPolicy, Mapping[int, ObservationPolicy]]:
+    """Returns what a run trained: its task, the policy of stage 1, and that of each side.
+
+    Raises:
+        BadInput: it is not a run of `field`, or lacks a side.
+    """
+    remedy = "make one with hyrl-mj run field --out runs/field"
+    local = run.task
+    if not isinstance(local, Field):
+        raise BadInput(
+            f"{run.path} is a run of {local.name}, but drive takes a run of field: {remedy}"
+        )
+    policy, every = run.policy, run.controller.policies
+    policies = {side: one for side, one in every.items() if isinstance(one, ObservationPolicy)}
+    if not isinstance(policy, MlpPolicy):
+        raise BadInput(
+            f"{run.path} is a run of an agent, but drive takes a run that trained: {remedy}"
+        )
+    if {*policies} != {LEFT, RIGHT}:
+        raise BadInput(
+            f"{run.path} has {len(policies)} mode(s), but drive takes a policy for each side, left and "
+            f"right: {remedy}, perhaps with another --seed"
+        )
+    return local, policy, policies
+
+
+def _check_shown(shown: Sequence[int] | None, starts: int) -> None:
+    """Raises `BadInput` unless these are numbers of starts."""
+    for number in shown or ():
+        if number >= starts:
+            raise BadInput(
+                f"--shown {number}: the file has no such start, give numbers from 0 to {starts - 1}"
+            )

@@ -1,0 +1,488 @@
+"""`hyrl-mj drive`: what a file of a field says, what is wrong with it, and how a drive is told and shown."""
+
+import json
+import sys
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from gl import needs_gl
+from PIL import Image
+
+import hyrl_mj
+from hyrl_mj import BadInput, MlpPolicy, cli, parsing
+from hyrl_mj.fields import (
+    DriveOptions,
+    cautions,
+    changes,
+    check_passable,
+    drive,
+    drives,
+    ending,
+    least_clearance,
+    noise_cautions,
+    read_field,
+)
+from hyrl_mj.fields.drives import Bounds
+from hyrl_mj.policies import ObservationPolicy
+from hyrl_mj.tasks import LEFT, RIGHT
+from hyrl_mj.viz.replay.marks import MODE_COLOURS
+
+BODY = 0.1
+POST = {"radius_m": 0.5, "positions_m": [[-3.0, 0.0]]}
+START = {"position_m": [-6.0, 0.1], "heading_rad": 0.0}
+ONE = {"goal_m": [0.0, 0.0], "posts": [POST], "starts": [START]}
+
+
+def post(x, y, radius=0.5):
+    return {"radius_m": radius, "positions_m": [[x, y]]}
+
+
+def start(x, y, heading=0.0):
+    return {"position_m": [x, y], "heading_rad": heading}
+
+
+def ring(count, radius=0.5, around=(0.0, 0.0), away=1.5):
+    """Posts around a place."""
+    angles = 2 * np.pi * np.arange(count) / count
+    return [
+        post(around[0] + away * np.cos(a), around[1] + away * np.sin(a), radius) for a in angles
+    ]
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Writes a file of a field, and returns its path."""
+
+    def write(content):
+        path = tmp_path / "field.json"
+        path.write_text(content if isinstance(content, str) else json.dumps(content))
+        return path
+
+    return write
+
+
+@pytest.fixture
+def read(written):
+    """Returns what a file of a field says."""
+    return lambda **content: read_field(written({**ONE, **content}))
+
+
+# ---- the file
+
+
+def test_a_file_says_what_stands_where(read):
+    field = read(
+        posts=[POST, {"radius_m": 0.4, "positions_m": [[-4, 2], [-4, 1], [-3, 1]]}],
+        starts=[START, start(-6, 1, 7.0)],
+        interval_s=2,
+        time_s=20,
+    )
+    assert (field.time, field.layouts.interval, len(field.layouts)) == (20, 2, 1)
+    np.testing.assert_allclose(field.layouts.radii, [[0.5, 0.4]])
+    np.testing.assert_allclose(field.starts, [[-6, 0.1, 0], [-6, 1, 7 - 2 * np.pi]])
+    assert field.standing.tolist() == [True, False]
+    number = np.zeros(4, dtype=int)
+    places = field.layouts.positions(number, np.array([0.0, 1.0, 3.0, 99.0]))
+    np.testing.assert_allclose(places[:, 0], np.tile([-3, 0], (4, 1)))
+    np.testing.assert_allclose(places[:, 1], [[-4, 2], [-4, 1.5], [-3.5, 1], [-3, 1]])
+
+
+def test_a_run_lasts_15_s_unless_the_file_says_otherwise(read):
+    assert read().time == 15
+
+
+def without(key):
+    return {k: v for k, v in ONE.items() if k != key}
+
+
+def with_post(**content):
+    return {**ONE, "posts": [content]}
+
+
+def with_start(**content):
+    return {**ONE, "starts": [content]}
+
+
+BAD = {
+    "not JSON": ("{", ["not JSON", "give the JSON file"]),
+    "deep": ("[" * 100_000, ["not JSON"]),
+    "repeated": ('{"goal_m": [0, 0], "goal_m": [1, 1]}', ["'goal_m' twice"]),
+    "list": ("[]", ["the file is []", "goal_m, posts, starts"]),
+    "no goal": (without("goal_m"), ["the file has no goal_m", "[x, y] in m"]),
+    "no posts": (without("posts"), ["the file has no posts", "a list of posts"]),
+    "no starts": (without("starts"), ["the file has no starts"]),
+    "empty posts": ({**ONE, "posts": []}, ["posts has 0 posts", "from 1 to 100"]),
+    "too many posts": ({**ONE, "posts": [POST] * 101}, ["posts has 101 posts", "to 100"]),
+    "empty starts": ({**ONE, "starts": []}, ["starts has 0 starts"]),
+    "posts no list": ({**ONE, "posts": POST}, ["posts is {", "a list of posts"]),
+    "post no object": ({**ONE, "posts": [1]}, ["posts[0] is 1", "radius_m, positions_m"]),
+    "unknown": ({**ONE, "obstacles": []}, ["key of the file 'obstacles'", "interval_s, time_s"]),
+    "near": ({**ONE, "post": [], "posts": [POST]}, ["'post'", "Did you mean 'posts'?"]),
+    "cm": (
+        with_post(radius_cm=50, positions_m=[[0, 0]]),
+        ["posts[0] has 'radius_cm'", "measured in m", "give 'radius_m'"],
+    ),
+    "no unit": (with_post(radius=0.5, positions_m=[[0, 0]]), ["'radius'", "give 'radius_m'"]),
+    "deg": (
+        with_start(position_m=[0, 0], heading_deg=90),
+        ["starts[0] has 'heading_deg'", "measured in rad", "'heading_rad'"],
+    ),
+    "ms": ({**ONE, "interval_ms": 5}, ["'interval_ms'", "measured in s", "'interval_s'"]),
+    "goal no unit": ({**without("goal_m"), "goal": [0, 0]}, ["'goal'", "'goal_m'"]),
+    "no radius": (with_post(positions_m=[[0, 0]]), ["posts[0] has no radius_m"]),
+    "no heading": (with_start(position_m=[0, 0]), ["starts[0] has no heading_rad"]),
+    "radius 0": (with_post(radius_m=0, positions_m=[[0, 0]]), ["radius_m is 0", "> 0"]),
+    "radius -1": (with_post(radius_m=-1, positions_m=[[0, 0]]), ["radius_m is -1", "> 0"]),
+    "radius true": (with_post(radius_m=True, positions_m=[[0, 0]]), ["radius_m is true"]),
+    "radius text": (with_post(radius_m="0.5", positions_m=[[0, 0]]), ['radius_m is "0.5"']),
+    "nan": (with_post(radius_m=0.5, positions_m=[[float("nan"), 0]]), ["[0][0] is NaN", "1000 m"]),
+    "infinite": ({**ONE, "goal_m": [0, float("inf")]}, ["goal_m[1] is Infinity"]),
+    "huge": ({**ONE, "goal_m": [10**400, 0]}, ["goal_m[0] is 1000", "from -1000 to 1000 m"]),
+    "three numbers": ({**ONE, "goal_m": [0, 0, 0]}, ["goal_m is [0, 0, 0]", "two numbers"]),
+    "no positions": (with_post(radius_m=1, positions_m=[]), ["has 0 positions"]),
+    "one number": (with_post(radius_m=1, positions_m=[0, 0]), ["positions_m[0] is 0", "[x, y]"]),
+    "no interval": (
+        with_post(radius_m=1, positions_m=[[0, 0], [1, 0]]),
+        ["posts[0] has 2 positions", "no interval_s"],
+    ),
+    "interval 0": ({**ONE, "interval_s": 0}, ["interval_s is 0", "> 0"]),
+    "time": ({**ONE, "time_s": 1e6}, ["time_s is 1000000.0", "at most 3600 s"]),
+}
+
+
+@pytest.mark.parametrize(("content", "parts"), BAD.values(), ids=BAD.keys())
+def test_a_bad_file_is_one_sentence(content, parts, written):
+    with pytest.raises(BadInput) as error:
+        read_field(path := written(content))
+    text = str(error.value)
+    assert text.startswith(str(path))
+    assert "\n" not in text
+    assert len(text) < len(str(path)) + 260
+    assert [part for part in parts if part not in text] == []
+
+
+def test_a_file_that_is_not_there_or_no_file_is_said(tmp_path):
+    for path in (tmp_path / "none.json", tmp_path):
+        with pytest.raises(BadInput, match=r"cannot be read \(.*\): give the JSON file of a field"):
+            read_field(path)
+    (tmp_path / "x.json").write_bytes(b"\xff\xfe{")
+    with pytest.raises(BadInput, match="is not JSON"):
+        read_field(tmp_path / "x.json")
+
+
+# ---- what no robot can pass, and what the policies do not know
+
+
+@pytest.mark.parametrize(
+    ("content", "parts"),
+    [
+        ({"starts": [START, start(-3.55, 0)]}, ["post 0 is 0.05 m from start 1", "radius 0.1 m"]),
+        ({"starts": [start(-3, 0)]}, ["post 0 is 0 m from start 0"]),
+        ({"posts": [POST, post(0.5, 0)]}, ["post 1 is 0 m from the goal"]),
+        ({"posts": ring(8)}, ["posts 0, 1, 2, 3 and 4 more shut the goal in", "more than 0.2 m"]),
+        (
+            {
+                "posts": [*ring(8, around=(-6, 0)), post(5, 5)],
+                "starts": [start(3, 0), start(-6, 0)],
+            },
+            ["and 4 more shut start 1 in"],
+        ),
+    ],
+)
+def test_what_cannot_be_passed_is_an_error(content, parts, read):
+    with pytest.raises(BadInput) as error:
+        check_passable(read(**content), BODY)
+    assert [part for part in parts if part not in str(error.value)] == []
+
+
+def test_what_can_be_passed_is_none(read):
+    # Between neighbours of a ring of six there is a gap; the shut ring is around neither start nor goal.
+    gap = 2 * 1.5 * np.sin(np.pi / 6) - 1.0
+    check_passable(read(posts=[*ring(6, radius=0.5 + (gap - 0.24) / 2)]), BODY)
+    with pytest.raises(BadInput, match="shut"):
+        check_passable(read(posts=[*ring(6, radius=0.5 + (gap - 0.15) / 2)]), BODY)
+    check_passable(read(posts=[*ring(8, around=(4, 4))]), BODY)
+    # Moving posts may come and go.
+    shut = ring(8)
+    shut[0]["positions_m"] += [[9, 9]]
+    check_passable(read(posts=shut, interval_s=1), BODY)
+
+
+def test_a_usual_field_has_no_cautions(read):
+    assert cautions(read(posts=[POST, post(-3, 1.9)]), BODY) == []
+
+
+@pytest.mark.parametrize(
+    ("content", "parts"),
+    [
+        ({"posts": [POST, post(-3, 1.15)]}, ["posts 0 and 1 are 0.15 m apart", "as one obstacle"]),
+        ({"posts": [POST, post(-3, 0.5)]}, ["posts 0 and 1 overlap", "as one obstacle"]),
+        ({"posts": [POST, post(-3, 1.5)]}, ["posts 0 and 1 are 0.5 m apart", "0.8 m"]),
+        ({"posts": [post(-3, 0.4 * i) for i in range(5)]}, ["and 5 more pairs"]),
+        ({"posts": [post(-3, 0, 0.2)]}, ["post 0 has a radius of 0.2 m", "0.3 to 0.9 m"]),
+        (
+            {"posts": [post(-3, 0, 0.2), post(-3, 5, 1.5)]},
+            ["posts 0, 1 have radii of 0.2 to 1.5 m"],
+        ),
+        (
+            {"posts": [{**POST, "positions_m": [[-3, 0], [-3, 1]]}], "interval_s": 2},
+            ["post 0 moves at up to 0.5 m/s", "at most 0.4 m/s"],
+        ),
+        ({"posts": [post(0.65, 0)]}, ["post 0 ends 0.15 m from the goal", "does not arrive"]),
+    ],
+)
+def test_what_the_policies_do_not_know_is_said_with_figures(content, parts, read):
+    texts = cautions(read(**content), BODY)
+    assert any(all(part in text for part in parts) for text in texts), texts
+
+
+# ---- the drive
+
+
+class Steering(ObservationPolicy):
+    """Turns to the way on its side of the post, and drives."""
+
+    def __init__(self, task, side):
+        self.task, self.sign = task, 1 - 2 * side
+
+    def inputs(self, observation):
+        cos, sin = (observation[:, 10 + i] + self.sign * observation[:, 12 + i] for i in range(2))
+        angle = np.arctan2(sin, cos)
+        return np.stack([np.maximum(np.cos(angle), 0.0), np.clip(3 * angle, -1, 1)], axis=1)
+
+
+@pytest.fixture(scope="module")
+def planted():
+    """A run of `field` whose policy drives straight on, and whose mode policies pass the post."""
+    task = hyrl_mj.get_task("field")
+    k, levels = len(task.observation_low), task.input_levels
+    ahead = np.all(levels == [1.0, 0.0], axis=1).astype(np.float32)
+    assert ahead.sum() == 1
+    weights = {
+        "action_net.weight": np.zeros((len(levels), k), dtype=np.float32),
+        "action_net.bias": ahead,
+    }
+    policy = MlpPolicy(task, "ppo", "tanh", weights)
+    return SimpleNamespace(
+        path=Path("runs/field"),
+        task=task,
+        policy=policy,
+        policy_title="RL policy (PPO)",
+        settings=SimpleNamespace(noise=0.1),
+        controller=SimpleNamespace(policies={side: Steering(task, side) for side in (LEFT, RIGHT)}),
+    )
+
+
+def driven(planted, field, **options):
+    policies = planted.controller.policies
+    chosen = DriveOptions(**options)
+    return drive(planted.task, planted.policy, policies, 0.1, field, chosen)
+
+
+def test_the_observation_of_the_tests_is_that_of_the_task(planted):
+    measured = np.array([[-6.0, 0.4, 0.0, 0, 0, -3, 0, 0, 0, 0.5, 0]])
+    directions = planted.task.directions(measured)[0][0]
+    observed = planted.task.observation(measured)
+    for side, policy in planted.controller.policies.items():
+        turn = np.clip(3 * directions[side], -1, 1)
+        np.testing.assert_allclose(policy.inputs(observed)[0, 1], turn, atol=1e-9)
+
+
+def test_both_controllers_drive_from_every_start(planted, read):
+    field = read(posts=[POST, post(-4.5, 2)], starts=[start(-6, 0.3), start(-6, -0.3)])
+    result = driven(planted, field)
+    assert {name: len(arcs) for name, arcs in result.arcs.items()} == {"policy": 2, "hyrl": 2}
+    assert result.attacked == {}
+    task = result.task
+    assert task.reached == pytest.approx(0.2)
+    policy, hyrl = result.arcs["policy"][0], result.arcs["hyrl"][0]
+    assert ending(task, policy) == "crashed"
+    assert least_clearance(task, policy) <= 0
+    assert ending(task, hyrl) == "arrived"
+    assert least_clearance(task, hyrl) > 0.1
+    # Noise of 0.1 m on the position and 0.05 rad on the heading, and none on the posts.
+    noise = np.abs(hyrl.measured[:-1, :3] - hyrl.z[:-1])
+    np.testing.assert_allclose(noise.max(axis=0), [0.1, 0.1, 0.05], atol=1e-9)
+    # One comes by on the left of the post, the other on its right.
+    sides = [task.mode_name(int(arc.q[0])) for arc in result.arcs["hyrl"]]
+    assert sides == ["post 0, left", "post 0, right"]
+    assert [changes(arc) for arc in result.arcs["hyrl"]] == [0, 0]
+
+
+def test_changes_of_focus_and_side_are_counted(planted, read):
+    result = driven(planted, read(posts=[POST, post(-8, 0.1)], starts=[start(-11, 0.0)]))
+    arc = result.arcs["hyrl"][0]
+    names = [result.task.mode_name(int(q)) for q in arc.q]
+    assert changes(arc) == sum(a != b for a, b in pairwise(names)) > 0
+
+
+def test_a_goal_that_a_post_stands_on_in_the_end_is_waited_for(planted, read):
+    comes = {"radius_m": 0.5, "positions_m": [[2.0, 0.0], [0.0, 0.0]]}
+    result = driven(planted, read(posts=[comes], interval_s=5, starts=[start(-9, 0)], time_s=15))
+    assert ending(result.task, result.arcs["hyrl"][0]) == "waited"
+    far = driven(planted, read(starts=[start(-90, 0)], time_s=1))
+    assert ending(far.task, far.arcs["hyrl"][0]) == "stalled"
+
+
+def test_the_bounds_are_those_that_were_asked_for(planted, read):
+    trained = Bounds.trained(planted.task, 0.1)
+    assert trained == Bounds(0.1, 0.05, 0.0, 0.0)
+    bounds = Bounds.of(DriveOptions(eps=0.2, eps_posts=0.3), trained)
+    assert bounds == Bounds(0.2, 0.1, 0.3, 0.0)
+    assert str(bounds) == "0.2 m, 0.1 rad, 0.3 m on the posts"
+    # Without noise on the position, the others still act.
+    field = read(posts=[{**POST, "positions_m": [[-3, 0], [-3, 0.5]]}], interval_s=5)
+    options = {"eps": 0.0, "eps_heading": 0.02, "eps_posts": 0.05, "eps_speeds": 0.04}
+    arc = driven(planted, field, **options, noise="uniform").arcs["hyrl"][0]
+    task = driven(planted, field, **options).task
+    plain = task.measure(np.column_stack([arc.z, arc.t, np.zeros(len(arc.t))]))
+    off = np.abs(arc.measured[:-1] - plain[:-1]).max(axis=0)
+    assert (off <= np.array([0, 0, 0.02, 0, 0, 0.05, 0.05, 0.04, 0.04, 0]) + 1e-9).all()
+    assert (off[[2, 5, 6, 7, 8]] > [0.015, 0.04, 0.04, 0.03, 0.03]).all()
+
+
+def test_more_noise_than_that_of_the_run_is_said(planted):
+    options = DriveOptions(eps=0.2, eps_heading=0.01, eps_posts=0.05)
+    texts = noise_cautions(planted.task, 0.1, options)
+    assert len(texts) == 2
+    assert "0.2 m on the robot's position is more than the 0.1 m" in texts[0]
+    assert "0.05 m on the posts' positions is more than the 0 m" in texts[1]
+    assert noise_cautions(planted.task, 0.1, DriveOptions()) == []
+    assert noise_cautions(planted.task, 0.1, replace(options, noise="none")) == []
+
+
+def test_an_attack_is_at_least_as_bad(planted, read, monkeypatch):
+    monkeypatch.setattr(drives, "ROUNDS", 1)
+    result = driven(planted, read(time_s=8), attack=True, eps=0.05)
+    assert set(result.attacked) == {"policy", "hyrl"}
+    assert result.attacked["hyrl"][0].noise == "attack"
+    clearance = [
+        least_clearance(result.task, arcs["hyrl"][0]) for arcs in (result.attacked, result.arcs)
+    ]
+    assert clearance[0] < clearance[1] + 0.05
+
+
+# ---- the command
+
+
+@pytest.fixture
+def command(planted, monkeypatch, capsys):
+    """Calls hyrl-mj drive on the planted run, and returns exit status, output and errors."""
+
+    def call(*words, run=planted):
+        monkeypatch.setattr(parsing, "load_run", lambda path, task=None: run)
+        monkeypatch.setattr(sys, "argv", ["hyrl-mj", "drive", "runs/field", *map(str, words)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        said = capsys.readouterr()
+        return end.value.code, said.out, said.err
+
+    return call
+
+
+def test_the_command_prints_a_table_and_writes_nothing(command, written, tmp_path, caplog):
+    path = written({**ONE, "posts": [POST, post(-3, 1.5)]})
+    status, out, _ = command("--field", path, "--eps", "0.12")
+    assert status == 0
+    flat = " ".join(out.split())
+    assert "2 posts: alternating noise of 0.12 m, 0.06 rad, seed 0" in flat
+    assert "-6.00 m, 0.10 m, 0.00 rad" in flat
+    assert "RL policy arrives from 0 of 1 starts, HyRL from 1" in flat
+    assert any("0.5 m apart" in record.getMessage() for record in caplog.records)
+    assert any("noise of 0.12 m" in record.getMessage() for record in caplog.records)
+    assert [p.name for p in tmp_path.iterdir()] == ["field.json"]
+
+
+@pytest.mark.parametrize(
+    ("words", "parts"),
+    [
+        (["--noise", "white"], ["'white'", "alternating"]),
+        (["--eps", "-1"], ["-1", ">= 0"]),
+        (["--eps-heading", "4"], ["4 rad hides the heading", "below 3.14"]),
+        (["--eps-posts", "nan"], ["nan", "finite"]),
+        (["--seed", "-1"], ["seed -1"]),
+        (["--eps", "0", "--attack"], ["--attack", "--eps > 0"]),
+        (["--out", "x.avi"], ["x.avi", ".mp4, .gif, .png"]),
+        (["--out", "x.png", "--camera", "top"], ["'top'", "overhead"]),
+        (["--out", "x.png", "--layout", "overlay"], ["'overlay'", "side-by-side"]),
+        (["--out", "x.png", "--shown", "3"], ["--shown 3", "from 0 to 0"]),
+        (["--shown", "0"], ["--out"]),
+        (["--size", "640x480"], ["--out"]),
+    ],
+)
+def test_what_is_wrong_with_the_words_is_one_sentence(words, parts, command, written, tmp_path):
+    status, _, errors = command("--field", written(ONE), *words)
+    assert status == 2
+    assert errors.count("\n") == 1
+    assert [part for part in parts if part not in errors] == []
+    assert [p.name for p in tmp_path.iterdir()] == ["field.json"]
+
+
+def test_what_is_wrong_with_the_run_or_the_file_is_one_sentence(command, written, planted, vehicle):
+    path = written(ONE)
+    other = SimpleNamespace(**{**vars(planted), "task": vehicle})
+    one_sided = SimpleNamespace(
+        **{**vars(planted), "controller": SimpleNamespace(policies={LEFT: planted.policy})}
+    )
+    agent = SimpleNamespace(**{**vars(planted), "policy": Steering(planted.task, LEFT)})
+    for run, part in (
+        (other, "is a run of vehicle"),
+        (one_sided, "has 1 mode"),
+        (agent, "is a run of an agent"),
+    ):
+        status, _, errors = command("--field", path, run=run)
+        assert status == 2
+        assert part in errors
+        assert "hyrl-mj run field" in errors
+    status, _, errors = command("--field", written({**ONE, "posts": []}))
+    assert (status, "posts has 0 posts" in errors) == (2, True)
+    status, _, errors = command()
+    assert (status, "drive needs --field" in errors) == (2, True)
+
+
+# ---- the picture
+
+
+def near(picture, colour, off=60):
+    """(height, width) bool: which pixels are about of a colour, in the light of the scene."""
+    return np.abs(picture.astype(int) - np.array(colour)).sum(axis=2) < off
+
+
+@needs_gl
+def test_the_post_in_focus_has_the_colour_of_its_side(command, written, tmp_path):
+    shares = []
+    for y in (0.3, -0.3):
+        path = written({**ONE, "starts": [start(-6, y)]})
+        status, out, errors = command(
+            "--field", path, "--out", tmp_path / "x.png", "--size", "640x360"
+        )
+        assert (status, errors) == (0, "")
+        assert f"picture at {tmp_path / 'x.png'}" in out
+        with Image.open(tmp_path / "x.png") as image:
+            picture = np.asarray(image.convert("RGB"))
+        # The middle of the post is in the middle of each panel, which both show the same field.
+        panels = picture[40:-40, :320], picture[40:-40, 320:]
+        shares.append(
+            [[near(panel, colour).mean() for colour in MODE_COLOURS[:2]] for panel in panels]
+        )
+    (policy, left), (_, right) = shares
+    assert max(policy) < 0.001  # the policy has no focus
+    assert left[0] > 0.005 > 0.001 > left[1]
+    assert right[1] > 0.005 > 0.001 > right[0]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["field.json", "x.png"]
+
+
+@needs_gl
+def test_a_start_at_the_goal_and_moving_posts_are_rendered(command, written, tmp_path):
+    moving = {"radius_m": 0.5, "positions_m": [[-3, 0], [-3, 1]]}
+    content = {**ONE, "posts": [moving], "interval_s": 4, "starts": [start(0, 0), START]}
+    words = ["--out", tmp_path / "x.gif", "--size", "480x240", "--fps", "2", "--camera", "chase"]
+    status, _, errors = command("--field", written(content), *words, "--shown", "0-1")
+    assert (status, errors) == (0, "")
+    with Image.open(tmp_path / "x.gif") as image:
+        assert image.size == (480, 240)
+        assert image.n_frames > 10
