@@ -10,7 +10,7 @@ import numpy as np
 
 from hyrl_mj.fields.driving import Driving
 from hyrl_mj.fields.focus import Seen, choose, turn_sense
-from hyrl_mj.fields.guard import guarded, margin, speed_bounds
+from hyrl_mj.fields.guard import Guard
 from hyrl_mj.fields.modes import MODES_OF_POST, NO_MODE, decoded, encoded
 from hyrl_mj.policies import (
     Controller,
@@ -56,10 +56,10 @@ class FocusController:
         return max(2 * float(np.sqrt(2.0)) * self.noise, LEAST_SWING)
 
     @cached_property
-    def speeds(self) -> tuple[float, float]:
-        """Limits of the forward speed [m/s]."""
+    def guard(self) -> Guard:
+        """What keeps the robot away from posts, and going."""
         low, high = self.task.input_limits
-        return float(low[0]), float(high[0])
+        return Guard(self.task.body, self.noise, float(low[0]), float(high[0]), float(high[1]))
 
     def on_side(self, side: int) -> FocusController:
         """Returns this controller with the side on which it passes the first post in focus."""
@@ -88,7 +88,7 @@ class FocusController:
         The mode -1 stands for none: the answer begins in the initial mode.
         """
         seen, (focus, side, sense) = Seen.of(measured), decoded(q)
-        pair = choose(seen, focus, side, self.swing, margin(self.task.body, self.noise))
+        pair = choose(seen, focus, side, self.swing, self.guard.margin)
         side = pair.side
         if self.first_side is not None:
             side = np.where(q < 0, self.first_side, side)
@@ -101,8 +101,7 @@ class FocusController:
         observed = self.local.observed(view, directions, lengths)
         left, right = (self.policies[number].inputs(observed) for number in (LEFT, RIGHT))
         u = np.where((side == LEFT)[:, None], left, right)
-        bounds = speed_bounds(seen, self.task.body, self.noise, *self.speeds)
-        u = guarded(u, turn, sense, float(self.task.input_limits[1][1]), bounds)
+        u = self.guard.inputs(seen, u, turn, sense)
         return u, encoded(pair.focus, side, sense)
 
 

@@ -76,6 +76,17 @@ class Seen:
         """From the robot's middle to the posts' surfaces (n, K) [m]."""
         return length(self.away) - self.radius
 
+    @cached_property
+    def axis(self) -> np.ndarray:
+        """Directions (n, 2) of the robots."""
+        return np.stack([np.cos(self.heading), np.sin(self.heading)], axis=1)
+
+    @cached_property
+    def coming(self) -> np.ndarray:
+        """Speeds (n, K) at which posts come towards where the robots are [m/s]."""
+        far = np.maximum(length(self.away), 1e-9)
+        return np.asarray(-(self.away * self.speed).sum(axis=2) / far)
+
 
 def approach(seen: Seen, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns how near robots come to the posts' centres on straight ways to targets (n, 2), and when.

@@ -82,8 +82,9 @@ def way_round(
     from_post = to_goal - to_post
     goal_away = length(from_post)
     # Where robot or goal is inside of the disc, the way follows a smaller one.
-    deep = np.maximum(1 - away / radius, 0.0)
-    radius = np.minimum(np.minimum(radius, goal_away), np.maximum(away, 1e-9))
+    radius = np.minimum(radius, goal_away)
+    deep = np.maximum(radius - away, 0.0)
+    radius = np.minimum(radius, np.maximum(away, 1e-9))
     bearing, goal = (np.arctan2(v[:, 1], v[:, 0]) for v in (to_post, to_goal))
     # The angle to turn about the disc, against the clock on its right.
     turn = sign * (
@@ -91,9 +92,11 @@ def way_round(
     )
     own, end = np.arccos(radius / away.clip(1e-9)), np.arccos(radius / goal_away.clip(1e-9))
     free = np.abs(wrapped(turn)) <= own + end
-    # Inside of the disc the way leads out of it, the more so the deeper it is.
-    half = np.pi / 2 - own + np.minimum(deep, 0.5) * np.pi
-    direction = np.where(free, goal, bearing + sign * half)
+    # Inside of the disc the way leads out of it, the more so the deeper it is, and no nearer to the post.
+    half = np.pi / 2 - own + np.minimum(deep / CLEAR, 1.0) * np.pi / 2
+    off = wrapped(goal - bearing)
+    out = bearing + np.where(free, np.where(off >= 0, 1.0, -1.0), sign) * half
+    direction = np.where(free & ((np.abs(off) >= half) | (deep == 0)), goal, out)
     legs = np.sqrt(away**2 - radius**2) + np.sqrt(goal_away**2 - radius**2)
     around = radius * np.maximum(turn % (2 * np.pi) - own - end, 0.0)
     return direction, np.where(free, far, legs + around)
