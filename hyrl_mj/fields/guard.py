@@ -84,7 +84,7 @@ class Guard:
         far, (cos, sin) = length(way), seen.axis.T
         behind = way[:, 0] * cos + way[:, 1] * sin < 0
         aside = np.where(behind, far, np.abs(way[:, 1] * cos - way[:, 0] * sin))
-        return np.asarray(self.rate * far**2 / (2 * np.maximum(aside, 1e-9)))
+        return self.rate * far * far / (2 * np.maximum(aside, 1e-9))
 
     def _bounds(self, seen: Seen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns the least and the greatest speed (n,) that keep the distance from all posts [m/s].
