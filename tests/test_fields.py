@@ -8,10 +8,10 @@ import pytest
 import hyrl_mj
 from hyrl_mj.fields import Driving, FocusController, decoded, encoded
 from hyrl_mj.fields.focus import Seen, choose
-from hyrl_mj.fields.guard import guarded, speed_bounds
+from hyrl_mj.fields.guard import Guard
 from hyrl_mj.simulation import LoopSettings, Noise, Recorded, closed_loop
 from hyrl_mj.tasks import LEFT, RIGHT, Layouts, Outcome
-from hyrl_mj.tasks.field import turns_to, way_round
+from hyrl_mj.tasks.field import CLEAR, turns_to, ways_round
 
 
 @pytest.fixture(scope="module")
@@ -59,26 +59,34 @@ def test_the_way_round_a_disc_is_the_shortest_on_its_side():
     radius = rng.uniform(0.3, 0.9, 400)
     away = np.minimum(*(np.linalg.norm(p, axis=1) for p in (robot, goal)))
     robot, goal, radius = (x[away > radius + 0.05] for x in (robot, goal, radius))
-    both = [way_round(-robot, goal - robot, radius, side) for side in (LEFT, RIGHT)]
+    directions, lengths = ways_round(-robot, goal - robot, radius)
     # A polygon around the disc, and the straight way if it is free.
     t = np.linspace(0, 1, 2_000)[:, None, None]
     straight = np.linalg.norm(robot + t * (goal - robot), axis=2).min(axis=0) >= radius
     direct = np.linalg.norm(goal - robot, axis=1)
-    for direction, length in both:
+    for side in (LEFT, RIGHT):
+        direction, length = directions[:, side], lengths[:, side]
         np.testing.assert_allclose(length[straight], direct[straight])
         assert (length[~straight] > direct[~straight]).all()
         # A step along the way makes it shorter by its length.
         ahead = robot + 1e-4 * np.stack([np.cos(direction), np.sin(direction)], axis=1)
-        side = LEFT if direction is both[0][0] else RIGHT
-        _, after = way_round(-ahead, goal - ahead, radius, side)
+        after = ways_round(-ahead, goal - ahead, radius)[1][:, side]
         near = np.abs(length - after - 1e-4) < 1e-6
         assert near.mean() > 0.99
-    ends = [np.array([-2.0, 0.0]), np.array([2.0, 0.0])]
-    (left, _), (right, _) = (
-        way_round(-ends[0][None], (ends[1] - ends[0])[None], np.array([1.0]), side)
-        for side in (LEFT, RIGHT)
-    )
-    assert (left[0], right[0]) == pytest.approx((np.pi / 6, -np.pi / 6))
+    directions, _ = ways_round(np.array([[2.0, 0.0]]), np.array([[4.0, 0.0]]), np.array([1.0]))
+    np.testing.assert_allclose(directions, [[np.pi / 6, -np.pi / 6]])
+
+
+def test_near_a_post_the_way_leads_out_without_a_jump():
+    # The goal lies across; half way into the disc the way leads out by half a right angle.
+    to_goal, radius = np.array([[0.0, 3.0]]), np.array([0.5 + CLEAR])
+    for deep, angle in ((0.0, np.pi / 2), (CLEAR / 2, 3 * np.pi / 4), (CLEAR, np.pi)):
+        to_post = np.array([[0.5 + CLEAR - deep, 0.0]])
+        directions, _ = ways_round(to_post, to_goal, radius)
+        np.testing.assert_allclose(directions[0, LEFT], angle, atol=1e-6)
+    beside = np.column_stack([np.full(50, 0.7), np.linspace(-0.1, 0.1, 50)])
+    directions, _ = ways_round(beside, np.tile(to_goal, (50, 1)), np.repeat(radius, 50))
+    assert np.abs(np.diff(directions[:, LEFT])).max() < 0.05
 
 
 def test_a_sense_of_turning_holds_beyond_a_right_angle():
@@ -202,27 +210,63 @@ def away_from(task, z, places, noise):
     return Recorded(signal, noise, "bias")
 
 
-def test_between_two_posts_that_are_too_near_a_robot_stands(field):
-    seen = Seen.of(measured((0, 0, 0.0), [(0.6, 0.3, 0.4), (0.6, -0.3, 0.4)]))
-    least, most = speed_bounds(seen, 0.1, 0.15, -1.0, 1.0)
+def guard(noise=0.1):
+    return Guard(body=0.1, noise=noise, low=-1.0, high=1.0, rate=1.0)
+
+
+def guarded(pose, posts, u, turn, sense=1, goal=(5.0, 0.0), noise=0.1):
+    """Returns the inputs that the guard makes of inputs u, with the goal ahead."""
+    seen = Seen.of(measured(pose, posts, goal))
+    values = np.array([u]), np.array([turn]), np.array([sense])
+    return guard(noise).inputs(seen, *values)[0]
+
+
+FAR_OFF = [(0.0, 50.0, 0.5)]
+
+
+def test_between_two_posts_that_are_too_near_a_robot_stands():
+    posts = [(0.6, 0.3, 0.4), (0.6, -0.3, 0.4)]
+    least, most, _ = guard(0.15).bounds(Seen.of(measured((0, 0, 0.0), posts)))
     assert most[0] == 0
     assert least[0] < 0
-    u = guarded(np.array([[1.0, -1.0]]), np.array([0.1]), np.array([1]), 1.0, (least, most))
-    np.testing.assert_allclose(u, [[0.0, -1.0]])
+    u = guarded((0, 0, 0.0), posts, (1.0, -1.0), 0.1, noise=0.15)
+    np.testing.assert_allclose(u, [0.0, -1.0])
 
 
-def test_a_robot_with_its_back_to_its_way_turns_round(field):
-    free = np.array([-1.0]), np.array([1.0])
-    u = guarded(np.array([[0.5, -1.0]]), np.array([-3.0]), np.array([1]), 1.0, free)
-    np.testing.assert_allclose(u, [[0.0, 1.0]])
-    ahead = guarded(np.array([[-1.0, 0.2]]), np.array([0.0]), np.array([1]), 1.0, free)
-    np.testing.assert_allclose(ahead, [[0.3, 0.2]])
+def test_a_robot_with_its_back_to_its_way_turns_round():
+    np.testing.assert_allclose(guarded((0, 0, 0.0), FAR_OFF, (0.5, -1.0), -3.0), [0.0, 1.0])
+    np.testing.assert_allclose(guarded((0, 0, 0.0), FAR_OFF, (-1.0, 0.2), 0.0), [0.3, 0.2])
 
 
-def test_a_robot_retreats_from_a_post_that_comes(field):
+def test_a_robot_that_a_post_beside_it_holds_back_turns_away_from_it():
+    for side in (1, -1):
+        u = guarded((0, 0, 0.0), [(-0.05, 0.6 * side, 0.5)], (1.0, side * 0.5), 0.0)
+        np.testing.assert_allclose(u, [0.0, -side])
+
+
+def test_near_the_goal_a_robot_drives_no_circles_around_it():
+    # The goal is 0.4 m to the left: a circle of radius 0.2 m leads there.
+    u = guarded((0, 0, 0.0), FAR_OFF, (1.0, 1.0), 1.5, goal=(0.0, 0.4))
+    np.testing.assert_allclose(u, [0.2, 1.0], atol=1e-6)
+    ahead = guarded((0, 0, 0.0), FAR_OFF, (1.0, 0.0), 0.0, goal=(0.4, 0.0))
+    np.testing.assert_allclose(ahead, [1.0, 0.0])
+
+
+def test_a_robot_retreats_from_a_post_that_comes():
     seen = Seen.of(measured((0, 0, 0.0), [(0.8, 0.0, -0.4, 0.0, 0.5)]))
-    _, most = speed_bounds(seen, 0.1, 0.1, -1.0, 1.0)
+    _, most, _ = guard().bounds(seen)
     assert -0.5 < most[0] < 0
+
+
+def test_a_robot_drives_out_of_the_way_of_a_post_that_comes_from_its_side():
+    # The robot turns round, and would stand meanwhile.
+    for across in (1, -1):
+        comes = [(0.0, 0.8 * across, 0.0, -0.4 * across, 0.5)]
+        speed, _ = guarded((0, 0, 0.0), comes, (0.0, 1.0), 3.0, goal=(-5.0, 0.0))
+        assert abs(speed) == 1.0
+        stands = [(0.0, 0.8 * across, 0.5)]
+        speed, _ = guarded((0, 0, 0.0), stands, (0.0, 1.0), 3.0, goal=(-5.0, 0.0))
+        assert speed == 0.0
 
 
 def test_the_reward_of_a_mode_leads_its_own_way(field):

@@ -1,6 +1,9 @@
 """Which post of a field is in focus, and on which side it is passed: the logic state (q, lambda).
 
 The way to the goal bends around the posts that block it. The focus is the post that it bends around first.
+
+A single robot asks for this at every sample, and NumPy takes longer to call than to compute: vectors are kept
+as two arrays x and y, (n,) or (n, K) for K posts.
 """
 
 from __future__ import annotations
@@ -10,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from hyrl_mj.tasks import CLEAR, LEFT, PROJECTED, RIGHT, length, posts_of, wrapped
+from hyrl_mj.tasks import CLEAR, LEFT, PROJECTED, RIGHT, posts_of
 
 # Posts that leave less room between them than this are one obstacle [m].
 ROOM = 0.3
@@ -21,18 +24,30 @@ NEARBY = 0.7
 # A robot at full speed comes so close to a post, within the next second, before the post takes the focus [m].
 CLOSE = 0.3
 GLANCES, GLANCE = 4, 0.25
-# The guard holds a robot back that is less than this farther from a post than its margin, and heads for it:
-# the cosine of the angle between its heading and the post's direction is greater than this [m], [1].
-HOLDING, AHEAD = 0.05, 0.0
-# Obstacles are followed over 2 to the power of this many posts.
-LINKS = 4
+# The guard holds a robot back that heads for a post and is less than this farther from it than its margin [m].
+HOLDING = 0.05
+# Obstacles are followed over 4 `FOLDED` posts.
+FOLDED = 4
+# Turns steps into ways.
+SUMS = np.triu(np.ones((GLANCES, GLANCES)))
 # A turn about less than this angle has a side of its own [rad].
 TURNED = 2.0
+TINY = 1e-9
 
 
-def pick(values: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Returns those values (n, K, ...) (n, ...) of which own (n, K) tells."""
-    return np.where(own if values.ndim == 2 else own[:, :, None], values, 0).sum(axis=1)
+def dot(ax: np.ndarray, ay: np.ndarray, bx: np.ndarray, by: np.ndarray) -> np.ndarray:
+    """Returns the scalar products of vectors."""
+    return ax * bx + ay * by
+
+
+def norm(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Returns the lengths of vectors."""
+    return np.sqrt(x * x + y * y)
+
+
+def cross(ax: np.ndarray, ay: np.ndarray, bx: np.ndarray, by: np.ndarray) -> np.ndarray:
+    """Returns the vector products of vectors: more than 0 where b is on the left of a."""
+    return ax * by - ay * bx
 
 
 def only(index: np.ndarray, count: int) -> np.ndarray:
@@ -40,88 +55,136 @@ def only(index: np.ndarray, count: int) -> np.ndarray:
     return np.arange(count) == index[:, None]
 
 
+def pick(values: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Returns those of finite values (n, K) (n,) of which own (n, K) tells."""
+    return (values * own).sum(axis=1)
+
+
+@dataclass(frozen=True)
+class Post:
+    """One post for each robot, (n,) each: the way x, y to it [m], its velocity [m/s], and its radius [m]."""
+
+    x: np.ndarray
+    y: np.ndarray
+    vx: np.ndarray
+    vy: np.ndarray
+    radius: np.ndarray
+
+
 @dataclass(frozen=True)
 class Seen:
     """What n measurements of K posts say.
 
     Attributes:
-        place, goal: (n, 2) of robot and goal [m].
+        posts: (n, K, 5) as `posts_of` returns them.
+        place_x, place_y, goal_x, goal_y: (n,) robot, and the way to the goal [m].
         heading: (n,) [rad].
-        centre, speed: (n, K, 2) of the posts [m], [m/s].
+        x, y: (n, K) ways to the posts [m].
+        vx, vy: (n, K) velocities of the posts [m/s].
         radius: (n, K) [m].
     """
 
-    place: np.ndarray
-    goal: np.ndarray
+    posts: np.ndarray
+    place_x: np.ndarray
+    place_y: np.ndarray
+    goal_x: np.ndarray
+    goal_y: np.ndarray
     heading: np.ndarray
-    centre: np.ndarray
-    speed: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    vx: np.ndarray
+    vy: np.ndarray
     radius: np.ndarray
 
     @staticmethod
     def of(measured: np.ndarray) -> Seen:
-        posts = posts_of(measured)
+        posts, x, y = posts_of(measured), measured[:, 0], measured[:, 1]
         return Seen(
-            measured[:, :2], measured[:, 3:5], measured[:, 2],
-            posts[..., :2], posts[..., 2:4], posts[..., 4],
+            posts, x, y, measured[:, 3] - x, measured[:, 4] - y, measured[:, 2],
+            posts[:, :, 0] - x[:, None], posts[:, :, 1] - y[:, None],
+            posts[:, :, 2], posts[:, :, 3], posts[:, :, 4],
         )  # fmt: skip
 
+    @property
+    def count(self) -> int:
+        """K, the number of posts."""
+        return int(self.radius.shape[1])
+
     @cached_property
-    def away(self) -> np.ndarray:
-        """From the robot to the posts (n, K, 2) [m]."""
-        return self.centre - self.place[:, None]
+    def far(self) -> np.ndarray:
+        """From the robot's middle to those of the posts (n, K) [m], more than 0."""
+        return np.maximum(norm(self.x, self.y), TINY)
 
     @cached_property
     def room(self) -> np.ndarray:
         """From the robot's middle to the posts' surfaces (n, K) [m]."""
-        return length(self.away) - self.radius
+        return self.far - self.radius
 
     @cached_property
-    def axis(self) -> np.ndarray:
-        """Directions (n, 2) of the robots."""
-        return np.stack([np.cos(self.heading), np.sin(self.heading)], axis=1)
+    def goal_far(self) -> np.ndarray:
+        """From the robot's middle to the goal (n,) [m], more than 0."""
+        return np.maximum(norm(self.goal_x, self.goal_y), TINY)
+
+    @cached_property
+    def cos(self) -> np.ndarray:
+        """Cosines of the headings (n,)."""
+        return np.cos(self.heading)
+
+    @cached_property
+    def sin(self) -> np.ndarray:
+        """Sines of the headings (n,)."""
+        return np.sin(self.heading)
 
     @cached_property
     def coming(self) -> np.ndarray:
         """Speeds (n, K) at which posts come towards where the robots are [m/s]."""
-        far = np.maximum(length(self.away), 1e-9)
-        return np.asarray(-(self.away * self.speed).sum(axis=2) / far)
+        return -dot(self.x, self.y, self.vx, self.vy) / self.far
+
+    @cached_property
+    def towards(self) -> np.ndarray:
+        """Cosines (n, K) of the angles between headings and the ways to posts."""
+        return dot(self.x, self.y, self.cos[:, None], self.sin[:, None]) / self.far
+
+    def post(self, own: np.ndarray) -> Post:
+        """Returns those posts of which own (n, K) tells."""
+        x, y, vx, vy, radius = (own.astype(float)[:, None] @ self.posts)[:, 0].T
+        return Post(x - self.place_x, y - self.place_y, vx, vy, radius)
 
 
-def approach(seen: Seen, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns how near robots come to the posts' centres on straight ways to targets (n, 2), and when.
+def tangent(
+    x: np.ndarray, y: np.ndarray, radius: np.ndarray, sign: np.ndarray | float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the ways to where the tangents past discs in x, y touch them; sign 1 is left, -1 right."""
+    far2 = np.maximum(x * x + y * y, TINY)
+    sin = np.minimum(radius / np.sqrt(far2), 1.0)
+    cos = np.sqrt(1 - sin * sin)
+    # The unit vector to the disc, turned by half the angle that the disc covers, times the tangent's length.
+    share = np.maximum(cos, CLEAR / np.sqrt(far2))
+    sin = sign * sin
+    return share * (x * cos - y * sin), share * (y * cos + x * sin)
 
-    Returns:
-        (n, K) distances [m]; (n, K) times at a speed of 1 m/s [s].
+
+def neighbours(posts: np.ndarray) -> np.ndarray:
+    """Returns between which posts (n, K, 5) there is no room now or soon: (n, K, K), 1 or 0."""
+    x, y, vx, vy, radius = (posts[:, :, i] for i in range(5))
+    dx, dy = x[:, :, None] - x[:, None], y[:, :, None] - y[:, None]
+    soon = PROJECTED / 2
+    sx, sy = x + soon * vx, y + soon * vy
+    sx, sy = sx[:, :, None] - sx[:, None], sy[:, :, None] - sy[:, None]
+    reach = radius[:, :, None] + (radius + ROOM)[:, None]
+    least = np.minimum(dx * dx + dy * dy, sx * sx + sy * sy)
+    return (least < reach * reach).astype(float)
+
+
+def wall(near: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Returns the posts (n, K) bool that are one obstacle with those of which own (n, K) tells.
+
+    `near` is what `neighbours` returns, to the power of `FOLDED`.
     """
-    way = target - seen.place
-    far = np.maximum(length(way), 1e-9)
-    relative = (way / far[:, None])[:, None] - seen.speed
-    away = seen.away
-    when = (away * relative).sum(axis=2) / np.maximum((relative**2).sum(axis=2), 1e-9)
-    when = np.clip(when, 0.0, far[:, None])
-    return length(away - relative * when[..., None]), when
-
-
-def tangent(away: np.ndarray, radius: np.ndarray, side: np.ndarray | int) -> np.ndarray:
-    """Returns the ways (..., 2) to where the tangents past discs touch them, for sides (...)."""
-    far = np.maximum(length(away), 1e-9)
-    half = np.arcsin(np.minimum(radius / far, 1.0))
-    bearing = np.arctan2(away[..., 1], away[..., 0]) + np.where(side == LEFT, half, -half)
-    leg = np.maximum(np.sqrt(np.maximum(far**2 - radius**2, 0.0)), CLEAR)
-    return leg[..., None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
-
-
-def clusters(seen: Seen) -> np.ndarray:
-    """Returns which posts (n, K, K) bool are one obstacle, because nothing fits between them."""
-    away = seen.centre[:, :, None] - seen.centre[:, None]
-    going = seen.speed[:, :, None] - seen.speed[:, None]
-    apart = np.minimum(length(away), length(away + PROJECTED / 2 * going))
-    near = apart - seen.radius[:, :, None] - seen.radius[:, None] < ROOM
-    joined = near.astype(np.float32)
-    for _ in range(LINKS):  # each time over twice as many posts in between
-        joined = np.minimum(joined @ joined, np.float32(1))
-    return joined > 0
+    row = own.astype(float)[:, None]
+    for _ in range(FOLDED):
+        row = row @ near
+    return row[:, 0] > 0
 
 
 @dataclass(frozen=True)
@@ -137,36 +200,55 @@ class Bend(Pair):
     """Where the way to the goal bends first.
 
     Attributes:
-        target: (n, 2) where the way leads first [m].
+        x, y: (n,) where the way leads first [m].
         around: (n, K) bool, the posts that the way bends around.
     """
 
-    target: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
     around: np.ndarray
 
 
-def shorter_side(
-    seen: Seen, post: np.ndarray, mine: np.ndarray, radius: np.ndarray, target: np.ndarray
-) -> np.ndarray:
-    """Returns the sides (n,) on which ways to targets (n, 2) past posts are shorter.
+class _Sides:
+    """The ways past obstacles on their left and right.
 
     Args:
         seen: what was measured.
-        post: (n, K) bool, the post.
-        mine: (n, K) bool, the posts that are one obstacle with it, and are passed on the same side.
-        radius: (n, K) of the discs to pass [m].
-        target: (n, 2) [m].
+        reach: (n, K) radii of the discs to pass [m].
     """
-    away, count = seen.away, post.shape[1]
-    bearing = np.arctan2(away[..., 1], away[..., 0])
-    half = np.arcsin(np.minimum(radius / np.maximum(length(away), 1e-9), 1.0))
-    off = wrapped(bearing - pick(bearing, post)[:, None])
-    lengths = []
-    for side, sign in ((LEFT, 1.0), (RIGHT, -1.0)):
-        last = only(np.where(mine, sign * off + half, -np.inf).argmax(axis=1), count)
-        leg = tangent(pick(away, last), pick(radius, last), side)
-        lengths.append(length(leg) + length(target - seen.place - leg))
-    return np.where(lengths[0] <= lengths[1], LEFT, RIGHT)
+
+    def __init__(self, seen: Seen, reach: np.ndarray):
+        self.seen = seen
+        near = neighbours(seen.posts)
+        near = near @ near
+        self.near = near @ near
+        self.half = np.arcsin(np.minimum(reach / seen.far, 1.0))
+        # To the ends of the tangents, and how long that is.
+        self.legs = []
+        for sign in (1.0, -1.0):
+            x, y = tangent(seen.x, seen.y, reach, sign)
+            self.legs.append((sign, x, y, norm(x, y)))
+
+    def shorter(
+        self, own: np.ndarray, mine: np.ndarray, x: np.ndarray, y: np.ndarray
+    ) -> np.ndarray:
+        """Returns the sides (n,) on which ways to x, y (n,) past posts are shorter.
+
+        Args:
+            own: (n, K) bool, the post.
+            mine: (n, K) bool, the posts that are one obstacle with it, and are passed on the same side.
+            x, y: the target [m].
+        """
+        seen = self.seen
+        post = seen.post(own)
+        px, py = post.x[:, None], post.y[:, None]
+        off = np.arctan2(cross(px, py, seen.x, seen.y), dot(px, py, seen.x, seen.y))
+        lengths = []
+        for sign, leg_x, leg_y, leg in self.legs:
+            last = np.where(mine, sign * off + self.half, -np.inf).argmax(axis=1)
+            whole = leg + norm(x[:, None] - leg_x, y[:, None] - leg_y)
+            lengths.append(pick(whole, only(last, seen.count)))
+        return np.where(lengths[0] <= lengths[1], LEFT, RIGHT)
 
 
 def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float) -> Bend:
@@ -177,63 +259,65 @@ def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float) ->
         focus, side: (n,) of before, -1 for none.
         wider: by how much the disc of the post in focus is wider than others [m].
     """
-    n, count = seen.radius.shape
-    radius = seen.radius + CLEAR + wider * only(focus, count)
-    room = seen.room
-    joined = clusters(seen)
-    target, passed = seen.goal, np.zeros((n, count), dtype=bool)
-    best, best_side = np.full(n, -1), np.full(n, LEFT)
+    count, kept = seen.count, only(focus, seen.radius.shape[1])
+    reach = seen.radius + CLEAR + wider * kept
+    sides: _Sides | None = None
+    x, y, far = seen.goal_x, seen.goal_y, seen.goal_far
+    passed = seen.radius < 0
+    best, best_side = np.full_like(focus, -1), np.full_like(focus, LEFT)
     for _ in range(BENDS):
-        near, when = approach(seen, target)
-        ahead = (seen.away * (target - seen.place)[:, None]).sum(axis=2) > 0
-        blocks = (near < radius) & ahead & ~passed
-        more = blocks.any(axis=1)
+        # How near robots come to the posts on straight ways at 1 m/s, and when.
+        vx, vy = (x / far)[:, None] - seen.vx, (y / far)[:, None] - seen.vy
+        when = dot(seen.x, seen.y, vx, vy) / np.maximum(dot(vx, vy, vx, vy), TINY)
+        when = np.minimum(np.maximum(when, 0.0), far[:, None])
+        near_x, near_y = seen.x - vx * when, seen.y - vy * when
+        ahead = dot(seen.x, seen.y, x[:, None], y[:, None]) > 0
+        blocks = (dot(near_x, near_y, near_x, near_y) < reach * reach) & ahead & ~passed
+        more: np.ndarray = blocks.any(axis=1)
         if isinstance(more, np.ndarray) and not more.any():  # an export does not know
             break
-        post = np.where(blocks, room, np.inf).argmin(axis=1)
+        sides = sides or _Sides(seen, reach)
+        post = np.where(blocks, seen.room, np.inf).argmin(axis=1)
         own = only(post, count)
-        mine = (joined & own[:, :, None]).any(axis=1)
+        mine = wall(sides.near, own)
         together = (mine & only(best, count)).any(axis=1)
-        way = np.where(together, best_side, shorter_side(seen, own, mine, radius, target))
+        way = np.where(together, best_side, sides.shorter(own, mine, x, y))
         way = np.where(post == focus, side, way)
         best, best_side = np.where(more, post, best), np.where(more, way, best_side)
         passed = passed | (own & more[:, None])
-        soon = np.minimum(pick(when, own), PROJECTED)[:, None]
-        leg = tangent(pick(seen.away, own) + soon * pick(seen.speed, own), pick(radius, own), way)
-        target = np.where(more[:, None], seen.place + leg, target)
-    return Bend(best, best_side, target, passed)
+        first, soon = seen.post(own), np.minimum(pick(when, own), PROJECTED)
+        next_x, next_y = tangent(
+            first.x + soon * first.vx,
+            first.y + soon * first.vy,
+            pick(reach, own),
+            np.where(way == LEFT, 1.0, -1.0),
+        )
+        x, y = np.where(more, next_x, x), np.where(more, next_y, y)
+        far = np.maximum(norm(x, y), TINY)
+    return Bend(best, best_side, x, y, passed)
 
 
-def least_room(seen: Seen, target: np.ndarray) -> np.ndarray:
-    """Returns how close robots come to the posts' surfaces, while they turn to targets (n, 2): (n, K) [m].
+def least_room(seen: Seen, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Returns how close robots come to the posts' surfaces, while they turn to x, y (n,): (n, K) [m].
 
     This looks `GLANCES` times `GLANCE` ahead.
     """
-    way = target - seen.place
-    far, turn = length(way), wrapped(np.arctan2(way[:, 1], way[:, 0]) - seen.heading)
-    place, least = seen.place, np.full(seen.radius.shape, np.inf)
-    for k in range(GLANCES):
-        most = GLANCE * (k + 0.5)
-        heading = seen.heading + np.clip(turn, -most, most)
-        step = np.clip(far - GLANCE * k, 0.0, GLANCE)[:, None]
-        place = place + step * np.stack([np.cos(heading), np.sin(heading)], axis=1)
-        centre = seen.centre + GLANCE * (k + 1) * seen.speed
-        least = np.minimum(least, length(centre - place[:, None]) - seen.radius)
-    return least
+    turn = np.arctan2(cross(seen.cos, seen.sin, x, y), dot(seen.cos, seen.sin, x, y))[:, None]
+    most = GLANCE * (np.arange(GLANCES) + 0.5)
+    heading = seen.heading[:, None] + np.minimum(np.maximum(turn, -most), most)
+    step = norm(x, y)[:, None] - GLANCE * np.arange(GLANCES)
+    step = np.minimum(np.maximum(step, 0.0), GLANCE)
+    place_x, place_y = (step * np.cos(heading)) @ SUMS, (step * np.sin(heading)) @ SUMS
+    time = GLANCE * np.arange(1, GLANCES + 1)[:, None]
+    away_x = seen.x[:, None] + time * seen.vx[:, None] - place_x[:, :, None]
+    away_y = seen.y[:, None] + time * seen.vy[:, None] - place_y[:, :, None]
+    return norm(away_x, away_y).min(axis=1) - seen.radius
 
 
-def side_of_way(seen: Seen, post: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Returns how far (n,) posts (n, K) bool are to the right of the ways to targets (n, 2) [m]."""
-    way, away = target - seen.place, pick(seen.away, post)
-    across = way[:, 1] * away[:, 0] - way[:, 0] * away[:, 1]
-    return across / np.maximum(length(way), 1e-9)
-
-
-def ahead_of(seen: Seen, post: np.ndarray) -> np.ndarray:
-    """Returns the cosines (n,) of the angles between headings and the ways to posts (n, K) bool."""
-    away = pick(seen.away, post)
-    ahead = away[:, 0] * np.cos(seen.heading) + away[:, 1] * np.sin(seen.heading)
-    return ahead / np.maximum(length(away), 1e-9)
+def on_side(seen: Seen, own: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Returns on which sides (n,) ways to x, y (n,) pass posts (n, K) bool."""
+    post = seen.post(own)
+    return np.where(cross(x, y, post.x, post.y) < 0, LEFT, RIGHT)
 
 
 def choose(
@@ -248,37 +332,35 @@ def choose(
             by more than that before another decision follows.
         margin: distance from the posts' surfaces at which the guard holds the robot back [m].
     """
-    count = seen.radius.shape[1]
+    count = seen.count
     # The difference of two distances changes by twice as much as either.
     nearer = wider = 2 * swing
+    own = only(focus, count)
     bend = first_bend(seen, focus, side, wider)
-    free = bend.focus < 0
-    # Nothing blocks the way.
-    room = seen.room
-    nearest = room.argmin(axis=1)
-    known = np.maximum(focus, 0)
-    own = only(known, count)
-    least, room_of_known = room.min(axis=1), pick(room, own)
+    # Nothing blocks the way: the nearest post.
+    room, room_of_known = seen.room, pick(seen.room, own)
+    least = room.min(axis=1)
     other = (focus < 0) | ((least < NEARBY) & (room_of_known > least + nearer))
-    idle = np.where(other, nearest, known)
-    right_of = side_of_way(seen, only(idle, count), seen.goal)
-    idle_side = np.where(idle == focus, side, np.where(right_of > 0, LEFT, RIGHT))
-    best = np.where(free, idle, bend.focus)
-    best_side = np.where(free, idle_side, bend.side)
+    idle = np.where(other, room.argmin(axis=1), focus)
+    idle_side = on_side(seen, only(idle, count), seen.goal_x, seen.goal_y)
+    idle_side = np.where(idle == focus, side, idle_side)
+    free = bend.focus < 0
+    best, best_side = np.where(free, idle, bend.focus), np.where(free, idle_side, bend.side)
     # What is too close on the way.
-    close_by = least_room(seen, bend.target) - CLOSE - swing * only(focus, count)
+    close_by = least_room(seen, bend.x, bend.y) - CLOSE - swing * own
     close = close_by.argmin(axis=1)
     # The post in focus keeps it while it matters, unless another one that does is nearer.
     matters = ((bend.around | (close_by < 0)) & own).any(axis=1)
     urgent = (close_by.min(axis=1) < 0) & (close != best)
-    close_side = np.where(side_of_way(seen, only(close, count), bend.target) > 0, LEFT, RIGHT)
+    close_side = on_side(seen, only(close, count), bend.x, bend.y)
     close_side = np.where(close == focus, side, close_side)
     best, best_side = np.where(urgent, close, best), np.where(urgent, close_side, best_side)
-    apart = pick(room, only(best, count)) - room_of_known
-    kept = (focus >= 0) & matters & (apart > -nearer)
+    first = only(best, count)
+    room_of_best = pick(room, first)
+    kept = matters & (room_of_best > room_of_known - nearer)
     # A post that holds the robot back takes the focus, or the robot would stand there for ever.
-    held = (pick(room, only(best, count)) < margin + HOLDING) & (apart < 0)
-    kept = kept & ~(held & (ahead_of(seen, only(best, count)) > AHEAD))
+    held = (room_of_best < margin + HOLDING) & (room_of_best < room_of_known)
+    kept = kept & ~(held & (pick(seen.towards, first) > 0))
     return Pair(np.where(kept, focus, best), np.where(kept, side, best_side))
 
 

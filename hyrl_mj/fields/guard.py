@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hyrl_mj.fields.focus import Seen, only, pick
-from hyrl_mj.tasks import length
+from hyrl_mj.fields.focus import TINY, Seen, cross, dot, norm, only, pick
 
 # The clearance beyond the margin may shrink by this share of itself in a second [1/s].
 RATE = 3.0
@@ -65,14 +64,15 @@ class Guard:
         """
         creep = LEAST * np.cos(turn)
         back = creep < 0
-        ahead = np.minimum(np.maximum(u[:, 0], creep), self._approach(seen))
-        speed = np.where(back, 0.0, ahead)
+        speed = np.minimum(np.maximum(u[:, 0], creep), self._approach(seen))
+        speed = np.where(back, 0.0, speed)
         rates = np.where(back, sense * self.rate, u[:, 1])
-        least, most, aside = self._bounds(seen)
+        least, most, aside = self.bounds(seen)
         bounded = np.minimum(np.maximum(speed, least), most)
         bounded = np.where(least > most, (least + most) / 2, bounded)
         rates = np.where((bounded < creep) & (aside != 0), aside * self.rate, rates)
-        return np.stack([self._evading(seen, bounded, rates), rates], axis=1)
+        speed = self._evading(seen, bounded, rates)
+        return np.concatenate([speed[:, None], rates[:, None]], axis=1)
 
     def _approach(self, seen: Seen) -> np.ndarray:
         """Returns the speeds (n,) above which robots may circle their goals for ever [m/s].
@@ -80,13 +80,12 @@ class Guard:
         A robot with speed v that turns at its greatest rate w drives on a circle of radius v / w. It reaches
         a goal in the direction a, at the distance d, if that is at most d / (2 sin a).
         """
-        way = seen.goal - seen.place
-        far, (cos, sin) = length(way), seen.axis.T
-        behind = way[:, 0] * cos + way[:, 1] * sin < 0
-        aside = np.where(behind, far, np.abs(way[:, 1] * cos - way[:, 0] * sin))
-        return self.rate * far * far / (2 * np.maximum(aside, 1e-9))
+        x, y, far = seen.goal_x, seen.goal_y, seen.goal_far
+        behind = dot(seen.cos, seen.sin, x, y) < 0
+        aside = np.where(behind, far, np.abs(cross(seen.cos, seen.sin, x, y)))
+        return self.rate * far * far / (2 * np.maximum(aside, TINY))
 
-    def _bounds(self, seen: Seen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def bounds(self, seen: Seen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns the least and the greatest speed (n,) that keep the distance from all posts [m/s].
 
         This is a control barrier function of the distance (Ames et al., "Control barrier functions: theory
@@ -95,50 +94,52 @@ class Guard:
         is the sense in which to turn away from the post that sets the greatest speed: 1 against the clock,
         -1 with it, 0 if it is ahead.
         """
-        away, far = seen.away, np.maximum(seen.room + seen.radius, 1e-9)
-        # The distance shrinks by `towards` for each meter ahead, and by `seen.coming` a second.
-        towards = (away * seen.axis[:, None]).sum(axis=2) / far
+        # The distance shrinks by `towards` for each meter ahead, and by `coming` a second.
+        towards = seen.towards
         allowed = RATE * np.maximum(seen.room - self.margin, 0.0) - seen.coming
         # The direction of the post is not known better than this [rad].
-        astray = np.sqrt(2.0) * self.noise / far + self.noise / 2
-        across = np.sqrt(np.maximum(1 - towards**2, 0.0)) * astray
-        ahead, behind = towards + across > 0, across - towards > 0
-        most = np.where(ahead, allowed / np.maximum(towards + across, 1e-3), np.inf)
-        least = np.where(behind, -allowed / np.maximum(across - towards, 1e-3), -np.inf)
-        most = np.where((allowed < 0) & (towards < STEEP), np.where(ahead, 0.0, np.inf), most)
-        least = np.where((allowed < 0) & (towards > -STEEP), np.where(behind, 0.0, -np.inf), least)
-        first = only(most.argmin(axis=1), most.shape[1])
-        post, (cos, sin) = pick(away, first), seen.axis.T
-        aside = np.where(post[:, 1] * cos > post[:, 0] * sin, -1.0, 1.0)
+        astray = np.sqrt(2.0) * self.noise / seen.far + self.noise / 2
+        across = np.sqrt(np.maximum(1 - towards * towards, 0.0)) * astray
+        ahead, behind, close = towards + across, across - towards, allowed < 0
+        most = np.where(ahead > 0, allowed / np.maximum(ahead, 1e-3), np.inf)
+        most = np.where(close & (towards < STEEP), np.maximum(most, 0.0), most)
+        least = np.where(behind > 0, -allowed / np.maximum(behind, 1e-3), -np.inf)
+        least = np.where(close & (towards > -STEEP), np.minimum(least, 0.0), least)
+        first = only(most.argmin(axis=1), seen.count)
+        post = seen.post(first)
+        aside = np.where(cross(seen.cos, seen.sin, post.x, post.y) > 0, -1.0, 1.0)
         aside = np.where(pick(towards, first) < STEEP, aside, 0.0)
         low, high = self.low, self.high
         return (
-            np.clip(least.max(axis=1), low, high),
-            np.clip(most.min(axis=1), low, high),
+            np.minimum(np.maximum(least.max(axis=1), low), high),
+            np.minimum(np.maximum(most.min(axis=1), low), high),
             aside,
         )
 
     def _evading(self, seen: Seen, speed: np.ndarray, rate: np.ndarray) -> np.ndarray:
         """Returns speeds (n,) that evade posts which come, instead of speeds (n,), at rates of turn (n,)."""
-        room, coming = self._least_rooms(seen, speed, rate)
-        threat, best = coming < self.margin, np.minimum(room + GAIN, self.margin)
-        for other in (self.high, self.low):
-            others = np.full(len(speed), other)
-            room, _ = self._least_rooms(seen, others, rate)
-            better = threat & (room > best)
-            best, speed = np.where(better, room, best), np.where(better, others, speed)
+        coming = seen.coming > COMING
+        if isinstance(coming, np.ndarray) and not coming.any():  # an export does not know
+            return speed
+        ones = np.ones_like(speed)
+        speeds = (speed, self.high * ones, self.low * ones)
+        rooms = self._rooms(seen, np.stack(speeds, axis=1), rate)
+        least = rooms.min(axis=2)
+        threat = np.where(coming, rooms[:, 0], np.inf).min(axis=1) < self.margin
+        best = np.minimum(least[:, 0] + GAIN, self.margin)
+        for i in (1, 2):
+            better = threat & (least[:, i] > best)
+            best, speed = np.where(better, least[:, i], best), np.where(better, speeds[i], speed)
         return speed
 
-    def _least_rooms(
-        self, seen: Seen, speed: np.ndarray, rate: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns how close robots soon are to posts, and to posts that come, (n,) [m]."""
-        least = np.full(seen.radius.shape, np.inf)
-        for k in range(1, LOOKS + 1):
-            time = k * LOOK
-            heading = seen.heading + rate * time / 2
-            step = (speed * time)[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
-            away = seen.away + time * seen.speed - step[:, None]
-            least = np.minimum(least, length(away) - seen.radius)
-        coming = np.where(seen.coming > COMING, least, np.inf)
-        return least.min(axis=1), coming.min(axis=1)
+    def _rooms(self, seen: Seen, speed: np.ndarray, rate: np.ndarray) -> np.ndarray:
+        """Returns how close robots soon are to posts (n, S, K) at speeds (n, S) and rates (n,) [m]."""
+        time = LOOK * np.arange(1, LOOKS + 1)
+        heading = seen.heading[:, None] + rate[:, None] * (time / 2)
+        # Axes: robots, speeds, times, posts.
+        step = speed[:, :, None] * time
+        step_x = (step * np.cos(heading)[:, None])[..., None]
+        step_y = (step * np.sin(heading)[:, None])[..., None]
+        x = seen.x[:, None] + time[:, None] * seen.vx[:, None]
+        y = seen.y[:, None] + time[:, None] * seen.vy[:, None]
+        return norm(x[:, None] - step_x, y[:, None] - step_y).min(axis=2) - seen.radius[:, None]

@@ -16,7 +16,7 @@ from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.field_robots import FieldRobot, Unicycle
 from hyrl_mj.tasks.layouts import OF_POST, POSE, TURN, Layouts, length, posts_of
-from hyrl_mj.tasks.obstacles import LEFT, RIGHT, wrapped
+from hyrl_mj.tasks.obstacles import wrapped
 from hyrl_mj.tasks.registry import register
 
 # What the layouts of a training are drawn from: radii of the post, distances of the goal from its surface
@@ -60,45 +60,48 @@ PPO: dict[str, Any] = {
         "gae_lambda": 0.95,
     },
 }
+# The sense in which ways turn from the post to its sides, `LEFT` and `RIGHT`.
+SIGNS = np.array([1.0, -1.0])
 # How far ahead the way of a moving post counts [s].
 PROJECTED = 2.0
 
 
-def way_round(
-    to_post: np.ndarray, to_goal: np.ndarray, radius: np.ndarray, side: np.ndarray | int
+def ways_round(
+    to_post: np.ndarray, to_goal: np.ndarray, radius: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns where the shortest way to the goal past a disc begins, and how long it is.
+    """Returns where the shortest ways to the goal past a disc begin, and how long they are.
 
     Args:
         to_post, to_goal: (n, 2) from the robot to the middle of the disc and to the goal [m].
         radius: (n,) of the disc [m].
-        side: (n,) or one, on which side of the disc the way passes, `LEFT` or `RIGHT`.
 
     Returns:
-        (n,) direction of the way [rad]; (n,) its length [m].
+        (n, 2) directions of the ways that pass the disc on its `LEFT` and on its `RIGHT` [rad]; (n, 2) their
+        lengths [m].
     """
-    sign = np.where(np.equal(side, LEFT), 1.0, -1.0)
-    away, far = length(to_post), length(to_goal)
-    from_post = to_goal - to_post
-    goal_away = length(from_post)
-    # Where robot or goal is inside of the disc, the way follows a smaller one.
-    radius = np.minimum(radius, goal_away)
-    deep = np.maximum(radius - away, 0.0)
-    radius = np.minimum(radius, np.maximum(away, 1e-9))
-    bearing, goal = (np.arctan2(v[:, 1], v[:, 0]) for v in (to_post, to_goal))
-    # The angle to turn about the disc, against the clock on its right.
-    turn = sign * (
-        np.arctan2(-to_post[:, 1], -to_post[:, 0]) - np.arctan2(from_post[:, 1], from_post[:, 0])
+    post_x, post_y, goal_x, goal_y = (v[:, i : i + 1] for v in (to_post, to_goal) for i in (0, 1))
+    from_x, from_y = goal_x - post_x, goal_y - post_y
+    away, far, goal_away = (
+        np.sqrt(x * x + y * y) for x, y in ((post_x, post_y), (goal_x, goal_y), (from_x, from_y))
     )
-    own, end = np.arccos(radius / away.clip(1e-9)), np.arccos(radius / goal_away.clip(1e-9))
-    free = np.abs(wrapped(turn)) <= own + end
+    # Where robot or goal is inside of the disc, the way follows a smaller one.
+    radius = np.minimum(radius[:, None], goal_away)
+    deep = np.maximum(radius - away, 0.0)
+    away = np.maximum(away, 1e-9)
+    radius = np.minimum(radius, away)
+    bearing, goal = np.arctan2(post_y, post_x), np.arctan2(goal_y, goal_x)
+    # The angle to turn about the disc, against the clock on its right.
+    turn = SIGNS * (np.arctan2(-post_y, -post_x) - np.arctan2(from_y, from_x))
+    own = np.arccos(radius / away)
+    both = own + np.arccos(radius / np.maximum(goal_away, 1e-9))
+    free = np.abs(wrapped(turn)) <= both
     # Inside of the disc the way leads out of it, the more so the deeper it is, and no nearer to the post.
-    half = np.pi / 2 - own + np.minimum(deep / CLEAR, 1.0) * np.pi / 2
+    half = np.pi / 2 - own + np.minimum(deep / CLEAR, 1.0) * (np.pi / 2)
     off = wrapped(goal - bearing)
-    out = bearing + np.where(free, np.where(off >= 0, 1.0, -1.0), sign) * half
+    out = bearing + np.where(free, np.where(off >= 0, 1.0, -1.0), SIGNS) * half
     direction = np.where(free & ((np.abs(off) >= half) | (deep == 0)), goal, out)
-    legs = np.sqrt(away**2 - radius**2) + np.sqrt(goal_away**2 - radius**2)
-    around = radius * np.maximum(turn % (2 * np.pi) - own - end, 0.0)
+    legs = np.sqrt(away * away - radius * radius) + np.sqrt(goal_away * goal_away - radius * radius)
+    around = radius * np.maximum(turn % (2 * np.pi) - both, 0.0)
     return direction, np.where(free, far, legs + around)
 
 
@@ -336,10 +339,7 @@ class Field(FieldTask):
         to_post = post[:, :2] - measurement[:, :2]
         radius = post[:, 4] + CLEAR
         soon = np.clip(length(to_post) - radius, 0.0, PROJECTED)[:, None]
-        to_post = to_post + soon * post[:, 2:4]
-        ways = [way_round(to_post, goal, radius, side) for side in (LEFT, RIGHT)]
-        directions, lengths = zip(*ways, strict=True)
-        return np.stack(directions, axis=1), np.stack(lengths, axis=1)
+        return ways_round(to_post + soon * post[:, 2:4], goal, radius)
 
     def for_mode(self, mode: int) -> Self:
         task = copy(self)
