@@ -81,6 +81,15 @@ def drive(
     return np.concatenate(ends)
 
 
+def drive_attacked(
+    task: Driving, who: str, loop: Controller, z0: np.ndarray, rounds: int, tally: Tally
+) -> None:
+    """Runs a controller from starts under the worst noise that so many rounds find, and counts."""
+    found = attack(task, {who: loop}, z0, 0.1, Budget(rounds=rounds))[who]
+    for arc in found.arcs:
+        tally.outcomes[arc.outcome] = tally.outcomes.get(arc.outcome, 0) + 1
+
+
 def count_changes(task: Driving, z0: np.ndarray, run, tally: Tally) -> None:
     """Counts changes of focus and side, and the posts that were in focus when they were passed."""
     q, length = np.array(run.q), run.length
@@ -239,12 +248,11 @@ def try_published(run: hyrl_mj.Run, path: Path, rounds: int, table: Table) -> No
                 table.add_row(name, f"{place:g}, {heading:g}", who, *tally.row())
         if rounds:
             task = Driving(run.task, layouts, Shares(), 0.2, TIME, starts)
-            for who, found in attack(
-                task, loops_of(run, task), starts, 0.1, Budget(rounds=rounds)
-            ).items():
-                lost = [arc.outcome for arc in found.arcs]
+            for who, loop in loops_of(run, task).items():
                 tally = Tally()
-                tally.outcomes = {k: lost.count(k) for k in set(lost)}
+                for side in (None, 0, 1) if who == "hyrl" else (None,):
+                    begun = loop if side is None else loop.on_side(side)
+                    drive_attacked(task, who, begun, starts, rounds, tally)
                 table.add_row(name, "attack 0.1, 0.05", who, *tally.row())
 
 
@@ -269,9 +277,7 @@ def try_random(
                     drive(task, loop, z0, Noise(kind, 0.1), tally)
                 if rounds:
                     tally = tallies.setdefault((where, "attack", who), Tally())
-                    found = attack(task, {who: loop}, z0, 0.1, Budget(rounds=rounds))[who]
-                    for arc in found.arcs:
-                        tally.outcomes[arc.outcome] = tally.outcomes.get(arc.outcome, 0) + 1
+                    drive_attacked(task, who, loop, z0[::each], rounds, tally)
     for key in sorted(tallies):
         table.add_row(*key, *tallies[key].row())
 
@@ -296,7 +302,12 @@ def main() -> None:
     parser.add_argument("--fields", type=int, default=100)
     parser.add_argument("--starts", type=int, default=10)
     parser.add_argument("--moving", action="store_true")
-    parser.add_argument("--rounds", type=int, default=0, help="rounds of the attack")
+    parser.add_argument(
+        "--rounds",
+        type=int,
+        default=0,
+        help="rounds of the attack; of a random field one start in STARTS is attacked",
+    )
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     run = hyrl_mj.load_run(given.run)

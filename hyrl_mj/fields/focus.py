@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +25,7 @@ NEARBY = 0.7
 # A robot at full speed comes so close to a post, within the next second, before the post takes the focus [m].
 CLOSE = 0.3
 GLANCES, GLANCE = 4, 0.25
-# The guard holds a robot back that heads for a post and is less than this farther from it than its margin [m].
+# A post ahead holds a robot back that is nearer to it than the margin of the guard and this [m].
 HOLDING = 0.05
 # Obstacles are followed over 4 `FOLDED` posts.
 FOLDED = 4
@@ -273,7 +274,7 @@ def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float) ->
         near_x, near_y = seen.x - vx * when, seen.y - vy * when
         ahead = dot(seen.x, seen.y, x[:, None], y[:, None]) > 0
         blocks = (dot(near_x, near_y, near_x, near_y) < reach * reach) & ahead & ~passed
-        more: np.ndarray = blocks.any(axis=1)
+        more: Any = blocks.any(axis=1)
         if isinstance(more, np.ndarray) and not more.any():  # an export does not know
             break
         sides = sides or _Sides(seen, reach)

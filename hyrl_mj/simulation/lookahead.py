@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from itertools import product
 from typing import Self
@@ -17,6 +18,8 @@ from hyrl_mj.tasks import Outcome, Task
 AHEAD = 6
 # Simulations side by side.
 BATCH = 2_048
+# A controller is asked about so many measurements at once: more do not stay in a processor's cache.
+TOGETHER = 1_024
 
 
 @dataclass
@@ -42,6 +45,33 @@ class Ahead:
         """Takes over other simulations (r,) as those of indices `rows` (r,)."""
         for field in fields(self):
             getattr(self, field.name)[rows] = getattr(other, field.name)
+
+
+def each_answer(
+    act: Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
+    true: np.ndarray,
+    candidates: np.ndarray,
+    q: np.ndarray,
+    past: np.ndarray,
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yields a controller's answers to candidates of the noise, to several of them at once.
+
+    Args:
+        act: returns inputs (n, m) and modes (n,) for measurements (n, p), modes (n,) and past (n, memory, p).
+        true: (n, p) measurements without noise.
+        candidates: (c, p) noise.
+        q, past: as `act` takes them, of the n runs.
+
+    Yields:
+        Inputs (k, n, m) and modes (k, n) for the next k of the candidates.
+    """
+    n = len(true)
+    several = max(TOGETHER // max(n, 1), 1)
+    for first in range(0, len(candidates), several):
+        some = candidates[first : first + several]
+        measured = (true + some[:, None]).reshape(-1, true.shape[1])
+        u, modes = act(measured, np.tile(q, len(some)), np.tile(past, (len(some), 1, 1)))
+        yield u.reshape(len(some), n, -1), modes.reshape(len(some), n)
 
 
 @register_noise
@@ -97,8 +127,11 @@ class Lookahead(Signal):
         q, rows, k = now.q[running], now.rows[running], now.k[running]
         past = nothing_past(self.controller, *true.shape) if now.past is None else now.past
         past = past[running]
-        answers = np.stack(
-            [np.column_stack(self._act(true[running] + c, q, past)) for c in self._candidates]
+        answers = np.concatenate(
+            [
+                np.concatenate([u, q[..., None]], axis=2)
+                for u, q in each_answer(self._act, true[running], self._candidates, q, past)
+            ]
         )
         # Simulate each distinct answer once, and only where the candidates' answers differ. With memory
         # the same answer to two candidates does not make them equal.
@@ -201,5 +234,7 @@ class Lookahead(Signal):
         self, measured: np.ndarray, q: np.ndarray, past: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Returns the controller's inputs (n, m) and modes (n,) for measurements (n, p) in modes (n,)."""
-        mode = np.where(q == NOT_STARTED, self.controller.initial_mode(measured), q)
-        return answer(self.controller, mode, measured, past)
+        begins = q == NOT_STARTED
+        if begins.any():
+            q = np.where(begins, self.controller.initial_mode(measured), q)
+        return answer(self.controller, q, measured, past)

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from hyrl_mj.policies import Controller, answer, nothing_past
-from hyrl_mj.simulation.lookahead import Lookahead
+from hyrl_mj.simulation.lookahead import Lookahead, each_answer
 from hyrl_mj.simulation.noise import NOT_STARTED, Sample, Signal
 from hyrl_mj.tasks import Outcome, Task
 
@@ -171,11 +171,9 @@ class Programmes(Signal):
         rows, rule = rows[wishful], rule[wishful]
         if not len(rows):
             return
-        answers = [
-            self._answers(now.measurement[rows] + candidate, now.q[rows], past[rows])
-            for candidate in self.rules.candidates
-        ]
-        u, q = np.stack([u for u, _ in answers]), np.stack([q for _, q in answers])
+        true, candidates = now.measurement[rows], self.rules.candidates
+        answers = [*each_answer(self._answers, true, candidates, now.q[rows], past[rows])]
+        u, q = (np.concatenate(parts) for parts in zip(*answers, strict=True))
         u = self._scaled(u)
         usual_mode = np.where(now.q[rows] == NOT_STARTED, q[0], now.q[rows])
         jumps, contrary = DECISIVE * (q != usual_mode), np.linalg.norm(u - u[0], axis=2)
