@@ -8,11 +8,11 @@ from pathlib import Path
 
 from hyrl_mj import pipeline
 from hyrl_mj.errors import BadInput, unknown
-from hyrl_mj.fields import DriveOptions
+from hyrl_mj.fields import DriveOptions, for_posts
 from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions, SweepOptions
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sweeps import DONE
-from hyrl_mj.tasks import get_task, task_names, write_task
+from hyrl_mj.tasks import Field, get_task, task_names, write_task
 from hyrl_mj.verdict import FAILED
 from hyrl_mj.viz import ReplayOptions, print_robustness, print_summary, print_sweep
 
@@ -294,17 +294,25 @@ def report(run: Run, *, out: Path | None = None) -> None:
         print(f"page at {out}")
 
 
-def export(run: Run, *, to: str, out: Path) -> None:
+def export(run: Run, *, to: str, out: Path, posts: int | None = None) -> None:
     """Write the hybrid controller of a run so that it works without hyrl_mj.
 
     Args:
         to: onnx (one file, q and measured in, u and q_next out; -1 as the first q), or numpy (a folder
             with controller.py and controller.npz, which need NumPy alone).
         out: the file or the folder to write.
+        posts: for a run of field, the number of posts of the fields to drive through; 1 by default.
     """
     from hyrl_mj.export import export
 
-    export(run.controller, to, out)
+    if isinstance(run.task, Field):
+        count = 1 if posts is None else posts
+        controller = for_posts(run.task, run.mode_policies, run.settings.noise, count)
+        export(controller, to, out)
+    elif posts is not None:
+        raise BadInput(f"{run.task.name} has no field of posts: leave --posts out")
+    else:
+        export(run.controller, to, out)
     print(f"controller at {out}")
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from hyrl_mj import artifacts, policies
 from hyrl_mj.errors import BadArtifact, BadInput
+from hyrl_mj.fields import GuardedPolicy
 from hyrl_mj.game import Lattice, Robustness, lattice_grid
 from hyrl_mj.learning import Settings, differing
 from hyrl_mj.manifest import FILES, Manifest, check_contents, locked, may_hold
@@ -27,7 +28,7 @@ from hyrl_mj.stages import (
     Partition,
     Retraining,
 )
-from hyrl_mj.tasks import Task, described_task, get_task, reference
+from hyrl_mj.tasks import Field, Task, described_task, get_task, reference
 from hyrl_mj.verdict import Verdict
 
 
@@ -174,10 +175,20 @@ class Run:
         return ExtendedSets.load(self._checked("extended_sets.npz"), self.task)
 
     @cached_property
+    def mode_policies(self) -> dict[int, MlpPolicy]:
+        """The policy of each mode, from stage 6."""
+        return {q: self._load_policy(f"mode_{q}") for q in self.extended_sets.modes}
+
+    @cached_property
     def controller(self) -> HybridController:
         """The hybrid controller, from stage 7."""
         extended, starts = self.extended_sets, None
-        mode_policies = {q: self._load_policy(f"mode_{q}") for q in extended.modes}
+        mode_policies: dict[int, Policy] = {**self.mode_policies}
+        if isinstance(self.task, Field):
+            mode_policies = {
+                q: GuardedPolicy(self.task, policy, q, self.settings.noise)
+                for q, policy in self.mode_policies.items()
+            }
         flow_sets = dict(zip(extended.modes, extended.sets, strict=True))
         if self.agent is not None:
             # The flow sets of an agent may reach farther to one side of its decision than to the other.

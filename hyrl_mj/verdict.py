@@ -27,7 +27,8 @@ class Verdict:
     - HELD: the game cannot be played or is an estimate, HyRL arrives in nearly all episodes under each kind
       of noise, and the attack, if there was one, breaks it from nearly no start.
     - FAILED: no start is winnable, or HyRL wins less than the policy without noise, or stage 6 gave up: for
-      some mode no attempt gave a policy that wins nearly all of its set.
+      some mode no attempt gave a policy that wins nearly all of its set. Tasks with a reward for each mode,
+      as `field`, may draw episodes that no policy wins: there stage 6 does not give up.
     - WEAK: HyRL wins more than the policy under noise, or the policy does not arrive from nearly all of its
       starts without noise, or the examination was under less noise than the run's bound.
     - FAILED: none of these. HyRL loses, and is no better than the policy.
@@ -181,10 +182,16 @@ class _Case:
                 f"without noise HyRL loses {percent(1 - hyrl)} of {self.whole}, more than the policy "
                 f"({percent(1 - policy)})"
             )
-        given_up = [result.mode for result in self.retraining.modes if result.won < NEARLY]
+        # A mode with a reward of its own is judged by episodes that perhaps no policy wins.
+        modes = self.retraining.modes
+        given_up = [
+            result.mode
+            for result in modes
+            if result.won < NEARLY and self.task.for_mode(result.mode) is self.task
+        ]
         if given_up:
-            modes = listed([self.task.mode_name(mode) for mode in given_up])
-            yield f"stage 6 gave up on mode{'s' * (len(given_up) > 1)} {modes}"
+            names = listed([self.task.mode_name(mode) for mode in given_up])
+            yield f"stage 6 gave up on mode{'s' * (len(given_up) > 1)} {names}"
 
     def weaknesses(self) -> Iterator[str]:
         """Yields why the run is WEAK, if it is."""

@@ -38,7 +38,9 @@ DEEPEST = -1e300
 class Traceable(Controller, Protocol):
     """A controller whose step is written in NumPy's functions of arrays, such as `FocusController`."""
 
-    task: Task
+    @property
+    def task(self) -> Task:
+        """What it controls."""
 
     def answer(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Does `step` without checks and branches, in the initial mode where q (n,) is -1."""

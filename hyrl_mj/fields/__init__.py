@@ -1,6 +1,6 @@
 """Fields: a controller that passes any number of posts, with two policies that were trained on one."""
 
-from hyrl_mj.fields.controller import FocusController, controllers
+from hyrl_mj.fields.controller import FocusController, GuardedPolicy, controllers, for_posts
 from hyrl_mj.fields.drives import (
     DriveOptions,
     Drives,
@@ -21,6 +21,7 @@ __all__ = [
     "Driving",
     "FieldFile",
     "FocusController",
+    "GuardedPolicy",
     "Shares",
     "cautions",
     "changes",
@@ -30,6 +31,7 @@ __all__ = [
     "drive",
     "encoded",
     "ending",
+    "for_posts",
     "least_clearance",
     "noise_cautions",
     "read_field",

@@ -8,7 +8,9 @@ from functools import cached_property
 
 import numpy as np
 
+from hyrl_mj.errors import BadInput
 from hyrl_mj.fields.driving import Driving
+from hyrl_mj.fields.files import MOST_POSTS
 from hyrl_mj.fields.focus import Seen, choose, turn_sense
 from hyrl_mj.fields.guard import Guard
 from hyrl_mj.fields.modes import MODES_OF_POST, NO_MODE, decoded, encoded
@@ -18,10 +20,74 @@ from hyrl_mj.policies import (
     PolicyController,
     check_modes,
 )
-from hyrl_mj.tasks import LEFT, RIGHT, Field, FieldTask, only_post, wrapped
+from hyrl_mj.tasks import LEFT, RIGHT, TURN, Field, FieldTask, Layouts, only_post, wrapped
 
 # The swing of measurements without noise: decisions must not follow rounding errors [m].
 LEAST_SWING = 0.1
+
+
+@dataclass(frozen=True)
+class Way:
+    """The way past a post, for n robots.
+
+    Attributes:
+        turn: (n,) angle from the heading to the way [rad].
+        sense: (n,) in which to turn, 1 against the clock, -1 with it.
+        observed: (n, 17) what the policies observe.
+    """
+
+    turn: np.ndarray
+    sense: np.ndarray
+    observed: np.ndarray
+
+
+def way_past(local: Field, view: np.ndarray, side: np.ndarray, sense: np.ndarray) -> Way:
+    """Returns the ways on sides (n,) of the one post of measurements (n, 10).
+
+    `local` is the task of the policies, and `sense` (n,) the senses of turning of before, 0 for none.
+    """
+    directions, lengths = local.directions(view)
+    direction = np.where(side == LEFT, directions[:, 0], directions[:, 1])
+    turn = wrapped(direction - view[:, 2])
+    sense = turn_sense(turn, sense)
+    view = np.concatenate([view, sense[:, None]], axis=1)
+    return Way(turn, sense, local.observed(view, directions, lengths))
+
+
+def guard_of(task: FieldTask, noise: float) -> Guard:
+    """Returns what keeps a robot away from posts, and going; `noise` is the bound on its position [m]."""
+    low, high = task.input_limits
+    return Guard(task.body, noise, float(low[0]), float(high[0]), float(high[1]))
+
+
+@dataclass(frozen=True)
+class GuardedPolicy:
+    """A policy of one side on the task that it was trained on, with the guard of fields.
+
+    Attributes:
+        task: with one post.
+        policy: of the side.
+        side: on which it passes the post.
+        noise: largest error of a measured coordinate [m] that the guard keeps away from posts for.
+    """
+
+    task: Field
+    policy: ObservationPolicy
+    side: int
+    noise: float
+
+    def act(self, measured: np.ndarray) -> np.ndarray:
+        """Returns inputs (n, m) for measurements (n, p).
+
+        Raises:
+            BadInput: a wrong shape, or a measurement that is not finite.
+        """
+        measured = self.task.check_measurement(measured)
+        side, sense = np.full(len(measured), self.side), np.zeros(len(measured))
+        way = way_past(self.task, measured[:, :TURN], side, sense)
+        u = self.policy.inputs(way.observed)
+        seen = Seen.of(measured)
+        return guard_of(self.task, self.noise).inputs(seen, u, way.turn, way.sense)
 
 
 @dataclass(frozen=True)
@@ -58,8 +124,7 @@ class FocusController:
     @cached_property
     def guard(self) -> Guard:
         """What keeps the robot away from posts, and going."""
-        low, high = self.task.input_limits
-        return Guard(self.task.body, self.noise, float(low[0]), float(high[0]), float(high[1]))
+        return guard_of(self.task, self.noise)
 
     def on_side(self, side: int) -> FocusController:
         """Returns this controller with the side on which it passes the first post in focus."""
@@ -92,16 +157,9 @@ class FocusController:
         side = pair.side
         if self.first_side is not None:
             side = np.where(q < 0, self.first_side, side)
-        view = only_post(measured, pair.focus)
-        directions, lengths = self.local.directions(view)
-        direction = np.where(side == LEFT, directions[:, 0], directions[:, 1])
-        turn = wrapped(direction - view[:, 2])
-        sense = turn_sense(turn, sense)
-        view = np.hstack([view, sense[:, None]])
-        observed = self.local.observed(view, directions, lengths)
-        u = self._of_policies(observed, side)
-        u = self.guard.inputs(seen, u, turn, sense)
-        return u, encoded(pair.focus, side, sense)
+        way = way_past(self.local, only_post(measured, pair.focus), side, sense)
+        u = self.guard.inputs(seen, self._of_policies(way.observed, side), way.turn, way.sense)
+        return u, encoded(pair.focus, side, way.sense)
 
     def _of_policies(self, observed: np.ndarray, side: np.ndarray) -> np.ndarray:
         """Returns the inputs (n, m) of the policies of sides (n,) for observations (n, 17)."""
@@ -139,6 +197,29 @@ class WithoutMemory:
         return self.policy.inputs(
             self.local.observation(np.hstack([view, np.zeros_like(view[:, :1])]))
         )
+
+
+def for_posts(
+    local: Field, policies: Mapping[int, ObservationPolicy], noise: float, posts: int
+) -> FocusController:
+    """Returns a controller for any field of so many posts, from 1 to `MOST_POSTS`.
+
+    Args:
+        local: the task on which the policies were trained.
+        policies: of each side.
+        noise: bound of the noise on the position [m].
+        posts: number of posts.
+
+    Raises:
+        BadInput: there cannot be so many posts.
+    """
+    if not 1 <= posts <= MOST_POSTS:
+        raise BadInput(f"a field cannot have {posts} posts: give from 1 to {MOST_POSTS}")
+    # A field that has so many: rows of five posts, which the robot drives through.
+    number = np.arange(posts)
+    places = np.stack([-2.0 - 2 * (number // 5), 2.0 * (number % 5) - 4], axis=1)
+    layouts = Layouts(places[None, None], np.full((1, posts), 0.5), np.zeros((1, 2)))
+    return FocusController(Driving(local, layouts), local, policies, noise)
 
 
 def controllers(

@@ -16,6 +16,8 @@ from hyrl_mj.tasks import Outcome, Task
 
 # Samples by which a plant with inertia is simulated ahead.
 AHEAD = 6
+# So many noisy columns have their noise combined; of more of them, so many.
+COMBINED, FEW = 6, 3
 # Simulations side by side.
 BATCH = 2_048
 # A controller is asked about so many measurements at once: more do not stay in a processor's cache.
@@ -109,11 +111,26 @@ class Lookahead(Signal):
         assert controller is not None
         signal.task, signal.controller = task, controller
         signal.samples = 1 if task.kinematic else self.farthest
-        fine = np.count_nonzero(self.shares) <= (2 if task.kinematic else 1)
-        factors = (0.0, -1.0, 1.0, -0.5, 0.5) if fine else (0.0, -1.0, 1.0)
-        choices = product(*[factors if share else (0.0,) for share in self.shares])
-        signal._candidates = self.bound * np.array(list(choices)) * self.shares
+        signal._candidates = self.bound * self._directions(task.kinematic) * self.shares
         return signal
+
+    def _directions(self, kinematic: bool) -> np.ndarray:
+        """Returns the candidates (c, p) as shares of the bound, the first of which is no noise.
+
+        With more than `COMBINED` noisy columns, combinations are too many: then the first `FEW` of them are
+        combined, and each of the others acts alone.
+        """
+        columns = np.flatnonzero(self.shares)
+        few = len(columns) if len(columns) <= COMBINED else FEW
+        first, rest = columns[:few], columns[few:]
+        fine = len(columns) <= (2 if kinematic else 1)
+        factors = (0.0, -1.0, 1.0, -0.5, 0.5) if fine else (0.0, -1.0, 1.0)
+        combined = np.array(list(product(factors, repeat=len(first))))
+        directions = np.zeros((len(combined) + 2 * len(rest), len(self.shares)))
+        directions[: len(combined), first] = combined
+        alone = np.arange(len(combined), len(directions)).reshape(2, -1)
+        directions[alone[0], rest], directions[alone[1], rest] = -1.0, 1.0
+        return directions
 
     def reset(self, n: int, rng: np.random.Generator) -> None:
         super().reset(n, rng)

@@ -19,7 +19,7 @@ from hyrl_mj.fields import (
     noise_cautions,
     read_field,
 )
-from hyrl_mj.policies import MlpPolicy, ObservationPolicy
+from hyrl_mj.policies import MlpPolicy
 from hyrl_mj.run_directory import Run
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import LEFT, RIGHT, Field
@@ -140,7 +140,7 @@ def drive_run(
     return drives
 
 
-def _parts(run: Run) -> tuple[Field, MlpPolicy, Mapping[int, ObservationPolicy]]:
+def _parts(run: Run) -> tuple[Field, MlpPolicy, Mapping[int, MlpPolicy]]:
     """Returns what a run trained: its task, the policy of stage 1, and that of each side.
 
     Raises:
@@ -152,8 +152,7 @@ def _parts(run: Run) -> tuple[Field, MlpPolicy, Mapping[int, ObservationPolicy]]
         raise BadInput(
             f"{run.path} is a run of {local.name}, but drive takes a run of field: {remedy}"
         )
-    policy, every = run.policy, run.controller.policies
-    policies = {side: one for side, one in every.items() if isinstance(one, ObservationPolicy)}
+    policy, policies = run.policy, run.mode_policies
     if not isinstance(policy, MlpPolicy):
         raise BadInput(
             f"{run.path} is a run of an agent, but drive takes a run that trained: {remedy}"
