@@ -16,8 +16,8 @@ import numpy as np
 
 from hyrl_mj.tasks import CLEAR, LEFT, PROJECTED, RIGHT, posts_of
 
-# Posts that leave less room between them than this are one obstacle [m].
-ROOM = 0.3
+# Posts that leave less room between them than this, now or after so long, are one obstacle [m], [s].
+ROOM, CLOSING = 0.3, 2.0
 # How many posts the way may bend around one after the other before the focus is found.
 BENDS = 4
 # Where nothing blocks the way, a post that is this near comes into focus [m].
@@ -169,8 +169,7 @@ def neighbours(posts: np.ndarray) -> np.ndarray:
     """Returns between which posts (n, K, 5) there is no room now or soon: (n, K, K), 1 or 0."""
     x, y, vx, vy, radius = (posts[:, :, i] for i in range(5))
     dx, dy = x[:, :, None] - x[:, None], y[:, :, None] - y[:, None]
-    soon = PROJECTED / 2
-    sx, sy = x + soon * vx, y + soon * vy
+    sx, sy = x + CLOSING * vx, y + CLOSING * vy
     sx, sy = sx[:, :, None] - sx[:, None], sy[:, :, None] - sy[:, None]
     reach = radius[:, :, None] + (radius + ROOM)[:, None]
     least = np.minimum(dx * dx + dy * dy, sx * sx + sy * sy)

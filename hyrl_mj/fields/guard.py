@@ -21,8 +21,8 @@ LEAST = 0.3
 # Posts that come faster than this are evaded [m/s]: more than the noise on the velocity of one that stands.
 COMING = 0.1
 # A robot looks so often, and each time so much farther ahead, at where posts that come will be [s].
-LOOKS, LOOK = 4, 0.15
-# It changes its speed for as much more room [m].
+LOOKS, LOOK = 5, 0.2
+# It changes its speed and its rate of turn for as much more room [m].
 GAIN = 0.1
 
 
@@ -71,7 +71,7 @@ class Guard:
         bounded = np.minimum(np.maximum(speed, least), most)
         bounded = np.where(least > most, (least + most) / 2, bounded)
         rates = np.where((bounded < creep) & (aside != 0), aside * self.rate, rates)
-        speed = self._evading(seen, bounded, rates)
+        speed, rates = self._evading(seen, bounded, rates)
         return np.concatenate([speed[:, None], rates[:, None]], axis=1)
 
     def _approach(self, seen: Seen) -> np.ndarray:
@@ -116,30 +116,34 @@ class Guard:
             aside,
         )
 
-    def _evading(self, seen: Seen, speed: np.ndarray, rate: np.ndarray) -> np.ndarray:
-        """Returns speeds (n,) that evade posts which come, instead of speeds (n,), at rates of turn (n,)."""
+    def _evading(
+        self, seen: Seen, speed: np.ndarray, rate: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Returns speeds (n,) and rates of turn (n,) that evade posts which come, instead of these."""
         coming = seen.coming > COMING
         if isinstance(coming, np.ndarray) and not coming.any():  # an export does not know
-            return speed
-        ones = np.ones_like(speed)
-        speeds = (speed, self.high * ones, self.low * ones)
-        rooms = self._rooms(seen, np.stack(speeds, axis=1), rate)
+            return speed, rate
+        one = np.ones_like(speed)
+        turns = (rate, self.rate * one, -self.rate * one)
+        others = [(v * one, w) for w in turns for v in (self.high, self.low)]
+        speeds, rates = zip((speed, rate), *others, strict=True)
+        rooms = self._rooms(seen, np.stack(speeds, axis=1), np.stack(rates, axis=1))
         least = rooms.min(axis=2)
         threat = np.where(coming, rooms[:, 0], np.inf).min(axis=1) < self.margin
         best = np.minimum(least[:, 0] + GAIN, self.margin)
-        for i in (1, 2):
+        for i, (v, w) in enumerate(others, 1):
             better = threat & (least[:, i] > best)
-            best, speed = np.where(better, least[:, i], best), np.where(better, speeds[i], speed)
-        return speed
+            best = np.where(better, least[:, i], best)
+            speed, rate = np.where(better, v, speed), np.where(better, w, rate)
+        return speed, rate
 
     def _rooms(self, seen: Seen, speed: np.ndarray, rate: np.ndarray) -> np.ndarray:
-        """Returns how close robots soon are to posts (n, S, K) at speeds (n, S) and rates (n,) [m]."""
+        """Returns how close robots soon are to posts (n, S, K) at speeds and rates (n, S) [m]."""
         time = LOOK * np.arange(1, LOOKS + 1)
-        heading = seen.heading[:, None] + rate[:, None] * (time / 2)
         # Axes: robots, speeds, times, posts.
+        heading = seen.heading[:, None, None] + rate[:, :, None] * (time / 2)
         step = speed[:, :, None] * time
-        step_x = (step * np.cos(heading)[:, None])[..., None]
-        step_y = (step * np.sin(heading)[:, None])[..., None]
+        step_x, step_y = (step * np.cos(heading))[..., None], (step * np.sin(heading))[..., None]
         x = seen.x[:, None] + time[:, None] * seen.vx[:, None]
         y = seen.y[:, None] + time[:, None] * seen.vy[:, None]
         return norm(x[:, None] - step_x, y[:, None] - step_y).min(axis=2) - seen.radius[:, None]
