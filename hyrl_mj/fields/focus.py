@@ -31,6 +31,8 @@ HOLDING = 0.05
 FOLDED = 4
 # Turns steps into ways.
 SUMS = np.triu(np.ones((GLANCES, GLANCES)))
+# The post in focus is passed on its other side if that way is shorter by more than this [m].
+LONGER = 1.0
 # A turn about less than this angle has a side of its own [rad].
 TURNED = 2.0
 TINY = 1e-9
@@ -202,11 +204,13 @@ class Bend(Pair):
     Attributes:
         x, y: (n,) where the way leads first [m].
         around: (n, K) bool, the posts that the way bends around.
+        kept_side: (n,) on which side the post that was in focus is passed.
     """
 
     x: np.ndarray
     y: np.ndarray
     around: np.ndarray
+    kept_side: np.ndarray
 
 
 class _Sides:
@@ -229,10 +233,8 @@ class _Sides:
             x, y = tangent(seen.x, seen.y, reach, sign)
             self.legs.append((sign, x, y, norm(x, y)))
 
-    def shorter(
-        self, own: np.ndarray, mine: np.ndarray, x: np.ndarray, y: np.ndarray
-    ) -> np.ndarray:
-        """Returns the sides (n,) on which ways to x, y (n,) past posts are shorter.
+    def longer(self, own: np.ndarray, mine: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Returns by how much (n,) ways to x, y (n,) are longer on the left of posts than on the right [m].
 
         Args:
             own: (n, K) bool, the post.
@@ -248,7 +250,7 @@ class _Sides:
             last = np.where(mine, sign * off + self.half, -np.inf).argmax(axis=1)
             whole = leg + norm(x[:, None] - leg_x, y[:, None] - leg_y)
             lengths.append(pick(whole, only(last, seen.count)))
-        return np.where(lengths[0] <= lengths[1], LEFT, RIGHT)
+        return lengths[0] - lengths[1]
 
 
 def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float) -> Bend:
@@ -264,7 +266,7 @@ def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float) ->
     sides: _Sides | None = None
     x, y, far = seen.goal_x, seen.goal_y, seen.goal_far
     passed = seen.radius < 0
-    best, best_side = np.full_like(focus, -1), np.full_like(focus, LEFT)
+    best, best_side, kept_side = np.full_like(focus, -1), np.full_like(focus, LEFT), side
     for _ in range(BENDS):
         # How near robots come to the posts on straight ways at 1 m/s, and when.
         vx, vy = (x / far)[:, None] - seen.vx, (y / far)[:, None] - seen.vy
@@ -281,8 +283,12 @@ def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float) ->
         own = only(post, count)
         mine = wall(sides.near, own)
         together = (mine & only(best, count)).any(axis=1)
-        way = np.where(together, best_side, sides.shorter(own, mine, x, y))
-        way = np.where(post == focus, side, way)
+        longer = sides.longer(own, mine, x, y)
+        way = np.where(together, best_side, np.where(longer <= 0, LEFT, RIGHT))
+        # The post in focus is passed on the other side only if that saves much.
+        held = np.where(side == LEFT, longer < LONGER, longer < -LONGER)
+        way = np.where(post == focus, np.where(held, LEFT, RIGHT), way)
+        kept_side = np.where((post == focus) & more, way, kept_side)
         best, best_side = np.where(more, post, best), np.where(more, way, best_side)
         passed = passed | (own & more[:, None])
         first, soon = seen.post(own), np.minimum(pick(when, own), PROJECTED)
@@ -294,7 +300,7 @@ def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float) ->
         )
         x, y = np.where(more, next_x, x), np.where(more, next_y, y)
         far = np.maximum(norm(x, y), TINY)
-    return Bend(best, best_side, x, y, passed)
+    return Bend(best, best_side, x, y, passed, kept_side)
 
 
 def least_room(seen: Seen, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -361,7 +367,7 @@ def choose(
     # A post that holds the robot back takes the focus, or the robot would stand there for ever.
     held = (room_of_best < margin + HOLDING) & (room_of_best < room_of_known)
     kept = kept & ~(held & (pick(seen.towards, first) > 0))
-    return Pair(np.where(kept, focus, best), np.where(kept, side, best_side))
+    return Pair(np.where(kept, focus, best), np.where(kept, bend.kept_side, best_side))
 
 
 def turn_sense(turn: np.ndarray, sense: np.ndarray) -> np.ndarray:
