@@ -252,6 +252,13 @@ def test_near_the_goal_a_robot_drives_no_circles_around_it():
     np.testing.assert_allclose(ahead, [1.0, 0.0])
 
 
+def test_a_post_that_does_not_hold_a_robot_back_does_not_turn_it():
+    # The goal is near: that alone makes the robot slow.
+    for left in (1, -1):
+        u = guarded((0, 0, 0.0), FAR_OFF, (1.0, -left), -left * 0.9, goal=(0.1, -left * 0.12))
+        np.testing.assert_allclose(u, [0.10167, -left], atol=1e-4)
+
+
 def test_a_robot_retreats_from_a_post_that_comes():
     seen = Seen.of(measured((0, 0, 0.0), [(0.8, 0.0, -0.4, 0.0, 0.5)]))
     _, most, _ = guard().bounds(seen)

@@ -18,6 +18,8 @@ RATE = 3.0
 STEEP = 0.5
 # With its face to its way a robot drives ahead with at least this speed [m/s].
 LEAST = 0.3
+# Near its goal a robot need not be slower than this: a circle of this radius is within reach of it [m/s].
+SLOWEST = 0.1
 # Posts that come faster than this are evaded [m/s]: more than the noise on the velocity of one that stands.
 COMING = 0.1
 # A robot looks so often, and each time so much farther ahead, at where posts that come will be [s].
@@ -70,7 +72,8 @@ class Guard:
         least, most, aside = self.bounds(seen)
         bounded = np.minimum(np.maximum(speed, least), most)
         bounded = np.where(least > most, (least + most) / 2, bounded)
-        rates = np.where((bounded < creep) & (aside != 0), aside * self.rate, rates)
+        held = (most < np.minimum(speed, creep)) & (aside != 0)
+        rates = np.where(held, aside * self.rate, rates)
         speed, rates = self._evading(seen, bounded, rates)
         return np.concatenate([speed[:, None], rates[:, None]], axis=1)
 
@@ -83,7 +86,8 @@ class Guard:
         x, y, far = seen.goal_x, seen.goal_y, seen.goal_far
         behind = dot(seen.cos, seen.sin, x, y) < 0
         aside = np.where(behind, far, np.abs(cross(seen.cos, seen.sin, x, y)))
-        return self.rate * far * far / (2 * np.maximum(aside, TINY))
+        fastest = self.rate * far * far / (2 * np.maximum(aside, TINY))
+        return np.maximum(fastest, SLOWEST)
 
     def bounds(self, seen: Seen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns the least and the greatest speed (n,) that keep the distance from all posts [m/s].
