@@ -125,9 +125,13 @@ def instead(words: list[str]) -> bool:
         case ["hyrl-mj", "drive", _, "--field", file, *_]:  # it needs a field that was trained
             from hyrl_mj.fields import cautions, check_passable, read_field
 
-            field = read_field(file)
+            field = read_field(ROOT / file if (ROOT / file).exists() else file)
             check_passable(field, 0.1)
             assert cautions(field, 0.1) == []
+        case ["hyrl-mj", "export", _, "--to", form, "--posts", _, *_]:  # it needs such a run, too
+            from hyrl_mj.export.forms import FORMS
+
+            assert form in FORMS
         # A minute, even with preset smoke.
         case ["hyrl-mj", "run", "field" | "rover" | "quadrotor" | "slalom" as task, *_]:
             from hyrl_mj import task_names
