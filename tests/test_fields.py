@@ -276,6 +276,36 @@ def test_a_robot_drives_out_of_the_way_of_a_post_that_comes_from_its_side():
         assert speed == 0.0
 
 
+class Weighted:
+    """Any smooth function of what it observes."""
+
+    def __init__(self, seed):
+        self.weights = np.random.default_rng(seed).normal(size=(17, 2))
+
+    def inputs(self, observation):
+        return np.tanh(observation @ self.weights)
+
+
+@pytest.mark.parametrize("posts", [1, 2, 5, 12])
+def test_one_robot_is_driven_as_many_are(field, posts):
+    rng, n = np.random.default_rng(posts), 300
+    task = drive_of(field, np.column_stack([rng.uniform(-4, 4, (posts, 2)), np.full(posts, 0.4)]))
+    controller = FocusController(task, field, {LEFT: Weighted(0), RIGHT: Weighted(1)}, 0.1)
+    poses = np.column_stack([rng.uniform(-6, 6, (n, 2)), rng.uniform(-4, 4, n)])
+    goals = rng.uniform(-6, 6, (n, 2))
+    # Of some rows all posts stand, and in some others they touch one another and the robot.
+    speeds = rng.uniform(-0.4, 0.4, (n, posts, 2)) * (rng.random((n, 1, 1)) < 0.7)
+    places, radii = rng.uniform(-5, 5, (n, posts, 2)), rng.uniform(0.2, 1.2, (n, posts, 1))
+    columns = np.concatenate([places, speeds, radii], axis=2).reshape(n, -1)
+    seen, q = np.hstack([poses, goals, columns]), rng.choice(controller.modes, n)
+    u, after = controller.answer(q, seen)
+    assert controller.single is not None
+    for i in range(n):
+        one_u, one_q = controller.step(q[i : i + 1], seen[i : i + 1])
+        assert one_q[0] == after[i]
+        np.testing.assert_allclose(one_u[0], u[i], atol=1e-7)
+
+
 def test_the_reward_of_a_mode_leads_its_own_way(field):
     place = np.array([[-3.0, 0.0, 0.0, 0, 0, -1.5, 0, 0, 0, 0.5, 1.0]])
     turned = np.array([0.5, -0.5])

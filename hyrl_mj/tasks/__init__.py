@@ -12,7 +12,7 @@ from hyrl_mj.tasks.checks import check_task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.field import CLEAR, FASTEST, PROJECTED, RADII, TAKEN, Field, FieldTask
 from hyrl_mj.tasks.guard import check_finite
-from hyrl_mj.tasks.layouts import POSE, TURN, Layouts, length, only_post, posts_of
+from hyrl_mj.tasks.layouts import OF_POST, POSE, TURN, Layouts, length, only_post, posts_of
 from hyrl_mj.tasks.obstacles import (
     ANY,
     LEFT,
@@ -31,6 +31,7 @@ __all__ = [
     "CLEAR",
     "FASTEST",
     "LEFT",
+    "OF_POST",
     "POSE",
     "PROJECTED",
     "RADII",
