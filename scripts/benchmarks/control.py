@@ -1,13 +1,17 @@
 """What a controller costs at run time, and what the package costs before it does anything."""
 
 from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import pairwise
 
 import numpy as np
 
 from benchmarks import Figure
 from benchmarks.runs import Runs, child
-from hyrl_mj import Run
+from hyrl_mj import Run, get_task
+from hyrl_mj.fields import for_posts
 from hyrl_mj.learning.training import build
+from hyrl_mj.tasks import LEFT, RIGHT, Field
 
 MANY, REPEATS = 100_000, 2_000
 
@@ -22,6 +26,8 @@ def figures(runs: Runs) -> Iterator[Figure]:
         yield Figure(f"controller.step, {name}, one state", "us", against, target, one, other)
         many = _step(run, MANY, 1)
         yield Figure(f"controller.step, {name}, {MANY:,} states", "ms", "", "<= 100 ms", many)
+    name, against = "controller.step, a field of 12 posts, one state", "its batched twin"
+    yield Figure(name, "us", against, "<= 100 us", *_steps_in_field(12))
     ours, other = _python("import hyrl_mj"), _python("import mujoco, gymnasium")
     target = "<= 1.3x the time, ratio >= 0.77"
     yield Figure("import hyrl_mj", "s", "import mujoco, gymnasium", target, ours, other, least=0.0)
@@ -42,6 +48,42 @@ def _step(run: Run, n: int, repeats: int) -> Callable[[], int]:
         return repeats
 
     return work
+
+
+def _steps_in_field(posts: int) -> tuple[Callable[[], int], Callable[[], int]]:
+    """Returns the steps of one robot, and the same steps as those of a batch of one."""
+    field, network = get_task("field"), _Network(17, 2)
+    assert isinstance(field, Field)
+    controller = for_posts(field, {LEFT: network, RIGHT: network}, 0.1, posts)
+    task, rng = controller.task, np.random.default_rng(0)
+    x, y, heading = rng.uniform(-10, 0, 50), rng.uniform(-4, 4, 50), rng.uniform(-3, 3, 50)
+    plant = task.plant(50)
+    plant.set_state(*task.state(np.column_stack([x, y, heading])))
+    measured = plant.measurement
+    q = controller.initial_mode(measured)
+    rows = [(q[i : i + 1], measured[i : i + 1]) for i in range(50)]
+
+    def work(step: Callable[[np.ndarray, np.ndarray], object]) -> int:
+        for q, measured in rows:
+            step(q, measured)
+        return len(rows)
+
+    return partial(work, controller.step), partial(work, controller.answer)
+
+
+class _Network:
+    """A network of the size that stage 6 trains."""
+
+    def __init__(self, inputs: int, outputs: int):
+        rng = np.random.default_rng(0)
+        sizes = inputs, 64, 64, outputs
+        self.layers = [rng.normal(0, 0.1, pair) for pair in pairwise(sizes)]
+
+    def inputs(self, observation: np.ndarray) -> np.ndarray:
+        """Returns inputs (n, m) for observations (n, k)."""
+        for layer in self.layers:
+            observation = np.tanh(observation @ layer)
+        return observation
 
 
 def _predict(run: Run) -> Callable[[], int]:
