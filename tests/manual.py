@@ -28,7 +28,7 @@ SHORTER = {
 TRAINING = ("run", "robustify", "diagnose", "sweep")
 EPISODES, FRAMES = "200", "4"
 # Scripts that have tests of their own; here their options are looked up.
-TESTED = ("scripts/benchmark.py", "scripts/reproduce_paper.py")
+TESTED = ("scripts/benchmark.py", "scripts/fields.py", "scripts/reproduce_paper.py")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,76 @@
+"""`scripts/fields.py`: the fields that it draws, and what it counts."""
+
+import json
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hyrl_mj
+from hyrl_mj.fields import Driving
+from hyrl_mj.tasks import Layouts
+
+SCRIPT = Path(__file__).parents[1] / "scripts" / "fields.py"
+
+
+@pytest.fixture(scope="module")
+def script():
+    return runpy.run_path(str(SCRIPT))
+
+
+def test_random_fields_have_gaps_and_starts_have_room(script):
+    rng = np.random.default_rng(0)
+    layouts = script["drawn"](rng, 5, 4, moving=False)
+    for places, radii, goal in zip(layouts.tracks[:, 0], layouts.radii, layouts.goals, strict=True):
+        gaps = np.linalg.norm(places[:, None] - places, axis=2) - radii[:, None] - radii
+        assert gaps[np.triu_indices(5, 1)].min() >= 0.8
+        assert (np.linalg.norm(places - goal, axis=1) - radii).min() >= 0.5
+    z = script["starts_anywhere"](layouts, 3, rng)
+    assert z[:, 3].tolist() == np.repeat(range(4), 3).tolist()
+    away = np.linalg.norm(layouts.tracks[z[:, 3].astype(int), 0] - z[:, None, :2], axis=2)
+    assert (away - layouts.radii[z[:, 3].astype(int)]).min() >= 0.3
+    moving = script["drawn"](rng, 4, 3, moving=True)
+    number, still = np.arange(3), np.zeros(3)
+    speeds = np.linalg.norm(moving.velocities(number, still), axis=2)
+    assert (speeds[:, ::2] > 0).all()
+    assert (speeds[:, 1::2] == 0).all()
+    assert speeds.max() <= 0.4
+
+
+def test_published_layouts_are_read(script, tmp_path):
+    starts = {"radius_m": 4, "angles_over_pi": [1.0, 0.5]}
+    swings = {"centre": [1, 0], "R": 1, "period_s": 12, "phase_over_pi": 0.5, "radius_m": 0.5}
+    layouts = {
+        "goal": [0, 0],
+        "static": {"one": {"obstacles": [[-2, 0, 0.5]], "starts": starts}},
+        "moving": {"two": {"obstacles": [swings], "starts": starts}},
+    }
+    path = tmp_path / "fields.json"
+    path.write_text(json.dumps(layouts))
+    (_, one, z), (_, two, _) = script["published"](path)
+    np.testing.assert_allclose(z, [[-4, 0, 0], [0, 4, -np.pi / 2]], atol=1e-12)
+    np.testing.assert_allclose(one.positions(np.zeros(1, int), np.ones(1)), [[[-2, 0]]])
+    np.testing.assert_allclose(two.positions(np.zeros(1, int), np.array([6.0])), [[[1, -1]]])
+
+
+class Ahead:
+    """Drives ahead in one mode."""
+
+    modes = (0,)
+
+    def initial_mode(self, measured):
+        return np.zeros(len(measured), dtype=int)
+
+    def step(self, q, measured):
+        return np.tile([1.0, 0.0], (len(measured), 1)), q
+
+
+def test_outcomes_are_counted(script):
+    layouts = Layouts(np.array([[[[-2.0, 0.0]]]]), np.array([[0.5]]), np.zeros((1, 2)))
+    z = np.array([[-4.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [-4.0, 2.0, 0.0]])
+    task = Driving(hyrl_mj.get_task("field"), layouts, time=5.0, starts=z)
+    tally = script["Tally"]()
+    script["drive"](task, Ahead(), z, None, tally)
+    assert tally.outcomes == {"crashed": 1, "reached": 1, "stalled": 1}
+    assert tally.row()[:3] == ["3", "1", "1"]
