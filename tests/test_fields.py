@@ -7,8 +7,9 @@ import pytest
 
 import hyrl_mj
 from hyrl_mj.fields import Driving, FocusController, decoded, encoded
-from hyrl_mj.fields.focus import Seen, choose
+from hyrl_mj.fields.focus import choose
 from hyrl_mj.fields.guard import Guard
+from hyrl_mj.fields.seen import Seen
 from hyrl_mj.simulation import LoopSettings, Noise, Recorded, closed_loop
 from hyrl_mj.tasks import LEFT, RIGHT, Layouts, Outcome
 from hyrl_mj.tasks.field import CLEAR, turns_to, ways_round

@@ -11,9 +11,10 @@ import numpy as np
 from hyrl_mj.errors import BadInput
 from hyrl_mj.fields.driving import Driving
 from hyrl_mj.fields.files import MOST_POSTS
-from hyrl_mj.fields.focus import Seen, choose, turn_sense
+from hyrl_mj.fields.focus import choose, turn_sense
 from hyrl_mj.fields.guard import Guard
 from hyrl_mj.fields.modes import MODES_OF_POST, NO_MODE, decoded, encoded
+from hyrl_mj.fields.seen import Seen
 from hyrl_mj.fields.single import Single
 from hyrl_mj.policies import (
     Controller,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hyrl_mj.fields.focus import TINY, Seen, cross, dot, norm, only, pick
+from hyrl_mj.fields.seen import TINY, Seen, cross, dot, norm, only, pick
 
 # The clearance beyond the margin may shrink by this share of itself in a second [1/s].
 RATE = 3.0

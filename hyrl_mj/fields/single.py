@@ -20,7 +20,6 @@ from hyrl_mj.fields.focus import (
     LONGER,
     NEARBY,
     ROOM,
-    TINY,
     TURNED,
 )
 from hyrl_mj.fields.guard import (
@@ -35,6 +34,7 @@ from hyrl_mj.fields.guard import (
     Guard,
 )
 from hyrl_mj.fields.modes import MODES_OF_POST
+from hyrl_mj.fields.seen import TINY
 from hyrl_mj.tasks import CLEAR, LEFT, OF_POST, POSE, PROJECTED, RIGHT
 
 Inputs = Callable[[int, list[float]], Sequence[float]]
@@ -55,7 +55,7 @@ def _tangent(x: float, y: float, radius: float, sign: float) -> tuple[float, flo
 
 @dataclass
 class _Seen:
-    """A measurement of one robot: see `focus.Seen`, with a number for each post in the lists."""
+    """A measurement of one robot: see `seen.Seen`, with a number for each post in the lists."""
 
     goal_x: float
     goal_y: float
