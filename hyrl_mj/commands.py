@@ -301,7 +301,7 @@ def export(run: Run, *, to: str, out: Path, posts: int | None = None) -> None:
         to: onnx (one file, q and measured in, u and q_next out; -1 as the first q), or numpy (a folder
             with controller.py and controller.npz, which need NumPy alone).
         out: the file or the folder to write.
-        posts: for a run of field, the number of posts of the fields to drive through; 1 by default.
+        posts: number of posts of the fields that a run of field drives through; by default 1.
     """
     from hyrl_mj.export import export
 
