@@ -8,7 +8,7 @@ from pathlib import Path
 
 from hyrl_mj import pipeline
 from hyrl_mj.errors import BadInput, unknown
-from hyrl_mj.fields import DriveOptions, for_posts
+from hyrl_mj.fields import DriveOptions, for_posts, read_field
 from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions, SweepOptions
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sweeps import DONE
@@ -294,23 +294,24 @@ def report(run: Run, *, out: Path | None = None) -> None:
         print(f"page at {out}")
 
 
-def export(run: Run, *, to: str, out: Path, posts: int | None = None) -> None:
+def export(run: Run, *, to: str, out: Path, field: Path | None = None) -> None:
     """Write the hybrid controller of a run so that it works without hyrl_mj.
 
     Args:
         to: onnx (one file, q and measured in, u and q_next out; -1 as the first q), or numpy (a folder
             with controller.py and controller.npz, which need NumPy alone).
         out: the file or the folder to write.
-        posts: number of posts of the fields that a run of field drives through; by default 1.
+        field: for a run of field, the JSON file of a field with as many posts as the controller will see; by
+            default one post.
     """
     from hyrl_mj.export import export
 
     if isinstance(run.task, Field):
-        count = 1 if posts is None else posts
-        controller = for_posts(run.task, run.mode_policies, run.settings.noise, count)
+        posts = 1 if field is None else read_field(field).layouts.posts
+        controller = for_posts(run.task, run.mode_policies, run.settings.noise, posts)
         export(controller, to, out)
-    elif posts is not None:
-        raise BadInput(f"{run.task.name} has no field of posts: leave --posts out")
+    elif field is not None:
+        raise BadInput(f"{run.task.name} has no field of posts: leave --field out")
     else:
         export(run.controller, to, out)
     print(f"controller at {out}")

@@ -128,10 +128,20 @@ def instead(words: list[str]) -> bool:
             field = read_field(ROOT / file if (ROOT / file).exists() else file)
             check_passable(field, 0.1)
             assert cautions(field, 0.1) == []
-        case ["hyrl-mj", "export", _, "--to", form, "--posts", _, *_]:  # it needs such a run, too
+        case [
+            "hyrl-mj",
+            "export",
+            _,
+            "--to",
+            form,
+            "--field",
+            file,
+            *_,
+        ]:  # it needs such a run, too
             from hyrl_mj.export.forms import FORMS
 
             assert form in FORMS
+            assert (ROOT / file).exists()
         # A minute, even with preset smoke.
         case ["hyrl-mj", "run", "field" | "rover" | "quadrotor" | "slalom" as task, *_]:
             from hyrl_mj import task_names

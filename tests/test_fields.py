@@ -1,12 +1,14 @@
 """Fields: layouts of posts, the ways round them, and which post is in focus."""
 
 from dataclasses import replace
+from runpy import run_path
 
 import numpy as np
 import pytest
 
 import hyrl_mj
-from hyrl_mj.fields import Driving, FocusController, decoded, encoded
+from hyrl_mj.export import export_numpy, export_onnx
+from hyrl_mj.fields import Driving, FocusController, decoded, encoded, for_posts
 from hyrl_mj.fields.focus import choose
 from hyrl_mj.fields.guard import Guard
 from hyrl_mj.fields.seen import Seen
@@ -305,6 +307,32 @@ def test_one_robot_is_driven_as_many_are(field, posts):
         one_u, one_q = controller.step(q[i : i + 1], seen[i : i + 1])
         assert one_q[0] == after[i]
         np.testing.assert_allclose(one_u[0], u[i], atol=1e-7)
+
+
+@pytest.mark.parametrize("posts", [1, 3])
+def test_a_controller_of_fields_is_exported(field, posts, tmp_path):
+    from onnxruntime import InferenceSession
+
+    controller = for_posts(field, {LEFT: Weighted(0), RIGHT: Weighted(1)}, 0.1, posts)
+    task, rng = controller.task, np.random.default_rng(0)
+    poses = np.column_stack([rng.uniform(-6, 2, (40, 2)), rng.uniform(-3, 3, 40)])
+    plant = task.plant(40)
+    plant.set_state(*task.state(poses))
+    seen, q = plant.measurement, rng.choice(controller.modes, 40)
+    seen[:, 7] = 0.3  # the first post moves
+    u, after = controller.step(q, seen)
+    export_numpy(controller, tmp_path / "exported")
+    module = run_path(str(tmp_path / "exported" / "controller.py"))
+    session = InferenceSession(export_onnx(controller, tmp_path / "controller.onnx"))
+    for exported in (module["step"](q, seen), session.run(None, {"q": q, "measured": seen})):
+        np.testing.assert_allclose(exported[0], u, atol=1e-5)
+        np.testing.assert_array_equal(exported[1], after)
+
+
+def test_a_field_has_from_one_to_a_hundred_posts(field):
+    for posts in (0, 101):
+        with pytest.raises(hyrl_mj.BadInput, match=f"{posts} posts: give from 1 to 100"):
+            for_posts(field, {LEFT: Weighted(0), RIGHT: Weighted(1)}, 0.1, posts)
 
 
 def test_the_reward_of_a_mode_leads_its_own_way(field):

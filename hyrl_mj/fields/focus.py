@@ -153,7 +153,7 @@ def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float) ->
         longer = sides.longer(own, mine, x, y)
         way = np.where(together, best_side, np.where(longer <= 0, LEFT, RIGHT))
         # The post in focus is passed on the other side only if that saves much.
-        held = np.where(side == LEFT, longer < LONGER, longer < -LONGER)
+        held = longer < np.where(side == LEFT, LONGER, -LONGER)
         way = np.where(post == focus, np.where(held, LEFT, RIGHT), way)
         kept_side = np.where((post == focus) & more, way, kept_side)
         best, best_side = np.where(more, post, best), np.where(more, way, best_side)
