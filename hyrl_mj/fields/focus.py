@@ -134,14 +134,15 @@ def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float) ->
     x, y, far = seen.goal_x, seen.goal_y, seen.goal_far
     passed = seen.radius < 0
     best, best_side, kept_side = np.full_like(focus, -1), np.full_like(focus, LEFT), side
-    for _ in range(BENDS):
+    for bend in range(BENDS):
         # How near robots come to the posts on straight ways at 1 m/s, and when.
         vx, vy = (x / far)[:, None] - seen.vx, (y / far)[:, None] - seen.vy
         when = dot(seen.x, seen.y, vx, vy) / np.maximum(dot(vx, vy, vx, vy), TINY)
         when = np.minimum(np.maximum(when, 0.0), far[:, None])
         near_x, near_y = seen.x - vx * when, seen.y - vy * when
         ahead = dot(seen.x, seen.y, x[:, None], y[:, None]) > 0
-        blocks = (dot(near_x, near_y, near_x, near_y) < reach * reach) & ahead & ~passed
+        nearest = dot(near_x, near_y, near_x, near_y)
+        blocks = (nearest < reach * reach) & ahead & ~passed
         more: Any = blocks.any(axis=1)
         if isinstance(more, np.ndarray) and not more.any():  # an export does not know
             break
@@ -155,6 +156,10 @@ def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float) ->
         # The post in focus is passed on the other side only if that saves much.
         held = longer < np.where(side == LEFT, LONGER, -LONGER)
         way = np.where(post == focus, np.where(held, LEFT, RIGHT), way)
+        if bend == 0:
+            # The policies drive straight to the goal where only the wider disc is in the way.
+            straight = pick(nearest, own) >= (pick(reach, own) - wider) ** 2
+            way = np.where((post == focus) & straight, on_side(seen, own, x, y), way)
         kept_side = np.where((post == focus) & more, way, kept_side)
         best, best_side = np.where(more, post, best), np.where(more, way, best_side)
         passed = passed | (own & more[:, None])

@@ -255,8 +255,8 @@ def _first_bend(
     reach[focus] += wider
     x, y, far = seen.goal_x, seen.goal_y, seen.goal_far
     best, best_side, kept_side, passed = -1, LEFT, side, set[int]()
-    for _ in range(BENDS):
-        ux, uy, post, nearest, when = x / far, y / far, -1, inf, 0.0
+    for bend in range(BENDS):
+        ux, uy, post, nearest, when, least = x / far, y / far, -1, inf, 0.0, 0.0
         for i, (px, py) in enumerate(zip(seen.x, seen.y, strict=True)):
             if px * x + py * y <= 0 or seen.room[i] >= nearest or i in passed:
                 continue
@@ -264,14 +264,17 @@ def _first_bend(
             time = (px * vx + py * vy) / max(vx * vx + vy * vy, TINY)
             time = min(max(time, 0.0), far)
             near_x, near_y = px - vx * time, py - vy * time
-            if near_x * near_x + near_y * near_y < reach[i] * reach[i]:
-                post, nearest, when = i, seen.room[i], time
+            near = near_x * near_x + near_y * near_y
+            if near < reach[i] * reach[i]:
+                post, nearest, when, least = i, seen.room[i], time, near
         if post < 0:
             break
         mine = _wall(seen, post)
         longer = _longer(seen, post, mine, reach, x, y)
         if post == focus:
             way = LEFT if longer < (LONGER if side == LEFT else -LONGER) else RIGHT
+            if bend == 0 and least >= (reach[post] - wider) ** 2:
+                way = _on_side(seen, post, x, y)
             kept_side = way
         elif best in mine:
             way = best_side
