@@ -126,8 +126,8 @@ def test_noise_does_not_change_focus_and_side():
 
 def test_where_the_straight_way_is_free_a_post_is_passed_on_its_side():
     # The robot was told to pass on the right, but the straight way just misses the disc on the left.
-    post = [(-3.0, 0.0, 0.5)]
-    free, blocked = (-6.0, 1.8, 0.0), (-6.0, 1.6, 0.0)
+    post = [(-5.0, 0.0, 0.5)]
+    free, blocked = (-8.0, 1.45, 0.0), (-8.0, 1.25, 0.0)
     assert chosen(free, post, 0, RIGHT) == (0, LEFT)
     assert chosen(blocked, post, 0, RIGHT) == (0, RIGHT)
     assert chosen(blocked, post, 0, LEFT) == (0, LEFT)
