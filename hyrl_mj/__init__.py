@@ -8,6 +8,7 @@ package needs neither torch nor a GL library.
 from hyrl_mj import gl as gl  # first: imports mujoco, with a GL backend that exists here
 from hyrl_mj.chart import Chart
 from hyrl_mj.cores import using_pool
+from hyrl_mj.environments import from_gymnasium
 from hyrl_mj.errors import BadArtifact, BadInput, HyrlError, NoRenderer
 from hyrl_mj.export import export_numpy, export_onnx
 from hyrl_mj.game import Game, Robustness, Score
@@ -82,6 +83,7 @@ __all__ = [
     "extend",
     "find_critical_set",
     "from_callable",
+    "from_gymnasium",
     "get_task",
     "load_agent",
     "load_run",

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from hyrl_mj import pipeline
+from hyrl_mj.environments import EnvironmentOptions, chosen_task, explained
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.fields import DriveOptions, for_posts, read_field
 from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions, SweepOptions
@@ -40,7 +41,7 @@ def new_task(name: str, *, folder: Path = Path()) -> None:
     print(f"then run all stages with hyrl-mj run {paths[0]}")
 
 
-def run(task: str, options: RunOptions) -> None:
+def run(task: str | None = None, *, environment: EnvironmentOptions, options: RunOptions) -> None:
     """Run all stages on a task, from training to the report.
 
     An existing run directory is resumed: only what is missing is done.
@@ -48,12 +49,23 @@ def run(task: str, options: RunOptions) -> None:
     The verdict is PROVED, WON, HELD, WEAK, or FAILED, which gives exit status 1.
 
     Args:
-        task: a task, see `hyrl-mj list`, or a Python file that defines one, see `hyrl-mj new-task`.
+        task: a task, see `hyrl-mj list`, or a Python file that defines one, see `hyrl-mj new-task`; by default
+            none, with --env.
     """
-    finish(pipeline.run(task, options))
+    chosen = chosen_task(task, environment)
+    if environment.explain:
+        print(explained(chosen))
+    else:
+        finish(pipeline.run(chosen, options))
 
 
-def robustify(task: str, *, policy: Path, options: AgentOptions) -> None:
+def robustify(
+    task: str | None = None,
+    *,
+    policy: Path | None = None,
+    environment: EnvironmentOptions,
+    options: AgentOptions,
+) -> None:
     """Make an agent robust that was trained elsewhere: all stages but the first.
 
     An existing run directory is resumed: only what is missing is done.
@@ -61,10 +73,17 @@ def robustify(task: str, *, policy: Path, options: AgentOptions) -> None:
     The verdict is PROVED, WON, HELD, WEAK, or FAILED, which gives exit status 1.
 
     Args:
-        task: a task, see `hyrl-mj list`, or a Python file that defines one.
-        policy: the agent, a .zip that SB3's model.save wrote, an .onnx file, or a .safetensors file.
+        task: a task, see `hyrl-mj list`, or a Python file that defines one; by default none, with --env.
+        policy: the agent, a .zip that SB3's model.save wrote, an .onnx file, or a .safetensors file; by default
+            none, with --explain.
     """
-    finish(pipeline.robustify(task, policy, options))
+    chosen = chosen_task(task, environment)
+    if environment.explain:
+        print(explained(chosen))
+    elif policy is None:
+        raise BadInput("robustify needs --policy: the agent, a .zip, .onnx or .safetensors file")
+    else:
+        finish(pipeline.robustify(chosen, policy, options))
 
 
 def finish(run: Run) -> None:
@@ -99,16 +118,29 @@ def sweep(
         raise SystemExit(1)
 
 
-def diagnose(task: str, *, policy: Path, options: AgentOptions) -> None:
+def diagnose(
+    task: str | None = None,
+    *,
+    policy: Path | None = None,
+    environment: EnvironmentOptions,
+    options: AgentOptions,
+) -> None:
     """Find out what noise can do to an agent: critical set, losses, margin.
 
     Nothing is trained; `hyrl-mj robustify` continues in the same run directory.
 
     Args:
-        task: a task, see `hyrl-mj list`, or a Python file that defines one.
-        policy: the agent, a .zip that SB3's model.save wrote, an .onnx file, or a .safetensors file.
+        task: a task, see `hyrl-mj list`, or a Python file that defines one; by default none, with --env.
+        policy: the agent, a .zip that SB3's model.save wrote, an .onnx file, or a .safetensors file; by default
+            none, with --explain.
     """
-    pipeline.diagnose(task, policy, options)
+    chosen = chosen_task(task, environment)
+    if environment.explain:
+        print(explained(chosen))
+    elif policy is None:
+        raise BadInput("diagnose needs --policy: the agent, a .zip, .onnx or .safetensors file")
+    else:
+        pipeline.diagnose(chosen, policy, options)
 
 
 def stage_command(name: str, help_text: str) -> Callable[..., None]:

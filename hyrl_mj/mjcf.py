@@ -29,6 +29,10 @@ _OF_VELOCITY = {
 }
 
 
+# Cameras that every model has.
+FREE_CAMERAS = "overhead", "free"
+
+
 def models_dir() -> Path:
     """Returns the folder of the MJCF files: in the installed package, else beside it in the checkout."""
     package = Path(__file__).resolve().parent
@@ -75,13 +79,68 @@ def names(model: mujoco.MjModel, kind: mujoco.mjtObj) -> list[str]:
     """Returns the names of all objects of one kind, in the order of their ids."""
     count = {
         mujoco.mjtObj.mjOBJ_ACTUATOR: model.nu,
+        mujoco.mjtObj.mjOBJ_BODY: model.nbody,
         mujoco.mjtObj.mjOBJ_CAMERA: model.ncam,
         mujoco.mjtObj.mjOBJ_GEOM: model.ngeom,
+        mujoco.mjtObj.mjOBJ_JOINT: model.njnt,
         mujoco.mjtObj.mjOBJ_NUMERIC: model.nnumeric,
         mujoco.mjtObj.mjOBJ_SENSOR: model.nsensor,
         mujoco.mjtObj.mjOBJ_SITE: model.nsite,
     }[kind]
     return [mujoco.mj_id2name(model, kind, i) or f"({i})" for i in range(count)]
+
+
+def camera_of(model: mujoco.MjModel, name: str) -> mujoco.MjvCamera:
+    """Returns a camera of the MJCF.
+
+    Where the MJCF has none of that name, "free" is MuJoCo's free camera, and "overhead" looks from above.
+
+    Raises:
+        BadInput: there is no such camera; the message lists those there are.
+    """
+    camera, own = mujoco.MjvCamera(), names(model, mujoco.mjtObj.mjOBJ_CAMERA)
+    if name in own:
+        camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        camera.fixedcamid = own.index(name)
+        return camera
+    if name not in FREE_CAMERAS:
+        raise unknown(
+            f"camera in model {model_name(model)}", name, dict.fromkeys([*own, *FREE_CAMERAS])
+        )
+    mujoco.mjv_defaultFreeCamera(model, camera)
+    if name == "overhead":
+        camera.azimuth, camera.elevation = 90.0, -90.0
+    return camera
+
+
+def rests(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> bool:
+    """Returns whether a camera stays where it is, and does not follow a body."""
+    if camera.type == mujoco.mjtCamera.mjCAMERA_FREE:
+        return True
+    number = camera.fixedcamid
+    fixed = model.cam_mode[number] == mujoco.mjtCamLight.mjCAMLIGHT_FIXED
+    return bool(fixed and model.cam_bodyid[number] == 0)
+
+
+def point_of(model: mujoco.MjModel, name: str) -> tuple[str, int]:
+    """Returns where the place of a site or a body is in MuJoCo's data: ("site_xpos", 2).
+
+    Where the MJCF has no site or body "tracked", that is the first body that moves.
+
+    Raises:
+        BadInput: there is neither a site nor a body of that name; the message lists those there are.
+    """
+    sites, bodies = (
+        names(model, kind) for kind in (mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY)
+    )
+    if name in sites:
+        return "site_xpos", sites.index(name)
+    if name in bodies:
+        return "xpos", bodies.index(name)
+    if name == "tracked" and model.njnt:
+        return "xpos", int(model.jnt_bodyid[0])
+    named = [n for n in (*sites, *bodies) if not n.startswith("(")]
+    raise unknown(f"site or body in model {model_name(model)}", name, dict.fromkeys(named))
 
 
 def model_name(model: mujoco.MjModel) -> str:

@@ -179,8 +179,8 @@ class Plant:
         self._wake()
         rows = self._rows(ids)
         qvel = np.zeros((len(rows), self.model.nv)) if qvel is None else qvel
-        qpos = _checked("qpos", qpos, self.model.nq, rows)
-        qvel = _checked("qvel", qvel, self.model.nv, rows)
+        qpos = checked("qpos", qpos, self.model.nq, rows)
+        qvel = checked("qvel", qvel, self.model.nv, rows)
         self._batch.state[rows] = self._initial  # time, activations and warm starts, too
         self._qpos[rows], self._qvel[rows] = qpos, qvel
         for columns in self._quaternions:
@@ -237,16 +237,7 @@ class Plant:
 
     def _inputs(self, u: np.ndarray, ids: np.ndarray | None) -> np.ndarray:
         """Returns the inputs (k, m), checked and clipped to their limits."""
-        rows = self._rows(ids)
-        u = _checked("input", u, len(self.low), rows)
-        wrong = (u < self.low - INPUT_TOLERANCE) | (u > self.high + INPUT_TOLERANCE)
-        if wrong.any():
-            row, column = np.argwhere(wrong)[0]
-            raise BadInput(
-                f"input {u[row, column]:g} of simulation {rows[row]} is outside the limits "
-                f"[{self.low[column]:g}, {self.high[column]:g}] of the MJCF"
-            )
-        return np.clip(u, self.low, self.high)
+        return checked_inputs(u, self.low, self.high, self._rows(ids), "the MJCF")
 
     def _sample(self, u: np.ndarray, ids: np.ndarray | None, sign: int = 1) -> None:
         """Advances the copies by one sample under checked inputs; sign -1 reverses all controls."""
@@ -264,7 +255,7 @@ class Plant:
             return ctrl
         rows = self._rows(ids)
         ctrl = self._control(u, self._qpos[rows], self._qvel[rows])
-        ctrl = _checked("control", ctrl, self.model.nu, rows)
+        ctrl = checked("control", ctrl, self.model.nu, rows)
         return np.clip(ctrl, self._ctrl_low, self._ctrl_high)
 
     def _drive(self, rows: np.ndarray) -> None:
@@ -325,7 +316,27 @@ def input_limits(
     return ranges[:, 0], ranges[:, 1]
 
 
-def _checked(name: str, values: np.ndarray, columns: int, rows: np.ndarray) -> np.ndarray:
+def checked_inputs(
+    u: np.ndarray, low: np.ndarray, high: np.ndarray, rows: np.ndarray, whose: str
+) -> np.ndarray:
+    """Returns the inputs (k, m) of the copies `rows` (k,), clipped to their limits (m,), which `whose` has.
+
+    Raises:
+        BadInput: a wrong shape, a value that is not finite, or one outside the limits.
+    """
+    u = checked("input", u, len(low), rows)
+    wrong = (u < low - INPUT_TOLERANCE) | (u > high + INPUT_TOLERANCE)
+    if wrong.any():
+        row, column = np.argwhere(wrong)[0]
+        raise BadInput(
+            f"input {u[row, column]:g} of simulation {rows[row]} is outside the limits "
+            f"[{low[column]:g}, {high[column]:g}] of {whose}"
+        )
+    return np.clip(u, low, high)
+
+
+def checked(name: str, values: np.ndarray, columns: int, rows: np.ndarray) -> np.ndarray:
+    """Returns the values (k, columns) of the copies `rows` (k,), if they are finite and have that shape."""
     values, shape = np.asarray(values, dtype=float), (len(rows), columns)
     if values.shape != shape:
         raise BadInput(f"{name} has shape {values.shape}, it must be {shape}")

@@ -191,8 +191,7 @@ class SceneRenderer:
 
     def look(self, qpos: np.ndarray, camera: str) -> None:
         """Selects a camera, which may follow the robot in its position (nq,)."""
-        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._camera.fixedcamid = mjcf.object_id(self.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
+        self._camera = mjcf.camera_of(self.model, camera)
         self._move(qpos)
         mujoco.mjv_updateCamera(self.model, self.data, self._camera, self.scene)
         mujoco.mjv_makeLights(self.model, self.data, self.scene)

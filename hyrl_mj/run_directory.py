@@ -284,7 +284,7 @@ class Run:
 
 
 def load_run(
-    path: str | Path, policy: AnyPolicy | None = None, task: str | Path | None = None
+    path: str | Path, policy: AnyPolicy | None = None, task: str | Path | Task | None = None
 ) -> Run:
     """Opens a run directory. No code runs but that of installed packages.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -69,7 +68,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         self.action_space = action_space(self.core.task)
         self.render_mode, self._size = render_mode, (width, height)
         self._camera = str(camera or self.core.task.scene.camera)
-        mjcf.object_id(self.core.task.model, mujoco.mjtObj.mjOBJ_CAMERA, self._camera)
+        mjcf.camera_of(self.core.task.model, self._camera)
         self._renderer: Any = None  # a `SceneRenderer`, opened by the first picture
 
     def reset(

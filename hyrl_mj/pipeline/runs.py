@@ -113,12 +113,12 @@ def complete(kind: type[Options], options: Options | None, changes: dict[str, An
 
 
 def run(
-    task: str | Path, options: RunOptions | None = None, *, say: Say = print, **changes: Any
+    task: str | Path | Task, options: RunOptions | None = None, *, say: Say = print, **changes: Any
 ) -> Run:
     """Runs all stages, or those that the run directory lacks.
 
     Args:
-        task: name of a task, or the Python file that defines one.
+        task: name of a task, the Python file that defines one, or a task, as of `from_gymnasium`.
         options: the options, by default `RunOptions()`.
         say: receives a line about each stage.
         changes: fields of the options to change, as in `run("vehicle", eps=0.2, seed=3)`.
@@ -136,7 +136,7 @@ def run(
 
 
 def robustify(
-    task: str | Path,
+    task: str | Path | Task,
     policy: AnyPolicy,
     options: AgentOptions | None = None,
     *,
@@ -161,7 +161,7 @@ def robustify(
 
 
 def diagnose(
-    task: str | Path,
+    task: str | Path | Task,
     policy: AnyPolicy,
     options: AgentOptions | None = None,
     *,
@@ -238,7 +238,7 @@ def _settings(task: Task, options: RunOptions | AgentOptions, **changes: Any) ->
 
 
 @contextmanager
-def _with_agent(task: str | Path, policy: AnyPolicy, options: AgentOptions) -> Iterator[Run]:
+def _with_agent(task: str | Path | Task, policy: AnyPolicy, options: AgentOptions) -> Iterator[Run]:
     """Opens the run directory of an agent, which then holds the agent, and holds its lock in the block."""
     checked = check_task(get_task(task))
     _settings(checked, options)  # a wrong value is reported before the agent is read

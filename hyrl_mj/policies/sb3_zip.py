@@ -76,7 +76,7 @@ def from_tensors(
     preprocessing: Preprocessing = UNCHANGED,
 ) -> MlpPolicy:
     """Returns the network of an SB3 agent with these tensors and this metadata."""
-    _check_plain(tensors, about)
+    _check_plain(tensors, about, task)
     algorithm = infer_algorithm(tensors, about)
     _check_used(tensors, algorithm)
     if ALGORITHMS[algorithm].is_actor_critic:
@@ -94,15 +94,18 @@ def from_tensors(
     return policy
 
 
-def _check_plain(tensors: Mapping[str, np.ndarray], about: Mapping[str, Any]) -> None:
-    """Raises `BadArtifact` if an agent is more than an MLP on a vector of numbers."""
+def _check_plain(tensors: Mapping[str, np.ndarray], about: Mapping[str, Any], task: Task) -> None:
+    """Raises `BadArtifact` if an agent is more than an MLP on a vector of numbers, or on a Dict of vectors."""
     for part, what in FOREIGN.items():
         if any(part in name for name in tensors):
             raise BadArtifact(f"{what}: {PLAIN}")
-    if "spaces.dict" in entry(about, "observation_space", ":type:"):
-        raise BadArtifact(f"its observations are a dict: {PLAIN}")
+    of_dict = "spaces.dict" in entry(about, "observation_space", ":type:")
+    if of_dict and not task.observation_keys:
+        raise BadArtifact(f"its observations are a dict, those of {task.name} a vector: {PLAIN}")
+    # SB3's extractor of a Dict puts vectors one after the other, in the order of their keys.
+    usual = "torch_layers.CombinedExtractor" if of_dict else "torch_layers.FlattenExtractor"
     extractor = entry(about, "policy_kwargs", "features_extractor_class")
-    if extractor and "torch_layers.FlattenExtractor" not in extractor:
+    if extractor and usual not in extractor:
         raise BadArtifact(f"it has a features extractor of its own, {extractor}: {PLAIN}")
     if "actor.log_std" in tensors or np.ndim(tensors.get("log_std", 0)) == 2:
         raise BadArtifact("it was trained with use_sde: train it without, or export it to .onnx")

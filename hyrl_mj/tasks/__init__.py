@@ -20,10 +20,18 @@ from hyrl_mj.tasks.obstacles import (
     number_of,
     pattern_of,
     sides,
+    touching,
     way_name,
     wrapped,
 )
-from hyrl_mj.tasks.registry import described_task, get_task, reference, register, task_names
+from hyrl_mj.tasks.registry import (
+    described_task,
+    get_task,
+    reference,
+    register,
+    register_opener,
+    task_names,
+)
 from hyrl_mj.tasks.scaffold import write_task
 
 __all__ = [
@@ -59,8 +67,10 @@ __all__ = [
     "posts_of",
     "reference",
     "register",
+    "register_opener",
     "sides",
     "task_names",
+    "touching",
     "way_name",
     "wrapped",
     "write_task",

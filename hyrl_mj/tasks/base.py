@@ -46,6 +46,10 @@ class Task(ABC):
     env_id: str
     #: the file that defines the task, None for one of this package
     source: Path | None = None
+    #: a text from which the task is made again, if it has neither a name nor a file
+    spec: str = ""
+    #: the keys of the Dict whose vectors, one after the other, are the observation; none of a plain vector
+    observation_keys: tuple[str, ...] = ()
     _digest: str = ""
     #: one line for `hyrl-mj list`
     description: str = ""

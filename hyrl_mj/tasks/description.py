@@ -50,8 +50,10 @@ class Scene:
         policy_starts: (l, d) chart points from which the figure of the policy draws runs, by default
             `starts`.
         title: the task's name in figures, by default its `name` in words.
-        camera: the MJCF's camera of the replay.
-        tracked: the MJCF's site whose path the replay draws.
+        camera: the MJCF's camera of the replay; where it has no such one, "overhead" looks from above, and
+            "free" is MuJoCo's free camera.
+        tracked: the MJCF's site or body whose path the replay draws; where it has neither, "tracked" is the
+            first body that moves.
     """
 
     starts: Sequence[Sequence[float]]

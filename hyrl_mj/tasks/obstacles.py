@@ -27,19 +27,27 @@ def islands(model: mujoco.MjModel) -> dict[str, int]:
     ids = [mjcf.object_id(model, mujoco.mjtObj.mjOBJ_GEOM, name) for name in geoms]
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    first = list(range(len(ids)))  # of each geom, the first one of its island
-    for i, geom in enumerate(ids):
-        for k in range(i):
-            if first[k] != first[i] and _touch(model, data, geom, ids[k]):
-                low, high = sorted((first[i], first[k]))
-                first = [low if one == high else one for one in first]
-    kept = sorted(set(first))
+    kept = [group[0] for group in touching(model, data, ids)]
     if len(kept) > MOST_OBSTACLES:
         raise BadInput(
             f"{mjcf.model_name(model)} has {len(kept)} obstacles, and ways are told apart past at most "
             f"{MOST_OBSTACLES}: give the task a direction() of its own"
         )
-    return {geoms[i].removeprefix("obstacle").lstrip("_ "): ids[i] for i in kept}
+    return {model.geom(i).name.removeprefix("obstacle").lstrip("_ "): i for i in kept}
+
+
+def touching(model: mujoco.MjModel, data: mujoco.MjData, ids: Sequence[int]) -> list[list[int]]:
+    """Returns the geoms of ids (k,) in groups of those that touch each other, and do not move."""
+    first = list(range(len(ids)))  # of each geom, the first one of its group
+    for i, geom in enumerate(ids):
+        for k in range(i):
+            if first[k] != first[i] and _touch(model, data, geom, ids[k]):
+                low, high = sorted((first[i], first[k]))
+                first = [low if one == high else one for one in first]
+    groups: dict[int, list[int]] = {}
+    for geom, of in zip(ids, first, strict=True):
+        groups.setdefault(of, []).append(geom)
+    return [groups[of] for of in sorted(groups)]
 
 
 def _touch(model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int) -> bool:

@@ -19,6 +19,8 @@ GROUP = "hyrl_mj.tasks"
 PACKAGE = Path(__file__).resolve().parents[1]
 _REGISTRY: dict[str, type[Task]] = {}
 _FILES: dict[Path, type[Task]] = {}
+# What makes the tasks of texts that begin with these marks, such as environments.
+_OPENERS: dict[str, Callable[[str], Task]] = {}
 # Names of the tasks that other installed packages offer, as far as they have been loaded.
 _INSTALLED: set[str] = set()
 # Attributes of a task in hyrl_mj 0.1 that a `Scene` or a `Learning` holds now, without "replay_".
@@ -88,8 +90,13 @@ def task_names() -> list[str]:
     return sorted(_REGISTRY.keys() | _offered().keys())
 
 
-def get_task(name: str | Path) -> Task:
-    """Returns a task, by its name or by the Python file that defines it.
+def register_opener(mark: str, opener: Callable[[str], Task]) -> None:
+    """Registers what makes the tasks of texts that begin with a mark; see `Task.spec`."""
+    _OPENERS[mark] = opener
+
+
+def get_task(name: str | Path | Task) -> Task:
+    """Returns a task, by its name or by the Python file that defines it; a task itself as it is.
 
     The file is executed, as Python executes what it imports. It defines one subclass of `Task`, and its
     MJCF lies beside it: `<name>.xml`.
@@ -97,6 +104,11 @@ def get_task(name: str | Path) -> Task:
     Raises:
         BadInput: there is no such task, or its file cannot be used; the message says why.
     """
+    if isinstance(name, Task):
+        return name
+    for mark, opener in _OPENERS.items():
+        if str(name).startswith(mark):
+            return opener(str(name))
     if str(name).endswith(".py"):
         task = _instance(_from_file(Path(name)), str(name))
         trust.remember(Path(name))
@@ -110,7 +122,9 @@ def get_task(name: str | Path) -> Task:
 
 
 def reference(task: Task) -> str:
-    """Returns what `get_task` finds a task by in another process: its name, or its file."""
+    """Returns what `get_task` finds a task by in another process: its name, its file, or its text."""
+    if task.spec:
+        return task.spec
     named = task.source is None or task.name in _INSTALLED
     return task.name if named else str(task.source)
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 
-import mujoco
 
 from hyrl_mj import artifacts, mjcf
 from hyrl_mj.errors import BadInput, unknown
@@ -77,4 +76,4 @@ def check_replay(task: Task, path: Path, options: ReplayOptions) -> None:
             f"{SLOWEST_MOTION}"
         )
     camera = options.camera or task.scene.camera
-    mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
+    mjcf.camera_of(task.model, camera)

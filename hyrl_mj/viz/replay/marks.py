@@ -92,12 +92,12 @@ def _add(
 
 
 def tracked_points(task: Task, qpos: np.ndarray) -> np.ndarray:
-    """Returns the points (n, 3) [m] of the site that the task's scene tracks at positions (n, nq)."""
+    """Returns the points (n, 3) [m] of the site or body that the task's scene tracks at positions (n, nq)."""
     data, points = mujoco.MjData(task.model), np.empty((len(qpos), 3))
-    site = mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_SITE, task.scene.tracked)
+    kind, number = mjcf.point_of(task.model, task.scene.tracked)
     for point, position in zip(points, qpos, strict=True):
         mjcf.place(task.model, data, position, task.mocap)
-        point[:] = data.site_xpos[site]
+        point[:] = getattr(data, kind)[number]
     return points
 
 

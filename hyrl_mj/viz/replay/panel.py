@@ -144,9 +144,7 @@ class Panel:
         floors: marks.Floors | None = None,
     ):
         self._tracks, self._camera = tracks, camera
-        number = mjcf.object_id(task.model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
-        fixed = task.model.cam_mode[number] == mujoco.mjtCamLight.mjCAMLIGHT_FIXED
-        self._rests = fixed and task.model.cam_bodyid[number] == 0
+        self._rests = mjcf.rests(task.model, mjcf.camera_of(task.model, camera))
         # A bar for each row, and all else in the scene, with room to spare.
         geoms = sum(len(track.arc.t) for track in tracks) + GEOMS * (1 + len(tracks))
         self._renderer = SceneRenderer(task.model, width, height, geoms, canvas, task.mocap)

@@ -1,0 +1,12 @@
+"""Environments of others as tasks: any environment of Gymnasium that MuJoCo simulates, as it is."""
+
+from hyrl_mj.environments.options import EnvironmentOptions, chosen_task, explained
+from hyrl_mj.environments.task import EnvironmentTask, from_gymnasium
+
+__all__ = [
+    "EnvironmentOptions",
+    "EnvironmentTask",
+    "chosen_task",
+    "explained",
+    "from_gymnasium",
+]

@@ -1,0 +1,191 @@
+"""Names of coordinates: each stands for one position or velocity of MuJoCo's state."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from gymnasium import spaces
+
+from hyrl_mj import mjcf
+from hyrl_mj.environments.copies import Host
+from hyrl_mj.errors import BadInput, unknown
+
+# Chart, as users give it: one name, several, or new names with the names of what they stand for.
+AnyChart = str | Sequence[str] | Mapping[str, str]
+INDEXED = re.compile(r"(.+)\[(\d+)\]")
+# States at which a name is compared with positions and velocities, and how much of these changes [m, rad].
+TRIED, MOVED = 6, 0.05
+AGREES = 1e-6
+SLIDE, HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """A coordinate of a chart.
+
+    Attributes:
+        name: in figures and messages.
+        kind: "qpos" or "qvel".
+        index: of the position or the velocity.
+        offset: what the coordinate is greater by.
+        joint: id of the joint.
+    """
+
+    name: str
+    kind: str
+    index: int
+    offset: float
+    joint: int
+
+    def described(self) -> str:
+        """Returns what it stands for: "qpos[0]"."""
+        return f"{self.kind}[{self.index}]"
+
+
+def coordinates(host: Host, chart: AnyChart) -> tuple[Coordinate, ...]:
+    """Returns the coordinates that a chart names.
+
+    A name is that of a position or velocity, as qpos[0], of a joint, of a part of the observation, as
+    achieved_goal or observation[3], or of a site or a body, which stands for its x and y.
+
+    Raises:
+        BadInput: there is no such name, or it is no single position or velocity.
+    """
+    names = {"": chart} if isinstance(chart, str) else chart
+    pairs = names.items() if isinstance(names, Mapping) else (("", name) for name in names)
+    found = [c for new, name in pairs for c in _resolved(host, str(new), str(name))]
+    places = [(c.kind, c.index) for c in found]
+    if not found or len(set(places)) < len(places):
+        raise BadInput(
+            f"the chart {chart!r} names no coordinate, or one of them twice: name each once"
+        )
+    return tuple(found)
+
+
+def all_names(host: Host) -> list[str]:
+    """Returns the names that a chart may use."""
+    model = host.model
+    positions = [f"qpos[{i}]" for i in range(model.nq)] + [f"qvel[{i}]" for i in range(model.nv)]
+    return [*positions, *(n for n in _joints(host) if n), *_parts(host), *_places(host)]
+
+
+def usual_name(model: mujoco.MjModel, joint: int, velocity: bool) -> str:
+    """Returns the name of a coordinate after its joint."""
+    name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint) or f"joint{joint}"
+    name = name.rpartition("/")[2]
+    return f"{name} rate" if velocity else name
+
+
+def _joints(host: Host) -> list[str]:
+    return [
+        mujoco.mj_id2name(host.model, mujoco.mjtObj.mjOBJ_JOINT, i) or ""
+        for i in range(host.model.njnt)
+    ]
+
+
+def _places(host: Host) -> list[str]:
+    kinds = mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY
+    names = [name for kind in kinds for name in mjcf.names(host.model, kind)]
+    return [name for name in dict.fromkeys(names) if not name.startswith("(") and name != "world"]
+
+
+def _parts(host: Host) -> dict[str, slice]:
+    """Returns the parts of the observation, with their columns."""
+    space = host.env.observation_space
+    if not isinstance(space, spaces.Dict):
+        return {"observation": slice(0, host.width)}
+    parts, at = {}, 0
+    for key in sorted(space.spaces):
+        size = int(np.prod(space.spaces[key].shape, dtype=int))
+        parts[key], at = slice(at, at + size), at + size
+    return parts
+
+
+def _resolved(host: Host, new: str, name: str) -> Iterator[Coordinate]:
+    base, index = name, None
+    if match := INDEXED.fullmatch(name):
+        base, index = match.group(1), int(match.group(2))
+    if base in ("qpos", "qvel") and index is not None:
+        size = host.model.nq if base == "qpos" else host.model.nv
+        if index >= size:
+            raise unknown("coordinate", name, all_names(host))
+        yield _of_state(host, new, base, index)
+        return
+    if name in _joints(host):
+        joint = _joints(host).index(name)
+        yield _of_state(host, new, "qpos", int(host.model.jnt_qposadr[joint]))
+        return
+    parts = _parts(host)
+    if base in parts:
+        columns = list(range(*parts[base].indices(host.width)))
+        if index is not None and index >= len(columns):
+            raise unknown("coordinate", name, [f"{base}[{i}]" for i in range(len(columns))])
+        chosen = columns if index is None else [columns[index]]
+
+        def observed() -> np.ndarray:
+            return host.observed()[chosen]
+
+        yield from _fitted(host, new, name, observed)
+        return
+    if base in _places(host):
+        kind, i = mjcf.point_of(host.model, base)
+        axes = [0, 1] if index is None else [index]
+
+        def placed() -> np.ndarray:
+            return np.array(getattr(host.data, kind)[i][axes])
+
+        yield from _fitted(host, new, name, placed)
+        return
+    raise unknown("coordinate", name, all_names(host))
+
+
+def _of_state(host: Host, new: str, kind: str, index: int, offset: float = 0.0) -> Coordinate:
+    model = host.model
+    addresses = model.jnt_qposadr if kind == "qpos" else model.jnt_dofadr
+    joint = int(np.searchsorted(addresses, index, side="right")) - 1
+    if model.jnt_type[joint] not in (SLIDE, HINGE):
+        free = [
+            usual_name(model, j, False)
+            for j in range(model.njnt)
+            if model.jnt_type[j] in (SLIDE, HINGE)
+        ]
+        raise BadInput(
+            f"{kind}[{index}] is a part of a free or ball joint of {host.name}, which hyrl_mj has no chart "
+            f"for: name slides and hinges ({', '.join(free) or 'it has none'})"
+        )
+    return Coordinate(new or usual_name(model, joint, kind == "qvel"), kind, index, offset, joint)
+
+
+def _fitted(host: Host, new: str, name: str, get: Callable[[], np.ndarray]) -> Iterator[Coordinate]:
+    """Yields the positions or velocities that the values of a function are, but for an offset."""
+    state, memory = host.base
+    rng, columns = np.random.default_rng(0), {"qpos": host.model.nq, "qvel": host.model.nv}
+    moved: dict[str, list[np.ndarray]] = {kind: [] for kind in columns}
+    values = []
+    for _ in range(TRIED):
+        host.write(state, memory)
+        for kind, count in columns.items():
+            getattr(host.data, kind)[:] += rng.uniform(-MOVED, MOVED, count)
+            moved[kind].append(getattr(host.data, kind).copy())
+        host.forward()
+        values.append(get())
+    host.write(state, memory)
+    for j, column in enumerate(np.array(values).T):
+        match = [
+            (kind, i, offsets.mean())
+            for kind, rows in moved.items()
+            for i, offsets in enumerate((column[:, None] - np.array(rows)).T)
+            if np.ptp(offsets) < AGREES
+        ]
+        if not match:
+            raise BadInput(
+                f"{name}[{j}] is no single position or velocity of {host.name}, but follows from several, or "
+                f"from none: name coordinates such as {', '.join(all_names(host)[:4])}"
+            )
+        kind, i, offset = match[0]
+        several = f"{new}[{j}]" if new and len(values[0]) > 1 else new
+        yield _of_state(host, several, kind, i, round(float(offset), 9))

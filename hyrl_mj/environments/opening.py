@@ -1,0 +1,231 @@
+"""Environments are made, from ids or functions, and what cannot work is refused."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import random
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from gymnasium import spaces
+
+from hyrl_mj.errors import BadInput, brief
+
+# Packages that offer environments, by the beginning of an id: module to import, and what to install. The
+# environments of OGBench have no namespace.
+ROBOTICS = 'pip install "hyrl-mj[robotics]"'
+PACKAGES = {
+    "gymnasium_robotics": "gymnasium-robotics",
+    "ogbench": "ogbench",
+    "shimmy": "shimmy[dm-control]",
+}
+# Wrappers that count or check, and change nothing of what an environment does.
+PEELED = (
+    "TimeLimit",
+    "OrderEnforcing",
+    "PassiveEnvChecker",
+    "Autoreset",
+    "RecordEpisodeStatistics",
+    "Monitor",
+)
+
+
+@dataclass(frozen=True)
+class Source:
+    """How an environment is made and reset.
+
+    Attributes:
+        make: id of the environment in Gymnasium, or a function that returns one.
+        kwargs: arguments of `gymnasium.make`, or of the function.
+        reset: the options of `reset`, such as where the goal is.
+        pinned: values of positions, velocities or attributes after each reset, by name.
+        seed: the seed of the reset that all copies begin from.
+    """
+
+    make: str | Callable[..., gym.Env]
+    kwargs: Mapping[str, Any] = field(default_factory=dict)
+    reset: Mapping[str, Any] = field(default_factory=dict)
+    pinned: Mapping[str, Any] = field(default_factory=dict)
+    seed: int = 0
+
+    @property
+    def name(self) -> str:
+        """The name of the environment, which is also that of its task."""
+        if isinstance(self.make, str):
+            return self.make.rpartition(":")[2].rpartition("/")[2]
+        return getattr(self.make, "__name__", type(self.make).__name__).strip("<>") or "environment"
+
+
+@contextmanager
+def global_seed(seed: int) -> Iterator[None]:
+    """Seeds the global generators of NumPy and Python in the block, which some environments draw from."""
+    numpy_state, python_state = np.random.get_state(), random.getstate()
+    np.random.seed(seed)
+    random.seed(seed)
+    try:
+        yield
+    finally:
+        np.random.set_state(numpy_state)
+        random.setstate(python_state)
+
+
+@dataclass(frozen=True)
+class Made:
+    """An environment without the wrappers that count or check.
+
+    Attributes:
+        env: the environment.
+        steps: after how many steps its episodes are truncated; None if it does not say.
+        model, data: of MuJoCo.
+    """
+
+    env: gym.Env
+    steps: int | None
+    model: mujoco.MjModel
+    data: mujoco.MjData
+
+
+def made(source: Source) -> Made:
+    """Returns an environment that can be used.
+
+    Raises:
+        BadInput: it cannot be made, or it is none that can be used.
+    """
+    if isinstance(source.make, str):
+        _register(source.make)
+        try:
+            env: Any = gym.make(source.make, disable_env_checker=True, **source.kwargs)
+        except Exception as error:  # whatever a foreign constructor raises
+            raise BadInput(_why_not_made(source.make, error)) from error
+    else:
+        try:
+            env = source.make(**source.kwargs)
+        except Exception as error:
+            raise BadInput(
+                f"{source.name} cannot be made ({brief(error)}): repair the function"
+            ) from error
+    physics = _check(env, source.name)
+    return Made(_peeled(env), _steps_of(env), *physics)
+
+
+def _steps_of(env: gym.Env) -> int | None:
+    """Returns after how many steps an episode of an environment is truncated; None if it does not say."""
+    if env.spec is not None and env.spec.max_episode_steps:
+        return int(env.spec.max_episode_steps)
+    wrapper: Any = env
+    while isinstance(wrapper, gym.Wrapper):
+        if isinstance(wrapper, gym.wrappers.TimeLimit):
+            return int(wrapper._max_episode_steps)
+        wrapper = wrapper.env
+    limit = getattr(getattr(wrapper, "_env", None), "_step_limit", np.inf)  # of dm_control
+    return int(limit) if np.isfinite(limit) else None
+
+
+def _register(name: str) -> None:
+    """Imports the packages that offer environments, as far as they are installed."""
+    if name in gym.registry:
+        return
+    for module in PACKAGES:
+        try:
+            package = importlib.import_module(module)
+        except ImportError:
+            continue
+        if module == "shimmy":
+            _adapt_dm_control()
+        gym.register_envs(package)
+        if name in gym.registry:
+            return
+
+
+def _adapt_dm_control() -> None:
+    """Takes the fields out of dm_control's table of MuJoCo's arrays that this version of MuJoCo lacks.
+
+    dm_control 1.0.50 reads them all when it loads a model, and MuJoCo 4 has renamed some.
+    """
+    try:
+        from dm_control.mujoco.wrapper.mjbindings import sizes
+    except ImportError:
+        return
+    for name, kind in (("mjmodel", mujoco.MjModel), ("mjdata", mujoco.MjData)):
+        table = sizes.array_sizes[name]
+        for field_name in [key for key in table if not hasattr(kind, key)]:
+            del table[field_name]
+
+
+def _why_not_made(name: str, error: Exception) -> str:
+    if name not in gym.registry and isinstance(error, gym.error.Error):
+        missing = [p for m, p in PACKAGES.items() if importlib.util.find_spec(m) is None]
+        close = get_close_matches(name, list(gym.registry), n=3, cutoff=0.5)
+        near = f": the nearest ones are {', '.join(close)}" if close else ""
+        install = f"; if it is of {' or '.join(missing)}, {ROBOTICS} brings it" if missing else ""
+        return f"there is no environment {name!r} here{near}{install}"
+    if isinstance(error, ImportError):
+        return f"the environment {name} takes a package that is not installed ({brief(error)}): {ROBOTICS}"
+    return f"the environment {name} cannot be made ({brief(error)}): change --env-args"
+
+
+def _check(env: Any, name: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """Returns model and data of an environment of one agent in MuJoCo, with vectors; refuses others."""
+    if hasattr(env, "possible_agents") or hasattr(env, "agents"):
+        raise BadInput(f"{name} has several agents: hyrl_mj takes environments of one agent")
+    if isinstance(env, gym.vector.VectorEnv) or not isinstance(env, gym.Env):
+        raise BadInput(
+            f"{name} is a {type(env).__name__}: give a single gymnasium.Env, or a function that makes one"
+        )
+    physics = _physics_of(env)
+    if physics is None:
+        raise BadInput(
+            f"{name} is not simulated by MuJoCo, as far as its attributes model and data tell: give an "
+            "environment of MuJoCo"
+        )
+    space = env.observation_space
+    parts = space.spaces.values() if isinstance(space, spaces.Dict) else (space,)
+    for part in parts:
+        if not isinstance(part, spaces.Box) or len(part.shape) > 1:
+            what = "images" if isinstance(part, spaces.Box) else f"a space {type(part).__name__}"
+            raise BadInput(
+                f"{name} observes {what} {getattr(part, 'shape', '')}: hyrl_mj takes vectors, or a Dict of "
+                "vectors; choose the observation of its state"
+            )
+    if not isinstance(env.action_space, spaces.Box | spaces.Discrete):
+        raise BadInput(
+            f"{name} takes actions of {env.action_space}: hyrl_mj takes a Box, or Discrete"
+        )
+    if (
+        isinstance(env.action_space, spaces.Box)
+        and not np.isfinite([env.action_space.low, env.action_space.high]).all()
+    ):
+        raise BadInput(f"{name} takes actions without limits: wrap it in gymnasium's RescaleAction")
+    return physics
+
+
+def _physics_of(env: Any) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
+    """Returns model and data of an environment, of Gymnasium or of dm_control; None if it has none."""
+    inner = env.unwrapped
+    model, data = getattr(inner, "model", None), getattr(inner, "data", None)
+    if isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
+        return model, data
+    physics = getattr(getattr(inner, "_env", None), "physics", None)
+    model, data = (getattr(getattr(physics, key, None), "ptr", None) for key in ("model", "data"))
+    if isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
+        return model, data
+    return None
+
+
+def _peeled(env: gym.Env) -> gym.Env:
+    """Takes the wrappers off that count or check."""
+    while type(env).__name__ in PEELED and isinstance(env, gym.Wrapper):
+        env = env.env
+    outer = env
+    while isinstance(outer, gym.Wrapper):
+        while type(outer.env).__name__ in PEELED and isinstance(outer.env, gym.Wrapper):
+            outer.env = outer.env.env
+        outer = outer.env
+    return env

@@ -1,0 +1,123 @@
+"""What an environment is found to have: walls and islands, bounds of its coordinates, and where resets put it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from hyrl_mj.environments.coordinates import HINGE, Coordinate
+from hyrl_mj.environments.copies import Host
+from hyrl_mj.tasks import touching
+
+# Resets that show where episodes start.
+RESETS = 64
+# What is sampled beyond this many times as far is outside of the chart.
+ROOM = 1.2
+
+
+@dataclass(frozen=True)
+class Bound:
+    """Ends of a coordinate of the chart.
+
+    Attributes:
+        low, high: the ends; of a periodic coordinate, one period.
+        periodic: whether it lives on a circle.
+        why: where that was found, as "its joint".
+    """
+
+    low: float
+    high: float
+    periodic: bool
+    why: str
+
+
+def starts_of(host: Host) -> np.ndarray:
+    """Returns the positions and velocities (RESETS, nq + nv) that resets lead to."""
+    found = []
+    for seed in range(RESETS):
+        host.reset(seed)
+        found.append(np.concatenate([host.data.qpos, host.data.qvel]))
+    host.write(*host.base)
+    return np.array(found)
+
+
+def walls(host: Host) -> list[int]:
+    """Returns the ids of the geoms that stand still and that a moving geom can collide with, but no planes."""
+    model = host.model
+    still = (model.body_weldid[model.geom_bodyid] == 0) & (
+        model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE
+    )
+    moving = np.flatnonzero(model.body_weldid[model.geom_bodyid] != 0)
+    meets = [
+        bool(
+            (
+                (model.geom_contype[g] & model.geom_conaffinity[moving])
+                | (model.geom_contype[moving] & model.geom_conaffinity[g])
+            ).any()
+        )
+        for g in range(model.ngeom)
+    ]
+    return [int(g) for g in np.flatnonzero(still & meets)]
+
+
+def islands_of(host: Host, places: np.ndarray) -> dict[str, int]:
+    """Returns the walls that can be passed on both sides, by name, each with the id of one geom.
+
+    Walls that touch each other are one. Those that enclose the places (n, 2) where the robot has been are
+    no island.
+    """
+    model, data, ids = host.model, host.data, walls(host)
+    if not ids:
+        return {}
+    found: dict[str, int] = {}
+    for group in touching(model, data, ids):
+        corners = data.geom_xpos[group][:, :2]
+        size = model.geom_rbound[group][:, None]
+        low, high = (corners - size).min(axis=0), (corners + size).max(axis=0)
+        if (low < places.min(axis=0)).all() and (high > places.max(axis=0)).all():
+            continue
+        middle = group[int(np.linalg.norm(corners - corners.mean(axis=0), axis=1).argmin())]
+        found[f"island {len(found) + 1}"] = middle
+    return found
+
+
+def bounds_of(
+    host: Host,
+    chart: Sequence[Coordinate],
+    samples: np.ndarray,
+    given: dict[str, tuple[float, float]],
+) -> list[Bound]:
+    """Returns the ends of the chart's coordinates.
+
+    Args:
+        host: the environment.
+        chart: its coordinates.
+        samples: (n, d) chart points that sampled runs have met.
+        given: ends that the user has given, by name.
+    """
+    model, found = host.model, []
+    for i, c in enumerate(chart):
+        if c.name in given:
+            low, high = given[c.name]
+            found.append(Bound(float(low), float(high), False, "given"))
+        elif c.kind == "qpos" and model.jnt_limited[c.joint]:
+            low, high = model.jnt_range[c.joint] + c.offset
+            found.append(Bound(float(low), float(high), False, "the range of its joint"))
+        elif c.kind == "qpos" and model.jnt_type[c.joint] == HINGE:
+            found.append(Bound(-np.pi + c.offset, np.pi + c.offset, True, "a joint without limits"))
+        elif c.kind == "qpos" and (ids := walls(host)):
+            axis = int(np.abs(model.jnt_axis[c.joint]).argmax())
+            places, size = host.data.geom_xpos[ids][:, axis], model.geom_size[ids][:, min(axis, 2)]
+            found.append(
+                Bound(
+                    float((places - size).min()), float((places + size).max()), False, "the walls"
+                )
+            )
+        else:
+            middle, half = np.median(samples[:, i]), np.ptp(samples[:, i]) / 2
+            half = max(ROOM * half, 1e-3)
+            found.append(Bound(float(middle - half), float(middle + half), False, "sampled runs"))
+    return found

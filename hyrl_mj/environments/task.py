@@ -1,0 +1,446 @@
+"""A task whose plant is an environment of Gymnasium, as it is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from hashlib import sha256
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from hyrl_mj.chart import Chart
+from hyrl_mj.environments.coordinates import SLIDE, AnyChart, Coordinate, all_names, coordinates
+from hyrl_mj.environments.copies import Host
+from hyrl_mj.environments.layout import Layout
+from hyrl_mj.environments.opening import Source
+from hyrl_mj.environments.plant import EnvironmentPlant
+from hyrl_mj.environments.success import FORMS, INFO, Success, success_of
+from hyrl_mj.environments.surroundings import Bound, bounds_of, islands_of, starts_of
+from hyrl_mj.errors import BadInput
+from hyrl_mj.tasks import ANY, Learning, Outcome, Scene, Task, register_opener
+
+# Steps of the runs under inputs at random that show how far coordinates go, and for how long inputs are held.
+RUNS, STEPS, HELD = 16, 150, 15
+# Samples of an episode of an environment that never ends by itself.
+STEPS_WITHOUT_END = 1_000
+# Times that starts are drawn again because they are inside of walls.
+DRAWS = 200
+# A run that turns by less than this decides nothing [rad].
+DECIDED = 0.5
+# The texts that describe environments begin with this; those that have been made in this process.
+MARK = "env:"
+_MADE: dict[str, EnvironmentTask] = {}
+
+
+class EnvironmentTask(Task):
+    """An environment of Gymnasium as a task; `from_gymnasium` makes it.
+
+    Its plant is the environment itself, which many copies take turns in. Noise on a coordinate of the chart
+    changes the state at which the environment computes its observation, so that every copy of a position in
+    it is changed alike.
+
+    Attributes:
+        host: the environment.
+        found: what was filled in, with the reason, by name.
+    """
+
+    scene: Scene
+    learning = Learning()
+
+    def __init__(
+        self,
+        source: Source,
+        chart: AnyChart | None,
+        noisy: Sequence[float] | None,
+        success: str | None,
+        bounds: Mapping[str, tuple[float, float]],
+        steps: int | None,
+        spec: str,
+    ):
+        self.host = Host(source)
+        self.name, self.spec = source.name, spec
+        self.env_id = source.name
+        self.found: dict[str, str] = {}
+        self.description = f"the environment {source.name}"
+        self._coordinates = self._charted(chart)
+        self.input_limits_of_space = self._limits()
+        resets = starts_of(self.host)
+        runs, rewards, ended, told = self._sampled(resets)
+        self._criterion = self._success(success, ended, told)
+        self._usual = self._at_rest(resets)
+        self._measure_bounds(resets, runs, dict(bounds))
+        self._count(steps)
+        self.noisy = self._shares(noisy)
+        self.worst_reward = float(min(rewards.min(), 0.0))
+        self.inputs = self._input_names()
+        self._islands = islands_of(self.host, self._places(runs)) if self._in_plane else {}
+        self._set_scene(resets)
+
+    def __reduce__(self) -> tuple[Callable[..., Task], tuple[Any, ...]]:
+        return from_spec, (self.spec, self.noisy)
+
+    # ---- what was filled in
+
+    def _charted(self, chart: AnyChart | None) -> tuple[Coordinate, ...]:
+        if chart is not None:
+            return coordinates(self.host, chart)
+        space = self.host.env.observation_space
+        if isinstance(space, spaces.Dict) and "achieved_goal" in space.spaces:
+            proposed: AnyChart = "achieved_goal"
+        else:
+            proposed = [f"qpos[{i}]" for i in range(min(self.host.model.nq, 2))]
+        found = coordinates(self.host, proposed)
+        names = ", ".join(c.described() for c in found)
+        self.found["chart"] = (
+            f"{proposed} ({names}); others are {', '.join(all_names(self.host)[:12])}"
+        )
+        return found
+
+    def _limits(self) -> tuple[np.ndarray, np.ndarray]:
+        space = self.host.env.action_space
+        if isinstance(space, spaces.Discrete):
+            self.learning = Learning(levels=int(space.n))
+            return np.zeros(1), np.array([float(space.n - 1)])
+        assert isinstance(space, spaces.Box)
+        return np.ravel(space.low).astype(float), np.ravel(space.high).astype(float)
+
+    def _sampled(self, resets: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool, bool]:
+        """Returns chart points (n, d) and rewards (n,) of runs, whether one ended, and what info tells."""
+        rng, host = np.random.default_rng(0), self.host
+        points, rewards, ended = [], [], False
+        for seed in range(RUNS):
+            host.reset(seed)
+            for k in range(STEPS):
+                if k % HELD == 0:
+                    u = host.drawn(rng)
+                _, reward, terminated, truncated, _, _ = host.step(u)
+                points.append(
+                    [getattr(host.data, c.kind)[c.index] + c.offset for c in self._coordinates]
+                )
+                rewards.append(reward)
+                ended = ended or terminated
+                if terminated or truncated:
+                    break
+        host.write(*host.base)
+        return np.array(points), np.array(rewards), ended, host.tells_success
+
+    def _success(self, success: str | None, ended: bool, told: bool) -> Success:
+        if success is None:
+            if not told:
+                raise BadInput(
+                    f"{self.name} does not tell in its info when it succeeds: say so with success, as {FORMS}"
+                )
+            success = INFO
+            self.found["success"] = 'info["success"]; or give ' + FORMS
+        return success_of(self.host, success)
+
+    def _at_rest(self, resets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns state and memory of the base, with the usual positions and at rest."""
+        model = self.host.model
+        usual = np.median(resets, axis=0)
+        self.host.write(*self.host.base)
+        self.host.data.qpos[:], self.host.data.qvel[:] = usual[: model.nq], 0.0
+        state, memory = self.host.read()
+        self.host.write(*self.host.base)
+        return state, memory
+
+    def _measure_bounds(
+        self, resets: np.ndarray, runs: np.ndarray, given: dict[str, tuple[float, float]]
+    ) -> None:
+        chosen = self._coordinates
+        names = [c.name for c in chosen]
+        for name in given:
+            if name not in names:
+                raise BadInput(
+                    f"bounds for {name} cannot be used: the chart has {', '.join(names)}"
+                )
+        where = [c.index + (c.kind == "qvel") * self.host.model.nq for c in chosen]
+        begun = resets[:, where] + [c.offset for c in chosen]
+        bounds: list[Bound] = bounds_of(self.host, chosen, np.vstack([runs, begun]), given)
+        self.found["bounds"] = ", ".join(
+            f"{c.name} {b.low:.3g} to {b.high:.3g} (from {b.why})"
+            for c, b in zip(chosen, bounds, strict=True)
+        )
+        low, high = tuple(b.low for b in bounds), tuple(b.high for b in bounds)
+        units = tuple(
+            ("m" if self.host.model.jnt_type[c.joint] == SLIDE else "rad")
+            + "/s" * (c.kind == "qvel")
+            for c in chosen
+        )
+        self.chart = Chart(tuple(names), units, low, high, tuple(b.periodic for b in bounds))
+        first, last = begun.min(axis=0), begun.max(axis=0)
+        self.start_low = tuple(np.clip(first, low, high).tolist())
+        self.start_high = tuple(np.clip(last, low, high).tolist())
+        self.found["starts"] = ", ".join(
+            f"{n} {a:.3g} to {b:.3g}" for n, a, b in zip(names, first, last, strict=True)
+        )
+
+    def _count(self, steps: int | None) -> None:
+        self.max_steps = steps or self.host.steps or STEPS_WITHOUT_END
+        if steps is None:
+            self.found["steps"] = f"{self.max_steps} ({self.max_steps * self.dt:g} s) of an episode"
+
+    def _shares(self, noisy: Sequence[float] | None) -> tuple[float, ...]:
+        chosen = self._coordinates
+        if noisy is None:
+            noisy = [float(c.kind == "qpos") for c in chosen]
+            on = ", ".join(c.name for c in chosen if c.kind == "qpos")
+            self.found["noise"] = (
+                f"on {on}, in the unit of each; or give the share of each with noisy"
+            )
+        if len(noisy) != len(chosen):
+            raise BadInput(
+                f"noisy has {len(noisy)} share(s), and the chart {len(chosen)} coordinate(s) "
+                f"({', '.join(c.name for c in chosen)}): give one for each"
+            )
+        return (*(float(share) for share in noisy), *([0.0] * sum(self._layout_sizes()[1:])))
+
+    def _input_names(self) -> tuple[str, ...]:
+        model, m = self.host.model, len(self.input_limits_of_space[0])
+        names = [model.actuator(i).name.rpartition("/")[2] for i in range(model.nu)]
+        return (
+            tuple(names)
+            if len(names) == m and all(names)
+            else tuple(f"action[{i}]" for i in range(m))
+        )
+
+    def _set_scene(self, resets: np.ndarray) -> None:
+        starts = self.starts(5, np.random.default_rng(0))
+        ways: tuple[str, ...] = ()
+        if self._islands:
+            self.found["ways"] = f"past {', '.join(self._islands)}, of walls that touch each other"
+        elif (turning := self._turning) is not None:
+            ways = "clockwise", "counter-clockwise"
+            self.found["ways"] = f"{self.chart.names[turning]} turns one way or the other"
+        else:
+            raise BadInput(
+                f"{self.name} has no walls that can be passed on both sides, and no joint of the chart turns "
+                f"freely ({', '.join(self.chart.names)}): name a chart with a decision"
+            )
+        self.scene = Scene(
+            starts=tuple(map(tuple, starts.tolist())),
+            time=min(self.max_steps * self.dt, 20.0),
+            mode_names=ways,
+        )
+
+    # ---- the task
+
+    def _layout_sizes(self) -> tuple[int, ...]:
+        state, memory = self._usual
+        return len(self._coordinates), len(state), len(memory), self.host.width + 5, 1
+
+    @cached_property
+    def layout(self) -> Layout:
+        """What a measurement holds."""
+        return Layout(
+            self.host, self._coordinates, self._criterion, self._usual, *self.input_limits_of_space
+        )
+
+    @property
+    def _in_plane(self) -> bool:
+        """Whether the chart's first two coordinates are a place."""
+        first = self._coordinates[:2]
+        slides = [self.host.model.jnt_type[c.joint] == SLIDE and c.kind == "qpos" for c in first]
+        return len(first) == 2 and all(slides)
+
+    @property
+    def _turning(self) -> int | None:
+        """The coordinate of the chart that turns freely; None if none does."""
+        return next((i for i, wraps in enumerate(self.chart.periodic) if wraps), None)
+
+    def _places(self, z: np.ndarray) -> np.ndarray:
+        return z[:, :2]
+
+    @cached_property
+    def model(self) -> Any:
+        return self.host.model
+
+    @cached_property
+    def code(self) -> str:
+        digest = sha256()
+        for name in ("qpos0", "body_mass", "geom_size", "geom_pos", "site_pos", "actuator_gear"):
+            digest.update(np.ascontiguousarray(getattr(self.model, name)).tobytes())
+        return digest.hexdigest()
+
+    @cached_property
+    def dt(self) -> float:
+        """Time of a step [s]."""
+        self.host.write(*self.host.base)
+        before = self.host.data.time
+        self.host.step(self.host.drawn(np.random.default_rng(0)))
+        passed = self.host.data.time - before
+        self.host.write(*self.host.base)
+        return round(float(passed), 9)
+
+    @cached_property
+    def input_limits(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.input_limits_of_space
+
+    @cached_property
+    def observation_keys(self) -> tuple[str, ...]:  # type: ignore[override]
+        space = self.host.env.observation_space
+        return tuple(sorted(space.spaces)) if isinstance(space, spaces.Dict) else ()
+
+    @cached_property
+    def observation_low(self) -> tuple[float, ...]:  # type: ignore[override]
+        return tuple(self._flat_limits("low"))
+
+    @cached_property
+    def observation_high(self) -> tuple[float, ...]:  # type: ignore[override]
+        return tuple(self._flat_limits("high"))
+
+    def _flat_limits(self, end: str) -> np.ndarray:
+        space = self.host.env.observation_space
+        parts = (
+            [space.spaces[key] for key in sorted(space.spaces)]
+            if isinstance(space, spaces.Dict)
+            else [space]
+        )
+        return np.concatenate([np.ravel(getattr(part, end)) for part in parts]).astype(float)
+
+    def plant(self, n: int, threads: int = 0) -> Any:
+        return EnvironmentPlant(self.host, self.layout, n)
+
+    @cached_property
+    def kinematic(self) -> bool:
+        return False
+
+    def state(
+        self, z: np.ndarray, rng: np.random.Generator | None = None
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        state = np.tile(self._usual[0], (len(z), 1))
+        state[:, self.layout.of_chart] = z - self.layout.offset
+        return state[:, self.layout.qpos], state[:, self.layout.qvel]
+
+    def observation(self, measured: np.ndarray) -> np.ndarray:
+        return self.layout.observation(measured)
+
+    def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
+        return np.maximum(self.layout.report(measurement).reward, self.worst_reward)
+
+    def ending(self, measurement: np.ndarray) -> np.ndarray:
+        return np.rint(measurement[:, -1]).astype(int)
+
+    def verdict(self, measurement: np.ndarray) -> np.ndarray:
+        holds = self._criterion.holds(self.layout.report(measurement))
+        return np.where(holds & ~self._criterion.ends, Outcome.REACHED, Outcome.STALLED)
+
+    def arrived(self, z: np.ndarray) -> np.ndarray:
+        return np.ones(len(z), dtype=bool)  # its own criterion tells
+
+    def miss(self, z: np.ndarray) -> np.ndarray:
+        return np.zeros(len(z))
+
+    def danger(self, measurement: np.ndarray) -> np.ndarray:
+        return -self.layout.report(measurement).reward
+
+    def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        z = super().starts(n, rng)
+        for _ in range(DRAWS):
+            plant = self.plant(n)
+            plant.set_state(*self.state(z))
+            inside = np.flatnonzero(self.ending(plant.measurement) != Outcome.RUNNING)
+            if not len(inside):
+                return z
+            z[inside] = super().starts(len(inside), rng)
+        raise BadInput(
+            f"hardly a start of {self.name} is free of walls: name another chart, or its bounds"
+        )
+
+    @property
+    def obstacles(self) -> dict[str, int]:  # type: ignore[override]
+        return self._islands
+
+    @property
+    def gives_direction(self) -> bool:
+        return not self._islands
+
+    def direction(self, path: np.ndarray) -> np.ndarray:
+        if self._islands:
+            return super().direction(path)
+        turned = path[-1, :, self._turning] - path[0, :, self._turning]
+        return np.where(np.abs(turned) < DECIDED, ANY, (turned > 0).astype(int))
+
+
+def from_gymnasium(
+    env: str | Callable[..., gym.Env],
+    *,
+    chart: AnyChart | None = None,
+    noisy: Sequence[float] | None = None,
+    success: str | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    steps: int | None = None,
+    kwargs: Mapping[str, Any] | None = None,
+    reset: Mapping[str, Any] | None = None,
+    pinned: Mapping[str, Any] | None = None,
+    seed: int = 0,
+) -> EnvironmentTask:
+    """Returns a task whose plant is an environment of MuJoCo, as it is.
+
+    What is not given is found, and `task.found` says what was found.
+
+    Args:
+        env: the id of the environment in Gymnasium, or a function that makes one.
+        chart: names of the coordinates in which the decision falls; see `coordinates`.
+        noisy: (d,) share of the noise bound on each coordinate of the chart; by default 1 on positions.
+        success: when an episode is a success: "info", "terminated", "reward >= 1", or
+            "distance(a, b) <= 0.05" of two sites or bodies.
+        bounds: (low, high) of coordinates of the chart, by name.
+        steps: steps of an episode, by default those of the environment.
+        kwargs: arguments of `gymnasium.make`, or of the function.
+        reset: options of `reset`.
+        pinned: values of positions, velocities or attributes after each reset, by name.
+        seed: the seed of the reset that all copies begin from.
+
+    Raises:
+        BadInput: it cannot be used; the message says why.
+    """
+    source = Source(env, dict(kwargs or {}), dict(reset or {}), dict(pinned or {}), seed)
+    content = {
+        "env": env if isinstance(env, str) else {"function": source.name},
+        "chart": chart, "noisy": noisy, "success": success, "bounds": bounds, "steps": steps,
+        "kwargs": kwargs, "reset": reset, "pinned": pinned, "seed": seed or None,
+    }  # fmt: skip
+    given = {key: value for key, value in content.items() if value is not None}
+    spec = MARK + json.dumps(given, default=_plain)
+    if not isinstance(env, str) or spec not in _MADE:
+        _MADE[spec] = EnvironmentTask(source, chart, noisy, success, bounds or {}, steps, spec)
+    return _MADE[spec]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.number):
+        return value.tolist()
+    raise BadInput(f"{value!r} cannot be written down: give numbers, texts, lists and dictionaries")
+
+
+def from_spec(spec: str, noisy: tuple[float, ...] | None = None) -> Task:
+    """Returns the task that a text describes, as `EnvironmentTask.spec` holds it.
+
+    Raises:
+        BadInput: it was made with a function, which no text holds, or the text is damaged.
+    """
+    if spec not in _MADE:
+        try:
+            given = json.loads(spec.removeprefix(MARK))
+            env = given["env"]
+        except (ValueError, TypeError, KeyError):
+            raise BadInput(f"{spec[:80]!r} describes no environment: start a new run") from None
+        if not isinstance(env, str):
+            raise BadInput(
+                f"the environment was made by the function {env.get('function')}, which no file holds: call "
+                "hyrl_mj.from_gymnasium with it first, in the same process"
+            )
+        try:
+            from_gymnasium(**given)
+        except TypeError:
+            raise BadInput(f"{spec[:80]!r} describes no environment: start a new run") from None
+    task: Task = _MADE[spec]
+    return task if noisy is None else task.with_noise(noisy)
+
+
+register_opener(MARK, from_spec)

@@ -1,0 +1,137 @@
+"""Agents of others: trains agents with plain SB3 on environments of others, for `hyrl-mj diagnose --env`.
+
+    pip install "hyrl-mj[robotics]"
+    python scripts/outside_agents.py reacher point-maze --out agents
+
+Nothing of hyrl_mj takes part. Each agent takes a few minutes, and the same seed gives the same agent on the same
+kind of machine.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+# Where the goal of Reacher is pinned [m].
+TARGET = (-0.15, 0.0)
+
+
+class PinnedTarget(gym.Wrapper):
+    """Reacher with its target at one place."""
+
+    def reset(self, **options: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        _, info = self.env.reset(**options)
+        inner: Any = self.env.unwrapped
+        qpos, qvel = inner.data.qpos.copy(), inner.data.qvel.copy()
+        qpos[2:4] = TARGET
+        inner.set_state(qpos, qvel)
+        return inner._get_obs(), info
+
+
+class WithOptions(gym.Wrapper):
+    """An environment that is always reset with the same options."""
+
+    def __init__(self, env: gym.Env, options: dict[str, Any]):
+        super().__init__(env)
+        self._options = options
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        return self.env.reset(seed=seed, options=self._options)
+
+
+@dataclass(frozen=True)
+class Agent:
+    """How an agent is trained.
+
+    Attributes:
+        make: makes its environment.
+        samples: number of samples.
+        policy: SB3's name of its policy.
+        options: arguments of PPO.
+        normalize: whether rewards are normalised by `VecNormalize`.
+    """
+
+    make: Callable[[], gym.Env]
+    samples: int
+    policy: str = "MlpPolicy"
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+def reacher() -> gym.Env:
+    return PinnedTarget(gym.make("Reacher-v5"))
+
+
+def maze(name: str, cell: tuple[int, int]) -> Callable[[], gym.Env]:
+    def make() -> gym.Env:
+        import gymnasium_robotics
+
+        gym.register_envs(gymnasium_robotics)
+        return WithOptions(gym.make(name), {"goal_cell": np.array(cell)})
+
+    return make
+
+
+def ogbench() -> gym.Env:
+    import ogbench  # noqa: F401
+
+    return gym.make("pointmaze-medium-singletask-v0")
+
+
+def pendulum() -> gym.Env:
+    import shimmy
+
+    gym.register_envs(shimmy)
+    return gym.wrappers.FlattenObservation(gym.make("dm_control/pendulum-swingup-v0"))
+
+
+LONG = {"n_steps": 256, "batch_size": 1024, "n_epochs": 6, "gamma": 0.995, "learning_rate": 1e-3}
+AGENTS = {
+    "reacher": Agent(reacher, 600_000, options={"n_steps": 128, "batch_size": 512, "learning_rate": 1e-3}),
+    "point-maze": Agent(
+        maze("PointMaze_Medium-v3", (6, 6)), 1_500_000, "MultiInputPolicy", {**LONG, "ent_coef": 0.003}
+    ),
+    "point-maze-large": Agent(
+        maze("PointMaze_Large-v3", (7, 10)), 2_500_000, "MultiInputPolicy", {**LONG, "ent_coef": 0.003}
+    ),
+    "ogbench": Agent(ogbench, 500_000, options={**LONG, "ent_coef": 0.003}),
+    "pendulum": Agent(pendulum, 1_000_000, options={**LONG, "gamma": 0.99}),
+}
+
+
+def trained(agent: Agent, seed: int) -> PPO:
+    env: VecEnv = make_vec_env(agent.make, n_envs=16, seed=seed)
+    env = VecNormalize(env, norm_obs=False, gamma=agent.options.get("gamma", 0.99))
+    model = PPO(agent.policy, env, seed=seed, device="cpu", verbose=0, **agent.options)
+    model.learn(agent.samples)
+    return model
+
+
+def main() -> None:
+    style = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=style)
+    parser.add_argument("agents", nargs="+", choices=AGENTS)
+    parser.add_argument("--out", type=Path, default=Path("agents"))
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    torch.set_num_threads(1)
+    given.out.mkdir(parents=True, exist_ok=True)
+    for name in given.agents:
+        began = time.monotonic()
+        model = trained(AGENTS[name], given.seed)
+        model.save(given.out / f"{name}.zip")
+        mean, spread = evaluate_policy(model, AGENTS[name].make(), 10, warn=False)
+        print(f"{name}: {time.monotonic() - began:.0f} s, return {mean:.1f} +- {spread:.1f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
