@@ -26,6 +26,7 @@ from hyrl_mj.stages import (
     ExtendedSets,
     HybridController,
     Partition,
+    PartPolicy,
     Retraining,
 )
 from hyrl_mj.tasks import Field, Task, described_task, get_task, reference
@@ -175,9 +176,9 @@ class Run:
         return ExtendedSets.load(self._checked("extended_sets.npz"), self.task)
 
     @cached_property
-    def mode_policies(self) -> dict[int, MlpPolicy]:
+    def mode_policies(self) -> dict[int, MlpPolicy | PartPolicy]:
         """The policy of each mode, from stage 6."""
-        return {q: self._load_policy(f"mode_{q}") for q in self.extended_sets.modes}
+        return {q: self._mode_policy(q) for q in self.extended_sets.modes}
 
     @cached_property
     def controller(self) -> HybridController:
@@ -277,6 +278,12 @@ class Run:
     def _checked(self, name: str) -> Path:
         """Returns the path of a file, if it is to be believed."""
         return self.manifest.checked(self.path / name)
+
+    def _mode_policy(self, mode: int) -> MlpPolicy | PartPolicy:
+        if self.manifest.has(self.path / f"mode_{mode}.safetensors"):
+            return self._load_policy(f"mode_{mode}")
+        path = self._checked(f"mode_{mode}.json")
+        return PartPolicy.load(path, self.task, self.steady, self.partition, mode)
 
     def _load_policy(self, stem: str) -> MlpPolicy:
         self._checked(f"{stem}.json")

@@ -15,24 +15,25 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 # Where the goal of Reacher is pinned [m].
 TARGET = (-0.15, 0.0)
 
 
 class PinnedTarget(gym.Wrapper):
-    """Reacher with its target at one place."""
+    """Reacher with its target at one place, from any pose of its arm."""
 
     def reset(self, **options: Any) -> tuple[np.ndarray, dict[str, Any]]:
         _, info = self.env.reset(**options)
         inner: Any = self.env.unwrapped
         qpos, qvel = inner.data.qpos.copy(), inner.data.qvel.copy()
+        qpos[:2] = inner.np_random.uniform((-np.pi, -2.8), (np.pi, 2.8))
         qpos[2:4] = TARGET
         inner.set_state(qpos, qvel)
         return inner._get_obs(), info
@@ -58,7 +59,6 @@ class Agent:
         samples: number of samples.
         policy: SB3's name of its policy.
         options: arguments of PPO.
-        normalize: whether rewards are normalised by `VecNormalize`.
     """
 
     make: Callable[[], gym.Env]
@@ -81,27 +81,56 @@ def maze(name: str, cell: tuple[int, int]) -> Callable[[], gym.Env]:
     return make
 
 
+class AnyCell(gym.Wrapper):
+    """A maze of OGBench from any free cell."""
+
+    def reset(self, **options: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        _, info = self.env.reset(**options)
+        inner: Any = self.env.unwrapped
+        cells = np.argwhere(inner.maze_map == 0)
+        place = inner.ij_to_xy(inner.np_random.choice(cells)) + inner.np_random.uniform(
+            -1.5, 1.5, 2
+        )
+        inner.set_xy(place)
+        return inner.get_ob(), info
+
+
 def ogbench() -> gym.Env:
     import ogbench  # noqa: F401
 
-    return gym.make("pointmaze-medium-singletask-v0")
+    return AnyCell(gym.make("pointmaze-medium-singletask-v0"))
 
 
 def pendulum() -> gym.Env:
     import shimmy
+    from dm_control.mujoco.wrapper.mjbindings import sizes
 
+    # dm_control 1.0.50 asks for arrays that MuJoCo 4 has renamed.
+    for name, kind in (("mjmodel", mujoco.MjModel), ("mjdata", mujoco.MjData)):
+        table = sizes.array_sizes[name]
+        sizes.array_sizes[name] = {key: table[key] for key in table if hasattr(kind, key)}
     gym.register_envs(shimmy)
     return gym.wrappers.FlattenObservation(gym.make("dm_control/pendulum-swingup-v0"))
 
 
 LONG = {"n_steps": 256, "batch_size": 1024, "n_epochs": 6, "gamma": 0.995, "learning_rate": 1e-3}
 AGENTS = {
-    "reacher": Agent(reacher, 600_000, options={"n_steps": 128, "batch_size": 512, "learning_rate": 1e-3}),
+    "reacher": Agent(
+        reacher,
+        600_000,
+        options={"n_steps": 128, "batch_size": 512, "learning_rate": 1e-3, "gamma": 0.98},
+    ),
     "point-maze": Agent(
-        maze("PointMaze_Medium-v3", (6, 6)), 1_500_000, "MultiInputPolicy", {**LONG, "ent_coef": 0.003}
+        maze("PointMaze_Medium-v3", (6, 6)),
+        1_500_000,
+        "MultiInputPolicy",
+        {**LONG, "ent_coef": 0.003},
     ),
     "point-maze-large": Agent(
-        maze("PointMaze_Large-v3", (7, 10)), 2_500_000, "MultiInputPolicy", {**LONG, "ent_coef": 0.003}
+        maze("PointMaze_Large-v3", (7, 10)),
+        2_500_000,
+        "MultiInputPolicy",
+        {**LONG, "ent_coef": 0.003},
     ),
     "ogbench": Agent(ogbench, 500_000, options={**LONG, "ent_coef": 0.003}),
     "pendulum": Agent(pendulum, 1_000_000, options={**LONG, "gamma": 0.99}),
@@ -109,8 +138,12 @@ AGENTS = {
 
 
 def trained(agent: Agent, seed: int) -> PPO:
-    env: VecEnv = make_vec_env(agent.make, n_envs=16, seed=seed)
-    env = VecNormalize(env, norm_obs=False, gamma=agent.options.get("gamma", 0.99))
+    """Returns an agent after its training, with rewards of unit variance."""
+
+    def make() -> gym.Env:
+        return gym.wrappers.NormalizeReward(agent.make(), gamma=agent.options["gamma"])
+
+    env = make_vec_env(make, n_envs=16, seed=seed)
     model = PPO(agent.policy, env, seed=seed, device="cpu", verbose=0, **agent.options)
     model.learn(agent.samples)
     return model
@@ -130,7 +163,10 @@ def main() -> None:
         model = trained(AGENTS[name], given.seed)
         model.save(given.out / f"{name}.zip")
         mean, spread = evaluate_policy(model, AGENTS[name].make(), 10, warn=False)
-        print(f"{name}: {time.monotonic() - began:.0f} s, return {mean:.1f} +- {spread:.1f}", flush=True)
+        print(
+            f"{name}: {time.monotonic() - began:.0f} s, return {mean:.1f} +- {spread:.1f}",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ import numpy as np
 
 from hyrl_mj.environments.coordinates import Coordinate
 from hyrl_mj.environments.copies import STATE, Host, Report
+from hyrl_mj.environments.crew import Crew
 from hyrl_mj.environments.success import Success
 
 
@@ -45,6 +46,11 @@ class Layout:
     def qvel(self) -> np.ndarray:
         """The columns (nv,) of a state that are velocities."""
         return self._columns("qvel")
+
+    @cached_property
+    def crew(self) -> Crew:
+        """What steps copies of the environment."""
+        return Crew(self.host)
 
     def _columns(self, kind: str) -> np.ndarray:
         model, data = self.host.model, mujoco.MjData(self.host.model)
@@ -95,7 +101,7 @@ class Layout:
         if len(noisy):
             moved = state[noisy].copy()
             moved[:, self.of_chart] = there[noisy]
-            observed[noisy] = self.host.observe(moved, memory[noisy])[0]
+            observed[noisy] = self.crew.observe(moved, memory[noisy])[0]
         return observed
 
     def report(self, measured: np.ndarray) -> Report:

@@ -88,7 +88,7 @@ class EnvironmentPlant:
         ):
             self._state[np.ix_(rows, columns)] = checked(name, values, len(columns), rows)
         self._report[rows] = 0.0
-        observed, blocked = self._host.observe(self._state[rows], self._memory[rows])
+        observed, blocked = self._layout.crew.observe(self._state[rows], self._memory[rows])
         self._report[rows, : self._host.width] = observed
         self._outcome[rows] = np.where(blocked, Outcome.CRASHED, Outcome.RUNNING)
         self._unstable[rows] = False
@@ -101,7 +101,9 @@ class EnvironmentPlant:
         """
         rows = self._rows(ids)
         u = checked_inputs(u, self.low, self.high, rows, self._host.name)
-        states, memories, report = self._host.advance(self._state[rows], self._memory[rows], u)
+        states, memories, report = self._layout.crew.advance(
+            self._state[rows], self._memory[rows], u
+        )
         self._keep(rows, states, memories, report)
 
     def step_backward(self, u: np.ndarray, ids: np.ndarray | None = None) -> None:

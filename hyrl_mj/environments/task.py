@@ -20,7 +20,7 @@ from hyrl_mj.environments.opening import Source
 from hyrl_mj.environments.plant import EnvironmentPlant
 from hyrl_mj.environments.success import FORMS, INFO, Success, success_of
 from hyrl_mj.environments.surroundings import Bound, bounds_of, islands_of, starts_of
-from hyrl_mj.errors import BadInput
+from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.tasks import ANY, Learning, Outcome, Scene, Task, register_opener
 
 # Steps of the runs under inputs at random that show how far coordinates go, and for how long inputs are held.
@@ -29,6 +29,8 @@ RUNS, STEPS, HELD = 16, 150, 15
 STEPS_WITHOUT_END = 1_000
 # Times that starts are drawn again because they are inside of walls.
 DRAWS = 200
+# Where episodes start.
+CHART, RESET = "chart", "reset"
 # A run that turns by less than this decides nothing [rad].
 DECIDED = 0.5
 # The texts that describe environments begin with this; those that have been made in this process.
@@ -49,6 +51,7 @@ class EnvironmentTask(Task):
     """
 
     scene: Scene
+    slow = True
     learning = Learning()
 
     def __init__(
@@ -59,6 +62,7 @@ class EnvironmentTask(Task):
         success: str | None,
         bounds: Mapping[str, tuple[float, float]],
         steps: int | None,
+        starts: str,
         spec: str,
     ):
         self.host = Host(source)
@@ -72,7 +76,7 @@ class EnvironmentTask(Task):
         runs, rewards, ended, told = self._sampled(resets)
         self._criterion = self._success(success, ended, told)
         self._usual = self._at_rest(resets)
-        self._measure_bounds(resets, runs, dict(bounds))
+        self._measure_bounds(resets, runs, dict(bounds), starts)
         self._count(steps)
         self.noisy = self._shares(noisy)
         self.worst_reward = float(min(rewards.min(), 0.0))
@@ -149,7 +153,11 @@ class EnvironmentTask(Task):
         return state, memory
 
     def _measure_bounds(
-        self, resets: np.ndarray, runs: np.ndarray, given: dict[str, tuple[float, float]]
+        self,
+        resets: np.ndarray,
+        runs: np.ndarray,
+        given: dict[str, tuple[float, float]],
+        starts: str,
     ) -> None:
         chosen = self._coordinates
         names = [c.name for c in chosen]
@@ -173,10 +181,15 @@ class EnvironmentTask(Task):
         )
         self.chart = Chart(tuple(names), units, low, high, tuple(b.periodic for b in bounds))
         first, last = begun.min(axis=0), begun.max(axis=0)
-        self.start_low = tuple(np.clip(first, low, high).tolist())
-        self.start_high = tuple(np.clip(last, low, high).tolist())
-        self.found["starts"] = ", ".join(
+        self.start_low, self.start_high = low, high
+        if starts == RESET:
+            self.start_low = tuple(np.clip(first, low, high).tolist())
+            self.start_high = tuple(np.clip(last, low, high).tolist())
+        resets_lead_to = ", ".join(
             f"{n} {a:.3g} to {b:.3g}" for n, a, b in zip(names, first, last, strict=True)
+        )
+        self.found["starts"] = (
+            f"all over the chart; with {RESET!r} where resets lead to: {resets_lead_to}"
         )
 
     def _count(self, steps: int | None) -> None:
@@ -374,6 +387,7 @@ def from_gymnasium(
     success: str | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     steps: int | None = None,
+    starts: str = CHART,
     kwargs: Mapping[str, Any] | None = None,
     reset: Mapping[str, Any] | None = None,
     pinned: Mapping[str, Any] | None = None,
@@ -391,6 +405,7 @@ def from_gymnasium(
             "distance(a, b) <= 0.05" of two sites or bodies.
         bounds: (low, high) of coordinates of the chart, by name.
         steps: steps of an episode, by default those of the environment.
+        starts: where episodes start, all over the "chart", or where "reset" leads to.
         kwargs: arguments of `gymnasium.make`, or of the function.
         reset: options of `reset`.
         pinned: values of positions, velocities or attributes after each reset, by name.
@@ -399,16 +414,20 @@ def from_gymnasium(
     Raises:
         BadInput: it cannot be used; the message says why.
     """
+    if starts not in (CHART, RESET):
+        raise unknown("starts", starts, (CHART, RESET))
     source = Source(env, dict(kwargs or {}), dict(reset or {}), dict(pinned or {}), seed)
     content = {
         "env": env if isinstance(env, str) else {"function": source.name},
         "chart": chart, "noisy": noisy, "success": success, "bounds": bounds, "steps": steps,
-        "kwargs": kwargs, "reset": reset, "pinned": pinned, "seed": seed or None,
+        "starts": None if starts == CHART else starts, "kwargs": kwargs, "reset": reset, "pinned": pinned, "seed": seed or None,
     }  # fmt: skip
     given = {key: value for key, value in content.items() if value is not None}
     spec = MARK + json.dumps(given, default=_plain)
     if not isinstance(env, str) or spec not in _MADE:
-        _MADE[spec] = EnvironmentTask(source, chart, noisy, success, bounds or {}, steps, spec)
+        _MADE[spec] = EnvironmentTask(
+            source, chart, noisy, success, bounds or {}, steps, starts, spec
+        )
     return _MADE[spec]
 
 

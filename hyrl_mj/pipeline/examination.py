@@ -29,8 +29,9 @@ from hyrl_mj.viz import robustness_sentence
 
 # The kinds of noise in episodes by default.
 KINDS = ("none", "uniform", "alternating", "adversarial")
-# Noisy episodes of a run whose worst case cannot be computed; fewer with preset smoke.
-EPISODES, EPISODES_SMOKE = 1_000, 200
+# Noisy episodes of a run whose worst case cannot be computed; fewer with preset smoke, and where samples take
+# long.
+EPISODES, EPISODES_FEW = 1_000, 200
 # Starts and rounds of the attack on such a run.
 ATTACKED, ATTACKED_SMOKE = 200, 40
 ROUNDS, ROUNDS_SMOKE = 2, 1
@@ -132,7 +133,8 @@ def examine_loops(
     count, seed = options.episodes, options.seed
     task.check_noise(eps, everywhere)
     if count is None and not run.exact:
-        count = EPISODES_SMOKE if run.settings.preset == "smoke" else EPISODES
+        few = task.slow or run.settings.preset == "smoke"
+        count = EPISODES_FEW if few else EPISODES
     if count is not None and count < 1:
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
     noises = tuple(Noise(kind, eps, everywhere) for kind in options.noise or KINDS)

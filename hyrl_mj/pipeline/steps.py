@@ -27,11 +27,13 @@ from hyrl_mj.run_directory import Run
 from hyrl_mj.stages import (
     Arrivals,
     ModeResult,
+    PartPolicy,
     Retraining,
     boundary,
     extend,
     find_critical_set,
     make_partition,
+    part_policy,
     with_room,
 )
 from hyrl_mj.verdict import mode_sentence
@@ -106,8 +108,10 @@ def retrain_stage(run: Run, say: Say) -> None:
     algorithms.check_named(s.stage6.algorithm)
     ground_of = partial(mode_ground, run.task, sets, parts=run.split, policy=run.steady)
     warm_start = partial(start_policy, run.steady, run.partition)
-    work = partial(_retrained, s, ground_of, warm_start, run.path / "logs")
-    done: list[tuple[MlpPolicy, ModeResult]] = []
+    part_of = partial(part_policy, run.task, run.steady, run.partition, noise=sets.noise)
+    parts = part_of if run.task.slow else None
+    work = partial(_retrained, s, ground_of, warm_start, parts, run.path / "logs")
+    done: list[tuple[MlpPolicy | PartPolicy, ModeResult]] = []
     if run.task.mirror is None:
         done += cores.spread(work, sets.modes)
     else:  # the mirror image of the policy of one mode may do for the next
@@ -124,10 +128,11 @@ def _retrained(
     settings: Settings,
     ground_of: Callable[[int], ModeGround],
     warm_start: WarmStart,
+    part_of: Callable[[int], PartPolicy] | None,
     logs: Path,
     mode: int,
-    others: Iterable[tuple[MlpPolicy, ModeResult]] = (),
-) -> tuple[MlpPolicy, ModeResult]:
+    others: Iterable[tuple[MlpPolicy | PartPolicy, ModeResult]] = (),
+) -> tuple[MlpPolicy | PartPolicy, ModeResult]:
     """Trains the policy of one mode, which may happen in a process of a pool."""
     from hyrl_mj.stages.retraining import retrain
 
@@ -137,6 +142,7 @@ def _retrained(
         settings.seed,
         warm_start=warm_start,
         others=others,
+        part=None if part_of is None else part_of(mode),
         log_dir=logs / f"mode_{mode}",
     )
 

@@ -11,7 +11,14 @@ from hyrl_mj.stages.episodes import Regions, noisy_episodes
 from hyrl_mj.stages.extended_sets import ExtendedSets, extend
 from hyrl_mj.stages.hybrid import ON_EDGE, HybridController
 from hyrl_mj.stages.losses import Losses, sort_losses
-from hyrl_mj.stages.partition import Partition, boundary, make_partition, with_room
+from hyrl_mj.stages.partition import (
+    Partition,
+    PartPolicy,
+    boundary,
+    make_partition,
+    part_policy,
+    with_room,
+)
 from hyrl_mj.stages.results import Arrivals, ModeResult, Retraining
 
 __all__ = [
@@ -24,6 +31,7 @@ __all__ = [
     "HybridController",
     "Losses",
     "ModeResult",
+    "PartPolicy",
     "Partition",
     "Regions",
     "Retraining",
@@ -36,6 +44,7 @@ __all__ = [
     "grounds",
     "make_partition",
     "noisy_episodes",
+    "part_policy",
     "retraining",
     "shown_arcs",
     "sort_losses",

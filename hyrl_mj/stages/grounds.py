@@ -36,8 +36,9 @@ BATCHES = (64, 64, 128, 256, 512)
 PLAYS = list(product(range(len(BATCHES)), JUDGES))
 # Some episodes lost in a thousand may be missed, but not if the noise is so many times as large as the bound.
 MARGIN = 1.2
-# The mirror image of a policy that wins all of its own mode has been judged there, so fewer plays tell.
-PLAYS_OF_IMAGE = PLAYS[: 3 * len(JUDGES)]
+# The mirror image of a policy that wins all of its own mode has been judged there, so fewer plays tell; and
+# there is no time for more where samples take long.
+FEW_PLAYS = PLAYS[: 3 * len(JUDGES)]
 # The plays by which policies are compared that are not expected to win them all, and how much less a mirror
 # image may win.
 SHARED = [play for play in PLAYS[-len(JUDGES) :] if play[1] != "adversarial"]
@@ -111,24 +112,24 @@ class ModeGround(ABC):
         early = self.nodes[task.may_start(self.grid.nodes[self.nodes])]
         self.early = early if len(early) else self.nodes
         self.lost, self._weight = np.empty(0, dtype=int), np.empty(0)
-        self._latest: tuple[MlpPolicy, Score] | None = None
+        self._latest: tuple[Policy, Score] | None = None
         self._prepare(policy)
 
     @abstractmethod
     def _prepare(self, policy: Policy | None) -> None:
         """Prepares the judge."""
 
-    def see(self, policy: MlpPolicy) -> None:
+    def see(self, policy: Policy) -> None:
         """Notes where a policy loses, as its score does."""
         self(policy)
 
-    def __call__(self, policy: MlpPolicy) -> Score:
+    def __call__(self, policy: Policy) -> Score:
         """Returns the score of a policy. Later starts are drawn where the latest policy has lost."""
         if self._latest is None or self._latest[0] is not policy:
             self._latest = policy, self.score(policy)
         return self._latest[1]
 
-    def suffices(self, policy: MlpPolicy) -> bool:
+    def suffices(self, policy: Policy) -> bool:
         """Returns whether no other training is needed.
 
         The score is `enough`, or the policy loses a `FEW` states at which the hybrid controller never selects
@@ -155,11 +156,11 @@ class ModeGround(ABC):
         return GridSet.from_mask(self.grid, own).dilated_by_box(self.bound).mask
 
     @abstractmethod
-    def score(self, policy: MlpPolicy) -> Score:
+    def score(self, policy: Policy) -> Score:
         """Computes the score of a policy, and remembers where it lost."""
 
     @abstractmethod
-    def won(self, policy: MlpPolicy) -> float:
+    def won(self, policy: Policy) -> float:
         """Returns the share that a policy wins, as in `ModeResult`."""
 
     def domain(self, gamma: float) -> Domain:
@@ -210,7 +211,7 @@ class ByGame(ModeGround):
         fewest, _ = game.fewest_samples(self.lattice, after, inside)
         self.fewest = int(fewest[self.nodes][fewest[self.nodes] < game.NEVER].max(initial=0))
 
-    def score(self, policy: MlpPolicy) -> Score:
+    def score(self, policy: Policy) -> Score:
         answers = game.Answers.of(self.lattice, PolicyController(policy), self.bound)
         moves = game.noisy_moves(answers, self.bound)
         value = game.solve(moves)[0, :-2]
@@ -227,7 +228,7 @@ class ByGame(ModeGround):
         few = 0 < len(self.lost) <= FEW * len(self.nodes)
         return few and not self._selected[self.lost].any()
 
-    def won(self, policy: MlpPolicy) -> float:
+    def won(self, policy: Policy) -> float:
         answers = game.Answers.of(self.lattice, PolicyController(policy), self.bound)
         moves = game.noisy_moves(answers, self.bound)
         value = game.solve(moves, self.task.max_steps)[0, :-2]
@@ -267,10 +268,11 @@ class ByEpisodes(ModeGround):
         allowed: allowed distance from the set-point at the end of episodes without noise [chart units].
     """
 
-    enough: Score = (float(len(PLAYS)), -1.0)
     margin = MARGIN
 
     def _prepare(self, policy: Policy | None) -> None:
+        self.plays = FEW_PLAYS if self.task.slow else PLAYS
+        self.enough = float(len(self.plays)), -1.0
         with np.errstate(divide="ignore"):
             most = (self.task.chart.sides / (2 * self.bound)).min()
         self.margin = min(self.margin, (1 + most) / 2)  # noise must not hide the whole chart
@@ -289,7 +291,7 @@ class ByEpisodes(ModeGround):
     def _allowed(self, policy: Policy | None) -> float:
         """Returns `allowed`, by the runs of the stage-1 policy that arrive, if there are any."""
         precision, close = self.task.precision, self.task.close
-        plays = [play for play in PLAYS if play[1] == JUDGES[0]]
+        plays = [play for play in self.plays if play[1] == JUDGES[0]]
         batches = [self._play(policy, *play) for play in plays] if policy else []
         ends = np.concatenate([np.empty(0), *(miss[won] for won, miss in batches)])
         farthest = float(ends.max(initial=0.0))
@@ -297,8 +299,8 @@ class ByEpisodes(ModeGround):
             return max(farthest, precision)
         return max(ALLOWED_MISS * farthest, MISS_SHARE * close if len(ends) else close)
 
-    def score(self, policy: MlpPolicy, plays: Sequence[tuple[int, str]] = PLAYS) -> Score:
-        farthest = 0.0
+    def score(self, policy: Policy, plays: Sequence[tuple[int, str]] | None = None) -> Score:
+        farthest, plays = 0.0, self.plays if plays is None else plays
         for survived, (batch, kind) in enumerate(plays):
             won, miss = self._play(policy, batch, kind)
             farthest = max(farthest, miss.max()) if kind == JUDGES[0] else farthest
@@ -311,13 +313,13 @@ class ByEpisodes(ModeGround):
     def won_by_image(self, image: MlpPolicy, won: float) -> float | None:
         if won < 1:
             return super().won_by_image(image, won)
-        enough = float(len(PLAYS_OF_IMAGE)), self.enough[1]
-        return won if self.score(image, PLAYS_OF_IMAGE) >= enough else None
+        enough = float(len(FEW_PLAYS)), -1.0
+        return won if self.score(image, FEW_PLAYS) >= enough else None
 
-    def won(self, policy: MlpPolicy) -> float:
+    def won(self, policy: Policy) -> float:
         if self(policy)[0] == self.enough[0]:
             return 1.0  # the same episodes
-        return float(np.concatenate([self._play(policy, *play)[0] for play in PLAYS]).mean())
+        return float(np.concatenate([self._play(policy, *play)[0] for play in self.plays]).mean())
 
     def _play(self, policy: Policy, batch: int, kind: str) -> tuple[np.ndarray, np.ndarray]:
         """Returns which episodes of a batch are won (k,), and how far off they end (k,)."""
@@ -338,10 +340,13 @@ class ByShare(ByEpisodes):
     It may draw episodes that no policy wins. The score is the share that is won in the plays `SHARED`.
     """
 
-    enough: Score = (1.0,)
     settled = 0.75
 
-    def see(self, policy: MlpPolicy) -> None:
+    def _prepare(self, policy: Policy | None) -> None:
+        super()._prepare(policy)
+        self.enough = (1.0,)
+
+    def see(self, policy: Policy) -> None:
         """Does nothing: a training draws many times as many episodes as it is judged by."""
 
     def domain(self, gamma: float) -> Domain:
@@ -349,16 +354,16 @@ class ByShare(ByEpisodes):
         caution = self.margin * self.extended.noise * np.array(self.shares)
         return Domain(self.task.starts, caution=caution)
 
-    def score(self, policy: MlpPolicy, plays: Sequence[tuple[int, str]] = PLAYS) -> Score:
+    def score(self, policy: Policy, plays: Sequence[tuple[int, str]] | None = None) -> Score:
         won = [self._play(policy, batch, kind)[0] for batch, kind in SHARED]
         return (float(np.concatenate(won).mean()),)
 
-    def suffices(self, policy: MlpPolicy) -> bool:
+    def suffices(self, policy: Policy) -> bool:
         return True  # another training would draw other episodes, and win about as many
 
     def won_by_image(self, image: MlpPolicy, won: float) -> float | None:
         share = self.score(image)[0]
         return share if share >= won - ALIKE else None
 
-    def won(self, policy: MlpPolicy) -> float:
+    def won(self, policy: Policy) -> float:
         return self(policy)[0]

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
+from hyrl_mj import artifacts
 from hyrl_mj.artifacts import Saved
 from hyrl_mj.errors import BadInput
 from hyrl_mj.game import NEVER, Limit
@@ -204,23 +206,45 @@ class PartPolicy:
         task: gives the chart.
         policy: the stage-1 policy.
         inside: M_i without the neighbourhood of its boundary.
+        near: width of that neighbourhood, in scaled units.
     """
+
+    KIND: ClassVar[str] = "part policy"
 
     task: Task
     policy: Policy
     inside: GridSet
+    near: float
 
     def act(self, measured: np.ndarray) -> np.ndarray:
         """Returns inputs (n, m) for measurements (n, p)."""
         nearest = self.inside.project(self.task.z(measured))
         return self.policy.act(self.task.with_z(measured, nearest))
 
+    def save(self, path: Path) -> None:
+        """Writes the width of the neighbourhood as JSON; the stage-1 policy and M_i are in other files."""
+        artifacts.write_json(path.with_suffix(".json"), {"near": self.near}, self.KIND)
+
+    @staticmethod
+    def load(path: Path, task: Task, policy: Policy, partition: Partition, mode: int) -> PartPolicy:
+        """Reads what `save` wrote; raises `BadArtifact` if it is missing, damaged, or of another version."""
+        near = artifacts.read_json(path, PartPolicy.KIND, lambda content: float(content["near"]))
+        return part_policies(task, policy, partition, near)[partition.modes.index(mode)]
+
 
 def part_policies(
     task: Task, policy: Policy, partition: Partition, near: float
 ) -> tuple[PartPolicy, ...]:
     """Returns pi_i of each mode; `near` is the width of the neighbourhood of M*."""
-    return tuple(PartPolicy(task, policy, part.eroded(near)) for part in partition.parts)
+    return tuple(PartPolicy(task, policy, part.eroded(near), near) for part in partition.parts)
+
+
+def part_policy(
+    task: Task, policy: Policy, partition: Partition, mode: int, noise: float
+) -> PartPolicy:
+    """Returns pi_i of a mode, with as wide a neighbourhood of M* as the noise and the steps need."""
+    near = neighbourhood(partition, noise, longest_hop(task, policy, partition.grid))
+    return part_policies(task, policy, partition, near)[partition.modes.index(mode)]
 
 
 def neighbourhood(partition: Partition, noise: float, hop: np.ndarray) -> float:

@@ -12,7 +12,7 @@ from hyrl_mj.learning.distillation import distil, fits
 from hyrl_mj.learning.training import Score, train
 from hyrl_mj.policies import ALGORITHMS, MlpPolicy, Policy
 from hyrl_mj.stages.grounds import ModeGround
-from hyrl_mj.stages.partition import Partition, longest_hop, neighbourhood, part_policies
+from hyrl_mj.stages.partition import Partition, PartPolicy, part_policy
 from hyrl_mj.stages.results import ModeResult
 
 # Returns the policy that the first attempt continues from, by the ground of the mode, settings and a seed.
@@ -34,11 +34,10 @@ def start_policy(
         settings: settings of the training.
         seed: seed of the weights and the points of the distillation.
     """
-    task, grid = ground.task, partition.grid
+    task = ground.task
     if not ALGORITHMS[settings.algorithm].is_actor_critic:
         return policy if isinstance(policy, MlpPolicy) and fits(task, settings, policy) else None
-    near = neighbourhood(partition, ground.extended.noise, longest_hop(task, policy, grid))
-    pi = part_policies(task, policy, partition, near)[partition.modes.index(ground.mode)]
+    pi = part_policy(task, policy, partition, ground.mode, ground.extended.noise)
     return distil(task, pi, ground.starts, settings, seed)
 
 
@@ -48,9 +47,10 @@ def retrain(
     seed: int,
     *,
     warm_start: WarmStart | None = None,
-    others: Iterable[tuple[MlpPolicy, ModeResult]] = (),
+    others: Iterable[tuple[MlpPolicy | PartPolicy, ModeResult]] = (),
+    part: PartPolicy | None = None,
     log_dir: Path | None = None,
-) -> tuple[MlpPolicy, ModeResult]:
+) -> tuple[MlpPolicy | PartPolicy, ModeResult]:
     """Trains the policy of one mode (paper, Step 6).
 
     Noise leads a policy that passes an obstacle closer than the noise bound into the obstacle, and no
@@ -65,20 +65,28 @@ def retrain(
             set; see `start_policy`.
         others: policies of other modes, and how their trainings ended; a mirror image of one is used if it is
             good enough for this mode.
+        part: pi_i of the mode (paper, Step 4), which is used as it is if it is good enough; by default it is
+            not tried.
         log_dir: folder of logs and checkpoints.
 
     Returns:
-        The first mirror image that is good enough; otherwise the best policy, of all attempts and the one
-        that the first continued from. And how the training ended.
+        pi_i, or the first mirror image, if it is good enough; otherwise the best policy, of all attempts, pi_i,
+        and the one that the first continued from. And how the training ended.
     """
     task, mode = ground.task, ground.mode
+    tried: list[tuple[Score, MlpPolicy | PartPolicy]] = []
+    if part is not None:
+        tried.append((ground(part), part))
+        if ground.suffices(part):
+            return part, ModeResult(mode, ground.won(part), 0)
     if task.mirror is not None:
         for other, result in others:
+            if isinstance(other, PartPolicy):
+                continue
             image = symmetry.mirrored(other)
             won = ground.won_by_image(image, result.won)
             if won is not None:
                 return image, ModeResult(mode, won, 0)
-    tried: list[tuple[Score, MlpPolicy]] = []
     trainings = 0
     for attempt in range(settings.attempts):
         draw = int(np.random.SeedSequence([seed, 1 + mode, attempt]).generate_state(1)[0])

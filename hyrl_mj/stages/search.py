@@ -130,7 +130,8 @@ def _bisected(
     apart = at_a.differ(at_b) & (
         np.linalg.norm((d - c) / task.chart.scale, axis=1) <= wedge * (1 + 1e-6)
     )
-    wide = np.flatnonzero(apart & known)
+    failures = np.linalg.norm((d - c) / task.chart.scale, axis=1)
+    wide = np.flatnonzero(apart & known & (failures > resolution))
     if len(wide):
         # Where no measurement within the wedge helps any more, there is nothing left to decide.
         middle, noisy = (a[wide] + b[wide]) / 2, task.noise_in_chart(1.0) > 0

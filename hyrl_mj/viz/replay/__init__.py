@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 
-
 from hyrl_mj import artifacts, mjcf
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.progress import progress_bar
