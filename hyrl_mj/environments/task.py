@@ -9,9 +9,11 @@ from hashlib import sha256
 from typing import Any
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 from gymnasium import spaces
 
+from hyrl_mj import mjcf
 from hyrl_mj.chart import Chart
 from hyrl_mj.environments.coordinates import SLIDE, AnyChart, Coordinate, all_names, coordinates
 from hyrl_mj.environments.copies import Host
@@ -31,6 +33,8 @@ STEPS_WITHOUT_END = 1_000
 DRAWS = 200
 # Where episodes start.
 CHART, RESET = "chart", "reset"
+# A joint turns in the plane of the floor if its axis is as upright as this, as a cosine.
+UPRIGHT = 0.9
 # A run that turns by less than this decides nothing [rad].
 DECIDED = 0.5
 # The texts that describe environments begin with this; those that have been made in this process.
@@ -115,7 +119,7 @@ class EnvironmentTask(Task):
     def _sampled(self, resets: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool, bool]:
         """Returns chart points (n, d) and rewards (n,) of runs, whether one ended, and what info tells."""
         rng, host = np.random.default_rng(0), self.host
-        points, rewards, ended = [], [], False
+        points, rewards, places, ended = [], [], [], False
         for seed in range(RUNS):
             host.reset(seed)
             for k in range(STEPS):
@@ -126,10 +130,12 @@ class EnvironmentTask(Task):
                     [getattr(host.data, c.kind)[c.index] + c.offset for c in self._coordinates]
                 )
                 rewards.append(reward)
+                places.append(host.data.xpos.copy())
                 ended = ended or terminated
                 if terminated or truncated:
                     break
         host.write(*host.base)
+        self._farthest = int(np.ptp(places, axis=0).sum(axis=1).argmax())
         return np.array(points), np.array(rewards), ended, host.tells_success
 
     def _success(self, success: str | None, ended: bool, told: bool) -> Success:
@@ -238,7 +244,22 @@ class EnvironmentTask(Task):
             starts=tuple(map(tuple, starts.tolist())),
             time=min(self.max_steps * self.dt, 20.0),
             mode_names=ways,
+            camera=self._camera(),
+            tracked=self._tracked(),
         )
+
+    def _camera(self) -> str:
+        """Returns the camera of replays: from above on what moves in a plane, else the model's first, or free."""
+        own = [n for n in mjcf.names(self.model, mujoco.mjtObj.mjOBJ_CAMERA) if not n.startswith("(")]
+        axis = self.model.jnt_axis[self._coordinates[0].joint]
+        flat = self._in_plane or abs(axis[2]) > UPRIGHT
+        if "overhead" in own or (flat and not own):
+            return "overhead"
+        return own[0] if own else "free"
+
+    def _tracked(self) -> str:
+        """Returns the body whose path replays draw: the one that went farthest in sampled runs."""
+        return self.model.body(self._farthest).name or "tracked"
 
     # ---- the task
 

@@ -21,7 +21,7 @@ from hyrl_mj.viz.replay import marks
 PATH_WIDTH, BOUND_WIDTH, START_RADIUS, JUMP_RADIUS, CROSS = 0.032, 0.05, 0.035, 0.055, 0.075  # [m]
 BOUND_PIECES, GHOST_ALPHA = 4, 0.35
 # Marks are larger where a picture shows more than this across [m].
-WIDE = 6.0
+WIDE, SMALL, USUAL = 6.0, 1.5, 3.0
 # The part that is redrawn is this much larger than what has moved [pixels].
 MARGIN = 2
 FAILED = ("crashed", "out_of_bounds", "stalled", "unstable")
@@ -153,14 +153,15 @@ class Panel:
         self._begin(self._floor_at(0.0))
 
     def _scale(self) -> float:
-        """Returns by how much marks are larger than usual, so that they are seen in a wide field."""
+        """Returns by how much marks are larger than usual in a wide field, or smaller in a small scene."""
         if not self._rests:
             return 1.0
         self._renderer.look(self._tracks[0].qpos(0.0), self._camera)
         points = np.vstack([track.points for track in self._tracks])
         _, scale = self._renderer.project(points)
         shown = min(self._renderer.width, self._renderer.height) / scale
-        return max(float(np.median(shown)) / WIDE, 1.0)
+        side = float(np.median(shown))
+        return side / USUAL if side < SMALL else max(side / WIDE, 1.0)
 
     def _begin(self, floor: marks.Floor | None) -> None:
         """Draws anew what stays: the marks on the floor, and where the tracks start."""
