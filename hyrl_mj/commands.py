@@ -49,8 +49,8 @@ def run(task: str | None = None, *, environment: EnvironmentOptions, options: Ru
     The verdict is PROVED, WON, HELD, WEAK, or FAILED, which gives exit status 1.
 
     Args:
-        task: a task, see `hyrl-mj list`, or a Python file that defines one, see `hyrl-mj new-task`; by default
-            none, with --env.
+        task: a task, see `hyrl-mj list`, or a Python file that defines one, see `hyrl-mj new-task`; by
+            default none, with --env.
     """
     chosen = chosen_task(task, environment)
     if environment.explain:
@@ -74,8 +74,8 @@ def robustify(
 
     Args:
         task: a task, see `hyrl-mj list`, or a Python file that defines one; by default none, with --env.
-        policy: the agent, a .zip that SB3's model.save wrote, an .onnx file, or a .safetensors file; by default
-            none, with --explain.
+        policy: the agent, a .zip that SB3's model.save wrote, an .onnx file, or a .safetensors file; by
+            default none, with --explain.
     """
     chosen = chosen_task(task, environment)
     if environment.explain:
@@ -131,8 +131,8 @@ def diagnose(
 
     Args:
         task: a task, see `hyrl-mj list`, or a Python file that defines one; by default none, with --env.
-        policy: the agent, a .zip that SB3's model.save wrote, an .onnx file, or a .safetensors file; by default
-            none, with --explain.
+        policy: the agent, a .zip that SB3's model.save wrote, an .onnx file, or a .safetensors file; by
+            default none, with --explain.
     """
     chosen = chosen_task(task, environment)
     if environment.explain:
@@ -340,7 +340,7 @@ def export(run: Run, *, to: str, out: Path, field: Path | None = None) -> None:
 
     if isinstance(run.task, Field):
         posts = 1 if field is None else read_field(field).layouts.posts
-        controller = for_posts(run.task, run.mode_policies, run.settings.noise, posts)
+        controller = for_posts(run.task, run.mode_networks, run.settings.noise, posts)
         export(controller, to, out)
     elif field is not None:
         raise BadInput(f"{run.task.name} has no field of posts: leave --field out")

@@ -180,6 +180,12 @@ class Run:
         """The policy of each mode, from stage 6."""
         return {q: self._mode_policy(q) for q in self.extended_sets.modes}
 
+    @property
+    def mode_networks(self) -> dict[int, MlpPolicy]:
+        """Those policies of modes that are networks."""
+        found = self.mode_policies.items()
+        return {q: policy for q, policy in found if isinstance(policy, MlpPolicy)}
+
     @cached_property
     def controller(self) -> HybridController:
         """The hybrid controller, from stage 7."""
@@ -188,7 +194,7 @@ class Run:
         if isinstance(self.task, Field):
             mode_policies = {
                 q: GuardedPolicy(self.task, policy, q, self.settings.noise)
-                for q, policy in self.mode_policies.items()
+                for q, policy in self.mode_networks.items()
             }
         flow_sets = dict(zip(extended.modes, extended.sets, strict=True))
         if self.agent is not None:
@@ -280,9 +286,10 @@ class Run:
         return self.manifest.checked(self.path / name)
 
     def _mode_policy(self, mode: int) -> MlpPolicy | PartPolicy:
-        if self.manifest.has(self.path / f"mode_{mode}.safetensors"):
+        path = self.path / f"mode_{mode}_part.json"
+        if not self.manifest.has(path):
             return self._load_policy(f"mode_{mode}")
-        path = self._checked(f"mode_{mode}.json")
+        self.manifest.checked(path)
         return PartPolicy.load(path, self.task, self.steady, self.partition, mode)
 
     def _load_policy(self, stem: str) -> MlpPolicy:

@@ -3,8 +3,8 @@
     pip install "hyrl-mj[robotics]"
     python scripts/outside_agents.py reacher point-maze --out agents
 
-Nothing of hyrl_mj takes part. Each agent takes a few minutes, and the same seed gives the same agent on the same
-kind of machine.
+Nothing of hyrl_mj takes part. Each agent takes a few minutes, and the same seed gives the same agent on the
+same kind of machine.
 """
 
 import argparse
@@ -18,7 +18,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import torch
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
@@ -58,12 +58,14 @@ class Agent:
         make: makes its environment.
         samples: number of samples.
         policy: SB3's name of its policy.
-        options: arguments of PPO.
+        kind: SB3's algorithm.
+        options: its arguments.
     """
 
     make: Callable[[], gym.Env]
     samples: int
     policy: str = "MlpPolicy"
+    kind: type[PPO] | type[SAC] = PPO
     options: dict[str, Any] = field(default_factory=dict)
 
 
@@ -124,27 +126,37 @@ AGENTS = {
         maze("PointMaze_Medium-v3", (6, 6)),
         1_500_000,
         "MultiInputPolicy",
-        {**LONG, "ent_coef": 0.003},
+        options={**LONG, "ent_coef": 0.003},
     ),
     "point-maze-large": Agent(
-        maze("PointMaze_Large-v3", (7, 10)),
+        maze("PointMaze_Large-v3", (3, 6)),
         2_500_000,
         "MultiInputPolicy",
-        {**LONG, "ent_coef": 0.003},
+        options={**LONG, "ent_coef": 0.003},
     ),
-    "ogbench": Agent(ogbench, 500_000, options={**LONG, "ent_coef": 0.003}),
-    "pendulum": Agent(pendulum, 1_000_000, options={**LONG, "gamma": 0.99}),
+    "ogbench": Agent(ogbench, 2_000_000, options={**LONG, "ent_coef": 0.003}),
+    "pendulum": Agent(
+        pendulum,
+        100_000,
+        kind=SAC,
+        options={
+            "learning_starts": 2_000,
+            "gradient_steps": 8,
+            "learning_rate": 1e-3,
+            "gamma": 0.99,
+        },
+    ),
 }
 
 
-def trained(agent: Agent, seed: int) -> PPO:
+def trained(agent: Agent, seed: int) -> PPO | SAC:
     """Returns an agent after its training, with rewards of unit variance."""
 
     def make() -> gym.Env:
         return gym.wrappers.NormalizeReward(agent.make(), gamma=agent.options["gamma"])
 
     env = make_vec_env(make, n_envs=16, seed=seed)
-    model = PPO(agent.policy, env, seed=seed, device="cpu", verbose=0, **agent.options)
+    model = agent.kind(agent.policy, env, seed=seed, device="cpu", verbose=0, **agent.options)
     model.learn(agent.samples)
     return model
 

@@ -28,7 +28,12 @@ SHORTER = {
 TRAINING = ("run", "robustify", "diagnose", "sweep")
 EPISODES, FRAMES = "200", "4"
 # Scripts that have tests of their own; here their options are looked up.
-TESTED = ("scripts/benchmark.py", "scripts/fields.py", "scripts/reproduce_paper.py")
+TESTED = (
+    "scripts/benchmark.py",
+    "scripts/fields.py",
+    "scripts/outside_agents.py",
+    "scripts/reproduce_paper.py",
+)
 
 
 @dataclass(frozen=True)
@@ -148,6 +153,9 @@ def instead(words: list[str]) -> bool:
 
             assert task in task_names()
             shutil.copytree("runs/vehicle", Path("runs", task))
+        # Minutes: what was found out about the environment is shown instead.
+        case ["hyrl-mj", ("diagnose" | "robustify") as name, "--env", *options]:
+            call([name, "--env", *options, *(() if "--explain" in options else ("--explain",))])
         case ["mkdocs", "build", *_]:  # has a test of its own
             assert " ".join(words) in (ROOT / ".mkdocs.yml").read_text(encoding="utf-8")
         case _:

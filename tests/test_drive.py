@@ -273,12 +273,12 @@ def planted():
         policy=policy,
         policy_title="RL policy (PPO)",
         settings=SimpleNamespace(noise=0.1),
-        mode_policies={side: Steering(task, side) for side in (LEFT, RIGHT)},
+        mode_networks={side: Steering(task, side) for side in (LEFT, RIGHT)},
     )
 
 
 def driven(planted, field, **options):
-    policies = planted.mode_policies
+    policies = planted.mode_networks
     chosen = DriveOptions(**options)
     return drive(planted.task, planted.policy, policies, 0.1, field, chosen)
 
@@ -287,7 +287,7 @@ def test_the_observation_of_the_tests_is_that_of_the_task(planted):
     measured = np.array([[-6.0, 0.4, 0.0, 0, 0, -3, 0, 0, 0, 0.5, 0]])
     directions = planted.task.directions(measured)[0][0]
     observed = planted.task.observation(measured)
-    for side, policy in planted.mode_policies.items():
+    for side, policy in planted.mode_networks.items():
         turn = np.clip(3 * directions[side], -1, 1)
         np.testing.assert_allclose(policy.inputs(observed)[0, 1], turn, atol=1e-9)
 
@@ -425,7 +425,7 @@ def test_what_is_wrong_with_the_words_is_one_sentence(words, parts, command, wri
 def test_what_is_wrong_with_the_run_or_the_file_is_one_sentence(command, written, planted, vehicle):
     path = written(ONE)
     other = SimpleNamespace(**{**vars(planted), "task": vehicle})
-    one_sided = SimpleNamespace(**{**vars(planted), "mode_policies": {LEFT: planted.policy}})
+    one_sided = SimpleNamespace(**{**vars(planted), "mode_networks": {LEFT: planted.policy}})
     agent = SimpleNamespace(**{**vars(planted), "policy": Steering(planted.task, LEFT)})
     for run, part in (
         (other, "is a run of vehicle"),

@@ -197,7 +197,7 @@ def test_the_version_is_said(capsys):
         ("diagnose vehicle --noise 0.2 --policy a.zip", ["diagnose vehicle --eps 0.2 --policy a.zip"]),
         ("simulate runs/v --start 0 0 --horizon 2", ["hyrl-mj simulate runs/v --start 0 0 --time 2"]),
         ("run vehicle --nose 0.2", ["unknown option '--nose'", "--eps, --seed"]),
-        ("run", ["run needs TASK: a task"]),
+        ("run", ["give a TASK, see hyrl-mj list"]),
         ("train", ["train needs RUN: a run directory"]),
     ],
 )  # fmt: skip

@@ -22,7 +22,7 @@ from hyrl_mj.learning.presets import preset
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets, extend
-from hyrl_mj.stages.grounds import BATCHES, PLAYS, PLAYS_OF_IMAGE, ByEpisodes, ByGame
+from hyrl_mj.stages.grounds import BATCHES, FEW_PLAYS, PLAYS, ByEpisodes, ByGame
 from hyrl_mj.stages.hybrid import HybridController
 from hyrl_mj.stages.results import ModeResult
 from hyrl_mj.stages.retraining import retrain
@@ -363,7 +363,7 @@ def test_a_mirror_image_is_taken_there_too(puck, puck_sets, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("won", "plays"), [(0.5, len(PLAYS)), (1.0, len(PLAYS_OF_IMAGE))])
+@pytest.mark.parametrize(("won", "plays"), [(0.5, len(PLAYS)), (1.0, len(FEW_PLAYS))])
 def test_the_image_of_a_policy_that_wins_all_is_judged_by_fewer_episodes(
     puck, puck_sets, monkeypatch, won, plays
 ):

@@ -100,7 +100,7 @@ def _parts(host: Host) -> dict[str, slice]:
         return {"observation": slice(0, host.width)}
     parts, at = {}, 0
     for key in sorted(space.spaces):
-        size = int(np.prod(space.spaces[key].shape, dtype=int))
+        size = int(spaces.flatdim(space.spaces[key]))
         parts[key], at = slice(at, at + size), at + size
     return parts
 

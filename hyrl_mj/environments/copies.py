@@ -1,8 +1,8 @@
-"""Copies of an environment that take turns in one: each is a row of MuJoCo's state and of what it remembers."""
+"""Copies of an environment that take turns in one: rows of MuJoCo's state and of what it remembers."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 
 from hyrl_mj.environments.memory import Slot, changing, remembered
-from hyrl_mj.environments.opening import Source, global_seed, made
+from hyrl_mj.environments.opening import Source, global_seed, global_state, made
 from hyrl_mj.errors import BadInput, brief
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -62,7 +62,7 @@ class Report:
 
 def flat(observation: Any) -> np.ndarray:
     """Returns an observation as a vector, as SB3 flattens it: a Dict in the order of its sorted keys."""
-    if isinstance(observation, dict):
+    if isinstance(observation, Mapping):
         return np.concatenate([np.ravel(observation[key]) for key in sorted(observation)])
     return np.ravel(observation)
 
@@ -244,7 +244,7 @@ class Host:
 
     @property
     def _middle(self) -> np.ndarray:
-        space = self.env.action_space
+        space: Any = self.env.action_space
         return (
             np.zeros(1)
             if isinstance(space, spaces.Discrete)
@@ -283,21 +283,20 @@ class Host:
 
     def drawn(self, rng: np.random.Generator) -> np.ndarray:
         """Returns inputs (m,) at random."""
-        space = self.env.action_space
+        space: Any = self.env.action_space
         if isinstance(space, spaces.Discrete):
             return np.array([float(rng.integers(space.n))])
         return np.ravel(rng.uniform(space.low, space.high))
 
     def _tried_step(self, u: np.ndarray) -> np.ndarray:
-        before = np.random.get_state()[1:3]
+        before = global_state()
         try:
             observation = self.step(u)[0]
         except Exception as error:
             raise BadInput(f"step() of {self.name} raises {brief(error)}: repair it") from error
-        after = np.random.get_state()[1:3]
-        if not (np.array_equal(before[0], after[0]) and before[1] == after[1]):
+        if global_state() != before:
             raise BadInput(
-                f"{self.name} draws random numbers in step() (NumPy's global generator), so its state does "
+                f"{self.name} draws random numbers in step() (a global generator), so its state does "
                 "not tell what comes next: make it without that noise"
             )
         return observation
@@ -306,15 +305,15 @@ class Host:
         """Returns whether steps from a state that was read go on as they did, after others in between."""
         rng = np.random.default_rng(1)
         self.reset(0)
-        seen, inputs = [], []
+        begun, told, inputs = [], [], []
         for _ in range(STEPS):
-            seen.append(self.read())
+            begun.append(self.read())
             inputs.append(self.drawn(rng))
-            seen[-1] = (*seen[-1], *self.step(inputs[-1]))
+            told.append(self.step(inputs[-1]))
         for k in rng.permutation(STEPS - 1):
-            self.write(*seen[k][:2])
-            told = self.step(inputs[k])
-            parts = zip((*told, *self.read()), (*seen[k][2:], *seen[k + 1][:2]), strict=True)
+            self.write(*begun[k])
+            again: tuple[Any, ...] = self.step(inputs[k])
+            parts = zip((*again, *self.read()), (*told[k], *begun[k + 1]), strict=True)
             for part, (a, b) in enumerate(parts):
                 scale = max(float(np.max(np.abs(b), initial=0.0)), 1.0)
                 # A reward may be computed from what MuJoCo computed one physics step earlier.
@@ -342,6 +341,9 @@ class Host:
 
             return observe
 
+        def inside(get: Callable[[Any], Any], own: Callable[[], Any]) -> Callable[[], np.ndarray]:
+            return through(lambda: get(_first(own())))
+
         found = []
         for name in OBSERVERS:
             get = getattr(inner, name, None)
@@ -351,12 +353,10 @@ class Host:
                 for part in vars(inner).values():
                     own = getattr(part, name, None)
                     if isinstance(part, gym.Env) and callable(own):
-                        found.append(through(lambda get=get, own=own: get(_first(own()))))
-        task, physics = (
-            getattr(getattr(inner, "_env", None), key, None) for key in ("task", "physics")
-        )
-        if hasattr(task, "get_observation"):
-            found.append(through(lambda: task.get_observation(physics)))
+                        found.append(inside(get, own))
+        control: Any = getattr(inner, "_env", None)  # of dm_control
+        if hasattr(getattr(control, "task", None), "get_observation"):
+            found.append(through(lambda: control.task.get_observation(control.physics)))
         return found
 
 

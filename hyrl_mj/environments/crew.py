@@ -1,7 +1,7 @@
 """Processes that step copies of one environment side by side, one on each core.
 
-Each is a fork of this process, with the environment in it. What copies do depends on their rows alone, so results do
-not depend on the number of processes.
+Each is a fork of this process, with the environment in it. What copies do depends on their rows alone, so
+results do not depend on the number of processes.
 """
 
 from __future__ import annotations

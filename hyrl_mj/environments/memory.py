@@ -10,6 +10,7 @@ import pickle
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from types import FunctionType, MethodType, ModuleType
 from typing import Any
 
@@ -207,7 +208,7 @@ def changing(episodes: Sequence[Sequence[dict[Path, Value]]], owner: str) -> tup
     paths = dict.fromkeys(path for episode in episodes for moment in episode for path in moment)
     for path in paths:
         values = [[moment.get(path) for moment in episode] for episode in episodes]
-        if all(same(a, b) for row in values for a, b in zip(row, row[1:], strict=False)):
+        if all(same(a, b) for row in values for a, b in pairwise(row)):
             continue
         flat = [value for row in values for value in row]
         name = name_of(tuple(step for step in path if step[0] != "length"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import pickle
 import random
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -18,14 +19,8 @@ from gymnasium import spaces
 
 from hyrl_mj.errors import BadInput, brief
 
-# Packages that offer environments, by the beginning of an id: module to import, and what to install. The
-# environments of OGBench have no namespace.
-ROBOTICS = 'pip install "hyrl-mj[robotics]"'
-PACKAGES = {
-    "gymnasium_robotics": "gymnasium-robotics",
-    "ogbench": "ogbench",
-    "shimmy": "shimmy[dm-control]",
-}
+# Packages that offer environments, with the extra that brings each.
+PACKAGES = {"gymnasium_robotics": "robotics", "ogbench": "robotics", "shimmy": "dm_control"}
 # Wrappers that count or check, and change nothing of what an environment does.
 PEELED = (
     "TimeLimit",
@@ -61,6 +56,11 @@ class Source:
         if isinstance(self.make, str):
             return self.make.rpartition(":")[2].rpartition("/")[2]
         return getattr(self.make, "__name__", type(self.make).__name__).strip("<>") or "environment"
+
+
+def global_state() -> bytes:
+    """Returns the state of the global generators of NumPy and Python."""
+    return pickle.dumps((np.random.get_state(), random.getstate()))
 
 
 @contextmanager
@@ -161,13 +161,20 @@ def _adapt_dm_control() -> None:
 
 def _why_not_made(name: str, error: Exception) -> str:
     if name not in gym.registry and isinstance(error, gym.error.Error):
-        missing = [p for m, p in PACKAGES.items() if importlib.util.find_spec(m) is None]
         close = get_close_matches(name, list(gym.registry), n=3, cutoff=0.5)
-        near = f": the nearest ones are {', '.join(close)}" if close else ""
-        install = f"; if it is of {' or '.join(missing)}, {ROBOTICS} brings it" if missing else ""
-        return f"there is no environment {name!r} here{near}{install}"
+        near = f"; near it are {', '.join(close)}" if close else ""
+        missing = {e: m for m, e in PACKAGES.items() if importlib.util.find_spec(m) is None}
+        install = "".join(
+            f'; if it is of {module}: pip install "hyrl-mj[{extra}]"'
+            for extra, module in missing.items()
+        )
+        return (
+            f"there is no environment {name!r}: give the id of one that is installed{near}{install}"
+        )
     if isinstance(error, ImportError):
-        return f"the environment {name} takes a package that is not installed ({brief(error)}): {ROBOTICS}"
+        return (
+            f"the environment {name} takes a package that is missing ({brief(error)}): install it"
+        )
     return f"the environment {name} cannot be made ({brief(error)}): change --env-args"
 
 

@@ -1,4 +1,4 @@
-"""n copies of an environment as a plant: their states are MuJoCo's, and their steps are the environment's own."""
+"""n copies of an environment as a plant: their states are MuJoCo's, their steps the environment's."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class EnvironmentPlant:
     def set_state(
         self, qpos: np.ndarray, qvel: np.ndarray | None = None, ids: np.ndarray | None = None
     ) -> None:
-        """Sets positions (k, nq) and velocities (k, nv) of the copies `ids` (k,); all else is as after a reset.
+        """Sets qpos (k, nq) and qvel (k, nv) of the copies `ids` (k,); all else is as after a reset.
 
         Raises:
             BadInput: a wrong shape or a value that is not finite.

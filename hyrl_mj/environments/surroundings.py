@@ -1,4 +1,4 @@
-"""What an environment is found to have: walls and islands, bounds of its coordinates, and where resets put it."""
+"""What an environment is found to have: walls, islands, bounds of coordinates, and where resets lead."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def starts_of(host: Host) -> np.ndarray:
 
 
 def walls(host: Host) -> list[int]:
-    """Returns the ids of the geoms that stand still and that a moving geom can collide with, but no planes."""
+    """Returns the ids of the geoms that stand still and can be collided with, but no planes."""
     model = host.model
     still = (model.body_weldid[model.geom_bodyid] == 0) & (
         model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE

@@ -249,8 +249,10 @@ class EnvironmentTask(Task):
         )
 
     def _camera(self) -> str:
-        """Returns the camera of replays: from above on what moves in a plane, else the model's first, or free."""
-        own = [n for n in mjcf.names(self.model, mujoco.mjtObj.mjOBJ_CAMERA) if not n.startswith("(")]
+        """Returns the camera of replays: from above on a plane, else the model's first, or the free one."""
+        own = [
+            n for n in mjcf.names(self.model, mujoco.mjtObj.mjOBJ_CAMERA) if not n.startswith("(")
+        ]
         axis = self.model.jnt_axis[self._coordinates[0].joint]
         flat = self._in_plane or abs(axis[2]) > UPRIGHT
         if "overhead" in own or (flat and not own):
@@ -386,7 +388,7 @@ class EnvironmentTask(Task):
         )
 
     @property
-    def obstacles(self) -> dict[str, int]:  # type: ignore[override]
+    def obstacles(self) -> dict[str, int]:
         return self._islands
 
     @property
@@ -439,9 +441,10 @@ def from_gymnasium(
         raise unknown("starts", starts, (CHART, RESET))
     source = Source(env, dict(kwargs or {}), dict(reset or {}), dict(pinned or {}), seed)
     content = {
-        "env": env if isinstance(env, str) else {"function": source.name},
+        "env": env if isinstance(env, str) else {"function": _where(env)},
         "chart": chart, "noisy": noisy, "success": success, "bounds": bounds, "steps": steps,
-        "starts": None if starts == CHART else starts, "kwargs": kwargs, "reset": reset, "pinned": pinned, "seed": seed or None,
+        "starts": None if starts == CHART else starts, "kwargs": kwargs, "reset": reset,
+        "pinned": pinned, "seed": seed or None,
     }  # fmt: skip
     given = {key: value for key, value in content.items() if value is not None}
     spec = MARK + json.dumps(given, default=_plain)
@@ -450,6 +453,12 @@ def from_gymnasium(
             source, chart, noisy, success, bounds or {}, steps, starts, spec
         )
     return _MADE[spec]
+
+
+def _where(function: Callable[..., gym.Env]) -> str:
+    """Returns where a function is defined: "my_module.make"."""
+    name = getattr(function, "__qualname__", type(function).__qualname__)
+    return f"{getattr(function, '__module__', '')}.{name}"
 
 
 def _plain(value: Any) -> Any:

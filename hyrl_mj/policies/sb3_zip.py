@@ -95,7 +95,7 @@ def from_tensors(
 
 
 def _check_plain(tensors: Mapping[str, np.ndarray], about: Mapping[str, Any], task: Task) -> None:
-    """Raises `BadArtifact` if an agent is more than an MLP on a vector of numbers, or on a Dict of vectors."""
+    """Raises `BadArtifact` if an agent is more than an MLP on a vector, or on a Dict of vectors."""
     for part, what in FOREIGN.items():
         if any(part in name for name in tensors):
             raise BadArtifact(f"{what}: {PLAIN}")

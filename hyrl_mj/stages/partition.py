@@ -222,8 +222,9 @@ class PartPolicy:
         return self.policy.act(self.task.with_z(measured, nearest))
 
     def save(self, path: Path) -> None:
-        """Writes the width of the neighbourhood as JSON; the stage-1 policy and M_i are in other files."""
-        artifacts.write_json(path.with_suffix(".json"), {"near": self.near}, self.KIND)
+        """Writes a JSON file beside a path; the stage-1 policy and M_i are in other files."""
+        path = path.with_name(f"{path.stem}_part.json")
+        artifacts.write_json(path, {"near": self.near}, self.KIND)
 
     @staticmethod
     def load(path: Path, task: Task, policy: Policy, partition: Partition, mode: int) -> PartPolicy:

@@ -70,8 +70,8 @@ def retrain(
         log_dir: folder of logs and checkpoints.
 
     Returns:
-        pi_i, or the first mirror image, if it is good enough; otherwise the best policy, of all attempts, pi_i,
-        and the one that the first continued from. And how the training ended.
+        pi_i, or the first mirror image, if it is good enough; otherwise the best policy, of all attempts,
+        pi_i, and the one that the first continued from. And how the training ended.
     """
     task, mode = ground.task, ground.mode
     tried: list[tuple[Score, MlpPolicy | PartPolicy]] = []

@@ -75,8 +75,8 @@ class Task(ABC):
     close: float = 0.2
     #: whether `control` depends on the inputs alone: it is then asked once for all physics steps of a sample
     steady_control: bool = False
-    #: whether each sample runs Python code of an environment: it is then judged by fewer episodes, and stage 6
-    #: first tries the policies of stage 4 as they are
+    #: whether each sample runs Python code of an environment: it is then judged by fewer episodes, and
+    #: stage 6 first tries the policies of stage 4 as they are
     slow: bool = False
     #: the mirror symmetry of observation, inputs and reward, if there is one (paper, Section IV-B)
     mirror: Mirror | None = None

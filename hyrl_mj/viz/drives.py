@@ -152,7 +152,7 @@ def _parts(run: Run) -> tuple[Field, MlpPolicy, Mapping[int, MlpPolicy]]:
         raise BadInput(
             f"{run.path} is a run of {local.name}, but drive takes a run of field: {remedy}"
         )
-    policy, policies = run.policy, run.mode_policies
+    policy, policies = run.policy, run.mode_networks
     if not isinstance(policy, MlpPolicy):
         raise BadInput(
             f"{run.path} is a run of an agent, but drive takes a run that trained: {remedy}"

@@ -20,8 +20,9 @@ from hyrl_mj.viz.replay import marks
 
 PATH_WIDTH, BOUND_WIDTH, START_RADIUS, JUMP_RADIUS, CROSS = 0.032, 0.05, 0.035, 0.055, 0.075  # [m]
 BOUND_PIECES, GHOST_ALPHA = 4, 0.35
-# Marks are larger where a picture shows more than this across [m].
-WIDE, SMALL, USUAL = 6.0, 1.5, 3.0
+# Marks are larger where a picture shows more than the first across, and smaller where less than the second;
+# they are made for the third [m].
+WIDE, SMALL, USUAL = 6.0, 1.6, 3.0
 # The part that is redrawn is this much larger than what has moved [pixels].
 MARGIN = 2
 FAILED = ("crashed", "out_of_bounds", "stalled", "unstable")
@@ -238,7 +239,8 @@ class Panel:
         if t < track.end and track.arc.bound > 0:
             for line in track.bounds(t):
                 for start, end in pairwise(line):
-                    marks.bar(scene, start, end, marks.BOUND, BOUND_WIDTH, marks.ON_BOUND)
+                    width = self._larger * BOUND_WIDTH
+                    marks.bar(scene, start, end, marks.BOUND, width, marks.ON_BOUND)
             if np.isfinite(ghost := track.measured(t)).all():
                 for geom, number in zip(robot, renderer.add_robot(ghost), strict=True):
                     scene.geoms[number].rgba[3] = GHOST_ALPHA

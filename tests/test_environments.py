@@ -1,0 +1,376 @@
+"""Environments of others as tasks: plant, noise, what is found out about them, and what is refused."""
+
+import json
+import pickle
+import subprocess
+import sys
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from environments import Delayed, Growing, Noisy, Puck, Secret, Seen, Several, puck_agent
+from gymnasium.wrappers import TimeLimit, TransformObservation
+
+import hyrl_mj
+from hyrl_mj import BadInput, cores, from_gymnasium
+from hyrl_mj.environments.crew import Crew
+from hyrl_mj.mjcf import camera_of, point_of, rests
+from hyrl_mj.simulation import Noise, closed_loop
+from hyrl_mj.tasks import check_task, described_task, reference
+
+# What the environments of other packages need, beside their ids.
+OTHERS = {
+    "Reacher-v5": {
+        "chart": {"shoulder": "qpos[0]", "elbow": "qpos[1]"},
+        "pinned": {"qpos[2]": -0.15, "qpos[3]": 0.0},
+        "success": "distance(fingertip, target) <= 0.05",
+    },
+    "PointMaze_Medium-v3": {"reset": {"goal_cell": [6, 6]}},
+    "PointMaze_Large-v3": {"reset": {"goal_cell": [3, 6]}},
+    "pointmaze-medium-singletask-v0": {},
+    "dm_control/pendulum-swingup-v0": {
+        "chart": {"angle": "qpos[0]", "rate": "qvel[0]"},
+        "success": "reward >= 1",
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def puck():
+    return from_gymnasium(Puck)
+
+
+def others(*names):
+    return pytest.mark.parametrize("name", names or OTHERS)
+
+
+@others()
+def test_copies_go_on_as_the_environment_alone_does(name):
+    task, rng = from_gymnasium(name, **OTHERS[name]), np.random.default_rng(0)
+    z = task.starts(3, rng)
+    plant = task.plant(3)
+    plant.set_state(*task.state(z))
+    inputs = rng.uniform(*task.input_limits, (20, 3, len(task.inputs)))
+    seen = []
+    for u in inputs:
+        plant.step(u)
+        seen.append(task.observation(plant.measurement))
+    host = task.host
+    for i in range(3):  # one after the other, in the environment itself
+        host.write(*host.base)
+        host.data.qpos[:], host.data.qvel[:] = (part[i] for part in task.state(z))
+        host.forward()
+        for k, u in enumerate(inputs):
+            np.testing.assert_allclose(host.step(u[i])[0], seen[k][i], rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
+@others()
+def test_the_tasks_of_other_packages_are_complete(name):
+    task = from_gymnasium(name, **OTHERS[name])
+    check_task(task)
+    assert set(task.found) >= {"bounds", "starts", "ways"}
+    point_of(task.model, task.scene.tracked)
+    camera_of(task.model, task.scene.camera)
+
+
+@pytest.mark.parametrize(
+    ("name", "islands"),
+    [
+        ("PointMaze_Medium-v3", 1),
+        ("PointMaze_Large-v3", 3),
+        ("pointmaze-medium-singletask-v0", 1),
+        ("Reacher-v5", 0),
+    ],
+)
+def test_islands_are_the_walls_that_can_be_passed_on_both_sides(name, islands):
+    task = from_gymnasium(name, **OTHERS[name])
+    assert len(task.obstacles) == islands
+    assert task.gives_direction == (islands == 0)
+
+
+def test_noise_moves_every_copy_of_a_position(puck):
+    plant = puck.plant(1)
+    plant.set_state(np.array([[-1.0, 0.5]]), np.array([[0.3, 0.0]]))
+    noisy = puck.with_z(plant.measurement, np.array([[-0.9, 0.4]]))
+    # position, to_goal and velocity, in the order of their keys
+    np.testing.assert_allclose(puck.observation(noisy), [[-0.9, 0.4, 2.4, -0.4, 0.3, 0.0]])
+    np.testing.assert_allclose(puck.observation(plant.measurement), [[-1, 0.5, 2.5, -0.5, 0.3, 0]])
+
+
+def test_without_a_known_name_the_environment_observes_in_a_step_that_lasts_no_time(puck):
+    class Renamed(Puck):
+        def what_is_seen(self):
+            return super()._get_obs()
+
+        def _get_obs(self):
+            raise AttributeError
+
+        def reset(self, **options):
+            gym.Env.reset(self, seed=options.get("seed"))
+            mujoco.mj_resetData(self.model, self.data)
+            self.data.qpos[:] = self.np_random.uniform((-1.8, -1.2), (-1.0, 1.2))
+            mujoco.mj_forward(self.model, self.data)
+            return self.what_is_seen(), {}
+
+        def step(self, action):
+            self.data.ctrl[:] = np.clip(action, -4, 4)
+            mujoco.mj_step(self.model, self.data, nstep=5)
+            close = np.linalg.norm(self.data.qpos - [1.5, 0]) < 0.25
+            return self.what_is_seen(), 0.0, False, False, {"success": close}
+
+    task = from_gymnasium(Renamed)
+    assert task.host._observer is None
+    plants = [t.plant(2) for t in (puck, task)]
+    seen = []
+    for t, plant in zip((puck, task), plants, strict=True):
+        plant.set_state(np.array([[-1.0, 0.5], [0.8, -1.0]]), np.array([[0.3, 0.0], [0.0, 1.0]]))
+        noisy = t.with_z(plant.measurement, t.z(plant.measurement) + 0.1)
+        seen.append(t.observation(noisy))
+    np.testing.assert_allclose(*seen, rtol=0, atol=1e-9)
+
+
+def test_results_do_not_depend_on_the_cores(puck, monkeypatch):
+    rng, ends = np.random.default_rng(0), []
+    z, u = puck.starts(100, rng), rng.uniform(-4, 4, (5, 100, 2))
+    for count in (1, 2):
+        monkeypatch.setattr(cores, "allowed", count)
+        plant = puck.plant(100)
+        plant.set_state(*puck.state(z))
+        for inputs in u:
+            plant.step(inputs)
+        ends.append(plant.measurement)
+    np.testing.assert_array_equal(*ends)
+
+
+def test_an_error_in_another_process_is_told(puck, monkeypatch):
+    monkeypatch.setattr(cores, "allowed", 2)
+    task = from_gymnasium(Failing)
+    plant = task.plant(100)
+    plant.set_state(*task.state(np.tile([[-1.0, 0.5]], (100, 1))))
+    u = np.zeros((100, 2))
+    u[-1] = 3.9  # of the second half
+    with pytest.raises(BadInput, match="cannot be stepped: RuntimeError: broken"):
+        plant.step(u)
+    plant.step(np.zeros((100, 2)))  # what was left unsaid is not taken for another answer
+    assert np.isfinite(plant.measurement).all()
+
+
+class Failing(Puck):
+    """Raises an error under one input."""
+
+    def step(self, action):
+        if np.all(np.asarray(action) == 3.9):
+            raise RuntimeError("broken")
+        return super().step(action)
+
+
+def test_attributes_that_change_are_remembered_by_each_copy(puck):
+    task = from_gymnasium(lambda: Delayed(Puck()))
+    assert [slot.path[-1][1] for slot in task.host.slots] == ["last"]
+    rng = np.random.default_rng(0)
+    z, u = task.starts(3, rng), rng.uniform(-4, 4, (6, 3, 2))
+    late, plain = task.plant(3), puck.plant(3)
+    for plant, t in ((late, task), (plain, puck)):
+        plant.set_state(*t.state(z))
+    plain.step(np.zeros((3, 2)))
+    for before in u:
+        late.step(before)
+        np.testing.assert_allclose(late.qpos, plain.qpos, atol=1e-12)
+        plain.step(before)
+
+
+def test_a_start_inside_of_a_wall_has_crashed(puck):
+    plant = puck.plant(2)
+    plant.set_state(np.array([[0.0, 0.0], [1.0, 0.0]]))
+    assert puck.ending(plant.measurement).tolist() == [2, 0]
+    free = puck.plant(200)
+    free.set_state(*puck.state(puck.starts(200, np.random.default_rng(0))))
+    assert (puck.ending(free.measurement) == 0).all()
+
+
+def test_an_episode_ends_where_info_tells_success(puck):
+    z = np.array([[1.0, 0.0]])
+    run = closed_loop(puck, Constant(puck, (4.0, 0.0)), z, Noise())
+    assert run.outcome.tolist() == [1]
+    at_end = from_gymnasium(Puck, success="reward >= -0.3", steps=30)
+    late = closed_loop(at_end, Constant(at_end, (0.0, 0.0)), np.array([[1.3, 0.0]]), Noise())
+    assert (late.outcome.tolist(), late.length.tolist()) == ([1], [30])
+    assert from_gymnasium(Puck, success="distance(puck, goal) < 0.3").host.between == (
+        ("xpos", 1),
+        ("site_xpos", 0),
+    )
+
+
+class Constant:
+    """A controller that always gives the same inputs."""
+
+    modes = (0,)
+
+    def __init__(self, task, u):
+        self.u = np.array(u)
+
+    def initial_mode(self, measured):
+        return np.zeros(len(measured), dtype=int)
+
+    def step(self, q, measured):
+        return np.tile(self.u, (len(q), 1)), q
+
+
+@pytest.mark.parametrize(
+    ("chart", "names"),
+    [
+        ("position", ["x", "y"]),
+        (["qpos[0]", "qpos[1]", "qvel[0]"], ["x", "y", "x rate"]),
+        ({"east": "x", "north": "y"}, ["east", "north"]),
+        ("puck", ["x", "y"]),
+        (["to_goal[1]"], None),
+        (["x", "position[0]"], None),
+        (["heading"], None),
+        (["position[7]"], None),
+    ],
+)
+def test_charts_are_named_as_users_name_things(chart, names):
+    if names is not None:
+        assert list(from_gymnasium(Puck, chart=chart).chart.names) == names
+        return
+    with pytest.raises(BadInput, match=r"no single position|twice|unknown coordinate"):
+        from_gymnasium(Puck, chart=chart)
+
+
+def test_what_was_not_given_is_found_and_said(puck):
+    assert list(puck.chart.names) == ["x", "y"]
+    np.testing.assert_allclose([puck.chart.low, puck.chart.high], [(-2.3, -1.7), (2.3, 1.7)])
+    assert puck.inputs == ("push_x", "push_y")
+    assert puck.dt == pytest.approx(0.1)
+    assert puck.max_steps == 1_000
+    for name in ("chart", "success", "bounds", "starts", "steps", "noise", "ways"):
+        assert puck.found[name]
+    shorter = from_gymnasium(lambda: TimeLimit(Puck(), 70), bounds={"x": (-2, 2)}, starts="reset")
+    assert shorter.max_steps == 70
+    assert shorter.chart.low[0] == -2
+    assert -1.8 <= shorter.start_low[0] < shorter.start_high[0] <= -1.0
+
+
+REFUSED = {
+    "hidden": (lambda: Secret(Puck()), "goes on differently from the same state"),
+    "growing": (lambda: Growing(Puck()), r"remembers something in actions .*cannot be copied"),
+    "random": (lambda: Noisy(Puck()), r"draws random numbers in step\(\)"),
+    "image": (lambda: Seen(Puck()), r"observes images \(8, 8, 3\).*vectors"),
+    "several": (Several, "several agents"),
+    "other physics": ("CartPole-v1", "not simulated by MuJoCo"),
+    "no environment": (lambda: 3, "is a int: give a single gymnasium.Env"),
+    "several copies": (lambda: gym.make_vec("Reacher-v5", 2), "single gymnasium.Env"),
+    "misspelt": ("PointMaze_Mediun-v3", "no environment.*PointMaze_Medium-v3"),
+    "broken": (lambda: 1 / 0, "cannot be made .ZeroDivisionError"),
+    "no success": ("Reacher-v5", "does not tell in its info when it succeeds"),
+    "nothing to decide": (
+        lambda: TransformObservation(Puck(), lambda o: o, None),
+        None,
+    ),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_cannot_work_is_refused_before_anything_is_trained(what):
+    make, message = REFUSED[what]
+    if message is None:  # a wrapper of observations takes part
+        assert from_gymnasium(make).observation_keys == ("position", "to_goal", "velocity")
+        return
+    with pytest.raises(BadInput, match=message):
+        from_gymnasium(make)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"success": "close"}, r"success 'close' cannot be used: give .info"),
+        ({"success": "distance(puck, moon) < 1"}, "unknown site or body.*'moon'"),
+        ({"noisy": (1,)}, r"noisy has 1 share.*2 coordinate"),
+        ({"bounds": {"z": (0, 1)}}, "bounds for z.*x, y"),
+        ({"pinned": {"qpos[9]": 0}}, r"no qpos\[9\]"),
+        ({"pinned": {"speed": 0}}, "no attribute speed"),
+        ({"starts": "there"}, "unknown starts"),
+        ({"kwargs": {"depth": 3}}, "cannot be made .TypeError"),
+    ],
+)
+def test_wrong_arguments_are_refused_with_what_is_allowed(options, message):
+    with pytest.raises(BadInput, match=message):
+        from_gymnasium(Puck, **options)
+
+
+def test_a_task_is_made_again_from_its_text():
+    task = from_gymnasium("PointMaze_Medium-v3", reset={"goal_cell": np.array([6, 6])})
+    assert reference(task).startswith("env:")
+    assert described_task(reference(task)) is task
+    assert pickle.loads(pickle.dumps(task)).chart == task.chart
+    assert hyrl_mj.get_task(task) is task
+    loud = task.noisy_everywhere()
+    assert pickle.loads(pickle.dumps(loud)).noisy == loud.noisy
+    with pytest.raises(BadInput, match="describes no environment"):
+        described_task("env:{}")
+    with pytest.raises(BadInput, match="made by the function elsewhere"):
+        described_task('env:{"env": {"function": "elsewhere"}}')
+
+
+def test_free_cameras_are_there_for_every_model():
+    model = from_gymnasium(Puck).model
+    assert rests(model, camera_of(model, "free"))
+    assert camera_of(model, "overhead").elevation == -90
+    assert point_of(model, "tracked") == ("xpos", 1)
+    with pytest.raises(BadInput, match="'chase'.*overhead, free"):
+        camera_of(model, "chase")
+
+
+def command(*words):
+    done = subprocess.run(
+        [sys.executable, "-m", "hyrl_mj.cli", *words], capture_output=True, text=True, check=False
+    )
+    return done.returncode, done.stdout, done.stderr
+
+
+def test_the_command_line_explains_what_was_found(tmp_path):
+    path = tmp_path / "goal.json"
+    path.write_text(json.dumps({"reset": {"goal_cell": [6, 6]}}))
+    env = ("--env", "PointMaze_Medium-v3", "--env-args", str(path))
+    status, out, _ = command("diagnose", *env, "--explain")
+    assert status == 0
+    for part in ("achieved_goal", "island 1", "from the walls", "to change it, give bounds"):
+        assert part in out
+    assert command("diagnose", *env)[0] == 2
+    path.write_text(json.dumps({"goal": 3}))
+    status, _, error = command("run", *env)
+    assert status == 2
+    assert "unknown argument in" in error
+    path.write_text("{")
+    assert "is no JSON" in command("run", *env)[2]
+    assert "not both" in command("run", "vehicle", "--env", "Reacher-v5")[2]
+    assert "need an --env" in command("run", "vehicle", "--explain")[2]
+
+
+@pytest.mark.slow
+def test_an_agent_is_diagnosed_and_made_robust_in_its_own_environment(tmp_path):
+    task = from_gymnasium(Puck, steps=80)
+    path, said = tmp_path / "puck", []
+    options = {"preset": "smoke", "eps": 0.1, "out": path, "say": said.append}
+    diagnosed = hyrl_mj.diagnose(task, puck_agent, **options)
+    assert (path / "diagnosis.html").is_file()
+    points = diagnosed.critical_set.points
+    assert len(points) > 5
+    assert (np.abs(points[points[:, 0] < -0.5, 1]) < 0.05).all()
+    run = hyrl_mj.robustify(task, puck_agent, **options)
+    assert (path / "replay.png").is_file()
+    lost = {count.controller: count.lost for count in run.robustness.attacks}
+    assert lost["hyrl"] <= lost["policy"]
+    again = hyrl_mj.load_run(path, puck_agent)
+    q, measured = np.array([0, 1]), np.tile(task.plant(1).measurement, (2, 1))
+    np.testing.assert_array_equal(
+        again.controller.step(q, measured)[0], run.controller.step(q, measured)[0]
+    )
+
+
+def test_few_copies_stay_in_one_process(puck):
+    crew = Crew(puck.host)
+    crew.observe(*(np.tile(part, (3, 1)) for part in puck.host.base))
+    assert not crew._hands
