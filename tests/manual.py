@@ -205,7 +205,8 @@ def run(page: Path) -> None:
                 text = text.replace(long, short)
             exec(compile("\n" * (block.line - 1) + text, block.page, "exec"), space)
         elif block.language == "json":
-            Path("field.json").write_text(block.text)
+            name = "goal" if page.stem == "your-environment" else "field"
+            Path(f"{name}.json").write_text(block.text)
 
 
 if __name__ == "__main__":

@@ -306,8 +306,10 @@ MISTAKES = {
     "a state that is not the chart's": (
         PY, "return z, np.stack", "return 1.01 * z, np.stack", r"state\(\) and z\(\) do not belong",
     ),
-    "nothing to track": (XML, 'name="tracked"', 'name="followed"', r"'tracked'.*followed"),
-    "no camera": (XML, 'name="overhead"', 'name="above"', r"'overhead'.*above"),
+    "nothing to track": (
+        PY, r"time=3\.2", 'time=3.2, tracked="followed"', r"site or body .*'followed'.*tracked",
+    ),
+    "no camera": (PY, r"time=3\.2", 'time=3.2, camera="above"', r"camera .*'above'.*overhead"),
     "a reward that is one number": (
         PY, r"return np\.where\(self\.failed.*\n", "return np.zeros(1)\n", r"reward\(\)",
     ),

@@ -263,7 +263,11 @@ REFUSED = {
     "no environment": (lambda: 3, "is a int: give a single gymnasium.Env"),
     "several copies": (lambda: gym.make_vec("Reacher-v5", 2), "single gymnasium.Env"),
     "misspelt": ("PointMaze_Mediun-v3", "no environment.*PointMaze_Medium-v3"),
-    "broken": (lambda: 1 / 0, "cannot be made .ZeroDivisionError"),
+    "broken": (lambda: 1 / 0, r"cannot be made .ZeroDivisionError"),
+    "a goal that is drawn": (
+        "PointMaze_Medium-v3",
+        "each reset of PointMaze_Medium-v3 draws goal.*pin it",
+    ),
     "no success": ("Reacher-v5", "does not tell in its info when it succeeds"),
     "nothing to decide": (
         lambda: TransformObservation(Puck(), lambda o: o, None),
@@ -292,7 +296,7 @@ def test_what_cannot_work_is_refused_before_anything_is_trained(what):
         ({"pinned": {"qpos[9]": 0}}, r"no qpos\[9\]"),
         ({"pinned": {"speed": 0}}, "no attribute speed"),
         ({"starts": "there"}, "unknown starts"),
-        ({"kwargs": {"depth": 3}}, "cannot be made .TypeError"),
+        ({"kwargs": {"depth": 3}}, r"cannot be made .TypeError"),
     ],
 )
 def test_wrong_arguments_are_refused_with_what_is_allowed(options, message):
@@ -319,7 +323,7 @@ def test_free_cameras_are_there_for_every_model():
     assert rests(model, camera_of(model, "free"))
     assert camera_of(model, "overhead").elevation == -90
     assert point_of(model, "tracked") == ("xpos", 1)
-    with pytest.raises(BadInput, match="'chase'.*overhead, free"):
+    with pytest.raises(BadInput, match=r"'chase'.*overhead, free"):
         camera_of(model, "chase")
 
 
@@ -345,6 +349,10 @@ def test_the_command_line_explains_what_was_found(tmp_path):
     assert "unknown argument in" in error
     path.write_text("{")
     assert "is no JSON" in command("run", *env)[2]
+    path.unlink()
+    status, _, error = command("run", *env)
+    assert status == 2
+    assert "goal.json cannot be read" in error
     assert "not both" in command("run", "vehicle", "--env", "Reacher-v5")[2]
     assert "need an --env" in command("run", "vehicle", "--explain")[2]
 

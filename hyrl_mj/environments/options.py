@@ -11,7 +11,7 @@ from typing import Any
 
 from hyrl_mj import artifacts
 from hyrl_mj.environments.task import EnvironmentTask, from_gymnasium
-from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.errors import BadInput, brief, unknown
 from hyrl_mj.tasks import Task, get_task
 
 
@@ -80,8 +80,10 @@ _KNOWN = {*inspect.signature(from_gymnasium).parameters, "noise", "starts"}
 def _arguments(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(artifacts.read_limited(path).decode())
-    except ValueError as error:
-        raise BadInput(f"{path} is no JSON: {error}") from None
+    except OSError as error:
+        raise BadInput(f"{path} cannot be read ({error.strerror}): give a JSON file") from None
+    except (ValueError, RecursionError) as error:
+        raise BadInput(f"{path} is no JSON ({brief(error)}): give a JSON file") from None
     if not isinstance(content, dict):
         raise BadInput(
             f"{path} holds no JSON object: give one with arguments of hyrl_mj.from_gymnasium"

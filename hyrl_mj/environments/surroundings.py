@@ -10,10 +10,13 @@ import numpy as np
 
 from hyrl_mj.environments.coordinates import HINGE, Coordinate
 from hyrl_mj.environments.copies import Host
+from hyrl_mj.environments.memory import name_of, remembered, same
 from hyrl_mj.tasks import touching
 
 # Resets that show where episodes start.
 RESETS = 64
+# Resets that are compared for what they draw.
+RESETS_COMPARED = 4
 # What is sampled beyond this many times as far is outside of the chart.
 ROOM = 1.2
 
@@ -42,6 +45,39 @@ def starts_of(host: Host) -> np.ndarray:
         found.append(np.concatenate([host.data.qpos, host.data.qvel]))
     host.write(*host.base)
     return np.array(found)
+
+
+def drawn_goals(host: Host, resets: np.ndarray, moved: np.ndarray) -> list[str]:
+    """Returns the names of what resets draw and steps never change, though what is observed depends on it.
+
+    Args:
+        host: the environment.
+        resets: (n, nq + nv) positions and velocities after resets.
+        moved: (nq,) bool, the positions that change in sampled runs.
+    """
+    drawn = np.ptp(resets[:, : host.model.nq], axis=0) > 0
+    names = [f"qpos[{i}]" for i in np.flatnonzero(drawn & ~moved)]
+    state, memory = host.base
+    rng = np.random.default_rng(0)
+    u, told, attributes = host.drawn(rng), [], []
+    for seed in range(RESETS_COMPARED):
+        host.reset(seed)
+        attributes.append(remembered(host.env))
+        host.write(state, memory)
+        told.append(np.append(host.step(u)[0], host.step(u)[1:3]))
+    host.reset(host.source.seed)
+    host.write(state, memory)
+    if all(np.allclose(other, told[0], rtol=0, atol=1e-9, equal_nan=True) for other in told):
+        return names
+    slots = {slot.path for slot in host.slots}
+    differing = [
+        name_of(path)
+        for path, value in attributes[0].items()
+        if path not in slots and not all(same(value, a.get(path)) for a in attributes[1:])
+    ]
+    words = ("goal", "target", "task")
+    goals = [name for name in differing if any(word in name for word in words)]
+    return names + (goals or differing)
 
 
 def walls(host: Host) -> list[int]:

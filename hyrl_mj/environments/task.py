@@ -21,7 +21,7 @@ from hyrl_mj.environments.layout import Layout
 from hyrl_mj.environments.opening import Source
 from hyrl_mj.environments.plant import EnvironmentPlant
 from hyrl_mj.environments.success import FORMS, INFO, Success, success_of
-from hyrl_mj.environments.surroundings import Bound, bounds_of, islands_of, starts_of
+from hyrl_mj.environments.surroundings import Bound, bounds_of, drawn_goals, islands_of, starts_of
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.tasks import ANY, Learning, Outcome, Scene, Task, register_opener
 
@@ -79,6 +79,7 @@ class EnvironmentTask(Task):
         resets = starts_of(self.host)
         runs, rewards, ended, told = self._sampled(resets)
         self._criterion = self._success(success, ended, told)
+        self._check_goal(resets)
         self._usual = self._at_rest(resets)
         self._measure_bounds(resets, runs, dict(bounds), starts)
         self._count(steps)
@@ -120,8 +121,10 @@ class EnvironmentTask(Task):
         """Returns chart points (n, d) and rewards (n,) of runs, whether one ended, and what info tells."""
         rng, host = np.random.default_rng(0), self.host
         points, rewards, places, ended = [], [], [], False
+        moved = np.zeros(host.model.nq, dtype=bool)
         for seed in range(RUNS):
             host.reset(seed)
+            begun = host.data.qpos.copy()
             for k in range(STEPS):
                 if k % HELD == 0:
                     u = host.drawn(rng)
@@ -131,10 +134,12 @@ class EnvironmentTask(Task):
                 )
                 rewards.append(reward)
                 places.append(host.data.xpos.copy())
+                moved |= np.abs(host.data.qpos - begun) > 0
                 ended = ended or terminated
                 if terminated or truncated:
                     break
         host.write(*host.base)
+        self._moved = moved
         self._farthest = int(np.ptp(places, axis=0).sum(axis=1).argmax())
         return np.array(points), np.array(rewards), ended, host.tells_success
 
@@ -147,6 +152,19 @@ class EnvironmentTask(Task):
             success = INFO
             self.found["success"] = 'info["success"]; or give ' + FORMS
         return success_of(self.host, success)
+
+    def _check_goal(self, resets: np.ndarray) -> None:
+        """Raises `BadInput` if resets draw a goal that nothing pins."""
+        source = self.host.source
+        names = drawn_goals(self.host, resets, self._moved)
+        if names and not (source.reset or source.pinned):
+            raise BadInput(
+                f"each reset of {self.name} draws {', '.join(names)}, and what is to be done depends on it: "
+                'pin it, with options of reset as {"reset": {"goal_cell": [6, 6]}}, or with values as '
+                '{"pinned": {"qpos[2]": 0.1}}'
+            )
+        if names:
+            self.found["goal"] = f"{', '.join(names)} as the reset with seed {source.seed} draws it"
 
     def _at_rest(self, resets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns state and memory of the base, with the usual positions and at rest."""

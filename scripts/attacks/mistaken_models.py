@@ -80,8 +80,6 @@ MODELS: Mistakes = {
     "no sensors": ("sensor>", "custom>"),
     "no obstacle": ('name="obstacle"', 'name="pillar"'),
     "no puck": ('name="puck"', 'name="ball"'),
-    "no tracked site": ('name="tracked"', 'name="seen"'),
-    "no overhead camera": ('name="overhead"', 'name="above"'),
     "an obstacle everywhere": ('size="0.5 0.1"', 'size="50 0.1"'),
     **changed("keyframe", KEY, 'qpos="0 0"', 'qpos="nan 0"', 'qpos="0"', 'qpos="0 0 0"'),
     **changed("keyframe", KEY, 'ctrl="1 0"', 'ctrl="nan 0"', 'ctrl="1"', 'ctrl="1e300 0"', 'ctrl="inf 0"'),
