@@ -151,6 +151,14 @@ class Plant:
         """MuJoCo's whole state, rows of `mjSTATE_INTEGRATION`: (n, nstate), a copy."""
         return self._batch.state.copy()
 
+    def put(self, state: np.ndarray) -> None:
+        """Sets the whole state of all copies (n, nstate), as `state` gives it, and updates their sensors."""
+        self._wake()
+        self._batch.state[:] = state
+        self._unstable[:] = False
+        if self._stage != mujoco.mjtStage.mjSTAGE_NONE:
+            self._batch.forward(None, self._stage)
+
     def geom_positions(self, ids: Sequence[int]) -> np.ndarray:
         """Returns the positions of geoms in the world: (n, k, 3) [m], or (1, k, 3) if none of them moves."""
         ids = list(ids)

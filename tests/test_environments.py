@@ -16,7 +16,7 @@ import hyrl_mj
 from hyrl_mj import BadInput, cores, from_gymnasium
 from hyrl_mj.environments.crew import Crew
 from hyrl_mj.mjcf import camera_of, point_of, rests
-from hyrl_mj.simulation import Noise, closed_loop
+from hyrl_mj.simulation import Noise, Recorded, closed_loop
 from hyrl_mj.tasks import check_task, described_task, reference
 
 # What the environments of other packages need, beside their ids.
@@ -188,6 +188,43 @@ def test_a_start_inside_of_a_wall_has_crashed(puck):
     free = puck.plant(200)
     free.set_state(*puck.state(puck.starts(200, np.random.default_rng(0))))
     assert (puck.ending(free.measurement) == 0).all()
+
+
+def test_the_environment_of_a_task_gives_the_episodes_of_the_task():
+    vehicle = hyrl_mj.get_task("vehicle")
+    (x0, y0), (x1, y1) = vehicle.chart.low, vehicle.chart.high
+    task = from_gymnasium(
+        vehicle.env_id,
+        chart={"x": "qpos[0]", "y": "qpos[1]"},
+        noisy=(0, 1),
+        bounds={"x": (x0, x1), "y": (y0, y1)},
+    )
+    rng = np.random.default_rng(0)
+    z, paths = vehicle.starts(8, rng), []
+    noise = rng.uniform(-0.1, 0.1, (vehicle.max_steps, 8))
+    low, high = (float(limit[0]) for limit in vehicle.input_limits)
+    for one, inputs in ((vehicle, (low, high)), (task, (0.0, len(vehicle.input_levels) - 1.0))):
+        signal = np.zeros((*noise.shape, one.measurement_columns))
+        signal[..., 1] = noise
+        run = closed_loop(one, Sided(one, *inputs), z, Recorded(signal, 0.1, "uniform"))
+        paths.append((run.length, run.path, run.outcome == 1))
+    for a, b in zip(*paths, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+class Sided:
+    """A controller with one of two inputs, by the side of y = 0."""
+
+    modes = (0,)
+
+    def __init__(self, task, low, high):
+        self.task, self.low, self.high = task, low, high
+
+    def initial_mode(self, measured):
+        return np.zeros(len(measured), dtype=int)
+
+    def step(self, q, measured):
+        return np.where(self.task.z(measured)[:, 1:] >= 0, self.high, self.low), q
 
 
 def test_an_episode_ends_where_info_tells_success(puck):

@@ -15,6 +15,7 @@ from gymnasium import spaces
 from hyrl_mj.environments.memory import Slot, changing, remembered
 from hyrl_mj.environments.opening import Source, global_seed, global_state, made
 from hyrl_mj.errors import BadInput, brief
+from hyrl_mj.tasks import Outcome
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 # Episodes and steps in which an environment is watched, under inputs that are held for some steps.
@@ -88,7 +89,7 @@ class Host:
         self.source, self.name = source, source.name
         opened = made(source)
         self.env, self.steps = opened.env, opened.steps
-        self.model, self.data = opened.model, opened.data
+        self.model, self.data, self._plant = opened.model, opened.data, opened.plant
         self.slots: tuple[Slot, ...] = ()
         self.between: tuple[tuple[str, int], tuple[str, int]] | None = None
         self._forward = self.tells_success = False
@@ -111,6 +112,7 @@ class Host:
                 raise BadInput(
                     f"{self.name} cannot be reset ({brief(error)}): change its options of reset"
                 ) from error
+        self._look()
         if self.source.pinned:
             self._pin()
             return self.observed()
@@ -139,6 +141,15 @@ class Host:
     def forward(self) -> None:
         """Computes what follows from MuJoCo's state, without a change of the state."""
         mujoco.mj_forward(self.model, self.data)
+        if self._plant is not None:
+            self._plant.put(self.read()[0][None])
+
+    def _look(self) -> None:
+        """Shows in `data` what the plant of an environment of this package has done."""
+        if self._plant is not None:
+            mujoco.mj_setState(self.model, self.data, self._plant.state[0], STATE)
+            mujoco.mj_forward(self.model, self.data)
+            mujoco.mj_setState(self.model, self.data, self._plant.state[0], STATE)
 
     def read(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns MuJoCo's state (S,) and what is remembered (A,)."""
@@ -150,6 +161,8 @@ class Host:
     def write(self, state: np.ndarray, memory: np.ndarray) -> None:
         """Makes the environment the copy of a state (S,) and a memory (A,)."""
         mujoco.mj_setState(self.model, self.data, state, STATE)
+        if self._plant is not None:
+            self._plant.put(state[None])
         at = 0
         for slot in self.slots:
             slot.write(self.env, memory[at : at + slot.size])
@@ -168,7 +181,10 @@ class Host:
     def step(self, u: np.ndarray) -> tuple[np.ndarray, float, bool, bool, float, float]:
         """Steps the environment with inputs u (m,), and returns a row of `Report`."""
         observation, reward, terminated, truncated, info = self.env.step(self.action(u))
+        self._look()
         told = next((float(info[key]) for key in SUCCESS if key in info), None)
+        if "outcome" in info:  # of an environment of this package
+            told = float(info["outcome"] == Outcome.REACHED.label)
         self.tells_success = self.tells_success or told is not None
         distance = 0.0
         if self.between is not None:

@@ -22,7 +22,7 @@ from hyrl_mj.errors import BadInput
 PASSED = (
     "mujoco", "dm_control.mujoco", "dm_control.mjcf", "dm_control.rl.specs", "dm_env", "OpenGL",
     "gymnasium.spaces", "gymnasium.envs.registration", "gymnasium.envs.mujoco.mujoco_rendering", "torch",
-    "lxml", "xml",
+    "lxml", "xml", "hyrl_mj.plant", "hyrl_mj.tasks",
 )  # fmt: skip
 # Attributes that hold the arguments of a constructor.
 COPIES = ("_ezpickle_args", "_ezpickle_kwargs", "_saved_kwargs")

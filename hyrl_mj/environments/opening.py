@@ -18,6 +18,7 @@ import numpy as np
 from gymnasium import spaces
 
 from hyrl_mj.errors import BadInput, brief
+from hyrl_mj.plant import Plant
 
 # Packages that offer environments, with the extra that brings each.
 PACKAGES = {"gymnasium_robotics": "robotics", "ogbench": "robotics", "shimmy": "dm_control"}
@@ -84,12 +85,14 @@ class Made:
         env: the environment.
         steps: after how many steps its episodes are truncated; None if it does not say.
         model, data: of MuJoCo.
+        plant: what holds the state of an environment of this package, whose `data` only shows it; else None.
     """
 
     env: gym.Env
     steps: int | None
     model: mujoco.MjModel
     data: mujoco.MjData
+    plant: Plant | None = None
 
 
 def made(source: Source) -> Made:
@@ -112,7 +115,8 @@ def made(source: Source) -> Made:
                 f"{source.name} cannot be made ({brief(error)}): repair the function"
             ) from error
     physics = _check(env, source.name)
-    return Made(_peeled(env), _steps_of(env), *physics)
+    plant = _plant_of(env)
+    return Made(_peeled(env), _steps_of(env), *physics, plant)
 
 
 def _steps_of(env: gym.Env) -> int | None:
@@ -213,9 +217,17 @@ def _check(env: Any, name: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
     return physics
 
 
+def _plant_of(env: Any) -> Plant | None:
+    """Returns the plant of an environment of this package; None of others."""
+    plant = getattr(getattr(env.unwrapped, "core", None), "plant", None)
+    return plant if isinstance(plant, Plant) and plant.n == 1 else None
+
+
 def _physics_of(env: Any) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
     """Returns model and data of an environment, of Gymnasium or of dm_control; None if it has none."""
     inner = env.unwrapped
+    if (plant := _plant_of(env)) is not None:
+        return plant.model, mujoco.MjData(plant.model)
     model, data = getattr(inner, "model", None), getattr(inner, "data", None)
     if isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
         return model, data

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from hyrl_mj import mjcf
 from hyrl_mj.environments.coordinates import HINGE, Coordinate
 from hyrl_mj.environments.copies import Host
 from hyrl_mj.environments.memory import name_of, remembered, same
@@ -81,7 +82,7 @@ def drawn_goals(host: Host, resets: np.ndarray, moved: np.ndarray) -> list[str]:
 
 
 def walls(host: Host) -> list[int]:
-    """Returns the ids of the geoms that stand still and can be collided with, but no planes."""
+    """Returns the geoms that stand still and can be collided with, or are named obstacles, but no planes."""
     model = host.model
     still = (model.body_weldid[model.geom_bodyid] == 0) & (
         model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE
@@ -96,7 +97,9 @@ def walls(host: Host) -> list[int]:
         )
         for g in range(model.ngeom)
     ]
-    return [int(g) for g in np.flatnonzero(still & meets)]
+    kind = mujoco.mjtObj.mjOBJ_GEOM
+    named = [name in mjcf.obstacles(model) for name in mjcf.names(model, kind)]
+    return [int(g) for g in np.flatnonzero(still & (np.array(meets) | named))]
 
 
 def islands_of(host: Host, places: np.ndarray) -> dict[str, int]:

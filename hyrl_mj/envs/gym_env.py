@@ -88,6 +88,11 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
         return result.observation[0], float(result.reward[0]), terminated, truncated, info
 
+    def _get_obs(self) -> np.ndarray:
+        """Returns the observation of the present state, as environments of Gymnasium's own have it."""
+        measured = self.core.task.observation(self.core._measure(np.arange(1)))
+        return np.asarray(measured[0].astype(np.float32))
+
     def render(self) -> np.ndarray | None:
         """Returns the scene as (height, width, 3) uint8 in render mode "rgb_array", else None."""
         if self.render_mode is None:

@@ -34,6 +34,9 @@ def figures(runs: Runs) -> Iterator[Figure]:
     yield Figure(
         name, "samples/s", "the Gymnasium environment", ">= 20", _episodes(vehicle, 4096), single
     )
+    name = "PointMaze_Medium-v3, n = 256, through from_gymnasium"
+    against = "Gymnasium's SyncVectorEnv"
+    yield Figure(name, "samples/s", against, ">= 0.8", *_outside("PointMaze_Medium-v3", 256))
     name = "vehicle, closed loop under noise, 10,000 episodes"
     yield Figure(name, "samples/s", raw, ">= 0.3", _closed_loop(runs), _physics(vehicle, 4096))
 
@@ -65,6 +68,30 @@ def _physics(task: Task, n: int) -> Callable[[], int]:
         return n * SAMPLES
 
     return work
+
+
+def _outside(name: str, n: int) -> tuple[Callable[[], int], Callable[[], int]]:
+    """Returns steps of copies of an environment of others, as ours and as Gymnasium's."""
+    options = {"goal_cell": np.array([6, 6])}
+    task = hyrl_mj.from_gymnasium(name, reset=options)
+    plant, rng = task.plant(n), np.random.default_rng(0)
+    plant.set_state(*task.state(task.starts(n, rng)))
+    inputs = rng.uniform(*task.input_limits, (SAMPLES, n, len(task.inputs)))
+    others = gymnasium.make_vec(name, n, vectorization_mode="sync")
+    others.reset(seed=0, options=options)
+
+    def ours() -> int:
+        for u in inputs:
+            plant.step(u)
+            task.observation(plant.measurement)
+        return n * SAMPLES
+
+    def theirs() -> int:
+        for u in inputs.astype(np.float32):
+            others.step(u)
+        return n * SAMPLES
+
+    return ours, theirs
 
 
 def _one_environment(task: Task) -> Callable[[], int]:
