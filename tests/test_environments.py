@@ -351,6 +351,8 @@ def test_a_task_is_made_again_from_its_text():
     assert pickle.loads(pickle.dumps(loud)).noisy == loud.noisy
     with pytest.raises(BadInput, match="describes no environment"):
         described_task("env:{}")
+    with pytest.raises(BadInput, match="imports no module that you have not named"):
+        described_task('env:{"env": "this:Puck-v0"}')
     with pytest.raises(BadInput, match="made by the function elsewhere"):
         described_task('env:{"env": {"function": "elsewhere"}}')
 

@@ -71,14 +71,14 @@ class EnvironmentTask(Task):
     ):
         self.host = Host(source)
         self.name, self.spec = source.name, spec
-        self.env_id = source.name
+        self.env_id = source.make if isinstance(source.make, str) else source.name
         self.found: dict[str, str] = {}
         self.description = f"the environment {source.name}"
         self._coordinates = self._charted(chart)
         self.input_limits_of_space = self._limits()
         resets = starts_of(self.host)
-        runs, rewards, ended, told = self._sampled(resets)
-        self._criterion = self._success(success, ended, told)
+        runs, rewards = self._sampled()
+        self._criterion = self._success(success)
         self._check_goal(resets)
         self._usual = self._at_rest(resets)
         self._measure_bounds(resets, runs, dict(bounds), starts)
@@ -86,8 +86,8 @@ class EnvironmentTask(Task):
         self.noisy = self._shares(noisy)
         self.worst_reward = float(min(rewards.min(), 0.0))
         self.inputs = self._input_names()
-        self._islands = islands_of(self.host, self._places(runs)) if self._in_plane else {}
-        self._set_scene(resets)
+        self._islands = islands_of(self.host, runs[:, :2]) if self._in_plane else {}
+        self._set_scene()
 
     def __reduce__(self) -> tuple[Callable[..., Task], tuple[Any, ...]]:
         return from_spec, (self.spec, self.noisy)
@@ -117,10 +117,10 @@ class EnvironmentTask(Task):
         assert isinstance(space, spaces.Box)
         return np.ravel(space.low).astype(float), np.ravel(space.high).astype(float)
 
-    def _sampled(self, resets: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool, bool]:
-        """Returns chart points (n, d) and rewards (n,) of runs, whether one ended, and what info tells."""
+    def _sampled(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns chart points (n, d) and rewards (n,) of runs under inputs at random."""
         rng, host = np.random.default_rng(0), self.host
-        points, rewards, places, ended = [], [], [], False
+        points, rewards, places = [], [], []
         moved = np.zeros(host.model.nq, dtype=bool)
         for seed in range(RUNS):
             host.reset(seed)
@@ -135,17 +135,16 @@ class EnvironmentTask(Task):
                 rewards.append(reward)
                 places.append(host.data.xpos.copy())
                 moved |= np.abs(host.data.qpos - begun) > 0
-                ended = ended or terminated
                 if terminated or truncated:
                     break
         host.write(*host.base)
         self._moved = moved
         self._farthest = int(np.ptp(places, axis=0).sum(axis=1).argmax())
-        return np.array(points), np.array(rewards), ended, host.tells_success
+        return np.array(points), np.array(rewards)
 
-    def _success(self, success: str | None, ended: bool, told: bool) -> Success:
+    def _success(self, success: str | None) -> Success:
         if success is None:
-            if not told:
+            if not self.host.tells_success:
                 raise BadInput(
                     f"{self.name} does not tell in its info when it succeeds: say so with success, as {FORMS}"
                 )
@@ -245,7 +244,7 @@ class EnvironmentTask(Task):
             else tuple(f"action[{i}]" for i in range(m))
         )
 
-    def _set_scene(self, resets: np.ndarray) -> None:
+    def _set_scene(self) -> None:
         starts = self.starts(5, np.random.default_rng(0))
         ways: tuple[str, ...] = ()
         if self._islands:
@@ -305,9 +304,6 @@ class EnvironmentTask(Task):
     def _turning(self) -> int | None:
         """The coordinate of the chart that turns freely; None if none does."""
         return next((i for i, wraps in enumerate(self.chart.periodic) if wraps), None)
-
-    def _places(self, z: np.ndarray) -> np.ndarray:
-        return z[:, :2]
 
     @cached_property
     def model(self) -> Any:
@@ -501,6 +497,11 @@ def from_spec(spec: str, noisy: tuple[float, ...] | None = None) -> Task:
             raise BadInput(
                 f"the environment was made by the function {env.get('function')}, which no file holds: call "
                 "hyrl_mj.from_gymnasium with it first, in the same process"
+            )
+        if ":" in env:  # Gymnasium would import the module before it
+            raise BadInput(
+                f"the environment is {env}, and opening a run imports no module that you have not named: call "
+                f"hyrl_mj.from_gymnasium({env!r}, ...) with the same arguments first, in the same process"
             )
         try:
             from_gymnasium(**given)
