@@ -500,8 +500,8 @@ def from_spec(spec: str, noisy: tuple[float, ...] | None = None) -> Task:
             )
         if ":" in env:  # Gymnasium would import the module before it
             raise BadInput(
-                f"the environment is {env}, and opening a run imports no module that you have not named: call "
-                f"hyrl_mj.from_gymnasium({env!r}, ...) with the same arguments first, in the same process"
+                f"the environment is {env}, and opening a run imports no module that you have not named: "
+                f"call hyrl_mj.from_gymnasium({env!r}, ...) with the same arguments first, in the same process"
             )
         try:
             from_gymnasium(**given)
