@@ -501,7 +501,7 @@ def from_spec(spec: str, noisy: tuple[float, ...] | None = None) -> Task:
         if ":" in env:  # Gymnasium would import the module before it
             raise BadInput(
                 f"the environment is {env}, and opening a run imports no module that you have not named: "
-                f"call hyrl_mj.from_gymnasium({env!r}, ...) with the same arguments first, in the same process"
+                f"call hyrl_mj.from_gymnasium({env!r}, ...) with the same arguments first, in this process"
             )
         try:
             from_gymnasium(**given)
