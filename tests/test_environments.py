@@ -68,7 +68,7 @@ def test_copies_go_on_as_the_environment_alone_does(name):
 @pytest.mark.slow
 @others()
 def test_the_tasks_of_other_packages_are_complete(name):
-    task = from_gymnasium(name, **OTHERS[name])
+    task = from_gymnasium(name, steps=60, **OTHERS[name])
     check_task(task)
     assert set(task.found) >= {"bounds", "starts", "ways"}
     point_of(task.model, task.scene.tracked)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from hyrl_mj.errors import NoRenderer
+from hyrl_mj.errors import BadInput, NoRenderer
 from hyrl_mj.game import Game, Robustness, worst_signal
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.run_directory import Run
 from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, simulate_batch
-from hyrl_mj.stages import Losses, sort_losses
+from hyrl_mj.stages import Budget, Losses, Regions, attack, attack_starts, sort_losses
 from hyrl_mj.verdict import NO_NOISE
 from hyrl_mj.viz.arcs import critical_start, from_middle, replay_floor
 from hyrl_mj.viz.commands import beginning
@@ -22,6 +22,8 @@ from hyrl_mj.viz.tables import margin_text, percent
 
 # In the run directory: the page, and the folder with its pictures and data.
 PAGE, FOLDER = "diagnosis.html", "diagnosis"
+ROUNDS = 2  # of an attack
+LARGER = (1, 2, 4, 8)  # times the bound that attacks try
 TRIED = 64  # lost starts that are simulated, the nearest to the middle of the replay starts first
 REPLAY = ReplayOptions(size=(960, 720))  # of the policy alone
 
@@ -38,7 +40,8 @@ def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
     """Returns a run that the policy loses, or None if no such run was found.
 
     Where the game decides its adversary gives the noise, from the starts of the more frequent kind of
-    losses first; otherwise the noise is adversarial, from drawn starts of the task.
+    losses first; otherwise the noise is adversarial, from drawn starts of the task. If that loses none, an
+    attack searches for noise, from starts half of which are near M*; if it finds none, for larger noise.
     """
     task, eps, loop = run.task, run.settings.noise, PolicyController(run.policy)
     if losses is not None:
@@ -55,6 +58,21 @@ def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
         if critical is not None and task.may_start(critical[None])[0]:
             z0 = np.vstack([critical, z0])
     arcs = simulate_batch(task, loop, z0, noise)
+    if (lost := _first_lost(arcs)) is not None or losses is not None:
+        return lost
+    starts = attack_starts(task, Regions(run.critical_set.points), eps, TRIED, run.settings.seed)
+    for factor in LARGER:
+        try:
+            task.check_noise(factor * eps)
+        except BadInput:  # it would hide the whole chart
+            break
+        found = attack(task, {"policy": loop}, starts, factor * eps, Budget(rounds=ROUNDS))
+        if (lost := _first_lost(found["policy"].arcs)) is not None:
+            return lost
+    return None
+
+
+def _first_lost(arcs: Iterable[HybridArc]) -> HybridArc | None:
     return next((arc for arc in arcs if arc.outcome != "reached"), None)
 
 
@@ -118,6 +136,9 @@ def sentences(
         return [*results, f"no start was found that {noise} makes it lose"]
     start, outcome = task.chart.format(arc.z[0]), arc.outcome.replace("_", " ")
     end = f"it ends {outcome} after {arc.t[-1]:.2f} s, under {arc.noise} noise"
+    if arc.bound > eps * (1 + 1e-9):
+        results.append(f"no start was found that {noise} makes it lose")
+        end += f" of up to {arc.bound:g} {unit}"
     return [*results, f"from {start} {end}"]
 
 
