@@ -13,7 +13,7 @@ from hyrl_mj.fields import DriveOptions, for_posts, read_field
 from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions, SweepOptions
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sweeps import DONE
-from hyrl_mj.tasks import Field, get_task, task_names, write_task
+from hyrl_mj.tasks import Field, Task, get_task, task_names, write_task
 from hyrl_mj.verdict import FAILED
 from hyrl_mj.viz import ReplayOptions, print_robustness, print_summary, print_sweep
 
@@ -77,13 +77,21 @@ def robustify(
         policy: the agent, a .zip that SB3's model.save wrote, an .onnx file, or a .safetensors file; by
             default none, with --explain.
     """
+    if given := given_agent("robustify", task, policy, environment):
+        finish(pipeline.robustify(*given, options))
+
+
+def given_agent(
+    command: str, task: str | None, policy: Path | None, environment: EnvironmentOptions
+) -> tuple[Task, Path] | None:
+    """Returns the task and the agent of a command; None if it only explains an environment."""
     chosen = chosen_task(task, environment)
     if environment.explain:
         print(explained(chosen))
-    elif policy is None:
-        raise BadInput("robustify needs --policy: the agent, a .zip, .onnx or .safetensors file")
-    else:
-        finish(pipeline.robustify(chosen, policy, options))
+        return None
+    if policy is None:
+        raise BadInput(f"{command} needs --policy: the agent, a .zip, .onnx or .safetensors file")
+    return chosen, policy
 
 
 def finish(run: Run) -> None:
@@ -134,13 +142,8 @@ def diagnose(
         policy: the agent, a .zip that SB3's model.save wrote, an .onnx file, or a .safetensors file; by
             default none, with --explain.
     """
-    chosen = chosen_task(task, environment)
-    if environment.explain:
-        print(explained(chosen))
-    elif policy is None:
-        raise BadInput("diagnose needs --policy: the agent, a .zip, .onnx or .safetensors file")
-    else:
-        pipeline.diagnose(chosen, policy, options)
+    if given := given_agent("diagnose", task, policy, environment):
+        pipeline.diagnose(*given, options)
 
 
 def stage_command(name: str, help_text: str) -> Callable[..., None]:

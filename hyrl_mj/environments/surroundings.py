@@ -98,7 +98,7 @@ def walls(host: Host) -> list[int]:
         for g in range(model.ngeom)
     ]
     kind = mujoco.mjtObj.mjOBJ_GEOM
-    named = [name in mjcf.obstacles(model) for name in mjcf.names(model, kind)]
+    named = np.isin(mjcf.names(model, kind), mjcf.obstacles(model))
     return [int(g) for g in np.flatnonzero(still & (np.array(meets) | named))]
 
 

@@ -233,7 +233,7 @@ class EnvironmentTask(Task):
                 f"noisy has {len(noisy)} share(s), and the chart {len(chosen)} coordinate(s) "
                 f"({', '.join(c.name for c in chosen)}): give one for each"
             )
-        return (*(float(share) for share in noisy), *([0.0] * sum(self._layout_sizes()[1:])))
+        return (*(float(share) for share in noisy), *([0.0] * sum(self.layout.sizes[1:])))
 
     def _input_names(self) -> tuple[str, ...]:
         model, m = self.host.model, len(self.input_limits_of_space[0])
@@ -281,10 +281,6 @@ class EnvironmentTask(Task):
         return self.model.body(self._farthest).name or "tracked"
 
     # ---- the task
-
-    def _layout_sizes(self) -> tuple[int, ...]:
-        state, memory = self._usual
-        return len(self._coordinates), len(state), len(memory), self.host.width + 5, 1
 
     @cached_property
     def layout(self) -> Layout:
