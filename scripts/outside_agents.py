@@ -60,6 +60,7 @@ class Agent:
         policy: SB3's name of its policy.
         kind: SB3's algorithm.
         options: its arguments.
+        copies: number of environments.
     """
 
     make: Callable[[], gym.Env]
@@ -67,6 +68,7 @@ class Agent:
     policy: str = "MlpPolicy"
     kind: type[PPO] | type[SAC] = PPO
     options: dict[str, Any] = field(default_factory=dict)
+    copies: int = 16
 
 
 def reacher() -> gym.Env:
@@ -97,10 +99,24 @@ class AnyCell(gym.Wrapper):
         return inner.get_ob(), info
 
 
+class Upright(gym.Wrapper):
+    """A pendulum whose reward tells how upright it is, with inputs that are held for two steps."""
+
+    def step(self, action: Any) -> Any:
+        total = 0.0
+        for _ in range(2):
+            observation, _, terminated, truncated, info = self.env.step(action)
+            inner: Any = self.env.unwrapped
+            total += float(inner._env.physics.pole_vertical() - 1) / 2
+            if terminated or truncated:
+                break
+        return observation, total, terminated, truncated, info
+
+
 def ogbench() -> gym.Env:
     import ogbench  # noqa: F401
 
-    return AnyCell(gym.make("pointmaze-medium-singletask-v0"))
+    return AnyCell(gym.make("pointmaze-medium-singletask-v0", add_noise_to_goal=False))
 
 
 def pendulum() -> gym.Env:
@@ -112,7 +128,7 @@ def pendulum() -> gym.Env:
         table = sizes.array_sizes[name]
         sizes.array_sizes[name] = {key: table[key] for key in table if hasattr(kind, key)}
     gym.register_envs(shimmy)
-    return gym.wrappers.FlattenObservation(gym.make("dm_control/pendulum-swingup-v0"))
+    return Upright(gym.wrappers.FlattenObservation(gym.make("dm_control/pendulum-swingup-v0")))
 
 
 LONG = {"n_steps": 256, "batch_size": 1024, "n_epochs": 6, "gamma": 0.995, "learning_rate": 1e-3}
@@ -130,21 +146,29 @@ AGENTS = {
     ),
     "point-maze-large": Agent(
         maze("PointMaze_Large-v3", (3, 6)),
-        2_500_000,
+        3_000_000,
         "MultiInputPolicy",
-        options={**LONG, "ent_coef": 0.003},
+        options={
+            **LONG,
+            "ent_coef": 0.003,
+            "gamma": 0.997,
+            "gae_lambda": 0.98,
+            "policy_kwargs": {"net_arch": [128, 128]},
+        },
     ),
     "ogbench": Agent(ogbench, 2_000_000, options={**LONG, "ent_coef": 0.003}),
     "pendulum": Agent(
         pendulum,
-        100_000,
+        60_000,
         kind=SAC,
         options={
             "learning_starts": 2_000,
-            "gradient_steps": 8,
+            "gradient_steps": 4,
             "learning_rate": 1e-3,
             "gamma": 0.99,
+            "policy_kwargs": {"net_arch": [64, 64]},
         },
+        copies=4,
     ),
 }
 
@@ -155,7 +179,7 @@ def trained(agent: Agent, seed: int) -> PPO | SAC:
     def make() -> gym.Env:
         return gym.wrappers.NormalizeReward(agent.make(), gamma=agent.options["gamma"])
 
-    env = make_vec_env(make, n_envs=16, seed=seed)
+    env = make_vec_env(make, n_envs=agent.copies, seed=seed)
     model = agent.kind(agent.policy, env, seed=seed, device="cpu", verbose=0, **agent.options)
     model.learn(agent.samples)
     return model

@@ -69,6 +69,42 @@ class Puck(gym.Env):
         return self._get_obs(), -distance, False, False, {"success": distance < 0.25}
 
 
+class Floating(Puck):
+    """A puck on a free joint, as robots have that walk."""
+
+    def __init__(self):
+        super().__init__()
+        joints = XML[XML.index('<joint name="x"') : XML.index('<geom type="sphere"')]
+        xml = XML.replace(joints, '<freejoint name="root"/>')
+        motors = xml[xml.index("<actuator>") : xml.index("</mujoco>")]
+        xml = xml.replace(motors, "").replace(
+            "<worldbody>", '<worldbody><geom type="plane" size="3 3 1"/>'
+        )
+        self.model = mujoco.MjModel.from_xml_string(xml)
+        self.data = mujoco.MjData(self.model)
+
+    def reset(self, *, seed=None, options=None):
+        gym.Env.reset(self, seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:2] = self.np_random.uniform((-1.8, -1.2), (-1.0, 1.2))
+        mujoco.mj_forward(self.model, self.data)
+        return self._get_obs(), {}
+
+    def _get_obs(self):
+        position = self.data.qpos[:2].copy()
+        return {
+            "position": position,
+            "velocity": self.data.qvel[:2].copy(),
+            "to_goal": GOAL - position,
+        }
+
+    def step(self, action):
+        self.data.qfrc_applied[:2] = np.clip(action, -4, 4)
+        mujoco.mj_step(self.model, self.data, nstep=5)
+        distance = float(np.linalg.norm(self.data.qpos[:2] - GOAL))
+        return self._get_obs(), -distance, False, False, {"success": distance < 0.25}
+
+
 def puck_agent(observation):
     """Goes around the rock on the nearer side: above it from y >= 0, else below."""
     (x, y), to_goal = observation[:, :2].T, observation[:, 2:4]

@@ -154,13 +154,17 @@ def test_pickles_are_read_without_unpickling(monkeypatch):
     ],
 )
 def test_arrays_in_pickles_are_those_of_numpy(array, protocol):
-    np.testing.assert_array_equal(pickled.array(pickle.dumps(array, protocol)), array)
+    (found,) = pickled.arrays(pickle.dumps(array, protocol)).values()
+    np.testing.assert_array_equal(found, array)
+    named = pickled.arrays(pickle.dumps({"a": array, "b": "no array"}, protocol))
+    assert named.keys() == {"a"}
+    np.testing.assert_array_equal(named["a"], array)
 
 
 def test_what_is_no_array_of_numbers_is_none(tmp_path):
     for thing in ({"a": 1}, [1.0], np.array([{}, None]), np.array(["text"]), tmp_path):
-        assert pickled.array(pickle.dumps(thing)) is None
-    assert pickled.array(b"") is None
+        assert pickled.arrays(pickle.dumps(thing)) == {}
+    assert pickled.arrays(b"") == {}
 
 
 @pytest.mark.parametrize(

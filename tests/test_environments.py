@@ -9,8 +9,8 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from environments import Delayed, Growing, Noisy, Puck, Secret, Seen, Several, puck_agent
-from gymnasium.wrappers import TimeLimit, TransformObservation
+from environments import Delayed, Floating, Growing, Noisy, Puck, Secret, Seen, Several, puck_agent
+from gymnasium.wrappers import TimeLimit
 
 import hyrl_mj
 from hyrl_mj import BadInput, cores, from_gymnasium
@@ -306,19 +306,12 @@ REFUSED = {
         "each reset of PointMaze_Medium-v3 draws goal.*pin it",
     ),
     "no success": ("Reacher-v5", "does not tell in its info when it succeeds"),
-    "nothing to decide": (
-        lambda: TransformObservation(Puck(), lambda o: o, None),
-        None,
-    ),
 }
 
 
 @pytest.mark.parametrize("what", REFUSED)
 def test_what_cannot_work_is_refused_before_anything_is_trained(what):
     make, message = REFUSED[what]
-    if message is None:  # a wrapper of observations takes part
-        assert from_gymnasium(make).observation_keys == ("position", "to_goal", "velocity")
-        return
     with pytest.raises(BadInput, match=message):
         from_gymnasium(make)
 
@@ -339,6 +332,34 @@ def test_what_cannot_work_is_refused_before_anything_is_trained(what):
 def test_wrong_arguments_are_refused_with_what_is_allowed(options, message):
     with pytest.raises(BadInput, match=message):
         from_gymnasium(Puck, **options)
+
+
+def test_what_resets_draw_is_pinned_by_options_that_they_heed_or_by_a_seed():
+    with pytest.raises(BadInput, match="change nothing in PointMaze_Medium-v3, which draws goal"):
+        from_gymnasium("PointMaze_Medium-v3", reset={"goal_cel": [6, 6]})
+    for seed in (0, 3):
+        task = from_gymnasium("PointMaze_Medium-v3", seed=seed)
+        assert f"with seed {seed}" in task.found["goal"]
+        np.testing.assert_array_equal(task.host.env.unwrapped.goal, reset_goal(seed))
+    assert (reset_goal(0) != reset_goal(3)).any()
+
+
+def test_a_free_joint_has_places_that_a_chart_may_name_but_no_orientation():
+    task = from_gymnasium(Floating)
+    assert task.chart.names == ("x of root", "y of root")
+    assert task.chart.units == ("m", "m")
+    np.testing.assert_allclose(task.chart.low, (-2.3, -1.7))
+    assert list(task.obstacles) == ["island 1"]
+    rate = from_gymnasium(Floating, chart=["qpos[0]", "qpos[1]", "qvel[1]"])
+    assert rate.chart.units[2] == "m/s"
+    with pytest.raises(BadInput, match=r"qpos\[4\] is a part of an orientation"):
+        from_gymnasium(Floating, chart=["qpos[0]", "qpos[4]"])
+
+
+def reset_goal(seed):
+    env = gym.make("PointMaze_Medium-v3")
+    env.reset(seed=seed)
+    return env.unwrapped.goal
 
 
 def test_a_task_is_made_again_from_its_text():

@@ -20,7 +20,15 @@ INDEXED = re.compile(r"(.+)\[(\d+)\]")
 # States at which a name is compared with positions and velocities, and how much of these changes [m, rad].
 TRIED, MOVED = 6, 0.05
 AGREES = 1e-6
-SLIDE, HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
+AXES = "xyz"
+FREE, SLIDE, HINGE = (
+    int(kind)
+    for kind in (
+        mujoco.mjtJoint.mjJNT_FREE,
+        mujoco.mjtJoint.mjJNT_SLIDE,
+        mujoco.mjtJoint.mjJNT_HINGE,
+    )
+)
 
 
 @dataclass(frozen=True)
@@ -33,6 +41,7 @@ class Coordinate:
         index: of the position or the velocity.
         offset: what the coordinate is greater by.
         joint: id of the joint.
+        axis: the axis of the world, 0 to 2, along which it moves most; None if it turns.
     """
 
     name: str
@@ -40,6 +49,12 @@ class Coordinate:
     index: int
     offset: float
     joint: int
+    axis: int | None
+
+    @property
+    def unit(self) -> str:
+        """The unit: "m", "rad", "m/s" or "rad/s"."""
+        return ("rad" if self.axis is None else "m") + "/s" * (self.kind == "qvel")
 
     def described(self) -> str:
         """Returns what it stands for: "qpos[0]"."""
@@ -147,17 +162,23 @@ def _of_state(host: Host, new: str, kind: str, index: int, offset: float = 0.0) 
     model = host.model
     addresses = model.jnt_qposadr if kind == "qpos" else model.jnt_dofadr
     joint = int(np.searchsorted(addresses, index, side="right")) - 1
-    if model.jnt_type[joint] not in (SLIDE, HINGE):
+    kind_of_joint, part = model.jnt_type[joint], index - addresses[joint]
+    name = new or usual_name(model, joint, kind == "qvel")
+    if kind_of_joint == FREE and part < len(AXES):
+        name = new or f"{AXES[part]} of {name}"
+        return Coordinate(name, kind, index, offset, joint, int(part))
+    if kind_of_joint not in (SLIDE, HINGE):
         free = [
             usual_name(model, j, False)
             for j in range(model.njnt)
             if model.jnt_type[j] in (SLIDE, HINGE)
         ]
         raise BadInput(
-            f"{kind}[{index}] is a part of a free or ball joint of {host.name}, which hyrl_mj has no chart "
-            f"for: name slides and hinges ({', '.join(free) or 'it has none'})"
+            f"{kind}[{index}] is a part of an orientation of {host.name}, which hyrl_mj has no chart for: "
+            f"name slides, hinges ({', '.join(free) or 'it has none'}) and places of free joints"
         )
-    return Coordinate(new or usual_name(model, joint, kind == "qvel"), kind, index, offset, joint)
+    axis = int(np.abs(model.jnt_axis[joint]).argmax()) if kind_of_joint == SLIDE else None
+    return Coordinate(name, kind, index, offset, joint, axis)
 
 
 def _fitted(host: Host, new: str, name: str, get: Callable[[], np.ndarray]) -> Iterator[Coordinate]:

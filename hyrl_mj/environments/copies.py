@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 
 from hyrl_mj.environments.memory import Slot, changing, remembered
-from hyrl_mj.environments.opening import Source, global_seed, global_state, made
+from hyrl_mj.environments.opening import Source, global_seed, global_state, made, physics_of
 from hyrl_mj.errors import BadInput, brief
 from hyrl_mj.tasks import Outcome
 
@@ -94,16 +94,23 @@ class Host:
         self.between: tuple[tuple[str, int], tuple[str, int]] | None = None
         self._forward = self.tells_success = False
         self._watch()
-        self.reset(source.seed)
+        self.reset(source.first)
         self.base = self.read()
 
     # ---- making it what a copy is
 
     def reset(self, seed: int) -> np.ndarray:
         """Resets the environment with a seed, pins what is pinned, and returns the observation (o,)."""
-        options = {
-            k: np.array(v) if isinstance(v, list) else v for k, v in self.source.reset.items()
-        }
+        observation = self.fresh(seed, self.source.reset)
+        self._look()
+        if self.source.pinned:
+            self._pin()
+            return self.observed()
+        return flat(observation)
+
+    def fresh(self, seed: int, given: Mapping[str, Any]) -> Any:
+        """Resets the environment with a seed and options, and returns its observation."""
+        options = {k: np.array(v) if isinstance(v, list) else v for k, v in given.items()}
         with global_seed(seed):
             self.env.action_space.seed(seed)
             try:
@@ -112,11 +119,13 @@ class Host:
                 raise BadInput(
                     f"{self.name} cannot be reset ({brief(error)}): change its options of reset"
                 ) from error
-        self._look()
-        if self.source.pinned:
-            self._pin()
-            return self.observed()
-        return flat(observation)
+        physics = physics_of(self.env)
+        if physics is None or physics[0] is not self.model:
+            raise BadInput(
+                f"reset() of {self.name} builds another model of MuJoCo, and copies share one: let it keep "
+                "its model"
+            )
+        return observation
 
     def _pin(self) -> None:
         for name, value in self.source.pinned.items():

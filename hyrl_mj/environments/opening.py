@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import io
 import pickle
 import random
+import traceback
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -42,14 +45,24 @@ class Source:
         kwargs: arguments of `gymnasium.make`, or of the function.
         reset: the options of `reset`, such as where the goal is.
         pinned: values of positions, velocities or attributes after each reset, by name.
-        seed: the seed of the reset that all copies begin from.
+        seed: the seed of the reset that all copies begin from; None if the user gave none.
     """
 
     make: str | Callable[..., gym.Env]
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     reset: Mapping[str, Any] = field(default_factory=dict)
     pinned: Mapping[str, Any] = field(default_factory=dict)
-    seed: int = 0
+    seed: int | None = None
+
+    @property
+    def first(self) -> int:
+        """The seed of the reset that all copies begin from."""
+        return self.seed or 0
+
+    @property
+    def pins(self) -> bool:
+        """Whether the user has said what resets would draw."""
+        return bool(self.reset or self.pinned) or self.seed is not None
 
     @property
     def name(self) -> str:
@@ -138,7 +151,9 @@ def _register(name: str) -> None:
         return
     for module in PACKAGES:
         try:
-            package = importlib.import_module(module)
+            # What a package prints is about environments that nobody has asked for.
+            with redirect_stderr(io.StringIO()):
+                package = importlib.import_module(module)
         except ImportError:
             continue
         if module == "shimmy":
@@ -179,7 +194,11 @@ def _why_not_made(name: str, error: Exception) -> str:
         return (
             f"the environment {name} takes a package that is missing ({brief(error)}): install it"
         )
-    return f"the environment {name} cannot be made ({brief(error)}): change --env-args"
+    origin = traceback.extract_tb(error.__traceback__)[-1]
+    return (
+        f"the environment {name} cannot be made ({brief(error)}, in {Path(origin.filename).name}, line "
+        f"{origin.lineno}): give it other kwargs, or see whether its package fits MuJoCo {mujoco.__version__}"
+    )
 
 
 def _check(env: Any, name: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -190,7 +209,11 @@ def _check(env: Any, name: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
         raise BadInput(
             f"{name} is a {type(env).__name__}: give a single gymnasium.Env, or a function that makes one"
         )
-    physics = _physics_of(env)
+    try:
+        physics = physics_of(env)
+    except Exception:  # whatever it raises before its first reset
+        env.reset(seed=0)
+        physics = physics_of(env)
     if physics is None:
         raise BadInput(
             f"{name} is not simulated by MuJoCo, as far as its attributes model and data tell: give an "
@@ -223,7 +246,7 @@ def _plant_of(env: Any) -> Plant | None:
     return plant if isinstance(plant, Plant) and plant.n == 1 else None
 
 
-def _physics_of(env: Any) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
+def physics_of(env: Any) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
     """Returns model and data of an environment, of Gymnasium or of dm_control; None if it has none."""
     inner = env.unwrapped
     if (plant := _plant_of(env)) is not None:

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 
 from hyrl_mj import mjcf
-from hyrl_mj.environments.coordinates import HINGE, Coordinate
-from hyrl_mj.environments.copies import Host
+from hyrl_mj.environments.coordinates import Coordinate
+from hyrl_mj.environments.copies import Host, flat
 from hyrl_mj.environments.memory import name_of, remembered, same
 from hyrl_mj.tasks import touching
 
@@ -66,7 +66,7 @@ def drawn_goals(host: Host, resets: np.ndarray, moved: np.ndarray) -> list[str]:
         attributes.append(remembered(host.env))
         host.write(state, memory)
         told.append(np.append(host.step(u)[0], host.step(u)[1:3]))
-    host.reset(host.source.seed)
+    host.reset(host.source.first)
     host.write(state, memory)
     if all(np.allclose(other, told[0], rtol=0, atol=1e-9, equal_nan=True) for other in told):
         return names
@@ -76,9 +76,27 @@ def drawn_goals(host: Host, resets: np.ndarray, moved: np.ndarray) -> list[str]:
         for path, value in attributes[0].items()
         if path not in slots and not all(same(value, a.get(path)) for a in attributes[1:])
     ]
+    differing = [name for name in differing if "random" not in name]  # generators and their seeds
     words = ("goal", "target", "task")
     goals = [name for name in differing if any(word in name for word in words)]
-    return names + (goals or differing)
+    return names + (goals or differing) or ["a part of its model"]
+
+
+def heeds_options(host: Host) -> bool:
+    """Returns whether resets with the user's options lead elsewhere than those without."""
+    heeds = False
+    for seed in range(RESETS_COMPARED):
+        seen = []
+        for options in (host.source.reset, {}):
+            observation = flat(host.fresh(seed, options))
+            seen.append([*remembered(host.env).items(), ((), observation)])
+        alike = len(seen[0]) == len(seen[1]) and all(
+            path == other and same(a, b) for (path, a), (other, b) in zip(*seen, strict=True)
+        )
+        heeds = heeds or not alike
+    host.reset(host.source.first)
+    host.write(*host.base)
+    return heeds
 
 
 def walls(host: Host) -> list[int]:
@@ -145,11 +163,10 @@ def bounds_of(
         elif c.kind == "qpos" and model.jnt_limited[c.joint]:
             low, high = model.jnt_range[c.joint] + c.offset
             found.append(Bound(float(low), float(high), False, "the range of its joint"))
-        elif c.kind == "qpos" and model.jnt_type[c.joint] == HINGE:
+        elif c.kind == "qpos" and c.axis is None:
             found.append(Bound(-np.pi + c.offset, np.pi + c.offset, True, "a joint without limits"))
         elif c.kind == "qpos" and (ids := walls(host)):
-            axis = int(np.abs(model.jnt_axis[c.joint]).argmax())
-            places, size = host.data.geom_xpos[ids][:, axis], model.geom_size[ids][:, min(axis, 2)]
+            places, size = host.data.geom_xpos[ids][:, c.axis], model.geom_size[ids][:, c.axis]
             found.append(
                 Bound(
                     float((places - size).min()), float((places + size).max()), False, "the walls"

@@ -15,13 +15,20 @@ from gymnasium import spaces
 
 from hyrl_mj import mjcf
 from hyrl_mj.chart import Chart
-from hyrl_mj.environments.coordinates import SLIDE, AnyChart, Coordinate, all_names, coordinates
+from hyrl_mj.environments.coordinates import AnyChart, Coordinate, all_names, coordinates
 from hyrl_mj.environments.copies import Host
 from hyrl_mj.environments.layout import Layout
 from hyrl_mj.environments.opening import Source
 from hyrl_mj.environments.plant import EnvironmentPlant
 from hyrl_mj.environments.success import FORMS, INFO, Success, success_of
-from hyrl_mj.environments.surroundings import Bound, bounds_of, drawn_goals, islands_of, starts_of
+from hyrl_mj.environments.surroundings import (
+    Bound,
+    bounds_of,
+    drawn_goals,
+    heeds_options,
+    islands_of,
+    starts_of,
+)
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.tasks import ANY, Learning, Outcome, Scene, Task, register_opener
 
@@ -156,14 +163,20 @@ class EnvironmentTask(Task):
         """Raises `BadInput` if resets draw a goal that nothing pins."""
         source = self.host.source
         names = drawn_goals(self.host, resets, self._moved)
-        if names and not (source.reset or source.pinned):
+        if not names:
+            return
+        if not source.pins:
             raise BadInput(
                 f"each reset of {self.name} draws {', '.join(names)}, and what is to be done depends on it: "
-                'pin it, with options of reset as {"reset": {"goal_cell": [6, 6]}}, or with values as '
-                '{"pinned": {"qpos[2]": 0.1}}'
+                'pin it, with options of reset as {"reset": {"goal_cell": [6, 6]}}, with values as '
+                '{"pinned": {"qpos[2]": 0.1}}, or as the reset with a seed draws it as {"seed": 0}'
             )
-        if names:
-            self.found["goal"] = f"{', '.join(names)} as the reset with seed {source.seed} draws it"
+        if source.reset and not heeds_options(self.host):
+            raise BadInput(
+                f"the options of reset {dict(source.reset)} change nothing in {self.name}, which draws "
+                f"{', '.join(names)}: name the options as its reset does"
+            )
+        self.found["goal"] = f"{', '.join(names)} as the reset with seed {source.first} draws it"
 
     def _at_rest(self, resets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns state and memory of the base, with the usual positions and at rest."""
@@ -197,11 +210,7 @@ class EnvironmentTask(Task):
             for c, b in zip(chosen, bounds, strict=True)
         )
         low, high = tuple(b.low for b in bounds), tuple(b.high for b in bounds)
-        units = tuple(
-            ("m" if self.host.model.jnt_type[c.joint] == SLIDE else "rad")
-            + "/s" * (c.kind == "qvel")
-            for c in chosen
-        )
+        units = tuple(c.unit for c in chosen)
         self.chart = Chart(tuple(names), units, low, high, tuple(b.periodic for b in bounds))
         first, last = begun.min(axis=0), begun.max(axis=0)
         self.start_low, self.start_high = low, high
@@ -293,8 +302,7 @@ class EnvironmentTask(Task):
     def _in_plane(self) -> bool:
         """Whether the chart's first two coordinates are a place."""
         first = self._coordinates[:2]
-        slides = [self.host.model.jnt_type[c.joint] == SLIDE and c.kind == "qpos" for c in first]
-        return len(first) == 2 and all(slides)
+        return len(first) == 2 and all(c.unit == "m" for c in first)
 
     @property
     def _turning(self) -> int | None:
@@ -327,9 +335,11 @@ class EnvironmentTask(Task):
         return self.input_limits_of_space
 
     @cached_property
-    def observation_keys(self) -> tuple[str, ...]:  # type: ignore[override]
+    def observation_parts(self) -> Mapping[str, int]:  # type: ignore[override]
         space = self.host.env.observation_space
-        return tuple(sorted(space.spaces)) if isinstance(space, spaces.Dict) else ()
+        if not isinstance(space, spaces.Dict):
+            return {}
+        return {key: spaces.flatdim(part) for key, part in sorted(space.spaces.items())}
 
     @cached_property
     def observation_low(self) -> tuple[float, ...]:  # type: ignore[override]
@@ -424,7 +434,7 @@ def from_gymnasium(
     kwargs: Mapping[str, Any] | None = None,
     reset: Mapping[str, Any] | None = None,
     pinned: Mapping[str, Any] | None = None,
-    seed: int = 0,
+    seed: int | None = None,
 ) -> EnvironmentTask:
     """Returns a task whose plant is an environment of MuJoCo, as it is.
 
@@ -442,7 +452,8 @@ def from_gymnasium(
         kwargs: arguments of `gymnasium.make`, or of the function.
         reset: options of `reset`.
         pinned: values of positions, velocities or attributes after each reset, by name.
-        seed: the seed of the reset that all copies begin from.
+        seed: the seed of the reset that all copies begin from, 0 by default; if it is given, what that reset
+            draws is pinned.
 
     Raises:
         BadInput: it cannot be used; the message says why.
@@ -454,7 +465,7 @@ def from_gymnasium(
         "env": env if isinstance(env, str) else {"function": _where(env)},
         "chart": chart, "noisy": noisy, "success": success, "bounds": bounds, "steps": steps,
         "starts": None if starts == CHART else starts, "kwargs": kwargs, "reset": reset,
-        "pinned": pinned, "seed": seed or None,
+        "pinned": pinned, "seed": seed,
     }  # fmt: skip
     given = {key: value for key, value in content.items() if value is not None}
     spec = MARK + json.dumps(given, default=_plain)

@@ -21,7 +21,7 @@ from hyrl_mj.policies.mlp import (
 )
 from hyrl_mj.policies.onnx_model import from_onnx
 from hyrl_mj.policies.preprocessing import UNCHANGED, PreprocessedPolicy, Preprocessing, network
-from hyrl_mj.policies.sb3_zip import REMEDY, from_tensors, read_zip
+from hyrl_mj.policies.sb3_zip import REMEDY, by_frames, from_tensors, observes_dict, read_zip
 from hyrl_mj.tasks import Task
 
 
@@ -170,23 +170,26 @@ def load_agent(
             raise BadInput("an .onnx file acts as it is: give neither an activation nor stochastic")
         policy = from_onnx(path, task, REMEDY, n_stack)
     else:
-        policy = mlp = _load_network(path, task, activation, preprocessing)
+        mlp, preprocessing = _load_network(path, task, activation, preprocessing)
         policy = SampledPolicy(mlp, np.random.default_rng(seed)) if stochastic else mlp
     return PreprocessedPolicy(policy, preprocessing) if preprocessing else policy
 
 
 def _load_network(
     path: Path, task: Task, activation: str | None, preprocessing: Preprocessing
-) -> MlpPolicy:
-    """Returns the network in a zip or a `.safetensors` file."""
+) -> tuple[MlpPolicy, Preprocessing]:
+    """Returns the network in a zip or a `.safetensors` file, and its preprocessing, frame by frame."""
     if path.suffix != ".safetensors":
         with artifacts.reading(path, REMEDY):
             tensors, about = read_zip(path)
-            return from_tensors(tensors, about, task, activation, preprocessing)
+            policy = from_tensors(tensors, about, task, activation, preprocessing)
+        if observes_dict(about):
+            preprocessing = preprocessing.reordered(by_frames(task, preprocessing.n_stack))
+        return policy, preprocessing
     policy = MlpPolicy.load(path, task, preprocessing.n_stack)
     if activation not in (None, policy.activation):
         raise BadArtifact(f"{path} has activation {policy.activation!r}: leave activation out")
-    return policy
+    return policy, preprocessing
 
 
 def read_agent(

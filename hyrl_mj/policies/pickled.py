@@ -128,14 +128,21 @@ def _to_mark(stack: list[Any]) -> list[Any]:
     return values
 
 
-def array(content: bytes) -> np.ndarray | None:
-    """Returns the array of numbers that NumPy pickled; None if it is none, or of another kind."""
+def arrays(content: bytes) -> dict[str, np.ndarray]:
+    """Returns the arrays of numbers in a pickled dictionary, or one that was pickled alone, as "".
+
+    What is none, or of another kind, is left out.
+    """
     if len(content) > LARGEST:
-        return None
+        return {}
     try:
-        return _array(read(content))
+        found = read(content)
+        entries = found.items if isinstance(found, Call) and found.items else found
+        named = entries if isinstance(entries, list) else [("", found)]
+        values = {str(name): _array(value) for name, value in named}
     except Exception:  # a damaged pickle may raise any error
-        return None
+        return {}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def _array(found: Any) -> np.ndarray | None:

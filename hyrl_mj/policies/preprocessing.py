@@ -118,6 +118,14 @@ class Preprocessing:
             )
         return Preprocessing(statistics, n_stack)
 
+    def reordered(self, order: np.ndarray) -> Preprocessing:
+        """Returns it with statistics of stacked observations in another order (n_stack k,)."""
+        normalize = self.normalization
+        if normalize is None or len(normalize.mean) != len(order):
+            return self
+        mean, var = normalize.mean[order], normalize.var[order]
+        return replace(self, normalization=replace(normalize, mean=mean, var=var))
+
     def __bool__(self) -> bool:
         return self.normalization is not None or self.n_stack > 1
 

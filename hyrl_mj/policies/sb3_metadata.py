@@ -103,13 +103,19 @@ def _observations(about: Mapping[str, Any], key: str, task: Task) -> np.ndarray 
     if not isinstance(text, str):
         return None
     try:
-        array = pickled.array(base64.b64decode(text, validate=True))
+        found = pickled.arrays(base64.b64decode(text, validate=True))
     except (binascii.Error, ValueError):
         return None
-    columns = len(task.observation_low)
-    if array is None or array.ndim != 2 or not array.size or array.shape[1] % columns:
+    sizes = {"": len(task.observation_low)} if "" in found else task.observation_parts
+    latest = []
+    for name, size in sizes.items():
+        part = found.get(name)
+        if part is None or part.ndim != 2 or not part.size or part.shape[1] % size:
+            return None
+        latest.append(part[:, -size:])
+    if len({len(part) for part in latest}) != 1:
         return None
-    array = array[:, -columns:]
+    array = np.hstack(latest)
     return array if np.isfinite(array).all() else None
 
 

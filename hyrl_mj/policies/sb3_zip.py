@@ -13,7 +13,7 @@ from zipfile import is_zipfile
 import numpy as np
 
 from hyrl_mj import archives
-from hyrl_mj.errors import BadArtifact
+from hyrl_mj.errors import BadArtifact, printable
 from hyrl_mj.policies import sb3_metadata, torch_file
 from hyrl_mj.policies.algorithms import ALGORITHMS
 from hyrl_mj.policies.mlp import ACTIVATIONS, TORCH_NAMES, MlpPolicy, check_kind, layer_names
@@ -26,6 +26,9 @@ INSTEAD = "export it to .onnx, or give a function that calls model.predict in Py
 PLAIN = f"only plain multilayer perceptrons on a vector of numbers can be used: {INSTEAD}"
 # Limit on the metadata [bytes]: those of SB3 take some ten kilobytes.
 LARGEST_METADATA = 2**22
+# A part of a Dict of vectors, in the text of metadata: "'goal': Box(-inf, inf, (2,), float32)".
+PART = re.compile(r"'([^']*)': Box\([^()]*\((\d*)[^()]*\)[^()]*\)")
+LONGEST_SPACES = 2**14
 LONGEST_TEXT = 120  # of a file, in messages
 # What the metadata of SBX, which has SB3's interface, says of its policy.
 SBX = re.compile(rb"[\"']sbx\.")
@@ -82,6 +85,11 @@ def from_tensors(
     if ALGORITHMS[algorithm].is_actor_critic:
         check_kind(task, levels="log_std" not in tensors)
     weights = {name: t for name, t in tensors.items() if t.dtype == np.float32}
+    if observes_dict(about) and preprocessing.n_stack > 1:
+        parts, order = ALGORITHMS[algorithm].parts, by_frames(task, preprocessing.n_stack)
+        first = next(name for part in parts for name in layer_names(weights, part))
+        if weights[first].shape[1:] == order.shape:  # else the policy says what does not fit
+            weights[first] = np.ascontiguousarray(weights[first][:, order])
     for name, weight in weights.items():
         if not np.isfinite(weight).all():
             raise BadArtifact(f"its tensor {_short(name)} has weights that are not finite")
@@ -99,9 +107,9 @@ def _check_plain(tensors: Mapping[str, np.ndarray], about: Mapping[str, Any], ta
     for part, what in FOREIGN.items():
         if any(part in name for name in tensors):
             raise BadArtifact(f"{what}: {PLAIN}")
-    of_dict = "spaces.dict" in entry(about, "observation_space", ":type:")
-    if of_dict and not task.observation_keys:
-        raise BadArtifact(f"its observations are a dict, those of {task.name} a vector: {PLAIN}")
+    of_dict = observes_dict(about)
+    if of_dict:
+        _check_parts(about, task)
     # SB3's extractor of a Dict puts vectors one after the other, in the order of their keys.
     usual = "torch_layers.CombinedExtractor" if of_dict else "torch_layers.FlattenExtractor"
     extractor = entry(about, "policy_kwargs", "features_extractor_class")
@@ -109,6 +117,46 @@ def _check_plain(tensors: Mapping[str, np.ndarray], about: Mapping[str, Any], ta
         raise BadArtifact(f"it has a features extractor of its own, {extractor}: {PLAIN}")
     if "actor.log_std" in tensors or np.ndim(tensors.get("log_std", 0)) == 2:
         raise BadArtifact("it was trained with use_sde: train it without, or export it to .onnx")
+
+
+def observes_dict(about: Mapping[str, Any]) -> bool:
+    """Returns whether an agent with this metadata observes a Dict."""
+    return "spaces.dict" in entry(about, "observation_space", ":type:")
+
+
+def _check_parts(about: Mapping[str, Any], task: Task) -> None:
+    """Raises `BadArtifact` if an agent observes a Dict with other keys than that of a task."""
+    ours = task.observation_parts
+    parts = PART.findall(str(about["observation_space"].get("spaces"))[:LONGEST_SPACES])
+    theirs = {key: int(size or 0) for key, size in sorted(parts)}
+    if ours and theirs.keys() == ours.keys():
+        return  # the network tells whether the sizes fit
+    of_task = _dict_of(ours) if ours else f"a vector of {len(task.observation_low)}"
+    raise BadArtifact(
+        f"its observations are {_dict_of(theirs)}, those of {task.name} {of_task}: give an agent that was "
+        "trained on this environment"
+    )
+
+
+def _dict_of(parts: Mapping[str, int]) -> str:
+    """Returns a Dict of vectors in words: "Dict(goal (2,), observation (4,))"."""
+    return f"Dict({', '.join(f'{printable(key)} ({size},)' for key, size in parts.items())})"
+
+
+def by_frames(task: Task, n_stack: int) -> np.ndarray:
+    """Returns where an agent of a Dict has the numbers of stacked observations, frame by frame: (n_stack k,).
+
+    `VecFrameStack` stacks each vector of a Dict by itself, and SB3 puts these stacks one after the other.
+    """
+    sizes = list(task.observation_parts.values())
+    begins = n_stack * np.cumsum([0, *sizes[:-1]])
+    frames = [
+        np.concatenate(
+            [b + i * size + np.arange(size) for b, size in zip(begins, sizes, strict=True)]
+        )
+        for i in range(n_stack)
+    ]
+    return np.concatenate(frames)
 
 
 def _check_used(tensors: Mapping[str, np.ndarray], algorithm: str) -> None:

@@ -1,7 +1,7 @@
 """The task: a plant with a measurement, a chart, an observation, a reward, an end and starts."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from itertools import compress, product
 from pathlib import Path
@@ -48,8 +48,9 @@ class Task(ABC):
     source: Path | None = None
     #: a text from which the task is made again, if it has neither a name nor a file
     spec: str = ""
-    #: the keys of the Dict whose vectors, one after the other, are the observation; none of a plain vector
-    observation_keys: tuple[str, ...] = ()
+    #: the vectors of a Dict that, one after the other, are the observation: the number of columns of each, by
+    #: its key; none of a plain vector
+    observation_parts: Mapping[str, int] = {}
     _digest: str = ""
     #: one line for `hyrl-mj list`
     description: str = ""

@@ -57,10 +57,10 @@ class Section(Task):
     where, plane, obstacles = _of_whole("where"), _of_whole("plane"), _of_whole("obstacles")
     gives_direction, mode_name = _of_whole("gives_direction"), _of_whole("mode_name")
     colour_of, tinted = _of_whole("colour_of"), _of_whole("tinted")
-    slow, spec, observation_keys = (
+    slow, spec, observation_parts = (
         _of_whole("slow"),
         _of_whole("spec"),
-        _of_whole("observation_keys"),
+        _of_whole("observation_parts"),
     )
     ending, verdict = _of_whole("ending"), _of_whole("verdict")
 

@@ -1,0 +1,101 @@
+"""Agents of a Dict of vectors act in a task's own loop as under SB3, also stacked and normalised."""
+
+import numpy as np
+import pytest
+import torch
+from environments import Puck
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+
+import hyrl_mj
+from hyrl_mj import BadArtifact, load_agent
+from hyrl_mj.policies.external import read_agent, reopen_agent
+
+STEPS = 20
+WRAPPED = {
+    "plain": lambda env: env,
+    "normalised": lambda env: VecNormalize(env, clip_obs=1.5),
+    "stacked": lambda env: VecFrameStack(env, 3),
+    "normalised, stacked": lambda env: VecFrameStack(VecNormalize(env, clip_obs=1.5), 3),
+    "stacked, normalised": lambda env: VecNormalize(VecFrameStack(env, 3), clip_obs=1.5),
+}
+
+
+@pytest.fixture(scope="module")
+def puck():
+    return hyrl_mj.from_gymnasium(Puck, steps=STEPS)
+
+
+def agent(kind, wrapped, folder):
+    """An SB3 agent with random weights, its environment, its zip, and what `load_agent` needs."""
+    env = WRAPPED[wrapped](DummyVecEnv([Puck]))
+    kwargs = {"net_arch": [16]}
+    model = kind("MultiInputPolicy", env, seed=0, device="cpu", policy_kwargs=kwargs)
+    for parameter in model.policy.parameters():
+        parameter.data = torch.randn(parameter.shape) / parameter.shape[-1] ** 0.5
+    needs = {"n_stack": 3 if "stacked" in wrapped else 1}
+    if "normalised" in wrapped:
+        norm = env if isinstance(env, VecNormalize) else env.venv
+        norm.training, rng = False, np.random.default_rng(0)
+        for found in norm.obs_rms.values():
+            found.mean = rng.normal(size=found.mean.shape)
+            found.var = rng.uniform(0.1, 2, found.var.shape)
+        keys = sorted(norm.obs_rms)
+        np.savez(
+            folder / "stats.npz",
+            mean=np.concatenate([norm.obs_rms[key].mean for key in keys]),
+            var=np.concatenate([norm.obs_rms[key].var for key in keys]),
+            clip=norm.clip_obs,
+        )
+        needs["vecnormalize"] = folder / "stats.npz"
+    model.save(folder / "agent.zip")
+    return model, env, folder / "agent.zip", needs
+
+
+@pytest.mark.parametrize("wrapped", WRAPPED)
+@pytest.mark.parametrize("kind", [PPO, SAC])
+def test_in_a_closed_loop_it_acts_as_under_sb3(kind, wrapped, puck, tmp_path):
+    model, env, path, needs = agent(kind, wrapped, tmp_path)
+    env.seed(0)
+    seen, inner = env.reset(), env.unwrapped.envs[0]
+    start, places, actions = inner.data.qpos.copy(), [], []
+    for _ in range(STEPS - 1):
+        action, _ = model.predict(seen, deterministic=True)
+        seen, _, done, _ = env.step(action)
+        assert not done.any()
+        places.append(inner.data.qpos.copy())
+        actions.append(action[0])
+    arc = hyrl_mj.simulate(puck, load_agent(path, puck, **needs), start)
+    np.testing.assert_allclose(arc.u[: STEPS - 1], actions, atol=1e-4)
+    np.testing.assert_allclose(arc.z[1:STEPS], places, atol=1e-4)
+
+
+def test_a_run_keeps_it_as_it_was(puck, tmp_path):
+    _, _, path, needs = agent(PPO, "stacked, normalised", tmp_path)
+    external = read_agent(puck, path, **needs)
+    external.store(tmp_path)
+    again = reopen_agent(tmp_path, external.agent, puck, 0, None)
+    start = puck.starts(1, np.random.default_rng(0))[0]
+    first, second = (hyrl_mj.simulate(puck, one, start) for one in (external.policy, again))
+    np.testing.assert_array_equal(first.u, second.u)
+
+
+def test_what_an_agent_observed_and_what_the_task_gives_are_both_named(puck, vehicle, tmp_path):
+    _, _, path, _ = agent(PPO, "plain", tmp_path)
+    theirs = r"Dict\(position \(2,\), to_goal \(2,\), velocity \(2,\)\)"
+    with pytest.raises(BadArtifact, match=f"observations are {theirs}, those of vehicle a vector"):
+        load_agent(path, vehicle)
+    maze = hyrl_mj.from_gymnasium("PointMaze_Medium-v3", reset={"goal_cell": [6, 6]})
+    with pytest.raises(
+        BadArtifact, match=rf"{theirs}, those of .* Dict\(achieved_goal \(2,\), des"
+    ):
+        load_agent(path, maze)
+
+
+def test_normalised_training_is_noticed_without_its_statistics(puck, tmp_path):
+    env = VecNormalize(DummyVecEnv([Puck]))
+    model = PPO("MultiInputPolicy", env, n_steps=64, seed=0, device="cpu")
+    model.learn(64)
+    model.save(tmp_path / "agent.zip")
+    with pytest.raises(BadArtifact, match="VecNormalize"):
+        load_agent(tmp_path / "agent.zip", puck)
