@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from hyrl_mj import artifacts
-from hyrl_mj.environments.task import EnvironmentTask, from_gymnasium
+from hyrl_mj.environments.making import from_gymnasium
+from hyrl_mj.environments.task import EnvironmentTask
 from hyrl_mj.errors import BadInput, brief, unknown
 from hyrl_mj.tasks import Task, get_task
 

@@ -18,6 +18,8 @@ from hyrl_mj.tasks import touching
 RESETS = 64
 # Resets that are compared for what they draw.
 RESETS_COMPARED = 4
+# Steps of the runs under inputs at random that show how far coordinates go, and for how long inputs are held.
+RUNS, STEPS, HELD = 16, 150, 15
 # What is sampled beyond this many times as far is outside of the chart.
 ROOM = 1.2
 
@@ -36,6 +38,45 @@ class Bound:
     high: float
     periodic: bool
     why: str
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Runs under inputs at random.
+
+    Attributes:
+        points: (n, d) chart points that they met.
+        worst_reward: the least reward.
+        moved: (nq,) bool, the positions that changed.
+        farthest: id of the body that went farthest.
+    """
+
+    points: np.ndarray
+    worst_reward: float
+    moved: np.ndarray
+    farthest: int
+
+
+def sampled_runs(host: Host, chart: Sequence[Coordinate]) -> Runs:
+    """Returns runs under inputs at random."""
+    rng, points, rewards, places = np.random.default_rng(0), [], [], []
+    moved = np.zeros(host.model.nq, dtype=bool)
+    for seed in range(RUNS):
+        host.reset(seed)
+        begun = host.data.qpos.copy()
+        for k in range(STEPS):
+            if k % HELD == 0:
+                u = host.drawn(rng)
+            _, reward, terminated, truncated, _, _ = host.step(u)
+            points.append([getattr(host.data, c.kind)[c.index] + c.offset for c in chart])
+            rewards.append(reward)
+            places.append(host.data.xpos.copy())
+            moved |= np.abs(host.data.qpos - begun) > 0
+            if terminated or truncated:
+                break
+    host.write(*host.base)
+    farthest = int(np.ptp(places, axis=0).sum(axis=1).argmax())
+    return Runs(np.array(points), float(min(rewards)), moved, farthest)
 
 
 def starts_of(host: Host) -> np.ndarray:

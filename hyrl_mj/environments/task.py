@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from hashlib import sha256
 from typing import Any
 
-import gymnasium as gym
 import mujoco
 import numpy as np
 from gymnasium import spaces
@@ -27,13 +25,12 @@ from hyrl_mj.environments.surroundings import (
     drawn_goals,
     heeds_options,
     islands_of,
+    sampled_runs,
     starts_of,
 )
-from hyrl_mj.errors import BadInput, unknown
-from hyrl_mj.tasks import ANY, Learning, Outcome, Scene, Task, register_opener
+from hyrl_mj.errors import BadInput
+from hyrl_mj.tasks import ANY, Learning, Outcome, Scene, Task, get_task
 
-# Steps of the runs under inputs at random that show how far coordinates go, and for how long inputs are held.
-RUNS, STEPS, HELD = 16, 150, 15
 # Samples of an episode of an environment that never ends by itself.
 STEPS_WITHOUT_END = 1_000
 # Times that starts are drawn again because they are inside of walls.
@@ -44,9 +41,6 @@ CHART, RESET = "chart", "reset"
 UPRIGHT = 0.9
 # A run that turns by less than this decides nothing [rad].
 DECIDED = 0.5
-# The texts that describe environments begin with this; those that have been made in this process.
-MARK = "env:"
-_MADE: dict[str, EnvironmentTask] = {}
 
 
 class EnvironmentTask(Task):
@@ -82,22 +76,22 @@ class EnvironmentTask(Task):
         self.found: dict[str, str] = {}
         self.description = f"the environment {source.name}"
         self._coordinates = self._charted(chart)
-        self.input_limits_of_space = self._limits()
+        self.input_limits = self._limits()
         resets = starts_of(self.host)
-        runs, rewards = self._sampled()
+        runs = sampled_runs(self.host, self._coordinates)
         self._criterion = self._success(success)
-        self._check_goal(resets)
+        self._check_goal(resets, runs.moved)
         self._usual = self._at_rest(resets)
-        self._measure_bounds(resets, runs, dict(bounds), starts)
+        self._measure_bounds(resets, runs.points, dict(bounds), starts)
         self._count(steps)
         self.noisy = self._shares(noisy)
-        self.worst_reward = float(min(rewards.min(), 0.0))
+        self.worst_reward = min(runs.worst_reward, 0.0)
         self.inputs = self._input_names()
-        self._islands = islands_of(self.host, runs[:, :2]) if self._in_plane else {}
-        self._set_scene()
+        self._islands = islands_of(self.host, runs.points[:, :2]) if self._in_plane else {}
+        self._set_scene(self.host.model.body(runs.farthest).name)
 
     def __reduce__(self) -> tuple[Callable[..., Task], tuple[Any, ...]]:
-        return from_spec, (self.spec, self.noisy)
+        return _again, (self.spec, self.noisy)
 
     # ---- what was filled in
 
@@ -124,31 +118,6 @@ class EnvironmentTask(Task):
         assert isinstance(space, spaces.Box)
         return np.ravel(space.low).astype(float), np.ravel(space.high).astype(float)
 
-    def _sampled(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns chart points (n, d) and rewards (n,) of runs under inputs at random."""
-        rng, host = np.random.default_rng(0), self.host
-        points, rewards, places = [], [], []
-        moved = np.zeros(host.model.nq, dtype=bool)
-        for seed in range(RUNS):
-            host.reset(seed)
-            begun = host.data.qpos.copy()
-            for k in range(STEPS):
-                if k % HELD == 0:
-                    u = host.drawn(rng)
-                _, reward, terminated, truncated, _, _ = host.step(u)
-                points.append(
-                    [getattr(host.data, c.kind)[c.index] + c.offset for c in self._coordinates]
-                )
-                rewards.append(reward)
-                places.append(host.data.xpos.copy())
-                moved |= np.abs(host.data.qpos - begun) > 0
-                if terminated or truncated:
-                    break
-        host.write(*host.base)
-        self._moved = moved
-        self._farthest = int(np.ptp(places, axis=0).sum(axis=1).argmax())
-        return np.array(points), np.array(rewards)
-
     def _success(self, success: str | None) -> Success:
         if success is None:
             if not self.host.tells_success:
@@ -159,10 +128,10 @@ class EnvironmentTask(Task):
             self.found["success"] = 'info["success"]; or give ' + FORMS
         return success_of(self.host, success)
 
-    def _check_goal(self, resets: np.ndarray) -> None:
+    def _check_goal(self, resets: np.ndarray, moved: np.ndarray) -> None:
         """Raises `BadInput` if resets draw a goal that nothing pins."""
         source = self.host.source
-        names = drawn_goals(self.host, resets, self._moved)
+        names = drawn_goals(self.host, resets, moved)
         if not names:
             return
         if not source.pins:
@@ -245,7 +214,7 @@ class EnvironmentTask(Task):
         return (*(float(share) for share in noisy), *([0.0] * sum(self.layout.sizes[1:])))
 
     def _input_names(self) -> tuple[str, ...]:
-        model, m = self.host.model, len(self.input_limits_of_space[0])
+        model, m = self.host.model, len(self.input_limits[0])
         names = [model.actuator(i).name.rpartition("/")[2] for i in range(model.nu)]
         return (
             tuple(names)
@@ -253,7 +222,7 @@ class EnvironmentTask(Task):
             else tuple(f"action[{i}]" for i in range(m))
         )
 
-    def _set_scene(self) -> None:
+    def _set_scene(self, tracked: str) -> None:
         starts = self.starts(5, np.random.default_rng(0))
         ways: tuple[str, ...] = ()
         if self._islands:
@@ -271,7 +240,7 @@ class EnvironmentTask(Task):
             time=min(self.max_steps * self.dt, 20.0),
             mode_names=ways,
             camera=self._camera(),
-            tracked=self._tracked(),
+            tracked=tracked or "tracked",
         )
 
     def _camera(self) -> str:
@@ -285,17 +254,13 @@ class EnvironmentTask(Task):
             return "overhead"
         return own[0] if own else "free"
 
-    def _tracked(self) -> str:
-        """Returns the body whose path replays draw: the one that went farthest in sampled runs."""
-        return self.model.body(self._farthest).name or "tracked"
-
     # ---- the task
 
     @cached_property
     def layout(self) -> Layout:
         """What a measurement holds."""
         return Layout(
-            self.host, self._coordinates, self._criterion, self._usual, *self.input_limits_of_space
+            self.host, self._coordinates, self._criterion, self._usual, *self.input_limits
         )
 
     @property
@@ -329,10 +294,6 @@ class EnvironmentTask(Task):
         passed = self.host.data.time - before
         self.host.write(*self.host.base)
         return round(float(passed), 9)
-
-    @cached_property
-    def input_limits(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.input_limits_of_space
 
     @cached_property
     def observation_parts(self) -> Mapping[str, int]:  # type: ignore[override]
@@ -422,100 +383,6 @@ class EnvironmentTask(Task):
         return np.where(np.abs(turned) < DECIDED, ANY, (turned > 0).astype(int))
 
 
-def from_gymnasium(
-    env: str | Callable[..., gym.Env],
-    *,
-    chart: AnyChart | None = None,
-    noisy: Sequence[float] | None = None,
-    success: str | None = None,
-    bounds: Mapping[str, tuple[float, float]] | None = None,
-    steps: int | None = None,
-    starts: str = CHART,
-    kwargs: Mapping[str, Any] | None = None,
-    reset: Mapping[str, Any] | None = None,
-    pinned: Mapping[str, Any] | None = None,
-    seed: int | None = None,
-) -> EnvironmentTask:
-    """Returns a task whose plant is an environment of MuJoCo, as it is.
-
-    What is not given is found, and `task.found` says what was found.
-
-    Args:
-        env: the id of the environment in Gymnasium, or a function that makes one.
-        chart: names of the coordinates in which the decision falls; see `coordinates`.
-        noisy: (d,) share of the noise bound on each coordinate of the chart; by default 1 on positions.
-        success: when an episode is a success: "info", "terminated", "reward >= 1", or
-            "distance(a, b) <= 0.05" of two sites or bodies.
-        bounds: (low, high) of coordinates of the chart, by name.
-        steps: steps of an episode, by default those of the environment.
-        starts: where episodes start, all over the "chart", or where "reset" leads to.
-        kwargs: arguments of `gymnasium.make`, or of the function.
-        reset: options of `reset`.
-        pinned: values of positions, velocities or attributes after each reset, by name.
-        seed: the seed of the reset that all copies begin from, 0 by default; if it is given, what that reset
-            draws is pinned.
-
-    Raises:
-        BadInput: it cannot be used; the message says why.
-    """
-    if starts not in (CHART, RESET):
-        raise unknown("starts", starts, (CHART, RESET))
-    source = Source(env, dict(kwargs or {}), dict(reset or {}), dict(pinned or {}), seed)
-    content = {
-        "env": env if isinstance(env, str) else {"function": _where(env)},
-        "chart": chart, "noisy": noisy, "success": success, "bounds": bounds, "steps": steps,
-        "starts": None if starts == CHART else starts, "kwargs": kwargs, "reset": reset,
-        "pinned": pinned, "seed": seed,
-    }  # fmt: skip
-    given = {key: value for key, value in content.items() if value is not None}
-    spec = MARK + json.dumps(given, default=_plain)
-    if not isinstance(env, str) or spec not in _MADE:
-        _MADE[spec] = EnvironmentTask(
-            source, chart, noisy, success, bounds or {}, steps, starts, spec
-        )
-    return _MADE[spec]
-
-
-def _where(function: Callable[..., gym.Env]) -> str:
-    """Returns where a function is defined: "my_module.make"."""
-    name = getattr(function, "__qualname__", type(function).__qualname__)
-    return f"{getattr(function, '__module__', '')}.{name}"
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.number):
-        return value.tolist()
-    raise BadInput(f"{value!r} cannot be written down: give numbers, texts, lists and dictionaries")
-
-
-def from_spec(spec: str, noisy: tuple[float, ...] | None = None) -> Task:
-    """Returns the task that a text describes, as `EnvironmentTask.spec` holds it.
-
-    Raises:
-        BadInput: it was made with a function, which no text holds, or the text is damaged.
-    """
-    if spec not in _MADE:
-        try:
-            given = json.loads(spec.removeprefix(MARK))
-            env = given["env"]
-        except (ValueError, TypeError, KeyError):
-            raise BadInput(f"{spec[:80]!r} describes no environment: start a new run") from None
-        if not isinstance(env, str):
-            raise BadInput(
-                f"the environment was made by the function {env.get('function')}, which no file holds: call "
-                "hyrl_mj.from_gymnasium with it first, in the same process"
-            )
-        if ":" in env:  # Gymnasium would import the module before it
-            raise BadInput(
-                f"the environment is {env}, and opening a run imports no module that you have not named: "
-                f"call hyrl_mj.from_gymnasium({env!r}, ...) with the same arguments first, in this process"
-            )
-        try:
-            from_gymnasium(**given)
-        except TypeError:
-            raise BadInput(f"{spec[:80]!r} describes no environment: start a new run") from None
-    task: Task = _MADE[spec]
-    return task if noisy is None else task.with_noise(noisy)
-
-
-register_opener(MARK, from_spec)
+def _again(spec: str, noisy: tuple[float, ...]) -> Task:
+    """Returns the task that a text describes, with shares of the noise (p,), in this or another process."""
+    return get_task(spec).with_noise(noisy)

@@ -1,0 +1,118 @@
+"""Tasks are made of environments, and again from the texts that describe them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from hyrl_mj.environments.coordinates import AnyChart
+from hyrl_mj.environments.opening import Source
+from hyrl_mj.environments.task import CHART, RESET, EnvironmentTask
+from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.tasks import Task, register_opener
+
+# The texts that describe environments begin with this; those that have been made in this process.
+MARK = "env:"
+_MADE: dict[str, EnvironmentTask] = {}
+
+
+def from_gymnasium(
+    env: str | Callable[..., gym.Env],
+    *,
+    chart: AnyChart | None = None,
+    noisy: Sequence[float] | None = None,
+    success: str | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    steps: int | None = None,
+    starts: str = CHART,
+    kwargs: Mapping[str, Any] | None = None,
+    reset: Mapping[str, Any] | None = None,
+    pinned: Mapping[str, Any] | None = None,
+    seed: int | None = None,
+) -> EnvironmentTask:
+    """Returns a task whose plant is an environment of MuJoCo, as it is.
+
+    What is not given is found, and `task.found` says what was found.
+
+    Args:
+        env: the id of the environment in Gymnasium, or a function that makes one.
+        chart: names of the coordinates in which the decision falls; see `coordinates`.
+        noisy: (d,) share of the noise bound on each coordinate of the chart; by default 1 on positions.
+        success: when an episode is a success: "info", "terminated", "reward >= 1", or
+            "distance(a, b) <= 0.05" of two sites or bodies.
+        bounds: (low, high) of coordinates of the chart, by name.
+        steps: steps of an episode, by default those of the environment.
+        starts: where episodes start, all over the "chart", or where "reset" leads to.
+        kwargs: arguments of `gymnasium.make`, or of the function.
+        reset: options of `reset`.
+        pinned: values of positions, velocities or attributes after each reset, by name.
+        seed: the seed of the reset that all copies begin from, 0 by default; if it is given, what that reset
+            draws is pinned.
+
+    Raises:
+        BadInput: it cannot be used; the message says why.
+    """
+    if starts not in (CHART, RESET):
+        raise unknown("starts", starts, (CHART, RESET))
+    source = Source(env, dict(kwargs or {}), dict(reset or {}), dict(pinned or {}), seed)
+    content = {
+        "env": env if isinstance(env, str) else {"function": _where(env)},
+        "chart": chart, "noisy": noisy, "success": success, "bounds": bounds, "steps": steps,
+        "starts": None if starts == CHART else starts, "kwargs": kwargs, "reset": reset,
+        "pinned": pinned, "seed": seed,
+    }  # fmt: skip
+    given = {key: value for key, value in content.items() if value is not None}
+    spec = MARK + json.dumps(given, default=_plain)
+    if not isinstance(env, str) or spec not in _MADE:
+        _MADE[spec] = EnvironmentTask(
+            source, chart, noisy, success, bounds or {}, steps, starts, spec
+        )
+    return _MADE[spec]
+
+
+def _where(function: Callable[..., gym.Env]) -> str:
+    """Returns where a function is defined: "my_module.make"."""
+    name = getattr(function, "__qualname__", type(function).__qualname__)
+    return f"{getattr(function, '__module__', '')}.{name}"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.number):
+        return value.tolist()
+    raise BadInput(f"{value!r} cannot be written down: give numbers, texts, lists and dictionaries")
+
+
+def from_spec(spec: str) -> Task:
+    """Returns the task that a text describes, as `EnvironmentTask.spec` holds it.
+
+    Raises:
+        BadInput: it was made with a function, which no text holds, or the text is damaged.
+    """
+    if spec not in _MADE:
+        try:
+            given = json.loads(spec.removeprefix(MARK))
+            env = given["env"]
+        except (ValueError, TypeError, KeyError):
+            raise BadInput(f"{spec[:80]!r} describes no environment: start a new run") from None
+        if not isinstance(env, str):
+            raise BadInput(
+                f"the environment was made by the function {env.get('function')}, which no file holds: call "
+                "hyrl_mj.from_gymnasium with it first, in the same process"
+            )
+        if ":" in env:  # Gymnasium would import the module before it
+            raise BadInput(
+                f"the environment is {env}, and opening a run imports no module that you have not named: "
+                f"call hyrl_mj.from_gymnasium({env!r}, ...) with the same arguments first, in this process"
+            )
+        try:
+            from_gymnasium(**given)
+        except TypeError:
+            raise BadInput(f"{spec[:80]!r} describes no environment: start a new run") from None
+    return _MADE[spec]
+
+
+register_opener(MARK, from_spec)
