@@ -21,6 +21,7 @@ import torch
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 # Where the goal of Reacher is pinned [m].
 TARGET = (-0.15, 0.0)
@@ -61,6 +62,7 @@ class Agent:
         kind: SB3's algorithm.
         options: its arguments.
         copies: number of environments.
+        normalized: whether it sees normalised observations.
     """
 
     make: Callable[[], gym.Env]
@@ -69,6 +71,7 @@ class Agent:
     kind: type[PPO] | type[SAC] = PPO
     options: dict[str, Any] = field(default_factory=dict)
     copies: int = 16
+    normalized: bool = False
 
 
 def reacher() -> gym.Env:
@@ -156,7 +159,7 @@ AGENTS = {
             "policy_kwargs": {"net_arch": [128, 128]},
         },
     ),
-    "ogbench": Agent(ogbench, 2_000_000, options={**LONG, "ent_coef": 0.003}),
+    "ogbench": Agent(ogbench, 2_000_000, options={**LONG, "ent_coef": 0.003}, normalized=True),
     "pendulum": Agent(
         pendulum,
         60_000,
@@ -173,16 +176,32 @@ AGENTS = {
 }
 
 
-def trained(agent: Agent, seed: int) -> PPO | SAC:
-    """Returns an agent after its training, with rewards of unit variance."""
+def train(agent: Agent, seed: int, path: Path) -> str:
+    """Trains an agent, PPO's with rewards of unit variance, saves it, and returns how well it does.
+
+    The statistics of an agent that sees normalised observations lie beside it, as an npz.
+    """
 
     def make() -> gym.Env:
-        return gym.wrappers.NormalizeReward(agent.make(), gamma=agent.options["gamma"])
+        env = agent.make()
+        if agent.kind is SAC:
+            return env
+        return gym.wrappers.NormalizeReward(env, gamma=agent.options["gamma"])
 
-    env = make_vec_env(make, n_envs=agent.copies, seed=seed)
+    env: VecEnv = make_vec_env(make, n_envs=agent.copies, seed=seed)
+    judge: VecEnv = DummyVecEnv([agent.make])
+    if agent.normalized:
+        env = VecNormalize(env, norm_reward=False)
     model = agent.kind(agent.policy, env, seed=seed, device="cpu", verbose=0, **agent.options)
     model.learn(agent.samples)
-    return model
+    model.save(path)
+    if isinstance(env, VecNormalize):
+        seen = env.obs_rms
+        np.savez(path.with_suffix(".npz"), mean=seen.mean, var=seen.var, clip=env.clip_obs)
+        judge = VecNormalize(judge, training=False, norm_reward=False)
+        judge.obs_rms = seen
+    mean, spread = evaluate_policy(model, judge, 10, warn=False)
+    return f"return {mean:.1f} +- {spread:.1f}"
 
 
 def main() -> None:
@@ -196,13 +215,8 @@ def main() -> None:
     given.out.mkdir(parents=True, exist_ok=True)
     for name in given.agents:
         began = time.monotonic()
-        model = trained(AGENTS[name], given.seed)
-        model.save(given.out / f"{name}.zip")
-        mean, spread = evaluate_policy(model, AGENTS[name].make(), 10, warn=False)
-        print(
-            f"{name}: {time.monotonic() - began:.0f} s, return {mean:.1f} +- {spread:.1f}",
-            flush=True,
-        )
+        how = train(AGENTS[name], given.seed, given.out / f"{name}.zip")
+        print(f"{name}: {time.monotonic() - began:.0f} s, {how}", flush=True)
 
 
 if __name__ == "__main__":

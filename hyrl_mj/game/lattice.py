@@ -21,7 +21,6 @@ from hyrl_mj.game.resolution import (
     resolves,
     transitions,
 )
-from hyrl_mj.mjcf import model_name
 from hyrl_mj.progress import progress_bar
 from hyrl_mj.sets import Cloud, Grid, Nodes
 from hyrl_mj.tasks import Outcome, Task
@@ -106,7 +105,7 @@ class Lattice:
         if task.measurement_columns != d or task.model.nq != d or not task.kinematic:
             return (
                 "the worst-case game takes a plant that one sample maps from chart point to chart point, "
-                f"and {model_name(task.model)} has a larger state"
+                f"and {task.name} has a larger state"
             )
         if grid is None:
             return None
