@@ -159,7 +159,11 @@ AGENTS = {
             "policy_kwargs": {"net_arch": [128, 128]},
         },
     ),
-    "ogbench": Agent(ogbench, 2_000_000, options={**LONG, "ent_coef": 0.003}, normalized=True),
+    "ogbench": Agent(
+        ogbench,
+        3_000_000,
+        options={**LONG, "ent_coef": 0.003, "policy_kwargs": {"net_arch": [128, 128]}},
+    ),
     "pendulum": Agent(
         pendulum,
         60_000,

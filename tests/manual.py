@@ -156,6 +156,8 @@ def instead(words: list[str]) -> bool:
         # Minutes: what was found out about the environment is shown instead.
         case ["hyrl-mj", ("diagnose" | "robustify") as name, "--env", *options]:
             call([name, "--env", *options, *(() if "--explain" in options else ("--explain",))])
+        case ["echo", text, ">", file]:
+            Path(file).write_text(text)
         case ["mkdocs", "build", *_]:  # has a test of its own
             assert " ".join(words) in (ROOT / ".mkdocs.yml").read_text(encoding="utf-8")
         case _:
@@ -205,8 +207,7 @@ def run(page: Path) -> None:
                 text = text.replace(long, short)
             exec(compile("\n" * (block.line - 1) + text, block.page, "exec"), space)
         elif block.language == "json":
-            name = "goal" if page.stem == "your-environment" else "field"
-            Path(f"{name}.json").write_text(block.text)
+            Path("field.json").write_text(block.text)
 
 
 if __name__ == "__main__":

@@ -237,4 +237,7 @@ def _stage6(task: Task, name: str, algorithm: str) -> Training:
         training = _MODES_PAPER_CONTINUOUS if continuous else _MODES_PAPER_DISCRETE
         return replace(training, warm_start=training.warm_start and training.algorithm == algorithm)
     training = replace(_MODES_CONTINUOUS if continuous else _MODES_DISCRETE, **task.learning.modes)
-    return replace(training, samples=_SMOKE_MODES, attempts=1) if name == "smoke" else training
+    if name == "smoke":
+        return replace(training, samples=_SMOKE_MODES, attempts=1)
+    # An attempt takes minutes where each sample runs Python code.
+    return replace(training, attempts=1) if task.slow else training
