@@ -14,6 +14,7 @@ from gymnasium.wrappers import TimeLimit
 
 import hyrl_mj
 from hyrl_mj import BadInput, cores, from_gymnasium
+from hyrl_mj.environments import making
 from hyrl_mj.environments.crew import Crew
 from hyrl_mj.mjcf import camera_of, point_of, rests
 from hyrl_mj.simulation import Noise, Recorded, closed_loop
@@ -372,10 +373,28 @@ def test_a_task_is_made_again_from_its_text():
     assert pickle.loads(pickle.dumps(loud)).noisy == loud.noisy
     with pytest.raises(BadInput, match="describes no environment"):
         described_task("env:{}")
-    with pytest.raises(BadInput, match="imports no module that you have not named"):
+    with pytest.raises(BadInput, match="imports no module that you have not used before"):
         described_task('env:{"env": "this:Puck-v0"}')
     with pytest.raises(BadInput, match="made by the function elsewhere"):
         described_task('env:{"env": {"function": "elsewhere"}}')
+
+
+def test_a_module_is_imported_again_only_as_it_was_when_it_was_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    module = tmp_path / "my_pucks.py"
+    module.write_text(
+        "import gymnasium as gym\nfrom environments import Puck\n"
+        "gym.register('MyPuck-v0', Puck, max_episode_steps=50)\n"
+    )
+    spec = from_gymnasium("my_pucks:MyPuck-v0").spec
+    monkeypatch.setattr(making, "_MADE", {})  # as another process would begin
+    assert described_task(spec).max_steps == 50
+    making._MADE.clear()
+    module.write_text(module.read_text() + "# changed\n")
+    with pytest.raises(BadInput, match=r"use it once, as with .*--env my_pucks:MyPuck-v0"):
+        described_task(spec)
+    del gym.registry["MyPuck-v0"]
 
 
 def test_free_cameras_are_there_for_every_model():

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
+from hyrl_mj import trust
 from hyrl_mj.environments.coordinates import AnyChart
 from hyrl_mj.environments.opening import Source
 from hyrl_mj.environments.task import CHART, RESET, EnvironmentTask
@@ -71,7 +76,24 @@ def from_gymnasium(
         _MADE[spec] = EnvironmentTask(
             source, chart, noisy, success, bounds or {}, steps, starts, spec
         )
+    if isinstance(env, str) and (module := _module_of(env)) is not None:
+        trust.remember(module)
     return _MADE[spec]
+
+
+def _module_of(env: str) -> Path | None:
+    """Returns the file of the module that Gymnasium imports for an id as "my_module:Puck-v0", if it is found.
+
+    Nothing is imported to find it, so a module inside of a package is not.
+    """
+    module, colon, _ = env.partition(":")
+    if not colon or "." in module:
+        return None
+    with suppress(ValueError):  # a name such as "" or "__main__"
+        found = find_spec(module)
+        if found is not None and found.origin is not None and Path(found.origin).is_file():
+            return Path(found.origin)
+    return None
 
 
 def _where(function: Callable[..., gym.Env]) -> str:
@@ -103,10 +125,12 @@ def from_spec(spec: str) -> Task:
                 f"the environment was made by the function {env.get('function')}, which no file holds: call "
                 "hyrl_mj.from_gymnasium with it first, in the same process"
             )
-        if ":" in env:  # Gymnasium would import the module before it
+        module = _module_of(env)
+        if ":" in env and (module is None or not trust.is_known(module)):
             raise BadInput(
-                f"the environment is {env}, and opening a run imports no module that you have not named: "
-                f"call hyrl_mj.from_gymnasium({env!r}, ...) with the same arguments first, in this process"
+                f"the environment is {env}, and opening a run imports no module that you have not used "
+                "before, as it is now: if you trust it, use it once, as with "
+                f"hyrl-mj diagnose --explain --env {shlex.quote(env)}"
             )
         try:
             from_gymnasium(**given)
