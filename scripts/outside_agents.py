@@ -134,6 +134,11 @@ def pendulum() -> gym.Env:
     return Upright(gym.wrappers.FlattenObservation(gym.make("dm_control/pendulum-swingup-v0")))
 
 
+def annealed(left: float) -> float:
+    """The rate of learning while a share of the training is left."""
+    return 1e-3 * left
+
+
 LONG = {"n_steps": 256, "batch_size": 1024, "n_epochs": 6, "gamma": 0.995, "learning_rate": 1e-3}
 AGENTS = {
     "reacher": Agent(
@@ -162,7 +167,12 @@ AGENTS = {
     "ogbench": Agent(
         ogbench,
         3_000_000,
-        options={**LONG, "ent_coef": 0.003, "policy_kwargs": {"net_arch": [128, 128]}},
+        options={
+            **LONG,
+            "ent_coef": 0.003,
+            "learning_rate": annealed,
+            "policy_kwargs": {"net_arch": [128, 128]},
+        },
     ),
     "pendulum": Agent(
         pendulum,

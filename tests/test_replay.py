@@ -325,6 +325,15 @@ def test_the_overlap_of_the_circle_is_around_its_critical_point(circle):
     np.testing.assert_allclose(floor.critical[:, :2], [[-1, 0]], atol=1e-9)
 
 
+def test_the_set_of_one_mode_overlaps_with_nothing():
+    grid = Grid.with_cells(TASK.chart, 120)
+    whole, won = GridSet(grid, np.full(len(grid.nodes), -1.0)), np.ones(len(grid.nodes), dtype=bool)
+    extended = ExtendedSets((1,), (whole,), (won,), 0.3, 0.1, np.empty((0, 2)), np.empty(0))
+    floor = Floor.of(TASK, decisions(TASK), halves(TASK, 120), extended)
+    assert len(floor.strips) == 0
+    assert len(floor.critical) > 0
+
+
 def test_between_samples_the_robot_is_between_its_places(jump):
     track, z = Track(TASK, jump), jump.z
     row = jump.at(0.1)

@@ -184,8 +184,8 @@ def _strips(
     Where the ways have joined again all sets overlap, and no strip is drawn.
     """
     grid = extended.sets[0].regular
-    if not len(critical.points):
-        return
+    if not len(critical.points) or len(extended.sets) < 2:
+        return  # nothing overlaps
     joined = np.sum([part.contains(grid.nodes) for part in partition.parts], axis=0) > 1
     # How deep a state lies in the second of the sets that hold it, negative inside.
     depth = np.sort([s.signed_distance(grid.nodes) for s in extended.sets], axis=0)[1]
