@@ -10,7 +10,7 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.simulation import Passing, WayRuns, windings
 from hyrl_mj.tasks import ANY, LEFT, RIGHT, Task, number_of, sides, wrapped
 
-# A way that fewer of the chart's nodes go is no mode, and the most modes of a controller.
+# A way that fewer of the nodes go from which a run can start is no mode, and the most modes of a controller.
 LEAST_SHARE, MOST_MODES = 0.01, 32
 
 
@@ -25,7 +25,7 @@ class Ways:
     Attributes:
         patterns: (Q, K) the pattern of each mode; a task's own direction is a pattern of one.
         modes: their numbers.
-        dropped: numbers of the ways that less than `LEAST_SHARE` of the nodes go.
+        dropped: numbers of the ways that less than `LEAST_SHARE` of the nodes go from which a run can start.
         end: (K,) the usual bearing of the end of a run from each obstacle [rad].
         half: (K,) an obstacle lies between start and end if they are seen from it at more than this angle: a
             right one (Thales), or less where the ways part at a smaller one [rad].
@@ -72,7 +72,7 @@ class Ways:
             decides = (seen == LEFT).any(axis=0) & (seen == RIGHT).any(axis=0)
         found = Ways(np.empty((0, len(decides)), dtype=int), (), (), end, half, decides, True)
         patterns = found.of_runs(runs)[counted]
-        kept, dropped = _modes(patterns, LEAST_SHARE * len(runs))
+        kept, dropped = _modes(patterns, LEAST_SHARE * runs.alive.sum())
         if len(kept) > MOST_MODES:
             raise BadInput(
                 f"{task.name} has {len(kept)} ways, and a controller has at most {MOST_MODES} modes: "
