@@ -1,6 +1,7 @@
 """Ways past obstacles are told by how planted paths wind about them, whatever the paths look like."""
 
 import copy
+from dataclasses import replace
 from itertools import product
 
 import mujoco
@@ -264,6 +265,16 @@ def test_a_way_that_hardly_any_node_goes_is_no_mode(rare, kept):
     assert (number in ways.modes) == kept
     assert ways.dropped == (() if kept else (number,))
     assert ways.works(runs).tolist() == [True] * 198 + [kept] * rare
+
+
+def test_nodes_inside_of_walls_make_no_way_rare():
+    field = Field(row(1))
+    paths = [past(field.posts, (side,)) for side in (LEFT, RIGHT)] + [[(4, 0), (4, 0)]] * 400
+    runs = runs_along(field, along(*paths, samples=40), np.arange(402) < 2)
+    alive = np.arange(402) < 2
+    ways = Ways.of(field, replace(runs, alive=alive, arrived=alive), NO_PAIRS)
+    assert ways.modes == (0, 1)
+    assert ways.dropped == ()
 
 
 def test_only_runs_that_arrive_make_modes():
