@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,16 @@ import numpy as np
 from hyrl_mj import trust
 from hyrl_mj.environments.coordinates import AnyChart
 from hyrl_mj.environments.opening import Source
+from hyrl_mj.environments.success import FORMS
 from hyrl_mj.environments.task import CHART, RESET, EnvironmentTask
-from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.errors import BadInput, check_seed, unknown
+from hyrl_mj.ranges import Integer, refused
 from hyrl_mj.tasks import Task, register_opener
 
 # The texts that describe environments begin with this; those that have been made in this process.
 MARK = "env:"
+# The longest episode, and the widest coordinate of a chart [m, rad].
+MOST_STEPS, WIDEST = 1_000_000, 1e6
 _MADE: dict[str, EnvironmentTask] = {}
 
 
@@ -61,8 +66,12 @@ def from_gymnasium(
     Raises:
         BadInput: it cannot be used; the message says why.
     """
-    if starts not in (CHART, RESET):
-        raise unknown("starts", starts, (CHART, RESET))
+    _check(chart, noisy, success, bounds, steps, starts, seed)
+    for name, named in (("kwargs", kwargs), ("reset", reset), ("pinned", pinned)):
+        _check_named(name, named)
+    for name, value in (pinned or {}).items():
+        if not _is_numeric(value):
+            raise refused(f"pinned {name}", value, "a number, or a list of numbers")
     source = Source(env, dict(kwargs or {}), dict(reset or {}), dict(pinned or {}), seed)
     content = {
         "env": env if isinstance(env, str) else {"function": _where(env)},
@@ -79,6 +88,54 @@ def from_gymnasium(
     if isinstance(env, str) and (module := _module_of(env)) is not None:
         trust.remember(module)
     return _MADE[spec]
+
+
+def _check(
+    chart: Any, noisy: Any, success: Any, bounds: Any, steps: Any, starts: Any, seed: Any
+) -> None:
+    """Raises `BadInput` if one of the arguments of `from_gymnasium` is of another kind."""
+    names = chart.values() if isinstance(chart, Mapping) else chart
+    if chart is not None and not isinstance(chart, str) and not _all(names, str):
+        raise refused(
+            "chart", chart, "a name, a list of names, or new names with those they stand for"
+        )
+    if noisy is not None:
+        if not _all(noisy, Real) or not np.isfinite([*noisy]).all() or min([*noisy, 0]) < 0:
+            raise refused("noisy", noisy, "a list of numbers from 0 on, one for each coordinate")
+        if not any(noisy):
+            raise refused("noisy", noisy, "a share above 0 for at least one coordinate")
+    if success is not None and not isinstance(success, str):
+        raise refused("success", success, FORMS)
+    _check_named("bounds", bounds)
+    for name, ends in (bounds or {}).items():
+        if not _all(ends, Real) or len(ends) != 2 or not 0 < ends[1] - ends[0] <= WIDEST:
+            raise refused(f"bounds of {name}", ends, "its low and its high end, as [-2, 2]")
+    if steps is not None:
+        Integer(1, MOST_STEPS).checked("steps", steps)
+    if seed is not None:
+        check_seed(seed)
+    if starts not in (CHART, RESET):
+        raise unknown("starts", starts, (CHART, RESET))
+
+
+def _all(values: Any, kind: type) -> bool:
+    """Returns whether a value is a list, or another collection, of one kind."""
+    several = isinstance(values, Collection) and not isinstance(values, str | Mapping)
+    return several and all(isinstance(value, kind) for value in values)
+
+
+def _is_numeric(value: Any) -> bool:
+    """Returns whether a value is a finite number, or an array of them."""
+    with suppress(ValueError):  # lists of different lengths
+        array = np.asarray(value)
+        return array.dtype.kind in "biuf" and bool(np.isfinite(array).all())
+    return False
+
+
+def _check_named(name: str, given: Any) -> None:
+    """Raises `BadInput` if an argument is no dictionary of names."""
+    if given is not None and not (isinstance(given, Mapping) and _all([*given], str)):
+        raise refused(name, given, "a dictionary of names and values")
 
 
 def _module_of(env: str) -> Path | None:

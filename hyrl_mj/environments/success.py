@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 import re
 from collections.abc import Callable
@@ -67,7 +68,9 @@ def success_of(host: Host, text: str) -> Success:
     try:
         limit = float(number)
     except ValueError:
-        raise BadInput(f"success {text!r} compares with {number!r}: give a number") from None
+        limit = math.nan
+    if not math.isfinite(limit):
+        raise BadInput(f"success {text!r} compares with {number!r}: give a number")
     compare = COMPARISONS[comparison]
     if what == "reward":
         return Success(text, lambda report: compare(report.reward, limit))

@@ -134,13 +134,13 @@ class Floor:
             widths.append(OVERLAP_WIDTH if len(half) == 1 else across)
         return Floor(places(critical.points), np.reshape(strips, (-1, 2, 3)), np.array(widths))
 
-    def draw(self, scene: mujoco.MjvScene) -> None:
-        """Adds the marks to a scene."""
+    def draw(self, scene: mujoco.MjvScene, larger: float) -> None:
+        """Adds the marks to a scene, points of M* larger than usual by a factor."""
         for (start, end), width in zip(self.strips, self.widths, strict=True):
             # The strips are a little longer, so that no gap is seen where they turn.
             bar(scene, start, end, OVERLAP, width, ON_FLOOR, width / 50)
         for point in self.critical:
-            disc(scene, point, CRITICAL_RADIUS, ON_SETS, CRITICAL)
+            disc(scene, point, larger * CRITICAL_RADIUS, ON_SETS, CRITICAL)
 
 
 @dataclass(frozen=True)

@@ -170,7 +170,7 @@ class Panel:
         self._renderer.clear()
         scene = self._renderer.scene
         if floor:
-            floor.draw(scene)
+            floor.draw(scene, self._larger)
         for track in self._tracks:
             marks.disc(scene, track.points[0], self._larger * START_RADIUS, marks.ON_TOP, marks.INK)
         self._renderer.keep()
