@@ -21,7 +21,6 @@ import torch
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 # Where the goal of Reacher is pinned [m].
 TARGET = (-0.15, 0.0)
@@ -62,7 +61,6 @@ class Agent:
         kind: SB3's algorithm.
         options: its arguments.
         copies: number of environments.
-        normalized: whether it sees normalised observations.
     """
 
     make: Callable[[], gym.Env]
@@ -71,7 +69,6 @@ class Agent:
     kind: type[PPO] | type[SAC] = PPO
     options: dict[str, Any] = field(default_factory=dict)
     copies: int = 16
-    normalized: bool = False
 
 
 def reacher() -> gym.Env:
@@ -191,10 +188,7 @@ AGENTS = {
 
 
 def train(agent: Agent, seed: int, path: Path) -> str:
-    """Trains an agent, PPO's with rewards of unit variance, saves it, and returns how well it does.
-
-    The statistics of an agent that sees normalised observations lie beside it, as an npz.
-    """
+    """Trains an agent, PPO's with rewards of unit variance, saves it, and returns how well it does."""
 
     def make() -> gym.Env:
         env = agent.make()
@@ -202,19 +196,11 @@ def train(agent: Agent, seed: int, path: Path) -> str:
             return env
         return gym.wrappers.NormalizeReward(env, gamma=agent.options["gamma"])
 
-    env: VecEnv = make_vec_env(make, n_envs=agent.copies, seed=seed)
-    judge: VecEnv = DummyVecEnv([agent.make])
-    if agent.normalized:
-        env = VecNormalize(env, norm_reward=False)
+    env = make_vec_env(make, n_envs=agent.copies, seed=seed)
     model = agent.kind(agent.policy, env, seed=seed, device="cpu", verbose=0, **agent.options)
     model.learn(agent.samples)
     model.save(path)
-    if isinstance(env, VecNormalize):
-        seen = env.obs_rms
-        np.savez(path.with_suffix(".npz"), mean=seen.mean, var=seen.var, clip=env.clip_obs)
-        judge = VecNormalize(judge, training=False, norm_reward=False)
-        judge.obs_rms = seen
-    mean, spread = evaluate_policy(model, judge, 10, warn=False)
+    mean, spread = evaluate_policy(model, agent.make(), 10, warn=False)
     return f"return {mean:.1f} +- {spread:.1f}"
 
 
