@@ -389,7 +389,7 @@ def about(path, **changes):
         (
             "observation_space",
             {":type:": "<class 'gym.spaces.dict.Dict'>"},
-            "observations are a dict",
+            "observations are a Dict",
         ),
         ("policy_kwargs", {"features_extractor_class": "<class 'mine.Extractor'>"}, r"mine\.Extr"),
         (

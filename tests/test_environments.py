@@ -16,6 +16,7 @@ import hyrl_mj
 from hyrl_mj import BadInput, cores, from_gymnasium
 from hyrl_mj.environments import making
 from hyrl_mj.environments.crew import Crew
+from hyrl_mj.learning import presets
 from hyrl_mj.mjcf import camera_of, point_of, rests
 from hyrl_mj.simulation import Noise, Recorded, closed_loop
 from hyrl_mj.tasks import check_task, described_task, reference
@@ -452,9 +453,10 @@ def test_the_command_line_explains_what_was_found(tmp_path):
 
 
 @pytest.mark.slow
-def test_an_agent_is_diagnosed_and_made_robust_in_its_own_environment(tmp_path):
-    task = from_gymnasium(Puck, steps=80)
+def test_an_agent_is_diagnosed_and_made_robust_in_its_own_environment(tmp_path, monkeypatch):
+    task = from_gymnasium(Puck, steps=60)
     path, said = tmp_path / "puck", []
+    monkeypatch.setitem(presets._GRIDS_DYNAMIC, 2, (20, 40))  # coarser than preset smoke
     options = {"preset": "smoke", "eps": 0.1, "out": path, "say": said.append}
     diagnosed = hyrl_mj.diagnose(task, puck_agent, **options)
     assert (path / "diagnosis.html").is_file()

@@ -140,7 +140,8 @@ def _check_parts(about: Mapping[str, Any], task: Task) -> None:
 
 def _dict_of(parts: Mapping[str, int]) -> str:
     """Returns a Dict of vectors in words: "Dict(goal (2,), observation (4,))"."""
-    return f"Dict({', '.join(f'{printable(key)} ({size},)' for key, size in parts.items())})"
+    words = ", ".join(f"{printable(key)} ({size},)" for key, size in parts.items())
+    return f"Dict({words})" if words else "a Dict"
 
 
 def by_frames(task: Task, n_stack: int) -> np.ndarray:
