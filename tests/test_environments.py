@@ -292,7 +292,33 @@ def test_what_was_not_given_is_found_and_said(puck):
     assert -1.8 <= shorter.start_low[0] < shorter.start_high[0] <= -1.0
 
 
+class Late(Puck):
+    """It has no model before its first reset, which fails."""
+
+    def __init__(self):
+        super().__init__()
+        del self.model
+
+    def __getattr__(self, name):
+        if name == "model":
+            raise ValueError("call reset first")
+        raise AttributeError(name)
+
+    def reset(self, *, seed=None, options=None):
+        raise RuntimeError("no file")
+
+
+class Rebuilding(Puck):
+    """It builds its model anew at each reset."""
+
+    def reset(self, *, seed=None, options=None):
+        Puck.__init__(self)
+        return super().reset(seed=seed, options=options)
+
+
 REFUSED = {
+    "late": (Late, "Late cannot be reset .RuntimeError: no file"),
+    "rebuilding": (Rebuilding, "reset.. of Rebuilding builds another model"),
     "hidden": (lambda: Secret(Puck()), "goes on differently from the same state"),
     "growing": (lambda: Growing(Puck()), r"remembers something in actions .*cannot be copied"),
     "random": (lambda: Noisy(Puck()), r"draws random numbers in step\(\)"),

@@ -212,8 +212,11 @@ def _check(env: Any, name: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
     try:
         physics = physics_of(env)
     except Exception:  # whatever it raises before its first reset
-        env.reset(seed=0)
-        physics = physics_of(env)
+        try:
+            env.reset(seed=0)
+            physics = physics_of(env)
+        except Exception as error:
+            raise BadInput(f"{name} cannot be reset ({brief(error)}): repair it") from error
     if physics is None:
         raise BadInput(
             f"{name} is not simulated by MuJoCo, as far as its attributes model and data tell: give an "

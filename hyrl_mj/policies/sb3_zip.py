@@ -27,7 +27,7 @@ PLAIN = f"only plain multilayer perceptrons on a vector of numbers can be used: 
 # Limit on the metadata [bytes]: those of SB3 take some ten kilobytes.
 LARGEST_METADATA = 2**22
 # A part of a Dict of vectors, in the text of metadata: "'goal': Box(-inf, inf, (2,), float32)".
-PART = re.compile(r"'([^']*)': Box\([^()]*\((\d*)[^()]*\)[^()]*\)")
+PART = re.compile(r"'([^']*)': Box\([^()]*\((\d{0,9})[^()]*\)[^()]*\)")
 LONGEST_SPACES = 2**14
 LONGEST_TEXT = 120  # of a file, in messages
 # What the metadata of SBX, which has SB3's interface, says of its policy.
@@ -149,15 +149,9 @@ def by_frames(task: Task, n_stack: int) -> np.ndarray:
 
     `VecFrameStack` stacks each vector of a Dict by itself, and SB3 puts these stacks one after the other.
     """
-    sizes = list(task.observation_parts.values())
-    begins = n_stack * np.cumsum([0, *sizes[:-1]])
-    frames = [
-        np.concatenate(
-            [b + i * size + np.arange(size) for b, size in zip(begins, sizes, strict=True)]
-        )
-        for i in range(n_stack)
-    ]
-    return np.concatenate(frames)
+    ends = n_stack * np.cumsum([*task.observation_parts.values()])
+    stacks = np.split(np.arange(ends[-1]), ends[:-1])
+    return np.hstack([stack.reshape(n_stack, -1) for stack in stacks]).ravel()
 
 
 def _check_used(tensors: Mapping[str, np.ndarray], algorithm: str) -> None:
