@@ -19,8 +19,12 @@ _kept: list[bool] = []
 
 
 def install() -> None:
-    """Receives MuJoCo's warnings from now on, unless the user has a handler (`set_mju_user_warning`)."""
-    if mujoco.get_mju_user_warning() is None:
+    """Receives MuJoCo's warnings from now on, unless the user has a handler (`set_mju_user_warning`).
+
+    That of dm_control is not the user's: importing dm_control sets it.
+    """
+    handler = mujoco.get_mju_user_warning()
+    if handler is None or str(getattr(handler, "__module__", "")).startswith("dm_control"):
         mujoco.set_mju_user_warning(_count)
 
 
