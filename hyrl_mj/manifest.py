@@ -34,7 +34,7 @@ FILES = {
     "partition": r"partition\.npz",
     "diagnose": r"diagnosis\.html|diagnosis/(robustness\.json|worst\.(npz|mp4)|\w+" + PICTURE + ")",
     "extended-sets": r"(extended_sets|split)\.npz",
-    "retrain": r"mode_\d+(\.safetensors|(_part)?\.json)|retraining\.json",
+    "retrain": r"mode_\d+(\.safetensors|(_part)?\.json|_table\.npz)|retraining\.json",
     "robustness": r"robustness\.(json|npz)|arcs/attack_\w+\.npz|figures/robustness_\w+" + PICTURE,
     "simulate": r"arcs/(start\d+|critical)_(policy|hyrl_q\d+)\.npz",
     "simulate --start": r"arcs/latest_\w+\.npz",

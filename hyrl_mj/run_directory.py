@@ -29,6 +29,7 @@ from hyrl_mj.stages import (
     PartPolicy,
     Retraining,
 )
+from hyrl_mj.stages.tables import BoundTable, TablePolicy
 from hyrl_mj.tasks import Field, Task, described_task, get_task, reference
 from hyrl_mj.verdict import Verdict
 
@@ -176,7 +177,7 @@ class Run:
         return ExtendedSets.load(self._checked("extended_sets.npz"), self.task)
 
     @cached_property
-    def mode_policies(self) -> dict[int, MlpPolicy | PartPolicy]:
+    def mode_policies(self) -> dict[int, MlpPolicy | PartPolicy | BoundTable]:
         """The policy of each mode, from stage 6."""
         return {q: self._mode_policy(q) for q in self.extended_sets.modes}
 
@@ -285,7 +286,10 @@ class Run:
         """Returns the path of a file, if it is to be believed."""
         return self.manifest.checked(self.path / name)
 
-    def _mode_policy(self, mode: int) -> MlpPolicy | PartPolicy:
+    def _mode_policy(self, mode: int) -> MlpPolicy | PartPolicy | BoundTable:
+        table = self.path / f"mode_{mode}_table.npz"
+        if self.manifest.has(table):
+            return TablePolicy.load(self.manifest.checked(table)).of(self.task)
         path = self.path / f"mode_{mode}_part.json"
         if not self.manifest.has(path):
             return self._load_policy(f"mode_{mode}")

@@ -190,3 +190,20 @@ class Several(Puck):
     """Has several agents."""
 
     possible_agents = ("a", "b")
+
+
+class Slid(Puck):
+    """A puck that each action moves, and that stands still between actions: its place is its whole state."""
+
+    def __init__(self):
+        super().__init__()
+        self.action_space = spaces.Box(-1.0, 1.0, (2,), dtype=np.float64)
+
+    def step(self, action):
+        self.data.qpos[:] += 0.1 * np.clip(action, -1, 1)
+        self.data.qvel[:] = 0.0
+        mujoco.mj_step(self.model, self.data)
+        self.data.qvel[:] = 0.0
+        mujoco.mj_forward(self.model, self.data)
+        distance = float(np.linalg.norm(self.data.qpos - GOAL))
+        return self._get_obs(), -distance, False, False, {"success": distance < 0.25}

@@ -1,38 +1,147 @@
-"""The summary's words for sets on a circle."""
+"""Tables of inputs as the policies of modes, and the game on environments whose chart is their state."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from environments import Puck, Slid, puck_agent
 
-import hyrl_mj
+from hyrl_mj import BadInput, from_gymnasium
+from hyrl_mj.game import Lattice, lattice_grid
+from hyrl_mj.policies import PolicyController
+from hyrl_mj.proof import examine
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.viz.tables import extent, percent
+from hyrl_mj.simulation import Signal, closed_loop, policy_runs
+from hyrl_mj.stages.tables import Held, TablePolicy, _in_reach, table_for
+from hyrl_mj.tasks import Outcome
+
+EPS = 0.15
 
 
-@pytest.mark.parametrize(
-    ("inside", "words"),
-    [
-        (lambda a: (a > 0.25) & (a < 0.75), "0.251 pi to 0.749 pi"),
-        (lambda a: (a > 1.75) | (a < 0.25), "1.751 pi to 0.249 pi"),
-        (
-            lambda a: (a > 1.75) | (a < 0.25) | ((a > 0.5) & (a < 0.9)),
-            "0.501 pi to 0.899 pi, 1.751 pi to 0.249 pi",
-        ),
-        (lambda a: a >= 0, "everything"),
-    ],
-)
-def test_extent_on_the_circle(inside, words):
-    task = hyrl_mj.get_task("unit_circle")
-    grid = Grid.with_cells(task.chart, 2000)
-    members = GridSet.from_mask(grid, inside(grid.nodes[:, 0] / np.pi))
-    run = SimpleNamespace(task=task, extended_sets=SimpleNamespace(modes=(0,), sets=(members,)))
-    assert extent(run, 0) == f"extended set {words}"
+@pytest.fixture(scope="module")
+def puck():
+    return from_gymnasium(Puck, steps=120)
 
 
-@pytest.mark.parametrize(
-    ("share", "words"),
-    [(1.0, "100%"), (0.99999, ">99.99%"), (0.128, "12.80%"), (1e-5, "<0.01%"), (0.0, "0%")],
-)
-def test_only_what_is_everything_is_called_so(share, words):
-    assert percent(share) == words
+@pytest.fixture(scope="module")
+def slid():
+    return from_gymnasium(Slid, steps=120)
+
+
+@pytest.fixture(scope="module")
+def held(puck):
+    return Held.of(puck, Grid.with_cells(puck.chart, 24), EPS)
+
+
+def test_held_inputs_lead_where_the_environment_leads_under_them(puck, held):
+    row, a = len(held.rows) // 3, 7
+    plant = puck.plant(1)
+    plant.set_state(*puck.state(held.grid.nodes[held.rows[[row]]]))
+    for _ in range(held.samples):
+        if puck.ending(plant.measurement)[0] == Outcome.RUNNING:
+            plant.step(held.inputs[[a]])
+    np.testing.assert_array_equal(puck.z(plant.measurement)[0], held.ends[a, row])
+    gone = np.linalg.norm(held.ends - held.grid.nodes[held.rows], axis=2).max(axis=0)
+    assert np.median(gone) >= 1.5 * EPS, "inputs are held until they tell"
+
+
+@pytest.mark.parametrize("how", ["worst", "mean"])
+def test_what_noise_may_hide_is_found_as_by_one_node_after_another(held, how):
+    values = np.random.default_rng(0).normal(size=len(held.rows))
+    found = _in_reach(held, np.array([EPS, 0.0]), values, how)
+    nodes, cell = held.grid.nodes, held.grid.spacing
+    reach = np.ceil(EPS / cell[0]) * cell[0] + 1e-9
+    of_rows = nodes[held.rows]
+    for i in range(0, len(nodes), 29):
+        off = np.abs(of_rows - nodes[i])
+        near = values[(off[:, 0] <= reach) & (off[:, 1] < cell[1] / 2)]
+        expected = (
+            near.max(initial=-np.inf) if how == "worst" else near.mean() if len(near) else np.inf
+        )
+        assert found[i] == pytest.approx(expected, abs=1e-9)
+
+
+class Corner(Signal):
+    """Noise that shows the robot at one corner of its bound all the time."""
+
+    def __init__(self, task, corner):
+        super().__init__(EPS, np.zeros(task.measurement_columns))
+        self.shares[:2] = corner
+
+    def sample(self, now):
+        return np.tile(self.bound * self.shares, (len(now.rows), 1))
+
+
+def test_a_table_goes_the_way_of_its_mode_whatever_noise_shows(puck, held):
+    """Along the upper side of the rock, also from starts below the line that leads to it."""
+    nodes = held.grid.nodes
+    upper = GridSet.from_mask(held.grid, (nodes[:, 1] > -0.3) | (nodes[:, 0] > 0.6))
+    table = table_for(held, SimpleNamespace(within=upper, bound=np.array([EPS, EPS])))
+    z = np.stack(np.meshgrid([-1.8, -1.4, -1.0], [0.0, 0.5, 1.0]), axis=-1).reshape(-1, 2)
+    path = policy_runs(puck, table, z).path
+    passing = np.abs(path[..., 0]) < 0.1
+    assert (path[..., 1][passing] > 0).all()
+    for corner in ((0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
+        run = closed_loop(puck, PolicyController(table), z, Corner(puck, corner))
+        assert (run.outcome == Outcome.REACHED).all(), corner
+
+
+def test_a_table_is_read_as_it_was_written(puck, held, tmp_path):
+    everywhere = GridSet.from_mask(held.grid, np.ones(held.grid.size, dtype=bool))
+    table = table_for(held, SimpleNamespace(within=everywhere, bound=np.zeros(2)))
+    table.save(tmp_path / "mode_0.safetensors")
+    again = TablePolicy.load(tmp_path / "mode_0_table.npz")
+    measured = puck.plant(3).measurement
+    np.testing.assert_array_equal(again.of(puck).act(measured), table.act(measured))
+    with pytest.raises(BadInput, match="does not fit"):
+        TablePolicy(again.counts, again.inputs[1:]).of(puck)
+
+
+def test_no_table_where_arrival_does_not_end_an_episode(puck, held):
+    kept = from_gymnasium(Puck, steps=40, success="reward >= -0.25")
+    assert Held.of(kept, Grid.with_cells(kept.chart, 8), EPS) is None
+    assert kept.learning.cells == round((800_000 / 40) ** 0.5 - 0.5), (
+        "fewer cells for whole episodes"
+    )
+    assert puck.learning.cells is None
+
+
+def test_whether_the_chart_is_the_state_is_tried_out(puck, slid):
+    assert slid.chart_is_state
+    assert not puck.chart_is_state, "it has a speed"
+    assert "larger state" in Lattice.why_not(puck)
+    z = slid.starts(5, np.random.default_rng(0))
+    plant = slid.plant(5)
+    plant.set_state(*slid.state(z))
+    np.testing.assert_array_equal(slid.observation(slid.at(z)), slid.observation(plant.measurement))
+
+
+def test_its_lattice_leads_to_where_it_goes_and_never_into_a_wall(slid):
+    lattice = Lattice.of(slid, lattice_grid(slid, 40))
+    assert lattice.estimate
+    ends = lattice.after[:, 0][:, lattice.running]
+    inside = ends < lattice.nodes
+    assert lattice.running[ends[inside]].all()
+    nodes = lattice.grid.nodes
+    off = nodes[ends[inside]] - np.broadcast_to(nodes[lattice.running], (*ends.shape, 2))[inside]
+    assert np.abs(off).max() < 0.1 + 3 * lattice.grid.spacing.max()
+    assert (ends == lattice.nodes).any(), "it arrives"
+
+
+@pytest.mark.slow
+def test_the_game_on_an_environment_is_an_estimate_with_its_reason(slid):
+    grid = Grid.with_cells(slid.chart, 24)
+    halves = [GridSet.from_mask(grid, sign * grid.nodes[:, 1] >= 0) for sign in (1, -1)]
+    loops = {
+        "policy": PolicyController(
+            SimpleNamespace(act=lambda m: puck_agent(slid.observation(m)) / 4)
+        )
+    }
+    points = np.array([[-1.0, 0.0]])
+    result, maps = examine(slid, points, halves, loops, (0.0, 0.2), False, 40)
+    assert result.estimate
+    assert "contacts" in result.why_not_proved["policy"]
+    quiet, noisy = result.scores["policy"]
+    assert quiet.won >= noisy.won
+    assert quiet.not_broken == 1
+    assert maps.map["policy"].shape == (np.prod(maps.grid_counts),)

@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from multiprocessing.connection import Connection
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,7 @@ class Crew:
         self._host = host
         self._owner = 0
         self._hands: list[Connection] = []
+        self._lock = Lock()  # a game attacks several controllers in threads
 
     def advance(
         self, states: np.ndarray, memories: np.ndarray, u: np.ndarray
@@ -54,6 +56,10 @@ class Crew:
 
     def _spread(self, what: str, *arrays: np.ndarray) -> list[Any]:
         """Returns what a method of hosts returns for parts of the rows of arrays."""
+        with self._lock:
+            return self._at_once(what, *arrays)
+
+    def _at_once(self, what: str, *arrays: np.ndarray) -> list[Any]:
         rows = len(arrays[0])
         count = min(cores.count(), rows // FEWEST)
         own = getattr(self._host, what)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from hashlib import sha256
 from typing import Any
@@ -33,10 +34,15 @@ from hyrl_mj.tasks import ANY, Learning, Outcome, Scene, Task, get_task
 
 # Samples of an episode of an environment that never ends by itself.
 STEPS_WITHOUT_END = 1_000
+# Where every episode takes all of its samples, runs from all nodes of the chart take about so many together.
+SAMPLES_OF_NODES = 800_000
 # Times that starts are drawn again because they are inside of walls.
 DRAWS = 200
 # Where episodes start.
 CHART, RESET = "chart", "reset"
+# Copies that are compared with others at the same chart points, for so many steps, under inputs that are held
+# for some of them, and how much they may differ.
+COMPARED, STEPS_COMPARED, HELD, SAME = 48, 60, 12, 1e-9
 # A joint turns in the plane of the floor if its axis is as upright as this, as a cosine.
 UPRIGHT = 0.9
 # A run that turns by less than this decides nothing [rad].
@@ -56,7 +62,7 @@ class EnvironmentTask(Task):
     """
 
     scene: Scene
-    slow = True
+    slow = stopped_by_walls = True
     learning = Learning()
 
     def __init__(
@@ -80,6 +86,7 @@ class EnvironmentTask(Task):
         resets = starts_of(self.host)
         runs = sampled_runs(self.host, self._coordinates)
         self._criterion = self._success(success)
+        self.arrival_ends = self._criterion.ends
         self._check_goal(resets, runs.moved)
         self._usual = self._at_rest(resets)
         self._measure_bounds(resets, runs.points, dict(bounds), starts)
@@ -197,6 +204,11 @@ class EnvironmentTask(Task):
         self.max_steps = steps or self.host.steps or STEPS_WITHOUT_END
         if steps is None:
             self.found["steps"] = f"{self.max_steps} ({self.max_steps * self.dt:g} s) of an episode"
+        if not self.arrival_ends:
+            nodes = SAMPLES_OF_NODES / self.max_steps
+            self.learning = replace(
+                self.learning, cells=max(int(nodes ** (1 / self.chart.dimension)), 2)
+            )
 
     def _shares(self, noisy: Sequence[float] | None) -> tuple[float, ...]:
         chosen = self._coordinates
@@ -325,6 +337,43 @@ class EnvironmentTask(Task):
     @cached_property
     def kinematic(self) -> bool:
         return False
+
+    @cached_property
+    def chart_is_state(self) -> bool:
+        """As of other tasks; it is tried out, by copies that are made anew at the chart point of others."""
+        chart, whole = self._coordinates, list(range(self.model.nq))
+        if sorted(c.index for c in chart if c.kind == "qpos") != whole or not self.arrival_ends:
+            return False
+        rng = np.random.default_rng(0)
+        plant, fresh = self.plant(COMPARED), self.plant(COMPARED)
+        plant.set_state(*self.state(self.starts(COMPARED, rng)))
+        for k in range(STEPS_COMPARED):
+            if k % HELD == 0:
+                u = rng.uniform(*self.input_limits, (COMPARED, len(self.inputs)))
+            before = plant.measurement
+            goes_on = np.flatnonzero(self.ending(before) == Outcome.RUNNING)
+            fresh.set_state(*self.state(self.z(before)))
+            plant.step(u[goes_on], goes_on)
+            fresh.step(u[goes_on], goes_on)
+            a, b = (self._told(copies.measurement[goes_on]) for copies in (plant, fresh))
+            if not np.allclose(a, b, rtol=0, atol=SAME, equal_nan=True):
+                return False
+        return True
+
+    def _told(self, measurement: np.ndarray) -> np.ndarray:
+        """Returns of measurements (k, p) what a game and a controller look at: (k, ...)."""
+        observed = self.layout.parts(measurement)[3]
+        return np.column_stack([self.z(measurement), observed, self.ending(measurement)])
+
+    def at(self, z: np.ndarray) -> np.ndarray:
+        (state, memory), n = self._usual, len(z)
+        states = np.tile(state, (n, 1))
+        states[:, self.layout.of_chart] = (
+            z - self.layout.offset + 1.0
+        )  # observed is what is at z instead
+        report = np.zeros((n, self.host.width + 5))
+        running = np.full((n, 1), float(Outcome.RUNNING))
+        return np.column_stack([z, states, np.tile(memory, (n, 1)), report, running])
 
     def state(
         self, z: np.ndarray, rng: np.random.Generator | None = None

@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 
-from hyrl_mj.game.lattice import Lattice
+from hyrl_mj.game.lattice import Lattice, nearest_of
 from hyrl_mj.game.solver import (
     AT_ONCE,
     FIRST,
@@ -94,12 +94,16 @@ class WorstEstimate(Lookahead):
         self, lattice: Lattice, modes: tuple[int, ...], value: np.ndarray, bound: np.ndarray
     ):
         largest = float(bound.max(initial=0.0))
-        super().__init__(largest, bound / (largest or 1.0))
+        shares = np.zeros(lattice.task.measurement_columns)
+        shares[: len(bound)] = bound / (largest or 1.0)
+        super().__init__(largest, shares)
         self._lattice, self._modes = lattice, modes
         # Between 0 and 1 if won, the later the greater; from 2 to 3 if lost, the earlier the greater.
         samples = np.where(value > NEVER, LOST - value, value) / lattice.task.max_steps
         worth = [3 - samples, samples]
-        self._worth = np.select([value > NEVER, value < NEVER], worth, 1.5)
+        self._worth = np.select([value > NEVER, value < NEVER], worth, 1.5)[:, :-2]
+        if lattice.task.stopped_by_walls:  # beside a wall, what lies inside of it is not worse
+            self._worth = self._worth[:, nearest_of(lattice.grid, lattice.running)]
 
     def _simulate(self, begun: Ahead, past: np.ndarray, samples: int) -> Ahead:
         task, grid = self._lattice.task, self._lattice.grid
@@ -111,6 +115,6 @@ class WorstEstimate(Lookahead):
         worth = np.full(len(rows), np.inf)
         for mode, values in zip(self._modes, self._worth, strict=False):
             at = (answers[:, -1] == mode) & ~lost
-            worth[at] = grid.interpolate(values[:-2], task.z(measured[at]))
+            worth[at] = grid.interpolate(values, task.z(measured[at]))
         worth = np.where(task.ending(measured) == Outcome.REACHED, 0.0, worth)
         return replace(begun, danger=worth[:, None])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import product
 
 import mujoco
@@ -42,8 +41,9 @@ class Lattice:
 
     Two more places follow the N nodes: number N is "arrived", N + 1 is "failed". A sample that ends between
     nodes leads to all nodes around its end, and the adversary chooses among them: the lattice errs to the
-    adversary's side, by less than a cell a sample. In three dimensions that would lose every run. There a
-    sample leads to one of these nodes, drawn so that it is right on average, and the game is an estimate.
+    adversary's side, by less than a cell a sample. In three dimensions, or along walls that stop the robot,
+    that would lose every run. There a sample leads to one of these nodes, drawn so that it is right on
+    average, and the game is an estimate. No sample leads to a node inside of such a wall.
 
     Attributes:
         task: the robot and its problem.
@@ -55,6 +55,7 @@ class Lattice:
         arrived: (N,) bool, nodes at which an episode ends as a success. Also those at which one that is cut
             off is a success, if the task has a `verdict` of its own or its episodes never end as a success.
         failed: (N,) bool, nodes at which an episode ends without success.
+        running: (N,) bool, nodes at which an episode goes on.
         hops: (A, d) how far one sample with each level moves the running nodes.
         uneven: (d,) by how much more or less it moves some of them, along each coordinate.
         direct: whether measurement, chart point and position are the same numbers.
@@ -66,6 +67,7 @@ class Lattice:
     after: np.ndarray
     arrived: np.ndarray
     failed: np.ndarray
+    running: np.ndarray
     hops: np.ndarray
     uneven: np.ndarray
     direct: bool
@@ -80,11 +82,6 @@ class Lattice:
         """N + 2: the nodes, "arrived" and "failed"."""
         return self.nodes + 2
 
-    @cached_property
-    def running(self) -> np.ndarray:
-        """(N,) bool, the nodes at which an episode goes on."""
-        return self.task.ending(self.grid.nodes) == Outcome.RUNNING
-
     @property
     def exact(self) -> bool:
         """Whether every sample under every possible input leads from node to node."""
@@ -94,7 +91,16 @@ class Lattice:
     @property
     def estimate(self) -> bool:
         """Whether what is won on the nodes is an estimate, which may err to either side."""
-        return self.grid.chart.dimension > 2
+        return bool(self.why_estimate)
+
+    @property
+    def why_estimate(self) -> str:
+        """Why what is won on the nodes is an estimate; "" if it is none."""
+        if self.grid.chart.dimension > 2:
+            return "the game is an estimate on a chart of three dimensions"
+        if self.task.stopped_by_walls:
+            return "the game is an estimate where contacts stop the robot between the nodes"
+        return ""
 
     @staticmethod
     def why_not(task: Task, grid: Grid | None = None) -> str | None:
@@ -102,7 +108,7 @@ class Lattice:
         d = task.chart.dimension
         if d not in LATTICE:
             return f"the worst-case game takes a chart of 1 to 3 dimensions, that of {task.name} has {d}"
-        if task.measurement_columns != d or task.model.nq != d or not task.kinematic:
+        if not task.chart_is_state:
             return (
                 "the worst-case game takes a plant that one sample maps from chart point to chart point, "
                 f"and {task.name} has a larger state"
@@ -137,7 +143,8 @@ class Lattice:
         """Returns whether what is won on these nodes is good enough to train and to design by."""
         if isinstance(grid, Cloud):
             return False
-        return task.chart.dimension < 3 and Lattice.why_not(task, grid) is None
+        exact = task.chart.dimension < 3 and not task.stopped_by_walls
+        return exact and Lattice.why_not(task, grid) is None
 
     @staticmethod
     def of(task: Task, grid: Grid | None = None) -> Lattice:
@@ -155,7 +162,8 @@ class Lattice:
         measurement = plant.measurement
         ending, failed = task.ending(measurement), task.failed(measurement)
         arrived = ending == Outcome.REACHED
-        alive = np.flatnonzero(ending == Outcome.RUNNING)
+        running = ending == Outcome.RUNNING
+        alive = np.flatnonzero(running)
         if not len(alive):
             raise BadInput(
                 f"a lattice of {len(nodes):,} nodes has none at which {task.name} goes on: give "
@@ -167,8 +175,10 @@ class Lattice:
                 f"a lattice of {len(nodes):,} nodes and {len(levels):,} inputs does not fit into the memory: "
                 "give fewer cells (`lattice` in the settings)"
             )
-        direct = bool((measurement == nodes).all())
-        ends = _Ends(grid, len(levels))
+        direct = measurement.shape == nodes.shape and bool((measurement == nodes).all())
+        estimate = len(grid.counts) > 2 or task.stopped_by_walls
+        occurs = nearest_of(grid, running) if task.stopped_by_walls else None
+        ends = _Ends(grid, len(levels), estimate, occurs)
         hops, uneven = np.empty((len(levels), nodes.shape[1])), np.zeros(nodes.shape[1])
         for a, measurement in enumerate(_one_sample_on(task, nodes[alive], levels, direct)):
             z = task.z(measurement)
@@ -184,7 +194,7 @@ class Lattice:
         # Then to be near the set-point is not enough, unless the task says so.
         if not ends_well or type(task).verdict is not Task.verdict:
             arrived |= ~failed & (task.verdict(plant.measurement) == Outcome.REACHED)
-        return Lattice(task, grid, levels, after, arrived, failed, hops, uneven, direct)
+        return Lattice(task, grid, levels, after, arrived, failed, running, hops, uneven, direct)
 
     def level_of(self, u: np.ndarray) -> np.ndarray:
         """Returns the levels (n,) int nearest to inputs (n, m).
@@ -212,6 +222,14 @@ class Lattice:
                 f"{np.unique(self.levels).tolist()}"
             )
         return level
+
+
+def nearest_of(grid: Grid, mask: np.ndarray) -> np.ndarray:
+    """Returns the nearest node of a mask (N,) bool to each node: (N,) int."""
+    of_mask = np.flatnonzero(mask)
+    return np.asarray(
+        of_mask[grid.chart.tree(grid.nodes[of_mask]).query(grid.chart.in_box(grid.nodes))[1]]
+    )
 
 
 def _ends_well(task: Task) -> bool:
@@ -259,12 +277,20 @@ def _levels(task: Task, grid: Grid) -> np.ndarray:
 
 
 class _Ends:
-    """The places to which the samples of all nodes lead, level by level."""
+    """The places to which the samples of all nodes lead, level by level.
 
-    def __init__(self, grid: Grid, levels: int):
+    Args:
+        grid: the nodes.
+        levels: number of levels.
+        estimate: whether a sample leads to one node that is drawn, and not to all around its end.
+        occurs: (N,) the node that stands for each, where not all of them occur.
+    """
+
+    def __init__(self, grid: Grid, levels: int, estimate: bool, occurs: np.ndarray | None):
         d, nodes = len(grid.counts), len(grid.nodes)
         self._grid = grid
-        self._rng = np.random.default_rng(0) if d > 2 else None
+        self._rng = np.random.default_rng(0) if estimate else None
+        self._occurs = occurs
         # Which of the two nodes along each coordinate a corner takes.
         self._corners = [(0,) * d] if self._rng else list(product((0, 1), repeat=d))
         self._between = np.zeros(d, dtype=bool)
@@ -291,6 +317,7 @@ class _Ends:
         ]
         for c, corner in enumerate(self._corners):
             place = sum(around[which][:, axis] for axis, which in enumerate(corner))
+            place = place if self._occurs is None else self._occurs[place]
             self._after[level, c, nodes] = np.where(ended < 0, place, ended)
 
     @property

@@ -19,6 +19,8 @@ CURVE_CELLS = {1: 3_000, 2: 240, 3: 80}
 # is asked for may have twice as many.
 FITTING = 2**23
 MOST_TRANSITIONS = 2 * FITTING
+# As many where each of them is a step in Python, of which a core takes some thousands a second.
+FITTING_SLOW = 2**22
 # Share of the cells that is left where a lattice is too large.
 FEWER = 0.97
 # States from which a plant is stepped to find out how far it moves, and values of each of m inputs. Without
@@ -54,7 +56,7 @@ def lattice_grid(task: Task, cells: int = 0, most: int | None = None) -> Grid:
     hops = probed_hops(task)
     if chart.dimension > 2:
         sides = sides / np.maximum(longest(hops), sides / cells)
-    hop_counts = common_hops(task, hops)
+    hop_counts, most_of_all = common_hops(task, hops), FITTING_SLOW if task.slow else FITTING
     while True:
         number = np.maximum(np.round(cells * sides / sides.max()).astype(int), 2)
         # Samples that lead from node to node are worth a few cells more or less.
@@ -62,7 +64,10 @@ def lattice_grid(task: Task, cells: int = 0, most: int | None = None) -> Grid:
         aligned = np.where(np.abs(aligned - number) <= SHIFTED * number, aligned, number)
         for counts in (aligned, number):
             grid = Grid(chart, tuple(int(k) for k in counts + ~np.array(chart.periodic)))
-            fits = math.prod(grid.counts) <= MOST_NODES and transitions(task, grid, hops) <= FITTING
+            fits = (
+                math.prod(grid.counts) <= MOST_NODES
+                and transitions(task, grid, hops) <= most_of_all
+            )
             if fits or cells <= 2:
                 return grid
         cells = int(cells * FEWER)
@@ -77,21 +82,26 @@ def curve_grid(task: Task, cells: int = 0) -> Grid:
 def probed_hops(task: Task) -> np.ndarray:
     """Returns how far one sample moves the robot, from states all over the chart under many inputs.
 
+    If walls stop the robot, this is how far it usually moves: less at a wall, and far out of one.
+
     Returns:
-        Values of each of the m inputs..., `PROBES` states, d coordinates.
+        Values of each of the m inputs..., `PROBES` states or the usual one, d coordinates.
     """
     low, high = task.input_limits
     m, levels = len(low), task.learning.levels
     values = levels or (VALUES.get(m, 3) if task.has_inner_loop else ENDS)
     rng, chart = np.random.default_rng(0), task.chart
     z = rng.uniform(chart.low, chart.high, (PROBES, chart.dimension))
+    if task.stopped_by_walls:  # outside of them
+        z = task.starts(PROBES, rng)
     plant, hops = task.plant(PROBES), []
     for u in product(*np.linspace(low, high, values).T):
         plant.set_state(*task.state(z))
         before = task.z(plant.measurement)
         plant.step(np.tile(u, (PROBES, 1)))
         hops.append(chart.difference(task.z(plant.measurement), before))
-    return np.array(hops).reshape(*(values,) * m, PROBES, chart.dimension)
+    moved = np.array(hops).reshape(*(values,) * m, PROBES, chart.dimension)
+    return np.median(moved, axis=-2, keepdims=True) if task.stopped_by_walls else moved
 
 
 def aligned_cells(task: Task, cells: int) -> int:
@@ -119,7 +129,7 @@ def common_hops(task: Task, hops: np.ndarray) -> np.ndarray:
     flat = hops.reshape(-1, hops.shape[-1])
     for along, side in zip(flat.T, task.chart.sides, strict=True):
         exact = SAME * side
-        if task.learning.levels is None and np.ptp(along) > exact:
+        if task.learning.levels is None and np.ptp(along) > exact and not task.stopped_by_walls:
             counts.append(1)  # between its extremes an input leads anywhere
             continue
         step = 0.0
@@ -151,7 +161,7 @@ def level_counts(task: Task, grid: Grid, hops: np.ndarray) -> tuple[int, ...]:
     for i in range(m):
         steps = np.abs(np.diff(hops, axis=i)).reshape(-1, hops.shape[-1]).max(axis=0)
         reach = steps * (hops.shape[i] - 1)
-        counts.append(int(np.ceil((reach / grid.spacing).max() - 1e-9)) + 1)
+        counts.append(int(np.ceil((reach / grid.spacing).max() - SAME)) + 1)
     return tuple(counts)
 
 

@@ -157,12 +157,14 @@ class LatticeSpacing:
         exact: whether every sample leads from node to node.
         cells: whether the starts of the scores are cells.
         curve_spacing: distance on the lattice on which the curve is computed.
+        contacts: whether contacts stop the robot between the nodes.
     """
 
     spacing: tuple[float, ...]
     exact: bool
     cells: bool
     curve_spacing: tuple[float, ...]
+    contacts: bool = False
 
 
 @dataclass(frozen=True)
@@ -196,8 +198,8 @@ class GameResult:
 
     @property
     def estimate(self) -> bool:
-        """Whether it is an estimate, because the lattice has three dimensions."""
-        return len(self.lattice.spacing) > 2
+        """Whether it is an estimate, because of three dimensions or of contacts."""
+        return len(self.lattice.spacing) > 2 or self.lattice.contacts
 
     @property
     def controllers(self) -> tuple[str, ...]:
@@ -246,6 +248,8 @@ class Robustness:
         seed: seed of the starts and the noise of these episodes and attacks.
         attacks: counts of the attack, one for each controller, if there was one.
     """
+
+    LATER: ClassVar[tuple[str, ...]] = ("game.lattice.contacts",)
 
     eps: float
     everywhere: bool

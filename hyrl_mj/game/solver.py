@@ -68,7 +68,8 @@ class Answers:
         measured = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
         def answer(q: int | None, points: np.ndarray) -> np.ndarray:
-            """Returns the answers (n,) to measurements (n, d) in a mode, or before the start if q is None."""
+            """Returns the answers (n,) at chart points (n, d) in a mode, or before the start if q is None."""
+            points = lattice.task.at(points)
             mode = controller.initial_mode(points) if q is None else np.full(len(points), q)
             u, after = controller.step(mode, points)
             unknown = ~np.isin(after, modes)

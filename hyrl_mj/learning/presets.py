@@ -183,6 +183,8 @@ def preset(
         cells = aligned_cells(task, cells)
     if not task.kinematic and dimension == 3 and name != "smoke":
         cells = enough_cells(task.chart, task.noise_in_chart(noise), cells, _MOST_CELLS)
+    if (most := task.learning.cells) is not None:
+        rods, cells = min(rods, most), min(cells, most)
     settings = Settings(
         task=reference(task),
         preset=name,

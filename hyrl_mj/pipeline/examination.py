@@ -92,8 +92,12 @@ def examination_plan(run: Run) -> str:
     if run.exact:
         return f"by the worst-case game on {nodes}"
     return (
-        f"by noisy episodes and an attack, and by the worst-case game on {nodes}, which is an estimate on a "
-        "chart of three dimensions"
+        f"by noisy episodes and an attack, and by the worst-case game on {nodes}, which is an estimate "
+        + (
+            "on a chart of three dimensions"
+            if len(grid.counts) > 2
+            else "where contacts stop the robot"
+        )
     )
 
 

@@ -21,7 +21,7 @@ from hyrl_mj.pipeline.examination import (
     examine_loops,
     examine_stage,
 )
-from hyrl_mj.policies import Agent, MlpPolicy, PolicyController, algorithms
+from hyrl_mj.policies import Agent, PolicyController, algorithms
 from hyrl_mj.progress import Say
 from hyrl_mj.run_directory import Run
 from hyrl_mj.stages import (
@@ -41,7 +41,8 @@ from hyrl_mj.viz import ReplayOptions, replay_sentence
 
 if TYPE_CHECKING:
     from hyrl_mj.stages.grounds import ModeGround
-    from hyrl_mj.stages.retraining import WarmStart
+    from hyrl_mj.stages.retraining import ModePolicy, WarmStart
+    from hyrl_mj.stages.tables import TableOf
 
 # The video with preset smoke only shows that a video can be made.
 SMOKE = ReplayOptions(size=(640, 360), fps=10)
@@ -103,15 +104,18 @@ def retrain_stage(run: Run, say: Say) -> None:
     """Stage 6: trains the policy of each mode."""
     from hyrl_mj.stages.grounds import mode_ground
     from hyrl_mj.stages.retraining import start_policy
+    from hyrl_mj.stages.tables import Held, table_for
 
     s, sets = run.settings, run.extended_sets
     algorithms.check_named(s.stage6.algorithm)
     ground_of = partial(mode_ground, run.task, sets, parts=run.split, policy=run.steady)
     warm_start = partial(start_policy, run.steady, run.partition)
     part_of = partial(part_policy, run.task, run.steady, run.partition, noise=sets.noise)
-    parts = part_of if run.task.slow else None
-    work = partial(_retrained, s, ground_of, warm_start, parts, run.path / "logs")
-    done: list[tuple[MlpPolicy | PartPolicy, ModeResult]] = []
+    parts, table_of = part_of if run.task.slow else None, None
+    if run.task.slow and (held := Held.of(run.task, sets.sets[0].grid, sets.noise)) is not None:
+        table_of = partial(table_for, held)
+    work = partial(_retrained, s, ground_of, warm_start, parts, table_of, run.path / "logs")
+    done: list[tuple[ModePolicy, ModeResult]] = []
     if run.task.mirror is None:
         done += cores.spread(work, sets.modes)
     else:  # the mirror image of the policy of one mode may do for the next
@@ -129,10 +133,11 @@ def _retrained(
     ground_of: Callable[[int], ModeGround],
     warm_start: WarmStart,
     part_of: Callable[[int], PartPolicy] | None,
+    table_of: TableOf | None,
     logs: Path,
     mode: int,
-    others: Iterable[tuple[MlpPolicy | PartPolicy, ModeResult]] = (),
-) -> tuple[MlpPolicy | PartPolicy, ModeResult]:
+    others: Iterable[tuple[ModePolicy, ModeResult]] = (),
+) -> tuple[ModePolicy, ModeResult]:
     """Trains the policy of one mode, which may happen in a process of a pool."""
     from hyrl_mj.stages.retraining import retrain
 
@@ -143,6 +148,7 @@ def _retrained(
         warm_start=warm_start,
         others=others,
         part=None if part_of is None else part_of(mode),
+        table=table_of,
         log_dir=logs / f"mode_{mode}",
     )
 

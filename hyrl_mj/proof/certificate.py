@@ -49,8 +49,7 @@ class Certificate:
     def of(game: Game, controllers: Mapping[str, Controller]) -> Certificate:
         """Returns the certificate of some controllers of a game."""
         answers, why_not = {}, {}
-        if game.lattice.estimate:
-            why = "the game is an estimate on a chart of three dimensions"
+        if why := game.lattice.why_estimate:
             return Certificate(game, None, {}, dict.fromkeys(controllers, why))
         try:
             cells = Cells.of(game.lattice)

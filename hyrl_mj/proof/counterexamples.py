@@ -26,8 +26,9 @@ from hyrl_mj.tasks import Outcome
 CANDIDATES = 17
 # Cells without a verdict in which a start is attacked, for each start mode.
 MOST_CELLS = 128
-# Nodes from which a controller is attacked where the game is an estimate, for each start mode.
-ATTACKED_NODES = 1_000
+# Nodes from which a controller is attacked where the game is an estimate, for each start mode; and where each
+# sample runs Python code.
+ATTACKED_NODES, ATTACKED_NODES_SLOW = 1_000, 48
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,8 @@ def attack(
     attacked, tried = value[-len(modes) :, :-2] >= NEVER, region
     if game.lattice.estimate:
         tried, every = np.zeros_like(region), np.flatnonzero(region)
-        tried[rng.choice(every, min(len(every), ATTACKED_NODES), replace=False)] = True
+        most = ATTACKED_NODES_SLOW if game.task.slow else ATTACKED_NODES
+        tried[rng.choice(every, min(len(every), most), replace=False)] = True
         attacked = np.ones_like(attacked)
     attacked &= tried
     noises: list[AnyNoise] = [game.worst_noise(name, eps)] if attacked.any() else []

@@ -71,11 +71,12 @@ def examine(
     Lattice.check(task)
     parts, grid = tuple(parts), lattice_grid(task, cells)
     Lattice.check(task, grid)
-    largest = max(bounds) if task.chart.dimension > 2 else max(*bounds, LARGEST)
+    exact = Lattice.decides(task, grid)
+    largest = max(*bounds, LARGEST) if exact else max(bounds)
     fine = Game(task, parts, controllers, largest, everywhere, grid)
     names = [*controllers, LIMIT]
     scores, maps, has_cells, why_not = _scores(fine, names, controllers, bounds)
-    if fine.lattice.estimate:  # a coarser lattice would estimate nothing
+    if not exact:  # a coarser lattice would estimate nothing
         coarse, margins = fine, dict.fromkeys(controllers)
         curve, profile = _known(bounds, scores), Profile((), dict.fromkeys(names, ()))
     else:
@@ -84,7 +85,9 @@ def examine(
         likely = [(name, _last_won(curve, curve.wins[name])) for name in controllers]
         margins = dict(zip(controllers, _in_threads("margins", fine.margin, likely), strict=True))
     spacing, curve_spacing = (tuple(g.lattice.grid.spacing.tolist()) for g in (fine, coarse))
-    lattice = LatticeSpacing(spacing, fine.lattice.exact, has_cells, curve_spacing)
+    lattice = LatticeSpacing(
+        spacing, fine.lattice.exact, has_cells, curve_spacing, task.stopped_by_walls
+    )
     proved = {name: _proved_margin(curve, curve.wins[name]) for name in controllers}
     misses = _misses(coarse, controllers)
     result = GameResult(

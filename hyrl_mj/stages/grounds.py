@@ -14,6 +14,7 @@ from hyrl_mj.learning.training import Score
 from hyrl_mj.policies import MlpPolicy, Policy, PolicyController
 from hyrl_mj.sets import GridSet
 from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
+from hyrl_mj.stages.attacks import Budget, attack
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.tasks import Outcome, Task
@@ -43,6 +44,8 @@ FEW_PLAYS = PLAYS[: 3 * len(JUDGES)]
 # image may win.
 SHARED = [play for play in PLAYS[-len(JUDGES) :] if play[1] != "adversarial"]
 ALIKE = 0.02
+# Starts from which a policy is attacked, and rounds of the attack.
+ATTACKED, ROUNDS = 64, 2
 # So many starts are drawn for each episode; those too close to where the mode cannot succeed are left out.
 SPARE = 4
 # There, unless the task has a precision, a policy may end this many times as far off the set-point as the
@@ -60,6 +63,8 @@ def mode_ground(
     """Returns the ground of a mode, judged by the worst-case game if possible, otherwise by episodes."""
     if task.for_mode(mode) is not task:
         return ByShare(task, extended, mode, parts, policy)
+    if task.slow and task.arrival_ends:
+        return ByAttack(task, extended, mode, parts, policy)
     kind = ByGame if game.Lattice.decides(task, extended.sets[0].grid) else ByEpisodes
     return kind(task, extended, mode, parts, policy)
 
@@ -331,6 +336,29 @@ class ByEpisodes(ModeGround):
         ends, won = run.path[-1], run.outcome == Outcome.REACHED
         won = won & self.task.arrived(ends) if kind == JUDGES[0] else won
         return won, self.task.miss(ends)
+
+
+class ByAttack(ByEpisodes):
+    """Judges by noisy episodes and by an attack, which finds noise that is held where it keeps a robot.
+
+    A policy that wins all plays is attacked from some of their starts.
+    """
+
+    def _prepare(self, policy: Policy | None) -> None:
+        super()._prepare(policy)
+        self.enough = float(len(self.plays) + 1), -1.0
+
+    def score(self, policy: Policy, plays: Sequence[tuple[int, str]] | None = None) -> Score:
+        score = super().score(policy, plays)
+        if score[0] < len(self.plays):
+            return score
+        starts, budget = self.judged[:ATTACKED], Budget(rounds=ROUNDS)
+        task, loops = self.task.with_noise(self.shares), {"mode": PolicyController(policy)}
+        found = attack(task, loops, starts, self.extended.noise, budget)["mode"]
+        lost = np.array([arc.outcome != Outcome.REACHED.label for arc in found.arcs])
+        at = self.grid.nearest(starts[lost])
+        self._remember(at, np.ones(len(at)))
+        return (score[0], -float(lost.mean())) if lost.any() else (score[0] + 1, score[1])
 
 
 class ByShare(ByEpisodes):

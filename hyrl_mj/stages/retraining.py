@@ -14,7 +14,10 @@ from hyrl_mj.policies import ALGORITHMS, MlpPolicy, Policy
 from hyrl_mj.stages.grounds import ModeGround
 from hyrl_mj.stages.partition import Partition, PartPolicy, part_policy
 from hyrl_mj.stages.results import ModeResult
+from hyrl_mj.stages.tables import BoundTable, TableOf
 
+# The policy of a mode: a trained network, pi_i, or a table.
+ModePolicy = MlpPolicy | PartPolicy | BoundTable
 # Returns the policy that the first attempt continues from, by the ground of the mode, settings and a seed.
 WarmStart = Callable[["ModeGround", Training, int], MlpPolicy | None]
 
@@ -47,10 +50,11 @@ def retrain(
     seed: int,
     *,
     warm_start: WarmStart | None = None,
-    others: Iterable[tuple[MlpPolicy | PartPolicy, ModeResult]] = (),
+    others: Iterable[tuple[ModePolicy, ModeResult]] = (),
     part: PartPolicy | None = None,
+    table: TableOf | None = None,
     log_dir: Path | None = None,
-) -> tuple[MlpPolicy | PartPolicy, ModeResult]:
+) -> tuple[ModePolicy, ModeResult]:
     """Trains the policy of one mode (paper, Step 6).
 
     Noise leads a policy that passes an obstacle closer than the noise bound into the obstacle, and no
@@ -67,6 +71,8 @@ def retrain(
             good enough for this mode.
         part: pi_i of the mode (paper, Step 4), which is used as it is if it is good enough; by default it is
             not tried.
+        table: returns a table of inputs for the ground; the better of it and pi_i then takes the place of the
+            trainings.
         log_dir: folder of logs and checkpoints.
 
     Returns:
@@ -74,20 +80,24 @@ def retrain(
         pi_i, and the one that the first continued from. And how the training ended.
     """
     task, mode = ground.task, ground.mode
-    tried: list[tuple[Score, MlpPolicy | PartPolicy]] = []
+    tried: list[tuple[Score, ModePolicy]] = []
     if part is not None:
         tried.append((ground(part), part))
         if ground.suffices(part):
             return part, ModeResult(mode, ground.won(part), 0)
     if task.mirror is not None:
         for other, result in others:
-            if isinstance(other, PartPolicy):
+            if not isinstance(other, MlpPolicy):
                 continue
             image = symmetry.mirrored(other)
             won = ground.won_by_image(image, result.won)
             if won is not None:
                 return image, ModeResult(mode, won, 0)
     trainings = 0
+    if table is not None:
+        made = table(ground)
+        tried.append((ground(made), made))
+        return _best(ground, tried, trainings)
     for attempt in range(settings.attempts):
         draw = int(np.random.SeedSequence([seed, 1 + mode, attempt]).generate_state(1)[0])
         warm = None
@@ -105,5 +115,12 @@ def retrain(
         tried.append((ground(trained), trained))
         if ground.suffices(trained):
             break
+    return _best(ground, tried, trainings)
+
+
+def _best(
+    ground: ModeGround, tried: list[tuple[Score, ModePolicy]], trainings: int
+) -> tuple[ModePolicy, ModeResult]:
+    """Returns the policy with the best score, and how its mode ended."""
     best = max(tried, key=lambda result: result[0])[1]
-    return best, ModeResult(mode, ground.won(best), trainings)
+    return best, ModeResult(ground.mode, ground.won(best), trainings)

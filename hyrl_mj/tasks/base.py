@@ -79,6 +79,10 @@ class Task(ABC):
     #: whether each sample runs Python code of an environment: it is then judged by fewer episodes, and
     #: stage 6 first tries the policies of stage 4 as they are
     slow: bool = False
+    #: whether an episode ends where it arrives, and does not go on to be judged at its end
+    arrival_ends: bool = True
+    #: whether contacts stop the robot, so that no run comes to states inside of walls
+    stopped_by_walls: bool = False
     #: the mirror symmetry of observation, inputs and reward, if there is one (paper, Section IV-B)
     mirror: Mirror | None = None
     #: bounds of the observation (k,), (k,), noise included
@@ -186,6 +190,12 @@ class Task(ABC):
         still = self.control(u, qpos, np.zeros_like(qvel))
         return bool(np.allclose(self.control(u, qpos, qvel), still, rtol=0, atol=1e-9))
 
+    @cached_property
+    def chart_is_state(self) -> bool:
+        """Whether one sample leads from chart point to chart point, so that nothing else tells what comes."""
+        d = self.chart.dimension
+        return self.measurement_columns == d and self.model.nq == d and self.kinematic
+
     def check_measurement(self, measured: np.ndarray) -> np.ndarray:
         """Returns a measurement as a float array (n, p).
 
@@ -246,6 +256,10 @@ class Task(ABC):
     def z(self, measured: np.ndarray) -> np.ndarray:
         """Returns the chart points (n, d) of measurements (n, p), by default the first d columns."""
         return measured[:, : self.chart.dimension]
+
+    def at(self, z: np.ndarray) -> np.ndarray:
+        """Returns measurements (n, p) with chart points z (n, d), where these are the whole measurement."""
+        return z
 
     def with_z(self, measured: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Returns measurements (n, p) changed so that their chart points are z (n, d)."""

@@ -136,6 +136,7 @@ def _check_training(task: Task) -> None:
     if learning.search not in SEARCHES:
         raise unknown("search", learning.search, SEARCHES)
     Number(0, LONGEST, above=True).checked("learning.horizon", learning.horizon)
+    Optional(Integer(2, 10**6)).checked("learning.cells", learning.cells)
     Optional(Integer(1, 1_000)).checked("learning.levels", learning.levels)
     if learning.levels is not None and not 2 <= learning.levels ** len(task.inputs) <= MOST_LEVELS:
         raise BadInput(

@@ -83,6 +83,8 @@ class Learning:
         levels: number of equally spaced levels of each input; None for continuous inputs.
         search: the search for the critical set, by "rods" or by "outcome"; see `find_critical_set`.
         horizon: the paper's horizon T of the backward propagation [s].
+        cells: the most grid cells along the longest side of the chart, where runs from more would take too
+            long; None for no such limit.
         training: fields of `Training` in which stage 1 with this algorithm differs from preset fast, as
             {"samples": 1_000_000, "hidden": (256, 256)}; preset smoke has its own number of samples.
         modes: the same of stage 6, which trains one policy for each mode, as {"gamma": 0.97}.
@@ -92,5 +94,6 @@ class Learning:
     levels: int | None = None
     search: str = "outcome"
     horizon: float = 0.5
+    cells: int | None = None
     training: Mapping[str, Any] = field(default_factory=dict)
     modes: Mapping[str, Any] = field(default_factory=dict)
