@@ -40,8 +40,8 @@ ACTIVATIONS = {name: getattr(nn, torch_name) for name, torch_name in TORCH_NAMES
 LOG_ROLLOUTS, LOG_EPISODES = 1, 100
 # The learning rate falls to this share of its first value, not to zero: the last samples count too.
 FINAL_RATE = 0.02
-# Number of checkpoints at which the policy is judged, and of the episodes of each.
-CHECKPOINTS = 32
+# Number of checkpoints at which a policy is judged, fewer where samples are slow, and of episodes of each.
+CHECKPOINTS, CHECKPOINTS_SLOW = 32, 8
 EPISODES = 256
 # The kinds of noise under which a policy that is trained for noise is judged.
 JUDGES = ("none", "uniform", "alternating")
@@ -104,7 +104,8 @@ def train(
     if log_dir is not None:
         model.set_logger(configure(str(log_dir / "tensorboard"), ["tensorboard"]))
     interval = LOG_ROLLOUTS if isinstance(model, OnPolicyAlgorithm) else LOG_EPISODES
-    watch = _Watch(settings.samples, ground, log_dir, label)
+    checkpoints = min(CHECKPOINTS, CHECKPOINTS_SLOW) if task.slow else CHECKPOINTS
+    watch = _Watch(settings.samples, checkpoints, ground, log_dir, label)
     try:
         with threads(1):  # faster for small networks
             model.learn(settings.samples, callback=watch, log_interval=interval)
@@ -303,13 +304,15 @@ class TaskGround:
 class _Watch(BaseCallback):
     """Shows progress, judges checkpoints at intervals, and keeps the best policy."""
 
-    def __init__(self, samples: int, ground: Ground, log_dir: Path | None, label: str):
+    def __init__(
+        self, samples: int, checkpoints: int, ground: Ground, log_dir: Path | None, label: str
+    ):
         super().__init__()
         self.best: MlpPolicy | None = None
         self.best_score: Score = (-np.inf,)
         self._ground, self._log_dir = ground, log_dir
         self._settled = int(ground.settled * samples)
-        self._next = self._interval = max(samples // CHECKPOINTS, 1)
+        self._next = self._interval = max(samples // checkpoints, 1)
         self._progress = progress_bar(None, label, "samples", samples)
 
     def _on_step(self) -> bool:

@@ -25,6 +25,7 @@ from hyrl_mj.stages import (
     noisy_episodes,
     shown_arcs,
 )
+from hyrl_mj.tasks import Task
 from hyrl_mj.viz import robustness_sentence
 
 # The kinds of noise in episodes by default.
@@ -35,6 +36,8 @@ EPISODES, EPISODES_FEW = 1_000, 200
 # Starts and rounds of the attack on such a run.
 ATTACKED, ATTACKED_SMOKE = 200, 40
 ROUNDS, ROUNDS_SMOKE = 2, 1
+# Samples of a long episode.
+LONG = 200
 
 
 @dataclass(frozen=True)
@@ -138,7 +141,7 @@ def examine_loops(
     task.check_noise(eps, everywhere)
     if count is None and not run.exact:
         few = task.slow or run.settings.preset == "smoke"
-        count = EPISODES_FEW if few else EPISODES
+        count = _fewer(task, EPISODES_FEW) if few else EPISODES
     if count is not None and count < 1:
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
     noises = tuple(Noise(kind, eps, everywhere) for kind in options.noise or KINDS)
@@ -163,6 +166,12 @@ def _winnable(run: Run, maps: Maps | None) -> tuple[Grid, np.ndarray] | None:
     return maps.grid(run.task.chart), ~np.isin(classes, (UNWINNABLE, OVER))
 
 
+def _fewer(task: Task, count: int) -> int:
+    """Returns half as many episodes where samples are slow and all episodes are long."""
+    long = task.slow and not task.arrival_ends and task.max_steps > LONG
+    return count // 2 if long else count
+
+
 def attack_loops(
     run: Run,
     loops: dict[str, Controller],
@@ -172,7 +181,7 @@ def attack_loops(
 ) -> dict[str, Attack]:
     """Attacks controllers by name, from the same starts."""
     task, eps = run.task, run.settings.noise if options.eps is None else options.eps
-    n = ATTACKED_SMOKE if run.settings.preset == "smoke" else ATTACKED
+    n = ATTACKED_SMOKE if run.settings.preset == "smoke" else _fewer(task, ATTACKED)
     starts = attack_starts(task, regions, eps, n, options.seed)
     everywhere = options.all_coordinates or run.settings.everywhere
     return attack(task, loops, starts, eps, budget, everywhere, options.seed)

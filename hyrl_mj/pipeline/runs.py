@@ -75,6 +75,7 @@ class AgentOptions:
         horizon: time T of the backward propagation [s]; by default the paper's with preset paper, otherwise
             the sets are sized to the noise.
         all_coordinates: noise on every coordinate of the measurement, not only on the noisy ones of the task.
+        set: settings to change, as they stand in config.json, such as cells=120; by default none.
         out: the run directory; by default runs/TASK_robust.
     """
 
@@ -87,6 +88,7 @@ class AgentOptions:
     preset: str = "fast"
     horizon: float | None = None
     all_coordinates: bool = False
+    set: dict[str, Any] = field(default_factory=dict)
     out: str | Path | None = None
 
 
@@ -217,9 +219,6 @@ def settings_of(task: Task, options: RunOptions) -> Settings:
         BadInput: a value that cannot be used.
     """
     settings = _settings(task, options, algorithm=options.algorithm)
-    if options.set:
-        settings = changed(settings, options.set)
-        settings.check(task)
     assert isinstance(settings.stage1, Training)
     if settings.stage1.algorithm not in ALGORITHMS:
         from hyrl_mj.learning.training import check_foreign
@@ -233,6 +232,8 @@ def _settings(task: Task, options: RunOptions | AgentOptions, **changes: Any) ->
     eps, seed, horizon = options.eps, options.seed, options.horizon
     settings = preset(task, options.preset, noise=eps, seed=seed, horizon=horizon, **changes)
     settings = replace(settings, everywhere=options.all_coordinates)
+    if options.set:
+        settings = changed(settings, options.set)
     settings.check(task)
     return settings
 

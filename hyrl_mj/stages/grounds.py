@@ -44,8 +44,8 @@ FEW_PLAYS = PLAYS[: 3 * len(JUDGES)]
 # image may win.
 SHARED = [play for play in PLAYS[-len(JUDGES) :] if play[1] != "adversarial"]
 ALIKE = 0.02
-# Starts from which a policy is attacked, and rounds of the attack.
-ATTACKED, ROUNDS = 64, 2
+# Starts from which a policy is attacked, and rounds of the attack; the second takes much longer.
+ATTACKED, ROUNDS = 64, 1
 # So many starts are drawn for each episode; those too close to where the mode cannot succeed are left out.
 SPARE = 4
 # There, unless the task has a precision, a policy may end this many times as far off the set-point as the

@@ -57,11 +57,9 @@ class Section(Task):
     where, plane, obstacles = _of_whole("where"), _of_whole("plane"), _of_whole("obstacles")
     gives_direction, mode_name = _of_whole("gives_direction"), _of_whole("mode_name")
     colour_of, tinted = _of_whole("colour_of"), _of_whole("tinted")
-    slow, spec, observation_parts = (
-        _of_whole("slow"),
-        _of_whole("spec"),
-        _of_whole("observation_parts"),
-    )
+    slow, spec, chart_is_state = _of_whole("slow"), _of_whole("spec"), _of_whole("chart_is_state")
+    observation_parts, arrival_ends = _of_whole("observation_parts"), _of_whole("arrival_ends")
+    stopped_by_walls = _of_whole("stopped_by_walls")
     ending, verdict = _of_whole("ending"), _of_whole("verdict")
 
     def __init__(self, whole: Task, rest: ArrayLike | None = None):
@@ -94,6 +92,9 @@ class Section(Task):
 
     def z(self, measured: np.ndarray) -> np.ndarray:
         return self.whole.z(measured)[:, :2]
+
+    def at(self, z: np.ndarray) -> np.ndarray:
+        return self.whole.at(self.lift(z))
 
     def with_z(self, measured: np.ndarray, z: np.ndarray) -> np.ndarray:
         return self.whole.with_z(measured, np.hstack([z, self.whole.z(measured)[:, 2:]]))
