@@ -14,6 +14,7 @@ from hyrl_mj.learning.training import Score
 from hyrl_mj.policies import MlpPolicy, Policy, PolicyController
 from hyrl_mj.sets import GridSet
 from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
+from hyrl_mj.stages import tables
 from hyrl_mj.stages.attacks import Budget, attack
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
@@ -63,7 +64,7 @@ def mode_ground(
     """Returns the ground of a mode, judged by the worst-case game if possible, otherwise by episodes."""
     if task.for_mode(mode) is not task:
         return ByShare(task, extended, mode, parts, policy)
-    if task.slow and task.arrival_ends:
+    if task.slow and tables.possible(task, extended.sets[0].grid):
         return ByAttack(task, extended, mode, parts, policy)
     kind = ByGame if game.Lattice.decides(task, extended.sets[0].grid) else ByEpisodes
     return kind(task, extended, mode, parts, policy)
@@ -339,26 +340,29 @@ class ByEpisodes(ModeGround):
 
 
 class ByAttack(ByEpisodes):
-    """Judges by noisy episodes and by an attack, which finds noise that is held where it keeps a robot.
+    """Judges by an attack, too, which finds noise that keeps a robot in a corner: where a table can be made.
 
-    A policy that wins all plays is attacked from some of their starts.
+    The score is the share of episodes that are won without noise, then the share of starts from which an attack
+    does not break it. For a policy that loses none of them the score of the noisy episodes follows.
     """
 
     def _prepare(self, policy: Policy | None) -> None:
         super()._prepare(policy)
-        self.enough = float(len(self.plays) + 1), -1.0
+        self.enough = (1.0, 1.0, *self.enough)
 
     def score(self, policy: Policy, plays: Sequence[tuple[int, str]] | None = None) -> Score:
-        score = super().score(policy, plays)
-        if score[0] < len(self.plays):
-            return score
+        quiet = [play for play in self.plays if play[1] == JUDGES[0]]
+        won = float(np.concatenate([self._play(policy, *play)[0] for play in quiet]).mean())
         starts, budget = self.judged[:ATTACKED], Budget(rounds=ROUNDS)
         task, loops = self.task.with_noise(self.shares), {"mode": PolicyController(policy)}
         found = attack(task, loops, starts, self.extended.noise, budget)["mode"]
-        lost = np.array([arc.outcome != Outcome.REACHED.label for arc in found.arcs])
-        at = self.grid.nearest(starts[lost])
-        self._remember(at, np.ones(len(at)))
-        return (score[0], -float(lost.mean())) if lost.any() else (score[0] + 1, score[1])
+        withstood = 1 - found.count.lost / len(starts)
+        if won < 1 or withstood < 1:
+            return won, withstood, 0.0, -1.0
+        return won, withstood, *super().score(policy, plays)
+
+    def won(self, policy: Policy) -> float:
+        return float(np.concatenate([self._play(policy, *play)[0] for play in self.plays]).mean())
 
 
 class ByShare(ByEpisodes):

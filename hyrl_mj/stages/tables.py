@@ -113,17 +113,11 @@ class Held:
 
     @staticmethod
     def of(task: Task, grid: Nodes, noise: float) -> Held | None:
-        """Returns these runs, None where no table can be made of them.
-
-        That is a chart of more than two dimensions, more than four inputs, an arrival that does not end the
-        episode, or a robot that takes too long to get away.
-        """
-        m = len(task.inputs)
-        if not isinstance(grid, Grid) or len(grid.counts) > 2 or not task.arrival_ends:
+        """Returns these runs, None where no table is `possible`, or the robot takes too long to get away."""
+        if not possible(task, grid):
             return None
-        if m not in VALUES and task.input_levels is None:
-            return None
-        inputs = task.input_levels
+        assert isinstance(grid, Grid)
+        m, inputs = len(task.inputs), task.input_levels
         if inputs is None:
             axes = [np.linspace(a, b, VALUES[m]) for a, b in zip(*task.input_limits, strict=True)]
             inputs = np.array(list(product(*axes)))
@@ -156,6 +150,16 @@ class Held:
         """(N,) the place among `rows` of the node nearest to each node."""
         tree = self.grid.chart.tree(self.grid.nodes[self.rows])
         return np.asarray(tree.query(self.grid.chart.in_box(self.grid.nodes))[1])
+
+
+def possible(task: Task, grid: Nodes) -> bool:
+    """Returns whether a table can be made.
+
+    That takes a chart of at most two dimensions, at most four inputs or a few levels, and an arrival that
+    ends the episode.
+    """
+    few = len(task.inputs) in VALUES or task.input_levels is not None
+    return isinstance(grid, Grid) and len(grid.counts) <= 2 and few and task.arrival_ends
 
 
 def _samples(task: Task, z: np.ndarray, inputs: np.ndarray, away: float) -> int:
