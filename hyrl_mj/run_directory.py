@@ -22,14 +22,15 @@ from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.stages import (
     Arrivals,
+    BoundTable,
     CriticalSet,
     ExtendedSets,
     HybridController,
     Partition,
     PartPolicy,
     Retraining,
+    TablePolicy,
 )
-from hyrl_mj.stages.tables import BoundTable, TablePolicy
 from hyrl_mj.tasks import Field, Task, described_task, get_task, reference
 from hyrl_mj.verdict import Verdict
 

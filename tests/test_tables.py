@@ -12,6 +12,9 @@ from hyrl_mj.policies import PolicyController
 from hyrl_mj.proof import examine
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import Signal, closed_loop, policy_runs
+from hyrl_mj.stages import ExtendedSets
+from hyrl_mj.stages.grounds import ByAttack, mode_ground
+from hyrl_mj.stages.retraining import retrain
 from hyrl_mj.stages.tables import Held, TablePolicy, _in_reach, table_for
 from hyrl_mj.tasks import Outcome
 
@@ -95,6 +98,52 @@ def test_a_table_is_read_as_it_was_written(puck, held, tmp_path):
     np.testing.assert_array_equal(again.of(puck).act(measured), table.act(measured))
     with pytest.raises(BadInput, match="does not fit"):
         TablePolicy(again.counts, again.inputs[1:]).of(puck)
+
+
+@pytest.mark.parametrize(("of_table", "taken"), [(0.9, "table"), (0.7, "part")])
+def test_the_better_of_table_and_part_is_taken_and_nothing_is_trained(puck, of_table, taken):
+    scores = {"part": (1.0, 0.8), "table": (1.0, of_table)}
+
+    class Ground:
+        task, mode = puck, 1
+
+        def __call__(self, policy):
+            return scores[policy]
+
+        def suffices(self, policy):
+            return False
+
+        def won(self, policy):
+            return scores[policy][1]
+
+    found, result = retrain(Ground(), None, 0, part="part", table=lambda ground: "table")
+    assert found == taken
+    assert (result.attempts, result.won) == (0, scores[taken][1])
+
+
+def test_a_policy_is_judged_without_noise_and_by_an_attack(puck):
+    grid = Grid.with_cells(puck.chart, 24)
+    whole = GridSet.from_mask(grid, np.ones(grid.size, dtype=bool))
+    wins = np.ones(grid.size, dtype=bool)
+    sets = ExtendedSets(
+        (0,),
+        (whole,),
+        (wins,),
+        0.0,
+        EPS,
+        np.empty((0, 2)),
+        np.empty(0),
+        np.empty((0, 2), dtype=int),
+    )
+    ground = mode_ground(puck, sets, 0)
+    assert isinstance(ground, ByAttack)
+    policy = SimpleNamespace(act=lambda m: np.clip(puck_agent(puck.observation(m)), -4, 4))
+    idle = SimpleNamespace(act=lambda m: np.zeros((len(m), 2)))
+    quiet, withstood, *_ = ground(policy)
+    assert quiet > 0.9
+    assert 0 <= withstood <= 1
+    assert ground(idle)[:2] < (quiet, withstood)
+    assert ground(idle)[1] < 0.1
 
 
 def test_no_table_where_arrival_does_not_end_an_episode(puck, held):

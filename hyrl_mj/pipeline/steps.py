@@ -26,14 +26,17 @@ from hyrl_mj.progress import Say
 from hyrl_mj.run_directory import Run
 from hyrl_mj.stages import (
     Arrivals,
+    Held,
     ModeResult,
     PartPolicy,
     Retraining,
+    TableOf,
     boundary,
     extend,
     find_critical_set,
     make_partition,
     part_policy,
+    table_for,
     with_room,
 )
 from hyrl_mj.verdict import mode_sentence
@@ -42,7 +45,6 @@ from hyrl_mj.viz import ReplayOptions, replay_sentence
 if TYPE_CHECKING:
     from hyrl_mj.stages.grounds import ModeGround
     from hyrl_mj.stages.retraining import ModePolicy, WarmStart
-    from hyrl_mj.stages.tables import TableOf
 
 # The video with preset smoke only shows that a video can be made.
 SMOKE = ReplayOptions(size=(640, 360), fps=10)
@@ -104,7 +106,6 @@ def retrain_stage(run: Run, say: Say) -> None:
     """Stage 6: trains the policy of each mode."""
     from hyrl_mj.stages.grounds import mode_ground
     from hyrl_mj.stages.retraining import start_policy
-    from hyrl_mj.stages.tables import Held, table_for
 
     s, sets = run.settings, run.extended_sets
     algorithms.check_named(s.stage6.algorithm)

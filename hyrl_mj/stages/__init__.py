@@ -20,14 +20,17 @@ from hyrl_mj.stages.partition import (
     with_room,
 )
 from hyrl_mj.stages.results import Arrivals, ModeResult, Retraining
+from hyrl_mj.stages.tables import BoundTable, Held, TableOf, TablePolicy, table_for
 
 __all__ = [
     "ON_EDGE",
     "Arrivals",
     "Attack",
+    "BoundTable",
     "Budget",
     "CriticalSet",
     "ExtendedSets",
+    "Held",
     "HybridController",
     "Losses",
     "ModeResult",
@@ -35,6 +38,8 @@ __all__ = [
     "Partition",
     "Regions",
     "Retraining",
+    "TableOf",
+    "TablePolicy",
     "attack",
     "attack_starts",
     "boundary",
@@ -48,5 +53,6 @@ __all__ = [
     "retraining",
     "shown_arcs",
     "sort_losses",
+    "table_for",
     "with_room",
 ]

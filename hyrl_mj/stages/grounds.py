@@ -14,10 +14,10 @@ from hyrl_mj.learning.training import Score
 from hyrl_mj.policies import MlpPolicy, Policy, PolicyController
 from hyrl_mj.sets import GridSet
 from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
-from hyrl_mj.stages import tables
 from hyrl_mj.stages.attacks import Budget, attack
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
+from hyrl_mj.stages.tables import possible
 from hyrl_mj.tasks import Outcome, Task
 
 # If the game is lost from some states, this share of the training episodes starts there.
@@ -64,7 +64,7 @@ def mode_ground(
     """Returns the ground of a mode, judged by the worst-case game if possible, otherwise by episodes."""
     if task.for_mode(mode) is not task:
         return ByShare(task, extended, mode, parts, policy)
-    if task.slow and tables.possible(task, extended.sets[0].grid):
+    if task.slow and possible(task, extended.sets[0].grid):
         return ByAttack(task, extended, mode, parts, policy)
     kind = ByGame if game.Lattice.decides(task, extended.sets[0].grid) else ByEpisodes
     return kind(task, extended, mode, parts, policy)
@@ -342,8 +342,8 @@ class ByEpisodes(ModeGround):
 class ByAttack(ByEpisodes):
     """Judges by an attack, too, which finds noise that keeps a robot in a corner: where a table can be made.
 
-    The score is the share of episodes that are won without noise, then the share of starts from which an attack
-    does not break it. For a policy that loses none of them the score of the noisy episodes follows.
+    The score is the share of episodes that are won without noise, then the share of starts from which an
+    attack does not break it. For a policy that loses none of them the score of the noisy episodes follows.
     """
 
     def _prepare(self, policy: Policy | None) -> None:
