@@ -83,6 +83,8 @@ class ModeGround(ABC):
         policy: the stage-1 policy, or the agent, which shows how close to the set-point a run can end.
 
     Attributes:
+        part: M_i of the mode; None where it earns its reward everywhere.
+        shared: (N,) bool, the nodes at which parts overlap, because nothing is left to decide.
         bound: (d,) largest error of a measured chart point, along each coordinate.
     """
 
@@ -101,7 +103,10 @@ class ModeGround(ABC):
     ):
         self.task, self.extended, self.mode = task.for_mode(mode), extended, mode
         own = self.task is not task
-        self.part = None if parts is None or own else parts.parts[parts.modes.index(mode)]
+        self.part, self.shared = None, np.zeros(extended.sets[0].grid.size, dtype=bool)
+        if parts is not None and not own:
+            self.part = parts.parts[parts.modes.index(mode)]
+            self.shared = np.sum([part.mask for part in parts], axis=0) > 1
         self.shares = tuple(float(share) for share in task.noisy)
         self.bound = task.noise_in_chart(extended.noise)
         index = extended.modes.index(mode)
@@ -342,13 +347,13 @@ class ByEpisodes(ModeGround):
 class ByAttack(ByEpisodes):
     """Judges by an attack, too, which finds noise that keeps a robot in a corner: where a table can be made.
 
-    The score is the share of episodes that are won without noise, then the share of starts from which an
-    attack does not break it. For a policy that loses none of them the score of the noisy episodes follows.
+    The score is the mean of two shares: of episodes that are won without noise, and of starts from which an
+    attack does not break the policy. If it loses none of them the score of the noisy episodes follows.
     """
 
     def _prepare(self, policy: Policy | None) -> None:
         super()._prepare(policy)
-        self.enough = (1.0, 1.0, *self.enough)
+        self.enough = (1.0, *self.enough)
 
     def score(self, policy: Policy, plays: Sequence[tuple[int, str]] | None = None) -> Score:
         quiet = [play for play in self.plays if play[1] == JUDGES[0]]
@@ -357,9 +362,8 @@ class ByAttack(ByEpisodes):
         task, loops = self.task.with_noise(self.shares), {"mode": PolicyController(policy)}
         found = attack(task, loops, starts, self.extended.noise, budget)["mode"]
         withstood = 1 - found.count.lost / len(starts)
-        if won < 1 or withstood < 1:
-            return won, withstood, 0.0, -1.0
-        return won, withstood, *super().score(policy, plays)
+        both = (won + withstood) / 2
+        return (both, *(super().score(policy, plays) if both == 1 else (0.0, -1.0)))
 
     def won(self, policy: Policy) -> float:
         return float(np.concatenate([self._play(policy, *play)[0] for play in self.plays]).mean())

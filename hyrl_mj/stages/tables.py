@@ -190,10 +190,15 @@ def table_for(held: Held, ground: ModeGround) -> BoundTable:
     """
     task, grid, rows = held.task, held.grid, held.rows
     never = 2.0 * task.max_steps
-    lost = held.failed | ~ground.within.contains(held.ends.reshape(-1, held.ends.shape[2])).reshape(
-        held.failed.shape
-    )
-    lost &= ~held.arrived
+    ends = held.ends.reshape(-1, len(grid.counts))
+    stays = ground.within.contains(ends)
+    if ground.part is not None:
+        # From M_i the way of the mode stays in it. From outside it leads there, and not to where parts
+        # overlap, which would be another way.
+        of_part = np.tile(ground.part.mask[rows], len(held.inputs))
+        shared = ground.shared[grid.nearest(ends)]
+        stays &= np.where(of_part, ground.part.contains(ends), ~shared)
+    lost = ~held.arrived & (held.failed | ~stays.reshape(held.failed.shape))
 
     def after(left: np.ndarray) -> np.ndarray:
         """Returns the samples (A, k) that are left at the ends, from those at the nodes (k,)."""
