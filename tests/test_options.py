@@ -20,11 +20,14 @@ def test_changes_are_made_on_top_of_the_options():
 
 
 def test_an_agent_has_the_options_of_a_run_but_those_of_its_training_and_four_of_its_own():
-    of_runs, of_agents = ({f.name for f in fields(kind)} for kind in (RunOptions, AgentOptions))
-    assert of_runs - of_agents == {"algorithm", "set"}
-    assert of_agents - of_runs == {"activation", "stochastic", "vecnormalize", "n_stack"}
-    for name in of_runs & of_agents:
-        assert getattr(RunOptions, name) == getattr(AgentOptions, name)
+    of_runs, of_agents = (
+        {f.name: (f.default, f.default_factory) for f in fields(kind)}
+        for kind in (RunOptions, AgentOptions)
+    )
+    assert {*of_runs} - {*of_agents} == {"algorithm"}
+    assert {*of_agents} - {*of_runs} == {"activation", "stochastic", "vecnormalize", "n_stack"}
+    for name in {*of_runs} & {*of_agents}:
+        assert of_runs[name] == of_agents[name]
 
 
 @pytest.mark.parametrize(
