@@ -33,6 +33,8 @@ VALUES = {1: 9, 2: 5, 3: 3, 4: 3}
 CELLS, BOUNDS, LONGEST, TRIED = 2.0, 1.5, 64, 64
 # To leave the mode's set, or to fail, counts as this share of the samples of an episode where it is averaged.
 LEAVING = 0.5
+# How much the worst of the nodes that noise may hide counts beside their average.
+WORST = 0.3
 # Values that change by less have converged [samples].
 SETTLED, SWEEPS = 1e-3, 2_000
 
@@ -182,7 +184,7 @@ def table_for(held: Held, ground: ModeGround) -> BoundTable:
     """Returns the policy of a mode: at each node the input that does well wherever noise may hide the robot.
 
     The measure of an input at a node is how many samples farther from arrival it leads, at the worst and on
-    average over the nodes within the noise bound; the two are added.
+    average over the nodes within the noise bound.
 
     Args:
         held: where held inputs lead.
@@ -218,7 +220,7 @@ def table_for(held: Held, ground: ModeGround) -> BoundTable:
     usual = np.stack([_in_reach(held, ground.bound, gain, "mean") for gain in most])
     hidden = ~np.isfinite(worst).all(axis=0)  # no node of the robot's is within the noise
     best = np.zeros(grid.size, dtype=int)
-    best[~hidden] = (worst[:, ~hidden] + usual[:, ~hidden]).argmin(axis=0)
+    best[~hidden] = (WORST * worst[:, ~hidden] + usual[:, ~hidden]).argmin(axis=0)
     best[hidden] = best[rows][held.nearest[hidden]]
     return BoundTable(task, grid, held.inputs[best])
 
