@@ -191,30 +191,16 @@ def table_for(held: Held, ground: ModeGround) -> BoundTable:
         ground: where the mode has to win.
     """
     task, grid, rows = held.task, held.grid, held.rows
-    never = 2.0 * task.max_steps
     ends = held.ends.reshape(-1, len(grid.counts))
-    stays = ground.within.contains(ends)
+    inside = ground.within.contains(ends)
+    farther, _ = _farther(held, inside)
     if ground.part is not None:
         # From M_i the way of the mode stays in it. From outside it leads there, and not to where parts
-        # overlap, which would be another way.
+        # overlap, which would be another way; but any way is better than none.
         of_part = np.tile(ground.part.mask[rows], len(held.inputs))
-        shared = ground.shared[grid.nearest(ends)]
-        stays &= np.where(of_part, ground.part.contains(ends), ~shared)
-    lost = ~held.arrived & (held.failed | ~stays.reshape(held.failed.shape))
-
-    def after(left: np.ndarray) -> np.ndarray:
-        """Returns the samples (A, k) that are left at the ends, from those at the nodes (k,)."""
-        everywhere = left[held.nearest]
-        value = np.stack([grid.interpolate(everywhere, z) for z in held.ends])
-        return np.where(held.arrived, 0.0, np.where(lost, never, value))
-
-    left = np.full(len(rows), never)
-    for _ in range(SWEEPS):
-        new = np.minimum(held.samples + after(left).min(axis=0), never)
-        change, left = np.abs(new - left).max(), new
-        if change < SETTLED:
-            break
-    farther = after(left) - left
+        own = np.where(of_part, ground.part.contains(ends), ~ground.shared[grid.nearest(ends)])
+        on_way, has_way = _farther(held, inside & own)
+        farther = np.where(has_way, on_way, farther)
     worst = np.stack([_in_reach(held, ground.bound, gain, "worst") for gain in farther])
     most = np.minimum(farther, LEAVING * task.max_steps)
     usual = np.stack([_in_reach(held, ground.bound, gain, "mean") for gain in most])
@@ -223,6 +209,29 @@ def table_for(held: Held, ground: ModeGround) -> BoundTable:
     best[~hidden] = (WORST * worst[:, ~hidden] + usual[:, ~hidden]).argmin(axis=0)
     best[hidden] = best[rows][held.nearest[hidden]]
     return BoundTable(task, grid, held.inputs[best])
+
+
+def _farther(held: Held, stays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns how many samples farther from arrival inputs lead (A, k), and which nodes have a way (k,) bool.
+
+    `stays` (A * k,) bool tells which ends are allowed.
+    """
+    never = 2.0 * held.task.max_steps
+    lost = ~held.arrived & (held.failed | ~stays.reshape(held.failed.shape))
+
+    def after(left: np.ndarray) -> np.ndarray:
+        """Returns the samples (A, k) that are left at the ends, from those at the nodes (k,)."""
+        everywhere = left[held.nearest]
+        value = np.stack([held.grid.interpolate(everywhere, z) for z in held.ends])
+        return np.where(held.arrived, 0.0, np.where(lost, never, value))
+
+    left = np.full(len(held.rows), never)
+    for _ in range(SWEEPS):
+        new = np.minimum(held.samples + after(left).min(axis=0), never)
+        change, left = np.abs(new - left).max(), new
+        if change < SETTLED:
+            break
+    return after(left) - left, left < never
 
 
 def _in_reach(held: Held, bound: np.ndarray, values: np.ndarray, how: str) -> np.ndarray:
