@@ -15,6 +15,7 @@ from hyrl_mj.policies import MlpPolicy, Policy, PolicyController
 from hyrl_mj.sets import GridSet
 from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
 from hyrl_mj.stages.attacks import Budget, attack
+from hyrl_mj.stages.critical_set import distance_to
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.stages.tables import possible
@@ -349,16 +350,25 @@ class ByAttack(ByEpisodes):
 
     The score is the mean of two shares: of episodes that are won without noise, and of starts from which an
     attack does not break the policy. If it loses none of them the score of the noisy episodes follows.
+
+    Attributes:
+        attacked: (n, d) starts of the attack.
     """
 
     def _prepare(self, policy: Policy | None) -> None:
         super()._prepare(policy)
         self.enough = (1.0, *self.enough)
+        # Half of the starts are where modes meet: there a mode may have to go against its neighbours.
+        off = distance_to(self.task, self.extended.points, self.grid.nodes[self.nodes])
+        near = self.nodes[off <= 2 * float(np.linalg.norm(self.bound / self.task.chart.scale))]
+        rng, half = np.random.default_rng(1), ATTACKED // 2 if len(near) else 0
+        meeting = self._around(rng.choice(near, half), rng) if half else self.judged[:0]
+        self.attacked = np.vstack([self.judged[: ATTACKED - half], meeting])
 
     def score(self, policy: Policy, plays: Sequence[tuple[int, str]] | None = None) -> Score:
         quiet = [play for play in self.plays if play[1] == JUDGES[0]]
         won = float(np.concatenate([self._play(policy, *play)[0] for play in quiet]).mean())
-        starts, budget = self.judged[:ATTACKED], Budget(rounds=ROUNDS)
+        starts, budget = self.attacked, Budget(rounds=ROUNDS)
         task, loops = self.task.with_noise(self.shares), {"mode": PolicyController(policy)}
         found = attack(task, loops, starts, self.extended.noise, budget)["mode"]
         withstood = 1 - found.count.lost / len(starts)
