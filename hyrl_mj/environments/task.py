@@ -368,9 +368,8 @@ class EnvironmentTask(Task):
     def at(self, z: np.ndarray) -> np.ndarray:
         (state, memory), n = self._usual, len(z)
         states = np.tile(state, (n, 1))
-        states[:, self.layout.of_chart] = (
-            z - self.layout.offset + 1.0
-        )  # observed is what is at z instead
+        # Not the state at z: what differs from the chart point is observed anew, at the chart point.
+        states[:, self.layout.of_chart] = z - self.layout.offset + 1.0
         report = np.zeros((n, self.host.width + 5))
         running = np.full((n, 1), float(Outcome.RUNNING))
         return np.column_stack([z, states, np.tile(memory, (n, 1)), report, running])

@@ -64,7 +64,10 @@ class TablePolicy(Saved):
             or self.inputs.shape != (np.prod(self.counts), len(task.inputs))
             or not np.isfinite(self.inputs).all()
         ):
-            raise BadInput(f"a table of inputs {self.inputs.shape} does not fit {task.name}")
+            raise BadInput(
+                f"a table of inputs {self.inputs.shape} does not fit {task.name}: run hyrl-mj retrain RUN "
+                "to write it again"
+            )
         return BoundTable(task, Grid.from_counts(task.chart, self.counts), self.inputs)
 
 
