@@ -2,6 +2,7 @@
 
 import logging
 import re
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,8 +24,8 @@ def install() -> None:
 
     That of dm_control is not the user's: importing dm_control sets it.
     """
-    handler = mujoco.get_mju_user_warning()
-    if handler is None or str(getattr(handler, "__module__", "")).startswith("dm_control"):
+    dm_control = sys.modules.get("dm_control.mujoco.wrapper.core")
+    if mujoco.get_mju_user_warning() in (None, getattr(dm_control, "_warning_callback", None)):
         mujoco.set_mju_user_warning(_count)
 
 
