@@ -18,7 +18,6 @@ from hyrl_mj.stages.attacks import Budget, attack
 from hyrl_mj.stages.critical_set import distance_to
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
-from hyrl_mj.stages.tables import possible
 from hyrl_mj.tasks import Outcome, Task
 
 # If the game is lost from some states, this share of the training episodes starts there.
@@ -65,7 +64,7 @@ def mode_ground(
     """Returns the ground of a mode, judged by the worst-case game if possible, otherwise by episodes."""
     if task.for_mode(mode) is not task:
         return ByShare(task, extended, mode, parts, policy)
-    if task.slow and possible(task, extended.sets[0].grid):
+    if task.slow:
         return ByAttack(task, extended, mode, parts, policy)
     kind = ByGame if game.Lattice.decides(task, extended.sets[0].grid) else ByEpisodes
     return kind(task, extended, mode, parts, policy)
@@ -346,7 +345,7 @@ class ByEpisodes(ModeGround):
 
 
 class ByAttack(ByEpisodes):
-    """Judges by an attack, too, which finds noise that keeps a robot in a corner: where a table can be made.
+    """Judges by an attack, too, which finds noise that keeps a robot in a corner: where samples take long.
 
     The score is the mean of two shares: of episodes that are won without noise, and of starts from which an
     attack does not break the policy. If it loses none of them the score of the noisy episodes follows.

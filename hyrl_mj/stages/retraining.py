@@ -69,22 +69,24 @@ def retrain(
             set; see `start_policy`.
         others: policies of other modes, and how their trainings ended; a mirror image of one is used if it is
             good enough for this mode.
-        part: pi_i of the mode (paper, Step 4), which is used as it is if it is good enough; by default it is
-            not tried.
+        part: pi_i of the mode (paper, Step 4), which is used as it is if it is good enough, or else the
+            stage-1 policy itself; by default neither is tried.
         table: returns a table of inputs for the ground; the better of it and pi_i then takes the place of the
             trainings.
         log_dir: folder of logs and checkpoints.
 
     Returns:
-        pi_i, or the first mirror image, if it is good enough; otherwise the best policy, of all attempts,
-        pi_i, and the one that the first continued from. And how the training ended.
+        pi_i, the stage-1 policy, or the first mirror image, if it is good enough; otherwise the best policy,
+        of all attempts, these, and the one that the first continued from. And how the training ended.
     """
     task, mode = ground.task, ground.mode
     tried: list[tuple[Score, ModePolicy]] = []
     if part is not None:
-        tried.append((ground(part), part))
-        if ground.suffices(part):
-            return part, ModeResult(mode, ground.won(part), 0)
+        # A mode need not be better than what bears all noise as it is.
+        for given in (part, part.undivided):
+            tried.append((ground(given), given))
+            if ground.suffices(given):
+                return given, ModeResult(mode, ground.won(given), 0)
     if task.mirror is not None:
         for other, result in others:
             if not isinstance(other, MlpPolicy):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,10 @@ from hyrl_mj.tasks import ANY, LEFT, RIGHT, Task, number_of, sides, wrapped
 
 # A way that fewer of the nodes go from which a run can start is no mode, and the most modes of a controller.
 LEAST_SHARE, MOST_MODES = 0.01, 32
+# Near where ways part, a start decides if an obstacle lies between it and the end at this share of the angle.
+NEAR_SHARE = 0.5
+# Indices (k,) of nodes -> which of all nodes (n,) bool lie near them.
+Near = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -28,7 +33,8 @@ class Ways:
         dropped: numbers of the ways that less than `LEAST_SHARE` of the nodes go from which a run can start.
         end: (K,) the usual bearing of the end of a run from each obstacle [rad].
         half: (K,) an obstacle lies between start and end if they are seen from it at more than this angle: a
-            right one (Thales), or less where the ways part at a smaller one [rad].
+            right one (Thales), or less where the ways part, or a run starts near there, at a smaller one
+            [rad].
         decides: (K,) bool, whether runs pass the obstacle on both sides.
         arriving: whether enough runs arrive; if not, all show a way.
     """
@@ -42,7 +48,12 @@ class Ways:
     arriving: bool
 
     @staticmethod
-    def of(task: Task, runs: WayRuns, neighbours: tuple[np.ndarray, np.ndarray]) -> Ways:
+    def of(
+        task: Task,
+        runs: WayRuns,
+        neighbours: tuple[np.ndarray, np.ndarray],
+        near: Near | None = None,
+    ) -> Ways:
         """Returns the ways of runs from all nodes of a chart.
 
         They are those of the runs that arrive; if hardly any does, those of all runs.
@@ -51,6 +62,8 @@ class Ways:
             task: the robot and its problem.
             runs: (n,) of the nodes.
             neighbours: (k,), (k,) indices of nodes that lie next to each other.
+            near: tells which nodes are so close to others, where ways part, that they decide, too: they
+                would otherwise leave a strip between the ways that noise can hide. By default none are.
 
         Raises:
             BadInput: there are more than `MOST_MODES` ways.
@@ -66,8 +79,13 @@ class Ways:
             first, second = first[both], second[both]
             part = windings(passing[first], passing[second]) != 0
             angle = np.abs(_angles(passing, end))
-            least = np.where(part, np.minimum(angle[first], angle[second]), np.inf)
-            half = np.minimum(least.min(axis=0, initial=np.inf), np.pi / 2)
+            half = np.full(angle.shape[1], np.pi / 2)
+            for k, pairs in enumerate(part.T):
+                at = np.unique([first[pairs], second[pairs]])
+                if len(at):
+                    close = counted & near(at) if near else at
+                    least = max(angle[close, k].min(), NEAR_SHARE * angle[at, k].min())
+                    half[k] = min(half[k], least)
             seen = sides(_angles(passing, end), half)[counted]
             decides = (seen == LEFT).any(axis=0) & (seen == RIGHT).any(axis=0)
         found = Ways(np.empty((0, len(decides)), dtype=int), (), (), end, half, decides, True)

@@ -35,8 +35,9 @@ def figures(runs: Runs) -> Iterator[Figure]:
         name, "samples/s", "the Gymnasium environment", ">= 20", _episodes(vehicle, 4096), single
     )
     name = "PointMaze_Medium-v3, n = 256, through from_gymnasium"
-    against = "Gymnasium's SyncVectorEnv"
-    yield Figure(name, "samples/s", against, ">= 0.8", *_outside("PointMaze_Medium-v3", 256))
+    for mode, against in (("sync", "SyncVectorEnv"), ("async", "AsyncVectorEnv")):
+        ours, theirs = _outside("PointMaze_Medium-v3", 256, mode)
+        yield Figure(name, "samples/s", f"Gymnasium's {against}", ">= 0.8", ours, theirs)
     name = "vehicle, closed loop under noise, 10,000 episodes"
     yield Figure(name, "samples/s", raw, ">= 0.3", _closed_loop(runs), _physics(vehicle, 4096))
 
@@ -70,14 +71,14 @@ def _physics(task: Task, n: int) -> Callable[[], int]:
     return work
 
 
-def _outside(name: str, n: int) -> tuple[Callable[[], int], Callable[[], int]]:
+def _outside(name: str, n: int, mode: str) -> tuple[Callable[[], int], Callable[[], int]]:
     """Returns steps of copies of an environment of others, as ours and as Gymnasium's."""
     options = {"goal_cell": np.array([6, 6])}
     task = hyrl_mj.from_gymnasium(name, reset=options)
     plant, rng = task.plant(n), np.random.default_rng(0)
     plant.set_state(*task.state(task.starts(n, rng)))
     inputs = rng.uniform(*task.input_limits, (SAMPLES, n, len(task.inputs)))
-    others = gymnasium.make_vec(name, n, vectorization_mode="sync")
+    others = gymnasium.make_vec(name, n, vectorization_mode=mode)
     others.reset(seed=0, options=options)
 
     def ours() -> int:
