@@ -195,11 +195,14 @@ def parsed(content: Mapping[str, Any], record: type[Record], remedy: str = REMED
         problems = error.errors(include_url=False, include_input=False)
     else:
         # Files are written with every field: a default would hide that one is missing.
-        later = getattr(record, "LATER", ())  # those that earlier versions did not write
-        lacking = (name for name in _missing(asdict(value), content) if name not in later)
-        if missing := next(lacking, None):
+        later = getattr(
+            record, "LATER", ()
+        )  # those that earlier versions did not write, at any place
+        missing = _missing(asdict(value), content)
+        lacking = (name for name in missing if re.sub(r"\.\d+", "", name) not in later)
+        if lacks := next(lacking, None):
             raise BadArtifact(
-                f"it has no {missing}, so it is damaged or of another version: {remedy}"
+                f"it has no {lacks}, so it is damaged or of another version: {remedy}"
             )
         return value
     # For a union, pydantic lists the problems of every type: report those of the closest type.

@@ -283,11 +283,19 @@ def _by_kind(robustness: Robustness, who: str) -> dict[str, tuple[int, int]]:
     return counts
 
 
+# What the policy of a mode is, unless it was trained.
+KINDS = {
+    "pi_i": ", the agent as on its own side of M*,",
+    "agent": ", the agent itself,",
+    "table": ", a table of inputs,",
+}
+
+
 def mode_sentence(task: Task, result: ModeResult) -> str:
     """Returns how well the policy of a mode holds its set."""
     trainings = f"{result.attempts} training{'' if result.attempts == 1 else 's'}"
     how = f"after {trainings}" if result.attempts else "without a training of its own"
-    mode = f"the policy of mode {task.mode_name(result.mode)}"
+    mode = f"the policy of mode {task.mode_name(result.mode)}{KINDS.get(result.policy, '')}"
     won = (
         "all of its set that was tried" if result.won == 1 else f"{percent(result.won)} of its set"
     )

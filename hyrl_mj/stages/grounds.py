@@ -42,7 +42,7 @@ MARGIN = 1.2
 # there is no time for more where samples take long.
 FEW_PLAYS = PLAYS[: 3 * len(JUDGES)]
 # The plays by which policies are compared that are not expected to win them all, and how much less a mirror
-# image may win.
+# image may win, or a policy that is not worth another training.
 SHARED = [play for play in PLAYS[-len(JUDGES) :] if play[1] != "adversarial"]
 ALIKE = 0.02
 # Starts from which a policy is attacked, and rounds of the attack; the second takes much longer.
@@ -147,6 +147,10 @@ class ModeGround(ABC):
         its mode.
         """
         return self(policy) >= self.enough or self._loses_elsewhere()
+
+    def nearly_won(self, score: Score) -> bool:
+        """Returns whether a score is so good that no training is expected to do better."""
+        return False
 
     def won_by_image(self, image: MlpPolicy, won: float) -> float | None:
         """Returns the share that a mirror image wins; None if it is too little.
@@ -373,6 +377,9 @@ class ByAttack(ByEpisodes):
         withstood = 1 - found.count.lost / len(starts)
         both = (won + withstood) / 2
         return (both, *(super().score(policy, plays) if both == 1 else (0.0, -1.0)))
+
+    def nearly_won(self, score: Score) -> bool:
+        return score[0] >= 1 - ALIKE
 
     def won(self, policy: Policy) -> float:
         return float(np.concatenate([self._play(policy, *play)[0] for play in self.plays]).mean())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -54,6 +55,10 @@ class Arrivals:
         return artifacts.read_record(path, "arrivals", Arrivals)
 
 
+# What the policy of a mode is.
+Kind = Literal["trained", "pi_i", "agent", "table"]
+
+
 @dataclass(frozen=True)
 class ModeResult:
     """How the training of one mode ended.
@@ -63,16 +68,21 @@ class ModeResult:
         won: share of the states of its set from which its policy arrives in time, whatever the noise; where
             the worst case cannot be computed, share of the noisy episodes in which it arrives.
         attempts: number of trainings; none if a mirror image or the warm start is good enough.
+        policy: what the policy is: "trained", "pi_i" (paper, Step 4), the "agent" itself, or a "table" of
+            inputs.
     """
 
     mode: int
     won: float
     attempts: int
+    policy: Kind = "trained"
 
 
 @dataclass(frozen=True)
 class Retraining:
     """How stage 6 ended: a result for each mode. Saved as `retraining.json`."""
+
+    LATER: ClassVar = ("modes.policy",)
 
     modes: tuple[ModeResult, ...]
 

@@ -13,7 +13,7 @@ from hyrl_mj.learning.training import Score, train
 from hyrl_mj.policies import ALGORITHMS, MlpPolicy, Policy
 from hyrl_mj.stages.grounds import ModeGround
 from hyrl_mj.stages.partition import Partition, PartPolicy, part_policy
-from hyrl_mj.stages.results import ModeResult
+from hyrl_mj.stages.results import Kind, ModeResult
 from hyrl_mj.stages.tables import BoundTable, TableOf
 
 # The policy of a mode: a trained network, pi_i, or a table.
@@ -86,7 +86,7 @@ def retrain(
         for given in (part, part.undivided):
             tried.append((ground(given), given))
             if ground.suffices(given):
-                return given, ModeResult(mode, ground.won(given), 0)
+                return given, _result(ground, given, 0)
     if task.mirror is not None:
         for other, result in others:
             if not isinstance(other, MlpPolicy):
@@ -99,6 +99,8 @@ def retrain(
     if table is not None:
         made = table(ground)
         tried.append((ground(made), made))
+        return _best(ground, tried, trainings)
+    if tried and ground.nearly_won(max(score for score, _ in tried)):
         return _best(ground, tried, trainings)
     for attempt in range(settings.attempts):
         draw = int(np.random.SeedSequence([seed, 1 + mode, attempt]).generate_state(1)[0])
@@ -125,4 +127,14 @@ def _best(
 ) -> tuple[ModePolicy, ModeResult]:
     """Returns the policy with the best score, and how its mode ended."""
     best = max(tried, key=lambda result: result[0])[1]
-    return best, ModeResult(ground.mode, ground.won(best), trainings)
+    return best, _result(ground, best, trainings)
+
+
+def _result(ground: ModeGround, policy: ModePolicy, trainings: int) -> ModeResult:
+    """Returns how the mode of a policy ended."""
+    kind: Kind = "trained"
+    if isinstance(policy, PartPolicy):
+        kind = "agent" if policy.near < 0 else "pi_i"
+    elif isinstance(policy, BoundTable):
+        kind = "table"
+    return ModeResult(ground.mode, ground.won(policy), trainings, kind)
