@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from environments import Puck, Slid, puck_agent
+from planted import ChartPolicy
 
 from hyrl_mj import BadInput, from_gymnasium
 from hyrl_mj.game import Lattice, lattice_grid
@@ -12,10 +13,10 @@ from hyrl_mj.policies import PolicyController
 from hyrl_mj.proof import examine
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import Signal, closed_loop, policy_runs
-from hyrl_mj.stages import ExtendedSets
+from hyrl_mj.stages import ExtendedSets, PartPolicy
 from hyrl_mj.stages.grounds import ByAttack, mode_ground
 from hyrl_mj.stages.retraining import retrain
-from hyrl_mj.stages.tables import Held, TablePolicy, _in_reach, table_for
+from hyrl_mj.stages.tables import BoundTable, Held, TablePolicy, _in_reach, table_for
 from hyrl_mj.tasks import Outcome
 
 EPS = 0.15
@@ -100,25 +101,51 @@ def test_a_table_is_read_as_it_was_written(puck, held, tmp_path):
         TablePolicy(again.counts, again.inputs[1:]).of(puck)
 
 
-@pytest.mark.parametrize(("of_table", "taken"), [(0.9, "table"), (0.7, "part")])
-def test_the_better_of_table_and_part_is_taken_and_nothing_is_trained(puck, of_table, taken):
-    scores = {"part": (1.0, 0.8), "table": (1.0, of_table)}
+@pytest.mark.parametrize(
+    ("scores", "taken"),
+    [
+        ({"pi_i": 0.8, "agent": 0.7, "table": 0.9}, "table"),
+        ({"pi_i": 0.8, "agent": 0.7, "table": 0.75}, "pi_i"),
+        ({"pi_i": 0.7, "agent": 0.95, "table": 0.9}, "agent"),
+        ({"pi_i": 1.0, "agent": 1.0, "table": 1.0}, "pi_i"),
+        ({"pi_i": 0.1, "agent": 1.0, "table": 1.0}, "agent"),
+        ({"pi_i": 0.1, "agent": 0.99}, "agent"),
+    ],
+)
+def test_the_best_of_what_is_given_is_taken_and_nothing_is_trained(puck, held, scores, taken):
+    """The first that wins all is; without a table also what wins nearly all."""
+    made = BoundTable(puck, held.grid, np.zeros((held.grid.size, 2)))
 
-    class Ground:
-        task, mode = puck, 1
+    class Ground(ByAttack):
+        task, mode, enough = puck, 1, (1.0,)
+
+        def __init__(self):
+            pass
+
+        def kind(self, policy):
+            if policy is made:
+                return "table"
+            return "agent" if policy.inside.mask.all() else "pi_i"
 
         def __call__(self, policy):
-            return scores[policy]
+            return (scores[self.kind(policy)],)
 
         def suffices(self, policy):
-            return False
+            return self(policy) >= self.enough
 
         def won(self, policy):
-            return scores[policy][1]
+            return scores[self.kind(policy)]
 
-    found, result = retrain(Ground(), None, 0, part="part", table=lambda ground: "table")
-    assert found == taken
-    assert (result.attempts, result.won) == (0, scores[taken][1])
+    half = GridSet.from_mask(held.grid, held.grid.nodes[:, 0] < 0)
+    part = PartPolicy(puck, ChartPolicy(puck, lambda z: z), half.eroded(0.1), 0.1)
+    table = (lambda ground: made) if "table" in scores else None
+    _, result = retrain(Ground(), None, 0, part=part, table=table)
+    assert (result.policy, result.attempts, result.won) == (taken, 0, scores[taken])
+    plant = puck.plant(held.grid.size)
+    plant.set_state(*puck.state(held.grid.nodes))
+    own = part.policy.act(plant.measurement)
+    np.testing.assert_array_equal(part.undivided.act(plant.measurement), own)
+    assert (part.act(plant.measurement) != own).any()
 
 
 def test_a_policy_is_judged_without_noise_and_by_an_attack(puck):

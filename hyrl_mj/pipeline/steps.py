@@ -48,6 +48,8 @@ if TYPE_CHECKING:
 
 # The video with preset smoke only shows that a video can be made.
 SMOKE = ReplayOptions(size=(640, 360), fps=10)
+# The video of a run has about so many frames at most: long episodes have fewer a second.
+FRAMES, FEWEST = 600, 10
 
 
 def train_stage(run: Run, say: Say) -> None:
@@ -178,11 +180,12 @@ def replay_stage(run: Run, say: Say) -> None:
     from hyrl_mj.viz.arcs import replay_floor, replay_shows
     from hyrl_mj.viz.replay import render_replay
 
-    options = SMOKE if run.settings.preset == "smoke" else ReplayOptions()
+    options, shows = ReplayOptions(), replay_shows(run)
+    longest = sum(max(arc.t[-1] for arc in (*show.policy, *show.hybrid)) for show in shows)
+    options = replace(options, fps=max(FEWEST, min(options.fps, int(FRAMES / longest))))
+    options = SMOKE if run.settings.preset == "smoke" else options
     try:
-        render_replay(
-            run.task, replay_shows(run), run.path / "replay.mp4", options, floor=replay_floor(run)
-        )
+        render_replay(run.task, shows, run.path / "replay.mp4", options, floor=replay_floor(run))
         say(f"video at {run.path / 'replay.mp4'}")
     except NoRenderer as error:
         say(f"no video: {error}")

@@ -360,7 +360,9 @@ class ByAttack(ByEpisodes):
 
     def _prepare(self, policy: Policy | None) -> None:
         super()._prepare(policy)
-        self.enough = (1.0, *self.enough)
+        # The attack stands for the adversary, whose looking ahead takes too long here.
+        self.plays = [play for play in self.plays if play[1] != "adversarial"]
+        self.enough = (1.0, float(len(self.plays)), -1.0)
         # Half of the starts are where modes meet: there a mode may have to go against its neighbours.
         off = distance_to(self.task, self.extended.points, self.grid.nodes[self.nodes])
         near = self.nodes[off <= 2 * float(np.linalg.norm(self.bound / self.task.chart.scale))]
