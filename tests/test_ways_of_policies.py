@@ -8,7 +8,8 @@ from fields import Field
 from planted import ChartPolicy, halves
 
 import hyrl_mj
-from hyrl_mj import BadInput, Chart, Partition, find_critical_set, make_partition
+from hyrl_mj import BadInput, Chart, Partition, extend, find_critical_set, make_partition
+from hyrl_mj.stages.critical_set import distance_to
 from hyrl_mj.tasks import check_task
 
 ROW = {"_a": (1, 0, 0.3), "_b": (2, 0.2, 0.3)}
@@ -86,6 +87,31 @@ def test_failed_nodes_take_the_way_of_the_nearest_that_arrives():
     sure = np.abs(off) > partition.grid.cell / 2
     for part, side in zip(partition.parts, (1, -1), strict=True):
         np.testing.assert_array_equal(part.mask[wedge][sure], side * off[sure] > 0)
+
+
+@pytest.mark.parametrize("eps", [0.0, 0.05, 0.1])
+def test_a_part_is_wide_enough_beside_m_star_for_the_set_of_the_other_mode_to_end_there(eps):
+    """The policy decides beside the post, close to where nothing is left to decide."""
+    field = Field({"": (2, 0, 0.1)})
+
+    def late(z):
+        x, y = z.T
+        down = (x < 2.2) & (y < 0.8) & (y > -0.3)
+        return np.where(down[:, None], [[0.0, -1.0]], [[1.0, 0.0]])
+
+    policy = ChartPolicy(field, late)
+    points = find_critical_set(field, policy, 40, 1 / 32, "outcome", eps).points
+    partition = make_partition(field, policy, points, 40, eps)
+    assert partition.modes == (0, 1)
+    shared = partition.parts[0] & partition.parts[1]
+    off = distance_to(field, points, partition.grid.nodes[shared.mask]).min()
+    if eps:
+        assert off > 5 * eps
+        sets = extend(field, policy, points, partition, eps)
+        z = np.array([[2.15, 0.8]])
+        assert [bool(s.contains(z)[0]) for s in sets.sets] == [True, False]
+    else:
+        assert off < 0.2, "without noise nothing needs to be wide"
 
 
 def test_a_policy_of_which_nothing_arrives_is_split_all_the_same():
