@@ -25,19 +25,18 @@ from hyrl_mj.stages import (
     noisy_episodes,
     shown_arcs,
 )
-from hyrl_mj.tasks import Task
 from hyrl_mj.viz import robustness_sentence
 
-# The kinds of noise in episodes by default.
+# The kinds of noise in episodes by default. Where samples take long, an adversary that looks ahead takes too
+# long; the attack is there.
 KINDS = ("none", "uniform", "alternating", "adversarial")
+KINDS_SLOW = KINDS[:-1]
 # Noisy episodes of a run whose worst case cannot be computed; fewer with preset smoke, and where samples take
 # long.
 EPISODES, EPISODES_FEW = 1_000, 200
 # Starts and rounds of the attack on such a run.
 ATTACKED, ATTACKED_SMOKE = 200, 40
 ROUNDS, ROUNDS_SMOKE = 2, 1
-# Samples of a long episode.
-LONG = 200
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,8 @@ class ExamineOptions:
         eps: bound of the noise, in the units of the chart; by default the run's.
         episodes: noisy episodes for each kind of noise and each controller; by default none where the worst
             case can be computed and not only estimated, on charts of one or two dimensions.
-        noise: kinds of noise in the episodes; by default none,uniform,alternating,adversarial.
+        noise: kinds of noise in the episodes; by default none,uniform,alternating,adversarial, without the
+            last for environments of others, which are attacked instead.
         all_coordinates: add noise to every coordinate of the measurement, not only to the noisy ones of the
             task; always, if the run was made so.
         near_critical: start all episodes within twice the bound of the critical set.
@@ -141,10 +141,11 @@ def examine_loops(
     task.check_noise(eps, everywhere)
     if count is None and not run.exact:
         few = task.slow or run.settings.preset == "smoke"
-        count = _fewer(task, EPISODES_FEW) if few else EPISODES
+        count = EPISODES_FEW if few else EPISODES
     if count is not None and count < 1:
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
-    noises = tuple(Noise(kind, eps, everywhere) for kind in options.noise or KINDS)
+    kinds = options.noise or (KINDS_SLOW if task.slow else KINDS)
+    noises = tuple(Noise(kind, eps, everywhere) for kind in kinds)
     game, maps = None, None
     if run.why_no_game is None:
         bounds = tuple(dict.fromkeys((0.0, eps / 2, eps)))
@@ -166,12 +167,6 @@ def _winnable(run: Run, maps: Maps | None) -> tuple[Grid, np.ndarray] | None:
     return maps.grid(run.task.chart), ~np.isin(classes, (UNWINNABLE, OVER))
 
 
-def _fewer(task: Task, count: int) -> int:
-    """Returns half as many episodes where samples are slow and all episodes are long."""
-    long = task.slow and not task.arrival_ends and task.max_steps > LONG
-    return count // 2 if long else count
-
-
 def attack_loops(
     run: Run,
     loops: dict[str, Controller],
@@ -181,7 +176,7 @@ def attack_loops(
 ) -> dict[str, Attack]:
     """Attacks controllers by name, from the same starts."""
     task, eps = run.task, run.settings.noise if options.eps is None else options.eps
-    n = ATTACKED_SMOKE if run.settings.preset == "smoke" else _fewer(task, ATTACKED)
+    n = ATTACKED_SMOKE if run.settings.preset == "smoke" else ATTACKED
     starts = attack_starts(task, regions, eps, n, options.seed)
     everywhere = options.all_coordinates or run.settings.everywhere
     return attack(task, loops, starts, eps, budget, everywhere, options.seed)

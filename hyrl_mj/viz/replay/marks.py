@@ -132,7 +132,10 @@ class Floor:
             strips.append(points[:2])
             across = 2 * float(np.linalg.norm(points[3] - points[2]))
             widths.append(OVERLAP_WIDTH if len(half) == 1 else across)
-        return Floor(places(critical.points), np.reshape(strips, (-1, 2, 3)), np.array(widths))
+        marked = places(critical.points)
+        if len(marked) > 1 and np.ptp(marked, axis=0).max() < 1e-9:
+            marked = marked[:0]  # the tracked point stays where it is, and tells nothing about M*
+        return Floor(marked, np.reshape(strips, (-1, 2, 3)), np.array(widths))
 
     def draw(self, scene: mujoco.MjvScene, larger: float) -> None:
         """Adds the marks to a scene, points of M* larger than usual by a factor."""
