@@ -16,7 +16,8 @@ from hyrl_mj.game import NEVER, Limit
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import GridSet, Nodes, resolving
 from hyrl_mj.simulation import WayRuns, policy_runs, way_runs
-from hyrl_mj.stages.critical_set import check_points, distance_to
+from hyrl_mj.stages import strips
+from hyrl_mj.stages.critical_set import check_points
 from hyrl_mj.stages.refinement import spread, thinned
 from hyrl_mj.stages.search import WEDGE
 from hyrl_mj.stages.ways import LEAST_SHARE, Ways
@@ -125,14 +126,15 @@ def make_partition(
     grid = resolving(task.chart, cells, points, task.noise_in_chart(max(noise, 1e-6)))
     simulated, neighbours = thinned(task, grid)
     first = WayRuns.of(task, way_runs(task, policy, grid.nodes[simulated], label="partition"))
-    nodes, reach = grid.nodes[simulated], _strip(task, policy, grid, noise)
+    nodes, hop = grid.nodes[simulated], longest_hop(task, policy, grid)
+    width = strips.width(task, noise, hop)
 
     def near(rows: np.ndarray) -> np.ndarray:
-        return distance_to(task, nodes[rows], nodes) <= reach
+        return strips.around_walls(task, nodes, neighbours, first.alive, rows) <= width
 
-    across = _across(task, nodes, points, max(2 * noise, ACROSS_CELLS * grid.cell))
-    first_of, second_of = np.hstack([neighbours, across])
-    ways = Ways.of(task, first, (first_of, second_of), near)
+    across = strips.across(task, nodes, points, max(2 * noise, ACROSS_CELLS * grid.cell))
+    a, b = np.hstack([neighbours, across])
+    ways = Ways.of(task, first, (a, b), near)
     modes = ways.modes if len(points) else ()
 
     def tell(rows: np.ndarray) -> np.ndarray:
@@ -154,30 +156,6 @@ def make_partition(
     unparted = () if modes or len(ways.modes) < 2 else ways.modes
     alone = 0 if ways.end.size < 2 else int(number_of(np.full((1, ways.end.size), ANY))[0])
     return Partition(modes or (alone,), parts, succeeds, ways.dropped, unparted)
-
-
-def _across(task: Task, nodes: np.ndarray, points: np.ndarray, reach: float) -> np.ndarray:
-    """Returns indices (2, k) of those of nodes (N, d) that lie opposite to each other across points of M*.
-
-    From nodes between them, so close to M*, runs may not arrive.
-    """
-    chart = task.chart
-    tree = chart.tree(nodes)
-    close = tree.query_ball_point(chart.in_box(points), reach)
-    first = np.concatenate([np.empty(0, dtype=int), *map(np.asarray, close)]).astype(int)
-    over = np.repeat(points, [len(rows) for rows in close], axis=0)
-    mirrored = chart.wrap(over + chart.difference(over, nodes[first]))
-    return np.stack([first, tree.query(chart.in_box(mirrored))[1]])
-
-
-def _strip(task: Task, policy: Policy, grid: Nodes, noise: float) -> float:
-    """Returns the width [scaled units] that a part needs beside M* for the other mode's set to end there.
-
-    That set reaches 2 eps and a hop over M*, and eps over the other edge of the strip. Between them a robot
-    must not be able to pass unseen, which takes 2 eps and a hop. All of these act along each coordinate.
-    """
-    eps, hop = task.noise_in_chart(noise), longest_hop(task, policy, grid)
-    return float(np.linalg.norm((5 * eps + 2 * hop) * (eps > 0) / grid.chart.scale))
 
 
 def with_room(

@@ -1,0 +1,73 @@
+"""The strips of a part beside M*: how wide one has to be for the set of the other mode to end there (stage 3).
+
+A state from which nothing is left to decide belongs to every part. If the policy decides late, such states lie
+close behind M*, and the set of the mode on the other side would reach over the strip between them. That mode
+would then never end, and would itself have to decide where it turns back.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hyrl_mj.tasks import Task
+
+
+def width(task: Task, noise: float, hop: np.ndarray) -> float:
+    """Returns the width that a strip needs, in scaled units.
+
+    The set of the other mode reaches 2 eps and a hop over M*, and eps over the other edge of the strip.
+    Between them a robot must not be able to pass unseen, which takes 2 eps and a hop. All of these act along
+    each coordinate.
+
+    Args:
+        task: gives the noisy coordinates.
+        noise: bound eps of the measurement noise.
+        hop: (d,) longest hop in one sample.
+    """
+    eps = task.noise_in_chart(noise)
+    return float(np.linalg.norm((5 * eps + 2 * hop) * (eps > 0) / task.chart.scale))
+
+
+def across(task: Task, nodes: np.ndarray, points: np.ndarray, reach: float) -> np.ndarray:
+    """Returns indices (2, k) of those of nodes (N, d) that lie opposite to each other across points of M*.
+
+    Runs from nodes next to each other may not arrive so close to M*.
+
+    Args:
+        task: gives the chart.
+        nodes: (N, d).
+        points: (K, d) of M*.
+        reach: how far from a point both may lie, in scaled units.
+    """
+    chart = task.chart
+    tree = chart.tree(nodes)
+    close = tree.query_ball_point(chart.in_box(points), reach)
+    first = np.concatenate([np.empty(0, dtype=int), *map(np.asarray, close)]).astype(int)
+    over = np.repeat(points, [len(rows) for rows in close], axis=0)
+    mirrored = chart.wrap(over + chart.difference(over, nodes[first]))
+    return np.stack([first, tree.query(chart.in_box(mirrored))[1]])
+
+
+def around_walls(
+    task: Task,
+    nodes: np.ndarray,
+    neighbours: tuple[np.ndarray, np.ndarray],
+    free: np.ndarray,
+    rows: np.ndarray,
+) -> np.ndarray:
+    """Returns how far nodes are from some of them: (N,) in scaled units, infinite where no way leads.
+
+    Args:
+        task: gives the chart.
+        nodes: (N, d).
+        neighbours: (k,), (k,) indices of nodes that lie next to each other; ways lead from one to the other.
+        free: (N,) bool, the nodes that ways may lead through.
+        rows: indices of the nodes where ways begin.
+    """
+    from scipy.sparse import csr_array  # slow to import
+    from scipy.sparse.csgraph import dijkstra
+
+    a, b = (ends[free[neighbours[0]] & free[neighbours[1]]] for ends in neighbours)
+    lengths = task.chart.distance(nodes[a], nodes[b])
+    graph = csr_array((lengths, (a, b)), shape=(len(nodes), len(nodes)))
+    return np.asarray(dijkstra(graph, directed=False, indices=rows, min_only=True))
