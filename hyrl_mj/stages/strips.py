@@ -1,8 +1,8 @@
-"""The strips of a part beside M*: how wide one has to be for the set of the other mode to end there (stage 3).
+"""The strips of a part beside M*: how wide one is for the set of the other mode to end there (stage 3).
 
-A state from which nothing is left to decide belongs to every part. If the policy decides late, such states lie
-close behind M*, and the set of the mode on the other side would reach over the strip between them. That mode
-would then never end, and would itself have to decide where it turns back.
+A state from which nothing is left to decide belongs to every part. If the policy decides late, such states
+lie close behind M*, and the set of the mode on the other side would reach over the strip between them. That
+mode would then never end, and would itself have to decide where it turns back.
 """
 
 from __future__ import annotations
