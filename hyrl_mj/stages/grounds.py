@@ -18,6 +18,7 @@ from hyrl_mj.stages.attacks import Budget, attack
 from hyrl_mj.stages.critical_set import distance_to
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
+from hyrl_mj.stages.tables import possible
 from hyrl_mj.tasks import Outcome, Task
 
 # If the game is lost from some states, this share of the training episodes starts there.
@@ -42,11 +43,12 @@ MARGIN = 1.2
 # there is no time for more where samples take long.
 FEW_PLAYS = PLAYS[: 3 * len(JUDGES)]
 # The plays by which policies are compared that are not expected to win them all, and how much less a mirror
-# image may win, or a policy that is not worth another training.
+# image may win.
 SHARED = [play for play in PLAYS[-len(JUDGES) :] if play[1] != "adversarial"]
 ALIKE = 0.02
-# Starts from which a policy is attacked, and rounds of the attack; the second takes much longer.
-ATTACKED, ROUNDS = 64, 1
+# Starts from which a policy is attacked, and rounds of the attack; the second takes much longer. A policy has
+# to win this share without noise. Where it withstands nearly all, a training is not expected to do better.
+ATTACKED, ROUNDS, WORTH_ATTACKING, NEARLY = 64, 1, 0.9, 0.05
 # So many starts are drawn for each episode; those too close to where the mode cannot succeed are left out.
 SPARE = 4
 # There, unless the task has a precision, a policy may end this many times as far off the set-point as the
@@ -117,7 +119,7 @@ class ModeGround(ABC):
         plant.set_state(*task.state(self.grid.nodes))
         alive = task.ending(plant.measurement) == Outcome.RUNNING
         # Where the stage-1 policy never succeeds, training may still find a way.
-        wins = extended.winning[index]
+        wins = self._winning(index)
         self.wanted = within & alive & (wins if (within & alive & wins).any() else True)
         self.nodes = np.flatnonzero(self.wanted)
         early = self.nodes[task.may_start(self.grid.nodes[self.nodes])]
@@ -125,6 +127,10 @@ class ModeGround(ABC):
         self.lost, self._weight = np.empty(0, dtype=int), np.empty(0)
         self._latest: tuple[Policy, Score] | None = None
         self._prepare(policy)
+
+    def _winning(self, index: int) -> np.ndarray:
+        """Returns the nodes (N,) bool from which the mode of an index can succeed, as far as is known."""
+        return self.extended.winning[index]
 
     @abstractmethod
     def _prepare(self, policy: Policy | None) -> None:
@@ -352,11 +358,17 @@ class ByAttack(ByEpisodes):
     """Judges by an attack, too, which finds noise that keeps a robot in a corner: where samples take long.
 
     The score is the mean of two shares: of episodes that are won without noise, and of starts from which an
-    attack does not break the policy. If it loses none of them the score of the noisy episodes follows.
+    attack does not break the policy. If it loses none of them the score of the noisy episodes follows. A
+    policy that wins too few of the first is not attacked, as if it were broken from everywhere.
 
     Attributes:
         attacked: (n, d) starts of the attack.
     """
+
+    def _winning(self, index: int) -> np.ndarray:
+        winning = super()._winning(index)
+        # A table may succeed where the agent does not.
+        return np.ones_like(winning) if possible(self.task, self.within.grid) else winning
 
     def _prepare(self, policy: Policy | None) -> None:
         super()._prepare(policy)
@@ -373,15 +385,17 @@ class ByAttack(ByEpisodes):
     def score(self, policy: Policy, plays: Sequence[tuple[int, str]] | None = None) -> Score:
         quiet = [play for play in self.plays if play[1] == JUDGES[0]]
         won = float(np.concatenate([self._play(policy, *play)[0] for play in quiet]).mean())
+        if won < WORTH_ATTACKING:
+            return won / 2, 0.0, -1.0
         starts, budget = self.attacked, Budget(rounds=ROUNDS)
         task, loops = self.task.with_noise(self.shares), {"mode": PolicyController(policy)}
-        found = attack(task, loops, starts, self.extended.noise, budget)["mode"]
+        found = attack(task, loops, starts, self.noise.bound, budget)["mode"]
         withstood = 1 - found.count.lost / len(starts)
         both = (won + withstood) / 2
         return (both, *(super().score(policy, plays) if both == 1 else (0.0, -1.0)))
 
     def nearly_won(self, score: Score) -> bool:
-        return score[0] >= 1 - ALIKE
+        return score[0] >= 1 - NEARLY
 
     def won(self, policy: Policy) -> float:
         return float(np.concatenate([self._play(policy, *play)[0] for play in self.plays]).mean())

@@ -69,8 +69,8 @@ def retrain(
             set; see `start_policy`.
         others: policies of other modes, and how their trainings ended; a mirror image of one is used if it is
             good enough for this mode.
-        part: pi_i of the mode (paper, Step 4), which is used as it is if it is good enough, or else the
-            stage-1 policy itself; by default neither is tried.
+        part: pi_i of the mode (paper, Step 4), which is used as it is if it is good enough, or else, without
+            a table, the stage-1 policy itself; by default neither is tried.
         table: returns a table of inputs for the ground; the better of it and pi_i then takes the place of the
             trainings.
         log_dir: folder of logs and checkpoints.
@@ -82,8 +82,8 @@ def retrain(
     task, mode = ground.task, ground.mode
     tried: list[tuple[Score, ModePolicy]] = []
     if part is not None:
-        # A mode need not be better than what bears all noise as it is.
-        for given in (part, part.undivided):
+        # Where nothing but trainings could follow, what bears all noise as it is need not be better.
+        for given in (part,) if table else (part, part.undivided):
             tried.append((ground(given), given))
             if ground.suffices(given):
                 return given, _result(ground, given, 0)
