@@ -5,7 +5,7 @@ import pytest
 from planted import ChartPolicy, circle_policy, one_way_policy, sign_policy
 
 from hyrl_mj import find_critical_set, make_partition
-from hyrl_mj.stages.partition import part_policies
+from hyrl_mj.stages.partition import PartPolicy, part_policies
 
 PI = np.pi
 
@@ -89,6 +89,19 @@ def test_a_part_policy_does_elsewhere_what_it_does_at_the_nearest_point(circle, 
     theta = np.array([[PI - 0.5], [PI - 0.05], [PI + 0.05], [PI + 0.5]])
     np.testing.assert_array_equal(first.act(theta), [[-1.0]] * 4)
     np.testing.assert_array_equal(second.act(theta), [[1.0]] * 4)
+
+
+def test_an_undivided_part_policy_is_the_policy_also_when_it_is_read_again(
+    circle, circle_parts, tmp_path
+):
+    policy = circle_policy(circle)
+    first, _ = part_policies(circle, policy, circle_parts, 0.1)
+    first.undivided.save(tmp_path / "mode_0.safetensors")
+    again = PartPolicy.load(tmp_path / "mode_0_part.json", circle, policy, circle_parts, 0)
+    theta = np.linspace(0, 2 * PI, 50)[:, None]
+    for undivided in (first.undivided, again):
+        np.testing.assert_array_equal(undivided.act(theta), policy.act(theta))
+    assert (first.act(theta) != policy.act(theta)).any()
 
 
 def test_a_part_policy_of_a_hesitant_policy_is_decided_at_the_critical_set(circle):
