@@ -195,9 +195,8 @@ def parsed(content: Mapping[str, Any], record: type[Record], remedy: str = REMED
         problems = error.errors(include_url=False, include_input=False)
     else:
         # Files are written with every field: a default would hide that one is missing.
-        later = getattr(
-            record, "LATER", ()
-        )  # those that earlier versions did not write, at any place
+        # Those that earlier versions did not write, at any place of a list.
+        later = getattr(record, "LATER", ())
         missing = _missing(asdict(value), content)
         lacking = (name for name in missing if re.sub(r"\.\d+", "", name) not in later)
         if lacks := next(lacking, None):

@@ -182,12 +182,15 @@ class _Case:
                 f"without noise HyRL loses {percent(1 - hyrl)} of {self.whole}, more than the policy "
                 f"({percent(1 - policy)})"
             )
-        # A mode with a reward of its own is judged by episodes that perhaps no policy wins.
+        # A mode with a reward of its own is judged by episodes that perhaps no policy wins. Where nothing was
+        # trained, nothing was given up.
         modes = self.retraining.modes
         given_up = [
             result.mode
             for result in modes
-            if result.won < NEARLY and self.task.for_mode(result.mode) is self.task
+            if result.won < NEARLY
+            and result.policy in (None, "trained")
+            and self.task.for_mode(result.mode) is self.task
         ]
         if given_up:
             names = listed([self.task.mode_name(mode) for mode in given_up])
@@ -284,7 +287,7 @@ def _by_kind(robustness: Robustness, who: str) -> dict[str, tuple[int, int]]:
 
 
 # What the policy of a mode is, unless it was trained.
-KINDS = {
+POLICIES = {
     "pi_i": ", the agent as on its own side of M*,",
     "agent": ", the agent itself,",
     "table": ", a table of inputs,",
@@ -295,7 +298,9 @@ def mode_sentence(task: Task, result: ModeResult) -> str:
     """Returns how well the policy of a mode holds its set."""
     trainings = f"{result.attempts} training{'' if result.attempts == 1 else 's'}"
     how = f"after {trainings}" if result.attempts else "without a training of its own"
-    mode = f"the policy of mode {task.mode_name(result.mode)}{KINDS.get(result.policy, '')}"
+    mode = (
+        f"the policy of mode {task.mode_name(result.mode)}{POLICIES.get(result.policy or '', '')}"
+    )
     won = (
         "all of its set that was tried" if result.won == 1 else f"{percent(result.won)} of its set"
     )

@@ -126,7 +126,7 @@ def test_the_best_of_what_is_given_is_taken_and_nothing_is_trained(puck, held, s
         def kind(self, policy):
             if policy is made:
                 return "table"
-            return "agent" if policy.inside.mask.all() else "pi_i"
+            return "agent" if policy.whole else "pi_i"
 
         def __call__(self, policy):
             return (scores[self.kind(policy)],)

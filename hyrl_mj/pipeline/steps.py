@@ -111,12 +111,14 @@ def retrain_stage(run: Run, say: Say) -> None:
 
     s, sets = run.settings, run.extended_sets
     algorithms.check_named(s.stage6.algorithm)
-    ground_of = partial(mode_ground, run.task, sets, parts=run.split, policy=run.steady)
     warm_start = partial(start_policy, run.steady, run.partition)
     part_of = partial(part_policy, run.task, run.steady, run.partition, noise=sets.noise)
     parts, table_of = part_of if run.task.slow else None, None
     if run.task.slow and (held := Held.of(run.task, sets.sets[0].grid, sets.noise)) is not None:
         table_of = partial(table_for, held)
+    ground_of = partial(
+        mode_ground, run.task, sets, parts=run.split, policy=run.steady, table=table_of is not None
+    )
     work = partial(_retrained, s, ground_of, warm_start, parts, table_of, run.path / "logs")
     done: list[tuple[ModePolicy, ModeResult]] = []
     if run.task.mirror is None:
@@ -182,8 +184,8 @@ def replay_stage(run: Run, say: Say) -> None:
 
     options, shows = ReplayOptions(), replay_shows(run)
     longest = sum(max(arc.t[-1] for arc in (*show.policy, *show.hybrid)) for show in shows)
-    options = replace(options, fps=max(FEWEST, min(options.fps, int(FRAMES / longest))))
-    options = SMOKE if run.settings.preset == "smoke" else options
+    fps = max(FEWEST, min(options.fps, int(FRAMES / longest)))
+    options = SMOKE if run.settings.preset == "smoke" else replace(options, fps=fps)
     try:
         render_replay(run.task, shows, run.path / "replay.mp4", options, floor=replay_floor(run))
         say(f"video at {run.path / 'replay.mp4'}")

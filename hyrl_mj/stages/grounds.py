@@ -18,7 +18,6 @@ from hyrl_mj.stages.attacks import Budget, attack
 from hyrl_mj.stages.critical_set import distance_to
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
-from hyrl_mj.stages.tables import possible
 from hyrl_mj.tasks import Outcome, Task
 
 # If the game is lost from some states, this share of the training episodes starts there.
@@ -48,7 +47,7 @@ SHARED = [play for play in PLAYS[-len(JUDGES) :] if play[1] != "adversarial"]
 ALIKE = 0.02
 # Starts from which a policy is attacked, and rounds of the attack; the second takes much longer. A policy has
 # to win this share without noise. Where it withstands nearly all, a training is not expected to do better.
-ATTACKED, ROUNDS, WORTH_ATTACKING, NEARLY = 64, 1, 0.9, 0.05
+ATTACKED, ROUNDS, WORTH_ATTACKING, MAY_BREAK = 64, 1, 0.9, 0.05
 # So many starts are drawn for each episode; those too close to where the mode cannot succeed are left out.
 SPARE = 4
 # There, unless the task has a precision, a policy may end this many times as far off the set-point as the
@@ -62,12 +61,17 @@ def mode_ground(
     mode: int,
     parts: Partition | None = None,
     policy: Policy | None = None,
+    table: bool = False,
 ) -> ModeGround:
-    """Returns the ground of a mode, judged by the worst-case game if possible, otherwise by episodes."""
+    """Returns the ground of a mode.
+
+    Modes of a slow task are judged by an attack; those of others by the worst-case game where it decides, and
+    otherwise by episodes. `table` tells whether a table of inputs can be made.
+    """
     if task.for_mode(mode) is not task:
         return ByShare(task, extended, mode, parts, policy)
     if task.slow:
-        return ByAttack(task, extended, mode, parts, policy)
+        return (ByAttackAnywhere if table else ByAttack)(task, extended, mode, parts, policy)
     kind = ByGame if game.Lattice.decides(task, extended.sets[0].grid) else ByEpisodes
     return kind(task, extended, mode, parts, policy)
 
@@ -365,11 +369,6 @@ class ByAttack(ByEpisodes):
         attacked: (n, d) starts of the attack.
     """
 
-    def _winning(self, index: int) -> np.ndarray:
-        winning = super()._winning(index)
-        # A table may succeed where the agent does not.
-        return np.ones_like(winning) if possible(self.task, self.within.grid) else winning
-
     def _prepare(self, policy: Policy | None) -> None:
         super()._prepare(policy)
         # The attack stands for the adversary, whose looking ahead takes too long here.
@@ -383,8 +382,11 @@ class ByAttack(ByEpisodes):
         self.attacked = np.vstack([self.judged[: ATTACKED - half], meeting])
 
     def score(self, policy: Policy, plays: Sequence[tuple[int, str]] | None = None) -> Score:
-        quiet = [play for play in self.plays if play[1] == JUDGES[0]]
-        won = float(np.concatenate([self._play(policy, *play)[0] for play in quiet]).mean())
+        quiet = [batch for batch, kind in self.plays if kind == JUDGES[0]]
+        wins = np.concatenate([self._play(policy, batch, JUDGES[0])[0] for batch in quiet])
+        starts = self.judged[np.concatenate([self._batches[batch] for batch in quiet])]
+        lost, won = self.grid.nearest(starts[~wins]), float(wins.mean())
+        self._remember(lost, np.ones(len(lost)))
         if won < WORTH_ATTACKING:
             return won / 2, 0.0, -1.0
         starts, budget = self.attacked, Budget(rounds=ROUNDS)
@@ -395,10 +397,19 @@ class ByAttack(ByEpisodes):
         return (both, *(super().score(policy, plays) if both == 1 else (0.0, -1.0)))
 
     def nearly_won(self, score: Score) -> bool:
-        return score[0] >= 1 - NEARLY
+        return score[0] >= 1 - MAY_BREAK
 
     def won(self, policy: Policy) -> float:
+        if self(policy)[:2] == self.enough[:2]:
+            return 1.0  # the same episodes
         return float(np.concatenate([self._play(policy, *play)[0] for play in self.plays]).mean())
+
+
+class ByAttackAnywhere(ByAttack):
+    """As `ByAttack`, from everywhere in the set: a table may succeed where the agent does not."""
+
+    def _winning(self, index: int) -> np.ndarray:
+        return np.ones(self.grid.size, dtype=bool)
 
 
 class ByShare(ByEpisodes):

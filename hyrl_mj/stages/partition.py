@@ -126,15 +126,18 @@ def make_partition(
     grid = resolving(task.chart, cells, points, task.noise_in_chart(max(noise, 1e-6)))
     simulated, neighbours = thinned(task, grid)
     first = WayRuns.of(task, way_runs(task, policy, grid.nodes[simulated], label="partition"))
-    nodes, hop = grid.nodes[simulated], longest_hop(task, policy, grid)
-    width = strips.width(task, noise, hop)
+    nodes, near = grid.nodes[simulated], None
+    if first.passing is not None and noise and len(points):
+        width = strips.width(task, noise, longest_hop(task, policy, grid))
+        eps = float((task.noise_in_chart(noise) / task.chart.scale).max())
+        a, b = neighbours
+        across = strips.across(task, nodes, points, max(2 * eps, ACROSS_CELLS * grid.cell))
+        neighbours = np.append(a, across[0]), np.append(b, across[1])
 
-    def near(rows: np.ndarray) -> np.ndarray:
-        return strips.around_walls(task, nodes, neighbours, first.alive, rows) <= width
+        def near(rows: np.ndarray) -> np.ndarray:
+            return strips.around_walls(task, nodes, (a, b), first.alive, rows, width) <= width
 
-    across = strips.across(task, nodes, points, max(2 * noise, ACROSS_CELLS * grid.cell))
-    a, b = np.hstack([neighbours, across])
-    ways = Ways.of(task, first, (a, b), near)
+    ways = Ways.of(task, first, neighbours, near)
     modes = ways.modes if len(points) else ()
 
     def tell(rows: np.ndarray) -> np.ndarray:
@@ -218,6 +221,7 @@ class PartPolicy:
         policy: the stage-1 policy.
         inside: M_i without the neighbourhood of its boundary.
         near: width of that neighbourhood, in scaled units.
+        whole: whether nothing counts as elsewhere, so that it is the stage-1 policy itself.
     """
 
     KIND: ClassVar[str] = "part policy"
@@ -226,28 +230,35 @@ class PartPolicy:
     policy: Policy
     inside: GridSet
     near: float
+    whole: bool = False
 
     @property
     def undivided(self) -> PartPolicy:
-        """The stage-1 policy itself, as of a part that is the whole chart (`near` is below zero)."""
-        widest = -float(np.linalg.norm(self.task.chart.scaled_sides))
-        return replace(self, inside=self.inside.eroded(widest - self.near), near=widest)
+        """The stage-1 policy itself, everywhere."""
+        return replace(self, whole=True)
 
     def act(self, measured: np.ndarray) -> np.ndarray:
         """Returns inputs (n, m) for measurements (n, p)."""
+        if self.whole:
+            return self.policy.act(measured)
         nearest = self.inside.project(self.task.z(measured))
         return self.policy.act(self.task.with_z(measured, nearest))
 
     def save(self, path: Path) -> None:
         """Writes a JSON file beside a path; the stage-1 policy and M_i are in other files."""
         path = path.with_name(f"{path.stem}_part.json")
-        artifacts.write_json(path, {"near": self.near}, self.KIND)
+        artifacts.write_json(path, {"near": self.near, "whole": self.whole}, self.KIND)
 
     @staticmethod
     def load(path: Path, task: Task, policy: Policy, partition: Partition, mode: int) -> PartPolicy:
         """Reads what `save` wrote; raises `BadArtifact` if it is missing, damaged, or of another version."""
-        near = artifacts.read_json(path, PartPolicy.KIND, lambda content: float(content["near"]))
-        return part_policies(task, policy, partition, near)[partition.modes.index(mode)]
+        near, whole = artifacts.read_json(
+            path,
+            PartPolicy.KIND,
+            lambda content: (float(content["near"]), bool(content.get("whole", False))),
+        )
+        pi = part_policies(task, policy, partition, near)[partition.modes.index(mode)]
+        return replace(pi, whole=whole)
 
 
 def part_policies(

@@ -67,15 +67,15 @@ class ModeResult:
         mode: the mode.
         won: share of the states of its set from which its policy arrives in time, whatever the noise; where
             the worst case cannot be computed, share of the noisy episodes in which it arrives.
-        attempts: number of trainings; none if a mirror image or the warm start is good enough.
+        attempts: number of trainings; 0 if nothing was trained.
         policy: what the policy is: "trained", "pi_i" (paper, Step 4), the "agent" itself, or a "table" of
-            inputs.
+            inputs; None in files of earlier versions.
     """
 
     mode: int
     won: float
     attempts: int
-    policy: Kind = "trained"
+    policy: Kind | None = None
 
 
 @dataclass(frozen=True)

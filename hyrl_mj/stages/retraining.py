@@ -76,13 +76,14 @@ def retrain(
         log_dir: folder of logs and checkpoints.
 
     Returns:
-        pi_i, the stage-1 policy, or the first mirror image, if it is good enough; otherwise the best policy,
-        of all attempts, these, and the one that the first continued from. And how the training ended.
+        pi_i, the stage-1 policy, or the first mirror image, if it is good enough; otherwise the best of pi_i,
+        the stage-1 policy, the table, the policy that the first attempt continued from, and all attempts,
+        of which there are none with a table, or if nearly all is won. And how the training ended.
     """
     task, mode = ground.task, ground.mode
     tried: list[tuple[Score, ModePolicy]] = []
     if part is not None:
-        # Where nothing but trainings could follow, what bears all noise as it is need not be better.
+        # Without a table only trainings could follow: the agent is tried unchanged, too.
         for given in (part,) if table else (part, part.undivided):
             tried.append((ground(given), given))
             if ground.suffices(given):
@@ -95,13 +96,12 @@ def retrain(
             won = ground.won_by_image(image, result.won)
             if won is not None:
                 return image, ModeResult(mode, won, 0)
-    trainings = 0
     if table is not None:
         made = table(ground)
         tried.append((ground(made), made))
-        return _best(ground, tried, trainings)
-    if tried and ground.nearly_won(max(score for score, _ in tried)):
-        return _best(ground, tried, trainings)
+    if table is not None or (tried and ground.nearly_won(max(score for score, _ in tried))):
+        return _best(ground, tried, 0)
+    trainings = 0
     for attempt in range(settings.attempts):
         draw = int(np.random.SeedSequence([seed, 1 + mode, attempt]).generate_state(1)[0])
         warm = None
@@ -134,7 +134,7 @@ def _result(ground: ModeGround, policy: ModePolicy, trainings: int) -> ModeResul
     """Returns how the mode of a policy ended."""
     kind: Kind = "trained"
     if isinstance(policy, PartPolicy):
-        kind = "agent" if policy.near < 0 else "pi_i"
+        kind = "agent" if policy.whole else "pi_i"
     elif isinstance(policy, BoundTable):
         kind = "table"
     return ModeResult(ground.mode, ground.won(policy), trainings, kind)

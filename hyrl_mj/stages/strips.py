@@ -11,13 +11,16 @@ import numpy as np
 
 from hyrl_mj.tasks import Task
 
+# At no more points of M*, one after the other, nodes are looked at.
+MOST_POINTS = 500
+
 
 def width(task: Task, noise: float, hop: np.ndarray) -> float:
     """Returns the width that a strip needs, in scaled units.
 
-    The set of the other mode reaches 2 eps and a hop over M*, and eps over the other edge of the strip.
-    Between them a robot must not be able to pass unseen, which takes 2 eps and a hop. All of these act along
-    each coordinate.
+    The set of the other mode reaches 2 eps and a hop over M*, and eps and a hop over the other edge of the
+    strip. Between them a robot must not be able to pass unseen, which takes 2 eps and a hop. All of these act
+    along each coordinate, so that they are longer where M* lies across several.
 
     Args:
         task: gives the noisy coordinates.
@@ -25,13 +28,13 @@ def width(task: Task, noise: float, hop: np.ndarray) -> float:
         hop: (d,) longest hop in one sample.
     """
     eps = task.noise_in_chart(noise)
-    return float(np.linalg.norm((5 * eps + 2 * hop) * (eps > 0) / task.chart.scale))
+    return float(np.linalg.norm((5 * eps + 3 * hop) * (eps > 0) / task.chart.scale))
 
 
 def across(task: Task, nodes: np.ndarray, points: np.ndarray, reach: float) -> np.ndarray:
     """Returns indices (2, k) of those of nodes (N, d) that lie opposite to each other across points of M*.
 
-    Runs from nodes next to each other may not arrive so close to M*.
+    Runs from adjacent nodes so close to M* often fail, so pairs are taken across M*.
 
     Args:
         task: gives the chart.
@@ -40,12 +43,13 @@ def across(task: Task, nodes: np.ndarray, points: np.ndarray, reach: float) -> n
         reach: how far from a point both may lie, in scaled units.
     """
     chart = task.chart
+    points = points[np.unique(np.linspace(0, len(points) - 1, MOST_POINTS).astype(int))]
     tree = chart.tree(nodes)
     close = tree.query_ball_point(chart.in_box(points), reach)
     first = np.concatenate([np.empty(0, dtype=int), *map(np.asarray, close)]).astype(int)
     over = np.repeat(points, [len(rows) for rows in close], axis=0)
     mirrored = chart.wrap(over + chart.difference(over, nodes[first]))
-    return np.stack([first, tree.query(chart.in_box(mirrored))[1]])
+    return np.unique([first, tree.query(chart.in_box(mirrored))[1]], axis=1)
 
 
 def around_walls(
@@ -54,15 +58,19 @@ def around_walls(
     neighbours: tuple[np.ndarray, np.ndarray],
     free: np.ndarray,
     rows: np.ndarray,
+    farthest: float,
 ) -> np.ndarray:
-    """Returns how far nodes are from some of them: (N,) in scaled units, infinite where no way leads.
+    """Returns the length of the shortest way from each node to the nearest of some: (N,) in scaled units.
+
+    It is infinite where no way leads, or only one longer than `farthest`.
 
     Args:
         task: gives the chart.
         nodes: (N, d).
         neighbours: (k,), (k,) indices of nodes that lie next to each other; ways lead from one to the other.
         free: (N,) bool, the nodes that ways may lead through.
-        rows: indices of the nodes where ways begin.
+        rows: indices of the nodes where ways end.
+        farthest: length beyond which ways are not followed, in scaled units.
     """
     from scipy.sparse import csr_array  # slow to import
     from scipy.sparse.csgraph import dijkstra
@@ -70,4 +78,4 @@ def around_walls(
     a, b = (ends[free[neighbours[0]] & free[neighbours[1]]] for ends in neighbours)
     lengths = task.chart.distance(nodes[a], nodes[b])
     graph = csr_array((lengths, (a, b)), shape=(len(nodes), len(nodes)))
-    return np.asarray(dijkstra(graph, directed=False, indices=rows, min_only=True))
+    return np.asarray(dijkstra(graph, directed=False, indices=rows, min_only=True, limit=farthest))

@@ -32,9 +32,9 @@ class Ways:
         modes: their numbers.
         dropped: numbers of the ways that less than `LEAST_SHARE` of the nodes go from which a run can start.
         end: (K,) the usual bearing of the end of a run from each obstacle [rad].
-        half: (K,) an obstacle lies between start and end if they are seen from it at more than this angle: a
-            right one (Thales), or less where the ways part, or a run starts near there, at a smaller one
-            [rad].
+        half: (K,) an obstacle lies between start and end if they are seen from it at more than this angle: at
+            most a right one (Thales), lowered to the smallest angle at which the ways part, and to that of
+            starts near there, but by no more than half [rad].
         decides: (K,) bool, whether runs pass the obstacle on both sides.
         arriving: whether enough runs arrive; if not, all show a way.
     """
@@ -62,8 +62,8 @@ class Ways:
             task: the robot and its problem.
             runs: (n,) of the nodes.
             neighbours: (k,), (k,) indices of nodes that lie next to each other.
-            near: tells which nodes are so close to others, where ways part, that they decide, too: they
-                would otherwise leave a strip between the ways that noise can hide. By default none are.
+            near: tells which nodes are so close to others, where ways part, that they have to decide, too
+                (see `strips`). By default none are.
 
         Raises:
             BadInput: there are more than `MOST_MODES` ways.

@@ -1,6 +1,7 @@
 """Samples of the batched environments, against the bare physics and against one environment in a loop."""
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cached_property
 
 import gymnasium
@@ -36,8 +37,8 @@ def figures(runs: Runs) -> Iterator[Figure]:
     )
     name = "PointMaze_Medium-v3, n = 256, through from_gymnasium"
     for mode, against in (("sync", "SyncVectorEnv"), ("async", "AsyncVectorEnv")):
-        ours, theirs = _outside("PointMaze_Medium-v3", 256, mode)
-        yield Figure(name, "samples/s", f"Gymnasium's {against}", ">= 0.8", ours, theirs)
+        with _outside("PointMaze_Medium-v3", 256, mode) as (ours, theirs):
+            yield Figure(name, "samples/s", f"Gymnasium's {against}", ">= 0.8", ours, theirs)
     name = "vehicle, closed loop under noise, 10,000 episodes"
     yield Figure(name, "samples/s", raw, ">= 0.3", _closed_loop(runs), _physics(vehicle, 4096))
 
@@ -71,8 +72,9 @@ def _physics(task: Task, n: int) -> Callable[[], int]:
     return work
 
 
-def _outside(name: str, n: int, mode: str) -> tuple[Callable[[], int], Callable[[], int]]:
-    """Returns steps of copies of an environment of others, as ours and as Gymnasium's."""
+@contextmanager
+def _outside(name: str, n: int, mode: str) -> Iterator[tuple[Callable[[], int], Callable[[], int]]]:
+    """Yields steps of copies of an environment of others, as ours and as Gymnasium's."""
     options = {"goal_cell": np.array([6, 6])}
     task = hyrl_mj.from_gymnasium(name, reset=options)
     plant, rng = task.plant(n), np.random.default_rng(0)
@@ -92,7 +94,8 @@ def _outside(name: str, n: int, mode: str) -> tuple[Callable[[], int], Callable[
             others.step(u)
         return n * SAMPLES
 
-    return ours, theirs
+    yield ours, theirs
+    others.close()
 
 
 def _one_environment(task: Task) -> Callable[[], int]:

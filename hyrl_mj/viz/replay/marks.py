@@ -27,6 +27,8 @@ ON_FLOOR, ON_SETS, ON_BOUND, ON_PATH, ON_TOP = -0.006, -0.004, -0.002, 0.0, 0.00
 THICKNESS = 0.004  # [m]
 FLYING = 0.3  # a robot flies if its tracked site is higher than this above the floor [m]
 CRITICAL_RADIUS, OVERLAP_WIDTH = 0.02, 0.16  # [m]
+# From so many nodes it is found out whether the tracked point moves at all.
+TRIED = 64
 # Cells of a strip of the overlap: short enough to follow a bent coordinate.
 STRIP = 16
 UP = np.array([0.0, 0.0, 1.0])
@@ -132,10 +134,10 @@ class Floor:
             strips.append(points[:2])
             across = 2 * float(np.linalg.norm(points[3] - points[2]))
             widths.append(OVERLAP_WIDTH if len(half) == 1 else across)
-        marked = places(critical.points)
-        if len(marked) > 1 and np.ptp(marked, axis=0).max() < 1e-9:
-            marked = marked[:0]  # the tracked point stays where it is, and tells nothing about M*
-        return Floor(marked, np.reshape(strips, (-1, 2, 3)), np.array(widths))
+        points, nodes = critical.points, partition.grid.nodes
+        if np.ptp(places(nodes[:: max(len(nodes) // TRIED, 1)]), axis=0).max() < 1e-9:
+            points = points[:0]  # the tracked point stays where it is, and tells nothing about M*
+        return Floor(places(points), np.reshape(strips, (-1, 2, 3)), np.array(widths))
 
     def draw(self, scene: mujoco.MjvScene, larger: float) -> None:
         """Adds the marks to a scene, points of M* larger than usual by a factor."""
