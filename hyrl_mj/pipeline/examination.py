@@ -48,7 +48,7 @@ class ExamineOptions:
         episodes: noisy episodes for each kind of noise and each controller; by default none where the worst
             case can be computed and not only estimated, on charts of one or two dimensions.
         noise: kinds of noise in the episodes; by default none,uniform,alternating,adversarial, without the
-            last for environments of others, which are attacked instead.
+            last in environments of others.
         all_coordinates: add noise to every coordinate of the measurement, not only to the noisy ones of the
             task; always, if the run was made so.
         near_critical: start all episodes within twice the bound of the critical set.
