@@ -18,7 +18,7 @@ from hyrl_mj.game import LIMIT, MAP_CLASSES, EpisodeCount, GameResult, Robustnes
 from hyrl_mj.learning import Training
 from hyrl_mj.policies import Agent, MlpPolicy
 from hyrl_mj.run_directory import Run
-from hyrl_mj.verdict import NO_NOISE, listed
+from hyrl_mj.verdict import NO_NOISE, POLICIES, listed
 from hyrl_mj.viz import tables
 from hyrl_mj.viz.arcs import attack_replay
 from hyrl_mj.viz.commands import changed, commands
@@ -191,7 +191,12 @@ def _stages(
     task, s, modes = run.task, run.settings, run.extended_sets.modes
     reach = "; ".join(f"mode {task.mode_name(q)}: {tables.extent(run, q)}" for q in modes)
     attempts = f"up to {s.stage6.attempts} times " if s.stage6.attempts > 1 else ""
-    retrained = f"a policy for each of {len(modes)} modes: {s.stage6.title}"
+    known = run.manifest.has(run.path / "retraining.json")
+    given = [r for r in run.retraining.modes if r.policy in POLICIES] if known else []
+    retrained = "nothing was trained"
+    if count := len(modes) - len(given):
+        many = f"each of {count} modes" if not given else f"{count} of {len(modes)} modes"
+        retrained = f"a policy for {many}: {s.stage6.title}, {attempts}{s.stage6.samples:,} samples"
     if isinstance(s.stage1, Agent):
         first = f"none: the agent {s.stage1} takes its place"
     else:
@@ -203,7 +208,7 @@ def _stages(
         ("critical-set", run.critical_set.sentence(task)),
         ("partition", run.partition.sentence(task)),
         ("extended-sets", f"{run.extended_sets.sentence(task)}; {reach}"),
-        ("retrain", f"{retrained}, {attempts}{s.stage6.samples:,} samples"),
+        ("retrain", retrained),
         (
             "robustness",
             "not done" if robustness is None else tables.robustness_sentence(robustness),
