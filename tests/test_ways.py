@@ -245,21 +245,6 @@ def test_modes_are_the_patterns_of_which_no_other_says_more():
     assert ways.members(runs).astype(int).tolist() == [*belongs.values()]
 
 
-def test_a_state_belongs_to_no_mode_that_leaves_open_what_it_decides():
-    field = Field(row(2))
-    of_a = [[(0, 0.1 * s), (1, s), (1.6, 0.1)] for s in (1, -1)]
-    of_b = [past(field.posts[1:], [side], start=(1.6, 0.1)) for side in (LEFT, RIGHT)]
-    runs = runs_along(field, along(*of_a, *of_b))
-    ways = Ways.of(field, runs, NO_PAIRS)
-    patterns = ways.of_runs(runs)
-    assert [RIGHT, ANY] in patterns.tolist()
-    assert [ANY, LEFT] in ways.patterns.tolist(), "a mode that does not say how to pass a"
-    for run, belongs in zip(patterns, ways.members(runs), strict=True):
-        said = run != ANY
-        assert belongs.any()
-        assert (ways.patterns[belongs][:, said] == run[said]).all()
-
-
 def test_a_post_that_all_pass_on_one_side_is_in_no_pattern():
     field = Field(row(2))
     runs = runs_along(field, along(*(past(field.posts, (side, LEFT)) for side in (LEFT, RIGHT))))

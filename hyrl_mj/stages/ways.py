@@ -25,8 +25,7 @@ class Ways:
 
     A pattern holds, for each obstacle, whether it is passed on its `LEFT`, on its `RIGHT`, or `ANY` of them:
     an obstacle says nothing if all runs pass it on the same side, or if it does not lie between the start
-    and the end of a run. A state belongs to every mode whose pattern says all that its own does: the policy
-    of another would have to decide by itself.
+    and the end of a run. A state belongs to every mode that agrees with its pattern.
 
     Attributes:
         patterns: (Q, K) the pattern of each mode; a task's own direction is a pattern of one.
@@ -120,7 +119,7 @@ class Ways:
     def members(self, runs: WayRuns) -> np.ndarray:
         """Returns the modes that runs belong to: (n, Q) bool, none for runs of a way that is no mode."""
         patterns = self.of_runs(runs)[:, None]
-        agree = (patterns == self.patterns) | (patterns == ANY)
+        agree = (patterns == self.patterns) | (patterns == ANY) | (self.patterns == ANY)
         return np.asarray(agree.all(axis=2))
 
 
