@@ -189,7 +189,7 @@ class _Case:
             result.mode
             for result in modes
             if result.won < NEARLY
-            and result.policy in (None, "trained")
+            and result.policy not in POLICIES
             and self.task.for_mode(result.mode) is self.task
         ]
         if given_up:

@@ -183,8 +183,9 @@ def replay_stage(run: Run, say: Say) -> None:
     from hyrl_mj.viz.replay import render_replay
 
     options, shows = ReplayOptions(), replay_shows(run)
-    longest = sum(max(arc.t[-1] for arc in (*show.policy, *show.hybrid)) for show in shows)
-    fps = max(FEWEST, min(options.fps, int(FRAMES / longest)))
+    seconds = sum(max(arc.t[-1] for arc in (*show.policy, *show.hybrid)) for show in shows)
+    # An arc that ends where it begins lasts no time.
+    fps = max(FEWEST, min(options.fps, int(FRAMES / max(seconds, 1.0))))
     options = SMOKE if run.settings.preset == "smoke" else replace(options, fps=fps)
     try:
         render_replay(run.task, shows, run.path / "replay.mp4", options, floor=replay_floor(run))
