@@ -245,6 +245,35 @@ def test_modes_are_the_patterns_of_which_no_other_says_more():
     assert ways.members(runs).astype(int).tolist() == [*belongs.values()]
 
 
+def to_the_middle(posts):
+    """Paths from both sides of a set-point between two posts, past the nearer one on its left and right."""
+    (a, b), middle = posts[:, 0], (2, 0)
+    ways = {(end, y): [(end, 0), (at, y), middle] for end, at in ((0, a), (4, b)) for y in (1, -1)}
+    return {"L any": ways[0, 1], "R any": ways[0, -1], "any R": ways[4, 1], "any L": ways[4, -1]}
+
+
+def test_modes_say_how_to_pass_what_no_start_has_to_pass_together():
+    field = Field({"_a": (1, 0, 0.3), "_b": (3, 0, 0.3)})
+    paths = to_the_middle(field.posts)
+    runs = runs_along(field, along(*paths.values()))
+    ways = Ways.of(field, runs, NO_PAIRS)
+    assert ways.patterns.tolist() == [[LEFT, LEFT], [RIGHT, LEFT], [LEFT, RIGHT], [RIGHT, RIGHT]]
+    belongs = {
+        "L any": [1, 0, 1, 0], "R any": [0, 1, 0, 1], "any R": [0, 0, 1, 1], "any L": [1, 1, 0, 0],
+    }  # fmt: skip
+    assert ways.members(runs).astype(int).tolist() == [belongs[way] for way in paths]
+
+
+def test_modes_do_not_say_together_what_hardly_any_run_does():
+    field = Field({"_a": (1, 0, 0.3), "_b": (3, 0, 0.3)})
+    many = [path for path in to_the_middle(field.posts).values() for _ in range(50)]
+    rare = [(0, 0), (1, -1), (3, -1), (4, 0), (3, 1), (2, 0)]  # to the right of a, and to that of b
+    runs = runs_along(field, along(*many, rare, samples=40))
+    ways = Ways.of(field, runs, NO_PAIRS)
+    assert ways.dropped == (number_of(np.array([[RIGHT, RIGHT]]))[0],)
+    assert ways.patterns.tolist() == [[LEFT, LEFT], [RIGHT, LEFT], [LEFT, RIGHT]]
+
+
 def test_a_post_that_all_pass_on_one_side_is_in_no_pattern():
     field = Field(row(2))
     runs = runs_along(field, along(*(past(field.posts, (side, LEFT)) for side in (LEFT, RIGHT))))

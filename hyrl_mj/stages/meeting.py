@@ -107,8 +107,9 @@ def least_room(
         same = (inside == inside[:, [i]]).all(axis=2)
         best[:, i] = np.where(same, room, 0.0).max(axis=1)
     of_pair = np.where(meet[rows], np.minimum(best[:, :, None], best[:, None]), np.inf)
-    # Of pairs with the same room that which meets at most points, with its modes in order.
-    of_pair -= STEP / 2 * meet.mean(axis=0)
+    # Of pairs with the same room that whose parts have most in common, with its modes in order.
+    masks = np.stack([part.mask for part in parts])
+    of_pair -= STEP / 2 * (masks[:, None] == masks).mean(axis=2)
     pair = of_pair.reshape(-1, len(parts) ** 2).argmin(axis=1)
     pairs = np.stack(np.divmod(pair, len(parts)), axis=1)
     return rows, pairs, np.take_along_axis(best, pairs, axis=1).min(axis=1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
@@ -25,7 +26,9 @@ class Ways:
 
     A pattern holds, for each obstacle, whether it is passed on its `LEFT`, on its `RIGHT`, or `ANY` of them:
     an obstacle says nothing if all runs pass it on the same side, or if it does not lie between the start
-    and the end of a run. A state belongs to every mode that agrees with its pattern.
+    and the end of a run. The patterns of modes are those of which no other one says more, put together where
+    they do not contradict: a mode says how to pass every obstacle about which starts decide. A state belongs
+    to every mode that agrees with its pattern.
 
     Attributes:
         patterns: (Q, K) the pattern of each mode; a task's own direction is a pattern of one.
@@ -90,7 +93,8 @@ class Ways:
             decides = (seen == LEFT).any(axis=0) & (seen == RIGHT).any(axis=0)
         found = Ways(np.empty((0, len(decides)), dtype=int), (), (), end, half, decides, True)
         patterns = found.of_runs(runs)[counted]
-        kept, dropped = _modes(patterns, LEAST_SHARE * runs.alive.sum())
+        alone, dropped = _modes(patterns, LEAST_SHARE * runs.alive.sum())
+        kept = _complete(alone, dropped)
         if len(kept) > MOST_MODES:
             raise BadInput(
                 f"{task.name} has {len(kept)} ways, and a controller has at most {MOST_MODES} modes: "
@@ -129,16 +133,16 @@ def _angles(passing: Passing, end: np.ndarray) -> np.ndarray:
 
 
 def _modes(patterns: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the patterns (Q, K) of the modes, and those (R, K) that are gone fewer than `least` times.
+    """Returns the patterns (P, K) of ways, and those (R, K) that are gone fewer than `least` times.
 
-    Modes are the patterns of which no other one says more.
+    Those are patterns of which no other one says more.
     """
     rows, counts = np.unique(patterns, axis=0, return_counts=True)
     decided = rows != ANY
     rows, counts = rows[decided.any(axis=1)], counts[decided.any(axis=1)]
     dropped: list[np.ndarray] = []
     while True:
-        modes = [i for i, row in enumerate(rows) if not _less_than_others(row, rows)]
+        modes = [i for i, row in enumerate(rows) if _say_all(rows, row).sum() == 1]  # itself
         rare = [i for i in modes if counts[i] < least]
         if not rare:
             return rows[modes], np.reshape(dropped, (-1, patterns.shape[1])).astype(int)
@@ -147,8 +151,27 @@ def _modes(patterns: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
         rows, counts = np.delete(rows, rarest, axis=0), np.delete(counts, rarest)
 
 
-def _less_than_others(pattern: np.ndarray, patterns: np.ndarray) -> bool:
-    """Returns whether one of the patterns (n, K) says all that a pattern (K,) says, and more."""
-    says = pattern != ANY
-    same = (patterns[:, says] == pattern[says]).all(axis=1)
-    return bool((same & ((patterns != ANY).sum(axis=1) > says.sum())).any())
+def _complete(modes: np.ndarray, dropped: np.ndarray) -> np.ndarray:
+    """Returns the patterns (Q, K) that say all that patterns (P, K) without a contradiction say together.
+
+    Where no start has to decide about two obstacles, each pattern would say something about only one of
+    them, and the policy of such a mode would decide about the other by itself. Ways that were `dropped`
+    (R, K) do not come back.
+    """
+    import networkx  # slow to import
+
+    if len(modes) < 2:
+        return modes
+    both = (modes != ANY) & (modes[:, None] != ANY)
+    agree = (~both | (modes == modes[:, None])).all(axis=2)
+    groups = networkx.find_cliques(networkx.from_numpy_array(agree))
+    # ANY is less than both sides.
+    joined = [modes[rows].max(axis=0) for rows in islice(groups, MOST_MODES + 1)]
+    joined = [row for row in joined if not any(_say_all(row, gone) for gone in dropped)]
+    alone = [row for row in modes if not any(_say_all(other, row) for other in joined)]
+    return np.unique([*joined, *alone], axis=0)
+
+
+def _say_all(patterns: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Returns whether patterns (..., K) say all that another (K,) says: (...) bool."""
+    return np.asarray(((other == ANY) | (patterns == other)).all(axis=-1))
