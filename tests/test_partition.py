@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from planted import ChartPolicy, circle_policy, one_way_policy, sign_policy
 
-from hyrl_mj import find_critical_set, make_partition
+from hyrl_mj import Partition, find_critical_set, make_partition
+from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.partition import PartPolicy, part_policies
 
 PI = np.pi
@@ -119,3 +120,17 @@ def test_a_part_policy_on_the_vehicle(vehicle, vehicle_parts):
     z = np.array([[0.1, 0.3], [0.1, 0.0], [0.1, -0.3]])
     np.testing.assert_array_equal(left.act(z), [[1.0]] * 3)
     np.testing.assert_array_equal(right.act(z), [[-1.0]] * 3)
+
+
+def test_a_run_goes_astray_that_comes_into_a_part_where_it_shares_it_with_the_start_s_own(circle):
+    """Of three parts the second holds the start, and the third overlaps with the first, too."""
+    grid = Grid.from_counts(circle.chart, np.array([8]))
+    start, with_second, with_third, alone, outside = range(5)
+    parts = tuple(
+        GridSet.from_mask(grid, np.isin(np.arange(grid.size), nodes))
+        for nodes in ([with_second, with_third, alone], [start, with_second], [with_third, outside])
+    )
+    partition = Partition((0, 1, 2), parts, parts[0].mask)
+    ends = np.array([with_second, with_third, alone, outside])
+    gone = partition.astray(parts[0], np.full(4, start), ends)
+    assert gone.tolist() == [True, False, False, False]

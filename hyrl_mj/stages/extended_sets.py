@@ -239,7 +239,7 @@ def _outside(
 
     These are whether they belong to W_i, from where pi_i arrives by its own way, whether the runs enter M_i
     on the rim (N,) bool, and after how many samples, infinite for others. Past obstacles, a run from outside
-    M_i goes another way if it first enters M_i where parts overlap. Scattered nodes lie too far apart for a
+    M_i may go another way into it (see `Partition.astray`). Scattered nodes lie too far apart for a
     rim: there it counts wherever the runs enter M_i. Without a rim, only W_i is asked for.
     """
     arrives = partition.succeeds & part.mask
@@ -253,24 +253,26 @@ def _outside(
         rollout = policy_runs(task, pi, nodes, label="extended sets")
         wins[outside] = rollout.outcome == Outcome.REACHED
         if not task.gives_direction:
-            wins[outside] &= ~_elsewhere(partition, part, arrives, rollout)
+            wins[outside] &= ~_astray(partition, part, arrives, rows[outside], rollout)
         if rim is not None:
             entry[outside] = _entries(task, part, rim, rollout)
     return np.column_stack([wins, np.isfinite(entry), entry])
 
 
-def _elsewhere(
-    partition: Partition, part: GridSet, arrives: np.ndarray, rollout: Rollout
+def _astray(
+    partition: Partition, part: GridSet, arrives: np.ndarray, starts: np.ndarray, rollout: Rollout
 ) -> np.ndarray:
-    """Returns the runs (k,) bool that enter M_i, where pi_i `arrives` (N,), first where parts overlap."""
-    shared = np.sum([other.mask for other in partition.parts], axis=0) > 1
-    entered, elsewhere = np.zeros((2, len(rollout.outcome)), dtype=bool)
+    """Returns which runs (k,) bool from nodes `starts` enter M_i by another way than its own.
+
+    They enter M_i where they first come to one of the nodes (N,) bool of it from which pi_i `arrives`.
+    """
+    entered, astray = np.zeros((2, len(rollout.outcome)), dtype=bool)
     for z in rollout.path[1:]:
         at = part.grid.nearest(z)
         enters = ~entered & arrives[at]
-        elsewhere |= enters & shared[at]
+        astray |= enters & partition.astray(part, starts, at)
         entered |= enters
-    return elsewhere
+    return astray
 
 
 def _entries(task: Task, part: GridSet, rim: np.ndarray, rollout: Rollout) -> np.ndarray:

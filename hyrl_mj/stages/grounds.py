@@ -90,7 +90,7 @@ class ModeGround(ABC):
 
     Attributes:
         part: M_i of the mode; None where it earns its reward everywhere.
-        shared: (N,) bool, the nodes at which parts overlap, because nothing is left to decide.
+        parts: the parts of all modes, or None, as `part`.
         bound: (d,) largest error of a measured chart point, along each coordinate.
     """
 
@@ -109,10 +109,8 @@ class ModeGround(ABC):
     ):
         self.task, self.extended, self.mode = task.for_mode(mode), extended, mode
         own = self.task is not task
-        self.part, self.shared = None, np.zeros(extended.sets[0].grid.size, dtype=bool)
-        if parts is not None and not own:
-            self.part = parts.parts[parts.modes.index(mode)]
-            self.shared = np.sum([part.mask for part in parts], axis=0) > 1
+        self.parts = None if own else parts
+        self.part = None if self.parts is None else self.parts.parts[self.parts.modes.index(mode)]
         self.shares = tuple(float(share) for share in task.noisy)
         self.bound = task.noise_in_chart(extended.noise)
         index = extended.modes.index(mode)

@@ -69,6 +69,20 @@ class Partition(Saved):
         """The nodes of the parts: a grid or a cloud."""
         return self.parts[0].grid
 
+    def astray(self, part: GridSet, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        """Returns whether runs from outside M_i come into it by another way than its own: (k,) bool.
+
+        They do if they end where M_i overlaps with a part that holds their start: nothing was left to decide
+        there, and they went as that part does.
+
+        Args:
+            part: M_i.
+            starts: (k,) indices of nodes outside M_i.
+            ends: (k,) indices of nodes.
+        """
+        masks = np.stack([other.mask for other in self.parts])
+        return np.asarray(part.mask[ends] & (masks[:, starts] & masks[:, ends]).any(axis=0))
+
     def sentence(self, task: Task) -> str:
         """Returns a one-line description."""
         shares = ", ".join(

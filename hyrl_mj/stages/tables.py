@@ -197,11 +197,12 @@ def table_for(held: Held, ground: ModeGround) -> BoundTable:
     ends = held.ends.reshape(-1, len(grid.counts))
     inside = ground.within.contains(ends)
     farther, _ = _farther(held, inside)
-    if ground.part is not None:
-        # From M_i the way of the mode stays in it. From outside it leads there, and not to where parts
-        # overlap, which would be another way; but any way is better than none.
-        of_part = np.tile(ground.part.mask[rows], len(held.inputs))
-        own = np.where(of_part, ground.part.contains(ends), ~ground.shared[grid.nearest(ends)])
+    if ground.part is not None and ground.parts is not None:
+        # From M_i the way of the mode stays in it. From outside it leads there, and not astray; but any way
+        # is better than none.
+        starts = np.tile(rows, len(held.inputs))
+        astray = ground.parts.astray(ground.part, starts, grid.nearest(ends))
+        own = np.where(ground.part.mask[starts], ground.part.contains(ends), ~astray)
         on_way, has_way = _farther(held, inside & own)
         farther = np.where(has_way, on_way, farther)
     worst = np.stack([_in_reach(held, ground.bound, gain, "worst") for gain in farther])
