@@ -168,7 +168,8 @@ def test_a_policy_is_judged_without_noise_and_by_an_attack(puck):
     policy = SimpleNamespace(act=lambda m: np.clip(puck_agent(puck.observation(m)), -4, 4))
     idle = SimpleNamespace(act=lambda m: np.zeros((len(m), 2)))
     both = ground(policy)[0]
-    assert 0.5 < both <= 1
+    assert 0.5 < both < 1
+    assert ground.won(policy) <= both, "what the attack breaks is not won"
     assert ground(idle)[0] < 0.1
 
 

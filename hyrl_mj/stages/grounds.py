@@ -398,9 +398,12 @@ class ByAttack(ByEpisodes):
         return score[0] >= 1 - MAY_BREAK
 
     def won(self, policy: Policy) -> float:
-        if self(policy)[:2] == self.enough[:2]:
+        """Returns the share that a policy wins, which is no larger than what the attack leaves of it."""
+        score = self(policy)
+        if score[:2] == self.enough[:2]:
             return 1.0  # the same episodes
-        return float(np.concatenate([self._play(policy, *play)[0] for play in self.plays]).mean())
+        episodes = np.concatenate([self._play(policy, *play)[0] for play in self.plays])
+        return float(min(score[0], episodes.mean()))
 
 
 class ByAttackAnywhere(ByAttack):
