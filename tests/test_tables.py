@@ -80,7 +80,7 @@ def test_a_table_goes_the_way_of_its_mode_whatever_noise_shows(puck, held):
     """Along the upper side of the rock, also from starts below the line that leads to it."""
     nodes = held.grid.nodes
     upper = GridSet.from_mask(held.grid, (nodes[:, 1] > -0.3) | (nodes[:, 0] > 0.6))
-    table = table_for(held, SimpleNamespace(within=upper, part=None, bound=np.array([EPS, EPS])))
+    table = table_for(held, SimpleNamespace(within=upper, bound=np.array([EPS, EPS])))
     z = np.stack(np.meshgrid([-1.8, -1.4, -1.0], [0.0, 0.5, 1.0]), axis=-1).reshape(-1, 2)
     path = policy_runs(puck, table, z).path
     passing = np.abs(path[..., 0]) < 0.1
@@ -92,7 +92,7 @@ def test_a_table_goes_the_way_of_its_mode_whatever_noise_shows(puck, held):
 
 def test_a_table_is_read_as_it_was_written(puck, held, tmp_path):
     everywhere = GridSet.from_mask(held.grid, np.ones(held.grid.size, dtype=bool))
-    table = table_for(held, SimpleNamespace(within=everywhere, part=None, bound=np.zeros(2)))
+    table = table_for(held, SimpleNamespace(within=everywhere, bound=np.zeros(2)))
     table.save(tmp_path / "mode_0.safetensors")
     again = TablePolicy.load(tmp_path / "mode_0_table.npz")
     measured = puck.plant(3).measurement

@@ -90,7 +90,6 @@ class ModeGround(ABC):
 
     Attributes:
         part: M_i of the mode; None where it earns its reward everywhere.
-        parts: the parts of all modes, or None, as `part`.
         bound: (d,) largest error of a measured chart point, along each coordinate.
     """
 
@@ -109,8 +108,7 @@ class ModeGround(ABC):
     ):
         self.task, self.extended, self.mode = task.for_mode(mode), extended, mode
         own = self.task is not task
-        self.parts = None if own else parts
-        self.part = None if self.parts is None else self.parts.parts[self.parts.modes.index(mode)]
+        self.part = None if parts is None or own else parts.parts[parts.modes.index(mode)]
         self.shares = tuple(float(share) for share in task.noisy)
         self.bound = task.noise_in_chart(extended.noise)
         index = extended.modes.index(mode)

@@ -187,7 +187,8 @@ def table_for(held: Held, ground: ModeGround) -> BoundTable:
     """Returns the policy of a mode: at each node the input that does well wherever noise may hide the robot.
 
     The measure of an input at a node is how many samples farther from arrival it leads, at the worst and on
-    average over the nodes within the noise bound.
+    average over the nodes within the noise bound. Inputs may lead anywhere in the mode's set, which ends
+    behind M*, so that no other way is open.
 
     Args:
         held: where held inputs lead.
@@ -195,16 +196,7 @@ def table_for(held: Held, ground: ModeGround) -> BoundTable:
     """
     task, grid, rows = held.task, held.grid, held.rows
     ends = held.ends.reshape(-1, len(grid.counts))
-    inside = ground.within.contains(ends)
-    farther, _ = _farther(held, inside)
-    if ground.part is not None and ground.parts is not None:
-        # From M_i the way of the mode stays in it. From outside it leads there, and not astray; but any way
-        # is better than none.
-        starts = np.tile(rows, len(held.inputs))
-        astray = ground.parts.astray(ground.part, starts, grid.nearest(ends))
-        own = np.where(ground.part.mask[starts], ground.part.contains(ends), ~astray)
-        on_way, has_way = _farther(held, inside & own)
-        farther = np.where(has_way, on_way, farther)
+    farther = _farther(held, ground.within.contains(ends))
     worst = np.stack([_in_reach(held, ground.bound, gain, "worst") for gain in farther])
     most = np.minimum(farther, LEAVING * task.max_steps)
     usual = np.stack([_in_reach(held, ground.bound, gain, "mean") for gain in most])
@@ -215,8 +207,8 @@ def table_for(held: Held, ground: ModeGround) -> BoundTable:
     return BoundTable(task, grid, held.inputs[best])
 
 
-def _farther(held: Held, stays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns how many samples farther from arrival inputs lead (A, k), and which nodes have a way (k,) bool.
+def _farther(held: Held, stays: np.ndarray) -> np.ndarray:
+    """Returns how many samples farther from arrival inputs lead: (A, k).
 
     `stays` (A * k,) bool tells which ends are allowed.
     """
@@ -235,7 +227,7 @@ def _farther(held: Held, stays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         change, left = np.abs(new - left).max(), new
         if change < SETTLED:
             break
-    return after(left) - left, left < never
+    return np.asarray(after(left) - left)
 
 
 def _in_reach(held: Held, bound: np.ndarray, values: np.ndarray, how: str) -> np.ndarray:
