@@ -357,9 +357,9 @@ class ByEpisodes(ModeGround):
 class ByAttack(ByEpisodes):
     """Judges by an attack, too, which finds noise that keeps a robot in a corner: where samples take long.
 
-    The score is the share of starts from which an attack does not break the policy, and then the share of
-    episodes that it wins without noise. If it loses none of both, the score of the noisy episodes follows. A
-    policy that wins too few of the second is not attacked, as if it were broken from everywhere.
+    The score is the mean of two shares: of episodes that are won without noise, and of starts from which an
+    attack does not break the policy. If it loses none of them the score of the noisy episodes follows. A
+    policy that wins too few of the first is not attacked, as if it were broken from everywhere.
 
     Attributes:
         attacked: (n, d) starts of the attack.
@@ -369,7 +369,7 @@ class ByAttack(ByEpisodes):
         super()._prepare(policy)
         # The attack stands for the adversary, whose looking ahead takes too long here.
         self.plays = [play for play in self.plays if play[1] != "adversarial"]
-        self.enough = (1.0, 1.0, float(len(self.plays)), -1.0)
+        self.enough = (1.0, float(len(self.plays)), -1.0)
         # Half of the starts are where modes meet: there a mode may have to go against its neighbours.
         off = distance_to(self.task, self.extended.points, self.grid.nodes[self.nodes])
         near = self.nodes[off <= 2 * float(np.linalg.norm(self.bound / self.task.chart.scale))]
@@ -384,21 +384,21 @@ class ByAttack(ByEpisodes):
         lost, won = self.grid.nearest(starts[~wins]), float(wins.mean())
         self._remember(lost, np.ones(len(lost)))
         if won < WORTH_ATTACKING:
-            return 0.0, won, 0.0, -1.0
+            return won / 2, 0.0, -1.0
         starts, budget = self.attacked, Budget(rounds=ROUNDS)
         task, loops = self.task.with_noise(self.shares), {"mode": PolicyController(policy)}
         found = attack(task, loops, starts, self.noise.bound, budget)["mode"]
         withstood = 1 - found.count.lost / len(starts)
-        sure = won == withstood == 1
-        return (withstood, won, *(super().score(policy, plays) if sure else (0.0, -1.0)))
+        both = (won + withstood) / 2
+        return (both, *(super().score(policy, plays) if both == 1 else (0.0, -1.0)))
 
     def nearly_won(self, score: Score) -> bool:
-        return float(np.mean(score[:2])) >= 1 - MAY_BREAK
+        return score[0] >= 1 - MAY_BREAK
 
     def won(self, policy: Policy) -> float:
         """Returns the share that a policy wins, which is no larger than what the attack leaves of it."""
         score = self(policy)
-        if score[:3] == self.enough[:3]:
+        if score[:2] == self.enough[:2]:
             return 1.0  # the same episodes
         episodes = np.concatenate([self._play(policy, *play)[0] for play in self.plays])
         return float(min(score[0], episodes.mean()))
