@@ -274,6 +274,12 @@ def test_modes_do_not_say_together_what_hardly_any_run_does():
     assert ways.patterns.tolist() == [[LEFT, LEFT], [RIGHT, LEFT], [LEFT, RIGHT]]
 
 
+def test_without_a_decision_there_is_no_mode():
+    field = Field({"_a": (1, 0, 0.3)})
+    runs = runs_along(field, along([(0, 0), (1, 1), (4, 0)], [(0, 0.1), (1, 1), (4, 0)]))
+    assert Ways.of(field, runs, (np.array([0]), np.array([1]))).modes == ()
+
+
 def test_a_post_that_all_pass_on_one_side_is_in_no_pattern():
     field = Field(row(2))
     runs = runs_along(field, along(*(past(field.posts, (side, LEFT)) for side in (LEFT, RIGHT))))

@@ -269,9 +269,9 @@ def _astray(
     entered, astray = np.zeros((2, len(rollout.outcome)), dtype=bool)
     for z in rollout.path[1:]:
         at = part.grid.nearest(z)
-        enters = ~entered & arrives[at]
-        astray |= enters & partition.astray(part, starts, at)
-        entered |= enters
+        rows = np.flatnonzero(~entered & arrives[at])
+        astray[rows] = partition.astray(part, starts[rows], at[rows])
+        entered[rows] = True
     return astray
 
 

@@ -81,7 +81,6 @@ class Ways:
             both = counted[first] & counted[second]
             first, second = first[both], second[both]
             part = windings(passing[first], passing[second]) != 0
-            alike = first[~part.any(axis=1)], second[~part.any(axis=1)]
             angle = np.abs(_angles(passing, end))
             half = np.full(angle.shape[1], np.pi / 2)
             for k, pairs in enumerate(part.T):
@@ -93,14 +92,15 @@ class Ways:
             seen = sides(_angles(passing, end), half)[counted]
             decides = (seen == LEFT).any(axis=0) & (seen == RIGHT).any(axis=0)
         found = Ways(np.empty((0, len(decides)), dtype=int), (), (), end, half, decides, True)
-        patterns = found.of_runs(runs)
-        kept, dropped = _modes(patterns[counted], LEAST_SHARE * runs.alive.sum())
-        if passing is not None:
-            kept = _complete(kept, _together(patterns[alike[0]], patterns[alike[1]]), dropped)
+        patterns = found.of_runs(runs)[counted]
+        kept, dropped = _modes(patterns, LEAST_SHARE * runs.alive.sum())
+        if len(kept):
+            kept = _complete(kept, dropped)
         if len(kept) > MOST_MODES:
             raise BadInput(
-                f"{task.name} has {len(kept)} ways, and a controller has at most {MOST_MODES} modes: "
-                "train it in a smaller part of the scene, or give it a direction() that tells fewer apart"
+                f"{task.name} has {len(kept)} ways, if not more, and a controller has at most {MOST_MODES} "
+                "modes: train it in a smaller part of the scene, or give it a direction() that tells "
+                "fewer apart"
             )
         numbers = (
             [kept[:, 0], dropped[:, 0]] if passing is None else [*map(number_of, (kept, dropped))]
@@ -153,33 +153,22 @@ def _modes(patterns: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
         rows, counts = np.delete(rows, rarest, axis=0), np.delete(counts, rarest)
 
 
-def _together(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Returns the patterns (P, K) that patterns a and b (n, K) of neighbours say together."""
-    agree = ((a == b) | (a == ANY) | (b == ANY)).all(axis=1)
-    return np.unique(np.maximum(a, b)[agree], axis=0)  # ANY is less than both sides
-
-
-def _complete(modes: np.ndarray, together: np.ndarray, dropped: np.ndarray) -> np.ndarray:
+def _complete(modes: np.ndarray, dropped: np.ndarray) -> np.ndarray:
     """Returns the patterns (Q, K) that say all that patterns (P, K) without a contradiction say together.
 
     Where no start has to decide about two obstacles, each pattern would say something about only one of
-    them, and the policy of such a mode would decide about the other by itself.
-
-    Args:
-        modes: (P, K) the patterns.
-        together: (T, K) what neighbours that go the same way say together: they need a mode in common.
-        dropped: (R, K) patterns of ways that do not come back.
+    them, and the policy of such a mode would decide about the other by itself. Ways that were `dropped`
+    (R, K) do not come back. There are no more than one too many for a controller, or P.
     """
     import networkx  # slow to import
 
-    rows = np.unique([*modes, *(row for row in together if not _says_any(row, dropped))], axis=0)
-    rows = np.array([row for row in rows if _say_all(rows, row).sum() == 1])  # itself
-    both = (rows != ANY) & (rows[:, None] != ANY)
-    agree = (~both | (rows == rows[:, None])).all(axis=2)
+    both = (modes != ANY) & (modes[:, None] != ANY)
+    agree = (~both | (modes == modes[:, None])).all(axis=2)
     groups = networkx.find_cliques(networkx.from_numpy_array(agree))
-    joined = [rows[group].max(axis=0) for group in islice(groups, MOST_MODES + 1)]
-    joined = [row for row in joined if not _says_any(row, dropped)]
-    alone = [row for row in rows if not any(_say_all(other, row) for other in joined)]
+    all_said = (modes[group].max(axis=0) for group in groups)  # ANY is less than both sides
+    kept = (row for row in all_said if not _says_any(row, dropped))
+    joined = list(islice(kept, MOST_MODES + 1))
+    alone = [row for row in modes if not any(_say_all(other, row) for other in joined)]
     return np.unique([*joined, *alone], axis=0)
 
 
