@@ -93,8 +93,8 @@ def test_it_says_where_it_is(section):
 # Of `Task`, what follows from the chart and the methods, so that a section inherits it.
 DERIVED = {
     "check_measurement", "check_noise", "code", "dt", "failed", "input_levels", "kinematic", "may_start",
-    "for_mode", "measurement_columns", "model_path", "noise_in_chart", "noisy_everywhere", "outcome",
-    "with_noise",
+    "for_mode", "goes_on", "measurement_columns", "model_path", "noise_in_chart", "noisy_everywhere",
+    "outcome", "with_noise",
 }  # fmt: skip
 
 

@@ -16,7 +16,15 @@ from hyrl_mj.simulation import Signal, closed_loop, policy_runs
 from hyrl_mj.stages import ExtendedSets, PartPolicy
 from hyrl_mj.stages.grounds import ByAttack, mode_ground
 from hyrl_mj.stages.retraining import retrain
-from hyrl_mj.stages.tables import BoundTable, Held, TablePolicy, _in_reach, table_for
+from hyrl_mj.stages.tables import (
+    WORST,
+    BoundTable,
+    Held,
+    TablePolicy,
+    _in_reach,
+    _under_noise,
+    table_for,
+)
 from hyrl_mj.tasks import Outcome
 
 EPS = 0.15
@@ -32,9 +40,25 @@ def slid():
     return from_gymnasium(Slid, steps=120)
 
 
+def extended(grid, *masks, noise=EPS):
+    """Returns extended sets of modes 0, 1, ... that are masks (N,) of a grid."""
+    return ExtendedSets(
+        tuple(range(len(masks))),
+        tuple(GridSet.from_mask(grid, mask) for mask in masks),
+        masks,
+        0.0,
+        noise,
+        np.empty((0, 2)),
+        np.empty(0),
+    )
+
+
 @pytest.fixture(scope="module")
 def held(puck):
-    return Held.of(puck, Grid.with_cells(puck.chart, 24), EPS)
+    """Mode 0 passes on the upper side of the rock, mode 1 on any."""
+    grid = Grid.with_cells(puck.chart, 24)
+    x, y = grid.nodes.T
+    return Held.of(puck, extended(grid, (y > -0.3) | (x > 0.6), np.ones(grid.size, dtype=bool)))
 
 
 def test_held_inputs_lead_where_the_environment_leads_under_them(puck, held):
@@ -51,18 +75,52 @@ def test_held_inputs_lead_where_the_environment_leads_under_them(puck, held):
 
 @pytest.mark.parametrize("how", ["worst", "mean"])
 def test_what_noise_may_hide_is_found_as_by_one_node_after_another(held, how):
-    values = np.random.default_rng(0).normal(size=len(held.rows))
-    found = _in_reach(held, np.array([EPS, 0.0]), values, how)
-    nodes, cell = held.grid.nodes, held.grid.spacing
+    grid, values = held.grid, np.random.default_rng(0).normal(size=held.grid.size)
+    robots = np.isin(np.arange(grid.size), held.rows)
+    found = _in_reach(grid, np.array([EPS, 0.0]), values, robots, how)
+    nodes, cell = grid.nodes, grid.spacing
     reach = np.ceil(EPS / cell[0]) * cell[0] + 1e-9
-    of_rows = nodes[held.rows]
     for i in range(0, len(nodes), 29):
-        off = np.abs(of_rows - nodes[i])
-        near = values[(off[:, 0] <= reach) & (off[:, 1] < cell[1] / 2)]
+        off = np.abs(nodes - nodes[i])
+        near = values[robots & (off[:, 0] <= reach) & (off[:, 1] < cell[1] / 2)]
         expected = (
             near.max(initial=-np.inf) if how == "worst" else near.mean() if len(near) else np.inf
         )
         assert found[i] == pytest.approx(expected, abs=1e-9)
+
+
+def test_how_far_arrival_is_under_noise_is_found_as_by_one_node_after_another(held):
+    """The noise takes the worst of what it can show with the probability `WORST`, and anything otherwise."""
+    nodes, grid, rng = held.grid.nodes, held.grid, np.random.default_rng(0)
+    table = rng.integers(len(held.inputs), size=grid.size)
+    left = rng.uniform(0, 100, len(held.rows))
+    after = held.after(left, 0)
+    found = _under_noise(held, table)(after)
+    cells = np.ceil(held.bound / grid.spacing - 1e-9)
+    everywhere = left[held.nearest]
+    for i in range(0, len(held.rows), 17):
+        near = (np.abs(nodes - nodes[held.rows[i]]) <= cells * grid.spacing + 1e-9).all(axis=1)
+        costs = []
+        for a in table[near]:
+            value = grid.interpolate(everywhere, held.ends[a, [i]])[0]
+            if held.failed[a, i] or not held.stays[0, a, i]:
+                value = held.never
+            costs.append(0.0 if held.arrived[a, i] else value)
+        expected = WORST * max(costs) + (1 - WORST) * np.mean(costs)
+        assert found[i] == pytest.approx(expected)
+
+
+def test_a_held_input_stays_only_if_it_does_after_every_sample(puck):
+    """A strip that the robot jumps over in the time for which an input is held is not passed."""
+    grid = Grid.with_cells(puck.chart, 24)
+    column = np.unique(grid.nodes[:, 0])[5]
+    held = Held.of(puck, extended(grid, np.abs(grid.nodes[:, 0] - column) > 1e-9))
+    starts, ends = grid.nodes[held.rows][:, 0], held.ends[..., 0]
+    over = (starts < column) & (ends > column + 0.6 * grid.spacing[0])
+    assert over.any()
+    assert not held.stays[0][over].any()
+    before = (starts < column) & (ends < column - grid.spacing[0])
+    assert held.stays[0][before].all()
 
 
 class Corner(Signal):
@@ -78,9 +136,7 @@ class Corner(Signal):
 
 def test_a_table_goes_the_way_of_its_mode_whatever_noise_shows(puck, held):
     """Along the upper side of the rock, also from starts below the line that leads to it."""
-    nodes = held.grid.nodes
-    upper = GridSet.from_mask(held.grid, (nodes[:, 1] > -0.3) | (nodes[:, 0] > 0.6))
-    table = table_for(held, SimpleNamespace(within=upper, bound=np.array([EPS, EPS])))
+    table = table_for(held, 0)
     z = np.stack(np.meshgrid([-1.8, -1.4, -1.0], [0.0, 0.5, 1.0]), axis=-1).reshape(-1, 2)
     path = policy_runs(puck, table, z).path
     passing = np.abs(path[..., 0]) < 0.1
@@ -91,8 +147,7 @@ def test_a_table_goes_the_way_of_its_mode_whatever_noise_shows(puck, held):
 
 
 def test_a_table_is_read_as_it_was_written(puck, held, tmp_path):
-    everywhere = GridSet.from_mask(held.grid, np.ones(held.grid.size, dtype=bool))
-    table = table_for(held, SimpleNamespace(within=everywhere, bound=np.zeros(2)))
+    table = table_for(held, 1)
     table.save(tmp_path / "mode_0.safetensors")
     again = TablePolicy.load(tmp_path / "mode_0_table.npz")
     measured = puck.plant(3).measurement
@@ -139,7 +194,7 @@ def test_the_best_of_what_is_given_is_taken_and_nothing_is_trained(puck, held, s
 
     half = GridSet.from_mask(held.grid, held.grid.nodes[:, 0] < 0)
     part = PartPolicy(puck, ChartPolicy(puck, lambda z: z), half.eroded(0.1), 0.1)
-    table = (lambda ground: made) if "table" in scores else None
+    table = (lambda mode: made) if "table" in scores else None
     _, result = retrain(Ground(), None, 0, part=part, table=table)
     assert (result.policy, result.attempts, result.won) == (taken, 0, scores[taken])
     plant = puck.plant(held.grid.size)
@@ -151,18 +206,7 @@ def test_the_best_of_what_is_given_is_taken_and_nothing_is_trained(puck, held, s
 
 def test_a_policy_is_judged_without_noise_and_by_an_attack(puck):
     grid = Grid.with_cells(puck.chart, 24)
-    whole = GridSet.from_mask(grid, np.ones(grid.size, dtype=bool))
-    wins = np.ones(grid.size, dtype=bool)
-    sets = ExtendedSets(
-        (0,),
-        (whole,),
-        (wins,),
-        0.0,
-        EPS,
-        np.empty((0, 2)),
-        np.empty(0),
-        np.empty((0, 2), dtype=int),
-    )
+    sets = extended(grid, np.ones(grid.size, dtype=bool))
     ground = mode_ground(puck, sets, 0)
     assert isinstance(ground, ByAttack)
     policy = SimpleNamespace(act=lambda m: np.clip(puck_agent(puck.observation(m)), -4, 4))
@@ -175,7 +219,8 @@ def test_a_policy_is_judged_without_noise_and_by_an_attack(puck):
 
 def test_no_table_where_arrival_does_not_end_an_episode(puck, held):
     kept = from_gymnasium(Puck, steps=40, success="reward >= -0.25")
-    assert Held.of(kept, Grid.with_cells(kept.chart, 8), EPS) is None
+    grid = Grid.with_cells(kept.chart, 8)
+    assert Held.of(kept, extended(grid, np.ones(grid.size, dtype=bool))) is None
     assert kept.learning.cells == round((800_000 / 40) ** 0.5 - 0.5), (
         "fewer cells for whole episodes"
     )

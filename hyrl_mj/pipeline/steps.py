@@ -114,7 +114,7 @@ def retrain_stage(run: Run, say: Say) -> None:
     warm_start = partial(start_policy, run.steady, run.partition)
     part_of = partial(part_policy, run.task, run.steady, run.partition, noise=sets.noise)
     parts, table_of = part_of if run.task.slow else None, None
-    if run.task.slow and (held := Held.of(run.task, sets.sets[0].grid, sets.noise)) is not None:
+    if run.task.slow and (held := Held.of(run.task, sets)) is not None:
         table_of = partial(table_for, held)
     ground_of = partial(
         mode_ground, run.task, sets, parts=run.split, policy=run.steady, table=table_of is not None

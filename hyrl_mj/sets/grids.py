@@ -123,14 +123,19 @@ class Grid:
         """The corners (d, 2**d, 1) of a cell: 0 is the lower node along a coordinate, 1 the upper."""
         return np.indices((2,) * len(self.counts)).reshape(len(self.counts), -1, 1)
 
-    def interpolate(self, values: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Returns values at points (n, d) by multilinear interpolation of the nodes' values (N,): (n,)."""
+    def corners(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the nodes (2**d, n) around points (n, d), and their weights (2**d, n) in interpolations."""
         index = self.index(z).T[:, None]
         below = index.astype(int)
         share = index - below
         weights = reduce(np.multiply, np.where(self._corners, share, 1 - share))
         # On the last node of an axis the upper corner has the weight 0: "wrap" keeps its index valid.
         nodes = np.ravel_multi_index(tuple(below + self._corners), self.counts, mode="wrap")
+        return nodes, weights
+
+    def interpolate(self, values: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """Returns values at points (n, d) by multilinear interpolation of the nodes' values (N,): (n,)."""
+        nodes, weights = self.corners(z)
         # The corners are added in turn: np.sum rounds differently for one point than for many.
         return reduce(np.add, weights * values[nodes])
 

@@ -115,9 +115,7 @@ class ModeGround(ABC):
         self.within = extended.sets[index].dilated_by_box(self.bound)
         self.grid = self.within.grid
         within = self.within.mask
-        plant = task.plant(len(self.grid.nodes))
-        plant.set_state(*task.state(self.grid.nodes))
-        alive = task.ending(plant.measurement) == Outcome.RUNNING
+        alive = task.goes_on(self.grid.nodes)
         # Where the stage-1 policy never succeeds, training may still find a way.
         wins = self._winning(index)
         self.wanted = within & alive & (wins if (within & alive & wins).any() else True)

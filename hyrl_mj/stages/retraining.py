@@ -71,7 +71,7 @@ def retrain(
             good enough for this mode.
         part: pi_i of the mode (paper, Step 4), which is used as it is if it is good enough, or else, without
             a table, the stage-1 policy itself; by default neither is tried.
-        table: returns a table of inputs for the ground; the better of it and pi_i then takes the place of the
+        table: returns a table of inputs for a mode; the better of it and pi_i then takes the place of the
             trainings.
         log_dir: folder of logs and checkpoints.
 
@@ -97,7 +97,7 @@ def retrain(
             if won is not None:
                 return image, ModeResult(mode, won, 0)
     if table is not None:
-        made = table(ground)
+        made = table(mode)
         tried.append((ground(made), made))
     if table is not None or (tried and ground.nearly_won(max(score for score, _ in tried))):
         return _best(ground, tried, 0)

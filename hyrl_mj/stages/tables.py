@@ -24,19 +24,21 @@ from hyrl_mj.sets import Grid, Nodes
 from hyrl_mj.tasks import Outcome, Task
 
 if TYPE_CHECKING:
-    from hyrl_mj.stages.grounds import ModeGround
+    from scipy.sparse import csr_array
+
+    from hyrl_mj.stages.extended_sets import ExtendedSets
 
 # Values of each of m inputs that are tried.
 VALUES = {1: 9, 2: 5, 3: 3, 4: 3}
 # Inputs are held until the robot has usually gone so many cells, and so many times the noise bound, but for
 # no more than so many samples. That is found out from so many nodes.
 CELLS, BOUNDS, LONGEST, TRIED = 2.0, 1.5, 64, 64
-# To leave the mode's set, or to fail, counts as this share of the samples of an episode where it is averaged.
-LEAVING = 0.5
-# How much the worst of the nodes that noise may hide counts beside their average.
-WORST = 0.3
-# Values that change by less have converged [samples].
-SETTLED, SWEEPS = 1e-3, 2_000
+# Tables that are made one from the other, and how often noise chooses the worst of what it can show. If it
+# always did, nearly all tables of narrow corridors would be equally bad: from everywhere it leads to where it
+# holds the robot.
+TABLES, WORST = 6, 0.8
+# Values that change by less have converged [samples]. Shares that are smaller are errors of rounding.
+SETTLED, SWEEPS, NONE = 1e-2, 2_000, 1e-9
 
 
 @dataclass(frozen=True)
@@ -98,27 +100,30 @@ class Held:
 
     Attributes:
         task: the robot and its problem.
-        grid: the nodes.
+        extended: M_ext_i of each mode, and the noise bound.
         rows: (k,) the nodes at which an episode goes on.
         inputs: (A, m) the inputs.
         samples: for how many samples each is held.
         ends: (A, k, d) chart points at the end.
         arrived: (A, k) bool, whether the robot arrives before.
         failed: (A, k) bool, whether it fails before.
+        stays: (M, A, k) bool, whether it is in M_ext_i after every sample.
     """
 
     task: Task
-    grid: Grid
+    extended: ExtendedSets
     rows: np.ndarray
     inputs: np.ndarray
     samples: int
     ends: np.ndarray
     arrived: np.ndarray
     failed: np.ndarray
+    stays: np.ndarray
 
     @staticmethod
-    def of(task: Task, grid: Nodes, noise: float) -> Held | None:
+    def of(task: Task, extended: ExtendedSets) -> Held | None:
         """Returns these runs, None where no table is `possible`, or the robot takes too long to get away."""
+        grid = extended.sets[0].grid
         if not possible(task, grid):
             return None
         assert isinstance(grid, Grid)
@@ -126,35 +131,71 @@ class Held:
         if inputs is None:
             axes = [np.linspace(a, b, VALUES[m]) for a, b in zip(*task.input_limits, strict=True)]
             inputs = np.array(list(product(*axes)))
-        plant = task.plant(len(grid.nodes))
-        plant.set_state(*task.state(grid.nodes))
-        rows = np.flatnonzero(task.ending(plant.measurement) == Outcome.RUNNING)
-        away = (
-            np.maximum(CELLS * grid.spacing, BOUNDS * task.noise_in_chart(noise)) / task.chart.scale
-        )
+        rows = np.flatnonzero(task.goes_on(grid.nodes))
+        bound = task.noise_in_chart(extended.noise)
+        away = np.maximum(CELLS * grid.spacing, BOUNDS * bound) / task.chart.scale
         samples = _samples(task, grid.nodes[rows], inputs, float(away.min()))
         if not samples:
             return None
         z = grid.nodes[rows]
-        ends, outcome = (
-            np.empty((len(inputs), *z.shape)),
-            np.empty((len(inputs), len(z)), dtype=int),
-        )
+        each = len(inputs), len(z)
+        ends, outcome = np.empty((*each, z.shape[1])), np.empty(each, dtype=int)
+        stays = np.ones((len(extended.sets), *each), dtype=bool)
         plant = task.plant(len(z))
         for a, u in enumerate(progress_bar(inputs, "held inputs", "inputs")):
             plant.set_state(*task.state(z))
             for _ in range(samples):
                 on = np.flatnonzero(task.ending(plant.measurement) == Outcome.RUNNING)
                 plant.step(np.tile(u, (len(on), 1)), on)
-            ends[a], outcome[a] = task.z(plant.measurement), task.ending(plant.measurement)
-        failed = ~np.isin(outcome, (Outcome.RUNNING, Outcome.REACHED))
-        return Held(task, grid, rows, inputs, samples, ends, outcome == Outcome.REACHED, failed)
+                ends[a] = task.z(plant.measurement)
+                for i, own in enumerate(extended.sets):
+                    stays[i, a] &= own.contains(ends[a])
+            outcome[a] = task.ending(plant.measurement)
+        arrived = outcome == Outcome.REACHED
+        failed = (outcome != Outcome.RUNNING) & ~arrived
+        return Held(task, extended, rows, inputs, samples, ends, arrived, failed, stays)
+
+    @property
+    def grid(self) -> Grid:
+        """The grid of the extended sets and of the table."""
+        grid = self.extended.sets[0].grid
+        assert isinstance(grid, Grid)
+        return grid
+
+    @cached_property
+    def bound(self) -> np.ndarray:
+        """(d,) largest error of a measured chart point, along each coordinate."""
+        return self.task.noise_in_chart(self.extended.noise)
+
+    @property
+    def never(self) -> float:
+        """As many samples as count for an arrival that never comes."""
+        return 2.0 * self.task.max_steps
 
     @cached_property
     def nearest(self) -> np.ndarray:
         """(N,) the place among `rows` of the node nearest to each node."""
         tree = self.grid.chart.tree(self.grid.nodes[self.rows])
         return np.asarray(tree.query(self.grid.chart.in_box(self.grid.nodes))[1])
+
+    @cached_property
+    def _at_ends(self) -> csr_array:
+        """(A * k, k) the matrix that interpolates values of the `rows` at the ends."""
+        from scipy.sparse import csr_array  # slow to import
+
+        nodes, weights = self.grid.corners(self.ends.reshape(-1, self.ends.shape[2]))
+        corners, ends = nodes.shape
+        index = np.tile(np.arange(ends), corners), self.nearest[nodes].ravel()
+        return csr_array((weights.ravel(), index), shape=(ends, len(self.rows)))
+
+    def after(self, left: np.ndarray, mode: int) -> np.ndarray:
+        """Returns the samples (A, k) that are left after an input was held, from those at the rows (k,).
+
+        They are `never` after a failure, and where the robot has left the set of the mode.
+        """
+        value = (self._at_ends @ left).reshape(self.arrived.shape)
+        lost = self.failed | ~self.stays[self.extended.modes.index(mode)]
+        return np.where(self.arrived, 0.0, np.where(lost, self.never, value))
 
 
 def possible(task: Task, grid: Nodes) -> bool:
@@ -183,80 +224,103 @@ def _samples(task: Task, z: np.ndarray, inputs: np.ndarray, away: float) -> int:
     return 0
 
 
-def table_for(held: Held, ground: ModeGround) -> BoundTable:
+def table_for(held: Held, mode: int) -> BoundTable:
     """Returns the policy of a mode: at each node the input that does well wherever noise may hide the robot.
 
     The measure of an input at a node is how many samples farther from arrival it leads, at the worst and on
-    average over the nodes within the noise bound. Inputs may lead anywhere in the mode's set, which ends
-    behind M*, so that no other way is open.
+    average over the nodes within the noise bound. How far a node is from arrival is computed without noise
+    at first, and then, some times over, under noise and the table so far: noise holds the robot where inputs
+    that do well from each of two places are of no use in between. The table that arrives first on average
+    is returned.
+
+    The robot may not leave the mode's set on its way. The set ends behind M*, so that no other way is open.
 
     Args:
         held: where held inputs lead.
-        ground: where the mode has to win.
+        mode: the mode.
     """
-    task, grid, rows = held.task, held.grid, held.rows
-    ends = held.ends.reshape(-1, len(grid.counts))
-    farther = _farther(held, ground.within.contains(ends))
-    worst = np.stack([_in_reach(held, ground.bound, gain, "worst") for gain in farther])
-    most = np.minimum(farther, LEAVING * task.max_steps)
-    usual = np.stack([_in_reach(held, ground.bound, gain, "mean") for gain in most])
-    hidden = ~np.isfinite(worst).all(axis=0)  # no node of the robot's is within the noise
-    best = np.zeros(grid.size, dtype=int)
-    best[~hidden] = (WORST * worst[:, ~hidden] + usual[:, ~hidden]).argmin(axis=0)
-    best[hidden] = best[rows][held.nearest[hidden]]
-    return BoundTable(task, grid, held.inputs[best])
+    own = held.extended.sets[held.extended.modes.index(mode)].mask[held.rows]
+    left = _left(held, mode, lambda after: after.min(axis=0))
+    tables: list[tuple[float, np.ndarray]] = []
+    for _ in range(TABLES):
+        table = _best(held, held.after(left, mode) - left)
+        left = _left(held, mode, _under_noise(held, table))
+        tables.append((float(left[own].mean()), table))
+    _, table = min(tables, key=lambda made: made[0])
+    return BoundTable(held.task, held.grid, held.inputs[table])
 
 
-def _farther(held: Held, stays: np.ndarray) -> np.ndarray:
-    """Returns how many samples farther from arrival inputs lead: (A, k).
+def _left(held: Held, mode: int, follow: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Returns the samples (k,) from the rows to arrival.
 
-    `stays` (A * k,) bool tells which ends are allowed.
+    `follow` returns those (k,) after the input that is held next, from those (A, k) after each input.
     """
-    never = 2.0 * held.task.max_steps
-    lost = ~held.arrived & (held.failed | ~stays.reshape(held.failed.shape))
-
-    def after(left: np.ndarray) -> np.ndarray:
-        """Returns the samples (A, k) that are left at the ends, from those at the nodes (k,)."""
-        everywhere = left[held.nearest]
-        value = np.stack([held.grid.interpolate(everywhere, z) for z in held.ends])
-        return np.where(held.arrived, 0.0, np.where(lost, never, value))
-
-    left = np.full(len(held.rows), never)
+    left = np.full(len(held.rows), held.never)
     for _ in range(SWEEPS):
-        new = np.minimum(held.samples + after(left).min(axis=0), never)
+        new = np.minimum(held.samples + follow(held.after(left, mode)), held.never)
         change, left = np.abs(new - left).max(), new
         if change < SETTLED:
             break
-    return np.asarray(after(left) - left)
+    return left
 
 
-def _in_reach(held: Held, bound: np.ndarray, values: np.ndarray, how: str) -> np.ndarray:
-    """Returns the worst or the mean (N,) of values (k,) of the `rows` within the noise of each node.
+def _under_noise(held: Held, table: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Returns what follows, for `_left`, where noise chooses among the inputs (N,) of a table.
+
+    The share `WORST` of its choices are the worst, the others are as likely as each other.
+    """
+    anywhere = np.ones(held.grid.size, dtype=bool)
+    shares = np.stack(
+        [
+            _in_reach(held.grid, held.bound, table == a, anywhere, "mean")[held.rows]
+            for a in range(len(held.inputs))
+        ]
+    )
+    choices = np.where(shares > NONE, 0.0, -np.inf)
+    return lambda after: (
+        WORST * (after + choices).max(axis=0) + (1 - WORST) * (shares * after).sum(axis=0)
+    )
+
+
+def _best(held: Held, farther: np.ndarray) -> np.ndarray:
+    """Returns the best inputs (N,), from how many samples farther each of them leads from the rows (A, k)."""
+    robots = np.zeros(held.grid.size, dtype=bool)
+    robots[held.rows] = True
+    score, values = np.full((len(farther), held.grid.size), np.inf), np.zeros(held.grid.size)
+    for a, of_rows in enumerate(farther):
+        values[held.rows] = of_rows
+        worst, mean = (
+            _in_reach(held.grid, held.bound, values, robots, how) for how in ("worst", "mean")
+        )
+        np.add(worst, mean, where=np.isfinite(worst), out=score[a])
+    best = score.argmin(axis=0)
+    hidden = ~np.isfinite(score).all(axis=0)  # no node of the robot's is within the noise
+    best[hidden] = best[held.rows][held.nearest[hidden]]
+    return best
+
+
+def _in_reach(
+    grid: Grid, bound: np.ndarray, values: np.ndarray, among: np.ndarray, how: str
+) -> np.ndarray:
+    """Returns the worst or the mean (N,) of values (N,), `among` (N,) bool, within the noise of each node.
 
     It is not finite where there is none.
     """
     from scipy.ndimage import maximum_filter, uniform_filter  # slow to import
 
-    grid = held.grid
     cells = np.where(bound > 0, np.maximum(np.ceil(bound / grid.spacing - 1e-9), 1), 0).astype(int)
     size = tuple(int(k) for k in 2 * cells + 1)
     modes = ["wrap" if wraps else "constant" for wraps in grid.chart.periodic]
-
-    def spread(filled: float, of_rows: np.ndarray) -> np.ndarray:
-        whole = np.full(grid.size, filled)
-        whole[held.rows] = of_rows
-        return whole.reshape(grid.counts)
-
     if how == "worst":
-        whole = spread(-np.inf, values)
-        return np.asarray(maximum_filter(whole, size, mode=modes, cval=-np.inf)).ravel()
+        kept = np.where(among, values, -np.inf).reshape(grid.counts)
+        return np.asarray(maximum_filter(kept, size, mode=modes, cval=-np.inf)).ravel()
     total, count = (
-        uniform_filter(spread(0.0, of_rows), size, mode=modes).ravel()
-        for of_rows in (values, np.ones(len(values)))
+        uniform_filter(v.reshape(grid.counts), size, mode=modes).ravel()
+        for v in (np.where(among, values, 0.0), among.astype(float))
     )
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(count > 1e-9, total / count, np.inf)
+        return np.where(count > NONE, total / count, np.inf)
 
 
-# Returns the table of a mode by its ground.
-TableOf = Callable[["ModeGround"], BoundTable]
+# Returns the table of a mode.
+TableOf = Callable[[int], BoundTable]

@@ -303,6 +303,12 @@ class Task(ABC):
         ending = self.ending(measurement)
         return np.asarray((ending != Outcome.RUNNING) & (ending != Outcome.REACHED))
 
+    def goes_on(self, z: np.ndarray) -> np.ndarray:
+        """Returns (n,) bool: whether episodes that begin at chart points z (n, d) do not end at once."""
+        plant = self.plant(len(z))
+        plant.set_state(*self.state(z))
+        return np.asarray(self.ending(plant.measurement) == Outcome.RUNNING)
+
     def verdict(self, measurement: np.ndarray) -> np.ndarray:
         """Returns the `Outcome` (n,) int of episodes that still ran when they were truncated."""
         return np.where(self.arrived(self.z(measurement)), Outcome.REACHED, Outcome.STALLED)

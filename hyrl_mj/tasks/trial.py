@@ -179,9 +179,7 @@ def _nodes(task: Task) -> np.ndarray:
         cells += 1
     nodes = Grid.with_cells(task.chart, cells).nodes
     nodes = nodes[np.random.default_rng(0).permutation(len(nodes))[:NODES]]
-    plant = task.plant(len(nodes))
-    plant.set_state(*task.state(nodes))
-    return nodes[task.ending(plant.measurement) == Outcome.RUNNING]
+    return nodes[task.goes_on(nodes)]
 
 
 def _play(task: Task, z: np.ndarray, inputs: Inputs, kind: str) -> np.ndarray:
