@@ -5,9 +5,7 @@ import pytest
 from planted import circle_policy, one_way_policy, sign_policy
 
 from hyrl_mj import BadInput, extend, find_critical_set, make_partition
-from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.critical_set import distance_to
-from hyrl_mj.stages.extended_sets import _without_holes
 
 PI = np.pi
 # From the axis an obstacle of radius 0.75 at x = 1.5 can be passed only if x <= this.
@@ -259,29 +257,3 @@ def test_points_of_the_critical_set_that_cannot_be_used_are_refused(on_circle):
             extend(case.task, case.policy, points, case.partition, 0.1)
         with pytest.raises(BadInput, match=message):
             make_partition(case.task, case.policy, points, 30)
-
-
-@pytest.mark.parametrize(
-    ("radius", "loses", "wall", "filled"),
-    [
-        (0.09, False, False, True),
-        (0.09, True, False, False),
-        (0.3, False, False, False),
-        (0.3, False, True, True),
-    ],
-    ids=["hidden by noise", "the mode fails", "wider than the noise", "a wall in its middle"],
-)
-def test_holes_that_noise_hides_are_filled_where_the_mode_succeeds(
-    vehicle, radius, loses, wall, filled
-):
-    """A hole is a square; a wall leaves of it only what lies at its edge."""
-    grid = Grid.with_cells(vehicle.chart, 60)
-    off = np.abs(grid.nodes - [1.0, 0.0]).max(axis=1)
-    hole, alive = off < radius, off >= (0.25 if wall else 0)
-    wins = ~hole | (not loses)
-    own = GridSet.from_mask(grid, ~hole)
-    found = _without_holes(own, wins, alive, np.array([0.12, 0.12]))
-    assert found.mask[hole & alive].all() == filled
-    if not filled:
-        assert found is own
-    assert not found.mask[~alive].any()

@@ -6,7 +6,7 @@ The plant is tabulated on a lattice of states, and the game is solved on it by b
 
 from hyrl_mj.game.adversary import WorstNoise
 from hyrl_mj.game.counts import AttackCount, EpisodeCount
-from hyrl_mj.game.lattice import EPISODES_INSTEAD, Lattice
+from hyrl_mj.game.lattice import EPISODES_INSTEAD, Lattice, nearest_of
 from hyrl_mj.game.limit import Limit, fewest_samples
 from hyrl_mj.game.resolution import CURVE_CELLS, LATTICE, aligned_cells, curve_grid, lattice_grid
 from hyrl_mj.game.result import (
@@ -84,6 +84,7 @@ __all__ = [
     "fewest_samples",
     "lasting",
     "lattice_grid",
+    "nearest_of",
     "noisy_moves",
     "percent",
     "share",

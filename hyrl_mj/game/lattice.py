@@ -224,7 +224,7 @@ class Lattice:
         return level
 
 
-def nearest_of(grid: Grid, mask: np.ndarray) -> np.ndarray:
+def nearest_of(grid: Nodes, mask: np.ndarray) -> np.ndarray:
     """Returns the nearest node of a mask (N,) bool to each node: (N,) int."""
     of_mask = np.flatnonzero(mask)
     return np.asarray(

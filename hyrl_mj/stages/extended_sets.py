@@ -11,7 +11,7 @@ import numpy as np
 
 from hyrl_mj.artifacts import Saved
 from hyrl_mj.errors import BadInput
-from hyrl_mj.game import Limit
+from hyrl_mj.game import Limit, nearest_of
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import Cloud, Grid, GridSet
 from hyrl_mj.simulation import Rollout, policy_runs
@@ -128,8 +128,8 @@ def extend(
         M_ext_i = ((M_i u X_i) n (W_i eroded by eps)) u (M_i dilated by eps)
 
     Erosion and dilation act along the noisy coordinates. For a plant with dynamics the dilation is by the
-    longest hop in one sample more. Without backward runs, holes that the noise can hide are filled if the
-    mode succeeds from all of them.
+    longest hop in one sample more. A wall that only stops the robot
+    is not eroded from, and its inside belongs to the sets of the states beside it.
 
     Args:
         task: gives plant and chart.
@@ -173,8 +173,10 @@ def extend(
         )
     else:
         winning = open_ways(ways, grid)
+    # Noise that shows the robot in a wall that only stops it does not show it where its mode fails.
+    walls = ~task.goes_on(grid.nodes) if task.stopped_by_walls else np.zeros(grid.size, dtype=bool)
     roomy = [
-        GridSet.from_mask(grid, wins | ~candidate).eroded_by_box(eps)
+        GridSet.from_mask(grid, wins | ~candidate | walls).eroded_by_box(eps)
         for wins, candidate in zip(winning, candidates, strict=True)
     ]
     propagated = horizon or 0.0
@@ -203,11 +205,9 @@ def extend(
         (r & room) | part.dilated_by_box(wide)
         for r, room, part in zip(reached, roomy, parts, strict=True)
     )
-    if not backward:  # backward runs leave no holes
-        alive = task.goes_on(grid.nodes)
-        sets = tuple(
-            _without_holes(own, wins, alive, eps) for own, wins in zip(sets, winning, strict=True)
-        )
+    if walls.any():  # where noise shows the robot in a wall, it is beside it
+        beside = nearest_of(grid, ~walls)
+        sets = tuple(GridSet.from_mask(grid, own.mask[beside]) for own in sets)
     rows, pair, room = least_room(points, parts, winning, eps)
     between = np.array(partition.modes)[pair]
     return ExtendedSets(
@@ -331,25 +331,6 @@ def _forward_reach(part: GridSet, entry: np.ndarray) -> Callable[[int], GridSet]
     """
     entry = np.where(entry > 0, entry, np.inf)
     return lambda samples: GridSet.from_mask(part.grid, part.mask | (entry <= samples))
-
-
-def _without_holes(own: GridSet, wins: np.ndarray, alive: np.ndarray, eps: np.ndarray) -> GridSet:
-    """Returns a set without those holes in W_i that are nowhere as wide as the noise of bound `eps` (d,).
-
-    No measurement tells for sure that the robot is in such a hole. Nodes (N,) that are not `alive`, as in a
-    wall, belong to no hole.
-    """
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import connected_components  # slow to import
-
-    grid, outside = own.grid, alive & ~own.mask
-    a, b = grid.neighbours()
-    both = outside[a] & outside[b]
-    pairs = csr_array((np.ones(both.sum()), (a[both], b[both])), shape=(grid.size, grid.size))
-    hole = connected_components(pairs, directed=False)[1]
-    certain = GridSet.from_mask(grid, ~own.mask).eroded_by_box(eps).mask
-    filled = outside & ~np.isin(hole, hole[outside & (certain | ~wins)])
-    return GridSet.from_mask(grid, own.mask | filled) if filled.any() else own
 
 
 def _between_samples(path: np.ndarray, grid: Grid) -> np.ndarray:

@@ -19,6 +19,7 @@ import numpy as np
 
 from hyrl_mj.artifacts import Saved
 from hyrl_mj.errors import BadInput
+from hyrl_mj.game import nearest_of
 from hyrl_mj.progress import progress_bar
 from hyrl_mj.sets import Grid, Nodes
 from hyrl_mj.tasks import Outcome, Task
@@ -107,7 +108,7 @@ class Held:
         ends: (A, k, d) chart points at the end.
         arrived: (A, k) bool, whether the robot arrives before.
         failed: (A, k) bool, whether it fails before.
-        stays: (M, A, k) bool, whether it is in M_ext_i after every sample.
+        leaves: (M, A, k) bool, whether it leaves M_ext_i after a sample, or is outside of it at the end.
     """
 
     task: Task
@@ -118,7 +119,7 @@ class Held:
     ends: np.ndarray
     arrived: np.ndarray
     failed: np.ndarray
-    stays: np.ndarray
+    leaves: np.ndarray
 
     @staticmethod
     def of(task: Task, extended: ExtendedSets) -> Held | None:
@@ -133,27 +134,31 @@ class Held:
             inputs = np.array(list(product(*axes)))
         rows = np.flatnonzero(task.goes_on(grid.nodes))
         bound = task.noise_in_chart(extended.noise)
-        away = np.maximum(CELLS * grid.spacing, BOUNDS * bound) / task.chart.scale
-        samples = _samples(task, grid.nodes[rows], inputs, float(away.min()))
+        away = max(CELLS * grid.cell, BOUNDS * float((bound / task.chart.scale).max()))
+        samples = _samples(task, grid.nodes[rows], inputs, away)
         if not samples:
             return None
         z = grid.nodes[rows]
         each = len(inputs), len(z)
         ends, outcome = np.empty((*each, z.shape[1])), np.empty(each, dtype=int)
-        stays = np.ones((len(extended.sets), *each), dtype=bool)
+        leaves = np.zeros((len(extended.sets), *each), dtype=bool)
         plant = task.plant(len(z))
         for a, u in enumerate(progress_bar(inputs, "held inputs", "inputs")):
             plant.set_state(*task.state(z))
+            outcome[a] = Outcome.RUNNING
+            inside = [own.contains(z) for own in extended.sets]
             for _ in range(samples):
-                on = np.flatnonzero(task.ending(plant.measurement) == Outcome.RUNNING)
+                on = np.flatnonzero(outcome[a] == Outcome.RUNNING)
                 plant.step(np.tile(u, (len(on), 1)), on)
+                outcome[a] = task.outcome(plant.measurement, plant.unstable)
                 ends[a] = task.z(plant.measurement)
                 for i, own in enumerate(extended.sets):
-                    stays[i, a] &= own.contains(ends[a])
-            outcome[a] = task.ending(plant.measurement)
+                    before, inside[i] = inside[i], own.contains(ends[a])
+                    leaves[i, a] |= before & ~inside[i]
+            leaves[:, a] |= ~np.stack(inside)
         arrived = outcome == Outcome.REACHED
         failed = (outcome != Outcome.RUNNING) & ~arrived
-        return Held(task, extended, rows, inputs, samples, ends, arrived, failed, stays)
+        return Held(task, extended, rows, inputs, samples, ends, arrived, failed, leaves)
 
     @property
     def grid(self) -> Grid:
@@ -175,8 +180,8 @@ class Held:
     @cached_property
     def nearest(self) -> np.ndarray:
         """(N,) the place among `rows` of the node nearest to each node."""
-        tree = self.grid.chart.tree(self.grid.nodes[self.rows])
-        return np.asarray(tree.query(self.grid.chart.in_box(self.grid.nodes))[1])
+        robots = np.isin(np.arange(self.grid.size), self.rows)
+        return np.searchsorted(self.rows, nearest_of(self.grid, robots))
 
     @cached_property
     def _at_ends(self) -> csr_array:
@@ -193,9 +198,9 @@ class Held:
 
         They are `never` after a failure, and where the robot has left the set of the mode.
         """
-        value = (self._at_ends @ left).reshape(self.arrived.shape)
-        lost = self.failed | ~self.stays[self.extended.modes.index(mode)]
-        return np.where(self.arrived, 0.0, np.where(lost, self.never, value))
+        value = np.where(self.arrived, 0.0, (self._at_ends @ left).reshape(self.arrived.shape))
+        lost = self.failed | self.leaves[self.extended.modes.index(mode)]
+        return np.where(lost, self.never, value)
 
 
 def possible(task: Task, grid: Nodes) -> bool:
@@ -234,6 +239,7 @@ def table_for(held: Held, mode: int) -> BoundTable:
     is returned.
 
     The robot may not leave the mode's set on its way. The set ends behind M*, so that no other way is open.
+    Where noise shows the robot outside of the set, inputs lead it back at once.
 
     Args:
         held: where held inputs lead.
@@ -243,7 +249,8 @@ def table_for(held: Held, mode: int) -> BoundTable:
     left = _left(held, mode, lambda after: after.min(axis=0))
     tables: list[tuple[float, np.ndarray]] = []
     for _ in range(TABLES):
-        table = _best(held, held.after(left, mode) - left)
+        after = held.after(left, mode)
+        table = _best(held, after - np.where(own, left, after.min(axis=0)))
         left = _left(held, mode, _under_noise(held, table))
         tables.append((float(left[own].mean()), table))
     _, table = min(tables, key=lambda made: made[0])
@@ -253,11 +260,14 @@ def table_for(held: Held, mode: int) -> BoundTable:
 def _left(held: Held, mode: int, follow: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """Returns the samples (k,) from the rows to arrival.
 
-    `follow` returns those (k,) after the input that is held next, from those (A, k) after each input.
+    `follow` returns those (k,) after the input that is held next, from those (A, k) after each input. From
+    rows outside of the mode's set there are `never` many: what lies behind its edge is not open.
     """
+    own = held.extended.sets[held.extended.modes.index(mode)].mask[held.rows]
     left = np.full(len(held.rows), held.never)
     for _ in range(SWEEPS):
         new = np.minimum(held.samples + follow(held.after(left, mode)), held.never)
+        new[~own] = held.never
         change, left = np.abs(new - left).max(), new
         if change < SETTLED:
             break
@@ -294,9 +304,9 @@ def _best(held: Held, farther: np.ndarray) -> np.ndarray:
         )
         np.add(worst, mean, where=np.isfinite(worst), out=score[a])
     best = score.argmin(axis=0)
-    hidden = ~np.isfinite(score).all(axis=0)  # no node of the robot's is within the noise
-    best[hidden] = best[held.rows][held.nearest[hidden]]
-    return best
+    told = score.min(axis=0) < score.max(axis=0) - SETTLED
+    told &= np.isfinite(score).all(axis=0)  # some node of the robot's is within the noise
+    return best[nearest_of(held.grid, told)] if told.any() else best
 
 
 def _in_reach(
