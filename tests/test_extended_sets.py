@@ -1,10 +1,13 @@
 """Extended sets reach over the critical set as far as backward motion, room and noise say."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+from environments import Puck, puck_agent
 from planted import circle_policy, one_way_policy, sign_policy
 
-from hyrl_mj import BadInput, extend, find_critical_set, make_partition
+from hyrl_mj import BadInput, extend, find_critical_set, from_gymnasium, make_partition
 from hyrl_mj.stages.critical_set import distance_to
 
 PI = np.pi
@@ -257,3 +260,25 @@ def test_points_of_the_critical_set_that_cannot_be_used_are_refused(on_circle):
             extend(case.task, case.policy, points, case.partition, 0.1)
         with pytest.raises(BadInput, match=message):
             make_partition(case.task, case.policy, points, 30)
+
+
+def test_sets_reach_walls_that_only_stop_the_robot_and_hold_their_inside(monkeypatch):
+    puck, noise = from_gymnasium(Puck, steps=120), 0.3
+    policy = SimpleNamespace(act=lambda m: np.clip(puck_agent(puck.observation(m)), -4, 4))
+    points = find_critical_set(puck, policy, 24, 1 / 8).points
+    partition = make_partition(puck, policy, points, 36, noise)
+    nodes = partition.grid.nodes
+    walls = ~puck.goes_on(nodes)
+    off = np.linalg.norm(nodes[walls][:, None] - nodes[~walls], axis=2)
+    stopped = extend(puck, policy, points, partition, noise).sets
+    for own in stopped:
+        for held, distance in zip(own.mask[walls], off, strict=True):
+            assert held in own.mask[~walls][distance < distance.min() + 1e-9]
+    monkeypatch.setattr(type(puck), "stopped_by_walls", False)
+    crashed = extend(puck, policy, points, partition, noise).sets
+    for own, other in zip(stopped, crashed, strict=True):
+        assert (other.mask <= own.mask)[~walls].all()
+        gained = nodes[~walls & own.mask & ~other.mask]
+        assert len(gained)
+        from_walls = np.linalg.norm(nodes[walls][:, None] - gained, axis=2).min(axis=0)
+        assert from_walls.max() < noise * np.sqrt(2) + 2 * partition.grid.cell
