@@ -6,10 +6,12 @@ environment.
 
 from __future__ import annotations
 
+import math
 import pickle
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from types import FunctionType, MethodType, ModuleType
 from typing import Any
@@ -144,9 +146,9 @@ class Slot:
     shape: tuple[int, ...]
     may_be_none: bool
 
-    @property
+    @cached_property  # asked for in each step of each copy
     def size(self) -> int:
-        return int(np.prod(self.shape, dtype=int)) + self.may_be_none
+        return math.prod(self.shape) + self.may_be_none
 
     def read(self, root: Any) -> np.ndarray:
         """Returns its value in an environment as numbers (size,)."""
