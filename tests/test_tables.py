@@ -22,6 +22,7 @@ from hyrl_mj.stages.tables import (
     Held,
     TablePolicy,
     _in_reach,
+    _left,
     _under_noise,
     table_for,
 )
@@ -145,6 +146,19 @@ def test_a_table_goes_the_way_of_its_mode_whatever_noise_shows(puck, held):
     for corner in ((0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
         run = closed_loop(puck, PolicyController(table), z, Corner(puck, corner))
         assert (run.outcome == Outcome.REACHED).all(), corner
+
+
+def test_later_tables_reckon_with_the_noise_and_arrive_earlier(held, monkeypatch):
+    def usual(mode):
+        inputs = table_for(held, mode).inputs
+        table = np.abs(held.inputs[:, None] - inputs).sum(axis=2).argmin(axis=0)
+        return _left(held, mode, _under_noise(held, table))[held.own(mode)].mean()
+
+    later = [usual(mode) for mode in (0, 1)]
+    monkeypatch.setattr("hyrl_mj.stages.tables.TABLES", 1)
+    first = [usual(mode) for mode in (0, 1)]
+    assert later[0] < 0.9 * first[0]
+    assert later[1] < 0.9 * first[1]
 
 
 def test_a_table_leads_back_from_where_noise_shows_the_robot_outside_of_the_set(puck, held):

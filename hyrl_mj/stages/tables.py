@@ -34,9 +34,9 @@ VALUES = {1: 9, 2: 5, 3: 3, 4: 3}
 # Inputs are held until the robot has usually gone so many cells, and so many times the noise bound, but for
 # no more than so many samples. That is found out from so many nodes.
 CELLS, BOUNDS, LONGEST, TRIED = 2.0, 1.5, 64, 64
-# Tables that are made one from the other, and how often noise chooses the worst of what it can show. If it
-# always did, nearly all tables of narrow corridors would be equally bad: from everywhere it leads to where it
-# holds the robot.
+# Tables that are made one from the other. Noise shows what is worst for a table with this probability, and
+# anything else otherwise, once for each held input. If it always showed the worst, it would hold the robot
+# somewhere on nearly all ways through narrow corridors, and all tables would be equally bad.
 TABLES, WORST = 6, 0.8
 # Values that change by less have converged [samples]. Shares that are smaller are errors of rounding.
 SETTLED, SWEEPS, NONE = 1e-2, 2_000, 1e-9
@@ -172,6 +172,10 @@ class Held:
         """(d,) largest error of a measured chart point, along each coordinate."""
         return self.task.noise_in_chart(self.extended.noise)
 
+    def own(self, mode: int) -> np.ndarray:
+        """Returns whether the rows are in the set of a mode: (k,) bool."""
+        return self.extended.sets[self.extended.modes.index(mode)].mask[self.rows]
+
     @property
     def never(self) -> float:
         """As many samples as count for an arrival that never comes."""
@@ -245,7 +249,7 @@ def table_for(held: Held, mode: int) -> BoundTable:
         held: where held inputs lead.
         mode: the mode.
     """
-    own = held.extended.sets[held.extended.modes.index(mode)].mask[held.rows]
+    own = held.own(mode)
     left = _left(held, mode, lambda after: after.min(axis=0))
     tables: list[tuple[float, np.ndarray]] = []
     for _ in range(TABLES):
@@ -263,7 +267,7 @@ def _left(held: Held, mode: int, follow: Callable[[np.ndarray], np.ndarray]) -> 
     `follow` returns those (k,) after the input that is held next, from those (A, k) after each input. From
     rows outside of the mode's set there are `never` many: what lies behind its edge is not open.
     """
-    own = held.extended.sets[held.extended.modes.index(mode)].mask[held.rows]
+    own = held.own(mode)
     left = np.full(len(held.rows), held.never)
     for _ in range(SWEEPS):
         new = np.minimum(held.samples + follow(held.after(left, mode)), held.never)
@@ -305,7 +309,7 @@ def _best(held: Held, farther: np.ndarray) -> np.ndarray:
         np.add(worst, mean, where=np.isfinite(worst), out=score[a])
     best = score.argmin(axis=0)
     told = score.min(axis=0) < score.max(axis=0) - SETTLED
-    told &= np.isfinite(score).all(axis=0)  # some node of the robot's is within the noise
+    told &= np.isfinite(score).all(axis=0)  # else no node at which an episode goes on is near
     return best[nearest_of(held.grid, told)] if told.any() else best
 
 
