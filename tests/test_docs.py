@@ -105,8 +105,11 @@ def test_names_in_the_text_exist(page):
 def options_of(command):
     """The options that a command of `hyrl-mj` has, from its help."""
     told = io.StringIO()
-    with contextlib.redirect_stdout(told), contextlib.suppress(SystemExit):
-        cli.dispatch([command, "--help"])
+    with contextlib.redirect_stdout(told):
+        try:
+            cli.dispatch([command, "--help"])
+        except SystemExit as end:
+            assert not end.code, told.getvalue()
     return set(re.findall(r"--[a-z][\w-]*", told.getvalue()))
 
 

@@ -128,8 +128,8 @@ def extend(
         M_ext_i = ((M_i u X_i) n (W_i eroded by eps)) u (M_i dilated by eps)
 
     Erosion and dilation act along the noisy coordinates. For a plant with dynamics the dilation is by the
-    longest hop in one sample more. A wall that only stops the robot
-    is not eroded from, and its inside belongs to the sets of the states beside it.
+    longest hop in one sample more. A wall that only stops the robot is not eroded from, and its inside
+    belongs to the sets of the states beside it.
 
     Args:
         task: gives plant and chart.
