@@ -105,11 +105,9 @@ def test_names_in_the_text_exist(page):
 def options_of(command):
     """The options that a command of `hyrl-mj` has, from its help."""
     told = io.StringIO()
-    with contextlib.redirect_stdout(told):
-        try:
-            cli.dispatch([command, "--help"])
-        except SystemExit as end:
-            assert not end.code, told.getvalue()
+    with contextlib.redirect_stdout(told), pytest.raises(SystemExit) as end:
+        cli.dispatch([command, "--help"])
+    assert not end.value.code
     return set(re.findall(r"--[a-z][\w-]*", told.getvalue()))
 
 
