@@ -57,6 +57,9 @@ class Canvas:
         self.model = copy(model)
         shape = self.model.vis.global_
         shape.offwidth, shape.offheight = width, height
+        # Shadows that are finer than the picture are not seen, and take most of the time without a GPU.
+        quality = self.model.vis.quality
+        quality.shadowsize = min(quality.shadowsize, max(width, height))
         self._gl: Any = None
         self._thread = threading.get_ident()
         if _GL_PROCESSES - {os.getpid()}:

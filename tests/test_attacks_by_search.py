@@ -161,6 +161,18 @@ def test_no_round_is_done_once_all_is_lost(vehicle):
     assert on(vehicle, loop, np.array([[0.3, 0.0]]), rounds=50).count.rounds == 1
 
 
+def test_no_round_follows_one_by_which_enough_is_lost(vehicle):
+    usual = on(vehicle, Lock(), ON_THE_LEFT, rounds=6)
+    assert usual.count.lost > 1
+    assert usual.count.rounds > 1
+    loop, some = {"it": Lock()}, Budget(rounds=6, enough=1)
+    found = attack(vehicle, loop, ON_THE_LEFT, EPS, some)["it"]
+    assert found.count.lost >= 1
+    before = on(vehicle, Lock(), ON_THE_LEFT, rounds=found.count.rounds - 1)
+    assert found.count.rounds < usual.count.rounds
+    assert before.count.lost == 0
+
+
 @pytest.mark.parametrize(
     ("budget", "message"),
     [

@@ -13,7 +13,7 @@ import pytest
 from gl import needs_gl
 
 from hyrl_mj import BadInput
-from hyrl_mj.rendering import SceneRenderer
+from hyrl_mj.rendering import Canvas, SceneRenderer
 
 CAMERAS = ("overhead", "chase", "three_quarter")
 POSITIONS = {"vehicle": [0.4, 0.7], "unit_circle": [2.4]}
@@ -173,7 +173,7 @@ def test_an_unknown_camera_lists_the_cameras(vehicle):
 def test_without_gl_one_message_says_what_to_install(backend):
     code = (
         "import hyrl_mj\n"
-        "from hyrl_mj.rendering import SceneRenderer\n"
+        "from hyrl_mj.rendering import Canvas, SceneRenderer\n"
         "try: SceneRenderer(hyrl_mj.get_task('vehicle').model, 64, 48)\n"
         "except hyrl_mj.NoRenderer as error: print(error)\n"
     )
@@ -195,7 +195,7 @@ def test_without_gl_one_message_says_what_to_install(backend):
 def test_who_imports_mujoco_first_gets_pictures_too():
     code = (
         "import mujoco, hyrl_mj\n"
-        "from hyrl_mj.rendering import SceneRenderer\n"
+        "from hyrl_mj.rendering import Canvas, SceneRenderer\n"
         "renderer = SceneRenderer(hyrl_mj.get_task('vehicle').model, 64, 48)\n"
         "renderer.place([0, 0], 'overhead')\n"
         "print(renderer.draw().std() > 5)\n"
@@ -209,3 +209,29 @@ def test_who_imports_mujoco_first_gets_pictures_too():
         timeout=60,
     )
     assert child.stdout == "True\n", child.stderr
+
+
+@needs_gl
+def test_shadows_are_no_finer_than_the_picture_and_fall_where_they_did():
+    text = """
+    <mujoco>
+      <visual><headlight diffuse="0 0 0" ambient="0.2 0.2 0.2"/></visual>
+      <worldbody>
+        <light pos="1 0 3" dir="-0.3 0 -1"/>
+        <geom type="plane" size="3 3 1"/>
+        <geom type="box" size="0.3 0.3 0.3" pos="0 0 0.6"/>
+        <camera name="above" pos="0 0 6" fovy="45"/>
+      </worldbody>
+    </mujoco>"""
+    model, pictures = mujoco.MjModel.from_xml_string(text), []
+    for size in ((320, 240), (2048, 2048)):
+        canvas = Canvas(model, *size)
+        assert canvas.model.vis.quality.shadowsize == size[0]
+        renderer = SceneRenderer(model, 320, 240, canvas=canvas)
+        renderer.place(np.zeros(0), "above")
+        pictures.append(renderer.draw().astype(int))
+        canvas.close()
+    assert model.vis.quality.shadowsize == 4096  # the user's model stays as it is
+    shaded = [picture.mean(axis=2) < 0.6 * picture.mean() for picture in pictures]
+    assert shaded[1].mean() > 0.02
+    assert (shaded[0] != shaded[1]).mean() < 0.005

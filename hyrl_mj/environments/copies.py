@@ -165,7 +165,7 @@ class Host:
         state = np.empty(mujoco.mj_stateSize(self.model, STATE))
         mujoco.mj_getState(self.model, self.data, state, STATE)
         kept = [slot.read(self.env) for slot in self.slots]
-        return state, np.concatenate(kept) if kept else np.empty(0)
+        return state, np.concatenate(kept, dtype=float) if kept else np.empty(0)
 
     def write(self, state: np.ndarray, memory: np.ndarray) -> None:
         """Makes the environment the copy of a state (S,) and a memory (A,)."""
@@ -229,7 +229,8 @@ class Host:
         found, blocked = np.empty((len(states), self.width)), np.zeros(len(states), dtype=bool)
         for i in range(len(states)):
             self.write(states[i], memories[i])
-            self.forward()
+            if not self._forward:
+                self.forward()
             blocked[i] = self._blocked()
             found[i] = self.observed()
         return found, blocked

@@ -153,12 +153,10 @@ class Slot:
     def read(self, root: Any) -> np.ndarray:
         """Returns its value in an environment as numbers (size,)."""
         value = _get(*_place(root, self.path))
-        row = np.zeros(self.size)
         if value is None:
-            return row
-        row[: self.size - self.may_be_none] = np.ravel(value)
-        row[self.size - self.may_be_none :] = 1.0
-        return row
+            return np.zeros(self.size)
+        numbers = np.ravel(value)
+        return np.append(numbers, 1.0) if self.may_be_none else numbers
 
     def write(self, root: Any, row: np.ndarray) -> None:
         """Gives it the value of numbers (size,) in an environment."""

@@ -60,10 +60,12 @@ class Budget:
     Attributes:
         seconds: time [s]; a round that would take longer than what is left of it does not begin.
         rounds: number of rounds.
+        enough: no round follows one after which each controller has lost so many starts; by default all.
     """
 
     seconds: float | None = None
     rounds: int | None = None
+    enough: int | None = None
 
     def __post_init__(self) -> None:
         if (self.seconds is None) == (self.rounds is None):
@@ -174,8 +176,8 @@ def attack(
         name: _Search(task, loop, starts, Rules(task, loop, bound, shares), seed)
         for name, loop in controllers.items()
     }
-    rounds = 0
-    while any(search.open.any() for search in searches.values()) or not rounds:
+    rounds, enough = 0, min(budget.enough or len(starts), len(starts))
+    while any(np.sum(~search.open) < enough for search in searches.values()) or not rounds:
         rounds, before = rounds + 1, time.monotonic() - began
         for search in searches.values():
             search.round(rounds)

@@ -10,7 +10,7 @@ from hyrl_mj.errors import BadInput, NoRenderer
 from hyrl_mj.game import Game, Robustness, worst_signal
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.run_directory import Run
-from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, simulate_batch
+from hyrl_mj.simulation import HybridArc, Noise, simulate_batch
 from hyrl_mj.stages import Budget, Losses, Regions, attack, attack_starts, sort_losses
 from hyrl_mj.verdict import NO_NOISE
 from hyrl_mj.viz.arcs import critical_start, from_middle, replay_floor
@@ -22,8 +22,9 @@ from hyrl_mj.viz.tables import margin_text, percent
 
 # In the run directory: the page, and the folder with its pictures and data.
 PAGE, FOLDER = "diagnosis.html", "diagnosis"
-ROUNDS = 2  # of an attack
+BUDGET = Budget(rounds=2, enough=1)  # of an attack
 LARGER = (1, 2, 4, 8)  # times the bound that attacks try
+ATTACKED, AGAIN = 48, 3  # starts that are attacked; every third of them is with larger noise
 TRIED = 64  # lost starts that are simulated, the nearest to the middle of the replay starts first
 REPLAY = ReplayOptions(size=(960, 720))  # of the policy alone
 
@@ -40,8 +41,8 @@ def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
     """Returns a run that the policy loses, or None if no such run was found.
 
     Where the game decides its adversary gives the noise, from the starts of the more frequent kind of
-    losses first; otherwise the noise is adversarial, from drawn starts of the task. If that loses none, an
-    attack searches for noise, from starts half of which are near M*; if it finds none, for larger noise.
+    losses first. Otherwise an attack searches for noise, from starts half of which are near M*. If it finds
+    none, attacks from a third of these starts search for larger noise.
     """
     task, eps, loop = run.task, run.settings.noise, PolicyController(run.policy)
     if losses is not None:
@@ -49,24 +50,17 @@ def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
         z0 = np.vstack([z[np.argsort(from_middle(task, z), kind="stable")[:TRIED]] for z in kinds])
         if not len(z0):
             return None
-        grid = run.lattice_grid
-        game = Game(task, run.partition, {"policy": loop}, eps, grid=grid)
-        noise: AnyNoise = worst_signal(game, "policy", loop, z0, eps)
-    else:
-        z0, noise = task.starts(TRIED, np.random.default_rng(0)), Noise("adversarial", eps)
-        critical = critical_start(run)
-        if critical is not None and task.may_start(critical[None])[0]:
-            z0 = np.vstack([critical, z0])
-    arcs = simulate_batch(task, loop, z0, noise)
-    if (lost := _first_lost(arcs)) is not None or losses is not None:
-        return lost
-    starts = attack_starts(task, Regions(run.critical_set.points), eps, TRIED, run.settings.seed)
+        game = Game(task, run.partition, {"policy": loop}, eps, grid=run.lattice_grid)
+        noise = worst_signal(game, "policy", loop, z0, eps)
+        return _first_lost(simulate_batch(task, loop, z0, noise))
+    starts = attack_starts(task, Regions(run.critical_set.points), eps, ATTACKED, run.settings.seed)
     for factor in LARGER:
         try:
             task.check_noise(factor * eps)
         except BadInput:  # it would hide the whole chart
             break
-        found = attack(task, {"policy": loop}, starts, factor * eps, Budget(rounds=ROUNDS))
+        some = starts if factor == 1 else starts[::AGAIN]
+        found = attack(task, {"policy": loop}, some, factor * eps, BUDGET)
         if (lost := _first_lost(found["policy"].arcs)) is not None:
             return lost
     return None
