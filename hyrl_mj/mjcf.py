@@ -123,24 +123,26 @@ def rests(model: mujoco.MjModel, camera: mujoco.MjvCamera) -> bool:
 
 
 def point_of(model: mujoco.MjModel, name: str) -> tuple[str, int]:
-    """Returns where the place of a site or a body is in MuJoCo's data: ("site_xpos", 2).
+    """Returns where the place of a site, a body or a geom is in MuJoCo's data: ("site_xpos", 2).
 
-    Where the MJCF has no site or body "tracked", that is the first body that moves.
+    Where the MJCF has none of the name "tracked", that is the first body that moves.
 
     Raises:
-        BadInput: there is neither a site nor a body of that name; the message lists those there are.
+        BadInput: nothing has that name; the message lists the names there are.
     """
-    sites, bodies = (
-        names(model, kind) for kind in (mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY)
-    )
-    if name in sites:
-        return "site_xpos", sites.index(name)
-    if name in bodies:
-        return "xpos", bodies.index(name)
+    kinds = {
+        "site_xpos": mujoco.mjtObj.mjOBJ_SITE,
+        "xpos": mujoco.mjtObj.mjOBJ_BODY,
+        "geom_xpos": mujoco.mjtObj.mjOBJ_GEOM,
+    }
+    all_names = {where: names(model, kind) for where, kind in kinds.items()}
+    for where, there in all_names.items():
+        if name in there:
+            return where, there.index(name)
     if name == "tracked" and model.njnt:
         return "xpos", int(model.jnt_bodyid[0])
-    named = [n for n in (*sites, *bodies) if not n.startswith("(")]
-    raise unknown(f"site or body in model {model_name(model)}", name, dict.fromkeys(named))
+    named = [n for there in all_names.values() for n in there if not n.startswith("(")]
+    raise unknown(f"site, body or geom in model {model_name(model)}", name, dict.fromkeys(named))
 
 
 def model_name(model: mujoco.MjModel) -> str:

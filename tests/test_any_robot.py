@@ -307,7 +307,7 @@ MISTAKES = {
         PY, "return z, np.stack", "return 1.01 * z, np.stack", r"state\(\) and z\(\) do not belong",
     ),
     "nothing to track": (
-        PY, r"time=3\.2", 'time=3.2, tracked="followed"', r"site or body .*'followed'.*tracked",
+        PY, r"time=3\.2", 'time=3.2, tracked="followed"', r"site, body or geom .*'followed'.*tracked",
     ),
     "no camera": (PY, r"time=3\.2", 'time=3.2, camera="above"', r"camera .*'above'.*overhead"),
     "a reward that is one number": (

@@ -20,6 +20,7 @@ from hyrl_mj.learning import presets
 from hyrl_mj.mjcf import camera_of, point_of, rests
 from hyrl_mj.simulation import Noise, Recorded, closed_loop
 from hyrl_mj.tasks import check_task, described_task, reference
+from hyrl_mj.viz.replay.marks import tracked_points
 
 # What the environments of other packages need, beside their ids.
 OTHERS = {
@@ -348,7 +349,7 @@ def test_what_cannot_work_is_refused_before_anything_is_trained(what):
     ("options", "message"),
     [
         ({"success": "close"}, r"success 'close' cannot be used: give .info"),
-        ({"success": "distance(puck, moon) < 1"}, "unknown site or body.*'moon'"),
+        ({"success": "distance(puck, moon) < 1"}, "unknown site, body or geom.*'moon'"),
         ({"noisy": (1,)}, r"noisy has 1 share.*2 coordinate"),
         ({"bounds": {"z": (0, 1)}}, "bounds for z.*x, y"),
         ({"pinned": {"qpos[9]": 0}}, r"no qpos\[9\]"),
@@ -439,6 +440,24 @@ def test_a_module_is_imported_again_only_as_it_was_when_it_was_named(tmp_path, m
     del gym.registry["MyPuck-v0"]
 
 
+@pytest.mark.parametrize(
+    ("name", "tracked", "kind"),
+    [
+        ("PointMaze_Medium-v3", "particle", "xpos"),
+        ("Reacher-v5", "fingertip", "xpos"),
+        # Its only body turns about its own origin.
+        ("dm_control/pendulum-swingup-v0", "mass", "geom_xpos"),
+    ],
+)
+def test_replays_draw_the_path_of_what_goes_farthest(name, tracked, kind):
+    task = from_gymnasium(name, **OTHERS[name])
+    assert task.scene.tracked == tracked
+    assert tracked in task.found["camera"]
+    assert point_of(task.model, tracked)[0] == kind
+    points = tracked_points(task, task.state(task.starts(20, np.random.default_rng(0)))[0])
+    assert np.ptp(points, axis=0).max() > 0.1
+
+
 def test_free_cameras_are_there_for_every_model():
     model = from_gymnasium(Puck).model
     assert rests(model, camera_of(model, "free"))
@@ -461,8 +480,17 @@ def test_the_command_line_explains_what_was_found(tmp_path):
     env = ("--env", "PointMaze_Medium-v3", "--env-args", str(path))
     status, out, _ = command("diagnose", *env, "--explain")
     assert status == 0
-    for part in ("achieved_goal", "island 1", "from the walls", "to change it, give bounds"):
+    for part in ("achieved_goal", "island 1", "from the walls", "{'goal_cell': [6, 6]}", "0.01 s"):
         assert part in out
+    ways = (
+        "bounds",
+        "starts",
+        "reset, pinned or seed",
+        "noisy",
+        "kwargs, such as frame_skip",
+        "task.scene",
+    )
+    assert [way for way in ways if f"(to change it, give {way}" not in out] == []
     assert command("diagnose", *env)[0] == 2
     path.write_text(json.dumps({"goal": 3}))
     status, _, error = command("run", *env)

@@ -53,7 +53,7 @@ def from_gymnasium(
         chart: names of the coordinates in which the decision falls; see `coordinates`.
         noisy: (d,) share of the noise bound on each coordinate of the chart; by default 1 on positions.
         success: when an episode is a success: "info", "terminated", "reward >= 1", or
-            "distance(a, b) <= 0.05" of two sites or bodies.
+            "distance(a, b) <= 0.05" of two sites, bodies or geoms.
         bounds: (low, high) of coordinates of the chart, by name.
         steps: steps of an episode, by default those of the environment.
         starts: where episodes start, all over the "chart", or where "reset" leads to.

@@ -67,15 +67,20 @@ def chosen_task(task: str | None, options: EnvironmentOptions) -> Task:
 def explained(task: Task) -> str:
     """Returns what was found out about an environment, and how to change it."""
     assert isinstance(task, EnvironmentTask)
-    names = {"noise": "noisy", "starts": "reset"}
     lines = [f"{task.name}: {task!r}"]
     for name, text in task.found.items():
-        lines.append(f"  {name}: {text}")
-        lines.append(f"    (to change it, give {names.get(name, name)})" if name in _KNOWN else "")
-    return "\n".join(filter(None, lines))
+        lines += [f"  {name}: {text}", f"    (to change it, give {_INSTEAD.get(name, name)})"]
+    return "\n".join(lines)
 
 
-_KNOWN = {*inspect.signature(from_gymnasium).parameters, "noise", "starts"}
+# What to give to change what was found, where it has another name.
+_INSTEAD = {
+    "noise": "noisy",
+    "goal": "reset, pinned or seed",
+    "ways": "chart",
+    "sample time": "kwargs, such as frame_skip, if the environment takes it",
+    "camera": "task.scene another one in Python",
+}
 
 
 def _arguments(path: Path) -> dict[str, Any]:

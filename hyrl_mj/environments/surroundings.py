@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -22,6 +23,8 @@ RESETS_COMPARED = 4
 RUNS, STEPS, HELD = 16, 150, 15
 # What is sampled beyond this many times as far is outside of the chart.
 ROOM = 1.2
+# What goes no farther than this stands [m].
+STANDS = 1e-6
 
 
 @dataclass(frozen=True)
@@ -48,18 +51,19 @@ class Runs:
         points: (n, d) chart points that they met.
         worst_reward: the least reward.
         moved: (nq,) bool, the positions that changed.
-        farthest: id of the body that went farthest.
+        farthest: name of the body that went farthest, or of the geom where no body went anywhere.
     """
 
     points: np.ndarray
     worst_reward: float
     moved: np.ndarray
-    farthest: int
+    farthest: str
 
 
 def sampled_runs(host: Host, chart: Sequence[Coordinate]) -> Runs:
     """Returns runs under inputs at random."""
-    rng, points, rewards, places = np.random.default_rng(0), [], [], []
+    rng, points, rewards = np.random.default_rng(0), [], []
+    bodies, geoms = [], []
     moved = np.zeros(host.model.nq, dtype=bool)
     for seed in range(RUNS):
         host.reset(seed)
@@ -70,13 +74,20 @@ def sampled_runs(host: Host, chart: Sequence[Coordinate]) -> Runs:
             _, reward, terminated, truncated, _, _ = host.step(u)
             points.append([getattr(host.data, c.kind)[c.index] + c.offset for c in chart])
             rewards.append(reward)
-            places.append(host.data.xpos.copy())
+            bodies.append(host.data.xpos.copy())
+            geoms.append(host.data.geom_xpos.copy())
             moved |= np.abs(host.data.qpos - begun) > 0
             if terminated or truncated:
                 break
     host.write(*host.base)
-    farthest = int(np.ptp(places, axis=0).sum(axis=1).argmax())
+    farthest = _farthest(host.model.body, bodies) or _farthest(host.model.geom, geoms)
     return Runs(np.array(points), float(min(rewards)), moved, farthest)
+
+
+def _farthest(named: Callable[[int], Any], places: Sequence[np.ndarray]) -> str:
+    """Returns the name of what goes farthest, of places (k, n, 3) [m]; none if nothing does."""
+    went = np.ptp(places, axis=0).sum(axis=1)
+    return str(named(int(went.argmax())).name) if went.max() > STANDS else ""
 
 
 def starts_of(host: Host) -> np.ndarray:

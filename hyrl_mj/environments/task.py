@@ -95,7 +95,7 @@ class EnvironmentTask(Task):
         self.worst_reward = min(runs.worst_reward, 0.0)
         self.inputs = self._input_names()
         self._islands = islands_of(self.host, runs.points[:, :2]) if self._in_plane else {}
-        self._set_scene(self.host.model.body(runs.farthest).name)
+        self._set_scene(runs.farthest)
 
     def __reduce__(self) -> tuple[Callable[..., Task], tuple[Any, ...]]:
         return _again, (self.spec, self.noisy)
@@ -152,7 +152,11 @@ class EnvironmentTask(Task):
                 f"the options of reset {dict(source.reset)} change nothing in {self.name}, which draws "
                 f"{', '.join(names)}: name the options as its reset does"
             )
-        self.found["goal"] = f"{', '.join(names)} as the reset with seed {source.first} draws it"
+        given = f" and {dict(source.reset)}" if source.reset else ""
+        pinned = f", with {dict(source.pinned)}" if source.pinned else ""
+        self.found["goal"] = (
+            f"{', '.join(names)} as the reset with seed {source.first}{given} draws it{pinned}"
+        )
 
     def _at_rest(self, resets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns state and memory of the base, with the usual positions and at rest."""
@@ -202,6 +206,7 @@ class EnvironmentTask(Task):
 
     def _count(self, steps: int | None) -> None:
         self.max_steps = steps or self.host.steps or STEPS_WITHOUT_END
+        self.found["sample time"] = f"{self.dt:g} s, of a step"
         if steps is None:
             self.found["steps"] = f"{self.max_steps} ({self.max_steps * self.dt:g} s) of an episode"
         if not self.arrival_ends:
@@ -254,6 +259,7 @@ class EnvironmentTask(Task):
             camera=self._camera(),
             tracked=tracked or "tracked",
         )
+        self.found["camera"] = f"{self.scene.camera}, with the path of {self.scene.tracked}"
 
     def _camera(self) -> str:
         """Returns the camera of replays: from above on a plane, else the model's first, or the free one."""

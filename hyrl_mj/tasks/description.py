@@ -52,8 +52,8 @@ class Scene:
         title: the task's name in figures, by default its `name` in words.
         camera: the MJCF's camera of the replay; where it has no such one, "overhead" looks from above, and
             "free" is MuJoCo's free camera.
-        tracked: the MJCF's site or body whose path the replay draws; where it has neither, "tracked" is the
-            first body that moves.
+        tracked: the MJCF's site, body or geom whose path the replay draws; where it has none of that name,
+            "tracked" is the first body that moves.
     """
 
     starts: Sequence[Sequence[float]]

@@ -94,7 +94,7 @@ def _add(
 
 
 def tracked_points(task: Task, qpos: np.ndarray) -> np.ndarray:
-    """Returns the points (n, 3) [m] of the site or body that the task's scene tracks at positions (n, nq)."""
+    """Returns the points (n, 3) [m] of what the task's scene tracks at positions (n, nq)."""
     data, points = mujoco.MjData(task.model), np.empty((len(qpos), 3))
     kind, number = mjcf.point_of(task.model, task.scene.tracked)
     for point, position in zip(points, qpos, strict=True):
