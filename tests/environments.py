@@ -175,6 +175,29 @@ class Noisy(gym.Wrapper):
         return self.env.step(action + self.unwrapped.np_random.normal(size=2))
 
 
+class Teleporting(Puck):
+    """Draws random numbers in its steps, but only in a corner, where inputs at random do not lead."""
+
+    def __init__(self, own=False):
+        super().__init__()
+        self.own = own
+
+    def step(self, action):
+        result = super().step(action)
+        if self.data.qpos.min() > 1.3:
+            self.np_random.random() if self.own else np.random.rand()
+        return result
+
+
+class Grid(Puck):
+    """What it observes is one array of two rows."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (2, 2))
+
+    def _get_obs(self):
+        return np.stack([self.data.qpos, self.data.qvel])
+
+
 class Seen(gym.ObservationWrapper):
     """Shows a picture."""
 

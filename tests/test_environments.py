@@ -9,7 +9,19 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-from environments import Delayed, Floating, Growing, Noisy, Puck, Secret, Seen, Several, puck_agent
+from environments import (
+    Delayed,
+    Floating,
+    Grid,
+    Growing,
+    Noisy,
+    Puck,
+    Secret,
+    Seen,
+    Several,
+    Teleporting,
+    puck_agent,
+)
 from gymnasium.wrappers import TimeLimit
 
 import hyrl_mj
@@ -66,6 +78,17 @@ def test_copies_go_on_as_the_environment_alone_does(name):
         host.forward()
         for k, u in enumerate(inputs):
             np.testing.assert_allclose(host.step(u[i])[0], seen[k][i], rtol=0, atol=1e-9)
+
+
+def test_what_an_environment_notes_at_the_end_of_an_episode_concerns_one_copy():
+    # After its last step dm_control resets the environment in the next step, whoever's it is.
+    task = from_gymnasium("dm_control/pendulum-swingup-v0", success="reward >= 1")
+    three, alone = task.plant(3), task.plant(1)
+    for plant, z in ((three, [[0.0], [1.0], [2.0]]), (alone, [[1.0]])):
+        plant.set_state(*task.state(np.array(z)))
+        for _ in range(task.max_steps):
+            plant.step(np.zeros((plant.n, 1)))
+    np.testing.assert_array_equal(three.qpos[1], alone.qpos[0])
 
 
 @pytest.mark.slow
@@ -328,6 +351,10 @@ REFUSED = {
     "other physics": ("CartPole-v1", "not simulated by MuJoCo"),
     "no environment": (lambda: 3, "is a int: give a single gymnasium.Env"),
     "several copies": (lambda: gym.make_vec("Reacher-v5", 2), "single gymnasium.Env"),
+    "a namespace": (
+        "metaworld/reach-v3",
+        "installed has environments metaworld/.*install their package",
+    ),
     "misspelt": ("PointMaze_Mediun-v3", "no environment.*PointMaze_Medium-v3"),
     "broken": (lambda: 1 / 0, r"cannot be made .ZeroDivisionError"),
     "a goal that is drawn": (
@@ -343,6 +370,33 @@ def test_what_cannot_work_is_refused_before_anything_is_trained(what):
     make, message = REFUSED[what]
     with pytest.raises(BadInput, match=message):
         from_gymnasium(make)
+
+
+@pytest.mark.parametrize("own", [True, False])
+@pytest.mark.parametrize("allowed", [0, 1])
+def test_random_numbers_that_few_steps_draw_are_refused_when_they_are(own, allowed, monkeypatch):
+    monkeypatch.setattr(cores, "allowed", allowed)
+    task = from_gymnasium(lambda: Teleporting(own))
+    plant, u = task.plant(60), np.zeros((60, 2))
+    plant.set_state(np.tile([0.9, 1.0], (60, 1)))
+    plant.step(u)
+    plant.set_state(np.tile([1.4, 1.35], (60, 1)))
+    with pytest.raises(BadInput, match=r"draws random numbers in step\(\)"):
+        plant.step(u)
+
+
+def test_an_observation_in_rows_is_a_vector_row_by_row():
+    task = from_gymnasium(Grid)
+    plant = task.plant(2)
+    plant.set_state(np.array([[-1.0, 0.5], [-1.5, 0.0]]), np.array([[0.1, 0.2], [0.3, 0.4]]))
+    wanted = [[-1.0, 0.5, 0.1, 0.2], [-1.5, 0.0, 0.3, 0.4]]
+    np.testing.assert_allclose(task.observation(plant.measurement), wanted, atol=1e-12)
+
+
+def test_walls_that_nothing_collides_with_are_none():
+    # Contacts are switched off in it, so its target is no wall, and there is nothing to decide.
+    with pytest.raises(BadInput, match="no walls that can be passed on both sides"):
+        from_gymnasium("dm_control/point_mass-easy-v0", success="reward >= 0.9", steps=20)
 
 
 @pytest.mark.parametrize(

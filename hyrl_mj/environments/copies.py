@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -12,7 +13,15 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 
-from hyrl_mj.environments.memory import Slot, changing, remembered
+from hyrl_mj.environments.memory import (
+    Path,
+    Slot,
+    changing,
+    generators,
+    name_of,
+    remembered,
+    state_of_generator,
+)
 from hyrl_mj.environments.opening import Source, global_seed, global_state, made, physics_of
 from hyrl_mj.errors import BadInput, brief
 from hyrl_mj.tasks import Outcome
@@ -93,6 +102,7 @@ class Host:
         self.slots: tuple[Slot, ...] = ()
         self.between: tuple[tuple[str, int], tuple[str, int]] | None = None
         self._forward = self.tells_success = False
+        self._generators: list[Path] = []
         self._watch()
         self.reset(source.first)
         self.base = self.read()
@@ -215,10 +225,11 @@ class Host:
     ) -> tuple[np.ndarray, np.ndarray, Report]:
         """Returns states (k, S), memories (k, A) and reports of k copies after a step with inputs (k, m)."""
         states, memories, rows = states.copy(), memories.copy(), []
-        for i in range(len(states)):
-            self.write(states[i], memories[i])
-            rows.append(self.step(u[i]))
-            states[i], memories[i] = self.read()
+        with self._undrawn():
+            for i in range(len(states)):
+                self.write(states[i], memories[i])
+                rows.append(self.step(u[i]))
+                states[i], memories[i] = self.read()
         return states, memories, _report(rows, self.width)
 
     def observe(self, states: np.ndarray, memories: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -287,6 +298,7 @@ class Host:
         episodes = []
         for seed in range(EPISODES):
             self.reset(seed)
+            self._generators = generators(self.env)
             moments = [remembered(self.env)]
             for k in range(STEPS):
                 if k % HELD == 0:
@@ -295,6 +307,8 @@ class Host:
                 moments.append(remembered(self.env))
                 candidates = [c for c in candidates if _agrees(c, observation)]
             episodes.append(moments)
+        self._end_episode(rng)
+        episodes[-1].append(remembered(self.env))
         self.slots = changing(episodes, self.name)
         self._observer = candidates[0] if candidates else None
         if self._replays():
@@ -307,6 +321,14 @@ class Host:
                 "wrapper that does so"
             )
 
+    def _end_episode(self, rng: np.random.Generator) -> None:
+        """Goes on to the end of the episode, which some environments note, as dm_control's do."""
+        with self._undrawn():
+            for _ in range(self.steps or 0):
+                _, _, terminated, truncated, _, _ = self.step(self.drawn(rng))
+                if terminated or truncated:
+                    break
+
     def drawn(self, rng: np.random.Generator) -> np.ndarray:
         """Returns inputs (m,) at random."""
         space: Any = self.env.action_space
@@ -315,17 +337,28 @@ class Host:
         return np.ravel(rng.uniform(space.low, space.high))
 
     def _tried_step(self, u: np.ndarray) -> np.ndarray:
-        before = global_state()
-        try:
-            observation = self.step(u)[0]
-        except Exception as error:
-            raise BadInput(f"step() of {self.name} raises {brief(error)}: repair it") from error
-        if global_state() != before:
+        with self._undrawn():
+            try:
+                return self.step(u)[0]
+            except Exception as error:
+                raise BadInput(f"step() of {self.name} raises {brief(error)}: repair it") from error
+
+    @contextmanager
+    def _undrawn(self) -> Iterator[None]:
+        """Raises `BadInput` after steps that have drawn random numbers, as some do in few places only."""
+        before = self._random()
+        yield
+        drawn = [name for name, state in self._random().items() if state != before[name]]
+        if drawn:
             raise BadInput(
-                f"{self.name} draws random numbers in step() (a global generator), so its state does "
-                "not tell what comes next: make it without that noise"
+                f"{self.name} draws random numbers in step() ({drawn[0]}), so its state does not tell what "
+                "comes next: make it without that noise"
             )
-        return observation
+
+    def _random(self) -> dict[str, bytes | None]:
+        """Returns the states of all generators that a step may draw from, by name."""
+        own = {name_of(path): state_of_generator(self.env, path) for path in self._generators}
+        return {"a global generator": global_state(), **own}
 
     def _replays(self) -> bool:
         """Returns whether steps from a state that was read go on as they did, after others in between."""

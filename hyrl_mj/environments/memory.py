@@ -72,6 +72,17 @@ def remembered(root: Any) -> dict[Path, Value]:
     return found
 
 
+def generators(root: Any) -> list[Path]:
+    """Returns the paths of the generators of random numbers that an environment has."""
+    return [path for path, value in remembered(root).items() if isinstance(value, _Generator)]
+
+
+def state_of_generator(root: Any, path: Path) -> bytes | None:
+    """Returns the state of the generator at a path, to compare it; None if there is none now."""
+    value = _get(*_place(root, path))
+    return None if value is None else _Generator(value).content
+
+
 def name_of(path: Path) -> str:
     """Returns the name of a path as one writes it in Python, without the environment: "goal[0]"."""
     words = [f".{key}" if kind == "attribute" else f"[{key!r}]" for kind, key in path]
@@ -212,11 +223,6 @@ def changing(episodes: Sequence[Sequence[dict[Path, Value]]], owner: str) -> tup
             continue
         flat = [value for row in values for value in row]
         name = name_of(tuple(step for step in path if step[0] != "length"))
-        if any(isinstance(value, _Generator) for value in flat):
-            raise BadInput(
-                f"{owner} draws random numbers in step() ({name}), so its state does not tell what comes "
-                "next: make it without that noise"
-            )
         numbers = [np.asarray(v) for v in flat if isinstance(v, float | np.ndarray)]
         shapes = {value.shape for value in numbers}
         other = [

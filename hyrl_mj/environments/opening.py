@@ -180,9 +180,17 @@ def _adapt_dm_control() -> None:
 
 def _why_not_made(name: str, error: Exception) -> str:
     if name not in gym.registry and isinstance(error, gym.error.Error):
+        missing = {e: m for m, e in PACKAGES.items() if importlib.util.find_spec(m) is None}
+        own = name.rpartition(":")[2]
+        namespace = own.partition("/")[0] if "/" in own else None
+        known = {spec.namespace for spec in gym.registry.values()} | set(missing)
+        if namespace and namespace not in known:
+            return (
+                f"nothing that is installed has environments {namespace}/...: install their package, and "
+                f"name the module that registers them, as module:{own}"
+            )
         close = get_close_matches(name, list(gym.registry), n=3, cutoff=0.5)
         near = f"; near it are {', '.join(close)}" if close else ""
-        missing = {e: m for m, e in PACKAGES.items() if importlib.util.find_spec(m) is None}
         install = "".join(
             f'; if it is of {module}: pip install "hyrl-mj[{extra}]"'
             for extra, module in missing.items()
@@ -225,8 +233,9 @@ def _check(env: Any, name: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
     space = env.observation_space
     parts = space.spaces.values() if isinstance(space, spaces.Dict) else (space,)
     for part in parts:
-        if not isinstance(part, spaces.Box) or len(part.shape) > 1:
-            what = "images" if isinstance(part, spaces.Box) else f"a space {type(part).__name__}"
+        is_image = isinstance(part, spaces.Box) and (len(part.shape) > 2 or part.dtype == np.uint8)
+        if is_image or not isinstance(part, spaces.Box):
+            what = "images" if is_image else f"a space {type(part).__name__}"
             raise BadInput(
                 f"{name} observes {what} {getattr(part, 'shape', '')}: hyrl_mj takes vectors, or a Dict of "
                 "vectors; choose the observation of its state"

@@ -154,6 +154,7 @@ def heeds_options(host: Host) -> bool:
 def walls(host: Host) -> list[int]:
     """Returns the geoms that stand still and can be collided with, or are named obstacles, but no planes."""
     model = host.model
+    contacts = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
     still = (model.body_weldid[model.geom_bodyid] == 0) & (
         model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE
     )
@@ -169,7 +170,7 @@ def walls(host: Host) -> list[int]:
     ]
     kind = mujoco.mjtObj.mjOBJ_GEOM
     named = np.isin(mjcf.names(model, kind), mjcf.obstacles(model))
-    return [int(g) for g in np.flatnonzero(still & (np.array(meets) | named))]
+    return [int(g) for g in np.flatnonzero(still & (contacts & np.array(meets) | named))]
 
 
 def islands_of(host: Host, places: np.ndarray) -> dict[str, int]:
