@@ -91,16 +91,16 @@ class Lattice:
     @property
     def estimate(self) -> bool:
         """Whether what is won on the nodes is an estimate, which may err to either side."""
-        return bool(self.why_estimate)
+        return Lattice.why_estimate(self.task) is not None
 
-    @property
-    def why_estimate(self) -> str:
-        """Why what is won on the nodes is an estimate; "" if it is none."""
-        if self.grid.chart.dimension > 2:
+    @staticmethod
+    def why_estimate(task: Task) -> str | None:
+        """Returns why what is won on nodes of this task's chart is an estimate, None if it is none."""
+        if task.chart.dimension > 2:
             return "the game is an estimate on a chart of three dimensions"
-        if self.task.stopped_by_walls:
+        if task.stopped_by_walls:
             return "the game is an estimate where contacts stop the robot between the nodes"
-        return ""
+        return None
 
     @staticmethod
     def why_not(task: Task, grid: Grid | None = None) -> str | None:
@@ -143,8 +143,7 @@ class Lattice:
         """Returns whether what is won on these nodes is good enough to train and to design by."""
         if isinstance(grid, Cloud):
             return False
-        exact = task.chart.dimension < 3 and not task.stopped_by_walls
-        return exact and Lattice.why_not(task, grid) is None
+        return Lattice.why_estimate(task) is None and Lattice.why_not(task, grid) is None
 
     @staticmethod
     def of(task: Task, grid: Grid | None = None) -> Lattice:
@@ -176,7 +175,7 @@ class Lattice:
                 "give fewer cells (`lattice` in the settings)"
             )
         direct = measurement.shape == nodes.shape and bool((measurement == nodes).all())
-        estimate = len(grid.counts) > 2 or task.stopped_by_walls
+        estimate = Lattice.why_estimate(task) is not None
         occurs = nearest_of(grid, running) if task.stopped_by_walls else None
         ends = _Ends(grid, len(levels), estimate, occurs)
         hops, uneven = np.empty((len(levels), nodes.shape[1])), np.zeros(nodes.shape[1])

@@ -49,7 +49,7 @@ class Certificate:
     def of(game: Game, controllers: Mapping[str, Controller]) -> Certificate:
         """Returns the certificate of some controllers of a game."""
         answers, why_not = {}, {}
-        if why := game.lattice.why_estimate:
+        if why := game.lattice.why_estimate(game.task):
             return Certificate(game, None, {}, dict.fromkeys(controllers, why))
         try:
             cells = Cells.of(game.lattice)
