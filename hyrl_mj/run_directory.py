@@ -183,6 +183,14 @@ class Run:
         return {q: self._mode_policy(q) for q in self.extended_sets.modes}
 
     @property
+    def keeps_agent(self) -> bool:
+        """Whether the policy of every mode is the agent itself, everywhere as it is."""
+        kept = self.mode_policies.values()
+        return all(
+            isinstance(pi, PartPolicy) and pi.whole and pi.policy is self.policy for pi in kept
+        )
+
+    @property
     def mode_networks(self) -> dict[int, MlpPolicy]:
         """Those policies of modes that are networks."""
         found = self.mode_policies.items()

@@ -1,6 +1,6 @@
 """The search for noise signals finds those that are planted, and reports only what is lost again."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -17,11 +17,15 @@ from planted import (
 
 from hyrl_mj import BadInput, Noise, Outcome, Recorded, Sample, cores, simulate
 from hyrl_mj.game import NEVER, Game
+from hyrl_mj.learning.presets import preset
 from hyrl_mj.policies import PolicyController
+from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import Programmes, Rules, closed_loop
 from hyrl_mj.stages.attacks import POPULATION, Budget, _Search, attack, attack_starts
 from hyrl_mj.stages.episodes import Regions
+from hyrl_mj.stages.hybrid import HybridController
+from hyrl_mj.stages.partition import PartPolicy
 
 EPS = 0.1
 ON_THE_LEFT = np.array([[0.0, 1.0], [0.05, 1.0], [0.1, 1.0], [0.0, 1.02]])
@@ -84,6 +88,42 @@ def test_an_order_of_noise_is_found_that_no_rule_gives_alone(vehicle):
     assert found.count.lost == len(ON_THE_LEFT)
     assert {arc.outcome for arc in found.arcs} == {"out_of_bounds"}
     assert found.arcs[found.strongest].t[-1] == min(arc.t[-1] for arc in found.arcs)
+
+
+def kept_parts(vehicle, agent):
+    """Policies of two modes that are both the agent itself."""
+    halved = halves(vehicle)
+    parts = zip(halved.modes, halved.parts, strict=True)
+    return {q: PartPolicy(vehicle, agent, part, 0.1, whole=True) for q, part in parts}
+
+
+def test_signals_against_an_agent_do_the_same_to_modes_that_all_keep_it(vehicle):
+    agent = sign_policy(vehicle)
+    flow_sets = dict(zip((0, 1), halves(vehicle).parts, strict=True))
+    hybrid = HybridController(vehicle, kept_parts(vehicle, agent), flow_sets)
+    starts = np.random.default_rng(0).uniform((0.0, -0.6), (0.3, 0.6), (40, 2))
+    found = on(vehicle, PolicyController(agent), starts)
+    assert 0 < found.count.lost < len(starts)
+    passed_on = found.on("hyrl", vehicle, hybrid)
+    assert passed_on.count == replace(found.count, controller="hyrl")
+    assert passed_on.count.lost == on(vehicle, hybrid, starts).count.lost
+    for one, two in zip(found.arcs, passed_on.arcs, strict=True):
+        flowing = np.append(True, np.diff(two.j) == 0)  # a jump repeats the state
+        np.testing.assert_array_equal(one.z, two.z[flowing])
+    # Modes that go their own ways are tried under the same signals, and lose fewer.
+    ideal = found.on("hyrl", vehicle, ideal_controller(vehicle))
+    assert ideal.count.lost < found.count.lost
+
+
+def test_a_run_keeps_its_agent_if_each_mode_is_the_agent_everywhere(vehicle, tmp_path):
+    agent = sign_policy(vehicle)
+    kept = kept_parts(vehicle, agent)
+    own = {**kept, 1: replace(kept[1], whole=False)}
+    other = {**kept, 1: replace(kept[1], policy=one_way_policy(vehicle))}
+    for policies, keeps in ((kept, True), (own, False), (other, False)):
+        run = Run(tmp_path, preset(vehicle))
+        vars(run).update(policy=agent, mode_policies=policies)
+        assert run.keeps_agent == keeps
 
 
 def test_what_cannot_be_beaten_is_not(vehicle, circle):

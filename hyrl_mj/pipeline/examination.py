@@ -168,12 +168,20 @@ def attack_loops(
     budget: Budget,
     options: ExamineOptions,
 ) -> dict[str, Attack]:
-    """Attacks controllers by name, from the same starts."""
+    """Attacks controllers by name, from the same starts.
+
+    Where every mode is the agent itself, the hybrid controller does under each signal what the agent does,
+    and is tried under the signals that were found against the agent.
+    """
     task, eps = run.task, run.settings.noise if options.eps is None else options.eps
     n = ATTACKED_SMOKE if run.settings.preset == "smoke" else ATTACKED
     starts = attack_starts(task, regions, eps, n, options.seed)
     everywhere = options.all_coordinates or run.settings.everywhere
-    return attack(task, loops, starts, eps, budget, everywhere, options.seed)
+    if not run.keeps_agent:
+        return attack(task, loops, starts, eps, budget, everywhere, options.seed)
+    alone = {"policy": loops["policy"]}
+    found = attack(task, alone, starts, eps, budget, everywhere, options.seed)["policy"]
+    return {name: found if name in alone else found.on(name, task, loops[name]) for name in loops}
 
 
 def draw_robustness(run: Run, robustness: Robustness, maps: Maps, folder: Path) -> None:

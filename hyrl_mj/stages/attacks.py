@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -98,6 +98,53 @@ class Attack:
     signal: Recorded
     arcs: tuple[HybridArc, ...]
     strongest: int
+
+    @staticmethod
+    def of(
+        arcs: Sequence[HybridArc],
+        signal: Recorded,
+        dangerous: int,
+        controller: str,
+        everywhere: bool,
+        rounds: int,
+        seconds: float | None,
+    ) -> Attack:
+        """Returns the attack of recorded signals, with the arcs under them.
+
+        Args:
+            arcs: of the controller, from each start.
+            signal: the signals.
+            dangerous: index of the start of the greatest danger.
+            controller, everywhere, rounds, seconds: as in `AttackCount`.
+        """
+        from scipy.stats import binomtest  # slow to import, and seldom needed
+
+        lost = np.array([arc.outcome != Outcome.REACHED.label for arc in arcs])
+        ends = np.where(lost, [arc.t[-1] for arc in arcs], np.inf)
+        strongest = int(np.argmin(ends)) if lost.any() else dangerous
+        interval = binomtest(int(lost.sum()), len(lost)).proportion_ci(0.95, method="wilson")
+        count = AttackCount(
+            controller=controller,
+            eps=signal.bound,
+            everywhere=everywhere,
+            starts=len(lost),
+            lost=int(lost.sum()),
+            interval=(float(interval.low), float(interval.high)),
+            rounds=rounds,
+            seconds=seconds,
+            start=tuple(map(float, arcs[strongest].z[0])),
+            outcome=arcs[strongest].outcome,
+        )
+        return Attack(count, signal, tuple(arcs), strongest)
+
+    def on(self, name: str, task: Task, controller: Controller) -> Attack:
+        """Returns the attack of the same signals on another controller, of a name."""
+        starts = np.array([arc.z[0] for arc in self.arcs])
+        arcs = simulate_batch(task, controller, starts, self.signal)
+        count = self.count
+        return Attack.of(
+            arcs, self.signal, self.strongest, name, count.everywhere, count.rounds, count.seconds
+        )
 
 
 def attack_starts(task: Task, regions: Regions, bound: float, n: int, seed: int) -> np.ndarray:
@@ -295,24 +342,7 @@ class _Search:
 
     def result(self, name: str, everywhere: bool, rounds: int, seconds: float | None) -> Attack:
         """Simulates the strongest signals again, as records, and returns what they do."""
-        from scipy.stats import binomtest  # slow to import, and seldom needed
-
         recorded = Recorded(self.signals, self.rules.bound, Programmes.kind)
         arcs = simulate_batch(self.task, self.controller, self.starts, recorded)
-        lost = np.array([arc.outcome != Outcome.REACHED.label for arc in arcs])
-        ends = np.where(lost, [arc.t[-1] for arc in arcs], np.inf)
-        strongest = int(np.argmin(ends) if lost.any() else np.argmax(self._worst))
-        interval = binomtest(int(lost.sum()), len(lost)).proportion_ci(0.95, method="wilson")
-        count = AttackCount(
-            controller=name,
-            eps=self.rules.bound,
-            everywhere=everywhere,
-            starts=len(lost),
-            lost=int(lost.sum()),
-            interval=(float(interval.low), float(interval.high)),
-            rounds=rounds,
-            seconds=seconds,
-            start=tuple(map(float, self.starts[strongest])),
-            outcome=arcs[strongest].outcome,
-        )
-        return Attack(count, recorded, tuple(arcs), strongest)
+        dangerous = int(np.argmax(self._worst))
+        return Attack.of(arcs, recorded, dangerous, name, everywhere, rounds, seconds)
