@@ -85,12 +85,18 @@ def given_agent(
     command: str, task: str | None, policy: Path | None, environment: EnvironmentOptions
 ) -> tuple[Task, Path] | None:
     """Returns the task and the agent of a command; None if it only explains an environment."""
+    if policy is None and not environment.explain:
+        chosen_task(task, environment)  # what is wrong with it is said first
+        raise BadInput(f"{command} needs --policy: the agent, a .zip, .onnx or .safetensors file")
+    if policy is not None and not policy.exists():  # before an environment is tried out
+        raise BadInput(
+            f"there is no file {policy}: give the agent, a .zip, .onnx or .safetensors file"
+        )
     chosen = chosen_task(task, environment)
     if environment.explain:
         print(explained(chosen))
         return None
-    if policy is None:
-        raise BadInput(f"{command} needs --policy: the agent, a .zip, .onnx or .safetensors file")
+    assert policy is not None
     return chosen, policy
 
 

@@ -9,11 +9,23 @@ from __future__ import annotations
 
 import json
 import os
-from contextlib import suppress
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from hyrl_mj.artifacts import digest, replacing
 from hyrl_mj.errors import BadInput
+
+
+@contextmanager
+def current_folder() -> Iterator[None]:
+    """Lets modules in the current folder be imported in the block, which a command does not do by itself."""
+    sys.path.insert(0, "")
+    try:
+        yield
+    finally:
+        sys.path.remove("")
 
 
 def store() -> Path | None:

@@ -1,6 +1,6 @@
 """Agents of others: trains agents with plain SB3 on environments of others, for `hyrl-mj diagnose --env`.
 
-    pip install "hyrl-mj[robotics]"
+    pip install "hyrl-mj[robotics,dm-control]"
     python scripts/outside_agents.py reacher point-maze --out agents
 
 Nothing of hyrl_mj takes part. Each agent takes a few minutes, and the same seed gives the same agent on the

@@ -1,9 +1,12 @@
 """Environments of others as tasks: plant, noise, what is found out about them, and what is refused."""
 
 import json
+import os
 import pickle
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium as gym
 import mujoco
@@ -22,6 +25,7 @@ from environments import (
     Teleporting,
     puck_agent,
 )
+from gl import needs_gl
 from gymnasium.wrappers import TimeLimit
 
 import hyrl_mj
@@ -30,6 +34,7 @@ from hyrl_mj.environments import making
 from hyrl_mj.environments.crew import Crew
 from hyrl_mj.learning import presets
 from hyrl_mj.mjcf import camera_of, point_of, rests
+from hyrl_mj.rendering import SceneRenderer
 from hyrl_mj.simulation import Noise, Recorded, closed_loop
 from hyrl_mj.tasks import check_task, described_task, reference
 from hyrl_mj.viz.replay.marks import tracked_points
@@ -359,7 +364,7 @@ REFUSED = {
     "broken": (lambda: 1 / 0, r"cannot be made .ZeroDivisionError"),
     "a goal that is drawn": (
         "PointMaze_Medium-v3",
-        "each reset of PointMaze_Medium-v3 draws goal.*pin it",
+        "each reset of PointMaze_Medium-v3 draws goal.*pin it.*goal_cell",
     ),
     "no success": ("Reacher-v5", "does not tell in its info when it succeeds"),
 }
@@ -412,6 +417,8 @@ def test_walls_that_nothing_collides_with_are_none():
         ({"kwargs": {"depth": 3}}, r"cannot be made .TypeError"),
         ({"steps": "many"}, "steps 'many' cannot be used: give an integer from 1"),
         ({"steps": 0}, "steps 0 cannot be used"),
+        ({"pinned": {"qpos[1]": 0.5}}, r"qpos\[1\] is the coordinate y of the chart.*leave it out"),
+        ({"reset": {"goal": 3}}, r"options of reset .'goal': 3. change nothing in Puck: name"),
         ({"bounds": {"x": 3}}, r"bounds of x 3 cannot be used: .*low.*high"),
         ({"bounds": {"x": [2, -2]}}, r"bounds of x \[2, -2\] cannot be used"),
         ({"bounds": [1, 2]}, "bounds .* give a dictionary"),
@@ -474,6 +481,53 @@ def test_a_task_is_made_again_from_its_text():
         described_task('env:{"env": "this:Puck-v0"}')
     with pytest.raises(BadInput, match="made by the function elsewhere"):
         described_task('env:{"env": {"function": "elsewhere"}}')
+
+
+def test_a_target_that_is_drawn_is_pinned_as_the_message_says():
+    with pytest.raises(BadInput, match="draws qpos") as refused:
+        from_gymnasium("Reacher-v5", chart="qpos[0]", success=OTHERS["Reacher-v5"]["success"])
+    assert "goal_cell" not in str(refused.value)
+    advised = re.search(r"with values as (\{.*?\}\})", str(refused.value))[1]
+    options = {**json.loads(advised), "success": OTHERS["Reacher-v5"]["success"]}
+    task = from_gymnasium("Reacher-v5", chart="qpos[0]", **options)
+    assert task.host.data.qpos[2] == pytest.approx(0.1)
+
+
+def test_a_module_of_the_current_folder_is_found(tmp_path):
+    text = (
+        "import gymnasium as gym\nfrom environments import Puck\n"
+        'gym.register("Beside-v0", entry_point=Puck)\n'
+    )
+    (tmp_path / "beside_me.py").write_text(text)
+    words = ("-m", "hyrl_mj.cli", "diagnose", "--env", "beside_me:Beside-v0", "--explain")
+    # Without -P the folder would be on the path, as it is not for the command hyrl-mj.
+    done = subprocess.run(
+        [sys.executable, "-P", *words], cwd=tmp_path, capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent), "XDG_STATE_HOME": str(tmp_path)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert 'info["is_success"]' in done.stdout or 'info["success"]' in done.stdout
+
+
+@needs_gl
+def test_the_free_camera_from_above_shows_the_whole_chart():
+    task = from_gymnasium(Puck, bounds={"x": (-6, 2)})
+    renderer = SceneRenderer(task.model, 320, 240)
+    renderer.place(np.zeros(2), task.scene.camera)
+    corners = np.array(
+        [[x, y, 0.1] for x in (-6, 2) for y in (task.chart.low[1], task.chart.high[1])]
+    )
+    pixels, _ = renderer.project(corners)
+    assert ((pixels >= 0) & (pixels <= (320, 240))).all()
+    renderer.close()
+
+
+def test_an_agent_that_is_missing_is_said_before_the_environment_is_tried_out(tmp_path):
+    status, _, error = command(
+        "diagnose", "--env", "Nowhere-v0", "--policy", str(tmp_path / "no.zip")
+    )
+    assert status == 2
+    assert "there is no file" in error
 
 
 def test_a_module_is_imported_again_only_as_it_was_when_it_was_named(tmp_path, monkeypatch):

@@ -88,6 +88,7 @@ class Host:
         model, data: of MuJoCo.
         slots: the attributes that change from step to step.
         base: MuJoCo's state (S,) and what is remembered (A,), after the reset that all copies begin from.
+        success_key: what `info` calls success; None as long as it has said nothing.
         between: two places whose distance is reported, such as ("site_xpos", 2); none at first.
 
     Raises:
@@ -101,7 +102,8 @@ class Host:
         self.model, self.data, self._plant = opened.model, opened.data, opened.plant
         self.slots: tuple[Slot, ...] = ()
         self.between: tuple[tuple[str, int], tuple[str, int]] | None = None
-        self._forward = self.tells_success = False
+        self._forward = False
+        self.success_key: str | None = None
         self._generators: list[Path] = []
         self._watch()
         self.reset(source.first)
@@ -126,8 +128,9 @@ class Host:
             try:
                 observation, _ = self.env.reset(seed=seed, options=options or None)
             except Exception as error:
+                told = f" with the options {dict(given)}" if given else ""
                 raise BadInput(
-                    f"{self.name} cannot be reset ({brief(error)}): change its options of reset"
+                    f"{self.name} cannot be reset{told} ({brief(error)}): change its options of reset"
                 ) from error
         physics = physics_of(self.env)
         if physics is None or physics[0] is not self.model:
@@ -201,10 +204,11 @@ class Host:
         """Steps the environment with inputs u (m,), and returns a row of `Report`."""
         observation, reward, terminated, truncated, info = self.env.step(self.action(u))
         self._look()
-        told = next((float(info[key]) for key in SUCCESS if key in info), None)
+        key = next((key for key in SUCCESS if key in info), None)
+        told = None if key is None else float(info[key])
         if "outcome" in info:  # of an environment of this package
-            told = float(info["outcome"] == Outcome.REACHED.label)
-        self.tells_success = self.tells_success or told is not None
+            key, told = "outcome", float(info["outcome"] == Outcome.REACHED.label)
+        self.success_key = self.success_key or key
         distance = 0.0
         if self.between is not None:
             first, second = (getattr(self.data, kind)[i] for kind, i in self.between)

@@ -147,7 +147,8 @@ def _module_of(env: str) -> Path | None:
     if not colon or "." in module:
         return None
     with suppress(ValueError):  # a name such as "" or "__main__"
-        found = find_spec(module)
+        with trust.current_folder():
+            found = find_spec(module)
         if found is not None and found.origin is not None and Path(found.origin).is_file():
             return Path(found.origin)
     return None

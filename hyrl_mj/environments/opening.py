@@ -22,9 +22,10 @@ from gymnasium import spaces
 
 from hyrl_mj.errors import BadInput, brief
 from hyrl_mj.plant import Plant
+from hyrl_mj.trust import current_folder
 
 # Packages that offer environments, with the extra that brings each.
-PACKAGES = {"gymnasium_robotics": "robotics", "ogbench": "robotics", "shimmy": "dm_control"}
+PACKAGES = {"gymnasium_robotics": "robotics", "ogbench": "robotics", "shimmy": "dm-control"}
 # Wrappers that count or check, and change nothing of what an environment does.
 PEELED = (
     "TimeLimit",
@@ -117,7 +118,8 @@ def made(source: Source) -> Made:
     if isinstance(source.make, str):
         _register(source.make)
         try:
-            env: Any = gym.make(source.make, disable_env_checker=True, **source.kwargs)
+            with current_folder():  # of the module in an id as "my_module:Puck-v0"
+                env: Any = gym.make(source.make, disable_env_checker=True, **source.kwargs)
         except Exception as error:  # whatever a foreign constructor raises
             raise BadInput(_why_not_made(source.make, error)) from error
     else:
@@ -183,7 +185,7 @@ def _why_not_made(name: str, error: Exception) -> str:
         missing = {e: m for m, e in PACKAGES.items() if importlib.util.find_spec(m) is None}
         own = name.rpartition(":")[2]
         namespace = own.partition("/")[0] if "/" in own else None
-        known = {spec.namespace for spec in gym.registry.values()} | set(missing)
+        known = {spec.namespace for spec in gym.registry.values()} | {"dm_control"}
         if namespace and namespace not in known:
             return (
                 f"nothing that is installed has environments {namespace}/...: install their package, and "

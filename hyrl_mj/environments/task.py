@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -45,6 +46,8 @@ CHART, RESET = "chart", "reset"
 COMPARED, STEPS_COMPARED, HELD, SAME = 48, 60, 12, 1e-9
 # A joint turns in the plane of the floor if its axis is as upright as this, as a cosine.
 UPRIGHT = 0.9
+# How much a free camera shows, as a share of the extent of a model.
+SEEN = 1.2
 # A run that turns by less than this decides nothing [rad].
 DECIDED = 0.5
 
@@ -111,10 +114,12 @@ class EnvironmentTask(Task):
         else:
             proposed = [f"qpos[{i}]" for i in range(min(self.host.model.nq, 2))]
         found = coordinates(self.host, proposed)
-        names = ", ".join(c.described() for c in found)
-        self.found["chart"] = (
-            f"{proposed} ({names}); others are {', '.join(all_names(self.host)[:12])}"
+        names = [c.described() for c in found]
+        chosen = (
+            f"{proposed} ({', '.join(names)})" if isinstance(proposed, str) else ", ".join(names)
         )
+        others = [name for name in all_names(self.host) if name not in (*names, proposed)]
+        self.found["chart"] = f"{chosen}; others are {', '.join(others[:12])}"
         return found
 
     def _limits(self) -> tuple[np.ndarray, np.ndarray]:
@@ -127,30 +132,39 @@ class EnvironmentTask(Task):
 
     def _success(self, success: str | None) -> Success:
         if success is None:
-            if not self.host.tells_success:
+            if self.host.success_key is None:
                 raise BadInput(
                     f"{self.name} does not tell in its info when it succeeds: say so with success, as {FORMS}"
                 )
             success = INFO
-            self.found["success"] = 'info["success"]; or give ' + FORMS
+            self.found["success"] = f'info["{self.host.success_key}"]; or give {FORMS}'
         return success_of(self.host, success)
 
     def _check_goal(self, resets: np.ndarray, moved: np.ndarray) -> None:
         """Raises `BadInput` if resets draw a goal that nothing pins."""
         source = self.host.source
         names = drawn_goals(self.host, resets, moved)
+        for c in self._coordinates:
+            if (pinned := f"{c.kind}[{c.index}]") in source.pinned:
+                raise BadInput(
+                    f"{pinned} is the coordinate {c.name} of the chart, where runs begin anywhere: leave "
+                    "it out of what is pinned, or name another chart"
+                )
+        if source.reset and not heeds_options(self.host):
+            draws = f", which draws {', '.join(names)}" if names else ""
+            raise BadInput(
+                f"the options of reset {dict(source.reset)} change nothing in {self.name}{draws}: name the "
+                "options as its reset does"
+            )
         if not names:
             return
         if not source.pins:
+            how = 'with options of reset as {"reset": {"goal_cell": [6, 6]}}'
+            if positions := {name: 0.1 for name in names if name.startswith("qpos[")}:
+                how = f"with values as {json.dumps({'pinned': positions})}"
             raise BadInput(
                 f"each reset of {self.name} draws {', '.join(names)}, and what is to be done depends on it: "
-                'pin it, with options of reset as {"reset": {"goal_cell": [6, 6]}}, with values as '
-                '{"pinned": {"qpos[2]": 0.1}}, or as the reset with a seed draws it as {"seed": 0}'
-            )
-        if source.reset and not heeds_options(self.host):
-            raise BadInput(
-                f"the options of reset {dict(source.reset)} change nothing in {self.name}, which draws "
-                f"{', '.join(names)}: name the options as its reset does"
+                f'pin it, {how}, or as the reset with a seed draws it as {{"seed": 0}}'
             )
         given = f" and {dict(source.reset)}" if source.reset else ""
         pinned = f", with {dict(source.pinned)}" if source.pinned else ""
@@ -240,6 +254,8 @@ class EnvironmentTask(Task):
         )
 
     def _set_scene(self, tracked: str) -> None:
+        if self._in_plane:
+            self._widen_view()
         starts = self.starts(5, np.random.default_rng(0))
         ways: tuple[str, ...] = ()
         if self._islands:
@@ -249,17 +265,28 @@ class EnvironmentTask(Task):
             self.found["ways"] = f"{self.chart.names[turning]} turns one way or the other"
         else:
             raise BadInput(
-                f"{self.name} has no walls that can be passed on both sides, and no joint of the chart turns "
-                f"freely ({', '.join(self.chart.names)}): name a chart with a decision"
+                f"nothing is decided on the chart {', '.join(self.chart.names)} of {self.name}, which has no "
+                "walls that can be passed on both sides and no joint that turns freely: name another chart, "
+                "if there is a decision elsewhere"
             )
         self.scene = Scene(
             starts=tuple(map(tuple, starts.tolist())),
             time=min(self.max_steps * self.dt, 20.0),
             mode_names=ways,
+            title=self.name,
             camera=self._camera(),
             tracked=tracked or "tracked",
         )
         self.found["camera"] = f"{self.scene.camera}, with the path of {self.scene.tracked}"
+
+    def _widen_view(self) -> None:
+        """Lets the free cameras see all of a chart in the plane."""
+        shown = self.model.stat
+        low, high = np.array(self.chart.low[:2]), np.array(self.chart.high[:2])
+        reach = shown.extent * SEEN / 2
+        low = np.minimum(low, shown.center[:2] - reach)
+        high = np.maximum(high, shown.center[:2] + reach)
+        shown.center[:2], shown.extent = (low + high) / 2, (high - low).max() / SEEN
 
     def _camera(self) -> str:
         """Returns the camera of replays: from above on a plane, else the model's first, or the free one."""

@@ -100,13 +100,11 @@ def sb3_class(name: str) -> type[BaseAlgorithm]:
     module, _, attribute = name.rpartition(":")
     if name in ALGORITHMS:
         module, attribute = "stable_baselines3", name.upper()
-    sys.path.insert(0, "")
     try:
-        algorithm: type[BaseAlgorithm] = getattr(importlib.import_module(module), attribute)
+        with trust.current_folder():
+            algorithm: type[BaseAlgorithm] = getattr(importlib.import_module(module), attribute)
     except (Exception, SystemExit) as error:  # a foreign module can raise anything
         raise BadInput(f"the algorithm {name} cannot be imported: {brief(error)}") from error
-    finally:
-        sys.path.remove("")
     kinds = (OnPolicyAlgorithm, OffPolicyAlgorithm)
     if not (isinstance(algorithm, type) and issubclass(algorithm, kinds)):
         raise BadInput(

@@ -65,8 +65,8 @@ class Agent:
 
     @property
     def title(self) -> str:
-        """Its kind for display: "DQN", "ONNX" or "FUNCTION"."""
-        return algorithms.title(self.algorithm)
+        """Its kind for display: "DQN", "ONNX" or "function"."""
+        return FUNCTION if self.algorithm == FUNCTION else algorithms.title(self.algorithm)
 
     @property
     def options(self) -> list[str]:

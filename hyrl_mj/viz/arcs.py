@@ -206,9 +206,13 @@ def replay_floor(run: Run, overlap: bool = True) -> Floors:
 def overview_arcs(task: Task, policy: Policy) -> list[HybridArc]:
     """Simulates a policy without noise, from starts along the longest side of the start region.
 
-    The other coordinates of the starts are at their lower end. The task may be a section's.
+    The other coordinates of the starts are at their lower end. Where the start region is a whole chart of
+    several dimensions, the starts are drawn. The task may be a section's.
     """
     low, high = np.array(task.start_low), np.array(task.start_high)
+    if task.chart.dimension > 1 and np.allclose([low, high], [task.chart.low, task.chart.high]):
+        drawn = task.starts(2 * OVERVIEW_RUNS, np.random.default_rng(0))
+        return simulate_batch(task, policy, drawn, horizon=task.scene.time)
     starts, axis = np.tile(low, (OVERVIEW_RUNS, 1)), int(np.argmax(high - low))
     shares = (np.arange(OVERVIEW_RUNS) + 0.5) / OVERVIEW_RUNS
     starts[:, axis] = low[axis] + shares * (high - low)[axis]
