@@ -11,6 +11,7 @@ from hyrl_mj.game import LIMIT, NEARLY, AttackCount, EpisodeCount, GameResult, R
 from hyrl_mj.run_directory import Run
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
+from hyrl_mj.verdict import NO_NOISE
 
 # No table is wider [columns].
 WIDEST = 10_000
@@ -161,7 +162,8 @@ def episode_table(task: Task, counts: Sequence[EpisodeCount]) -> Table:
     for c in counts:
         (low, high), (_, unit) = c.interval, task.noise_on(c.everywhere)
         outcomes = ", ".join(f"{k.replace('_', ' ')} {v:,}" for k, v in c.outcomes.items())
-        row = [f"{c.noise} {c.eps:g} {unit}", NAMES[c.controller], c.region]
+        noise = c.noise if c.noise == NO_NOISE else f"{c.noise} {c.eps:g} {unit}"
+        row = [noise, NAMES[c.controller], c.region]
         row += [
             f"{c.episodes:,}",
             percent(c.reached, surely=False),
