@@ -27,6 +27,7 @@ from hyrl_mj.viz.replay.captions import Layout
 from hyrl_mj.viz.replay.marks import (
     BAD,
     CRITICAL,
+    CRITICAL_RADIUS,
     GOOD,
     MODE_COLOURS,
     OPEN,
@@ -323,6 +324,17 @@ def test_the_overlap_of_the_circle_is_around_its_critical_point(circle):
     lengths = np.linalg.norm(floor.strips[:, 0] - floor.strips[:, 1], axis=1)
     assert lengths.sum() == pytest.approx(0.8, abs=0.02)
     np.testing.assert_allclose(floor.critical[:, :2], [[-1, 0]], atol=1e-9)
+
+
+def test_of_discs_that_lie_on_each_other_one_is_drawn():
+    angles = np.linspace(0, 2 * np.pi, 2_000)
+    points = np.stack([0.5 * np.cos(angles), 0.5 * np.sin(angles), 0 * angles], axis=-1)
+    scene = mujoco.MjvScene(TASK.model, maxgeom=3_000)
+    Floor(points, np.empty((0, 2, 3)), np.empty(0)).draw(scene, 1.0)
+    drawn = np.array([geom.pos for geom in scene.geoms[: scene.ngeom]])
+    assert len(drawn) < 300
+    off = np.linalg.norm(points[:, None, :2] - drawn[None, :, :2], axis=2).min(axis=1)
+    assert off.max() < 2 * CRITICAL_RADIUS, "there is no gap"
 
 
 def test_the_set_of_one_mode_overlaps_with_nothing():

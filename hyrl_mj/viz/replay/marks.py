@@ -144,8 +144,11 @@ class Floor:
         for (start, end), width in zip(self.strips, self.widths, strict=True):
             # The strips are a little longer, so that no gap is seen where they turn.
             bar(scene, start, end, OVERLAP, width, ON_FLOOR, width / 50)
-        for point in self.critical:
-            disc(scene, point, larger * CRITICAL_RADIUS, ON_SETS, CRITICAL)
+        # Of discs that lie on each other one is drawn: hundreds take a while in each frame.
+        radius = larger * CRITICAL_RADIUS
+        first = np.unique(np.round(self.critical / radius), axis=0, return_index=True)[1]
+        for point in self.critical[first]:
+            disc(scene, point, radius, ON_SETS, CRITICAL)
 
 
 @dataclass(frozen=True)
