@@ -6,11 +6,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from hyrl_mj import pipeline
+from hyrl_mj import artifacts, pipeline
 from hyrl_mj.environments import EnvironmentOptions, chosen_task, explained
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.fields import DriveOptions, for_posts, read_field
 from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions, SweepOptions
+from hyrl_mj.policies.sb3_zip import REMEDY
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sweeps import DONE
 from hyrl_mj.tasks import Field, Task, get_task, task_names, write_task
@@ -85,18 +86,15 @@ def given_agent(
     command: str, task: str | None, policy: Path | None, environment: EnvironmentOptions
 ) -> tuple[Task, Path] | None:
     """Returns the task and the agent of a command; None if it only explains an environment."""
-    if policy is None and not environment.explain:
-        chosen_task(task, environment)  # what is wrong with it is said first
-        raise BadInput(f"{command} needs --policy: the agent, a .zip, .onnx or .safetensors file")
-    if policy is not None and not policy.exists():  # before an environment is tried out
-        raise BadInput(
-            f"there is no file {policy}: give the agent, a .zip, .onnx or .safetensors file"
-        )
+    if policy is not None and not environment.explain:
+        with artifacts.reading(policy, REMEDY):
+            policy.stat()  # that it is there is known before an environment is tried out
     chosen = chosen_task(task, environment)
     if environment.explain:
         print(explained(chosen))
         return None
-    assert policy is not None
+    if policy is None:
+        raise BadInput(f"{command} needs --policy: the agent, a .zip, .onnx or .safetensors file")
     return chosen, policy
 
 
