@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from hyrl_mj import artifacts, pipeline
+from hyrl_mj import pipeline
 from hyrl_mj.environments import EnvironmentOptions, chosen_task, explained
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.fields import DriveOptions, for_posts, read_field
 from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions, SweepOptions
-from hyrl_mj.policies.sb3_zip import REMEDY
+from hyrl_mj.policies import check_agent_file
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sweeps import DONE
 from hyrl_mj.tasks import Field, Task, get_task, task_names, write_task
@@ -87,8 +87,7 @@ def given_agent(
 ) -> tuple[Task, Path] | None:
     """Returns the task and the agent of a command; None if it only explains an environment."""
     if policy is not None and not environment.explain:
-        with artifacts.reading(policy, REMEDY):
-            policy.stat()  # that it is there is known before an environment is tried out
+        check_agent_file(policy)  # said before an environment is tried out, which takes longer
     chosen = chosen_task(task, environment)
     if environment.explain:
         print(explained(chosen))

@@ -120,6 +120,12 @@ class ExternalAgent:
             normalization.save(path / STATISTICS)
 
 
+def check_agent_file(path: Path) -> None:
+    """Raises BadArtifact if there is no file at the path of an agent."""
+    with artifacts.reading(path, REMEDY):
+        path.stat()
+
+
 def load_agent(
     path: str | Path,
     task: Task,
