@@ -141,6 +141,8 @@ _SMOKE_MODES = 8_192
 # the sets; fewer for plants with dynamics, whose samples are slower to simulate.
 _GRIDS = {1: (120, 2880), 2: (120, 240), 3: (24, 48), 4: (11, 13)}
 _GRIDS_DYNAMIC = {1: (120, 720), 2: (40, 96), 3: (16, 30), 4: (8, 11)}
+# Where runs from many nodes take too long: length of the last rods, as a share of the first.
+_RESOLUTION_COARSE = 1 / 8
 # In three dimensions these have as many more cells for the sets as the noise needs, up to so many; most of
 # their nodes are not simulated.
 _MOST_CELLS = 88
@@ -178,6 +180,7 @@ def preset(
     stage1 = agent or _stage1(task, name, algorithm or task.learning.algorithm)
     stage6 = _stage6(task, name, stage1.algorithm)
     dimension = task.chart.dimension
+    resolution = Settings.resolution
     rods, cells = (_GRIDS if task.kinematic else _GRIDS_DYNAMIC)[min(dimension, 4)]
     if task.kinematic and dimension == 2:
         cells = aligned_cells(task, cells)
@@ -185,6 +188,7 @@ def preset(
         cells = enough_cells(task.chart, task.noise_in_chart(noise), cells, _MOST_CELLS)
     if (most := task.learning.cells) is not None:
         rods, cells = min(rods, most), min(cells, most)
+        resolution = _RESOLUTION_COARSE
     settings = Settings(
         task=reference(task),
         preset=name,
@@ -197,6 +201,7 @@ def preset(
         # Rods miss a part of M* if the agent goes straight on for some samples before it picks a way.
         search="outcome" if agent else task.learning.search,
         rods=rods,
+        resolution=resolution,
         lattice=(_LATTICE_SMOKE if name == "smoke" else LATTICE).get(dimension, 0)
         if dimension < 3 or Lattice.possible(task)
         else 0,

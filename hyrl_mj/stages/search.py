@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from hyrl_mj.policies import Policy, PolicyController
-from hyrl_mj.simulation import Sample, Signal, WayRuns, closed_loop, policy_runs, way_runs
+from hyrl_mj.simulation import Rollout, Sample, Signal, WayRuns, closed_loop, way_runs
 from hyrl_mj.stages.ways import Ways
 from hyrl_mj.tasks import Outcome, Task
 
@@ -33,7 +35,8 @@ def critical_points(
         neighbours: (k,), (k,) indices of starts that lie next to each other.
         cell: the usual distance between two neighbours, in scaled units.
     """
-    runs = WayRuns.of(task, way_runs(task, policy, nodes, label="critical set"))
+    rollout = way_runs(task, policy, nodes, label="critical set")
+    runs, paths = WayRuns.of(task, rollout), _paths(task, rollout)
     ways = Ways.of(task, runs, neighbours)
     works = ways.works(runs)
     if not works.any():
@@ -46,10 +49,9 @@ def critical_points(
     # Between two nodes that work, failures end up to an edge of the grid before each of them.
     near = np.linalg.norm(gap / task.chart.scale, axis=1) <= (wedge + 2 * longest) * (1 + 1e-9)
     first, second, gap = first[near], second[near], gap[near]
-    a, b = nodes[first], nodes[first] + gap
-    return _bisected(
-        task, policy, ways, a, b, runs[first], runs[second], resolution * cell, wedge, cell
-    )
+    a = _Side(nodes[first], runs[first], paths[first])
+    b = _Side(nodes[first] + gap, runs[second], paths[second])
+    return _bisected(task, policy, ways, a, b, resolution * cell, wedge, cell)
 
 
 def _gap(task: Task, nodes: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -82,14 +84,47 @@ def _across(
     return first, second
 
 
+@dataclass
+class _Side:
+    """One side of pairs of starts.
+
+    Attributes:
+        z: (n, d) the starts.
+        runs: the ways of the runs from them.
+        paths: (n,) the paths of these runs, of `_paths`.
+    """
+
+    z: np.ndarray
+    runs: WayRuns
+    paths: np.ndarray
+
+    def move(self, rows: np.ndarray, other: _Side) -> None:
+        """Puts others (k,) in the rows (k,)."""
+        self.z[rows], self.paths[rows] = other.z, other.paths
+        self.runs = self.runs.with_rows(rows, other.runs)
+
+    def __getitem__(self, rows: np.ndarray) -> _Side:
+        return _Side(self.z[rows], self.runs[rows], self.paths[rows])
+
+
+def _paths(task: Task, rollout: Rollout) -> np.ndarray:
+    """Returns the paths of n runs: (n,) of arrays (samples + 1, d), each up to the end of its run.
+
+    They are asked for only where a task gives directions; elsewhere they are None.
+    """
+    paths = np.full(len(rollout.length), None, dtype=object)
+    if task.gives_direction:
+        for i, samples in enumerate(rollout.length):
+            paths[i] = rollout.path[: samples + 1, i].copy()
+    return paths
+
+
 def _bisected(
     task: Task,
     policy: Policy,
     ways: Ways,
-    a: np.ndarray,
-    b: np.ndarray,
-    at_a: WayRuns,
-    at_b: WayRuns,
+    a: _Side,
+    b: _Side,
     resolution: float,
     wedge: float,
     cell: float,
@@ -97,49 +132,46 @@ def _bisected(
     """Returns the middles (N, d) of pairs of starts a, b (n, d), bisected until only failures lie between.
 
     Args:
-        at_a, at_b: the runs from a and b, which go different ways.
+        a, b: starts from which runs go different ways.
         resolution: the least distance from a way to what lies beside it.
         wedge: the greatest width of the failures.
         task, policy, ways, cell: as in `critical_points`.
     """
     # Failures are known between c and d; without any, c is b and d is a.
-    c, d, known = b.copy(), a.copy(), np.zeros(len(a), dtype=bool)
+    c, d, known = b.z.copy(), a.z.copy(), np.zeros(len(a.z), dtype=bool)
     resolution *= 1 + 1e-9
     finished = 0
     while finished < 2:  # one after the other, both sides
-        left = np.flatnonzero(np.linalg.norm((c - a) / task.chart.scale, axis=1) > resolution)
+        left = np.flatnonzero(np.linalg.norm((c - a.z) / task.chart.scale, axis=1) > resolution)
         finished = 0 if len(left) else finished + 1
         if len(left):
-            middle = (a[left] + c[left]) / 2
-            runs = WayRuns.of(task, way_runs(task, policy, middle))
-            works = ways.works(runs)
-            same = works & ~runs.differ(at_a[left])
+            middle = (a.z[left] + c[left]) / 2
+            rollout = way_runs(task, policy, middle)
+            found = _Side(middle, WayRuns.of(task, rollout), _paths(task, rollout))
+            works = ways.works(found.runs)
+            same = works & ~found.runs.differ(a.runs[left])
             other = works & ~same
             fails = left[~works]
             d[fails] = np.where(known[fails, None], d[fails], middle[~works])
             c[fails], known[fails] = middle[~works], True
-            a[left[same]], b[left[other]] = middle[same], middle[other]
+            a.move(left[same], found[same])
+            b.move(left[other], found[other])
             c[left[other]], known[left[other]] = middle[other], False
-            at_a, at_b = (
-                at_a.with_rows(left[same], runs[same]),
-                at_b.with_rows(left[other], runs[other]),
-            )
             # Without failures in between, c is b and d is a.
-            d[left] = np.where(known[left, None], d[left], a[left])
-        a, b, c, d, at_a, at_b = b, a, d, c, at_b, at_a
-    apart = at_a.differ(at_b) & (
-        np.linalg.norm((d - c) / task.chart.scale, axis=1) <= wedge * (1 + 1e-6)
-    )
+            d[left] = np.where(known[left, None], d[left], a.z[left])
+        a, b, c, d = b, a, d, c
     failures = np.linalg.norm((d - c) / task.chart.scale, axis=1)
+    apart = a.runs.differ(b.runs) & (failures <= wedge * (1 + 1e-6))
     wide = np.flatnonzero(apart & known & (failures > resolution))
     if len(wide):
         # Where no measurement within the wedge helps any more, there is nothing left to decide.
-        middle, noisy = (a[wide] + b[wide]) / 2, task.noise_in_chart(1.0) > 0
-        ends = (_arrives(task, policy, middle, noisy * (z[wide] - middle)) for z in (a, b))
+        middle, noisy = (a.z[wide] + b.z[wide]) / 2, task.noise_in_chart(1.0) > 0
+        ends = (_arrives(task, policy, middle, noisy * (z[wide] - middle)) for z in (a.z, b.z))
         apart[wide] = np.logical_or(*ends)
     if task.gives_direction:
-        apart &= _go_apart(task, policy, a, b, cell)
-    return ((a + b) / 2)[apart]
+        pairs = zip(a.paths, b.paths, strict=True)
+        apart &= np.array([_go_apart(task, *pair, cell) for pair in pairs], dtype=bool)
+    return ((a.z + b.z) / 2)[apart]
 
 
 def _arrives(task: Task, policy: Policy, z: np.ndarray, error: np.ndarray) -> np.ndarray:
@@ -162,19 +194,14 @@ class _Constant(Signal):
         return np.asarray(task.with_z(true, task.z(true) + self._error[now.rows]) - true)
 
 
-def _go_apart(task: Task, policy: Policy, a: np.ndarray, b: np.ndarray, far: float) -> np.ndarray:
-    """Returns whether runs from a and b (n, d) get farther apart than `far` while both last: (n,) bool.
+def _go_apart(task: Task, a: np.ndarray, b: np.ndarray, far: float) -> bool:
+    """Returns whether runs along paths a and b (samples + 1, d) get farther apart than `far` while both last.
 
     Two runs that crash into a pillar on either side of its middle do not go apart, and neither do two that
     chatter around the same point: the longest hop of each run in one sample does not count.
     """
-    n = len(a)
-    if not n:
-        return np.zeros(0, dtype=bool)
-    rollout = policy_runs(task, policy, np.vstack([a, b]))
-    moved = (rollout.path - rollout.path[0]) / task.chart.scale
-    apart = np.linalg.norm(moved[:, :n] - moved[:, n:], axis=2)
-    last = np.minimum(rollout.length[:n], rollout.length[n:])
-    apart[np.arange(len(apart))[:, None] > last] = 0.0
-    hop = np.linalg.norm(np.diff(moved, axis=0), axis=2).max(axis=0)
-    return np.asarray(apart.max(axis=0) > far + hop[:n] + hop[n:])
+    moved = [(path - path[0]) / task.chart.scale for path in (a, b)]
+    last = min(map(len, moved))
+    hops = (np.linalg.norm(np.diff(m, axis=0), axis=1).max(initial=0.0) for m in moved)
+    apart = np.linalg.norm(moved[0][:last] - moved[1][:last], axis=1)
+    return bool(apart.max() > far + sum(hops))

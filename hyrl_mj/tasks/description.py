@@ -84,7 +84,7 @@ class Learning:
         search: the search for the critical set, by "rods" or by "outcome"; see `find_critical_set`.
         horizon: the paper's horizon T of the backward propagation [s].
         cells: the most grid cells along the longest side of the chart, where runs from more would take too
-            long; None for no such limit.
+            long; the critical set is then found to a sixteenth of a cell. None for no such limit.
         training: fields of `Training` in which stage 1 with this algorithm differs from preset fast, as
             {"samples": 1_000_000, "hidden": (256, 256)}; preset smoke has its own number of samples.
         modes: the same of stage 6, which trains one policy for each mode, as {"gamma": 0.97}.
