@@ -166,6 +166,12 @@ def test_the_steps_of_a_trial_are_bounded(vehicle, monkeypatch):
     assert steps <= trial.STEPS
 
 
+def test_a_trial_of_a_slow_plant_has_fewer_episodes(vehicle, monkeypatch):
+    usual = trial._side_by_side(vehicle)
+    monkeypatch.setattr(type(vehicle), "slow", True)
+    assert trial.FEWEST <= trial._side_by_side(vehicle) < usual
+
+
 # ---- later, wherever a method is called
 
 

@@ -134,7 +134,7 @@ def test_a_run_without_a_critical_set_has_one_mode_and_leaves_nothing_of_two(cop
     assert_has_ended(again)
     assert "no critical set found" in again.stdout
     assert "extended set everything" in again.stdout
-    assert "of 5 of the paper's starts" in again.stdout
+    assert "of 5 of the scene's starts" in again.stdout
     assert hyrl_mj.load_run(copied).controller.modes == (0,)
     left = {p.name for p in [*copied.glob("mode_*"), *(copied / "arcs").iterdir()]}
     assert not {n for n in left if "critical" in n or "1." in n.replace("start1", "")}

@@ -189,6 +189,17 @@ def test_a_lattice_without_a_node_to_start_from_is_refused(vehicle, monkeypatch)
         Lattice.of(vehicle, Grid.with_cells(vehicle.chart, 4))
 
 
+def test_where_many_runs_take_too_long_there_are_fewer_and_the_bisection_is_coarser(
+    vehicle, monkeypatch
+):
+    usual = preset(vehicle)
+    assert usual.resolution == Settings.resolution
+    monkeypatch.setattr(vehicle, "learning", replace(vehicle.learning, cells=30))
+    coarse = preset(vehicle)
+    assert (coarse.rods, coarse.cells) == (30, 30) != (usual.rods, usual.cells)
+    assert Settings.resolution < coarse.resolution <= 1 / 8
+
+
 # ---- options of SB3
 
 

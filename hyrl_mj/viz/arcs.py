@@ -220,7 +220,7 @@ def overview_arcs(task: Task, policy: Policy) -> list[HybridArc]:
 
 
 def policy_start_arcs(task: Task, policy: Policy, eps: float, seed: int) -> list[HybridArc]:
-    """Simulates a policy from the paper's starts (Section III), under the paper's noise of bound `eps`.
+    """Simulates a policy from the scene's starts, under the paper's noise (Section III) of bound `eps`.
 
     The task may be a section's.
     """

@@ -131,7 +131,7 @@ def _numbers(
         numbers.append(Number("starts from which the attack breaks it", shares, note))
     if arrived:
         counts = [f"{count} of {total}" for count, total in arrived.values()]
-        note = f"the paper's starts, alternating noise {run.settings.noise:g}"
+        note = f"the scene's starts, alternating noise {run.settings.noise:g}"
         numbers.append(Number("replays that reach the set-point", counts, note))
     return numbers
 

@@ -85,9 +85,9 @@ def arrivals(run: Run, arcs: Arcs, policy: bool) -> tuple[int, int]:
 
 
 def replay_sentence(run: Run, arcs: Arcs) -> str:
-    """Returns from how many of the paper's starts the hybrid controller reaches the set-point."""
+    """Returns from how many of the scene's starts the hybrid controller reaches the set-point."""
     reached, total = arrivals(run, arcs, policy=False)
-    return f"HyRL reaches the set-point from {reached} of {total} of the paper's starts"
+    return f"HyRL reaches the set-point from {reached} of {total} of the scene's starts"
 
 
 # ---- robustness

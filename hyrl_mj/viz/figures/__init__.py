@@ -56,7 +56,7 @@ FIGURES = {
         draw_policy_map,
         ShownPolicy,
         "The input that the stage-1 policy gives at each measurement, with the critical set M* in red, "
-        "and its runs from the paper's starts under measurement noise.",
+        "and its runs from the scene's starts under measurement noise.",
     ),
     "extended_sets": Entry(
         draw_extended_sets,
@@ -79,7 +79,7 @@ FIGURES = {
     "runs": Entry(
         draw_runs,
         ShownRun,
-        "The hybrid controller and the stage-1 policy from the paper's starts under the same "
+        "The hybrid controller and the stage-1 policy from the scene's starts under the same "
         "measurement noise, for each start mode.",
         flat=False,
     ),

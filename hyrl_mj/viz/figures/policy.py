@@ -138,7 +138,7 @@ def _noisy_run(panel: Axes, shown: ShownPolicy, view: View) -> None:
 
 
 def draw_policy_map(shown: ShownPolicy, path: Path | None = None) -> Figure:
-    """Draws a map of each input of the policy, and the policy's runs from the paper's starts."""
+    """Draws a map of each input of the policy, and the policy's runs from the scene's starts."""
     task = shown.task
     charts.check_drawable(task)
     with style.drawing(path, 5.2, task, f"the {shown.algorithm} policy") as figure:
@@ -151,7 +151,7 @@ def draw_policy_map(shown: ShownPolicy, path: Path | None = None) -> Figure:
 
 
 def _paper_runs(panel: Axes, shown: ShownPolicy) -> None:
-    """Draws the runs from the paper's starts."""
+    """Draws the runs from the scene's starts."""
     task, first = shown.task, shown.paper[0]
     panel.set_title(style.noise_label(task, first.noise, first.bound).replace(", ", ",\n"))
     view = runs.make_view(panel, task)

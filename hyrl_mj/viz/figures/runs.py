@@ -154,7 +154,7 @@ def draw_runs(shown: ShownRun, path: Path | None = None) -> Figure:
 
     Of a chart with two coordinates the paths are shown in its plane, at most four beside each other; else
     each coordinate over time.
-    Only the paper's starts ("start0", ...) are drawn.
+    Only the scene's starts ("start0", ...) are drawn.
     """
     task, replays, policy_title = shown.whole, shown.replays, shown.policy_title
     loops = list(dict.fromkeys(who for _, who in replays if who != "policy"))

@@ -27,7 +27,7 @@ class ShownPolicy:
         partition: the parts M_i.
         noisy: a run under noise, from M* if there is one.
         noiseless: runs from starts all along the start region.
-        paper: runs from the paper's starts of the policy, under the paper's noise.
+        paper: runs from the scene's starts of the policy, under the paper's noise.
     """
 
     task: Task
