@@ -161,6 +161,11 @@ def test_around_a_jump_it_is_slower(tmp_path, show):
 
 
 @needs_gl
+@pytest.mark.parametrize(("seconds", "fps"), [(0.0, 30), (8.0, 30), (40.0, 15), (1_000.0, 10)])
+def test_long_runs_have_fewer_frames_a_second(seconds, fps):
+    assert ReplayOptions(size=SIZE).lasting(seconds) == ReplayOptions(size=SIZE, fps=fps)
+
+
 def test_a_gif_has_as_many_frames_and_a_picture_is_the_last(tmp_path, show):
     render_replay(TASK, [show], tmp_path / "replay.gif", ReplayOptions(size=SIZE, fps=FPS))
     with Image.open(tmp_path / "replay.gif") as film:

@@ -48,8 +48,6 @@ if TYPE_CHECKING:
 
 # The video with preset smoke only shows that a video can be made.
 SMOKE = ReplayOptions(size=(640, 360), fps=10)
-# The video of a run has about so many frames at most: long episodes have fewer a second.
-FRAMES, FEWEST = 600, 10
 
 
 def train_stage(run: Run, say: Say) -> None:
@@ -182,11 +180,9 @@ def replay_stage(run: Run, say: Say) -> None:
     from hyrl_mj.viz.arcs import replay_floor, replay_shows
     from hyrl_mj.viz.replay import render_replay
 
-    options, shows = ReplayOptions(), replay_shows(run)
-    seconds = sum(max(arc.t[-1] for arc in (*show.policy, *show.hybrid)) for show in shows)
-    # An arc that ends where it begins lasts no time.
-    fps = max(FEWEST, min(options.fps, int(FRAMES / max(seconds, 1.0))))
-    options = SMOKE if run.settings.preset == "smoke" else replace(options, fps=fps)
+    shows = replay_shows(run)
+    options = SMOKE if run.settings.preset == "smoke" else ReplayOptions()
+    options = options.lasting(sum(show.seconds for show in shows))
     try:
         render_replay(run.task, shows, run.path / "replay.mp4", options, floor=replay_floor(run))
         say(f"video at {run.path / 'replay.mp4'}")

@@ -89,7 +89,8 @@ def write_worst(run: Run, arc: HybridArc | None, say: Callable[[str], None]) -> 
     try:
         floor = replay_floor(run, overlap=False)
         show = Show([arc], title=run.policy_title)
-        render_replay(run.task, [show], path.with_suffix(".mp4"), REPLAY, floor=floor)
+        options = REPLAY.lasting(show.seconds)
+        render_replay(run.task, [show], path.with_suffix(".mp4"), options, floor=floor)
     except NoRenderer as error:
         say(f"no video: {error}")
 

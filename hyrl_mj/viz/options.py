@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+# A video of a run has about so many frames at most: long episodes have fewer a second, down to so many.
+FRAMES, SLOWEST = 600, 10
 
 
 @dataclass(frozen=True)
@@ -22,3 +25,8 @@ class ReplayOptions:
     size: tuple[int, int] = (1280, 720)
     fps: int = 30
     slow_motion: float = 1.0
+
+    def lasting(self, seconds: float) -> ReplayOptions:
+        """Returns these options with at most as many frames per second as a video of so many seconds may have."""
+        # An arc that ends where it begins lasts no time.
+        return replace(self, fps=max(SLOWEST, min(self.fps, int(FRAMES / max(seconds, 1.0)))))

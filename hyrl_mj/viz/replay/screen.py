@@ -42,6 +42,11 @@ class Show:
     title: str = "RL policy"
     modes: Sequence[int] = (0, 1)
 
+    @property
+    def seconds(self) -> float:
+        """How long its longest arc lasts [s]."""
+        return float(max(arc.t[-1] for arc in (*self.policy, *self.hybrid)))
+
 
 class Screen:
     """A show, laid out in panels with captions.
