@@ -27,6 +27,6 @@ class ReplayOptions:
     slow_motion: float = 1.0
 
     def lasting(self, seconds: float) -> ReplayOptions:
-        """Returns these options with at most as many frames per second as a video of so many seconds may have."""
+        """Returns these options with no more frames per second than so many seconds [s] may have."""
         # An arc that ends where it begins lasts no time.
         return replace(self, fps=max(SLOWEST, min(self.fps, int(FRAMES / max(seconds, 1.0)))))
