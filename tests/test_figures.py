@@ -428,10 +428,23 @@ def test_an_obstacle_of_any_shape_is_drawn_where_runs_end():
     assert inside(over, *at) == [True, False, True, False, False]
 
 
-def test_a_path_round_a_period_is_broken_at_the_seam():
-    class Torus(type(VEHICLE)):
-        chart = hyrl_mj.Chart(("a", "b"), ("rad",) * 2, (0.0,) * 2, (2 * np.pi,) * 2, (True, False))
+class Torus(type(VEHICLE)):
+    """A plane whose first coordinate has a period."""
 
+    chart = hyrl_mj.Chart(("a", "b"), ("rad",) * 2, (0.0,) * 2, (2 * np.pi,) * 2, (True, False))
+
+
+def test_a_set_reaches_to_the_end_of_a_period():
+    grid = Grid.with_cells(Torus.chart, 20)
+    begins, ends = grid.nodes[:, 0] < 1, grid.nodes[:, 0] > 5
+    with style.style.context("default"):
+        panel = Figure().subplots()
+        charts.region(panel, GridSet.from_mask(grid, begins | ends), style.GREY)
+    over = filled(panel, style.GREY)
+    assert inside(over, (0.1, 3.0), (3.0, 3.0), (6.2, 3.0)) == [True, False, True]
+
+
+def test_a_path_round_a_period_is_broken_at_the_seam():
     z = np.stack([np.linspace(5, 8, 31), np.full(31, 1.0)], axis=1)
     with style.style.context("default"):
         panel = Figure().subplots()

@@ -87,9 +87,8 @@ class Crew:
         process = multiprocessing.current_process()
         if "fork" not in multiprocessing.get_all_start_methods() or process.daemon:
             return False
-        if (
-            self._owner != os.getpid()
-        ):  # those of a process that this one was forked from are not ours
+        if self._owner != os.getpid():
+            # Those of a process that this one was forked from are not ours.
             self._owner, self._hands = os.getpid(), []
         context = multiprocessing.get_context("fork")
         while len(self._hands) < count - 1:

@@ -76,12 +76,17 @@ def plane(panel: Axes, task: Task) -> None:
 def region(panel: Axes, members: GridSet, face: str, edge: str | None = None, **looks: Any) -> None:
     """Fills a set in a plane, and draws its outline if that has a colour."""
     grid, inside = members.regular, members.mask
-    x, y = grid.nodes.reshape(*grid.counts, 2).transpose(2, 1, 0)
-    values = members.values.reshape(grid.counts).T
+    # The end of a period is no node: there the values are those of its beginning.
+    ends = [(0, int(wraps)) for wraps in grid.chart.periodic]
+    values = np.pad(members.values.reshape(grid.counts), ends, mode="wrap")
+    x, y = (
+        low + step * np.arange(count)
+        for low, step, count in zip(grid.chart.low, grid.spacing, values.shape, strict=True)
+    )
     if inside.any():
-        panel.contourf(x, y, values, [values.min() - 1, 0], colors=[face], **looks)
+        panel.contourf(x, y, values.T, [values.min() - 1, 0], colors=[face], **looks)
     if edge and inside.any() and not inside.all():
-        panel.contour(x, y, values, [0], colors=[edge], linewidths=1.2, **looks)
+        panel.contour(x, y, values.T, [0], colors=[edge], linewidths=1.2, **looks)
 
 
 def image(panel: Axes, grid: Grid, values: np.ndarray, **looks: Any) -> None:
