@@ -29,7 +29,7 @@ from gl import needs_gl
 from gymnasium.wrappers import TimeLimit
 
 import hyrl_mj
-from hyrl_mj import BadInput, cores, from_gymnasium
+from hyrl_mj import BadInput, Outcome, cores, from_gymnasium
 from hyrl_mj.environments import making
 from hyrl_mj.environments.crew import Crew
 from hyrl_mj.learning import presets
@@ -85,7 +85,7 @@ def test_copies_go_on_as_the_environment_alone_does(name):
             np.testing.assert_allclose(host.step(u[i])[0], seen[k][i], rtol=0, atol=1e-9)
 
 
-def test_what_an_environment_notes_at_the_end_of_an_episode_concerns_one_copy():
+def test_an_environment_that_counts_its_steps_ends_the_episode_of_each_copy():
     # After its last step dm_control resets the environment in the next step, whoever's it is.
     task = from_gymnasium("dm_control/pendulum-swingup-v0", success="reward >= 1")
     three, alone = task.plant(3), task.plant(1)
@@ -94,6 +94,12 @@ def test_what_an_environment_notes_at_the_end_of_an_episode_concerns_one_copy():
         for _ in range(task.max_steps):
             plant.step(np.zeros((plant.n, 1)))
     np.testing.assert_array_equal(three.qpos[1], alone.qpos[0])
+    # It counts its steps itself. What succeeds at the last of them has arrived: the first stands upright.
+    assert task.ending(three.measurement).tolist() == [
+        Outcome.REACHED,
+        Outcome.STALLED,
+        Outcome.STALLED,
+    ]
 
 
 @pytest.mark.slow

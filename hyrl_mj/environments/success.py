@@ -47,7 +47,9 @@ class Success:
         ended = np.where(report.terminated, Outcome.CRASHED, Outcome.RUNNING)
         if self.text == TERMINATED:
             return np.where(holds, Outcome.REACHED, Outcome.RUNNING)
-        ended = np.where(report.truncated & ~report.terminated, Outcome.STALLED, ended)
+        # Some environments count their steps themselves, as dm_control's do.
+        at_end = np.where(holds, Outcome.REACHED, Outcome.STALLED)
+        ended = np.where(report.truncated & ~report.terminated, at_end, ended)
         return np.where(holds & self.ends, Outcome.REACHED, ended)
 
 
