@@ -147,7 +147,12 @@ class Manifest:
             stage = next((s for s, names in FILES.items() if re.fullmatch(names, name)), None)
             if stage is None:
                 raise BadArtifact(f"{path} is no file that a run writes, so nothing vouches for it")
-            raise BadArtifact(f"{path} {doubt}: {_remedy(stage, self.folder)}")
+            remedy = _remedy(stage, self.folder)
+            if "diagnose" in entries and "extended-sets" not in entries:
+                remedy = (
+                    "the run is a diagnosis, go on with hyrl-mj robustify and the same arguments"
+                )
+            raise BadArtifact(f"{path} {doubt}: {remedy}")
         self._note(name, self._current(entries)[name])
         return path
 

@@ -189,6 +189,15 @@ class Teleporting(Puck):
         return result
 
 
+class Moved(Puck):
+    """Each reset puts the rock elsewhere, in the model itself."""
+
+    def reset(self, *, seed=None, options=None):
+        gym.Env.reset(self, seed=seed)
+        self.model.geom_pos[0, 1] = self.np_random.uniform(-0.3, 0.3)
+        return super().reset(seed=seed)
+
+
 class Grid(Puck):
     """What it observes is one array of two rows."""
 

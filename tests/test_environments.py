@@ -1,5 +1,6 @@
 """Environments of others as tasks: plant, noise, what is found out about them, and what is refused."""
 
+import importlib
 import json
 import os
 import pickle
@@ -17,6 +18,7 @@ from environments import (
     Floating,
     Grid,
     Growing,
+    Moved,
     Noisy,
     Puck,
     Secret,
@@ -354,7 +356,11 @@ class Rebuilding(Puck):
 REFUSED = {
     "late": (Late, "Late cannot be reset .RuntimeError: no file"),
     "rebuilding": (Rebuilding, "reset.. of Rebuilding builds another model"),
-    "hidden": (lambda: Secret(Puck()), "goes on differently from the same state"),
+    "hidden": (
+        lambda: Secret(Puck()),
+        "goes on differently from the same state.*something in scale or elsewhere",
+    ),
+    "an obstacle that is drawn": (Moved, r"draws geom_pos of its model.*pin it"),
     "growing": (lambda: Growing(Puck()), r"remembers something in actions .*cannot be copied"),
     "random": (lambda: Noisy(Puck()), r"draws random numbers in step\(\)"),
     "image": (lambda: Seen(Puck()), r"observes images \(8, 8, 3\).*vectors"),
@@ -453,6 +459,27 @@ def test_what_resets_draw_is_pinned_by_options_that_they_heed_or_by_a_seed():
         assert f"with seed {seed}" in task.found["goal"]
         np.testing.assert_array_equal(task.host.env.unwrapped.goal, reset_goal(seed))
     assert (reset_goal(0) != reset_goal(3)).any()
+
+
+def test_an_obstacle_that_resets_draw_is_pinned_by_a_seed():
+    places = {seed: from_gymnasium(Moved, seed=seed).model.geom_pos[0, 1] for seed in (0, 3)}
+    env = Moved()
+    for seed, place in places.items():
+        env.reset(seed=seed)
+        assert place == env.model.geom_pos[0, 1]
+    assert places[0] != places[3]
+
+
+def test_the_code_of_an_environment_is_that_of_its_files(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    path = tmp_path / "my_puck.py"
+    path.write_text("from environments import Puck\nclass Mine(Puck):\n    push = 1\n")
+    mine = importlib.import_module("my_puck").Mine
+    codes = [from_gymnasium(Puck).code, from_gymnasium(mine).code, from_gymnasium(mine).code]
+    path.write_text(path.read_text().replace("1", "2"))
+    codes.append(from_gymnasium(mine).code)
+    assert codes[1] == codes[2]
+    assert len({*codes}) == 3
 
 
 def test_a_free_joint_has_places_that_a_chart_may_name_but_no_orientation():

@@ -59,6 +59,15 @@ def test_a_damaged_file_is_named_with_its_stage(harm, sentence, folder):
         Manifest(folder, SETTINGS).checked(folder / "critical_set.npz")
 
 
+def test_who_asks_a_diagnosis_for_more_is_told_how_to_go_on(folder):
+    write(folder, "diagnose", "diagnosis.html", "d", "partition.npz")
+    with pytest.raises(BadArtifact, match=r"extended_sets.npz is missing.*hyrl-mj robustify"):
+        Manifest(folder, SETTINGS).checked(folder / "extended_sets.npz")
+    write(folder, "extended-sets", "extended_sets.npz", "e", "partition.npz")
+    with pytest.raises(BadArtifact, match=r"replay.mp4 is missing.*hyrl-mj replay"):
+        Manifest(folder, SETTINGS).checked(folder / "replay.mp4")
+
+
 def test_another_input_makes_all_that_follows_out_of_date(folder):
     write(folder, "train", "policy.json", "other")
     assert done(folder) == ["train"]

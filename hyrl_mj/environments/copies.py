@@ -18,6 +18,7 @@ from hyrl_mj.environments.memory import (
     Slot,
     changing,
     generators,
+    hiding,
     name_of,
     remembered,
     state_of_generator,
@@ -319,10 +320,11 @@ class Host:
             return
         self._forward = True
         if not self._replays():
+            places = " or ".join((*hiding(self.env), "elsewhere"))
             raise BadInput(
                 f"step() of {self.name} goes on differently from the same state of MuJoCo and the same "
-                "attributes: it remembers something elsewhere, or it draws random numbers; leave out the "
-                "wrapper that does so"
+                f"attributes: it remembers something in {places}, or it draws random numbers; leave that "
+                "out, or keep it in attributes that are numbers or arrays"
             )
 
     def _end_episode(self, rng: np.random.Generator) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from types import FunctionType, MethodType, ModuleType
+from types import FunctionType, GeneratorType, MethodType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -81,6 +81,20 @@ def state_of_generator(root: Any, path: Path) -> bytes | None:
     """Returns the state of the generator at a path, to compare it; None if there is none now."""
     value = _get(*_place(root, path))
     return None if value is None else _Generator(value).content
+
+
+def hiding(env: Any) -> list[str]:
+    """Returns the attributes of an environment and its wrappers that may hold a memory that cannot be read.
+
+    These are generators, and functions with variables of their own.
+    """
+    found, layer = [], env
+    while layer is not None:
+        for name, value in vars(layer).items():
+            if isinstance(value, GeneratorType) or getattr(value, "__closure__", None):
+                found.append(name)
+        layer = vars(layer).get("env")  # of a wrapper
+    return found
 
 
 def name_of(path: Path) -> str:

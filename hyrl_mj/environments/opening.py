@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import inspect
 import io
 import pickle
 import random
 import traceback
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, redirect_stderr
+from contextlib import contextmanager, redirect_stderr, suppress
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
@@ -20,6 +21,7 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 
+from hyrl_mj import mujoco_log
 from hyrl_mj.errors import BadInput, brief
 from hyrl_mj.plant import Plant
 from hyrl_mj.trust import current_folder
@@ -115,6 +117,7 @@ def made(source: Source) -> Made:
     Raises:
         BadInput: it cannot be made, or it is none that can be used.
     """
+    mujoco_log.install()  # what MuJoCo warns of while it reads a model is not written to a file
     if isinstance(source.make, str):
         _register(source.make)
         try:
@@ -201,9 +204,9 @@ def _why_not_made(name: str, error: Exception) -> str:
             f"there is no environment {name!r}: give the id of one that is installed{near}{install}"
         )
     if isinstance(error, ImportError):
-        return (
-            f"the environment {name} takes a package that is missing ({brief(error)}): install it"
-        )
+        module = name.partition(":")[0] if ":" in name else ""
+        own = f", or give the command in the folder of {module}.py" if module else ""
+        return f"the environment {name} takes a package that is missing ({brief(error)}): install it{own}"
     origin = traceback.extract_tb(error.__traceback__)[-1]
     return (
         f"the environment {name} cannot be made ({brief(error)}, in {Path(origin.filename).name}, line "
@@ -252,6 +255,24 @@ def _check(env: Any, name: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
     ):
         raise BadInput(f"{name} takes actions without limits: wrap it in gymnasium's RescaleAction")
     return physics
+
+
+def sources_of(env: Any) -> list[bytes]:
+    """Returns the files of Python that define an environment, its wrappers, and a task of dm_control."""
+    layers = [env]
+    while isinstance(layers[-1], gym.Wrapper):
+        layers.append(layers[-1].env)
+    control = getattr(layers[-1], "_env", None)
+    kinds = [
+        kind
+        for part in (*layers, control, getattr(control, "task", None))
+        for kind in type(part).__mro__
+    ]
+    files = set()
+    for kind in kinds:
+        with suppress(TypeError, OSError):  # of a class that no file holds
+            files.add(Path(inspect.getfile(kind)))
+    return [path.read_bytes() for path in sorted(files) if path.is_file()]
 
 
 def _plant_of(env: Any) -> Plant | None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hyrl_mj import artifacts
-from hyrl_mj.environments.making import from_gymnasium
+from hyrl_mj.environments.making import MARK, from_gymnasium
 from hyrl_mj.environments.task import EnvironmentTask
 from hyrl_mj.errors import BadInput, brief, unknown
 from hyrl_mj.tasks import Task, get_task
@@ -65,9 +65,11 @@ def chosen_task(task: str | None, options: EnvironmentOptions) -> Task:
 
 
 def explained(task: Task) -> str:
-    """Returns what was found out about an environment, and how to change it."""
+    """Returns what was given and found out about an environment, and how to change it."""
     assert isinstance(task, EnvironmentTask)
     lines = [f"{task.name}: {task!r}"]
+    for name, value in json.loads(task.spec.removeprefix(MARK)).items():
+        lines.append(f"  {name}: {value if isinstance(value, str) else json.dumps(value)} (given)")
     for name, text in task.found.items():
         lines += [f"  {name}: {text}", f"    (to change it, give {_INSTEAD.get(name, name)})"]
     return "\n".join(lines)

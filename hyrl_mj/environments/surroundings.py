@@ -23,6 +23,12 @@ RESETS_COMPARED = 4
 RUNS, STEPS, HELD = 16, 150, 15
 # What is sampled beyond this many times as far is outside of the chart.
 ROOM = 1.2
+# What a reset may change in MuJoCo's model so that runs go on differently.
+MODEL = (
+    "body_pos", "body_quat", "body_mass", "body_inertia", "geom_pos", "geom_quat", "geom_size",
+    "geom_friction", "geom_contype", "geom_conaffinity", "dof_damping", "dof_armature", "dof_frictionloss",
+    "actuator_gear", "actuator_gainprm", "actuator_biasprm", "hfield_data",
+)  # fmt: skip
 # What goes no farther than this stands [m].
 STANDS = 1e-6
 
@@ -101,7 +107,7 @@ def starts_of(host: Host) -> np.ndarray:
 
 
 def drawn_goals(host: Host, resets: np.ndarray, moved: np.ndarray) -> list[str]:
-    """Returns the names of what resets draw and steps never change, though what is observed depends on it.
+    """Returns the names of what resets draw and steps never change, though what comes next depends on it.
 
     Args:
         host: the environment.
@@ -112,14 +118,21 @@ def drawn_goals(host: Host, resets: np.ndarray, moved: np.ndarray) -> list[str]:
     names = [f"qpos[{i}]" for i in np.flatnonzero(drawn & ~moved)]
     state, memory = host.base
     rng = np.random.default_rng(0)
-    u, told, attributes = host.drawn(rng), [], []
+    u, told, attributes, models = host.drawn(rng), [], [], []
     for seed in range(RESETS_COMPARED):
         host.reset(seed)
         attributes.append(remembered(host.env))
+        models.append({name: getattr(host.model, name).copy() for name in MODEL})
         host.write(state, memory)
         told.append(np.append(host.step(u)[0], host.step(u)[1:3]))
     host.reset(host.source.first)
     host.write(state, memory)
+    drawn_in_model = [
+        f"{name} of its model"
+        for name in MODEL
+        if any((other[name] != models[0][name]).any() for other in models)
+    ]
+    names += drawn_in_model
     if all(np.allclose(other, told[0], rtol=0, atol=1e-9, equal_nan=True) for other in told):
         return names
     slots = {slot.path for slot in host.slots}

@@ -25,6 +25,8 @@ PAGE, FOLDER = "diagnosis.html", "diagnosis"
 BUDGET = Budget(rounds=2, enough=1)  # of an attack
 LARGER = (1, 2, 4, 8)  # times the bound that attacks try
 ATTACKED, AGAIN = 48, 3  # starts that are attacked; every third of them is with larger noise
+# Where every episode is played to its end, attacked starts have about so many samples together.
+SAMPLES, FEWEST = 20_000, 16
 TRIED = 64  # lost starts that are simulated, the nearest to the middle of the replay starts first
 REPLAY = ReplayOptions(size=(960, 720))  # of the policy alone
 
@@ -53,7 +55,10 @@ def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
         game = Game(task, run.partition, {"policy": loop}, eps, grid=run.lattice_grid)
         noise = worst_signal(game, "policy", loop, z0, eps)
         return _first_lost(simulate_batch(task, loop, z0, noise))
-    starts = attack_starts(task, Regions(run.critical_set.points), eps, ATTACKED, run.settings.seed)
+    count = ATTACKED
+    if not task.arrival_ends:
+        count = int(np.clip(SAMPLES / task.max_steps, FEWEST, ATTACKED))
+    starts = attack_starts(task, Regions(run.critical_set.points), eps, count, run.settings.seed)
     for factor in LARGER:
         try:
             task.check_noise(factor * eps)
@@ -125,7 +130,8 @@ def sentences(
             results.append(f"{why}: noisy episodes stand in for the worst case")
         noisy = [count for count in robustness.episodes if count.noise != NO_NOISE]
         worst = min(noisy, key=lambda count: count.reached)
-        lost = f"{percent(1 - worst.reached)} of the episodes that start {worst.region}"
+        count = f"{worst.episodes - worst.outcomes.get('reached', 0)} of {worst.episodes:,}"
+        lost = f"{count} episodes that start {worst.region}"
         results.append(f"under {worst.noise} {noise} it loses {lost}")
     if arc is None:
         return [*results, f"no start was found that {noise} makes it lose"]
