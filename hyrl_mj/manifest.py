@@ -11,7 +11,7 @@ import os
 import re
 import stat
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -147,12 +147,7 @@ class Manifest:
             stage = next((s for s, names in FILES.items() if re.fullmatch(names, name)), None)
             if stage is None:
                 raise BadArtifact(f"{path} is no file that a run writes, so nothing vouches for it")
-            remedy = _remedy(stage, self.folder)
-            if "diagnose" in entries and "extended-sets" not in entries:
-                remedy = (
-                    "the run is a diagnosis, go on with hyrl-mj robustify and the same arguments"
-                )
-            raise BadArtifact(f"{path} {doubt}: {remedy}")
+            raise BadArtifact(f"{path} {doubt}: {_remedy(stage, self.folder, entries)}")
         self._note(name, self._current(entries)[name])
         return path
 
@@ -229,7 +224,10 @@ def _outputs(entries: Iterable[Entry]) -> dict[str, str]:
     return {name: content for entry in entries for name, content in entry.outputs.items()}
 
 
-def _remedy(stage: str, folder: Path) -> str:
+def _remedy(stage: str, folder: Path, done: Collection[str]) -> str:
+    """Returns how to make a file of a stage again, where the stages `done` were made."""
+    if "diagnose" in done and not {stage, "extended-sets"} & {*done}:
+        return "the run is a diagnosis, go on with hyrl-mj robustify and the same arguments"
     if stage == "simulate --start":
         return f"simulate it again with hyrl-mj simulate {folder} --start ..."
     resumed = "by giving the command again that made the run"

@@ -190,11 +190,12 @@ class Teleporting(Puck):
 
 
 class Moved(Puck):
-    """Each reset puts the rock elsewhere, in the model itself."""
+    """Each reset puts the rock elsewhere, in the model itself, unless its options say where."""
 
     def reset(self, *, seed=None, options=None):
         gym.Env.reset(self, seed=seed)
-        self.model.geom_pos[0, 1] = self.np_random.uniform(-0.3, 0.3)
+        drawn = self.np_random.uniform(-0.3, 0.3)
+        self.model.geom_pos[0, 1] = (options or {}).get("rock", drawn)
         return super().reset(seed=seed)
 
 

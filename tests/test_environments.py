@@ -468,17 +468,18 @@ def test_an_obstacle_that_resets_draw_is_pinned_by_a_seed():
         env.reset(seed=seed)
         assert place == env.model.geom_pos[0, 1]
     assert places[0] != places[3]
+    assert from_gymnasium(Moved, reset={"rock": 0.2}).model.geom_pos[0, 1] == 0.2
 
 
 def test_the_code_of_an_environment_is_that_of_its_files(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     path = tmp_path / "my_puck.py"
     path.write_text("from environments import Puck\nclass Mine(Puck):\n    push = 1\n")
-    mine = importlib.import_module("my_puck").Mine
-    codes = [from_gymnasium(Puck).code, from_gymnasium(mine).code, from_gymnasium(mine).code]
-    path.write_text(path.read_text().replace("1", "2"))
-    codes.append(from_gymnasium(mine).code)
-    assert codes[1] == codes[2]
+    module = importlib.import_module("my_puck")
+    codes = [from_gymnasium(Puck).code, from_gymnasium(module.Mine).code]
+    path.write_text(path.read_text() + "# changed\n")
+    assert from_gymnasium(module.Mine).code == codes[1], "it has not been imported again"
+    codes.append(from_gymnasium(importlib.reload(module).Mine).code)
     assert len({*codes}) == 3
 
 
@@ -524,6 +525,16 @@ def test_a_target_that_is_drawn_is_pinned_as_the_message_says():
     options = {**json.loads(advised), "success": OTHERS["Reacher-v5"]["success"]}
     task = from_gymnasium("Reacher-v5", chart="qpos[0]", **options)
     assert task.host.data.qpos[2] == pytest.approx(0.1)
+
+
+def test_what_mujoco_warns_of_while_it_reads_a_model_is_not_written_to_a_file(tmp_path):
+    words = ("-m", "hyrl_mj.cli", "run", "--env", "HalfCheetah-v5", "--success", "reward >= 1")
+    done = subprocess.run(
+        [sys.executable, *words], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert "nothing is decided on the chart" in done.stderr
+    assert not [*tmp_path.iterdir()]
 
 
 def test_a_module_of_the_current_folder_is_found(tmp_path):
@@ -621,7 +632,14 @@ def test_the_command_line_explains_what_was_found(tmp_path):
     env = ("--env", "PointMaze_Medium-v3", "--env-args", str(path))
     status, out, _ = command("diagnose", *env, "--explain")
     assert status == 0
-    for part in ("achieved_goal", "island 1", "from the walls", "{'goal_cell': [6, 6]}", "0.01 s"):
+    for part in (
+        "achieved_goal",
+        "island 1",
+        "from the walls",
+        "{'goal_cell': [6, 6]}",
+        "0.01 s",
+        '{"goal_cell": [6, 6]} (given)',
+    ):
         assert part in out
     ways = (
         "bounds",

@@ -63,6 +63,9 @@ def test_who_asks_a_diagnosis_for_more_is_told_how_to_go_on(folder):
     write(folder, "diagnose", "diagnosis.html", "d", "partition.npz")
     with pytest.raises(BadArtifact, match=r"extended_sets.npz is missing.*hyrl-mj robustify"):
         Manifest(folder, SETTINGS).checked(folder / "extended_sets.npz")
+    (folder / "diagnosis.html").unlink()
+    with pytest.raises(BadArtifact, match=r"diagnosis.html is missing: run the stage diagnose"):
+        Manifest(folder, SETTINGS).checked(folder / "diagnosis.html")
     write(folder, "extended-sets", "extended_sets.npz", "e", "partition.npz")
     with pytest.raises(BadArtifact, match=r"replay.mp4 is missing.*hyrl-mj replay"):
         Manifest(folder, SETTINGS).checked(folder / "replay.mp4")

@@ -23,7 +23,7 @@ from hyrl_mj.environments.memory import (
     remembered,
     state_of_generator,
 )
-from hyrl_mj.environments.opening import Source, global_seed, global_state, made, physics_of
+from hyrl_mj.environments.opening import Source, global_seed, global_state, layers, made, physics_of
 from hyrl_mj.errors import BadInput, brief
 from hyrl_mj.tasks import Outcome
 
@@ -390,12 +390,7 @@ class Host:
     def _observers(self) -> list[Callable[[], np.ndarray]]:
         """Returns functions that may compute the observation of the present state."""
         inner = self.env.unwrapped
-        wrappers: list[Any] = []
-        wrapper: Any = self.env
-        while isinstance(wrapper, gym.Wrapper):
-            if isinstance(wrapper, gym.ObservationWrapper):
-                wrappers.insert(0, wrapper)
-            wrapper = wrapper.env
+        wrappers = [w for w in reversed(layers(self.env)) if isinstance(w, gym.ObservationWrapper)]
 
         def through(get: Callable[[], Any]) -> Callable[[], np.ndarray]:
             def observe() -> np.ndarray:

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from hyrl_mj.environments.opening import layers
 from hyrl_mj.errors import BadInput
 
 # Objects of these modules hold no memory of an environment, or it is in MuJoCo's state.
@@ -88,13 +89,12 @@ def hiding(env: Any) -> list[str]:
 
     These are generators, and functions with variables of their own.
     """
-    found, layer = [], env
-    while layer is not None:
-        for name, value in vars(layer).items():
-            if isinstance(value, GeneratorType) or getattr(value, "__closure__", None):
-                found.append(name)
-        layer = vars(layer).get("env")  # of a wrapper
-    return found
+    return [
+        name
+        for layer in layers(env)
+        for name, value in vars(layer).items()
+        if isinstance(value, GeneratorType) or getattr(value, "__closure__", None)
+    ]
 
 
 def name_of(path: Path) -> str:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, suppress
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ import numpy as np
 from gymnasium import spaces
 
 from hyrl_mj import mujoco_log
+from hyrl_mj.artifacts import digest
 from hyrl_mj.errors import BadInput, brief
 from hyrl_mj.plant import Plant
 from hyrl_mj.trust import current_folder
@@ -141,12 +143,10 @@ def _steps_of(env: gym.Env) -> int | None:
     """Returns after how many steps an episode of an environment is truncated; None if it does not say."""
     if env.spec is not None and env.spec.max_episode_steps:
         return int(env.spec.max_episode_steps)
-    wrapper: Any = env
-    while isinstance(wrapper, gym.Wrapper):
-        if isinstance(wrapper, gym.wrappers.TimeLimit):
-            return int(wrapper._max_episode_steps)
-        wrapper = wrapper.env
-    limit = getattr(getattr(wrapper, "_env", None), "_step_limit", np.inf)  # of dm_control
+    for layer in layers(env):
+        if isinstance(layer, gym.wrappers.TimeLimit):
+            return int(layer._max_episode_steps)
+    limit = getattr(getattr(env.unwrapped, "_env", None), "_step_limit", np.inf)  # of dm_control
     return int(limit) if np.isfinite(limit) else None
 
 
@@ -257,22 +257,27 @@ def _check(env: Any, name: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
     return physics
 
 
-def sources_of(env: Any) -> list[bytes]:
-    """Returns the files of Python that define an environment, its wrappers, and a task of dm_control."""
-    layers = [env]
-    while isinstance(layers[-1], gym.Wrapper):
-        layers.append(layers[-1].env)
-    control = getattr(layers[-1], "_env", None)
-    kinds = [
-        kind
-        for part in (*layers, control, getattr(control, "task", None))
-        for kind in type(part).__mro__
-    ]
-    files = set()
-    for kind in kinds:
-        with suppress(TypeError, OSError):  # of a class that no file holds
-            files.add(Path(inspect.getfile(kind)))
-    return [path.read_bytes() for path in sorted(files) if path.is_file()]
+def layers(env: gym.Env) -> list[Any]:
+    """Returns the wrappers of an environment, the outermost first, and the environment within."""
+    found: list[Any] = [env]
+    while isinstance(found[-1], gym.Wrapper):
+        found.append(found[-1].env)
+    return found
+
+
+def code_of(env: gym.Env) -> list[str]:
+    """Returns the SHA-256 of the files that define an environment, its wrappers, and a task of dm_control."""
+    control = getattr(env.unwrapped, "_env", None)
+    parts = (*layers(env), control, getattr(control, "task", None))
+    return sorted({_digest_of(kind) for part in parts for kind in type(part).__mro__})
+
+
+@cache  # Python imports a file once, so what has become of it since is not what runs
+def _digest_of(kind: type) -> str:
+    """Returns the SHA-256 of the file that defines a class; "" if no file does."""
+    with suppress(TypeError, OSError):
+        return digest(Path(inspect.getfile(kind)))
+    return ""
 
 
 def _plant_of(env: Any) -> Plant | None:

@@ -122,17 +122,16 @@ def drawn_goals(host: Host, resets: np.ndarray, moved: np.ndarray) -> list[str]:
     for seed in range(RESETS_COMPARED):
         host.reset(seed)
         attributes.append(remembered(host.env))
-        models.append({name: getattr(host.model, name).copy() for name in MODEL})
+        models.append(_physics(host))
         host.write(state, memory)
         told.append(np.append(host.step(u)[0], host.step(u)[1:3]))
     host.reset(host.source.first)
     host.write(state, memory)
-    drawn_in_model = [
+    names += [
         f"{name} of its model"
         for name in MODEL
         if any((other[name] != models[0][name]).any() for other in models)
     ]
-    names += drawn_in_model
     if all(np.allclose(other, told[0], rtol=0, atol=1e-9, equal_nan=True) for other in told):
         return names
     slots = {slot.path for slot in host.slots}
@@ -147,6 +146,11 @@ def drawn_goals(host: Host, resets: np.ndarray, moved: np.ndarray) -> list[str]:
     return names + (goals or differing) or ["a part of its model"]
 
 
+def _physics(host: Host) -> dict[str, np.ndarray]:
+    """Returns copies of what a reset may change in the model, by name."""
+    return {name: getattr(host.model, name).copy() for name in MODEL}
+
+
 def heeds_options(host: Host) -> bool:
     """Returns whether resets with the user's options lead elsewhere than those without."""
     heeds = False
@@ -154,7 +158,8 @@ def heeds_options(host: Host) -> bool:
         seen = []
         for options in (host.source.reset, {}):
             observation = flat(host.fresh(seed, options))
-            seen.append([*remembered(host.env).items(), ((), observation)])
+            told = {"observation": observation, **_physics(host)}
+            seen.append([*remembered(host.env).items(), *told.items()])
         alike = len(seen[0]) == len(seen[1]) and all(
             path == other and same(a, b) for (path, a), (other, b) in zip(*seen, strict=True)
         )

@@ -18,7 +18,7 @@ from hyrl_mj.chart import Chart
 from hyrl_mj.environments.coordinates import AnyChart, Coordinate, all_names, coordinates
 from hyrl_mj.environments.copies import Host
 from hyrl_mj.environments.layout import Layout
-from hyrl_mj.environments.opening import Source, sources_of
+from hyrl_mj.environments.opening import Source, code_of
 from hyrl_mj.environments.plant import EnvironmentPlant
 from hyrl_mj.environments.success import FORMS, INFO, Success, success_of
 from hyrl_mj.environments.surroundings import (
@@ -328,8 +328,7 @@ class EnvironmentTask(Task):
         digest = sha256()
         for name in ("qpos0", "body_mass", "geom_size", "geom_pos", "site_pos", "actuator_gear"):
             digest.update(np.ascontiguousarray(getattr(self.model, name)).tobytes())
-        for text in sources_of(self.host.env):
-            digest.update(text)
+        digest.update("".join(code_of(self.host.env)).encode())
         return digest.hexdigest()
 
     @cached_property

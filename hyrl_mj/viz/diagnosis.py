@@ -130,9 +130,11 @@ def sentences(
             results.append(f"{why}: noisy episodes stand in for the worst case")
         noisy = [count for count in robustness.episodes if count.noise != NO_NOISE]
         worst = min(noisy, key=lambda count: count.reached)
-        count = f"{worst.episodes - worst.outcomes.get('reached', 0)} of {worst.episodes:,}"
-        lost = f"{count} episodes that start {worst.region}"
-        results.append(f"under {worst.noise} {noise} it loses {lost}")
+        failed = worst.episodes - worst.outcomes.get("reached", 0)
+        results.append(
+            f"under {worst.noise} {noise} it loses {failed:,} of {worst.episodes:,} episodes that start "
+            f"{worst.region}"
+        )
     if arc is None:
         return [*results, f"no start was found that {noise} makes it lose"]
     start, outcome = task.chart.format(arc.z[0]), arc.outcome.replace("_", " ")
