@@ -124,6 +124,21 @@ class Plant:
         return self._measure(self._batch.state[:, self._columns_of_state])
 
     @property
+    def truth(self) -> np.ndarray:
+        """The same as `measurement`; environments tell them apart."""
+        return self.measurement
+
+    def observe(self, true: np.ndarray, noise: np.ndarray, ids: np.ndarray) -> np.ndarray:
+        """Returns the noisy measurements (k, p) of true ones (k, p), of the copies `ids` (k,)."""
+        return true + noise
+
+    def end(self) -> None:
+        """Ends all runs; environments are told."""
+
+    #: whether what a step came to is known only after `observe`, as where wrappers lie around an environment
+    late = False
+
+    @property
     def unstable(self) -> np.ndarray:
         """The copies (n,) bool whose simulation has diverged since `set_state`.
 

@@ -175,8 +175,8 @@ class Noisy(gym.Wrapper):
         return self.env.step(action + self.unwrapped.np_random.normal(size=2))
 
 
-class Teleporting(Puck):
-    """Draws random numbers in its steps, but only in a corner, where inputs at random do not lead."""
+class Gambling(Puck):
+    """Draws random numbers in its steps, but only under one input, which is not drawn at random."""
 
     def __init__(self, own=False):
         super().__init__()
@@ -184,7 +184,7 @@ class Teleporting(Puck):
 
     def step(self, action):
         result = super().step(action)
-        if self.data.qpos.min() > 1.3:
+        if np.all(np.asarray(action) == 3.9):
             self.np_random.random() if self.own else np.random.rand()
         return result
 

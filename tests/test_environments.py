@@ -16,6 +16,7 @@ import pytest
 from environments import (
     Delayed,
     Floating,
+    Gambling,
     Grid,
     Growing,
     Moved,
@@ -24,7 +25,6 @@ from environments import (
     Secret,
     Seen,
     Several,
-    Teleporting,
     puck_agent,
 )
 from gl import needs_gl
@@ -33,7 +33,7 @@ from gymnasium.wrappers import TimeLimit
 import hyrl_mj
 from hyrl_mj import BadInput, Outcome, cores, from_gymnasium
 from hyrl_mj.environments import making
-from hyrl_mj.environments.crew import Crew
+from hyrl_mj.environments.instance import Instance, flat
 from hyrl_mj.learning import presets
 from hyrl_mj.mjcf import camera_of, point_of, rests
 from hyrl_mj.rendering import SceneRenderer
@@ -78,13 +78,14 @@ def test_copies_go_on_as_the_environment_alone_does(name):
     for u in inputs:
         plant.step(u)
         seen.append(task.observation(plant.measurement))
-    host = task.host
-    for i in range(3):  # one after the other, in the environment itself
-        host.write(*host.base)
-        host.data.qpos[:], host.data.qvel[:] = (part[i] for part in task.state(z))
-        host.forward()
+    for i in range(3):  # one after the other, in an environment of its own
+        instance = Instance(task.specification.recipe)
+        instance.reset()
+        instance.physics.write(task.specification.state_at(z)[i])
         for k, u in enumerate(inputs):
-            np.testing.assert_allclose(host.step(u[i])[0], seen[k][i], rtol=0, atol=1e-9)
+            observation, *_ = instance.env.step(instance.action(u[i]))
+            space = instance.env.observation_space
+            np.testing.assert_array_equal(flat(observation, space), seen[k][i])
 
 
 def test_an_environment_that_counts_its_steps_ends_the_episode_of_each_copy():
@@ -133,18 +134,23 @@ def test_noise_moves_every_copy_of_a_position(puck):
     plant = puck.plant(1)
     plant.set_state(np.array([[-1.0, 0.5]]), np.array([[0.3, 0.0]]))
     noisy = puck.with_z(plant.measurement, np.array([[-0.9, 0.4]]))
-    # position, to_goal and velocity, in the order of their keys
-    np.testing.assert_allclose(puck.observation(noisy), [[-0.9, 0.4, 2.4, -0.4, 0.3, 0.0]])
-    np.testing.assert_allclose(puck.observation(plant.measurement), [[-1, 0.5, 2.5, -0.5, 0.3, 0]])
+    # velocity, position and to_goal, in the order of the space
+    order = [*puck.observation_parts]
+    expected = {"position": [-0.9, 0.4], "to_goal": [2.4, -0.4], "velocity": [0.3, 0.0]}
+    np.testing.assert_allclose(
+        puck.observation(noisy)[0], np.concatenate([expected[k] for k in order])
+    )
+    noise = np.zeros((1, puck.measurement_columns))
+    noise[0, :2] = 0.1, -0.1
+    sensed = plant.observe(plant.truth, noise, np.arange(1))
+    np.testing.assert_allclose(puck.observation(sensed), puck.observation(noisy), atol=1e-12)
+    np.testing.assert_allclose(puck.z(sensed), [[-0.9, 0.4]])
 
 
-def test_without_a_known_name_the_environment_observes_in_a_step_that_lasts_no_time(puck):
+def test_without_a_known_name_nothing_is_known_of_noise():
     class Renamed(Puck):
         def what_is_seen(self):
-            return super()._get_obs()
-
-        def _get_obs(self):
-            raise AttributeError
+            return Puck._get_obs(self)
 
         def reset(self, **options):
             gym.Env.reset(self, seed=options.get("seed"))
@@ -159,15 +165,11 @@ def test_without_a_known_name_the_environment_observes_in_a_step_that_lasts_no_t
             close = np.linalg.norm(self.data.qpos - [1.5, 0]) < 0.25
             return self.what_is_seen(), 0.0, False, False, {"success": close}
 
-    task = from_gymnasium(Renamed)
-    assert task.host._observer is None
-    plants = [t.plant(2) for t in (puck, task)]
-    seen = []
-    for t, plant in zip((puck, task), plants, strict=True):
-        plant.set_state(np.array([[-1.0, 0.5], [0.8, -1.0]]), np.array([[0.3, 0.0], [0.0, 1.0]]))
-        noisy = t.with_z(plant.measurement, t.z(plant.measurement) + 0.1)
-        seen.append(t.observation(noisy))
-    np.testing.assert_allclose(*seen, rtol=0, atol=1e-9)
+        def _get_obs(self, of):
+            raise AssertionError(of)
+
+    with pytest.raises(BadInput, match="no method that computes what it observes"):
+        from_gymnasium(Renamed)
 
 
 def test_results_do_not_depend_on_the_cores(puck, monkeypatch):
@@ -190,8 +192,9 @@ def test_an_error_in_another_process_is_told(puck, monkeypatch):
     plant.set_state(*task.state(np.tile([[-1.0, 0.5]], (100, 1))))
     u = np.zeros((100, 2))
     u[-1] = 3.9  # of the second half
-    with pytest.raises(BadInput, match="cannot be stepped: RuntimeError: broken"):
+    with pytest.raises(BadInput, match=r"step\(\) of Failing raises RuntimeError: broken"):
         plant.step(u)
+    plant.set_state(*task.state(np.tile([[-1.0, 0.5]], (100, 1))))
     plant.step(np.zeros((100, 2)))  # what was left unsaid is not taken for another answer
     assert np.isfinite(plant.measurement).all()
 
@@ -205,9 +208,9 @@ class Failing(Puck):
         return super().step(action)
 
 
-def test_attributes_that_change_are_remembered_by_each_copy(puck):
+def test_attributes_that_change_belong_to_each_run(puck):
     task = from_gymnasium(lambda: Delayed(Puck()))
-    assert [slot.path[-1][1] for slot in task.host.slots] == ["last"]
+    assert not task.specification.memoryless
     rng = np.random.default_rng(0)
     z, u = task.starts(3, rng), rng.uniform(-4, 4, (6, 3, 2))
     late, plain = task.plant(3), puck.plant(3)
@@ -273,10 +276,8 @@ def test_an_episode_ends_where_info_tells_success(puck):
     at_end = from_gymnasium(Puck, success="reward >= -0.3", steps=30)
     late = closed_loop(at_end, Constant(at_end, (0.0, 0.0)), np.array([[1.3, 0.0]]), Noise())
     assert (late.outcome.tolist(), late.length.tolist()) == ([1], [30])
-    assert from_gymnasium(Puck, success="distance(puck, goal) < 0.3").host.between == (
-        ("xpos", 1),
-        ("site_xpos", 0),
-    )
+    near = from_gymnasium(Puck, success="distance(puck, goal) < 0.3").specification
+    assert near.recipe.places == ((("xpos", 1), ("site_xpos", 0)),)
 
 
 class Constant:
@@ -356,12 +357,7 @@ class Rebuilding(Puck):
 REFUSED = {
     "late": (Late, "Late cannot be reset .RuntimeError: no file"),
     "rebuilding": (Rebuilding, "reset.. of Rebuilding builds another model"),
-    "hidden": (
-        lambda: Secret(Puck()),
-        "goes on differently from the same state.*something in scale or elsewhere",
-    ),
     "an obstacle that is drawn": (Moved, r"draws geom_pos of its model.*pin it"),
-    "growing": (lambda: Growing(Puck()), r"remembers something in actions .*cannot be copied"),
     "random": (lambda: Noisy(Puck()), r"draws random numbers in step\(\)"),
     "image": (lambda: Seen(Puck()), r"observes images \(8, 8, 3\).*vectors"),
     "several": (Several, "several agents"),
@@ -376,7 +372,7 @@ REFUSED = {
     "broken": (lambda: 1 / 0, r"cannot be made .ZeroDivisionError"),
     "a goal that is drawn": (
         "PointMaze_Medium-v3",
-        "each reset of PointMaze_Medium-v3 draws goal.*pin it.*goal_cell",
+        "each reset of PointMaze_Medium-v3 draws .*goal.*pin it.*goal_cell",
     ),
     "no success": ("Reacher-v5", "does not tell in its info when it succeeds"),
 }
@@ -393,13 +389,35 @@ def test_what_cannot_work_is_refused_before_anything_is_trained(what):
 @pytest.mark.parametrize("allowed", [0, 1])
 def test_random_numbers_that_few_steps_draw_are_refused_when_they_are(own, allowed, monkeypatch):
     monkeypatch.setattr(cores, "allowed", allowed)
-    task = from_gymnasium(lambda: Teleporting(own))
+    task = from_gymnasium(lambda: Gambling(own))
     plant, u = task.plant(60), np.zeros((60, 2))
-    plant.set_state(np.tile([0.9, 1.0], (60, 1)))
+    plant.set_state(*task.state(np.tile([[-1.0, 0.5]], (60, 1))))
     plant.step(u)
-    plant.set_state(np.tile([1.4, 1.35], (60, 1)))
+    plant.end()
+    plant.set_state(*task.state(np.tile([[-1.0, 0.5]], (60, 1))))
     with pytest.raises(BadInput, match=r"draws random numbers in step\(\)"):
-        plant.step(u)
+        plant.step(u + 3.9)
+        plant.end()
+
+
+@pytest.mark.parametrize("wrapper", [Secret, Growing])
+def test_what_no_reset_clears_takes_a_new_instance_for_each_episode(wrapper, puck):
+    task = from_gymnasium(lambda: wrapper(Puck()))
+    runs = []
+    for _ in range(2):
+        plant = task.plant(2)
+        plant.set_state(*task.state(np.array([[-1.0, 0.5], [-1.2, 0.0]])))
+        for _ in range(5):
+            plant.step(np.full((2, 2), 3.0))
+        runs.append(plant.qpos)
+    alone = wrapper(Puck())
+    alone.reset(seed=0)
+    alone.unwrapped.data.qpos[:] = -1.0, 0.5
+    mujoco.mj_forward(alone.unwrapped.model, alone.unwrapped.data)
+    for _ in range(5):
+        alone.step(np.full(2, 3.0))
+    np.testing.assert_array_equal(*runs)
+    np.testing.assert_allclose(alone.unwrapped.data.qpos, runs[0][0], rtol=0, atol=1e-12)
 
 
 def test_an_observation_in_rows_is_a_vector_row_by_row():
@@ -419,7 +437,7 @@ def test_walls_that_nothing_collides_with_are_none():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"success": "close"}, r"success 'close' cannot be used: give .info"),
+        ({"success": "close"}, r"success 'close' cannot be used: 'close' is not known"),
         ({"success": "distance(puck, moon) < 1"}, "unknown site, body or geom.*'moon'"),
         ({"noisy": (1,)}, r"noisy has 1 share.*2 coordinate"),
         ({"bounds": {"z": (0, 1)}}, "bounds for z.*x, y"),
@@ -443,7 +461,7 @@ def test_walls_that_nothing_collides_with_are_none():
         ({"pinned": {"qpos[0]": "a"}}, "pinned .* give a number"),
         ({"pinned": {"qpos[0]": [[1], [1, 2]]}}, "pinned .* give a number"),
         ({"success": 3}, "success 3 cannot be used"),
-        ({"success": "reward >= nan"}, "compares with 'nan': give a number"),
+        ({"success": "reward >= nan"}, "nan is no finite number"),
     ],
 )
 def test_wrong_arguments_are_refused_with_what_is_allowed(options, message):
@@ -452,12 +470,12 @@ def test_wrong_arguments_are_refused_with_what_is_allowed(options, message):
 
 
 def test_what_resets_draw_is_pinned_by_options_that_they_heed_or_by_a_seed():
-    with pytest.raises(BadInput, match="change nothing in PointMaze_Medium-v3, which draws goal"):
+    with pytest.raises(BadInput, match="change nothing in PointMaze_Medium-v3, which draws .*goal"):
         from_gymnasium("PointMaze_Medium-v3", reset={"goal_cel": [6, 6]})
     for seed in (0, 3):
         task = from_gymnasium("PointMaze_Medium-v3", seed=seed)
         assert f"with seed {seed}" in task.found["goal"]
-        np.testing.assert_array_equal(task.host.env.unwrapped.goal, reset_goal(seed))
+        np.testing.assert_array_equal(task._instance.inner.goal, reset_goal(seed))
     assert (reset_goal(0) != reset_goal(3)).any()
 
 
@@ -524,7 +542,7 @@ def test_a_target_that_is_drawn_is_pinned_as_the_message_says():
     advised = re.search(r"with values as (\{.*?\}\})", str(refused.value))[1]
     options = {**json.loads(advised), "success": OTHERS["Reacher-v5"]["success"]}
     task = from_gymnasium("Reacher-v5", chart="qpos[0]", **options)
-    assert task.host.data.qpos[2] == pytest.approx(0.1)
+    assert task.specification.state[task.specification.qpos[2]] == pytest.approx(0.1)
 
 
 def test_what_mujoco_warns_of_while_it_reads_a_model_is_not_written_to_a_file(tmp_path):
@@ -685,9 +703,3 @@ def test_an_agent_is_diagnosed_and_made_robust_in_its_own_environment(tmp_path, 
     np.testing.assert_array_equal(
         again.controller.step(q, measured)[0], run.controller.step(q, measured)[0]
     )
-
-
-def test_few_copies_stay_in_one_process(puck):
-    crew = Crew(puck.host)
-    crew.observe(*(np.tile(part, (3, 1)) for part in puck.host.base))
-    assert not crew._hands

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from hyrl_mj import mjcf
-from hyrl_mj.environments.copies import Host
+from hyrl_mj.environments.instance import Instance, columns_of
 from hyrl_mj.errors import BadInput, unknown
 
 # Chart, as users give it: one name, several, or new names with the names of what they stand for.
@@ -61,7 +61,7 @@ class Coordinate:
         return f"{self.kind}[{self.index}]"
 
 
-def coordinates(host: Host, chart: AnyChart) -> tuple[Coordinate, ...]:
+def coordinates(instance: Instance, chart: AnyChart) -> tuple[Coordinate, ...]:
     """Returns the coordinates that a chart names.
 
     A name is that of a position or velocity, as qpos[0], of a joint, of a part of the observation, as
@@ -72,7 +72,7 @@ def coordinates(host: Host, chart: AnyChart) -> tuple[Coordinate, ...]:
     """
     names = {"": chart} if isinstance(chart, str) else chart
     pairs = names.items() if isinstance(names, Mapping) else (("", name) for name in names)
-    found = [c for new, name in pairs for c in _resolved(host, str(new), str(name))]
+    found = [c for new, name in pairs for c in _resolved(instance, str(new), str(name))]
     places = [(c.kind, c.index) for c in found]
     if not found or len(set(places)) < len(places):
         raise BadInput(
@@ -81,11 +81,11 @@ def coordinates(host: Host, chart: AnyChart) -> tuple[Coordinate, ...]:
     return tuple(found)
 
 
-def all_names(host: Host) -> list[str]:
+def all_names(instance: Instance) -> list[str]:
     """Returns the names that a chart may use."""
-    model = host.model
+    model = instance.model
     positions = [f"qpos[{i}]" for i in range(model.nq)] + [f"qvel[{i}]" for i in range(model.nv)]
-    return [*positions, *(n for n in _joints(host) if n), *_parts(host), *_places(host)]
+    return [*positions, *(n for n in _joints(instance) if n), *_parts(instance), *_places(instance)]
 
 
 def usual_name(model: mujoco.MjModel, joint: int, velocity: bool) -> str:
@@ -95,71 +95,74 @@ def usual_name(model: mujoco.MjModel, joint: int, velocity: bool) -> str:
     return f"{name} rate" if velocity else name
 
 
-def _joints(host: Host) -> list[str]:
+def _joints(instance: Instance) -> list[str]:
     return [
-        mujoco.mj_id2name(host.model, mujoco.mjtObj.mjOBJ_JOINT, i) or ""
-        for i in range(host.model.njnt)
+        mujoco.mj_id2name(instance.model, mujoco.mjtObj.mjOBJ_JOINT, i) or ""
+        for i in range(instance.model.njnt)
     ]
 
 
-def _places(host: Host) -> list[str]:
+def _places(instance: Instance) -> list[str]:
     kinds = mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY
-    names = [name for kind in kinds for name in mjcf.names(host.model, kind)]
+    names = [name for kind in kinds for name in mjcf.names(instance.model, kind)]
     return [name for name in dict.fromkeys(names) if not name.startswith("(") and name != "world"]
 
 
-def _parts(host: Host) -> dict[str, slice]:
+def _parts(instance: Instance) -> dict[str, slice]:
     """Returns the parts of the observation, with their columns."""
-    space = host.env.observation_space
+    space = instance.env.observation_space
     if not isinstance(space, spaces.Dict):
-        return {"observation": slice(0, host.width)}
+        return {"observation": slice(0, int(spaces.flatdim(space)))}
     parts, at = {}, 0
-    for key in sorted(space.spaces):
+    for key in space.spaces:
         size = int(spaces.flatdim(space.spaces[key]))
         parts[key], at = slice(at, at + size), at + size
     return parts
 
 
-def _resolved(host: Host, new: str, name: str) -> Iterator[Coordinate]:
+def _resolved(instance: Instance, new: str, name: str) -> Iterator[Coordinate]:
     base, index = name, None
     if match := INDEXED.fullmatch(name):
         base, index = match.group(1), int(match.group(2))
     if base in ("qpos", "qvel") and index is not None:
-        size = host.model.nq if base == "qpos" else host.model.nv
+        size = instance.model.nq if base == "qpos" else instance.model.nv
         if index >= size:
-            raise unknown("coordinate", name, all_names(host))
-        yield _of_state(host, new, base, index)
+            raise unknown("coordinate", name, all_names(instance))
+        yield _of_state(instance, new, base, index)
         return
-    if name in _joints(host):
-        joint = _joints(host).index(name)
-        yield _of_state(host, new, "qpos", int(host.model.jnt_qposadr[joint]))
+    if name in _joints(instance):
+        joint = _joints(instance).index(name)
+        yield _of_state(instance, new, "qpos", int(instance.model.jnt_qposadr[joint]))
         return
-    parts = _parts(host)
+    parts = _parts(instance)
     if base in parts:
-        columns = list(range(*parts[base].indices(host.width)))
+        columns = list(range(parts[base].start, parts[base].stop))
         if index is not None and index >= len(columns):
             raise unknown("coordinate", name, [f"{base}[{i}]" for i in range(len(columns))])
         chosen = columns if index is None else [columns[index]]
 
-        def observed() -> np.ndarray:
-            return host.observed()[chosen]
+        def observed(state: np.ndarray) -> np.ndarray:
+            return instance.rested(state)[chosen]
 
-        yield from _fitted(host, new, name, observed)
+        yield from _fitted(instance, new, name, observed)
         return
-    if base in _places(host):
-        kind, i = mjcf.point_of(host.model, base)
+    if base in _places(instance):
+        kind, i = mjcf.point_of(instance.model, base)
         axes = [0, 1] if index is None else [index]
 
-        def placed() -> np.ndarray:
-            return np.array(getattr(host.data, kind)[i][axes])
+        def placed(state: np.ndarray) -> np.ndarray:
+            instance.physics.write(state)
+            return np.array(getattr(instance.data, kind)[i][axes])
 
-        yield from _fitted(host, new, name, placed)
+        yield from _fitted(instance, new, name, placed)
         return
-    raise unknown("coordinate", name, all_names(host))
+    raise unknown("coordinate", name, all_names(instance))
 
 
-def _of_state(host: Host, new: str, kind: str, index: int, offset: float = 0.0) -> Coordinate:
-    model = host.model
+def _of_state(
+    instance: Instance, new: str, kind: str, index: int, offset: float = 0.0
+) -> Coordinate:
+    model = instance.model
     addresses = model.jnt_qposadr if kind == "qpos" else model.jnt_dofadr
     joint = int(np.searchsorted(addresses, index, side="right")) - 1
     kind_of_joint, part = model.jnt_type[joint], index - addresses[joint]
@@ -174,27 +177,28 @@ def _of_state(host: Host, new: str, kind: str, index: int, offset: float = 0.0) 
             if model.jnt_type[j] in (SLIDE, HINGE)
         ]
         raise BadInput(
-            f"{kind}[{index}] is a part of an orientation of {host.name}, which hyrl_mj has no chart for: "
+            f"{kind}[{index}] is a part of an orientation of {instance.name}, which hyrl_mj has no chart for: "
             f"name slides, hinges ({', '.join(free) or 'it has none'}) and places of free joints"
         )
     axis = int(np.abs(model.jnt_axis[joint]).argmax()) if kind_of_joint == SLIDE else None
     return Coordinate(name, kind, index, offset, joint, axis)
 
 
-def _fitted(host: Host, new: str, name: str, get: Callable[[], np.ndarray]) -> Iterator[Coordinate]:
-    """Yields the positions or velocities that the values of a function are, but for an offset."""
-    state, memory = host.base
-    rng, columns = np.random.default_rng(0), {"qpos": host.model.nq, "qvel": host.model.nv}
+def _fitted(
+    instance: Instance, new: str, name: str, get: Callable[[np.ndarray], np.ndarray]
+) -> Iterator[Coordinate]:
+    """Yields the positions or velocities that a function of MuJoCo's state (S,) gives, but for an offset."""
+    instance.reset()
+    state, places = instance.physics.read(), columns_of(instance.model)
+    rng, columns = np.random.default_rng(0), {"qpos": instance.model.nq, "qvel": instance.model.nv}
     moved: dict[str, list[np.ndarray]] = {kind: [] for kind in columns}
     values = []
     for _ in range(TRIED):
-        host.write(state, memory)
+        other = state.copy()
         for kind, count in columns.items():
-            getattr(host.data, kind)[:] += rng.uniform(-MOVED, MOVED, count)
-            moved[kind].append(getattr(host.data, kind).copy())
-        host.forward()
-        values.append(get())
-    host.write(state, memory)
+            other[places[kind]] += rng.uniform(-MOVED, MOVED, count)
+            moved[kind].append(other[places[kind]])
+        values.append(get(other))
     for j, column in enumerate(np.array(values).T):
         match = [
             (kind, i, offsets.mean())
@@ -204,9 +208,9 @@ def _fitted(host: Host, new: str, name: str, get: Callable[[], np.ndarray]) -> I
         ]
         if not match:
             raise BadInput(
-                f"{name}[{j}] is no single position or velocity of {host.name}, but follows from several, or "
-                f"from none: name coordinates such as {', '.join(all_names(host)[:4])}"
+                f"{name}[{j}] is no single position or velocity of {instance.name}, but follows from several, or "
+                f"from none: name coordinates such as {', '.join(all_names(instance)[:4])}"
             )
         kind, i, offset = match[0]
         several = f"{new}[{j}]" if new and len(values[0]) > 1 else new
-        yield _of_state(host, several, kind, i, round(float(offset), 9))
+        yield _of_state(instance, several, kind, i, round(float(offset), 9))

@@ -16,9 +16,10 @@ import numpy as np
 
 from hyrl_mj import trust
 from hyrl_mj.environments.coordinates import AnyChart
+from hyrl_mj.environments.inspection import CHART, RESET, inspect
 from hyrl_mj.environments.opening import Source
-from hyrl_mj.environments.success import FORMS
-from hyrl_mj.environments.task import CHART, RESET, EnvironmentTask
+from hyrl_mj.environments.specification import FORMS
+from hyrl_mj.environments.task import EnvironmentTask
 from hyrl_mj.errors import BadInput, check_seed, unknown
 from hyrl_mj.ranges import Integer, refused
 from hyrl_mj.tasks import Task, register_opener
@@ -36,6 +37,7 @@ def from_gymnasium(
     chart: AnyChart | None = None,
     noisy: Sequence[float] | None = None,
     success: str | None = None,
+    failure: str | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     steps: int | None = None,
     starts: str = CHART,
@@ -52,8 +54,10 @@ def from_gymnasium(
         env: the id of the environment in Gymnasium, or a function that makes one.
         chart: names of the coordinates in which the decision falls; see `coordinates`.
         noisy: (d,) share of the noise bound on each coordinate of the chart; by default 1 on positions.
-        success: when an episode is a success: "info", "terminated", "reward >= 1", or
-            "distance(a, b) <= 0.05" of two sites, bodies or geoms.
+        success: when an episode is a success, as "terminated and reward >= 1", 'info["solved"]' or
+            "distance(a, b) <= 0.05" of two sites, bodies or geoms: see `Expression`. By default what info
+            says.
+        failure: when an episode is a failure, by default when it is terminated without success.
         bounds: (low, high) of coordinates of the chart, by name.
         steps: steps of an episode, by default those of the environment.
         starts: where episodes start, all over the "chart", or where "reset" leads to.
@@ -66,7 +70,7 @@ def from_gymnasium(
     Raises:
         BadInput: it cannot be used; the message says why.
     """
-    _check(chart, noisy, success, bounds, steps, starts, seed)
+    _check(chart, noisy, success, failure, bounds, steps, starts, seed)
     for name, named in (("kwargs", kwargs), ("reset", reset), ("pinned", pinned)):
         _check_named(name, named)
     for name, value in (pinned or {}).items():
@@ -75,23 +79,30 @@ def from_gymnasium(
     source = Source(env, dict(kwargs or {}), dict(reset or {}), dict(pinned or {}), seed)
     content = {
         "env": env if isinstance(env, str) else {"function": _where(env)},
-        "chart": chart, "noisy": noisy, "success": success, "bounds": bounds, "steps": steps,
+        "chart": chart, "noisy": noisy, "success": success, "failure": failure,
+        "bounds": bounds, "steps": steps,
         "starts": None if starts == CHART else starts, "kwargs": kwargs, "reset": reset,
         "pinned": pinned, "seed": seed,
     }  # fmt: skip
     given = {key: value for key, value in content.items() if value is not None}
     spec = MARK + json.dumps(given, default=_plain)
     if not isinstance(env, str) or spec not in _MADE:
-        _MADE[spec] = EnvironmentTask(
-            source, chart, noisy, success, bounds or {}, steps, starts, spec
-        )
+        inspected = inspect(source, chart, noisy, success, failure, bounds, steps, starts)
+        _MADE[spec] = EnvironmentTask(*inspected, spec)
     if isinstance(env, str) and (module := _module_of(env)) is not None:
         trust.remember(module)
     return _MADE[spec]
 
 
 def _check(
-    chart: Any, noisy: Any, success: Any, bounds: Any, steps: Any, starts: Any, seed: Any
+    chart: Any,
+    noisy: Any,
+    success: Any,
+    failure: Any,
+    bounds: Any,
+    steps: Any,
+    starts: Any,
+    seed: Any,
 ) -> None:
     """Raises `BadInput` if one of the arguments of `from_gymnasium` is of another kind."""
     names = chart.values() if isinstance(chart, Mapping) else chart
@@ -104,8 +115,9 @@ def _check(
             raise refused("noisy", noisy, "a list of numbers from 0 on, one for each coordinate")
         if not any(noisy):
             raise refused("noisy", noisy, "a share above 0 for at least one coordinate")
-    if success is not None and not isinstance(success, str):
-        raise refused("success", success, FORMS)
+    for name, condition in (("success", success), ("failure", failure)):
+        if condition is not None and not isinstance(condition, str):
+            raise refused(name, condition, FORMS)
     _check_named("bounds", bounds)
     for name, ends in (bounds or {}).items():
         if not _all(ends, Real) or len(ends) != 2 or not 0 < ends[1] - ends[0] <= WIDEST:

@@ -11,7 +11,7 @@ import random
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
@@ -63,6 +63,11 @@ class Source:
     def first(self) -> int:
         """The seed of the reset that all copies begin from."""
         return self.seed or 0
+
+    @property
+    def unpinned(self) -> Source:
+        """The same without what the user pins."""
+        return replace(self, reset={}, pinned={})
 
     @property
     def pins(self) -> bool:
@@ -134,9 +139,8 @@ def made(source: Source) -> Made:
             raise BadInput(
                 f"{source.name} cannot be made ({brief(error)}): repair the function"
             ) from error
-    physics = _check(env, source.name)
-    plant = _plant_of(env)
-    return Made(_peeled(env), _steps_of(env), *physics, plant)
+    physics, plant, steps = _check(env, source.name), _plant_of(env), _steps_of(env)
+    return Made(_peeled(env), steps, *physics, plant)
 
 
 def _steps_of(env: gym.Env) -> int | None:

@@ -30,6 +30,8 @@ class EnvironmentOptions:
         noisy: share of --eps on each coordinate of the chart; by default 1 on positions.
         success: when an episode is a success, as info, terminated, "reward >= 1" or
             "distance(fingertip, target) <= 0.05"; by default what info tells.
+        failure: when an episode is a failure, as 'info["collision"]'; by default when it is terminated
+            without success.
         explain: say what was found out about the environment and how to change it, and do nothing else.
     """
 
@@ -38,6 +40,7 @@ class EnvironmentOptions:
     chart: tuple[str, ...] | None = None
     noisy: tuple[float, ...] | None = None
     success: str | None = None
+    failure: str | None = None
     explain: bool = False
 
 
@@ -49,7 +52,9 @@ def chosen_task(task: str | None, options: EnvironmentOptions) -> Task:
     """
     if options.env is None:
         if options != EnvironmentOptions():
-            raise BadInput("--env-args, --chart, --noisy, --success and --explain need an --env")
+            raise BadInput(
+                "--env-args, --chart, --noisy, --success, --failure and --explain need an --env"
+            )
         if task is None:
             raise BadInput("give a TASK, see hyrl-mj list, or an environment with --env ID")
         return get_task(task)
@@ -58,7 +63,7 @@ def chosen_task(task: str | None, options: EnvironmentOptions) -> Task:
     given = {} if options.env_args is None else _arguments(options.env_args)
     if options.chart is not None:
         given["chart"] = _chart(options.chart)
-    for name in ("noisy", "success"):
+    for name in ("noisy", "success", "failure"):
         if (value := getattr(options, name)) is not None:
             given[name] = value
     return from_gymnasium(options.env, **given)

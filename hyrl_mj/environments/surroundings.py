@@ -1,8 +1,8 @@
-"""What an environment is found to have: walls, islands, bounds of coordinates, and where resets lead."""
+"""What an environment is found to have: walls, islands, bounds of coordinates, and what its resets draw."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,26 +11,20 @@ import numpy as np
 
 from hyrl_mj import mjcf
 from hyrl_mj.environments.coordinates import Coordinate
-from hyrl_mj.environments.copies import Host, flat
-from hyrl_mj.environments.memory import name_of, remembered, same
+from hyrl_mj.environments.fingerprint import differing
+from hyrl_mj.environments.instance import Instance, columns_of, flat
+from hyrl_mj.errors import BadInput
 from hyrl_mj.tasks import touching
 
-# Resets that show where episodes start.
-RESETS = 64
-# Resets that are compared for what they draw.
-RESETS_COMPARED = 4
-# Steps of the runs under inputs at random that show how far coordinates go, and for how long inputs are held.
-RUNS, STEPS, HELD = 16, 150, 15
+# Resets that show where episodes start, and those that are compared for all that they draw, with so many
+# samples of runs after them.
+RESETS, COMPARED, SAMPLES = 64, 4, 20
 # What is sampled beyond this many times as far is outside of the chart.
 ROOM = 1.2
-# What a reset may change in MuJoCo's model so that runs go on differently.
-MODEL = (
-    "body_pos", "body_quat", "body_mass", "body_inertia", "geom_pos", "geom_quat", "geom_size",
-    "geom_friction", "geom_contype", "geom_conaffinity", "dof_damping", "dof_armature", "dof_frictionloss",
-    "actuator_gear", "actuator_gainprm", "actuator_biasprm", "hfield_data",
-)  # fmt: skip
-# What goes no farther than this stands [m].
-STANDS = 1e-6
+# Differences of what is observed that are none, as a share of the largest number.
+SAME = 1e-9
+# Parts of MuJoCo's state that say nothing of where a run goes.
+LEFT_OUT = ("warmstart",)
 
 
 @dataclass(frozen=True)
@@ -49,129 +43,172 @@ class Bound:
     why: str
 
 
-@dataclass(frozen=True)
-class Runs:
-    """Runs under inputs at random.
-
-    Attributes:
-        points: (n, d) chart points that they met.
-        worst_reward: the least reward.
-        moved: (nq,) bool, the positions that changed.
-        farthest: name of the body that went farthest, or of the geom where no body went anywhere.
-    """
-
-    points: np.ndarray
-    worst_reward: float
-    moved: np.ndarray
-    farthest: str
+def robot_of(model: mujoco.MjModel, chart: Sequence[Coordinate]) -> np.ndarray:
+    """Returns the bodies (nbody,) bool that hang together with the joints of the chart."""
+    trees = {int(model.body_treeid[model.jnt_bodyid[c.joint]]) for c in chart}
+    return np.isin(model.body_treeid, list(trees))
 
 
-def sampled_runs(host: Host, chart: Sequence[Coordinate]) -> Runs:
-    """Returns runs under inputs at random."""
-    rng, points, rewards = np.random.default_rng(0), [], []
-    bodies, geoms = [], []
-    moved = np.zeros(host.model.nq, dtype=bool)
-    for seed in range(RUNS):
-        host.reset(seed)
-        begun = host.data.qpos.copy()
-        for k in range(STEPS):
-            if k % HELD == 0:
-                u = host.drawn(rng)
-            _, reward, terminated, truncated, _, _ = host.step(u)
-            points.append([getattr(host.data, c.kind)[c.index] + c.offset for c in chart])
-            rewards.append(reward)
-            bodies.append(host.data.xpos.copy())
-            geoms.append(host.data.geom_xpos.copy())
-            moved |= np.abs(host.data.qpos - begun) > 0
-            if terminated or truncated:
-                break
-    host.write(*host.base)
-    farthest = _farthest(host.model.body, bodies) or _farthest(host.model.geom, geoms)
-    return Runs(np.array(points), float(min(rewards)), moved, farthest)
+def names_of_state(model: mujoco.MjModel) -> list[str]:
+    """Returns the names of the entries of a state of MuJoCo, as "qpos[0]"."""
+    return [f"{kind}[{i}]" for kind, at in columns_of(model).items() for i in range(len(at))]
 
 
-def _farthest(named: Callable[[int], Any], places: Sequence[np.ndarray]) -> str:
-    """Returns the name of what goes farthest, of places (k, n, 3) [m]; none if nothing does."""
-    went = np.ptp(places, axis=0).sum(axis=1)
-    return str(named(int(went.argmax())).name) if went.max() > STANDS else ""
-
-
-def starts_of(host: Host) -> np.ndarray:
-    """Returns the positions and velocities (RESETS, nq + nv) that resets lead to."""
+def states_of_resets(instance: Instance) -> np.ndarray:
+    """Returns MuJoCo's states (RESETS, S) that resets lead to."""
     found = []
     for seed in range(RESETS):
-        host.reset(seed)
-        found.append(np.concatenate([host.data.qpos, host.data.qvel]))
-    host.write(*host.base)
+        instance.reset(seed)
+        found.append(instance.physics.read())
     return np.array(found)
 
 
-def drawn_goals(host: Host, resets: np.ndarray, moved: np.ndarray) -> list[str]:
-    """Returns the names of what resets draw and steps never change, though what comes next depends on it.
+def drawn(instance: Instance, states: np.ndarray, robot: np.ndarray) -> list[str]:
+    """Returns the names of what resets draw, beside the robot's own state, and what comes next depends on.
 
     Args:
-        host: the environment.
-        resets: (n, nq + nv) positions and velocities after resets.
-        moved: (nq,) bool, the positions that change in sampled runs.
+        instance: the environment.
+        states: MuJoCo's states (n, S) after resets.
+        robot: (nbody,) bool, the bodies of the robot.
     """
-    drawn = np.ptp(resets[:, : host.model.nq], axis=0) > 0
-    names = [f"qpos[{i}]" for i in np.flatnonzero(drawn & ~moved)]
-    state, memory = host.base
-    rng = np.random.default_rng(0)
-    u, told, attributes, models = host.drawn(rng), [], [], []
-    for seed in range(RESETS_COMPARED):
-        host.reset(seed)
-        attributes.append(remembered(host.env))
-        models.append(_physics(host))
-        host.write(state, memory)
-        told.append(np.append(host.step(u)[0], host.step(u)[1:3]))
-    host.reset(host.source.first)
-    host.write(state, memory)
-    names += [
-        f"{name} of its model"
-        for name in MODEL
-        if any((other[name] != models[0][name]).any() for other in models)
-    ]
-    if all(np.allclose(other, told[0], rtol=0, atol=1e-9, equal_nan=True) for other in told):
-        return names
-    slots = {slot.path for slot in host.slots}
-    differing = [
-        name_of(path)
-        for path, value in attributes[0].items()
-        if path not in slots and not all(same(value, a.get(path)) for a in attributes[1:])
-    ]
-    differing = [name for name in differing if "random" not in name]  # generators and their seeds
-    words = ("goal", "target", "task")
-    goals = [name for name in differing if any(word in name for word in words)]
-    return names + (goals or differing) or ["a part of its model"]
-
-
-def _physics(host: Host) -> dict[str, np.ndarray]:
-    """Returns copies of what a reset may change in the model, by name."""
-    return {name: getattr(host.model, name).copy() for name in MODEL}
-
-
-def heeds_options(host: Host) -> bool:
-    """Returns whether resets with the user's options lead elsewhere than those without."""
-    heeds = False
-    for seed in range(RESETS_COMPARED):
-        seen = []
-        for options in (host.source.reset, {}):
-            observation = flat(host.fresh(seed, options))
-            told = {"observation": observation, **_physics(host)}
-            seen.append([*remembered(host.env).items(), *told.items()])
-        alike = len(seen[0]) == len(seen[1]) and all(
-            path == other and same(a, b) for (path, a), (other, b) in zip(*seen, strict=True)
+    model, at = instance.model, columns_of(instance.model)
+    left = np.concatenate([at[kind] for kind in LEFT_OUT])
+    varies = np.ptp(states, axis=0) > 0
+    varies[left] = False
+    for kind, bodies in (("qpos", _bodies_of_qpos(model)), ("qvel", model.dof_bodyid)):
+        varies[at[kind][robot[bodies]]] = False
+    names = [name for name, v in zip(names_of_state(model), varies, strict=True) if v]
+    told, attributes = [], []
+    for _ in range(2):  # what outlasts a reset is not drawn by it
+        instance.reset(0)
+        attributes.append(instance.remembered())
+        _told(instance, states[0])
+    lasting, attributes = set(differing(*attributes)), []
+    for seed in range(COMPARED):
+        one = Instance(instance.recipe) if lasting else instance
+        one.reset(seed)
+        attributes.append(one.remembered())
+        told.append(_told(one, states[0]))
+    changed = {n: None for other in attributes[1:] for n in differing(attributes[0], other)}
+    of_model = [n for n in changed if n.endswith(" of its model") and n not in lasting]
+    scale = max(float(np.abs(told[0]).max(initial=0.0)), 1.0)
+    if all(
+        other.shape == told[0].shape
+        and np.allclose(other, told[0], rtol=0, atol=SAME * scale, equal_nan=True)
+        for other in told
+    ):
+        return names + of_model
+    chance = [name for a in attributes for name in a.generators]
+    differ = [
+        name
+        for name in changed
+        if not (
+            "_seed" in name
+            or name in chance
+            or name in of_model
+            or name in lasting
+            or name == "MuJoCo's state"
         )
-        heeds = heeds or not alike
-    host.reset(host.source.first)
-    host.write(*host.base)
-    return heeds
+    ]
+    words = ("goal", "target", "task")
+    goals = [name for name in differ if any(word in name for word in words)]
+    return names + of_model + (goals or differ) or ["something that no attribute holds"]
 
 
-def walls(host: Host) -> list[int]:
+def _bodies_of_qpos(model: mujoco.MjModel) -> np.ndarray:
+    """Returns the bodies (nq,) that generalised positions move."""
+    ends = np.append(model.jnt_qposadr[1:], model.nq)
+    return np.repeat(model.jnt_bodyid, ends - model.jnt_qposadr)
+
+
+def _told(instance: Instance, state: np.ndarray) -> np.ndarray:
+    """Returns what an instance tells after a reset, put to a state (S,), over some samples."""
+    rng, told = np.random.default_rng(0), []
+    instance.physics.write(state)
+    for _ in range(SAMPLES):
+        observation, reward, terminated, truncated, _ = instance.stepped(instance.drawn(rng))
+        told.append([*flat(observation, instance.env.observation_space), reward, terminated])
+        if terminated or truncated:
+            break
+    return np.array(told, dtype=float)
+
+
+def changed_by_user(instance: Instance) -> list[str]:
+    """Returns the names of what the user's options of reset and pinned values change after a reset."""
+    found: dict[str, None] = {}
+    for seed in range(COMPARED):
+        seen = []
+        for options in (None, {}):
+            instance.reset(seed, options)
+            remembered = instance.remembered()
+            state = instance.physics.read()
+            names = names_of_state(instance.model)
+            remembered.update((n, float(v)) for n, v in zip(names, state, strict=True))
+            seen.append(remembered)
+        found |= dict.fromkeys(differing(*seen))
+    pinned = [
+        name.partition("[")[0] if "[" not in name else name for name in instance.source.pinned
+    ]
+    return [name for name in (*found, *pinned) if name != "MuJoCo's state"]
+
+
+def check_pins(instance: Instance) -> None:
+    """Raises `BadInput` if a pinned attribute contradicts what is drawn where the attribute was.
+
+    An attribute that, after each reset, is a copy of a place in the model or in the state is one after the
+    resets that pin it, too.
+    """
+    pins = {name: v for name, v in instance.source.pinned.items() if hasattr(instance.inner, name)}
+    if not pins:
+        return
+    source, seen = instance.source, []
+    for seed in range(COMPARED):
+        instance.recipe = instance.recipe.with_source(source.unpinned)
+        instance.reset(seed)
+        seen.append(
+            ({n: np.ravel(getattr(instance.inner, n)).copy() for n in pins}, _places(instance))
+        )
+    instance.recipe = instance.recipe.with_source(source)
+    instance.reset()
+    places = _places(instance)
+    for name, value in pins.items():
+        own = np.ravel(value).astype(float)
+        if all(np.array_equal(a[name], seen[0][0][name]) for a, _ in seen):
+            continue  # no reset draws it
+        for place, now in places.items():
+            copies = len(own) <= len(now) and all(
+                np.array_equal(a[name], p[place][: len(own)]) for a, p in seen
+            )
+            if copies and not np.array_equal(own, now[: len(own)]):
+                raise BadInput(
+                    f"pinned {name} is {own.tolist()}, and {place} of {instance.name}, which each reset puts at "
+                    f"the same place, stays at {now[: len(own)].tolist()}: pin it by the options of reset, or "
+                    "by a seed"
+                )
+
+
+def _places(instance: Instance) -> dict[str, np.ndarray]:
+    """Returns places of the model and of the state by name, each as numbers (k,)."""
+    instance.physics.read()
+    model, data, found = instance.model, instance.data, {}
+    for kind, owner in (
+        ("site_pos", model),
+        ("body_pos", model),
+        ("geom_pos", model),
+        ("mocap_pos", data),
+    ):
+        for i, row in enumerate(np.reshape(getattr(owner, kind), (-1, 3))):
+            found[f"{kind}[{i}]"] = row.copy()
+    for i in range(model.nq):
+        found[f"qpos[{i}:]"] = data.qpos[i:].copy()
+    return found
+
+
+# ---- walls
+
+
+def walls(model: mujoco.MjModel) -> list[int]:
     """Returns the geoms that stand still and can be collided with, or are named obstacles, but no planes."""
-    model = host.model
     contacts = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
     still = (model.body_weldid[model.geom_bodyid] == 0) & (
         model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE
@@ -191,42 +228,68 @@ def walls(host: Host) -> list[int]:
     return [int(g) for g in np.flatnonzero(still & (contacts & np.array(meets) | named))]
 
 
-def islands_of(host: Host, places: np.ndarray) -> dict[str, int]:
-    """Returns the walls that can be passed on both sides, by name, each with the id of one geom.
+@dataclass(frozen=True)
+class Group:
+    """Walls that touch each other.
 
-    Walls that touch each other are one. Those that enclose the places (n, 2) where the robot has been are
-    no island.
+    Attributes:
+        geoms: their ids.
+        low, high: corners (2,) of a box around them, in the plane.
+        encloses: whether this box is around all places where the robot has been.
     """
-    model, data, ids = host.model, host.data, walls(host)
-    if not ids:
-        return {}
-    found: dict[str, int] = {}
-    for group in touching(model, data, ids):
-        corners = data.geom_xpos[group][:, :2]
+
+    geoms: tuple[int, ...]
+    low: np.ndarray
+    high: np.ndarray
+    encloses: bool
+
+
+def groups_of(instance: Instance, places: np.ndarray) -> list[Group]:
+    """Returns the groups of walls that touch each other; the robot has been at places (n, 2)."""
+    model, data, found = instance.model, instance.data, []
+    for group in touching(model, data, ids) if (ids := walls(model)) else ():
+        centres = data.geom_xpos[group][:, :2]
         size = model.geom_rbound[group][:, None]
-        low, high = (corners - size).min(axis=0), (corners + size).max(axis=0)
-        if (low < places.min(axis=0)).all() and (high > places.max(axis=0)).all():
-            continue
-        middle = group[int(np.linalg.norm(corners - corners.mean(axis=0), axis=1).argmin())]
-        found[f"island {len(found) + 1}"] = middle
+        low, high = (centres - size).min(axis=0), (centres + size).max(axis=0)
+        encloses = bool((low < places.min(axis=0)).all() and (high > places.max(axis=0)).all())
+        found.append(Group(tuple(map(int, group)), low, high, encloses))
+    return found
+
+
+def islands_of(instance: Instance, groups: Sequence[Group]) -> dict[str, int]:
+    """Returns the groups of walls that can be passed on both sides, by name, each with the id of one geom."""
+    found: dict[str, int] = {}
+    for group in groups:
+        if not group.encloses:
+            ids = list(group.geoms)
+            centres = instance.data.geom_xpos[ids][:, :2]
+            middle = np.linalg.norm(centres - centres.mean(axis=0), axis=1).argmin()
+            found[f"island {len(found) + 1}"] = ids[int(middle)]
     return found
 
 
 def bounds_of(
-    host: Host,
+    instance: Instance,
     chart: Sequence[Coordinate],
     samples: np.ndarray,
-    given: dict[str, tuple[float, float]],
+    given: Mapping[str, tuple[float, float]],
+    groups: Sequence[Group],
 ) -> list[Bound]:
     """Returns the ends of the chart's coordinates.
 
     Args:
-        host: the environment.
+        instance: the environment.
         chart: its coordinates.
         samples: (n, d) chart points that sampled runs have met.
         given: ends that the user has given, by name.
+        groups: walls. Those that enclose all runs are the end of the chart; beside others there is room to
+            pass.
     """
-    model, found = host.model, []
+    model, found = instance.model, []
+    ids = [g for group in groups if group.encloses for g in group.geoms]
+    others = [g for group in groups if not group.encloses for g in group.geoms]
+    solid = np.flatnonzero(robot_of(model, chart)[model.geom_bodyid])
+    passing = 2 * float(model.geom_rbound[solid].max(initial=0.0))
     for i, c in enumerate(chart):
         if c.name in given:
             low, high = given[c.name]
@@ -236,15 +299,28 @@ def bounds_of(
             found.append(Bound(float(low), float(high), False, "the range of its joint"))
         elif c.kind == "qpos" and c.axis is None:
             found.append(Bound(-np.pi + c.offset, np.pi + c.offset, True, "a joint without limits"))
-        elif c.kind == "qpos" and (ids := walls(host)):
-            places, size = host.data.geom_xpos[ids][:, c.axis], model.geom_size[ids][:, c.axis]
-            found.append(
-                Bound(
-                    float((places - size).min()), float((places + size).max()), False, "the walls"
-                )
-            )
+        elif c.kind == "qpos" and ids:
+            found.append(Bound(*_extent(instance, ids, c, 0.0), False, "the walls"))
         else:
             middle, half = np.median(samples[:, i]), np.ptp(samples[:, i]) / 2
             half = max(ROOM * half, 1e-3)
-            found.append(Bound(float(middle - half), float(middle + half), False, "sampled runs"))
+            low, high, why = float(middle - half), float(middle + half), "sampled runs"
+            if c.kind == "qpos" and others:
+                ends = _extent(instance, others, c, passing)
+                low, high, why = min(low, ends[0]), max(high, ends[1]), "sampled runs and walls"
+            found.append(Bound(low, high, False, why))
     return found
+
+
+def _extent(
+    instance: Instance, ids: Sequence[int], c: Coordinate, room: float
+) -> tuple[float, float]:
+    """Returns the ends of geoms along the axis of a coordinate, with room beside them."""
+    rows: Any = list(ids)
+    places, size = (
+        instance.data.geom_xpos[rows][:, c.axis],
+        instance.model.geom_size[rows][:, c.axis],
+    )
+    round_ = instance.model.geom_type[rows] != mujoco.mjtGeom.mjGEOM_BOX
+    size = np.where(round_, instance.model.geom_size[rows][:, 0], size)
+    return float((places - size).min()) - room, float((places + size).max()) + room

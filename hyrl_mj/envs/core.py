@@ -138,12 +138,12 @@ class BatchedEnv:
         """
         self.plant.step(u)
         self.samples += 1
+        measured = self._measure(np.arange(self.n))
         measurement, unstable = self.plant.measurement, self.plant.unstable
         outcome = self.task.outcome(measurement, unstable)
         terminated = outcome != Outcome.RUNNING
         reward = self.task.reward(measurement, u)
         reward[unstable] = self.task.worst_reward
-        measured = self._measure(np.arange(self.n))
         if self.domain is not None:
             if (caution := self.domain.caution) is not None:
                 reward = np.minimum(reward, cautious_reward(self.task, measured, u, caution))
@@ -192,8 +192,9 @@ class BatchedEnv:
 
     def _measure(self, ids: np.ndarray) -> np.ndarray:
         """Returns noisy measurements (k, p) of the rows `ids`."""
-        true, modes = self.plant.measurement[ids], np.full(len(ids), NOT_STARTED)
-        return true + self._noise.sample(Sample(ids, self.samples[ids], true, modes, self.plant))
+        true, modes = self.plant.truth[ids], np.full(len(ids), NOT_STARTED)
+        noise = self._noise.sample(Sample(ids, self.samples[ids], true, modes, self.plant))
+        return self.plant.observe(true, noise, ids)
 
 
 def cautious_reward(

@@ -35,7 +35,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
     """One episode of a task, for `gymnasium.make`.
 
     `info["z"]` is the true chart point (d,). When an episode is over, `info["outcome"]` is "reached",
-    "crashed", "out_of_bounds" or "stalled".
+    "crashed", "out_of_bounds" or "stalled", and `info["is_success"]` whether it is "reached".
 
     Args:
         task: name of the task.
@@ -85,6 +85,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         info: dict[str, Any] = {"z": self.core.z[0]}
         if result.done[0]:
             info["outcome"] = Outcome(result.outcome[0]).label
+            info["is_success"] = bool(result.outcome[0] == Outcome.REACHED)
         terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
         return result.observation[0], float(result.reward[0]), terminated, truncated, info
 

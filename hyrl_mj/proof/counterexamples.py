@@ -77,7 +77,7 @@ def attack(
         attacked = np.ones_like(attacked)
     attacked &= tried
     noises: list[AnyNoise] = [game.worst_noise(name, eps)] if attacked.any() else []
-    if noises and game.lattice.estimate:
+    if noises and game.lattice.estimate and not game.task.slow:
         noises.append(Noise("adversarial", eps, game.everywhere))
     nodes = np.zeros_like(attacked)
     for noise in noises:

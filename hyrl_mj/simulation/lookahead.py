@@ -9,6 +9,7 @@ from typing import Self
 
 import numpy as np
 
+from hyrl_mj.errors import BadInput
 from hyrl_mj.plant import Plant
 from hyrl_mj.policies import Controller, answer, nothing_past, remembering
 from hyrl_mj.simulation.noise import NOT_STARTED, Sample, Signal, register_noise
@@ -50,6 +51,7 @@ class Ahead:
 
 
 def each_answer(
+    task: Task,
     act: Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
     true: np.ndarray,
     candidates: np.ndarray,
@@ -59,6 +61,7 @@ def each_answer(
     """Yields a controller's answers to candidates of the noise, to several of them at once.
 
     Args:
+        task: tells what would be measured under noise.
         act: returns inputs (n, m) and modes (n,) for measurements (n, p), modes (n,) and past (n, memory, p).
         true: (n, p) measurements without noise.
         candidates: (c, p) noise.
@@ -71,7 +74,8 @@ def each_answer(
     several = max(TOGETHER // max(n, 1), 1)
     for first in range(0, len(candidates), several):
         some = candidates[first : first + several]
-        measured = (true + some[:, None]).reshape(-1, true.shape[1])
+        each = np.broadcast_to(some[:, None], (len(some), *true.shape)).reshape(-1, true.shape[1])
+        measured = task.perturbed(np.tile(true, (len(some), 1)), each)
         u, modes = act(measured, np.tile(q, len(some)), np.tile(past, (len(some), 1, 1)))
         yield u.reshape(len(some), n, -1), modes.reshape(len(some), n)
 
@@ -107,6 +111,11 @@ class Lookahead(Signal):
         self._copies: Plant | None = None
 
     def against(self, task: Task, controller: Controller | None) -> Self:
+        if task.slow:
+            raise BadInput(
+                f"adversarial noise looks ahead from the middle of episodes, where {task.name} cannot begin: "
+                "use the attack (hyrl-mj robustness RUN --attack-rounds 2), or uniform or alternating noise"
+            )
         signal = super().against(task, controller)
         assert controller is not None
         signal.task, signal.controller = task, controller
@@ -147,7 +156,9 @@ class Lookahead(Signal):
         answers = np.concatenate(
             [
                 np.concatenate([u, q[..., None]], axis=2)
-                for u, q in each_answer(self._act, true[running], self._candidates, q, past)
+                for u, q in each_answer(
+                    self.task, self._act, true[running], self._candidates, q, past
+                )
             ]
         )
         # Simulate each distinct answer once, and only where the candidates' answers differ. With memory

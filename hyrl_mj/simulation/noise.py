@@ -4,9 +4,11 @@
 those below and register it where it is defined.
 """
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self, TypeVar
 
 import numpy as np
@@ -74,6 +76,13 @@ class Signal(ABC):
                 f"{self.kind} noise needs a controller to act against: use simulate(), or another kind of "
                 "noise here"
             )
+        return copy(self)
+
+    def for_rows(self, rows: np.ndarray) -> Signal:
+        """Returns the signal for the simulations `rows` (k,), which then are numbered from 0 on.
+
+        A signal that holds something for each simulation returns that of these.
+        """
         return copy(self)
 
     def reset(self, n: int, rng: np.random.Generator) -> None:
@@ -155,6 +164,9 @@ class Recorded(Signal):
     values: np.ndarray
     bound: float
     kind: str = "recorded"
+
+    def for_rows(self, rows: np.ndarray) -> Signal:
+        return replace(self, values=self.values[:, rows])
 
     def reset(self, n: int, rng: np.random.Generator) -> None:
         if self.values.shape[1] != n:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +28,12 @@ class Passing:
     def __getitem__(self, rows: np.ndarray) -> Passing:
         return Passing(self.first[rows], self.last[rows], self.turned[rows])
 
+    @staticmethod
+    def joined(parts: Sequence[Passing]) -> Passing:
+        """Returns the runs of several parts, one after the other."""
+        columns = zip(*(vars(part).values() for part in parts), strict=True)
+        return Passing(*map(np.concatenate, columns))
+
 
 class Follower:
     """Follows the bearings of n robots from all obstacles, during their runs."""
@@ -40,7 +47,7 @@ class Follower:
 
     def _bearings(self) -> np.ndarray:
         centres = self._plant.geom_positions(self._geoms)[..., list(self._task.plane)]
-        away = self._task.where(self._plant.measurement)[:, None] - centres
+        away = self._task.where(self._plant.truth)[:, None] - centres
         return np.arctan2(away[..., 1], away[..., 0])
 
     def follow(self, active: np.ndarray) -> None:

@@ -42,7 +42,7 @@ class Rules:
         fixed: (rules, p) noise of the rules that are no wishes; zero for the others.
         alternates: (rules,) bool, whether the sign of this noise alternates.
         wishes: for each rule its wish: None, a word, or the column and direction to steer to.
-        lookahead: gives the noise of the rule `ahead`.
+        lookahead: gives the noise of the rule `ahead`; None where nothing can be simulated ahead.
     """
 
     def __init__(self, task: Task, controller: Controller, bound: float, shares: np.ndarray):
@@ -64,7 +64,12 @@ class Rules:
         self.alternates = np.zeros(len(self.fixed), dtype=bool)
         self.alternates[len(wishes) + len(ends) : -2] = True
         self.wishes = [*wishes, *[None] * (len(self.fixed) - len(wishes))]
-        self.lookahead = Lookahead(bound, shares).against(task, controller)
+        # An environment cannot be simulated ahead from the middle of an episode.
+        self.lookahead = (
+            Lookahead(bound, shares).against(task, controller)
+            if task.tabulated and not task.slow
+            else None
+        )
 
     def __len__(self) -> int:
         return len(self.fixed)
@@ -114,7 +119,6 @@ class Programmes(Signal):
         segment: number of samples in a segment.
 
     Attributes:
-        values: the noise (n, p) at each sample so far.
         danger: (n,) the greatest danger that each run has met, by the task's own measure.
         reversals: (n,) how much the answers changed from sample to sample, in shares of the input range;
             a change of the mode counts one.
@@ -127,20 +131,43 @@ class Programmes(Signal):
     def __init__(
         self, task: Task, controller: Controller, rules: Rules, programmes: np.ndarray, segment: int
     ):
-        n, p = len(programmes), rules.fixed.shape[1]
+        self._shape = n, p = len(programmes), rules.fixed.shape[1]
         super().__init__(rules.bound, np.ones(p))
         self.task, self.controller, self.rules = task, controller, rules
         self.programmes, self.segment = programmes, segment
-        self.values: list[np.ndarray] = []
+        self._values: list[np.ndarray] = []
+        self._parts: list[Programmes] = []  # of these runs, where not all are simulated at once
         self.danger, self.reversals, self.rewards = np.full(n, -np.inf), np.zeros(n), np.zeros(n)
         self._last = np.full((n, len(task.inputs)), np.nan)
 
     def against(self, task: Task, controller: Controller | None) -> Self:
         return self
 
+    def for_rows(self, rows: np.ndarray) -> Programmes:
+        some = slice(rows[0], rows[-1] + 1)
+        part = Programmes(
+            self.task, self.controller, self.rules, self.programmes[some], self.segment
+        )
+        # What the part notes, it notes here.
+        part.danger, part.reversals = self.danger[some], self.reversals[some]
+        part.rewards = self.rewards[some]
+        self._parts.append(part)
+        return part
+
+    @property
+    def values(self) -> np.ndarray:
+        """The noise (K, n, p) so far; none in runs that are over."""
+        if not self._parts:
+            return np.array(self._values).reshape(-1, *self._shape)
+        parts = [part.values for part in self._parts]
+        samples = max(map(len, parts))
+        ends = [((0, samples - len(p)), (0, 0), (0, 0)) for p in parts]
+        return np.concatenate([np.pad(*pair) for pair in zip(parts, ends, strict=True)], axis=1)
+
     def reset(self, n: int, rng: np.random.Generator) -> None:
         super().reset(n, rng)
-        self.rules.lookahead.reset(n, rng)
+        if self.rules.lookahead is not None:
+            self.rules.lookahead.reset(n, rng)
 
     def sample(self, now: Sample) -> np.ndarray:
         true, noise = now.measurement, np.zeros_like(now.measurement)
@@ -154,13 +181,15 @@ class Programmes(Signal):
         noise[rows] = self.rules.fixed[rule] * sign[:, None]
         past = nothing_past(self.controller, *true.shape) if now.past is None else now.past
         self._fulfil(noise, rows, rule, now, past)
-        if len(mine := rows[rule == self.rules.ahead]):
+        mine = rows[rule == self.rules.ahead]
+        if len(mine) and self.rules.lookahead is not None:
             runs = now.rows[mine]
             part = Sample(runs, now.k[mine], true[mine], now.q[mine], now.plant, past[mine])
             noise[mine] = self.rules.lookahead.sample(part)
-        u, q = self._answers(true[rows] + noise[rows], now.q[rows], past[rows])
+        measured = self.task.perturbed(true[rows], noise[rows])
+        u, q = self._answers(measured, now.q[rows], past[rows])
         self._observe(true[rows], rows, u, q != now.q[rows])
-        self.values.append(noise)
+        self._values.append(noise)
         return noise
 
     def _fulfil(
@@ -172,7 +201,9 @@ class Programmes(Signal):
         if not len(rows):
             return
         true, candidates = now.measurement[rows], self.rules.candidates
-        answers = [*each_answer(self._answers, true, candidates, now.q[rows], past[rows])]
+        answers = [
+            *each_answer(self.task, self._answers, true, candidates, now.q[rows], past[rows])
+        ]
         u, q = (np.concatenate(parts) for parts in zip(*answers, strict=True))
         u = self._scaled(u)
         usual_mode = np.where(now.q[rows] == NOT_STARTED, q[0], now.q[rows])

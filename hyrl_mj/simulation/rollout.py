@@ -1,6 +1,7 @@
 """The closed loop of task, noise and controller, for many starts at once."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -90,6 +91,8 @@ def closed_loop(
     Raises:
         BadInput: the noise cannot be used.
     """
+    if task.side_by_side is not None and len(z0) > task.side_by_side:
+        return _in_turns(task, controller, z0, noise, q0, seed, settings)
     limit = task.max_steps if settings.steps is None else settings.steps
     backward, record, n = settings.backward, settings.record, len(z0)
     plant = settings.plant or task.plant(n)
@@ -114,7 +117,10 @@ def closed_loop(
         if not len(active):
             break
         now = Sample(np.arange(n), np.full(n, k), measurement, q, plant, past)
-        measured = measurement + signal.sample(now)
+        measured = plant.observe(measurement, signal.sample(now), np.arange(n))
+        if plant.late:  # what the last step came to is known only now
+            outcome[active] = task.outcome(plant.truth[active], plant.unstable[active])
+            active = np.flatnonzero(outcome == Outcome.RUNNING)
         if k == 0 and (fresh := q == NOT_STARTED).any():
             q[fresh] = controller.initial_mode(measured[fresh])
             first_mode = q.copy()
@@ -122,7 +128,7 @@ def closed_loop(
         u[active], q[active] = answer(controller, q[active], measured[active], past[active])
         past = remembering(past, measured)
         (plant.step_backward if backward else plant.step)(u[active], active)
-        measurement, last, lost = plant.measurement, measurement, plant.unstable
+        measurement, last, lost = plant.truth, measurement, plant.unstable
         measurement[lost] = last[lost]  # the last one before the simulation became unstable
         path[k + 1] = task.chart.near(task.z(measurement), path[k])
         length[active] = k + 1
@@ -134,9 +140,14 @@ def closed_loop(
             for name, values in zip(shapes, (before, q.copy(), measured, u), strict=True):
                 kept[name].append(values)
             states.append(np.where(lost[:, None], states[-1], plant.state))
+    if plant.late and not backward:
+        going = outcome == Outcome.RUNNING
+        outcome[going] = task.outcome(plant.measurement[going], plant.unstable[going])
+        measurement = plant.truth
     if not backward:
         late = outcome == Outcome.RUNNING
         outcome[late] = task.verdict(measurement[late])
+    plant.end()
     arrays = {k: np.array(values).reshape(-1, n, *shapes[k]) for k, values in kept.items()}
     arrays |= {k: arrays[k].astype(int) for k in ("before", "q")}
     path = path[: length.max() + 1]
@@ -144,3 +155,50 @@ def closed_loop(
     return Rollout(
         path, length, outcome, first_mode, **arrays, state=np.array(states), passing=passing
     )
+
+
+def _in_turns(
+    task: Task,
+    controller: Controller,
+    z0: np.ndarray,
+    noise: AnyNoise | None,
+    q0: np.ndarray | None,
+    seed: int,
+    settings: LoopSettings,
+) -> Rollout:
+    """Runs the closed loop from some starts after the other, as many at once as the task can."""
+    n, size = len(z0), task.side_by_side
+    assert size is not None
+    parts, signal = [], signal_for(noise, task, controller)
+    turns = range(0, n, size)
+    for first in progress_bar(turns, settings.label, "turns", quiet=settings.quiet):
+        rows = np.arange(first, min(first + size, n))
+        begun = None if q0 is None else np.asarray(q0)[rows]
+        quiet = replace(settings, quiet=True, plant=None)
+        some = signal.for_rows(rows)
+        own = seed if not first else int(np.random.SeedSequence([seed, first]).generate_state(1)[0])
+        parts.append(closed_loop(task, controller, z0[rows], some, begun, own, quiet))
+    return _joined(parts)
+
+
+def _joined(parts: list[Rollout]) -> Rollout:
+    """Returns the runs of several rollouts as one."""
+    found: dict[str, Any] = {}
+    for name in ("path", "before", "q", "measured", "u", "state"):
+        arrays = [getattr(part, name) for part in parts]
+        if arrays[0].ndim < 2:  # not recorded
+            found[name] = arrays[0]
+            continue
+        samples = max(map(len, arrays))
+        found[name] = np.concatenate([_lasting(a, samples) for a in arrays], axis=1)
+    for name in ("length", "outcome", "q0"):
+        found[name] = np.concatenate([getattr(part, name) for part in parts])
+    seen = [part.passing for part in parts if part.passing is not None]
+    return Rollout(**found, passing=Passing.joined(seen) if seen else None)
+
+
+def _lasting(values: np.ndarray, samples: int) -> np.ndarray:
+    """Returns values (k, n, ...) of runs, the last ones repeated, for so many samples."""
+    more = samples - len(values)
+    last = values[-1:] if len(values) else np.zeros((1, *values.shape[1:]), values.dtype)
+    return np.concatenate([values, np.repeat(last, more, axis=0)])

@@ -281,7 +281,8 @@ class _Search:
         explores = rng.random(shape) < EXPLORE
         programmes = np.where(explores, rng.integers(self.rules.ahead, size=shape), drawn)
         rules = np.arange(self.rules.nothing)
-        rules = np.insert(rules, min(LOOKS_AHEAD, len(rules)), self.rules.ahead)
+        if self.rules.lookahead is not None:
+            rules = np.insert(rules, min(LOOKS_AHEAD, len(rules)), self.rules.ahead)
         held = rules[(number - 1) * POPULATION : number * POPULATION]
         programmes[:, : len(held)] = held[:, None]
         lost = np.flatnonzero(~self.open)

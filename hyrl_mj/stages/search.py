@@ -189,9 +189,13 @@ class _Constant(Signal):
         super().__init__(float(np.abs(error).max(initial=0.0)), np.array(task.noisy, dtype=float))
         self._task, self._error = task, error
 
+    def for_rows(self, rows: np.ndarray) -> _Constant:
+        return _Constant(self._task, self._error[rows])
+
     def sample(self, now: Sample) -> np.ndarray:
         task, true = self._task, now.measurement
-        return np.asarray(task.with_z(true, task.z(true) + self._error[now.rows]) - true)
+        there = task.with_z(true, task.z(true) + self._error[now.rows])
+        return np.where(self.shares > 0, there - true, 0.0)
 
 
 def _go_apart(task: Task, a: np.ndarray, b: np.ndarray, far: float) -> bool:

@@ -214,7 +214,13 @@ def possible(task: Task, grid: Nodes) -> bool:
     ends the episode.
     """
     few = len(task.inputs) in VALUES or task.input_levels is not None
-    return isinstance(grid, Grid) and len(grid.counts) <= 2 and few and task.arrival_ends
+    return (
+        isinstance(grid, Grid)
+        and len(grid.counts) <= 2
+        and few
+        and task.arrival_ends
+        and task.tabulated
+    )
 
 
 def _samples(task: Task, z: np.ndarray, inputs: np.ndarray, away: float) -> int:

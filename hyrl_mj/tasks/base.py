@@ -83,6 +83,8 @@ class Task(ABC):
     arrival_ends: bool = True
     #: whether contacts stop the robot, so that no run comes to states inside of walls
     stopped_by_walls: bool = False
+    #: how many episodes are played side by side where each takes an instance of its own; None for any number
+    side_by_side: int | None = None
     #: the mirror symmetry of observation, inputs and reward, if there is one (paper, Section IV-B)
     mirror: Mirror | None = None
     #: bounds of the observation (k,), (k,), noise included
@@ -256,6 +258,28 @@ class Task(ABC):
     def z(self, measured: np.ndarray) -> np.ndarray:
         """Returns the chart points (n, d) of measurements (n, p), by default the first d columns."""
         return measured[:, : self.chart.dimension]
+
+    @property
+    def tabulated(self) -> bool:
+        """Whether a plant can begin anywhere in the middle of an episode, as tables and the game have it."""
+        return True
+
+    def verify(self, z0: np.ndarray, u: np.ndarray, path: np.ndarray, lengths: np.ndarray) -> None:
+        """Plays runs again on the real thing, where the plant is only thought to be like it.
+
+        Args:
+            z0: (n, d) starts.
+            u: (K, n, m) inputs, for so many samples of each run as it lasts.
+            path: (K + 1, n, d) chart points.
+            lengths: (n,) samples of the runs.
+
+        Raises:
+            BadInput: a run goes another way there; the message names the quantity, the sample and both values.
+        """
+
+    def perturbed(self, measured: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Returns what would be measured (n, p) under noise (n, p), as far as a measurement (n, p) tells."""
+        return measured + noise
 
     def at(self, z: np.ndarray) -> np.ndarray:
         """Returns measurements (n, p) with chart points z (n, d), where these are the whole measurement."""

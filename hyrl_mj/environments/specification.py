@@ -1,0 +1,188 @@
+"""What is known of an environment: the values that a task is made of, and when an episode is a success."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from hyrl_mj.chart import Chart
+from hyrl_mj.environments.coordinates import Coordinate
+from hyrl_mj.environments.expressions import Expression
+from hyrl_mj.environments.instance import Recipe
+from hyrl_mj.errors import BadInput
+from hyrl_mj.tasks import Outcome
+
+TERMINATED = "terminated"
+FORMS = '"terminated", "terminated and reward >= 1", \'info["solved"]\' or "distance(fingertip, target) <= 0.05"'
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """When an episode is a success, and when a failure.
+
+    Both are asked at every sample. A success that asks for `terminated` or for `info` ends the episode; any
+    other one has to hold at the end of the episode.
+
+    Attributes:
+        success: the condition of success.
+        failure: the condition of failure; by default the environment ends the episode without success.
+    """
+
+    success: Expression
+    failure: Expression | None = None
+
+    @property
+    def ends(self) -> bool:
+        """Whether a success ends the episode."""
+        return (
+            bool(self.success.keys) or re.search(r"\bterminated\b", self.success.text) is not None
+        )
+
+    @property
+    def keys(self) -> tuple[tuple[str | int, ...], ...]:
+        """The entries of `info` that it needs."""
+        others = () if self.failure is None else self.failure.keys
+        return tuple(dict.fromkeys((*self.success.keys, *others)))
+
+    @property
+    def places(self) -> tuple[tuple[str, str], ...]:
+        """The pairs of names whose distance it needs."""
+        others = () if self.failure is None else self.failure.places
+        return tuple(dict.fromkeys((*self.success.places, *others)))
+
+    def succeeds(self, report: np.ndarray) -> np.ndarray:
+        """Returns whether the condition of success holds for reports (k, r): (k,) bool."""
+        return self.success.holds(self._values(report))
+
+    def outcome(self, report: np.ndarray) -> np.ndarray:
+        """Returns the `Outcome` (k,) of reports (k, r).
+
+        Raises:
+            BadInput: "terminated" alone is the success, and an episode ended in touch with something.
+        """
+        success = self.succeeds(report)
+        terminated, truncated, touches = (report[:, 1:4] > 0).T
+        if self.success.text.strip() == TERMINATED and (touches & terminated).any():
+            raise BadInput(
+                'an episode ended where the robot touches something, and "terminated" counts it as a success: '
+                'say which ends are successes, as "terminated and reward >= 1"'
+            )
+        if self.failure is None:
+            failure = terminated & ~success
+        else:
+            failure = self.failure.holds(self._values(report))
+        reached = success & (terminated | truncated | self.ends)
+        return np.select(
+            [failure, reached, terminated | truncated],
+            [Outcome.CRASHED, Outcome.REACHED, Outcome.STALLED],
+            Outcome.RUNNING,
+        ).astype(int)
+
+    def _values(self, report: np.ndarray) -> dict[object, np.ndarray]:
+        named = {
+            "reward": report[:, 0],
+            "terminated": report[:, 1] > 0,
+            "truncated": report[:, 2] > 0,
+        }
+        entries = [("info", key) for key in self.keys]
+        columns = zip(
+            [*entries, *(("distance", *pair) for pair in self.places)], report[:, 4:].T, strict=True
+        )
+        return {**named, **dict(columns)}
+
+
+@dataclass(frozen=True)
+class EnvironmentSpec:
+    """What is known of an environment; `inspect` finds it.
+
+    Attributes:
+        name: of the environment.
+        recipe: how instances are made, and what they report.
+        chart: the coordinates of the decision.
+        coordinates: where they lie in MuJoCo's state.
+        state: MuJoCo's state (S,) from which runs begin, but for the positions of the chart.
+        qpos, qvel: the places (nq,), (nv,) of positions and velocities in a state.
+        columns: o, the number of columns of an observation.
+        parts: the number of columns of each part of a Dict, in the order of its space; none of a vector.
+        observation_low, observation_high: limits (o,).
+        moves: (o,) bool, the columns of an observation at rest that follow the chart.
+        wrapped: whether wrappers lie around the environment.
+        low, high: limits (m,) of the inputs.
+        inputs: their names.
+        levels: number of a discrete action's values; None of continuous ones.
+        criterion: of success and failure.
+        depth: how deep the robot may be inside of something at a start, as it is in sampled runs [m].
+        start_low, start_high: corners (d,) of the box of starts.
+        noisy: (d,) share of the noise bound on each coordinate.
+        max_steps: samples of an episode.
+        dt: time of a sample [s].
+        worst_reward: the least reward of sampled runs.
+        islands: what can be passed on both sides, by name, each with the id of a geom.
+        tracked: the name of what goes farthest in sampled runs.
+        memoryless: whether MuJoCo's state is all that runs depend on, as far as trials show.
+        found: what was filled in, with the reason, by name.
+    """
+
+    name: str
+    recipe: Recipe
+    chart: Chart
+    coordinates: tuple[Coordinate, ...]
+    state: np.ndarray
+    qpos: np.ndarray
+    qvel: np.ndarray
+    columns: int
+    parts: Mapping[str, int]
+    observation_low: np.ndarray
+    observation_high: np.ndarray
+    moves: np.ndarray
+    wrapped: bool
+    low: np.ndarray
+    high: np.ndarray
+    inputs: tuple[str, ...]
+    levels: int | None
+    criterion: Criterion
+    depth: float
+    start_low: tuple[float, ...]
+    start_high: tuple[float, ...]
+    noisy: tuple[float, ...]
+    max_steps: int
+    dt: float
+    worst_reward: float
+    islands: Mapping[str, int]
+    tracked: str
+    memoryless: bool
+    found: Mapping[str, str]
+
+    @property
+    def dimension(self) -> int:
+        """d, the number of the chart's coordinates."""
+        return len(self.coordinates)
+
+    @property
+    def offset(self) -> np.ndarray:
+        """What the chart's coordinates are greater by than the state (d,)."""
+        return np.array([c.offset for c in self.coordinates])
+
+    def z(self, state: np.ndarray) -> np.ndarray:
+        """Returns the chart points (n, d) of MuJoCo's states (n, S)."""
+        return state[:, list(self.recipe.noisy)] + self.offset
+
+    def state_at(self, z: np.ndarray) -> np.ndarray:
+        """Returns MuJoCo's states (n, S) in which runs begin at chart points (n, d)."""
+        states = np.tile(self.state, (len(z), 1))
+        states[:, list(self.recipe.noisy)] = z - self.offset
+        return states
+
+    def outcome(self, report: np.ndarray) -> np.ndarray:
+        """Returns the `Outcome` (k,) of reports (k, r)."""
+        try:
+            return self.criterion.outcome(report)
+        except BadInput as error:
+            raise BadInput(f"{self.name}: {error}") from None
+
+    def succeeds(self, report: np.ndarray) -> np.ndarray:
+        """Returns whether the condition of success holds for reports (k, r): (k,) bool."""
+        return self.criterion.succeeds(report)
