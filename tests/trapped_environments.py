@@ -7,227 +7,17 @@ name of a case, as "trapped 17", in its place tries that one.
 """
 
 import sys
-import warnings
 from collections import Counter, defaultdict
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from itertools import count
+from dataclasses import replace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
-import traps
-from gymnasium import spaces
-from trap_kinds import ALL, BESIDE, HONEST, TRAPS
-from trapped_worlds import Pilot, Plan, World
-
-import hyrl_mj
-from hyrl_mj import BadInput
-from hyrl_mj.simulation.noise import Recorded
-
-# Starts of a case, and how many of them are also tried alone and with the other agent.
-STARTS, ALONE = 12, 3
-# Bounds of the noise [m, rad].
-SIGNALS = {"no noise": 0.0, "noise": 0.03, "larger noise": 0.15}
-# Both do the same arithmetic, so they differ by rounding at most: where an offset of the chart is added and taken
-# away again. So much of the larger of a value and 1 is far above that, and far below what any trap does.
-SAME = 1e-9
-VERDICTS = ("right", "refused", "refused at run", "wrong", "crash")
-FAILURES = ("wrong", "crash")
-
-
-@dataclass(frozen=True)
-class Case:
-    """An environment to be tried.
-
-    Attributes:
-        name: by which it is found again.
-        traps: the names of its traps.
-        factory: makes it.
-        given: the arguments of `from_gymnasium`.
-        pilot, other: two agents of it.
-        starts: (n, d).
-        steps: of an episode, at most.
-        draws: whether each reset draws something that has to be told.
-    """
-
-    name: str
-    traps: tuple[str, ...]
-    factory: Callable[[], gym.Env]
-    given: dict
-    pilot: Pilot
-    other: Pilot
-    starts: np.ndarray
-    steps: int
-    draws: bool
-
-
-@dataclass(frozen=True)
-class Run:
-    """What happened: t (K + 1,), z (K + 1, d), u (K, m), and the label of the outcome."""
-
-    t: np.ndarray
-    z: np.ndarray
-    u: np.ndarray
-    outcome: str
-
-
-# ---- the truth
-
-
-def played(case, agent, z0, noise, arrival_ends=False):
-    """Returns how an environment that nobody else has touched runs from a start (d,) under noise (K + 1, d)."""
-    traps.forget()
-    env, inner = case.factory(), None
-    inner = env.unwrapped
-    samples = iter(noise)
-
-    def next_sample():
-        inner.sensor_offset = next(samples)
-
-    inner.next_sample, inner.start = next_sample, z0
-    observation, _ = env.reset(seed=case.given.get("seed", 0))
-    begun = inner.data.time
-    t, z, u = [0.0], [inner.place()], []
-    for k in count(1):
-        answer = agent(_flat(env, observation)[None].astype(np.float32))[0]
-        u.append(np.atleast_1d(answer).astype(float))
-        observation, reward, terminated, truncated, info = env.step(_action(env, answer))
-        t.append(inner.data.time - begun)
-        z.append(inner.place())
-        holds, ends = _holds(case.given["success"], inner, reward, terminated, info)
-        last = truncated or k == case.steps
-        outcome = ("reached" if holds else "crashed") if terminated else None
-        if holds and (ends or arrival_ends):
-            outcome = "reached"
-        if outcome is None and last:
-            outcome = "reached" if holds else "stalled"
-        if outcome is not None:
-            return Run(np.array(t), np.array(z), np.array(u), outcome)
-
-
-def _flat(env, observation):
-    """Returns an observation as a vector, the parts of a Dict in the order of their space."""
-    space = env.observation_space
-    if isinstance(space, spaces.Dict):
-        return np.concatenate([np.ravel(observation[key]) for key in space.spaces])
-    return np.ravel(observation)
-
-
-def _action(env, answer):
-    space = env.action_space
-    if isinstance(space, spaces.Discrete):
-        return int(space.start + answer)
-    return np.clip(answer, space.low, space.high).astype(space.dtype)
-
-
-def _holds(success, inner, reward, terminated, info):
-    """Returns whether a step is a success, and whether such a success ends the episode."""
-    if success == "info":
-        return any(info.get(key, False) for key in ("success", "is_success")), True
-    if success == "terminated":
-        return terminated, True
-    if success.startswith("terminated and reward >="):
-        return terminated and reward >= float(success.split()[-1]), True
-    if success.startswith("reward >="):
-        return reward >= float(success.split()[-1]), False
-    data, goal = inner.data, inner.plan.goal_in
-    goal = data.body("goal").xpos if goal in ("mocap", "qpos", "body") else data.site("goal").xpos
-    return np.linalg.norm(data.site("tip").xpos - goal) <= float(success.split()[-1]), False
-
-
-# ---- the judge
-
-
-def difference(arc, run):
-    """Returns a sentence on the first difference of an arc from the truth; "" without one."""
-    n = min(len(arc.t), len(run.t))
-    for name, values, truth, rows in (("z", arc.z, run.z, n), ("u", arc.u, run.u, n - 1)):
-        values, truth = values[:rows], truth[:rows]
-        far = ~(np.abs(values - truth) <= SAME * np.maximum(np.abs(truth), 1.0))
-        if far.any():
-            k = int(far.any(axis=1).argmax())
-            return f"{name} at sample {k} is {values[k].round(6)}, in truth {truth[k].round(6)}"
-    if len(arc.t) != len(run.t):
-        return f"{arc.outcome} after {len(arc.t) - 1} samples, in truth {run.outcome} after {len(run.t) - 1}"
-    if not np.allclose(arc.t, run.t, rtol=0, atol=SAME):
-        return f"the last sample is at {arc.t[-1]:g} s, in truth {run.t[-1]:g} s"
-    return "" if arc.outcome == run.outcome else f"{arc.outcome}, in truth {run.outcome}"
-
-
-def judged(case, starts=STARTS):
-    """Returns the verdict on a case, and why."""
-    traps.forget()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            task = hyrl_mj.from_gymnasium(case.factory, **case.given)
-        except BadInput as refusal:
-            return "refused", str(refusal)
-        except Exception as error:
-            return "crash", f"from_gymnasium raises {type(error).__name__}: {error}"
-        try:
-            wrong = _compared(case, task, case.starts[:starts])
-        except BadInput as refusal:
-            return "refused at run", str(refusal)
-        except _Untrue as error:
-            raise error.__cause__ from None
-        except Exception as error:
-            return "crash", f"simulate raises {type(error).__name__}: {error}"
-    if not wrong and case.draws and "seed" not in case.given:
-        told = " ".join(str(text) for text in getattr(task, "found", {}).values())
-        wrong = "" if "seed" in told else "each reset draws something, and nothing tells which"
-    return ("wrong", wrong) if wrong else ("right", "")
-
-
-class _Untrue(Exception):
-    """The truth itself cannot be had."""
-
-
-def _compared(case, task, starts):
-    rng = np.random.default_rng([7, *case.name.encode()])
-    n, d = starts.shape
-    signals = {
-        name: bound * rng.uniform(-1, 1, (case.steps + 2, n, d)) for name, bound in SIGNALS.items()
-    }
-    truths = {}
-
-    def truth(agent, name, i):
-        key = agent.course, name, i
-        if key not in truths:
-            try:
-                truths[key] = played(case, agent, starts[i], signals[name][:, i], task.arrival_ends)
-            except Exception as error:
-                raise _Untrue from error
-        return truths[key]
-
-    def compare(agent, name, rows, how):
-        policy = hyrl_mj.from_callable(agent, task)
-        noise = _recorded(task, signals[name][:, rows], SIGNALS[name])
-        arcs = hyrl_mj.simulate(task, policy, starts[rows], noise, seed=0)
-        for i, arc in zip(rows, arcs, strict=True):
-            if wrong := difference(arc, truth(agent, name, i)):
-                return f"start {i}, {name}{how}: {wrong}"
-        return ""
-
-    everyone, few = [*range(n)], [*range(min(ALONE, n))]
-    order = rng.permutation(n).tolist()
-    plays = [(case.pilot, name, everyone, "") for name in signals]
-    plays += [(case.pilot, "noise", order, ", in another order")]
-    plays += [(case.pilot, "larger noise", [i], ", alone") for i in few]
-    plays += [(case.other, "noise", few, ", of the other agent")]
-    plays += [(case.pilot, "noise", everyone, ", after the other agent")]
-    return next((wrong for play in plays if (wrong := compare(*play))), "")
-
-
-def _recorded(task, noise, bound):
-    """Returns noise (K, n, d) on the chart as a signal; None without noise."""
-    if not bound:
-        return None
-    values = np.zeros((*noise.shape[:2], len(task.noisy)))
-    values[:, :, : noise.shape[2]] = noise
-    return Recorded(values, bound)
-
+from gymnasium import logger, spaces
+from traps import draws, memories
+from traps.judge import STARTS, VERDICTS, Case, judged
+from traps.kinds import ALL, BESIDE, HONEST, TRAPS
+from traps.pilots import Pilot
+from traps.worlds import Plan, World
 
 # ---- what is drawn
 
@@ -237,7 +27,13 @@ def drawn_plan(rng, kinds):
     kind = str(rng.choice(kinds))
     if kind == "hinge":
         force, damping = rng.uniform(1.0, 2.0), rng.uniform(0.3, 0.6)
-        base = Plan(kind, force=float(force), damping=float(damping), goal=(rng.uniform(-3, 3),))
+        base = Plan(
+            kind,
+            force=float(force),
+            damping=float(damping),
+            goal=(float(rng.uniform(-3, 3)),),
+            rated=bool(rng.random() < 0.3),
+        )
     else:
         rock = rng.uniform((-0.25, -0.15, 0.2, 0.2), (0.05, 0.15, 0.35, 0.4))
         half = (float(rng.uniform(1.5, 1.8)), float(rng.uniform(1.2, 1.5)))
@@ -286,8 +82,12 @@ def made(name, found, plan, planted, rng):
         return env
 
     given: dict[str, Any] = {"success": plan.success}
+    for one in planted:
+        given |= one.given
     if not plan.turns and (plan.first or plan.goal_in == "qpos" or rng.random() < 0.5):
         given["chart"] = _chart(plan, rng)
+    if plan.rated:
+        given |= {"chart": {"angle": "turn", "rate": "qvel[0]"}, "bounds": {"rate": [-8, 8]}}
     if not any(one.limit for one in planted):
         given["steps"] = plan.steps
     draws = any(one.draws for one in planted)
@@ -310,13 +110,13 @@ def _chart(plan, rng):
 
 def _rank(mixin):
     """Those that look at what others do come first, so that these are ready when they look."""
-    looks = (traps.Cached, traps.LateEyes, traps.Inline)
-    return 0 if issubclass(mixin, looks) else 1 if issubclass(mixin, traps.Looking) else 2
+    looks = (memories.Cached, memories.LateEyes, draws.Inline)
+    return 0 if issubclass(mixin, looks) else 1 if issubclass(mixin, memories.Looking) else 2
 
 
 def _pilot(env, plan, frames, rng):
     inner = env.unwrapped
-    sizes = inner.sizes()
+    sizes = inner.widths
     names = [*sizes] if plan.view == "box" else [*inner.observation_space.spaces]
     width = spaces.flatdim(env.observation_space)
     at, columns = width - width // frames, {}
@@ -388,10 +188,11 @@ def tabled(verdicts):
 
 def is_failure(found, verdict):
     """Returns whether a verdict must not be: honest environments have to be accepted, too."""
-    return verdict != "right" if found == ("honest",) else verdict in FAILURES
+    return verdict != "right" if found == ("honest",) else verdict in ("wrong", "crash")
 
 
 def main(argv):
+    logger.min_level = logger.ERROR
     if len(argv) == 1:
         kind, number = argv[0].split()
         case = {"trapped": trapped, "honest": honest}[kind](int(number))

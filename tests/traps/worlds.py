@@ -1,4 +1,4 @@
-"""Small worlds of MuJoCo as environments, in which traps are planted, and the agents that drive through them."""
+"""Small worlds of MuJoCo as environments, in which traps are planted."""
 
 import math
 from dataclasses import dataclass
@@ -39,6 +39,7 @@ class Plan:
         beacon: the place of a mocap body that can be touched; None without one.
         first: whether what moves beside the robot comes first in the model.
         forward: whether a step ends with `mj_forward`.
+        rated: whether the chart has the rate of a hinge, too.
     """
 
     kind: str = "slides"
@@ -61,6 +62,7 @@ class Plan:
     beacon: tuple[float, float] | None = None
     first: bool = False
     forward: bool = False
+    rated: bool = False
 
     @property
     def turns(self):
@@ -102,13 +104,15 @@ class Plan:
         )
 
     def starts(self, n, rng):
-        """Starts (n, d) that touch nothing."""
+        """Starts (n, c) in the chart that touch nothing."""
         found = []
         high = np.array([np.pi] if self.turns else self.half)
         while len(found) < n:
             place = rng.uniform(-high, high)
             if self.free(place):
                 found.append(place)
+        if self.rated:
+            found = [[*place, rng.uniform(-1, 1)] for place in found]
         return np.array(found)
 
     def xml(self):
@@ -136,7 +140,8 @@ class Plan:
 def _hinge(plan):
     return f"""
     <body name="arm"><joint name="turn" type="hinge" axis="0 0 1" damping="{plan.damping}"/>
-      <geom type="capsule" fromto="0 0 0 0.5 0 0" size="0.04" mass="1"/><site name="tip" pos="0.5 0 0"/></body>"""
+      <geom type="capsule" fromto="0 0 0 0.5 0 0" size="0.04" mass="1"/>
+      <site name="tip" pos="0.5 0 0"/></body>"""
 
 
 def _puck(plan):
@@ -173,9 +178,7 @@ def _arena(plan):
     beacon = ""
     if plan.beacon is not None:
         bx, by = plan.beacon
-        beacon = (
-            f'<body name="beacon" mocap="true" pos="{bx} {by} 0.1"><geom size="{plan.radius}"/></body>'
-        )
+        beacon = f'<body name="beacon" mocap="true" pos="{bx} {by} 0.1"><geom size="{plan.radius}"/></body>'
     floor = '<geom type="plane" size="3 3 1"/>' if plan.kind == "free" else ""
     return f'<geom name="rock" type="box" size="{rx} {ry} 0.1" pos="{x} {y} 0.1"/>{walls}{floor}{beacon}'
 
@@ -223,16 +226,15 @@ class World(gym.Env):
             if kind == "qpos":
                 self.goal_at = int(self.model.joint("goal_x").qposadr[0])
         self.widths = self.sizes()
+        self.target = np.array(plan.goal)
         self.start, self.sensor_offset = None, np.zeros(plan.dimension)
-        parts = [
-            (name, spaces.Box(-np.inf, np.inf, (size,))) for name, size in self.widths.items()
-        ]
+        parts = [(name, _numbers(size)) for name, size in self.widths.items()]
         if plan.view == "unsorted":
             self.observation_space = spaces.Dict(parts)
         elif plan.view == "dict":
             self.observation_space = spaces.Dict(dict(parts))
         else:
-            self.observation_space = spaces.Box(-np.inf, np.inf, (sum(self.widths.values()),))
+            self.observation_space = _numbers(sum(self.widths.values()))
         limit = plan.scale * np.ones(plan.dimension)
         self.action_space = spaces.Box(-limit, limit, dtype=np.float64)
         if plan.levels:
@@ -250,11 +252,14 @@ class World(gym.Env):
         mujoco.mj_resetData(self.model, self.data)
         drawn = self.plan.starts(1, self.np_random)[0]
         self.draw()
-        self.data.qpos[self.chart] = drawn if self.start is None else self.start
+        start = drawn if self.start is None else self.start
+        self.data.qpos[self.chart] = start[: self.plan.dimension]
+        if self.plan.rated:
+            self.data.qvel[self.rates] = start[self.plan.dimension :]
         mujoco.mj_forward(self.model, self.data)
         self.next_sample()
         self.begin()
-        return self._get_obs(), {}
+        return self.shown(), {}
 
     def step(self, action):
         self.drive(self.decoded(action))
@@ -263,8 +268,7 @@ class World(gym.Env):
             mujoco.mj_forward(self.model, self.data)
         self.next_sample()
         self.remember()
-        observation = self._get_obs()
-        return observation, *self.judged()
+        return self.shown(), *self.judged()
 
     def draw(self):
         """Draws what a reset draws, beside the start."""
@@ -300,6 +304,11 @@ class World(gym.Env):
     def place(self):
         """The robot's place (d,)."""
         return self.data.qpos[self.chart].copy()
+
+    def charted(self):
+        """The chart point (c,)."""
+        rate = self.data.qvel[self.rates] if self.plan.rated else []
+        return np.append(self.place(), rate)
 
     def sense(self):
         """The robot's place (d,), as its sensor reads it."""
@@ -375,6 +384,10 @@ class World(gym.Env):
         )
 
     def _get_obs(self):
+        return self.shown()
+
+    def shown(self):
+        """The observation, of its space."""
         parts = self.parts()
         if self.plan.view == "box":
             return np.concatenate([parts[name] for name in self.widths])
@@ -407,60 +420,5 @@ class World(gym.Env):
         return self.reward(arrived), bool(ends or self.crashed()), False, info
 
 
-@dataclass(frozen=True)
-class Pilot:
-    """An agent without a memory: around the island on the nearer side, then to the goal.
-
-    It looks a little at each number of its observation, so that its inputs tell what it saw. All that it
-    computes is rounded alike for one observation and for many.
-
-    Attributes:
-        plan: of the world.
-        columns: those of velocity, position and to_goal in the observation.
-        weights: (k,) of the numbers of the observation.
-        course: a direction (d,) that it always drives in instead; None to reach the goal.
-    """
-
-    plan: Plan
-    columns: dict
-    weights: np.ndarray
-    course: tuple | None = None
-
-    def __call__(self, observation):
-        """Inputs (n, m), or numbers of levels (n,), for observations (n, k)."""
-        o, plan = np.asarray(observation, dtype=float), self.plan
-        velocity, position, to_goal = (
-            o[:, self.columns[name]] for name in ("velocity", "position", "to_goal")
-        )
-        glance = np.cumsum(o * self.weights, axis=1)[:, -1:]
-        glance = glance / (1 + np.abs(glance))
-        if self.course is not None:
-            course = np.broadcast_to(np.array(self.course), velocity.shape)
-        elif plan.turns:
-            course = _turn(to_goal, velocity)
-        else:
-            course = _around(plan, position, to_goal) - 0.2 * velocity
-        share = 0.9 * np.clip(course, -1, 1) + 0.1 * glance * np.array([1.0, -0.7])[: plan.dimension]
-        if not plan.levels:
-            return plan.scale * share
-        scores = np.stack([share, -share], axis=2).reshape(len(o), -1)
-        return np.where(scores.max(axis=1) < 0.05, 0, 1 + scores.argmax(axis=1))
-
-
-def _turn(to_goal, velocity):
-    cosine, sine = to_goal[:, :1], to_goal[:, 1:]
-    push = np.where(cosine > 0, 2 * sine, np.where(sine >= 0, 1.0, -1.0))
-    return -push - 0.3 * velocity
-
-
-def _around(plan, position, to_goal):
-    (px, py), (x, y, hx, hy) = position.T, plan.rock
-    room = plan.radius + 0.12
-    side = np.where(py >= y, 1.0, -1.0)
-    behind, within = px < x + hx + room, np.abs(py - y) < hy + room
-    corner = np.stack([x + hx + room + 0.1 - px, y + side * (hy + room + 0.05) - py], axis=1)
-    aside = np.stack([0.1 + 0 * px, side], axis=1)
-    ahead = np.where(behind[:, None], corner, to_goal)
-    ahead = np.where((behind & within)[:, None], aside, ahead)
-    length = np.sqrt(ahead[:, :1] * ahead[:, :1] + ahead[:, 1:] * ahead[:, 1:])
-    return ahead / np.maximum(length, 0.3)
+def _numbers(size):
+    return spaces.Box(-np.inf, np.inf, (size,), dtype=np.float64)

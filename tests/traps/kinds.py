@@ -1,19 +1,28 @@
 """The kinds of traps, each with variants that are drawn, and what honest environments are made of."""
 
+import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import gymnasium as gym
 import numpy as np
-import traps
-from gymnasium import wrappers
-from trapped_worlds import Plan
-from traps import HIDDEN, VISIBLE, planted
+
+from hyrl_mj import from_gymnasium
+from traps import draws, memories, wrappers
+from traps.memories import planted
+from traps.storages import HIDDEN, VISIBLE
+from traps.worlds import Plan
 
 PUCKS = ("slides", "free", "cart", "door")
 DRIVEN = ("slides", "cart", "door")
 BESIDE = ("cart", "door")
 ALL = (*PUCKS, "hinge")
+
+
+# Expressions for success, with those for failure, where `from_gymnasium` takes them.
+EXPRESSIONS = {"terminated and reward >= 1": "terminated and reward < 1"}
+if "failure" not in inspect.signature(from_gymnasium).parameters:
+    EXPRESSIONS.clear()
 
 
 @dataclass(frozen=True)
@@ -27,6 +36,7 @@ class Planted:
         draws: whether each reset draws something that has to be told.
         frames: of the observation that are stacked.
         limit: whether the environment tells the length of its episodes.
+        given: arguments of `from_gymnasium`.
     """
 
     mixins: tuple[type, ...] = ()
@@ -35,6 +45,7 @@ class Planted:
     draws: bool = False
     frames: int = 1
     limit: bool = False
+    given: dict = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -75,7 +86,7 @@ def _region(rng, plan):
 
 def _latch(rng, plan, storages):
     storage = _one(rng, *storages)
-    kind = _one(rng, traps.Key, traps.Broken, traps.Waypoint)
+    kind = _one(rng, memories.Key, memories.Broken, memories.Waypoint)
     return planted(kind, storage, **_region(rng, plan))
 
 
@@ -87,56 +98,56 @@ def _(rng, plan):
 @trap("latch in the model")
 def _(rng, plan):
     what = _one(rng, "dof_damping", "wind", *(() if plan.turns else ("rock",)))
-    return Planted((planted(traps.Unlatched, unlatches=what, **_region(rng, plan)),))
+    return Planted((planted(memories.Unlatched, unlatches=what, **_region(rng, plan)),))
 
 
 @trap("sticky success")
 def _(rng, plan):
-    return Planted((planted(traps.Sticky, forgets=_one(rng, True, False)),))
+    return Planted((planted(memories.Sticky, forgets=_one(rng, True, False)),))
 
 
 @trap("action delay")
 def _(rng, plan):
     delay, kind = int(rng.integers(1, 5)), _one(rng, "deque", "list", "ring")
     if rng.random() < 0.5 and not plan.levels:
-        return Planted(wrappers=(lambda env: traps.Waits(env, delay, kind),))
-    return Planted((planted(traps.LateAction, action_delay=delay, action_queue=kind),))
+        return Planted(wrappers=(lambda env: wrappers.Waits(env, delay, kind),))
+    return Planted((planted(memories.LateAction, action_delay=delay, action_queue=kind),))
 
 
 @trap("observation delay")
 def _(rng, plan):
     delay, kind = int(rng.integers(1, 4)), _one(rng, "deque", "list", "ring")
     if rng.random() < 0.4:
-        return Planted((planted(traps.LateEyes, eye_delay=delay, eye_queue=kind),))
+        return Planted((planted(memories.LateEyes, eye_delay=delay, eye_queue=kind),))
     if rng.random() < 0.5:
-        wrap = lambda env: wrappers.DelayObservation(env, delay)  # noqa: E731
+        wrap = lambda env: gym.wrappers.DelayObservation(env, delay)  # noqa: E731
     else:
-        wrap = lambda env: traps.Looks(env, delay, kind)  # noqa: E731
+        wrap = lambda env: wrappers.Looks(env, delay, kind)  # noqa: E731
     return Planted(wrappers=(wrap,), plan={"view": "box"})
 
 
 @trap("cached value")
 def _(rng, plan):
-    return Planted((planted(traps.Cached, caches=_one(rng, "step", "slow", "counter")),))
+    return Planted((planted(memories.Cached, caches=_one(rng, "step", "slow", "counter")),))
 
 
 @trap("stored difference")
 def _(rng, plan):
     differs = _one(rng, "step", "observation", "filter")
-    return Planted((planted(traps.Difference, differs=differs),))
+    return Planted((planted(memories.Difference, differs=differs),))
 
 
 @trap("rare attribute")
 def _(rng, plan):
     period = _one(rng, None, 61, 71, 97)
     storage = _one(rng, *VISIBLE)
-    return Planted((planted(traps.Seldom, storage, period=period, **_region(rng, plan)),))
+    return Planted((planted(memories.Seldom, storage, period=period, **_region(rng, plan)),))
 
 
 @trap("drawn model", DRIVEN)
 def _(rng, plan):
     what = _one(rng, "damping", "mass", "rock", "friction", "gear", "wind", "timestep")
-    return Planted((planted(traps.Drawn, drawn=what),), draws=True)
+    return Planted((planted(draws.Drawn, drawn=what),), draws=True)
 
 
 @trap("drawn goal", PUCKS)
@@ -145,7 +156,7 @@ def _(rng, plan):
     change = {"goal_in": where}
     if where in ("userdata", "attribute"):
         change["success"] = _one(rng, "info", "terminated", "reward >= 1")
-    return Planted((planted(traps.DrawnGoal),), plan=change, draws=True)
+    return Planted((planted(draws.DrawnGoal),), plan=change, draws=True)
 
 
 @trap("step noise")
@@ -155,35 +166,37 @@ def _(rng, plan):
         "rough_everywhere": _one(rng, True, False, False),
         "rough_on": _one(rng, "drive", "sensor"),
     }
-    return Planted((planted(traps.Rough, **values, **_region(rng, plan)),))
+    return Planted((planted(draws.Rough, **values, **_region(rng, plan)),))
 
 
 @trap("wrapper order")
 def _(rng, plan):
     steps = int(plan.steps * rng.uniform(0.5, 0.9))
     own = rng.random() < 0.2
-    limit = traps.Stops if own else wrappers.TimeLimit
+    limit = wrappers.Stops if own else gym.wrappers.TimeLimit
     frames = int(rng.integers(2, 5))
     outer = {
-        "clip": wrappers.ClipAction,
-        "rescale": lambda env: wrappers.RescaleAction(env, -1.0, 1.0),
-        "stack": lambda env: wrappers.FrameStackObservation(env, frames),
-        "normalize": wrappers.NormalizeObservation,
+        "clip": gym.wrappers.ClipAction,
+        "rescale": lambda env: gym.wrappers.RescaleAction(env, -1.0, 1.0),
+        "stack": lambda env: gym.wrappers.FrameStackObservation(env, frames),
+        "normalize": gym.wrappers.NormalizeObservation,
         "transform": _scaled,
-        "delay": lambda env: wrappers.DelayObservation(env, 2),
-        "ease": lambda env: traps.Eases(env, 0.4),
-        "blend": lambda env: traps.Blends(env, 0.6),
-        "append": traps.Appends,
-        "reward": lambda env: wrappers.NormalizeReward(env),
-        "statistics": wrappers.RecordEpisodeStatistics,
+        "delay": lambda env: gym.wrappers.DelayObservation(env, 2),
+        "ease": lambda env: wrappers.Eases(env, 0.4),
+        "blend": lambda env: wrappers.Blends(env, 0.6),
+        "append": wrappers.Appends,
+        "reward": lambda env: gym.wrappers.NormalizeReward(env),
+        "statistics": gym.wrappers.RecordEpisodeStatistics,
     }
     if not own:
-        outer["time"] = wrappers.TimeAwareObservation
+        outer["time"] = gym.wrappers.TimeAwareObservation
     # What is below may be anything; what is stacked is stacked last, so that the last frame is the newest.
     names = [str(name) for name in rng.permutation([*outer])[: int(rng.integers(1, 4))]]
     names.sort(key=lambda name: name == "stack")
     chain = [outer[name] for name in names]
-    chain.insert(int(rng.integers(len(chain) + 1)) if "time" not in names else 0, _limited(limit, steps))
+    chain.insert(
+        int(rng.integers(len(chain) + 1)) if "time" not in names else 0, _limited(limit, steps)
+    )
     change = {"view": "box", "levels": False}
     if "reward" in names:
         change["success"] = "info"
@@ -197,7 +210,7 @@ def _limited(limit, steps):
 
 
 def _scaled(env):
-    return wrappers.TransformObservation(env, _at_nine_tenths, env.observation_space)
+    return gym.wrappers.TransformObservation(env, _at_nine_tenths, env.observation_space)
 
 
 def _at_nine_tenths(observation):
@@ -209,9 +222,9 @@ def _(rng, plan):
     frames = int(rng.integers(2, 5))
     wrap, stacked = _one(
         rng,
-        (lambda env: wrappers.FrameStackObservation(env, frames), frames),
-        (wrappers.NormalizeObservation, 1),
-        (lambda env: traps.Blends(env, 0.5), 1),
+        (lambda env: gym.wrappers.FrameStackObservation(env, frames), frames),
+        (gym.wrappers.NormalizeObservation, 1),
+        (lambda env: wrappers.Blends(env, 0.5), 1),
     )
     return Planted(wrappers=(wrap,), plan={"view": "box"}, frames=stacked)
 
@@ -222,10 +235,10 @@ def _(rng, plan):
     # A distance would be stale, too: which one counts is another question.
     change = {"forward": False, "success": _one(rng, "info", "reward >= 1")}
     if what == "forces":
-        return Planted((planted(traps.Forces),), plan=change)
+        return Planted((planted(draws.Forces),), plan=change)
     if what == "substep":
-        return Planted((planted(traps.Substep),), plan=change)
-    return Planted((planted(traps.Stale, stale=what),), plan=change)
+        return Planted((planted(draws.Substep),), plan=change)
+    return Planted((planted(draws.Stale, stale=what),), plan=change)
 
 
 @trap("own clock")
@@ -233,7 +246,7 @@ def _(rng, plan):
     kinds = ("wind", "wall") if plan.turns else ("wind", "wall", "beacon", "beacon")
     kind = _one(rng, *kinds)
     change = {"beacon": _beacon(plan, rng)} if kind == "beacon" else {}
-    return Planted((planted(traps.Clock, clock=kind),), plan=change)
+    return Planted((planted(draws.Clock, clock=kind),), plan=change)
 
 
 def _beacon(plan, rng):
@@ -246,62 +259,69 @@ def _(rng, plan):
     kinds = ("goal", "wins", "learnt", *(("cart",) if plan.kind in BESIDE else ()))
     success = _one(rng, "info", "terminated", "reward >= 1")
     return Planted(
-        (planted(traps.Surviving, survives=_one(rng, *kinds)),), plan={"success": success}
+        (planted(draws.Surviving, survives=_one(rng, *kinds)),), plan={"success": success}
     )
 
 
 @trap("initial motion", BESIDE)
 def _(rng, plan):
-    values = {"rolls_as_drawn": _one(rng, True, True, False), "rolls_by": _one(rng, "speed", "place")}
-    return Planted((planted(traps.Rolling, **values),))
+    values = {
+        "rolls_as_drawn": _one(rng, True, True, False),
+        "rolls_by": _one(rng, "speed", "place"),
+    }
+    return Planted((planted(draws.Rolling, **values),))
 
 
 @trap("recalled input or observation")
 def _(rng, plan):
     recalls = _one(rng, "action", "seen", "tracked")
     if recalls == "tracked":
-        return Planted((planted(traps.Tracked),))
-    return Planted((planted(traps.Recalled, recalls=recalls),))
+        return Planted((planted(memories.Tracked),))
+    return Planted((planted(memories.Recalled, recalls=recalls),))
 
 
 @trap("drawn bias of the sensor")
 def _(rng, plan):
-    return Planted((planted(traps.Bias),), draws=True)
+    return Planted((planted(draws.Bias),), draws=True)
 
 
 @trap("smoothing")
 def _(rng, plan):
     share = float(rng.uniform(0.2, 0.6))
     if rng.random() < 0.4 and not plan.levels:
-        return Planted(wrappers=(lambda env: traps.Eases(env, share),))
-    return Planted((planted(traps.Smooth, _one(rng, *VISIBLE), share_of_new=share),))
+        return Planted(wrappers=(lambda env: wrappers.Eases(env, share),))
+    return Planted((planted(memories.Smooth, _one(rng, *VISIBLE), share_of_new=share),))
 
 
 @trap("hidden memory")
 def _(rng, plan):
     storage = _one(rng, *HIDDEN)
-    kind = _one(rng, traps.Smooth, traps.Seldom, None)
+    kind = _one(rng, memories.Smooth, memories.Seldom, None)
     if kind is None:
         return Planted((_latch(rng, plan, (storage,)),))
-    values = {"share_of_new": 0.4} if kind is traps.Smooth else {"period": 61, **_region(rng, plan)}
+    values = (
+        {"share_of_new": 0.4} if kind is memories.Smooth else {"period": 61, **_region(rng, plan)}
+    )
     return Planted((planted(kind, storage, **values),))
 
 
 @trap("shared by instances")
 def _(rng, plan):
-    return Planted((planted(traps.Ageing),))
+    return Planted((planted(draws.Ageing),))
 
 
 @trap("success and collision terminate", PUCKS)
 def _(rng, plan):
-    success = _one(rng, "info", "reward >= 1", "distance")
-    return Planted((planted(traps.Both),), plan={"success": success, "crashes": True})
+    success = _one(rng, "info", "reward >= 1", "distance", *EXPRESSIONS)
+    change = {"success": success, "crashes": True, "word": "success"}
+    given = {"failure": EXPRESSIONS[success]} if success in EXPRESSIONS else {}
+    return Planted((planted(draws.Both),), plan=change, given=given)
 
 
 @trap("progress as reward")
 def _(rng, plan):
     success = f"reward >= {float(rng.uniform(-0.1, 0.1)):.3f}"
-    return Planted((planted(traps.Progress),), plan={"success": success})
+    return Planted((planted(memories.Progress),), plan={"success": success})
 
 
 @trap("order of a Dict")
@@ -311,7 +331,7 @@ def _(rng, plan):
 
 @trap("no method observes")
 def _(rng, plan):
-    return Planted((planted(traps.Inline),))
+    return Planted((planted(draws.Inline),))
 
 
 # ---- what honest environments are made of
@@ -323,42 +343,42 @@ def _plain(rng, plan):
 
 def _limited_in_time(rng, plan):
     steps = int(plan.steps * rng.uniform(0.7, 1.0))
-    return Planted(wrappers=(_limited(wrappers.TimeLimit, steps),), limit=True)
+    return Planted(wrappers=(_limited(gym.wrappers.TimeLimit, steps),), limit=True)
 
 
 def _rescaled(rng, plan):
     return Planted(
-        wrappers=(lambda env: wrappers.RescaleAction(env, -0.5, 0.5),), plan={"levels": False}
+        wrappers=(lambda env: gym.wrappers.RescaleAction(env, -0.5, 0.5),), plan={"levels": False}
     )
 
 
 def _flattened(rng, plan):
-    return Planted(wrappers=(wrappers.FlattenObservation,))
+    return Planted(wrappers=(gym.wrappers.FlattenObservation,))
 
 
 def _counting(rng, plan):
-    return Planted((traps.Counting,))
+    return Planted((draws.Counting,))
 
 
 def _single(rng, plan):
-    wrap = lambda env: wrappers.DtypeObservation(env, np.float32)  # noqa: E731
+    wrap = lambda env: gym.wrappers.DtypeObservation(env, np.float32)  # noqa: E731
     return Planted(wrappers=(wrap,), plan={"view": "box"})
 
 
 def _recorded(rng, plan):
-    return Planted(wrappers=(wrappers.RecordEpisodeStatistics, wrappers.OrderEnforcing))
+    return Planted(wrappers=(gym.wrappers.RecordEpisodeStatistics, gym.wrappers.OrderEnforcing))
 
 
 def _fresh_fields(rng, plan):
     if plan.turns:
         return Planted(plan={"forward": True})
-    return Planted((planted(traps.Stale, stale="site_xpos"),), plan={"forward": True})
+    return Planted((planted(draws.Stale, stale="site_xpos"),), plan={"forward": True})
 
 
 def _timed(rng, plan):
     if plan.turns:
         return Planted()
-    return Planted((traps.Timed,), plan={"beacon": _beacon(plan, rng), "scan": True})
+    return Planted((draws.Timed,), plan={"beacon": _beacon(plan, rng), "scan": True})
 
 
 def _scaled_observation(rng, plan):
