@@ -9,8 +9,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from trapped_environments import honest, is_failure, judged, trapped
+from traps.honest import HONEST
 from traps.judge import difference, played
-from traps.kinds import HONEST, TRAPS
+from traps.kinds import TRAPS
 from traps.worlds import World
 
 import hyrl_mj

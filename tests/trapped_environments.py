@@ -14,10 +14,12 @@ from typing import Any
 import numpy as np
 from gymnasium import logger, spaces
 from traps import draws, memories
+from traps.honest import HONEST
 from traps.judge import STARTS, VERDICTS, Case, judged
-from traps.kinds import ALL, BESIDE, HONEST, TRAPS
+from traps.kinds import ALL, BESIDE, TRAPS
 from traps.pilots import Pilot
-from traps.worlds import Plan, World
+from traps.plans import Plan
+from traps.worlds import World
 
 # ---- what is drawn
 

@@ -1,4 +1,4 @@
-"""The kinds of traps, each with variants that are drawn, and what honest environments are made of."""
+"""The kinds of traps, each with variants that are drawn."""
 
 import inspect
 from collections.abc import Callable
@@ -10,8 +10,8 @@ import numpy as np
 from hyrl_mj import from_gymnasium
 from traps import draws, memories, wrappers
 from traps.memories import planted
+from traps.plans import Plan
 from traps.storages import HIDDEN, VISIBLE
-from traps.worlds import Plan
 
 PUCKS = ("slides", "free", "cart", "door")
 DRIVEN = ("slides", "cart", "door")
@@ -180,7 +180,7 @@ def _(rng, plan):
         "rescale": lambda env: gym.wrappers.RescaleAction(env, -1.0, 1.0),
         "stack": lambda env: gym.wrappers.FrameStackObservation(env, frames),
         "normalize": gym.wrappers.NormalizeObservation,
-        "transform": _scaled,
+        "transform": scaled,
         "delay": lambda env: gym.wrappers.DelayObservation(env, 2),
         "ease": lambda env: wrappers.Eases(env, 0.4),
         "blend": lambda env: wrappers.Blends(env, 0.6),
@@ -195,7 +195,7 @@ def _(rng, plan):
     names.sort(key=lambda name: name == "stack")
     chain = [outer[name] for name in names]
     chain.insert(
-        int(rng.integers(len(chain) + 1)) if "time" not in names else 0, _limited(limit, steps)
+        int(rng.integers(len(chain) + 1)) if "time" not in names else 0, limited(limit, steps)
     )
     change = {"view": "box", "levels": False}
     if "reward" in names:
@@ -205,11 +205,11 @@ def _(rng, plan):
     )
 
 
-def _limited(limit, steps):
+def limited(limit, steps):
     return lambda env: limit(env, steps)
 
 
-def _scaled(env):
+def scaled(env):
     return gym.wrappers.TransformObservation(env, _at_nine_tenths, env.observation_space)
 
 
@@ -245,11 +245,11 @@ def _(rng, plan):
 def _(rng, plan):
     kinds = ("wind", "wall") if plan.turns else ("wind", "wall", "beacon", "beacon")
     kind = _one(rng, *kinds)
-    change = {"beacon": _beacon(plan, rng)} if kind == "beacon" else {}
+    change = {"beacon": beacon(plan, rng)} if kind == "beacon" else {}
     return Planted((planted(draws.Clock, clock=kind),), plan=change)
 
 
-def _beacon(plan, rng):
+def beacon(plan, rng):
     x = plan.rock[0] + plan.rock[2] + 0.4
     return float(x), float(plan.rock[1] + rng.uniform(-0.6, 0.6))
 
@@ -332,60 +332,3 @@ def _(rng, plan):
 @trap("no method observes")
 def _(rng, plan):
     return Planted((planted(draws.Inline),))
-
-
-# ---- what honest environments are made of
-
-
-def _plain(rng, plan):
-    return Planted()
-
-
-def _limited_in_time(rng, plan):
-    steps = int(plan.steps * rng.uniform(0.7, 1.0))
-    return Planted(wrappers=(_limited(gym.wrappers.TimeLimit, steps),), limit=True)
-
-
-def _rescaled(rng, plan):
-    return Planted(
-        wrappers=(lambda env: gym.wrappers.RescaleAction(env, -0.5, 0.5),), plan={"levels": False}
-    )
-
-
-def _flattened(rng, plan):
-    return Planted(wrappers=(gym.wrappers.FlattenObservation,))
-
-
-def _counting(rng, plan):
-    return Planted((draws.Counting,))
-
-
-def _single(rng, plan):
-    wrap = lambda env: gym.wrappers.DtypeObservation(env, np.float32)  # noqa: E731
-    return Planted(wrappers=(wrap,), plan={"view": "box"})
-
-
-def _recorded(rng, plan):
-    return Planted(wrappers=(gym.wrappers.RecordEpisodeStatistics, gym.wrappers.OrderEnforcing))
-
-
-def _fresh_fields(rng, plan):
-    if plan.turns:
-        return Planted(plan={"forward": True})
-    return Planted((planted(draws.Stale, stale="site_xpos"),), plan={"forward": True})
-
-
-def _timed(rng, plan):
-    if plan.turns:
-        return Planted()
-    return Planted((draws.Timed,), plan={"beacon": _beacon(plan, rng), "scan": True})
-
-
-def _scaled_observation(rng, plan):
-    return Planted(wrappers=(_scaled,), plan={"view": "box"})
-
-
-HONEST = (
-    _plain, _limited_in_time, _rescaled, _flattened, _counting, _single, _recorded, _fresh_fields, _timed,
-    _scaled_observation,
-)  # fmt: skip

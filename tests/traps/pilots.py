@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from traps.worlds import Plan
+from traps.plans import Plan
 
 
 @dataclass(frozen=True)
