@@ -2,7 +2,7 @@
 
     python tests/trapped_environments.py 300 100
 
-tries 300 with traps and 100 honest ones, and prints a table with the failures. A third number is the seed; a
+tries 300 with traps and 100 honest ones, and prints the failures and a table. A third number is the seed; a
 name of a case, as "trapped 17", in its place tries that one.
 """
 
@@ -202,16 +202,16 @@ def main(argv):
         return
     n, m = int(argv[0]), int(argv[1])
     seed = int(argv[2]) if len(argv) > 2 else 0
-    verdicts, failures = [], []
+    verdicts, failures = [], 0
     for made_case, cases in ((trapped, n), (honest, m)):
         for i in range(cases):
             case = made_case(i, seed)
             verdict, why = judged(case)
             verdicts.append((case.traps, verdict))
             if is_failure(case.traps, verdict):
-                failures.append(f"{case.name} ({', '.join(case.traps)}): {verdict}: {why}")
-    print(tabled(verdicts))
-    print(f"\n{len(failures)} failures", *failures, sep="\n")
+                failures += 1
+                print(f"{case.name} ({', '.join(case.traps)}): {verdict}: {why}", flush=True)
+    print(f"\n{tabled(verdicts)}\n\n{failures} failures")
 
 
 if __name__ == "__main__":

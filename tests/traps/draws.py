@@ -160,6 +160,8 @@ class Rough(Region, Looking):
             if "late" not in self.__dict__:
                 self.late = np.random.default_rng(7)
             return self.late.uniform(-1, 1)
+        if self.rough_source == "space":
+            return float(np.ravel(self.action_space.sample())[0]) / 4
         if self.rough_source == "urandom":
             return int.from_bytes(os.urandom(4), "little") / 2**31 - 1
         return (time.perf_counter_ns() % 1000) / 500 - 1

@@ -162,7 +162,9 @@ def _(rng, plan):
 @trap("step noise")
 def _(rng, plan):
     values = {
-        "rough_source": _one(rng, "np_random", "numpy", "random", "late", "urandom", "time"),
+        "rough_source": _one(
+            rng, "np_random", "numpy", "random", "late", "space", "urandom", "time"
+        ),
         "rough_everywhere": _one(rng, True, False, False),
         "rough_on": _one(rng, "drive", "sensor"),
     }
