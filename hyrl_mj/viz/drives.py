@@ -27,7 +27,6 @@ from hyrl_mj.viz.options import ReplayOptions
 from hyrl_mj.viz.replay import Show, check_replay, render_replay
 from hyrl_mj.viz.tables import NAMES, Table, print_table
 
-ARRIVED = ("arrived", "waited")
 USUAL = ReplayOptions()
 
 
@@ -64,14 +63,13 @@ def drive_sentences(drives: Drives) -> list[str]:
 
 
 def _arrivals(drives: Drives, arcs: Mapping[str, Sequence[HybridArc]]) -> str:
-    counts = {
-        name: sum(ending(drives.task, arc) in ARRIVED for arc in several)
-        for name, several in arcs.items()
-    }
-    starts = len(arcs["hyrl"])
-    return (
-        f"RL policy arrives from {counts['policy']} of {starts} starts, HyRL from {counts['hyrl']}"
-    )
+    counts = []
+    for name in ("policy", "hyrl"):
+        ends = [ending(drives.task, arc) for arc in arcs[name]]
+        arrives = f"{ends.count('arrived')}" + f" of {len(ends)} starts" * (name == "policy")
+        waits = ends.count("waited")
+        counts.append(arrives + f" and waits near a post at the goal from {waits}" * (waits > 0))
+    return f"RL policy arrives from {counts[0]}, HyRL from {counts[1]}"
 
 
 def drive_shows(drives: Drives, title: str, starts: Sequence[int] | None = None) -> list[Show]:
