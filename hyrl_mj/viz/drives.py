@@ -35,7 +35,8 @@ def drive_tables(drives: Drives, noise: str, seed: int) -> list[Table]:
     posts = drives.task.layouts.posts
     what = f"{posts} post{'s' * (posts != 1)}"
     named = "no noise" if noise == "none" else f"{noise} noise of {drives.bounds}"
-    tables = [_table(drives, drives.arcs, f"{what}: {named}, seed {seed}")]
+    near = f"arrived: within {drives.task.reached:g} m of the goal"
+    tables = [_table(drives, drives.arcs, f"{what}: {named}, seed {seed}; {near}")]
     if drives.attacked:
         title = f"{what}: the worst noise of up to {drives.bounds} that a search found for each"
         tables.append(_table(drives, drives.attacked, title))
