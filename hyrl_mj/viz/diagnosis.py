@@ -48,8 +48,8 @@ def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
     """
     task, eps, loop = run.task, run.settings.noise, PolicyController(run.policy)
     if losses is not None:
-        kinds = (losses.grazing, losses.undecided, losses.unaided)
-        kinds = sorted(kinds, key=len, reverse=True)
+        parts = losses.grazing, losses.undecided, losses.unaided
+        kinds = sorted(parts, key=len, reverse=True)
         z0 = np.vstack([z[np.argsort(from_middle(task, z), kind="stable")[:TRIED]] for z in kinds])
         if not len(z0):
             return None
