@@ -349,6 +349,20 @@ def test_who_waits_near_the_goal_has_not_arrived(planted, read):
     )
 
 
+def test_a_rover_that_waits_has_not_arrived_either(read):
+    rover = hyrl_mj.get_task("rover_field")
+    field = read(posts=[post(-0.7, 0)], starts=[start(-1.5, 0), start(-6, 0)], time_s=1)
+    steering = {side: Steering(rover, side) for side in (LEFT, RIGHT)}
+    levels, k = rover.input_levels, len(rover.observation_low)
+    weights = {
+        "action_net.weight": np.zeros((len(levels), k), dtype=np.float32),
+        "action_net.bias": np.all(levels == 0, axis=1).astype(np.float32),
+    }
+    policy = MlpPolicy(rover, "ppo", "tanh", weights)
+    result = drive(rover, policy, steering, 0.1, field, DriveOptions())
+    assert [ending(result.task, arc) for arc in result.arcs["policy"]] == ["waited", "stalled"]
+
+
 def test_a_post_far_from_the_goal_is_none_to_wait_for(planted, read):
     """Held by one post, while another one stands at the goal far away, a robot stalls."""
     shut_in = ring(8, radius=0.55, around=(-20, 0), away=1.5)

@@ -168,7 +168,7 @@ def ending(task: Driving, arc: HybridArc) -> str:
     """Returns how a run ended: "arrived", "waited" near a goal that a post stood on, "crashed", "stalled"."""
     if arc.outcome == "reached":
         return "arrived"
-    last = task.measure(np.column_stack([arc.z[-1:, :3], arc.t[-1:], [0.0]]))
+    last = task.measured_at(arc.z[-1:, :3], arc.t[-1:], np.zeros(1, dtype=int))
     if arc.outcome == "stalled" and task.waits(last)[0]:
         return "waited"
     return arc.outcome.replace("_", " ")

@@ -143,14 +143,15 @@ class FieldTask(Task):
 
     def measure(self, sensors: np.ndarray) -> np.ndarray:
         sensed = self.robot.sensed(sensors)
-        clock, number = sensed[:, 3], np.rint(sensed[:, 4]).astype(int)
-        posts = np.empty((len(sensors), self.layouts.posts, OF_POST))
+        return self.measured_at(sensed[:, :3], sensed[:, 3], np.rint(sensed[:, 4]).astype(int))
+
+    def measured_at(self, pose: np.ndarray, clock: np.ndarray, number: np.ndarray) -> np.ndarray:
+        """Returns the measurements (n, 5 + 5 K) at poses (n, 3) and times (n,) [s] in layouts (n,) int."""
+        posts = np.empty((len(pose), self.layouts.posts, OF_POST))
         posts[..., :2] = self.layouts.positions(number, clock)
         posts[..., 2:4] = self.layouts.velocities(number, clock)
         posts[..., 4] = self.layouts.radii[number]
-        return np.hstack(
-            [sensed[:, :3], self.layouts.goals[number], posts.reshape(len(sensed), -1)]
-        )
+        return np.hstack([pose, self.layouts.goals[number], posts.reshape(len(pose), -1)])
 
     def control(self, u: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         return self.robot.control(u, qpos, qvel)
