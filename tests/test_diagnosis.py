@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planted import homing_policy, sign_policy
+from planted import ChartPolicy, homing_policy, sign_policy
 
 import hyrl_mj
 from hyrl_mj import HybridArc, NoRenderer
@@ -93,6 +93,19 @@ def test_the_usual_arc_begins_on_the_critical_set_under_alternating_noise(run):
 
 
 # ---- what is written and said
+
+
+def test_what_is_lost_without_noise_is_said_first(tmp_path, circle, monkeypatch):
+    monkeypatch.setattr(diagnosis, "render_replay", no_renderer)
+    still = ChartPolicy(circle, lambda z: np.zeros((len(z), 1)))
+    said = []
+    hyrl_mj.diagnose("unit_circle", still, out=tmp_path / "still", preset="smoke", say=said.append)
+    lines = [line.removeprefix("diagnose: ") for line in said]
+    first = next(i for i, line in enumerate(lines) if line.startswith("without noise it loses"))
+    assert all("noise on theta" not in line for line in lines[:first])
+    assert any("lost nodes without noise, too" in line for line in lines)
+    assert any(line.endswith("under worst noise, and without noise, too") for line in lines)
+    assert not any("closer than the noise" in line for line in lines)
 
 
 def test_what_is_said_is_on_the_page(diagnosed):

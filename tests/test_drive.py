@@ -29,6 +29,7 @@ from hyrl_mj.fields import (
 from hyrl_mj.fields.drives import Bounds
 from hyrl_mj.policies import ObservationPolicy
 from hyrl_mj.tasks import LEFT, RIGHT
+from hyrl_mj.viz.drives import drive_sentences
 from hyrl_mj.viz.replay.marks import MODE_COLOURS
 
 BODY = 0.1
@@ -326,6 +327,76 @@ def test_a_goal_that_a_post_stands_on_in_the_end_is_waited_for(planted, read):
     assert ending(result.task, result.arcs["hyrl"][0]) == "waited"
     far = driven(planted, read(starts=[start(-90, 0)], time_s=1))
     assert ending(far.task, far.arcs["hyrl"][0]) == "stalled"
+
+
+def test_who_waits_near_the_goal_has_not_arrived(planted, read):
+    """A robot that stands still is not led to the goal by a post that stands close to it."""
+    stands = np.all(planted.task.input_levels == 0, axis=1).astype(np.float32)
+    weights = {**planted.policy.weights, "action_net.bias": stands}
+    policy = MlpPolicy(planted.task, "ppo", "tanh", weights)
+    starts = [start(-1.5, 0), start(-1.4, 0.2), start(-1.2, 1), start(-6, 0)]
+    field = read(posts=[post(-0.7, 0)], starts=starts)
+    result = drive(planted.task, policy, planted.mode_networks, 0.1, field, DriveOptions())
+    ends = [ending(result.task, arc) for arc in result.arcs["policy"]]
+    assert ends == ["waited", "waited", "waited", "stalled"]
+    assert [arc.outcome for arc in result.arcs["policy"]] == ["stalled"] * 4
+    for arc in result.arcs["hyrl"]:
+        near = np.hypot(*arc.z[-1, :2]) <= result.task.reached
+        assert (ending(result.task, arc) == "arrived") == near
+    said = drive_sentences(result)[0]
+    assert said.startswith(
+        "RL policy arrives from 0 of 4 starts and waits near a post at the goal from 3,"
+    )
+
+
+def test_a_rover_that_waits_has_not_arrived_either(read):
+    rover = hyrl_mj.get_task("rover_field")
+    field = read(posts=[post(-0.7, 0)], starts=[start(-1.5, 0), start(-6, 0)], time_s=1)
+    steering = {side: Steering(rover, side) for side in (LEFT, RIGHT)}
+    levels, k = rover.input_levels, len(rover.observation_low)
+    weights = {
+        "action_net.weight": np.zeros((len(levels), k), dtype=np.float32),
+        "action_net.bias": np.all(levels == 0, axis=1).astype(np.float32),
+    }
+    policy = MlpPolicy(rover, "ppo", "tanh", weights)
+    result = drive(rover, policy, steering, 0.1, field, DriveOptions())
+    assert [ending(result.task, arc) for arc in result.arcs["policy"]] == ["waited", "stalled"]
+
+
+def test_a_post_far_from_the_goal_is_none_to_wait_for(planted, read):
+    """Held by one post, while another one stands at the goal far away, a robot stalls."""
+    shut_in = ring(8, radius=0.55, around=(-20, 0), away=1.5)
+    field = read(posts=[*shut_in, post(-0.7, 0)], starts=[start(-20, 0)], time_s=3)
+    result = driven(planted, field)
+    assert ending(result.task, result.arcs["hyrl"][0]) == "stalled"
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.3, 0.5])
+def test_no_post_leaps_over_a_robot_between_two_samples(planted, read, phase):
+    """At 100 m/s a post moves 5 m a sample: it is seen in touch with the robot at none of them."""
+    y = -50.0 - 5 * phase
+    fast = {"radius_m": 0.3, "positions_m": [[-6, y], [-6, y + 100]]}
+    field = read(posts=[fast], interval_s=1, starts=[start(-6.3, 0)], time_s=3)
+    result = driven(planted, field, noise="none")
+    for arc in (result.arcs["policy"][0], result.arcs["hyrl"][0]):
+        assert ending(result.task, arc) == "crashed"
+        assert arc.t[-1] == pytest.approx(0.5 if phase == 0 else 0.55)
+        assert least_clearance(result.task, arc) < 0
+        assert np.isnan(arc.u[-1]).all()
+        assert np.isnan(arc.measured[-1]).all()
+
+
+def test_the_least_clearance_is_that_of_a_fine_look(planted, read):
+    moving = {"radius_m": 0.4, "positions_m": [[-3, 1.5], [-2.5, 0.9], [-3.2, 1.6], [-3, 1]]}
+    field = read(posts=[moving, post(-4, -1)], interval_s=0.77, starts=[start(-5, 0)], time_s=6)
+    result = driven(planted, field, noise="none")
+    arc, layouts = result.arcs["policy"][0], field.layouts
+    t = np.linspace(0, arc.t[-1], 20_001)
+    place = np.stack([np.interp(t, arc.t, arc.z[:, i]) for i in range(2)], axis=1)
+    posts = layouts.positions(np.zeros(len(t), dtype=int), t)
+    fine = (np.linalg.norm(posts - place[:, None], axis=2) - layouts.radii[0] - BODY).min()
+    assert least_clearance(result.task, arc) == pytest.approx(fine, abs=1e-4)
+    assert least_clearance(result.task, arc) <= fine + 1e-9
 
 
 def test_the_bounds_are_those_that_were_asked_for(planted, read):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from planted import ChartPolicy, halves, pass_on, sign_policy
 
+from hyrl_mj import simulate
 from hyrl_mj.game import NEVER, Game
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.sets import Grid
@@ -29,6 +30,7 @@ def test_a_policy_that_only_cannot_decide_is_cured_by_hysteresis(vehicle):
     losses = sort_losses(vehicle, policy, halves(vehicle), EPS, CELLS)
     assert len(losses.undecided) == len(lost_by(vehicle, policy)) > 20
     assert not len(losses.grazing)
+    assert not len(losses.unaided)
     assert np.abs(losses.undecided[:, 1]).max() <= 3 * EPS, "around the axis"
     assert "(100%: noise at M* keeps it undecided, hysteresis cures that)" in losses.sentence()
 
@@ -36,9 +38,30 @@ def test_a_policy_that_only_cannot_decide_is_cured_by_hysteresis(vehicle):
 def test_a_policy_that_passes_too_close_is_not(vehicle):
     policy = grazing_policy(vehicle)
     losses = sort_losses(vehicle, policy, halves(vehicle), EPS, CELLS)
-    assert len(losses.undecided) + len(losses.grazing) == len(lost_by(vehicle, policy))
-    assert len(losses.grazing) > 5 * len(losses.undecided)
+    sizes = [len(z) for z in (losses.unaided, losses.undecided, losses.grazing)]
+    assert sum(sizes) == len(lost_by(vehicle, policy))
+    assert sizes[2] > 5 * sizes[1]
     assert "it passes closer than the noise" in losses.sentence()
+    # Right of the pillar it has no room to turn left: what it loses there it loses by itself.
+    assert (
+        f"it loses {sizes[0]:,} without noise, too (46%: it fails there by itself"
+        in losses.sentence()
+    )
+    for z, outcome in ((losses.unaided, "crashed"), (losses.grazing, "reached")):
+        assert {arc.outcome for arc in simulate(vehicle, policy, z[:: len(z) // 100])} == {outcome}
+
+
+def test_a_policy_that_stands_still_fails_without_noise(circle):
+    policy = ChartPolicy(circle, lambda z: np.zeros((len(z), 1)))
+    losses = sort_losses(circle, policy, halves(circle), EPS, CELLS)
+    assert len(losses.unaided) == len(lost_by(circle, policy)) > 5
+    assert not len(losses.undecided)
+    assert not len(losses.grazing)
+    said = losses.sentence()
+    assert said.startswith(
+        f"it loses all {len(losses.unaided)} lost nodes without noise, too: it fails"
+    )
+    assert "closer than the noise" not in said
 
 
 @pytest.mark.parametrize("eps", [0.0])

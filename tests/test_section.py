@@ -5,7 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from planted import Cube, sphere_policy
+from environments import Puck
+from planted import ChartPolicy, Cube, sphere_policy
 
 import hyrl_mj
 from hyrl_mj import LoopSettings, Task, closed_loop, find_critical_set
@@ -90,17 +91,47 @@ def test_it_says_where_it_is(section):
     assert section.set_point.tolist() == [0.0, 0.0]
 
 
-# Of `Task`, what follows from the chart and the methods, so that a section inherits it.
-DERIVED = {
-    "check_measurement", "check_noise", "code", "dt", "failed", "input_levels", "kinematic", "may_start",
-    "for_mode", "goes_on", "measurement_columns", "model_path", "noise_in_chart", "noisy_everywhere",
-    "outcome", "with_noise",
+# Of `Task`, what has to be cut to the plane.
+CUT = {
+    "arrived", "at", "check_noise", "direction", "for_mode", "goes_on", "may_start", "miss",
+    "noise_in_chart", "noisy_everywhere", "set_point", "starts", "state", "with_noise", "with_z", "z",
 }  # fmt: skip
 
 
-def test_its_task_defines_all_that_a_task_has():
+class Other:
+    """A task all of whose parts are told by their names."""
+
+    def __getattr__(self, name):
+        return f"the whole task's {name}"
+
+
+def test_all_that_has_no_chart_in_it_is_that_of_the_whole_task(section):
+    other = object.__new__(Section)
+    vars(other).update(whole=Other())
     public = {name for name in vars(Task) if not name.startswith("_")}
-    assert public <= {*vars(Section), *DERIVED}, "a new part of a task has to be cut, too"
+    assert public >= CUT
+    for name in public - CUT:
+        assert getattr(other, name) == f"the whole task's {name}"
+
+
+def test_it_has_the_time_of_an_environment_of_several_steps_a_sample():
+    task = hyrl_mj.from_gymnasium(Puck, steps=30)  # five steps of the physics a sample
+    section = Section(task)
+    assert section.dt == task.dt == pytest.approx(0.1)
+    z, ahead = task.scene.starts[0], ChartPolicy(task, lambda z: np.ones((len(z), 2)))
+    arc, whole = (hyrl_mj.simulate(one, ahead, z, horizon=0.5) for one in (section, task))
+    np.testing.assert_array_equal(arc.t, whole.t)
+    np.testing.assert_array_equal(arc.z, whole.z)
+    assert (len(arc.t), arc.t[-1]) == (6, pytest.approx(0.5))
+
+
+def test_noise_and_modes_of_a_section_are_those_of_the_whole(vehicle):
+    section = Section(vehicle)
+    everywhere = section.noisy_everywhere()
+    assert isinstance(everywhere, Section)
+    assert everywhere.noise_on() == vehicle.noisy_everywhere().noise_on() != section.noise_on()
+    assert everywhere.noisy == (True, True)
+    assert isinstance(section.for_mode(0), Section)
 
 
 def test_its_task_is_the_whole_one_but_for_the_chart():

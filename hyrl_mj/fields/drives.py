@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,6 +21,8 @@ from hyrl_mj.tasks import POSE, Field, length
 REACHED, ROUNDS = 0.1, 4
 # Columns of a measurement: x, heading, and x and its velocity of the first post.
 COLUMNS = (0, 2, POSE, POSE + 2)
+# What an arc has a row of for each sample.
+ROWS = ("t", "j", "z", "measured", "q", "u", "state")
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,8 @@ class Bounds:
 class Drives:
     """Runs through a field: an arc for each start, by controller, "policy" and "hyrl".
 
+    A run that arrives comes within `task.reached` of the goal, and touches no post on the whole way.
+
     Attributes:
         task: the field with its robot.
         bounds: of the noise.
@@ -149,22 +153,24 @@ def drive(
     noise = Noise(options.noise, bounds.largest)
     loops = controllers(task, policy, policies, made_for)
     arcs = {
-        name: simulate_batch(task, loop, field.starts, noise, seed=options.seed)
+        name: _checked(task, simulate_batch(task, loop, field.starts, noise, seed=options.seed))
         for name, loop in loops.items()
     }
     attacked = {}
     if options.attack:
         budget = Budget(rounds=ROUNDS)
         found = attack(task, loops, field.starts, bounds.largest, budget, seed=options.seed)
-        attacked = {name: [*one.arcs] for name, one in found.items()}
+        attacked = {name: _checked(task, one.arcs) for name, one in found.items()}
     return Drives(task, bounds, arcs, attacked)
 
 
 def ending(task: Driving, arc: HybridArc) -> str:
     """Returns how a run ended: "arrived", "waited" near a goal that a post stood on, "crashed", "stalled"."""
     if arc.outcome == "reached":
-        near = length(arc.z[-1, :2] - task.layouts.goals[0]) <= task.reached + 1e-9
-        return "arrived" if near else "waited"
+        return "arrived"
+    last = task.measured_at(arc.z[-1:, :3], arc.t[-1:], np.zeros(1, dtype=int))
+    if arc.outcome == "stalled" and task.waits(last)[0]:
+        return "waited"
     return arc.outcome.replace("_", " ")
 
 
@@ -175,11 +181,45 @@ def changes(arc: HybridArc) -> int:
 
 
 def least_clearance(task: Driving, arc: HybridArc) -> float:
-    """Returns the least distance of the robot's hull from a post at the samples [m]; negative in a post."""
-    layouts, number = task.layouts, np.zeros(len(arc.t), dtype=int)
-    posts = layouts.positions(number, arc.t)
-    away = length(posts - arc.z[:, None, :2]) - layouts.radii[0] - task.body
-    return float(away.min())
+    """Returns the least distance of the robot's hull from a post on the way [m]; negative in a post."""
+    return float(_clearances(task, arc)[1].min())
+
+
+def _clearances(task: Driving, arc: HybridArc) -> tuple[np.ndarray, np.ndarray]:
+    """Returns times (m,) [s], and the least distances (m,) [m] of the hull from posts since the time before.
+
+    Robot and posts move straight from each of these times to the next: a post that is fast could leap over
+    the robot between two samples.
+    """
+    layouts = task.layouts
+    t, rows = np.unique(arc.t, return_index=True)
+    turns = layouts.interval * np.arange(layouts.tracks.shape[1])
+    times = np.union1d(t, turns[(turns > t[0]) & (turns < t[-1])])
+    x, y = (np.interp(times, t, arc.z[rows, i]) for i in range(2))
+    posts = layouts.positions(np.zeros(len(times), dtype=int), times)
+    away = posts - np.stack([x, y], axis=1)[:, None]
+    before = np.concatenate([away[:1], away[:-1]])
+    step = away - before
+    # Where on the straight line between two relative places the origin is nearest.
+    share = -(before * step).sum(axis=2) / np.maximum((step * step).sum(axis=2), 1e-300)
+    nearest = before + np.clip(share, 0.0, 1.0)[..., None] * step
+    return times, (length(nearest) - layouts.radii[0] - task.body).min(axis=1)
+
+
+def _checked(task: Driving, arcs: Iterable[HybridArc]) -> list[HybridArc]:
+    """Returns arcs that crash where the robot touches a post between two samples."""
+    checked = []
+    for arc in arcs:
+        times, clearances = _clearances(task, arc)
+        hits = np.flatnonzero(clearances <= 0)
+        if len(hits) and arc.outcome != "crashed":
+            # The first row at the next sample, as where a crash was seen.
+            end = int(np.searchsorted(arc.t, times[hits[0]])) + 1
+            rows = {name: getattr(arc, name)[:end].copy() for name in ROWS}
+            rows["measured"][-1] = rows["u"][-1] = np.nan
+            arc = replace(arc, outcome="crashed", **rows)
+        checked.append(arc)
+    return checked
 
 
 def noise_cautions(local: Field, made_for: float, options: DriveOptions) -> list[str]:

@@ -16,8 +16,11 @@ from hyrl_mj.tasks import Field, FieldTask, Layouts, Scene, length
 
 # How far around posts, starts and goals the world reaches [m], and how much of that a camera shows.
 AROUND, SHOWN = 6.0, 1.0
+# The least radius of what is drawn [m]: MuJoCo refuses 0.
+LEAST_DRAWN = 1e-6
 # Columns of the pose.
 POSE = 3
+ORTHOGRAPHIC = mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC
 
 
 @dataclass(frozen=True)
@@ -139,24 +142,29 @@ class Driving(FieldTask):
             if body.mocap:
                 number = int(body.name.partition("_")[2] or 0)
                 for geom in body.geoms:
-                    geom.size[0] += radii[number] - mjcf.geom_size(self.local.model, "obstacle")[0]
+                    larger = radii[number] - mjcf.geom_size(self.local.model, "obstacle")[0]
+                    # The rim of a thin post is thinner, too.
+                    geom.size[0] = max(geom.size[0] + larger, radii[number] / 2, LEAST_DRAWN)
         for geom in spec.worldbody.geoms:
             if geom.name.startswith("goal"):
                 geom.pos[:2] += goal
-        self._aim(spec)
-        return spec.compile()
+        wide = self._half + max(SHOWN, float(self.layouts.radii.max()) + 0.1)
+        self._aim(spec, wide)
+        model = spec.compile()
+        # What an orthographic camera sees is a length, but the compiler refuses 180 m as if it were an angle.
+        model.cam_fovy[model.cam_projection == ORTHOGRAPHIC] = 2 * wide
+        return model
 
-    def _aim(self, spec: mujoco.MjSpec) -> None:
-        """Moves the cameras that stay so that they see the whole field, and turns those on the robot.
+    def _aim(self, spec: mujoco.MjSpec, wide: float) -> None:
+        """Moves the cameras that stay so that they see `wide` metres around the middle of the field.
 
         A camera on the robot looks from the first start to the goal.
         """
         overhead = self.local.model.cam("overhead")
-        wide = self._half + max(SHOWN, float(self.layouts.radii.max()) + 0.1)
         seen = np.append(overhead.pos[:2], 0.0)
         for camera in spec.worldbody.cameras:
-            if camera.proj == mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC:
-                camera.pos[:2], camera.fovy = self._middle, 2 * wide
+            if camera.proj == ORTHOGRAPHIC:
+                camera.pos[:2] = self._middle
             else:
                 closer = (camera.pos - seen) * 2 * wide / overhead.fovy[0]
                 camera.pos = np.append(self._middle, 0.0) + closer

@@ -37,8 +37,8 @@ def check_passable(field: FieldFile, body: float) -> None:
     room = np.where(standing, length(tracks[0] - goal) - radii, np.inf)
     if room[post := int(room.argmin())] <= body:
         raise BadInput(
-            f"{field.name}: post {post} is {_gap(room[post])} from the goal, which the robot of radius "
-            f"{body:g} m cannot reach: move one of the two"
+            f"{field.name}: post {post} is {_gap(room[post])} from the goal, where the robot of radius "
+            f"{body:g} m cannot stand: move one of the two"
         )
     if standing.any():
         _check_ways(field, body)

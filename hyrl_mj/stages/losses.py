@@ -1,4 +1,4 @@
-"""Why a policy loses starts to noise: it cannot decide, or it passes closer than the noise."""
+"""Why a policy loses starts: also without noise, it cannot decide, or it passes closer than the noise."""
 
 from __future__ import annotations
 
@@ -18,24 +18,35 @@ class Losses:
     """The winnable starts that a policy loses in the worst-case game, by what would cure it.
 
     Attributes:
+        unaided: (n, d) starts that are lost without noise, too. The others are won without noise.
         undecided: (n, d) starts that are won if the policy holds the way of its first measurement: noise
             makes it change its mind at M*. Hysteresis cures that.
         grazing: (n, d) starts that are lost all the same: on its way the policy comes so close to where it
             fails that noise does the rest. Training under noise cures that.
     """
 
+    unaided: np.ndarray
     undecided: np.ndarray
     grazing: np.ndarray
 
     def sentence(self) -> str:
-        """Returns both shares, and what to do."""
-        n, total = len(self.undecided), len(self.undecided) + len(self.grazing)
+        """Returns the shares, what is lost without noise first, and what to do."""
+        alone, n, close = len(self.unaided), len(self.undecided), len(self.grazing)
+        total = alone + n + close
         if not total:
             return "it loses none of them on the nodes"
+        fails = "it fails there by itself, train it further first"
+        if alone == total:
+            return f"it loses all {total:,} lost nodes without noise, too: {fails}"
+        first = (
+            f"loses {alone:,} without noise, too ({100 * alone / total:.0f}%: {fails}), "
+            if alone
+            else ""
+        )
         return (
-            f"of {total:,} lost nodes it would win {n:,} if it held the way of its first measurement "
+            f"of {total:,} lost nodes it {first}would win {n:,} if it held the way of its first measurement "
             f"({100 * n / total:.0f}%: noise at M* keeps it undecided, hysteresis cures that), and loses "
-            f"{total - n:,} all the same ({100 - 100 * n / total:.0f}%: it passes closer than the noise, "
+            f"{close:,} all the same ({100 * close / total:.0f}%: it passes closer than the noise, "
             "training under noise cures that); hyrl-mj robustify does both"
         )
 
@@ -64,5 +75,5 @@ def sort_losses(task: Task, policy: Policy, partition: Partition, eps: float, ce
     for name, side in zip(loops, game.limit.sides, strict=True):
         selected = within_reach(side.reshape(grid.counts), window, task.chart.periodic).ravel()
         held &= ~selected | (game.value(name, eps)[-1, :-2] < NEVER)
-    nodes = grid.nodes
-    return Losses(nodes[lost & held], nodes[lost & ~held])
+    nodes, alone = grid.nodes, game.value("policy", 0.0)[-1, :-2] >= NEVER
+    return Losses(nodes[lost & alone], nodes[lost & ~alone & held], nodes[lost & ~alone & ~held])

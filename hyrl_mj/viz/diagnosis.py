@@ -48,7 +48,8 @@ def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
     """
     task, eps, loop = run.task, run.settings.noise, PolicyController(run.policy)
     if losses is not None:
-        kinds = sorted((losses.grazing, losses.undecided), key=len, reverse=True)
+        parts = losses.grazing, losses.undecided, losses.unaided
+        kinds = sorted(parts, key=len, reverse=True)
         z0 = np.vstack([z[np.argsort(from_middle(task, z), kind="stable")[:TRIED]] for z in kinds])
         if not len(z0):
             return None
@@ -111,6 +112,8 @@ def sentences(
     if robustness.deciding is not None:
         score = robustness.deciding.scores["policy"][-1]
         lost = percent(1 - score.not_broken)
+        if losses is not None and len(losses.unaided):
+            results.append(f"without noise it loses {len(losses.unaided):,} nodes that can be won")
         results.append(
             f"signals of {noise} are known that make it lose {lost} of the winnable starts"
         )
@@ -130,10 +133,14 @@ def sentences(
             results.append(f"{why}: noisy episodes stand in for the worst case")
         noisy = [count for count in robustness.episodes if count.noise != NO_NOISE]
         worst = min(noisy, key=lambda count: count.reached)
-        failed = worst.episodes - worst.outcomes.get("reached", 0)
+        where = f"episodes that start {worst.region}"
+        for count in robustness.episodes:
+            if (count.noise, count.region) == (NO_NOISE, worst.region) and count.lost:
+                results.append(
+                    f"without noise it loses {count.lost:,} of {count.episodes:,} {where}"
+                )
         results.append(
-            f"under {worst.noise} {noise} it loses {failed:,} of {worst.episodes:,} episodes that start "
-            f"{worst.region}"
+            f"under {worst.noise} {noise} it loses {worst.lost:,} of {worst.episodes:,} {where}"
         )
     if arc is None:
         return [*results, f"no start was found that {noise} makes it lose"]
@@ -142,6 +149,9 @@ def sentences(
     if arc.bound > eps * (1 + 1e-9):
         results.append(f"no start was found that {noise} makes it lose")
         end += f" of up to {arc.bound:g} {unit}"
+    (alone,) = simulate_batch(task, run.policy, arc.z[:1])
+    if alone.outcome != "reached":
+        end += ", and without noise, too"
     return [*results, f"from {start} {end}"]
 
 

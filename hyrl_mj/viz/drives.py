@@ -27,7 +27,6 @@ from hyrl_mj.viz.options import ReplayOptions
 from hyrl_mj.viz.replay import Show, check_replay, render_replay
 from hyrl_mj.viz.tables import NAMES, Table, print_table
 
-ARRIVED = ("arrived", "waited")
 USUAL = ReplayOptions()
 
 
@@ -36,7 +35,8 @@ def drive_tables(drives: Drives, noise: str, seed: int) -> list[Table]:
     posts = drives.task.layouts.posts
     what = f"{posts} post{'s' * (posts != 1)}"
     named = "no noise" if noise == "none" else f"{noise} noise of {drives.bounds}"
-    tables = [_table(drives, drives.arcs, f"{what}: {named}, seed {seed}")]
+    near = f"arrived: within {drives.task.reached:g} m of the goal"
+    tables = [_table(drives, drives.arcs, f"{what}: {named}, seed {seed}; {near}")]
     if drives.attacked:
         title = f"{what}: the worst noise of up to {drives.bounds} that a search found for each"
         tables.append(_table(drives, drives.attacked, title))
@@ -64,14 +64,13 @@ def drive_sentences(drives: Drives) -> list[str]:
 
 
 def _arrivals(drives: Drives, arcs: Mapping[str, Sequence[HybridArc]]) -> str:
-    counts = {
-        name: sum(ending(drives.task, arc) in ARRIVED for arc in several)
-        for name, several in arcs.items()
-    }
-    starts = len(arcs["hyrl"])
-    return (
-        f"RL policy arrives from {counts['policy']} of {starts} starts, HyRL from {counts['hyrl']}"
-    )
+    counts = []
+    for name in ("policy", "hyrl"):
+        ends = [ending(drives.task, arc) for arc in arcs[name]]
+        arrives = f"{ends.count('arrived')}" + f" of {len(ends)} starts" * (name == "policy")
+        waits = ends.count("waited")
+        counts.append(arrives + f" and waits near a post at the goal from {waits}" * (waits > 0))
+    return f"RL policy arrives from {counts[0]}, HyRL from {counts[1]}"
 
 
 def drive_shows(drives: Drives, title: str, starts: Sequence[int] | None = None) -> list[Show]:

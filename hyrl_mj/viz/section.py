@@ -46,21 +46,8 @@ class Section(Task):
         rest: (d - 2,) values of the other coordinates.
     """
 
-    source, description, mirror = _of_whole("source"), _of_whole("description"), _of_whole("mirror")
-    precision, close, learning = _of_whole("precision"), _of_whole("close"), _of_whole("learning")
-    model, plant, measure = _of_whole("model"), _of_whole("plant"), _of_whole("measure")
-    control, has_inner_loop = _of_whole("control"), _of_whole("has_inner_loop")
-    mocap, steady_control = _of_whole("mocap"), _of_whole("steady_control")
-    input_units, input_limits = _of_whole("input_units"), _of_whole("input_limits")
-    observation, measured = _of_whole("observation"), _of_whole("measured")
-    reward, danger = _of_whole("reward"), _of_whole("danger")
-    where, plane, obstacles = _of_whole("where"), _of_whole("plane"), _of_whole("obstacles")
-    gives_direction, mode_name = _of_whole("gives_direction"), _of_whole("mode_name")
-    colour_of, tinted = _of_whole("colour_of"), _of_whole("tinted")
-    slow, spec, chart_is_state = _of_whole("slow"), _of_whole("spec"), _of_whole("chart_is_state")
-    observation_parts, arrival_ends = _of_whole("observation_parts"), _of_whole("arrival_ends")
-    stopped_by_walls = _of_whole("stopped_by_walls")
-    ending, verdict = _of_whole("ending"), _of_whole("verdict")
+    # The abstract ones; the rest of `Task` is forwarded below.
+    observation, reward, ending = (_of_whole(name) for name in ("observation", "reward", "ending"))
 
     def __init__(self, whole: Task, rest: ArrayLike | None = None):
         chart, scene = whole.chart, whole.scene
@@ -105,8 +92,14 @@ class Section(Task):
     def miss(self, z: np.ndarray) -> np.ndarray:
         return self.whole.miss(self.lift(z))
 
-    def noise_on(self, everywhere: bool = False) -> tuple[str, str]:
-        return self.whole.noise_on(everywhere)
+    def for_mode(self, mode: int) -> Section:
+        return Section(self.whole.for_mode(mode), self.rest)
+
+    def with_noise(self, shares: Sequence[float]) -> Section:
+        return Section(self.whole.with_noise(shares), self.rest)
+
+    def goes_on(self, z: np.ndarray) -> np.ndarray:
+        return self.whole.goes_on(self.lift(z))
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         return self.whole.starts(n, rng)[:, :2]
@@ -163,6 +156,13 @@ class Section(Task):
         counts = whole.counts[:2] if isinstance(whole, Grid) else (CELLS_OF_CLOUD,) * 2
         grid = Grid(self.chart, counts)
         return GridSet(grid, members.signed_distance(self.lift(grid.nodes)))
+
+
+# Of `Task`, what follows from the section's own chart.
+OF_CHART = {"may_start", "noise_in_chart", "check_noise", "noisy_everywhere"}
+for _name in {*vars(Task)} - {*vars(Section)} - OF_CHART:
+    if not _name.startswith("_"):
+        setattr(Section, _name, _of_whole(_name))
 
 
 def sections(task: Task) -> tuple[int | None, list[Section]]:
