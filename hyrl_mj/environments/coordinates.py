@@ -177,7 +177,7 @@ def _of_state(
             if model.jnt_type[j] in (SLIDE, HINGE)
         ]
         raise BadInput(
-            f"{kind}[{index}] is a part of an orientation of {instance.name}, which hyrl_mj has no chart for: "
+            f"{kind}[{index}] is a part of an orientation of {instance.name}, for which there is no chart: "
             f"name slides, hinges ({', '.join(free) or 'it has none'}) and places of free joints"
         )
     axis = int(np.abs(model.jnt_axis[joint]).argmax()) if kind_of_joint == SLIDE else None
@@ -208,8 +208,8 @@ def _fitted(
         ]
         if not match:
             raise BadInput(
-                f"{name}[{j}] is no single position or velocity of {instance.name}, but follows from several, or "
-                f"from none: name coordinates such as {', '.join(all_names(instance)[:4])}"
+                f"{name}[{j}] is no single position or velocity of {instance.name}, but follows from several, "
+                f"or from none: name coordinates such as {', '.join(all_names(instance)[:4])}"
             )
         kind, i, offset = match[0]
         several = f"{new}[{j}]" if new and len(values[0]) > 1 else new

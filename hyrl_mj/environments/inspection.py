@@ -60,6 +60,7 @@ class Runs:
         dt: time of a step [s].
         tracked: name of the body that went farthest, or of the geom where no body went anywhere.
         memory: the name of what changed, "" if nothing did.
+        harmless: the geoms that the robot touched without an end of the episode.
     """
 
     states: np.ndarray
@@ -69,6 +70,7 @@ class Runs:
     dt: float
     tracked: str
     memory: str
+    harmless: frozenset[int]
 
 
 def inspect(
@@ -94,7 +96,7 @@ def inspect(
     instance.reset()
     if (took := time.monotonic() - began) > LONGEST_RESET:
         raise BadInput(
-            f"reset() of {source.name} takes {took:.1f} s, and each of thousands of episodes begins with one: "
+            f"reset() of {source.name} takes {took:.1f} s, and each of thousands of episodes begins with it: "
             f"give an environment whose reset takes less than {LONGEST_RESET:g} s"
         )
     instance.recipe = replace(instance.recipe, observer=trials.observer_of(instance))
@@ -106,9 +108,12 @@ def inspect(
     runs = _sampled(instance)
     criterion = _criterion(instance, success, failure, runs, found)
     points = [
-        tuple(mjcf.point_of(instance.model, name) for name in pair) for pair in criterion.places
+        (mjcf.point_of(instance.model, a), mjcf.point_of(instance.model, b))
+        for a, b in criterion.places
     ]
-    instance.recipe = replace(instance.recipe, keys=criterion.keys, places=tuple(points))  # type: ignore[arg-type]
+    instance.recipe = replace(
+        instance.recipe, keys=criterion.keys, places=tuple(points), harmless=runs.harmless
+    )
     resets = states_of_resets(instance)
     _check_drawn(instance, chosen, drawn(instance, resets, robot), found)
     check_pins(instance)
@@ -167,7 +172,7 @@ def inspect(
 def _sampled(instance: Instance) -> Runs:
     """Returns what runs under inputs at random show; refuses random numbers in steps."""
     rng, states, rewards, info_keys = np.random.default_rng(0), [], [], {}
-    bodies, geoms, deepest, dt, memory = [], [], 0.0, 0.0, ""
+    bodies, geoms, deepest, dt, memory, harmless = [], [], 0.0, 0.0, "", set()
     for seed in range(RUNS):
         instance.reset(seed)
         with suppress(Worn):  # these resets draw from other seeds
@@ -189,6 +194,7 @@ def _sampled(instance: Instance) -> Runs:
             geoms.append(instance.data.geom_xpos.copy())
             if terminated or truncated:
                 break
+            harmless |= instance.touched()
         instance.finish()
         changed = differing(fingerprint(instance.env), before)
         memory = memory or (changed[0] if changed else "")
@@ -197,8 +203,9 @@ def _sampled(instance: Instance) -> Runs:
     model = instance.model
     tracked = _farthest(model.body, bodies) or _farthest(model.geom, geoms)
     return Runs(
-        np.array(states), tuple(info_keys), min(rewards), deepest, round(dt, 9), tracked, memory
-    )
+        np.array(states), tuple(info_keys), min(rewards), deepest, round(dt, 9), tracked, memory,
+        frozenset(harmless),
+    )  # fmt: skip
 
 
 def _farthest(named: Any, places: Sequence[np.ndarray]) -> str:
@@ -229,8 +236,8 @@ def _chart_of(
     for c in chosen:
         if (pinned := f"{c.kind}[{c.index}]") in instance.source.pinned:
             raise BadInput(
-                f"{pinned} is the coordinate {c.name} of the chart, where runs begin anywhere: leave it out of "
-                "what is pinned, or name another chart"
+                f"{pinned} is the coordinate {c.name} of the chart, where runs begin anywhere: leave it out "
+                "of what is pinned, or name another chart"
             )
     return chosen
 
@@ -280,8 +287,8 @@ def _check_drawn(
         if positions := {n: 0.1 for n in left if n.startswith(("qpos[", "qvel[", "mocap_pos["))}:
             how = f"with values as {json.dumps({'pinned': dict(list(positions.items())[:4])})}"
         raise BadInput(
-            f"each reset of {name} draws {', '.join(left[:8])}, and what is to be done depends on it: pin it, "
-            f'{how}, or as the reset with a seed draws it as {{"seed": 0}}'
+            f"each reset of {name} draws {', '.join(left[:8])}, and what is to be done depends on it: pin it"
+            f', {how}, or as the reset with a seed draws it as {{"seed": 0}}'
         )
     given = f" and {dict(source.reset)}" if source.reset else ""
     pinned = f", with {dict(source.pinned)}" if source.pinned else ""

@@ -42,6 +42,7 @@ class Recipe:
         keys: entries of `info` that are reported.
         places: pairs of names whose distance is reported, each as a kind and an index for both.
         solid: (ngeom,) bool, the geoms of the robot.
+        harmless: geoms that the robot has touched without an end of the episode.
     """
 
     source: Source
@@ -50,6 +51,7 @@ class Recipe:
     keys: tuple[tuple[str | int, ...], ...] = ()
     places: tuple[tuple[tuple[str, int], tuple[str, int]], ...] = ()
     solid: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    harmless: frozenset[int] = frozenset()
 
     def with_source(self, source: Source) -> Recipe:
         """Returns the recipe for an environment that is made or reset in another way."""
@@ -367,12 +369,12 @@ class Instance:
     # ---- what it observes
 
     def watched(self) -> Any:
-        """Returns what the innermost environment observes in its present state, derived quantities included."""
+        """Returns what the innermost environment observes in its present state."""
         watch = self._observers.get(self.recipe.observer)
         if watch is None:
             raise BadInput(
-                f"{self.name} has no method that computes what it observes in its present state, so nothing is "
-                "known of what it would observe under noise: give it one named _get_obs, without arguments"
+                f"{self.name} has no method that computes what it observes in its present state, so nothing "
+                "is known of what it would observe under noise: give it one named _get_obs, without arguments"
             )
         try:
             return watch()
@@ -419,6 +421,11 @@ class Instance:
         touches = self.recipe.solid[contact.geom].sum(axis=1) == 1
         return float(-min(contact.dist[touches].min(initial=0.0), 0.0))
 
+    def touched(self) -> set[int]:
+        """Returns the geoms that the robot touches."""
+        pairs = self.data.contact.geom[: self.data.ncon]
+        return {int(g) for pair in pairs if self.recipe.solid[pair].sum() == 1 for g in pair}
+
     # ---- steps
 
     def action(self, u: np.ndarray) -> Any:
@@ -457,7 +464,7 @@ class Instance:
             for (a, i), (b, j) in self.recipe.places
         ]
         ends = bool(terminated)
-        touch = self.depth() > 0 if ends else False
+        touch = ends and bool(self.touched() - self.recipe.harmless)
         return np.array([reward, ends, bool(truncated), touch, *entries, *distances], dtype=float)
 
     @contextmanager

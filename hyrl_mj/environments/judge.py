@@ -93,7 +93,7 @@ class Real:
             return
         i = int(np.argmax(~((ours[k] == real) | (np.isnan(ours[k]) & np.isnan(real)))))
         raise BadInput(
-            f"{name} goes another way than a new one from the same start with the same inputs: {what}[{i}] is "
-            f"{ours[k][i]:.9g} after {k} sample(s), and {real[i]:.9g} in the new one; it depends on "
+            f"{name} goes another way than a new one from the same start with the same inputs: {what}[{i}] "
+            f"is {ours[k][i]:.9g} after {k} sample(s), and {real[i]:.9g} in the new one; it depends on "
             "other episodes, on time, on chance, or on what it observes"
         )

@@ -118,7 +118,7 @@ class Stage:
                     self._put_back(episode)
 
     def rest(self, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns what is observed at rest in states (k, S), as an episode there begins: (k, o), depths (k,)."""
+        """Returns what episodes that begin in states (k, S) observe first (k, o), and depths (k,)."""
         seen, depths = [], []
         for start in starts:
             if self._resting is None:
@@ -147,7 +147,7 @@ class Stage:
             seen.append(instance.observation)
         if changed := written.differing(written.fingerprint(instance.env), before):
             raise BadInput(
-                f"{self.recipe.source.name} remembers something in {changed[0]}, which no sampled run showed: "
+                f"{self.recipe.source.name} remembers something in {changed[0]}, which no sampled run showed; "
                 "without a memory that is always there it cannot be tabulated"
             )
         return np.array(after), np.array(reports), np.array(seen)

@@ -16,7 +16,7 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.tasks import Outcome
 
 TERMINATED = "terminated"
-FORMS = '"terminated", "terminated and reward >= 1", \'info["solved"]\' or "distance(fingertip, target) <= 0.05"'
+FORMS = '"terminated and reward >= 1", \'info["solved"]\' or "distance(fingertip, target) <= 0.05"'
 
 
 @dataclass(frozen=True)
@@ -67,12 +67,11 @@ class Criterion:
         terminated, truncated, touches = (report[:, 1:4] > 0).T
         if self.success.text.strip() == TERMINATED and (touches & terminated).any():
             raise BadInput(
-                'an episode ended where the robot touches something, and "terminated" counts it as a success: '
-                'say which ends are successes, as "terminated and reward >= 1"'
+                'an episode ended where the robot touches what it does not touch elsewhere, and "terminated" '
+                'counts that as a success: say which ends are successes, as "terminated and reward >= 1"'
             )
-        if self.failure is None:
-            failure = terminated & ~success
-        else:
+        failure = terminated & ~success
+        if self.failure is not None:
             failure = self.failure.holds(self._values(report))
         reached = success & (terminated | truncated | self.ends)
         return np.select(

@@ -42,9 +42,9 @@ SIDE_BY_SIDE = 64
 class EnvironmentTask(Task):
     """An environment of Gymnasium as a task; `from_gymnasium` makes it.
 
-    Its plant is the environment itself: each episode is played by an instance of it. Noise on a coordinate of
-    the chart changes the state at which the innermost environment computes its observation, so that every copy
-    of a position in it is changed alike, and its wrappers see what a sensor would have sent.
+    Its plant is the environment itself: each episode is played by an instance of it. Noise on a coordinate
+    of the chart changes the state at which the innermost environment computes its observation, so that every
+    copy of a position in it is changed alike, and its wrappers see what a sensor would have sent.
 
     A measurement holds the chart point, the observation, the reward, whether the condition of success holds,
     and the outcome.

@@ -1,4 +1,4 @@
-"""Trials of an environment: does what it observes follow its state, and do its instances go as new ones do?"""
+"""Trials of an environment: whether what it observes follows its state, and its instances go as new ones."""
 
 from __future__ import annotations
 
@@ -71,8 +71,8 @@ def _check_observer(instance: Instance, spec: EnvironmentSpec) -> None:
     """Raises `BadInput` unless what is observed follows the state, as after a reset to that state.
 
     After some steps the state of the reset is written again. What is observed then has to be what the reset
-    observed, but for columns that have nothing to do with the place: those that no noise moves, that all resets
-    observe alike, and that do not depend on where the run began.
+    observed, but for columns that have nothing to do with the place: those that no noise moves, that all
+    resets observe alike, and that do not depend on where the run began.
     """
     rng, name, space = np.random.default_rng(1), instance.name, instance.inner.observation_space
     first: list[np.ndarray] = []
@@ -104,8 +104,7 @@ def _check_observer(instance: Instance, spec: EnvironmentSpec) -> None:
         scale = max(float(np.abs(begun).max(initial=0.0)), 1.0)
         for column in np.flatnonzero(~(off <= ROUNDING * scale)):
             suspects[int(column)] = (
-                f"is {begun[column]:.6g} after reset() and {begun[column] + off[column]:.6g} in the same state "
-                "later"
+                f"is {begun[column]:.6g} after reset() and differs by {off[column]:.6g} in the same state later"
             )
             if moved[column]:
                 _refuse(name, int(column), suspects[int(column)])
@@ -154,7 +153,7 @@ def _free(pool: Pool, spec: EnvironmentSpec, n: int, rng: np.random.Generator) -
 
 
 def _check_instances(pool: Pool, spec: EnvironmentSpec) -> None:
-    """Raises `BadInput` unless instances that played other episodes go as new ones, with noise and without."""
+    """Raises `BadInput` unless instances go as new ones after other episodes, with noise and without."""
     rng, n, d = np.random.default_rng(3), EPISODES, spec.dimension
     for noise in (0.0, 0.0, MOVED):
         plant = EnvironmentPlant(spec, pool, None, n)

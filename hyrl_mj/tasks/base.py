@@ -264,7 +264,9 @@ class Task(ABC):
         """Whether a plant can begin anywhere in the middle of an episode, as tables and the game have it."""
         return True
 
-    def verify(self, z0: np.ndarray, u: np.ndarray, path: np.ndarray, lengths: np.ndarray) -> None:
+    def verify(  # noqa: B027 - most plants are what they are taken for
+        self, z0: np.ndarray, u: np.ndarray, path: np.ndarray, lengths: np.ndarray
+    ) -> None:
         """Plays runs again on the real thing, where the plant is only thought to be like it.
 
         Args:
@@ -274,7 +276,7 @@ class Task(ABC):
             lengths: (n,) samples of the runs.
 
         Raises:
-            BadInput: a run goes another way there; the message names the quantity, the sample and both values.
+            BadInput: a run goes another way there; the message names quantity, sample and both values.
         """
 
     def perturbed(self, measured: np.ndarray, noise: np.ndarray) -> np.ndarray:
