@@ -48,6 +48,7 @@ class Rollout:
         q0: (n,) modes at the start.
         before: (K, n) modes at each sample before a jump. Empty without `record`, like all that follow.
         q: (K, n) modes at each sample after a jump.
+        true: (K + 1, n, p) measurements without noise.
         measured: (K, n, p) noisy measurements.
         u: (K, n, m) inputs.
         state: (K + 1, n, nstate) MuJoCo's states.
@@ -60,6 +61,7 @@ class Rollout:
     q0: np.ndarray
     before: np.ndarray
     q: np.ndarray
+    true: np.ndarray
     measured: np.ndarray
     u: np.ndarray
     state: np.ndarray
@@ -107,7 +109,7 @@ def closed_loop(
     first_mode = q.copy()
     shapes = {"before": (), "q": (), "measured": (len(task.noisy),), "u": (len(task.inputs),)}
     kept: dict[str, list[np.ndarray]] = {name: [] for name in shapes}
-    states = [plant.state] if record else []
+    states, true = ([plant.state], [measurement]) if record else ([], [])
     follower = Follower(task, plant) if settings.passing else None
     for k in progress_bar(range(limit), settings.label, "samples", quiet=settings.quiet):
         active = np.flatnonzero(outcome == Outcome.RUNNING)
@@ -134,6 +136,7 @@ def closed_loop(
             for name, values in zip(shapes, (before, q.copy(), measured, u), strict=True):
                 kept[name].append(values)
             states.append(np.where(lost[:, None], states[-1], plant.state))
+            true.append(measurement)
     if not backward:
         late = outcome == Outcome.RUNNING
         outcome[late] = task.verdict(measurement[late])
@@ -142,5 +145,6 @@ def closed_loop(
     path = path[: length.max() + 1]
     passing = None if follower is None else follower.passing
     return Rollout(
-        path, length, outcome, first_mode, **arrays, state=np.array(states), passing=passing
-    )
+        path, length, outcome, first_mode, **arrays,
+        true=np.array(true), state=np.array(states), passing=passing,
+    )  # fmt: skip
