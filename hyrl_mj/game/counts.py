@@ -1,4 +1,4 @@
-"""Counts of what noise does in episodes on the plant: drawn ones, under attack, and replays of what is said."""
+"""Counts of what noise does in episodes: drawn ones, under attack, and replays of what the game says."""
 
 from __future__ import annotations
 
@@ -133,6 +133,15 @@ class ReplayCount:
     def failures(self) -> int:
         """The number of starts that were lost."""
         return sum(self.lost.values())
+
+    @property
+    def shares(self) -> tuple[float, float]:
+        """The shares of the starts that were not lost without noise, and under noise; 1 of no starts."""
+        quiet, noisy = ([k for k in self.starts if (k == "none") == none] for none in (True, False))
+        lost = (sum(self.lost[k] for k in kinds) for kinds in (quiet, noisy))
+        played = (sum(self.starts[k] for k in kinds) for kinds in (quiet, noisy))
+        without, under = (1 - x / max(n, 1) for x, n in zip(lost, played, strict=True))
+        return without, under
 
     @property
     def is_whole(self) -> bool:

@@ -232,6 +232,10 @@ class GameResult:
             and set(map(len, self.profile.eps.values())) == {len(self.profile.points)}
         )
 
+    def replays_of(self, controller: str) -> ReplayCount | None:
+        """Returns the replays of a controller, None if there were none."""
+        return next((count for count in self.replays if count.controller == controller), None)
+
     @property
     def lasting(self) -> bool:
         """Whether some run never ends, so that times and excursions are informative."""

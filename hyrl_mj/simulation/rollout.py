@@ -21,6 +21,7 @@ class LoopSettings:
         backward: simulate x' = -f(x, u); such runs end with the last sample only.
         passing: whether to follow how the runs pass the obstacles.
         record: whether to keep modes, measurements, inputs and states.
+        states: whether to keep MuJoCo's states, too, if the others are kept.
         vary: whether to draw the coordinates outside the chart at random, as in training.
         plant: n copies of the task's robot to use again; by default new ones.
         label: label of the progress bar.
@@ -31,10 +32,15 @@ class LoopSettings:
     backward: bool = False
     passing: bool = False
     record: bool = False
+    states: bool = True
     vary: bool = False
     plant: Plant | None = None
     label: str = "simulating"
     quiet: bool = False
+
+    def rng_of_starts(self, seed: int) -> np.random.Generator | None:
+        """Returns the generator of the coordinates outside the chart, None if they are not drawn."""
+        return np.random.default_rng([seed, 1]) if self.vary else None
 
 
 @dataclass(frozen=True)
@@ -95,8 +101,7 @@ def closed_loop(
     limit = task.max_steps if settings.steps is None else settings.steps
     backward, record, n = settings.backward, settings.record, len(z0)
     plant = settings.plant or task.plant(n)
-    rng_of_starts = np.random.default_rng([seed, 1]) if settings.vary else None
-    plant.set_state(*task.state(z0, rng_of_starts))
+    plant.set_state(*task.state(z0, settings.rng_of_starts(seed)))
     signal = signal_for(noise, task, controller)
     signal.reset(n, np.random.default_rng(seed))
     measurement = plant.measurement
@@ -109,7 +114,8 @@ def closed_loop(
     first_mode = q.copy()
     shapes = {"before": (), "q": (), "measured": (len(task.noisy),), "u": (len(task.inputs),)}
     kept: dict[str, list[np.ndarray]] = {name: [] for name in shapes}
-    states, true = ([plant.state], [measurement]) if record else ([], [])
+    true = [measurement] if record else []
+    states = [plant.state] if record and settings.states else []
     follower = Follower(task, plant) if settings.passing else None
     for k in progress_bar(range(limit), settings.label, "samples", quiet=settings.quiet):
         active = np.flatnonzero(outcome == Outcome.RUNNING)
@@ -135,8 +141,9 @@ def closed_loop(
         if record:
             for name, values in zip(shapes, (before, q.copy(), measured, u), strict=True):
                 kept[name].append(values)
-            states.append(np.where(lost[:, None], states[-1], plant.state))
             true.append(measurement)
+        if states:
+            states.append(np.where(lost[:, None], states[-1], plant.state))
     if not backward:
         late = outcome == Outcome.RUNNING
         outcome[late] = task.verdict(measurement[late])
