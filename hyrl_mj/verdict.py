@@ -331,8 +331,9 @@ def replays_sentence(task: Task, count: ReplayCount) -> str:
     mode = "" if first.q0 is None else f" in mode {task.mode_name(first.q0)}"
     noise = "without noise" if first.noise == NO_NOISE else f"under {first.noise} noise"
     said = "a proved start" if count.of == PROVED_STARTS else "a start that no known noise beats"
+    withdrawn = "withdrawn: " if count.controller == "hyrl" else ""
     return (
-        f"withdrawn: {said} was lost in a replay: from {task.chart.format(np.array(first.start))}{mode} "
+        f"{withdrawn}{said} was lost in a replay: from {task.chart.format(np.array(first.start))}{mode} "
         f"{noise} {who} ends {first.outcome.replace('_', ' ')}, and {count.failures:,} of "
         f"{count.played:,} such replays in MuJoCo are lost"
     )

@@ -185,7 +185,9 @@ def test_replays_are_read_as_they_were_and_damage_is_named(tmp_path):
     for change, told in (({"judged": "all"}, "judged"), ({"first": {"start": [0.1]}}, "first")):
         content["game"]["replays"] = [whole | change]
         artifacts.write_json(path, content, "robustness")
-        with pytest.raises(BadArtifact, match=rf"game\.replays\.0\.{told}.*robustness RUN") as caught:
+        with pytest.raises(
+            BadArtifact, match=rf"game\.replays\.0\.{told}.*robustness RUN"
+        ) as caught:
             Robustness.load(path)
         assert_one_sentence_about(caught, path)
 

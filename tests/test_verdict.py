@@ -151,7 +151,9 @@ def test_one_lost_replay_withdraws_the_word_and_is_named(circle, proved):
         f"withdrawn: {said} was lost in a replay: from theta = 3 rad in mode 1 (counter-clockwise) without "
         "noise HyRL ends crashed, and 1 of 1,000 such replays in MuJoCo are lost"
     )
-    assert (verdict.word, verdict.sentence.split("; ")[0]) == (FAILED, sentence), "less than the policy"
+    assert (verdict.word, verdict.sentence.split("; ")[0]) == (FAILED, sentence), (
+        "less than the policy"
+    )
     assert "HyRL loses 0.25% of the winnable starts or of those replayed" in verdict.sentence
     assert sentence in verdict.reasons
     poor = game((0.9, 0.9), (1.0, 1.0), proved=proved, replayed=(replays(lost=1, of=of),))
