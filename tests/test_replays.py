@@ -1,4 +1,4 @@
-"""What is proved or won is replayed in MuJoCo: one lost start is found and named, and plain MuJoCo is the judge."""
+"""What is proved or won is replayed in MuJoCo; one lost start is named, and plain MuJoCo is the judge."""
 
 import json
 import shutil
@@ -118,7 +118,10 @@ def test_starts_lie_in_what_is_proved_in_every_mode_and_at_its_border(certificat
     assert set(q0) == {-1, 0, 1}
     cells, spacing = certificate.cells, certificate.game.lattice.grid.spacing
     value = certificate.value("hyrl", EPS)[:, :-2]
+    each, latest = 440 // 3, round(scores["hyrl"][-1].proved_time_any / certificate.game.task.dt)
     for mode, row in ((0, 0), (1, 1), (-1, 2)):
+        assert abs((q0 == mode).sum() - each) < 5
+
         proved = value[row] < NEVER
         assert proved[cells.place(z0[q0 == mode])].all()
         outer = ~proved & ~cells.arrived
@@ -127,6 +130,9 @@ def test_starts_lie_in_what_is_proved_in_every_mode_and_at_its_border(certificat
             for step in ((0, 1), (0, -1), (1, 0), (-1, 0))
         ]
         assert np.any(beside, axis=0).mean() > 0.2
+    firsts = {b.kind: b for b in reversed(plan.batches)}
+    assert all(b.steps is None and len(set(b.q0)) == 3 for b in firsts.values())
+    assert {b.steps for b in plan.batches} == {None, latest}, "the others until all have arrived"
     off = (z0 - vehicle_low(certificate)) / spacing
     assert np.std(off - np.round(off), axis=0).min() > 0.2, "between the nodes"
 
@@ -257,7 +263,7 @@ class Leaking(Vehicle):
     before = 0.0
 
     def measure(self, sensors):
-        measured = sensors + [0.0, 1e-6 * self.before]
+        measured = sensors + np.array([0.0, 1e-6 * self.before])
         type(self).before = float(np.mean(sensors))
         return measured
 

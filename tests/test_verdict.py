@@ -16,11 +16,12 @@ from hyrl_mj.verdict import FAILED, HELD, PROVED, WEAK, WON, Verdict
 from hyrl_mj.viz.tables import print_verdict
 
 EPS = 0.1
+NONE_LOST = (replays(),)
 ALL, NO_ONE = Arrivals(1_000, 0, 1_000), Arrivals(0, 0, 1_000)
 HOLDS = Retraining((ModeResult(0, 1.0, 1), ModeResult(1, 1.0, 0)))
 
 
-def game(policy, hyrl, winnable=1.0, bounds=(0.0, EPS), proved=None, replayed=(replays(),)):
+def game(policy, hyrl, winnable=1.0, bounds=(0.0, EPS), proved=None, replayed=NONE_LOST):
     """The result of a game: the shares that are won at each bound, what is proved of HyRL, and replays."""
     scores = {
         who: tuple(

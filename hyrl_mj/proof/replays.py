@@ -37,6 +37,7 @@ class Batch:
         z0: (n, d) chart points.
         q0: (n,) modes at the start, `NOT_STARTED` where the controller picks it.
         seed: seed of the noise.
+        steps: samples after which every run is proved to have arrived for good; None to the end of episodes.
     """
 
     controller: Controller
@@ -45,6 +46,7 @@ class Batch:
     z0: np.ndarray
     q0: np.ndarray
     seed: int
+    steps: int | None = None
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,9 @@ class Replays:
         is known that beats one of them, they lie in winnable cells, and the controller picks its mode. With
         the weakest first: a third lies at the border of what is proved, a third where it arrives latest, and
         the others are starts of the score, at random.
+
+        Of each kind of noise the first `BATCH` episodes are played to their end. The others are until all are
+        proved to have arrived for good, and to their end only if one has not.
         """
         if certificate.game.lattice.estimate or not score.winnable:
             return None
@@ -97,12 +102,11 @@ class Replays:
         pools = _pools(certificate, name, controller, score.eps, of)
         batches = []
         for kind, noise in _noises(certificate, name, controller, score.eps).items():
-            drawn = [pool.draw(n, rng) for pool, n in _shares(pools, STARTS[kind] // few)]
-            z0, q0 = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
+            z0, q0 = _drawn(pools, STARTS[kind] // few, rng)
             for first in range(0, len(z0), BATCH):
-                part = slice(first, first + BATCH)
-                number = int(rng.integers(2**31))
-                batches.append(Batch(controller, noise, kind, z0[part], q0[part], number))
+                part, number = slice(first, first + BATCH), int(rng.integers(2**31))
+                steps = max(pool.samples for pool in pools) if first else None
+                batches.append(Batch(controller, noise, kind, z0[part], q0[part], number, steps))
         return Replays(name, score.eps, certificate.game.everywhere, of, tuple(batches))
 
     def count(self, results: Iterable[Played]) -> ReplayCount:
@@ -127,9 +131,14 @@ def play(task: Task, batch: Batch) -> Played:
     """
     # Batches are played side by side: more threads for each would only wait for the others'.
     plant = task.plant(len(batch.z0), threads=1)
-    settings = LoopSettings(record=True, states=False, plant=plant, quiet=True)
-    run = closed_loop(task, batch.controller, batch.z0, batch.noise, batch.q0, batch.seed, settings)
-    lost = run.outcome != Outcome.REACHED
+    for steps in dict.fromkeys((batch.steps, None)):
+        settings = LoopSettings(steps, record=True, states=False, plant=plant, quiet=True)
+        run = closed_loop(
+            task, batch.controller, batch.z0, batch.noise, batch.q0, batch.seed, settings
+        )
+        lost = run.outcome != Outcome.REACHED
+        if not lost.any():
+            break
     judged = lost.copy()
     judged[::EVERY] = True
     judge(task, run, task.state(batch.z0), np.flatnonzero(judged))
@@ -166,6 +175,7 @@ class _Pool:
         border: (b,) places with a neighbour of which the same is not said.
         late: (l,) places, the latest to arrive first.
         counted: (c,) places that the score counts.
+        samples: after so many samples every run is proved to have arrived, else those of an episode.
     """
 
     grid: Grid
@@ -174,6 +184,7 @@ class _Pool:
     border: np.ndarray
     late: np.ndarray
     counted: np.ndarray
+    samples: int
 
     def draw(self, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Returns n starts (n, d), anywhere in their cells, and their modes (n,)."""
@@ -214,11 +225,15 @@ def _pools(
         late = places[np.argsort(-value[places], kind="stable")]
         counted = np.flatnonzero(said & region)
         border, counted = np.flatnonzero(weak), counted if len(counted) else places
-        pools.append(_Pool(grid, cells, q0, border, late, counted))
+        samples = int(value[said].max()) if proved else game.task.max_steps
+        pools.append(_Pool(grid, cells, q0, border, late, counted, samples))
     return pools
 
 
-def _shares(pools: list[_Pool], n: int) -> list[tuple[_Pool, int]]:
-    """Returns how many of n starts each pool gives."""
+def _drawn(pools: list[_Pool], n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Returns n starts (n, d) and their modes (n,), as many from each pool, in any order."""
     each, rest = divmod(n, len(pools))
-    return [(pool, each + (i < rest)) for i, pool in enumerate(pools)]
+    drawn = [pool.draw(each + (i < rest), rng) for i, pool in enumerate(pools)]
+    z0, q0 = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
+    order = rng.permutation(n)
+    return z0[order], q0[order]
