@@ -16,7 +16,7 @@ from hyrl_mj.game import NEVER, Game
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.proof import Certificate, examination, examine, replays
 from hyrl_mj.sets import Grid
-from hyrl_mj.simulation import LoopSettings, closed_loop, judge
+from hyrl_mj.simulation import LoopSettings, closed_loop, judge, judge_task
 from hyrl_mj.tasks import Outcome
 from hyrl_mj.tasks.vehicle import Vehicle
 from hyrl_mj.verdict import Verdict
@@ -283,6 +283,22 @@ def test_a_task_with_a_memory_or_a_view_of_others_is_refused_by_name(kind, told)
     run, start = played(task, controller)
     with pytest.raises(BadInput, match=rf"vehicle is not simulated as .* {told}"):
         judge(task, run, start)
+
+
+@pytest.mark.parametrize("kind", [Counting, Mixing, Ordered, Leaking])
+def test_a_run_of_such_a_task_is_refused_before_it_trains(kind, tmp_path, monkeypatch):
+    with pytest.raises(BadInput, match="vehicle is not simulated as MuJoCo alone simulates it"):
+        judge_task(kind())
+    monkeypatch.setattr("hyrl_mj.pipeline.runs.check_task", lambda task: task)
+    monkeypatch.setattr(hyrl_mj.run_directory.Run, "task", kind())
+    with pytest.raises(BadInput, match="something keeps a memory between episodes or copies"):
+        hyrl_mj.run("vehicle", preset="smoke", out=tmp_path / "run")
+    assert not (tmp_path / "run" / "policy.safetensors").exists()
+
+
+@pytest.mark.parametrize("name", ["vehicle", "beam", "field"])
+def test_the_tasks_of_this_package_are_simulated_as_plain_mujoco_does(name):
+    assert judge_task(hyrl_mj.get_task(name)) == 50
 
 
 def test_every_examination_by_episodes_is_judged(puck, monkeypatch):

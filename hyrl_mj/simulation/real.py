@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
 from hyrl_mj import mjcf
 from hyrl_mj.errors import BadInput
-from hyrl_mj.simulation.rollout import Rollout
+from hyrl_mj.policies import PolicyController
+from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop
 from hyrl_mj.tasks import Outcome, Task
 
 # Largest difference of a value, of values below 1, else as a share of them. The same code of MuJoCo computes
@@ -20,6 +22,8 @@ from hyrl_mj.tasks import Outcome, Task
 ROUNDING = 1e-8
 # Episodes whose samples are shown to the task one by one, and not together.
 ALONE = 2
+# Episodes that are tried when a run begins, and their longest duration [samples].
+TRIED, SAMPLES = 50, 40
 # MuJoCo's warnings about states that it resets.
 BAD = [
     int(kind)
@@ -70,6 +74,41 @@ def judge(
         theirs = tuple(values[: k + 1, number] for values in seen)
         _compare(task, run, row, theirs, mine, alone=number < ALONE)
     return len(judged)
+
+
+@dataclass(frozen=True)
+class _AnyInputs:
+    """A policy that draws its inputs, between the limits or among the levels of a task."""
+
+    task: Task
+    rng: np.random.Generator
+
+    def act(self, measured: np.ndarray) -> np.ndarray:
+        levels, shape = self.task.input_levels, (len(measured), len(self.task.inputs))
+        if levels is not None:
+            return levels[self.rng.integers(len(levels), size=len(measured))]
+        return self.rng.uniform(*self.task.input_limits, shape)
+
+
+def judge_task(task: Task) -> int:
+    """Judges episodes under random inputs from starts of a task, before anything is made of it.
+
+    Returns:
+        The number of episodes that were judged; 0 of a task whose robot is no MJCF.
+
+    Raises:
+        BadInput: something differs, as in `judge`.
+    """
+    if type(task).plant is not Task.plant:
+        return 0
+    rng = np.random.default_rng(0)
+    z = task.starts(TRIED, rng)
+    settings = LoopSettings(
+        min(task.max_steps, SAMPLES), record=True, states=False, vary=True, quiet=True
+    )
+    run = closed_loop(task, PolicyController(_AnyInputs(task, rng)), z, settings=settings)
+    start = task.state(z, settings.rng_of_starts(0))
+    return judge(task, run, start, np.arange(TRIED)[::-1])
 
 
 def fresh_model(task: Task) -> mujoco.MjModel:
