@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from hyrl_mj.game import NEARLY, Robustness, Score, percent
+import numpy as np
+
+from hyrl_mj.game import NEARLY, PROVED_STARTS, ReplayCount, Robustness, Score, percent
 from hyrl_mj.stages import Arrivals, ModeResult, Retraining
 from hyrl_mj.tasks import Task
 
@@ -32,6 +34,9 @@ class Verdict:
     - WEAK: HyRL wins more than the policy under noise, or the policy does not arrive from nearly all of its
       starts without noise, or the examination was under less noise than the run's bound.
     - FAILED: none of these. HyRL loses, and is no better than the policy.
+
+    PROVED and WON are said only after starts that are proved, or not known to be lost, were replayed in
+    MuJoCo: a single one that is lost withdraws both words, and is named.
 
     In the game, HyRL picks its start mode. In episodes, the kind of noise that stops a controller most often
     counts; the attack is one of these kinds.
@@ -97,8 +102,11 @@ class _Wins:
         attacked = [1 - c.lost / c.starts for c in robustness.attacks if c.controller == who]
         if robustness.deciding:
             scores = robustness.deciding.scores[who]
-            quiet = [score.not_broken for score in scores if score.eps == 0]
-            return _Wins(quiet[0] if quiet else None, min(scores[-1].not_broken, *attacked, 1.0))
+            replays = robustness.deciding.replays_of(who)
+            replayed = replays.shares if replays else (1.0, 1.0)
+            quiet = [min(score.not_broken, replayed[0]) for score in scores if score.eps == 0]
+            noisy = min(scores[-1].not_broken, replayed[1], *attacked, 1.0)
+            return _Wins(quiet[0] if quiet else None, noisy)
         shares = {
             kind: arrived / episodes
             for kind, (arrived, episodes) in _by_kind(robustness, who).items()
@@ -138,6 +146,12 @@ class _Case:
         return "the winnable starts" if self.robustness.deciding else "the episodes"
 
     @property
+    def lost_of(self) -> str:
+        """What shares of losses are shares of."""
+        replayed = self.replays is not None and self.replays.failures
+        return f"{self.whole} or of those replayed" if replayed else self.whole
+
+    @property
     def examined(self) -> bool:
         """Whether the examination was under as much noise as the run's bound."""
         return self.robustness.eps >= self.bound and self.hyrl.noisy is not None
@@ -148,8 +162,41 @@ class _Case:
         game = self.robustness.deciding
         return game.scores["hyrl"][-1].winnable if game else 1.0
 
+    @property
+    def replays(self) -> ReplayCount | None:
+        """The replays of HyRL in MuJoCo, None if there were none."""
+        game = self.robustness.deciding
+        return game.replays_of("hyrl") if game else None
+
+    @property
+    def stands(self) -> bool:
+        """Whether what the game says of HyRL was replayed in MuJoCo, and nothing was lost."""
+        return self.replays is not None and not self.replays.failures
+
     def proofs(self) -> Iterator[str]:
         """Yields why the run is PROVED, if it is."""
+        if self.stands:
+            yield from self._proved()
+
+    def success(self) -> Iterator[str]:
+        """Yields why the run is WON or HELD, if it is."""
+        if self.stands or not self.robustness.deciding:
+            yield from self._won()
+
+    def withdrawn(self) -> Iterator[str]:
+        """Yields why the run is neither PROVED nor WON, although the game says so."""
+        if not self.robustness.deciding or self.stands:
+            return
+        if self.replays:
+            yield replays_sentence(self.task, self.replays)
+        elif [*self._proved(), *self._won()]:
+            yield (
+                "what the worst-case game says of HyRL was not replayed in MuJoCo, which "
+                "hyrl-mj robustness RUN does"
+            )
+
+    def _proved(self) -> Iterator[str]:
+        """Yields why the run is PROVED, if the game is to be believed."""
         game = self.robustness.deciding
         if not game or not self.examined or not self.winnable:
             return
@@ -157,8 +204,8 @@ class _Case:
         if score.proved is not None and score.proved >= NEARLY:
             yield f"whatever the {self.noise}, HyRL {_share(score)} of {self.whole}"
 
-    def success(self) -> Iterator[str]:
-        """Yields why the run is WON or HELD, if it is."""
+    def _won(self) -> Iterator[str]:
+        """Yields why the run is WON or HELD, if the game is to be believed."""
         won = self.hyrl.noisy
         if not self.examined or not self.winnable or won is None:
             return
@@ -174,12 +221,17 @@ class _Case:
 
     def failures(self) -> Iterator[str]:
         """Yields why the run FAILED, if it did for sure."""
+        if grounds := [*self._failed()]:
+            yield from [*self.withdrawn(), *grounds]
+
+    def _failed(self) -> Iterator[str]:
+        """Yields what makes a run a failure, whatever else it does."""
         if not self.winnable:
             yield f"no start is winnable under {self.noise}"
         policy, hyrl = self.policy.quiet, self.hyrl.quiet
         if policy is not None and hyrl is not None and hyrl < policy:
             yield (
-                f"without noise HyRL loses {percent(1 - hyrl)} of {self.whole}, more than the policy "
+                f"without noise HyRL loses {percent(1 - hyrl)} of {self.lost_of}, more than the policy "
                 f"({percent(1 - policy)})"
             )
         # A mode with a reward of its own is judged by episodes that perhaps no policy wins. Where nothing was
@@ -198,11 +250,12 @@ class _Case:
 
     def weaknesses(self) -> Iterator[str]:
         """Yields why the run is WEAK, if it is."""
+        yield from self.withdrawn()
         if self.arrivals.arrived < NEARLY * self.arrivals.episodes:
             yield f"the policy {self.arrivals}"
         policy, hyrl = self.policy.noisy, self.hyrl.noisy
-        if policy is not None and hyrl is not None and hyrl > policy:
-            whole = self.whole
+        if policy is not None and hyrl is not None and policy < hyrl < 1:
+            whole = self.lost_of
             if self.robustness.attacks:
                 whole = f"{whole} or of those attacked"
             yield (
@@ -237,6 +290,8 @@ class _Case:
             if ours.eps in (0, self.robustness.eps):
                 when = f"under the worst {self.noise}" if ours.eps else "without noise"
                 yield f"{when} HyRL {_share(ours)} of {self.whole}, the policy {_share(theirs)}"
+        for count in self.robustness.deciding.replays:
+            yield replays_sentence(self.task, count)
         yield from self._attacked("hyrl", "policy")
 
     def _counts(self) -> Iterator[str]:
@@ -262,6 +317,26 @@ class _Case:
         breaks = [f"{names[who]} from {found[who].broken}" for who in controllers if who in found]
         if breaks:
             yield f"the attack breaks {', '.join(breaks)}"
+
+
+def replays_sentence(task: Task, count: ReplayCount) -> str:
+    """Returns how many replays a controller lost, and the first of them."""
+    who = "the policy" if count.controller == "policy" else "HyRL"
+    said = "proved" if count.of == PROVED_STARTS else "winnable"
+    if count.first is None:
+        return (
+            f"{who} lost none of {count.played:,} {said} starts when they were replayed in MuJoCo"
+        )
+    first = count.first
+    mode = "" if first.q0 is None else f" in mode {task.mode_name(first.q0)}"
+    noise = "without noise" if first.noise == NO_NOISE else f"under {first.noise} noise"
+    said = "a proved start" if count.of == PROVED_STARTS else "a start that no known noise beats"
+    withdrawn = "withdrawn: " if count.controller == "hyrl" else ""
+    return (
+        f"{withdrawn}{said} was lost in a replay: from {task.chart.format(np.array(first.start))}{mode} "
+        f"{noise} {who} ends {first.outcome.replace('_', ' ')}, and {count.failures:,} of "
+        f"{count.played:,} such replays in MuJoCo are lost"
+    )
 
 
 def _share(score: Score) -> str:

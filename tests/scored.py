@@ -1,8 +1,15 @@
 """Planted results of the worst-case game, for the tests of what is made of them."""
 
-from hyrl_mj.game import LatticeSpacing, Score
+from hyrl_mj.game import LatticeSpacing, LostReplay, ReplayCount, Score
 
 SPACING = LatticeSpacing((0.1,), exact=True, cells=True, curve_spacing=(0.1,))
+
+
+def replays(who="hyrl", lost=0, of="proved", eps=0.1, start=(3.0,), q0=1):
+    """Replays of a controller, of which some are lost without noise."""
+    first = LostReplay(start, q0, "none", "crashed") if lost else None
+    starts, lost_by_kind = {"none": 400, "uniform": 600}, {"none": lost, "uniform": 0}
+    return ReplayCount(who, eps, False, of, starts, lost_by_kind, 50 + lost, first)
 
 
 def score(eps, winnable, won, won_any, *, proved=None, excursion=None, time=3.0):

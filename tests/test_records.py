@@ -4,7 +4,7 @@ import json
 from dataclasses import asdict, dataclass, replace
 
 import pytest
-from scored import SPACING, score
+from scored import SPACING, replays, score
 from sentences import assert_one_sentence_about
 
 import hyrl_mj
@@ -124,6 +124,7 @@ GAME = GameResult(
         (0.0, 0.1), (1.0, 0.98), {"policy": Wins((1.0, 0.9), (1.0, 0.9), (), (), (3.0, None))}
     ),
     profile=Profile(((0.0, 0.1),), {"policy": (None,)}),
+    replays=(replays("policy", lost=2),),
 )
 COUNT = EpisodeCount(
     "uniform", 0.1, False, "policy", "near M*", 4, {"crashed": 3, "reached": 1}, 0.25, (0.1, 0.7)
@@ -148,6 +149,47 @@ def test_scores_margins_and_episodes_are_where_readers_of_the_file_expect_them(t
     assert game["miss_without_noise"] == {"policy": 0.025}
     assert content["episodes"] == [asdict(COUNT) | {"interval": [0.1, 0.7]}]
     assert (content["eps"], content["everywhere"], content["seed"]) == (0.1, False, 2)
+
+
+def test_replays_are_read_as_they_were_and_damage_is_named(tmp_path):
+    path = tmp_path / "r.json"
+    wins = GAME.curve.wins | {LIMIT: Wins((1.0, 1.0), (1.0, 1.0), (), (), (3.0, 3.0))}
+    profile = replace(GAME.profile, eps=dict.fromkeys(("policy", LIMIT), (None,)))
+    game = replace(GAME, curve=replace(GAME.curve, wins=wins), profile=profile)
+    replace(ROBUSTNESS, game=game).save(path)
+    assert Robustness.load(path, ("policy",)).game == game
+    content = json.loads(json.dumps(asdict(replace(ROBUSTNESS, game=game))))
+    before = json.loads(json.dumps(content))
+    del before["game"]["replays"]  # as in files of earlier versions
+    artifacts.write_json(path, before, "robustness")
+    assert Robustness.load(path, ("policy",)).game == replace(game, replays=())
+    (whole,) = content["game"]["replays"]
+    for change in (
+        {"lost": {"none": 2}},
+        {"lost": {"none": 401, "uniform": 0}},
+        {"starts": {}, "lost": {}},
+        {"judged": 1},
+        {"judged": 1_001},
+        {"first": None},
+        {"of": "hoped"},
+        {"controller": "hyrl"},
+    ):
+        content["game"]["replays"] = [whole | change]
+        artifacts.write_json(path, content, "robustness")
+        with pytest.raises(BadArtifact, match=r"r\.json.*its game is not one of policy"):
+            Robustness.load(path, ("policy",))
+    content["game"]["replays"] = [whole, whole]
+    artifacts.write_json(path, content, "robustness")
+    with pytest.raises(BadArtifact, match="its game is not one of policy"):
+        Robustness.load(path, ("policy",))
+    for change, told in (({"judged": "all"}, "judged"), ({"first": {"start": [0.1]}}, "first")):
+        content["game"]["replays"] = [whole | change]
+        artifacts.write_json(path, content, "robustness")
+        with pytest.raises(
+            BadArtifact, match=rf"game\.replays\.0\.{told}.*robustness RUN"
+        ) as caught:
+            Robustness.load(path)
+        assert_one_sentence_about(caught, path)
 
 
 def test_a_file_of_version_0_1_ends_in_one_sentence(tmp_path):

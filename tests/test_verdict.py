@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from planted import one_way_policy
-from scored import SPACING, score
+from scored import SPACING, replays, score
 
 from hyrl_mj import BadArtifact, artifacts
 from hyrl_mj.game import LIMIT, AttackCount, Curve, EpisodeCount, GameResult, Profile, Robustness
@@ -16,12 +16,13 @@ from hyrl_mj.verdict import FAILED, HELD, PROVED, WEAK, WON, Verdict
 from hyrl_mj.viz.tables import print_verdict
 
 EPS = 0.1
+NONE_LOST = (replays(),)
 ALL, NO_ONE = Arrivals(1_000, 0, 1_000), Arrivals(0, 0, 1_000)
 HOLDS = Retraining((ModeResult(0, 1.0, 1), ModeResult(1, 1.0, 0)))
 
 
-def game(policy, hyrl, winnable=1.0, bounds=(0.0, EPS), proved=None):
-    """The result of a game, from the shares that are won at each bound, and what is proved of HyRL."""
+def game(policy, hyrl, winnable=1.0, bounds=(0.0, EPS), proved=None, replayed=NONE_LOST):
+    """The result of a game: the shares that are won at each bound, what is proved of HyRL, and replays."""
     scores = {
         who: tuple(
             score(eps, winnable, won, won, proved=proved if who == "hyrl" else None)
@@ -30,7 +31,7 @@ def game(policy, hyrl, winnable=1.0, bounds=(0.0, EPS), proved=None):
         for who, shares in (("policy", policy), ("hyrl", hyrl), (LIMIT, (1.0,) * len(bounds)))
     }
     result = GameResult(
-        False, SPACING, scores, {}, {}, {}, {}, Curve((), (), {}), Profile((), {})
+        False, SPACING, scores, {}, {}, {}, {}, Curve((), (), {}), Profile((), {}), replayed
     )  # fmt: skip
     return Robustness(bounds[-1], False, result, (), seed=0)
 
@@ -141,6 +142,38 @@ def test_without_noise_all_that_counts_is_that_everything_is_won(circle):
     assert word(circle, game((0.8,), (0.9,), bounds=(0.0,)), bound=0.0) == WEAK
 
 
+@pytest.mark.parametrize("proved", [1.0, None])
+def test_one_lost_replay_withdraws_the_word_and_is_named(circle, proved):
+    of = "won" if proved is None else "proved"
+    lost = game((1.0, 0.9), (1.0, 1.0), proved=proved, replayed=(replays(lost=1, of=of),))
+    verdict = Verdict.of(circle, EPS, lost, HOLDS, ALL)
+    said = "a proved start" if proved else "a start that no known noise beats"
+    sentence = (
+        f"withdrawn: {said} was lost in a replay: from theta = 3 rad in mode 1 (counter-clockwise) without "
+        "noise HyRL ends crashed, and 1 of 1,000 such replays in MuJoCo are lost"
+    )
+    assert (verdict.word, verdict.sentence.split("; ")[0]) == (FAILED, sentence), (
+        "less than the policy"
+    )
+    assert "HyRL loses 0.25% of the winnable starts or of those replayed" in verdict.sentence
+    assert sentence in verdict.reasons
+    poor = game((0.9, 0.9), (1.0, 1.0), proved=proved, replayed=(replays(lost=1, of=of),))
+    verdict = Verdict.of(circle, EPS, poor, HOLDS, ALL)
+    assert (verdict.word, verdict.sentence) == (WEAK, sentence)
+
+
+def test_no_word_is_said_without_a_replay(circle):
+    for proved in (1.0, None):
+        none = game((1.0, 0.9), (1.0, 1.0), proved=proved, replayed=())
+        verdict = Verdict.of(circle, EPS, none, HOLDS, ALL)
+        assert verdict.word == WEAK
+        assert "was not replayed in MuJoCo, which hyrl-mj robustness RUN does" in verdict.sentence
+    of_another = game((1.0, 0.9), (1.0, 1.0), replayed=(replays("policy"),))
+    assert word(circle, of_another) == WEAK
+    nothing = game((1.0, 0.9), (1.0, 0.95), replayed=())
+    assert "replayed" not in str(Verdict.of(circle, EPS, nothing, HOLDS, ALL))
+
+
 def test_everything_of_nothing_is_not_won(circle):
     verdict = Verdict.of(circle, EPS, game((1.0, 1.0), (1.0, 1.0), winnable=0.0), HOLDS, ALL)
     assert verdict.word == FAILED
@@ -220,6 +253,7 @@ def test_a_verdict_reads_as_a_sentence_with_reasons(circle, capsys):
         "lose any",
         f"- under the worst {NOISE} HyRL is not known to lose any of the winnable starts, the policy is "
         "known to lose 10.00%",
+        "- HyRL lost none of 1,000 proved starts when they were replayed in MuJoCo",
         "- stage 1: the policy arrives from 1,000 of 1,000 starts without noise",
         "- stage 6: the policy of mode 0 (clockwise) wins all of its set that was tried, after 1 training",
         "- stage 6: the policy of mode 1 (counter-clockwise) wins all of its set that was tried, without a "

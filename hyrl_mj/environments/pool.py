@@ -147,7 +147,7 @@ class Stage:
             seen.append(instance.observation)
         if changed := written.differing(written.fingerprint(instance.env), before):
             raise BadInput(
-                f"{self.recipe.source.name} remembers something in {changed[0]}, which no sampled run showed; "
+                f"{self.recipe.source.name} remembers something in {changed[0]}, as no sampled run showed; "
                 "without a memory that is always there it cannot be tabulated"
             )
         return np.array(after), np.array(reports), np.array(seen)

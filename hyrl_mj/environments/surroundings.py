@@ -182,8 +182,8 @@ def check_pins(instance: Instance) -> None:
             if copies and not np.array_equal(own, now[: len(own)]):
                 raise BadInput(
                     f"pinned {name} is {own.tolist()}, and {place} of {instance.name}, which each reset puts "
-                    f"at the same place, stays at {now[: len(own)].tolist()}: pin it by the options of reset, "
-                    "or by a seed"
+                    f"at the same place, stays at {now[: len(own)].tolist()}: pin it by options of reset or "
+                    "by a seed"
                 )
 
 

@@ -104,7 +104,7 @@ def _check_observer(instance: Instance, spec: EnvironmentSpec) -> None:
         scale = max(float(np.abs(begun).max(initial=0.0)), 1.0)
         for column in np.flatnonzero(~(off <= ROUNDING * scale)):
             suspects[int(column)] = (
-                f"is {begun[column]:.6g} after reset() and differs by {off[column]:.6g} in the same state later"
+                f"is {begun[column]:.6g} after reset() and differs by {off[column]:.6g} in that state later"
             )
             if moved[column]:
                 _refuse(name, int(column), suspects[int(column)])

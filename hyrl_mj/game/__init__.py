@@ -5,7 +5,14 @@ The plant is tabulated on a lattice of states, and the game is solved on it by b
 """
 
 from hyrl_mj.game.adversary import WorstNoise
-from hyrl_mj.game.counts import AttackCount, EpisodeCount
+from hyrl_mj.game.counts import (
+    PROVED_STARTS,
+    WON_STARTS,
+    AttackCount,
+    EpisodeCount,
+    LostReplay,
+    ReplayCount,
+)
 from hyrl_mj.game.lattice import EPISODES_INSTEAD, Lattice, nearest_of
 from hyrl_mj.game.limit import Limit, fewest_samples
 from hyrl_mj.game.resolution import CURVE_CELLS, LATTICE, aligned_cells, curve_grid, lattice_grid
@@ -57,10 +64,12 @@ __all__ = [
     "NEARLY",
     "NEVER",
     "OVER",
+    "PROVED_STARTS",
     "UNCLEAR",
     "UNWINNABLE",
     "WON",
     "WON_FROM_SOME",
+    "WON_STARTS",
     "Answers",
     "AttackCount",
     "Curve",
@@ -70,11 +79,13 @@ __all__ = [
     "Lattice",
     "LatticeSpacing",
     "Limit",
+    "LostReplay",
     "Maps",
     "Moves",
     "NodeScore",
     "Places",
     "Profile",
+    "ReplayCount",
     "Robustness",
     "Score",
     "Wins",

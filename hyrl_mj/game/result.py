@@ -12,7 +12,7 @@ import numpy as np
 from hyrl_mj import artifacts
 from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadArtifact
-from hyrl_mj.game.counts import AttackCount, EpisodeCount
+from hyrl_mj.game.counts import AttackCount, EpisodeCount, ReplayCount
 from hyrl_mj.sets import Grid
 
 # Name of the limit, a controller that is scored beside the examined ones.
@@ -184,6 +184,8 @@ class GameResult:
             without noise.
         curve: what is won against the noise bound.
         profile: the noise that can be borne along M*.
+        replays: the replays of what is proved or won at the largest noise bound, at most one for each
+            controller; none of an estimate, and in files of earlier versions.
     """
 
     everywhere: bool
@@ -195,6 +197,7 @@ class GameResult:
     miss_without_noise: dict[str, float]
     curve: Curve
     profile: Profile
+    replays: tuple[ReplayCount, ...] = ()
 
     @property
     def estimate(self) -> bool:
@@ -209,6 +212,11 @@ class GameResult:
     def is_whole(self, controllers: Collection[str]) -> bool:
         """Whether all tables have the same controllers, and as many rows as noise bounds."""
         examined = {*controllers}
+        replayed = [count.controller for count in self.replays if count.is_whole]
+        if len(replayed) < len(self.replays) or not {*replayed} <= examined:
+            return False
+        if len({*replayed}) < len(replayed):
+            return False
         whole = (self.margin, self.proved_margin, self.miss_without_noise)
         if any(set(table) != examined for table in whole) or not {*self.why_not_proved} <= examined:
             return False
@@ -223,6 +231,10 @@ class GameResult:
             and set(map(len, [self.curve.winnable, *columns])) == {len(self.curve.eps)}
             and set(map(len, self.profile.eps.values())) == {len(self.profile.points)}
         )
+
+    def replays_of(self, controller: str) -> ReplayCount | None:
+        """Returns the replays of a controller, None if there were none."""
+        return next((count for count in self.replays if count.controller == controller), None)
 
     @property
     def lasting(self) -> bool:
@@ -249,7 +261,7 @@ class Robustness:
         attacks: counts of the attack, one for each controller, if there was one.
     """
 
-    LATER: ClassVar[tuple[str, ...]] = ("game.lattice.contacts",)
+    LATER: ClassVar[tuple[str, ...]] = ("game.lattice.contacts", "game.replays")
 
     eps: float
     everywhere: bool

@@ -21,6 +21,7 @@ from hyrl_mj.policies import ALGORITHMS, FUNCTION, AnyPolicy, algorithms, read_a
 from hyrl_mj.progress import Say
 from hyrl_mj.run_directory import Run, load_run, opened, write_config
 from hyrl_mj.sets import coarseness
+from hyrl_mj.simulation import judge_task
 from hyrl_mj.stages import Arrivals
 from hyrl_mj.tasks import Task, check_task, get_task
 from hyrl_mj.viz import beginning
@@ -195,6 +196,8 @@ def extend_again(run: Run, horizon: float, say: Say = print) -> Run:
 
 def _run_all(run: Run, say: Say, stages: Collection[str] = STAGES) -> Run:
     """Runs the stages that are not done."""
+    if not run.manifest.is_done("critical-set"):
+        judge_task(run.task)
     if "robustness" in stages and not run.manifest.is_done("robustness"):
         say(f"the run will be examined {examination_plan(run)}")
     s = run.settings

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from hyrl_mj.game import (
     Maps,
     NodeScore,
     Profile,
+    ReplayCount,
     Score,
     Wins,
     curve_grid,
@@ -34,6 +36,7 @@ from hyrl_mj.policies import BLAS, Controller
 from hyrl_mj.progress import progress_bar
 from hyrl_mj.proof.certificate import Certificate, Proved
 from hyrl_mj.proof.counterexamples import Broken, attack
+from hyrl_mj.proof.replays import Replays, play
 from hyrl_mj.sets import GridSet
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import Task
@@ -75,7 +78,9 @@ def examine(
     largest = max(*bounds, LARGEST) if exact else max(bounds)
     fine = Game(task, parts, controllers, largest, everywhere, grid)
     names = [*controllers, LIMIT]
-    scores, maps, has_cells, why_not = _scores(fine, names, controllers, bounds)
+    certificate = Certificate.of(fine, controllers)
+    scores, maps = _scores(certificate, names, controllers, bounds)
+    replays = _replays(certificate, controllers, scores)
     if not exact:  # a coarser lattice would estimate nothing
         coarse, margins = fine, dict.fromkeys(controllers)
         curve, profile = _known(bounds, scores), Profile((), dict.fromkeys(names, ()))
@@ -86,24 +91,26 @@ def examine(
         margins = dict(zip(controllers, _in_threads("margins", fine.margin, likely), strict=True))
     spacing, curve_spacing = (tuple(g.lattice.grid.spacing.tolist()) for g in (fine, coarse))
     lattice = LatticeSpacing(
-        spacing, fine.lattice.exact, has_cells, curve_spacing, task.stopped_by_walls
-    )
+        spacing, fine.lattice.exact, certificate.cells is not None, curve_spacing,
+        task.stopped_by_walls,
+    )  # fmt: skip
     proved = {name: _proved_margin(curve, curve.wins[name]) for name in controllers}
     misses = _misses(coarse, controllers)
     result = GameResult(
-        everywhere, lattice, scores, margins, proved, why_not, misses, curve, profile
-    )
+        everywhere, lattice, scores, margins, proved, dict(certificate.why_not), misses, curve, profile,
+        replays,
+    )  # fmt: skip
     return result, maps
 
 
 def _scores(
-    game: Game,
+    certificate: Certificate,
     names: list[str],
     controllers: Mapping[str, Controller],
     bounds: tuple[float, ...],
-) -> tuple[dict[str, tuple[Score, ...]], Maps, bool, dict[str, str]]:
-    """Returns scores and maps, whether there are cells, and what stopped a proof, by controller."""
-    certificate = Certificate.of(game, controllers)
+) -> tuple[dict[str, tuple[Score, ...]], Maps]:
+    """Returns the scores by controller, and the maps."""
+    game = certificate.game
     games = [(name, eps) for eps in bounds for name in names]
     results = list(_in_threads("worst-case scores", game.score, games))
     tried = [(certificate, name, controllers[name], eps) for name, eps in games if name != LIMIT]
@@ -119,7 +126,23 @@ def _scores(
     }
     classes = {name: _map(certificate, name, bounds[-1]) for name in controllers}
     maps = Maps(bounds[-1], np.array(game.lattice.grid.counts), classes)
-    return scores, maps, certificate.cells is not None, dict(certificate.why_not)
+    return scores, maps
+
+
+def _replays(
+    certificate: Certificate,
+    controllers: Mapping[str, Controller],
+    scores: Mapping[str, tuple[Score, ...]],
+) -> tuple[ReplayCount, ...]:
+    """Plays in MuJoCo what the scores at the largest bound say, and returns what was lost."""
+    plans = [
+        plan
+        for name, controller in controllers.items()
+        if (plan := Replays.of_score(certificate, name, controller, scores[name][-1]))
+    ]
+    calls = [(certificate.game.task, batch) for plan in plans for batch in plan.batches]
+    played = _in_threads("replays", play, calls)
+    return tuple(plan.count(list(islice(played, len(plan.batches)))) for plan in plans)
 
 
 def _score(certificate: Certificate, name: str, nodes: NodeScore, broken: Broken | None) -> Score:

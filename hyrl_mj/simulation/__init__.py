@@ -23,6 +23,7 @@ from hyrl_mj.simulation.noise import (
 )
 from hyrl_mj.simulation.passing import Passing, windings
 from hyrl_mj.simulation.programmes import Programmes, Rules
+from hyrl_mj.simulation.real import judge, judge_task
 from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop
 from hyrl_mj.simulation.way_runs import WayRuns, policy_runs, way_runs
 
@@ -43,6 +44,8 @@ __all__ = [
     "Signal",
     "WayRuns",
     "closed_loop",
+    "judge",
+    "judge_task",
     "noise_kinds",
     "policy_runs",
     "register_noise",

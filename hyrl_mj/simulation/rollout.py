@@ -22,6 +22,7 @@ class LoopSettings:
         backward: simulate x' = -f(x, u); such runs end with the last sample only.
         passing: whether to follow how the runs pass the obstacles.
         record: whether to keep modes, measurements, inputs and states.
+        states: whether to keep MuJoCo's states, too, if the others are kept.
         vary: whether to draw the coordinates outside the chart at random, as in training.
         plant: n copies of the task's robot to use again; by default new ones.
         label: label of the progress bar.
@@ -32,10 +33,15 @@ class LoopSettings:
     backward: bool = False
     passing: bool = False
     record: bool = False
+    states: bool = True
     vary: bool = False
     plant: Plant | None = None
     label: str = "simulating"
     quiet: bool = False
+
+    def rng_of_starts(self, seed: int) -> np.random.Generator | None:
+        """Returns the generator of the coordinates outside the chart, None if they are not drawn."""
+        return np.random.default_rng([seed, 1]) if self.vary else None
 
 
 @dataclass(frozen=True)
@@ -49,6 +55,7 @@ class Rollout:
         q0: (n,) modes at the start.
         before: (K, n) modes at each sample before a jump. Empty without `record`, like all that follow.
         q: (K, n) modes at each sample after a jump.
+        true: (K + 1, n, p) measurements without noise.
         measured: (K, n, p) noisy measurements.
         u: (K, n, m) inputs.
         state: (K + 1, n, nstate) MuJoCo's states.
@@ -61,6 +68,7 @@ class Rollout:
     q0: np.ndarray
     before: np.ndarray
     q: np.ndarray
+    true: np.ndarray
     measured: np.ndarray
     u: np.ndarray
     state: np.ndarray
@@ -96,8 +104,7 @@ def closed_loop(
     limit = task.max_steps if settings.steps is None else settings.steps
     backward, record, n = settings.backward, settings.record, len(z0)
     plant = settings.plant or task.plant(n)
-    rng_of_starts = np.random.default_rng([seed, 1]) if settings.vary else None
-    plant.set_state(*task.state(z0, rng_of_starts))
+    plant.set_state(*task.state(z0, settings.rng_of_starts(seed)))
     signal = signal_for(noise, task, controller)
     signal.reset(n, np.random.default_rng(seed))
     measurement = plant.measurement
@@ -110,7 +117,8 @@ def closed_loop(
     first_mode = q.copy()
     shapes = {"before": (), "q": (), "measured": (len(task.noisy),), "u": (len(task.inputs),)}
     kept: dict[str, list[np.ndarray]] = {name: [] for name in shapes}
-    states = [plant.state] if record else []
+    true = [measurement] if record else []
+    states = [plant.state] if record and settings.states else []
     follower = Follower(task, plant) if settings.passing else None
     for k in progress_bar(range(limit), settings.label, "samples", quiet=settings.quiet):
         active = np.flatnonzero(outcome == Outcome.RUNNING)
@@ -121,6 +129,8 @@ def closed_loop(
         if plant.late:  # what the last step came to is known only now
             outcome[active] = task.outcome(plant.truth[active], plant.unstable[active])
             active = np.flatnonzero(outcome == Outcome.RUNNING)
+            if not len(active):
+                break
         if k == 0 and (fresh := q == NOT_STARTED).any():
             q[fresh] = controller.initial_mode(measured[fresh])
             first_mode = q.copy()
@@ -139,6 +149,8 @@ def closed_loop(
         if record:
             for name, values in zip(shapes, (before, q.copy(), measured, u), strict=True):
                 kept[name].append(values)
+            true.append(measurement)
+        if states:
             states.append(np.where(lost[:, None], states[-1], plant.state))
     if plant.late and not backward:
         going = outcome == Outcome.RUNNING
@@ -153,8 +165,9 @@ def closed_loop(
     path = path[: length.max() + 1]
     passing = None if follower is None else follower.passing
     return Rollout(
-        path, length, outcome, first_mode, **arrays, state=np.array(states), passing=passing
-    )
+        path, length, outcome, first_mode, **arrays,
+        true=np.array(true), state=np.array(states), passing=passing,
+    )  # fmt: skip
 
 
 def _in_turns(
@@ -184,7 +197,7 @@ def _in_turns(
 def _joined(parts: list[Rollout]) -> Rollout:
     """Returns the runs of several rollouts as one."""
     found: dict[str, Any] = {}
-    for name in ("path", "before", "q", "measured", "u", "state"):
+    for name in ("path", "before", "q", "measured", "u", "true", "state"):
         arrays = [getattr(part, name) for part in parts]
         if arrays[0].ndim < 2:  # not recorded
             found[name] = arrays[0]

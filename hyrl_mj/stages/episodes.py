@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,12 +17,14 @@ from hyrl_mj.plant import Plant
 from hyrl_mj.policies import Controller
 from hyrl_mj.progress import progress_bar
 from hyrl_mj.sets import Grid
-from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
+from hyrl_mj.simulation import LoopSettings, Noise, closed_loop, judge
 from hyrl_mj.stages.critical_set import check_points, distance_to
 from hyrl_mj.tasks import Outcome, Task
 
 # Episodes that are simulated at once, which limits the memory.
 BATCH = 4_096
+# Episodes that plain MuJoCo plays once more, spread over all kinds of noise and controllers; lost ones first.
+JUDGED = 500
 # The search for starts near M* ends after this many draws without one.
 RARE = 100_000
 
@@ -106,7 +109,8 @@ def noisy_episodes(
         seed: seed of starts and noise.
 
     Raises:
-        BadInput: no episodes, a noise bound that hides the state space, or no starts near M*.
+        BadInput: no episodes, a noise bound that hides the state space, no starts near M*, or episodes that
+            plain MuJoCo plays otherwise.
     """
     check_seed(seed)
     check_points(task, regions.points)
@@ -115,9 +119,11 @@ def noisy_episodes(
     for noise in noises:
         task.check_noise(noise.bound, noise.everywhere)
     pairs, firsts = list(product(noises, controllers)), range(0, count, BATCH)
+    judged = math.ceil(JUDGED / len(pairs))
     batches = [
-        _Batch(task, regions, controllers[name], noise, seed, first, min(BATCH, count - first))
+        _Batch(task, regions, controllers[name], noise, seed, first, n, 0 if first else judged)
         for (noise, name), first in product(pairs, firsts)
+        for n in (min(BATCH, count - first),)
     ]
     # The plants are used again: new ones for each batch would fragment the memory.
     plants = {} if cores.given() else {n: task.plant(n) for n in {batch.n for batch in batches}}
@@ -136,7 +142,10 @@ def noisy_episodes(
 
 @dataclass(frozen=True)
 class _Batch:
-    """Episodes that are simulated at once: the next `n` after the `first` of one noise and controller."""
+    """Episodes that are simulated at once: the next `n` after the `first` of one noise and controller.
+
+    `judged` of them are played once more by plain MuJoCo.
+    """
 
     task: Task
     regions: Regions
@@ -145,6 +154,7 @@ class _Batch:
     seed: int
     first: int
     n: int
+    judged: int = 0
 
 
 def _outcomes(plants: Mapping[int, Plant], batch: _Batch) -> dict[str, np.ndarray]:
@@ -152,8 +162,18 @@ def _outcomes(plants: Mapping[int, Plant], batch: _Batch) -> dict[str, np.ndarra
     task, noise, regions, n = batch.task, batch.noise, batch.regions, batch.n
     seeds = np.random.SeedSequence([batch.seed, batch.first]).generate_state(2)
     z0 = regions.draw(task, noise.bound, n, np.random.default_rng(seeds[0]))
-    settings = LoopSettings(vary=True, plant=plants.get(n), quiet=True)
+    plant = plants.get(n) or task.plant(n)
+    judged = batch.judged
+    settings = LoopSettings(vary=True, plant=plant, quiet=True, record=judged > 0, states=False)
     runs = closed_loop(task, batch.controller, z0, noise, seed=int(seeds[1]), settings=settings)
+    if judged:
+        lost_first = np.argsort(runs.outcome == Outcome.REACHED, kind="stable")
+        if isinstance(plant, Plant):
+            start = task.state(z0, settings.rng_of_starts(int(seeds[1])))
+            judge(task, runs, start, lost_first[:judged])
+        else:  # every loss of an environment is played again
+            rows = lost_first[: max(judged, int((runs.outcome != Outcome.REACHED).sum()))]
+            task.verify(z0[rows], runs.u[:, rows], runs.path[:, rows], runs.length[rows])
     return {
         region: np.bincount(runs.outcome[inside], minlength=len(Outcome))
         for region, inside in regions.split(task, noise.bound, z0).items()

@@ -12,7 +12,7 @@ from hyrl_mj.policies import PolicyController
 from hyrl_mj.run_directory import Run
 from hyrl_mj.simulation import HybridArc, Noise, simulate_batch
 from hyrl_mj.stages import Budget, Losses, Regions, attack, attack_starts, sort_losses
-from hyrl_mj.verdict import NO_NOISE
+from hyrl_mj.verdict import NO_NOISE, replays_sentence
 from hyrl_mj.viz.arcs import critical_start, from_middle, replay_floor
 from hyrl_mj.viz.commands import beginning
 from hyrl_mj.viz.options import ReplayOptions
@@ -117,7 +117,10 @@ def sentences(
         results.append(
             f"signals of {noise} are known that make it lose {lost} of the winnable starts"
         )
-        if score.proved is not None:
+        replays = robustness.deciding.replays_of("policy")
+        if replays and replays.failures:
+            results.append(replays_sentence(task, replays))
+        elif score.proved is not None:
             results.append(f"it is proved to win {percent(score.proved)} of them")
         if losses is not None:
             results.append(losses.sentence())

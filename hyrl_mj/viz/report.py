@@ -266,6 +266,7 @@ def fill(template: str, run: Run, robustness: Robustness | None, **values: Any) 
             deciding=robustness.deciding if robustness else None,
             scores=tables.score_table(task, game) if game else None,
             margins=tables.margin_table(task, game) if game and not game.estimate else None,
+            replayed=tables.replays_table(task, game.replays) if game and game.replays else None,
             episodes=tables.episode_table(task, episodes) if episodes else None,
             attacks=tables.attack_table(task, attacks) if attacks else None,
             **values,

@@ -7,7 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hyrl_mj.game import LIMIT, NEARLY, AttackCount, EpisodeCount, GameResult, Robustness, percent
+from hyrl_mj.game import (
+    LIMIT,
+    NEARLY,
+    AttackCount,
+    EpisodeCount,
+    GameResult,
+    ReplayCount,
+    Robustness,
+    percent,
+)
 from hyrl_mj.run_directory import Run
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
@@ -156,6 +165,24 @@ def margin_text(margin: float | None, unit: str) -> str:
     return "none" if margin is None else f"{margin:.3g} {unit}"
 
 
+def replays_table(task: Task, counts: Sequence[ReplayCount]) -> Table:
+    """Returns how many proved or won starts were lost when they were replayed: a row for each controller."""
+    kinds = list(dict.fromkeys(kind for count in counts for kind in count.starts))
+    rows = []
+    for c in counts:
+        row = [NAMES[c.controller], c.of, f"{c.played:,}", f"{c.failures:,}"]
+        row += [f"{c.lost[k]:,} of {c.starts[k]:,}" if k in c.starts else "-" for k in kinds]
+        lost = "-"
+        if first := c.first:
+            mode = "" if first.q0 is None else f", mode {task.mode_name(first.q0)}"
+            lost = f"{first.outcome.replace('_', ' ')} from {_point(np.array(first.start))}{mode}"
+        rows.append([*row, f"{c.judged:,}", lost])
+    headings = ["controller", "starts", "played", "lost", *(f"lost, {kind}" for kind in kinds)]
+    where, unit = task.noise_on(counts[0].everywhere)
+    title = f"{task.name}: replays in MuJoCo, noise on {where} of up to {counts[0].eps:g} {unit}"
+    return Table(title, [*headings, "judged", "first lost"], rows)
+
+
 def episode_table(task: Task, counts: Sequence[EpisodeCount]) -> Table:
     """Returns the counts of the noisy episodes: a row for each noise, controller and start region."""
     rows = []
@@ -215,6 +242,10 @@ def robustness_sentence(robustness: Robustness) -> str:
             ("hyrl", hyrl.proved, hyrl.not_broken, ""),
             ("hyrl", hyrl.proved_any, hyrl.not_broken_any, " if any q0 is given"),
         )
+    ]
+    shares += [
+        f"{NAMES[count.controller]} lost {count.failures:,} of {count.played:,} replays"
+        for count in robustness.deciding.replays
     ]
     return f"worst case at noise {hyrl.eps:g}, of the winnable starts: {', '.join(shares)}"
 
@@ -278,6 +309,8 @@ def print_robustness(run: Run) -> None:
         print_table(score_table(run.task, game))
         if not game.estimate:
             print_table(margin_table(run.task, game))
+        if game.replays:
+            print_table(replays_table(run.task, game.replays))
         for who, why in game.why_not_proved.items():
             print(f"{NAMES[who]} is not proved: {why}")
     if episodes:

@@ -1,0 +1,239 @@
+"""Replays: what is proved or won is played in MuJoCo before a word is said about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hyrl_mj.game import NEARLY, NEVER, PROVED_STARTS, WON_STARTS, LostReplay, ReplayCount, Score
+from hyrl_mj.policies import Controller
+from hyrl_mj.proof.cells import Cells
+from hyrl_mj.proof.certificate import Certificate
+from hyrl_mj.proof.counterexamples import CellNoise
+from hyrl_mj.sets import Grid
+from hyrl_mj.simulation import NOT_STARTED, AnyNoise, LoopSettings, Noise, closed_loop, judge
+from hyrl_mj.tasks import Outcome, Task
+
+# Starts by kind of noise, 10,000 in all: a run of a minute takes about two seconds longer. The noise between
+# the nodes asks the controller about seventeen measurements at each sample, and the worst on nodes is looked
+# up, which takes twice as long as other noise: these get fewer starts.
+STARTS = {"none": 3_000, "uniform": 3_000, "alternating": 2_900, "worst": 1_000, "cells": 100}
+# A tenth of them where so little is proved that no word follows from it.
+FEWER = 10
+# Runs side by side, and how many of them plain MuJoCo plays once more: every twentieth, 500 in all.
+BATCH, EVERY = 1_000, 20
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Starts that are played at once.
+
+    Attributes:
+        controller: the controller.
+        noise: the noise.
+        kind: its kind.
+        z0: (n, d) chart points.
+        q0: (n,) modes at the start, `NOT_STARTED` where the controller picks it.
+        seed: seed of the noise.
+        steps: samples after which every run is proved to have arrived for good; None to the end of episodes.
+    """
+
+    controller: Controller
+    noise: AnyNoise
+    kind: str
+    z0: np.ndarray
+    q0: np.ndarray
+    seed: int
+    steps: int | None = None
+
+
+@dataclass(frozen=True)
+class Played:
+    """What a batch came to: the number of runs, those lost (n,) bool, and judged, and the first lost one."""
+
+    kind: str
+    lost: np.ndarray
+    judged: int
+    first: LostReplay | None
+
+
+@dataclass(frozen=True)
+class Replays:
+    """The replays of what is said of one controller.
+
+    Attributes:
+        name: the name of the controller.
+        eps, everywhere: of the noise.
+        of: what is said of the starts, "proved" or "won".
+        batches: the starts with their noise.
+    """
+
+    name: str
+    eps: float
+    everywhere: bool
+    of: str
+    batches: tuple[Batch, ...]
+
+    @staticmethod
+    def of_score(
+        certificate: Certificate, name: str, controller: Controller, score: Score, seed: int = 0
+    ) -> Replays | None:
+        """Returns the replays that a score needs before it is believed, None if it says nothing.
+
+        Where something is proved these are starts anywhere in proved cells, for each start mode and for the
+        mode that the controller picks. Where nothing is proved of nearly all winnable starts, but no signal
+        is known that beats one of them, they lie in winnable cells, and the controller picks its mode. With
+        the weakest first: a third lies at the border of what is proved, a third where it arrives latest, and
+        the others are starts of the score, at random.
+
+        Of each kind of noise the first `BATCH` episodes are played to their end. The others are until all are
+        proved to have arrived for good, and to their end only if one has not.
+        """
+        if certificate.game.lattice.estimate or not score.winnable:
+            return None
+        nearly = score.proved is not None and score.proved >= NEARLY
+        whole = score.not_broken == 1
+        if not (nearly or whole or score.proved):
+            return None
+        of = WON_STARTS if whole and not nearly else PROVED_STARTS
+        rng, few = np.random.default_rng(seed), 1 if nearly or whole else FEWER
+        pools = _pools(certificate, name, controller, score.eps, of)
+        batches = []
+        for kind, noise in _noises(certificate, name, controller, score.eps).items():
+            z0, q0 = _drawn(pools, STARTS[kind] // few, rng)
+            for first in range(0, len(z0), BATCH):
+                part, number = slice(first, first + BATCH), int(rng.integers(2**31))
+                steps = max(pool.samples for pool in pools) if first else None
+                batches.append(Batch(controller, noise, kind, z0[part], q0[part], number, steps))
+        return Replays(name, score.eps, certificate.game.everywhere, of, tuple(batches))
+
+    def count(self, results: Iterable[Played]) -> ReplayCount:
+        """Returns what the batches came to, in their order."""
+        starts: dict[str, int] = {}
+        lost: dict[str, int] = {}
+        judged, first = 0, None
+        for result in results:
+            starts[result.kind] = starts.get(result.kind, 0) + len(result.lost)
+            lost[result.kind] = lost.get(result.kind, 0) + int(result.lost.sum())
+            judged, first = judged + result.judged, first or result.first
+        return ReplayCount(
+            self.name, self.eps, self.everywhere, self.of, starts, lost, judged, first
+        )
+
+
+def play(task: Task, batch: Batch) -> Played:
+    """Plays a batch on the plant, and every twentieth run and all lost ones once more in plain MuJoCo.
+
+    Raises:
+        BadInput: the plant did not do what plain MuJoCo does.
+    """
+    # Batches are played side by side: more threads for each would only wait for the others'.
+    plant = task.plant(len(batch.z0), threads=1)
+    for steps in dict.fromkeys((batch.steps, None)):
+        settings = LoopSettings(steps, record=True, states=False, plant=plant, quiet=True)
+        run = closed_loop(
+            task, batch.controller, batch.z0, batch.noise, batch.q0, batch.seed, settings
+        )
+        lost = run.outcome != Outcome.REACHED
+        if not lost.any():
+            break
+    judged = lost.copy()
+    judged[::EVERY] = True
+    judge(task, run, task.state(batch.z0), np.flatnonzero(judged))
+    first = None
+    if lost.any():
+        at = int(lost.argmax())
+        mode = None if batch.q0[at] == NOT_STARTED else int(batch.q0[at])
+        outcome = Outcome(run.outcome[at]).label
+        first = LostReplay(tuple(map(float, batch.z0[at])), mode, batch.kind, outcome)
+    return Played(batch.kind, lost, int(judged.sum()), first)
+
+
+def _noises(
+    certificate: Certificate, name: str, controller: Controller, eps: float
+) -> dict[str, AnyNoise]:
+    """Returns the noise signals that are known, the strongest last, by kind."""
+    game = certificate.game
+    simple = {kind: Noise(kind, eps, game.everywhere) for kind in ("uniform", "alternating")}
+    noises: dict[str, AnyNoise] = {"none": Noise(), **simple, "worst": game.worst_noise(name, eps)}
+    if name in certificate.answers:
+        outer, inner = certificate.value(name, eps), game.value(name, eps)
+        noises["cells"] = CellNoise(certificate, controller, outer, inner, game.bound(eps))
+    return noises
+
+
+@dataclass(frozen=True)
+class _Pool:
+    """The places of one start mode from which starts are drawn: cells, or nodes where there are no cells.
+
+    Attributes:
+        grid: the nodes.
+        cells: the cells; None of nodes.
+        q0: the start mode, `NOT_STARTED` if the controller picks it.
+        border: (b,) places with a neighbour of which the same is not said.
+        late: (l,) places, the latest to arrive first.
+        counted: (c,) places that the score counts.
+        samples: after so many samples every run is proved to have arrived, else those of an episode.
+    """
+
+    grid: Grid
+    cells: Cells | None
+    q0: int
+    border: np.ndarray
+    late: np.ndarray
+    counted: np.ndarray
+    samples: int
+
+    def draw(self, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Returns n starts (n, d), anywhere in their cells, and their modes (n,)."""
+        weak = [rng.permutation(self.border)[: n // 3], self.late[: n // 3]]
+        rest = rng.choice(self.counted, n - sum(map(len, weak)))
+        places, q0 = np.concatenate([*weak, rest]), np.full(n, self.q0)
+        if self.cells is None:
+            return self.grid.nodes[places], q0
+        off = rng.uniform(-0.5, 0.5, (n, len(self.grid.counts)))
+        return self.cells.middle(places) + off * self.grid.spacing, q0
+
+
+def _pools(
+    certificate: Certificate, name: str, controller: Controller, eps: float, of: str
+) -> list[_Pool]:
+    """Returns where starts are drawn, for each start mode of which something is said."""
+    game, cells, region = certificate.game, certificate.cells, certificate.region(eps)
+    if not region.any():  # a start region thinner than a cell
+        cells, region = None, game.starts & game.winnable(eps)
+    grid, rng, pools = game.lattice.grid, np.random.default_rng(0), []
+    # With one mode the controller cannot pick another one.
+    modes = [*(controller.modes if len(controller.modes) > 1 else ()), NOT_STARTED]
+    proved = of == PROVED_STARTS and cells is not None
+    values = (certificate if proved else game).value(name, eps)[:, :-2]
+    if cells is not None and not proved:
+        values = values[:, grid.nearest(cells.middle(np.arange(cells.nodes)))]
+    for q0, value in zip(modes, values[-len(modes) :], strict=True):
+        if cells is not None and proved:
+            said = (value < NEVER) & cells.running
+        else:
+            said = region & (q0 == NOT_STARTED)
+        if not said.any():
+            continue
+        weak = said
+        if cells is not None:
+            weak = said & ~cells.all_corners(cells.all_around(said | cells.arrived))
+        places = rng.permutation(np.flatnonzero(said))
+        late = places[np.argsort(-value[places], kind="stable")]
+        counted = np.flatnonzero(said & region)
+        border, counted = np.flatnonzero(weak), counted if len(counted) else places
+        samples = int(value[said].max()) if proved else game.task.max_steps
+        pools.append(_Pool(grid, cells, q0, border, late, counted, samples))
+    return pools
+
+
+def _drawn(pools: list[_Pool], n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Returns n starts (n, d) and their modes (n,), as many from each pool, in any order."""
+    each, rest = divmod(n, len(pools))
+    drawn = [pool.draw(each + (i < rest), rng) for i, pool in enumerate(pools)]
+    z0, q0 = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
+    order = rng.permutation(n)
+    return z0[order], q0[order]
