@@ -208,7 +208,7 @@ def _fitted(
         ]
         if not match:
             raise BadInput(
-                f"{name}[{j}] is no single position or velocity of {instance.name}, but follows from several, "
+                f"{name}[{j}] is no single position or velocity of {instance.name}, but follows from several "
                 f"or from none: name coordinates such as {', '.join(all_names(instance)[:4])}"
             )
         kind, i, offset = match[0]

@@ -96,7 +96,7 @@ def is_shared(name: str) -> bool:
     return name.startswith(("module ", "class "))
 
 
-def state_of(generator: np.random.Generator | np.random.RandomState) -> bytes:
+def state_of(generator: Any) -> bytes:
     """Returns the state of a generator of random numbers, to compare it."""
     bits = getattr(generator, "bit_generator", None)
     return pickle.dumps(generator.get_state() if bits is None else bits.state)

@@ -171,7 +171,8 @@ def inspect(
 
 def _sampled(instance: Instance) -> Runs:
     """Returns what runs under inputs at random show; refuses random numbers in steps."""
-    rng, states, rewards, info_keys = np.random.default_rng(0), [], [], {}
+    rng, states, rewards = np.random.default_rng(0), [], []
+    info_keys: dict[str, None] = {}
     bodies, geoms, deepest, dt, memory, harmless = [], [], 0.0, 0.0, "", set()
     for seed in range(RUNS):
         instance.reset(seed)

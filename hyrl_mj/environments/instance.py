@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from queue import SimpleQueue
 from threading import Thread
 from typing import Any
@@ -175,17 +176,17 @@ def observers(env: gym.Env) -> dict[str, Callable[[], Any]]:
         for part_name, part in vars(inner).items():
             if isinstance(part, gym.Env):
                 for own_name, own in of(part).items():
-                    found[f"{name}({part_name}.{own_name})"] = lambda get=get, own=own: get(
-                        _first(own())
-                    )
+                    found[f"{name}({part_name}.{own_name})"] = partial(_through, get, own)
     control: Any = getattr(inner, "_env", None)  # of dm_control
     if hasattr(getattr(control, "task", None), "get_observation"):
         found["task.get_observation"] = lambda: control.task.get_observation(control.physics)
     return found
 
 
-def _first(result: Any) -> Any:
-    return result[0] if isinstance(result, tuple) else result
+def _through(get: Callable[[Any], Any], own: Callable[[], Any]) -> Any:
+    """Returns what an environment observes of what the one within it does, which may come with an info."""
+    result = own()
+    return get(result[0] if isinstance(result, tuple) else result)
 
 
 class Instance:

@@ -11,7 +11,7 @@ import os
 import signal
 import warnings
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
@@ -230,14 +230,14 @@ class Pool:
         self.left: deque[set[Key]] = deque()  # runs of plants that nobody has any more
 
     def act(
-        self, keys: Sequence[Key], starts: dict[Key, np.ndarray], u: np.ndarray
+        self, keys: Sequence[Key], starts: Mapping[Key, np.ndarray], u: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Does what `Stage.act` does."""
         parts = self._spread("act", keys, starts, u)
         return tuple(_joined(parts, len(keys), i) for i in range(3))  # type: ignore[return-value]
 
     def sense(
-        self, keys: Sequence[Key], starts: dict[Key, np.ndarray], noise: np.ndarray
+        self, keys: Sequence[Key], starts: Mapping[Key, np.ndarray], noise: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """Does what `Stage.sense` does."""
         parts = self._spread("sense", keys, starts, noise)
@@ -285,9 +285,9 @@ class Pool:
             count = self._opened(int(place.max(initial=0)) + 1)
             rows = [r for i in range(count) if len(r := np.flatnonzero(place == i)) or not i]
             places = [i for i in range(count) if (place == i).any() or not i]
-            jobs = []
+            jobs: list[tuple[str, Any]] = []
             for r in rows:
-                mine = [keys[i] for i in r]
+                mine = [keys[int(i)] for i in r]
                 if values is None:
                     jobs.append((what, (mine,)))
                 else:

@@ -81,7 +81,7 @@ class Criterion:
         ).astype(int)
 
     def _values(self, report: np.ndarray) -> dict[object, np.ndarray]:
-        named = {
+        named: dict[object, np.ndarray] = {
             "reward": report[:, 0],
             "terminated": report[:, 1] > 0,
             "truncated": report[:, 2] > 0,

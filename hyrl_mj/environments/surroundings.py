@@ -138,7 +138,8 @@ def changed_by_user(instance: Instance) -> list[str]:
     found: dict[str, None] = {}
     for seed in range(COMPARED):
         seen = []
-        for options in (None, {}):
+        choices: tuple[Mapping[str, Any] | None, ...] = (None, {})
+        for options in choices:
             instance.reset(seed, options)
             remembered = instance.remembered()
             state = instance.physics.read()

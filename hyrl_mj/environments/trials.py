@@ -102,12 +102,12 @@ def _check_observer(instance: Instance, spec: EnvironmentSpec) -> None:
         instance.physics.write(state)
         off = np.abs(flat(instance.watched(), space) - begun)
         scale = max(float(np.abs(begun).max(initial=0.0)), 1.0)
-        for column in np.flatnonzero(~(off <= ROUNDING * scale)):
-            suspects[int(column)] = (
+        for column in map(int, np.flatnonzero(~(off <= ROUNDING * scale))):
+            suspects[column] = (
                 f"is {begun[column]:.6g} after reset() and differs by {off[column]:.6g} in that state later"
             )
             if moved[column]:
-                _refuse(name, int(column), suspects[int(column)])
+                _refuse(name, column, suspects[column])
     for column, why in suspects.items():
         if np.ptp([row[column] for row in first]) > 0 or _depends(instance, spec, column, step):
             _refuse(name, column, why)
@@ -134,7 +134,7 @@ def _depends(instance: Instance, spec: EnvironmentSpec, column: int, step: np.nd
             if terminated or truncated:
                 break
         ends.append(seen)
-    return not np.array_equal(*ends, equal_nan=True)
+    return not np.array_equal(ends[0], ends[1], equal_nan=True)
 
 
 def _moving(pool: Pool, spec: EnvironmentSpec) -> np.ndarray:
