@@ -5,7 +5,7 @@ import re
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hyrl_mj import mjcf
+from hyrl_mj import memory, mjcf
 from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput, brief, line_in, unknown
 from hyrl_mj.ranges import Flag, Integer, Number, Optional, Rule, Several, Text
@@ -185,7 +185,7 @@ def _check_model(task: Task) -> None:
             f"its sample time {task.dt:g} s takes {steps:,.0f} physics steps of {model.opt.timestep:g} s in "
             f"{path.name}: give at most {SUBSTEPS:,}"
         )
-    if problem := mjcf.wrong_physics(model):
+    if problem := mjcf.wrong_physics(model) or memory.late_sensor(model):
         raise BadInput(problem)
 
 
