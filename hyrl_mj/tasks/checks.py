@@ -12,18 +12,20 @@ from hyrl_mj.ranges import Flag, Integer, Number, Optional, Rule, Several, Text
 from hyrl_mj.sets import MOST_DIMENSIONS
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.mirrored import try_mirror
 from hyrl_mj.tasks.registry import check_current
 from hyrl_mj.tasks.trial import (
     try_control,
     try_extreme,
     try_inputs,
-    try_mirror,
     try_random,
     try_where,
 )
 
 # Number of starts that are tried.
 STARTS = 64
+# Starts that are drawn to see whether they lie in the box of starts.
+DRAWN = 4_000
 # Most combinations of the levels of the inputs.
 MOST_LEVELS = 1_000
 # Most physics steps of a sample.
@@ -197,6 +199,7 @@ def _check_starts(task: Task) -> None:
     if len(outside):
         point = task.chart.format(outside[0])
         raise BadInput(f"it starts outside its chart, at {point}: change one of them")
+    _check_box(task)
     plant = task.plant(STARTS)
     plant.set_state(*task.state(z, np.random.default_rng(1)))
     if task.model.nmocap:
@@ -222,6 +225,19 @@ def _check_starts(task: Task) -> None:
         raise BadInput(
             f"{len(over)} of {STARTS} starts are over before they begin: {task.chart.format(z[over[0]])} "
             f"is {Outcome(ending[over[0]]).label}; start elsewhere, or change ending()"
+        )
+
+
+def _check_box(task: Task) -> None:
+    """Raises `BadInput` unless the starts that are drawn are starts that the task says may be."""
+    drawn = task.starts(STARTS if task.slow else DRAWN, np.random.default_rng(2))
+    off = ~(task.chart.contains(drawn) & task.may_start(drawn))
+    if off.any():
+        low, high = (task.chart.format(np.array(end)) for end in (task.start_low, task.start_high))
+        raise BadInput(
+            f"{off.sum():,} of {len(drawn):,} starts that starts() draws lie outside of its box, as "
+            f"{task.chart.format(drawn[off][0])}: what is not in the box from {low} to {high} (start_low, "
+            "start_high, may_start) is not examined; change one of them"
         )
 
 

@@ -25,8 +25,6 @@ CORNERS = 16
 EFFECT = 10
 # Places in the plane that spread no wider than this, as a share of their length, lie on a line.
 ON_A_LINE = 1e-6
-# How far mirrored observations may be off, as a share of their range after a sample.
-ALIKE = 0.01
 
 # Number of the sample -> inputs (n, m).
 Inputs = Callable[[int], np.ndarray]
@@ -127,36 +125,6 @@ def try_where(task: Task) -> None:
         raise BadInput(
             f"where() puts all states of the chart {shape}, as {places[0][0].tolist()}: give two coordinates "
             "of a plane that change with the state, or give the task a direction() of its own"
-        )
-
-
-def try_mirror(task: Task) -> None:
-    """Raises `BadInput` if mirrored states under mirrored inputs do not lead to mirrored observations.
-
-    That can be told of a task with `measured`, from states that the chart alone determines.
-    """
-    if task.mirror is None or type(task).measured is Task.measured:
-        return
-    rng, seen = np.random.default_rng(0), np.array(task.mirror.observation)
-    z = task.starts(STARTS, rng)
-    plant = task.plant(STARTS)
-    plant.set_state(*task.state(z))
-    image = task.z(task.measured(task.observation(plant.measurement) * seen))
-    u = rng.uniform(*task.input_limits, (STARTS, len(task.inputs)))
-    after = []
-    for points, inputs in ((z, u), (image, u * task.mirror.inputs)):
-        plant.set_state(*task.state(points))
-        with mujoco_log.kept():
-            plant.step(np.clip(inputs, *task.input_limits))
-        after.append(task.observation(plant.measurement))
-    scale = np.maximum(np.ptp(after[0], axis=0), 1e-3)
-    off = np.abs(after[1] - after[0] * seen) / scale
-    if off.max() > ALIKE:
-        row = int(off.max(axis=1).argmax())
-        raise BadInput(
-            f"mirror is no symmetry of it: a sample from {task.chart.format(z[row])} is observed as "
-            f"{np.round(after[0][row], 4).tolist()}, and its image as {np.round(after[1][row], 4).tolist()}; "
-            "change its signs, or give none"
         )
 
 
