@@ -18,6 +18,7 @@ from hyrl_mj.tasks.trial import (
     try_control,
     try_extreme,
     try_inputs,
+    try_methods,
     try_random,
     try_where,
 )
@@ -212,19 +213,30 @@ def _check_starts(task: Task) -> None:
     back = task.z(measurement)
     _check_shape("z() gives", back, z.shape)
     _check_shape("with_z() gives", task.with_z(measurement, z[::-1]), measurement.shape)
-    off = np.abs(task.chart.difference(back, z)).max(axis=1)
-    if off.max() > ROUND_TRIP:
-        worst = int(off.argmax())
-        raise BadInput(
-            f"state() and z() do not belong to each other: {task.chart.format(z[worst])} is measured as "
-            f"{task.chart.format(back[worst])}"
-        )
+    _check_round_trip(task, z, back)
+    if not task.slow:
+        anywhere = np.random.default_rng(3).uniform(task.chart.low, task.chart.high, (DRAWN, d))
+        whole = task.plant(DRAWN)
+        whole.set_state(*task.state(anywhere))
+        _check_round_trip(task, anywhere, task.z(whole.measurement))
     ending = task.ending(measurement)
     over = np.flatnonzero(ending != Outcome.RUNNING)
     if len(over):
         raise BadInput(
             f"{len(over)} of {STARTS} starts are over before they begin: {task.chart.format(z[over[0]])} "
             f"is {Outcome(ending[over[0]]).label}; start elsewhere, or change ending()"
+        )
+
+
+def _check_round_trip(task: Task, z: np.ndarray, back: np.ndarray) -> None:
+    """Raises `BadInput` unless chart points (n, d) are measured as what they are."""
+    off = np.abs(task.chart.difference(back, z)).max(axis=1)
+    if off.max() > ROUND_TRIP:
+        worst = int(off.argmax())
+        raise BadInput(
+            f"state() and z() do not belong to each other: {task.chart.format(z[worst])} is measured as "
+            f"{task.chart.format(back[worst])}; let them agree all over the chart, with sensors that do not "
+            "clip there (cutoff)"
         )
 
 
@@ -270,6 +282,7 @@ def _check_mocap(task: Task, qpos: np.ndarray) -> None:
 
 
 def _check_episodes(task: Task) -> None:
+    try_methods(task)
     ends = np.append(try_random(task), try_extreme(task))
     try_inputs(task)
     try_control(task)

@@ -23,6 +23,8 @@ CORNERS = 16
 
 # Samples after which an input must have changed something.
 EFFECT = 10
+# Rows that are asked for one by one.
+ALONE = 8
 # Places in the plane that spread no wider than this, as a share of their length, lie on a line.
 ON_A_LINE = 1e-6
 
@@ -65,6 +67,37 @@ def try_extreme(task: Task) -> np.ndarray:
         return np.where((alternating & (k % 2))[:, None], opposite, held)
 
     return _play(task, places[place], inputs, "extreme")
+
+
+def try_methods(task: Task) -> None:
+    """Raises `BadInput` if a method gives something else for the same rows in another batch or order.
+
+    Then it depends on other rows, or on what it was asked before: nothing that is computed in bulk would hold.
+    """
+    rng = np.random.default_rng(0)
+    z = np.vstack(
+        [
+            task.starts(STARTS, rng),
+            rng.uniform(task.chart.low, task.chart.high, (STARTS, task.chart.dimension)),
+        ]
+    )
+    plant = task.plant(len(z))
+    plant.set_state(*task.state(z))
+    measured, order = plant.measurement, rng.permutation(len(z))
+    for name in ("z", "observation", "ending", "verdict"):
+        method = getattr(task, name)
+        first = method(measured)
+        shuffled = np.empty_like(first)
+        shuffled[order] = method(measured[order])
+        alone = np.concatenate([method(measured[row : row + 1]) for row in range(ALONE)])
+        for again in (shuffled, method(measured), alone):
+            same = np.isclose(again, first[: len(again)], rtol=0, atol=1e-9, equal_nan=True)
+            if not same.all():
+                row = int(np.argwhere(~same)[0][0])
+                raise BadInput(
+                    f"{name}() gives {again[row]} and then {first[row]} for the same row, at "
+                    f"{task.chart.format(z[row])}: let it depend on this row alone, and on nothing before"
+                )
 
 
 def try_inputs(task: Task) -> None:
