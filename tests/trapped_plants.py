@@ -6,6 +6,7 @@ Each is drawn from a seed: a vehicle that passes a pillar, or a pointer on a dia
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,6 +26,7 @@ from hyrl_mj.tasks import Outcome, check_task
 
 # Starts that are replayed of each robot, and the noise bound.
 STARTS, EPS = 60, 0.05
+NUMBER = itertools.count()  # names of tasks are used once
 
 MJCF = """<mujoco model="{name}">
   <option timestep="0.05" integrator="implicitfast" gravity="0 0 0">{flag}</option>
@@ -60,7 +62,7 @@ class Robot(hyrl_mj.Task):
     worst_reward = -10.0
     start_low, start_high = {box}
     scene = Scene(starts={shown}, time=2.0, mode_names=("left", "right"))
-    learning = Learning(levels=5)
+    learning = Learning(levels={levels})
     observation_low, observation_high = {limits}
     mirror = {mirror}
     set_point = np.array({goal})
@@ -121,7 +123,7 @@ def vehicle():
         "        ends[x >= 3 - 1e-6] = Outcome.REACHED\n"
         "        ends[np.abs(y) >= 1.5 - 1e-6] = Outcome.OUT_OF_BOUNDS\n"
         "        ends[np.sqrt((x - 1.5) ** 2 + y**2) <= 0.6] = Outcome.CRASHED",
-        "methods": "",
+        "methods": "", "levels": "5",
     }  # fmt: skip
     return Robot("", xml, py, "", "", 1e9, "")
 
@@ -133,7 +135,7 @@ def dial():
     }  # fmt: skip
     py = {
         "chart": '("theta",), ("rad",), (0.0,), (2 * np.pi,), (True,)',
-        "noisy": "(True,)", "max_steps": "200", "box": "(0.0,), (2 * np.pi,)", "shown": "((3.0,),)",
+        "noisy": "(True,)", "max_steps": "200", "levels": "None", "box": "(0.0,), (2 * np.pi,)", "shown": "((3.0,),)",
         "limits": "(-999.0, -999.0), (999.0, 999.0)", "mirror": "None", "goal": "[0.0]",
         "measured": "np.arctan2(observation[:, 1:], observation[:, :1])",
         "observation": "return np.hstack([np.cos(measured), np.sin(measured)])",
@@ -307,7 +309,7 @@ TRAPS = {
 def drawn(seed: int, folder: Path):
     """Writes the files of the robot of a seed, and returns its trap and its task."""
     trap = [*TRAPS][seed % len(TRAPS)]
-    robot, name = TRAPS[trap](np.random.default_rng(seed)), f"trapped_{seed}"
+    robot, name = TRAPS[trap](np.random.default_rng(seed)), f"trapped_{seed}_{next(NUMBER)}"
     actuator = FILTERED if "dyntype" in robot.servo else VELOCITY
     ahead = VELOCITY.format(name="ahead", joint="x", kv=robot.kv, more="")
     joint, ahead = ("y", ahead) if "x" in robot.py["chart"] else ("theta", "")
@@ -325,11 +327,9 @@ def drawn(seed: int, folder: Path):
 
 
 def policy_of(task):
-    """A network: past the pillar on the left, or to the set-point of the dial at full speed one way."""
-    if task.chart.dimension == 1:  # clockwise, until it is there
-        weights = [[0.0, 0.0]] * 5
-        weights[0], bias = [-100.0, 0.0], [98.0, -999.0, 0.0, -999.0, -999.0]
-        return linear(task, weights, bias)
+    """A network: past the pillar on the left, or the shorter way to the set-point of the dial."""
+    if task.chart.dimension == 1:
+        return linear(task, [[0.0, -3.0]], [0.0])
     weights, bias = [[0.0, 0.0]] * 5, [-99.0, -99.0, 0.0, -99.0, 0.95]
     weights[4] = [0.0, -1.0]
     return linear(task, weights, bias)
