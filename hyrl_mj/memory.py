@@ -7,8 +7,8 @@ import numpy as np
 
 from hyrl_mj import mjcf
 
-# Parts of MuJoCo's state that remember nothing: they are given anew by `Plant.set_state` and at each sample, or
-# solved anew from there. Nothing but callbacks writes userdata.
+# Parts of MuJoCo's state that remember nothing: they are given anew by `Plant.set_state` and at each sample,
+# or solved anew from there. Nothing but callbacks writes userdata.
 NO_MEMORY = (
     "TIME", "QPOS", "QVEL", "WARMSTART", "CTRL", "QFRC_APPLIED", "XFRC_APPLIED", "EQ_ACTIVE", "MOCAP_POS",
     "MOCAP_QUAT", "USERDATA",
@@ -19,7 +19,10 @@ MEMORIES = {
     "HISTORY": "histories of actuators or sensors (delay, nsample)",
     "PLUGIN": "states of plugins",
 }
-CALLBACKS = [f"get_mjcb_{name}" for name in "control passive act_dyn act_gain act_bias sensor".split()]
+CALLBACKS = [
+    f"get_mjcb_{name}"
+    for name in ["control", "passive", "act_dyn", "act_gain", "act_bias", "sensor"]
+]
 # Coefficients of springs and dampers that are not linear; older versions of MuJoCo do not have them.
 BENT = ("jnt_stiffnesspoly", "dof_dampingpoly", "actuator_dampingpoly", "jnt_springyield")
 
@@ -76,4 +79,3 @@ def why_not_direct(model: mujoco.MjModel) -> str:
     if any(np.any(getattr(model, name, 0)) for name in BENT):
         return "springs or dampers that are not linear can move it"
     return ""
-

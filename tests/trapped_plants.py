@@ -1,7 +1,7 @@
 """Robots with planted traps: plants and task files in which something is not what it seems.
 
-Each is drawn from a seed: a vehicle that passes a pillar, or a pointer on a dial, with the files of one of `TRAPS`.
-`examined` tells what the package says of it, and plays what it calls won with `mujoco.mj_step` alone.
+Each is drawn from a seed: a vehicle that passes a pillar, or a pointer on a dial, with one of `TRAPS` in its
+files. `examined` tells what the package says of it, and plays what it calls won with `mujoco.mj_step` alone.
 """
 
 from __future__ import annotations
@@ -89,7 +89,8 @@ class Robot(hyrl_mj.Task):
 CALM = '<flag contact="disable" constraint="disable"/>'
 VELOCITY = '<velocity name="{name}" joint="{joint}" kv="{kv:g}" {more}/>'
 FILTERED = (
-    '<general name="{name}" joint="{joint}" gainprm="{kv:g}" biastype="affine" biasprm="0 0 -{kv:g}" {more}/>'
+    '<general name="{name}" joint="{joint}" gainprm="{kv:g}" biastype="affine" '
+    'biasprm="0 0 -{kv:g}" {more}/>'
 )
 
 
@@ -135,12 +136,14 @@ def dial():
     }  # fmt: skip
     py = {
         "chart": '("theta",), ("rad",), (0.0,), (2 * np.pi,), (True,)',
-        "noisy": "(True,)", "max_steps": "200", "levels": "None", "box": "(0.0,), (2 * np.pi,)", "shown": "((3.0,),)",
+        "noisy": "(True,)", "max_steps": "200", "levels": "None",
+        "box": "(0.0,), (2 * np.pi,)", "shown": "((3.0,),)",
         "limits": "(-999.0, -999.0), (999.0, 999.0)", "mirror": "None", "goal": "[0.0]",
         "measured": "np.arctan2(observation[:, 1:], observation[:, :1])",
         "observation": "return np.hstack([np.cos(measured), np.sin(measured)])",
         "ending": "theta = measured[:, 0]\n        ends = np.full(len(theta), Outcome.RUNNING)",
-        "methods": "    def miss(self, z):\n        return np.abs(self.chart.difference(z, self.set_point))[:, 0]\n",
+        "methods": "    def miss(self, z):\n"
+        "        return np.abs(self.chart.difference(z, self.set_point))[:, 0]\n",
     }  # fmt: skip
     return Robot("", xml, py, "", "", 1e9, "")
 
@@ -293,9 +296,9 @@ def trap_spring(rng):
     """A tendon that pulls in a part of the arena alone, against a weak servo."""
     robot, start = vehicle(), rng.uniform(1.0, 2.5)
     more = (
-        '<tendon><fixed name="t" stiffness="1e7" springlength="-9 {:.3f}"><joint joint="x" coef="1"/>'
+        f'<tendon><fixed name="t" stiffness="1e7" springlength="-9 {start:.3f}"><joint joint="x" coef="1"/>'
         "</fixed></tendon>"
-    ).format(start)
+    )
     return robot._replace(xml=robot.xml | {"more": more}, kv=1e6)
 
 
@@ -313,7 +316,9 @@ def drawn(seed: int, folder: Path):
     actuator = FILTERED if "dyntype" in robot.servo else VELOCITY
     ahead = VELOCITY.format(name="ahead", joint="x", kv=robot.kv, more="")
     joint, ahead = ("y", ahead) if "x" in robot.py["chart"] else ("theta", "")
-    drive = actuator.format(name="u", joint=joint, kv=robot.kv, more='ctrlrange="-1 1" ' + robot.servo)
+    drive = actuator.format(
+        name="u", joint=joint, kv=robot.kv, more='ctrlrange="-1 1" ' + robot.servo
+    )
     joints = ("x", "y") if ahead else ("theta",)
     xml = robot.xml | {
         "name": name,
@@ -351,7 +356,11 @@ def replay(task, policy, z, noise):
     outcome = np.full(len(z), Outcome.RUNNING)
     for k in range(task.max_steps + 1):
         qpos = np.array([data.qpos for data in datas])
-        now = task.ending(qpos) if type(task).outcome is hyrl_mj.Task.outcome else task.outcome(qpos, False)
+        now = (
+            task.ending(qpos)
+            if type(task).outcome is hyrl_mj.Task.outcome
+            else task.outcome(qpos, False)
+        )
         outcome = np.where(outcome == Outcome.RUNNING, now, outcome)
         if k == task.max_steps or (outcome != Outcome.RUNNING).all():
             break

@@ -94,9 +94,7 @@ def examination_plan(run: Run) -> str:
         nodes += f" (fewer than {wanted:,} on a side, which would not fit into the memory)"
     if run.exact:
         return f"by the worst-case game on {nodes}"
-    return (
-        f"by noisy episodes and an attack, and by the worst-case game on {nodes}: {run.why_estimate}"
-    )
+    return f"by noisy episodes and an attack, and by the worst-case game on {nodes}: {run.why_estimate}"
 
 
 def examine_stage(run: Run, say: Say, options: ExamineOptions = USUAL) -> None:

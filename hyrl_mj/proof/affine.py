@@ -4,8 +4,8 @@ A quantity that depends on a box is centre + sum_k generators[k] * s_k + rest, w
 side of the box and |rest| <= remainder (affine forms: Comba and Stolfi, SIBGRAPI 1993). What is linear stays
 exact; a smooth function leaves a remainder of second order in the size of the box.
 
-A form bounds the numbers that NumPy computes. Whether NumPy may also give NaN somewhere in the box, as for the
-square root of a negative number, stands beside it.
+A form bounds the numbers that NumPy computes. Whether NumPy may also give NaN somewhere in the box, as for
+the square root of a negative number, stands beside it.
 """
 
 from __future__ import annotations

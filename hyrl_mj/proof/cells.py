@@ -10,8 +10,8 @@ import numpy as np
 from hyrl_mj.errors import BadInput
 from hyrl_mj.game import Lattice
 from hyrl_mj.proof.affine import Affine, Unbounded
-from hyrl_mj.proof.networks import bounds_of, program_of
 from hyrl_mj.proof.assumptions import check_assumptions
+from hyrl_mj.proof.networks import bounds_of, program_of
 from hyrl_mj.proof.rules import as_form
 from hyrl_mj.sets import Grid, Nodes
 from hyrl_mj.tasks import Outcome, Task
@@ -109,7 +109,11 @@ class Cells:
         exact = (drift <= ON_BORDER * h) & on_levels
         slack = np.where(exact, drift, error) + 2 * TINY * h
         # Far from the chart, after many turns, numbers are rounded more.
-        far = np.abs(grid.chart.low) + grid.chart.sides + task.max_steps * np.abs(lattice.hops).max(axis=0)
+        far = (
+            np.abs(grid.chart.low)
+            + grid.chart.sides
+            + task.max_steps * np.abs(lattice.hops).max(axis=0)
+        )
         slack = np.maximum(slack, np.where(periodic, ROUNDING * far, 0.0))
         counts = np.array(grid.counts) - ~periodic
         reach = np.ceil(np.abs(cells).max(axis=0) + 1).astype(int)

@@ -1,6 +1,4 @@
-"""Functions in affine arithmetic: the least and greatest values of NumPy's functions over boxes, and where they
-may be NaN.
-"""
+"""Functions in affine arithmetic: bounds of NumPy's functions over boxes, and where they may be NaN."""
 
 from __future__ import annotations
 

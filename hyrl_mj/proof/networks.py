@@ -137,7 +137,9 @@ class BoundedPolicy:
             seen = as_form(bounds_of(self.normalization, "VecNormalize", seen), centre.shape[1])
         if seen.wild.any() or seen.nan.any():
             what = "has no limit" if seen.wild.any() else "may be NaN"
-            raise Unbounded(f"{_observation_of(task)} cannot be bounded: it {what} near some states")
+            raise Unbounded(
+                f"{_observation_of(task)} cannot be bounded: it {what} near some states"
+            )
         x: Relaxed = (
             seen.centre.astype(np.float32),
             seen.generators.astype(np.float32),

@@ -75,7 +75,7 @@ def _apply(
         values[o] if isinstance(o, Operation) else o for o in _as_computed(operation)
     ]
     dtype = operation.value.dtype
-    if dtype == bool and name in OF_BOOLS and all(map(_is_condition, operands)):
+    if dtype.kind == "b" and name in OF_BOOLS and all(map(_is_condition, operands)):
         name = OF_BOOLS[name]
         rule = RULES[name]
     if name in LOGICAL:
@@ -88,9 +88,9 @@ def _apply(
         found = rule(*forms, **options)
     if not isinstance(found, Affine):
         return found
-    if dtype == bool and name in MOVING:
+    if dtype.kind == "b" and name in MOVING:
         return Truth(found.low > 0.5, found.high > 0.5)
-    if dtype == bool:
+    if dtype.kind == "b":
         raise Unbounded(f"uses np.{name} of conditions, for which there are no bounds")
     return _in_type(affine.tidy(found.wider(_rounding(operation, found, forms))), dtype)
 
@@ -104,7 +104,7 @@ def _as_computed(operation: Operation) -> list[Any]:
     if dtype.kind != "f" or dtype.itemsize >= np.dtype(float).itemsize:
         return operands
     return [
-        o if isinstance(o, Operation) or np.asarray(o).dtype == bool else np.asarray(o, dtype)
+        o if isinstance(o, Operation) or np.asarray(o).dtype.kind == "b" else np.asarray(o, dtype)
         for o in operands
     ]
 
@@ -130,7 +130,9 @@ def _rounding(operation: Operation, found: Affine, operands: list[Any]) -> np.nd
     size = np.abs(found.centre) + found.radius
     if operation.name in ADDING:
         sizes = [
-            Affine(np.abs(o.centre) + o.radius, np.zeros_like(o.generators), np.zeros_like(o.centre))
+            Affine(
+                np.abs(o.centre) + o.radius, np.zeros_like(o.generators), np.zeros_like(o.centre)
+            )
             for o in operands
         ]
         terms = max(2, *(int(np.prod(o.centre.shape[1:], dtype=int)) for o in operands))
@@ -240,9 +242,7 @@ def _reduced(name: str) -> Callable[..., Affine]:
         options = {"axis": axis, "keepdims": keepdims}
         low, high = (function(x, **options) for x in (a.low, a.high))
         found = Affine.between(low, high, len(a.generators))
-        return replace(
-            found, nan=a.nan.any(**options), nonnegative=a.positive.all(**options)
-        )
+        return replace(found, nan=a.nan.any(**options), nonnegative=a.positive.all(**options))
 
     return rule
 

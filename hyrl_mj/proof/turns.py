@@ -1,7 +1,7 @@
 """Whether NumPy code gives the same for all whole turns of a periodic coordinate, as its operations tell.
 
-By how much a turn of the argument changes each result is followed from operation to operation: a sum by the sum of
-the changes, a sine not at all if its argument changes by whole turns. So nothing has to be tried.
+By how much a turn of the argument changes each result is followed from operation to operation: a sum by the
+sum of the changes, a sine not at all if its argument changes by whole turns. So nothing has to be tried.
 """
 
 from __future__ import annotations
@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from hyrl_mj.tracing import Operation, Program
-from hyrl_mj.tracing.traced_array import EVALUATED
+from hyrl_mj.tracing import EVALUATED, Operation, Program
 
 # Whole numbers are recognised up to this.
 WHOLE = 1e-9
@@ -40,7 +39,10 @@ def tells_turns(program: Program, turn: np.ndarray) -> bool:
 
 def _change(operation: Operation, changes: Mapping[Operation, np.ndarray]) -> np.ndarray | None:
     """Returns by how much a turn changes the result of an operation; None if that depends on the state."""
-    by = [changes[o] if isinstance(o, Operation) else np.zeros(np.shape(o)) for o in operation.operands]
+    by = [
+        changes[o] if isinstance(o, Operation) else np.zeros(np.shape(o))
+        for o in operation.operands
+    ]
     if not any(change.any() for change in by):
         return np.zeros(operation.value.shape)
     rule = RULES.get(operation.name)

@@ -1,4 +1,4 @@
-"""Whether each sample of a plant begins anew: whether nothing but positions, or the chart, tells what comes."""
+"""Whether each sample of a plant begins anew: whether positions alone, or the chart, tell what comes."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 # Runs that are compared, samples of each, and the starts that are drawn for them.
 RUNS, SAMPLES, DRAWN = 50, 20, 500
 # How far a sample may lead beside that of a copy that is made anew, as a share of the longest one. A velocity
-# actuator of strength kv keeps m / (m + h kv) of the velocity of a mass m in a physics step of h seconds: 2e-5 at
-# 1 kg, kv 1e6 and 0.05 s, but 0.67 at 1e5 kg. The finest lattice has cells of about a hundredth of a sample, of
-# which this is a tenth; and it does not add up, because what lags behind once has caught up later. A proof takes
-# the lag that it measures into account.
+# actuator of strength kv keeps m / (m + h kv) of the velocity of a mass m in a physics step of h seconds:
+# 2e-5 at 1 kg, kv 1e6 and 0.05 s, but 0.67 at 1e5 kg. The finest lattice has cells of about a hundredth of a
+# sample, of which this is a tenth; and it does not add up, because what lags behind once has caught up later.
+# A proof takes the lag that it measures into account.
 ALIKE = 1e-3
 ROUNDING = 1e-12  # of positions
 

@@ -282,8 +282,8 @@ def _check_mocap(task: Task, qpos: np.ndarray) -> None:
 
 
 def _check_episodes(task: Task) -> None:
-    try_methods(task)
     ends = np.append(try_random(task), try_extreme(task))
+    try_methods(task)
     try_inputs(task)
     try_control(task)
     try_mirror(task)

@@ -1,4 +1,4 @@
-"""A task's mirror is tried: mirrored states under mirrored inputs have to lead to mirrored states and ends."""
+"""A task's mirror is tried: mirrored states under mirrored inputs have to do the same, mirrored."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from hyrl_mj.tasks.description import Outcome
 
 # Pairs of runs that are compared, from all over the chart, and their samples.
 RUNS, RUNS_SLOW, SAMPLES = 2_000, 64, 5
-# How far images may be off, as a share of the range of what is compared: friction is solved for directions that
-# are no images of each other, which moves the wheels of `rover` by 0.013.
+# How far images may be off, as a share of the range of what is compared: friction is solved for directions
+# that are no images of each other, which moves the wheels of `rover` by 0.013.
 ALIKE = 0.02
 # Images that agree up to this share of the range have to have the same end and the same reward.
 SAME = 1e-6
@@ -37,7 +37,9 @@ def try_mirror(task: Task) -> None:
     inside = chart.contains(image) & chart.contains(z)
     inside &= task.goes_on(z) | task.goes_on(image)
     if not inside.any():
-        raise BadInput("its mirror cannot be tried: the images of all states lie outside of the chart")
+        raise BadInput(
+            "its mirror cannot be tried: the images of all states lie outside of the chart"
+        )
     z, image = z[inside], image[inside]
     plant, other = task.plant(len(z)), task.plant(len(z))
     plant.set_state(*task.state(z))
@@ -46,7 +48,7 @@ def try_mirror(task: Task) -> None:
     running = np.ones(len(z), dtype=bool)
     with mujoco_log.kept():
         for sample in range(SAMPLES + 1):
-            _compare(task, z, running, sample, u, (plant.measurement, other.measurement))
+            running &= _compare(task, z, running, sample, u, (plant.measurement, other.measurement))
             running &= task.ending(plant.measurement) == Outcome.RUNNING
             u = rng.uniform(*task.input_limits, u.shape)
             plant.step(u)
@@ -99,8 +101,14 @@ def _compare(
     sample: int,
     u: np.ndarray,
     measured: tuple[np.ndarray, np.ndarray],
-) -> None:
-    """Raises `BadInput` unless the measurements (n, p) of runs and of their images are images, too."""
+) -> np.ndarray:
+    """Returns which measurements (n, p) of runs and of their images are images but for rounding: (n,) bool.
+
+    The others are not followed any more: after contacts, small differences grow.
+
+    Raises:
+        BadInput: some of the running ones are no images, or end or earn otherwise.
+    """
     assert task.mirror is not None
     seen = np.array(task.mirror.observation)
     observed, image = (task.observation(m) for m in measured)
@@ -111,9 +119,13 @@ def _compare(
     apart = np.abs(rewards[0] - rewards[1]) > ALIKE * max(float(np.ptp(rewards[0])), 1e-3)
     wrong = (running & (off > ALIKE)) | (same & ((ends != others) | apart))
     if not wrong.any():
-        return
+        return np.asarray(same)
     row = int(np.argmax(wrong))
-    where = f"{task.chart.format(z[row])}, {sample} sample(s) later," if sample else task.chart.format(z[row])
+    where = (
+        f"{task.chart.format(z[row])}, {sample} sample(s) later,"
+        if sample
+        else task.chart.format(z[row])
+    )
     told = [
         f"is observed as {np.round(o[row], 4).tolist()} ({Outcome(e[row]).label}, reward {r[row]:.4g})"
         for o, e, r in ((observed, ends, rewards[0]), (image, others, rewards[1]))

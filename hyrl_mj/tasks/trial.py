@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
+from functools import cached_property
 from itertools import product
+from typing import Any
 
 import numpy as np
 
@@ -72,9 +75,10 @@ def try_extreme(task: Task) -> np.ndarray:
 def try_methods(task: Task) -> None:
     """Raises `BadInput` if a method gives something else for the same rows in another batch or order.
 
-    Then it depends on other rows, or on what it was asked before: nothing that is computed in bulk would hold.
+    Then it depends on other rows, or on what it was asked before: nothing that is computed in bulk would
+    hold. Nor may it change an attribute of the task.
     """
-    rng = np.random.default_rng(0)
+    rng, before = np.random.default_rng(0), _attributes(task)
     z = np.vstack(
         [
             task.starts(STARTS, rng),
@@ -100,6 +104,28 @@ def try_methods(task: Task) -> None:
                     f"{name}() gives {again[row]} and then {first[row]} for the same row, at "
                     f"{task.chart.format(z[row])}: let it depend on this row alone, and on nothing before"
                 )
+    after = _attributes(task)
+    lazy = {name for name in after if isinstance(getattr(type(task), name, None), cached_property)}
+    for name in after.keys() - lazy:
+        if name not in before or not _same(before[name], after[name]):
+            raise BadInput(
+                f"its methods change its attribute {name} when they are asked: a task remembers nothing, so "
+                "compute it from the measurement"
+            )
+
+
+def _attributes(task: Task) -> dict[str, Any]:
+    """Returns copies of a task's plain attributes by name."""
+    kinds = (bool, int, float, str, list, dict, set, np.ndarray, np.generic, np.random.Generator)
+    return {n: copy.deepcopy(v) for n, v in vars(task).items() if isinstance(v, kinds)}
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, np.random.Generator):
+        return repr(a.bit_generator.state) == repr(b.bit_generator.state)
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        return type(a) is type(b) and np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+    return repr(a) == repr(b)
 
 
 def try_inputs(task: Task) -> None:

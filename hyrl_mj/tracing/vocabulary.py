@@ -82,7 +82,9 @@ def _erf(x: Any) -> Any:
 
 def _reciprocal(x: Any) -> Any:
     if x.dtype.kind != "f":
-        raise Untraceable("uses np.reciprocal of integers, which gives integers: divide 1.0 by them")
+        raise Untraceable(
+            "uses np.reciprocal of integers, which gives integers: divide 1.0 by them"
+        )
     return 1 / x
 
 
