@@ -7,7 +7,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from hyrl_mj import cores, forked, mjcf, mujoco_log
+from hyrl_mj import cores, forked, memory, mjcf, mujoco_log
 from hyrl_mj.errors import BadInput
 from hyrl_mj.ranges import Integer
 
@@ -42,7 +42,8 @@ class Plant:
         steady: whether the inner loop depends on u alone, so that its controls hold for a whole sample.
 
     Raises:
-        BadInput: the model has no such inputs, or this version of MuJoCo simulates it wrongly.
+        BadInput: the model has no such inputs, a sensor of it holds or delays its values, or this version of
+            MuJoCo simulates it wrongly.
     """
 
     def __init__(
@@ -57,7 +58,7 @@ class Plant:
         mocap: mjcf.Mocap | None = None,
         steady: bool = False,
     ):
-        if problem := mjcf.wrong_physics(model):
+        if problem := mjcf.wrong_physics(model) or memory.late_sensor(model):
             raise BadInput(problem)
         n = Integer(1, MOST).checked("the number of copies of a robot", n)
         self.n, self._threads, self._measure, self._control = n, threads, measure, control
@@ -241,14 +242,17 @@ class Plant:
 
     @property
     def invertible(self) -> bool:
-        """Whether each degree of freedom follows its own velocity actuator.
+        """Whether each degree of freedom has its own velocity actuator, strong and without a memory.
 
-        An inner loop may give these their speeds, from the inputs and the positions.
+        An inner loop may give these their speeds, from the inputs and the positions. Whether they follow
+        depends on the masses, too: `Task.kinematic` tries it.
         """
         model = self.model
         driven = sorted(model.actuator_trnid[:, 0])
+        one_to_one = model.nq == model.nv and driven == list(range(model.njnt))
+        joints = (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)).all()
         follows = -model.actuator_biasprm[:, 2] >= 1e6
-        return bool(model.nq == model.nv and driven == list(range(model.njnt)) and follows.all())
+        return bool(one_to_one and joints and follows.all() and not memory.remembers(model))
 
     def _wake(self) -> None:
         """Makes new copies in a forked process: MuJoCo's threads are in the other one."""

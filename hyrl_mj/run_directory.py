@@ -17,6 +17,7 @@ from hyrl_mj.game import Lattice, Robustness, lattice_grid
 from hyrl_mj.learning import Settings, differing
 from hyrl_mj.manifest import FILES, Manifest, check_contents, locked, may_hold
 from hyrl_mj.policies import Agent, AnyPolicy, MlpPolicy, Policy
+from hyrl_mj.proof import why_no_cells
 from hyrl_mj.run_config import Config
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import HybridArc
@@ -131,7 +132,15 @@ class Run:
     @property
     def exact(self) -> bool:
         """Whether the game can be played, and is more than an estimate."""
-        return self.why_no_game is None and Lattice.decides(self.task, self.lattice_grid)
+        return self.why_no_game is None and self.why_estimate is None
+
+    @cached_property
+    def why_estimate(self) -> str | None:
+        """Why the worst-case game, where it can be played, is an estimate; None if it decides."""
+        if why := Lattice.why_estimate(self.task):
+            return why
+        why = why_no_cells(self.task, self.lattice_grid)
+        return f"the game is an estimate between the nodes, because {why}" if why else None
 
     @property
     def lattice_grid(self) -> Grid:

@@ -275,6 +275,7 @@ def test_how_a_run_will_be_examined_is_said_first(unicycle):
     rough = SimpleNamespace(
         why_no_game=None,
         exact=False,
+        why_estimate=Lattice.why_estimate(unicycle),
         task=unicycle,
         lattice_grid=lattice_grid(unicycle),
         settings=SimpleNamespace(lattice=160),

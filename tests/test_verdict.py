@@ -99,7 +99,7 @@ def test_what_is_proved_of_nearly_all_winnable_starts_has_the_first_word(
 
 def test_a_game_that_is_an_estimate_stands_beside_the_episodes_that_decide(circle):
     estimate = game((1.0, 0.4), (1.0, 0.998)).game
-    rough = replace(estimate, lattice=replace(SPACING, spacing=(0.1, 0.1, 0.1)))
+    rough = replace(estimate, lattice=replace(SPACING, cells=False))
     assert rough.estimate
     assert not estimate.estimate
     counted = episodes({"none": 990, "adversarial": 500}, {"none": 1_000, "adversarial": 1_000})

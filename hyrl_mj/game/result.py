@@ -201,8 +201,8 @@ class GameResult:
 
     @property
     def estimate(self) -> bool:
-        """Whether it is an estimate, because of three dimensions or of contacts."""
-        return len(self.lattice.spacing) > 2 or self.lattice.contacts
+        """Whether it is an estimate, because no cells stand for what lies between the nodes."""
+        return not self.lattice.cells
 
     @property
     def controllers(self) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.game import LATTICE, OVER, UNWINNABLE, EpisodeCount, Lattice, Maps, Robustness
+from hyrl_mj.game import LATTICE, OVER, UNWINNABLE, EpisodeCount, Maps, Robustness
 from hyrl_mj.policies import Controller
 from hyrl_mj.progress import Say
 from hyrl_mj.proof import examine
@@ -94,8 +94,7 @@ def examination_plan(run: Run) -> str:
         nodes += f" (fewer than {wanted:,} on a side, which would not fit into the memory)"
     if run.exact:
         return f"by the worst-case game on {nodes}"
-    why = Lattice.why_estimate(run.task)
-    return f"by noisy episodes and an attack, and by the worst-case game on {nodes}: {why}"
+    return f"by noisy episodes and an attack, and by the worst-case game on {nodes}: {run.why_estimate}"
 
 
 def examine_stage(run: Run, say: Say, options: ExamineOptions = USUAL) -> None:

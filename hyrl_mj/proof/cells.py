@@ -3,23 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
-import mujoco
 import numpy as np
 
+from hyrl_mj.errors import BadInput
 from hyrl_mj.game import Lattice
 from hyrl_mj.proof.affine import Affine, Unbounded
+from hyrl_mj.proof.assumptions import check_assumptions
 from hyrl_mj.proof.networks import bounds_of, program_of
 from hyrl_mj.proof.rules import as_form
+from hyrl_mj.sets import Grid, Nodes
 from hyrl_mj.tasks import Outcome, Task
 
 # Samples whose ends lie this close to the border of a cell, in cells after a whole episode, end on it.
 ON_BORDER = 1e-3
 # Rounding of what is counted in cells.
 TINY = 1e-9
+# Rounding of a coordinate, and of how far a turn is, as a share of it.
+ROUNDING = 16 * float(np.finfo(float).eps)
 # The plant has to move all states alike, up to this share of a cell.
 ALIKE = 1e-3
+# States from which it is tried how evenly the plant moves, and samples of each run.
+STATES, SAMPLES = 3_000, 3
+# Nodes along each side of the lattice on which it is tried whether there are cells.
+FEW = 61
 
 
 @dataclass(frozen=True)
@@ -75,32 +83,20 @@ class Cells:
         return ~(self.arrived | self.failed)
 
     @staticmethod
-    def of(lattice: Lattice) -> Cells:
-        """Returns the cells of a lattice.
+    def of(lattice: Lattice, spacing: np.ndarray | None = None) -> Cells:
+        """Returns the cells of a lattice; its plant has to be even on nodes `spacing` (d,) apart.
 
         Raises:
             Unbounded: the plant does not move all states alike, or the end of an episode cannot be bounded.
         """
         task, grid = lattice.task, lattice.grid
-        if not lattice.direct or not _is_measured_directly(task):
-            raise Unbounded(
-                f"{task.name} computes its chart, measurement or state in methods of its own"
-            )
-        if not task.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT:
-            raise Unbounded(
-                f"contacts and other constraints could move {task.name} between the nodes otherwise than on "
-                'them: if it needs none, switch them off in its MJCF with <flag constraint="disable"/>'
-            )
-        if task.has_inner_loop:
-            raise Unbounded(
-                f"an inner loop (`control`) stands between the inputs of {task.name} and its speeds"
-            )
-        _check_periods(task)
+        check_assumptions(task)
+        if not lattice.direct:
+            raise Unbounded(f"the chart of {task.name} is not its position")
         periodic, h = np.array(task.chart.periodic), grid.spacing
         slope, offset = _displacement(lattice)
-        off = np.abs(lattice.hops - lattice.levels @ slope.T - offset).max(axis=0)
-        error = 2 * (lattice.uneven + off + _carried(lattice))
-        if (error > ALIKE * h).any():
+        error = _error(lattice, slope, offset)
+        if (error > ALIKE * (h if spacing is None else spacing)).any():
             raise Unbounded(
                 f"the plant of {task.name} does not move all states alike: with the same input some move "
                 f"{error.max():.2g} farther than others"
@@ -112,6 +108,13 @@ class Cells:
         on_levels = (task.input_levels is not None) | ~slope.any(axis=1)
         exact = (drift <= ON_BORDER * h) & on_levels
         slack = np.where(exact, drift, error) + 2 * TINY * h
+        # Far from the chart, after many turns, numbers are rounded more.
+        far = (
+            np.abs(grid.chart.low)
+            + grid.chart.sides
+            + task.max_steps * np.abs(lattice.hops).max(axis=0)
+        )
+        slack = np.maximum(slack, np.where(periodic, ROUNDING * far, 0.0))
         counts = np.array(grid.counts) - ~periodic
         reach = np.ceil(np.abs(cells).max(axis=0) + 1).astype(int)
         margin = np.where(periodic, 0, reach)
@@ -211,12 +214,6 @@ class Cells:
         return np.asarray(grid.chart.low + grid.spacing * (index + 0.5))
 
 
-def _is_measured_directly(task: Task) -> bool:
-    """Whether chart, measurement and positions of a task are the same numbers."""
-    kind = type(task)
-    return kind.z is Task.z and kind.state is Task.state
-
-
 def _displacement(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
     """Returns slope (d, m) and offset (d,) of the displacement as a function of the input."""
     levels = np.hstack([lattice.levels, np.ones((len(lattice.levels), 1))])
@@ -233,11 +230,38 @@ def _ends(task: Task, boxes: Affine) -> tuple[np.ndarray, np.ndarray, np.ndarray
         found.append(as_form(outcome, len(boxes.generators)))
     ending, verdict = found
     # The outcomes RUNNING, REACHED, and the failures are numbered in this order.
-    fails = ending.high > Outcome.REACHED + 0.5
+    fails = (ending.high > Outcome.REACHED + 0.5) | ending.nan
     reached, success = (
-        np.abs(form.centre - Outcome.REACHED) + form.radius < 0.5 for form in (ending, verdict)
+        (np.abs(form.centre - Outcome.REACHED) + form.radius < 0.5) & ~form.nan
+        for form in (ending, verdict)
     )
     return fails, reached & ~fails, (reached | success) & ~fails
+
+
+def _error(lattice: Lattice, slope: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Returns the largest error (d,) of the displacement in one sample, with a safety factor of 2.
+
+    It is that of the nodes and levels, and of runs from states between them, with all kinds of inputs, each
+    of which carries on what the input before has left.
+    """
+    task = lattice.task
+    off = np.abs(lattice.hops - lattice.levels @ slope.T - offset).max(axis=0)
+    spread = np.zeros_like(off)
+    rng, low, high = np.random.default_rng(0), *task.input_limits
+    z = rng.uniform(task.chart.low, task.chart.high, (STATES, task.chart.dimension))
+    plant = task.plant(STATES)
+    plant.set_state(*task.state(z))
+    for _ in range(SAMPLES):
+        drawn = rng.uniform(low, high, (STATES, len(low)))
+        corners = np.where(rng.random(drawn.shape) < 0.5, low, high)
+        levels = lattice.levels[rng.integers(len(lattice.levels), size=STATES)]
+        which = rng.integers(3, size=(STATES, 1))
+        u = np.select([which == 0, which == 1], [drawn, corners], levels)
+        before = plant.measurement
+        plant.step(u)
+        hops = plant.measurement - before
+        spread = np.maximum(spread, np.abs(hops - u @ slope.T - offset).max(axis=0))
+    return np.asarray(2 * np.maximum(lattice.uneven + off + _carried(lattice), spread))
 
 
 def _carried(lattice: Lattice) -> np.ndarray:
@@ -258,16 +282,24 @@ def _carried(lattice: Lattice) -> np.ndarray:
     return np.asarray(np.abs(hops - np.tile(lattice.hops, (len(before), 1))).max(axis=0))
 
 
-def _check_periods(task: Task) -> None:
-    """Raises `Unbounded` if a method of a task tells whole turns of a periodic coordinate apart."""
-    chart, rng = task.chart, np.random.default_rng(0)
-    z = rng.uniform(chart.low, chart.high, (1_000, chart.dimension))
-    for axis in np.flatnonzero(chart.periodic):
-        for turns in (-1, 1, 7):
-            turned = z + turns * chart.sides * (np.arange(chart.dimension) == axis)
-            for name in ("observation", "ending", "verdict"):
-                method = getattr(task, name)
-                if not np.allclose(method(turned), method(z), rtol=0, atol=1e-6):
-                    raise Unbounded(
-                        f"the method {name} of {task.name} tells whole turns of {chart.names[axis]} apart"
-                    )
+def why_no_cells(task: Task, grid: Grid) -> str | None:
+    """Returns why no cells cover this task's chart, so that a game proves nothing and decides nothing.
+
+    None if they do. The cells are tried on few nodes, the plant at the distances of the grid's nodes.
+    """
+    return _why_no_cells(task, tuple(grid.counts))
+
+
+@lru_cache(8)
+def _why_no_cells(task: Task, counts: tuple[int, ...]) -> str | None:
+    few = tuple(min(count, FEW) for count in counts)
+    try:
+        Cells.of(Lattice.of(task, Grid(task.chart, few)), Grid(task.chart, counts).spacing)
+    except (Unbounded, BadInput) as error:
+        return str(error)
+    return None
+
+
+def decides(task: Task, grid: Nodes) -> bool:
+    """Returns whether the game on these nodes is more than an estimate: cells cover the chart, too."""
+    return Lattice.decides(task, grid) and isinstance(grid, Grid) and not why_no_cells(task, grid)

@@ -70,14 +70,15 @@ def attack(
     value, rng = game.value(name, eps), np.random.default_rng(seed)
     region = game.starts & game.winnable(eps)
     attacked, tried = value[-len(modes) :, :-2] >= NEVER, region
-    if game.lattice.estimate:
+    estimate = game.lattice.estimate or cells is None
+    if estimate:
         tried, every = np.zeros_like(region), np.flatnonzero(region)
         most = ATTACKED_NODES_SLOW if game.task.slow else ATTACKED_NODES
         tried[rng.choice(every, min(len(every), most), replace=False)] = True
         attacked = np.ones_like(attacked)
     attacked &= tried
     noises: list[AnyNoise] = [game.worst_noise(name, eps)] if attacked.any() else []
-    if noises and game.lattice.estimate and not game.task.slow:
+    if noises and estimate and not game.task.slow:
         noises.append(Noise("adversarial", eps, game.everywhere))
     nodes = np.zeros_like(attacked)
     for noise in noises:

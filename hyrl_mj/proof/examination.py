@@ -34,6 +34,7 @@ from hyrl_mj.game import (
 )
 from hyrl_mj.policies import BLAS, Controller
 from hyrl_mj.progress import progress_bar
+from hyrl_mj.proof.cells import decides
 from hyrl_mj.proof.certificate import Certificate, Proved
 from hyrl_mj.proof.counterexamples import Broken, attack
 from hyrl_mj.proof.replays import Replays, play
@@ -74,7 +75,7 @@ def examine(
     Lattice.check(task)
     parts, grid = tuple(parts), lattice_grid(task, cells)
     Lattice.check(task, grid)
-    exact = Lattice.decides(task, grid)
+    exact = decides(task, grid)
     largest = max(*bounds, LARGEST) if exact else max(bounds)
     fine = Game(task, parts, controllers, largest, everywhere, grid)
     names = [*controllers, LIMIT]

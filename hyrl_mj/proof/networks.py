@@ -133,11 +133,12 @@ class BoundedPolicy:
         if self.normalization is not None:
             # The network sees the observation in single precision.
             rounding = 2 * ROUNDING * (np.abs(seen.centre) + seen.radius)
-            seen = Affine(seen.centre, seen.generators, seen.remainder + rounding)
+            seen = seen.wider(rounding)
             seen = as_form(bounds_of(self.normalization, "VecNormalize", seen), centre.shape[1])
-        if np.isinf(seen.remainder).any():
+        if seen.wild.any() or seen.nan.any():
+            what = "has no limit" if seen.wild.any() else "may be NaN"
             raise Unbounded(
-                f"{_observation_of(task)} cannot be bounded: it has no limit near some states"
+                f"{_observation_of(task)} cannot be bounded: it {what} near some states"
             )
         x: Relaxed = (
             seen.centre.astype(np.float32),

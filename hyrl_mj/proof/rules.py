@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from hyrl_mj.errors import brief
-from hyrl_mj.proof import affine
+from hyrl_mj.proof import affine, functions
 from hyrl_mj.proof.affine import Affine, Unbounded
 from hyrl_mj.tracing import BATCH, Operation, Program
 
@@ -17,6 +17,16 @@ from hyrl_mj.tracing import BATCH, Operation, Program
 ROUNDING = 8
 # Operations whose rounding errors go with their operands, not with their result.
 ADDING = ("add", "subtract", "sum", "matmul")
+# Operations that only move entries, and those that NumPy takes for others if all operands are bool.
+MOVING = ("reshape", "transpose", "concatenate", "take")
+OF_BOOLS = {
+    "add": "logical_or",
+    "maximum": "logical_or",
+    "multiply": "logical_and",
+    "minimum": "logical_and",
+    "max": "any",
+    "min": "all",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,16 +71,55 @@ def _apply(
         raise Unbounded(f"uses np.{name}, for which there are no bounds")
     if "shape" in options:
         options["shape"] = tuple(n if k == BATCH else k for k in options["shape"])
-    operands: list[Any] = [values[o] if isinstance(o, Operation) else o for o in operation.operands]
-    if name == "multiply" and operands[0] is operands[1] and isinstance(operands[0], Affine):
-        return affine.square(operands[0])
+    operands: list[Any] = [
+        values[o] if isinstance(o, Operation) else o for o in _as_computed(operation)
+    ]
+    dtype = operation.value.dtype
+    if dtype.kind == "b" and name in OF_BOOLS and all(map(_is_condition, operands)):
+        name = OF_BOOLS[name]
+        rule = RULES[name]
     if name in LOGICAL:
         return rule(*map(_truth, operands))
     forms = [o if name in AS_THEY_ARE and _is_condition(o) else as_form(o, d) for o in operands]
-    found: Affine | Truth = rule(*forms, **options)
-    if isinstance(found, Affine):
-        error = _rounding(operation, found, forms)
-        return affine.tidy(Affine(found.centre, found.generators, found.remainder + error))
+    found: Affine | Truth
+    if name == "multiply" and operands[0] is operands[1] and isinstance(operands[0], Affine):
+        found = affine.square(operands[0])
+    else:
+        found = rule(*forms, **options)
+    if not isinstance(found, Affine):
+        return found
+    if dtype.kind == "b" and name in MOVING:
+        return Truth(found.low > 0.5, found.high > 0.5)
+    if dtype.kind == "b":
+        raise Unbounded(f"uses np.{name} of conditions, for which there are no bounds")
+    return _in_type(affine.tidy(found.wider(_rounding(operation, found, forms))), dtype)
+
+
+def _as_computed(operation: Operation) -> list[Any]:
+    """Returns the operands; constants as NumPy takes them beside numbers of single precision, say."""
+    operands = list(operation.operands)
+    if operation.name == "take":  # its constants may be indices
+        return operands
+    dtype = np.result_type(*(o.value if isinstance(o, Operation) else o for o in operands))
+    if dtype.kind != "f" or dtype.itemsize >= np.dtype(float).itemsize:
+        return operands
+    return [
+        o if isinstance(o, Operation) or np.asarray(o).dtype.kind == "b" else np.asarray(o, dtype)
+        for o in operands
+    ]
+
+
+def _in_type(found: Affine, dtype: np.dtype[Any]) -> Affine:
+    """Returns a form of numbers of a type: what is too large for it is infinite, or of integers unknown."""
+    if dtype.kind == "f":
+        if dtype.itemsize >= np.dtype(float).itemsize:
+            return found
+        over = np.abs(found.centre) + found.radius > np.finfo(dtype).max
+        return replace(found, remainder=np.where(over, np.inf, found.remainder))
+    # Beyond 2**53 our own numbers are not exact.
+    least, most = max(np.iinfo(dtype).min, -(2**53)), min(np.iinfo(dtype).max, 2**53)
+    if not ((found.low >= least) & (found.high <= most)).all():
+        raise Unbounded(f"computes with numbers of the type {dtype} that may be too large for it")
     return found
 
 
@@ -81,7 +130,10 @@ def _rounding(operation: Operation, found: Affine, operands: list[Any]) -> np.nd
     size = np.abs(found.centre) + found.radius
     if operation.name in ADDING:
         sizes = [
-            Affine(s := np.abs(o.centre) + o.radius, 0 * o.generators, 0 * s) for o in operands
+            Affine(
+                np.abs(o.centre) + o.radius, np.zeros_like(o.generators), np.zeros_like(o.centre)
+            )
+            for o in operands
         ]
         terms = max(2, *(int(np.prod(o.centre.shape[1:], dtype=int)) for o in operands))
         whole = RULES["add" if operation.name == "subtract" else operation.name]
@@ -96,7 +148,9 @@ def as_form(x: Any, d: int) -> Affine:
     if isinstance(x, Truth):
         return Affine.between(x.surely.astype(float), x.possibly.astype(float), d)
     centre = np.asarray(x, dtype=float)
-    return Affine(centre, np.zeros((d, *centre.shape)), np.zeros(centre.shape))
+    nan = np.isnan(centre)
+    centre = np.where(nan, 0.0, centre)
+    return Affine(centre, np.zeros((d, *centre.shape)), np.zeros(centre.shape), nan)
 
 
 def _is_condition(x: Any) -> bool:
@@ -107,7 +161,8 @@ def _truth(x: Any) -> Truth:
     if isinstance(x, Truth):
         return x
     if isinstance(x, Affine):
-        return Truth((x.low > 0) | (x.high < 0), (x.radius > 0) | (x.centre != 0))
+        # NaN counts as true.
+        return Truth((x.low > 0) | (x.high < 0), (x.radius > 0) | (x.centre != 0) | x.nan)
     return Truth(np.asarray(x, dtype=bool), np.asarray(x, dtype=bool))
 
 
@@ -116,17 +171,17 @@ def _truth(x: Any) -> Truth:
 
 def _greater(a: Affine, b: Affine) -> Truth:
     a, b = affine.pair(a, b)
-    return Truth(a.low > b.high, a.high > b.low)
+    return Truth((a.low > b.high) & ~(a.nan | b.nan), a.high > b.low)
 
 
 def _greater_equal(a: Affine, b: Affine) -> Truth:
     a, b = affine.pair(a, b)
-    return Truth(a.low >= b.high, a.high >= b.low)
+    return Truth((a.low >= b.high) & ~(a.nan | b.nan), a.high >= b.low)
 
 
 def _equal(a: Affine, b: Affine) -> Truth:
     a, b = affine.pair(a, b)
-    point = (a.radius == 0) & (b.radius == 0)
+    point = (a.radius == 0) & (b.radius == 0) & ~(a.nan | b.nan)
     return Truth(point & (a.centre == b.centre), (a.low <= b.high) & (b.low <= a.high))
 
 
@@ -141,7 +196,11 @@ def _where(condition: Any, a: Any, b: Any) -> Affine | Truth:
         return Truth(surely, possibly)
     d = len((a if isinstance(a, Affine) else b).generators)
     a, b = affine.pair(as_form(a, d), as_form(b, d))
-    hull = Affine.between(np.minimum(a.low, b.low), np.maximum(a.high, b.high), d)
+    hull = replace(
+        Affine.between(np.minimum(a.low, b.low), np.maximum(a.high, b.high), d),
+        nan=a.nan | b.nan,
+        nonnegative=a.positive & b.positive,
+    )
     return affine.choose(c.surely, a, affine.choose(c.possibly, hull, b))
 
 
@@ -153,7 +212,10 @@ def _astype(a: Any, dtype: str) -> Any:
         raise Unbounded(f"makes numbers of the type {dtype}, which wrap")
     if kind.kind == "f" or not isinstance(a, Affine):
         return a
-    return Affine.between(np.trunc(a.low), np.trunc(a.high), len(a.generators))
+    if (a.nan | a.wild).any():
+        raise Unbounded(f"makes numbers of the type {dtype} of what may be NaN or infinite")
+    whole = Affine.between(np.trunc(a.low), np.trunc(a.high), len(a.generators))
+    return replace(whole, nonnegative=a.positive)
 
 
 def _concatenate(*parts: Affine, axis: int) -> Affine:
@@ -161,11 +223,13 @@ def _concatenate(*parts: Affine, axis: int) -> Affine:
         np.concatenate([part.centre for part in parts], axis),
         np.concatenate([part.generators for part in parts], axis + 1),
         np.concatenate([part.remainder for part in parts], axis),
+        np.concatenate([part.nan for part in parts], axis),
+        np.concatenate([part.nonnegative for part in parts], axis),
     )
 
 
 def _take(a: Affine, indices: Affine, axis: int) -> Affine:
-    if indices.radius.any():
+    if indices.radius.any() or indices.nan.any():
         raise Unbounded("looks up values by an index that depends on the state")
     at = indices.centre.astype(int)
     return a.each(lambda x: np.take(x, at, axis))
@@ -175,8 +239,10 @@ def _reduced(name: str) -> Callable[..., Affine]:
     function = getattr(np, name)
 
     def rule(a: Affine, axis: Any, keepdims: bool) -> Affine:
-        low, high = (function(x, axis=axis, keepdims=keepdims) for x in (a.low, a.high))
-        return Affine.between(low, high, len(a.generators))
+        options = {"axis": axis, "keepdims": keepdims}
+        low, high = (function(x, **options) for x in (a.low, a.high))
+        found = Affine.between(low, high, len(a.generators))
+        return replace(found, nan=a.nan.any(**options), nonnegative=a.positive.all(**options))
 
     return rule
 
@@ -189,36 +255,53 @@ RULES: dict[str, Callable[..., Any]] = {
     "subtract": affine.subtract,
     "negative": affine.negative,
     "multiply": affine.multiply,
-    "divide": affine.divide,
-    "power": affine.raised,
+    "divide": functions.divide,
+    "power": functions.raised,
     "matmul": affine.matmul,
-    "sqrt": affine.sqrt,
-    "exp": affine.smooth(np.exp, np.exp, lambda _, high: np.exp(high), affine.rising(np.exp)),
-    "log": affine.smooth(
-        affine.logarithm,
+    "sqrt": functions.sqrt,
+    "exp": functions.smooth(
+        np.exp,
+        np.exp,
+        lambda _, high: np.exp(high),
+        functions.rising(np.exp),
+        nonnegative=True,
+    ),
+    "log": functions.smooth(
+        functions.logarithm,
         lambda x: 1 / x,
         lambda low, _: np.where(low > 0, low, 0.0) ** -2,
-        affine.rising(affine.logarithm),
+        functions.rising(functions.logarithm),
+        functions.may_be_negative,
     ),
-    "sin": affine.smooth(np.sin, np.cos, lambda low, _: np.ones_like(low), affine.unit),
-    "cos": affine.smooth(
-        np.cos, lambda x: -np.sin(x), lambda low, _: np.ones_like(low), affine.unit
+    "sin": functions.smooth(
+        np.sin,
+        np.cos,
+        lambda low, _: np.ones_like(low),
+        functions.unit,
+        functions.may_be_infinite,
     ),
-    "tanh": affine.smooth(
+    "cos": functions.smooth(
+        np.cos,
+        lambda x: -np.sin(x),
+        lambda low, _: np.ones_like(low),
+        functions.unit,
+        functions.may_be_infinite,
+    ),
+    "tanh": functions.smooth(
         np.tanh,
         lambda x: 1 - np.tanh(x) ** 2,
         lambda low, _: np.full_like(low, 0.77),
-        affine.rising(np.tanh),
+        functions.rising(np.tanh),
     ),
-    "arctan2": affine.arctan2,
-    "absolute": affine.absolute,
-    "sign": affine.stepwise(np.sign),
-    "floor": affine.stepwise(np.floor),
-    "ceil": affine.stepwise(np.ceil),
-    "rint": affine.stepwise(np.rint),
-    "maximum": affine.maximum,
-    "minimum": affine.minimum,
-    "remainder": affine.remainder,
+    "arctan2": functions.arctan2,
+    "absolute": functions.absolute,
+    "sign": functions.stepwise(np.sign),
+    "floor": functions.stepwise(np.floor),
+    "ceil": functions.stepwise(np.ceil),
+    "rint": functions.stepwise(np.rint),
+    "maximum": functions.maximum,
+    "minimum": functions.minimum,
+    "remainder": functions.remainder,
     "sum": affine.total,
     "max": _reduced("max"),
     "min": _reduced("min"),
@@ -227,8 +310,7 @@ RULES: dict[str, Callable[..., Any]] = {
     "less": lambda a, b: _greater(b, a),
     "less_equal": lambda a, b: _greater_equal(b, a),
     "equal": _equal,
-    # An affine form does not tell what is no number.
-    "isnan": lambda a: Truth(np.zeros(a.centre.shape, bool), np.ones(a.centre.shape, bool)),
+    "isnan": lambda a: Truth(np.zeros(a.centre.shape, bool), a.nan),
     "logical_and": lambda a, b: Truth(a.surely & b.surely, a.possibly & b.possibly),
     "logical_or": lambda a, b: Truth(a.surely | b.surely, a.possibly | b.possibly),
     "logical_not": lambda a: Truth(~a.possibly, ~a.surely),

@@ -15,6 +15,7 @@ from hyrl_mj.artifacts import digest
 from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput, check_bound
 from hyrl_mj.plant import Plant, input_limits
+from hyrl_mj.tasks.anew import begins_anew
 from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.guard import guard
 from hyrl_mj.tasks.obstacles import (
@@ -176,27 +177,32 @@ class Task(ABC):
     def kinematic(self) -> bool:
         """Whether the robot follows its inputs without inertia, so that it can be run backward.
 
-        An inner loop must give the speeds from the inputs and the positions alone; that is tried out.
+        An inner loop must give the speeds from the inputs and the positions alone. Both are tried out.
         """
         plant = self.plant(TRIED)
-        if not plant.invertible or not self.has_inner_loop:
-            return plant.invertible
-        rng = np.random.default_rng(0)
-        qpos, _ = self.state(
-            rng.uniform(self.chart.low, self.chart.high, (TRIED, self.chart.dimension))
-        )
-        u, qvel = (
-            rng.uniform(*self.input_limits, (TRIED, len(self.inputs))),
-            rng.normal(size=qpos.shape),
-        )
-        still = self.control(u, qpos, np.zeros_like(qvel))
-        return bool(np.allclose(self.control(u, qpos, qvel), still, rtol=0, atol=1e-9))
+        if not plant.invertible:
+            return False
+        if self.has_inner_loop:
+            rng = np.random.default_rng(0)
+            qpos, _ = self.state(
+                rng.uniform(self.chart.low, self.chart.high, (TRIED, self.chart.dimension))
+            )
+            u = rng.uniform(*self.input_limits, (TRIED, len(self.inputs)))
+            qvel = rng.normal(size=qpos.shape)
+            still = self.control(u, qpos, np.zeros_like(qvel))
+            if not np.allclose(self.control(u, qpos, qvel), still, rtol=0, atol=1e-9):
+                return False
+        return begins_anew(self)
 
     @cached_property
     def chart_is_state(self) -> bool:
-        """Whether one sample leads from chart point to chart point, so that nothing else tells what comes."""
+        """Whether one sample leads from chart point to chart point, so that nothing else tells what comes.
+
+        That is tried out, too, by copies that are made anew at the chart point of others.
+        """
         d = self.chart.dimension
-        return self.measurement_columns == d and self.model.nq == d and self.kinematic
+        same = self.measurement_columns == d and self.model.nq == d
+        return same and self.kinematic and begins_anew(self, of_chart=True)
 
     def check_measurement(self, measured: np.ndarray) -> np.ndarray:
         """Returns a measurement as a float array (n, p).

@@ -5,25 +5,28 @@ import re
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hyrl_mj import mjcf
+from hyrl_mj import memory, mjcf
 from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput, brief, line_in, unknown
 from hyrl_mj.ranges import Flag, Integer, Number, Optional, Rule, Several, Text
 from hyrl_mj.sets import MOST_DIMENSIONS
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.mirrored import try_mirror
 from hyrl_mj.tasks.registry import check_current
 from hyrl_mj.tasks.trial import (
     try_control,
     try_extreme,
     try_inputs,
-    try_mirror,
+    try_methods,
     try_random,
     try_where,
 )
 
 # Number of starts that are tried.
 STARTS = 64
+# Starts that are drawn to see whether they lie in the box of starts.
+DRAWN = 4_000
 # Most combinations of the levels of the inputs.
 MOST_LEVELS = 1_000
 # Most physics steps of a sample.
@@ -185,7 +188,7 @@ def _check_model(task: Task) -> None:
             f"its sample time {task.dt:g} s takes {steps:,.0f} physics steps of {model.opt.timestep:g} s in "
             f"{path.name}: give at most {SUBSTEPS:,}"
         )
-    if problem := mjcf.wrong_physics(model):
+    if problem := mjcf.wrong_physics(model) or memory.late_sensor(model):
         raise BadInput(problem)
 
 
@@ -197,6 +200,7 @@ def _check_starts(task: Task) -> None:
     if len(outside):
         point = task.chart.format(outside[0])
         raise BadInput(f"it starts outside its chart, at {point}: change one of them")
+    _check_box(task)
     plant = task.plant(STARTS)
     plant.set_state(*task.state(z, np.random.default_rng(1)))
     if task.model.nmocap:
@@ -209,19 +213,43 @@ def _check_starts(task: Task) -> None:
     back = task.z(measurement)
     _check_shape("z() gives", back, z.shape)
     _check_shape("with_z() gives", task.with_z(measurement, z[::-1]), measurement.shape)
-    off = np.abs(task.chart.difference(back, z)).max(axis=1)
-    if off.max() > ROUND_TRIP:
-        worst = int(off.argmax())
-        raise BadInput(
-            f"state() and z() do not belong to each other: {task.chart.format(z[worst])} is measured as "
-            f"{task.chart.format(back[worst])}"
-        )
+    _check_round_trip(task, z, back)
+    if not task.slow:
+        anywhere = np.random.default_rng(3).uniform(task.chart.low, task.chart.high, (DRAWN, d))
+        whole = task.plant(DRAWN)
+        whole.set_state(*task.state(anywhere))
+        _check_round_trip(task, anywhere, task.z(whole.measurement))
     ending = task.ending(measurement)
     over = np.flatnonzero(ending != Outcome.RUNNING)
     if len(over):
         raise BadInput(
             f"{len(over)} of {STARTS} starts are over before they begin: {task.chart.format(z[over[0]])} "
             f"is {Outcome(ending[over[0]]).label}; start elsewhere, or change ending()"
+        )
+
+
+def _check_round_trip(task: Task, z: np.ndarray, back: np.ndarray) -> None:
+    """Raises `BadInput` unless chart points (n, d) are measured as what they are."""
+    off = np.abs(task.chart.difference(back, z)).max(axis=1)
+    if off.max() > ROUND_TRIP:
+        worst = int(off.argmax())
+        raise BadInput(
+            f"state() and z() do not belong to each other: {task.chart.format(z[worst])} is measured as "
+            f"{task.chart.format(back[worst])}; let them agree all over the chart, with sensors that do not "
+            "clip there (cutoff)"
+        )
+
+
+def _check_box(task: Task) -> None:
+    """Raises `BadInput` unless the starts that are drawn are starts that the task says may be."""
+    drawn = task.starts(STARTS if task.slow else DRAWN, np.random.default_rng(2))
+    off = ~(task.chart.contains(drawn) & task.may_start(drawn))
+    if off.any():
+        low, high = (task.chart.format(np.array(end)) for end in (task.start_low, task.start_high))
+        raise BadInput(
+            f"{off.sum():,} of {len(drawn):,} starts that starts() draws lie outside of its box, as "
+            f"{task.chart.format(drawn[off][0])}: what is not in the box from {low} to {high} (start_low, "
+            "start_high, may_start) is not examined; change one of them"
         )
 
 
@@ -255,6 +283,7 @@ def _check_mocap(task: Task, qpos: np.ndarray) -> None:
 
 def _check_episodes(task: Task) -> None:
     ends = np.append(try_random(task), try_extreme(task))
+    try_methods(task)
     try_inputs(task)
     try_control(task)
     try_mirror(task)

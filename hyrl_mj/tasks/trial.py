@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
+from functools import cached_property
 from itertools import product
+from typing import Any
 
 import numpy as np
 
@@ -23,10 +26,10 @@ CORNERS = 16
 
 # Samples after which an input must have changed something.
 EFFECT = 10
+# Rows that are asked for one by one.
+ALONE = 32
 # Places in the plane that spread no wider than this, as a share of their length, lie on a line.
 ON_A_LINE = 1e-6
-# How far mirrored observations may be off, as a share of their range after a sample.
-ALIKE = 0.01
 
 # Number of the sample -> inputs (n, m).
 Inputs = Callable[[int], np.ndarray]
@@ -67,6 +70,62 @@ def try_extreme(task: Task) -> np.ndarray:
         return np.where((alternating & (k % 2))[:, None], opposite, held)
 
     return _play(task, places[place], inputs, "extreme")
+
+
+def try_methods(task: Task) -> None:
+    """Raises `BadInput` if a method gives something else for the same rows in another batch or order.
+
+    Then it depends on other rows, or on what it was asked before: nothing that is computed in bulk would
+    hold. Nor may it change an attribute of the task.
+    """
+    rng, before = np.random.default_rng(0), _attributes(task)
+    z = np.vstack(
+        [
+            task.starts(STARTS, rng),
+            rng.uniform(task.chart.low, task.chart.high, (STARTS, task.chart.dimension)),
+        ]
+    )
+    plant = task.plant(len(z))
+    plant.set_state(*task.state(z))
+    measured, order = plant.measurement, rng.permutation(len(z))
+    for name in ("z", "observation", "ending", "verdict"):
+        method = getattr(task, name)
+        first = method(measured)
+        shuffled = np.empty_like(first)
+        shuffled[order] = method(measured[order])
+        alone = first.copy()
+        for row in order[:ALONE]:
+            alone[row] = method(measured[[row]])[0]
+        for again in (shuffled, method(measured), alone):
+            same = np.isclose(again, first, rtol=0, atol=1e-9, equal_nan=True)
+            if not same.all():
+                row = int(np.argwhere(~same)[0][0])
+                raise BadInput(
+                    f"{name}() gives {again[row]} and then {first[row]} for the same row, at "
+                    f"{task.chart.format(z[row])}: let it depend on this row alone, and on nothing before"
+                )
+    after = _attributes(task)
+    lazy = {name for name in after if isinstance(getattr(type(task), name, None), cached_property)}
+    for name in after.keys() - lazy:
+        if name not in before or not _same(before[name], after[name]):
+            raise BadInput(
+                f"its methods change its attribute {name} when they are asked: a task remembers nothing, so "
+                "compute it from the measurement"
+            )
+
+
+def _attributes(task: Task) -> dict[str, Any]:
+    """Returns copies of a task's plain attributes by name."""
+    kinds = (bool, int, float, str, list, dict, set, np.ndarray, np.generic, np.random.Generator)
+    return {n: copy.deepcopy(v) for n, v in vars(task).items() if isinstance(v, kinds)}
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, np.random.Generator):
+        return repr(a.bit_generator.state) == repr(b.bit_generator.state)
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        return type(a) is type(b) and np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+    return repr(a) == repr(b)
 
 
 def try_inputs(task: Task) -> None:
@@ -127,36 +186,6 @@ def try_where(task: Task) -> None:
         raise BadInput(
             f"where() puts all states of the chart {shape}, as {places[0][0].tolist()}: give two coordinates "
             "of a plane that change with the state, or give the task a direction() of its own"
-        )
-
-
-def try_mirror(task: Task) -> None:
-    """Raises `BadInput` if mirrored states under mirrored inputs do not lead to mirrored observations.
-
-    That can be told of a task with `measured`, from states that the chart alone determines.
-    """
-    if task.mirror is None or type(task).measured is Task.measured:
-        return
-    rng, seen = np.random.default_rng(0), np.array(task.mirror.observation)
-    z = task.starts(STARTS, rng)
-    plant = task.plant(STARTS)
-    plant.set_state(*task.state(z))
-    image = task.z(task.measured(task.observation(plant.measurement) * seen))
-    u = rng.uniform(*task.input_limits, (STARTS, len(task.inputs)))
-    after = []
-    for points, inputs in ((z, u), (image, u * task.mirror.inputs)):
-        plant.set_state(*task.state(points))
-        with mujoco_log.kept():
-            plant.step(np.clip(inputs, *task.input_limits))
-        after.append(task.observation(plant.measurement))
-    scale = np.maximum(np.ptp(after[0], axis=0), 1e-3)
-    off = np.abs(after[1] - after[0] * seen) / scale
-    if off.max() > ALIKE:
-        row = int(off.max(axis=1).argmax())
-        raise BadInput(
-            f"mirror is no symmetry of it: a sample from {task.chart.format(z[row])} is observed as "
-            f"{np.round(after[0][row], 4).tolist()}, and its image as {np.round(after[1][row], 4).tolist()}; "
-            "change its signs, or give none"
         )
 
 

@@ -80,6 +80,19 @@ def _erf(x: Any) -> Any:
     return np.sign(x) * (1 - polynomial * np.exp(-x * x))
 
 
+def _reciprocal(x: Any) -> Any:
+    if x.dtype.kind != "f":
+        raise Untraceable(
+            "uses np.reciprocal of integers, which gives integers: divide 1.0 by them"
+        )
+    return 1 / x
+
+
+def _of_numbers(extreme: np.ufunc, x: Any, y: Any) -> Any:
+    """Does np.fmax or np.fmin, which give the other number where one is NaN."""
+    return np.where(np.isnan(x), y, np.where(np.isnan(y), x, extreme(x, y)))
+
+
 def _of_bools(logical: np.ufunc, *operands: Any) -> Any:
     """Does a bitwise operation, which on bool is a logical one."""
     arrays = (o if hasattr(o, "dtype") else np.asarray(o) for o in operands)
@@ -126,7 +139,7 @@ COMPOSED: dict[Any, Callable[..., Any]] = {
     "arccos": lambda x: np.arctan2(np.sqrt((1 - x) * (1 + x)), x),
     "fabs": np.absolute,
     "square": lambda x: x * x,
-    "reciprocal": lambda x: 1 / x,
+    "reciprocal": _reciprocal,
     "hypot": lambda x, y: np.sqrt(x * x + y * y),
     **dict.fromkeys(("radians", "deg2rad"), lambda x: x * (np.pi / 180)),
     **dict.fromkeys(("degrees", "rad2deg"), lambda x: x * (180 / np.pi)),
@@ -141,8 +154,8 @@ COMPOSED: dict[Any, Callable[..., Any]] = {
     "trunc": lambda x: np.sign(x) * np.floor(np.absolute(x)),
     "float_power": np.power,
     "erf": _erf,
-    "fmax": np.maximum,
-    "fmin": np.minimum,
+    "fmax": lambda x, y: _of_numbers(np.maximum, x, y),
+    "fmin": lambda x, y: _of_numbers(np.minimum, x, y),
     "bitwise_and": partial(_of_bools, np.logical_and),
     "bitwise_or": partial(_of_bools, np.logical_or),
     "bitwise_xor": partial(_of_bools, np.logical_xor),

@@ -1,0 +1,225 @@
+"""What is not as it seems is refused, left open, or right: robots with planted traps, each trap by itself.
+
+All 200 robots: HYRL_MJ_TRAPPED=200 python -m pytest tests/test_trapped_plants.py
+"""
+
+import os
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+import trapped_plants
+from trapped_plants import TRAPS, Robot, dial, drawn, ends, examined, methods, vehicle
+
+from hyrl_mj import BadInput
+from hyrl_mj.game import Lattice
+from hyrl_mj.proof import why_no_cells
+from hyrl_mj.proof.affine import Unbounded
+from hyrl_mj.proof.assumptions import check_assumptions
+from hyrl_mj.sets import Grid
+from hyrl_mj.tasks import check_task
+from hyrl_mj.tasks.anew import begins_anew
+
+# Robots that are tried: seed k has the trap number k modulo their number.
+TRIED = int(os.environ.get("HYRL_MJ_TRAPPED", "30"))
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:invalid value")
+@pytest.mark.parametrize("part", range(2))
+def test_nothing_that_is_called_won_is_lost_in_mujoco(tmp_path, part):
+    found = [examined(seed, tmp_path) for seed in range(part, TRIED, 2)]
+    assert [(f.trap, f.wrong) for f in found if f.wrong] == []
+    assert any(f.claims for f in found)
+
+
+@pytest.mark.slow
+def test_honest_robots_are_proved(tmp_path):
+    honest = [examined(seed * len(TRAPS), tmp_path) for seed in range(3)]
+    assert {f.word for f in honest} == {"proved"}
+
+
+# ---- each trap by itself
+
+
+def task_of(robot, folder, monkeypatch):
+    """The task of one robot."""
+    monkeypatch.setattr(trapped_plants, "TRAPS", {"this": lambda rng: robot})
+    return drawn(0, folder)[1]
+
+
+@pytest.mark.parametrize("make", [vehicle, dial])
+@pytest.mark.parametrize(
+    "servo",
+    ['delay="0.05" nsample="2"', 'delay="0.2" nsample="5"', 'dyntype="filterexact" dynprm="0.2"'],
+)
+def test_a_servo_with_a_memory_is_not_kinematic(tmp_path, monkeypatch, make, servo):
+    task = task_of(make()._replace(servo=servo), tmp_path, monkeypatch)
+    assert not task.kinematic
+    assert "larger state" in Lattice.why_not(task)
+    with pytest.raises(Unbounded, match=r"histories of actuators|activations of actuators"):
+        check_assumptions(task)
+
+
+@pytest.mark.parametrize(("mass", "kinematic"), [("1", True), ("1000", False), ("1e5", False)])
+def test_a_mass_that_lags_is_not_kinematic(tmp_path, monkeypatch, mass, kinematic):
+    robot = vehicle()._replace(kv=1e6)
+    task = task_of(robot._replace(xml=robot.xml | {"mass": mass}), tmp_path, monkeypatch)
+    assert task.kinematic == task.chart_is_state == kinematic
+
+
+def test_a_saturated_servo_is_no_direct_one(tmp_path, monkeypatch):
+    weak = task_of(vehicle()._replace(kv=1e6, servo='forcerange="-5 5"'), tmp_path, monkeypatch)
+    assert not begins_anew(weak)
+    strong = vehicle()._replace(kv=1e6, servo='forcerange="-1e9 1e9"')
+    task = task_of(strong, tmp_path, monkeypatch)
+    assert "the forcerange of actuator u" in why_no_cells(task, Grid.with_cells(task.chart, 60))
+
+
+@pytest.mark.parametrize(
+    ("code", "bad"),
+    [
+        ("np.sqrt(x - 2.5) >= -1", "x < 2.5"),
+        ("np.log(x - 2.5) >= -99", "x < 2.5"),
+        ("np.arcsin(x) >= -9", "x > 1"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:invalid value", "ignore:divide by zero")
+def test_an_end_by_nan_is_not_proved(tmp_path, monkeypatch, code, bad):
+    from hyrl_mj.proof.cells import Cells
+
+    crash = f"ends[~({code}) & (x > 0.5)] = Outcome.CRASHED"
+    task = task_of(ends(vehicle(), crash), tmp_path, monkeypatch)
+    cells = Cells.of(Lattice.of(task, Grid.with_cells(task.chart, 60)))
+    x = cells.middle(np.arange(cells.nodes))[:, 0]
+    assert cells.failed[(x > 0.6) & eval(bad)].all()
+
+
+@pytest.mark.parametrize("turns", [-3, -2, 2])
+@pytest.mark.parametrize("wide", [1e-4, 1.0])
+def test_an_end_beyond_some_turns_is_told(tmp_path, monkeypatch, turns, wide):
+    place = 2 * np.pi * turns + 1
+    code = f"ends[np.abs(theta - {place}) < {wide}] = Outcome.CRASHED"
+    task = task_of(ends(dial(), code), tmp_path, monkeypatch)
+    why = why_no_cells(task, Grid.with_cells(task.chart, 600))
+    assert "the method ending" in why
+    assert "tells whole turns of theta apart" in why
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "ends[np.cos(3 * theta) > 2] = Outcome.CRASHED",
+        "ends[np.remainder(theta + 0.3, 2 * np.pi) > 9] = Outcome.CRASHED",
+        "ends[self.chart.wrap(measured)[:, 0] < -1] = Outcome.CRASHED",
+        "ends[np.abs(self.chart.difference(measured, self.set_point))[:, 0] > 9] = Outcome.CRASHED",
+    ],
+)
+def test_code_that_is_the_same_for_all_turns_is_covered(tmp_path, monkeypatch, code):
+    task = task_of(ends(dial(), code), tmp_path, monkeypatch)
+    assert why_no_cells(task, Grid.with_cells(task.chart, 600)) is None
+
+
+@pytest.mark.parametrize(
+    ("sensor", "says"),
+    [
+        (
+            'interval="0.2" nsample="3"',
+            r"sensor \(0\) of trapped_\d+_\d+ holds its value for 0.2 s",
+        ),
+        ('delay="0.1" nsample="4"', "is 0.1 s late, and the true state is taken from the sensors"),
+        ('cutoff="2"', "is measured as x = 2 m"),
+    ],
+)
+def test_a_sensor_that_does_not_tell_the_position_is_refused(tmp_path, monkeypatch, sensor, says):
+    task = task_of(vehicle()._replace(sensor=sensor), tmp_path, monkeypatch)
+    with pytest.raises(BadInput, match=says):
+        check_task(task)
+
+
+def test_starts_outside_of_their_box_are_refused(tmp_path, monkeypatch):
+    code = "\n    def starts(self, n, rng):\n        return rng.uniform((0.0, -1.0), (0.41, 1.0), (n, 2))\n"
+    task = task_of(methods(vehicle(), code), tmp_path, monkeypatch)
+    with pytest.raises(
+        BadInput, match=r"of 4,000 starts that starts\(\) draws lie outside of its box, as"
+    ):
+        check_task(task)
+
+
+@pytest.mark.parametrize("radius", [0.4, 0.05])
+def test_a_mirror_that_a_second_obstacle_breaks_is_refused(tmp_path, monkeypatch, radius):
+    second = f"ends[(x - 2.4) ** 2 + (y - 0.8) ** 2 <= {radius} ** 2] = Outcome.CRASHED"
+    scenery = vehicle().xml["scenery"]
+    scenery += (
+        f'<geom name="obstacle_b" size="{radius}" pos="2.4 0.8 0" contype="0" conaffinity="0"/>'
+    )
+    robot = ends(vehicle(), second)
+    robot = Robot(**robot._asdict())._replace(
+        xml=robot.xml | {"scenery": scenery}, py=robot.py | {"mirror": "Mirror((1, -1), (-1,))"}
+    )
+    task = task_of(robot, tmp_path, monkeypatch)
+    with pytest.raises(
+        BadInput, match=r"mirror is no symmetry of it: x = .*\((running|crashed), reward"
+    ):
+        check_task(task)
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "\n    def outcome(self, measurement, unstable):\n        return self.ending(measurement)\n",
+        "\n    def at(self, z):\n        return z + 1\n",
+        "\n    def with_z(self, measured, z):\n        return z + 1\n",
+    ],
+)
+def test_a_method_that_a_proof_takes_for_the_default_must_be_it(tmp_path, monkeypatch, code):
+    task = task_of(methods(vehicle(), code), tmp_path, monkeypatch)
+    name = code.split("def ")[1].split("(")[0]
+    with pytest.raises(Unbounded, match=rf"methods of its own \({name}\)"):
+        check_assumptions(task)
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "self.count = self.count + 1\n        ends[(self.count > 5) & (x > 1)] = Outcome.CRASHED",
+        "ends[(x > 1) & (y >= y.max() - 0.1)] = Outcome.CRASHED",
+    ],
+)
+def test_an_end_with_a_memory_is_refused(tmp_path, monkeypatch, code):
+    task = task_of(ends(vehicle(), code), tmp_path, monkeypatch)
+    with pytest.raises(
+        BadInput, match=r"gives \d and then \d for the same row|change its attribute count"
+    ):
+        check_task(task)
+
+
+def test_a_callback_is_a_memory(vehicle):
+    from hyrl_mj import memory
+
+    assert memory.remembers(vehicle.model) == ""
+    try:
+        mujoco.set_mjcb_passive(lambda model, data: None)
+        assert "callback" in memory.remembers(vehicle.model)
+    finally:
+        mujoco.set_mjcb_passive(None)
+
+
+def test_hops_between_the_nodes_count(vehicle, monkeypatch):
+    """A plant that moves some states farther, but no node."""
+    from hyrl_mj.proof import cells as module
+
+    lattice = Lattice.of(vehicle, Grid.with_cells(vehicle.chart, 60))
+    plant = type(vehicle.plant(1))
+    stepped = plant.step
+
+    def step(self, u, ids=None):
+        stepped(self, u, ids)
+        z = self.qpos
+        z[:, 1] += 1e-3 * ((z[:, 0] > 1.001) & (z[:, 0] < 1.024))
+        self._qpos[:] = z
+
+    monkeypatch.setattr(plant, "step", step)
+    with pytest.raises(Unbounded, match="does not move all states alike"):
+        module.Cells.of(replace(lattice))
