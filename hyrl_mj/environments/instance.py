@@ -189,6 +189,12 @@ def _through(get: Callable[[Any], Any], own: Callable[[], Any]) -> Any:
     return get(result[0] if isinstance(result, tuple) else result)
 
 
+def _global_state() -> tuple[Any, ...]:
+    """Returns how far the global generators of NumPy and Python are."""
+    numpy_state: Any = np.random.get_state()
+    return numpy_state[2], random.getstate()
+
+
 class Instance:
     """An environment that plays episodes, one at a time.
 
@@ -256,6 +262,23 @@ class Instance:
             self.pin()
         return observation
 
+    def put(self, state: np.ndarray, seed: int | None = None) -> np.ndarray:
+        """Resets the environment and puts it to a state of MuJoCo (S,); returns what it observes there (o,).
+
+        Wrappers see the start as the first observation, as if the reset of the innermost environment had led
+        there.
+        """
+        space = self.env.observation_space
+        if self._chain is None:
+            self.reset(seed)
+            self.physics.write(state)
+            return flat(self.watched(), space)
+        self.start = state
+        try:
+            return flat(self.reset(seed), space)
+        finally:
+            self.start = None
+
     def drawn(self, rng: np.random.Generator) -> np.ndarray:
         """Returns inputs (m,) at random."""
         space: Any = self.env.action_space
@@ -279,8 +302,9 @@ class Instance:
                     raise BadInput(f"pinned {name} is {value}: give one number")
                 values[int(i)] = value
                 continue
-            old = getattr(self.inner, name, None)
-            if old is None or isinstance(old, str) or np.shape(old) != np.shape(value):
+            old: Any = getattr(self.inner, name, None)
+            numbers = isinstance(old, bool | int | float | list | tuple | np.ndarray | np.generic)
+            if not numbers or np.shape(old) != np.shape(value):
                 raise BadInput(
                     f"{self.name} has no attribute {name} of shape {np.shape(value)} to pin: name a "
                     "position as qpos[2], or an attribute"
@@ -471,9 +495,9 @@ class Instance:
     @contextmanager
     def undrawn(self) -> Iterator[None]:
         """Raises `BadInput` after steps that draw from a global generator of random numbers."""
-        before = np.random.get_state()[2], random.getstate()
+        before = _global_state()
         yield
-        if (np.random.get_state()[2], random.getstate()) != before:
+        if _global_state() != before:
             self._drawn("a global generator")
 
     def _drawn(self, name: str) -> None:

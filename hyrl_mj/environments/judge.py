@@ -55,23 +55,14 @@ class Real:
 
     def _reset(self, start: np.ndarray) -> tuple[Instance, np.ndarray]:
         """Returns an environment at a start (S,), and what it observes there (o,)."""
-        instance = self._instance or Instance(self._recipe)
-        self._instance = instance
-        space = instance.env.observation_space
+        instance = self._instance = self._instance or Instance(self._recipe)
         instance.reset()
         try:
             instance.mark()
         except Worn:
             self._instance = None
             return self._reset(start)
-        if instance.env is instance.inner:
-            instance.physics.write(start)
-            return instance, flat(instance.watched(), space)
-        # Wrappers see the start as the first observation, as if reset() had led there.
-        instance.start = start
-        observation = instance.reset()
-        instance.start = None
-        return instance, flat(observation, space)
+        return instance, instance.put(start)
 
     def _check(self, run: Played) -> None:
         instance, seen = self._reset(run.start)

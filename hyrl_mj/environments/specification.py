@@ -73,6 +73,11 @@ class Criterion:
         failure = terminated & ~success
         if self.failure is not None:
             failure = self.failure.holds(self._values(report))
+            if (success & failure).any():
+                raise BadInput(
+                    f"at the same sample it is a success ({self.success.text}) and a failure "
+                    f"({self.failure.text}): let one of the conditions exclude the other"
+                )
         reached = success & (terminated | truncated | self.ends)
         return np.select(
             [failure, reached, terminated | truncated],

@@ -80,15 +80,15 @@ def drawn(instance: Instance, states: np.ndarray, robot: np.ndarray) -> list[str
     names = [name for name, v in zip(names_of_state(model), varies, strict=True) if v]
     told, attributes = [], []
     for _ in range(2):  # what outlasts a reset is not drawn by it
-        instance.reset(0)
+        instance.put(states[0], 0)
         attributes.append(instance.remembered())
-        _told(instance, states[0])
+        _told(instance)
     lasting, attributes = set(differing(*attributes)), []
     for seed in range(COMPARED):
         one = Instance(instance.recipe) if lasting else instance
-        one.reset(seed)
+        one.put(states[0], seed)
         attributes.append(one.remembered())
-        told.append(_told(one, states[0]))
+        told.append(_told(one))
     changed = {n: None for other in attributes[1:] for n in differing(attributes[0], other)}
     of_model = [n for n in changed if n.endswith(" of its model") and n not in lasting]
     scale = max(float(np.abs(told[0]).max(initial=0.0)), 1.0)
@@ -121,10 +121,9 @@ def _bodies_of_qpos(model: mujoco.MjModel) -> np.ndarray:
     return np.repeat(model.jnt_bodyid, ends - model.jnt_qposadr)
 
 
-def _told(instance: Instance, state: np.ndarray) -> np.ndarray:
-    """Returns what an instance tells after a reset, put to a state (S,), over some samples."""
+def _told(instance: Instance) -> np.ndarray:
+    """Returns what an instance tells over some samples."""
     rng, told = np.random.default_rng(0), []
-    instance.physics.write(state)
     for _ in range(SAMPLES):
         observation, reward, terminated, truncated, _ = instance.stepped(instance.drawn(rng))
         told.append([*flat(observation, instance.env.observation_space), reward, terminated])
