@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 
 from traps import draws
-from traps.kinds import Planted, beacon, limited, scaled
+from traps.kinds import ALONE, Planted, beacon, limited, scaled
 from traps.memories import planted
 
 
@@ -47,11 +47,10 @@ def _fresh_fields(rng, plan):
 
 
 def _timed(rng, plan):
-    if plan.turns:
-        return Planted()
-    return Planted(
-        (draws.Timed,), plan={"beacon": beacon(plan, rng), "scan": True, "forward": True}
-    )
+    if plan.kind not in ALONE:
+        return Planted(plan={"forward": True})
+    change = {"beacon": beacon(plan, rng), "scan": True, "forward": True}
+    return Planted((draws.Timed,), plan=change)
 
 
 def _scaled_observation(rng, plan):

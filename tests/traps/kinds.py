@@ -15,7 +15,7 @@ from traps.storages import HIDDEN, VISIBLE
 
 PUCKS = ("slides", "free", "cart", "door")
 DRIVEN = ("slides", "cart", "door")
-BESIDE = ("cart", "door")
+ALONE, BESIDE = ("slides", "free"), ("cart", "door")
 ALL = (*PUCKS, "hinge")
 
 
@@ -245,8 +245,8 @@ def _(rng, plan):
 
 @trap("own clock")
 def _(rng, plan):
-    kinds = ("wind", "wall") if plan.turns else ("wind", "wall", "beacon", "beacon")
-    kind = _one(rng, *kinds)
+    kinds = ("beacon", "beacon") if plan.kind in ALONE else ()
+    kind = _one(rng, "wind", "wall", *kinds)
     change = {"beacon": beacon(plan, rng)} if kind == "beacon" else {}
     return Planted((planted(draws.Clock, clock=kind),), plan=change)
 
