@@ -19,6 +19,7 @@ from hyrl_mj.simulation.noise import (
     Signal,
     noise_kinds,
     register_noise,
+    drawn,
     signal_for,
 )
 from hyrl_mj.simulation.passing import Passing, windings
@@ -47,6 +48,7 @@ __all__ = [
     "policy_runs",
     "register_noise",
     "samples",
+    "drawn",
     "signal_for",
     "simulate",
     "simulate_batch",

@@ -7,7 +7,7 @@ import numpy as np
 from hyrl_mj.plant import Plant
 from hyrl_mj.policies import Controller, answer, nothing_past, remembering
 from hyrl_mj.progress import progress_bar
-from hyrl_mj.simulation.noise import NOT_STARTED, AnyNoise, Sample, signal_for
+from hyrl_mj.simulation.noise import NOT_STARTED, AnyNoise, Sample, drawn, signal_for
 from hyrl_mj.simulation.passing import Follower, Passing
 from hyrl_mj.tasks import Outcome, Task
 
@@ -114,7 +114,7 @@ def closed_loop(
         if not len(active):
             break
         now = Sample(np.arange(n), np.full(n, k), measurement, q, plant, past)
-        measured = measurement + signal.sample(now)
+        measured = measurement + drawn(signal, now)
         if k == 0 and (fresh := q == NOT_STARTED).any():
             q[fresh] = controller.initial_mode(measured[fresh])
             first_mode = q.copy()

@@ -189,6 +189,11 @@ class _Constant(Signal):
         super().__init__(float(np.abs(error).max(initial=0.0)), np.array(task.noisy, dtype=float))
         self._task, self._error = task, error
 
+    @property
+    def limits(self) -> np.ndarray:
+        """No limits: the errors are those of chart points, and a measurement may show them otherwise."""
+        return np.full(len(self.shares), np.inf)
+
     def sample(self, now: Sample) -> np.ndarray:
         task, true = self._task, now.measurement
         return np.asarray(task.with_z(true, task.z(true) + self._error[now.rows]) - true)
