@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hyrl_mj.plant import Plant
-from hyrl_mj.policies import Controller, answer, nothing_past, remembering
+from hyrl_mj.policies import Asked, Controller, nothing_past, remembering
 from hyrl_mj.progress import progress_bar
 from hyrl_mj.simulation.noise import NOT_STARTED, AnyNoise, Sample, drawn, signal_for
 from hyrl_mj.simulation.passing import Follower, Passing
@@ -88,7 +88,7 @@ def closed_loop(
         settings: duration, direction and what to record.
 
     Raises:
-        BadInput: the noise cannot be used.
+        BadInput: the noise cannot be used, or the controller has a memory or draws at random.
     """
     limit = task.max_steps if settings.steps is None else settings.steps
     backward, record, n = settings.backward, settings.record, len(z0)
@@ -97,7 +97,7 @@ def closed_loop(
     plant.set_state(*task.state(z0, rng_of_starts))
     signal = signal_for(noise, task, controller)
     signal.reset(n, np.random.default_rng(seed))
-    measurement = plant.measurement
+    ask, measurement = Asked(task, controller), plant.measurement
     past = nothing_past(controller, n, measurement.shape[1])
     q = np.full(n, NOT_STARTED) if q0 is None else np.asarray(q0, dtype=int).copy()
     outcome = np.full(n, Outcome.RUNNING) if backward else task.outcome(measurement, plant.unstable)
@@ -119,7 +119,7 @@ def closed_loop(
             q[fresh] = controller.initial_mode(measured[fresh])
             first_mode = q.copy()
         before, u = q.copy(), np.full((n, len(task.inputs)), np.nan)
-        u[active], q[active] = answer(controller, q[active], measured[active], past[active])
+        u[active], q[active] = ask(k, q[active], measured[active], past[active])
         past = remembering(past, measured)
         (plant.step_backward if backward else plant.step)(u[active], active)
         measurement, last, lost = plant.measurement, measurement, plant.unstable
@@ -134,6 +134,7 @@ def closed_loop(
             for name, values in zip(shapes, (before, q.copy(), measured, u), strict=True):
                 kept[name].append(values)
             states.append(np.where(lost[:, None], states[-1], plant.state))
+    ask.again()
     if not backward:
         late = outcome == Outcome.RUNNING
         outcome[late] = task.verdict(measurement[late])
