@@ -152,7 +152,10 @@ def jumping(self, now):
     [
         (gaussian, r"in column 1 of the measurement, where at most 0\.1 in magnitude is allowed"),
         (lambda self, now: np.full(now.measurement.shape, 0.1), "in column 0 .* where none is"),
-        (lambda self, now: np.full(len(now.rows), 0.1), r"float64 of shape \(60,\), where \(60, 2\)"),
+        (
+            lambda self, now: np.full(len(now.rows), 0.1),
+            r"float64 of shape \(60,\), where \(60, 2\)",
+        ),
         (lambda self, now: 0.0, r"of shape \(\)"),
         (lambda self, now: None, r"object of shape \(\)"),
         (lambda self, now: np.zeros(now.measurement.shape, int), "gives int64 of shape"),
@@ -170,11 +173,14 @@ def test_each_sample_of_a_noise_is_checked(sample, message, vehicle, monkeypatch
         closed_loop(vehicle, loop, z0, Noise("given", 0.1))
     assert len(str(caught.value).splitlines()) == 1
     with pytest.raises(BadInput, match=message.replace("60", "1")):  # also where an agent acts
-        env = gym.make(vehicle.env_id, noise=Noise("given", 0.1))
-        for seed in range(5):
-            env.reset(seed=seed)
-            for _ in range(15):
-                env.step(2)
+        _episodes(gym.make(vehicle.env_id, noise=Noise("given", 0.1)))
+
+
+def _episodes(env):
+    for seed in range(5):
+        env.reset(seed=seed)
+        for _ in range(15):
+            env.step(2)
 
 
 def wider(self, bound, shares):

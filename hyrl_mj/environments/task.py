@@ -349,6 +349,13 @@ class EnvironmentTask(Task):
         return {key: spaces.flatdim(part) for key, part in sorted(space.spaces.items())}
 
     @cached_property
+    def observation_dtype(self) -> str:  # type: ignore[override]
+        space = self.host.env.observation_space
+        parts = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
+        types = {str(part.dtype) for part in parts}
+        return types.pop() if len(types) == 1 else ""
+
+    @cached_property
     def observation_low(self) -> tuple[float, ...]:  # type: ignore[override]
         return tuple(self._flat_limits("low"))
 

@@ -21,8 +21,21 @@ from hyrl_mj.policies.mlp import (
     SampledPolicy,
 )
 from hyrl_mj.policies.onnx_model import from_onnx
-from hyrl_mj.policies.preprocessing import UNCHANGED, PreprocessedPolicy, Preprocessing, network
-from hyrl_mj.policies.sb3_zip import REMEDY, by_frames, from_tensors, observes_dict, read_zip
+from hyrl_mj.policies.preprocessing import (
+    NONE,
+    UNCHANGED,
+    PreprocessedPolicy,
+    Preprocessing,
+    network,
+)
+from hyrl_mj.policies.sb3_zip import (
+    REMEDY,
+    by_frames,
+    from_tensors,
+    observed_parts,
+    observes_dict,
+    read_zip,
+)
 from hyrl_mj.tasks import Task
 
 
@@ -158,7 +171,7 @@ def load_agent(
             SAC). Such a policy is reproducible call by call only.
         seed: the seed of these draws.
         vecnormalize: an npz file with the statistics of the `VecNormalize` of its training: arrays mean,
-            var, clip, and epsilon.
+            var, clip, and epsilon; or "none" if it saw plain observations. By default the zip has to tell.
         n_stack: the number of observations that it sees at once, if it was trained under `VecFrameStack`.
             Its `act` is then the steady answer; in closed loops it acts with its memory.
 
@@ -192,26 +205,47 @@ def _load(
             raise BadInput("an .onnx file acts as it is: give neither an activation nor stochastic")
         policy = from_onnx(path, task, REMEDY, n_stack)
     else:
-        mlp, preprocessing = _load_network(path, task, activation, preprocessing)
+        plain = str(vecnormalize) == NONE
+        mlp, preprocessing = _load_network(path, task, activation, preprocessing, plain)
         policy = SampledPolicy(mlp, np.random.default_rng(seed)) if stochastic else mlp
     return PreprocessedPolicy(policy, preprocessing) if preprocessing else policy
 
 
 def _load_network(
-    path: Path, task: Task, activation: str | None, preprocessing: Preprocessing
+    path: Path, task: Task, activation: str | None, preprocessing: Preprocessing, plain: bool
 ) -> tuple[MlpPolicy, Preprocessing]:
     """Returns the network in a zip or a `.safetensors` file, and its preprocessing, frame by frame."""
     if path.suffix != ".safetensors":
         with artifacts.reading(path, REMEDY):
             tensors, about = read_zip(path)
-            policy = from_tensors(tensors, about, task, activation, preprocessing)
-        if observes_dict(about):
-            preprocessing = preprocessing.reordered(by_frames(task, preprocessing.n_stack))
+            policy = from_tensors(tensors, about, task, activation, preprocessing, plain)
+            if observes_dict(about):
+                preprocessing = _framewise(preprocessing, task, list(observed_parts(about)))
         return policy, preprocessing
     policy = MlpPolicy.load(path, task, preprocessing.n_stack)
     if activation not in (None, policy.activation):
         raise BadArtifact(f"{path} has activation {policy.activation!r}: leave activation out")
     return policy, preprocessing
+
+
+def _framewise(preprocessing: Preprocessing, task: Task, keys: list[str]) -> Preprocessing:
+    """Returns the preprocessing of an agent of a Dict with `keys` for the task's order, frame by frame.
+
+    Raises:
+        BadArtifact: its statistics are in an order that is not known.
+    """
+    if preprocessing.normalization is None:
+        return preprocessing
+    if preprocessing.normalization.by_key:
+        keys = list(task.observation_parts)
+    elif keys != sorted(keys):
+        raise BadArtifact(
+            f"its Dict has the keys {', '.join(keys)}, which are not sorted, so that a row of statistics may "
+            "be in one order or the other: give arrays mean.KEY and var.KEY for each of them"
+        )
+    for n in {1, preprocessing.n_stack}:
+        preprocessing = preprocessing.reordered(by_frames(task, n, keys))
+    return preprocessing
 
 
 def read_agent(
@@ -247,8 +281,8 @@ def read_agent(
     if isinstance(policy, Policy) and network(policy) is not None:
         return _network(policy, task)
     function = policy if isinstance(policy, Policy) else from_callable(policy, task)
+    check_memoryless(function, task)
     agent = Agent(FUNCTION, "", _fingerprint(function, task))
-    check_memoryless(function, task, "the function")
     return ExternalAgent(function, _seeing(agent, function))
 
 
@@ -318,12 +352,4 @@ def _fingerprint(policy: Policy, task: Task) -> str:
     plant.set_state(*task.state(task.starts(PROBES, rng), rng))
     measured = plant.measurement
     first = np.asarray(policy.act(measured))
-    shape = (PROBES, len(task.inputs))
-    if first.shape != shape or not np.issubdtype(first.dtype, np.number):
-        raise BadInput(
-            f"the policy gives {first.dtype} of shape {first.shape} for {PROBES} measurements, "
-            f"{task.name} takes inputs of shape {shape}"
-        )
-    if not np.isfinite(first).all():
-        raise BadInput(f"the policy gives inputs that are not finite: {task.name} takes numbers")
     return sha256((np.round(first.astype(float), DECIMALS) + 0.0).tobytes()).hexdigest()

@@ -12,17 +12,19 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hyrl_mj.errors import BadInput
+from hyrl_mj.errors import BadInput, brief
 from hyrl_mj.policies.controllers import Controller, PolicyController, answer
 from hyrl_mj.policies.mlp import Policy, SampledPolicy
 from hyrl_mj.policies.preprocessing import PreprocessedPolicy, as_function
 from hyrl_mj.tasks import Outcome, Task
 
-# The trial of an agent: runs side by side, samples of them, and measurements that it is asked about one by one.
-RUNS, SAMPLES, ALONE = 8, 64, 256
-# Runs whose measurements a closed loop asks about again; it does after 1, 4, 16, ... samples and at its end.
-KEPT, FACTOR = 8, 4
-# Sums of 256 numbers in another order differ by some 16 roundings of float32, and a network has a few of them.
+# The trial of an agent: runs side by side, half of them by random inputs that are held for so many samples;
+# their samples; and measurements that it is asked about one by one. Of what takes a call a batch, some do.
+RUNS, HELD, SAMPLES, ALONE, SOME = 16, 8, 64, 128, 4
+# A closed loop asks again about its samples 0, 1, 4, 16, ...; with more runs than a few, which take longer, about
+# the first two. Of so many runs it asks about all these samples at once.
+FACTOR, FEW, KEPT = 4, 256, 8
+# Sums of 256 numbers in another order differ by some 16 roundings of float32; a network has a few of them.
 ROUNDING = 32 * float(np.finfo(np.float32).eps)
 # A difference larger than that is a rounding, too, where the answer changes as much over a rounding of the
 # measurement. So many measurements that far apart are asked about, for so many of the largest differences.
@@ -43,8 +45,9 @@ def draws(policy: object) -> bool:
 def check_memoryless(policy: Policy, task: Task, name: str = "the policy") -> None:
     """Tries whether a policy is a function of the measurement, where it would act.
 
-    It acts in a few runs without noise, and is then asked about the measurements of these runs again: in the
-    same batches, later first; in one batch, and in another order; one by one, hundreds of times, in an array
+    It acts in a few runs without noise, and watches as many that random inputs drive elsewhere. It is then
+    asked about their measurements again: in the same batches, later first, and with only the first row in its
+    place; in one batch, and in another order; in a few rows, and one by one, many times, in an array
     that is used again; and once more in the first batches. Of a policy that draws its inputs, or sees several
     observations, this is about `as_function` of it.
 
@@ -76,24 +79,27 @@ class _Trial:
             self._again(k, "asked again later")
         rows, rng = np.concatenate(self.batches), np.random.default_rng(1)
         first = np.concatenate(self.answers)
-        for order in (np.arange(len(rows)), rng.permutation(len(rows))):
-            words = f"asked in a batch of {len(rows)}"
-            self._compare(rows, first, order, self._ask(rows[order]), words)
-        several = np.array_split(rng.permutation(len(rows)), max(len(rows) // 3, 1))
-        for some in several[: SAMPLES // 4]:
-            self._compare(rows, first, some, self._ask(rows[some]), f"asked in a batch of {len(some)}")
+        whole = np.arange(len(rows))
+        ends = np.cumsum([len(batch) for batch in self.batches])
+        orders = [whole, rng.permutation(whole)]
+        orders += np.array_split(rng.permutation(whole), max(len(rows) // 3, 1))[: SAMPLES // SOME]
+        for batch, end in zip(self.batches[::SOME], ends[::SOME], strict=True):
+            others = rng.choice(whole, len(batch) - 1)
+            orders.append(np.append(end - len(batch), others))
+        for order in orders:
+            self._compare(rows, first, order, self._ask(rows[order]), f"in a batch of {len(order)}")
         one = np.empty((1, rows.shape[1]))
         for i in rng.permutation(len(rows))[:ALONE]:
             one[:] = rows[i]
-            self._compare(rows, first, np.array([i]), self._ask(one), "asked alone")
-        for k in range(len(self.batches)):
+            self._compare(rows, first, np.array([i]), self._ask(one), "alone")
+        for k in range(0, len(self.batches), SOME):
             self._again(k, f"asked again after {len(rows)} others")
 
     def _act(self) -> None:
         """Acts in runs from the start distribution; what has ended begins anew once all have."""
         task, rng = self.task, np.random.default_rng(0)
         plant, active = task.plant(RUNS), np.zeros(0, dtype=int)
-        for _ in range(SAMPLES):
+        for k in range(SAMPLES):
             measured = plant.measurement
             if len(active):
                 outcome = task.outcome(measured, plant.unstable)[active]
@@ -103,22 +109,35 @@ class _Trial:
                 measured, active = plant.measurement, np.arange(RUNS)
             self.batches.append(measured[active])
             self.answers.append(self._ask(self.batches[-1]))
+            if k % HELD == 0:
+                low, high = task.input_limits
+                drawn = rng.uniform(low, high, (RUNS, len(low)))
+            mine = (active < RUNS // 2)[:, None]
             try:
-                plant.step(self.answers[-1], active)
+                plant.step(np.where(mine, self.answers[-1], drawn[active]), active)
             except BadInput:  # inputs beyond the limits are named where a run is really made
                 active = active[:0]
 
     def _ask(self, measured: np.ndarray) -> np.ndarray:
         """Returns a copy of the answers (n, m) to measurements (n, p)."""
-        given = measured.copy()
-        u = np.asarray(self.policy.act(given))
+        kept = measured.copy()
+        try:
+            u = np.asarray(self.policy.act(measured))
+        except BadInput:
+            raise
+        except Exception as error:  # a user's code can raise anything
+            raise BadInput(f"{self.name} cannot be used: it raised {brief(error)}") from error
         shape = (len(measured), len(self.task.inputs))
-        if u.shape != shape or u.dtype.kind not in "iuf" or not np.isfinite(u).all():
+        if u.shape != shape or u.dtype.kind not in "iuf":
             raise BadInput(
                 f"{self.name} gives {u.dtype} of shape {u.shape} for {shape[0]} measurements, "
-                f"{self.task.name} takes finite inputs of shape {shape}"
+                f"{self.task.name} takes inputs of shape {shape}"
             )
-        if not np.array_equal(given, measured):
+        if not np.isfinite(u).all():
+            raise BadInput(
+                f"{self.name} gives inputs that are not finite: {self.task.name} takes numbers"
+            )
+        if not np.array_equal(kept, measured):
             raise BadInput(
                 f"{self.name} changes the measurements that it is given: let it work on a copy"
             )
@@ -187,7 +206,7 @@ def _row(values: np.ndarray) -> str:
 
 @dataclass
 class Asked:
-    """A controller in a closed loop, which is asked again about what it has answered.
+    """A controller in a closed loop, which at its end is asked again about some of what it has answered.
 
     Attributes:
         task: the task.
@@ -197,33 +216,40 @@ class Asked:
     task: Task
     controller: Controller
     _kept: list[tuple[np.ndarray, ...]] = field(default_factory=list)
-    _next: int = 1
+    _next: int = 0
 
     def __call__(
         self, k: int, q: np.ndarray, measured: np.ndarray, past: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns inputs (n, m) and next modes (n,) at sample k of runs, as `answer`.
-
-        Raises:
-            BadInput: it answers otherwise than before.
-        """
+        """Returns inputs (n, m) and next modes (n,) at sample k of runs, as `answer`."""
         u, after = answer(self.controller, q, measured, past)
-        if k in (0, self._next):
-            asked = (q, measured, past, np.column_stack([u, after]))
-            self._kept.append(tuple(values[:KEPT].copy() for values in asked))
-        if k == self._next:
-            self.again()
-            self._next *= FACTOR
+        if k == self._next and (k < 2 or len(measured) <= FEW):
+            rows = (q, measured, past, np.column_stack([u, after]))
+            self._kept.append(tuple(values.copy() for values in rows))
+            self._next = max(FACTOR * k, 1)
         return u, after
 
     def again(self) -> None:
-        """Asks about the first measurements again; raises `BadInput` if an answer is another one."""
+        """Asks about these measurements again, later ones first, and about a few of each at once.
+
+        Raises:
+            BadInput: an answer is another one.
+        """
         controller = self.controller
         if isinstance(controller, PolicyController) and draws(controller.policy):
             return
+        low, high = self.task.input_limits
+        span = np.zeros_like(low) if self.task.input_levels is not None else high - low
+        margin, name, words = ROUNDING * np.append(span, 0.0), "the controller", "asked again later"
+        if isinstance(controller, PolicyController):
+            name = getattr(controller.policy, "name", "the policy")
+        for q, measured, past, first in reversed(self._kept):
+            again = np.column_stack(answer(controller, q, measured, past))
+            compare(name, measured, first, again, margin, words)
         if not self._kept:
             return
-        q, measured, past, first = map(np.concatenate, zip(*self._kept, strict=True))
+        few = ([values[:KEPT] for values in batch] for batch in self._kept)
+        q, measured, past, first = map(np.concatenate, zip(*few, strict=True))
 
         def ask(rows: np.ndarray, shift: np.ndarray) -> np.ndarray:
             moved = measured[rows] + shift
@@ -235,10 +261,4 @@ class Asked:
             )
 
         again = np.column_stack(answer(controller, q, measured, past))
-        low, high = self.task.input_limits
-        span = np.zeros_like(low) if self.task.input_levels is not None else high - low
-        name = "the controller"
-        if isinstance(controller, PolicyController):
-            name = getattr(controller.policy, "name", "the policy")
-        words = "asked again later in the run"
-        compare(name, measured, first, again, ROUNDING * np.append(span, 0.0), words, ask)
+        compare(name, measured, first, again, margin, f"in a batch of {len(q)}", ask)

@@ -17,9 +17,9 @@ from hyrl_mj.simulation.noise import (
     Recorded,
     Sample,
     Signal,
+    drawn,
     noise_kinds,
     register_noise,
-    drawn,
     signal_for,
 )
 from hyrl_mj.simulation.passing import Passing, windings
@@ -44,11 +44,11 @@ __all__ = [
     "Signal",
     "WayRuns",
     "closed_loop",
+    "drawn",
     "noise_kinds",
     "policy_runs",
     "register_noise",
     "samples",
-    "drawn",
     "signal_for",
     "simulate",
     "simulate_batch",

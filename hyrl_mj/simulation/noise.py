@@ -314,11 +314,13 @@ def _limits(signal: Signal) -> np.ndarray:
         return np.asarray(signal.limits, dtype=float)
     except (AttributeError, TypeError, ValueError):
         raise BadInput(
-            f"{signal.kind} noise has no bound and shares: call super().__init__(bound, shares) where it is made"
+            f"{signal.kind} noise has no bound and shares: call super().__init__(bound, shares) in its __init__"
         ) from None
 
 
-def _within(noise: np.ndarray, limits: np.ndarray, measured: np.ndarray | None = None) -> np.ndarray:
+def _within(
+    noise: np.ndarray, limits: np.ndarray, measured: np.ndarray | None = None
+) -> np.ndarray:
     """Returns whether noise (..., p) is finite and within limits (p,), but for rounding, of each number."""
     largest = np.abs(noise)
     within = largest <= limits

@@ -59,6 +59,7 @@ class Section(Task):
     colour_of, tinted = _of_whole("colour_of"), _of_whole("tinted")
     slow, spec, chart_is_state = _of_whole("slow"), _of_whole("spec"), _of_whole("chart_is_state")
     observation_parts, arrival_ends = _of_whole("observation_parts"), _of_whole("arrival_ends")
+    observation_dtype = _of_whole("observation_dtype")
     stopped_by_walls = _of_whole("stopped_by_walls")
     ending, verdict = _of_whole("ending"), _of_whole("verdict")
 
