@@ -38,14 +38,22 @@ def test_who_answers_otherwise_is_refused_with_both_answers(trap, name):
         read_agent(task, TRAPS[trap](steering(task), task))
 
 
-@pytest.mark.parametrize(
-    "trap", ["holds_six", "filters", "delays", "draws", "normalises_running", "counts"]
-)
+def turning(observation):
+    """An agent of the vehicle whose answer changes as it drives."""
+    return np.rint(2 + 2 * np.sin(5 * observation.sum(axis=1))).astype(int)
+
+
+IN_LOOPS = ("holds_six", "filters", "delays", "draws", "normalises_running", "counts")
+
+
+@pytest.mark.parametrize("trap", IN_LOOPS)
 @pytest.mark.parametrize("starts", [1, 20])
 def test_a_closed_loop_notices_it_too(trap, starts, vehicle):
-    """From one start, and without a trial before; one that changes after 50 calls at the end of a run."""
-    z0 = vehicle.starts(starts, np.random.default_rng(0))
-    agent = hyrl_mj.from_callable(TRAPS[trap](steering(vehicle), vehicle), vehicle)
+    """From one start, too, and without a trial before."""
+    z0 = np.random.default_rng(0).uniform((0, 0.3), (0.2, 0.4), (starts, 2))
+    late = {"calls": 20} if trap == "counts" else {}
+    simulate(vehicle, hyrl_mj.from_callable(turning, vehicle), z0, Noise("uniform", 0.1))
+    agent = hyrl_mj.from_callable(TRAPS[trap](turning, vehicle, **late), vehicle)
     with pytest.raises(
         BadInput, match=r"the function answers .* and, (asked again later|in a batch)"
     ):
@@ -79,7 +87,7 @@ class Plain:
     [
         ("input", "changes the measurements that it is given"),
         ("answer", "changes an answer that it gave before"),
-        ("shape", r"of shape \(16,\) for 16 measurements"),
+        ("shape", r"of shape \(256,\) for 256 measurements"),
         ("number", "not finite"),
         ("error", "raised LookupError"),
     ],

@@ -12,7 +12,7 @@ from hyrl_mj import artifacts
 from hyrl_mj.errors import BadArtifact, BadInput, check_seed, unknown
 from hyrl_mj.policies import algorithms
 from hyrl_mj.policies.functions import from_callable
-from hyrl_mj.policies.memoryless import check_memoryless
+from hyrl_mj.policies.memoryless import answers, check_memoryless
 from hyrl_mj.policies.mlp import (
     ACTIVATIONS,
     MlpPolicy,
@@ -281,8 +281,8 @@ def read_agent(
     if isinstance(policy, Policy) and network(policy) is not None:
         return _network(policy, task)
     function = policy if isinstance(policy, Policy) else from_callable(policy, task)
-    check_memoryless(function, task)
     agent = Agent(FUNCTION, "", _fingerprint(function, task))
+    check_memoryless(function, task)
     return ExternalAgent(function, _seeing(agent, function))
 
 
@@ -351,5 +351,5 @@ def _fingerprint(policy: Policy, task: Task) -> str:
     plant = task.plant(PROBES)
     plant.set_state(*task.state(task.starts(PROBES, rng), rng))
     measured = plant.measurement
-    first = np.asarray(policy.act(measured))
+    first = answers(policy, task, measured, "the policy")
     return sha256((np.round(first.astype(float), DECIMALS) + 0.0).tobytes()).hexdigest()

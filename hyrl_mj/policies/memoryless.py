@@ -21,8 +21,8 @@ from hyrl_mj.tasks import Outcome, Task
 # The trial of an agent: runs side by side, half of them by random inputs that are held for so many samples;
 # their samples; and measurements that it is asked about one by one. Of what takes a call a batch, some do.
 RUNS, HELD, SAMPLES, ALONE, SOME = 16, 8, 64, 128, 4
-# A closed loop asks again about its samples 0, 1, 4, 16, ...; with more runs than a few, which take longer, about
-# the first two. Of so many runs it asks about all these samples at once.
+# A closed loop asks again about its samples 0, 1, 4, 16, ...; with more runs than a few, which takes longer,
+# about the first two. Of so many runs it asks about all these samples at once.
 FACTOR, FEW, KEPT = 4, 256, 8
 # Sums of 256 numbers in another order differ by some 16 roundings of float32; a network has a few of them.
 ROUNDING = 32 * float(np.finfo(np.float32).eps)
@@ -55,6 +55,32 @@ def check_memoryless(policy: Policy, task: Task, name: str = "the policy") -> No
         BadInput: it answers a measurement otherwise than before, or changes an array that is not its own.
     """
     _Trial(as_function(policy), task, getattr(policy, "name", name)).run()
+
+
+def answers(policy: Policy, task: Task, measured: np.ndarray, name: str) -> np.ndarray:
+    """Returns what a policy answers to measurements (n, p), an array (n, m), which is the policy's own.
+
+    Raises:
+        BadInput: it raises an error, changes the measurements, or gives no finite inputs of that shape.
+    """
+    kept = measured.copy()
+    try:
+        u = np.asarray(policy.act(measured))
+    except BadInput:
+        raise
+    except Exception as error:  # a user's code can raise anything
+        raise BadInput(f"{name} cannot be used: it raised {brief(error)}") from error
+    if not np.array_equal(kept, measured):
+        raise BadInput(f"{name} changes the measurements that it is given: let it work on a copy")
+    shape = (len(measured), len(task.inputs))
+    if u.shape != shape or u.dtype.kind not in "iuf":
+        raise BadInput(
+            f"{name} gives {u.dtype} of shape {u.shape} for {shape[0]} measurements, {task.name} takes "
+            f"inputs of shape {shape}"
+        )
+    if not np.isfinite(u).all():
+        raise BadInput(f"{name} gives inputs that are not finite: {task.name} takes numbers")
+    return u
 
 
 class _Trial:
@@ -120,27 +146,7 @@ class _Trial:
 
     def _ask(self, measured: np.ndarray) -> np.ndarray:
         """Returns a copy of the answers (n, m) to measurements (n, p)."""
-        kept = measured.copy()
-        try:
-            u = np.asarray(self.policy.act(measured))
-        except BadInput:
-            raise
-        except Exception as error:  # a user's code can raise anything
-            raise BadInput(f"{self.name} cannot be used: it raised {brief(error)}") from error
-        shape = (len(measured), len(self.task.inputs))
-        if u.shape != shape or u.dtype.kind not in "iuf":
-            raise BadInput(
-                f"{self.name} gives {u.dtype} of shape {u.shape} for {shape[0]} measurements, "
-                f"{self.task.name} takes inputs of shape {shape}"
-            )
-        if not np.isfinite(u).all():
-            raise BadInput(
-                f"{self.name} gives inputs that are not finite: {self.task.name} takes numbers"
-            )
-        if not np.array_equal(kept, measured):
-            raise BadInput(
-                f"{self.name} changes the measurements that it is given: let it work on a copy"
-            )
+        u = answers(self.policy, self.task, measured, self.name)
         latest, copy = self._before
         if not np.array_equal(latest, copy):
             raise BadInput(
@@ -185,9 +191,10 @@ def compare(
         BadInput: they differ by more.
     """
     off = np.abs(again - first) - margin
-    doubtful = np.argsort(-off.max(axis=1))[:DOUBTS] if (off > 0).any() else []
-    for i in doubtful:
-        if ask is not None and (off[i] > 0).any():
+    if not (off > 0).any():
+        return
+    for i in np.argsort(-off.max(axis=1))[:DOUBTS]:
+        if ask is not None:
             size = np.maximum(np.abs(rows[i]), np.abs(rows).max(axis=0) * ROUNDING)
             signs = np.random.default_rng(0).uniform(-1, 1, (SHIFTS, len(size)))
             shifts = np.vstack([np.zeros_like(size), ROUNDING * size * signs])

@@ -314,7 +314,7 @@ def _limits(signal: Signal) -> np.ndarray:
         return np.asarray(signal.limits, dtype=float)
     except (AttributeError, TypeError, ValueError):
         raise BadInput(
-            f"{signal.kind} noise has no bound and shares: call super().__init__(bound, shares) in its __init__"
+            f"{signal.kind} noise has no bound and shares: call super().__init__(bound, shares) when made"
         ) from None
 
 
