@@ -30,7 +30,7 @@ from hyrl_mj.policies.preprocessing import (
 )
 from hyrl_mj.policies.sb3_zip import (
     REMEDY,
-    by_frames,
+    framewise,
     from_tensors,
     observed_parts,
     observes_dict,
@@ -220,32 +220,12 @@ def _load_network(
             tensors, about = read_zip(path)
             policy = from_tensors(tensors, about, task, activation, preprocessing, plain)
             if observes_dict(about):
-                preprocessing = _framewise(preprocessing, task, list(observed_parts(about)))
+                preprocessing = framewise(preprocessing, task, list(observed_parts(about)))
         return policy, preprocessing
     policy = MlpPolicy.load(path, task, preprocessing.n_stack)
     if activation not in (None, policy.activation):
         raise BadArtifact(f"{path} has activation {policy.activation!r}: leave activation out")
     return policy, preprocessing
-
-
-def _framewise(preprocessing: Preprocessing, task: Task, keys: list[str]) -> Preprocessing:
-    """Returns the preprocessing of an agent of a Dict with `keys` for the task's order, frame by frame.
-
-    Raises:
-        BadArtifact: its statistics are in an order that is not known.
-    """
-    if preprocessing.normalization is None:
-        return preprocessing
-    if preprocessing.normalization.by_key:
-        keys = list(task.observation_parts)
-    elif keys != sorted(keys):
-        raise BadArtifact(
-            f"its Dict has the keys {', '.join(keys)}, which are not sorted, so that a row of statistics may "
-            "be in one order or the other: give arrays mean.KEY and var.KEY for each of them"
-        )
-    for n in {1, preprocessing.n_stack}:
-        preprocessing = preprocessing.reordered(by_frames(task, n, keys))
-    return preprocessing
 
 
 def read_agent(

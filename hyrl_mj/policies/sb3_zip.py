@@ -168,6 +168,26 @@ def by_frames(task: Task, n_stack: int, keys: Sequence[str]) -> np.ndarray:
     return np.hstack([stacks[key].reshape(n_stack, -1) for key in parts]).ravel()
 
 
+def framewise(preprocessing: Preprocessing, task: Task, keys: list[str]) -> Preprocessing:
+    """Returns the preprocessing of an agent of a Dict with `keys` for the task's order, frame by frame.
+
+    Raises:
+        BadArtifact: its statistics are in an order that is not known.
+    """
+    if preprocessing.normalization is None:
+        return preprocessing
+    if preprocessing.normalization.by_key:
+        keys = list(task.observation_parts)
+    elif keys != sorted(keys):
+        raise BadArtifact(
+            f"its Dict has the keys {', '.join(keys)}, which are not sorted, so that a row of statistics may "
+            "be in one order or the other: give arrays mean.KEY and var.KEY for each of them"
+        )
+    for n in {1, preprocessing.n_stack}:
+        preprocessing = preprocessing.reordered(by_frames(task, n, keys))
+    return preprocessing
+
+
 def _check_used(tensors: Mapping[str, np.ndarray], algorithm: str) -> None:
     """Raises `BadArtifact` if an agent has tensors that the policy of its algorithm does not have."""
     known = ALGORITHMS[algorithm]
