@@ -158,7 +158,9 @@ def test_a_zip_that_holds_nothing_but_weights_has_the_default_activation(
     model = untrained(algorithm, circle, net_arch=[16])
     path = saved(model, tmp_path)
     rewritten(path, **{name: None for name in members(path) if name != "policy.pth"})
-    policy = load_agent(path, circle)
+    with pytest.raises(BadArtifact, match=r"nothing in it tells whether .*--vecnormalize none if"):
+        load_agent(path, circle)
+    policy = load_agent(path, circle, vecnormalize="none")
     assert policy.activation == DEFAULT[algorithm]
     assert_it_acts_alike(policy, model, circle, observations(circle))
 
@@ -166,7 +168,7 @@ def test_a_zip_that_holds_nothing_but_weights_has_the_default_activation(
 def test_the_activation_can_be_given_where_the_file_does_not_say(circle, tmp_path):
     model = untrained(PPO, circle, activation_fn=nn.ELU)
     path = rewritten(saved(model, tmp_path), data=None)
-    policy = load_agent(path, circle, activation="elu")
+    policy = load_agent(path, circle, activation="elu", vecnormalize="none")
     assert_it_acts_alike(policy, model, circle, observations(circle))
 
 
@@ -409,7 +411,8 @@ def test_metadata_that_cannot_be_read_is_named(agent, circle):
         with pytest.raises(BadArtifact, match=r"agent\.zip"):
             load_agent(rewritten(agent, data=data), circle)
     # Entries of another shape than SB3's are no entries.
-    load_agent(rewritten(agent, data='{"policy_kwargs": [], "observation_space": 3}'), circle)
+    unusual = '{"policy_kwargs": [], "observation_space": 3, "num_timesteps": 0}'
+    load_agent(rewritten(agent, data=unusual), circle)
 
 
 def test_an_activation_that_cannot_be_is_refused(agent, circle, tmp_path):

@@ -8,11 +8,13 @@ import struct
 import sys
 import zipfile
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from stable_baselines3 import DQN, PPO, SAC
-from stable_baselines3.common.vec_env import VecNormalize
+from environments import Puck
+from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from test_agents import (
     Payload,
     members,
@@ -307,12 +309,9 @@ def trained(task, algorithm, folder, n, seed, **options):
     env.seed(seed)
     if options:
         env = VecNormalize(env, **options)
-    mine = (
-        {"n_steps": 25, "batch_size": 25, "n_epochs": 1}
-        if algorithm is PPO
-        else {"buffer_size": 500}
-    )
-    mine |= {} if algorithm is PPO else {"learning_starts": 10**6}
+    mine = {"buffer_size": 500, "learning_starts": 10**6}
+    if algorithm in (PPO, A2C):
+        mine = {"n_steps": 25} | ({"batch_size": 25, "n_epochs": 1} if algorithm is PPO else {})
     model = algorithm(
         "MlpPolicy", env, seed=seed, device="cpu", policy_kwargs={"net_arch": [8]}, **mine
     )
@@ -360,7 +359,7 @@ def test_what_cannot_be_told_is_refused_with_the_way_out(tmp_path):
 
 
 @pytest.mark.slow
-def test_last_observations_that_cannot_be_read_say_nothing(circle, tmp_path):
+def test_last_observations_that_cannot_be_read_tell_nothing(circle, tmp_path):
     executed = tmp_path / "executed"
     payload = pickle.dumps(Payload(executed))
     path = trained(circle, PPO, tmp_path, 1, 0, norm_obs=True)
@@ -368,10 +367,52 @@ def test_last_observations_that_cannot_be_read_say_nothing(circle, tmp_path):
     for content in (payload, b"", b"\x80\x02" + DOUBLING + b".", b"\x80\x02" + b"]" * 10**5 + b"."):
         entry = {":serialized:": base64.b64encode(content).decode()}
         with_metadata(path, _last_obs=entry, _last_original_obs=about["_last_original_obs"])
-        load_agent(path, circle)
+        refused(path, circle, "nothing in it tells whether")
     for text in ("no base64", 3, None):
-        load_agent(with_metadata(path, _last_obs={":serialized:": text}), circle)
+        with_metadata(path, _last_obs={":serialized:": text})
+        refused(path, circle, "nothing in it tells whether")
     assert not executed.exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algorithm", [SAC, TD3, DDPG, PPO, A2C])
+@pytest.mark.parametrize("without", ["_last_obs", "_last_original_obs"])
+def test_an_agent_that_keeps_no_observation_is_not_taken_for_a_plain_one(
+    algorithm, without, circle, tmp_path
+):
+    path = trained(circle, algorithm, tmp_path, 1, 0, norm_obs=True)
+    about = json.loads(members(path)["data"])
+    del about[without]
+    refused(rewritten(path, data=json.dumps(about)), circle, "VecNormalize.*--vecnormalize none")
+    load_agent(path, circle, vecnormalize="none")
+
+
+class Pushed(Puck):
+    """A puck whose observation is one vector of float64."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (6,), np.float64)
+
+    def _get_obs(self):
+        parts = super()._get_obs()
+        return np.concatenate([parts[key] for key in sorted(parts)])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wrapped", ["plain", "VecNormalize", "NormalizeObservation"])
+@pytest.mark.parametrize("algorithm", [SAC, PPO])
+def test_the_type_of_observations_tells_of_wrappers(algorithm, wrapped, tmp_path):
+    """Both wrappers give float32, and most environments of MuJoCo float64."""
+    task, inside = hyrl_mj.from_gymnasium(Pushed, steps=20), wrapped == "NormalizeObservation"
+    make = Pushed if not inside else lambda: gym.wrappers.NormalizeObservation(Pushed())
+    env = DummyVecEnv([lambda: gym.wrappers.TimeLimit(make(), 20)])
+    env = VecNormalize(env) if wrapped == "VecNormalize" else env
+    options = {"n_steps": 32} if algorithm is PPO else {"learning_starts": 10**6}
+    model = algorithm("MlpPolicy", env, seed=0, device="cpu", **options)
+    path = saved(model.learn(64), tmp_path)
+    if wrapped == "plain":
+        load_agent(path, task)
+    else:
+        refused(path, task, "normalised observations .VecNormalize.*--vecnormalize")
 
 
 def test_limits_leave_room_for_large_mlps(circle, tmp_path):

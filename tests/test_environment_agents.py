@@ -1,9 +1,12 @@
 """Agents of a Dict of vectors act in a task's own loop as under SB3, also stacked and normalised."""
 
+from collections import OrderedDict
+
 import numpy as np
 import pytest
 import torch
 from environments import Puck
+from gymnasium import spaces
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
@@ -98,4 +101,94 @@ def test_normalised_training_is_noticed_without_its_statistics(puck, tmp_path):
     model.learn(64)
     model.save(tmp_path / "agent.zip")
     with pytest.raises(BadArtifact, match="VecNormalize"):
+        load_agent(tmp_path / "agent.zip", puck)
+
+
+ORDERS = {
+    "theirs": ("velocity", "to_goal", "position"),
+    "ours": ("to_goal", "position", "velocity"),
+}
+
+
+class Ordered(Puck):
+    """A puck whose Dict has an order of its own, which Gymnasium keeps."""
+
+    def __init__(self, order):
+        super().__init__()
+        parts = Puck.observation_space.spaces
+        self.observation_space = spaces.Dict(OrderedDict((key, parts[key]) for key in order))
+
+
+@pytest.mark.parametrize("wrapped", WRAPPED)
+def test_parts_of_a_dict_are_joined_in_the_order_of_the_agent(wrapped, puck, tmp_path, monkeypatch):
+    """Also where the task has them in another order than the agent."""
+    env = WRAPPED[wrapped](DummyVecEnv([lambda: Ordered(ORDERS["theirs"])]))
+    model = PPO("MultiInputPolicy", env, seed=0, device="cpu", policy_kwargs={"net_arch": [16]})
+    for parameter in model.policy.parameters():
+        parameter.data = torch.randn(parameter.shape) / parameter.shape[-1] ** 0.5
+    model.save(tmp_path / "agent.zip")
+    n, norm, needs = 3 if "stacked" in wrapped else 1, None, {}
+    if "normalised" in wrapped:
+        norm, rng = env if isinstance(env, VecNormalize) else env.venv, np.random.default_rng(0)
+        norm.training = False
+        arrays = {"clip": norm.clip_obs}
+        for key, found in norm.obs_rms.items():
+            found.mean, found.var = (rng.uniform(0.1, 2, found.mean.shape) for _ in range(2))
+            arrays |= {f"mean.{key}": found.mean, f"var.{key}": found.var}
+        np.savez(tmp_path / "stats.npz", **arrays)
+        needs["vecnormalize"] = tmp_path / "stats.npz"
+    for order in (sorted(ORDERS["ours"]), ORDERS["ours"]):
+        task = hyrl_mj.from_gymnasium(Puck, steps=STEPS)
+        vars(task)["observation_parts"] = dict.fromkeys(order, 2)
+        policy = load_agent(tmp_path / "agent.zip", task, n_stack=n, **needs)
+        frames = {
+            key: np.random.default_rng(1).normal(size=(50, n, 2)) + i for i, key in enumerate(order)
+        }
+        ours = np.concatenate([frames[key] for key in order], axis=2)
+        seen = {key: frame.reshape(50, -1).astype(np.float32) for key, frame in frames.items()}
+        if wrapped == "normalised, stacked":
+            each = [
+                norm.normalize_obs({key: f[:, i] for key, f in frames.items()}) for i in range(n)
+            ]
+            seen = {key: np.hstack([one[key] for one in each]) for key in frames}
+        elif norm is not None:
+            seen = norm.normalize_obs(seen)
+        theirs, _ = model.predict({key: seen[key] for key in ORDERS["theirs"]}, deterministic=True)
+        inner, sees = (
+            (policy.policy, policy.preprocessing(ours)) if n > 1 or norm else (policy, ours[:, 0])
+        )
+        np.testing.assert_allclose(inner.inputs(sees), theirs, atol=1e-4)
+
+
+def test_statistics_in_an_order_that_is_not_known_are_refused(puck, tmp_path):
+    env = VecNormalize(DummyVecEnv([lambda: Ordered(ORDERS["theirs"])]))
+    PPO("MultiInputPolicy", env, seed=0, device="cpu").save(tmp_path / "agent.zip")
+    statistics = {"mean": np.zeros(6), "var": np.ones(6), "clip": 10.0}
+    np.savez(tmp_path / "s.npz", **statistics)
+    with pytest.raises(
+        BadArtifact, match=r"keys velocity, to_goal, position, which are not sorted"
+    ):
+        load_agent(tmp_path / "agent.zip", puck, vecnormalize=tmp_path / "s.npz")
+    np.savez(
+        tmp_path / "s.npz", **{"mean.position": np.zeros(2), "var.position": np.ones(2), "clip": 1}
+    )
+    with pytest.raises(
+        BadArtifact, match=r"are not those of the Dict, mean.position, .* only some keys"
+    ):
+        load_agent(tmp_path / "agent.zip", puck, vecnormalize=tmp_path / "s.npz")
+
+
+def test_parts_of_other_sizes_are_refused_though_their_sum_fits(puck, tmp_path):
+    class Other(Puck):
+        observation_space = spaces.Dict(
+            {
+                key: spaces.Box(-np.inf, np.inf, (size,))
+                for key, size in (("position", 1), ("to_goal", 2), ("velocity", 3))
+            }
+        )
+
+    PPO("MultiInputPolicy", DummyVecEnv([Other]), device="cpu").save(tmp_path / "agent.zip")
+    with pytest.raises(
+        BadArtifact, match=r"Dict\(position \(1,\), to_goal \(2,\), velocity \(3,\)\)"
+    ):
         load_agent(tmp_path / "agent.zip", puck)

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from planted import sign_policy
 
-from hyrl_mj import BadInput, Noise, Outcome, Recorded, Sample
+from hyrl_mj import BadInput, Noise, Outcome, Recorded, Sample, Signal
 from hyrl_mj.policies.controllers import PolicyController
+from hyrl_mj.simulation.noise import _KINDS
 from hyrl_mj.simulation.rollout import LoopSettings, closed_loop
 
 
@@ -90,13 +91,113 @@ def test_a_misspelt_kind_gets_a_hint():
 # ---- signals that are given, and noise that looks at the loop
 
 
-def test_a_recorded_signal_is_repeated_and_then_over():
+def test_a_recorded_signal_is_played_as_it_is():
     values = np.arange(12.0).reshape(3, 2, 2)
     signal = Recorded(values, 11.0)
     signal.reset(2, np.random.default_rng(0))
     for k in range(3):
         np.testing.assert_array_equal(draw(signal, np.full(2, k)), values[k])
-    np.testing.assert_array_equal(draw(signal, np.full(2, 3)), np.zeros((2, 2)))
+
+
+def test_a_recorded_signal_that_ends_says_so_or_goes_on_as_it_is_told(vehicle):
+    values = np.zeros((3, 1, 2))
+    values[:, 0, 1] = 0.01, 0.02, 0.03
+    for after, expected in (("hold", 0.03), ("repeat", 0.02), ("none", 0.0)):
+        signal = Recorded(values, 0.03, after=after)
+        assert draw(signal, np.array([4]))[0].tolist() == [0.0, expected]
+    loop, z0 = PolicyController(sign_policy(vehicle)), np.array([[0.0, 0.5]])
+    with pytest.raises(BadInput, match=r'recorded for 3 samples.*after="hold", "repeat" or "none"'):
+        closed_loop(vehicle, loop, z0, Recorded(values, 0.03))
+    closed_loop(vehicle, loop, z0, Recorded(values, 0.03), settings=LoopSettings(steps=3))
+    with pytest.raises(BadInput, match="'loop': choose one of refuse, hold, repeat, none"):
+        Recorded(values, 0.03, after="loop")
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (np.zeros((3, 2)), r"shape \(3, 2\) cannot be used: give numbers of shape \(samples, sim"),
+        (np.zeros((0, 1, 2)), r"shape \(0, 1, 2\) cannot be used"),
+        (np.array([[["a"]]]), "type <U1"),
+        (np.array([[[0.0, np.nan]]]), "is nan at sample 0 of simulation 0 in column 1"),
+        (np.array([[[0.0, 0.1]], [[-0.2, 0.0]]]), r"is -0\.2 at sample 1 .* at most 0\.1 in magn"),
+    ],
+)
+def test_a_record_that_is_no_noise_of_its_bound_is_refused(values, message):
+    with pytest.raises(BadInput, match=message):
+        Recorded(values, 0.1)
+
+
+def kind_of(sample, **methods):
+    """A class of signals with a method `sample(self, now)`."""
+    return type("Given", (Signal,), {"kind": "given", "sample": sample, **methods})
+
+
+def gaussian(self, now):
+    return self.rng.normal(scale=self.bound, size=now.measurement.shape) * self.shares
+
+
+def moving(self, now):
+    now.measurement[:] += 0.05
+    return np.zeros_like(now.measurement)
+
+
+def jumping(self, now):
+    now.q[:] = 0
+    return np.zeros_like(now.measurement)
+
+
+@pytest.mark.parametrize(
+    ("sample", "message"),
+    [
+        (gaussian, r"in column 1 of the measurement, where at most 0\.1 in magnitude is allowed"),
+        (lambda self, now: np.full(now.measurement.shape, 0.1), "in column 0 .* where none is"),
+        (
+            lambda self, now: np.full(len(now.rows), 0.1),
+            r"float64 of shape \(60,\), where \(60, 2\)",
+        ),
+        (lambda self, now: 0.0, r"of shape \(\)"),
+        (lambda self, now: None, r"object of shape \(\)"),
+        (lambda self, now: np.zeros(now.measurement.shape, int), "gives int64 of shape"),
+        (lambda self, now: now.measurement * np.nan, "noise is nan at sample 0 of simulation 0"),
+        (lambda self, now: np.where(now.k[:, None] > 9, 1.0, [0, 0.1]), "is 1 at sample 10 of"),
+        (lambda self, now: 1 / 0, "it raised ZeroDivisionError"),
+        (moving, "it raised ValueError: .* read-only"),
+        (jumping, "it raised ValueError: .* read-only"),
+    ],
+)
+def test_each_sample_of_a_noise_is_checked(sample, message, vehicle, monkeypatch):
+    monkeypatch.setitem(_KINDS, "given", kind_of(sample))
+    loop, z0 = PolicyController(sign_policy(vehicle)), np.tile([0.0, 0.5], (60, 1))
+    with pytest.raises(BadInput, match=message) as caught:
+        closed_loop(vehicle, loop, z0, Noise("given", 0.1))
+    assert len(str(caught.value).splitlines()) == 1
+    with pytest.raises(BadInput, match=message.replace("60", "1")):  # also where an agent acts
+        _episodes(gym.make(vehicle.env_id, noise=Noise("given", 0.1)))
+
+
+def _episodes(env):
+    for seed in range(5):
+        env.reset(seed=seed)
+        for _ in range(15):
+            env.step(2)
+
+
+def wider(self, bound, shares):
+    Signal.__init__(self, 3 * bound, shares)
+
+
+@pytest.mark.parametrize(
+    ("init", "message"),
+    [
+        (wider, r"takes \[.* 0\.3\] .* is allowed \[.* 0\.1\]"),
+        (lambda self, bound, shares: None, r"has no bound and shares: call super\(\).__init__"),
+    ],
+)
+def test_a_kind_that_does_not_keep_its_bound_is_refused(init, message, vehicle, monkeypatch):
+    monkeypatch.setitem(_KINDS, "given", kind_of(gaussian, __init__=init))
+    with pytest.raises(BadInput, match=message):
+        Noise("given", 0.1).against(vehicle, None)
 
 
 def test_a_recorded_signal_of_other_runs_is_refused():

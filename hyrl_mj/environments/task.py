@@ -10,6 +10,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from gymnasium import spaces
 
 from hyrl_mj import mjcf
 from hyrl_mj.environments.fingerprint import of_model
@@ -152,6 +153,13 @@ class EnvironmentTask(Task):
         digest = sha256(b"".join(of_model(self.model).values()))
         digest.update("".join(code_of(self._instance.env)).encode())
         return digest.hexdigest()
+
+    @property
+    def observation_dtype(self) -> str:  # type: ignore[override]
+        space: Any = self._instance.env.observation_space
+        parts = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
+        types = {str(part.dtype) for part in parts}
+        return types.pop() if len(types) == 1 else ""
 
     def plant(self, n: int, threads: int = 0) -> Any:
         return EnvironmentPlant(self.specification, self._pool, self.model, n)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.ranges import Integer, Optional
-from hyrl_mj.simulation import NOT_STARTED, AnyNoise, Sample, signal_for
+from hyrl_mj.simulation import NOT_STARTED, AnyNoise, Sample, drawn, signal_for
 from hyrl_mj.tasks import Outcome, Task, at_levels, check_finite
 
 # The most episodes side by side.
@@ -193,7 +193,7 @@ class BatchedEnv:
     def _measure(self, ids: np.ndarray) -> np.ndarray:
         """Returns noisy measurements (k, p) of the rows `ids`."""
         true, modes = self.plant.truth[ids], np.full(len(ids), NOT_STARTED)
-        noise = self._noise.sample(Sample(ids, self.samples[ids], true, modes, self.plant))
+        noise = drawn(self._noise, Sample(ids, self.samples[ids], true, modes, self.plant))
         return self.plant.observe(true, noise, ids)
 
 

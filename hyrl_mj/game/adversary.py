@@ -33,7 +33,8 @@ class WorstNoise(Signal):
     needs_controller = True
 
     def __init__(self, answers: Answers, bound: np.ndarray):
-        self.bound = float(bound.max(initial=0.0))
+        largest = float(bound.max(initial=0.0))
+        super().__init__(largest, bound / (largest or 1.0))
         self._answers, self._bound = answers, bound
         self._any = solve(noisy_moves(answers, bound))
         self._settled = solve(noisy_moves(answers, bound, settled_only=True))

@@ -199,7 +199,8 @@ def worst_signal(
     loop, settings = as_controller(controller), LoopSettings(steps=steps, record=True)
     rollout = closed_loop(game.task, loop, z0, noise, modes, settings=settings)
     if not len(rollout.measured):  # all runs are over where they start
-        return Recorded(np.zeros((1, len(z0), game.task.measurement_columns)), eps, kind="worst")
+        none = np.zeros((1, len(z0), game.task.measurement_columns))
+        return Recorded(none, eps, kind="worst", after="none")
     chart = game.task.chart
     rows = [
         (measured, chart.near(z, game.task.z(measured)))
@@ -207,4 +208,7 @@ def worst_signal(
     ]
     true = np.stack([game.task.with_z(measured, z) for measured, z in rows])
     values = np.where(np.isnan(rollout.u).any(axis=-1)[..., None], 0.0, rollout.measured - true)
-    return Recorded(values, eps, kind="worst")
+    limits = noise.limits
+    # The differences are rounded; and a run of a replay that goes on after those of the game has no noise.
+    values = np.clip(values, -limits, limits)
+    return Recorded(values, eps, kind="worst", after="none", shares=limits / (eps or 1.0))

@@ -26,6 +26,7 @@ from hyrl_mj.policies.external import (
     reopen_agent,
 )
 from hyrl_mj.policies.functions import from_callable
+from hyrl_mj.policies.memoryless import Asked, check_memoryless
 from hyrl_mj.policies.mlp import (
     ACTIVATIONS,
     BLAS,
@@ -54,6 +55,7 @@ __all__ = [
     "TORCH_NAMES",
     "Agent",
     "AnyPolicy",
+    "Asked",
     "Controller",
     "MlpPolicy",
     "Normalization",
@@ -68,6 +70,7 @@ __all__ = [
     "as_controller",
     "as_function",
     "check_agent_file",
+    "check_memoryless",
     "check_modes",
     "from_callable",
     "infer_algorithm",

@@ -12,6 +12,7 @@ from hyrl_mj import artifacts
 from hyrl_mj.errors import BadArtifact, BadInput, check_seed, unknown
 from hyrl_mj.policies import algorithms
 from hyrl_mj.policies.functions import from_callable
+from hyrl_mj.policies.memoryless import answers, check_memoryless
 from hyrl_mj.policies.mlp import (
     ACTIVATIONS,
     MlpPolicy,
@@ -20,8 +21,21 @@ from hyrl_mj.policies.mlp import (
     SampledPolicy,
 )
 from hyrl_mj.policies.onnx_model import from_onnx
-from hyrl_mj.policies.preprocessing import UNCHANGED, PreprocessedPolicy, Preprocessing, network
-from hyrl_mj.policies.sb3_zip import REMEDY, by_frames, from_tensors, observes_dict, read_zip
+from hyrl_mj.policies.preprocessing import (
+    NONE,
+    UNCHANGED,
+    PreprocessedPolicy,
+    Preprocessing,
+    network,
+)
+from hyrl_mj.policies.sb3_zip import (
+    REMEDY,
+    framewise,
+    from_tensors,
+    observed_parts,
+    observes_dict,
+    read_zip,
+)
 from hyrl_mj.tasks import Task
 
 
@@ -157,15 +171,30 @@ def load_agent(
             SAC). Such a policy is reproducible call by call only.
         seed: the seed of these draws.
         vecnormalize: an npz file with the statistics of the `VecNormalize` of its training: arrays mean,
-            var, clip, and epsilon.
+            var, clip, and epsilon; or "none" if it saw plain observations. By default the zip has to tell.
         n_stack: the number of observations that it sees at once, if it was trained under `VecFrameStack`.
             Its `act` is then the steady answer; in closed loops it acts with its memory.
 
     Raises:
-        BadInput: an unknown activation, a bad seed, or a policy without a distribution to draw from.
+        BadInput: an unknown activation, a bad seed, a policy without a distribution to draw from, or an
+            agent that is no function of its observations.
         BadArtifact: a file that is no such agent, or one that does not fit the task.
     """
-    path = Path(path)
+    policy = _load(Path(path), task, activation, stochastic, seed, vecnormalize, n_stack)
+    check_memoryless(policy, task, f"the agent of {path}")
+    return policy
+
+
+def _load(
+    path: Path,
+    task: Task,
+    activation: str | None,
+    stochastic: bool,
+    seed: int,
+    vecnormalize: str | Path | None,
+    n_stack: int,
+) -> ObservationPolicy:
+    """Returns the policy in a file, as `load_agent`, without a trial of it."""
     if activation is not None and activation not in ACTIVATIONS:
         raise unknown("activation", activation, ACTIVATIONS)
     check_seed(seed)
@@ -176,21 +205,22 @@ def load_agent(
             raise BadInput("an .onnx file acts as it is: give neither an activation nor stochastic")
         policy = from_onnx(path, task, REMEDY, n_stack)
     else:
-        mlp, preprocessing = _load_network(path, task, activation, preprocessing)
+        plain = str(vecnormalize) == NONE
+        mlp, preprocessing = _load_network(path, task, activation, preprocessing, plain)
         policy = SampledPolicy(mlp, np.random.default_rng(seed)) if stochastic else mlp
     return PreprocessedPolicy(policy, preprocessing) if preprocessing else policy
 
 
 def _load_network(
-    path: Path, task: Task, activation: str | None, preprocessing: Preprocessing
+    path: Path, task: Task, activation: str | None, preprocessing: Preprocessing, plain: bool
 ) -> tuple[MlpPolicy, Preprocessing]:
     """Returns the network in a zip or a `.safetensors` file, and its preprocessing, frame by frame."""
     if path.suffix != ".safetensors":
         with artifacts.reading(path, REMEDY):
             tensors, about = read_zip(path)
-            policy = from_tensors(tensors, about, task, activation, preprocessing)
-        if observes_dict(about):
-            preprocessing = preprocessing.reordered(by_frames(task, preprocessing.n_stack))
+            policy = from_tensors(tensors, about, task, activation, preprocessing, plain)
+            if observes_dict(about):
+                preprocessing = framewise(preprocessing, task, list(observed_parts(about)))
         return policy, preprocessing
     policy = MlpPolicy.load(path, task, preprocessing.n_stack)
     if activation not in (None, policy.activation):
@@ -232,6 +262,7 @@ def read_agent(
         return _network(policy, task)
     function = policy if isinstance(policy, Policy) else from_callable(policy, task)
     agent = Agent(FUNCTION, "", _fingerprint(function, task))
+    check_memoryless(function, task)
     return ExternalAgent(function, _seeing(agent, function))
 
 
@@ -262,7 +293,8 @@ def reopen_agent(
     file = path / ("policy.onnx" if agent.algorithm == ONNX else "policy.safetensors")
     statistics = path / STATISTICS if agent.statistics else None
     stochastic, n_stack = agent.stochastic, agent.n_stack
-    return load_agent(file, task, None, stochastic, seed, statistics, n_stack)
+    # It was tried when the run was made, and is in each closed loop.
+    return _load(file, task, None, stochastic, seed, statistics, n_stack)
 
 
 def _network(policy: Policy, task: Task, source: str = "", vecnormalize: str = "") -> ExternalAgent:
@@ -294,23 +326,10 @@ def _seeing(agent: Agent, policy: Policy) -> Agent:
 
 
 def _fingerprint(policy: Policy, task: Task) -> str:
-    """Returns a hash of a function's answers to fixed measurements; refuses chance and memory."""
+    """Returns a hash of a function's answers to fixed measurements."""
     rng = np.random.default_rng(0)
     plant = task.plant(PROBES)
     plant.set_state(*task.state(task.starts(PROBES, rng), rng))
     measured = plant.measurement
-    first, again = (np.asarray(policy.act(measured)) for _ in range(2))
-    shape = (PROBES, len(task.inputs))
-    if first.shape != shape or not np.issubdtype(first.dtype, np.number):
-        raise BadInput(
-            f"the policy gives {first.dtype} of shape {first.shape} for {PROBES} measurements, "
-            f"{task.name} takes inputs of shape {shape}"
-        )
-    if not np.isfinite(first).all():
-        raise BadInput(f"the policy gives inputs that are not finite: {task.name} takes numbers")
-    if not np.allclose(first, again, rtol=0, atol=1e-6):
-        raise BadInput(
-            "the function answers the same measurements otherwise the second time: give one without "
-            "chance or memory"
-        )
+    first = answers(policy, task, measured, "the policy")
     return sha256((np.round(first.astype(float), DECIMALS) + 0.0).tobytes()).hexdigest()

@@ -160,4 +160,4 @@ def _array(found: Any) -> np.ndarray | None:
         return None
     text, swapped = kind.arguments[0], kind.state[1]
     numbers = np.frombuffer(data, dtype=np.dtype(text).newbyteorder(swapped))
-    return numbers.reshape(shape, order=order).astype(float)
+    return numbers.reshape(shape, order=order) if numbers.dtype.kind in "biuf" else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
@@ -18,6 +19,7 @@ from hyrl_mj.tasks import Task
 EPSILON = 1e-8
 LARGEST = 2**20  # of a file of statistics [bytes]
 LARGEST_STACK = 1000
+NONE = "none"  # in place of a file of statistics: the agent saw plain observations
 RECIPE = "write it with mean, var and clip, as docs/your-agent.md shows"
 
 
@@ -29,12 +31,14 @@ class Normalization:
         mean, var: (k,) of observations, or (n_stack k,) of stacked ones.
         clip: the largest magnitude of a normalised observation.
         epsilon: keeps the divisor from zero.
+        by_key: whether the file had them for each key of a Dict; they are in the order of the task then.
     """
 
     mean: np.ndarray
     var: np.ndarray
     clip: float
     epsilon: float = EPSILON
+    by_key: bool = False
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Returns normalised observations."""
@@ -53,14 +57,18 @@ class Normalization:
             np.savez(temporary, **{name: getattr(self, name) for name in _FIELDS})
 
     @staticmethod
-    def load(path: Path) -> Normalization:
+    def load(path: Path, parts: Mapping[str, int] = {}, n_stack: int = 1) -> Normalization:
         """Reads an npz file with the arrays mean, var, clip, and epsilon unless it is SB3's.
+
+        For a Dict with `parts` these may be arrays "mean.KEY" and "var.KEY" for each key, and one clip.
 
         Raises:
             BadArtifact: an array is missing, or has numbers that cannot be.
         """
         with artifacts.reading(path, RECIPE):
             arrays = archives.read_npz(path, LARGEST)
+            if by_key := any(name.startswith(("mean.", "var.")) for name in arrays):
+                arrays = _joined(arrays, parts, n_stack)
             if missing := [name for name in _FIELDS[:3] if name not in arrays]:
                 raise BadArtifact(f"it has no array {' and no '.join(missing)}: {RECIPE}")
             values = {n: np.asarray(arrays[n], dtype=float) for n in _FIELDS if n in arrays}
@@ -77,7 +85,30 @@ class Normalization:
                 raise BadArtifact(
                     "its numbers cannot be statistics: mean is finite, var >= 0, clip > 0, epsilon > 0"
                 )
-            return Normalization(mean, var, clip.item(), epsilon.item())
+            return Normalization(mean, var, clip.item(), epsilon.item(), by_key)
+
+
+def _joined(
+    arrays: Mapping[str, np.ndarray], parts: Mapping[str, int], n_stack: int
+) -> dict[str, np.ndarray]:
+    """Returns arrays for each key of a Dict as those of its `parts` one after the other."""
+    needed = [f"{name}.{key}" for key in parts for name in ("mean", "var")]
+    given = [name for name in arrays if name.startswith(("mean.", "var."))]
+    if sorted(needed) != sorted(given):
+        raise BadArtifact(
+            f"its arrays {', '.join(given)} are not those of the Dict, {', '.join(needed) or 'if any'}: "
+            "give all of them, or a function where only some keys were normalised"
+        )
+    factors = {np.size(arrays[f"mean.{key}"]) / size for key, size in parts.items()}
+    if len(factors) > 1 or not factors <= {1, n_stack}:
+        raise BadArtifact(
+            f"its arrays have other sizes than the vectors of the Dict, {dict(parts)}"
+        )
+    rest = {name: array for name, array in arrays.items() if name not in given}
+    return rest | {
+        name: np.concatenate([np.ravel(arrays[f"{name}.{key}"]) for key in parts])
+        for name in ("mean", "var")
+    }
 
 
 _FIELDS = ("mean", "var", "clip", "epsilon")
@@ -108,9 +139,10 @@ class Preprocessing:
                 f"n_stack {n_stack!r} cannot be used: give the number of observations that the agent sees at "
                 f"once, from 1 to {LARGEST_STACK}"
             )
-        if vecnormalize is None:
+        if vecnormalize is None or str(vecnormalize) == NONE:
             return Preprocessing(None, n_stack)
-        statistics, k = Normalization.load(Path(vecnormalize)), len(task.observation_low)
+        k = len(task.observation_low)
+        statistics = Normalization.load(Path(vecnormalize), task.observation_parts, n_stack)
         if len(statistics.mean) not in (k, n_stack * k):
             raise BadArtifact(
                 f"{vecnormalize} is about observations of {len(statistics.mean)} numbers, those of "
@@ -119,7 +151,7 @@ class Preprocessing:
         return Preprocessing(statistics, n_stack)
 
     def reordered(self, order: np.ndarray) -> Preprocessing:
-        """Returns it with statistics of stacked observations in another order (n_stack k,)."""
+        """Returns it with statistics in another order, if they are of so many numbers."""
         normalize = self.normalization
         if normalize is None or len(normalize.mean) != len(order):
             return self

@@ -2,7 +2,7 @@
 
 SB3 keeps the last observation of the training, and the last original one, which is the same before
 `VecNormalize`. Without `VecNormalize` PPO and A2C keep no original one; the others keep the observation one
-sample earlier in its place.
+sample earlier in its place. Under it PPO and A2C keep the very first.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import base64
 import binascii
 import re
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,13 @@ EPISODES, SAMPLES = 256, 20
 NOISE = 0.1
 # The error of an observation in float32, with room to spare.
 ROUNDING = 1e-3
+# Normalised numbers have about the density of the standard normal distribution, at most so much. That all of
+# them lie by chance where plain ones may has to be less likely than this.
+DENSITY, CHANCE = 0.4, 1e-3
+HOW = (
+    "give its statistics with --vecnormalize FILE.npz, which docs/your-agent.md shows how to write, or "
+    "--vecnormalize none if it saw plain observations, also for norm_obs=False"
+)
 SHOWN = 6  # numbers of a range in messages
 NUMBER = re.compile(r"[-+]?(?:inf|nan|\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+)")
 
@@ -67,34 +75,102 @@ def _box(low: np.ndarray, high: np.ndarray) -> str:
     return " x ".join(text + ["..."] * (max(len(low), len(high)) > SHOWN))
 
 
-def check_observations(about: Mapping[str, Any], task: Task, on_policy: bool) -> None:
-    """Raises `BadArtifact` if an agent was trained on normalised observations, or may have been.
+def check_observations(
+    about: Mapping[str, Any], task: Task, on_policy: bool, n_stack: int = 1
+) -> None:
+    """Raises `BadArtifact` unless the metadata show that an agent was trained on plain observations.
 
-    `on_policy` tells PPO and A2C from the others.
+    `on_policy` tells PPO and A2C from the others; `n_stack` is the number of observations that it sees.
     """
+    if about.get("num_timesteps") == 0:
+        return  # it has not been trained
     last, original = (
         _observations(about, f"_last_{name}", task) for name in ("obs", "original_obs")
     )
-    if last is None or original is None or last.shape != original.shape:
-        return
-    if np.array_equal(last, original):
-        return  # under VecNormalize(norm_obs=False), or at rest
-    normalized = _Seen(task).normalized(last, original, on_policy)
-    how = "give its statistics with --vecnormalize FILE.npz, which docs/your-agent.md shows how to write"
+    seen, normalized = _Seen(task), None
+    if on_policy and "_last_original_obs" in about and about["_last_original_obs"] is None:
+        normalized = False  # under VecNormalize SB3 keeps it from the first observation on
+    elif last is not None and original is not None and _sizes(last) == _sizes(original):
+        normalized = _normalized(last, original, seen, on_policy, n_stack)
     if normalized:
+        assert last is not None
+        assert original is not None
         raise BadArtifact(
-            f"it was trained on normalised observations (VecNormalize): its last one is {_row(last)}, where "
-            f"{task.name} gave {_row(original)}; {how}"
+            "it was trained on normalised observations (VecNormalize): its last one is "
+            f"{_row(_joined(last))}, where {task.name} gave {_row(_joined(original))}; {HOW}"
         )
+    _check_wrappers(about, last, seen)
     if normalized is None:
         raise BadArtifact(
-            "it was trained under VecNormalize, and nothing in it tells whether that normalised its "
-            f"observations: {how}, also for norm_obs=False"
+            "nothing in it tells whether it was trained on normalised observations (VecNormalize), as "
+            f"would change its inputs: {HOW}"
         )
 
 
-def _observations(about: Mapping[str, Any], key: str, task: Task) -> np.ndarray | None:
-    """Returns the observations (n, k) in an entry of the metadata; None if there are none of this task.
+# Observations (n, size) by the part of a Dict; those of a vector as "".
+_Parts = dict[str, np.ndarray]
+
+
+def _check_wrappers(about: Mapping[str, Any], last: _Parts | None, seen: _Seen) -> None:
+    """Raises `BadArtifact` if an agent saw observations that the task does not give.
+
+    So it is with `NormalizeObservation` and other wrappers inside of the environment of the training.
+    """
+    task, joined = seen.task, None if last is None else _joined(last)
+    given = None if joined is None else seen.given(joined)
+    if given:
+        return
+    which, types = "", {str(part.dtype) for part in (last or {}).values()}
+    space = about.get("observation_space")
+    limits = [_numbers(space, end) if isinstance(space, dict) else None for end in ("low", "high")]
+    ours = np.array([task.observation_low, task.observation_high], dtype=float)
+    if given is False:
+        assert joined is not None
+        which = f"its last one is {_row(joined)}, which {task.name} never gives"
+    elif task.observation_dtype == "float64" and "float32" in types:
+        which = f"they are float32, those of {task.name} float64"
+    elif all(end is not None and len(end) == ours.shape[1] for end in limits):
+        low, high = np.array(limits)
+        if not np.allclose([low, high], ours, rtol=1e-4, atol=1e-4):
+            which = f"they lie in {_box(low, high)}, those of {task.name} in {_box(*ours)}"
+    if which:
+        raise BadArtifact(
+            "it was trained on normalised observations (VecNormalize), or on others under a wrapper such as "
+            f"NormalizeObservation: {which}; {HOW}"
+        )
+
+
+def _normalized(
+    last: _Parts, original: _Parts, seen: _Seen, on_policy: bool, n_stack: int
+) -> bool | None:
+    """Returns whether the last observations are normalised, the original ones being not.
+
+    None if that cannot be told.
+    """
+    open_parts = []
+    for name, after in last.items():
+        before = original[name]
+        if after.dtype != before.dtype:
+            return True  # VecNormalize gives float32 whatever it gets
+        plain = after.dtype == np.float64 and n_stack == 1  # stacks have the type of the space
+        # What is constant, a goal say, stays as it is; normalised it would be 0.
+        if not plain and not ((after == before) & (after != 0)).all(axis=0).any():
+            open_parts.append(name)
+    if not open_parts:
+        return False
+    ends = np.cumsum([part.shape[1] for part in last.values()])
+    columns = np.concatenate(
+        [
+            np.arange(end - last[name].shape[1], end)
+            for name, end in zip(last, ends, strict=True)
+            if name in open_parts
+        ]
+    )
+    return seen.normalized(_joined(last), _joined(original), on_policy, columns)
+
+
+def _observations(about: Mapping[str, Any], key: str, task: Task) -> _Parts | None:
+    """Returns the observations in an entry of the metadata; None if there are none of this task.
 
     Of stacked observations these are the latest.
     """
@@ -107,16 +183,23 @@ def _observations(about: Mapping[str, Any], key: str, task: Task) -> np.ndarray 
     except (binascii.Error, ValueError):
         return None
     sizes = {"": len(task.observation_low)} if "" in found else task.observation_parts
-    latest = []
+    latest = {}
     for name, size in sizes.items():
         part = found.get(name)
         if part is None or part.ndim != 2 or not part.size or part.shape[1] % size:
             return None
-        latest.append(part[:, -size:])
-    if len({len(part) for part in latest}) != 1:
+        latest[name] = part[:, -size:]
+    if len({len(part) for part in latest.values()}) != 1:
         return None
-    array = np.hstack(latest)
-    return array if np.isfinite(array).all() else None
+    return latest if all(np.isfinite(part).all() for part in latest.values()) else None
+
+
+def _sizes(parts: _Parts) -> dict[str, tuple[int, ...]]:
+    return {name: part.shape for name, part in parts.items()}
+
+
+def _joined(parts: _Parts) -> np.ndarray:
+    return np.hstack([part.astype(float) for part in parts.values()])
 
 
 def _row(observations: np.ndarray) -> str:
@@ -127,51 +210,106 @@ class _Seen:
     """What a task lets an agent see, found by random inputs."""
 
     def __init__(self, task: Task):
-        self.task, rng = task, np.random.default_rng(0)
-        plant = task.plant(EPISODES)
-        plant.set_state(*task.state(task.starts(EPISODES, rng), rng))
-        measured = plant.measurement
-        noise = rng.uniform(-NOISE, NOISE, measured.shape) * np.array(task.noisy, dtype=float)
-        observation = self.starts = task.observation(measured)
-        self.change = 2 * np.abs(task.observation(measured + noise) - observation).max(axis=0)
-        self.change += self._longest_step(plant, observation, rng)
+        self.task, self._rng = task, np.random.default_rng(0)
 
-    def _longest_step(self, plant: Any, before: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Returns the largest change (k,) of an observation within a sample."""
-        low, high = self.task.input_limits
+    @cached_property
+    def _plant(self) -> Any:
+        """Copies of the robot, until `by_step` at its start."""
+        plant = self.task.plant(EPISODES)
+        plant.set_state(*self.task.state(self.task.starts(EPISODES, self._rng), self._rng))
+        return plant
+
+    @cached_property
+    def _measured(self) -> np.ndarray:
+        return np.asarray(self._plant.measurement)
+
+    @cached_property
+    def starts(self) -> np.ndarray:
+        """Observations (n, k) where episodes start."""
+        return self.task.observation(self._measured)
+
+    @cached_property
+    def by_noise(self) -> np.ndarray:
+        """The largest difference (k,) between two observations that noise makes."""
+        shares = np.array(self.task.noisy, dtype=float)
+        noise = self._rng.uniform(-NOISE, NOISE, self._measured.shape) * shares
+        noisy = self.task.observation(self._measured + noise)
+        return np.asarray(2 * np.abs(noisy - self.starts).max(axis=0))
+
+    @cached_property
+    def by_step(self) -> np.ndarray:
+        """The largest change (k,) of an observation within a sample."""
+        task, low, high = self.task, *self.task.input_limits
+        before = self.starts
         longest = np.zeros(before.shape[1])
         for _ in range(SAMPLES):
-            plant.step(np.where(rng.random((EPISODES, len(low))) < 0.5, low, high))
-            after = self.task.observation(plant.measurement)
-            going = ~plant.unstable
+            self._plant.step(np.where(self._rng.random((EPISODES, len(low))) < 0.5, low, high))
+            after = task.observation(self._plant.measurement)
+            going = ~self._plant.unstable
             longest = np.maximum(longest, np.abs(after - before)[going].max(axis=0, initial=0.0))
             before = after
         return longest
 
-    def normalized(self, last: np.ndarray, original: np.ndarray, on_policy: bool) -> bool | None:
-        """Returns whether the last observations (n, k) are normalised, the original ones being not.
+    @cached_property
+    def _inverts(self) -> bool:
+        """Whether the task tells what was measured from what was observed."""
+        try:
+            self.task.measured(np.zeros((1, len(self.task.observation_low))))
+        except BadInput:
+            return False
+        return True
+
+    @property
+    def _limits(self) -> np.ndarray:
+        return np.array([self.task.observation_low, self.task.observation_high], dtype=float)
+
+    @property
+    def slack(self) -> np.ndarray:
+        """How far observations (k,) may lie beyond those that were found."""
+        low, high = self._limits
+        return np.asarray(self.by_noise + self.by_step + 1e-3 * (high - low))
+
+    def given(self, last: np.ndarray) -> bool | None:
+        """Returns whether a task gives such observations (n, k); None if that cannot be told."""
+        low, high = self._limits
+        outside = (
+            (last < low) | (last > high)
+        ).any()  # else the slack, which takes long, is not needed
+        if outside and ((last < low - self.slack) | (last > high + self.slack)).any():
+            return False
+        if not self._inverts:
+            return None
+        tolerance = ROUNDING + 5 * self._off(self.starts.astype(np.float32)).max()
+        if np.median(self._off(0.7 * self.starts + 0.1)) <= tolerance:
+            return None  # any numbers may be an observation
+        return bool(self._off(last).max() <= tolerance)
+
+    def normalized(
+        self, last: np.ndarray, original: np.ndarray, on_policy: bool, columns: np.ndarray
+    ) -> bool | None:
+        """Returns whether `columns` of the last observations (n, k) are normalised, unlike the original ones.
 
         None if that cannot be told.
         """
-        task = self.task
-        low, high = np.array([task.observation_low, task.observation_high], dtype=float)
-        slack = self.change + 1e-3 * (high - low)
-        if ((last < low - slack) | (last > high + slack)).any():
-            return True
-        tolerance = ROUNDING + 5 * self._off(original).max()
-        if np.median(self._off(0.7 * self.starts + 0.1)) > tolerance:
-            return bool(self._off(last).max() > tolerance)
+        given = self.given(last)
+        if given is not None:
+            return not given
         if on_policy:
             return None
-        jumped = np.abs(last - original) > 1.5 * self.change + ROUNDING
-        first, final = self.starts.min(axis=0) - slack, self.starts.max(axis=0) + slack
-        started = ((last >= first) & (last <= final)).all(axis=1)  # where an episode began
-        return bool((jumped.any(axis=1) & ~started).any())
+        moved, quiet = np.abs(last - original), 1.5 * self.by_step + ROUNDING
+        calm = (moved <= quiet).all(axis=1)[:, None]
+        change = np.where(calm, quiet, quiet + 1.5 * self.by_noise)
+        near = (moved <= change)[:, columns]
+        first, final = self.starts.min(axis=0) - self.slack, self.starts.max(axis=0) + self.slack
+        started = ((last >= first) & (last <= final))[:, columns]  # where an episode began
+        goes_on, began = near.all(axis=1), started.all(axis=1)
+        if not (goes_on | began).all():
+            return True
+        widths = np.where(goes_on[:, None], 2 * change[:, columns], (final - first)[columns])
+        chance = np.minimum(DENSITY * widths, 1.0).prod(axis=1)
+        return False if chance.min() < CHANCE else None
 
     def _off(self, observation: np.ndarray) -> np.ndarray:
-        """Returns how far (n,) observations are from any that a measurement gives, if that can be told."""
-        try:
-            measured = self.task.measured(observation)
-        except BadInput:
-            return np.zeros(len(observation))
-        return np.abs(self.task.observation(measured) - observation).max(axis=1)
+        """Returns how far (n,) observations are from any that a measurement gives."""
+        measured = self.task.measured(observation)
+        return np.asarray(np.abs(self.task.observation(measured) - observation).max(axis=1))

@@ -5,7 +5,7 @@ The file is data: nothing in it is unpickled.
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from zipfile import is_zipfile
@@ -26,8 +26,9 @@ INSTEAD = "export it to .onnx, or give a function that calls model.predict in Py
 PLAIN = f"only plain multilayer perceptrons on a vector of numbers can be used: {INSTEAD}"
 # Limit on the metadata [bytes]: those of SB3 take some ten kilobytes.
 LARGEST_METADATA = 2**22
-# A part of a Dict of vectors, in the text of metadata: "'goal': Box(-inf, inf, (2,), float32)".
-PART = re.compile(r"'([^']*)': Box\([^()]*\((\d{0,9})[^()]*\)[^()]*\)")
+# A part of a Dict, in the text of metadata: "'goal': Box(-inf, inf, (2,), float32)", or "('goal', Box(..." of
+# an OrderedDict. Only vectors have a size.
+PART = re.compile(r"'([^']*)'(?::|,) Box\([^()]*\((?:(\d{1,9}),|[^()]*)\)[^()]*\)")
 LONGEST_SPACES = 2**14
 LONGEST_TEXT = 120  # of a file, in messages
 # What the metadata of SBX, which has SB3's interface, says of its policy.
@@ -77,16 +78,21 @@ def from_tensors(
     task: Task,
     activation: str | None = None,
     preprocessing: Preprocessing = UNCHANGED,
+    plain: bool = False,
 ) -> MlpPolicy:
-    """Returns the network of an SB3 agent with these tensors and this metadata."""
+    """Returns the network of an SB3 agent with these tensors and this metadata.
+
+    `plain` says that it was trained on plain observations, whatever its metadata tell.
+    """
     _check_plain(tensors, about, task)
     algorithm = infer_algorithm(tensors, about)
     _check_used(tensors, algorithm)
     if ALGORITHMS[algorithm].is_actor_critic:
         check_kind(task, levels="log_std" not in tensors)
     weights = {name: t for name, t in tensors.items() if t.dtype == np.float32}
-    if observes_dict(about) and preprocessing.n_stack > 1:
-        parts, order = ALGORITHMS[algorithm].parts, by_frames(task, preprocessing.n_stack)
+    if observes_dict(about):
+        keys, parts = list(observed_parts(about)), ALGORITHMS[algorithm].parts
+        order = by_frames(task, preprocessing.n_stack, keys)
         first = next(name for part in parts for name in layer_names(weights, part))
         if weights[first].shape[1:] == order.shape:  # else the policy says what does not fit
             weights[first] = np.ascontiguousarray(weights[first][:, order])
@@ -96,9 +102,9 @@ def from_tensors(
     activation = _activation(about, activation) or ALGORITHMS[algorithm].activation
     policy = MlpPolicy(task, algorithm, activation, weights, preprocessing.n_stack)
     sb3_metadata.check_inputs(about, task)
-    if preprocessing.normalization is None:
+    if preprocessing.normalization is None and not plain:
         on_policy = ALGORITHMS[algorithm].is_actor_critic
-        sb3_metadata.check_observations(about, task, on_policy)
+        sb3_metadata.check_observations(about, task, on_policy, preprocessing.n_stack)
     return policy
 
 
@@ -127,15 +133,21 @@ def observes_dict(about: Mapping[str, Any]) -> bool:
 def _check_parts(about: Mapping[str, Any], task: Task) -> None:
     """Raises `BadArtifact` if an agent observes a Dict with other keys than that of a task."""
     ours = task.observation_parts
-    parts = PART.findall(str(about["observation_space"].get("spaces"))[:LONGEST_SPACES])
-    theirs = {key: int(size or 0) for key, size in sorted(parts)}
-    if ours and theirs.keys() == ours.keys():
-        return  # the network tells whether the sizes fit
+    theirs = observed_parts(about)
+    # The sizes are those of the task, or all as many times larger as observations are stacked.
+    if theirs.keys() == ours.keys() and len({theirs[key] / ours[key] for key in ours}) == 1:
+        return
     of_task = _dict_of(ours) if ours else f"a vector of {len(task.observation_low)}"
     raise BadArtifact(
         f"its observations are {_dict_of(theirs)}, those of {task.name} {of_task}: give an agent that was "
         "trained on this environment"
     )
+
+
+def observed_parts(about: Mapping[str, Any]) -> dict[str, int]:
+    """Returns the sizes of the vectors of an agent's Dict by key, in the order in which SB3 joins them."""
+    text = str(about["observation_space"].get("spaces"))[:LONGEST_SPACES]
+    return {key: int(size or 0) for key, size in PART.findall(text)}
 
 
 def _dict_of(parts: Mapping[str, int]) -> str:
@@ -144,14 +156,36 @@ def _dict_of(parts: Mapping[str, int]) -> str:
     return f"Dict({words})" if words else "a Dict"
 
 
-def by_frames(task: Task, n_stack: int) -> np.ndarray:
+def by_frames(task: Task, n_stack: int, keys: Sequence[str]) -> np.ndarray:
     """Returns where an agent of a Dict has the numbers of stacked observations, frame by frame: (n_stack k,).
 
-    `VecFrameStack` stacks each vector of a Dict by itself, and SB3 puts these stacks one after the other.
+    `VecFrameStack` stacks each vector of a Dict by itself, and SB3 puts these stacks one after the other, in
+    the order of the `keys` of its space. The task's own observation has its parts in an order of its own.
     """
-    ends = n_stack * np.cumsum([*task.observation_parts.values()])
-    stacks = np.split(np.arange(ends[-1]), ends[:-1])
-    return np.hstack([stack.reshape(n_stack, -1) for stack in stacks]).ravel()
+    parts = task.observation_parts
+    ends = n_stack * np.cumsum([parts[key] for key in keys])
+    stacks = dict(zip(keys, np.split(np.arange(ends[-1]), ends[:-1]), strict=True))
+    return np.hstack([stacks[key].reshape(n_stack, -1) for key in parts]).ravel()
+
+
+def framewise(preprocessing: Preprocessing, task: Task, keys: list[str]) -> Preprocessing:
+    """Returns the preprocessing of an agent of a Dict with `keys` for the task's order, frame by frame.
+
+    Raises:
+        BadArtifact: its statistics are in an order that is not known.
+    """
+    if preprocessing.normalization is None:
+        return preprocessing
+    if preprocessing.normalization.by_key:
+        keys = list(task.observation_parts)
+    elif keys != sorted(keys):
+        raise BadArtifact(
+            f"its Dict has the keys {', '.join(keys)}, which are not sorted, so that a row of statistics may "
+            "be in one order or the other: give arrays mean.KEY and var.KEY for each of them"
+        )
+    for n in {1, preprocessing.n_stack}:
+        preprocessing = preprocessing.reordered(by_frames(task, n, keys))
+    return preprocessing
 
 
 def _check_used(tensors: Mapping[str, np.ndarray], algorithm: str) -> None:

@@ -151,11 +151,9 @@ class CellNoise(Signal):
         bound: np.ndarray,
     ):
         assert certificate.cells is not None
-        self.bound, self._cells, self._controller = (
-            float(bound.max()),
-            certificate.cells,
-            controller,
-        )
+        largest = float(bound.max())
+        super().__init__(largest, bound / (largest or 1.0))
+        self._cells, self._controller = certificate.cells, controller
         self._outer, self._inner = outer, inner
         steps = [np.linspace(-b, b, CANDIDATES if b else 1) for b in bound]
         candidates = np.array([*product(*steps)])

@@ -9,17 +9,22 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Self, TypeVar
+from typing import Literal, Self, TypeVar, get_args
 
 import numpy as np
 
-from hyrl_mj.errors import BadInput, check_bound, unknown
+from hyrl_mj.errors import BadInput, brief, check_bound, unknown
 from hyrl_mj.plant import Plant
 from hyrl_mj.policies import Controller
 from hyrl_mj.tasks import Task
 
 # The mode of a run before its first measurement, from which the controller picks its start mode.
 NOT_STARTED = -1
+# By so much noise may exceed what is allowed: a few roundings of it, or of the measurement that it is the
+# difference of [units in the last place].
+ULPS = 8
+# What follows the last sample of a recorded signal.
+After = Literal["refuse", "hold", "repeat", "none"]
 
 
 @dataclass(frozen=True)
@@ -62,6 +67,11 @@ class Signal(ABC):
 
     def __init__(self, bound: float, shares: np.ndarray):
         self.bound, self.shares = bound, shares
+
+    @property
+    def limits(self) -> np.ndarray:
+        """The largest magnitude of the noise on each column of the measurement, (p,)."""
+        return np.asarray(self.bound * np.abs(self.shares))
 
     def against(self, task: Task, controller: Controller | None) -> Self:
         """Returns the signal for one closed loop: a copy, because loops do not share their memory.
@@ -153,17 +163,46 @@ class Alternating(Signal):
 
 @dataclass(frozen=True)
 class Recorded(Signal):
-    """A recorded noise signal; after its last sample there is no noise.
+    """A recorded noise signal.
 
     Attributes:
         values: (K, n, p) noise on n simulations, in the unit of the measurement.
-        bound: largest magnitude of the values.
+        bound: largest magnitude of the values, or of values / shares if shares are given.
         kind: name of the kind.
+        after: what follows the last sample while a run goes on: "refuse" raises `BadInput`, "hold" keeps the
+            last sample, "repeat" begins again with the first, and "none" adds no more noise.
+        shares: (p,) how much of the bound acts on each column of the measurement; by default all of it.
+
+    Raises:
+        BadInput: values of another shape or type, not finite, or beyond the bound; or an unknown `after`.
     """
 
     values: np.ndarray
     bound: float
     kind: str = "recorded"
+    after: After = "refuse"
+    shares: np.ndarray = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        check_bound(self.bound)
+        if self.after not in get_args(After):
+            raise unknown("way to go on after a recorded noise", self.after, get_args(After))
+        values = np.asarray(self.values)
+        if values.ndim != 3 or not values.size or values.dtype.kind not in "iuf":
+            raise BadInput(
+                f"a recorded noise of type {values.dtype} and shape {values.shape} cannot be used: give "
+                "numbers of shape (samples, simulations, columns)"
+            )
+        columns = values.shape[2]
+        shares = np.ones(columns) if self.shares is None else np.asarray(self.shares, dtype=float)
+        if shares.shape != (columns,):
+            raise BadInput(f"a recorded noise on {columns} columns has shares of {shares.shape}")
+        object.__setattr__(self, "values", values.astype(float, copy=False))
+        object.__setattr__(self, "shares", shares)
+        bad = ~_within(self.values, self.limits)
+        if bad.any():
+            k, row, column = np.argwhere(bad)[0]
+            raise _too_large(self, k, row, column, self.values[k, row, column])
 
     def for_rows(self, rows: np.ndarray) -> Signal:
         return replace(self, values=self.values[:, rows])
@@ -173,12 +212,18 @@ class Recorded(Signal):
             raise self._misfit(f"{n} simulations")
 
     def sample(self, now: Sample) -> np.ndarray:
-        columns = now.measurement.shape[1]
+        columns, samples = now.measurement.shape[1], len(self.values)
         if self.values.shape[2] != columns:
             raise self._misfit(f"{columns} columns of measurement")
-        over = now.k >= len(self.values)
-        values = self.values[np.minimum(now.k, len(self.values) - 1), now.rows]
-        return np.where(over[:, None], 0.0, values)
+        over = now.k >= samples
+        if self.after == "refuse" and over.any():
+            raise BadInput(
+                f"the {self.kind} noise was recorded for {samples} samples, and a run goes on after them: "
+                'record more, or give after="hold", "repeat" or "none"'
+            )
+        k = now.k % samples if self.after == "repeat" else np.minimum(now.k, samples - 1)
+        values = self.values[k, now.rows]
+        return np.where(over[:, None], 0.0, values) if self.after == "none" else values
 
     def _misfit(self, what: str) -> BadInput:
         return BadInput(
@@ -216,7 +261,13 @@ class Noise:
         """
         task.check_noise(self.bound, self.everywhere)
         shares = np.ones(len(task.noisy)) if self.everywhere else np.array(task.noisy, dtype=float)
-        return _KINDS[self.kind](self.bound, shares).against(task, controller)
+        signal = _KINDS[self.kind](self.bound, shares.copy()).against(task, controller)
+        if not np.array_equal(_limits(signal), self.bound * shares):
+            raise BadInput(
+                f"{self.kind} noise of {self.bound:g} takes {_limits(signal)} as its largest magnitudes, and "
+                f"is allowed {self.bound * shares}: leave its bound and shares as they are given"
+            )
+        return signal
 
 
 # The types that a closed loop takes as noise.
@@ -233,3 +284,68 @@ def signal_for(noise: AnyNoise | None, task: Task, controller: Controller | None
     if not isinstance(noise, AnyNoise):
         raise BadInput(f'noise {noise!r} cannot be used: give a hyrl_mj.Noise("uniform", 0.1), say')
     return noise.against(task, controller)
+
+
+def drawn(signal: Signal, now: Sample) -> np.ndarray:
+    """Returns the noise (n, p) of a signal at a sample; each loop draws its noise here.
+
+    Raises:
+        BadInput: it raises an error, changes what it is shown, gives another shape or type, or noise that is
+            not finite or larger than its bound times the share of its column.
+    """
+    shown = replace(now, measurement=_read_only(now.measurement), q=_read_only(now.q))
+    try:
+        noise = signal.sample(shown)
+    except BadInput:
+        raise
+    except Exception as error:  # a user's code can raise anything
+        raise BadInput(f"{signal.kind} noise cannot be used: it raised {brief(error)}") from error
+    true = now.measurement
+    if not isinstance(noise, np.ndarray) or noise.shape != true.shape or noise.dtype.kind != "f":
+        given = np.asarray(noise)
+        raise BadInput(
+            f"{signal.kind} noise gives {given.dtype} of shape {given.shape}, where {true.shape} floats are "
+            "needed: a row for each simulation, a column for each of the measurement"
+        )
+    bad = ~_within(noise, _limits(signal), true)
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        raise _too_large(signal, now.k[row], now.rows[row], column, noise[row, column])
+    return noise
+
+
+def _read_only(array: np.ndarray) -> np.ndarray:
+    view = array.view()
+    view.setflags(write=False)
+    return view
+
+
+def _limits(signal: Signal) -> np.ndarray:
+    """Returns `limits` of a signal, whose class may be a user's."""
+    try:
+        return np.asarray(signal.limits, dtype=float)
+    except (AttributeError, TypeError, ValueError):
+        raise BadInput(
+            f"{signal.kind} noise has no bound and shares: call super().__init__(bound, shares) when made"
+        ) from None
+
+
+def _within(
+    noise: np.ndarray, limits: np.ndarray, measured: np.ndarray | None = None
+) -> np.ndarray:
+    """Returns whether noise (..., p) is finite and within limits (p,), but for rounding, of each number."""
+    largest = np.abs(noise)
+    within = largest <= limits
+    if not within.all():  # seldom, so that the usual case stays cheap
+        scale = limits if measured is None else limits + np.abs(measured)
+        within = largest <= limits + ULPS * np.finfo(float).eps * np.where(limits > 0, scale, 0.0)
+    return np.asarray(within)
+
+
+def _too_large(signal: Signal, k: int, row: int, column: int, value: float) -> BadInput:
+    allowed = _limits(signal)[column]
+    most = f"at most {allowed:g} in magnitude" if allowed else "none"
+    return BadInput(
+        f"{signal.kind} noise is {value:g} at sample {k} of simulation {row} in column {column} of the "
+        f"measurement, where {most} is allowed: bound {signal.bound:g} times the column's share"
+    )

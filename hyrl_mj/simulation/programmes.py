@@ -37,7 +37,7 @@ class Rules:
         shares: (p,) how much of the bound acts on each column of the measurement.
 
     Attributes:
-        bound: as above.
+        bound, shares: as above.
         candidates: (c, p) noise that wishes choose from, the first of which is none.
         fixed: (rules, p) noise of the rules that are no wishes; zero for the others.
         alternates: (rules,) bool, whether the sign of this noise alternates.
@@ -46,7 +46,7 @@ class Rules:
     """
 
     def __init__(self, task: Task, controller: Controller, bound: float, shares: np.ndarray):
-        self.bound = bound
+        self.bound, self.shares = bound, shares
         self.candidates = bound * _directions(shares != 0) * shares
         wishes: list[str | tuple[int, int]] = [CONTRARY, STRAIGHT, REVERSE]
         if len(controller.modes) > 1:
@@ -131,8 +131,8 @@ class Programmes(Signal):
     def __init__(
         self, task: Task, controller: Controller, rules: Rules, programmes: np.ndarray, segment: int
     ):
-        self._shape = n, p = len(programmes), rules.fixed.shape[1]
-        super().__init__(rules.bound, np.ones(p))
+        self._shape = n, _ = len(programmes), rules.fixed.shape[1]
+        super().__init__(rules.bound, rules.shares)
         self.task, self.controller, self.rules = task, controller, rules
         self.programmes, self.segment = programmes, segment
         self._values: list[np.ndarray] = []

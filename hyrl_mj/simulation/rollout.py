@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from hyrl_mj.plant import Plant
-from hyrl_mj.policies import Controller, answer, nothing_past, remembering
+from hyrl_mj.policies import Asked, Controller, nothing_past, remembering
 from hyrl_mj.progress import progress_bar
-from hyrl_mj.simulation.noise import NOT_STARTED, AnyNoise, Sample, signal_for
+from hyrl_mj.simulation.noise import NOT_STARTED, AnyNoise, Sample, drawn, signal_for
 from hyrl_mj.simulation.passing import Follower, Passing
 from hyrl_mj.tasks import Outcome, Task
 
@@ -97,7 +97,7 @@ def closed_loop(
         settings: duration, direction and what to record.
 
     Raises:
-        BadInput: the noise cannot be used.
+        BadInput: the noise cannot be used, or the controller has a memory or draws at random.
     """
     if task.side_by_side is not None and len(z0) > task.side_by_side:
         return _in_turns(task, controller, z0, noise, q0, seed, settings)
@@ -107,7 +107,7 @@ def closed_loop(
     plant.set_state(*task.state(z0, settings.rng_of_starts(seed)))
     signal = signal_for(noise, task, controller)
     signal.reset(n, np.random.default_rng(seed))
-    measurement = plant.measurement
+    ask, measurement = Asked(task, controller), plant.measurement
     past = nothing_past(controller, n, measurement.shape[1])
     q = np.full(n, NOT_STARTED) if q0 is None else np.asarray(q0, dtype=int).copy()
     outcome = np.full(n, Outcome.RUNNING) if backward else task.outcome(measurement, plant.unstable)
@@ -125,7 +125,7 @@ def closed_loop(
         if not len(active):
             break
         now = Sample(np.arange(n), np.full(n, k), measurement, q, plant, past)
-        measured = plant.observe(measurement, signal.sample(now), np.arange(n))
+        measured = plant.observe(measurement, drawn(signal, now), np.arange(n))
         if plant.late:  # what the last step came to is known only now
             outcome[active] = task.outcome(plant.truth[active], plant.unstable[active])
             active = np.flatnonzero(outcome == Outcome.RUNNING)
@@ -135,7 +135,7 @@ def closed_loop(
             q[fresh] = controller.initial_mode(measured[fresh])
             first_mode = q.copy()
         before, u = q.copy(), np.full((n, len(task.inputs)), np.nan)
-        u[active], q[active] = answer(controller, q[active], measured[active], past[active])
+        u[active], q[active] = ask(k, q[active], measured[active], past[active])
         past = remembering(past, measured)
         (plant.step_backward if backward else plant.step)(u[active], active)
         measurement, last, lost = plant.truth, measurement, plant.unstable
@@ -156,6 +156,7 @@ def closed_loop(
         going = outcome == Outcome.RUNNING
         outcome[going] = task.outcome(plant.measurement[going], plant.unstable[going])
         measurement = plant.truth
+    ask.again()
     if not backward:
         late = outcome == Outcome.RUNNING
         outcome[late] = task.verdict(measurement[late])

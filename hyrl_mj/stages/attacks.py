@@ -343,7 +343,9 @@ class _Search:
 
     def result(self, name: str, everywhere: bool, rounds: int, seconds: float | None) -> Attack:
         """Simulates the strongest signals again, as records, and returns what they do."""
-        recorded = Recorded(self.signals, self.rules.bound, Programmes.kind)
+        rules = self.rules
+        # Replays may be longer than an episode, in which alone the attack acts.
+        recorded = Recorded(self.signals, rules.bound, Programmes.kind, "none", rules.shares)
         arcs = simulate_batch(self.task, self.controller, self.starts, recorded)
         dangerous = int(np.argmax(self._worst))
         return Attack.of(arcs, recorded, dangerous, name, everywhere, rounds, seconds)

@@ -192,10 +192,14 @@ class _Constant(Signal):
     def for_rows(self, rows: np.ndarray) -> _Constant:
         return _Constant(self._task, self._error[rows])
 
+    @property
+    def limits(self) -> np.ndarray:
+        """No limits: the errors are those of chart points, and a measurement may show them otherwise."""
+        return np.full(len(self.shares), np.inf)
+
     def sample(self, now: Sample) -> np.ndarray:
         task, true = self._task, now.measurement
-        there = task.with_z(true, task.z(true) + self._error[now.rows])
-        return np.where(self.shares > 0, there - true, 0.0)
+        return np.asarray(task.with_z(true, task.z(true) + self._error[now.rows]) - true)
 
 
 def _go_apart(task: Task, a: np.ndarray, b: np.ndarray, far: float) -> bool:

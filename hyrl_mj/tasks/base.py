@@ -52,6 +52,8 @@ class Task(ABC):
     #: the vectors of a Dict that, one after the other, are the observation: the number of columns of each, by
     #: its key; none of a plain vector
     observation_parts: Mapping[str, int] = {}
+    #: the type of the numbers that the task's environments give in observations, such as "float64"; "" if any
+    observation_dtype: str = ""
     _digest: str = ""
     #: one line for `hyrl-mj list`
     description: str = ""
