@@ -29,7 +29,7 @@ PASSED = (
     "lxml", "xml", "logging", "re", "_thread", "threading", "weakref", "hyrl_mj",
 )  # fmt: skip
 # Packages whose modules and classes hold no memory of an episode.
-LIBRARIES = ("gymnasium", "dm_control", "shimmy", "numpy", "mujoco", "builtins", "abc", "hyrl_mj")
+LIBRARIES = ("gymnasium", "dm_control", "shimmy", "numpy", "mujoco", "hyrl_mj")
 # Attributes that hold the arguments of a constructor, and methods that are put in by `Instance`.
 LEFT_OUT = frozenset(("_ezpickle_args", "_ezpickle_kwargs", "_saved_kwargs", "step", "reset"))
 # How deep attributes of attributes are looked at, and how many values at most. What lies beyond cannot be
@@ -191,7 +191,7 @@ def _has_no_memory(value: Any) -> bool:
 def _shared(kind: type, found: Fingerprint, seen: set[int]) -> None:
     """Writes down the variables that the instances of a class share: its own, and those of its module."""
     module = kind.__module__ or ""
-    if module.partition(".")[0] in LIBRARIES or kind is object:
+    if module.partition(".")[0] in {*LIBRARIES, *sys.stdlib_module_names}:
         return
     for where, owner in (
         (f"class {kind.__name__}", kind),

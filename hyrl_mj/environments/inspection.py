@@ -148,6 +148,7 @@ def inspect(
         observation_low=_ends(space, "low"),
         observation_high=_ends(space, "high"),
         moves=np.zeros(int(spaces.flatdim(space)), dtype=bool),
+        affine=None,
         wrapped=instance.env is not instance.inner,
         low=low,
         high=high,

@@ -44,6 +44,7 @@ class Recipe:
         places: pairs of names whose distance is reported, each as a kind and an index for both.
         solid: (ngeom,) bool, the geoms of the robot.
         harmless: geoms that the robot has touched without an end of the episode.
+        lags: whether what is observed after a step is computed from quantities of a physics step before.
     """
 
     source: Source
@@ -53,6 +54,7 @@ class Recipe:
     places: tuple[tuple[tuple[str, int], tuple[str, int]], ...] = ()
     solid: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
     harmless: frozenset[int] = frozenset()
+    lags: bool = True
 
     def with_source(self, source: Source) -> Recipe:
         """Returns the recipe for an environment that is made or reset in another way."""
@@ -345,7 +347,8 @@ class Instance:
         self.mark()
         if self._chain is None:
             self.physics.write(start)
-            self.observation = flat(self.watched(), self.inner.observation_space)
+            self.inner_seen = self.watched()
+            self.observation = flat(self.inner_seen, self.inner.observation_space)
         else:
             self.start = start
             self._chain.ask(lambda: self.reset())
@@ -421,14 +424,16 @@ class Instance:
     def displaced(self, noise: np.ndarray) -> np.ndarray:
         """Returns by how much the innermost observation changes (o,) where the chart's coordinates do.
 
-        It is the difference of two observations with all derived quantities up to date. What the environment
-        observes after a step may be computed from those of a physics step before, and keeps that.
+        Where what is observed lags, it is the difference of two observations with all derived quantities up to
+        date.
         """
         space, state = self.inner.observation_space, self.physics.read()
         moved = self.moved(state, noise)
         with self.physics.kept():
-            self.physics.write(state)
-            here = flat(self.watched(), space)
+            here = flat(self.inner_seen, space)
+            if self.recipe.lags:
+                self.physics.write(state)
+                here = flat(self.watched(), space)
             self.physics.write(moved)
             return flat(self.watched(), space) - here
 
@@ -581,7 +586,7 @@ class _Chain:
             return result
         self._instance.pin()
         self._instance.physics.write(self._instance.start)
-        observation = self._instance.watched()
+        observation = self._instance.inner_seen = self._instance.watched()
         if not self._asked:
             return (observation, *result[1:])
         self._count()

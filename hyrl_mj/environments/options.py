@@ -85,6 +85,7 @@ _INSTEAD = {
     "noise": "noisy",
     "goal": "reset, pinned or seed",
     "ways": "chart",
+    "lag": "an environment that calls mj_forward at the end of step()",
     "sample time": "kwargs, such as frame_skip, if the environment takes it",
     "camera": "task.scene another one in Python",
 }

@@ -123,7 +123,11 @@ class Stage:
         for start in starts:
             if self._resting is None:
                 self._resting = self._new()
-            seen.append(self._resting.rested(start))
+            try:
+                seen.append(self._resting.rested(start))
+            except Worn:
+                self._resting = self._new()
+                seen.append(self._resting.rested(start))
             depths.append(self._resting.depth())
         return np.array(seen), np.array(depths)
 

@@ -113,6 +113,7 @@ class EnvironmentSpec:
         parts: the number of columns of each part of a Dict, in the order of its space; none of a vector.
         observation_low, observation_high: limits (o,).
         moves: (o,) bool, the columns of an observation at rest that follow the chart.
+        affine: a matrix (d + 1, o) that gives what is observed at rest at z from (z, 1), if one does.
         wrapped: whether wrappers lie around the environment.
         low, high: limits (m,) of the inputs.
         inputs: their names.
@@ -142,6 +143,7 @@ class EnvironmentSpec:
     observation_low: np.ndarray
     observation_high: np.ndarray
     moves: np.ndarray
+    affine: np.ndarray | None
     wrapped: bool
     low: np.ndarray
     high: np.ndarray

@@ -37,7 +37,7 @@ SEEN = 1.2
 # A run that turns by less than this decides nothing [rad].
 DECIDED = 0.5
 # Episodes that are played side by side, each by an instance.
-SIDE_BY_SIDE = 64
+SIDE_BY_SIDE = 128
 
 
 class EnvironmentTask(Task):
@@ -207,9 +207,15 @@ class EnvironmentTask(Task):
         self._pool.check(runs)
 
     def at(self, z: np.ndarray) -> np.ndarray:
-        seen, _ = self._pool.rest(self.specification.state_at(z))
+        seen = self._at_rest(z)
         rest = np.tile([0.0, 0.0, float(Outcome.RUNNING)], (len(z), 1))
         return np.column_stack([z, seen, rest])
+
+    def _at_rest(self, z: np.ndarray) -> np.ndarray:
+        """Returns what a robot at rest at chart points (n, d) observes (n, o)."""
+        if (affine := self.specification.affine) is not None:
+            return np.asarray(np.column_stack([z, np.ones(len(z))]) @ affine)
+        return self._pool.rest(self.specification.state_at(z))[0]
 
     def with_z(self, measured: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Returns measurements (n, p) with what a robot at rest at chart points z (n, d) would observe.
@@ -219,7 +225,7 @@ class EnvironmentTask(Task):
         d, o = self.chart.dimension, self.specification.columns
         changed, found = np.flatnonzero((measured[:, :d] != z).any(axis=1)), measured.copy()
         if len(changed):
-            seen, _ = self._pool.rest(self.specification.state_at(z[changed]))
+            seen = self._at_rest(z[changed])
             moves = d + np.flatnonzero(self.specification.moves)
             found[changed[:, None], moves] = seen[:, self.specification.moves]
             found[changed, :d] = z[changed]

@@ -58,8 +58,17 @@ def tried(instance: Instance, spec: EnvironmentSpec) -> tuple[EnvironmentSpec, P
         BadInput: the environment does not observe what it is told, or goes otherwise than a new one.
     """
     _check_observer(instance, spec)
+    found, lagging = dict(spec.found), _lagging(instance)
+    if len(lagging):
+        found["lag"] = (
+            f"observation {', '.join(map(str, lagging))} comes from a physics step before the end of a step; "
+            "noise adds to it what it changes at the end"
+        )
+    spec = replace(spec, recipe=replace(spec.recipe, lags=len(lagging) > 0), found=found)
+    instance.recipe = spec.recipe
     pool = Pool(spec.recipe)
-    spec = replace(spec, moves=_moving(pool, spec))
+    moves, affine = _moving(pool, spec)
+    spec = replace(spec, moves=moves, affine=affine)
     _check_instances(pool, spec)
     if spec.memoryless:
         spec = replace(spec, memoryless=_forgets(pool, spec))
@@ -113,6 +122,27 @@ def _check_observer(instance: Instance, spec: EnvironmentSpec) -> None:
             _refuse(name, column, why)
 
 
+def _lagging(instance: Instance) -> np.ndarray:
+    """Returns the columns of what is observed after a step that lag behind the state at its end."""
+    rng, space = np.random.default_rng(5), instance.inner.observation_space
+    lags = np.zeros(0, dtype=bool)
+    for seed in range(EPISODES):
+        instance.reset(seed)
+        for k in range(SAMPLES):
+            if k % HELD == 0:
+                u = instance.drawn(rng)
+            _, _, terminated, truncated, _ = instance.stepped(u)
+            seen = flat(instance.inner_seen, space)
+            with instance.physics.kept():
+                instance.physics.write(instance.physics.read())
+                off = np.abs(flat(instance.watched(), space) - seen)
+            scale = max(float(np.abs(seen).max(initial=0.0)), 1.0)
+            lags = (off > ROUNDING * scale) | (lags if len(lags) else False)
+            if terminated or truncated:
+                break
+    return np.flatnonzero(lags)
+
+
 def _refuse(name: str, column: int, why: str) -> None:
     raise BadInput(
         f"what {name} observes does not follow its state: observation[{column}] {why}. It is stored by "
@@ -137,12 +167,17 @@ def _depends(instance: Instance, spec: EnvironmentSpec, column: int, step: np.nd
     return not np.array_equal(ends[0], ends[1], equal_nan=True)
 
 
-def _moving(pool: Pool, spec: EnvironmentSpec) -> np.ndarray:
-    """Returns which columns of an observation at rest follow the chart: (o,) bool."""
+def _moving(pool: Pool, spec: EnvironmentSpec) -> tuple[np.ndarray, np.ndarray | None]:
+    """Returns which columns of an observation at rest follow the chart (o,) bool, and `affine` of a spec."""
     rng = np.random.default_rng(0)
-    z = rng.uniform(spec.start_low, spec.start_high, (EPISODES, spec.dimension))
+    z = rng.uniform(
+        spec.start_low, spec.start_high, (EPISODES * (spec.dimension + 1), spec.dimension)
+    )
     seen, _ = pool.rest(spec.state_at(z))
-    return np.ptp(seen, axis=0) > 0
+    one = np.column_stack([z, np.ones(len(z))])
+    fit = np.linalg.lstsq(one, seen, rcond=None)[0]
+    exact = np.abs(one @ fit - seen).max() <= ROUNDING * max(np.abs(seen).max(), 1.0)
+    return np.ptp(seen, axis=0) > 0, fit if exact else None
 
 
 def _free(pool: Pool, spec: EnvironmentSpec, n: int, rng: np.random.Generator) -> np.ndarray:

@@ -136,7 +136,9 @@ class Programmes(Signal):
         self.task, self.controller, self.rules = task, controller, rules
         self.programmes, self.segment = programmes, segment
         self._values: list[np.ndarray] = []
-        self._parts: list[Programmes] = []  # of these runs, where not all are simulated at once
+        self._parts: list[
+            tuple[np.ndarray, Programmes]
+        ] = []  # of these runs, where not all are simulated at once
         self.danger, self.reversals, self.rewards = np.full(n, -np.inf), np.zeros(n), np.zeros(n)
         self._last = np.full((n, len(task.inputs)), np.nan)
 
@@ -144,25 +146,29 @@ class Programmes(Signal):
         return self
 
     def for_rows(self, rows: np.ndarray) -> Programmes:
-        some = slice(rows[0], rows[-1] + 1)
         part = Programmes(
-            self.task, self.controller, self.rules, self.programmes[some], self.segment
+            self.task, self.controller, self.rules, self.programmes[rows], self.segment
         )
-        # What the part notes, it notes here.
-        part.danger, part.reversals = self.danger[some], self.reversals[some]
-        part.rewards = self.rewards[some]
-        self._parts.append(part)
+        self._parts.append((rows, part))
         return part
+
+    def gather(self) -> None:
+        """Takes over what its parts noted, where not all runs were simulated at once."""
+        if not self._parts:
+            return
+        samples = max(len(part._values) for _, part in self._parts)
+        values = np.zeros((samples, *self._shape))
+        for rows, part in self._parts:
+            if part._values:
+                values[: len(part._values), rows] = part._values
+            for name in ("danger", "reversals", "rewards"):
+                getattr(self, name)[rows] = getattr(part, name)
+        self._values, self._parts = list(values), []
 
     @property
     def values(self) -> np.ndarray:
         """The noise (K, n, p) so far; none in runs that are over."""
-        if not self._parts:
-            return np.array(self._values).reshape(-1, *self._shape)
-        parts = [part.values for part in self._parts]
-        samples = max(map(len, parts))
-        ends = [((0, samples - len(p)), (0, 0), (0, 0)) for p in parts]
-        return np.concatenate([np.pad(*pair) for pair in zip(parts, ends, strict=True)], axis=1)
+        return np.array(self._values).reshape(-1, *self._shape)
 
     def reset(self, n: int, rng: np.random.Generator) -> None:
         super().reset(n, rng)

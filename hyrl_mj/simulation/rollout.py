@@ -184,19 +184,21 @@ def _in_turns(
     n, size = len(z0), task.side_by_side
     assert size is not None
     parts, signal = [], signal_for(noise, task, controller)
+    # Those that are over before they begin come last: they take no time.
+    order = np.argsort(~task.goes_on(z0), kind="stable")
     turns = range(0, n, size)
     for first in progress_bar(turns, settings.label, "turns", quiet=settings.quiet):
-        rows = np.arange(first, min(first + size, n))
+        rows = order[first : first + size]
         begun = None if q0 is None else np.asarray(q0)[rows]
         quiet = replace(settings, quiet=True, plant=None)
         some = signal.for_rows(rows)
         own = seed if not first else int(np.random.SeedSequence([seed, first]).generate_state(1)[0])
         parts.append(closed_loop(task, controller, z0[rows], some, begun, own, quiet))
-    return _joined(parts)
+    return _joined(parts, np.argsort(order))
 
 
-def _joined(parts: list[Rollout]) -> Rollout:
-    """Returns the runs of several rollouts as one."""
+def _joined(parts: list[Rollout], order: np.ndarray) -> Rollout:
+    """Returns the runs of several rollouts as one, in an order (n,)."""
     found: dict[str, Any] = {}
     for name in ("path", "before", "q", "measured", "u", "true", "state"):
         arrays = [getattr(part, name) for part in parts]
@@ -204,11 +206,11 @@ def _joined(parts: list[Rollout]) -> Rollout:
             found[name] = arrays[0]
             continue
         samples = max(map(len, arrays))
-        found[name] = np.concatenate([_lasting(a, samples) for a in arrays], axis=1)
+        found[name] = np.concatenate([_lasting(a, samples) for a in arrays], axis=1)[:, order]
     for name in ("length", "outcome", "q0"):
-        found[name] = np.concatenate([getattr(part, name) for part in parts])
+        found[name] = np.concatenate([getattr(part, name) for part in parts])[order]
     seen = [part.passing for part in parts if part.passing is not None]
-    return Rollout(**found, passing=Passing.joined(seen) if seen else None)
+    return Rollout(**found, passing=Passing.joined(seen)[order] if seen else None)
 
 
 def _lasting(values: np.ndarray, samples: int) -> np.ndarray:

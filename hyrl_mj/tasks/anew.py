@@ -50,10 +50,13 @@ def begins_anew(task: Task, of_chart: bool = False) -> bool:
                 break
             start = plant.qpos
             anew.set_state(*(task.state(task.z(before)) if of_chart else (start, None)))
+            # A copy may be whole turns of a periodic coordinate away: the hops are compared.
+            copied = anew.qpos
             plant.step(u)
             anew.step(u)
-            off.append(np.abs(plant.qpos - anew.qpos)[goes_on])
-            hops.append(np.abs(plant.qpos - start)[goes_on])
+            hop = plant.qpos - start
+            off.append(np.abs(hop - (anew.qpos - copied))[goes_on])
+            hops.append(np.abs(hop)[goes_on])
     longest = np.concatenate(hops).max(axis=0)
     return bool((np.concatenate(off) <= ALIKE * longest + ROUNDING).all())
 
