@@ -117,6 +117,7 @@ def inspect(
     resets = states_of_resets(instance)
     _check_drawn(instance, chosen, drawn(instance, resets, robot), found)
     check_pins(instance)
+    instance = Instance(instance.recipe)  # a new one: something may have outlasted the resets of the other
     state = _at_rest(instance, places, robot)
     offset = np.array([c.offset for c in chosen])
     groups = groups_of(instance, runs.states[:, list(at)][:, :2]) if _in_plane(chosen) else []
@@ -167,7 +168,10 @@ def inspect(
         memoryless=not runs.memory and instance.env is instance.inner,
         found=found,
     )
-    return *trials.tried(instance, spec), instance
+    tried = trials.tried(instance, spec)
+    instance = Instance(tried[0].recipe)
+    instance.reset()
+    return *tried, instance
 
 
 def _sampled(instance: Instance) -> Runs:

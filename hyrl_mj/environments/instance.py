@@ -424,8 +424,8 @@ class Instance:
     def displaced(self, noise: np.ndarray) -> np.ndarray:
         """Returns by how much the innermost observation changes (o,) where the chart's coordinates do.
 
-        Where what is observed lags, it is the difference of two observations with all derived quantities up to
-        date.
+        Where what is observed lags, it is the difference of two observations with all derived quantities
+        up to date.
         """
         space, state = self.inner.observation_space, self.physics.read()
         moved = self.moved(state, noise)

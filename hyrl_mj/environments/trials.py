@@ -52,7 +52,6 @@ def _agrees(get: Any, seen: np.ndarray, space: Any) -> bool:
 def tried(instance: Instance, spec: EnvironmentSpec) -> tuple[EnvironmentSpec, Pool]:
     """Returns what is known of an environment after the trials, and what plays its episodes.
 
-    The instance is left as the reset that all runs begin with leaves it.
 
     Raises:
         BadInput: the environment does not observe what it is told, or goes otherwise than a new one.
@@ -72,7 +71,6 @@ def tried(instance: Instance, spec: EnvironmentSpec) -> tuple[EnvironmentSpec, P
     _check_instances(pool, spec)
     if spec.memoryless:
         spec = replace(spec, memoryless=_forgets(pool, spec))
-    instance.reset()
     return spec, pool
 
 
