@@ -180,7 +180,7 @@ def test_a_zip_without_any_pickled_member_is_the_same_agent(dqn, vehicle, tmp_pa
     with zipfile.ZipFile(bare) as file:
         others = [name for name in file.namelist() if name != "policy.pth"]
     rewritten(bare, **dict.fromkeys(others))
-    assert read_agent(vehicle, bare).agent == read_agent(vehicle, dqn).agent
+    assert read_agent(vehicle, bare, vecnormalize="none").agent == read_agent(vehicle, dqn).agent
 
 
 def test_a_stage_works_on_the_agent(robust, tmp_path):

@@ -72,7 +72,10 @@ def write_zip(folder: Path, policy: object = None, data: object = None, **member
     with zipfile.ZipFile(folder / "agent.zip", "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr("policy.pth", pth)
         file.writestr(
-            "data", data if isinstance(data, str) else json.dumps(data or {"clip_range": 0.2})
+            "data",
+            data
+            if isinstance(data, str)
+            else json.dumps({"num_timesteps": 0, **(data or {"clip_range": 0.2})}),
         )
         for name, content in members.items():
             file.writestr(name.replace("__", "."), content)
