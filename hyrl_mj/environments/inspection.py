@@ -117,7 +117,9 @@ def inspect(
     resets = states_of_resets(instance)
     _check_drawn(instance, chosen, drawn(instance, resets, robot), found)
     check_pins(instance)
-    instance = Instance(instance.recipe)  # a new one: something may have outlasted the resets of the other
+    instance = Instance(
+        instance.recipe
+    )  # a new one: something may have outlasted the resets of the other
     state = _at_rest(instance, places, robot)
     offset = np.array([c.offset for c in chosen])
     groups = groups_of(instance, runs.states[:, list(at)][:, :2]) if _in_plane(chosen) else []

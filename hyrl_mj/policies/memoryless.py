@@ -36,10 +36,10 @@ Ask = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def draws(policy: object) -> bool:
-    """Returns whether a policy draws its inputs, as its user has asked for."""
+    """Returns whether a policy draws its inputs and says so, as its user has asked for."""
     while isinstance(policy, PreprocessedPolicy):
         policy = policy.policy
-    return isinstance(policy, SampledPolicy)
+    return isinstance(policy, SampledPolicy) or getattr(policy, "draws", False)
 
 
 def check_memoryless(policy: Policy, task: Task, name: str = "the policy") -> None:

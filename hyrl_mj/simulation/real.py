@@ -82,6 +82,7 @@ class _AnyInputs:
 
     task: Task
     rng: np.random.Generator
+    draws: bool = True
 
     def act(self, measured: np.ndarray) -> np.ndarray:
         levels, shape = self.task.input_levels, (len(measured), len(self.task.inputs))
