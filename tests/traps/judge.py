@@ -23,7 +23,8 @@ SIGNALS = {"no noise": 0.0, "noise": 0.03, "larger noise": 0.15}
 # and taken away again. This share of the larger of a value and 1 is far above rounding, and below what traps
 # do. What an agent is shown is rounded to float32: one number of a hundred million then makes 6e-8 of 1e-16.
 SAME = 1e-9
-VERDICTS = ("right", "refused", "refused at run", "wrong", "crash")
+# "Said" is what differs under noise where `task.found` tells that an observation lags behind the state.
+VERDICTS = ("right", "refused", "refused at run", "said", "wrong", "crash")
 
 
 @dataclass(frozen=True)
@@ -166,6 +167,8 @@ def judged(case, starts=STARTS):
             return "crash", f"from_gymnasium raises {type(error).__name__}: {error}"
         try:
             wrong = _compared(case, task, case.starts[:starts])
+            if "lag" in task.found and "no noise" not in wrong and wrong:
+                return "said", wrong
         except BadInput as refusal:
             return "refused at run", str(refusal)
         except _Untrue as error:

@@ -1,0 +1,349 @@
+"""Environments of which a sample misleads: they are run as they are, or refused by name."""
+
+import time
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from environments import GOAL, XML, Delayed, Puck
+from gymnasium import spaces
+from gymnasium.wrappers import (
+    DelayObservation,
+    FlattenObservation,
+    FrameStackObservation,
+    TimeLimit,
+)
+
+from hyrl_mj import BadInput, from_callable, from_gymnasium, simulate
+from hyrl_mj.simulation import Recorded
+
+BOX = spaces.Box(-np.inf, np.inf, (4,))
+
+
+def puck_with(old="", new=""):
+    """Returns the puck on another model."""
+
+    class Other(Puck):
+        def __init__(self):
+            super().__init__()
+            self.model = mujoco.MjModel.from_xml_string(XML.replace(old, new))
+            self.data = mujoco.MjData(self.model)
+
+    return Other
+
+
+def east(observation):
+    """An agent that drives to the right, and up or down by the second number that it sees."""
+    return np.column_stack(
+        [np.full(len(observation), 1.5), np.where(observation[:, 1] > 0, 1.0, -1.0)]
+    )
+
+
+class Key(Puck):
+    """The goal counts only once the robot has been at a key, far from where random inputs lead."""
+
+    taken = False
+
+    def reset(self, **options):
+        self.taken = False
+        return super().reset(**options)
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        self.taken = self.taken or bool(self.data.qpos[0] > 1.3 and self.data.qpos[1] > 1.0)
+        info["success"] = info["success"] and self.taken
+        return observation, reward, terminated, truncated, info
+
+
+def test_what_a_run_remembers_is_its_own():
+    task = from_gymnasium(Key, steps=30)
+    agent = from_callable(lambda o: np.tile([4.0, 0.0], (len(o), 1)), task)
+    up = from_callable(lambda o: np.tile([0.0, 4.0], (len(o), 1)), task)
+    goal, key = [1.0, 0.0], [1.6, 0.9]
+    assert [arc.outcome for arc in simulate(task, up, [key, key])] == ["stalled"] * 2
+    # The runs before have taken keys; these have not.
+    assert [arc.outcome for arc in simulate(task, agent, [goal, goal])] == ["stalled"] * 2
+
+
+@pytest.mark.parametrize(
+    "wrap", [lambda e: DelayObservation(e, 2), lambda e: FrameStackObservation(e, 3)]
+)
+def test_noise_reaches_what_lies_around_an_environment(wrap):
+    make = lambda: wrap(FlattenObservation(Puck()))  # noqa: E731
+    task, rng = from_gymnasium(make), np.random.default_rng(0)
+    seen = []
+
+    def watch(observation):
+        seen.append(np.array(observation, dtype=float))
+        return np.tile([0.5, 0.1], (len(observation), 1))
+
+    values = np.zeros((6, 1, task.measurement_columns))
+    values[:, 0, :2] = rng.uniform(-0.1, 0.1, (6, 2))
+    arc = simulate(
+        task, from_callable(watch, task), [-1.0, 0.5], Recorded(values, 0.1), horizon=0.5
+    )
+    noisy = np.concatenate([arc.z[:5] + values[:5, 0, :2]])
+    names = [*make().unwrapped.observation_space.spaces]
+    at = 2 * names.index("position")
+    last = arc.measured[4, 2:-3].reshape(-1, 6)[:, at : at + 2]
+    delayed = isinstance(make(), DelayObservation)
+    np.testing.assert_allclose(last, noisy[2:3] if delayed else noisy[2:5], atol=1e-6)
+
+
+class Remembering(Puck):
+    """What it observes holds the last action."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (6,))
+    last = np.zeros(2)
+
+    def reset(self, **options):
+        self.last = np.zeros(2)
+        return super().reset(**options)
+
+    def step(self, action):
+        self.last = np.array(action, dtype=float)
+        return super().step(action)
+
+    def _get_obs(self):
+        return np.concatenate([self.data.qpos, self.data.qvel, self.last])
+
+
+def test_an_observed_action_is_that_of_the_run():
+    task = from_gymnasium(Remembering)
+    plant = task.plant(2)
+    plant.set_state(*task.state(np.array([[-1.0, 0.5], [-1.2, 0.0]])))
+    plant.step(np.array([[1.0, 2.0], [3.0, -1.0]]))
+    noise = np.zeros((2, task.measurement_columns))
+    noise[:, :2] = 0.05
+    observed = task.observation(plant.observe(plant.truth, noise, np.arange(2)))
+    np.testing.assert_allclose(observed[:, 4:], [[1.0, 2.0], [3.0, -1.0]])
+    np.testing.assert_allclose(observed[:, :2], plant.qpos + 0.05)
+
+
+class Difference(Puck):
+    """It observes a velocity that is the difference to where it was a step ago."""
+
+    observation_space, before = BOX, None
+
+    def reset(self, **options):
+        self.before = None
+        return super().reset(**options)
+
+    def step(self, action):
+        self.before = self.data.qpos.copy()
+        return super().step(action)
+
+    def _get_obs(self):
+        before = self.data.qpos if self.before is None else self.before
+        return np.concatenate([self.data.qpos, (self.data.qpos - before) / 0.1])
+
+
+class Cached(Puck):
+    """It observes a place that step() has stored."""
+
+    observation_space, place = BOX, np.zeros(2)
+
+    def reset(self, **options):
+        super().reset(**options)
+        self.place = self.data.qpos.copy()
+        return self._get_obs(), {}
+
+    def step(self, action):
+        result = super().step(action)
+        self.place = self.data.qpos.copy()
+        return self._get_obs(), *result[1:]
+
+    def _get_obs(self):
+        return np.concatenate([self.place, self.data.qvel])
+
+
+class Terminating(Puck):
+    """Reaching the goal ends the episode."""
+
+    def step(self, action):
+        observation, reward, _, truncated, info = super().step(action)
+        return observation, (5.0 if info["success"] else reward), info["success"], truncated, {}
+
+
+@pytest.mark.parametrize("success", ["reward >= 4", "distance(puck, goal) < 0.3", "terminated"])
+def test_an_episode_that_ends_at_the_goal_has_arrived(success):
+    task = from_gymnasium(Terminating, success=success)
+    assert simulate(task, from_callable(east, task), [1.2, 0.0]).outcome == "reached"
+
+
+class Colliding(Terminating):
+    """Collisions end the episode, too."""
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        return observation, reward, bool(terminated or self.data.ncon), truncated, info
+
+
+def test_collisions_are_no_success():
+    task = from_gymnasium(Colliding, success="terminated and reward >= 4")
+    assert simulate(task, from_callable(east, task), [-1.0, 0.0]).outcome == "crashed"
+    assert simulate(task, from_callable(east, task), [1.2, 0.0]).outcome == "reached"
+
+
+CART = (
+    '<body name="cart" pos="0 2.6 0.1"><joint type="slide" axis="1 0 0"/>'
+    '<geom size="0.1" mass="1"/></body>'
+)
+
+
+class Cart(puck_with('<body name="puck"', CART + '<body name="puck"')):
+    """Beside the puck rolls a cart, which resets draw in motion."""
+
+    def reset(self, *, seed=None, options=None):
+        gym.Env.reset(self, seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[1:] = self.np_random.uniform((-1.8, -1.2), (-1.0, 1.2))
+        self.data.qvel[0] = self.np_random.uniform(-1, 1)
+        mujoco.mj_forward(self.model, self.data)
+        return self._get_obs(), {}
+
+    def _get_obs(self):
+        place, speed = self.data.qpos[1:].copy(), self.data.qvel[1:].copy()
+        return {"position": place, "velocity": speed, "to_goal": GOAL - place}
+
+    def step(self, action):
+        self.data.ctrl[:] = np.clip(action, -4, 4)
+        mujoco.mj_step(self.model, self.data, nstep=5)
+        distance = float(np.linalg.norm(self.data.qpos[1:] - GOAL))
+        return self._get_obs(), -distance, False, False, {"success": distance < 0.25}
+
+
+def test_other_bodies_keep_what_a_reset_drew():
+    env = Cart()
+    env.reset(seed=3)
+    task = from_gymnasium(Cart, chart=["x", "y"], seed=3)
+    _, qvel = task.state(np.array([[-1.0, 0.5]]))
+    np.testing.assert_array_equal(qvel, [[env.data.qvel[0], 0.0, 0.0]])
+    pinned = from_gymnasium(Cart, chart=["x", "y"], pinned={"qvel[0]": 0.5})
+    np.testing.assert_array_equal(pinned.state(np.array([[-1.0, 0.5]]))[1], [[0.5, 0.0, 0.0]])
+
+
+MOCAP = '<body name="goal" mocap="true" pos="1.5 0 0"><site name="at_goal"/></body>'
+
+
+class Mocap(puck_with('<site name="goal" pos="1.5 0 0"/>', MOCAP)):
+    """Each reset draws where the goal is, a mocap body."""
+
+    def reset(self, **options):
+        super().reset(**options)
+        self.data.mocap_pos[0, :2] = self.np_random.uniform((1.3, -1), (1.6, 1))
+        mujoco.mj_forward(self.model, self.data)
+        return self._get_obs(), {}
+
+    def _get_obs(self):
+        return super()._get_obs() | {"to_goal": self.data.mocap_pos[0, :2] - self.data.qpos}
+
+
+class Site(Puck):
+    """Each reset draws a goal, and puts a site there."""
+
+    goal = GOAL
+
+    def reset(self, **options):
+        gym.Env.reset(self, seed=options.get("seed"))
+        self.goal = self.np_random.uniform((1.3, -1), (1.6, 1))
+        self.model.site_pos[0, :2] = self.goal
+        return super().reset(**options)
+
+    def _get_obs(self):
+        return super()._get_obs() | {"to_goal": self.goal - self.data.qpos}
+
+
+class Failing(Puck):
+    """Its step fails somewhere."""
+
+    def step(self, action):
+        if self.data.qpos[0] > -1:
+            raise ValueError("broken")
+        return super().step(action)
+
+
+class Slow(Puck):
+    """Its reset takes long."""
+
+    def reset(self, **options):
+        time.sleep(3.2)
+        return super().reset(**options)
+
+
+REFUSED = {
+    "a stored difference": (Difference, {}, r"does not follow its state: observation\[2\]"),
+    "a cached place": (Cached, {}, r"does not follow its state: observation\[0\]"),
+    "collisions": (
+        Colliding,
+        {"success": "terminated"},
+        "touches what it does not touch elsewhere",
+    ),
+    "a cart": (Cart, {"chart": ["x", "y"]}, r"draws qvel\[0\].*pin it"),
+    "a mocap body": (Mocap, {}, r"draws mocap_pos\[0\], mocap_pos\[1\].*pin it"),
+    "a site": (Site, {}, "draws site_pos of its model, goal.*pin it"),
+    "a pinned goal whose site is drawn": (Site, {"pinned": {"goal": [1.5, 0.2]}}, "draws site_pos"),
+    "a contradiction": (
+        Site,
+        {"pinned": {"goal": [1.5, 0.2]}, "seed": 0},
+        r"site_pos\[0\].*stays at",
+    ),
+    "a step that fails": (Failing, {}, r"step\(\) of Failing raises ValueError: broken: repair it"),
+    "a slow reset": (Slow, {}, r"reset\(\) of Slow takes 3.* s"),
+    "pinned of another kind": (Puck, {"pinned": {"data": 1.0}}, "no attribute data of shape"),
+    "a name that is not there": (Puck, {"success": "distance(puck, moon) < 1"}, "'moon'"),
+    "a key that is not there": (
+        Puck,
+        {"success": 'info["won"]'},
+        "unknown entry of info of Puck 'won'",
+    ),
+    "success and failure": (
+        Puck,
+        {"failure": 'info["success"]'},
+        "it is a success .* and a failure",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_misleads_is_refused_by_name(what):
+    make, given, message = REFUSED[what]
+    with pytest.raises(BadInput, match=message):
+        from_gymnasium(make, **given)
+
+
+def test_a_mocap_body_can_be_pinned():
+    task = from_gymnasium(Mocap, pinned={"mocap_pos[0]": 1.4, "mocap_pos[1]": 0.2})
+    to_goal = dict(
+        zip(
+            task.observation_parts,
+            np.split(task.observation(task.at(np.zeros((1, 2))))[0], 3),
+            strict=True,
+        )
+    )
+    np.testing.assert_allclose(to_goal["to_goal"], [1.4, 0.2])
+
+
+def test_a_time_limit_below_other_wrappers_counts():
+    assert from_gymnasium(lambda: Delayed(TimeLimit(Puck(), 200))).max_steps == 200
+
+
+def test_walls_in_the_open_do_not_end_the_chart():
+    class Open(Puck):
+        def __init__(self):
+            super().__init__()
+            lines = [line for line in XML.splitlines() if '<geom type="box"' not in line]
+            self.model = mujoco.MjModel.from_xml_string("\n".join(lines))
+            self.data = mujoco.MjData(self.model)
+
+    chart = from_gymnasium(Open).chart
+    assert np.all(np.less(chart.low, [-1.8, -1.2]))
+    assert np.all(np.greater(chart.high, [0.5, 1.2]))
+
+
+def test_a_start_may_touch_a_wall_no_deeper_than_runs_do():
+    task = from_gymnasium(Puck)
+    # The rock ends at x = -0.3, and the puck is 0.1 m wide.
+    z = np.array([[-0.41, 0.0], [-0.36, 0.0]])
+    assert task.goes_on(z).tolist() == [True, False]
