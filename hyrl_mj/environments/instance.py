@@ -70,13 +70,27 @@ class Worn(HyrlError):
     """An instance is not like a new one after its reset."""
 
 
+# Data that one instance at a time copies its own into, by all sizes of the model: many would take much memory.
+_SPARE: dict[tuple[int, ...], mujoco.MjData] = {}
+
+
+def _spare_of(model: mujoco.MjModel) -> mujoco.MjData:
+    """Returns data of MuJoCo that are laid out as those of a model."""
+    names = [name for name in dir(model) if name.startswith("n") and name.islower()]
+    sizes = tuple(v for name in names if isinstance(v := getattr(model, name), int))
+    if sizes not in _SPARE:
+        _SPARE[sizes] = mujoco.MjData(model)
+    return _SPARE[sizes]
+
+
 class Physics:
     """MuJoCo's state in an environment, or in the plant of an environment of this package."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, plant: Any):
         self.model, self.data, self._plant = model, data, plant
         self._size = mujoco.mj_stateSize(model, STATE)
-        self._spare, self._other = mujoco.MjData(model), mujoco.MjData(model)
+        self._spare = _spare_of(model)
+        self._other: mujoco.MjData | None = None
         self._left: np.ndarray | None = None
 
     @property
@@ -119,7 +133,7 @@ class Physics:
 
     def leave_for(self, state: np.ndarray) -> None:
         """Goes to a state (S,) until `come_back`."""
-        self._left = self.read()
+        self._left, self._other = self.read(), self._other or mujoco.MjData(self.model)
         mujoco.mj_copyData(self._other, self.model, self.data)
         self.write(state)
 

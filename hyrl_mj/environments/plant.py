@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from hyrl_mj import mjcf
+from hyrl_mj.environments.pool import MOST as MOST_PLAYED
 from hyrl_mj.environments.pool import Key, Pool
 from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.errors import BadInput
@@ -50,6 +51,8 @@ class EnvironmentPlant:
         self._unstable = np.zeros(n, dtype=bool)
         self._begun = np.zeros(n, dtype=bool)  # whether an instance plays the run
         self._open = np.zeros(n, dtype=bool)  # whether the sample has not been observed yet
+        #: whether states are written, and no instance plays a run: without a memory, that is the same
+        self.direct = spec.memoryless and n > MOST_PLAYED
         self._played: set[Key] = set()
         # Not at once: a plant may be collected while the pool is at work.
         weakref.finalize(self, pool.left.append, self._played).atexit = False
@@ -96,6 +99,11 @@ class EnvironmentPlant:
         return measured
 
     def _sense(self, rows: np.ndarray, noise: np.ndarray) -> None:
+        if self.direct:
+            raise BadInput(
+                f"{self.n} episodes of {self.spec.name} cannot be observed under noise side by side: give at "
+                f"most {MOST_PLAYED}"
+            )
         keys = [self._keys[i] for i in rows]
         self._played.update(keys)
         seen, reports = self._pool.sense(keys, self._new(rows), noise)
@@ -172,10 +180,14 @@ class EnvironmentPlant:
         rows, u = rows[goes_on], u[goes_on]
         if not len(rows):
             return
-        keys = [self._keys[i] for i in rows]
-        self._played.update(keys)
-        states, reports, seen = self._pool.act(keys, self._new(rows), u)
-        self._begun[rows], self._open[rows] = True, True
+        if self.direct:
+            states, reports, seen = self._pool.branch(self._state[rows], u)
+        else:
+            keys = [self._keys[i] for i in rows]
+            self._played.update(keys)
+            states, reports, seen = self._pool.act(keys, self._new(rows), u)
+            self._begun[rows] = True
+        self._open[rows] = True
         finite = np.isfinite(states).all(axis=1) & np.isfinite(seen).all(axis=1)
         self._state[rows[finite]], self._seen[rows[finite]] = states[finite], seen[finite]
         self._unstable[rows[~finite]] = True

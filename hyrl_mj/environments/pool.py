@@ -12,7 +12,7 @@ import signal
 import warnings
 from collections import deque
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from threading import Lock
@@ -60,9 +60,7 @@ class Stage:
 
     def __init__(self, recipe: Recipe):
         self.recipe = recipe
-        self._episodes: dict[
-            Key, Episode
-        ] = {}  # those with an instance in the order of their last use
+        self._episodes: dict[Key, Episode] = {}  # in the order of their last use
         self._free: list[Instance] = []
         self._playing = 0
         self._resting: Instance | None = None
@@ -76,16 +74,18 @@ class Stage:
             MuJoCo's states (k, S), reports (k, r) and observations (k, o).
         """
         states, reports, seen = [], [], []
-        episodes = [self._opened(key, starts) for key in keys]
-        instances = [self._ready(key, e) for key, e in zip(keys, episodes, strict=True)]
-        with instances[0].undrawn() if instances else nullcontext():
-            for episode, instance, inputs in zip(episodes, instances, u, strict=True):
-                if len(episode.noise) == len(episode.inputs):
-                    self._sense(episode, np.zeros(len(self.recipe.noisy)))
-                reports.append(instance.act(inputs))
-                episode.inputs.append(inputs)
-                states.append(instance.physics.read())
-                seen.append(instance.observation)
+        for first in range(0, len(keys), MOST):  # so many have an instance at once
+            some = slice(first, first + MOST)
+            episodes = [self._opened(key, starts) for key in keys[some]]
+            instances = [self._ready(episode) for episode in episodes]
+            with instances[0].undrawn():
+                for episode, instance, inputs in zip(episodes, instances, u[some], strict=True):
+                    if len(episode.noise) == len(episode.inputs):
+                        self._sense(episode, np.zeros(len(self.recipe.noisy)))
+                    reports.append(instance.act(inputs))
+                    episode.inputs.append(inputs)
+                    states.append(instance.physics.read())
+                    seen.append(instance.observation)
         return np.array(states), np.array(reports), np.array(seen)
 
     def sense(self, keys: Sequence[Key], starts: Any, noise: np.ndarray) -> tuple[Any, ...]:
@@ -97,7 +97,7 @@ class Stage:
         seen, reports = [], []
         for key, row in zip(keys, noise, strict=True):
             episode = self._opened(key, starts)
-            instance = self._ready(key, episode)
+            instance = self._ready(episode)
             reports.append(self._sense(episode, row))
             seen.append(instance.observation)
         late = [report for report in reports if report is not None]
@@ -163,11 +163,11 @@ class Stage:
     # ---- instances
 
     def _opened(self, key: Key, starts: Any) -> Episode:
-        if key not in self._episodes:
-            self._episodes[key] = Episode(starts[key])
-        return self._episodes[key]
+        episode = self._episodes.pop(key, None) or Episode(starts[key])
+        self._episodes[key] = episode
+        return episode
 
-    def _ready(self, key: Key, episode: Episode) -> Instance:
+    def _ready(self, episode: Episode) -> Instance:
         """Returns the instance of an episode, which has played it up to the present sample."""
         if episode.instance is not None:
             return episode.instance

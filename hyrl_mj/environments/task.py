@@ -182,6 +182,7 @@ class EnvironmentTask(Task):
         rng = np.random.default_rng(0)
         plant, fresh = self.plant(COMPARED), self.plant(COMPARED)
         plant.set_state(*self.state(self.starts(COMPARED, rng)))
+        fresh.direct = True
         for k in range(STEPS_COMPARED):
             if k % HELD == 0:
                 u = rng.uniform(*self.input_limits, (COMPARED, len(self.inputs)))
