@@ -70,7 +70,7 @@ class Worn(HyrlError):
     """An instance is not like a new one after its reset."""
 
 
-# Data that one instance at a time copies its own into, by all sizes of the model: many would take much memory.
+# Data that one instance at a time copies its own into, by all sizes of the model: many take much memory.
 _SPARE: dict[tuple[int, ...], mujoco.MjData] = {}
 
 

@@ -208,7 +208,7 @@ class EnvironmentTask(Task):
         self._pool.check(runs)
 
     def at(self, z: np.ndarray) -> np.ndarray:
-        seen = self._at_rest(z)
+        seen, _ = self._pool.rest(self.specification.state_at(z))
         rest = np.tile([0.0, 0.0, float(Outcome.RUNNING)], (len(z), 1))
         return np.column_stack([z, seen, rest])
 

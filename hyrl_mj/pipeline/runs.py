@@ -67,7 +67,7 @@ class AgentOptions:
         stochastic: sample the inputs of the agent, as during its training (PPO, A2C, SAC); noisy episodes
             then replace the worst-case game.
         vecnormalize: statistics of the VecNormalize that the agent was trained under, an npz file with mean,
-            var, clip and epsilon; or none if it saw plain observations. By default the agent has to tell.
+            var, clip and epsilon; or none if it saw plain observations; by default what the agent tells.
         n_stack: the number of observations that the agent sees at once, for one trained under VecFrameStack;
             noisy episodes then replace the worst-case game.
         eps: bound of the measurement noise to survive, in the units of the chart.
