@@ -38,7 +38,7 @@ def puck():
 
 @pytest.fixture(scope="module")
 def slid():
-    return from_gymnasium(Slid, steps=120)
+    return from_gymnasium(Slid, steps=120, bounds={"x": (-2.3, 2.3), "y": (-1.7, 1.7)})
 
 
 def extended(grid, *masks, noise=EPS):

@@ -44,6 +44,7 @@ class Recipe:
         places: pairs of names whose distance is reported, each as a kind and an index for both.
         solid: (ngeom,) bool, the geoms of the robot.
         harmless: geoms that the robot has touched without an end of the episode.
+        anew: whether a reset changes what the next one does to a wrapper: each episode takes a new instance.
         lags: whether what is observed after a step is computed from quantities of a physics step before.
     """
 
@@ -55,6 +56,7 @@ class Recipe:
     solid: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
     harmless: frozenset[int] = frozenset()
     lags: bool = True
+    anew: bool = False
 
     def with_source(self, source: Source) -> Recipe:
         """Returns the recipe for an environment that is made or reset in another way."""
@@ -232,6 +234,7 @@ class Instance:
         self.inner_seen: Any = None  # what the innermost environment observed last
         self._like: written.Fingerprint | None = None  # after its first reset
         self._chain: _Chain | None = None
+        self._used = False
         self.start: np.ndarray | None = (
             None  # to which the innermost reset has to lead, below wrappers
         )
@@ -357,8 +360,13 @@ class Instance:
             Worn: after its reset it is not like a new one.
         """
         self.quit()
-        self.observation = flat(self.reset(), self.env.observation_space)
-        self.mark()
+        if self.recipe.anew:
+            if self._used:
+                raise Worn("a wrapper")
+            self._used = True
+        else:
+            self.observation = flat(self.reset(), self.env.observation_space)
+            self.mark()
         if self._chain is None:
             self.physics.write(start)
             self.inner_seen = self.watched()

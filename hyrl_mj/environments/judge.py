@@ -55,6 +55,9 @@ class Real:
 
     def _reset(self, start: np.ndarray) -> tuple[Instance, np.ndarray]:
         """Returns an environment at a start (S,), and what it observes there (o,)."""
+        if self._recipe.anew:
+            instance = Instance(self._recipe)
+            return instance, instance.put(start)
         instance = self._instance = self._instance or Instance(self._recipe)
         instance.reset()
         try:

@@ -66,6 +66,9 @@ class Stage:
         self._resting: Instance | None = None
         self._tabulating: Instance | None = None
         self._real = Real(recipe)
+        self._shared: written.Fingerprint | None = (
+            None  # what a new instance shares with all others
+        )
 
     def act(self, keys: Sequence[Key], starts: Any, u: np.ndarray) -> tuple[np.ndarray, ...]:
         """Steps episodes; those that are new begin at `starts`, MuJoCo's states by the run.
@@ -190,10 +193,7 @@ class Stage:
                 instance.quit()
                 self._playing -= 1
                 if written.is_shared(str(worn)):
-                    raise BadInput(
-                        f"{self.recipe.source.name} changes {worn}, which all its instances share, so its "
-                        "episodes depend on each other: keep it in an attribute that reset() sets"
-                    ) from None
+                    raise self._is_shared(str(worn)) from None
 
     def _taken(self) -> Instance:
         """Returns an instance that plays nothing."""
@@ -204,7 +204,21 @@ class Stage:
         return self._free.pop() if self._free else self._new()
 
     def _new(self) -> Instance:
-        return Instance(self.recipe)
+        instance = Instance(self.recipe)
+        shared = written.Fingerprint()
+        found = written.fingerprint(instance.env)
+        shared.update((name, value) for name, value in found.items() if written.is_shared(name))
+        if self._shared is None:
+            self._shared = shared
+        elif changed := written.differing(shared, self._shared):
+            raise self._is_shared(changed[0])
+        return instance
+
+    def _is_shared(self, name: str) -> BadInput:
+        return BadInput(
+            f"{self.recipe.source.name} changes {name}, which all its instances share, so its episodes "
+            "depend on each other: keep it in an attribute that reset() sets"
+        )
 
     def _put_back(self, episode: Episode) -> None:
         assert episode.instance is not None

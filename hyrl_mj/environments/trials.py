@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hyrl_mj.environments.fingerprint import differing, fingerprint
-from hyrl_mj.environments.instance import Instance, flat, observers
+from hyrl_mj.environments.instance import Instance, Recipe, flat, observers
 from hyrl_mj.environments.judge import Played
 from hyrl_mj.environments.plant import EnvironmentPlant
 from hyrl_mj.environments.pool import Pool
@@ -63,7 +63,9 @@ def tried(instance: Instance, spec: EnvironmentSpec) -> tuple[EnvironmentSpec, P
             f"observation {', '.join(map(str, lagging))} comes from a physics step before the end of a step; "
             "noise adds to it what it changes at the end"
         )
-    spec = replace(spec, recipe=replace(spec.recipe, lags=len(lagging) > 0), found=found)
+    recipe = replace(spec.recipe, lags=len(lagging) > 0)
+    recipe = replace(recipe, anew=spec.wrapped and _changes_by_reset(recipe, spec.state))
+    spec = replace(spec, recipe=recipe, found=found)
     instance.recipe = spec.recipe
     pool = Pool(spec.recipe)
     moves, affine = _moving(pool, spec)
@@ -118,6 +120,20 @@ def _check_observer(instance: Instance, spec: EnvironmentSpec) -> None:
     for column, why in suspects.items():
         if np.ptp([row[column] for row in first]) > 0 or _depends(instance, spec, column, step):
             _refuse(name, column, why)
+
+
+def _changes_by_reset(recipe: Recipe, start: np.ndarray) -> bool:
+    """Returns whether a start (S,) is another one after a reset before, as with running statistics."""
+    found = []
+    for resets in (0, 0, 1):
+        instance = Instance(recipe)
+        for _ in range(resets):
+            instance.reset()
+        observation = instance.put(start)
+        found.append((observation, instance.remembered()))
+    usual = set(differing(found[0][1], found[1][1]))  # such as names of files
+    changed = set(differing(found[0][1], found[2][1])) - usual
+    return bool(changed) or not np.array_equal(found[0][0], found[2][0], equal_nan=True)
 
 
 def _lagging(instance: Instance) -> np.ndarray:
