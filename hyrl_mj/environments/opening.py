@@ -6,7 +6,6 @@ import importlib
 import importlib.util
 import inspect
 import io
-import pickle
 import random
 import traceback
 from collections.abc import Callable, Iterator, Mapping
@@ -80,11 +79,6 @@ class Source:
         if isinstance(self.make, str):
             return self.make.rpartition(":")[2].rpartition("/")[2]
         return getattr(self.make, "__name__", type(self.make).__name__).strip("<>") or "environment"
-
-
-def global_state() -> bytes:
-    """Returns the state of the global generators of NumPy and Python."""
-    return pickle.dumps((np.random.get_state(), random.getstate()))
 
 
 @contextmanager
