@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import random
 import re
+import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -550,7 +551,8 @@ class _Chain:
         self._news: SimpleQueue[tuple[str, Any]] = SimpleQueue()
         self._asked = self._busy = False
         self._calls = 0
-        Thread(target=self._run, daemon=True).start()
+        Thread(target=_serve, args=(self._work, self._news), daemon=True).start()
+        weakref.finalize(self, self._work.put, None)  # the thread ends with the instance
 
     def ask(self, work: Callable[[], Any]) -> None:
         """Begins a step or a reset, up to where the innermost environment would observe."""
@@ -580,18 +582,6 @@ class _Chain:
         """Ends a step that waits for noise."""
         if self._busy:
             self.answer(np.zeros(len(self._instance.recipe.noisy)))
-
-    def close(self) -> None:
-        """Ends the thread."""
-        self.leave()
-        self._work.put(None)
-
-    def _run(self) -> None:
-        while (work := self._work.get()) is not None:
-            try:
-                self._news.put(("done", work()))
-            except BaseException as error:
-                self._news.put(("error", error))
 
     def _step(self, action: Any) -> Any:
         result = self._own_step(action)
@@ -632,3 +622,13 @@ class _Chain:
             # Wrappers that look at MuJoCo's state themselves see it where the sensor does.
             instance.physics.leave_for(instance.moved(instance.physics.read(), noise))
         return (observation, *rest)
+
+
+def _serve(work: SimpleQueue[Any], news: SimpleQueue[Any]) -> None:
+    """Does what is asked for in turn, until that is None; it holds on to nothing in between."""
+    while (job := work.get()) is not None:
+        try:
+            news.put(("done", job()))
+        except BaseException as error:
+            news.put(("error", error))
+        del job
