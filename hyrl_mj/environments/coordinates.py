@@ -11,7 +11,8 @@ import numpy as np
 from gymnasium import spaces
 
 from hyrl_mj import mjcf
-from hyrl_mj.environments.instance import Instance, columns_of
+from hyrl_mj.environments.instance import Instance
+from hyrl_mj.environments.observations import columns_of_parts
 from hyrl_mj.errors import BadInput, unknown
 
 # Chart, as users give it: one name, several, or new names with the names of what they stand for.
@@ -113,11 +114,7 @@ def _parts(instance: Instance) -> dict[str, slice]:
     space = instance.env.observation_space
     if not isinstance(space, spaces.Dict):
         return {"observation": slice(0, int(spaces.flatdim(space)))}
-    parts, at = {}, 0
-    for key in space.spaces:
-        size = int(spaces.flatdim(space.spaces[key]))
-        parts[key], at = slice(at, at + size), at + size
-    return parts
+    return columns_of_parts(space)
 
 
 def _resolved(instance: Instance, new: str, name: str) -> Iterator[Coordinate]:
@@ -189,7 +186,7 @@ def _fitted(
 ) -> Iterator[Coordinate]:
     """Yields the positions or velocities that a function of MuJoCo's state (S,) gives, but for an offset."""
     instance.reset()
-    state, places = instance.physics.read(), columns_of(instance.model)
+    state, places = instance.physics.read(), instance.physics.columns
     rng, columns = np.random.default_rng(0), {"qpos": instance.model.nq, "qvel": instance.model.nv}
     moved: dict[str, list[np.ndarray]] = {kind: [] for kind in columns}
     values = []

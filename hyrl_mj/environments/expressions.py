@@ -13,7 +13,6 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
-from enum import Enum
 from functools import reduce
 from itertools import pairwise
 from typing import Any, NamedTuple, NoReturn
@@ -22,42 +21,33 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput
 
-# What the environment reports by name, and as what.
-NAMES = ("terminated", "truncated", "reward")
 FORMS = 'terminated, truncated, reward, info["key"] and distance(a, b), with and, or, not and comparisons'
 # Conditions are read by people: [characters], and levels of brackets and operators, where Python's stack is
 # far from its end.
 LENGTH, DEPTH = 1000, 50
 PLACE = re.compile(r"[\w.-]+")  # a name in a model that need not be quoted
+# What a part of an expression is. An entry of `info` is a number, or true or false.
+CONSTANT, NUMBER, TRUTH, ENTRY = "constant", "number", "truth", "entry"
+NAMES = {"terminated": TRUTH, "truncated": TRUTH, "reward": NUMBER}
 
 Values = Mapping[Any, np.ndarray]
 Path = tuple[str | int, ...]
 
 
-class Kind(Enum):
-    """What a part of an expression is: an entry of `info` is a number, or true or false."""
-
-    CONSTANT, NUMBER, TRUTH, ENTRY = range(4)
-
-
 class Part(NamedTuple):
-    """A part of an expression: its text, its kind, and its values (k,) for what k copies report."""
+    """A part of an expression: its text, what it is, and its values (k,) for what k copies report."""
 
     text: str
-    kind: Kind
+    kind: str
     of: Callable[[Values], Any]
 
 
-def _differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.less(a, b) | np.greater(a, b)  # as every comparison false where a value is missing
-
-
-COMPARISONS: dict[type[ast.cmpop], Callable] = {
+OPERATORS: dict[type, Callable[..., Any]] = {
     ast.Lt: np.less, ast.LtE: np.less_equal, ast.Gt: np.greater, ast.GtE: np.greater_equal,
-    ast.Eq: np.equal, ast.NotEq: _differ,
-}  # fmt: skip
-ARITHMETIC: dict[type[ast.operator], Callable] = {
+    # As every comparison false where a value is missing.
+    ast.Eq: np.equal, ast.NotEq: lambda a, b: np.less(a, b) | np.greater(a, b),
     ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide,
+    ast.And: np.logical_and, ast.Or: np.logical_or, ast.USub: np.negative, ast.UAdd: np.positive,
 }  # fmt: skip
 
 
@@ -93,10 +83,12 @@ class Expression:
             BadInput: it is no expression, has other parts, or is neither true nor false.
         """
         reader = _Reader(text, what)
-        rule = reader.truth(reader.part(reader.tree(), 0))
-        if not reader.reports:
+        rule = reader.truth(reader.tree(), 0)
+        needed = list(reader.needed)
+        if not needed:
             reader.refuse(f"it asks nothing of the environment: use {FORMS}")
-        return cls(text, what, tuple(reader.keys), tuple(reader.places), rule)
+        keys = tuple(name[1] for name in needed if name[0] == "info")
+        return cls(text, what, keys, tuple(name[1:] for name in needed if len(name) == 3), rule)
 
     def holds(self, values: Values) -> np.ndarray:
         """Returns where the expression holds, (k,) bool.
@@ -120,25 +112,28 @@ def entry(info: Mapping[str, Any], path: Path) -> float:
     """
     value: Any = info
     for depth, step in enumerate(path):
-        listed = isinstance(value, (Sequence, np.ndarray)) and not isinstance(value, (str, bytes))
+        listed = isinstance(value, Sequence | np.ndarray) and not isinstance(value, str | bytes)
         if isinstance(value, Mapping):
             value = value.get(step)
         elif listed and isinstance(step, int):
             value = value[step] if -len(value) <= step < len(value) else None
         else:
-            kind = type(value).__name__
-            raise BadInput(f"{_written(path[:depth])} is of type {kind}: it has no entry {step!r}")
+            what = f"is of type {type(value).__name__}: it has no entry {step!r}"
+            raise BadInput(f"{_written(path[:depth])} {what}")
         if value is None:
             return math.nan
-    array = (
-        np.asarray(value) if isinstance(value, (bool, int, float, np.generic, np.ndarray)) else None
-    )
-    if array is None or array.size != 1 or array.dtype.kind not in "biuf":
-        kind = type(value).__name__
+    if isinstance(value, bool | int | float):  # nearly all are
+        return float(value)
+    if (
+        not isinstance(value, np.generic | np.ndarray)
+        or value.size != 1
+        or value.dtype.kind not in "biuf"
+    ):
         raise BadInput(
-            f"{_written(path)} is of type {kind}: use an entry that is one number, or true or false"
+            f"{_written(path)} is of type {type(value).__name__}: use an entry that is one number, or true "
+            "or false"
         )
-    return float(array.item())
+    return float(value.item())
 
 
 def _written(path: Path) -> str:
@@ -153,11 +148,8 @@ class _Reader:
             raise BadInput(
                 f"{what} is of type {type(text).__name__}: give text, such as 'reward >= 1'"
             )
-        self.text, self.what = text, what
-        self.source = text.strip()
-        self.keys: dict[Path, None] = {}  # in order, each once
-        self.places: dict[tuple[str, str], None] = {}
-        self.reports = False  # whether anything is asked of the environment
+        self.text, self.what, self.source = text, what, text.strip()
+        self.needed: dict[tuple[Any, ...], None] = {}  # in order, each once
 
     def refuse(self, why: str) -> NoReturn:
         raise BadInput(f"{self.what} {_short(self.text)!r} cannot be used: {why}")
@@ -180,26 +172,12 @@ class _Reader:
         except (ValueError, RecursionError, MemoryError):  # null bytes, lone surrogates, nesting
             self.refuse("Python cannot read it: give a short expression without special characters")
 
-    def part(self, node: ast.expr, depth: int) -> Part:
-        """Returns a node as a part."""
-        if depth > DEPTH:
-            self.refuse(f"it is nested deeper than {DEPTH} levels: write it simpler")
-        # Looked up by the node's own type, so that nothing passes that is not listed here.
-        known: dict[type[ast.expr], Callable[[Any, int], Part]] = {
-            ast.Constant: self._constant, ast.Name: self._name, ast.Subscript: self._entry,
-            ast.Call: self._call, ast.BoolOp: self._joined, ast.UnaryOp: self._signed,
-            ast.BinOp: self._computed, ast.Compare: self._compared,
-        }  # fmt: skip
-        translate = known.get(type(node))
-        if translate is None:
-            self.refuse(f"{self._of(node)!r} is not allowed in it: use {FORMS}")
-        return translate(node, depth + 1)
-
-    def truth(self, part: Part) -> Callable[[Values], np.ndarray]:
-        """Returns the values of a part that has to be true or false."""
-        if part.kind is Kind.TRUTH:
+    def truth(self, node: ast.expr, depth: int) -> Callable[[Values], np.ndarray]:
+        """Returns the values of a node that has to be true or false."""
+        part = self._part(node, depth)
+        if part.kind == TRUTH:
             return part.of
-        if part.kind is not Kind.ENTRY:
+        if part.kind != ENTRY:
             self.refuse(f"{part.text!r} is neither true nor false: compare it, as in reward >= 1")
 
         def told(values: Values) -> np.ndarray:
@@ -211,154 +189,147 @@ class _Reader:
 
         return told
 
-    def _number(self, part: Part) -> Callable[[Values], Any]:
-        if part.kind is Kind.TRUTH:
+    def _number(self, node: ast.expr, depth: int) -> Part:
+        """Returns a node that has to be a number."""
+        part = self._part(node, depth)
+        if part.kind == TRUTH:
             self.refuse(f"{part.text!r} is true or false, no number: join it by and, or, not")
-        return part.of
+        return part
 
-    def _constant(self, node: ast.Constant, depth: int) -> Part:
-        value = node.value
+    def _asked(self, name: tuple[Any, ...], kind: str, text: str) -> Part:
+        """Returns what an environment reports under a name."""
+        self.needed[name] = None
+        key, dtype = name if len(name) > 1 else name[0], bool if kind == TRUTH else float
+        return Part(text, kind, lambda values: np.asarray(values[key], dtype=dtype))
+
+    def _part(self, node: ast.expr, depth: int) -> Part:
+        if depth > DEPTH:
+            self.refuse(f"it is nested deeper than {DEPTH} levels: write it simpler")
+        text, depth = _short(self._source_of(node)), depth + 1
+        match node:
+            case ast.Constant():
+                return self._constant(node.value, text)
+            case ast.Name():
+                return self._name(node.id)
+            case ast.Subscript():
+                return self._asked(("info", self._path(node, text)), ENTRY, text)
+            case ast.Call():
+                return self._call(node, text, depth)
+            case ast.BoolOp():
+                truths, join = (
+                    [self.truth(value, depth) for value in node.values],
+                    OPERATORS[type(node.op)],
+                )
+                # Each is asked, also where the first decides, so that an entry that is neither shows.
+                return Part(text, TRUTH, lambda v: reduce(join, [truth(v) for truth in truths]))
+            case ast.UnaryOp(op=ast.Not()):
+                truth = self.truth(node.operand, depth)
+                return Part(text, TRUTH, lambda v: ~truth(v))
+            case ast.UnaryOp(op=ast.USub() | ast.UAdd()):
+                return self._computed(OPERATORS[type(node.op)], [node.operand], text, depth)
+            case ast.BinOp(op=ast.Add() | ast.Sub() | ast.Mult() | ast.Div()):
+                return self._computed(
+                    OPERATORS[type(node.op)], [node.left, node.right], text, depth
+                )
+            case ast.Compare() if all(type(op) in OPERATORS for op in node.ops):
+                sides = [self._number(side, depth).of for side in (node.left, *node.comparators)]
+                operators = [OPERATORS[type(op)] for op in node.ops]
+
+                def compared(v: Values) -> Any:
+                    pairs = zip(operators, pairwise([side(v) for side in sides]), strict=True)
+                    return reduce(np.logical_and, [compare(*pair) for compare, pair in pairs])
+
+                return Part(text, TRUTH, compared)
+        self.refuse(
+            f"{text!r} is not allowed in it: use <, <=, >, >=, == and !=, + - * / and, for truths, and, or, "
+            "and not instead of ~"
+        )
+
+    def _constant(self, value: Any, text: str) -> Part:
         if isinstance(value, bool):
             self.refuse(f"{value} is the same at every step: use {FORMS}")
-        if not isinstance(value, (int, float)):
-            self.refuse(f"{self._of(node)} is no number, and nothing else can be compared")
-        return Part(self._of(node), Kind.CONSTANT, self._finite(node, lambda values: float(value)))
+        if not isinstance(value, int | float):
+            self.refuse(f"{text} is no number, and nothing else can be compared")
+        return self._checked(Part(text, CONSTANT, lambda values: float(value)))
 
-    def _finite(self, node: ast.expr, of: Callable[[Values], Any]) -> Callable[[Values], Any]:
-        """Returns a function that takes no values, if what it gives is finite."""
+    def _checked(self, constant: Part) -> Part:
+        """Returns a constant if it is finite."""
         try:
             with np.errstate(all="ignore"):
-                finite = math.isfinite(of({}))
+                finite = math.isfinite(constant.of({}))
         except OverflowError:  # an integer beyond every float
             finite = False
         if not finite:
-            self.refuse(f"{self._of(node)!r} is no finite number")
-        return of
+            self.refuse(f"{constant.text!r} is no finite number")
+        return constant
 
-    def _name(self, node: ast.Name, depth: int) -> Part:
-        name = node.id
-        if name not in NAMES:
-            if name == "info":
-                self.refuse('info holds many things: name one of them, as info["success"]')
-            if name.lower() in ("nan", "inf", "infinity"):
-                self.refuse(f"{name} is no finite number")
-            close = get_close_matches(name, [*NAMES, "info", "distance"], n=1)
-            hint = f"; did you mean {close[0]}?" if close else ""
-            self.refuse(f"{_short(name)!r} is not known: use {FORMS}{hint}")
-        self.reports = True
-        if name == "reward":
-            return Part(name, Kind.NUMBER, lambda values: np.asarray(values[name], dtype=float))
-        return Part(name, Kind.TRUTH, lambda values: np.asarray(values[name], dtype=bool))
+    def _name(self, name: str) -> Part:
+        if name in NAMES:
+            return self._asked((name,), NAMES[name], name)
+        if name == "info":
+            self.refuse('info holds many things: name one of them, as info["success"]')
+        if name.lower() in ("nan", "inf", "infinity"):
+            self.refuse(f"{name} is no finite number")
+        close = get_close_matches(name, [*NAMES, "info", "distance"], n=1)
+        hint = f"; did you mean {close[0]}?" if close else ""
+        self.refuse(f"{_short(name)!r} is not known: use {FORMS}{hint}")
 
-    def _entry(self, node: ast.Subscript, depth: int) -> Part:
+    def _path(self, node: ast.expr, text: str) -> Path:
         steps: list[Any] = []
-        inner: ast.expr = node
-        while isinstance(inner, ast.Subscript):
+        while isinstance(node, ast.Subscript):
             try:
                 steps.insert(
-                    0, ast.literal_eval(inner.slice)
-                )  # a literal: a string, a number, a sign and a number
+                    0, ast.literal_eval(node.slice)
+                )  # a string, a number, or one with a sign
             except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError):
                 steps.insert(0, None)
-            inner = inner.value
-        keyed = isinstance(inner, ast.Name) and inner.id == "info" and type(steps[0]) is str
+            node = node.value
+        keyed = isinstance(node, ast.Name) and node.id == "info" and type(steps[0]) is str
         if not keyed or any(type(step) not in (str, int) for step in steps):
             self.refuse(
-                f'{self._of(node)!r} names no entry: write info["key"], or info["key"][0], with quotes'
+                f'{text!r} names no entry: write info["key"], or info["key"][0], with quotes'
             )
-        path, self.reports = tuple(steps), True
-        self.keys[path] = None
-        key = ("info", path)
-        return Part(self._of(node), Kind.ENTRY, lambda values: np.asarray(values[key], dtype=float))
+        return tuple(steps)
 
-    def _call(self, node: ast.Call, depth: int) -> Part:
+    def _call(self, node: ast.Call, text: str, depth: int) -> Part:
         name = node.func.id if isinstance(node.func, ast.Name) else None
         if name == "abs" and len(node.args) == 1 and not node.keywords:
-            inner = self.part(node.args[0], depth)
-            number = self._number(inner)
-            kind = Kind.CONSTANT if inner.kind is Kind.CONSTANT else Kind.NUMBER
-            return Part(self._of(node), kind, lambda values: np.abs(number(values)))
+            return self._computed(np.abs, node.args, text, depth)
         if name != "distance":
             self.refuse(
-                f"{self._of(node)!r} is not allowed in it: only distance(a, b) and abs(x) can be called"
+                f"{text!r} is not allowed in it: only distance(a, b) and abs(x) can be called"
             )
         if len(node.args) != 2 or node.keywords:
             self.refuse("distance takes two names of the model, as distance(fingertip, target)")
-        pair = self._place(node.args[0]), self._place(node.args[1])
-        self.places[pair], self.reports = None, True
-        key = ("distance", *pair)
-        return Part(
-            self._of(node), Kind.NUMBER, lambda values: np.asarray(values[key], dtype=float)
-        )
+        return self._asked(("distance", *map(self._place, node.args)), NUMBER, text)
 
     def _place(self, node: ast.expr) -> str:
         """Returns a name in the model: quoted, or bare if it looks like names, dots and hyphens."""
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value:
             return node.value
         # The source itself: `finger-tip` is a difference, and `body.1` would be no tree at all.
-        source = ast.get_source_segment(self.source, node) or ""
+        source = self._source_of(node)
         if not PLACE.fullmatch(source):
             self.refuse(
                 f"{_short(source)!r} is no name of the model: quote names with other characters than . and -"
             )
         return source
 
-    def _joined(self, node: ast.BoolOp, depth: int) -> Part:
-        truths = [self.truth(self.part(value, depth)) for value in node.values]
-        join = np.logical_and if isinstance(node.op, ast.And) else np.logical_or
-        # Each is asked, also where the first decides, so that an entry that is neither is never overlooked.
-        return Part(
-            self._of(node),
-            Kind.TRUTH,
-            lambda values: reduce(join, [truth(values) for truth in truths]),
-        )
-
-    def _signed(self, node: ast.UnaryOp, depth: int) -> Part:
-        inner = self.part(node.operand, depth)
-        if isinstance(node.op, ast.Not):
-            truth = self.truth(inner)
-            return Part(self._of(node), Kind.TRUTH, lambda values: ~truth(values))
-        if not isinstance(node.op, (ast.USub, ast.UAdd)):
-            self.refuse(f"{self._of(node)!r} is not allowed in it: write not instead of ~")
-        number = self._number(inner)
-        kind = Kind.CONSTANT if inner.kind is Kind.CONSTANT else Kind.NUMBER
-        sign = np.negative if isinstance(node.op, ast.USub) else np.positive
-        return Part(self._of(node), kind, lambda values: sign(number(values)))
-
-    def _computed(self, node: ast.BinOp, depth: int) -> Part:
-        compute = ARITHMETIC.get(type(node.op))
-        if compute is None:
-            self.refuse(
-                f"{self._of(node)!r} is not allowed in it: use + - * / and, for truths, and, or"
-            )
-        parts = self.part(node.left, depth), self.part(node.right, depth)
-        left, right = (self._number(part) for part in parts)
+    def _computed(
+        self, compute: Callable[..., Any], nodes: Sequence[ast.expr], text: str, depth: int
+    ) -> Part:
+        parts = [self._number(node, depth) for node in nodes]
 
         def of(values: Values) -> Any:
-            value = compute(left(values), right(values))
+            value = compute(*[part.of(values) for part in parts])
             return np.where(np.isfinite(value), value, np.nan)  # a quotient by 0 is none
 
-        if all(part.kind is Kind.CONSTANT for part in parts):
-            return Part(self._of(node), Kind.CONSTANT, self._finite(node, of))
-        return Part(self._of(node), Kind.NUMBER, of)
+        if all(part.kind == CONSTANT for part in parts):
+            return self._checked(Part(text, CONSTANT, of))
+        return Part(text, NUMBER, of)
 
-    def _compared(self, node: ast.Compare, depth: int) -> Part:
-        sides = [self._number(self.part(value, depth)) for value in (node.left, *node.comparators)]
-        comparisons = []
-        for op in node.ops:
-            if type(op) not in COMPARISONS:
-                self.refuse(f"{self._of(node)!r} is not allowed in it: use <, <=, >, >=, == or !=")
-            comparisons.append(COMPARISONS[type(op)])
-
-        def of(values: Values) -> np.ndarray:
-            pairs = pairwise([side(values) for side in sides])
-            each = [compare(a, b) for compare, (a, b) in zip(comparisons, pairs, strict=True)]
-            return reduce(np.logical_and, each)
-
-        return Part(self._of(node), Kind.TRUTH, of)
-
-    def _of(self, node: ast.expr) -> str:
-        return _short(ast.get_source_segment(self.source, node) or "")
+    def _source_of(self, node: ast.expr) -> str:
+        return ast.get_source_segment(self.source, node) or ""
 
 
 def _short(text: str) -> str:

@@ -18,7 +18,8 @@ from hyrl_mj.environments import trials
 from hyrl_mj.environments.coordinates import AnyChart, Coordinate, all_names, coordinates
 from hyrl_mj.environments.expressions import Expression
 from hyrl_mj.environments.fingerprint import differing, fingerprint
-from hyrl_mj.environments.instance import Instance, Recipe, Worn, columns_of, flat
+from hyrl_mj.environments.instance import Instance, Recipe, Worn
+from hyrl_mj.environments.observations import flat
 from hyrl_mj.environments.opening import Source
 from hyrl_mj.environments.pool import Pool
 from hyrl_mj.environments.specification import FORMS, Criterion, EnvironmentSpec
@@ -101,7 +102,7 @@ def inspect(
         )
     instance.recipe = replace(instance.recipe, observer=trials.observer_of(instance))
     chosen = _chart_of(instance, chart, found)
-    places = columns_of(instance.model)
+    places = instance.physics.columns
     at = tuple(int(places[c.kind][c.index]) for c in chosen)
     robot = robot_of(instance.model, chosen)
     instance.recipe = replace(instance.recipe, noisy=at, solid=robot[instance.model.geom_bodyid])

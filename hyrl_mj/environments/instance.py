@@ -8,29 +8,27 @@ so that stacks, delays, filters and normalisation see what a sensor would have s
 from __future__ import annotations
 
 import random
-import re
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, field
 from queue import SimpleQueue
 from threading import Thread
 from typing import Any
 
-import gymnasium as gym
-import mujoco
 import numpy as np
 from gymnasium import spaces
 
 from hyrl_mj.environments import fingerprint as written
-from hyrl_mj.environments.expressions import entry
+from hyrl_mj.environments.expressions import Path, entry
+from hyrl_mj.environments.observations import flat, observers, shaped
 from hyrl_mj.environments.opening import Source, global_seed, made, physics_of
+from hyrl_mj.environments.physics import Physics
 from hyrl_mj.errors import BadInput, HyrlError, brief
 
-STATE = mujoco.mjtState.mjSTATE_INTEGRATION
-# The names under which environments compute their observations.
-OBSERVER = re.compile(r"_?((get|compute|make|build)_?)?(ob|obs|observe|observation)s?")
+# What derived quantities are, as what is observed after a step shows them: as at the end of the step; as a
+# step of the physics before; or neither.
+NOW, EARLIER, UNKNOWN = "now", "earlier", "unknown"
 
 
 @dataclass(frozen=True)
@@ -46,22 +44,18 @@ class Recipe:
         solid: (ngeom,) bool, the geoms of the robot.
         harmless: geoms that the robot has touched without an end of the episode.
         anew: whether a reset changes what the next one does to a wrapper: each episode takes a new instance.
-        lags: whether what is observed after a step is computed from quantities of a physics step before.
+        derived: `NOW`, `EARLIER` or `UNKNOWN`.
     """
 
     source: Source
     noisy: tuple[int, ...] = ()
     observer: str = ""
-    keys: tuple[tuple[str | int, ...], ...] = ()
+    keys: tuple[Path, ...] = ()
     places: tuple[tuple[tuple[str, int], tuple[str, int]], ...] = ()
     solid: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
     harmless: frozenset[int] = frozenset()
-    lags: bool = True
     anew: bool = False
-
-    def with_source(self, source: Source) -> Recipe:
-        """Returns the recipe for an environment that is made or reset in another way."""
-        return replace(self, source=source)
+    derived: str = UNKNOWN
 
     @property
     def width(self) -> int:
@@ -71,147 +65,6 @@ class Recipe:
 
 class Worn(HyrlError):
     """An instance is not like a new one after its reset."""
-
-
-# Data that one instance at a time copies its own into, by all sizes of the model: many take much memory.
-_SPARE: dict[tuple[int, ...], mujoco.MjData] = {}
-
-
-def _spare_of(model: mujoco.MjModel) -> mujoco.MjData:
-    """Returns data of MuJoCo that are laid out as those of a model."""
-    names = [name for name in dir(model) if name.startswith("n") and name.islower()]
-    sizes = tuple(v for name in names if isinstance(v := getattr(model, name), int))
-    if sizes not in _SPARE:
-        _SPARE[sizes] = mujoco.MjData(model)
-    return _SPARE[sizes]
-
-
-class Physics:
-    """MuJoCo's state in an environment, or in the plant of an environment of this package."""
-
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, plant: Any):
-        self.model, self.data, self._plant = model, data, plant
-        self._size = mujoco.mj_stateSize(model, STATE)
-        self._spare = _spare_of(model)
-        self._other: mujoco.MjData | None = None
-        self._left: np.ndarray | None = None
-
-    @property
-    def is_plant(self) -> bool:
-        """Whether a plant of this package holds the state, which `data` only shows."""
-        return self._plant is not None
-
-    def read(self) -> np.ndarray:
-        """Returns MuJoCo's state (S,)."""
-        if self._plant is not None:
-            mujoco.mj_setState(self.model, self.data, self._plant.state[0], STATE)
-        return self.shown()
-
-    def shown(self) -> np.ndarray:
-        """Returns the state (S,) in MuJoCo's data."""
-        state = np.empty(self._size)
-        mujoco.mj_getState(self.model, self.data, state, STATE)
-        return state
-
-    def write(self, state: np.ndarray) -> None:
-        """Sets MuJoCo's state (S,) and computes what follows from it."""
-        mujoco.mj_setState(self.model, self.data, state, STATE)
-        mujoco.mj_forward(self.model, self.data)
-        mujoco.mj_rnePostConstraint(self.model, self.data)  # forces of contacts on bodies
-        mujoco.mj_setState(self.model, self.data, state, STATE)
-        if self._plant is not None:
-            self._plant.put(state[None])
-
-    @contextmanager
-    def kept(self) -> Iterator[None]:
-        """Puts everything back after the block, derived quantities included."""
-        if self._plant is not None:
-            state = self._plant.state
-            yield
-            self._plant.put(state)
-            return
-        mujoco.mj_copyData(self._spare, self.model, self.data)
-        yield
-        mujoco.mj_copyData(self.data, self.model, self._spare)
-
-    def leave_for(self, state: np.ndarray) -> None:
-        """Goes to a state (S,) until `come_back`."""
-        self._left, self._other = self.read(), self._other or mujoco.MjData(self.model)
-        mujoco.mj_copyData(self._other, self.model, self.data)
-        self.write(state)
-
-    def come_back(self) -> None:
-        """Puts everything back as it was before `leave_for`, if that was called."""
-        if self._left is not None:
-            if self._plant is not None:
-                self._plant.put(self._left[None])
-            mujoco.mj_copyData(self.data, self.model, self._other)
-            self._left = None
-
-
-def columns_of(model: mujoco.MjModel) -> dict[str, np.ndarray]:
-    """Returns the places in a state of MuJoCo of each of its parts, such as "qpos"."""
-    found, at = {}, 0
-    for part in mujoco.mjtState.__members__.values():
-        name = part.name.removeprefix("mjSTATE_").lower()
-        if part.value.bit_count() == 1 and part & STATE:
-            size = mujoco.mj_stateSize(model, part)
-            found[name], at = np.arange(at, at + size), at + size
-    return found
-
-
-def flat(observation: Any, space: spaces.Space[Any]) -> np.ndarray:
-    """Returns an observation as a vector, as SB3 does: the parts of a Dict in the order of its space."""
-    if isinstance(space, spaces.Dict):
-        return np.concatenate([np.ravel(observation[k]) for k in space.spaces], dtype=float)
-    return np.array(observation, dtype=float).ravel()
-
-
-def _shaped(vector: np.ndarray, like: Any, space: spaces.Space[Any]) -> Any:
-    """Returns a vector as an observation of the shape and types of another one."""
-    if not isinstance(space, spaces.Dict):
-        array = np.asarray(like)
-        return vector.astype(array.dtype).reshape(array.shape)
-    parts, at = {}, 0
-    for key in space.spaces:
-        size = np.size(like[key])
-        parts[key] = _shaped(vector[at : at + size], like[key], space.spaces[key])
-        at += size
-    return {key: parts[key] for key in like if key in parts}
-
-
-def observers(env: gym.Env) -> dict[str, Callable[[], Any]]:
-    """Returns functions that may compute the observation of the innermost environment, by name."""
-    inner: Any = env.unwrapped
-    found: dict[str, Callable[[], Any]] = {}
-
-    def of(owner: Any) -> dict[str, Callable[..., Any]]:
-        names = sorted(name for name in dir(type(owner)) if OBSERVER.fullmatch(name))
-        return {n: getattr(owner, n) for n in names if callable(getattr(owner, n, None))}
-
-    for name, get in of(inner).items():
-        found[name] = get
-        # An environment around another one, as PointMaze: it takes what the inner one observes.
-        for part_name, part in vars(inner).items():
-            if isinstance(part, gym.Env):
-                for own_name, own in of(part).items():
-                    found[f"{name}({part_name}.{own_name})"] = partial(_through, get, own)
-    control: Any = getattr(inner, "_env", None)  # of dm_control
-    if hasattr(getattr(control, "task", None), "get_observation"):
-        found["task.get_observation"] = lambda: control.task.get_observation(control.physics)
-    return found
-
-
-def _through(get: Callable[[Any], Any], own: Callable[[], Any]) -> Any:
-    """Returns what an environment observes of what the one within it does, which may come with an info."""
-    result = own()
-    return get(result[0] if isinstance(result, tuple) else result)
-
-
-def _global_state() -> tuple[Any, ...]:
-    """Returns how far the global generators of NumPy and Python are."""
-    numpy_state: Any = np.random.get_state()
-    return numpy_state[2], random.getstate()
 
 
 class Instance:
@@ -225,25 +78,21 @@ class Instance:
     """
 
     def __init__(self, recipe: Recipe):
-        self.recipe = recipe
         opened = made(recipe.source)
-        self.env, self.steps, self.name = opened.env, opened.steps, recipe.source.name
-        self.model, self.data = opened.model, opened.data
+        self.recipe, self.env, self.steps = recipe, opened.env, opened.steps
+        self.name, self.model, self.data = recipe.source.name, opened.model, opened.data
         self.physics = Physics(opened.model, opened.data, opened.plant)
         self.inner: Any = self.env.unwrapped
+        self._space = self.env.observation_space
         self._observers = observers(self.env)
         self.inner_seen: Any = None  # what the innermost environment observed last
-        self._like: written.Fingerprint | None = None  # after its first reset
-        self._chain: _Chain | None = None
-        self._used = False
-        self.start: np.ndarray | None = (
-            None  # to which the innermost reset has to lead, below wrappers
-        )
-        self._offset = np.zeros(len(recipe.noisy))
-        if self.env is not self.inner:
-            self._chain = _Chain(self)
-        self._generators: dict[str, tuple[Any, bytes]] = {}
         self.observation = np.empty(0)
+        self._like: written.Fingerprint | None = None  # after its first reset
+        self._generators: dict[str, tuple[Any, bytes]] = {}
+        self._used = self._at_start = False
+        # To which the innermost reset has to lead, below wrappers.
+        self.start: np.ndarray | None = None
+        self._chain = None if self.env is self.inner else _Chain(self)
 
     @property
     def source(self) -> Source:
@@ -288,23 +137,24 @@ class Instance:
         Wrappers see the start as the first observation, as if the reset of the innermost environment had led
         there.
         """
-        space = self.env.observation_space
         if self._chain is None:
             self.reset(seed)
-            self.physics.write(state)
-            return flat(self.watched(), space)
+            return self._placed(state)
         self.start = state
         try:
-            return flat(self.reset(seed), space)
+            return flat(self.reset(seed), self._space)
         finally:
             self.start = None
 
-    def drawn(self, rng: np.random.Generator) -> np.ndarray:
-        """Returns inputs (m,) at random."""
-        space: Any = self.env.action_space
-        if isinstance(space, spaces.Discrete):
-            return np.array([float(rng.integers(space.n))])
-        return np.ravel(rng.uniform(space.low, space.high)).astype(float)
+    def _placed(self, state: np.ndarray) -> np.ndarray:
+        self.arrive(state)
+        self.observation = flat(self.inner_seen, self._space)
+        return self.observation
+
+    def arrive(self, state: np.ndarray) -> None:
+        """Puts the innermost environment to a start (S,), and has it observe."""
+        self.physics.write(state)
+        self.inner_seen, self._at_start = self.watched(), True
 
     def pin(self) -> None:
         """Sets what is pinned."""
@@ -330,13 +180,13 @@ class Instance:
                     "position as qpos[2], or an attribute"
                 )
             setattr(self.inner, name, np.array(value) if isinstance(value, list) else value)
-        self.physics.write(self.physics.shown())
+        self.physics.write(self.physics.shown)
 
     def remembered(self) -> written.Fingerprint:
         """Returns what it remembers now, to compare it: attributes, MuJoCo's state and model."""
         found = written.fingerprint(self.env)
         found.update(
-            (f"{name} of its model", value) for name, value in written.of_model(self.model).items()
+            (f"{name} of its model", v) for name, v in written.of_model(self.model).items()
         )
         found["MuJoCo's state"] = self.physics.read().tobytes()
         return found
@@ -355,7 +205,7 @@ class Instance:
             raise Worn(differ[0])
 
     def begin(self, start: np.ndarray) -> None:
-        """Begins an episode at a state of MuJoCo (S,); `sense` then gives its first observation.
+        """Begins an episode at a state of MuJoCo (S,); with wrappers, `sense` gives its first observation.
 
         Raises:
             Worn: after its reset it is not like a new one.
@@ -366,15 +216,13 @@ class Instance:
                 raise Worn("a wrapper")
             self._used = True
         else:
-            self.observation = flat(self.reset(), self.env.observation_space)
+            self.observation = flat(self.reset(), self._space)
             self.mark()
         if self._chain is None:
-            self.physics.write(start)
-            self.inner_seen = self.watched()
-            self.observation = flat(self.inner_seen, self.inner.observation_space)
+            self._placed(start)
         else:
             self.start = start
-            self._chain.ask(lambda: self.reset())
+            self._chain.ask(self.reset)
 
     def act(self, u: np.ndarray) -> np.ndarray:
         """Steps the environment with inputs u (m,), and returns its report (see `Recipe.width`).
@@ -386,29 +234,28 @@ class Instance:
         self._chain.ask(lambda: self.stepped(u))
         return np.zeros(self.recipe.width)
 
-    def sense(self, noise: np.ndarray) -> np.ndarray | None:
+    def sense(self, noise: np.ndarray) -> np.ndarray:
         """Computes `observation` under noise (d,) on the chart's coordinates.
 
         Returns:
-            With wrappers the report of the step; None at the start, and without wrappers.
+            With wrappers the report of the step; zeros at the start, and without wrappers.
         """
         if self._chain is None:
             if noise.any():
                 self.observation = self.observation + self.displaced(noise)
-            return None
-        result, starting = self._chain.answer(noise), self.start is not None
-        if starting:
-            self.start = None
-            self.observation = flat(result, self.env.observation_space)
-            return None
-        return self._told(result)
+            return np.zeros(self.recipe.width)
+        result = self._chain.answer(noise)
+        if self.start is None:
+            return self._told(result)
+        self.start, self.observation = None, flat(result, self._space)
+        return np.zeros(self.recipe.width)
 
     def finish(self) -> None:
         """Refuses an episode in which random numbers were drawn, at its end."""
-        for name, (generator, state) in self._generators.items():
+        generators, self._generators = self._generators, {}
+        for name, (generator, state) in generators.items():
             if written.state_of(generator) != state:
                 self._drawn(name)
-        self._generators = {}
 
     def quit(self) -> None:
         """Leaves an episode before its end."""
@@ -436,29 +283,39 @@ class Instance:
 
     def rested(self, start: np.ndarray) -> np.ndarray:
         """Returns what is first observed (o,) of an episode that begins at a state of MuJoCo (S,)."""
-        if self._chain is not None or not len(self.observation):
-            self.begin(start)
-            self.sense(np.zeros(len(self.recipe.noisy)))
-        else:
-            self.physics.write(start)
-            self.observation = flat(self.watched(), self.inner.observation_space)
+        if self._chain is None and len(self.observation):
+            return self._placed(start)
+        self.begin(start)
+        self.sense(np.zeros(len(self.recipe.noisy)))
         return self.observation
 
     def displaced(self, noise: np.ndarray) -> np.ndarray:
         """Returns by how much the innermost observation changes (o,) where the chart's coordinates do.
 
-        Where what is observed lags, it is the difference of two observations with all derived quantities
-        up to date.
+        Where what is observed is known to show derived quantities of a physics step before, these are
+        computed where the robot was then, with the noise. Where it is not known which they are, it is the
+        difference of two observations with all of them up to date.
         """
-        space, state = self.inner.observation_space, self.physics.read()
-        moved = self.moved(state, noise)
+        state, derived = self.physics.read(), NOW if self._at_start else self.recipe.derived
         with self.physics.kept():
-            here = flat(self.inner_seen, space)
-            if self.recipe.lags:
-                self.physics.write(state)
-                here = flat(self.watched(), space)
+            if derived == UNKNOWN:
+                before = self.seen_as(NOW, state, np.zeros(len(noise)))
+            else:
+                before = flat(self.inner_seen, self.inner.observation_space)
+            return self.seen_as(derived, state, noise) - before
+
+    def seen_as(self, derived: str, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Returns the innermost observation (o,) of a state (S,) under noise (d,); see `Recipe.derived`.
+
+        MuJoCo's data are left there.
+        """
+        moved = self.moved(state, noise)
+        if derived == EARLIER:
+            self.physics.write(self.moved(self.physics.earlier(state), noise))
+            self.physics.show(moved)
+        else:
             self.physics.write(moved)
-            return flat(self.watched(), space) - here
+        return flat(self.watched(), self.inner.observation_space)
 
     def moved(self, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Returns a state of MuJoCo (S,) with noise (d,) added to the coordinates of the chart."""
@@ -481,6 +338,13 @@ class Instance:
 
     # ---- steps
 
+    def drawn(self, rng: np.random.Generator) -> np.ndarray:
+        """Returns inputs (m,) at random."""
+        space: Any = self.env.action_space
+        if isinstance(space, spaces.Discrete):
+            return np.array([float(rng.integers(space.n))])
+        return np.ravel(rng.uniform(space.low, space.high)).astype(float)
+
     def action(self, u: np.ndarray) -> Any:
         """Returns the environment's action for inputs u (m,)."""
         space = self.env.action_space
@@ -490,7 +354,7 @@ class Instance:
 
     def stepped(self, u: np.ndarray) -> Any:
         """Returns what the environment's own step returns for inputs u (m,)."""
-        action = self.action(u)
+        action, self._at_start = self.action(u), False
         try:
             result = self.env.step(action)
         except HyrlError:
@@ -508,7 +372,7 @@ class Instance:
 
     def _told(self, result: Any) -> np.ndarray:
         observation, reward, terminated, truncated, info = result
-        self.observation = flat(observation, self.env.observation_space)
+        self.observation = flat(observation, self._space)
         entries = [entry(info, key) for key in self.recipe.keys]
         if self.physics.is_plant:
             self.physics.read()
@@ -535,6 +399,12 @@ class Instance:
         )
 
 
+def _global_state() -> tuple[Any, ...]:
+    """Returns how far the global generators of NumPy and Python are."""
+    numpy_state: Any = np.random.get_state()
+    return numpy_state[2], random.getstate()
+
+
 class _Chain:
     """Plays the steps of wrapped environments in a thread that waits for noise inside of the innermost.
 
@@ -547,7 +417,7 @@ class _Chain:
         self._own_step, self._own_reset = instance.inner.step, instance.inner.reset
         instance.inner.step, instance.inner.reset = self._step, self._reset
         self._work: SimpleQueue[Callable[[], Any] | None] = SimpleQueue()
-        self._noise: SimpleQueue[np.ndarray | None] = SimpleQueue()
+        self._noise: SimpleQueue[np.ndarray] = SimpleQueue()
         self._news: SimpleQueue[tuple[str, Any]] = SimpleQueue()
         self._asked = self._busy = False
         self._calls = 0
@@ -586,39 +456,33 @@ class _Chain:
     def _step(self, action: Any) -> Any:
         result = self._own_step(action)
         self._instance.inner_seen = result[0]
-        if not self._asked:
-            return result
-        self._count()
         return self._observed(result[0], result[1:])
 
     def _reset(self, **options: Any) -> Any:
-        result = self._own_reset(**options)
-        self._instance.inner_seen = result[0]
-        if self._instance.start is None:
+        instance, result = self._instance, self._own_reset(**options)
+        instance.inner_seen = result[0]
+        if instance.start is None:
             return result
-        self._instance.pin()
-        self._instance.physics.write(self._instance.start)
-        observation = self._instance.inner_seen = self._instance.watched()
-        if not self._asked:
-            return (observation, *result[1:])
-        self._count()
-        return self._observed(observation, result[1:])
-
-    def _count(self) -> None:
-        self._calls += 1
-        if self._calls > 1:
-            raise BadInput(
-                f"a wrapper of {self._instance.name} steps or resets the environment more than once in a "
-                "step, and noise comes once a sample: give the environment a frame_skip instead"
-            )
+        instance.pin()
+        instance.arrive(instance.start)
+        return self._observed(instance.inner_seen, result[1:])
 
     def _observed(self, observation: Any, rest: tuple[Any, ...]) -> tuple[Any, ...]:
         instance, space = self._instance, self._instance.inner.observation_space
+        if not self._asked:
+            return (observation, *rest)
+        self._calls += 1
+        if self._calls > 1:
+            raise BadInput(
+                f"a wrapper of {instance.name} steps or resets the environment more than once in a step, and "
+                "noise comes once a sample: give the environment a frame_skip instead"
+            )
         self._news.put(("sensing", None))
         noise = self._noise.get()
-        if noise is not None and noise.any():
-            vector = flat(observation, space) + instance.displaced(noise)
-            observation = _shaped(vector, observation, space)
+        if noise.any():
+            observation = shaped(
+                flat(observation, space) + instance.displaced(noise), observation, space
+            )
             # Wrappers that look at MuJoCo's state themselves see it where the sensor does.
             instance.physics.leave_for(instance.moved(instance.physics.read(), noise))
         return (observation, *rest)

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hyrl_mj.environments.instance import Instance, Recipe, Worn, flat
+from hyrl_mj.environments.instance import Instance, Recipe, Worn
+from hyrl_mj.environments.observations import flat
 from hyrl_mj.errors import BadInput
 
 

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import count
 from typing import Any
 
 import numpy as np
 
 from hyrl_mj import mjcf
-from hyrl_mj.environments.pool import MOST as MOST_PLAYED
-from hyrl_mj.environments.pool import Key, Pool
+from hyrl_mj.environments.pool import Pool
 from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.errors import BadInput
 from hyrl_mj.plant import MOST, checked, checked_inputs
 from hyrl_mj.ranges import Integer
 from hyrl_mj.tasks import Outcome
 
+# Runs that are played by instances side by side, at most: each holds an environment in memory.
+PLAYED = 1024
+# From so many runs on states are written, where that is the same.
+WRITTEN = 257
 _NUMBERS = count()
 
 
@@ -38,79 +41,82 @@ class EnvironmentPlant:
 
     def __init__(self, spec: EnvironmentSpec, pool: Pool, model: Any, n: int):
         self.n = Integer(1, MOST).checked("the number of copies of a robot", n)
+        #: whether states are written, and no instance plays a run: without a memory, that is the same
+        self.direct = spec.memoryless and n >= WRITTEN
         self.spec, self._pool, self.model = spec, pool, model
         self.low, self.high = spec.low, spec.high
-        self._number, processes = next(_NUMBERS), pool.processes(n)
+        self._number, self._processes = next(_NUMBERS), pool.processes(n)
         self.late = spec.wrapped
-        self._keys: list[Key] = [(self._number, i, i % processes) for i in range(n)]
         self._state = np.tile(spec.state, (n, 1))
         self._starts = self._state.copy()
-        self._seen = np.zeros((n, spec.columns))
-        self._report = np.zeros((n, spec.recipe.width))
-        self._outcome = np.full(n, int(Outcome.RUNNING))
+        self._seen = slice(spec.dimension, spec.dimension + spec.columns)
+        self._truth = np.zeros((n, spec.dimension + spec.columns + 3))
         self._unstable = np.zeros(n, dtype=bool)
-        self._begun = np.zeros(n, dtype=bool)  # whether an instance plays the run
         self._open = np.zeros(n, dtype=bool)  # whether the sample has not been observed yet
-        #: whether states are written, and no instance plays a run: without a memory, that is the same
-        self.direct = spec.memoryless and n > MOST_PLAYED
-        self._played: set[Key] = set()
+        self._plays = np.zeros(n, dtype=bool)  # whether an instance plays the run
         # Not at once: a plant may be collected while the pool is at work.
-        weakref.finalize(self, pool.left.append, self._played).atexit = False
+        left = self._number, self._processes, self._plays
+        weakref.finalize(self, pool.left.append, left).atexit = False
 
     # ---- what is measured
 
     @property
     def measurement(self) -> np.ndarray:
         """The current measurement (n, p), a copy; what no noise was given for is observed without."""
-        if (rows := np.flatnonzero(self._open & self._begun)).size and self.spec.wrapped:
+        if self.spec.wrapped and (rows := np.flatnonzero(self._open & self._plays)).size:
             self._sense(rows, np.zeros((len(rows), self.spec.dimension)))
         return self.truth
 
     @property
     def truth(self) -> np.ndarray:
         """The current measurement (n, p), a copy, before the present sample has been observed."""
-        return np.column_stack(
-            [
-                self.spec.z(self._state),
-                self._seen,
-                self._report[:, 0],
-                self.spec.succeeds(self._report),
-                self._outcome,
-            ]
-        )
+        return self._truth.copy()
 
     def observe(self, true: np.ndarray, noise: np.ndarray, ids: np.ndarray) -> np.ndarray:
         """Returns the noisy measurements (k, p) of runs `ids` (k,), under noise (k, p) of this sample.
 
         Each run can be observed once in each sample: what remembers its observations then has seen it.
         """
-        d = self.spec.dimension
-        measured, needed = (
-            true.copy(),
-            noise[:, :d].any(axis=1) | (self.spec.wrapped & self._begun[ids]),
-        )
-        goes_on = self._outcome[ids] == Outcome.RUNNING
-        some = np.flatnonzero(needed & self._open[ids] & goes_on)
+        d, measured = self.spec.dimension, true.copy()
+        needed = noise[:, :d].any(axis=1)
+        if self.spec.wrapped:
+            needed |= self._plays[ids]
+        some = np.flatnonzero(needed & self._open[ids] & (self._outcome[ids] == Outcome.RUNNING))
         if len(some):
             self._sense(ids[some], noise[some, :d])
         self._open[ids] = False
         measured[:, :d] += noise[:, :d]
-        measured[:, d : d + self.spec.columns] = self._seen[ids]
+        measured[:, self._seen] = self._truth[ids, self._seen]
         return measured
 
     def _sense(self, rows: np.ndarray, noise: np.ndarray) -> None:
         if self.direct:
             raise BadInput(
                 f"{self.n} episodes of {self.spec.name} cannot be observed under noise side by side: give at "
-                f"most {MOST_PLAYED}"
+                f"most {WRITTEN - 1}"
             )
-        keys = [self._keys[i] for i in rows]
-        self._played.update(keys)
-        seen, reports = self._pool.sense(keys, self._new(rows), noise)
-        self._begun[rows], self._open[rows] = True, False
-        self._seen[rows] = seen
-        if reports is not None:
-            self._judge(rows, reports)
+        begun = self._plays[rows]
+        self._begin(rows)
+        seen, reports = self._pool.runs("sense", self._number, self._processes, rows, noise)
+        self._open[rows] = False
+        self._truth[rows, self._seen] = seen
+        if self.spec.wrapped:
+            self._judge(rows[begun], reports[begun])
+
+    @property
+    def _outcome(self) -> np.ndarray:
+        return self._truth[:, -1]
+
+    def _begin(self, rows: np.ndarray) -> None:
+        """Gives those of the runs an instance that have none."""
+        if len(new := rows[~self._plays[rows]]):
+            if self._plays.sum() + len(new) > PLAYED:
+                raise BadInput(
+                    f"{self.n} episodes of {self.spec.name} side by side need as many environments in memory: "
+                    f"give at most {PLAYED}"
+                )
+            self._pool.runs("begin", self._number, self._processes, new, self._starts[new])
+            self._plays[new] = True
 
     # ---- the state
 
@@ -161,11 +167,14 @@ class EnvironmentPlant:
         ):
             self._state[np.ix_(rows, columns)] = checked(name, values, len(columns), rows)
         self._starts[rows] = self._state[rows]
-        self._report[rows], self._unstable[rows] = 0.0, False
-        self._begun[rows], self._open[rows] = False, True
-        self._seen[rows], depths = self._pool.rest(self._starts[rows])
+        self._unstable[rows], self._open[rows] = False, True
+        seen, depths = self._pool.rest(self._starts[rows])
         blocked = depths > self.spec.depth
-        self._outcome[rows] = np.where(blocked, Outcome.CRASHED, Outcome.RUNNING)
+        outcome = np.where(blocked, Outcome.CRASHED, Outcome.RUNNING)
+        nothing = np.zeros((len(rows), 2))
+        self._truth[rows] = np.column_stack(
+            [self.spec.z(self._state[rows]), seen, nothing, outcome]
+        )
 
     def step(self, u: np.ndarray, ids: np.ndarray | None = None) -> None:
         """Steps the runs `ids` (k,), all by default, with inputs u (k, m).
@@ -181,15 +190,18 @@ class EnvironmentPlant:
         if not len(rows):
             return
         if self.direct:
-            states, reports, seen = self._pool.branch(self._state[rows], u)
+            states, seen, reports = self._pool.branch(self._state[rows], u)
         else:
-            keys = [self._keys[i] for i in rows]
-            self._played.update(keys)
-            states, reports, seen = self._pool.act(keys, self._new(rows), u)
-            self._begun[rows] = True
+            if self.spec.wrapped and (unseen := rows[self._open[rows]]).size:
+                self._sense(unseen, np.zeros((len(unseen), self.spec.dimension)))
+            self._begin(rows)
+            states, seen, reports = self._pool.runs("act", self._number, self._processes, rows, u)
         self._open[rows] = True
         finite = np.isfinite(states).all(axis=1) & np.isfinite(seen).all(axis=1)
-        self._state[rows[finite]], self._seen[rows[finite]] = states[finite], seen[finite]
+        some = rows[finite]
+        self._state[some] = states[finite]
+        self._truth[some, : self.spec.dimension] = self.spec.z(states[finite])
+        self._truth[some, self._seen] = seen[finite]
         self._unstable[rows[~finite]] = True
         if not self.spec.wrapped:
             self._judge(rows, reports)
@@ -209,19 +221,17 @@ class EnvironmentPlant:
 
     def _judge(self, rows: np.ndarray, reports: np.ndarray) -> None:
         """Notes what the environment reported of runs, and lets go of those that are over."""
-        self._report[rows] = reports
-        self._outcome[rows] = self.spec.outcome(reports)
-        self._leave(rows[self._outcome[rows] != Outcome.RUNNING])
-
-    def _new(self, rows: np.ndarray) -> Mapping[Key, np.ndarray]:
-        """Returns the starts of those of the runs that no instance plays yet."""
-        return {self._keys[i]: self._starts[i] for i in rows if not self._begun[i]}
+        outcome = self.spec.outcome(reports)
+        self._truth[rows, -3:] = np.column_stack(
+            [reports[:, 0], self.spec.succeeds(reports), outcome]
+        )
+        self._leave(rows[outcome != Outcome.RUNNING])
 
     def _leave(self, rows: np.ndarray) -> None:
         self._open[rows] = False
-        keys = [self._keys[i] for i in rows if self._keys[i] in self._played]
-        self._played.difference_update(keys)
-        self._pool.leave(keys)
+        if len(rows := rows[self._plays[rows]]):
+            self._plays[rows] = False
+            self._pool.runs("leave", self._number, self._processes, rows)
 
     def _rows(self, ids: np.ndarray | None) -> np.ndarray:
         return np.arange(self.n) if ids is None else np.asarray(ids)

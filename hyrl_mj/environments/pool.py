@@ -11,9 +11,8 @@ import os
 import signal
 import warnings
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from threading import Lock
 from typing import Any
@@ -28,27 +27,7 @@ from hyrl_mj.errors import BadInput, HyrlError, brief
 
 # Fewer episodes than this for each process are played by one.
 FEWEST = 16
-# Instances of each process. A run whose instance plays another one is played again from its start.
-MOST = 256
-# Runs: number of the plant, row, and number of the process that plays it.
-Key = tuple[int, int, int]
-
-
-@dataclass
-class Episode:
-    """An episode that is being played.
-
-    Attributes:
-        start: MuJoCo's state (S,) in which it begins.
-        inputs: inputs (m,) of the samples so far.
-        noise: noise (d,) of the samples so far; one more where the last one has been sensed.
-        instance: which plays it; None if that plays another one now.
-    """
-
-    start: np.ndarray
-    inputs: list[np.ndarray] = field(default_factory=list)
-    noise: list[np.ndarray] = field(default_factory=list)
-    instance: Instance | None = None
+Arrays = tuple[np.ndarray, ...]
 
 
 class Stage:
@@ -60,73 +39,61 @@ class Stage:
 
     def __init__(self, recipe: Recipe):
         self.recipe = recipe
-        self._episodes: dict[Key, Episode] = {}  # in the order of their last use
+        self._playing: dict[tuple[int, int], Instance] = {}  # by plant and row
         self._free: list[Instance] = []
-        self._playing = 0
         self._resting: Instance | None = None
-        self._tabulating: Instance | None = None
         self._real = Real(recipe)
         self._shared: written.Fingerprint | None = (
             None  # what a new instance shares with all others
         )
 
-    def act(self, keys: Sequence[Key], starts: Any, u: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Steps episodes; those that are new begin at `starts`, MuJoCo's states by the run.
+    def begin(self, plant: int, rows: np.ndarray, starts: np.ndarray) -> Arrays:
+        """Begins episodes at MuJoCo's states (k, S) and gives each row of a plant an instance."""
+        for row, start in zip(rows.tolist(), starts, strict=True):
+            self._playing[plant, row] = self._begun(self._free, start)
+        return ()
+
+    def act(self, plant: int, rows: np.ndarray, u: np.ndarray) -> Arrays:
+        """Steps episodes with inputs (k, m).
 
         Returns:
-            MuJoCo's states (k, S), reports (k, r) and observations (k, o).
+            MuJoCo's states (k, S), observations (k, o) and reports (k, r), which with wrappers come from
+            `sense`.
         """
-        states, reports, seen = [], [], []
-        for first in range(0, len(keys), MOST):  # so many have an instance at once
-            some = slice(first, first + MOST)
-            episodes = [self._opened(key, starts) for key in keys[some]]
-            instances = [self._ready(episode) for episode in episodes]
-            with instances[0].undrawn():
-                for episode, instance, inputs in zip(episodes, instances, u[some], strict=True):
-                    if len(episode.noise) == len(episode.inputs):
-                        self._sense(episode, np.zeros(len(self.recipe.noisy)))
-                    reports.append(instance.act(inputs))
-                    episode.inputs.append(inputs)
-                    states.append(instance.physics.read())
-                    seen.append(instance.observation)
-        return np.array(states), np.array(reports), np.array(seen)
+        return self._acted([self._playing[plant, row] for row in rows.tolist()], u)
 
-    def sense(self, keys: Sequence[Key], starts: Any, noise: np.ndarray) -> tuple[Any, ...]:
+    def sense(self, plant: int, rows: np.ndarray, noise: np.ndarray) -> Arrays:
         """Gives episodes the noise (k, d) of a sample.
 
         Returns:
-            Observations (k, o), and reports (k, r) where they are complete only now, else None.
+            Observations (k, o), and with wrappers reports (k, r).
         """
-        seen, reports = [], []
-        for key, row in zip(keys, noise, strict=True):
-            episode = self._opened(key, starts)
-            instance = self._ready(episode)
-            reports.append(self._sense(episode, row))
-            seen.append(instance.observation)
-        late = [report for report in reports if report is not None]
-        return np.array(seen), np.array(late) if len(late) == len(reports) else None
+        instances = [self._playing[plant, row] for row in rows.tolist()]
+        reports = [i.sense(n) for i, n in zip(instances, noise, strict=True)]
+        return np.array([instance.observation for instance in instances]), np.array(reports)
 
-    def leave(self, keys: Sequence[Key]) -> None:
+    def leave(self, plant: int, rows: np.ndarray) -> Arrays:
         """Lets the instances of episodes play others.
 
         Raises:
             BadInput: random numbers were drawn in one of them.
         """
-        for key in keys:
-            episode = self._episodes.pop(key, None)
-            if episode is not None and episode.instance is not None:
-                try:
-                    episode.instance.finish()
-                finally:
-                    self._put_back(episode)
+        instances = [self._playing.pop((plant, row)) for row in rows.tolist()]
+        self._free += instances
+        try:
+            for instance in instances:
+                instance.finish()
+        finally:
+            for instance in instances:
+                instance.quit()
+        return ()
 
-    def rest(self, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns what episodes that begin in states (k, S) observe first (k, o), and depths (k,)."""
+    def rest(self, rows: np.ndarray, starts: np.ndarray) -> Arrays:
+        """Returns what episodes that begin in states (k, S) observe first (k, o), and depths (k,) [m]."""
         seen, depths = [], []
         for start in starts:
-            if self._resting is None:
-                self._resting = self._new()
             try:
+                self._resting = self._resting or self._new()
                 seen.append(self._resting.rested(start))
             except Worn:
                 self._resting = self._new()
@@ -134,7 +101,7 @@ class Stage:
             depths.append(self._resting.depth())
         return np.array(seen), np.array(depths)
 
-    def branch(self, states: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, ...]:
+    def branch(self, rows: np.ndarray, states: np.ndarray, u: np.ndarray) -> Arrays:
         """Steps an environment without memory from states (k, S), written directly, with inputs u (k, m).
 
         Returns what `act` returns.
@@ -142,75 +109,54 @@ class Stage:
         Raises:
             BadInput: it remembers something after all.
         """
-        if self._tabulating is None:
-            self._tabulating = self._new()
-            self._tabulating.begin(self._tabulating.physics.read())
-        instance, after, reports, seen = self._tabulating, [], [], []
-        before = written.fingerprint(instance.env)
+        instance = self._begun(self._free, states[0])
+        before, results = written.fingerprint(instance.env), []
         for state, inputs in zip(states, u, strict=True):
             instance.physics.write(state)
-            reports.append(instance.act(inputs))
-            after.append(instance.physics.read())
-            seen.append(instance.observation)
+            results.append(self._acted([instance], inputs[None]))
         if changed := written.differing(written.fingerprint(instance.env), before):
             raise BadInput(
                 f"{self.recipe.source.name} remembers something in {changed[0]}, as no sampled run showed; "
                 "without a memory that is always there it cannot be tabulated"
             )
-        return np.array(after), np.array(reports), np.array(seen)
+        self._free.append(instance)
+        return tuple(map(np.concatenate, zip(*results, strict=True)))
 
-    def check(self, runs: Sequence[Played]) -> None:
-        """Plays runs in new environments, and raises `BadInput` if these go another way."""
-        self._real.check(runs)
+    def check(self, rows: np.ndarray, runs: np.ndarray) -> Arrays:
+        """Plays runs (k,) of `Played` in new environments; raises `BadInput` if these go another way."""
+        self._real.check(runs.tolist())
+        return ()
+
+    def _acted(self, instances: Sequence[Instance], u: np.ndarray) -> Arrays:
+        states, reports, seen = [], [], []
+        with instances[0].undrawn():
+            for instance, inputs in zip(instances, u, strict=True):
+                reports.append(instance.act(inputs))
+                states.append(instance.physics.read())
+                seen.append(instance.observation)
+        return np.array(states), np.array(seen), np.array(reports)
 
     # ---- instances
 
-    def _opened(self, key: Key, starts: Any) -> Episode:
-        episode = self._episodes.pop(key, None) or Episode(starts[key])
-        self._episodes[key] = episode
-        return episode
-
-    def _ready(self, episode: Episode) -> Instance:
-        """Returns the instance of an episode, which has played it up to the present sample."""
-        if episode.instance is not None:
-            return episode.instance
-        episode.instance = instance = self._begun(episode.start)
-        for k, noise in enumerate(episode.noise):
-            instance.sense(noise)
-            if k < len(episode.inputs):
-                instance.act(episode.inputs[k])
-        if len(episode.inputs) > len(episode.noise):
-            raise AssertionError("an episode went on without an observation")
-        return instance
-
-    def _begun(self, start: np.ndarray) -> Instance:
+    def _begun(self, free: list[Instance], start: np.ndarray) -> Instance:
+        """Returns an instance that begins at a state (S,); a new one takes the place of those worn."""
         while True:
-            instance = self._taken()
+            instance = free.pop() if free else self._new()
             try:
                 instance.begin(start)
                 return instance
-            except Worn as worn:  # a new one takes its place
+            except Worn as worn:
                 instance.quit()
-                self._playing -= 1
                 if written.is_shared(str(worn)):
                     raise self._is_shared(str(worn)) from None
 
-    def _taken(self) -> Instance:
-        """Returns an instance that plays nothing."""
-        self._playing += 1
-        if not self._free and self._playing > MOST:
-            oldest = next(e for e in self._episodes.values() if e.instance is not None)
-            self._put_back(oldest)
-        return self._free.pop() if self._free else self._new()
-
     def _new(self) -> Instance:
         instance = Instance(self.recipe)
-        shared = written.Fingerprint()
         found = written.fingerprint(instance.env)
+        shared = written.Fingerprint()
         shared.update((name, value) for name, value in found.items() if written.is_shared(name))
-        if self._shared is None:
-            self._shared = shared
-        elif changed := written.differing(shared, self._shared):
+        self._shared = self._shared or shared
+        if changed := written.differing(shared, self._shared):
             raise self._is_shared(changed[0])
         return instance
 
@@ -219,17 +165,6 @@ class Stage:
             f"{self.recipe.source.name} changes {name}, which all its instances share, so its episodes "
             "depend on each other: keep it in an attribute that reset() sets"
         )
-
-    def _put_back(self, episode: Episode) -> None:
-        assert episode.instance is not None
-        episode.instance.quit()
-        self._free.append(episode.instance)
-        episode.instance, self._playing = None, self._playing - 1
-
-    def _sense(self, episode: Episode, noise: np.ndarray) -> np.ndarray | None:
-        assert episode.instance is not None
-        episode.noise.append(noise)
-        return episode.instance.sense(noise)
 
 
 class Pool:
@@ -241,138 +176,99 @@ class Pool:
 
     def __init__(self, recipe: Recipe):
         self.recipe = recipe
-        self._stage = Stage(recipe)
-        self._owner = os.getpid()
+        self._stage, self._owner = Stage(recipe), os.getpid()
         self._hands: list[Connection] = []
         self._lock = Lock()  # a game attacks several controllers in threads
-        self.left: deque[set[Key]] = deque()  # runs of plants that nobody has any more
+        # Plants that nobody has any more: their number, their processes, and which rows play (n,).
+        self.left: deque[tuple[int, int, np.ndarray]] = deque()
 
-    def act(
-        self, keys: Sequence[Key], starts: Mapping[Key, np.ndarray], u: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Does what `Stage.act` does."""
-        parts = self._spread("act", keys, starts, u)
-        return tuple(_joined(parts, len(keys), i) for i in range(3))  # type: ignore[return-value]
+    def runs(
+        self, what: str, plant: int, processes: int, rows: np.ndarray, *values: np.ndarray
+    ) -> Arrays:
+        """Does what `Stage.begin`, `act`, `sense` or `leave` do, each row in the same process ever again."""
+        while self.left and what != "leave":
+            number, count, plays = self.left.popleft()
+            self.runs("leave", number, count, np.flatnonzero(plays))
+        return self._spread(what, (plant,), rows % processes, rows, *values)
 
-    def sense(
-        self, keys: Sequence[Key], starts: Mapping[Key, np.ndarray], noise: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Does what `Stage.sense` does."""
-        parts = self._spread("sense", keys, starts, noise)
-        late = all(result[1] is not None for _, result in parts)
-        seen = _joined(parts, len(keys), 0)
-        return seen, _joined(parts, len(keys), 1) if late else None
-
-    def leave(self, keys: Sequence[Key]) -> None:
-        """Does what `Stage.leave` does."""
-        if keys:
-            self._spread("leave", keys)
-
-    def rest(self, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def rest(self, starts: np.ndarray) -> Arrays:
         """Does what `Stage.rest` does."""
-        rows, parts = self._rows("rest", starts)
-        return tuple(_joined([*zip(rows, parts, strict=True)], len(starts), i) for i in range(2))  # type: ignore[return-value]
+        return self._any("rest", starts)
 
-    def branch(self, states: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, ...]:
+    def branch(self, states: np.ndarray, u: np.ndarray) -> Arrays:
         """Does what `Stage.branch` does."""
-        rows, parts = self._rows("branch", states, u)
-        return tuple(_joined([*zip(rows, parts, strict=True)], len(states), i) for i in range(3))
+        return self._any("branch", states, u)
 
     def check(self, runs: Sequence[Played]) -> None:
         """Does what `Stage.check` does."""
-        count = self.processes(len(runs))
-        with self._lock:
-            self._opened(count)
-            self._at_once([("check", (runs[i::count],)) for i in range(count)])
+        array = np.empty(len(runs), dtype=object)
+        array[:] = runs
+        self._any("check", array)
 
-    def _rows(self, what: str, *arrays: np.ndarray) -> tuple[list[np.ndarray], list[Any]]:
-        """Returns rows of arrays for each process, and what it answers to them."""
-        with self._lock:
-            count = self._opened(self.processes(len(arrays[0])))
-            rows = [np.arange(len(arrays[0]))[i::count] for i in range(count)]
-            return rows, self._at_once([(what, tuple(a[r] for a in arrays)) for r in rows])
+    def _any(self, what: str, *values: np.ndarray) -> Arrays:
+        rows = np.arange(len(values[0]))
+        return self._spread(what, (), rows % self.processes(len(rows)), rows, *values)
 
     def _spread(
-        self, what: str, keys: Sequence[Key], starts: Any = None, values: np.ndarray | None = None
-    ) -> list[tuple[np.ndarray, Any]]:
-        """Returns the rows of each process with what it answers; a run stays in its process."""
-        while self.left and what != "leave":
-            self.leave(sorted(self.left.popleft()))
+        self, what: str, first: tuple[Any, ...], places: np.ndarray, *values: np.ndarray
+    ) -> Arrays:
+        """Does something with rows of values, each in the process of `places` (k,), and joins the answers."""
         with self._lock:
-            place = np.array([key[2] for key in keys])
-            count = self._opened(int(place.max(initial=0)) + 1)
-            rows = [r for i in range(count) if len(r := np.flatnonzero(place == i)) or not i]
-            places = [i for i in range(count) if (place == i).any() or not i]
-            jobs: list[tuple[str, Any]] = []
-            for r in rows:
-                mine = [keys[int(i)] for i in r]
-                if values is None:
-                    jobs.append((what, (mine,)))
-                else:
-                    new = {key: starts[key] for key in mine if key in starts}
-                    jobs.append((what, (mine, new, values[r])))
-            answers = self._at_once(jobs, places)
-            return [(r, a) for r, a in zip(rows, answers, strict=True) if len(r)]
+            self._open(int(places.max(initial=0)) + 1)
+            parts = {int(i): np.flatnonzero(places == i) for i in np.unique(places)}
+            jobs = {i: (what, (*first, *(v[rows] for v in values))) for i, rows in parts.items()}
+            answers = self._answers(jobs)
+        joined = []
+        for column in zip(*answers.values(), strict=True):
+            whole = np.empty((len(places), *column[0].shape[1:]))
+            for rows, part in zip(parts.values(), column, strict=True):
+                whole[rows] = part
+            joined.append(whole)
+        return tuple(joined)
 
-    def _at_once(self, jobs: list[tuple[str, Any]], places: list[int] | None = None) -> list[Any]:
-        """Returns the answers to jobs: the first is done here, the others by other processes."""
-        hands = [self._hands[i - 1] for i in (places or range(len(jobs)))[1:]]
-        for hand, job in zip(hands, jobs[1:], strict=True):
-            hand.send(job)
-        results, error = [], None
+    def _answers(self, jobs: dict[int, tuple[str, Any]]) -> dict[int, Any]:
+        """Returns the answer of each process: that of number 0 is this one."""
+        for i, job in jobs.items():
+            if i:
+                self._hands[i - 1].send(job)
+        answers: dict[int, Any] = {}
         try:
-            what, arguments = jobs[0]
-            results = [getattr(self._stage, what)(*arguments)]
+            if 0 in jobs:
+                what, arguments = jobs[0]
+                answers[0] = getattr(self._stage, what)(*arguments)
         finally:  # what was asked for is always taken, or it would be taken for another answer
-            for hand in hands:
-                answer = _answer(hand)
-                error = error or (answer if isinstance(answer, Exception) else None)
-                results.append(answer)
-        if error is not None:
-            raise error
-        return results
+            answers |= {i: _answer(self._hands[i - 1]) for i in jobs if i}
+        for answer in answers.values():
+            if isinstance(answer, Exception):
+                raise answer
+        return answers
 
     def processes(self, runs: int) -> int:
         """Returns over how many processes so many runs are spread, this one included."""
-        if "fork" not in multiprocessing.get_all_start_methods():
-            return 1
-        if multiprocessing.current_process().daemon:
+        forks = "fork" in multiprocessing.get_all_start_methods()
+        if not forks or multiprocessing.current_process().daemon:
             return 1
         return min(cores.count(), max(runs // FEWEST, 1))
 
-    def _opened(self, count: int) -> int:
-        """Makes the processes that are missing, and returns their number."""
+    def _open(self, count: int) -> None:
+        """Makes the processes that are missing."""
         if self._owner != os.getpid():
             # Instances and processes of a process that this one was forked from are not ours.
-            self._owner, self._hands = os.getpid(), []
-            self._stage = Stage(self.recipe)
-        context = multiprocessing.get_context("fork") if count > 1 else None
-        while context is not None and len(self._hands) < count - 1:
+            self._stage, self._owner, self._hands = Stage(self.recipe), os.getpid(), []
+        while len(self._hands) < count - 1:
+            context = multiprocessing.get_context("fork")
             ours, theirs = context.Pipe()
-            worker = context.Process(
-                target=_serve,
-                args=(theirs, self.recipe, [*self._hands, ours]),
-                daemon=True,
-            )
+            arguments = theirs, self.recipe, [*self._hands, ours]
+            worker = context.Process(target=_serve, args=arguments, daemon=True)
             with warnings.catch_warnings():
                 # Python 3.12 warns of threads: those of torch and MuJoCo take no part in the children.
                 warnings.simplefilter("ignore", DeprecationWarning)
                 worker.start()
             theirs.close()
             self._hands.append(ours)
-        return count
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Pool:
         return self
-
-
-def _joined(parts: Sequence[tuple[np.ndarray, Any]], n: int, i: int) -> np.ndarray:
-    """Returns arrays (k, ...) of parts of n rows as one array, each row in its place."""
-    first = parts[0][1][i]
-    whole = np.empty((n, *first.shape[1:]))
-    for rows, result in parts:
-        whole[rows] = result[i]
-    return whole
 
 
 def _answer(hand: Connection) -> Any:

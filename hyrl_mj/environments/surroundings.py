@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -12,7 +12,8 @@ import numpy as np
 from hyrl_mj import mjcf
 from hyrl_mj.environments.coordinates import Coordinate
 from hyrl_mj.environments.fingerprint import differing
-from hyrl_mj.environments.instance import Instance, columns_of, flat
+from hyrl_mj.environments.instance import Instance
+from hyrl_mj.environments.observations import flat
 from hyrl_mj.errors import BadInput
 from hyrl_mj.tasks import touching
 
@@ -49,9 +50,9 @@ def robot_of(model: mujoco.MjModel, chart: Sequence[Coordinate]) -> np.ndarray:
     return np.isin(model.body_treeid, list(trees))
 
 
-def names_of_state(model: mujoco.MjModel) -> list[str]:
+def names_of_state(instance: Instance) -> list[str]:
     """Returns the names of the entries of a state of MuJoCo, as "qpos[0]"."""
-    return [f"{kind}[{i}]" for kind, at in columns_of(model).items() for i in range(len(at))]
+    return [f"{kind}[{i}]" for kind, at in instance.physics.columns.items() for i in range(len(at))]
 
 
 def states_of_resets(instance: Instance) -> np.ndarray:
@@ -71,13 +72,13 @@ def drawn(instance: Instance, states: np.ndarray, robot: np.ndarray) -> list[str
         states: MuJoCo's states (n, S) after resets.
         robot: (nbody,) bool, the bodies of the robot.
     """
-    model, at = instance.model, columns_of(instance.model)
+    model, at = instance.model, instance.physics.columns
     left = np.concatenate([at[kind] for kind in LEFT_OUT])
     varies = np.ptp(states, axis=0) > 0
     varies[left] = False
     for kind, bodies in (("qpos", _bodies_of_qpos(model)), ("qvel", model.dof_bodyid)):
         varies[at[kind][robot[bodies]]] = False
-    names = [name for name, v in zip(names_of_state(model), varies, strict=True) if v]
+    names = [name for name, v in zip(names_of_state(instance), varies, strict=True) if v]
     told, attributes = [], []
     for _ in range(2):  # what outlasts a reset is not drawn by it
         instance.put(states[0], 0)
@@ -142,7 +143,7 @@ def changed_by_user(instance: Instance) -> list[str]:
             instance.reset(seed, options)
             remembered = instance.remembered()
             state = instance.physics.read()
-            names = names_of_state(instance.model)
+            names = names_of_state(instance)
             remembered.update((n, float(v)) for n, v in zip(names, state, strict=True))
             seen.append(remembered)
         found |= dict.fromkeys(differing(*seen))
@@ -163,12 +164,12 @@ def check_pins(instance: Instance) -> None:
         return
     source, seen = instance.source, []
     for seed in range(COMPARED):
-        instance.recipe = instance.recipe.with_source(source.unpinned)
+        instance.recipe = replace(instance.recipe, source=source.unpinned)
         instance.reset(seed)
         seen.append(
             ({n: np.ravel(getattr(instance.inner, n)).copy() for n in pins}, _places(instance))
         )
-    instance.recipe = instance.recipe.with_source(source)
+    instance.recipe = replace(instance.recipe, source=source)
     instance.reset()
     places = _places(instance)
     for name, value in pins.items():

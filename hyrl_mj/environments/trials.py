@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from hyrl_mj.environments.fingerprint import differing, fingerprint
-from hyrl_mj.environments.instance import Instance, Recipe, flat, observers
+from hyrl_mj.environments.instance import EARLIER, NOW, UNKNOWN, Instance, Recipe
 from hyrl_mj.environments.judge import Played
+from hyrl_mj.environments.observations import flat, observers
 from hyrl_mj.environments.plant import EnvironmentPlant
 from hyrl_mj.environments.pool import Pool
 from hyrl_mj.environments.specification import EnvironmentSpec
@@ -57,13 +58,19 @@ def tried(instance: Instance, spec: EnvironmentSpec) -> tuple[EnvironmentSpec, P
         BadInput: the environment does not observe what it is told, or goes otherwise than a new one.
     """
     _check_observer(instance, spec)
-    found, lagging = dict(spec.found), _lagging(instance)
-    if len(lagging):
-        found["lag"] = (
-            f"observation {', '.join(map(str, lagging))} comes from a physics step before the end of a step; "
-            "noise adds to it what it changes at the end"
-        )
-    recipe = replace(spec.recipe, lags=len(lagging) > 0)
+    found, (derived, columns) = dict(spec.found), _derived(instance)
+    if columns:
+        what = f"observation {', '.join(map(str, columns))}"
+        if derived == EARLIER:
+            found["lag"] = (
+                f"{what} comes from a physics step before the end of a step, with noise, too"
+            )
+        else:
+            found["lag"] = (
+                f"{what} comes from a physics step before the end of a step; noise adds to it what it "
+                "changes at the end"
+            )
+    recipe = replace(spec.recipe, derived=derived)
     recipe = replace(recipe, anew=spec.wrapped and _changes_by_reset(recipe, spec.state))
     spec = replace(spec, recipe=recipe, found=found)
     instance.recipe = spec.recipe
@@ -136,25 +143,26 @@ def _changes_by_reset(recipe: Recipe, start: np.ndarray) -> bool:
     return bool(changed) or not np.array_equal(found[0][0], found[2][0], equal_nan=True)
 
 
-def _lagging(instance: Instance) -> np.ndarray:
-    """Returns the columns of what is observed after a step that lag behind the state at its end."""
+def _derived(instance: Instance) -> tuple[str, list[int]]:
+    """Returns `Recipe.derived`, with the columns of what is observed that are not as at the end of a step."""
     rng, space = np.random.default_rng(5), instance.inner.observation_space
-    lags = np.zeros(0, dtype=bool)
+    odd: dict[str, np.ndarray | bool] = {NOW: False, EARLIER: False}
     for seed in range(EPISODES):
         instance.reset(seed)
         for k in range(SAMPLES):
             if k % HELD == 0:
                 u = instance.drawn(rng)
             _, _, terminated, truncated, _ = instance.stepped(u)
-            seen = flat(instance.inner_seen, space)
-            with instance.physics.kept():
-                instance.physics.write(instance.physics.read())
-                off = np.abs(flat(instance.watched(), space) - seen)
-            scale = max(float(np.abs(seen).max(initial=0.0)), 1.0)
-            lags = (off > ROUNDING * scale) | (lags if len(lags) else False)
+            seen, state = flat(instance.inner_seen, space), instance.physics.read()
+            for derived in odd:
+                with instance.physics.kept():
+                    again = instance.seen_as(derived, state, np.zeros(len(instance.recipe.noisy)))
+                off = np.abs(again - seen)
+                odd[derived] |= ~(off <= ROUNDING * max(float(np.abs(seen).max(initial=0.0)), 1.0))
             if terminated or truncated:
                 break
-    return np.flatnonzero(lags)
+    fits = [derived for derived, columns in odd.items() if not np.any(columns)]
+    return fits[0] if fits else UNKNOWN, np.flatnonzero(odd[NOW]).tolist()
 
 
 def _refuse(name: str, column: int, why: str) -> None:

@@ -1,0 +1,70 @@
+"""Observations as vectors, and what computes them in an environment."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+# The names under which environments compute their observations.
+OBSERVER = re.compile(r"_?((get|compute|make|build)_?)?(ob|obs|observe|observation)s?")
+
+
+def flat(observation: Any, space: spaces.Space[Any]) -> np.ndarray:
+    """Returns an observation as a vector, as SB3 does: the parts of a Dict in the order of its space."""
+    if isinstance(space, spaces.Dict):
+        return np.concatenate([np.ravel(observation[k]) for k in space.spaces], dtype=float)
+    return np.array(observation, dtype=float).ravel()
+
+
+def shaped(vector: np.ndarray, like: Any, space: spaces.Space[Any]) -> Any:
+    """Returns a vector as an observation of the shape and types of another one."""
+    if not isinstance(space, spaces.Dict):
+        array = np.asarray(like)
+        return vector.astype(array.dtype).reshape(array.shape)
+    parts = {}
+    for key, columns in columns_of_parts(space).items():
+        parts[key] = shaped(vector[columns], like[key], space.spaces[key])
+    return {key: parts[key] for key in like if key in parts}
+
+
+def columns_of_parts(space: spaces.Dict) -> dict[str, slice]:
+    """Returns the columns of each part of a Dict, in the order of its space."""
+    found, at = {}, 0
+    for key, part in space.spaces.items():
+        size = int(spaces.flatdim(part))
+        found[key], at = slice(at, at + size), at + size
+    return found
+
+
+def observers(env: gym.Env) -> dict[str, Callable[[], Any]]:
+    """Returns functions that may compute the observation of the innermost environment, by name."""
+    inner: Any = env.unwrapped
+    found: dict[str, Callable[[], Any]] = {}
+    for name, get in _observers_of(inner).items():
+        found[name] = get
+        # An environment around another one, as PointMaze: it takes what the inner one observes.
+        for part_name, part in vars(inner).items():
+            if isinstance(part, gym.Env):
+                for own_name, own in _observers_of(part).items():
+                    found[f"{name}({part_name}.{own_name})"] = partial(_through, get, own)
+    control: Any = getattr(inner, "_env", None)  # of dm_control
+    if hasattr(getattr(control, "task", None), "get_observation"):
+        found["task.get_observation"] = lambda: control.task.get_observation(control.physics)
+    return found
+
+
+def _observers_of(owner: Any) -> dict[str, Callable[..., Any]]:
+    names = sorted(name for name in dir(type(owner)) if OBSERVER.fullmatch(name))
+    return {name: get for name in names if callable(get := getattr(owner, name, None))}
+
+
+def _through(get: Callable[[Any], Any], own: Callable[[], Any]) -> Any:
+    """Returns what an environment observes of what the one within it does, which may come with an info."""
+    result = own()
+    return get(result[0] if isinstance(result, tuple) else result)

@@ -1,0 +1,109 @@
+"""MuJoCo's state in an environment: read, written, moved by noise, and put back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cached_property
+from typing import Any
+
+import mujoco
+import numpy as np
+
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+# Data that one instance at a time copies its own into, by all sizes of the model: many take much memory.
+_SPARE: dict[tuple[int, ...], mujoco.MjData] = {}
+
+
+class Physics:
+    """MuJoCo's state in an environment, or in the plant of an environment of this package.
+
+    Args:
+        model, data: of MuJoCo.
+        plant: what holds the state of an environment of this package, which `data` only shows; else None.
+    """
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, plant: Any):
+        self.model, self.data, self._plant = model, data, plant
+        self._size = mujoco.mj_stateSize(model, STATE)
+        names = [name for name in dir(model) if name.startswith("n") and name.islower()]
+        sizes = tuple(v for name in names if isinstance(v := getattr(model, name), int))
+        self._spare = _SPARE.setdefault(sizes, mujoco.MjData(model))
+        self._other: mujoco.MjData | None = None
+        self._left: np.ndarray | None = None
+
+    @property
+    def is_plant(self) -> bool:
+        """Whether a plant of this package holds the state, which `data` only shows."""
+        return self._plant is not None
+
+    @cached_property
+    def columns(self) -> dict[str, np.ndarray]:
+        """The places in a state of each of its parts, by name."""
+        found, at = {}, 0
+        for part in mujoco.mjtState.__members__.values():
+            name = part.name.removeprefix("mjSTATE_").lower()
+            if part.value.bit_count() == 1 and part & STATE:
+                size = mujoco.mj_stateSize(self.model, part)
+                found[name], at = np.arange(at, at + size), at + size
+        return found
+
+    def read(self) -> np.ndarray:
+        """Returns MuJoCo's state (S,)."""
+        if self._plant is not None:
+            self.show(self._plant.state[0])
+        return self.shown
+
+    @property
+    def shown(self) -> np.ndarray:
+        """The state (S,) in MuJoCo's data, a copy."""
+        state = np.empty(self._size)
+        mujoco.mj_getState(self.model, self.data, state, STATE)
+        return state
+
+    def write(self, state: np.ndarray) -> None:
+        """Sets MuJoCo's state (S,) and computes what follows from it."""
+        self.show(state)
+        mujoco.mj_forward(self.model, self.data)
+        mujoco.mj_rnePostConstraint(self.model, self.data)  # forces of contacts on bodies
+        self.show(state)
+        if self._plant is not None:
+            self._plant.put(state[None])
+
+    def show(self, state: np.ndarray) -> None:
+        """Sets MuJoCo's state (S,) and leaves what follows from it as it is."""
+        mujoco.mj_setState(self.model, self.data, state, STATE)
+
+    def earlier(self, state: np.ndarray) -> np.ndarray:
+        """Returns the state (S,) a step of the physics before, as the semi-implicit Euler method has it."""
+        found, dt = state.copy(), self.model.opt.timestep
+        qpos, qvel = state[self.columns["qpos"]], state[self.columns["qvel"]]
+        mujoco.mj_integratePos(self.model, qpos, qvel, -dt)
+        found[self.columns["qpos"]], found[self.columns["qvel"]] = qpos, qvel - dt * self.data.qacc
+        return found
+
+    @contextmanager
+    def kept(self) -> Iterator[None]:
+        """Puts everything back after the block, derived quantities included."""
+        if self._plant is not None:
+            state = self._plant.state
+            yield
+            self._plant.put(state)
+            return
+        mujoco.mj_copyData(self._spare, self.model, self.data)
+        yield
+        mujoco.mj_copyData(self.data, self.model, self._spare)
+
+    def leave_for(self, state: np.ndarray) -> None:
+        """Goes to a state (S,) until `come_back`."""
+        self._left, self._other = self.read(), self._other or mujoco.MjData(self.model)
+        mujoco.mj_copyData(self._other, self.model, self.data)
+        self.write(state)
+
+    def come_back(self) -> None:
+        """Puts everything back as it was before `leave_for`, if that was called."""
+        if self._left is not None:
+            if self._plant is not None:
+                self._plant.put(self._left[None])
+            mujoco.mj_copyData(self.data, self.model, self._other)
+            self._left = None
