@@ -133,8 +133,8 @@ class Plant:
         """Returns the noisy measurements (k, p) of true ones (k, p), of the copies `ids` (k,)."""
         return true + noise
 
-    def end(self) -> None:
-        """Ends all runs; environments are told."""
+    def end(self, ids: np.ndarray | None = None) -> None:
+        """Ends the runs `ids` (k,), all by default; environments are told."""
 
     #: whether what a step came to is known only after `observe`, as where wrappers lie around an environment
     late = False

@@ -29,7 +29,9 @@ PASSED = (
     "lxml", "xml", "logging", "re", "_thread", "threading", "weakref", "hyrl_mj",
 )  # fmt: skip
 # Packages whose modules and classes hold no memory of an episode.
-LIBRARIES = ("gymnasium", "dm_control", "shimmy", "numpy", "mujoco", "hyrl_mj")
+LIBRARIES = {
+    "gymnasium", "dm_control", "shimmy", "numpy", "mujoco", "hyrl_mj", *sys.stdlib_module_names,
+}  # fmt: skip
 # Attributes that hold the arguments of a constructor, and methods that are put in by `Instance`.
 LEFT_OUT = frozenset(("_ezpickle_args", "_ezpickle_kwargs", "_saved_kwargs", "step", "reset"))
 # How deep attributes of attributes are looked at, and how many values at most. What lies beyond cannot be
@@ -154,14 +156,15 @@ def _walk_parts(value: Any, path: str, found: Fingerprint, seen: set[int], depth
         for name, item in list(vars(value).items()):
             if name not in LEFT_OUT:
                 _walk(item, f"{path}.{name}" if path else name, found, seen, depth)
-        for name in _slots(type(value)):
+        for name in _slots(value.__class__):
             if hasattr(value, name):
                 _walk(getattr(value, name), f"{path}.{name}", found, seen, depth)
     else:
         found[path] = _written(value)
 
 
-def _slots(kind: type) -> list[str]:
+@cache
+def _slots(kind: Any) -> list[str]:
     """Returns the names of attributes that a class keeps outside of `__dict__`."""
     names: list[str] = []
     for base in kind.__mro__:
@@ -184,14 +187,18 @@ def _has_no_memory(value: Any) -> bool:
         return not (function.__closure__ or vars(function))
     if isinstance(value, type | ModuleType | BuiltinFunctionType | property):
         return True
-    module = type(value).__module__ or ""
+    return _is_passed(type(value).__module__ or "")
+
+
+@cache
+def _is_passed(module: str) -> bool:
     return any(module == name or module.startswith(f"{name}.") for name in PASSED)
 
 
 def _shared(kind: type, found: Fingerprint, seen: set[int]) -> None:
     """Writes down the variables that the instances of a class share: its own, and those of its module."""
     module = kind.__module__ or ""
-    if module.partition(".")[0] in {*LIBRARIES, *sys.stdlib_module_names}:
+    if module.partition(".")[0] in LIBRARIES:
         return
     for where, owner in (
         (f"class {kind.__name__}", kind),

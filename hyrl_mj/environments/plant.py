@@ -19,8 +19,6 @@ from hyrl_mj.tasks import Outcome
 
 # Runs that are played by instances side by side, at most: each holds an environment in memory.
 PLAYED = 1024
-# From so many runs on states are written, where that is the same.
-WRITTEN = 257
 _NUMBERS = count()
 
 
@@ -35,14 +33,16 @@ class EnvironmentPlant:
         pool: plays the runs.
         model: of MuJoCo.
         n: number of runs.
+        written: whether states are written, and no instance plays a run: without a memory, that is the same.
     """
 
     invertible = False
 
-    def __init__(self, spec: EnvironmentSpec, pool: Pool, model: Any, n: int):
+    def __init__(
+        self, spec: EnvironmentSpec, pool: Pool, model: Any, n: int, written: bool = False
+    ):
         self.n = Integer(1, MOST).checked("the number of copies of a robot", n)
-        #: whether states are written, and no instance plays a run: without a memory, that is the same
-        self.direct = spec.memoryless and n >= WRITTEN
+        self._written = written
         self.spec, self._pool, self.model = spec, pool, model
         self.low, self.high = spec.low, spec.high
         self._number, self._processes = next(_NUMBERS), pool.processes(n)
@@ -90,10 +90,9 @@ class EnvironmentPlant:
         return measured
 
     def _sense(self, rows: np.ndarray, noise: np.ndarray) -> None:
-        if self.direct:
+        if self._written:
             raise BadInput(
-                f"{self.n} episodes of {self.spec.name} cannot be observed under noise side by side: give at "
-                f"most {WRITTEN - 1}"
+                f"{self.spec.name} cannot be observed under noise where states are written"
             )
         begun = self._plays[rows]
         self._begin(rows)
@@ -112,8 +111,8 @@ class EnvironmentPlant:
         if len(new := rows[~self._plays[rows]]):
             if self._plays.sum() + len(new) > PLAYED:
                 raise BadInput(
-                    f"{self.n} episodes of {self.spec.name} side by side need as many environments in memory: "
-                    f"give at most {PLAYED}"
+                    f"{self.n} episodes of {self.spec.name} side by side need as many environments in "
+                    f"memory: give at most {PLAYED}"
                 )
             self._pool.runs("begin", self._number, self._processes, new, self._starts[new])
             self._plays[new] = True
@@ -189,7 +188,7 @@ class EnvironmentPlant:
         rows, u = rows[goes_on], u[goes_on]
         if not len(rows):
             return
-        if self.direct:
+        if self._written:
             states, seen, reports = self._pool.branch(self._state[rows], u)
         else:
             if self.spec.wrapped and (unseen := rows[self._open[rows]]).size:
@@ -207,13 +206,13 @@ class EnvironmentPlant:
             self._judge(rows, reports)
         self._leave(rows[~finite])
 
-    def end(self) -> None:
-        """Ends all runs.
+    def end(self, ids: np.ndarray | None = None) -> None:
+        """Ends the runs `ids` (k,), all by default.
 
         Raises:
             BadInput: random numbers were drawn in one of them.
         """
-        self._leave(np.arange(self.n))
+        self._leave(self._rows(ids))
 
     def step_backward(self, u: np.ndarray, ids: np.ndarray | None = None) -> None:
         """Refuses: an environment cannot be run backward."""

@@ -164,6 +164,9 @@ class EnvironmentTask(Task):
     def plant(self, n: int, threads: int = 0) -> Any:
         return EnvironmentPlant(self.specification, self._pool, self.model, n)
 
+    def tabulating(self, n: int) -> Any:
+        return EnvironmentPlant(self.specification, self._pool, self.model, n, written=True)
+
     @cached_property
     def kinematic(self) -> bool:
         return False
@@ -180,9 +183,8 @@ class EnvironmentTask(Task):
         if whole != list(range(self.model.nq)) or not (self.arrival_ends and self.tabulated):
             return False
         rng = np.random.default_rng(0)
-        plant, fresh = self.plant(COMPARED), self.plant(COMPARED)
+        plant, fresh = self.plant(COMPARED), self.tabulating(COMPARED)
         plant.set_state(*self.state(self.starts(COMPARED, rng)))
-        fresh.direct = True
         for k in range(STEPS_COMPARED):
             if k % HELD == 0:
                 u = rng.uniform(*self.input_limits, (COMPARED, len(self.inputs)))
@@ -208,9 +210,8 @@ class EnvironmentTask(Task):
         self._pool.check(runs)
 
     def at(self, z: np.ndarray) -> np.ndarray:
-        seen, _ = self._pool.rest(self.specification.state_at(z))
         rest = np.tile([0.0, 0.0, float(Outcome.RUNNING)], (len(z), 1))
-        return np.column_stack([z, seen, rest])
+        return np.column_stack([z, self._at_rest(z), rest])
 
     def _at_rest(self, z: np.ndarray) -> np.ndarray:
         """Returns what a robot at rest at chart points (n, d) observes (n, o)."""

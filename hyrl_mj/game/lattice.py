@@ -252,7 +252,7 @@ def _one_sample_on(
     unconstrained = bool(task.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
     free = direct and unconstrained and not task.has_inner_loop
     few = nodes[:: max(len(nodes) // SAMPLE, 1)] if free else nodes
-    plant = task.plant(len(few))
+    plant = task.tabulating(len(few))
     for level in progress_bar(levels, "tabulating the plant", "inputs"):
         plant.set_state(*task.state(few))
         plant.step(np.tile(level, (len(few), 1)))

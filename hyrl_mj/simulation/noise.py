@@ -58,11 +58,14 @@ class Signal(ABC):
     Attributes:
         kind: name of the kind.
         needs_controller: whether the signal acts against a controller.
+        unseeing: whether it draws its noise whatever it is shown. In a loop whose runs are not at the same
+            sample, the noise of each sample is then drawn for all of them at once.
         rng: the generator that random noise is drawn from, after `reset`.
     """
 
     kind: str
     needs_controller = False
+    unseeing = False
     rng: np.random.Generator
 
     def __init__(self, bound: float, shares: np.ndarray):
@@ -86,13 +89,6 @@ class Signal(ABC):
                 f"{self.kind} noise needs a controller to act against: use simulate(), or another kind of "
                 "noise here"
             )
-        return copy(self)
-
-    def for_rows(self, rows: np.ndarray) -> Signal:
-        """Returns the signal for the simulations `rows` (k,), which then are numbered from 0 on.
-
-        A signal that holds something for each simulation returns that of these.
-        """
         return copy(self)
 
     def reset(self, n: int, rng: np.random.Generator) -> None:
@@ -146,6 +142,7 @@ class Uniform(Signal):
     """Noise drawn anew at every sample, uniformly between its bounds."""
 
     kind = "uniform"
+    unseeing = True
 
     def sample(self, now: Sample) -> np.ndarray:
         return self.rng.uniform(-self.bound, self.bound, now.measurement.shape) * self.shares
@@ -203,9 +200,6 @@ class Recorded(Signal):
         if bad.any():
             k, row, column = np.argwhere(bad)[0]
             raise _too_large(self, k, row, column, self.values[k, row, column])
-
-    def for_rows(self, rows: np.ndarray) -> Signal:
-        return replace(self, values=self.values[:, rows])
 
     def reset(self, n: int, rng: np.random.Generator) -> None:
         if self.values.shape[1] != n:

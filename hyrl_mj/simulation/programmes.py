@@ -131,44 +131,21 @@ class Programmes(Signal):
     def __init__(
         self, task: Task, controller: Controller, rules: Rules, programmes: np.ndarray, segment: int
     ):
-        self._shape = n, _ = len(programmes), rules.fixed.shape[1]
+        n, columns = len(programmes), rules.fixed.shape[1]
         super().__init__(rules.bound, rules.shares)
         self.task, self.controller, self.rules = task, controller, rules
         self.programmes, self.segment = programmes, segment
-        self._values: list[np.ndarray] = []
-        self._parts: list[
-            tuple[np.ndarray, Programmes]
-        ] = []  # of these runs, where not all are simulated at once
+        self._noise, self._samples = np.zeros((task.max_steps, n, columns)), 0
         self.danger, self.reversals, self.rewards = np.full(n, -np.inf), np.zeros(n), np.zeros(n)
         self._last = np.full((n, len(task.inputs)), np.nan)
-
-    def against(self, task: Task, controller: Controller | None) -> Self:
-        return self
-
-    def for_rows(self, rows: np.ndarray) -> Programmes:
-        part = Programmes(
-            self.task, self.controller, self.rules, self.programmes[rows], self.segment
-        )
-        self._parts.append((rows, part))
-        return part
-
-    def gather(self) -> None:
-        """Takes over what its parts noted, where not all runs were simulated at once."""
-        if not self._parts:
-            return
-        samples = max(len(part._values) for _, part in self._parts)
-        values = np.zeros((samples, *self._shape))
-        for rows, part in self._parts:
-            if part._values:
-                values[: len(part._values), rows] = part._values
-            for name in ("danger", "reversals", "rewards"):
-                getattr(self, name)[rows] = getattr(part, name)
-        self._values, self._parts = list(values), []
 
     @property
     def values(self) -> np.ndarray:
         """The noise (K, n, p) so far; none in runs that are over."""
-        return np.array(self._values).reshape(-1, *self._shape)
+        return self._noise[: self._samples]
+
+    def against(self, task: Task, controller: Controller | None) -> Self:
+        return self
 
     def reset(self, n: int, rng: np.random.Generator) -> None:
         super().reset(n, rng)
@@ -194,8 +171,9 @@ class Programmes(Signal):
             noise[mine] = self.rules.lookahead.sample(part)
         measured = self.task.perturbed(true[rows], noise[rows])
         u, q = self._answers(measured, now.q[rows], past[rows])
-        self._observe(true[rows], rows, u, q != now.q[rows])
-        self._values.append(noise)
+        self._observe(true[rows], now.rows[rows], u, q != now.q[rows])
+        self._samples = max(self._samples, int(now.k.max(initial=-1)) + 1)
+        self._noise[now.k, now.rows] = noise
         return noise
 
     def _fulfil(
@@ -214,7 +192,7 @@ class Programmes(Signal):
         u = self._scaled(u)
         usual_mode = np.where(now.q[rows] == NOT_STARTED, q[0], now.q[rows])
         jumps, contrary = DECISIVE * (q != usual_mode), np.linalg.norm(u - u[0], axis=2)
-        last = self._scaled(self._last[rows])
+        last = self._scaled(self._last[now.rows[rows]])
         values = {
             CONTRARY: contrary,
             STRAIGHT: -np.linalg.norm(u, axis=2),

@@ -1,14 +1,14 @@
 """The closed loop of task, noise and controller, for many starts at once."""
 
 from dataclasses import dataclass, replace
-from typing import Any
+from itertools import count
 
 import numpy as np
 
 from hyrl_mj.plant import Plant
 from hyrl_mj.policies import Asked, Controller, nothing_past, remembering
 from hyrl_mj.progress import progress_bar
-from hyrl_mj.simulation.noise import NOT_STARTED, AnyNoise, Sample, drawn, signal_for
+from hyrl_mj.simulation.noise import NOT_STARTED, AnyNoise, Sample, Signal, drawn, signal_for
 from hyrl_mj.simulation.passing import Follower, Passing
 from hyrl_mj.tasks import Outcome, Task
 
@@ -99,122 +99,118 @@ def closed_loop(
     Raises:
         BadInput: the noise cannot be used, or the controller has a memory or draws at random.
     """
-    if task.side_by_side is not None and len(z0) > task.side_by_side:
-        return _in_turns(task, controller, z0, noise, q0, seed, settings)
     limit = task.max_steps if settings.steps is None else settings.steps
     backward, record, n = settings.backward, settings.record, len(z0)
+    # Where each run takes an environment of its own, the next one begins where one ends.
+    most = n if task.side_by_side is None else task.side_by_side
+    together = n <= most
     plant = settings.plant or task.plant(n)
     plant.set_state(*task.state(z0, settings.rng_of_starts(seed)))
     signal = signal_for(noise, task, controller)
     signal.reset(n, np.random.default_rng(seed))
+    ahead: list[np.ndarray] | None = [] if signal.unseeing and not together else None
     ask, measurement = Asked(task, controller), plant.measurement
     past = nothing_past(controller, n, measurement.shape[1])
     q = np.full(n, NOT_STARTED) if q0 is None else np.asarray(q0, dtype=int).copy()
     outcome = np.full(n, Outcome.RUNNING) if backward else task.outcome(measurement, plant.unstable)
-    length = np.zeros(n, dtype=int)
+    k, length, first_mode = np.zeros(n, dtype=int), np.zeros(n, dtype=int), q.copy()
     path = np.empty((limit + 1, n, task.chart.dimension))
     path[0] = task.chart.near(task.z(measurement), z0)
-    first_mode = q.copy()
     shapes = {"before": (), "q": (), "measured": (len(task.noisy),), "u": (len(task.inputs),)}
-    kept: dict[str, list[np.ndarray]] = {name: [] for name in shapes}
-    true = [measurement] if record else []
-    states = [plant.state] if record and settings.states else []
+    kept = {name: np.empty((limit, n, *shape)) for name, shape in shapes.items() if record}
+    if record:
+        kept["true"] = np.empty((limit + 1, *measurement.shape))
+        kept["true"][0] = measurement
+    if record and settings.states:
+        kept["state"] = np.empty((limit + 1, *plant.state.shape))
+        kept["state"][0] = plant.state
     follower = Follower(task, plant) if settings.passing else None
-    for k in progress_bar(range(limit), settings.label, "samples", quiet=settings.quiet):
-        active = np.flatnonzero(outcome == Outcome.RUNNING)
+    ticks = range(limit) if together else count()
+    for tick in progress_bar(ticks, settings.label, "samples", quiet=settings.quiet):
+        active = np.flatnonzero((outcome == Outcome.RUNNING) & (k < limit))[:most]
         if not len(active):
             break
-        now = Sample(np.arange(n), np.full(n, k), measurement, q, plant, past)
-        measured = plant.observe(measurement, drawn(signal, now), np.arange(n))
+        rows = np.arange(n) if together else active
+        now = Sample(rows, k[rows], measurement[rows], q[rows], plant, past[rows])
+        measured = plant.observe(now.measurement, _noise(signal, now, ahead, measurement), rows)
         if plant.late:  # what the last step came to is known only now
             outcome[active] = task.outcome(plant.truth[active], plant.unstable[active])
-            active = np.flatnonzero(outcome == Outcome.RUNNING)
-            if not len(active):
-                break
-        if k == 0 and (fresh := q == NOT_STARTED).any():
-            q[fresh] = controller.initial_mode(measured[fresh])
-            first_mode = q.copy()
-        before, u = q.copy(), np.full((n, len(task.inputs)), np.nan)
-        u[active], q[active] = ask(k, q[active], measured[active], past[active])
-        past = remembering(past, measured)
-        (plant.step_backward if backward else plant.step)(u[active], active)
+            active = active[outcome[active] == Outcome.RUNNING]
+        if (fresh := (now.k == 0) & (now.q == NOT_STARTED)).any():
+            first_mode[rows[fresh]] = q[rows[fresh]] = controller.initial_mode(measured[fresh])
+        before, on = q[rows], np.searchsorted(rows, active)
+        u = np.full((len(rows), len(task.inputs)), np.nan)
+        if len(active):
+            u[on], q[active] = ask(tick, q[active], measured[on], past[active])
+        past[rows] = remembering(past[rows], measured)
+        if len(active):
+            (plant.step_backward if backward else plant.step)(u[on], active)
         measurement, last, lost = plant.truth, measurement, plant.unstable
         measurement[lost] = last[lost]  # the last one before the simulation became unstable
-        path[k + 1] = task.chart.near(task.z(measurement), path[k])
-        length[active] = k + 1
+        path[now.k + 1, rows] = task.chart.near(task.z(measurement[rows]), path[now.k, rows])
+        k[rows] += 1
+        length[active] = k[active]
         if follower is not None:
             follower.follow(active[~lost[active]])
         if not backward:
             outcome[active] = task.outcome(measurement[active], lost[active])
+            over = active[(outcome[active] == Outcome.RUNNING) & (k[active] == limit)]
+            if plant.late and len(over):
+                plant.observe(measurement[over], np.zeros_like(measurement[over]), over)
+                measurement[over] = plant.truth[over]
+                outcome[over] = task.outcome(measurement[over], lost[over])
+                over = over[outcome[over] == Outcome.RUNNING]
+            outcome[over] = task.verdict(measurement[over])
+            plant.end(over)
         if record:
-            for name, values in zip(shapes, (before, q.copy(), measured, u), strict=True):
-                kept[name].append(values)
-            true.append(measurement)
-        if states:
-            states.append(np.where(lost[:, None], states[-1], plant.state))
-    if plant.late and not backward:
-        going = outcome == Outcome.RUNNING
-        outcome[going] = task.outcome(plant.measurement[going], plant.unstable[going])
-        measurement = plant.truth
+            for name, values in zip(shapes, (before, q[rows], measured, u), strict=True):
+                kept[name][now.k, rows] = values
+            kept["true"][k[rows], rows] = measurement[rows]
+        if "state" in kept:
+            was, state = kept["state"][now.k, rows], plant.state[rows]
+            kept["state"][k[rows], rows] = np.where(lost[rows, None], was, state)
     ask.again()
-    if not backward:
-        late = outcome == Outcome.RUNNING
-        outcome[late] = task.verdict(measurement[late])
     plant.end()
-    arrays = {k: np.array(values).reshape(-1, n, *shapes[k]) for k, values in kept.items()}
-    arrays |= {k: arrays[k].astype(int) for k in ("before", "q")}
-    path = path[: length.max() + 1]
+    if not together:
+        _stay(path, length)
+        for name, table in kept.items():
+            _stay(table, length if name in ("true", "state") else length - 1)
+    samples = length.max(initial=0)
+    arrays = {name: np.empty((0, n, *shape), dtype=float) for name, shape in shapes.items()}
+    arrays |= {"true": np.empty(0), "state": np.empty(0)}
+    for name, table in kept.items():
+        arrays[name] = table[: samples + (name in ("true", "state"))]
+    arrays |= {name: arrays[name].astype(int) for name in ("before", "q")}
     passing = None if follower is None else follower.passing
-    return Rollout(
-        path, length, outcome, first_mode, **arrays,
-        true=np.array(true), state=np.array(states), passing=passing,
-    )  # fmt: skip
+    return Rollout(path[: samples + 1], length, outcome, first_mode, **arrays, passing=passing)
 
 
-def _in_turns(
-    task: Task,
-    controller: Controller,
-    z0: np.ndarray,
-    noise: AnyNoise | None,
-    q0: np.ndarray | None,
-    seed: int,
-    settings: LoopSettings,
-) -> Rollout:
-    """Runs the closed loop from some starts after the other, as many at once as the task can."""
-    n, size = len(z0), task.side_by_side
-    assert size is not None
-    parts, signal = [], signal_for(noise, task, controller)
-    # Those that are over before they begin come last: they take no time.
-    order = np.argsort(~task.goes_on(z0), kind="stable")
-    turns = range(0, n, size)
-    for first in progress_bar(turns, settings.label, "turns", quiet=settings.quiet):
-        rows = order[first : first + size]
-        begun = None if q0 is None else np.asarray(q0)[rows]
-        quiet = replace(settings, quiet=True, plant=None)
-        some = signal.for_rows(rows)
-        own = seed if not first else int(np.random.SeedSequence([seed, first]).generate_state(1)[0])
-        parts.append(closed_loop(task, controller, z0[rows], some, begun, own, quiet))
-    return _joined(parts, np.argsort(order))
+def _noise(
+    signal: Signal, now: Sample, ahead: list[np.ndarray] | None, measurement: np.ndarray
+) -> np.ndarray:
+    """Returns the noise (k, p) of a sample.
+
+    Args:
+        signal: the noise.
+        now: the sample.
+        ahead: if the runs are at different samples, and the signal does not look at them, its noise so far,
+            drawn for all of them; so that it does not depend on when a run begins.
+        measurement: (n, p) of all runs.
+    """
+    if ahead is None:
+        return drawn(signal, now)
+    everyone, columns = np.arange(len(measurement)), np.flatnonzero(signal.limits)
+    while len(ahead) <= now.k.max():
+        k = np.full(len(everyone), len(ahead))
+        ahead.append(
+            drawn(signal, replace(now, rows=everyone, k=k, measurement=measurement))[:, columns]
+        )
+    noise = np.zeros_like(now.measurement)
+    noise[:, columns] = [ahead[k][row] for k, row in zip(now.k, now.rows, strict=True)]
+    return noise
 
 
-def _joined(parts: list[Rollout], order: np.ndarray) -> Rollout:
-    """Returns the runs of several rollouts as one, in an order (n,)."""
-    found: dict[str, Any] = {}
-    for name in ("path", "before", "q", "measured", "u", "true", "state"):
-        arrays = [getattr(part, name) for part in parts]
-        if arrays[0].ndim < 2:  # not recorded
-            found[name] = arrays[0]
-            continue
-        samples = max(map(len, arrays))
-        found[name] = np.concatenate([_lasting(a, samples) for a in arrays], axis=1)[:, order]
-    for name in ("length", "outcome", "q0"):
-        found[name] = np.concatenate([getattr(part, name) for part in parts])[order]
-    seen = [part.passing for part in parts if part.passing is not None]
-    return Rollout(**found, passing=Passing.joined(seen)[order] if seen else None)
-
-
-def _lasting(values: np.ndarray, samples: int) -> np.ndarray:
-    """Returns values (k, n, ...) of runs, the last ones repeated, for so many samples."""
-    more = samples - len(values)
-    last = values[-1:] if len(values) else np.zeros((1, *values.shape[1:]), values.dtype)
-    return np.concatenate([values, np.repeat(last, more, axis=0)])
+def _stay(values: np.ndarray, last: np.ndarray) -> None:
+    """Repeats the values (K, n, ...) of each run after its `last` (n,) ones, in place."""
+    for row, k in enumerate(last):
+        values[k + 1 : last.max() + 1, row] = values[max(k, 0), row]

@@ -320,7 +320,6 @@ class _Search:
         signal = Programmes(self.task, self.controller, self.rules, programmes, self.segment)
         settings = LoopSettings(label=self._label)
         run = closed_loop(self.task, self.controller, self.starts[rows], signal, settings=settings)
-        signal.gather()
         lost = run.outcome != Outcome.REACHED
         mean = signal.rewards / np.maximum(run.length, 1)
         # Among runs of equal length the one with the least reward counts as the latest.

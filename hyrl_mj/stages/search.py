@@ -189,9 +189,6 @@ class _Constant(Signal):
         super().__init__(float(np.abs(error).max(initial=0.0)), np.array(task.noisy, dtype=float))
         self._task, self._error = task, error
 
-    def for_rows(self, rows: np.ndarray) -> _Constant:
-        return _Constant(self._task, self._error[rows])
-
     @property
     def limits(self) -> np.ndarray:
         """No limits: the errors are those of chart points, and a measurement may show them otherwise."""

@@ -142,7 +142,7 @@ class Held:
         each = len(inputs), len(z)
         ends, outcome = np.empty((*each, z.shape[1])), np.empty(each, dtype=int)
         leaves = np.zeros((len(extended.sets), *each), dtype=bool)
-        plant = task.plant(len(z))
+        plant = task.tabulating(len(z))
         for a, u in enumerate(progress_bar(inputs, "held inputs", "inputs")):
             plant.set_state(*task.state(z))
             outcome[a] = Outcome.RUNNING
@@ -227,7 +227,7 @@ def _samples(task: Task, z: np.ndarray, inputs: np.ndarray, away: float) -> int:
     """Returns after how many samples a held input usually has led away far enough, 0 if too many."""
     z = z[np.random.default_rng(0).choice(len(z), min(len(z), TRIED), replace=False)]
     n = len(z)
-    plant = task.plant(n * len(inputs))
+    plant = task.tabulating(n * len(inputs))
     starts, u = np.tile(z, (len(inputs), 1)), np.repeat(inputs, n, axis=0)
     plant.set_state(*task.state(starts))
     for k in range(1, LONGEST + 1):

@@ -175,6 +175,10 @@ class Task(ABC):
             measure=self.measure, control=control, mocap=self.mocap, steady=self.steady_control,
         )  # fmt: skip
 
+    def tabulating(self, n: int) -> Any:
+        """Returns n copies of the robot that are put to states, for a sample or a few from each."""
+        return self.plant(n)
+
     @cached_property
     def kinematic(self) -> bool:
         """Whether the robot follows its inputs without inertia, so that it can be run backward.
@@ -292,8 +296,12 @@ class Task(ABC):
         return measured + noise
 
     def at(self, z: np.ndarray) -> np.ndarray:
-        """Returns measurements (n, p) with chart points z (n, d), where these are the whole measurement."""
-        return z
+        """Returns the measurements (n, p) of a robot at chart points z (n, d), without noise."""
+        if self.measurement_columns == self.chart.dimension:
+            return z
+        plant = self.plant(len(z))
+        plant.set_state(*self.state(z))
+        return plant.measurement
 
     def with_z(self, measured: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Returns measurements (n, p) changed so that their chart points are z (n, d)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,6 +22,8 @@ from hyrl_mj.viz.figures.style import CASING, GREEN, GREY, INK, PALE, PAPER, ang
 OUTER, INNER, TICK, LABEL, EDGE = 1.0, 0.7, 1.05, 1.18, 1.25
 # Cells along the longest side of the grid that shows where runs are over, and its blur in cells.
 OVER_CELLS, OVER_BLUR = 240, 1.5
+# Where runs are over, by task: a picture has several charts of one.
+_OVER: WeakKeyDictionary[Task, np.ndarray] = WeakKeyDictionary()
 # Periods to either side at which the set-point is drawn over time.
 TURNS = 9
 
@@ -63,7 +66,11 @@ def plane(panel: Axes, task: Task) -> None:
     label_axis(panel.xaxis, task, 0)
     label_axis(panel.yaxis, task, 1)
     grid = Grid.with_cells(task.chart, OVER_CELLS)
-    over = task.failed(measured_at(task, grid.nodes)).reshape(grid.counts)
+    if task not in _OVER:
+        plant = task.plant(grid.size)
+        plant.set_state(*task.state(grid.nodes))
+        _OVER[task] = task.failed(plant.measurement).reshape(grid.counts)
+    over = _OVER[task]
     if over.any():
         # Blurred, the mask has a smooth outline where it is one half, without the steps of its cells.
         blurred = gaussian_filter(over.astype(float), OVER_BLUR, mode="nearest")
@@ -153,13 +160,6 @@ def arcs(
 
 
 # ---- marks on planes and rings
-
-
-def measured_at(task: Task, z: np.ndarray) -> np.ndarray:
-    """Returns the measurement (n, p) at chart points (n, d), without noise."""
-    plant = task.plant(len(z))
-    plant.set_state(*task.state(z))
-    return plant.measurement
 
 
 def cross(panel: Axes, x: float, y: float) -> None:

@@ -166,7 +166,7 @@ def _input_map(panel: Axes, shown: ShownPolicy, i: int) -> None:
     task, ring, chart = shown.task, charts.is_ring(shown.task), shown.task.chart
     colours, scale, ticks = _input_colours(task, i)
     grid = Grid(chart, (RING_NODES,)) if ring else Grid.with_cells(chart, PLANE_CELLS)
-    values = shown.policy.act(charts.measured_at(task, grid.nodes))[:, i]
+    values = shown.policy.act(task.at(grid.nodes))[:, i]
     if ring:
         shades, classes = np.unique(colours(scale(values)), axis=0, return_inverse=True)
         charts.arcs(panel, task, classes.ravel(), shades, OUTER, INNER)
