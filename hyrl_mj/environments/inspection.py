@@ -49,6 +49,19 @@ SUCCESS = ("success", "is_success")
 STANDS = 1e-6
 
 
+@dataclass(frozen=True)
+class Given:
+    """What the user says of an environment: the arguments of `from_gymnasium` of these names."""
+
+    chart: AnyChart | None = None
+    noisy: Sequence[float] | None = None
+    success: str | None = None
+    failure: str | None = None
+    bounds: Mapping[str, tuple[float, float]] | None = None
+    steps: int | None = None
+    starts: str = CHART
+
+
 @dataclass
 class Runs:
     """What runs under inputs at random showed.
@@ -74,19 +87,8 @@ class Runs:
     harmless: frozenset[int]
 
 
-def inspect(
-    source: Source,
-    chart: AnyChart | None = None,
-    noisy: Sequence[float] | None = None,
-    success: str | None = None,
-    failure: str | None = None,
-    bounds: Mapping[str, tuple[float, float]] | None = None,
-    steps: int | None = None,
-    starts: str = CHART,
-) -> tuple[EnvironmentSpec, Pool, Instance]:
+def inspect(source: Source, given: Given) -> tuple[EnvironmentSpec, Pool, Instance]:
     """Returns what is known of an environment, what plays its episodes, and an instance to look at.
-
-    The arguments are those of `from_gymnasium`.
 
     Raises:
         BadInput: it cannot be used, or one of its instances went another way than a new one.
@@ -101,13 +103,15 @@ def inspect(
             f"give an environment whose reset takes less than {LONGEST_RESET:g} s"
         )
     instance.recipe = replace(instance.recipe, observer=trials.observer_of(instance))
-    chosen = _chart_of(instance, chart, found)
+    chosen = _chart_of(instance, given.chart, found)
     places = instance.physics.columns
     at = tuple(int(places[c.kind][c.index]) for c in chosen)
     robot = robot_of(instance.model, chosen)
-    instance.recipe = replace(instance.recipe, noisy=at, solid=robot[instance.model.geom_bodyid])
+    offset = tuple(c.offset for c in chosen)
+    solid = robot[instance.model.geom_bodyid]
+    instance.recipe = replace(instance.recipe, noisy=at, offset=offset, solid=solid)
     runs = _sampled(instance)
-    criterion = _criterion(instance, success, failure, runs, found)
+    criterion = _criterion(instance, given, runs, found)
     points = [
         (mjcf.point_of(instance.model, a), mjcf.point_of(instance.model, b))
         for a, b in criterion.places
@@ -122,11 +126,10 @@ def inspect(
         instance.recipe
     )  # a new one: something may have outlasted the resets of the other
     state = _at_rest(instance, places, robot)
-    offset = np.array([c.offset for c in chosen])
     groups = groups_of(instance, runs.states[:, list(at)][:, :2]) if _in_plane(chosen) else []
     box, starting = _bounds(
-        instance, chosen, runs.states[:, list(at)] + offset, resets[:, list(at)] + offset, bounds or {},
-        starts, groups, found,
+        instance, chosen, runs.states[:, list(at)] + offset, resets[:, list(at)] + offset, given, groups,
+        found,
     )  # fmt: skip
     low, high, levels = _limits(instance)
     space = instance.env.observation_space
@@ -135,9 +138,9 @@ def inspect(
         if isinstance(space, spaces.Dict)
         else {}
     )
-    max_steps = steps or instance.steps or STEPS_WITHOUT_END
+    max_steps = given.steps or instance.steps or STEPS_WITHOUT_END
     found["sample time"] = f"{runs.dt:g} s, of a step"
-    if steps is None:
+    if given.steps is None:
         found["steps"] = f"{max_steps} ({max_steps * runs.dt:g} s) of an episode"
     spec = EnvironmentSpec(
         name=source.name,
@@ -162,7 +165,7 @@ def inspect(
         depth=runs.deepest,
         start_low=starting[0],
         start_high=starting[1],
-        noisy=_shares(chosen, noisy, found),
+        noisy=_shares(chosen, given.noisy, found),
         max_steps=max_steps,
         dt=runs.dt,
         worst_reward=min(runs.worst_reward, 0.0),
@@ -186,14 +189,9 @@ def _sampled(instance: Instance) -> Runs:
         instance.reset(seed)
         with suppress(Worn):  # these resets draw from other seeds
             instance.mark()
-        before = fingerprint(instance.env)
+        before, began = fingerprint(instance.env), instance.data.time
         deepest = max(deepest, instance.depth())
-        for k in range(STEPS):
-            if k % HELD == 0:
-                u = instance.drawn(rng)
-            began = instance.data.time
-            with instance.undrawn():
-                _, reward, terminated, truncated, info = instance.stepped(u)
+        for _, reward, terminated, truncated, info in instance.wander(rng, STEPS, HELD):
             states.append(instance.physics.read())
             dt = dt or float(instance.data.time - began)
             deepest = max(deepest, instance.depth())
@@ -201,9 +199,8 @@ def _sampled(instance: Instance) -> Runs:
             info_keys |= dict.fromkeys(key for key in info if isinstance(key, str))
             bodies.append(instance.data.xpos.copy())
             geoms.append(instance.data.geom_xpos.copy())
-            if terminated or truncated:
-                break
-            harmless |= instance.touched()
+            if not (terminated or truncated):
+                harmless |= instance.touched()
         instance.finish()
         changed = differing(fingerprint(instance.env), before)
         memory = memory or (changed[0] if changed else "")
@@ -251,10 +248,8 @@ def _chart_of(
     return chosen
 
 
-def _criterion(
-    instance: Instance, success: str | None, failure: str | None, runs: Runs, found: dict[str, str]
-) -> Criterion:
-    name = instance.name
+def _criterion(instance: Instance, given: Given, runs: Runs, found: dict[str, str]) -> Criterion:
+    name, success, failure = instance.name, given.success, given.failure
     if success is None or success.strip() == "info":
         told = [key for key in SUCCESS if key in runs.info]
         if not told:
@@ -322,16 +317,15 @@ def _bounds(
     chosen: Sequence[Coordinate],
     runs: np.ndarray,
     begun: np.ndarray,
-    given: Mapping[str, tuple[float, float]],
-    starts: str,
+    given: Given,
     groups: Any,
     found: dict[str, str],
 ) -> tuple[Chart, tuple[tuple[float, ...], tuple[float, ...]]]:
     names = [c.name for c in chosen]
-    for name in given:
+    for name in given.bounds or {}:
         if name not in names:
             raise BadInput(f"bounds for {name} cannot be used: the chart has {', '.join(names)}")
-    bounds = bounds_of(instance, chosen, np.vstack([runs, begun]), given, groups)
+    bounds = bounds_of(instance, chosen, np.vstack([runs, begun]), given.bounds or {}, groups)
     found["bounds"] = ", ".join(
         f"{c.name} {b.low:.3g} to {b.high:.3g} (from {b.why})"
         for c, b in zip(chosen, bounds, strict=True)
@@ -345,7 +339,7 @@ def _bounds(
         f"all over the chart, the robot at rest and all else as after a reset; with {RESET!r} where resets "
         f"lead to: {lead}"
     )
-    if starts == RESET:
+    if given.starts == RESET:
         return chart, (
             tuple(np.clip(first, low, high).tolist()), tuple(np.clip(last, low, high).tolist())
         )  # fmt: skip

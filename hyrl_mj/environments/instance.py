@@ -7,9 +7,10 @@ so that stacks, delays, filters and normalisation see what a sensor would have s
 
 from __future__ import annotations
 
+import math
 import random
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from queue import SimpleQueue
@@ -38,6 +39,7 @@ class Recipe:
     Attributes:
         source: how the environment is made and reset.
         noisy: places (d,) in a state of MuJoCo that the coordinates of the chart are in.
+        offset: (d,) what the coordinates are greater by than these.
         observer: the name of what computes the observation, of those that `observers` gives; "" if none does.
         keys: entries of `info` that are reported.
         places: pairs of names whose distance is reported, each as a kind and an index for both.
@@ -49,6 +51,7 @@ class Recipe:
 
     source: Source
     noisy: tuple[int, ...] = ()
+    offset: tuple[float, ...] = ()
     observer: str = ""
     keys: tuple[Path, ...] = ()
     places: tuple[tuple[tuple[str, int], tuple[str, int]], ...] = ()
@@ -84,6 +87,8 @@ class Instance:
         self.physics = Physics(opened.model, opened.data, opened.plant)
         self.inner: Any = self.env.unwrapped
         self._space = self.env.observation_space
+        self._actions: Any = self.env.action_space
+        self._discrete = isinstance(self._actions, spaces.Discrete)
         self._observers = observers(self.env)
         self.inner_seen: Any = None  # what the innermost environment observed last
         self.observation = np.empty(0)
@@ -180,7 +185,7 @@ class Instance:
                     "position as qpos[2], or an attribute"
                 )
             setattr(self.inner, name, np.array(value) if isinstance(value, list) else value)
-        self.physics.write(self.physics.shown)
+        self.physics.write(self.physics.shown())
 
     def remembered(self) -> written.Fingerprint:
         """Returns what it remembers now, to compare it: attributes, MuJoCo's state and model."""
@@ -224,7 +229,7 @@ class Instance:
             self.start = start
             self._chain.ask(self.reset)
 
-    def act(self, u: np.ndarray) -> np.ndarray:
+    def act(self, u: np.ndarray) -> Sequence[float]:
         """Steps the environment with inputs u (m,), and returns its report (see `Recipe.width`).
 
         With wrappers the report is complete only after `sense`, which returns it.
@@ -232,9 +237,9 @@ class Instance:
         if self._chain is None:
             return self._told(self.stepped(u))
         self._chain.ask(lambda: self.stepped(u))
-        return np.zeros(self.recipe.width)
+        return [0.0] * self.recipe.width
 
-    def sense(self, noise: np.ndarray) -> np.ndarray:
+    def sense(self, noise: np.ndarray) -> Sequence[float]:
         """Computes `observation` under noise (d,) on the chart's coordinates.
 
         Returns:
@@ -243,12 +248,12 @@ class Instance:
         if self._chain is None:
             if noise.any():
                 self.observation = self.observation + self.displaced(noise)
-            return np.zeros(self.recipe.width)
+            return [0.0] * self.recipe.width
         result = self._chain.answer(noise)
         if self.start is None:
             return self._told(result)
         self.start, self.observation = None, flat(result, self._space)
-        return np.zeros(self.recipe.width)
+        return [0.0] * self.recipe.width
 
     def finish(self) -> None:
         """Refuses an episode in which random numbers were drawn, at its end."""
@@ -340,15 +345,15 @@ class Instance:
 
     def drawn(self, rng: np.random.Generator) -> np.ndarray:
         """Returns inputs (m,) at random."""
-        space: Any = self.env.action_space
-        if isinstance(space, spaces.Discrete):
+        space = self._actions
+        if self._discrete:
             return np.array([float(rng.integers(space.n))])
         return np.ravel(rng.uniform(space.low, space.high)).astype(float)
 
     def action(self, u: np.ndarray) -> Any:
         """Returns the environment's action for inputs u (m,)."""
-        space = self.env.action_space
-        if isinstance(space, spaces.Discrete):
+        space = self._actions
+        if self._discrete:
             return int(space.start + round(float(u[0])))
         return u.astype(space.dtype).reshape(space.shape)
 
@@ -370,19 +375,30 @@ class Instance:
             self.inner_seen = result[0]
         return result
 
-    def _told(self, result: Any) -> np.ndarray:
+    def _told(self, result: Any) -> list[float]:
         observation, reward, terminated, truncated, info = result
         self.observation = flat(observation, self._space)
-        entries = [entry(info, key) for key in self.recipe.keys]
         if self.physics.is_plant:
             self.physics.read()
-        distances = [
-            float(np.linalg.norm(getattr(self.data, a)[i] - getattr(self.data, b)[j]))
-            for (a, i), (b, j) in self.recipe.places
-        ]
         ends = bool(terminated)
         touch = ends and bool(self.touched() - self.recipe.harmless)
-        return np.array([reward, ends, bool(truncated), touch, *entries, *distances], dtype=float)
+        told = [float(reward), ends, bool(truncated), touch]
+        told += [entry(info, key) for key in self.recipe.keys]
+        for (a, i), (b, j) in self.recipe.places:
+            away = getattr(self.data, a)[i] - getattr(self.data, b)[j]
+            told.append(math.sqrt(away.dot(away)))
+        return told
+
+    def wander(self, rng: np.random.Generator, samples: int, held: int) -> Iterator[Any]:
+        """Yields what each step returns under inputs at random, each held for so many samples, to the end."""
+        for k in range(samples):
+            if k % held == 0:
+                u = self.drawn(rng)
+            with self.undrawn():
+                result = self.stepped(u)
+            yield result
+            if result[2] or result[3]:
+                return
 
     @contextmanager
     def undrawn(self) -> Iterator[None]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from hyrl_mj import trust
 from hyrl_mj.environments.coordinates import AnyChart
-from hyrl_mj.environments.inspection import CHART, RESET, inspect
+from hyrl_mj.environments.inspection import CHART, RESET, Given, inspect
 from hyrl_mj.environments.opening import Source
 from hyrl_mj.environments.specification import FORMS
 from hyrl_mj.environments.task import EnvironmentTask
@@ -70,7 +70,8 @@ def from_gymnasium(
     Raises:
         BadInput: it cannot be used; the message says why.
     """
-    _check(chart, noisy, success, failure, bounds, steps, starts, seed)
+    given = Given(chart, noisy, success, failure, bounds, steps, starts)
+    _check(given, seed)
     for name, named in (("kwargs", kwargs), ("reset", reset), ("pinned", pinned)):
         _check_named(name, named)
     for name, value in (pinned or {}).items():
@@ -78,33 +79,22 @@ def from_gymnasium(
             raise refused(f"pinned {name}", value, "a number, or a list of numbers")
     source = Source(env, dict(kwargs or {}), dict(reset or {}), dict(pinned or {}), seed)
     content = {
-        "env": env if isinstance(env, str) else {"function": _where(env)},
-        "chart": chart, "noisy": noisy, "success": success, "failure": failure,
-        "bounds": bounds, "steps": steps,
+        "env": env if isinstance(env, str) else {"function": _where(env)}, **vars(given),
         "starts": None if starts == CHART else starts, "kwargs": kwargs, "reset": reset,
         "pinned": pinned, "seed": seed,
     }  # fmt: skip
-    given = {key: value for key, value in content.items() if value is not None}
-    spec = MARK + json.dumps(given, default=_plain)
+    told = {key: value for key, value in content.items() if value is not None}
+    spec = MARK + json.dumps(told, default=_plain)
     if not isinstance(env, str) or spec not in _MADE:
-        inspected = inspect(source, chart, noisy, success, failure, bounds, steps, starts)
-        _MADE[spec] = EnvironmentTask(*inspected, spec)
+        _MADE[spec] = EnvironmentTask(*inspect(source, given), spec)
     if isinstance(env, str) and (module := _module_of(env)) is not None:
         trust.remember(module)
     return _MADE[spec]
 
 
-def _check(
-    chart: Any,
-    noisy: Any,
-    success: Any,
-    failure: Any,
-    bounds: Any,
-    steps: Any,
-    starts: Any,
-    seed: Any,
-) -> None:
+def _check(given: Given, seed: Any) -> None:
     """Raises `BadInput` if one of the arguments of `from_gymnasium` is of another kind."""
+    chart, noisy, steps = given.chart, given.noisy, given.steps
     names = chart.values() if isinstance(chart, Mapping) else chart
     if chart is not None and not isinstance(chart, str) and not _all(names, str):
         raise refused(
@@ -115,19 +105,19 @@ def _check(
             raise refused("noisy", noisy, "a list of numbers from 0 on, one for each coordinate")
         if not any(noisy):
             raise refused("noisy", noisy, "a share above 0 for at least one coordinate")
-    for name, condition in (("success", success), ("failure", failure)):
-        if condition is not None and not isinstance(condition, str):
+    for name in ("success", "failure"):
+        if (condition := getattr(given, name)) is not None and not isinstance(condition, str):
             raise refused(name, condition, FORMS)
-    _check_named("bounds", bounds)
-    for name, ends in (bounds or {}).items():
+    _check_named("bounds", given.bounds)
+    for name, ends in (given.bounds or {}).items():
         if not _all(ends, Real) or len(ends) != 2 or not 0 < ends[1] - ends[0] <= WIDEST:
             raise refused(f"bounds of {name}", ends, "its low and its high end, as [-2, 2]")
     if steps is not None:
         Integer(1, MOST_STEPS).checked("steps", steps)
     if seed is not None:
         check_seed(seed)
-    if starts not in (CHART, RESET):
-        raise unknown("starts", starts, (CHART, RESET))
+    if given.starts not in (CHART, RESET):
+        raise unknown("starts", given.starts, (CHART, RESET))
 
 
 def _all(values: Any, kind: type) -> bool:

@@ -10,7 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 # Data that one instance at a time copies its own into, by all sizes of the model: many take much memory.
 _SPARE: dict[tuple[int, ...], mujoco.MjData] = {}
 
@@ -25,10 +25,12 @@ class Physics:
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, plant: Any):
         self.model, self.data, self._plant = model, data, plant
-        self._size = mujoco.mj_stateSize(model, STATE)
+        self.size = mujoco.mj_stateSize(model, STATE)
         names = [name for name in dir(model) if name.startswith("n") and name.islower()]
         sizes = tuple(v for name in names if isinstance(v := getattr(model, name), int))
-        self._spare = _SPARE.setdefault(sizes, mujoco.MjData(model))
+        if sizes not in _SPARE:
+            _SPARE[sizes] = mujoco.MjData(model)
+        self._spare = _SPARE[sizes]
         self._other: mujoco.MjData | None = None
         self._left: np.ndarray | None = None
 
@@ -43,21 +45,20 @@ class Physics:
         found, at = {}, 0
         for part in mujoco.mjtState.__members__.values():
             name = part.name.removeprefix("mjSTATE_").lower()
-            if part.value.bit_count() == 1 and part & STATE:
+            if part.value.bit_count() == 1 and part.value & STATE:
                 size = mujoco.mj_stateSize(self.model, part)
                 found[name], at = np.arange(at, at + size), at + size
         return found
 
-    def read(self) -> np.ndarray:
-        """Returns MuJoCo's state (S,)."""
+    def read(self, into: np.ndarray | None = None) -> np.ndarray:
+        """Returns MuJoCo's state (S,), a new array or one that is given."""
         if self._plant is not None:
             self.show(self._plant.state[0])
-        return self.shown
+        return self.shown(into)
 
-    @property
-    def shown(self) -> np.ndarray:
-        """The state (S,) in MuJoCo's data, a copy."""
-        state = np.empty(self._size)
+    def shown(self, into: np.ndarray | None = None) -> np.ndarray:
+        """Returns the state (S,) in MuJoCo's data, a new array or one that is given."""
+        state = np.empty(self.size) if into is None else into
         mujoco.mj_getState(self.model, self.data, state, STATE)
         return state
 

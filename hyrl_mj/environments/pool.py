@@ -124,17 +124,20 @@ class Stage:
 
     def check(self, rows: np.ndarray, runs: np.ndarray) -> Arrays:
         """Plays runs (k,) of `Played` in new environments; raises `BadInput` if these go another way."""
-        self._real.check(runs.tolist())
+        for run in runs:
+            self._real.check(run)
         return ()
 
     def _acted(self, instances: Sequence[Instance], u: np.ndarray) -> Arrays:
-        states, reports, seen = [], [], []
-        with instances[0].undrawn():
-            for instance, inputs in zip(instances, u, strict=True):
-                reports.append(instance.act(inputs))
-                states.append(instance.physics.read())
-                seen.append(instance.observation)
-        return np.array(states), np.array(seen), np.array(reports)
+        first = instances[0]
+        sizes = first.physics.size, len(first.observation), self.recipe.width
+        states, seen, reports = (np.empty((len(u), size)) for size in sizes)
+        with first.undrawn():
+            for i, (instance, inputs) in enumerate(zip(instances, u, strict=True)):
+                reports[i] = instance.act(inputs)
+                instance.physics.read(states[i])
+                seen[i] = instance.observation
+        return states, seen, reports
 
     # ---- instances
 

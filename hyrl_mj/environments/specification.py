@@ -167,19 +167,14 @@ class EnvironmentSpec:
         """d, the number of the chart's coordinates."""
         return len(self.coordinates)
 
-    @property
-    def offset(self) -> np.ndarray:
-        """What the chart's coordinates are greater by than the state (d,)."""
-        return np.array([c.offset for c in self.coordinates])
-
     def z(self, state: np.ndarray) -> np.ndarray:
         """Returns the chart points (n, d) of MuJoCo's states (n, S)."""
-        return state[:, list(self.recipe.noisy)] + self.offset
+        return state[:, list(self.recipe.noisy)] + self.recipe.offset
 
     def state_at(self, z: np.ndarray) -> np.ndarray:
         """Returns MuJoCo's states (n, S) in which runs begin at chart points (n, d)."""
         states = np.tile(self.state, (len(z), 1))
-        states[:, list(self.recipe.noisy)] = z - self.offset
+        states[:, list(self.recipe.noisy)] = z - self.recipe.offset
         return states
 
     def outcome(self, report: np.ndarray) -> np.ndarray:

@@ -124,12 +124,11 @@ def _bodies_of_qpos(model: mujoco.MjModel) -> np.ndarray:
 
 def _told(instance: Instance) -> np.ndarray:
     """Returns what an instance tells over some samples."""
-    rng, told = np.random.default_rng(0), []
-    for _ in range(SAMPLES):
-        observation, reward, terminated, truncated, _ = instance.stepped(instance.drawn(rng))
-        told.append([*flat(observation, instance.env.observation_space), reward, terminated])
-        if terminated or truncated:
-            break
+    space, runs = (
+        instance.env.observation_space,
+        instance.wander(np.random.default_rng(0), SAMPLES, 1),
+    )
+    told = [[*flat(seen, space), reward, ends] for seen, reward, ends, _, _ in runs]
     return np.array(told, dtype=float)
 
 

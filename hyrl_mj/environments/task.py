@@ -199,15 +199,10 @@ class EnvironmentTask(Task):
         return True
 
     def verify(self, z0: np.ndarray, u: np.ndarray, path: np.ndarray, lengths: np.ndarray) -> None:
-        spec = self.specification
-        starts = spec.state_at(z0)
-        low, high = self.input_limits
-        runs = []
-        for i, end in enumerate(lengths):
-            if np.isfinite(u[:end, i]).all():
-                inputs = np.clip(u[:end, i], low, high)
-                runs.append(Played(starts[i], inputs, path[: end + 1, i], spec.offset))
-        self._pool.check(runs)
+        starts = self.specification.state_at(z0)
+        ends = [(i, k) for i, k in enumerate(lengths) if np.isfinite(u[:k, i]).all()]
+        inputs = np.clip(u, *self.input_limits)
+        self._pool.check([Played(starts[i], inputs[:k, i], path[: k + 1, i]) for i, k in ends])
 
     def at(self, z: np.ndarray) -> np.ndarray:
         rest = np.tile([0.0, 0.0, float(Outcome.RUNNING)], (len(z), 1))
