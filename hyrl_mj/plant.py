@@ -124,10 +124,9 @@ class Plant:
             return self._measure(self._sensors.copy())
         return self._measure(self._batch.state[:, self._columns_of_state])
 
-    @property
-    def truth(self) -> np.ndarray:
-        """The same as `measurement`; environments tell them apart."""
-        return self.measurement
+    def truth(self, ids: np.ndarray) -> np.ndarray:
+        """Returns the `measurement` (k, p) of the copies `ids` (k,); environments tell them apart."""
+        return self.measurement[ids]
 
     def observe(self, true: np.ndarray, noise: np.ndarray, ids: np.ndarray) -> np.ndarray:
         """Returns the noisy measurements (k, p) of true ones (k, p), of the copies `ids` (k,)."""

@@ -142,7 +142,7 @@ def test_noise_moves_every_copy_of_a_position(puck):
     )
     noise = np.zeros((1, puck.measurement_columns))
     noise[0, :2] = 0.1, -0.1
-    sensed = plant.observe(plant.truth, noise, np.arange(1))
+    sensed = plant.observe(plant.truth(np.arange(1)), noise, np.arange(1))
     np.testing.assert_allclose(puck.observation(sensed), puck.observation(noisy), atol=1e-12)
     np.testing.assert_allclose(puck.z(sensed), [[-0.9, 0.4]])
 

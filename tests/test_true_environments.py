@@ -116,7 +116,7 @@ def test_an_observed_action_is_that_of_the_run():
     plant.step(np.array([[1.0, 2.0], [3.0, -1.0]]))
     noise = np.zeros((2, task.measurement_columns))
     noise[:, :2] = 0.05
-    observed = task.observation(plant.observe(plant.truth, noise, np.arange(2)))
+    observed = task.observation(plant.observe(plant.truth(np.arange(2)), noise, np.arange(2)))
     np.testing.assert_allclose(observed[:, 4:], [[1.0, 2.0], [3.0, -1.0]])
     np.testing.assert_allclose(observed[:, :2], plant.qpos + 0.05)
 
@@ -347,3 +347,17 @@ def test_a_start_may_touch_a_wall_no_deeper_than_runs_do():
     # The rock ends at x = -0.3, and the puck is 0.1 m wide.
     z = np.array([[-0.41, 0.0], [-0.36, 0.0]])
     assert task.goes_on(z).tolist() == [True, False]
+
+
+class Monitor(gym.Wrapper):
+    """A user's wrapper with the name of one that only counts: this one turns the actions."""
+
+    def step(self, action):
+        return self.env.step(-np.asarray(action))
+
+
+def test_a_wrapper_is_kept_that_only_has_the_name_of_one_that_counts():
+    task = from_gymnasium(lambda: Monitor(Puck()), steps=4)
+    agent = from_callable(lambda o: np.tile([2.0, 0.0], (len(o), 1)), task)
+    arc = simulate(task, agent, [-1.0, 1.0])
+    assert arc.z[-1, 0] < arc.z[0, 0]

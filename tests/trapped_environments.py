@@ -9,6 +9,7 @@ name of a case, as "trapped 17", in its place tries that one.
 import sys
 from collections import Counter, defaultdict
 from dataclasses import replace
+from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
@@ -193,6 +194,13 @@ def is_failure(found, verdict):
     return verdict != "right" if found == ("honest",) else verdict in ("wrong", "crash")
 
 
+def tried(case):
+    """Returns the name of a case (kind, number, seed), its traps, the verdict, and why."""
+    kind, number, seed = case
+    made_case = {"trapped": trapped, "honest": honest}[kind](number, seed)
+    return made_case.name, made_case.traps, *judged(made_case)
+
+
 def main(argv):
     logger.min_level = logger.ERROR
     if len(argv) == 1:
@@ -202,15 +210,15 @@ def main(argv):
         return
     n, m = int(argv[0]), int(argv[1])
     seed = int(argv[2]) if len(argv) > 2 else 0
+    cases = [("trapped", i, seed) for i in range(n)] + [("honest", i, seed) for i in range(m)]
     verdicts, failures = [], 0
-    for made_case, cases in ((trapped, n), (honest, m)):
-        for i in range(cases):
-            case = made_case(i, seed)
-            verdict, why = judged(case)
-            verdicts.append((case.traps, verdict))
-            if is_failure(case.traps, verdict):
+    # Each case in a process of its own, as it would be: what an environment leaves behind ends with it.
+    with get_context("fork").Pool(maxtasksperchild=1) as processes:
+        for name, traps, verdict, why in processes.imap(tried, cases):
+            verdicts.append((traps, verdict))
+            if is_failure(traps, verdict):
                 failures += 1
-                print(f"{case.name} ({', '.join(case.traps)}): {verdict}: {why}", flush=True)
+                print(f"{name} ({', '.join(traps)}): {verdict}: {why}", flush=True)
     print(f"\n{tabled(verdicts)}\n\n{failures} failures")
 
 

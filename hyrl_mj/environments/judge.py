@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -79,7 +78,7 @@ class Real:
         return instance, instance.put(start)
 
 
-def _compare(name: str, what: str, ours: np.ndarray | None, real: Sequence[Any]) -> None:
+def _compare(name: str, what: str, ours: np.ndarray | None, real: Any) -> None:
     if ours is None or np.array_equal(ours, real, equal_nan=True):
         return
     same = (ours == real) | (np.isnan(ours) & np.isnan(real))

@@ -301,11 +301,18 @@ def physics_of(env: Any) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
 
 def _peeled(env: gym.Env) -> gym.Env:
     """Takes the wrappers off that count or check."""
-    while type(env).__name__ in PEELED and isinstance(env, gym.Wrapper):
-        env = env.env
+    while _is_peeled(env):
+        env = env.env  # type: ignore[attr-defined]
     outer = env
     while isinstance(outer, gym.Wrapper):
-        while type(outer.env).__name__ in PEELED and isinstance(outer.env, gym.Wrapper):
-            outer.env = outer.env.env
+        while _is_peeled(outer.env):
+            outer.env = outer.env.env  # type: ignore[attr-defined]
         outer = outer.env
     return env
+
+
+def _is_peeled(env: gym.Env) -> bool:
+    """Returns whether an environment is one of those wrappers, not a user's of the same name."""
+    kind = type(env)
+    library = kind.__module__.partition(".")[0] in ("gymnasium", "stable_baselines3")
+    return isinstance(env, gym.Wrapper) and kind.__name__ in PEELED and library

@@ -65,12 +65,11 @@ class EnvironmentPlant:
         """The current measurement (n, p), a copy; what no noise was given for is observed without."""
         if self.spec.wrapped and (rows := np.flatnonzero(self._open & self._plays)).size:
             self._sense(rows, np.zeros((len(rows), self.spec.dimension)))
-        return self.truth
-
-    @property
-    def truth(self) -> np.ndarray:
-        """The current measurement (n, p), a copy, before the present sample has been observed."""
         return self._truth.copy()
+
+    def truth(self, ids: np.ndarray) -> np.ndarray:
+        """Returns the current measurement (k, p) of runs `ids` (k,), before the sample has been observed."""
+        return self._truth[ids]
 
     def observe(self, true: np.ndarray, noise: np.ndarray, ids: np.ndarray) -> np.ndarray:
         """Returns the noisy measurements (k, p) of runs `ids` (k,), under noise (k, p) of this sample.

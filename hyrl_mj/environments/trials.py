@@ -216,7 +216,8 @@ def _check_instances(pool: Pool, spec: EnvironmentSpec) -> None:
                 noise * rng.uniform(-1, 1, (EPISODES, d)) * spec.chart.sides * spec.noisy
             )
             if noise:
-                plant.observe(plant.truth, errors, np.arange(EPISODES))
+                everyone = np.arange(EPISODES)
+                plant.observe(plant.truth(everyone), errors, everyone)
             plant.step(u)
             inputs.append(u)
             measured.append(plant.measurement)

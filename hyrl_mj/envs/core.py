@@ -192,7 +192,7 @@ class BatchedEnv:
 
     def _measure(self, ids: np.ndarray) -> np.ndarray:
         """Returns noisy measurements (k, p) of the rows `ids`."""
-        true, modes = self.plant.truth[ids], np.full(len(ids), NOT_STARTED)
+        true, modes = self.plant.truth(ids), np.full(len(ids), NOT_STARTED)
         noise = drawn(self._noise, Sample(ids, self.samples[ids], true, modes, self.plant))
         return self.plant.observe(true, noise, ids)
 

@@ -41,18 +41,20 @@ class Follower:
     def __init__(self, task: Task, plant: Plant):
         self._task, self._plant = task, plant
         self._geoms = list(task.obstacles.values())
-        self._first = self._bearings()
+        self._first = self._bearings(np.arange(plant.n))
         self._last = self._first.copy()
         self._turned = np.zeros_like(self._first)
 
-    def _bearings(self) -> np.ndarray:
+    def _bearings(self, rows: np.ndarray) -> np.ndarray:
         centres = self._plant.geom_positions(self._geoms)[..., list(self._task.plane)]
-        away = self._task.where(self._plant.truth)[:, None] - centres
+        if len(centres) > 1:  # they move
+            centres = centres[rows]
+        away = self._task.where(self._plant.truth(rows))[:, None] - centres
         return np.arctan2(away[..., 1], away[..., 0])
 
     def follow(self, active: np.ndarray) -> None:
         """Follows the runs `active` (k,) by one sample."""
-        now = self._bearings()[active]
+        now = self._bearings(active)
         self._turned[active] += wrapped(now - self._last[active])
         self._last[active] = now
 

@@ -134,7 +134,7 @@ def closed_loop(
         now = Sample(rows, k[rows], measurement[rows], q[rows], plant, past[rows])
         measured = plant.observe(now.measurement, _noise(signal, now, ahead, measurement), rows)
         if plant.late:  # what the last step came to is known only now
-            outcome[active] = task.outcome(plant.truth[active], plant.unstable[active])
+            outcome[active] = task.outcome(plant.truth(active), plant.unstable[active])
             active = active[outcome[active] == Outcome.RUNNING]
         if (fresh := (now.k == 0) & (now.q == NOT_STARTED)).any():
             first_mode[rows[fresh]] = q[rows[fresh]] = controller.initial_mode(measured[fresh])
@@ -145,8 +145,9 @@ def closed_loop(
         past[rows] = remembering(past[rows], measured)
         if len(active):
             (plant.step_backward if backward else plant.step)(u[on], active)
-        measurement, last, lost = plant.truth, measurement, plant.unstable
-        measurement[lost] = last[lost]  # the last one before the simulation became unstable
+        lost = plant.unstable
+        stable = rows[~lost[rows]]  # the others keep the last one before they became unstable
+        measurement[stable] = plant.truth(stable)
         path[now.k + 1, rows] = task.chart.near(task.z(measurement[rows]), path[now.k, rows])
         k[rows] += 1
         length[active] = k[active]
@@ -157,7 +158,7 @@ def closed_loop(
             over = active[(outcome[active] == Outcome.RUNNING) & (k[active] == limit)]
             if plant.late and len(over):
                 plant.observe(measurement[over], np.zeros_like(measurement[over]), over)
-                measurement[over] = plant.truth[over]
+                measurement[over] = plant.truth(over)
                 outcome[over] = task.outcome(measurement[over], lost[over])
                 over = over[outcome[over] == Outcome.RUNNING]
             outcome[over] = task.verdict(measurement[over])
