@@ -442,6 +442,8 @@ class _Chain:
 
     def ask(self, work: Callable[[], Any]) -> None:
         """Begins a step or a reset, up to where the innermost environment would observe."""
+        if self._busy:
+            raise AssertionError("a sample has not been observed")
         self._calls, self._asked, self._busy = 0, True, True
         self._work.put(work)
         what, value = self._news.get()

@@ -77,9 +77,7 @@ class EnvironmentPlant:
         Each run can be observed once in each sample: what remembers its observations then has seen it.
         """
         d, measured = self.spec.dimension, true.copy()
-        needed = noise[:, :d].any(axis=1)
-        if self.spec.wrapped:
-            needed |= self._plays[ids]
+        needed = noise[:, :d].any(axis=1) | self.spec.wrapped
         some = np.flatnonzero(needed & self._open[ids] & (self._outcome[ids] == Outcome.RUNNING))
         if len(some):
             self._sense(ids[some], noise[some, :d])
