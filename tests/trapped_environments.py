@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import logger, spaces
+from tqdm import tqdm
 from traps import draws, memories
 from traps.honest import HONEST
 from traps.judge import STARTS, VERDICTS, Case, judged
@@ -214,7 +215,7 @@ def main(argv):
     verdicts, failures = [], 0
     # Each case in a process of its own, as it would be: what an environment leaves behind ends with it.
     with get_context("fork").Pool(maxtasksperchild=1) as processes:
-        for name, traps, verdict, why in processes.imap(tried, cases):
+        for name, traps, verdict, why in tqdm(processes.imap(tried, cases), total=len(cases)):
             verdicts.append((traps, verdict))
             if is_failure(traps, verdict):
                 failures += 1
