@@ -12,6 +12,9 @@ from hyrl_mj.simulation.noise import NOT_STARTED, AnyNoise, Sample, Signal, draw
 from hyrl_mj.simulation.passing import Follower, Passing
 from hyrl_mj.tasks import Outcome, Task
 
+# Samples for which a record has room at first; then it doubles.
+GROWS = 64
+
 
 @dataclass(frozen=True)
 class LoopSettings:
@@ -117,20 +120,21 @@ def closed_loop(
     path = np.empty((limit + 1, n, task.chart.dimension))
     path[0] = task.chart.near(task.z(measurement), z0)
     shapes = {"before": (), "q": (), "measured": (len(task.noisy),), "u": (len(task.inputs),)}
-    kept = {name: np.empty((limit, n, *shape)) for name, shape in shapes.items() if record}
+    kept = {name: _Table(n, shape) for name, shape in shapes.items() if record}
+    every = np.arange(n)
     if record:
-        kept["true"] = np.empty((limit + 1, *measurement.shape))
-        kept["true"][0] = measurement
+        kept["true"] = _Table(n, measurement.shape[1:])
+        kept["true"].put(k, every, measurement)
     if record and settings.states:
-        kept["state"] = np.empty((limit + 1, *plant.state.shape))
-        kept["state"][0] = plant.state
+        kept["state"] = _Table(n, plant.state.shape[1:])
+        kept["state"].put(k, every, plant.state)
     follower = Follower(task, plant) if settings.passing else None
     ticks = range(limit) if together else count()
     for tick in progress_bar(ticks, settings.label, "samples", quiet=settings.quiet):
         active = np.flatnonzero((outcome == Outcome.RUNNING) & (k < limit))[:most]
         if not len(active):
             break
-        rows = np.arange(n) if together else active
+        rows = every if together else active
         now = Sample(rows, k[rows], measurement[rows], q[rows], plant, past[rows])
         measured = plant.observe(now.measurement, _noise(signal, now, ahead, measurement), rows)
         if plant.late:  # what the last step came to is known only now
@@ -165,23 +169,25 @@ def closed_loop(
             plant.end(over)
         if record:
             for name, values in zip(shapes, (before, q[rows], measured, u), strict=True):
-                kept[name][now.k, rows] = values
-            kept["true"][k[rows], rows] = measurement[rows]
+                kept[name].put(now.k, rows, values)
+            kept["true"].put(k[rows], rows, measurement[rows])
         if "state" in kept:
-            was, state = kept["state"][now.k, rows], plant.state[rows]
-            kept["state"][k[rows], rows] = np.where(lost[rows, None], was, state)
+            was, state = kept["state"].values[now.k, rows], plant.state[rows]
+            kept["state"].put(k[rows], rows, np.where(lost[rows, None], was, state))
     ask.again()
     plant.end()
     if not together:
         _stay(path, length)
         for name, table in kept.items():
-            _stay(table, length if name in ("true", "state") else length - 1)
+            if name != "u":
+                _stay(table.values, length - (name in shapes))
     samples = length.max(initial=0)
-    arrays = {name: np.empty((0, n, *shape), dtype=float) for name, shape in shapes.items()}
+    arrays = {name: np.empty((0, n, *shape)) for name, shape in shapes.items()}
     arrays |= {"true": np.empty(0), "state": np.empty(0)}
     for name, table in kept.items():
-        arrays[name] = table[: samples + (name in ("true", "state"))]
-    arrays |= {name: arrays[name].astype(int) for name in ("before", "q")}
+        arrays[name] = table.values[: samples + (name not in shapes)]
+    for name in ("before", "q"):  # of runs that were over before they began, none
+        arrays[name] = np.nan_to_num(arrays[name], nan=NOT_STARTED).astype(int)
     passing = None if follower is None else follower.passing
     return Rollout(path[: samples + 1], length, outcome, first_mode, **arrays, passing=passing)
 
@@ -192,7 +198,7 @@ def _noise(
     """Returns the noise (k, p) of a sample.
 
     Args:
-        signal: the noise.
+        signal: where it comes from.
         now: the sample.
         ahead: if the runs are at different samples, and the signal does not look at them, its noise so far,
             drawn for all of them; so that it does not depend on when a run begins.
@@ -209,6 +215,20 @@ def _noise(
     noise = np.zeros_like(now.measurement)
     noise[:, columns] = [ahead[k][row] for k, row in zip(now.k, now.rows, strict=True)]
     return noise
+
+
+class _Table:
+    """Values (K, n, ...) of n runs, which may be at different samples; NaN where there are none."""
+
+    def __init__(self, n: int, shape: tuple[int, ...]):
+        self.values = np.full((GROWS, n, *shape), np.nan)
+
+    def put(self, k: np.ndarray, rows: np.ndarray, values: np.ndarray) -> None:
+        """Takes values (r, ...) of the samples k (r,) of the runs `rows` (r,)."""
+        if (more := int(k.max(initial=0)) + 1 - len(self.values)) > 0:
+            shape = max(more, len(self.values)), *self.values.shape[1:]
+            self.values = np.concatenate([self.values, np.full(shape, np.nan)])
+        self.values[k, rows] = values
 
 
 def _stay(values: np.ndarray, last: np.ndarray) -> None:
