@@ -15,8 +15,9 @@ from gymnasium.wrappers import (
     TimeLimit,
 )
 
-from hyrl_mj import BadInput, from_callable, from_gymnasium, simulate
-from hyrl_mj.simulation import Recorded
+from hyrl_mj import BadInput, Noise, closed_loop, from_callable, from_gymnasium, simulate
+from hyrl_mj.policies import PolicyController
+from hyrl_mj.simulation import LoopSettings, Programmes, Recorded, Rules
 
 BOX = spaces.Box(-np.inf, np.inf, (4,))
 
@@ -361,3 +362,32 @@ def test_a_wrapper_is_kept_that_only_has_the_name_of_one_that_counts():
     agent = from_callable(lambda o: np.tile([2.0, 0.0], (len(o), 1)), task)
     arc = simulate(task, agent, [-1.0, 1.0])
     assert arc.z[-1, 0] < arc.z[0, 0]
+
+
+@pytest.mark.parametrize(
+    "wrap", [lambda e: e, lambda e: FrameStackObservation(FlattenObservation(e), 2)]
+)
+@pytest.mark.parametrize("kind", ["none", "uniform", "alternating", "attack"])
+def test_runs_do_not_depend_on_how_many_are_played_side_by_side(wrap, kind):
+    task, rng = from_gymnasium(lambda: wrap(Puck()), steps=25), np.random.default_rng(0)
+    loop = PolicyController(from_callable(east, task))
+    z, found, settings = task.starts(9, rng), [], LoopSettings(record=True, passing=True)
+    assert task.side_by_side > 9
+    for side in (9, 2):
+        task.side_by_side = side
+        noise = Noise() if kind in ("none", "attack") else Noise(kind, 0.1)
+        if kind == "attack":
+            rules = Rules(task, loop, 0.1, np.array(task.noisy))
+            programmes = np.random.default_rng(1).integers(len(rules) - 1, size=(9, 3))
+            noise = Programmes(task, loop, rules, programmes, 4)
+        run = closed_loop(task, loop, z, noise, seed=1, settings=settings)
+        found.append((run, getattr(noise, "values", np.zeros(1)), getattr(noise, "danger", 0)))
+    (a, *of_a), (b, *of_b) = found
+    assert np.ptp(a.length) > 0
+    for name in ("path", "length", "outcome", "q0", "before", "q", "u", "state"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), name)
+    for i, end in enumerate(a.length):
+        np.testing.assert_array_equal(a.measured[:end, i], b.measured[:end, i])
+        np.testing.assert_array_equal(a.true[:end, i], b.true[:end, i])
+    for one, other in zip((a.passing.turned, *of_a), (b.passing.turned, *of_b), strict=True):
+        np.testing.assert_array_equal(one, other)
