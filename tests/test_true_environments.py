@@ -391,3 +391,43 @@ def test_runs_do_not_depend_on_how_many_are_played_side_by_side(wrap, kind):
         np.testing.assert_array_equal(a.true[:end, i], b.true[:end, i])
     for one, other in zip((a.passing.turned, *of_a), (b.passing.turned, *of_b), strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+class Behind(Puck):
+    """It observes places as `mj_step` leaves them behind: those of the physics step before."""
+
+    def _get_obs(self):
+        return {**super()._get_obs(), "was_at": self.data.xpos[self.model.body("puck").id, :2].copy()}
+
+    def __init__(self):
+        super().__init__()
+        parts = self.observation_space.spaces
+        self.observation_space = spaces.Dict({**parts, "was_at": spaces.Box(-np.inf, np.inf, (2,))})
+
+
+def test_what_lags_by_a_physics_step_is_moved_by_noise_where_the_robot_was_then():
+    task = from_gymnasium(Behind)
+    assert "a physics step before" in task.found["lag"]
+    plant, rows = task.plant(2), np.arange(2)
+    plant.set_state(*task.state(np.array([[-1.2, 0.4], [-1.2, 0.4]])))
+    noise = np.zeros_like(plant.measurement)
+    noise[1, :2] = 0.03, -0.02
+    for _ in range(3):
+        plant.step(np.tile([2.0, 1.0], (2, 1)))
+    true, alike = plant.observe(plant.truth(rows), noise, rows)
+    seen = slice(-3 - 2, -3)  # before reward, success and outcome
+    assert not np.allclose(true[seen], true[:2], rtol=0, atol=1e-4)  # it moves
+    np.testing.assert_allclose(alike[seen] - true[seen], noise[1, :2], rtol=0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_forces_of_neither_the_end_of_a_step_nor_a_physics_step_before_are_refused_under_noise():
+    given = {"reset": {"goal_cell": [6, 6]}, "chart": ["qpos[0]", "qpos[1]"]}
+    with pytest.raises(
+        BadInput, match=r"observation\[\d+\] .* include_cfrc_ext_in_observation=False"
+    ):
+        from_gymnasium("AntMaze_Medium-v5", **given)
+    without = from_gymnasium(
+        "AntMaze_Medium-v5", kwargs={"include_cfrc_ext_in_observation": False}, **given
+    )
+    assert "lag" not in without.found
