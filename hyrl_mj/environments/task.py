@@ -206,7 +206,7 @@ class EnvironmentTask(Task):
 
     def at(self, z: np.ndarray) -> np.ndarray:
         rest = np.tile([0.0, 0.0, float(Outcome.RUNNING)], (len(z), 1))
-        return np.column_stack([z, self._at_rest(z), rest])
+        return np.column_stack([z, self._pool.rest(self.specification.state_at(z))[0], rest])
 
     def _at_rest(self, z: np.ndarray) -> np.ndarray:
         """Returns what a robot at rest at chart points (n, d) observes (n, o)."""

@@ -143,8 +143,11 @@ def draw_policy_map(shown: ShownPolicy, path: Path | None = None) -> Figure:
     charts.check_drawable(task)
     with style.drawing(path, 5.2, task, f"the {shown.algorithm} policy") as figure:
         *maps, panel = figure.subplots(1, len(task.inputs) + 1)
+        ring = charts.is_ring(task)
+        grid = Grid(task.chart, (RING_NODES,)) if ring else Grid.with_cells(task.chart, PLANE_CELLS)
+        inputs = shown.policy.act(task.at(grid.nodes))
         for i, input_panel in enumerate(maps):
-            _input_map(input_panel, shown, i)
+            _input_map(input_panel, shown, grid, inputs, i)
         _paper_runs(panel, shown)
         style.legend(figure, by_label=True)
     return figure
@@ -161,12 +164,11 @@ def _paper_runs(panel: Axes, shown: ShownPolicy) -> None:
     charts.set_point_lines(panel, task)
 
 
-def _input_map(panel: Axes, shown: ShownPolicy, i: int) -> None:
-    """Draws the map of an input, measured without noise, with its colour bar."""
-    task, ring, chart = shown.task, charts.is_ring(shown.task), shown.task.chart
+def _input_map(panel: Axes, shown: ShownPolicy, grid: Grid, inputs: np.ndarray, i: int) -> None:
+    """Draws the map of an input, of those (N, m) at the nodes without noise, with its colour bar."""
+    task, ring = shown.task, charts.is_ring(shown.task)
     colours, scale, ticks = _input_colours(task, i)
-    grid = Grid(chart, (RING_NODES,)) if ring else Grid.with_cells(chart, PLANE_CELLS)
-    values = shown.policy.act(task.at(grid.nodes))[:, i]
+    values = inputs[:, i]
     if ring:
         shades, classes = np.unique(colours(scale(values)), axis=0, return_inverse=True)
         charts.arcs(panel, task, classes.ravel(), shades, OUTER, INNER)
