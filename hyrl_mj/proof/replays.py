@@ -24,6 +24,8 @@ STARTS = {"none": 3_000, "uniform": 3_000, "alternating": 2_900, "worst": 1_000,
 FEWER = 10
 # Runs side by side, and how many of them plain MuJoCo plays once more: every twentieth, 500 in all.
 BATCH, EVERY = 1_000, 20
+# Runs of each kind of noise that are played to their end, though they are proved to have arrived before.
+WHOLE = 100
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ class Replays:
         the weakest first: a third lies at the border of what is proved, a third where it arrives latest, and
         the others are starts of the score, at random.
 
-        Of each kind of noise the first `BATCH` episodes are played to their end. The others are until all are
+        Of each kind of noise the first `WHOLE` episodes are played to their end. The others are until all are
         proved to have arrived for good, and to their end only if one has not.
         """
         if certificate.game.lattice.estimate or not score.winnable:
@@ -103,8 +105,9 @@ class Replays:
         batches = []
         for kind, noise in _noises(certificate, name, controller, score.eps).items():
             z0, q0 = _drawn(pools, STARTS[kind] // few, rng)
-            for first in range(0, len(z0), BATCH):
-                part, number = slice(first, first + BATCH), int(rng.integers(2**31))
+            for first in (0, *range(WHOLE, len(z0), BATCH)):
+                part = slice(first, first + BATCH if first else WHOLE)
+                number = int(rng.integers(2**31))
                 steps = max(pool.samples for pool in pools) if first else None
                 batches.append(Batch(controller, noise, kind, z0[part], q0[part], number, steps))
         return Replays(name, score.eps, certificate.game.everywhere, of, tuple(batches))
