@@ -20,6 +20,8 @@ from hyrl_mj.errors import BadInput
 EPISODES, SAMPLES, HELD = 8, 40, 8
 # Rounding of what is computed again from the same state, as a share of the largest number.
 ROUNDING = 1e-9
+# What differs by less than this share of what a physics step changes is from near the end of a step.
+NEAR = 0.5
 # By how much coordinates are moved to see what follows them, as a share of the side of the chart.
 MOVED = 1e-3
 
@@ -59,13 +61,11 @@ def tried(instance: Instance, spec: EnvironmentSpec) -> tuple[EnvironmentSpec, P
     _check_observer(instance, step)
     found, (derived, columns) = dict(spec.found), _derived(instance, step)
     if columns:
-        found["lag"] = (
-            f"observation {', '.join(map(str, columns))} comes from a physics step before the end of a step"
-            + (
-                ", with noise, too" if derived == EARLIER
-                else "; noise adds to it what it changes at the end"
-            )
-        )  # fmt: skip
+        when = {
+            EARLIER: "is that of a physics step before the end of a step, with noise, too",
+            UNKNOWN: "is from shortly before the end of a step; noise adds what it changes at the end",
+        }
+        found["lag"] = f"observation {', '.join(map(str, columns))} {when[derived]}"
     recipe = replace(spec.recipe, derived=derived)
     recipe = replace(recipe, anew=spec.wrapped and _changes_by_reset(recipe, spec.state))
     instance.recipe, pool = recipe, Pool(recipe)
@@ -143,27 +143,33 @@ def _derived(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
         BadInput: noise on the chart's coordinates moves columns of which it is not known when they are from.
     """
     rng, space = np.random.default_rng(5), instance.inner.observation_space
-    odd: dict[str, list[np.ndarray]] = {NOW: [], EARLIER: []}
-    moving: list[np.ndarray] = []
+    off: dict[str, list[np.ndarray]] = {NOW: [], EARLIER: []}
+    step_of_physics, moving, size = [], [], []
     for seed in range(EPISODES):
         instance.reset(seed)
         for _ in instance.wander(rng, SAMPLES, HELD):
             seen, state = flat(instance.inner_seen, space), instance.physics.read()
-            for derived, columns in odd.items():
+            size.append(np.abs(seen))
+            for derived, differences in off.items():
                 with instance.physics.kept():
-                    again = instance.seen_as(derived, state, 0 * step)
-                columns.append(~_rounds(np.abs(again - seen), seen))
-            moving.append(~_rounds(np.abs(instance.displaced(step)), seen))
-    differ = {derived: np.any(columns, axis=0) for derived, columns in odd.items()}
+                    differences.append(instance.seen_as(derived, state, 0 * step) - seen)
+            step_of_physics.append(np.abs(off[NOW][-1] - off[EARLIER][-1]))
+            moving.append(np.abs(instance.displaced(step)))
+    most = {derived: np.abs(differences).max(axis=0) for derived, differences in off.items()}
+    differ = {derived: ~_rounds(far, np.array(size)) for derived, far in most.items()}
     lags = np.flatnonzero(differ[NOW]).tolist()
     for derived, columns in differ.items():
         if not columns.any():
             return derived, lags
-    if (unknown := np.flatnonzero(differ[NOW] & differ[EARLIER] & np.any(moving, axis=0))).size:
+    # With the Runge-Kutta method they are from its last stage, which is near the end.
+    far = most[NOW] > NEAR * np.max(step_of_physics, axis=0)
+    unknown = differ[NOW] & differ[EARLIER] & far & ~_rounds(np.max(moving, axis=0), np.array(size))
+    if unknown.any():
         raise BadInput(
-            f"observation[{unknown[0]}] of {instance.name} comes neither from the end of a step nor from a "
-            "physics step before, so it is not known what it is under noise: leave it out, such as forces of "
-            "contacts by include_cfrc_ext_in_observation=False, or call mj_forward at the end of step()"
+            f"observation[{unknown.argmax()}] of {instance.name} comes neither from the end of a step nor "
+            "from a physics step before, so it is not known what it is under noise: leave it out, such as "
+            "forces of contacts by include_cfrc_ext_in_observation=False, or call mj_forward at the end of "
+            "step()"
         )
     return UNKNOWN, lags
 
