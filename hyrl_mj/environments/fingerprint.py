@@ -79,6 +79,15 @@ def fingerprint(env: gym.Env) -> Fingerprint:
     return found
 
 
+def shared(env: gym.Env) -> Fingerprint:
+    """Returns what all instances of an environment share: variables of its classes and their modules."""
+    found = Fingerprint()
+    seen: set[int] = set()
+    for kind in {kind for layer in layers(env) for kind in type(layer).__mro__}:
+        _shared(kind, found, seen)
+    return found
+
+
 def of_model(model: mujoco.MjModel) -> dict[str, bytes]:
     """Returns what may be changed in MuJoCo's model, by name."""
     found = {name: getattr(model, name).tobytes() for name in MODEL}

@@ -94,6 +94,7 @@ class Instance:
         self.observation = np.empty(0)
         self._like: written.Fingerprint | None = None  # after its first reset
         self._generators: dict[str, tuple[Any, bytes]] = {}
+        self._shared = written.Fingerprint()  # by all instances, after the reset
         self._used = self._at_start = False
         # To which the innermost reset has to lead, below wrappers.
         self.start: np.ndarray | None = None
@@ -134,6 +135,7 @@ class Instance:
             self.inner_seen = observation
         if self.start is None:
             self.pin()
+        self._shared = written.shared(self.env)
         return observation
 
     def put(self, state: np.ndarray, seed: int | None = None) -> np.ndarray:
@@ -256,11 +258,20 @@ class Instance:
         return [0.0] * self.recipe.width
 
     def finish(self) -> None:
-        """Refuses an episode in which random numbers were drawn, at its end."""
+        """Refuses an episode in which random numbers were drawn, or what all instances share changed."""
+        if changed := written.differing(written.shared(self.env), self._shared):
+            raise self.is_shared(changed[0])
         generators, self._generators = self._generators, {}
         for name, (generator, state) in generators.items():
             if written.state_of(generator) != state:
                 self._drawn(name)
+
+    def is_shared(self, name: str) -> BadInput:
+        """Returns the error that an environment changes what all its instances share."""
+        return BadInput(
+            f"{self.name} changes {name}, which all its instances share, so its episodes depend on each "
+            "other: keep it in an attribute that reset() sets"
+        )
 
     def quit(self) -> None:
         """Leaves an episode before its end."""

@@ -151,23 +151,15 @@ class Stage:
             except Worn as worn:
                 instance.quit()
                 if written.is_shared(str(worn)):
-                    raise self._is_shared(str(worn)) from None
+                    raise instance.is_shared(str(worn)) from None
 
     def _new(self) -> Instance:
         instance = Instance(self.recipe)
-        found = written.fingerprint(instance.env)
-        shared = written.Fingerprint()
-        shared.update((name, value) for name, value in found.items() if written.is_shared(name))
+        shared = written.shared(instance.env)
         self._shared = self._shared or shared
         if changed := written.differing(shared, self._shared):
-            raise self._is_shared(changed[0])
+            raise instance.is_shared(changed[0])
         return instance
-
-    def _is_shared(self, name: str) -> BadInput:
-        return BadInput(
-            f"{self.recipe.source.name} changes {name}, which all its instances share, so its episodes "
-            "depend on each other: keep it in an attribute that reset() sets"
-        )
 
 
 class Pool:
