@@ -397,7 +397,10 @@ class Behind(Puck):
     """It observes places as `mj_step` leaves them behind: those of the physics step before."""
 
     def _get_obs(self):
-        return {**super()._get_obs(), "was_at": self.data.xpos[self.model.body("puck").id, :2].copy()}
+        return {
+            **super()._get_obs(),
+            "was_at": self.data.xpos[self.model.body("puck").id, :2].copy(),
+        }
 
     def __init__(self):
         super().__init__()
