@@ -434,3 +434,27 @@ def test_forces_of_neither_the_end_of_a_step_nor_a_physics_step_before_are_refus
         "AntMaze_Medium-v5", kwargs={"include_cfrc_ext_in_observation": False}, **given
     )
     assert "lag" not in without.found
+
+
+class Flagged(Puck):
+    """All of its instances share a flag, which a reset lowers and a place far to the right raises."""
+
+    raised = {"flag": False}
+
+    def reset(self, **options):
+        self.raised["flag"] = False
+        return super().reset(**options)
+
+    def step(self, action):
+        self.raised["flag"] = self.raised["flag"] or bool(self.data.qpos[0] > 1.5)
+        return super().step(action)
+
+
+def test_what_all_instances_share_may_not_change_in_an_episode_though_a_reset_sets_it_again():
+    with pytest.raises(BadInput, match=r"class Flagged\.raised, which all its instances share"):
+        _driven_right(from_gymnasium(Flagged, steps=30))
+
+
+def _driven_right(task):
+    agent = from_callable(lambda o: np.tile([4.0, 0.0], (len(o), 1)), task)
+    return simulate(task, agent, [[1.0, 1.0]] * 2)
