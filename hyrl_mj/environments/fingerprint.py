@@ -74,15 +74,15 @@ def fingerprint(env: gym.Env) -> Fingerprint:
     seen: set[int] = set()
     for layer in layers(env):
         _walk(layer, "" if layer is env.unwrapped else f"{type(layer).__name__}", found, seen, 0)
-    for kind in {kind for layer in layers(env) for kind in type(layer).__mro__}:
-        _shared(kind, found, seen)
-    return found
+    return _with_shared(env, found, seen)
 
 
 def shared(env: gym.Env) -> Fingerprint:
     """Returns what all instances of an environment share: variables of its classes and their modules."""
-    found = Fingerprint()
-    seen: set[int] = set()
+    return _with_shared(env, Fingerprint(), set())
+
+
+def _with_shared(env: gym.Env, found: Fingerprint, seen: set[int]) -> Fingerprint:
     for kind in {kind for layer in layers(env) for kind in type(layer).__mro__}:
         _shared(kind, found, seen)
     return found

@@ -50,7 +50,7 @@ class Stage:
     def begin(self, plant: int, rows: np.ndarray, starts: np.ndarray) -> Arrays:
         """Begins episodes at MuJoCo's states (k, S) and gives each row of a plant an instance."""
         for row, start in zip(rows.tolist(), starts, strict=True):
-            self._playing[plant, row] = self._begun(self._free, start)
+            self._playing[plant, row] = self._begun(start)
         return ()
 
     def act(self, plant: int, rows: np.ndarray, u: np.ndarray) -> Arrays:
@@ -109,7 +109,7 @@ class Stage:
         Raises:
             BadInput: it remembers something after all.
         """
-        instance = self._begun(self._free, states[0])
+        instance = self._begun(states[0])
         before, results = written.fingerprint(instance.env), []
         for state, inputs in zip(states, u, strict=True):
             instance.physics.write(state)
@@ -141,10 +141,10 @@ class Stage:
 
     # ---- instances
 
-    def _begun(self, free: list[Instance], start: np.ndarray) -> Instance:
+    def _begun(self, start: np.ndarray) -> Instance:
         """Returns an instance that begins at a state (S,); a new one takes the place of those worn."""
         while True:
-            instance = free.pop() if free else self._new()
+            instance = self._free.pop() if self._free else self._new()
             try:
                 instance.begin(start)
                 return instance

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,12 +26,6 @@ class Passing:
 
     def __getitem__(self, rows: np.ndarray) -> Passing:
         return Passing(self.first[rows], self.last[rows], self.turned[rows])
-
-    @staticmethod
-    def joined(parts: Sequence[Passing]) -> Passing:
-        """Returns the runs of several parts, one after the other."""
-        columns = zip(*(vars(part).values() for part in parts), strict=True)
-        return Passing(*map(np.concatenate, columns))
 
 
 class Follower:
