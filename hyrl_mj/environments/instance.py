@@ -96,6 +96,7 @@ class Instance:
         self._generators: dict[str, tuple[Any, bytes]] = {}
         self._shared = written.Fingerprint()  # by all instances, after the reset
         self._used = self._at_start = False
+        self._pairs: list[tuple[np.ndarray, np.ndarray]] = []
         # To which the innermost reset has to lead, below wrappers.
         self.start: np.ndarray | None = None
         self._chain = None if self.env is self.inner else _Chain(self)
@@ -131,6 +132,11 @@ class Instance:
             )
         if not self.physics.is_plant:
             self.data = self.physics.data = physics[1]
+        # Views of MuJoCo's data, which show where these are at any time.
+        self._pairs = [
+            (getattr(self.data, a)[i], getattr(self.data, b)[j])
+            for (a, i), (b, j) in self.recipe.places
+        ]
         if self._chain is None:
             self.inner_seen = observation
         if self.start is None:
@@ -395,8 +401,8 @@ class Instance:
         touch = ends and bool(self.touched() - self.recipe.harmless)
         told = [float(reward), ends, bool(truncated), touch]
         told += [entry(info, key) for key in self.recipe.keys]
-        for (a, i), (b, j) in self.recipe.places:
-            away = getattr(self.data, a)[i] - getattr(self.data, b)[j]
+        for a, b in self._pairs:
+            away = a - b
             told.append(math.sqrt(away.dot(away)))
         return told
 

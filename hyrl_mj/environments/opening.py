@@ -81,17 +81,32 @@ class Source:
         return getattr(self.make, "__name__", type(self.make).__name__).strip("<>") or "environment"
 
 
+_kept = False  # whether a block of `kept_generators` is open
+
+
 @contextmanager
-def global_seed(seed: int) -> Iterator[None]:
-    """Seeds the global generators of NumPy and Python in the block, which some environments draw from."""
-    numpy_state, python_state = np.random.get_state(), random.getstate()
-    np.random.seed(seed)
-    random.seed(seed)
+def kept_generators() -> Iterator[None]:
+    """Puts the global generators of NumPy and Python back after the block; of nested blocks the outermost."""
+    global _kept
+    if _kept:
+        yield
+        return
+    numpy_state, python_state, _kept = np.random.get_state(), random.getstate(), True
     try:
         yield
     finally:
         np.random.set_state(numpy_state)
         random.setstate(python_state)
+        _kept = False
+
+
+@contextmanager
+def global_seed(seed: int) -> Iterator[None]:
+    """Seeds the global generators of NumPy and Python in the block, which some environments draw from."""
+    with kept_generators():
+        np.random.seed(seed)
+        random.seed(seed)
+        yield
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from hyrl_mj import cores
 from hyrl_mj.environments import fingerprint as written
 from hyrl_mj.environments.instance import Instance, Recipe, Worn
 from hyrl_mj.environments.judge import Played, Real
+from hyrl_mj.environments.opening import kept_generators
 from hyrl_mj.errors import BadInput, HyrlError, brief
 
 # Fewer episodes than this for each process are played by one.
@@ -49,8 +50,9 @@ class Stage:
 
     def begin(self, plant: int, rows: np.ndarray, starts: np.ndarray) -> Arrays:
         """Begins episodes at MuJoCo's states (k, S) and gives each row of a plant an instance."""
-        for row, start in zip(rows.tolist(), starts, strict=True):
-            self._playing[plant, row] = self._begun(start)
+        with kept_generators():  # once for all of them
+            for row, start in zip(rows.tolist(), starts, strict=True):
+                self._playing[plant, row] = self._begun(start)
         return ()
 
     def act(self, plant: int, rows: np.ndarray, u: np.ndarray) -> Arrays:
@@ -130,14 +132,14 @@ class Stage:
 
     def _acted(self, instances: Sequence[Instance], u: np.ndarray) -> Arrays:
         first = instances[0]
-        sizes = first.physics.size, len(first.observation), self.recipe.width
-        states, seen, reports = (np.empty((len(u), size)) for size in sizes)
+        states, seen = (np.empty((len(u), n)) for n in (first.physics.size, len(first.observation)))
+        reports = []
         with first.undrawn():
             for i, (instance, inputs) in enumerate(zip(instances, u, strict=True)):
-                reports[i] = instance.act(inputs)
+                reports.append(instance.act(inputs))
                 instance.physics.read(states[i])
                 seen[i] = instance.observation
-        return states, seen, reports
+        return states, seen, np.array(reports, dtype=float)
 
     # ---- instances
 
