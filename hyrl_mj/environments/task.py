@@ -37,7 +37,7 @@ SEEN = 1.2
 # A run that turns by less than this decides nothing [rad].
 DECIDED = 0.5
 # Episodes that are played side by side, each by an instance.
-SIDE_BY_SIDE = 256
+SIDE_BY_SIDE = 128
 
 
 class EnvironmentTask(Task):
