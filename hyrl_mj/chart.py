@@ -9,10 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hyrl_mj.errors import BadInput
+from hyrl_mj.errors import BadInput, has_controls
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
+
+
+LONGEST = 80  # characters of a name
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,12 @@ class Chart:
     scale: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        for name in (*self.names, *self.units, self.section):
+            if not isinstance(name, str) or len(name) > LONGEST or has_controls(name):
+                raise BadInput(
+                    f"a coordinate cannot have the name or the unit {str(name)[:LONGEST]!r}: give at most "
+                    f"{LONGEST} characters that can be printed"
+                )
         if not len(self.scale):
             object.__setattr__(self, "scale", (1.0,) * len(self.names))
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from hyrl_mj import pipeline
+from hyrl_mj import pipeline, trust
 from hyrl_mj.environments import EnvironmentOptions, chosen_task, explained
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.fields import DriveOptions, for_posts, read_field
@@ -235,6 +235,7 @@ def replay(
     starts: str = "critical",
     noise: str | None = None,
     eps: float | None = None,
+    force: bool = False,
     options: ReplayOptions,
 ) -> None:
     """Render policy and controller under the same noise, as a video or a picture.
@@ -250,6 +251,7 @@ def replay(
             or worst (of the worst-case game, for each controller); by default the arcs of the run, which
             are under alternating noise, and from the critical set under the strongest noise that is known.
         eps: bound of the noise, in the units of the chart; by default the run's.
+        force: overwrite a file that hyrl-mj has not written.
     """
     from hyrl_mj.viz.arcs import replay_floor, replay_shows
     from hyrl_mj.viz.replay import render_replay
@@ -267,7 +269,8 @@ def replay(
     if out is None:
         pipeline.as_stage(run, "replay", work)
     else:
-        work(run)
+        with trust.output(out, out.with_suffix(".png"), force=force):
+            work(run)
     out = out or usual_out
     print(f"{'picture' if out.suffix == '.png' else 'video'} at {out}")
 
@@ -278,6 +281,7 @@ def drive(
     field: Path,
     out: Path | None = None,
     shown: tuple[int, ...] | None = None,
+    force: bool = False,
     options: DriveOptions,
     how: ReplayOptions,
 ) -> None:
@@ -291,10 +295,13 @@ def drive(
             default none.
         shown: numbers of the starts to render, the first of them in the png; by default all, one after the
             other.
+        force: overwrite a file that hyrl-mj has not written.
     """
     from hyrl_mj.viz import drives
 
-    drives.drive_run(run, field, options, out, how, shown)
+    written = () if out is None else (out, out.with_suffix(".png"))
+    with trust.output(*written, force=force):
+        drives.drive_run(run, field, options, out, how, shown)
 
 
 def view(run: Run, *, arc: str = "critical_hyrl_q0", port: int = 0) -> None:
@@ -315,24 +322,26 @@ def view(run: Run, *, arc: str = "critical_hyrl_q0", port: int = 0) -> None:
     view(run.task, run.arc(paths[arc]), port)
 
 
-def report(run: Run, *, out: Path | None = None) -> None:
+def report(run: Run, *, out: Path | None = None, force: bool = False) -> None:
     """Write one page with all results of a run, and how to repeat it.
 
     The page opens in any browser, without a network, and can be printed.
 
     Args:
         out: the html to write; by default report.html in the run directory.
+        force: overwrite a file that hyrl-mj has not written.
     """
     from hyrl_mj.viz.report import write_report
 
     if out is None:
         pipeline.run_stage(run, "report")
     else:
-        write_report(run, out)
+        with trust.output(out, force=force):
+            write_report(run, out)
         print(f"page at {out}")
 
 
-def export(run: Run, *, to: str, out: Path, field: Path | None = None) -> None:
+def export(run: Run, *, to: str, out: Path, field: Path | None = None, force: bool = False) -> None:
     """Write the hybrid controller of a run so that it works without hyrl_mj.
 
     Args:
@@ -341,17 +350,19 @@ def export(run: Run, *, to: str, out: Path, field: Path | None = None) -> None:
         out: the file or the folder to write.
         field: for a run of field, the JSON file of a field with as many posts as the controller will see; by
             default one post.
+        force: overwrite a file that hyrl-mj has not written.
     """
-    from hyrl_mj.export import export
+    from hyrl_mj.export import export, files_of
 
-    if isinstance(run.task, Field):
-        posts = 1 if field is None else read_field(field).layouts.posts
-        controller = for_posts(run.task, run.mode_networks, run.settings.noise, posts)
-        export(controller, to, out)
-    elif field is not None:
-        raise BadInput(f"{run.task.name} has no field of posts: leave --field out")
-    else:
-        export(run.controller, to, out)
+    with trust.output(*files_of(to, out), force=force):
+        if isinstance(run.task, Field):
+            posts = 1 if field is None else read_field(field).layouts.posts
+            controller = for_posts(run.task, run.mode_networks, run.settings.noise, posts)
+            export(controller, to, out)
+        elif field is not None:
+            raise BadInput(f"{run.task.name} has no field of posts: leave --field out")
+        else:
+            export(run.controller, to, out)
     print(f"controller at {out}")
 
 

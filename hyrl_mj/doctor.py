@@ -101,8 +101,8 @@ def _rendering() -> str:
     # In a child process, because a broken GL driver may take its process down.
     try:
         child = subprocess.run(
-            [sys.executable, "-c", _FRAMES],
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+            [sys.executable, "-P", "-c", _FRAMES],
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(os.path.isabs, sys.path))},
             capture_output=True,
             text=True,
             errors="replace",

@@ -2,23 +2,31 @@
 
 import math
 import traceback
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 from numbers import Integral, Real
 from pathlib import Path
 from unicodedata import category
 
+# The longest text of an error [characters]: what is longer holds something of a file that nobody reads.
+LONGEST = 500
+
 
 class HyrlError(Exception):
     """Base of every error that the package raises on purpose.
 
-    Control characters in its text, which may come from a file, are written as escapes.
+    Control characters in its text, which may come from a file, are written as escapes, and the middle of a
+    text that is too long is left out.
     """
 
     exit_status = 1
 
     def __init__(self, text: object = "") -> None:
-        super().__init__(printable(str(text)))
+        whole = str(text)
+        if len(whole) > LONGEST:
+            whole = f"{whole[: LONGEST // 2]} [...] {whole[-LONGEST // 2 :]}"
+        super().__init__(printable(whole))
 
 
 class BadInput(HyrlError, ValueError):
@@ -63,6 +71,19 @@ def brief(error: BaseException) -> str:
     """Returns the kind of an error and the beginning of its text, in one line that can be printed."""
     kind, text = type(error).__name__, printable(" ".join(str(error).split()))
     return f"{kind}: {text if len(text) <= 160 else text[:157] + '...'}" if text else kind
+
+
+@contextmanager
+def described(what: str) -> Iterator[None]:
+    """Raises `BadInput` where the block, which makes something of a description, raises another error."""
+    try:
+        yield
+    except (HyrlError, MemoryError):
+        raise
+    except Exception as error:  # a description can be wrong in any way
+        raise BadInput(
+            f"{what} cannot be made as it is described ({brief(error)}): correct its arguments"
+        ) from error
 
 
 def line_in(error: BaseException, path: Path | None) -> str:

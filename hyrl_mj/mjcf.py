@@ -7,8 +7,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from hyrl_mj import mujoco_log
-from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj import limits, mujoco_log, trust
+from hyrl_mj.errors import BadInput, has_controls, unknown
 
 # Positions (n, nq) of the joints -> positions (n, k, 3) [m] or poses (n, k, 7) of the mocap bodies.
 Mocap = Callable[[np.ndarray], np.ndarray]
@@ -44,11 +44,15 @@ def models_dir() -> Path:
 def load(path: Path) -> mujoco.MjModel:
     """Returns a compiled MJCF file. Compiled models are shared: do not write to them.
 
+    One that is not of this package is compiled and stepped in a process with limits first.
+
     Raises:
-        BadInput: the file is missing or MuJoCo cannot compile it.
+        BadInput: the file is missing, MuJoCo cannot compile it, or it takes too much time or memory.
     """
     if not path.is_file():
         raise BadInput(f"there is no MJCF model at {path}")
+    if models_dir() not in path.resolve().parents:
+        _try(path.resolve())
     mujoco_log.install()
     try:
         with mujoco_log.kept() as warnings:
@@ -59,7 +63,36 @@ def load(path: Path) -> mujoco.MjModel:
         raise BadInput(f"MuJoCo cannot compile {path}: {reason}") from error
     if reason:
         raise BadInput(f"{path} cannot be used: {reason}")
+    check_names(model, str(path))
     return model
+
+
+def check_names(model: mujoco.MjModel, what: str) -> None:
+    """Raises `BadInput` if a name in a model has characters that control a terminal."""
+    for name in model.names.split(b"\0"):
+        if has_controls(text := name.decode(errors="replace")):
+            raise BadInput(
+                f"{what} has an object {text[:80]!r}: give names of characters that can be printed"
+            )
+
+
+def _try(path: Path) -> None:
+    """Compiles and steps a file in a process with limits, unless that was done before.
+
+    What was done is remembered of a file that names no others, which may change.
+    """
+    if trust.is_known(path):
+        return
+    try:
+        found = limits.tried(Path(__file__).with_name("mjcf_trial.py"), b"", str(path))
+    except limits.Ended as ended:
+        raise BadInput(
+            f"{path} cannot be used: {ended} where it is compiled and stepped twice; make it simpler"
+        ) from None
+    if "problem" in found:
+        raise BadInput(f"{path} cannot be used: {found['problem']}")
+    if b"file" not in path.read_bytes():
+        trust.remember(path)
 
 
 def object_id(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str) -> int:

@@ -20,6 +20,8 @@ from hyrl_mj.run_directory import Run, load_run
 
 NAME = "sweep.json"
 MOST_RUNS = 1_000
+# A spreadsheet takes a text that begins so for a formula.
+FORMULAS = ("=", "+", "-", "@", "\t", "\r")
 # States of a run.
 OPEN: Final = "open"
 DONE: Final = "done"
@@ -192,7 +194,8 @@ class Sweep:
                 values = [row.seed, row.state, row.verdict, f"{row.seconds:.1f}"]
                 found = [row.figures.get(name) for name in names]
                 cells = ["" if value is None else f"{value:.6g}" for value in found]
-                writer.writerow([*asdict(row.setting).values(), *values, *cells, row.sentence])
+                cells = [*asdict(row.setting).values(), *values, *cells, row.sentence]
+                writer.writerow([_plain(cell) for cell in cells])
 
     def groups(self) -> dict[Setting, list[Row]]:
         """Returns the rows by setting."""
@@ -200,6 +203,20 @@ class Sweep:
         for row in self.rows:
             found.setdefault(row.setting, []).append(row)
         return found
+
+
+def _plain(cell: object) -> object:
+    """Returns a cell that a spreadsheet does not take for a formula."""
+    is_formula = isinstance(cell, str) and cell.startswith(FORMULAS) and not _is_number(cell)
+    return f"'{cell}" if is_formula else cell
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def opened(folder: Path, common: Common, rows: Iterable[Row]) -> Sweep:

@@ -1,8 +1,9 @@
-"""The code of the user's that this machine has run: only such code is loaded without being named again.
+"""Where a text comes from, the code and texts of the user's that were used here, and what was written here.
 
-A run directory names the file of its task. Opening a directory from a stranger must not run that file, and
-opening a run of one's own should not ask for it each time. So whenever the user names a file, its path and
-SHA-256 are recorded outside all run directories.
+A run directory names the file or the environment of its task. Opening a directory from a stranger must not
+run code that it names, and opening a run of one's own should not ask for it each time. So what a file says is
+read in a block `received`, in which everything that can run code or open a file asks `allows`; and whenever
+the user names a file or describes an environment, its SHA-256 is recorded outside all run directories.
 """
 
 from __future__ import annotations
@@ -12,20 +13,48 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 from hyrl_mj.artifacts import digest, replacing
 from hyrl_mj.errors import BadInput
 
+# The keys of the hashes of texts and of written files, which are no paths, and how many are kept of each.
+_TEXT, _WRITTEN, MOST = "texts", "written", 1_000
+_RECEIVED: ContextVar[bool] = ContextVar("received", default=False)
+
 
 @contextmanager
-def current_folder() -> Iterator[None]:
-    """Lets modules in the current folder be imported in the block, which a command does not do by itself."""
-    sys.path.insert(0, "")
+def received() -> Iterator[None]:
+    """What is made in the block is described by a file, not by the user: of code, only what is known runs."""
+    token = _RECEIVED.set(True)
     try:
         yield
     finally:
-        sys.path.remove("")
+        _RECEIVED.reset(token)
+
+
+def is_received() -> bool:
+    """Returns whether what is made now is described by a file."""
+    return _RECEIVED.get()
+
+
+def allows(path: Path) -> bool:
+    """Returns whether a file of code may be run: the user names it, or this machine knows it."""
+    return not is_received() or is_known(path)
+
+
+@contextmanager
+def current_folder() -> Iterator[None]:
+    """Lets a module that the user names be imported from the current folder, after all that are installed."""
+    sys.path.append("")
+    try:
+        yield
+    finally:
+        last = max(i for i, folder in enumerate(sys.path) if folder == "")
+        del sys.path[last]  # not one of the user's own
 
 
 def store() -> Path | None:
@@ -40,13 +69,8 @@ def store() -> Path | None:
 
 
 def remember(path: Path) -> None:
-    """Records that the user has named this file of code; without a place for records, nothing is kept."""
-    file, records = store(), _records()
-    entry = {str(path.resolve()): digest(path)}
-    if file is None or records | entry == records:
-        return
-    with suppress(BadInput), replacing(file) as temporary:
-        temporary.write_text(json.dumps(records | entry, indent=2) + "\n", encoding="utf-8")
+    """Records that the user has named this file of code."""
+    _record(str(path.resolve()), digest(path))
 
 
 def is_known(path: Path) -> bool:
@@ -56,8 +80,60 @@ def is_known(path: Path) -> bool:
     return known is not None and path.is_file() and known == digest(path)
 
 
-def _records() -> dict[str, str]:
-    """Returns the hashes of the files by path; none where the records are missing or damaged."""
+def remember_text(text: str) -> None:
+    """Records that the user has described something by this text."""
+    if not is_known_text(text):
+        _record(_TEXT, [*_texts(), _digest_of(text)][-MOST:])
+
+
+def is_known_text(text: str) -> bool:
+    """Returns whether the user has described something by this text before, on this machine."""
+    return _digest_of(text) in _texts()
+
+
+@contextmanager
+def output(*paths: Path, force: bool = False) -> Iterator[None]:
+    """Lets files be written in the block that this machine wrote before, or that are new.
+
+    Raises:
+        BadInput: there is one that was not written so, and it is not to be overwritten by `force`.
+    """
+    known = _records().get(_WRITTEN)
+    known = known if isinstance(known, dict) else {}
+    for path in paths:
+        if path.exists() and not path.is_dir() and not force:
+            record = known.get(str(path.resolve()))
+            if record is None or not path.is_file() or record != digest(path):
+                raise BadInput(
+                    f"{path} exists, and hyrl-mj has not written it as it is: give another --out, or --force "
+                    "to overwrite it"
+                )
+    yield
+    now = {str(path.resolve()): digest(path) for path in paths if path.is_file()}
+    kept = {path: value for path, value in known.items() if path not in now} | now
+    _record(_WRITTEN, dict([*kept.items()][-MOST:]))
+
+
+def _digest_of(text: str) -> str:
+    return sha256(text.encode(errors="surrogatepass")).hexdigest()
+
+
+def _texts() -> list[str]:
+    texts = _records().get(_TEXT)
+    return texts if isinstance(texts, list) else []
+
+
+def _record(key: str, value: Any) -> None:
+    """Records a value, unless a file asked for it; without a place for records, nothing is kept."""
+    file, records = store(), _records()
+    if file is None or is_received() or records.get(key) == value:
+        return
+    with suppress(BadInput), replacing(file) as temporary:
+        temporary.write_text(json.dumps(records | {key: value}, indent=2) + "\n", encoding="utf-8")
+
+
+def _records() -> dict[str, Any]:
+    """Returns the hashes of files by path, and of texts; none where the records are missing or damaged."""
     file = store()
     try:
         content = json.loads(file.read_text(encoding="utf-8")) if file else {}

@@ -10,15 +10,12 @@ from pathlib import Path
 
 import pytest
 import unmeasured
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "scripts"))
-
 from attacks import Answer, child, differences
 from attacks.crafted_agents import Payload
 
 from hyrl_mj.errors import BadInput
 
-SCRIPTS = str(Path(__file__).parent.parent / "scripts")
+HERE = str(Path(__file__).parent)
 # Weaknesses that are planted, and the attacks that must find them.
 PLANTED = {
     "crashes": (
@@ -33,7 +30,7 @@ PLANTED = {
 
 
 def attack(*words, weakness=""):
-    code = f"import sys; sys.path.insert(0, {SCRIPTS!r}); import attack\n{weakness}\n"
+    code = f"import sys; sys.path.insert(0, {HERE!r}); import attack\n{weakness}\n"
     return subprocess.run(
         [sys.executable, "-c", f"{code}sys.exit(attack.main())", *words],
         env=unmeasured.environment(),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
@@ -14,13 +15,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from hyrl_mj import trust
+from hyrl_mj import limits, trust
 from hyrl_mj.environments.coordinates import AnyChart
 from hyrl_mj.environments.inspection import CHART, RESET, Given, inspect
-from hyrl_mj.environments.opening import Source
+from hyrl_mj.environments.opening import Source, register
 from hyrl_mj.environments.specification import FORMS
 from hyrl_mj.environments.task import EnvironmentTask
-from hyrl_mj.errors import BadInput, check_seed, unknown
+from hyrl_mj.errors import BadInput, check_seed, described, unknown
 from hyrl_mj.ranges import Integer, refused
 from hyrl_mj.tasks import Task, register_opener
 
@@ -29,6 +30,7 @@ MARK = "env:"
 # The longest episode, and the widest coordinate of a chart [m, rad].
 MOST_STEPS, WIDEST = 1_000_000, 1e6
 _MADE: dict[str, EnvironmentTask] = {}
+SHOWN = 120  # characters of arguments in a message
 
 
 def from_gymnasium(
@@ -71,12 +73,13 @@ def from_gymnasium(
         BadInput: it cannot be used; the message says why.
     """
     given = Given(chart, noisy, success, failure, bounds, steps, starts)
-    _check(given, seed)
-    for name, named in (("kwargs", kwargs), ("reset", reset), ("pinned", pinned)):
-        _check_named(name, named)
-    for name, value in (pinned or {}).items():
-        if not _is_numeric(value):
-            raise refused(f"pinned {name}", value, "a number, or a list of numbers")
+    with described(_shown(env)):
+        _check(given, seed)
+        for name, named in (("kwargs", kwargs), ("reset", reset), ("pinned", pinned)):
+            _check_named(name, named)
+        for name, value in (pinned or {}).items():
+            if not _is_numeric(value):
+                raise refused(f"pinned {name}", value, "a number, or a list of numbers")
     source = Source(env, dict(kwargs or {}), dict(reset or {}), dict(pinned or {}), seed)
     content = {
         "env": env if isinstance(env, str) else {"function": _where(env)}, **vars(given),
@@ -86,10 +89,35 @@ def from_gymnasium(
     told = {key: value for key, value in content.items() if value is not None}
     spec = MARK + json.dumps(told, default=_plain)
     if not isinstance(env, str) or spec not in _MADE:
-        _MADE[spec] = EnvironmentTask(*inspect(source, given), spec)
-    if isinstance(env, str) and (module := _module_of(env)) is not None:
-        trust.remember(module)
+        with described(_shown(env)):
+            if isinstance(env, str) and (kwargs or trust.is_received()):
+                _try(source, spec)
+            _MADE[spec] = EnvironmentTask(*inspect(source, given), spec)
+    if isinstance(env, str):
+        trust.remember_text(spec)
+        if (module := _module_of(env)) is not None:
+            trust.remember(module)
     return _MADE[spec]
+
+
+def _shown(env: Any) -> str:
+    return f"the environment {env[:80]}" if isinstance(env, str) else "the environment"
+
+
+def _try(source: Source, spec: str) -> None:
+    """Makes, resets and steps an environment in a process with limits, unless that was done before."""
+    if trust.is_known_text(spec):
+        return
+    content = json.dumps(vars(source), default=_plain).encode()
+    try:
+        found = limits.tried(Path(__file__).with_name("first_trial.py"), content)
+    except limits.Ended as ended:
+        raise BadInput(
+            f"the environment {source.name} cannot be used: {ended} where it is made, reset and stepped; "
+            "give it other arguments"
+        ) from None
+    if "problem" in found:
+        raise BadInput(found["problem"])
 
 
 def _check(given: Given, seed: Any) -> None:
@@ -174,29 +202,58 @@ def from_spec(spec: str) -> Task:
     Raises:
         BadInput: it was made with a function, which no text holds, or the text is damaged.
     """
-    if spec not in _MADE:
-        try:
-            given = json.loads(spec.removeprefix(MARK))
-            env = given["env"]
-        except (ValueError, TypeError, KeyError):
-            raise BadInput(f"{spec[:80]!r} describes no environment: start a new run") from None
-        if not isinstance(env, str):
-            raise BadInput(
-                f"the environment was made by the function {env.get('function')}, which no file holds: call "
-                "hyrl_mj.from_gymnasium with it first, in the same process"
-            )
+    if spec in _MADE:
+        return _MADE[spec]
+    try:
+        given = json.loads(spec.removeprefix(MARK))
+        env = given["env"]
+    except (ValueError, TypeError, KeyError, RecursionError):
+        raise BadInput(f"{spec[:80]!r} describes no environment: start a new run") from None
+    if not isinstance(env, str):
+        function = env.get("function") if isinstance(env, dict) else env
+        raise BadInput(
+            f"the environment was made by the function {str(function)[:80]}, which no file holds: call "
+            "hyrl_mj.from_gymnasium with it first, in the same process"
+        )
+    with described(_shown(env)):
+        if trust.is_received():
+            _check_received(env, given, spec)
+        return from_gymnasium(**given)
+
+
+def _check_received(env: str, given: Mapping[str, Any], spec: str) -> None:
+    """Raises `BadInput` if a file describes an environment that could run code or open files of its sender.
+
+    What this machine has described by the same text before is allowed, if it is of the same module. Else it
+    is an environment of an installed package, without arguments but numbers and plain words.
+    """
+    if ":" in env:
         module = _module_of(env)
-        if ":" in env and (module is None or not trust.is_known(module)):
-            raise BadInput(
-                f"the environment is {env}, and opening a run imports no module that you have not used "
-                "before, as it is now: if you trust it, use it once, as with "
-                f"hyrl-mj diagnose --explain --env {shlex.quote(env)}"
-            )
-        try:
-            from_gymnasium(**given)
-        except TypeError:
-            raise BadInput(f"{spec[:80]!r} describes no environment: start a new run") from None
-    return _MADE[spec]
+        known = module is not None and trust.is_known(module)
+    else:
+        register(env)
+        known = env in gym.registry
+    if not known or not (trust.is_known_text(spec) or _is_plain(given.get("kwargs"))):
+        args = {name: value for name, value in given.items() if name != "env"}
+        how = f"--env {shlex.quote(env)}"
+        if args:
+            text = json.dumps(args)
+            held = text if len(text) <= SHOWN else "its arguments, which stand in config.json"
+            how += f" --env-args FILE, where FILE holds {held}"
+        raise BadInput(
+            f"the environment is {env}, and opening a run imports no module and gives no names of files "
+            "that you have not used before: if you trust it, use it once, as with "
+            f"hyrl-mj diagnose --explain {how}"
+        )
+
+
+def _is_plain(value: Any) -> bool:
+    """Returns whether an argument holds numbers and plain words only, none of which is the name of a file."""
+    if isinstance(value, str):
+        return re.fullmatch(r"[A-Za-z0-9_ -]{0,40}", value) is not None and not Path(value).exists()
+    if isinstance(value, Mapping):
+        return all(_is_plain(part) for pair in value.items() for part in pair)
+    return value is None or isinstance(value, int | float) or all(map(_is_plain, value))
 
 
 register_opener(MARK, from_spec)

@@ -9,7 +9,7 @@ import io
 import random
 import traceback
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, redirect_stderr, suppress
+from contextlib import contextmanager, nullcontext, redirect_stderr, suppress
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import cache
@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 
-from hyrl_mj import mujoco_log
+from hyrl_mj import mjcf, mujoco_log
 from hyrl_mj.artifacts import digest
 from hyrl_mj.errors import BadInput, brief
 from hyrl_mj.plant import Plant
@@ -135,9 +135,10 @@ def made(source: Source) -> Made:
     """
     mujoco_log.install()  # what MuJoCo warns of while it reads a model is not written to a file
     if isinstance(source.make, str):
-        _register(source.make)
+        register(source.make)
+        own = ":" in source.make  # of a module of the user's, as "my_module:Puck-v0"
         try:
-            with current_folder():  # of the module in an id as "my_module:Puck-v0"
+            with current_folder() if own else nullcontext():
                 env: Any = gym.make(source.make, disable_env_checker=True, **source.kwargs)
         except Exception as error:  # whatever a foreign constructor raises
             raise BadInput(_why_not_made(source.make, error)) from error
@@ -149,6 +150,7 @@ def made(source: Source) -> Made:
                 f"{source.name} cannot be made ({brief(error)}): repair the function"
             ) from error
     physics, plant, steps = _check(env, source.name), _plant_of(env), _steps_of(env)
+    mjcf.check_names(physics[0], source.name)
     return Made(_peeled(env), steps, *physics, plant)
 
 
@@ -163,7 +165,7 @@ def _steps_of(env: gym.Env) -> int | None:
     return int(limit) if np.isfinite(limit) else None
 
 
-def _register(name: str) -> None:
+def register(name: str) -> None:
     """Imports the packages that offer environments, as far as they are installed."""
     if name in gym.registry:
         return

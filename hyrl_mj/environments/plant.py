@@ -53,6 +53,7 @@ class EnvironmentPlant:
         self._truth = np.zeros((n, spec.dimension + spec.columns + 3))
         self._unstable = np.zeros(n, dtype=bool)
         self._open = np.zeros(n, dtype=bool)  # whether the sample has not been observed yet
+        self._places: dict[tuple[int, ...], np.ndarray] = {}
         self._plays = np.zeros(n, dtype=bool)  # whether an instance plays the run
         # Not at once: a plant may be collected while the pool is at work.
         left = self._number, self._processes, self._plays
@@ -143,7 +144,9 @@ class EnvironmentPlant:
 
     def geom_positions(self, ids: Sequence[int]) -> np.ndarray:
         """Returns the positions of geoms that do not move: (1, k, 3) [m]."""
-        return mjcf.geom_positions(self.model, list(ids))[None]
+        if (key := tuple(ids)) not in self._places:
+            self._places[key] = mjcf.geom_positions(self.model, list(ids))[None]
+        return self._places[key]
 
     def set_state(
         self, qpos: np.ndarray, qvel: np.ndarray | None = None, ids: np.ndarray | None = None

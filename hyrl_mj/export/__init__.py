@@ -14,6 +14,6 @@ No library exports NumPy code as it is:
 - jax2onnx 0.17 was not tried: it needs JAX, whose arrays cannot be assigned to.
 """
 
-from hyrl_mj.export.forms import export, export_numpy, export_onnx
+from hyrl_mj.export.forms import export, export_numpy, export_onnx, files_of
 
-__all__ = ["export", "export_numpy", "export_onnx"]
+__all__ = ["export", "export_numpy", "export_onnx", "files_of"]

@@ -129,14 +129,25 @@ def export_onnx(controller: HybridController | Traceable, path: str | Path) -> P
 FORMS: dict[str, Callable[..., Any]] = {"onnx": export_onnx, "numpy": export_numpy}
 
 
+def files_of(form: str, out: Path) -> list[Path]:
+    """Returns the files that `export` writes.
+
+    Raises:
+        BadInput: the form is unknown.
+    """
+    if form not in FORMS:
+        raise unknown("form", form, FORMS)
+    numpy_form = [out / TEMPLATE.name, out / TEMPLATE.with_suffix(".npz").name]
+    return numpy_form if form == "numpy" else [out]
+
+
 def export(controller: HybridController | Traceable, form: str, out: Path) -> None:
     """Writes a controller in one of `FORMS`.
 
     Raises:
         BadInput: the form is unknown, or the errors of `export_numpy` and `export_onnx`.
     """
-    if form not in FORMS:
-        raise unknown("form", form, FORMS)
+    files_of(form, out)
     FORMS[form](controller, out)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -128,7 +129,7 @@ def _content(path: Path) -> Any:
         return json.loads(content.decode(), object_pairs_hook=_once)
     except _Repeated as error:
         raise BadInput(
-            f"{path} has the key {error.args[0]!r} twice in a row: give it once"
+            f"{path} has the key {error.args[0][:SHOWN]!r} twice in a row: give it once"
         ) from None
     except (ValueError, RecursionError) as error:
         raise BadInput(
@@ -143,8 +144,8 @@ class _Repeated(Exception):
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     content = dict(pairs)
     if len(content) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise _Repeated(next(name for name in names if names.count(name) > 1))
+        counts = Counter(name for name, _ in pairs)
+        raise _Repeated(next(name for name, count in counts.items() if count > 1))
     return content
 
 

@@ -28,9 +28,14 @@ GB = 10**9
 Tell = Callable[[Row, str], None]
 
 
-def make(row: Row, options: RunOptions, share: int, journal: Any = None) -> Row:
-    """Does a run with a share of the cores; returns its row with the time that it took, or its error."""
+def make(row: Row, options: RunOptions, share: int, journal: Any = None, folder: str = "") -> Row:
+    """Does a run with a share of the cores; returns its row with the time that it took, or its error.
+
+    `folder` is where the user gave the command, if that is on this machine.
+    """
     began = time.monotonic()
+    if folder and os.path.isdir(folder):
+        os.chdir(folder)
     cores.allowed = share
 
     def say(text: str) -> None:
@@ -91,7 +96,8 @@ def work(
     journal = ray.remote(Journal).options(num_cpus=0, max_restarts=-1, max_task_retries=-1).remote()
     remote = ray.remote(make).options(num_cpus=share, memory=int(memory * GB), max_retries=DEATHS)
     rows = {row.name: row for row, _ in jobs}
-    pending = {remote.remote(row, options, share, journal): row for row, options in jobs}
+    here = os.getcwd()
+    pending = {remote.remote(row, options, share, journal, here): row for row, options in jobs}
     try:
         while pending:
             done, _ = ray.wait([*pending], num_returns=len(pending), timeout=POLL)
@@ -158,7 +164,10 @@ def _start(ray: Any, address: str | None) -> None:
     else:
         quiet |= {"num_cpus": cores.count(), "include_dashboard": False}
         quiet |= {"object_store_memory": 100 * 2**20}
+    here = os.getcwd()
     try:
+        # Ray's processes begin where this one is, and import what lies there before all that is installed.
+        os.chdir(os.path.abspath(os.sep))
         ray.init(address or "local", **quiet)
     except Exception as error:  # Ray has many
         if address is not None:
@@ -167,6 +176,8 @@ def _start(ray: Any, address: str | None) -> None:
             f"Ray cannot start on this machine ({brief(error)}): see to it that there is room in "
             "the folder for temporary files, or make the runs one by one with hyrl-mj run"
         ) from error
+    finally:
+        os.chdir(here)
     host = ray.util.get_node_ip_address()
     if address is None and host not in ("127.0.0.1", "::1"):
         raise BadInput(
@@ -189,7 +200,15 @@ def _check_address(address: str) -> None:
     except (OSError, OverflowError, ValueError) as error:
         raise _no_answer(address, brief(error)) from error
     # Whether the versions are the same is said when Ray connects.
-    words = [sys.executable, "-m", "ray.scripts.scripts", "health-check", "--address", address]
+    words = [
+        sys.executable,
+        "-P",
+        "-m",
+        "ray.scripts.scripts",
+        "health-check",
+        "--address",
+        address,
+    ]
     try:
         left = PATIENCE - (time.monotonic() - began)
         subprocess.run(

@@ -98,6 +98,8 @@ def sb3_class(name: str) -> type[BaseAlgorithm]:
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
     module, _, attribute = name.rpartition(":")
+    if trust.is_received():
+        check_named(name)
     if name in ALGORITHMS:
         module, attribute = "stable_baselines3", name.upper()
     try:
@@ -135,7 +137,10 @@ def check_named(name: str) -> None:
 def _source(name: str) -> Path | None:
     """Returns the file of the top-level module of a `module:Class`, without an import of it."""
     top = name.partition(":")[0].partition(".")[0]
-    spec = PathFinder.find_spec(top, ["", *sys.path]) if name not in ALGORITHMS and top else None
+    if name in ALGORITHMS or not top:
+        return None
+    with trust.current_folder():
+        spec = PathFinder.find_spec(top, sys.path)
     return Path(spec.origin) if spec and spec.origin else None
 
 

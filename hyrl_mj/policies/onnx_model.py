@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hyrl_mj import artifacts
+from hyrl_mj import artifacts, limits
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.policies.functions import FunctionPolicy, preferred_levels
 from hyrl_mj.tasks import Task
@@ -21,8 +17,8 @@ from hyrl_mj.tasks import Task
 LARGEST = 2**25
 # Rows that a model answers at a time: so many as were tried.
 ROWS = 1024
-# The longest that the trial may last [s], whose model may use the processor for four.
-LONGEST = 60
+# The longest that the trial may last [s], of which its model may use the processor; and its memory [bytes].
+LONGEST, SECONDS, MEMORY = 60, 4, 200 * 2**20
 INSTEAD = "in Python, give a function of your own that runs it"
 
 
@@ -80,37 +76,17 @@ def _examined(model: bytes, columns: int) -> dict[str, Any]:
         BadArtifact: it is not to be run.
         ValueError: it is no model.
     """
-    trial = Path(__file__).with_name("onnx_trial.py")
-    # Without the folder of the script on the path, whose modules are not meant for it.
-    command = [sys.executable, "-P", str(trial), str(columns), str(ROWS)]
-    one_thread = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    trial, shape = Path(__file__).with_name("onnx_trial.py"), (str(columns), str(ROWS))
+    most = {"seconds": SECONDS, "longest": LONGEST, "memory": MEMORY}
     try:
-        run = subprocess.run(
-            command, input=model, capture_output=True, timeout=LONGEST, env=os.environ | one_thread
-        )
-    except subprocess.TimeoutExpired:
-        raise BadArtifact(f"it takes longer than {LONGEST} s for {ROWS} observations") from None
-    try:
-        found = json.loads(run.stdout)
-    except ValueError:
-        raise BadArtifact(_end(run)) from None
+        found = limits.tried(trial, model, *shape, **most)
+    except limits.Ended as ended:
+        raise BadArtifact(f"for {ROWS} observations {ended}; {INSTEAD}") from None
     if "error" in found:
         raise ValueError(found["error"])
     if "problem" in found:
         raise BadArtifact(f"{found['problem']}; {INSTEAD}")
     return dict(found)
-
-
-def _end(run: subprocess.CompletedProcess[bytes]) -> str:
-    """Returns why the trial ended without a result."""
-    import signal
-
-    if run.returncode == -getattr(signal, "SIGXCPU", 0):
-        return f"it takes longer than 4 s for {ROWS} observations; {INSTEAD}"
-    if run.returncode < 0:
-        return f"it makes onnxruntime crash, or needs more than 200 MB of memory; {INSTEAD}"
-    last = run.stderr.decode(errors="replace").strip().rpartition("\n")[2]
-    return f"it could not be tried ({last[:160]}): check the packages onnx and onnxruntime"
 
 
 def _check_input(inputs: list[list[Any]], task: Task, k: int) -> bool:

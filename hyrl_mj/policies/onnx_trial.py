@@ -1,22 +1,20 @@
 """A program that examines and tries an ONNX model within limits of time and memory; see `onnx_model`.
 
-It runs in a process of its own, `python onnx_trial.py COLUMNS ROWS < model`, and writes a JSON object: the
-`inputs` and `outputs` of the model, or the `problem` because of which it is refused, or an `error` of the
-reader.
+It runs in a process of its own, `python onnx_trial.py SECONDS MEMORY COLUMNS ROWS < model`, and writes a JSON
+object: the `inputs` and `outputs` of the model, or the `problem` because of which it is refused, or an
+`error` of the reader.
 """
 
 import json
-import math
+import runpy
 import sys
-import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
 import onnxruntime
 
-# More than this is not needed for a policy: seconds of the processor, and bytes.
-SECONDS, MEMORY = 4, 200 * 2**20
 SINGLY = 32  # calls of a model that takes one observation at a time
 # A policy is made of these operators. Others repeat, branch, draw, read files, or belong to a vendor.
 OPERATORS = {
@@ -45,23 +43,6 @@ SIZES = {
 
 class Refused(Exception):
     """The model is not run."""
-
-
-def limit() -> None:
-    """Limits the time and the memory of this process from now on, where the system can."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return
-    soft = math.ceil(time.process_time()) + SECONDS
-    resource.setrlimit(resource.RLIMIT_CPU, (soft, soft + 1))
-    try:
-        with open("/proc/self/status", encoding="ascii") as status:
-            (used,) = (line.split()[1] for line in status if line.startswith("VmData"))
-    except OSError:  # macOS
-        return
-    most = int(used) * 1024 + MEMORY
-    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
 
 
 def check(model: onnx.ModelProto) -> None:
@@ -155,21 +136,22 @@ def _is_float(answers: np.ndarray) -> bool:
 
 
 def main() -> None:
-    columns, rows = map(int, sys.argv[1:])
+    seconds, memory, columns, rows = map(int, sys.argv[1:])
     content = sys.stdin.buffer.read()
-    limit()
+    limits = runpy.run_path(str(Path(__file__).parents[1] / "limits.py"))
+    limits["limit"](seconds, memory)
     result: dict[str, Any]
     try:
         result = examine(content, columns, rows)
     except Refused as refused:
         result = {"problem": str(refused)}
     except MemoryError:
-        result = {"problem": f"it needs more than {MEMORY >> 20} MB of memory"}
+        result = {"problem": f"it needs more than {memory >> 20} MB of memory"}
     except Exception as error:  # of the readers, whose errors are of many kinds
         text = " ".join(str(error).split())
         result = {"error": f"{type(error).__name__}: {text[:160]}"}
         if "alloc" in text.lower():
-            result = {"problem": f"it needs more than {MEMORY >> 20} MB of memory"}
+            result = {"problem": f"it needs more than {memory >> 20} MB of memory"}
     json.dump(result, sys.stdout)
 
 

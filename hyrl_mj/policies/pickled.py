@@ -139,7 +139,8 @@ def arrays(content: bytes) -> dict[str, np.ndarray]:
         found = read(content)
         entries = found.items if isinstance(found, Call) and found.items else found
         named = entries if isinstance(entries, list) else [("", found)]
-        values = {str(name): _array(value) for name, value in named}
+        # Only texts are names: others can be nested so that they have no end.
+        values = {name: _array(value) for name, value in named if isinstance(name, str)}
     except Exception:  # a damaged pickle may raise any error
         return {}
     return {name: value for name, value in values.items() if value is not None}
@@ -159,5 +160,9 @@ def _array(found: Any) -> np.ndarray | None:
     else:
         return None
     text, swapped = kind.arguments[0], kind.state[1]
+    if not (isinstance(text, str) and isinstance(swapped, str) and isinstance(data, bytes)):
+        return None
+    if not (isinstance(shape, tuple) and all(isinstance(side, int) for side in shape)):
+        return None
     numbers = np.frombuffer(data, dtype=np.dtype(text).newbyteorder(swapped))
     return numbers.reshape(shape, order=order) if numbers.dtype.kind in "biuf" else None

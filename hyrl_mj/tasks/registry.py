@@ -110,6 +110,13 @@ def get_task(name: str | Path | Task) -> Task:
         if str(name).startswith(mark):
             return opener(str(name))
     if str(name).endswith(".py"):
+        path = Path(name)
+        if path.resolve() not in _FILES and not trust.allows(path):
+            raise BadInput(
+                f"the task is defined in {path}, and opening a run executes no file that you have not run "
+                "before, as it is now: if you trust the file, name it with --task FILE, in Python with "
+                "load_run(path, task=FILE)"
+            )
         task = _instance(_from_file(Path(name)), str(name))
         trust.remember(Path(name))
         return task
@@ -132,19 +139,14 @@ def reference(task: Task) -> str:
 def described_task(name: str) -> Task:
     """Returns the task that a file of a run names, by `reference`; code of unknown origin does not run.
 
-    A task's file is executed only if the user has named it, in this process or before on this machine.
+    A task's file is executed only if the user has named it, in this process or before on this machine, and
+    so are modules and arguments of environments.
 
     Raises:
         BadInput: there is no such task, or it is in a file that the user has not named.
     """
-    path = Path(name)
-    if name.endswith(".py") and path.resolve() not in _FILES and not trust.is_known(path):
-        raise BadInput(
-            f"the task is defined in {path}, and opening a run executes no file that you have not run "
-            "before, as it is now: if you trust the file, name it with --task FILE, in Python with "
-            "load_run(path, task=FILE)"
-        )
-    return get_task(name)
+    with trust.received():
+        return get_task(name)
 
 
 def _offered() -> dict[str, EntryPoint]:

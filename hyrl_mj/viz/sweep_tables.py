@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -122,8 +123,13 @@ def worst(group: Iterable[Row]) -> Row | None:
 
 def markdown(table: Table) -> str:
     """Returns a table to paste as Markdown."""
-    lines = [table.headings, ["---"] * len(table.headings), *table.rows]
-    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
+    lines = [_escaped(table.headings), ["---"] * len(table.headings), *map(_escaped, table.rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _escaped(cells: Iterable[object]) -> list[str]:
+    """Returns cells that hold no Markdown: no column, no link and no element of HTML."""
+    return [re.sub(r"([\\|\[\]<>`])", r"\\\1", str(cell)) for cell in cells]
 
 
 def print_sweep(sweep: Sweep) -> None:

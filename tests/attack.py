@@ -1,8 +1,8 @@
 """Attacks hyrl_mj: crashes, kills, damaged and crafted files, wrong settings and tasks, rivals, bad machines.
 
-    python scripts/attack.py                        # all of it, under ten minutes on two cores
-    python scripts/attack.py --short                # a sample of each attack
-    python scripts/attack.py --only received --match zip --seed 3
+    python tests/attack.py                        # all of it, under ten minutes on two cores
+    python tests/attack.py --short                # a sample of each attack
+    python tests/attack.py --only received --match zip --seed 3
 
 Prints for each attack how many trials were made, survived and broke, and a line about each trial that broke;
 the exit status is 1 if any did.
@@ -33,6 +33,7 @@ from attacks import (
     configurations,
     crashes,
     damage,
+    doors,
     kills,
     received,
     small,
@@ -70,6 +71,7 @@ ATTACKS = {
     "kills": Attack("killed at a random moment, then resumed", kills.trials, 50, 1),
     "artifacts": Attack("truncated, or one bit flipped", damage.trials, 80, 6),
     "received": Attack("crafted files of a stranger", received.trials, 60, 6),
+    "doors": Attack("generated descriptions of a stranger", doors.trials, 600, 24),
     "configurations": Attack(
         "one setting changed, through every stage", configurations.trials, 200, 12
     ),

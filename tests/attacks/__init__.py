@@ -1,4 +1,4 @@
-"""What `scripts/attack.py` tries, a file for each attack, and how a trial runs in a process of its own.
+"""What `tests/attack.py` tries, a file for each attack, and how a trial runs in a process of its own.
 
 Everything is imported once. Each trial forks, so that it costs no import, leaves nothing behind, and its
 memory is its own.

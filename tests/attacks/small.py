@@ -2,7 +2,7 @@
 
 As a program it is `hyrl-mj` with such runs, for surroundings that only a new process can have:
 
-    python scripts/attacks/small.py run unit_circle --preset smoke
+    python tests/attacks/small.py run unit_circle --preset smoke
 """
 
 import os

@@ -1,0 +1,32 @@
+"""A program that compiles and steps an MJCF file within limits of time and memory; see `mjcf.load`.
+
+It runs in a process of its own, `python mjcf_trial.py SECONDS MEMORY FILE`, and writes a JSON object: empty,
+or with the `problem` because of which the file is refused.
+"""
+
+import json
+import runpy
+import sys
+from pathlib import Path
+
+import mujoco
+
+
+def main() -> None:
+    seconds, memory, path = sys.argv[1:]
+    limits = runpy.run_path(str(Path(__file__).with_name("limits.py")))
+    limits["limit"](int(seconds), int(memory))
+    result = {}
+    try:
+        model = mujoco.MjModel.from_xml_path(path)
+    except ValueError as error:
+        result["problem"] = f"MuJoCo cannot compile it: {' '.join(str(error).split())[:300]}"
+    else:
+        data = mujoco.MjData(model)
+        for _ in range(2):
+            mujoco.mj_step(model, data)
+    json.dump(result, sys.stdout)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,302 @@
+"""What a stranger wrote runs no code, takes no more than its share, and overwrites nothing."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+import time
+from random import Random
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from attacks import doors
+
+import hyrl_mj
+from hyrl_mj import mjcf, trust
+from hyrl_mj.chart import Chart
+from hyrl_mj.environments import from_gymnasium
+from hyrl_mj.environments.making import MARK, from_spec
+from hyrl_mj.errors import LONGEST, BadInput
+from hyrl_mj.fields import read_field
+from hyrl_mj.fields.driving import Driving
+from hyrl_mj.policies import pickled
+from hyrl_mj.sweeps import Common, Row, Setting, Sweep
+from hyrl_mj.tasks import get_task
+from hyrl_mj.viz.sweep_tables import markdown
+from hyrl_mj.viz.tables import Table
+
+CIRCLE = "hyrl_mj/UnitCircle-v0"
+
+
+def spec_of(env, **given):
+    return MARK + json.dumps({"env": env, **given})
+
+
+def code(folder, name="notes.py"):
+    """A file of code that leaves a file behind when it runs."""
+    path = folder / name
+    path.write_text(f"open({str(folder / 'executed')!r}, 'w').close()\n")
+    return path
+
+
+def refusal(work):
+    """The sentence with which something is refused."""
+    with pytest.raises(BadInput) as error:
+        work()
+    sentence = str(error.value)
+    assert len(sentence) <= LONGEST + 10
+    assert sentence.isprintable()
+    return sentence
+
+
+# ---- what a file describes
+
+
+@pytest.mark.parametrize(
+    ("env", "given"),
+    [
+        (CIRCLE, {"kwargs": {"task": "notes.py"}}),
+        (CIRCLE, {"kwargs": {"task": spec_of(CIRCLE, kwargs={"task": "notes.py"})}}),
+        ("Reacher-v5", {"kwargs": {"xml_file": "robot.xml"}}),
+        ("Reacher-v5", {"kwargs": {"xml_file": "robot"}}),
+        ("notes:Env-v0", {}),
+        ("notes", {}),
+        ("Reacher-v5", {"kwargs": {"noise": ["a/b"]}}),
+    ],
+)
+def test_a_received_environment_runs_no_code_and_opens_no_file(env, given, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = code(tmp_path)
+    (tmp_path / "robot").write_text("<mujoco/>")
+    with trust.received():
+        sentence = refusal(lambda: get_task(spec_of(env, **given)))
+    assert "hyrl-mj diagnose --explain --env" in sentence
+    assert not (tmp_path / "executed").exists()
+    assert not trust.is_known(path)
+
+
+def test_an_environment_that_a_file_names_gets_no_task_of_another_file(tmp_path):
+    path = code(tmp_path)
+    with trust.received():
+        assert "executes no file" in refusal(lambda: gym.make(CIRCLE, task=str(path)))
+    assert not (tmp_path / "executed").exists()
+
+
+def test_what_this_machine_has_described_opens_again(monkeypatch):
+    spec = spec_of(CIRCLE, kwargs={"task": "unit_circle"}, steps=17, seed=3)
+    with trust.received():
+        task = from_spec(spec)  # plain words
+    assert task.max_steps == 17
+    assert not trust.is_known_text(task.spec)
+    own = from_gymnasium(CIRCLE, kwargs={"task": "unit_circle", "camera": None}, steps=18)
+    assert trust.is_known_text(own.spec)
+    monkeypatch.setattr("hyrl_mj.environments.making._MADE", {})
+    with trust.received():
+        assert from_spec(own.spec).max_steps == 18
+
+
+def test_what_a_file_asks_for_is_not_recorded(tmp_path):
+    path = tmp_path / "code.py"
+    path.write_text("")
+    with trust.received():
+        trust.remember(path)
+        trust.remember_text("text")
+    assert not trust.is_known(path)
+    assert not trust.is_known_text("text")
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"pinned": {"qpos[²]": 1}},
+        {"pinned": {"core": 1}},
+        {"pinned": {"__class__": 1}},
+        {"reset": {"z": [1, [2]]}},
+        {"pinned": {"qpos[0]": doors.DIGITS}},
+        {"noisy": [10**400]},
+        {"bounds": {"theta": [0, float("inf")]}},
+        {"chart": {"\x1b[31m": "theta"}},
+        {"chart": ["a" * 3_000_000]},
+        {"success": "(" * 5_000},
+        {"success": "a" * 100_000},
+        {"kwargs": {"\x1b": 1}},
+        {"steps": 10**400},
+        {"seed": -(10**400)},
+    ],
+)
+def test_an_argument_that_is_none_is_one_sentence(given):
+    refusal(lambda: from_gymnasium(CIRCLE, **given))
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"env":', "null", '{"env": {"a": 1}}', "[]", "1"])
+def test_a_damaged_description_is_one_sentence(text):
+    refusal(lambda: get_task(MARK + text))
+
+
+# ---- limits
+
+
+@pytest.mark.parametrize("name", doors.MODELS)
+def test_a_hostile_model_is_one_sentence(name, tmp_path, monkeypatch):
+    monkeypatch.setattr(doors, "MODELS", {name: doors.MODELS[name]})
+    path = doors._written(Random(0), tmp_path)
+    began = time.monotonic()
+    refusal(lambda: mjcf.load(path))
+    assert time.monotonic() - began < doors.LONGEST
+
+
+def test_a_model_of_the_users_own_is_tried_once(tmp_path, monkeypatch):
+    path = tmp_path / "robot.xml"
+    path.write_text("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+    assert mjcf.load(path).ngeom == 1
+    monkeypatch.setattr("hyrl_mj.limits.tried", None)  # not called again
+    mjcf.load.cache_clear()
+    assert mjcf.load(path).ngeom == 1
+
+
+def test_an_environment_of_a_hostile_model_is_one_sentence(tmp_path):
+    path = tmp_path / "robot.xml"
+    path.write_text(f"<mujoco>{doors.MODELS['attaches itself']}</mujoco>")
+    sentence = refusal(lambda: from_gymnasium("Reacher-v5", kwargs={"xml_file": str(path)}))
+    assert "crash" in sentence
+
+
+def test_an_environment_that_never_ends_a_step_is_one_sentence():
+    sentence = refusal(lambda: from_gymnasium("Reacher-v5", kwargs={"frame_skip": 10**9}))
+    assert "takes longer than" in sentence
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_nested_pickle_takes_no_time(seed):
+    began = time.monotonic()
+    found = pickled.arrays(doors._pickle(Random(seed)))
+    assert all(isinstance(value, np.ndarray) for value in found.values())
+    assert time.monotonic() - began < 5
+
+
+# ---- modules in the current folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "words", [("doctor",), ("diagnose", "--env", "Reacher-v5"), ("list",), ("report", ".")]
+)
+def test_nothing_is_imported_from_the_current_folder(words, tmp_path):
+    for name in doors.MODULES:
+        code(tmp_path, f"{name}.py")
+    program = "import sys; from hyrl_mj.cli import main; sys.argv[0] = 'hyrl-mj'; main()"
+    subprocess.run(
+        [sys.executable, "-P", "-c", program, *words],
+        cwd=tmp_path,
+        capture_output=True,
+        check=False,
+    )
+    assert not (tmp_path / "executed").exists()
+
+
+def test_a_module_that_the_user_names_comes_last(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    before = [*sys.path]
+    with trust.current_folder():
+        assert sys.path == [*before, ""]
+    assert sys.path == before
+
+
+# ---- fields
+
+
+@pytest.mark.parametrize("radius", [1e-9, 0.01, 0.02, 0.04, 300.0])
+@pytest.mark.parametrize(
+    ("post", "start"), [((3, 0), (-6, 0)), ((200, 0), (-6, 0)), ((3, 1), (-300, 0))]
+)
+def test_a_field_at_its_limits_can_be_drawn(radius, post, start, tmp_path):
+    path = tmp_path / "field.json"
+    content = {
+        "goal_m": [0, 0],
+        "posts": [{"radius_m": radius, "positions_m": [post]}],
+        "starts": [{"position_m": start, "heading_rad": 0}],
+    }
+    path.write_text(json.dumps(content))
+    field = read_field(path)
+    task = Driving(get_task("field"), field.layouts, time=field.time, starts=field.starts)
+    assert task.model.ncam >= 1
+
+
+def test_many_keys_twice_take_no_time(tmp_path):
+    path = tmp_path / "field.json"
+    path.write_text("{" + ",".join(f'"k{i % 20_000}": 1' for i in range(40_000)) + "}")
+    began = time.monotonic()
+    assert "'k0' twice" in refusal(lambda: read_field(path))
+    assert time.monotonic() - began < 5
+
+
+# ---- what is shown and written
+
+
+def test_a_name_controls_no_terminal():
+    for names, units in ((("\x1b[31mx",), ("m",)), (("x",), ("\x07",)), (("x" * 81,), ("m",))):
+        refusal(lambda names=names, units=units: Chart(names, units, (0.0,), (1.0,), (False,)))
+
+
+def test_a_sweep_holds_no_formula(tmp_path):
+    texts = ["=1+1", "+1+1", "-1+cmd", "@SUM(1)"]
+    rows = [Row(Setting(t, "", 0.1), 0, "stopped", t, t, 1.0, {}) for t in texts]
+    Sweep(Common("fast", None, {}), tuple(rows)).write_csv(tmp_path)
+    with (tmp_path / "sweep.csv").open(encoding="utf-8") as file:
+        cells = [cell for row in csv.reader(file) for cell in row]
+    assert [c for c in cells if c.startswith(("=", "+", "-", "@"))] == []
+    assert "'=1+1" in cells
+
+
+def test_a_table_in_markdown_holds_no_other_column_link_or_element():
+    text = markdown(Table("", ["a"], [["x | y"], ["[x](javascript:1)"], ["<img src=x>"]]))
+    assert text.splitlines()[2:] == [
+        r"| x \| y |",
+        r"| \[x\](javascript:1) |",
+        r"| \<img src=x\> |",
+    ]
+
+
+def test_a_long_sentence_is_cut_in_the_middle():
+    text = str(BadInput(f"begin {'x' * 3_000_000} end"))
+    assert text.startswith("begin x")
+    assert text.endswith("x end")
+    assert len(text) <= LONGEST + 10
+
+
+def test_what_was_not_written_here_is_not_overwritten(tmp_path):
+    path = tmp_path / "page.html"
+    with trust.output(path):
+        path.write_text("ours")
+    with trust.output(path):  # as it was written
+        path.write_text("ours again")
+    path.write_text("theirs")
+    with pytest.raises(BadInput, match="--force"), trust.output(path):
+        raise AssertionError
+    with trust.output(path, force=True):
+        path.write_text("ours")
+    assert path.read_text() == "ours"
+
+
+@pytest.mark.slow
+def test_export_overwrites_no_file_of_a_run(tmp_path):
+    run = hyrl_mj.run(
+        "unit_circle", out=tmp_path / "run", preset="smoke", set={"stage1.samples": 8192, "lattice": 130}
+    )  # fmt: skip
+    before = (run.path / "config.json").read_bytes()
+    words = ("export", str(run.path), "--to", "onnx", "--out", str(run.path / "config.json"))
+    done = subprocess.run(
+        [sys.executable, "-m", "hyrl_mj.cli", *words], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert "--force" in done.stderr
+    assert (run.path / "config.json").read_bytes() == before
+
+
+def test_a_file_without_an_end_is_not_read(tmp_path):
+    os.mkfifo(tmp_path / "fifo")
+    with pytest.raises(BadInput, match="no MJCF model"):
+        mjcf.load(tmp_path / "fifo")
+    assert not trust.is_known(tmp_path / "fifo")
