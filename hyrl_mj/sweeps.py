@@ -194,8 +194,8 @@ class Sweep:
                 values = [row.seed, row.state, row.verdict, f"{row.seconds:.1f}"]
                 found = [row.figures.get(name) for name in names]
                 cells = ["" if value is None else f"{value:.6g}" for value in found]
-                cells = [*asdict(row.setting).values(), *values, *cells, row.sentence]
-                writer.writerow([_plain(cell) for cell in cells])
+                whole = [*asdict(row.setting).values(), *values, *cells, row.sentence]
+                writer.writerow([_plain(cell) for cell in whole])
 
     def groups(self) -> dict[Setting, list[Row]]:
         """Returns the rows by setting."""

@@ -128,6 +128,7 @@ def main() -> int:
     parser.add_argument("--only", help=f"some of {','.join(ATTACKS)}")
     parser.add_argument("--match", default="", help="only trials whose name contains this")
     parser.add_argument("--short", action="store_true", help="a sample of each attack")
+    parser.add_argument("--count", type=int, help="trials of each attack, before --match")
     parser.add_argument("--seed", type=int, default=0, help="seed of all random numbers")
     parser.add_argument("--verbose", action="store_true", help="name each trial on standard error")
     options = parser.parse_args()
@@ -144,7 +145,7 @@ def main() -> int:
         material = Material(folder)
         for name in chosen:
             attack = ATTACKS[name]
-            count = attack.short if options.short else attack.count
+            count = options.count or (attack.short if options.short else attack.count)
             trials = attack.trials(material, Random(f"{options.seed} {name}"), count)
             UNDER_WAY.extend((name, trial) for trial in trials if options.match in trial.name)
         with multiprocessing.get_context("fork").Pool(PROCESSES) as pool:

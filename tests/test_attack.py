@@ -27,6 +27,24 @@ PLANTED = {
     ),
     "artifacts": "from hyrl_mj.manifest import Manifest; Manifest.checked = lambda self, path: path",
 }
+# Mends that are taken out, and how many generated descriptions are drawn, some of which must find it.
+OPENED = {
+    "spec": (60, "from hyrl_mj import trust; trust.is_received = lambda: False"),
+    "agent": (
+        90,
+        "from hyrl_mj.policies import pickled\n"
+        "pickled.arrays = lambda content: {str(name): None for name, _ in pickled.read(content)}",
+    ),
+    "field": (
+        90,
+        "from hyrl_mj.fields import files\n"
+        "def once(pairs):\n"
+        "    names = [name for name, _ in pairs]\n"
+        "    raise files._Repeated(max(names, key=names.count))\n"
+        "files._once = once",
+    ),
+    "arguments": (180, "from hyrl_mj import errors; errors.LONGEST = 10**9"),
+}
 
 
 def attack(*words, weakness=""):
@@ -52,6 +70,16 @@ def test_a_planted_weakness_is_found(name):
     answer = attack("--short", "--only", name, weakness=PLANTED[name])
     assert answer.returncode == 1, answer.stdout + answer.stderr
     assert f"{name}: " in answer.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", OPENED)
+def test_a_door_that_is_opened_again_is_found(kind):
+    count, weakness = OPENED[kind]
+    words = ("--only", "doors", "--match", kind, "--seed", "1", "--count", str(count))
+    answer = attack(*words, weakness=weakness)
+    assert answer.returncode == 1, answer.stdout + answer.stderr
+    assert f"doors: {kind}" in answer.stdout
 
 
 # ---- one process

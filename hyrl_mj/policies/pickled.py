@@ -160,7 +160,9 @@ def _array(found: Any) -> np.ndarray | None:
     else:
         return None
     text, swapped = kind.arguments[0], kind.state[1]
-    if not (isinstance(text, str) and isinstance(swapped, str) and isinstance(data, bytes)):
+    if not isinstance(text, str) or swapped not in ("<", ">", "|", "="):
+        return None
+    if not isinstance(data, bytes | bytearray):
         return None
     if not (isinstance(shape, tuple) and all(isinstance(side, int) for side in shape)):
         return None

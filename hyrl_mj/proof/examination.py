@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from itertools import islice
 from typing import Any
 
@@ -141,8 +142,9 @@ def _replays(
         for name, controller in controllers.items()
         if (plan := Replays.of_score(certificate, name, controller, scores[name][-1]))
     ]
-    calls = [(certificate.game.task, batch) for plan in plans for batch in plan.batches]
-    played = _in_threads("replays", play, calls)
+    task, batches = certificate.game.task, [batch for plan in plans for batch in plan.batches]
+    # One after the other: the physics takes all cores, and the rest holds the interpreter's lock.
+    played = map(partial(play, task), progress_bar(batches, "replays", "games", len(batches)))
     return tuple(plan.count(list(islice(played, len(plan.batches)))) for plan in plans)
 
 

@@ -132,8 +132,7 @@ def play(task: Task, batch: Batch) -> Played:
     Raises:
         BadInput: the plant did not do what plain MuJoCo does.
     """
-    # Batches are played side by side: more threads for each would only wait for the others'.
-    plant = task.plant(len(batch.z0), threads=1)
+    plant = task.plant(len(batch.z0))
     for steps in dict.fromkeys((batch.steps, None)):
         settings = LoopSettings(steps, record=True, states=False, plant=plant, quiet=True)
         run = closed_loop(

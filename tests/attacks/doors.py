@@ -5,6 +5,7 @@ None may run code, import what lies in the current folder, end in a traceback, o
 
 import json
 import os
+import sys
 from base64 import b64encode
 from collections.abc import Callable
 from functools import partial
@@ -14,7 +15,7 @@ from typing import Any
 
 from attacks import MARKER, Trial, child, command, crafted_agents, limited
 from attacks.crafted_runs import evil
-from attacks.forgery import content_of, setting, write
+from attacks.forgery import setting, write
 from attacks.material import TASK, Material
 
 # Limits on what is refused: seconds of the processor, and memory in MB; and in all for what is tried in a
@@ -33,7 +34,7 @@ MODULES = (
 )
 ESCAPE = "\x1b]0;owned\x07"
 IDS = (
-    "hyrl_mj/UnitCircle-v0", "hyrl_mj/Vehicle-v0", "Reacher-v5", "Ant-v5", "Pusher-v5", "CartPole-v1",
+    *4 * ("hyrl_mj/UnitCircle-v0", "hyrl_mj/Vehicle-v0", "Reacher-v5", "Ant-v5"), "CartPole-v1",
     "evil:Env-v0", "evil:UnitCircle-v0", "os:Env-v0", "evil", "", ".", "../evil", "a" * 5_000, ESCAPE,
     "hyrl_mj/UnitCircle-v0 ", "evil.sub:Env-v0", ":Env-v0", "evil:hyrl_mj/UnitCircle-v0",
 )  # fmt: skip
@@ -248,7 +249,7 @@ def _agent(seed: int, folder: Path) -> str:
     draw = Random(seed)
     keys = ("_last_obs", "_last_original_obs", "observation_space", "action_space")
     pickled = {":type:": "x", ":serialized:": b64encode(_pickle(draw)).decode()}
-    data = {"num_timesteps": 1_000, draw.choice(keys): pickled}
+    data = {"num_timesteps": 1_000, **dict.fromkeys(draw.sample(keys, 3), pickled)}
     name = crafted_agents.write_zip(folder, data=data)
     words = ("diagnose", TASK, "--policy", name, "--preset", "smoke", "--out", "out")
     return _broke(command(*words), folder)
@@ -307,8 +308,9 @@ def _field(seed: int, folder: Path) -> str:
             local = get_task("field")
             drive = Driving(local, field.layouts, time=field.time, starts=field.starts)
             assert drive.model is not None
-        except BadInput:
-            pass
+        except BadInput as error:
+            print(f"hyrl-mj: {error}", file=sys.stderr)
+            sys.exit(2)
 
     (folder / "field.json").write_text(text, encoding="utf-8")
     return _broke(work, folder)
@@ -325,13 +327,13 @@ def _sweep(material: Material, seed: int, folder: Path) -> str:
         "[x](javascript:alert(1))", "env:{}", "../..", f"env:{json.dumps({'env': 'evil:X-v0'})}",
     )  # fmt: skip
     setting(path, "task", draw.choice(texts))
-    row = {
+    row: dict[str, Any] = {
         "setting": {"task": draw.choice(texts), "algorithm": draw.choice(texts), "eps": 0.1},
         "seed": 0, "state": draw.choice(("done", "stopped")), "verdict": draw.choice(texts),
         "sentence": draw.choice(texts), "seconds": 1.0, "figures": {draw.choice(texts): 1.0},
     }  # fmt: skip
-    sweep = folder / "sweep" / "sweep.json"
-    write(sweep, {"common": content_of(path / "config.json"), "rows": [row]})
+    common = {"preset": "fast", "horizon": None, "set": {}, "everywhere": False}
+    write(folder / "sweep" / "sweep.json", {"common": common, "rows": [row]})
     broke = _broke(command("sweep", "--report", "sweep"), folder)
     page = folder / "sweep" / "sweep.html"
     if not broke and page.exists() and "<img src=x" in page.read_text(encoding="utf-8"):

@@ -12,7 +12,12 @@ import numpy as np
 
 from hyrl_mj import artifacts
 
-KINDS = {"config.json": "run", "robustness.json": "robustness", "manifest.json": "manifest"}
+KINDS = {
+    "config.json": "run",
+    "robustness.json": "robustness",
+    "manifest.json": "manifest",
+    "sweep.json": "sweep",
+}
 
 
 def content_of(path: Path) -> dict[str, Any]:
