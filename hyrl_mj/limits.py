@@ -64,7 +64,7 @@ def tried(
         raise Ended(f"it takes longer than {longest:g} s") from None
     try:
         # What a library prints comes before.
-        return json.loads(run.stdout.decode(errors="replace").rpartition("\n")[2])
+        return json.loads(run.stdout.decode(errors="replace").strip().rpartition("\n")[2])
     except ValueError:
         raise Ended(_why(run, seconds, memory)) from None
 

@@ -229,7 +229,8 @@ def call(
     titles = [word.partition("=")[0].replace("_", "-") for word in words]
     for (word, following), title in zip(pairwise([*words, "--"]), titles, strict=True):
         option = options.get(title)
-        if option and option.kind is not FLAG and "=" not in word and following.startswith("--"):
+        is_option = re.match(r"-[^\d.]", following)  # numbers may be negative
+        if option and option.kind is not FLAG and "=" not in word and is_option:
             raise BadInput(f"{word} needs a value: give {option.kind.meaning}")
         if option and option.kind.gather and titles.count(title) > 1:
             raise BadInput(

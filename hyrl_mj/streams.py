@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import io
 import os
+import re
 import shutil
 import signal
 import sys
@@ -18,7 +19,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, TextIO
 
-from hyrl_mj.errors import BadInput, HyrlError, brief
+from hyrl_mj.errors import BadInput, HyrlError, brief, printable
 
 # A narrower terminal breaks the lines itself: libraries that lay out text cannot [columns].
 NARROWEST = 60
@@ -28,6 +29,11 @@ NARROWEST_BAR = 30
 # this time the process ends by itself [s].
 GRACE = 5.0
 INTERRUPTED, INTERRUPTED_STATUS = "interrupted; finished work is kept, run again to resume", 130
+
+
+# What may be written beside printable characters: breaks, and on a terminal sequences that libraries write.
+_BREAKS = re.compile("([\\n\\r\\t])")
+_SEQUENCES = re.compile("([\\n\\r\\t]|\\x1b\\[[0-9;?]*[A-Za-z])")
 
 
 class _Raw(io.FileIO):
@@ -42,6 +48,21 @@ class _Raw(io.FileIO):
             except OSError as error:
                 self.problem = error
         return len(memoryview(data))
+
+
+class _Escaping(io.TextIOWrapper):
+    """A text stream on which names from files cannot control the terminal: it shows them as escapes.
+
+    Colours and movements of the cursor are kept where it is a terminal: they come from libraries, since texts
+    of errors, charts and models are checked where they enter.
+    """
+
+    def write(self, text: str) -> int:
+        if not text.isprintable():
+            kept = _SEQUENCES if self.isatty() else _BREAKS
+            parts = kept.split(text)  # what is kept stands at the odd places
+            text = "".join(p if i % 2 else printable(p) for i, p in enumerate(parts))
+        return super().write(text)
 
 
 class Streams:
@@ -74,7 +95,7 @@ class Streams:
         except (OSError, ValueError, AttributeError):  # a test has put another object in its place
             return stream
         self._raw[number] = raw = _Raw(number, "wb", closefd=False)
-        return io.TextIOWrapper(
+        return _Escaping(
             io.BufferedWriter(raw),
             encoding=stream.encoding,
             errors="backslashreplace",

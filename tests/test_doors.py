@@ -1,6 +1,7 @@
 """What a stranger wrote runs no code, takes no more than its share, and overwrites nothing."""
 
 import csv
+import io
 import json
 import os
 import subprocess
@@ -14,7 +15,7 @@ import pytest
 from attacks import doors
 
 import hyrl_mj
-from hyrl_mj import mjcf, trust
+from hyrl_mj import mjcf, streams, trust
 from hyrl_mj.chart import Chart
 from hyrl_mj.environments import from_gymnasium
 from hyrl_mj.environments.making import MARK, from_spec
@@ -168,6 +169,20 @@ def test_an_environment_that_never_ends_a_step_is_one_sentence():
     assert "takes longer than" in sentence
 
 
+def test_an_environment_that_this_process_registered_takes_arguments():
+    def make(**kwargs):
+        return gym.make("Reacher-v5", **kwargs).unwrapped
+
+    gym.register("OwnReacher-v0", make, max_episode_steps=50)
+    chart = {"shoulder": "qpos[0]", "elbow": "qpos[1]"}
+    pinned = {"qpos[2]": -0.15, "qpos[3]": 0.0}
+    task = from_gymnasium(
+        "OwnReacher-v0", kwargs={"frame_skip": 3}, chart=chart, pinned=pinned,
+        success="distance(fingertip, target) <= 0.05",
+    )  # fmt: skip
+    assert task.max_steps == 50
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_a_nested_pickle_takes_no_time(seed):
     began = time.monotonic()
@@ -300,3 +315,19 @@ def test_a_file_without_an_end_is_not_read(tmp_path):
     with pytest.raises(BadInput, match="no MJCF model"):
         mjcf.load(tmp_path / "fifo")
     assert not trust.is_known(tmp_path / "fifo")
+
+
+@pytest.mark.parametrize(
+    ("terminal", "shown"),
+    [
+        (True, "\x1b[31mred\n\\x1b]0;owned\\x07\r\\u202egnp"),
+        (False, "\\x1b[31mred\n\\x1b]0;owned\\x07\r\\u202egnp"),
+    ],
+)
+def test_a_stream_shows_what_controls_a_terminal_as_escapes(terminal, shown):
+    raw = io.BytesIO()
+    raw.isatty = lambda: terminal
+    stream = streams._Escaping(raw, encoding="utf-8", newline="")
+    stream.write("\x1b[31mred\n\x1b]0;owned\x07\r\u202egnp")
+    stream.flush()
+    assert raw.getvalue().decode() == shown

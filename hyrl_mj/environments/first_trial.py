@@ -1,14 +1,15 @@
 """A program that makes, resets and steps an environment within limits of time and memory; see `making`.
 
 It runs in a process of its own, `python first_trial.py SECONDS MEMORY < source`, where the source is a JSON
-object of what `Source` holds. It writes a JSON object: nothing, or the
-`problem` because of which the environment is refused.
+object of what `Source` holds. It writes a JSON object with the `problem` because of which the environment is
+refused, "" if there is none.
 """
 
 import json
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 
 sys.path.append(str(Path(__file__).parents[2]))  # of the package, if it is not installed
@@ -19,21 +20,28 @@ from hyrl_mj.environments.opening import Source, register
 from hyrl_mj.errors import BadInput
 
 
-def main() -> None:
-    seconds, memory = map(int, sys.argv[1:])
-    told = json.load(sys.stdin)
-    result = {}
+def problem_of(source: Source, seconds: int, memory: int) -> str:
+    """Returns because of what an environment cannot be used, "" if there is nothing."""
+    assert isinstance(source.make, str)
+    register(source.make)
+    if ":" not in source.make and source.make not in gym.registry:
+        return ""  # code of the user's has registered it, in the other process alone
+    limits.limit(seconds, memory)
     try:
-        register(told["make"])
-        limits.limit(seconds, memory)
-        instance = Instance(Recipe(Source(**told)))
+        instance = Instance(Recipe(source))
         instance.reset()
         instance.stepped(instance.drawn(np.random.default_rng(0)))
     except BadInput as error:
-        result["problem"] = str(error)
+        return str(error)
     except MemoryError:
-        result["problem"] = f"it needs more than {memory >> 20} MB of memory"
-    sys.stdout.write("\n" + json.dumps(result))
+        return f"the environment {source.name} needs more than {memory >> 20} MB of memory"
+    return ""
+
+
+def main() -> None:
+    seconds, memory = map(int, sys.argv[1:])
+    problem = problem_of(Source(**json.load(sys.stdin)), seconds, memory)
+    print("\n" + json.dumps({"problem": problem}))
 
 
 if __name__ == "__main__":

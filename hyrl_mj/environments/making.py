@@ -116,7 +116,7 @@ def _try(source: Source, spec: str) -> None:
             f"the environment {source.name} cannot be used: {ended} where it is made, reset and stepped; "
             "give it other arguments"
         ) from None
-    if "problem" in found:
+    if found["problem"]:
         raise BadInput(found["problem"])
 
 

@@ -220,10 +220,8 @@ class EnvironmentPlant:
 
     def _judge(self, rows: np.ndarray, reports: np.ndarray) -> None:
         """Notes what the environment reported of runs, and lets go of those that are over."""
-        outcome = self.spec.outcome(reports)
-        self._truth[rows, -3:] = np.column_stack(
-            [reports[:, 0], self.spec.succeeds(reports), outcome]
-        )
+        success, outcome = self.spec.judged(reports)
+        self._truth[rows, -3:] = np.column_stack([reports[:, 0], success, outcome])
         self._leave(rows[outcome != Outcome.RUNNING])
 
     def _leave(self, rows: np.ndarray) -> None:

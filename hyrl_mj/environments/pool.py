@@ -186,10 +186,17 @@ class Pool:
         self, what: str, plant: int, processes: int, rows: np.ndarray, *values: np.ndarray
     ) -> Arrays:
         """Does what `Stage.begin`, `act`, `sense` or `leave` do, each row in the same process ever again."""
-        while self.left and what != "leave":
-            number, count, plays = self.left.popleft()
-            self.runs("leave", number, count, np.flatnonzero(plays))
+        while what != "leave" and (gone := self._gone()):
+            self.runs("leave", *gone)
         return self._spread(what, (plant,), rows % processes, rows, *values)
+
+    def _gone(self) -> tuple[int, int, np.ndarray] | None:
+        """Takes a plant that nobody has any more: its number, its processes, and the rows that play (k,)."""
+        try:  # another thread may take the last one
+            number, processes, plays = self.left.popleft()
+        except IndexError:
+            return None
+        return number, processes, np.flatnonzero(plays)
 
     def rest(self, starts: np.ndarray) -> Arrays:
         """Does what `Stage.rest` does."""

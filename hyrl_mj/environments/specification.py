@@ -53,17 +53,14 @@ class Criterion:
         others = () if self.failure is None else self.failure.places
         return tuple(dict.fromkeys((*self.success.places, *others)))
 
-    def succeeds(self, report: np.ndarray) -> np.ndarray:
-        """Returns whether the condition of success holds for reports (k, r): (k,) bool."""
-        return self.success.holds(self._values(report))
-
-    def outcome(self, report: np.ndarray) -> np.ndarray:
-        """Returns the `Outcome` (k,) of reports (k, r).
+    def judged(self, report: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns whether reports (k, r) are successes, (k,) bool, and the `Outcome` (k,) of their samples.
 
         Raises:
             BadInput: "terminated" alone is the success, and an episode ended in touch with something.
         """
-        success = self.succeeds(report)
+        values = self._values(report)
+        success = self.success.holds(values)
         terminated, truncated, touches = (report[:, 1:4] > 0).T
         if self.success.text.strip() == TERMINATED and (touches & terminated).any():
             raise BadInput(
@@ -72,18 +69,19 @@ class Criterion:
             )
         failure = terminated & ~success
         if self.failure is not None:
-            failure = self.failure.holds(self._values(report))
+            failure = self.failure.holds(values)
             if (success & failure).any():
                 raise BadInput(
                     f"at the same sample it is a success ({self.success.text}) and a failure "
                     f"({self.failure.text}): let one of the conditions exclude the other"
                 )
         reached = success & (terminated | truncated | self.ends)
-        return np.select(
+        outcome = np.select(
             [failure, reached, terminated | truncated],
             [Outcome.CRASHED, Outcome.REACHED, Outcome.STALLED],
             Outcome.RUNNING,
-        ).astype(int)
+        )
+        return success, outcome.astype(int)
 
     def _values(self, report: np.ndarray) -> dict[object, np.ndarray]:
         named: dict[object, np.ndarray] = {
@@ -177,13 +175,9 @@ class EnvironmentSpec:
         states[:, list(self.recipe.noisy)] = z - self.recipe.offset
         return states
 
-    def outcome(self, report: np.ndarray) -> np.ndarray:
-        """Returns the `Outcome` (k,) of reports (k, r)."""
+    def judged(self, report: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns what `Criterion.judged` does."""
         try:
-            return self.criterion.outcome(report)
+            return self.criterion.judged(report)
         except BadInput as error:
             raise BadInput(f"{self.name}: {error}") from None
-
-    def succeeds(self, report: np.ndarray) -> np.ndarray:
-        """Returns whether the condition of success holds for reports (k, r): (k,) bool."""
-        return self.criterion.succeeds(report)

@@ -8,11 +8,15 @@ import os
 import sys
 from base64 import b64encode
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Any
 
+import numpy as np
+
+import hyrl_mj
 from attacks import MARKER, Trial, child, command, crafted_agents, limited
 from attacks.crafted_runs import evil
 from attacks.forgery import setting, write
@@ -54,6 +58,11 @@ EXPRESSIONS = (
     "__import__('os').system('touch executed')", "open('executed', 'w')", "(" * 5_000, "x" * 100_000,
     "info['a'].__class__", "reward >= 1e400", "distance('a', 'b') <= 1 ** 99999999", ESCAPE, "lambda: 1",
 )  # fmt: skip
+# Names of run directories that a shell, a format or a parser could take for something else.
+PATHS = (
+    " a b ", "it's", 'q"q', "-dash", "--out", "x" * 200, "über", "$(touch executed)", "`touch executed`",
+    "a;touch executed", "%s%n", "{0}", "back\\slash", "#", "~", "a&b<c>", "*", "\u202egnp", "new\nline",
+)  # fmt: skip
 # Hostile models: the text of an MJCF, in which {fifo} is a file that nobody writes to.
 # fmt: off
 MODELS = {
@@ -85,6 +94,7 @@ MODELS = {
 
 def trials(material: Material, draw: Random, count: int) -> list[Trial]:
     """Returns trials of each kind, drawn at random."""
+    material.finished()
     makers = {
         "spec": partial(_spec, material),
         "arguments": _arguments,
@@ -92,6 +102,8 @@ def trials(material: Material, draw: Random, count: int) -> list[Trial]:
         "agent": _agent,
         "field": _field,
         "sweep": partial(_sweep, material),
+        "path": partial(_path, material),
+        "threads": partial(_threads, material),
     }
     kinds = [*makers]
     made = []
@@ -313,6 +325,40 @@ def _field(seed: int, folder: Path) -> str:
             sys.exit(2)
 
     (folder / "field.json").write_text(text, encoding="utf-8")
+    return _broke(work, folder)
+
+
+def _path(material: Material, seed: int, folder: Path) -> str:
+    """A run directory, and a file to write, with odd names."""
+    draw = Random(seed)
+    run, out = draw.choice(PATHS), draw.choice(PATHS)
+    material.copy(folder).rename(folder / run)
+    words = draw.choice(
+        (
+            ("report", run, "--out", f"{out}.html"),
+            ("export", run, "--to", "numpy", "--out", out),
+            ("replay", run, "--out", f"{out}.png"),
+            ("simulate", run),
+        )
+    )
+    return _broke(command(*words), folder)
+
+
+def _threads(material: Material, seed: int, folder: Path) -> str:
+    """A run that several threads open and use at once."""
+    path = material.copy(folder)
+
+    def work() -> None:
+        def used(number: int) -> bytes:
+            run = hyrl_mj.load_run(path)
+            q, measured = np.zeros(8, dtype=int), np.full((8, 1), 0.5 + number % 2)
+            return b"".join(np.asarray(part).tobytes() for part in run.controller.step(q, measured))
+
+        with ThreadPoolExecutor(8) as pool:
+            found = list(pool.map(used, range(16)))
+        assert len({*found[::2]}) == 1
+        assert len({*found[1::2]}) == 1
+
     return _broke(work, folder)
 
 
