@@ -269,10 +269,15 @@ def replay(
     if out is None:
         pipeline.as_stage(run, "replay", work)
     else:
-        with trust.output(out, out.with_suffix(".png"), force=force):
+        with trust.output(*_pictures(out), force=force):
             work(run)
     out = out or usual_out
     print(f"{'picture' if out.suffix == '.png' else 'video'} at {out}")
+
+
+def _pictures(out: Path | None) -> list[Path]:
+    """Returns the files that a replay is written to: a video or a picture, and its last frame."""
+    return [] if out is None else [out, out.with_suffix(".png")] if out.name else [out]
 
 
 def drive(
@@ -299,8 +304,7 @@ def drive(
     """
     from hyrl_mj.viz import drives
 
-    written = () if out is None else (out, out.with_suffix(".png"))
-    with trust.output(*written, force=force):
+    with trust.output(*_pictures(out), force=force):
         drives.drive_run(run, field, options, out, how, shown)
 
 

@@ -78,7 +78,7 @@ def described(what: str) -> Iterator[None]:
     """Raises `BadInput` where the block, which makes something of a description, raises another error."""
     try:
         yield
-    except (HyrlError, MemoryError):
+    except HyrlError:
         raise
     except Exception as error:  # a description can be wrong in any way
         raise BadInput(

@@ -28,16 +28,23 @@ def limit(seconds: int = SECONDS, memory: int = MEMORY) -> None:
         import resource
     except ImportError:  # Windows
         return
-    soft = math.ceil(time.process_time()) + seconds
-    resource.setrlimit(resource.RLIMIT_CPU, (soft, soft + 1))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+    def lower(kind: int, soft: int, hard: int) -> None:
+        now = resource.getrlimit(kind)[1]
+        if now != resource.RLIM_INFINITY:
+            soft, hard = min(soft, now), min(hard, now)
+        resource.setrlimit(kind, (soft, hard))
+
+    busy = math.ceil(time.process_time()) + seconds
+    lower(resource.RLIMIT_CPU, busy, busy + 1)
+    lower(resource.RLIMIT_CORE, 0, 0)
     try:
         with open("/proc/self/status", encoding="ascii") as status:
             (used,) = (line.split()[1] for line in status if line.startswith("VmData"))
     except OSError:  # macOS
         return
     most = int(used) * 1024 + memory
-    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+    lower(resource.RLIMIT_DATA, most, most)
 
 
 def tried(
@@ -58,7 +65,7 @@ def tried(
     command = [sys.executable, "-P", str(program), str(seconds), str(memory), *arguments]
     try:
         run = subprocess.run(
-            command, input=content, capture_output=True, timeout=longest, env=child_environment()
+            command, input=content, capture_output=True, timeout=longest, env=_environment()
         )
     except subprocess.TimeoutExpired:
         raise Ended(f"it takes longer than {longest:g} s") from None
@@ -69,12 +76,14 @@ def tried(
         raise Ended(_why(run, seconds, memory)) from None
 
 
-def child_environment() -> dict[str, str]:
-    """Returns the environment of a process on one thread, without the current folder on its path."""
-    folders = os.environ.get("PYTHONPATH", "").split(os.pathsep)
-    kept = [folder for folder in folders if os.path.isabs(folder)]
-    one_thread = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"}
-    return os.environ | one_thread | {"PYTHONPATH": os.pathsep.join(kept)}
+def _environment() -> dict[str, str]:
+    """Returns the environment of a program on one thread, which finds what this process does.
+
+    But for the current folder, whose modules it searches for none but what the user names.
+    """
+    folders = [f for f in sys.path if os.path.isabs(f) and f != os.getcwd()]
+    one_thread = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    return os.environ | one_thread | {"PYTHONPATH": os.pathsep.join(folders)}
 
 
 def _why(run: subprocess.CompletedProcess[bytes], seconds: int, memory: int) -> str:

@@ -52,7 +52,7 @@ def load(path: Path) -> mujoco.MjModel:
     if not path.is_file():
         raise BadInput(f"there is no MJCF model at {path}")
     if models_dir() not in path.resolve().parents:
-        _try(path.resolve())
+        _try(path.absolute())
     mujoco_log.install()
     try:
         with mujoco_log.kept() as warnings:

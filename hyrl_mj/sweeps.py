@@ -189,7 +189,7 @@ class Sweep:
         ):
             writer = csv.writer(file)
             head = ["task", "algorithm", "eps", "seed", "state", "verdict", "seconds"]
-            writer.writerow([*head, *names, "sentence"])
+            writer.writerow([_plain(cell) for cell in (*head, *names, "sentence")])
             for row in self.rows:
                 values = [row.seed, row.state, row.verdict, f"{row.seconds:.1f}"]
                 found = [row.figures.get(name) for name in names]

@@ -2,8 +2,8 @@
 
 A run directory names the file or the environment of its task. Opening a directory from a stranger must not
 run code that it names, and opening a run of one's own should not ask for it each time. So what a file says is
-read in a block `received`, in which everything that can run code or open a file asks `allows`; and whenever
-the user names a file or describes an environment, its SHA-256 is recorded outside all run directories.
+read in a block `received`; and whenever the user names a file or describes an environment, its SHA-256 is
+recorded outside all run directories.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from hashlib import sha256
+from importlib.machinery import ModuleSpec, PathFinder
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +30,10 @@ _RECEIVED: ContextVar[bool] = ContextVar("received", default=False)
 
 @contextmanager
 def received() -> Iterator[None]:
-    """What is made in the block is described by a file, not by the user: of code, only what is known runs."""
+    """What is made in the block is described by a file, not by the user: of code, only what is known runs.
+
+    Tasks and environments ask `is_received` before they run code or open a file that has been named.
+    """
     token = _RECEIVED.set(True)
     try:
         yield
@@ -41,20 +46,38 @@ def is_received() -> bool:
     return _RECEIVED.get()
 
 
-def allows(path: Path) -> bool:
-    """Returns whether a file of code may be run: the user names it, or this machine knows it."""
-    return not is_received() or is_known(path)
-
-
 @contextmanager
-def current_folder() -> Iterator[None]:
-    """Lets a module that the user names be imported from the current folder, after all that are installed."""
+def current_folder(name: str) -> Iterator[None]:
+    """Lets a module that the user names, as "package.module:Name", be imported from the current folder.
+
+    What is installed comes first: where the module is, the current folder is not searched at all.
+    """
+    if _installed(name) is not None:
+        yield
+        return
     sys.path.append("")
     try:
         yield
     finally:
         last = max(i for i, folder in enumerate(sys.path) if folder == "")
         del sys.path[last]  # not one of the user's own
+
+
+def module_file(name: str) -> Path | None:
+    """Returns the file of the top-level module of "package.module:Name"; nothing is imported to find it."""
+    spec = _installed(name) or PathFinder.find_spec(_top(name), [""])
+    found = None if spec is None or spec.origin is None else Path(spec.origin)
+    return found if found is not None and found.is_file() else None
+
+
+def _top(name: str) -> str:
+    return name.partition(":")[0].partition(".")[0]
+
+
+def _installed(name: str) -> ModuleSpec | None:
+    with suppress(ValueError, ImportError):  # a name such as "" or "__main__"
+        return find_spec(_top(name))
+    return None
 
 
 def store() -> Path | None:
@@ -69,12 +92,12 @@ def store() -> Path | None:
 
 
 def remember(path: Path) -> None:
-    """Records that the user has named this file of code."""
+    """Records that the user has named this file of code, or that this model was tried."""
     _record(str(path.resolve()), digest(path))
 
 
 def is_known(path: Path) -> bool:
-    """Returns whether this machine has run the file, as it is now, because the user named it."""
+    """Returns whether the file has been recorded by `remember`, as it is now."""
     # A file without a record is not even read: it may have no end.
     known = _records().get(str(path.resolve()))
     return known is not None and path.is_file() and known == digest(path)
@@ -98,20 +121,28 @@ def output(*paths: Path, force: bool = False) -> Iterator[None]:
     Raises:
         BadInput: there is one that was not written so, and it is not to be overwritten by `force`.
     """
-    known = _records().get(_WRITTEN)
-    known = known if isinstance(known, dict) else {}
+    known = _written()
+    before = {path: digest(path) for path in paths if path.is_file()}
     for path in paths:
         if path.exists() and not path.is_dir() and not force:
             record = known.get(str(path.resolve()))
-            if record is None or not path.is_file() or record != digest(path):
+            if record is None or record != before.get(path):
                 raise BadInput(
                     f"{path} exists, and hyrl-mj has not written it as it is: give another --out, or --force "
                     "to overwrite it"
                 )
-    yield
-    now = {str(path.resolve()): digest(path) for path in paths if path.is_file()}
-    kept = {path: value for path, value in known.items() if path not in now} | now
-    _record(_WRITTEN, dict([*kept.items()][-MOST:]))
+    try:
+        yield
+    finally:
+        after = {path: digest(path) for path in paths if path.is_file()}
+        new = {str(p.resolve()): d for p, d in after.items() if before.get(p) != d or force}
+        kept = {path: value for path, value in _written().items() if path not in new} | new
+        _record(_WRITTEN, dict([*kept.items()][-MOST:]))
+
+
+def _written() -> dict[str, str]:
+    known = _records().get(_WRITTEN)
+    return known if isinstance(known, dict) else {}
 
 
 def _digest_of(text: str) -> str:

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 from random import Random
 
 import gymnasium as gym
@@ -83,6 +84,34 @@ def test_an_environment_that_a_file_names_gets_no_task_of_another_file(tmp_path)
     with trust.received():
         assert "executes no file" in refusal(lambda: gym.make(CIRCLE, task=str(path)))
     assert not (tmp_path / "executed").exists()
+
+
+def test_a_file_of_arguments_runs_no_task_file(tmp_path):
+    path = code(tmp_path)
+    refusal(lambda: from_gymnasium(CIRCLE, kwargs={"task": str(path)}))
+    assert not (tmp_path / "executed").exists()
+
+
+def test_a_file_in_another_folder_is_another_file(tmp_path, monkeypatch):
+    path = Path(gym.envs.mujoco.__file__).parent / "assets" / "reacher.xml"
+    folders = [tmp_path / name for name in ("own", "theirs")]
+    for folder in folders:
+        folder.mkdir()
+        (folder / "r.xml").write_text(path.read_text())
+    monkeypatch.chdir(folders[0])
+    chart = {"shoulder": "qpos[0]", "elbow": "qpos[1]"}
+    pinned = {"qpos[2]": -0.15, "qpos[3]": 0.0}
+    own = from_gymnasium(
+        "Reacher-v5", kwargs={"xml_file": "./r.xml"}, chart=chart, pinned=pinned,
+        success="distance(fingertip, target) <= 0.05",
+    )  # fmt: skip
+    monkeypatch.setattr("hyrl_mj.environments.making._MADE", {})
+    monkeypatch.chdir(folders[1])
+    with trust.received():
+        refusal(lambda: from_spec(own.spec))
+    monkeypatch.chdir(folders[0])
+    with trust.received():
+        assert from_spec(own.spec).spec == own.spec
 
 
 def test_what_this_machine_has_described_opens_again(monkeypatch):
@@ -183,6 +212,53 @@ def test_an_environment_that_this_process_registered_takes_arguments():
     assert task.max_steps == 50
 
 
+def test_a_step_that_takes_long_is_one_sentence():
+    given = {"pinned": {"qpos[2]": -0.15, "qpos[3]": 0.0}, "success": "reward >= 1"}
+    sentence = refusal(
+        lambda: from_gymnasium("Reacher-v5", kwargs={"frame_skip": 150_000}, **given)
+    )
+    assert "whose step takes less than" in sentence
+
+
+def test_a_pinned_attribute_that_never_ends_a_step_is_one_sentence():
+    pinned = {"frame_skip": 2_000_000_000, "qpos[2]": 0.1, "qpos[3]": 0.1}
+    refusal(lambda: from_gymnasium("Reacher-v5", pinned=pinned, success="reward >= 1"))
+
+
+def test_arrays_as_arguments_are_the_users_own():
+    def make(goal, **kwargs):
+        assert isinstance(goal, np.ndarray)
+        return gym.make("Reacher-v5", **kwargs).unwrapped
+
+    gym.register("GoalReacher-v0", make, max_episode_steps=50)
+    task = from_gymnasium(
+        "GoalReacher-v0", kwargs={"goal": np.array([1.0, 2.0])},
+        chart={"shoulder": "qpos[0]", "elbow": "qpos[1]"}, pinned={"qpos[2]": -0.15, "qpos[3]": 0.0},
+        success="distance(fingertip, target) <= 0.05",
+    )  # fmt: skip
+    assert task.max_steps == 50
+
+
+def test_a_model_writes_no_warnings_into_the_current_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "robot.xml"
+    path.write_text(
+        '<mujoco><option timestep="1" gravity="1e20 0 0"/><worldbody><body><freejoint/>'
+        '<geom size="1"/></body></worldbody></mujoco>'
+    )
+    mjcf.load(path)
+    assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
+
+
+def test_a_model_beside_a_link_is_read_beside_it(tmp_path):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "part.xml").write_text("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+    real = tmp_path / "real" / "robot.xml"
+    real.write_text('<mujoco><include file="part.xml"/></mujoco>')
+    (tmp_path / "robot.xml").symlink_to(real)
+    assert mjcf.load(tmp_path / "robot.xml").ngeom == 1
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_a_nested_pickle_takes_no_time(seed):
     began = time.monotonic()
@@ -214,9 +290,16 @@ def test_nothing_is_imported_from_the_current_folder(words, tmp_path):
 def test_a_module_that_the_user_names_comes_last(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     before = [*sys.path]
-    with trust.current_folder():
+    with trust.current_folder("my_module:Puck-v0"):
         assert sys.path == [*before, ""]
+    with trust.current_folder("mujoco.batch:Batch"):  # what is installed imports nothing from here
+        assert sys.path == before
     assert sys.path == before
+    path = code(tmp_path, "my_module.py")
+    assert trust.module_file("my_module.sub:Puck-v0").resolve() == path.resolve()
+    assert trust.module_file("mujoco:X").parent.name == "mujoco"
+    for name in ("", "__main__", "no_such_module"):
+        assert trust.module_file(name) is None
 
 
 # ---- fields

@@ -41,6 +41,8 @@ STEPS_WITHOUT_END = 1_000
 CHART, RESET = "chart", "reset"
 # Each episode begins with a reset: one that takes longer [s] would take hours for a thousand.
 LONGEST_RESET = 3.0
+# And so would steps, of which an episode has hundreds [s].
+LONGEST_STEP = 0.3
 # Runs under inputs at random that show how far coordinates go, their steps, and for how long inputs are held.
 RUNS, STEPS, HELD = 16, 150, 15
 # What info calls success.
@@ -102,6 +104,14 @@ def inspect(source: Source, given: Given) -> tuple[EnvironmentSpec, Pool, Instan
             f"reset() of {source.name} takes {took:.1f} s, and each of thousands of episodes begins with it: "
             f"give an environment whose reset takes less than {LONGEST_RESET:g} s"
         )
+    began = time.monotonic()
+    instance.stepped(instance.drawn(np.random.default_rng(0)))
+    if (took := time.monotonic() - began) > LONGEST_STEP:
+        raise BadInput(
+            f"step() of {source.name} takes {took:.1f} s, and thousands of episodes take many of them: give "
+            f"an environment whose step takes less than {LONGEST_STEP:g} s"
+        )
+    instance.reset()
     instance.recipe = replace(instance.recipe, observer=trials.observer_of(instance))
     chosen = _chart_of(instance, given.chart, found)
     places = instance.physics.columns

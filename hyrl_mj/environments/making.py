@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from importlib.util import find_spec
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -90,11 +90,11 @@ def from_gymnasium(
     spec = MARK + json.dumps(told, default=_plain)
     if not isinstance(env, str) or spec not in _MADE:
         with described(_shown(env)):
-            if isinstance(env, str) and (kwargs or trust.is_received()):
+            if isinstance(env, str) and (kwargs or reset or pinned or trust.is_received()):
                 _try(source, spec)
             _MADE[spec] = EnvironmentTask(*inspect(source, given), spec)
     if isinstance(env, str):
-        trust.remember_text(spec)
+        trust.remember_text(_recorded(spec, told))
         if (module := _module_of(env)) is not None:
             trust.remember(module)
     return _MADE[spec]
@@ -106,11 +106,17 @@ def _shown(env: Any) -> str:
 
 def _try(source: Source, spec: str) -> None:
     """Makes, resets and steps an environment in a process with limits, unless that was done before."""
-    if trust.is_known_text(spec):
+    told = vars(source)
+    if trust.is_known_text(spec) and _is_plain([*source.kwargs.values(), *source.reset.values()]):
         return
-    content = json.dumps(vars(source), default=_plain).encode()
     try:
-        found = limits.tried(Path(__file__).with_name("first_trial.py"), content)
+        content = json.dumps(told)
+    except TypeError:
+        content = ""
+    if not content or json.loads(content) != told:
+        return  # arrays and tuples, which only the user's own code gives, and the program would see lists
+    try:
+        found = limits.tried(Path(__file__).with_name("first_trial.py"), content.encode())
     except limits.Ended as ended:
         raise BadInput(
             f"the environment {source.name} cannot be used: {ended} where it is made, reset and stepped; "
@@ -169,19 +175,8 @@ def _check_named(name: str, given: Any) -> None:
 
 
 def _module_of(env: str) -> Path | None:
-    """Returns the file of the module that Gymnasium imports for an id as "my_module:Puck-v0", if it is found.
-
-    Nothing is imported to find it, so a module inside of a package is not.
-    """
-    module, colon, _ = env.partition(":")
-    if not colon or "." in module:
-        return None
-    with suppress(ValueError):  # a name such as "" or "__main__"
-        with trust.current_folder():
-            found = find_spec(module)
-        if found is not None and found.origin is not None and Path(found.origin).is_file():
-            return Path(found.origin)
-    return None
+    """Returns the file of the module of an id as "my_module:Puck-v0", if it is found."""
+    return trust.module_file(env) if ":" in env else None
 
 
 def _where(function: Callable[..., gym.Env]) -> str:
@@ -224,8 +219,9 @@ def from_spec(spec: str) -> Task:
 def _check_received(env: str, given: Mapping[str, Any], spec: str) -> None:
     """Raises `BadInput` if a file describes an environment that could run code or open files of its sender.
 
-    What this machine has described by the same text before is allowed, if it is of the same module. Else it
-    is an environment of an installed package, without arguments but numbers and plain words.
+    What this machine has described by the same text before is allowed, if it is of the same module and given
+    in the same folder. Else it is an environment of an installed package, and what is given to its maker and
+    its reset are numbers and plain words.
     """
     if ":" in env:
         module = _module_of(env)
@@ -233,7 +229,8 @@ def _check_received(env: str, given: Mapping[str, Any], spec: str) -> None:
     else:
         register(env)
         known = env in gym.registry
-    if not known or not (trust.is_known_text(spec) or _is_plain(given.get("kwargs"))):
+    plain = _is_plain([given.get("kwargs"), given.get("reset")])
+    if not known or not (plain or trust.is_known_text(_recorded(spec, given))):
         args = {name: value for name, value in given.items() if name != "env"}
         how = f"--env {shlex.quote(env)}"
         if args:
@@ -245,6 +242,12 @@ def _check_received(env: str, given: Mapping[str, Any], spec: str) -> None:
             "that you have not used before: if you trust it, use it once, as with "
             f"hyrl-mj diagnose --explain {how}"
         )
+
+
+def _recorded(spec: str, given: Mapping[str, Any]) -> str:
+    """Returns the text that a description is recorded by: names of files stand for files of a folder."""
+    plain = _is_plain([given.get("kwargs"), given.get("reset")])
+    return spec if plain else f"{spec} in {os.getcwd()}"
 
 
 def _is_plain(value: Any) -> bool:

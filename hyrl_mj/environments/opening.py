@@ -138,7 +138,7 @@ def made(source: Source) -> Made:
         register(source.make)
         own = ":" in source.make  # of a module of the user's, as "my_module:Puck-v0"
         try:
-            with current_folder() if own else nullcontext():
+            with current_folder(source.make) if own else nullcontext():
                 env: Any = gym.make(source.make, disable_env_checker=True, **source.kwargs)
         except Exception as error:  # whatever a foreign constructor raises
             raise BadInput(_why_not_made(source.make, error)) from error

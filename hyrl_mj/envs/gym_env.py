@@ -14,7 +14,7 @@ from hyrl_mj import mjcf
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.simulation import AnyNoise
-from hyrl_mj.tasks import Outcome, Task, get_task
+from hyrl_mj.tasks import Outcome, Task, described_task
 
 
 def observation_space(task: Task) -> spaces.Box:
@@ -38,7 +38,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
     "crashed", "out_of_bounds" or "stalled", and `info["is_success"]` whether it is "reached".
 
     Args:
-        task: name of the task.
+        task: name of the task, or a file of one that this machine has run before.
         noise: measurement noise on the observation.
         render_mode: None or "rgb_array".
         camera: name of a camera of the MJCF, by default that of the task's scene.
@@ -62,7 +62,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
     ):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise BadInput(f"render_mode {render_mode!r} is unknown: use None or 'rgb_array'")
-        self.core = BatchedEnv(get_task(task), 1, noise=noise, threads=1)
+        self.core = BatchedEnv(described_task(task), 1, noise=noise, threads=1)
         self.metadata = {**self.metadata, "render_fps": round(1 / self.core.task.dt)}
         self.observation_space = observation_space(self.core.task)
         self.action_space = action_space(self.core.task)
@@ -123,7 +123,7 @@ class TaskVectorEnv(VectorEnv):
     observations and `infos["final_info"]` their outcomes, both masked by `infos["_final_obs"]`.
 
     Args:
-        task: name of the task.
+        task: name of the task, or a file of one that this machine has run before.
         num_envs: number of episodes n.
         noise, threads: as in `BatchedEnv`.
         max_episode_steps: samples until truncation, by default the task's limit.
@@ -151,7 +151,11 @@ class TaskVectorEnv(VectorEnv):
                 'for one, or gymnasium.make_vec(..., vectorization_mode="sync")'
             )
         self.core = BatchedEnv(
-            get_task(task), num_envs, noise=noise, max_steps=max_episode_steps, threads=threads
+            described_task(task),
+            num_envs,
+            noise=noise,
+            max_steps=max_episode_steps,
+            threads=threads,
         )
         self.num_envs, self.render_mode = self.core.n, None
         self.single_observation_space = observation_space(self.core.task)

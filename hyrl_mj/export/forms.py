@@ -147,7 +147,8 @@ def export(controller: HybridController | Traceable, form: str, out: Path) -> No
     Raises:
         BadInput: the form is unknown, or the errors of `export_numpy` and `export_onnx`.
     """
-    files_of(form, out)
+    if form not in FORMS:
+        raise unknown("form", form, FORMS)
     FORMS[form](controller, out)
 
 

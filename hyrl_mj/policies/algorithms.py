@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -98,12 +96,10 @@ def sb3_class(name: str) -> type[BaseAlgorithm]:
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
     module, _, attribute = name.rpartition(":")
-    if trust.is_received():
-        check_named(name)
     if name in ALGORITHMS:
         module, attribute = "stable_baselines3", name.upper()
     try:
-        with trust.current_folder():
+        with trust.current_folder(module):
             algorithm: type[BaseAlgorithm] = getattr(importlib.import_module(module), attribute)
     except (Exception, SystemExit) as error:  # a foreign module can raise anything
         raise BadInput(f"the algorithm {name} cannot be imported: {brief(error)}") from error
@@ -136,12 +132,7 @@ def check_named(name: str) -> None:
 
 def _source(name: str) -> Path | None:
     """Returns the file of the top-level module of a `module:Class`, without an import of it."""
-    top = name.partition(":")[0].partition(".")[0]
-    if name in ALGORITHMS or not top:
-        return None
-    with trust.current_folder():
-        spec = PathFinder.find_spec(top, sys.path)
-    return Path(spec.origin) if spec and spec.origin else None
+    return None if name in ALGORITHMS else trust.module_file(name)
 
 
 def sb3_relative(name: str, levels: int | None) -> str:
