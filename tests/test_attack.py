@@ -29,28 +29,28 @@ PLANTED = {
 }
 # Mends that are taken out, and how many generated descriptions are drawn, some of which must find it.
 OPENED = {
-    "spec": (60, "from hyrl_mj import trust; trust.is_received = lambda: False"),
+    "spec": (160, "from hyrl_mj import trust; trust.is_received = lambda: False"),
     "agent": (
-        90,
+        120,
         "from hyrl_mj.policies import pickled\n"
         "pickled.arrays = lambda content: {str(name): None for name, _ in pickled.read(content)}",
     ),
     "field": (
-        90,
+        120,
         "from hyrl_mj.fields import files\n"
         "def once(pairs):\n"
         "    names = [name for name, _ in pairs]\n"
         "    raise files._Repeated(max(names, key=names.count))\n"
         "files._once = once",
     ),
-    "arguments": (180, "from hyrl_mj import errors; errors.LONGEST = 10**9"),
+    "arguments": (240, "from hyrl_mj import errors; errors.LONGEST = 10**9"),
 }
 
 
 def attack(*words, weakness=""):
     code = f"import sys; sys.path.insert(0, {HERE!r}); import attack\n{weakness}\n"
     return subprocess.run(
-        [sys.executable, "-c", f"{code}sys.exit(attack.main())", *words],
+        [sys.executable, "-P", "-c", f"{code}sys.exit(attack.main())", *words],
         env=unmeasured.environment(),
         capture_output=True,
         text=True,
