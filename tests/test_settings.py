@@ -184,6 +184,7 @@ def test_grids_and_lattices_fit_the_memory(circle, vehicle):
 
 
 def test_a_lattice_without_a_node_to_start_from_is_refused(vehicle, monkeypatch):
+    assert vehicle.chart_is_state  # which is found out once, from runs that go on
     monkeypatch.setattr(type(vehicle), "ending", lambda self, m: np.full(len(m), Outcome.CRASHED))
     with pytest.raises(BadInput, match="none at which vehicle goes on: give more cells"):
         Lattice.of(vehicle, Grid.with_cells(vehicle.chart, 4))
