@@ -42,7 +42,7 @@ class Chart:
 
     def __post_init__(self) -> None:
         for name in (*self.names, *self.units, self.section):
-            if not isinstance(name, str) or len(name) > LONGEST or has_controls(name):
+            if len(str(name)) > LONGEST or has_controls(str(name)):
                 raise BadInput(
                     f"a coordinate cannot have the name or the unit {str(name)[:LONGEST]!r}: give at most "
                     f"{LONGEST} characters that can be printed"

@@ -90,7 +90,7 @@ def _try(path: Path) -> None:
             f"{path} cannot be used: {ended} where it is compiled and stepped twice; make it simpler"
         ) from None
     if "problem" in found:
-        raise BadInput(f"{path} cannot be used: {found['problem']}")
+        raise BadInput(f"MuJoCo cannot compile {path}: {found['problem']}")
     if b"file" not in path.read_bytes():
         trust.remember(path)
 

@@ -21,7 +21,7 @@ def main() -> None:
     try:
         model = mujoco.MjModel.from_xml_path(path)
     except ValueError as error:
-        result["problem"] = f"MuJoCo cannot compile it: {' '.join(str(error).split())[:300]}"
+        result["problem"] = " ".join(str(error).split())[:300]
     else:
         data = mujoco.MjData(model)
         for _ in range(2):

@@ -240,7 +240,7 @@ def call(
     parsed: Any
     parsed, rest = tyro.cli(
         make_dataclass("Words", [argument.field(helping) for argument in every], kw_only=True),
-        prog=f"hyrl-mj {name}",
+        prog=f"hyrl-mj {name}\n ",  # the options begin in a line of their own
         description=documented(function)[0],
         args=words,
         return_unknown_args=True,

@@ -238,8 +238,8 @@ def _check_received(env: str, given: Mapping[str, Any], spec: str) -> None:
             held = text if len(text) <= SHOWN else "its arguments, which stand in config.json"
             how += f" --env-args FILE, where FILE holds {held}"
         raise BadInput(
-            f"the environment is {env}, and opening a run imports no module and gives no names of files "
-            "that you have not used before: if you trust it, use it once, as with "
+            f"the environment is {env}, and opening a run imports no module that you have not used before, as "
+            "it is now, and opens no file that it names: if you trust it, use it once, as with "
             f"hyrl-mj diagnose --explain {how}"
         )
 
@@ -256,7 +256,9 @@ def _is_plain(value: Any) -> bool:
         return re.fullmatch(r"[A-Za-z0-9_ -]{0,40}", value) is not None and not Path(value).exists()
     if isinstance(value, Mapping):
         return all(_is_plain(part) for pair in value.items() for part in pair)
-    return value is None or isinstance(value, int | float) or all(map(_is_plain, value))
+    if isinstance(value, list | tuple):
+        return all(map(_is_plain, value))
+    return value is None or isinstance(value, int | float | np.number | np.ndarray)
 
 
 register_opener(MARK, from_spec)
