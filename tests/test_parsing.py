@@ -137,7 +137,7 @@ def test_an_unknown_option_is_answered_with_a_near_one():
 
 def test_help_shows_types_and_defaults(monkeypatch, capsys):
     text = helped(paint, "paint", 120, monkeypatch, capsys)
-    assert "usage: hyrl-mj paint [-h] [OPTIONS]" in text
+    assert "usage: hyrl-mj paint\n  [-h] [OPTIONS]" in text
     assert "It takes a while." in text
     rows = [" ".join(line.strip("│ ").split()) for line in text.splitlines()]
     assert set(rows) >= {

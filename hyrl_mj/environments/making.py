@@ -238,8 +238,8 @@ def _check_received(env: str, given: Mapping[str, Any], spec: str) -> None:
             held = text if len(text) <= SHOWN else "its arguments, which stand in config.json"
             how += f" --env-args FILE, where FILE holds {held}"
         raise BadInput(
-            f"the environment is {env}, and opening a run imports no module that you have not used before, as "
-            "it is now, and opens no file that it names: if you trust it, use it once, as with "
+            f"the environment is {env}, and opening a run imports no module that you have not used before, "
+            "as it is now, and opens no file that it names: if you trust it, use it once, as with "
             f"hyrl-mj diagnose --explain {how}"
         )
 
