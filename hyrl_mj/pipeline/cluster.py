@@ -200,15 +200,8 @@ def _check_address(address: str) -> None:
     except (OSError, OverflowError, ValueError) as error:
         raise _no_answer(address, brief(error)) from error
     # Whether the versions are the same is said when Ray connects.
-    words = [
-        sys.executable,
-        "-P",
-        "-m",
-        "ray.scripts.scripts",
-        "health-check",
-        "--address",
-        address,
-    ]
+    words = [sys.executable, "-P", "-m", "ray.scripts.scripts"]
+    words += ["health-check", "--address", address]
     try:
         left = PATIENCE - (time.monotonic() - began)
         subprocess.run(

@@ -111,8 +111,8 @@ def get_task(name: str | Path | Task) -> Task:
             return opener(str(name))
     if str(name).endswith(".py"):
         path = Path(name)
-        known = path.resolve() in _FILES or trust.is_known(path)
-        if trust.is_received() and not known:
+        has_run = path.resolve() in _FILES
+        if trust.is_received() and not has_run and not trust.is_known(path):
             raise BadInput(
                 f"the task is defined in {path}, and opening a run executes no file that you have not run "
                 "before, as it is now: if you trust the file, name it with --task FILE, in Python with "
