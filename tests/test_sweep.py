@@ -15,6 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from attacks.crafted_runs import MARKER
+from attacks.doors import plant_modules
 
 import hyrl_mj
 from hyrl_mj import (
@@ -272,14 +274,22 @@ def listening():
 
 @pytest.fixture(scope="module")
 def swept(tmp_path_factory):
-    """A sweep over two seeds, what it said, and where its processes listened."""
+    """A sweep over two seeds, what it said, and where its processes listened.
+
+    In the current folder lie modules of the names of installed ones, and of one that is not installed.
+    """
     out, said, addresses = tmp_path_factory.mktemp("sweeps") / "sweep", [], set()
+    here = tmp_path_factory.mktemp("stranger")
+    plant_modules(here)
 
     def say(text):
         said.append(text)
         addresses.update(listening())
 
-    result = hyrl_mj.sweep("unit_circle", seeds=(0, 1), out=out, say=say, **SMOKE)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(here)
+        result = hyrl_mj.sweep("unit_circle", seeds=(0, 1), out=out, say=say, **SMOKE)
+    assert not (here / MARKER).exists(), "a module in the current folder was imported"
     return out, result, said, addresses
 
 

@@ -115,17 +115,15 @@ class Stage:
             BadInput: it remembers something after all.
         """
         instance = self._begun(states[0])
-        before, results = written.fingerprint(instance.env), []
-        for state, inputs in zip(states, u, strict=True):
-            instance.physics.write(state)
-            results.append(self._acted([instance], inputs[None]))
+        before = written.fingerprint(instance.env)
+        results = self._acted([instance] * len(u), u, states)
         if changed := written.differing(written.fingerprint(instance.env), before):
             raise BadInput(
                 f"{self.recipe.source.name} remembers something in {changed[0]}, as no sampled run showed; "
                 "without a memory that is always there it cannot be tabulated"
             )
         self._free.append(instance)
-        return tuple(map(np.concatenate, zip(*results, strict=True)))
+        return results
 
     def check(self, rows: np.ndarray, runs: np.ndarray) -> Arrays:
         """Plays runs (k,) of `Played` in new environments; raises `BadInput` if these go another way."""
@@ -133,12 +131,17 @@ class Stage:
             self._real.check(run)
         return ()
 
-    def _acted(self, instances: Sequence[Instance], u: np.ndarray) -> Arrays:
+    def _acted(
+        self, instances: Sequence[Instance], u: np.ndarray, begun: np.ndarray | None = None
+    ) -> Arrays:
+        """Steps instances with inputs (k, m), from where they are or from states (k, S) written before."""
         first = instances[0]
         states, seen = (np.empty((len(u), n)) for n in (first.physics.size, len(first.observation)))
         reports = []
         with first.undrawn():
             for i, (instance, inputs) in enumerate(zip(instances, u, strict=True)):
+                if begun is not None:
+                    instance.physics.write(begun[i])
                 reports.append(instance.act(inputs))
                 instance.physics.read(states[i])
                 seen[i] = instance.observation

@@ -39,7 +39,8 @@ class Batch:
         z0: (n, d) chart points.
         q0: (n,) modes at the start, `NOT_STARTED` where the controller picks it.
         seed: seed of the noise.
-        steps: samples after which every run is proved to have arrived for good; None to the end of episodes.
+        steps: samples (n,) after which each run is proved to have arrived for good; None to the end of
+            episodes.
     """
 
     controller: Controller
@@ -48,7 +49,7 @@ class Batch:
     z0: np.ndarray
     q0: np.ndarray
     seed: int
-    steps: int | None = None
+    steps: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -90,8 +91,8 @@ class Replays:
         the weakest first: a third lies at the border of what is proved, a third where it arrives latest, and
         the others are starts of the score, at random.
 
-        Of each kind of noise the first `WHOLE` episodes are played to their end. The others are until all are
-        proved to have arrived for good, and to their end only if one has not.
+        Of each kind of noise the first `WHOLE` episodes are played to their end. The others are until they
+        are proved to have arrived for good, and a batch to its end only if one has not.
         """
         if certificate.game.lattice.estimate or not score.winnable:
             return None
@@ -104,11 +105,11 @@ class Replays:
         pools = _pools(certificate, name, controller, score.eps, of)
         batches = []
         for kind, noise in _noises(certificate, name, controller, score.eps).items():
-            z0, q0 = _drawn(pools, STARTS[kind] // few, rng)
+            z0, q0, samples = _drawn(pools, STARTS[kind] // few, rng)
             for first in (0, *range(WHOLE, len(z0), BATCH)):
                 part = slice(first, first + BATCH if first else WHOLE)
                 number = int(rng.integers(2**31))
-                steps = max(pool.samples for pool in pools) if first else None
+                steps = samples[part] if first else None
                 batches.append(Batch(controller, noise, kind, z0[part], q0[part], number, steps))
         return Replays(name, score.eps, certificate.game.everywhere, of, tuple(batches))
 
@@ -133,13 +134,13 @@ def play(task: Task, batch: Batch) -> Played:
         BadInput: the plant did not do what plain MuJoCo does.
     """
     plant = task.plant(len(batch.z0))
-    for steps in dict.fromkeys((batch.steps, None)):
+    for steps in (batch.steps, None):
         settings = LoopSettings(steps, record=True, states=False, plant=plant, quiet=True)
         run = closed_loop(
             task, batch.controller, batch.z0, batch.noise, batch.q0, batch.seed, settings
         )
         lost = run.outcome != Outcome.REACHED
-        if not lost.any():
+        if steps is None or not lost.any():
             break
     judged = lost.copy()
     judged[::EVERY] = True
@@ -177,7 +178,8 @@ class _Pool:
         border: (b,) places with a neighbour of which the same is not said.
         late: (l,) places, the latest to arrive first.
         counted: (c,) places that the score counts.
-        samples: after so many samples every run is proved to have arrived, else those of an episode.
+        samples: samples (N,) after which a run from each place is proved to have arrived for good, else
+            those of an episode.
     """
 
     grid: Grid
@@ -186,17 +188,18 @@ class _Pool:
     border: np.ndarray
     late: np.ndarray
     counted: np.ndarray
-    samples: int
+    samples: np.ndarray
 
-    def draw(self, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Returns n starts (n, d), anywhere in their cells, and their modes (n,)."""
+    def draw(self, n: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+        """Returns n starts (n, d), anywhere in their cells, their modes (n,), and their samples (n,)."""
         weak = [rng.permutation(self.border)[: n // 3], self.late[: n // 3]]
         rest = rng.choice(self.counted, n - sum(map(len, weak)))
         places, q0 = np.concatenate([*weak, rest]), np.full(n, self.q0)
+        samples = self.samples[places]
         if self.cells is None:
-            return self.grid.nodes[places], q0
+            return self.grid.nodes[places], q0, samples
         off = rng.uniform(-0.5, 0.5, (n, len(self.grid.counts)))
-        return self.cells.middle(places) + off * self.grid.spacing, q0
+        return self.cells.middle(places) + off * self.grid.spacing, q0, samples
 
 
 def _pools(
@@ -227,15 +230,14 @@ def _pools(
         late = places[np.argsort(-value[places], kind="stable")]
         counted = np.flatnonzero(said & region)
         border, counted = np.flatnonzero(weak), counted if len(counted) else places
-        samples = int(value[said].max()) if proved else game.task.max_steps
+        samples = np.maximum(value, 1) if proved else np.full(len(value), game.task.max_steps)
         pools.append(_Pool(grid, cells, q0, border, late, counted, samples))
     return pools
 
 
-def _drawn(pools: list[_Pool], n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Returns n starts (n, d) and their modes (n,), as many from each pool, in any order."""
+def _drawn(pools: list[_Pool], n: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """Returns n starts (n, d) as `_Pool.draw` does, as many from each pool, in any order."""
     each, rest = divmod(n, len(pools))
     drawn = [pool.draw(each + (i < rest), rng) for i, pool in enumerate(pools)]
-    z0, q0 = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
     order = rng.permutation(n)
-    return z0[order], q0[order]
+    return tuple(np.concatenate(parts)[order] for parts in zip(*drawn, strict=True))

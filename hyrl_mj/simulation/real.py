@@ -220,7 +220,7 @@ def _compare(
         mine_rewards = _asked(task.reward, alone, mine[1:], run.u[:k, row])
         _check(task, run, row, "reward", rewards[1:], mine_rewards, first=1)
     ends = _asked(task.ending, alone, mine)
-    if k == len(run.u) and ends[-1] == Outcome.RUNNING:  # the episode was cut off
+    if k == run.limit[row] and ends[-1] == Outcome.RUNNING:  # the episode was cut off
         ends[-1] = task.verdict(mine[-1:])[0]
     expected = np.full(k + 1, Outcome.RUNNING)
     if k == run.length[row]:  # otherwise the simulation diverged after that

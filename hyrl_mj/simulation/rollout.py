@@ -21,7 +21,7 @@ class LoopSettings:
     """How the closed loop is run.
 
     Attributes:
-        steps: number of samples, by default the task's limit.
+        steps: number of samples, of all runs or of each (n,); by default the task's limit.
         backward: simulate x' = -f(x, u); such runs end with the last sample only.
         passing: whether to follow how the runs pass the obstacles.
         record: whether to keep modes, measurements, inputs and states.
@@ -32,7 +32,7 @@ class LoopSettings:
         quiet: show no progress bar.
     """
 
-    steps: int | None = None
+    steps: int | np.ndarray | None = None
     backward: bool = False
     passing: bool = False
     record: bool = False
@@ -54,6 +54,7 @@ class Rollout:
     Attributes:
         path: (K + 1, n, d) true chart points at the samples, periodic coordinates unwrapped.
         length: (n,) samples until the end of each run.
+        limit: (n,) samples after which each run is cut off.
         outcome: (n,) `Outcome`.
         q0: (n,) modes at the start.
         before: (K, n) modes at each sample before a jump. Empty without `record`, like all that follow.
@@ -67,6 +68,7 @@ class Rollout:
 
     path: np.ndarray
     length: np.ndarray
+    limit: np.ndarray
     outcome: np.ndarray
     q0: np.ndarray
     before: np.ndarray
@@ -102,8 +104,9 @@ def closed_loop(
     Raises:
         BadInput: the noise cannot be used, or the controller has a memory or draws at random.
     """
-    limit = task.max_steps if settings.steps is None else settings.steps
     backward, record, n = settings.backward, settings.record, len(z0)
+    limit = np.broadcast_to(task.max_steps if settings.steps is None else settings.steps, n)
+    longest = int(limit.max(initial=0))
     # Where each run takes an environment of its own, the next one begins where one ends.
     most = n if task.side_by_side is None else task.side_by_side
     together = n <= most
@@ -117,7 +120,7 @@ def closed_loop(
     q = np.full(n, NOT_STARTED) if q0 is None else np.asarray(q0, dtype=int).copy()
     outcome = np.full(n, Outcome.RUNNING) if backward else task.outcome(measurement, plant.unstable)
     k, length, first_mode = np.zeros(n, dtype=int), np.zeros(n, dtype=int), q.copy()
-    path = np.empty((limit + 1, n, task.chart.dimension))
+    path = np.empty((longest + 1, n, task.chart.dimension))
     path[0] = task.chart.near(task.z(measurement), z0)
     shapes = {"before": (), "q": (), "measured": (len(task.noisy),), "u": (len(task.inputs),)}
     kept = {name: _Table(n, shape) for name, shape in shapes.items() if record}
@@ -129,7 +132,7 @@ def closed_loop(
         kept["state"] = _Table(n, plant.state.shape[1:])
         kept["state"].put(k, every, plant.state)
     follower = Follower(task, plant) if settings.passing else None
-    ticks = range(limit) if together else count()
+    ticks = range(longest) if together else count()
     for tick in progress_bar(ticks, settings.label, "samples", quiet=settings.quiet):
         active = np.flatnonzero((outcome == Outcome.RUNNING) & (k < limit))[:most]
         if not len(active):
@@ -159,7 +162,7 @@ def closed_loop(
             follower.follow(active[~lost[active]])
         if not backward:
             outcome[active] = task.outcome(measurement[active], lost[active])
-            over = active[(outcome[active] == Outcome.RUNNING) & (k[active] == limit)]
+            over = active[(outcome[active] == Outcome.RUNNING) & (k[active] == limit[active])]
             if plant.late and len(over):
                 plant.observe(measurement[over], np.zeros_like(measurement[over]), over)
                 measurement[over] = plant.truth(over)
@@ -189,7 +192,9 @@ def closed_loop(
     for name in ("before", "q"):  # of runs that were over before they began, none
         arrays[name] = np.nan_to_num(arrays[name], nan=NOT_STARTED).astype(int)
     passing = None if follower is None else follower.passing
-    return Rollout(path[: samples + 1], length, outcome, first_mode, **arrays, passing=passing)
+    return Rollout(
+        path[: samples + 1], length, limit, outcome, first_mode, **arrays, passing=passing
+    )
 
 
 def _noise(

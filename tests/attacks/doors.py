@@ -185,7 +185,7 @@ def _written(draw: Random, folder: Path) -> Path:
     return path
 
 
-def _plant(folder: Path) -> None:
+def plant_modules(folder: Path) -> None:
     """Puts modules into the current folder that leave the marker behind."""
     for name in MODULES:
         evil(folder, f"{name}.py")
@@ -211,7 +211,7 @@ def _broke(work: Callable[[], object], folder: Path, seconds: float = SECONDS) -
 def _spec(material: Material, seed: int, folder: Path) -> str:
     """A received run whose task is an environment."""
     draw, path = Random(seed), material.copy(folder)
-    _plant(folder)
+    plant_modules(folder)
     spec = f"env:{json.dumps({'env': draw.choice(IDS), **_described(draw, folder)})}"
     spec = draw.choice(
         [spec] * 9 + ["env:", "env:{", "env:[" + "[" * 100_000, "env:null", 'env:{"env":1}']
@@ -231,7 +231,7 @@ def _spec(material: Material, seed: int, folder: Path) -> str:
 def _arguments(seed: int, folder: Path) -> str:
     """A file of arguments that a stranger wrote, for an environment that the user names."""
     draw = Random(seed)
-    _plant(folder)
+    plant_modules(folder)
     given = _described(draw, folder)
     text = json.dumps(given)
     text = draw.choice([text] * 9 + ["[" * 100_000, "{" * 1_000, '{"a":' * 50_000, "null", "1e400"])
@@ -365,7 +365,7 @@ def _threads(material: Material, seed: int, folder: Path) -> str:
 def _sweep(material: Material, seed: int, folder: Path) -> str:
     """A received folder of a sweep, whose texts are formulas, links, escapes and elements."""
     draw = Random(seed)
-    _plant(folder)
+    plant_modules(folder)
     (folder / "sweep").mkdir()
     path = material.copy(folder / "sweep")
     texts = (

@@ -9,12 +9,13 @@ from attacks import Answer, child, command
 from attacks.small import shorten  # noqa: F401
 
 TASK = "unit_circle"
-RUN = ("run", TASK, "--preset", "smoke", "--out", TASK)
+SMOKE = ("--preset", "smoke", "--out")
+RUN = ("run", TASK, *SMOKE, TASK)
 
 
 @dataclass(frozen=True)
 class Material:
-    """Runs of preset smoke on the unit circle, which nothing disturbed.
+    """Runs of preset smoke, which nothing disturbed.
 
     Attributes:
         folder: where they are.
@@ -22,13 +23,13 @@ class Material:
 
     folder: Path
 
-    def finished(self, *options: str) -> Path:
-        """Returns the run directory of `hyrl-mj run` with these options."""
-        path = self.folder / "_".join(("material", *options)).replace("-", "")
+    def finished(self, *options: str, of: str = TASK) -> Path:
+        """Returns the run directory of `hyrl-mj run` of a task with these options."""
+        path = self.folder / "_".join(("material", of, *options)).replace("-", "")
         if not path.exists():
             path.mkdir()
-            self.do(path, [(*RUN, *options)])
-        return path / TASK
+            self.do(path, [("run", of, *SMOKE, of, *options)])
+        return path / of
 
     def do(self, folder: Path, commands: Iterable[tuple[str, ...]]) -> list[Answer]:
         """Gives commands in a folder, which must succeed."""
