@@ -25,7 +25,7 @@ AGENT = (
 )
 FIELD = {
     "goal_m": [4.0, 0.0],
-    "posts": [{"positions_m": [[2.0, 0.1]]}],
+    "posts": [{"radius_m": 0.3, "positions_m": [[2.0, 0.1]]}],
     "starts": [{"position_m": [0.0, 0.0], "heading_rad": 0.0}],
     "time_s": 1.0,
 }
@@ -39,7 +39,7 @@ COMMANDS = {
     "sweep": SWEEP,
 }
 # What is compared of what a command makes.
-MADE = {"drive": PICTURE, "sweep": f"sweep/{TASK}-seed0"}
+MADE = {"drive": PICTURE, "sweep": f"sweep/{TASK}-0.1-0"}
 # A sweep takes half a minute, of which Ray takes most: it is killed once where others are several times.
 OFTEN = {"sweep": 1 / 5}
 
@@ -72,7 +72,9 @@ def _whole(material: Material, name: str) -> Whole:
     folder.mkdir()
     _prepare(material, name, folder)
     (answer,) = material.do(folder, [COMMANDS[name]])
-    return Whole(folder / MADE.get(name, TASK), answer.seconds[0])
+    made = folder / MADE.get(name, TASK)
+    assert made.exists(), name
+    return Whole(made, answer.seconds[0])
 
 
 def _prepare(material: Material, name: str, folder: Path) -> None:
@@ -80,7 +82,7 @@ def _prepare(material: Material, name: str, folder: Path) -> None:
     crafted_agents.write_zip(folder)
     (folder / "field.json").write_text(json.dumps(FIELD), encoding="utf-8")
     if name == "drive":
-        shutil.copytree(material.finished(of="field"), folder / "field")
+        shutil.copytree(material.field(), folder / "field")
 
 
 def _killed(
@@ -97,5 +99,8 @@ def _killed(
         return f"an uninterrupted {name} writes another {made.name}"
     if broke := child(work, folder).broke(ended=(0, 1)):
         return broke
-    wrong = differences(made.parent, whole.parent) if made.is_file() else differences(made, whole)
+    if made.is_file():
+        same = made.read_bytes() == whole.read_bytes()
+        return "" if same else f"not the {made.name} of an uninterrupted {name}"
+    wrong = differences(made, whole)
     return f"not as an uninterrupted {name}: {wrong}" if wrong else ""

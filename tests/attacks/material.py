@@ -5,12 +5,19 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+import hyrl_mj
 from attacks import Answer, child, command
 from attacks.small import shorten  # noqa: F401
+from hyrl_mj.learning import preset
+from hyrl_mj.policies import MlpPolicy
+from hyrl_mj.run_directory import Run, write_config
+from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.stages import Arrivals, ExtendedSets, ModeResult, Retraining
 
 TASK = "unit_circle"
-SMOKE = ("--preset", "smoke", "--out")
-RUN = ("run", TASK, *SMOKE, TASK)
+RUN = ("run", TASK, "--preset", "smoke", "--out", TASK)
 
 
 @dataclass(frozen=True)
@@ -23,13 +30,46 @@ class Material:
 
     folder: Path
 
-    def finished(self, *options: str, of: str = TASK) -> Path:
-        """Returns the run directory of `hyrl-mj run` of a task with these options."""
-        path = self.folder / "_".join(("material", of, *options)).replace("-", "")
+    def finished(self, *options: str) -> Path:
+        """Returns the run directory of `hyrl-mj run` with these options."""
+        path = self.folder / "_".join(("material", *options)).replace("-", "")
         if not path.exists():
             path.mkdir()
-            self.do(path, [("run", of, *SMOKE, of, *options)])
-        return path / of
+            self.do(path, [(*RUN, *options)])
+        return path / TASK
+
+    def field(self) -> Path:
+        """Returns a run directory of `field` whose policies, which are not trained, drive straight on."""
+        path = self.folder / "material_field" / "field"
+        if path.exists():
+            return path
+        task = hyrl_mj.get_task("field")
+        levels, observed = task.input_levels, len(task.observation_low)
+        weights = {
+            "action_net.weight": np.zeros((len(levels), observed), dtype=np.float32),
+            "action_net.bias": np.all(levels == [1.0, 0.0], axis=1).astype(np.float32),
+        }
+        ahead = MlpPolicy(task, "ppo", "tanh", weights)
+        run = Run(path, preset(task, "smoke"))
+        write_config(run)
+        with run.stage("train"):
+            ahead.save(path / "policy.safetensors")
+            Arrivals(990, 0, 1_000).save(path / "arrivals.json")
+        with run.stage("extended-sets"):
+            grid = Grid.with_cells(task.chart, 4)
+            inside = np.ones(len(grid.nodes), dtype=bool)
+            sets = (GridSet(grid, -np.ones(len(grid.nodes))),) * 2
+            ends = np.empty((0, task.chart.dimension)), np.empty(0)
+            ExtendedSets((0, 1), sets, (inside, inside), 0.3, 0.1, *ends).save(
+                path / "extended_sets.npz"
+            )
+        with run.stage("retrain"):
+            for mode in (0, 1):
+                ahead.save(path / f"mode_{mode}.safetensors")
+            Retraining((ModeResult(0, 1.0, 1), ModeResult(1, 1.0, 1))).save(
+                path / "retraining.json"
+            )
+        return path
 
     def do(self, folder: Path, commands: Iterable[tuple[str, ...]]) -> list[Answer]:
         """Gives commands in a folder, which must succeed."""
