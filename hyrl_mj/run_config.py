@@ -6,7 +6,6 @@ import platform
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import ClassVar
 
 from hyrl_mj import artifacts
 from hyrl_mj.learning import Settings
@@ -25,8 +24,6 @@ class Config:
         settings: every setting of the run.
         versions: the versions of Python and the packages when the run began.
     """
-
-    LATER: ClassVar = ("settings.everywhere", "settings.stage1.spread", "settings.stage6.spread")
 
     settings: Settings
     versions: dict[str, str]

@@ -75,8 +75,6 @@ class Run:
         """SHA-256 of the settings that each stage is made with."""
         values = asdict(self.settings)
         del values["task"]
-        if not values["everywhere"]:
-            del values["everywhere"]  # as in earlier versions
         last = {stage: values | {"horizon": None} for stage in FILES} | {"extended-sets": values}
         texts = {stage: json.dumps(v, sort_keys=True, default=str) for stage, v in last.items()}
         return {name: sha256(text.encode()).hexdigest() for name, text in texts.items()}

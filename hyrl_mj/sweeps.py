@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -141,8 +141,6 @@ class Sweep:
         common: the settings that all runs share.
         rows: the runs.
     """
-
-    LATER: ClassVar = ("common.everywhere",)
 
     common: Common
     rows: tuple[Row, ...]
