@@ -322,7 +322,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], kind: str) -> Non
 def read_arrays(path: Path, kind: str) -> dict[str, np.ndarray]:
     """Returns the arrays that `write_arrays` wrote."""
     with reading(path):
-        content = archives.read_npz(path, LARGEST)
+        content = archives.read_npz(read_limited(path), LARGEST)
         check_version(int(content.pop("version")), str(content.pop("kind")), kind)
         return content
 

@@ -12,7 +12,7 @@ from zipfile import is_zipfile
 
 import numpy as np
 
-from hyrl_mj import archives
+from hyrl_mj import archives, artifacts
 from hyrl_mj.errors import BadArtifact, printable
 from hyrl_mj.policies import sb3_metadata, torch_file
 from hyrl_mj.policies.algorithms import ALGORITHMS
@@ -51,12 +51,13 @@ def read_zip(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Returns the tensors of an SB3 zip by name, and its metadata, {} if it has none."""
     if not is_zipfile(path):
         raise BadArtifact(f"it is not a zip: {REMEDY}")
-    with archives.open_zip(path.open("rb")) as file:
+    with archives.open_zip(artifacts.read_limited(path)) as file:
         names = set(file.namelist())
         if "policy.pth" not in names:
-            if "data" in names and SBX.search(
-                archives.read_member(file, "data", torch_file.LARGEST)
-            ):
+            data = (
+                archives.read_member(file, "data", torch_file.LARGEST) if "data" in names else b""
+            )
+            if SBX.search(data):
                 raise BadArtifact(
                     "it is an agent of SBX, whose networks are in JAX and saved as a pickle, which is not "
                     f"opened: {INSTEAD}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from typing import Any, Literal
 from zipfile import ZIP_STORED, ZipFile
@@ -34,7 +33,7 @@ def read_tensors(content: bytes) -> dict[str, np.ndarray]:
         BadArtifact: it holds anything else, or more than an MLP policy.
     """
     try:
-        with archives.open_zip(io.BytesIO(content)) as file:
+        with archives.open_zip(content) as file:
             return _StateDict(file).tensors()
     except BadArtifact:
         raise
