@@ -113,7 +113,8 @@ def with_pickle(path, content):
     return rewritten(path, policy_pth=buffer.getvalue())
 
 
-DOUBLING = b")" + b"".join(b"q%ch%ch%c\x86" % (i, i, i) for i in range(100))
+# (x, x) of (x, x) of ...: each tuple is twice the one that was memoised before.
+DOUBLING = b")" + b"".join(b"q%ch%c\x86" % (i, i) for i in range(100))
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from hyrl_mj.game.result import (
     Wins,
 )
 from hyrl_mj.learning import preset
-from hyrl_mj.run_config import Config
+from hyrl_mj.run_directory import Config
 
 
 @dataclass(frozen=True)

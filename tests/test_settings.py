@@ -13,7 +13,7 @@ from hyrl_mj.game import Lattice
 from hyrl_mj.learning import Settings, Training, preset, training
 from hyrl_mj.learning.options import OPTIONS, OWN
 from hyrl_mj.policies import algorithms
-from hyrl_mj.run_config import Config
+from hyrl_mj.run_directory import Config
 from hyrl_mj.sets import MOST_NODES, Grid
 
 NAN, INF = math.nan, math.inf
