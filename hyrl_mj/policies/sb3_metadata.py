@@ -147,26 +147,18 @@ def _normalized(
 
     None if that cannot be told.
     """
-    open_parts = []
+    open_columns: list[bool] = []
     for name, after in last.items():
         before = original[name]
         if after.dtype != before.dtype:
             return True  # VecNormalize gives float32 whatever it gets
         plain = after.dtype == np.float64 and n_stack == 1  # stacks have the type of the space
         # What is constant, a goal say, stays as it is; normalised it would be 0.
-        if not plain and not ((after == before) & (after != 0)).all(axis=0).any():
-            open_parts.append(name)
-    if not open_parts:
+        constant = ((after == before) & (after != 0)).all(axis=0).any()
+        open_columns += [not (plain or constant)] * after.shape[1]
+    if not any(open_columns):
         return False
-    ends = np.cumsum([part.shape[1] for part in last.values()])
-    columns = np.concatenate(
-        [
-            np.arange(end - last[name].shape[1], end)
-            for name, end in zip(last, ends, strict=True)
-            if name in open_parts
-        ]
-    )
-    return seen.normalized(_joined(last), _joined(original), on_policy, columns)
+    return seen.normalized(_joined(last), _joined(original), on_policy, np.array(open_columns))
 
 
 def _observations(about: Mapping[str, Any], key: str, task: Task) -> _Parts | None:
@@ -287,7 +279,7 @@ class _Seen:
     def normalized(
         self, last: np.ndarray, original: np.ndarray, on_policy: bool, columns: np.ndarray
     ) -> bool | None:
-        """Returns whether `columns` of the last observations (n, k) are normalised, unlike the original ones.
+        """Returns whether `columns` (k,) of the last observations (n, k) are normalised, unlike the original.
 
         None if that cannot be told.
         """
