@@ -2,6 +2,9 @@
 
 Keyword-only parameters are options, the others are positional, and a parameter that is a frozen dataclass
 stands for an option per field. An entry of the docstring ends in "; by default ..." if None has a meaning.
+
+tyro collects the words and lays out the help. It does not read the values, because it answers a mistake with
+a box of several lines, and shows Python's types and None.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ from hyrl_mj.policies.external import (
     reopen_agent,
 )
 from hyrl_mj.policies.functions import from_callable
-from hyrl_mj.policies.memoryless import Asked, check_memoryless
+from hyrl_mj.policies.memoryless import Asked
 from hyrl_mj.policies.mlp import (
     ACTIVATIONS,
     BLAS,
@@ -34,15 +34,8 @@ from hyrl_mj.policies.mlp import (
     MlpPolicy,
     ObservationPolicy,
     Policy,
-    SampledPolicy,
 )
-from hyrl_mj.policies.preprocessing import (
-    Normalization,
-    PreprocessedPolicy,
-    Preprocessing,
-    as_function,
-    network,
-)
+from hyrl_mj.policies.preprocessing import PreprocessedPolicy, as_function, network
 from hyrl_mj.policies.sb3_zip import infer_algorithm
 
 __all__ = [
@@ -58,19 +51,15 @@ __all__ = [
     "Asked",
     "Controller",
     "MlpPolicy",
-    "Normalization",
     "ObservationPolicy",
     "Policy",
     "PolicyController",
     "PreprocessedPolicy",
-    "Preprocessing",
-    "SampledPolicy",
     "algorithms",
     "answer",
     "as_controller",
     "as_function",
     "check_agent_file",
-    "check_memoryless",
     "check_modes",
     "from_callable",
     "infer_algorithm",
