@@ -34,6 +34,7 @@ from hyrl_mj.policies.mlp import (
     MlpPolicy,
     ObservationPolicy,
     Policy,
+    SampledPolicy,
 )
 from hyrl_mj.policies.preprocessing import PreprocessedPolicy, as_function, network
 from hyrl_mj.policies.sb3_zip import infer_algorithm
@@ -55,6 +56,7 @@ __all__ = [
     "Policy",
     "PolicyController",
     "PreprocessedPolicy",
+    "SampledPolicy",
     "algorithms",
     "answer",
     "as_controller",
