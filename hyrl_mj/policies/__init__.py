@@ -36,7 +36,13 @@ from hyrl_mj.policies.mlp import (
     Policy,
     SampledPolicy,
 )
-from hyrl_mj.policies.preprocessing import PreprocessedPolicy, as_function, network
+from hyrl_mj.policies.preprocessing import (
+    Normalization,
+    PreprocessedPolicy,
+    Preprocessing,
+    as_function,
+    network,
+)
 from hyrl_mj.policies.sb3_zip import infer_algorithm
 
 __all__ = [
@@ -52,10 +58,12 @@ __all__ = [
     "Asked",
     "Controller",
     "MlpPolicy",
+    "Normalization",
     "ObservationPolicy",
     "Policy",
     "PolicyController",
     "PreprocessedPolicy",
+    "Preprocessing",
     "SampledPolicy",
     "algorithms",
     "answer",

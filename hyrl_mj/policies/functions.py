@@ -34,7 +34,7 @@ class FunctionPolicy(ObservationPolicy):
         discrete = self.task.input_levels is not None
         try:
             actions = np.asarray(self.function(observation.astype(np.float32)))
-            if discrete and actions.dtype.kind == "f":
+            if discrete and actions.ndim > 1 and actions.dtype.kind == "f":
                 actions = _preferred(actions, self.task)
         except Exception as error:  # a user's code can raise anything
             what = error if isinstance(error, BadInput) else f"it raised {brief(error)}"
