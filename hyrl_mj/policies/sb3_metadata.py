@@ -92,13 +92,11 @@ def check_observations(
         normalized = False  # under VecNormalize SB3 keeps it from the first observation on
     elif last is not None and original is not None and _sizes(last) == _sizes(original):
         normalized = _normalized(last, original, seen, on_policy, n_stack)
-    if normalized:
-        assert last is not None
-        assert original is not None
-        raise BadArtifact(
-            "it was trained on normalised observations (VecNormalize): its last one is "
-            f"{_row(_joined(last))}, where {task.name} gave {_row(_joined(original))}; {HOW}"
-        )
+        if normalized:
+            raise BadArtifact(
+                "it was trained on normalised observations (VecNormalize): its last one is "
+                f"{_row(_joined(last))}, where {task.name} gave {_row(_joined(original))}; {HOW}"
+            )
     _check_wrappers(about, last, seen)
     if normalized is None:
         raise BadArtifact(
@@ -124,8 +122,7 @@ def _check_wrappers(about: Mapping[str, Any], last: _Parts | None, seen: _Seen) 
     space = about.get("observation_space")
     limits = [_numbers(space, end) if isinstance(space, dict) else None for end in ("low", "high")]
     ours = np.array([task.observation_low, task.observation_high], dtype=float)
-    if given is False:
-        assert joined is not None
+    if joined is not None and given is False:
         which = f"its last one is {_row(joined)}, which {task.name} never gives"
     elif task.observation_dtype == "float64" and "float32" in types:
         which = f"they are float32, those of {task.name} float64"
