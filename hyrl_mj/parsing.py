@@ -246,9 +246,9 @@ def call(function: Callable[..., None], name: str, words: Sequence[str]) -> None
         config=(tyro.conf.FlagCreatePairsOff,),
     )
     if rest:
-        option = rest[0].partition("=")[0]
-        if option.startswith("-"):
-            raise unknown("option", option, [*options, "--help"])
+        title = rest[0].partition("=")[0]
+        if title.startswith("-"):
+            raise unknown("option", title, [*options, "--help"])
         raise BadInput(f"{name} has no use for {rest[0]!r}: see hyrl-mj {name} --help")
     keywords: dict[str, Any] = {}
     for argument in every:
