@@ -195,11 +195,7 @@ def parsed(content: Mapping[str, Any], record: type[Record], remedy: str = REMED
         problems = error.errors(include_url=False, include_input=False)
     else:
         # Files are written with every field: a default would hide that one is missing.
-        # Those that earlier versions did not write, at any place of a list.
-        later = getattr(record, "LATER", ())
-        missing = _missing(asdict(value), content)
-        lacking = (name for name in missing if re.sub(r"\.\d+", "", name) not in later)
-        if lacks := next(lacking, None):
+        if lacks := next(_missing(asdict(value), content), None):
             raise BadArtifact(
                 f"it has no {lacks}, so it is damaged or of another version: {remedy}"
             )
@@ -326,7 +322,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], kind: str) -> Non
 def read_arrays(path: Path, kind: str) -> dict[str, np.ndarray]:
     """Returns the arrays that `write_arrays` wrote."""
     with reading(path):
-        content = archives.read_npz(path, LARGEST)
+        content = archives.read_npz(read_limited(path), LARGEST)
         check_version(int(content.pop("version")), str(content.pop("kind")), kind)
         return content
 

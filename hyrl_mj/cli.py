@@ -14,10 +14,6 @@ from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.parsing import call, documented
 from hyrl_mj.streams import Streams
 
-# Options of version 0.1, by command.
-BOUND = {"--noise": "--eps"}
-RENAMED = {"run": BOUND, "robustify": BOUND, "diagnose": BOUND, "simulate": {"--horizon": "--time"}}
-
 HEAD = """\
 usage: hyrl-mj [-h] [--version] COMMAND ...
 
@@ -43,7 +39,7 @@ def dispatch(words: Sequence[str]) -> None:
         case ["--version", *_]:
             print(f"hyrl-mj {__version__}")
         case [name, *rest] if name in COMMANDS:
-            call(COMMANDS[name], name, rest, RENAMED.get(name, {}))
+            call(COMMANDS[name], name, rest)
         case [name, *_]:
             raise unknown("command", name, COMMANDS)
         case _:

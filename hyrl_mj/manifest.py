@@ -11,7 +11,7 @@ import os
 import re
 import stat
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -164,7 +164,8 @@ class Manifest:
 
     def _doubt(self, name: str, entries: Mapping[str, Entry]) -> str:
         """Returns why a file is not to be believed after the entries of a manifest, "" if it is."""
-        path, recorded = self.folder / name, _outputs(entries.values())
+        path = self.folder / name
+        recorded = {name: sha for entry in entries.values() for name, sha in entry.outputs.items()}
         if not path.is_file():
             return "is missing"
         if name not in recorded:
@@ -217,11 +218,6 @@ class Manifest:
         """Writes the manifest; in whichever order stages ran, the same results are the same bytes."""
         in_order = {stage: entries[stage] for stage in FILES if stage in entries}
         artifacts.write_json(self.folder / NAME, _Stages(in_order), kind="manifest")
-
-
-def _outputs(entries: Iterable[Entry]) -> dict[str, str]:
-    """Returns the recorded SHA-256 of all files that stages wrote."""
-    return {name: content for entry in entries for name, content in entry.outputs.items()}
 
 
 def _remedy(stage: str, folder: Path, done: Collection[str]) -> str:

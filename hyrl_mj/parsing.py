@@ -2,6 +2,9 @@
 
 Keyword-only parameters are options, the others are positional, and a parameter that is a frozen dataclass
 stands for an option per field. An entry of the docstring ends in "; by default ..." if None has a meaning.
+
+tyro collects the words and lays out the help. It does not read the values, because it answers a mistake with
+a box of several lines, and shows Python's types and None.
 """
 
 from __future__ import annotations
@@ -9,7 +12,7 @@ from __future__ import annotations
 import inspect
 import re
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, make_dataclass, replace
 from itertools import chain, pairwise
 from pathlib import Path
@@ -212,12 +215,8 @@ def _has_options(kind: Any) -> bool:
     return is_dataclass(kind) and kind not in KINDS
 
 
-def call(
-    function: Callable[..., None], name: str, words: Sequence[str], renamed: Mapping[str, str]
-) -> None:
+def call(function: Callable[..., None], name: str, words: Sequence[str]) -> None:
     """Calls the function of a command with the words that a user types after "hyrl-mj" and its name.
-
-    `renamed` holds the options that the command no longer has, with their new names.
 
     Raises:
         BadInput: the words cannot be used.
@@ -247,7 +246,10 @@ def call(
         config=(tyro.conf.FlagCreatePairsOff,),
     )
     if rest:
-        raise _unexpected(rest[0], name, words, options, renamed)
+        title = rest[0].partition("=")[0]
+        if title.startswith("-"):
+            raise unknown("option", title, [*options, "--help"])
+        raise BadInput(f"{name} has no use for {rest[0]!r}: see hyrl-mj {name} --help")
     keywords: dict[str, Any] = {}
     for argument in every:
         typed = getattr(parsed, argument.name)
@@ -262,17 +264,3 @@ def call(
             inside = [option.name for option in fields(kind) if option.name in keywords]
             keywords[parameter] = kind(**{option: keywords.pop(option) for option in inside})
     function(**keywords)
-
-
-def _unexpected(
-    word: str, name: str, words: Sequence[str], options: Iterable[str], renamed: Mapping[str, str]
-) -> BadInput:
-    """Returns the error for a word that the command of this name has no use for."""
-    option = word.partition("=")[0]
-    if option in renamed:
-        new = renamed[option]
-        again = [new + w[len(option) :] if w.partition("=")[0] == option else w for w in words]
-        return BadInput(f"{option} is now called {new}: hyrl-mj {name} {shlex.join(again)}")
-    if option.startswith("-"):
-        return unknown("option", option, [*options, "--help"])
-    return BadInput(f"{name} has no use for {word!r}: see hyrl-mj {name} --help")

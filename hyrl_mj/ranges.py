@@ -2,7 +2,9 @@
 
     samples: Annotated[int, Integer(1, 1_000_000_000)]
 
-`check_fields` applies them where a record is made, also from a file.
+`check_fields` applies them where a record is made, also from a file. Pydantic, which reads the files, has
+ranges, too. But it takes the text "12" and True for integers, or in its strict mode no numbers of NumPy; it
+names neither the value nor the other end of a range; and its import takes a fifth of a second.
 """
 
 from __future__ import annotations

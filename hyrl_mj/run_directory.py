@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import platform
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from hashlib import sha256
+from importlib.metadata import version
 from pathlib import Path
 
 from hyrl_mj import artifacts, policies
@@ -18,7 +20,6 @@ from hyrl_mj.learning import Settings, differing
 from hyrl_mj.manifest import FILES, Manifest, check_contents, locked, may_hold
 from hyrl_mj.policies import Agent, AnyPolicy, MlpPolicy, Policy
 from hyrl_mj.proof import why_no_cells
-from hyrl_mj.run_config import Config
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.stages import (
@@ -34,6 +35,29 @@ from hyrl_mj.stages import (
 )
 from hyrl_mj.tasks import Field, Task, described_task, get_task, reference
 from hyrl_mj.verdict import Verdict
+
+# The packages whose versions `config.json` records.
+PACKAGES = (
+    "hyrl-mj", "mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "mediapy",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Config:
+    """The content of `config.json`.
+
+    Attributes:
+        settings: every setting of the run.
+        versions: the versions of Python and the packages when the run began.
+    """
+
+    settings: Settings
+    versions: dict[str, str]
+
+    @staticmethod
+    def load(path: Path) -> Config:
+        """Reads `config.json`; raises `BadArtifact` if it is damaged or of another version."""
+        return artifacts.read_record(path, "run", Config, "start a new run with another --out")
 
 
 @dataclass(frozen=True)
@@ -75,8 +99,6 @@ class Run:
         """SHA-256 of the settings that each stage is made with."""
         values = asdict(self.settings)
         del values["task"]
-        if not values["everywhere"]:
-            del values["everywhere"]  # as in earlier versions
         last = {stage: values | {"horizon": None} for stage in FILES} | {"extended-sets": values}
         texts = {stage: json.dumps(v, sort_keys=True, default=str) for stage, v in last.items()}
         return {name: sha256(text.encode()).hexdigest() for name, text in texts.items()}
@@ -349,7 +371,10 @@ def load_run(
 
 def write_config(run: Run, versions: dict[str, str] | None = None) -> None:
     """Writes `config.json`: every setting, and the versions of Python and the packages, by default of now."""
-    artifacts.write_json(run.path / "config.json", Config.of(run.settings, versions), kind="run")
+    if versions is None:
+        versions = {name: version(name) for name in PACKAGES}
+        versions["python"] = platform.python_version()
+    artifacts.write_json(run.path / "config.json", Config(run.settings, versions), kind="run")
 
 
 @contextmanager

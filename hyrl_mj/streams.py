@@ -2,7 +2,8 @@
 
 A run takes minutes, and what it writes to disk does not depend on who reads what it says. A closed stream, a
 pipe whose reader has gone, a full disk behind a redirection, or a character that the terminal does not know
-must not end it. What could not be shown is said once, at the end.
+must not end it. What could not be shown is said once, at the end. Python's own streams raise an error at the
+next `print`, wherever that is.
 """
 
 from __future__ import annotations

@@ -6,9 +6,9 @@ import csv
 import json
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -142,8 +142,6 @@ class Sweep:
         rows: the runs.
     """
 
-    LATER: ClassVar = ("common.everywhere",)
-
     common: Common
     rows: tuple[Row, ...]
 
@@ -189,13 +187,14 @@ class Sweep:
         ):
             writer = csv.writer(file)
             head = ["task", "algorithm", "eps", "seed", "state", "verdict", "seconds"]
-            writer.writerow([_plain(cell) for cell in (*head, *names, "sentence")])
+            writer.writerow([*head, *map(_plain, names), "sentence"])
             for row in self.rows:
-                values = [row.seed, row.state, row.verdict, f"{row.seconds:.1f}"]
+                task, algorithm = _plain(row.setting.task), _plain(row.setting.algorithm)
+                values = [row.seed, row.state, _plain(row.verdict), f"{row.seconds:.1f}"]
                 found = [row.figures.get(name) for name in names]
                 cells = ["" if value is None else f"{value:.6g}" for value in found]
-                whole = [*asdict(row.setting).values(), *values, *cells, row.sentence]
-                writer.writerow([_plain(cell) for cell in whole])
+                sentence = _plain(row.sentence)
+                writer.writerow([task, algorithm, row.setting.eps, *values, *cells, sentence])
 
     def groups(self) -> dict[Setting, list[Row]]:
         """Returns the rows by setting."""
@@ -205,18 +204,9 @@ class Sweep:
         return found
 
 
-def _plain(cell: object) -> object:
-    """Returns a cell that a spreadsheet does not take for a formula."""
-    is_formula = isinstance(cell, str) and cell.startswith(FORMULAS) and not _is_number(cell)
-    return f"'{cell}" if is_formula else cell
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+def _plain(text: str) -> str:
+    """Returns a text that a spreadsheet does not take for a formula."""
+    return f"'{text}" if text.startswith(FORMULAS) else text
 
 
 def opened(folder: Path, common: Common, rows: Iterable[Row]) -> Sweep:

@@ -373,9 +373,7 @@ def mode_sentence(task: Task, result: ModeResult) -> str:
     """Returns how well the policy of a mode holds its set."""
     trainings = f"{result.attempts} training{'' if result.attempts == 1 else 's'}"
     how = f"after {trainings}" if result.attempts else "without a training of its own"
-    mode = (
-        f"the policy of mode {task.mode_name(result.mode)}{POLICIES.get(result.policy or '', '')}"
-    )
+    mode = f"the policy of mode {task.mode_name(result.mode)}{POLICIES.get(result.policy, '')}"
     won = (
         "all of its set that was tried" if result.won == 1 else f"{percent(result.won)} of its set"
     )

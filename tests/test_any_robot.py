@@ -5,7 +5,6 @@ import os
 import re
 import subprocess
 import sys
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import gymnasium
@@ -15,11 +14,10 @@ from gl import needs_gl
 from sentences import assert_has_ended
 
 import hyrl_mj
-from hyrl_mj import BadInput, Outcome
+from hyrl_mj import Outcome
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.simulation import WayRuns, way_runs
-from hyrl_mj.tasks import registry
 from hyrl_mj.tasks.checks import check_task
 from hyrl_mj.tasks.registry import reference
 from hyrl_mj.tasks.scaffold import TEMPLATES, write_task
@@ -353,72 +351,6 @@ def test_a_mistake_is_one_sentence_before_any_training(tmp_path, mistake):
     assert "Traceback" not in done.stderr
     assert "my_robot" in done.stderr
     assert not (tmp_path / "runs").exists()
-
-
-# ---- tasks written for 0.1
-
-NOW = r"    scene = Scene\(.*?\n    # What trains.*?\n    learning = .*?\n"
-THEN = """    replay_starts = ((0.0, 0.15),)
-    replay_time, mode_names = 3.2, ("left", "right")
-    levels, algorithm = 5, "dqn"
-    horizon = 0.3
-"""
-SCENE = (
-    "replay_starts, replay_time, mode_names -> "
-    "scene = hyrl_mj.Scene(starts=..., time=..., mode_names=...)"
-)
-LEARNING = "levels, algorithm, horizon -> learning = hyrl_mj.Learning(levels=..., algorithm=..., horizon=...)"
-REWARD = "reward(self, measurement) -> reward(self, measurement, u)"
-
-
-def written_for_01(folder, name, attributes=True, reward=True, in_init=False):
-    """Writes a task as the scaffold of 0.1 did, and returns its file."""
-    write_task(name, folder)
-    path = folder / f"{name}.py"
-    text = path.read_text()
-    if attributes:
-        text = re.sub(NOW, THEN, text, flags=re.DOTALL)
-    if reward:
-        text = text.replace("def reward(self, measured, u):", "def reward(self, measured):")
-    if in_init:
-        text += "\n    def __init__(self):\n        self.levels = 5\n        self.search = 'rods'\n"
-    path.write_text(text)
-    return path
-
-
-def test_a_task_written_for_01_is_told_all_that_has_another_name(tmp_path):
-    path = written_for_01(tmp_path, "former_robot")
-    for load in (hyrl_mj.get_task, hyrl_mj.run):
-        with pytest.raises(BadInput) as caught:
-            load(path)
-        assert str(caught.value) == (
-            f"the task former_robot of {path} was written for hyrl_mj 0.1: rename "
-            f"{SCENE}; {LEARNING}; {REWARD}"
-        )
-    done = command("run", path, "--preset", "smoke", cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.count("was written for hyrl_mj 0.1") == 1
-    assert len(done.stderr.strip().splitlines()) == 1
-
-
-def test_a_reward_of_01_alone_is_told_too(tmp_path):
-    with pytest.raises(BadInput, match=re.escape(f"0.1: rename {REWARD}") + "$"):
-        hyrl_mj.get_task(written_for_01(tmp_path, "former_reward", attributes=False))
-
-
-def test_attributes_of_01_are_found_on_the_instance_too(tmp_path):
-    path = written_for_01(tmp_path, "former_init", False, False, in_init=True)
-    with pytest.raises(BadInput, match=r"levels, search -> learning = hyrl_mj\.Learning"):
-        hyrl_mj.get_task(path)
-
-
-def test_an_installed_task_of_01_is_told_by_its_own_sentence(tmp_path, monkeypatch):
-    path = written_for_01(tmp_path, "former_installed")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    entry = EntryPoint("former_installed", "former_installed:FormerInstalled", registry.GROUP)
-    monkeypatch.setattr(registry, "_offered", lambda: {"former_installed": entry})
-    with pytest.raises(BadInput, match=f"^the task former_installed of {path} was written for"):
-        hyrl_mj.get_task("former_installed")
 
 
 # ---- a simulation that breaks down

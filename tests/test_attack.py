@@ -33,7 +33,7 @@ OPENED = {
     "agent": (
         120,
         "from hyrl_mj.policies import pickled\n"
-        "pickled.arrays = lambda content: {str(name): None for name, _ in pickled.read(content)}",
+        "pickled.arrays = lambda content: {str(name): None for name, _ in pickled.read(content).items}",
     ),
     "field": (
         120,

@@ -1,7 +1,6 @@
 """The attack on a run: what is written, read, printed, played and judged."""
 
 import shutil
-from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from test_report import Page, plant
 from test_verdict import ALL, EPS, HOLDS, episodes
 
 import hyrl_mj
-from hyrl_mj import BadArtifact, BadInput, artifacts, load_run
+from hyrl_mj import BadArtifact, BadInput, load_run
 from hyrl_mj.game import AttackCount, Robustness
 from hyrl_mj.pipeline import ExamineOptions, examine_run, run_stage
 from hyrl_mj.run_directory import Run
@@ -93,17 +92,6 @@ def test_an_impossible_budget_is_refused_before_any_work(copied, options):
 
 
 # ---- the record
-
-
-def test_a_record_without_attacks_is_read(examined, tmp_path):
-    content = asdict(load_run(examined).robustness)
-    assert len(content.pop("attacks")) == 2
-    path = tmp_path / "robustness.json"
-    artifacts.write_json(path, content, "robustness")
-    assert "attacks" not in path.read_text()
-    old = Robustness.load(path, of=("policy", "hyrl"))
-    assert old.attacks == ()
-    assert old.episodes == load_run(examined).robustness.episodes
 
 
 @pytest.mark.parametrize(

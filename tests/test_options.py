@@ -33,8 +33,6 @@ def test_an_agent_has_the_options_of_a_run_but_those_of_its_training_and_four_of
 @pytest.mark.parametrize(
     ("options", "changes", "parts"),
     [
-        (None, {"noise": 0.2}, ["the option noise is now called eps: give eps=0.2"]),
-        (None, {"preset_name": "smoke"}, ["is now called preset: give preset='smoke'"]),
         (None, {"sed": 3}, ["unknown option 'sed': choose one of", "Did you mean 'seed'?"]),
         (0.2, {}, ["options 0.2 cannot be used: give", "Options(...)"]),
         (RunOptions, {"activation": "tanh"}, ["unknown option 'activation'"]),

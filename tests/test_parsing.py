@@ -10,8 +10,6 @@ from hyrl_mj import __version__, cli
 from hyrl_mj.errors import BadInput
 from hyrl_mj.parsing import arguments, call, documented
 
-RENAMED = {"--length": "--size"}
-
 
 @dataclass(frozen=True)
 class Colour:
@@ -64,7 +62,7 @@ DEFAULTS = {"count": 3, "size": (640, 480), "layers": ("base",), "colour": Colou
 def painted(text):
     """What `paint` is called with."""
     CALLS.clear()
-    call(paint, "paint", text.split(), RENAMED)
+    call(paint, "paint", text.split())
     (only,) = CALLS
     return only
 
@@ -73,7 +71,7 @@ def helped(command, name, width, monkeypatch, capsys):
     """The help of a command in so many columns."""
     monkeypatch.setenv("COLUMNS", str(width))
     with pytest.raises(SystemExit) as ended:
-        call(command, name, ["--help"], {})
+        call(command, name, ["--help"])
     assert ended.value.code == 0
     return capsys.readouterr().out
 
@@ -112,8 +110,6 @@ def test_only_what_is_said_differs_from_the_defaults():
         ("north --who me --size 640", "--size '640' cannot be used: give WIDTHxHEIGHT in pixels, as 640x480"),
         ("north south --who me", "paint has no use for 'south': see hyrl-mj paint --help"),
         ("north --who me --bright yes", "paint has no use for 'yes': see hyrl-mj paint --help"),
-        ("north --length 8x6", "--length is now called --size: hyrl-mj paint north --size 8x6"),
-        ("--length=8x6 north", "--length is now called --size: hyrl-mj paint --size=8x6 north"),
     ],
 )  # fmt: skip
 def test_a_mistake_is_one_sentence(text, sentence, capsys):
@@ -192,10 +188,6 @@ def test_the_version_is_said(capsys):
     [
         ("", ["give a command, one of list, new-task, run"]),
         ("traim", ["unknown command 'traim'", "Did you mean 'train'?"]),
-        ("run vehicle --noise 0.2", ["hyrl-mj run vehicle --eps 0.2"]),
-        ("robustify vehicle --policy a.zip --noise=0.2", ["robustify vehicle --policy a.zip --eps=0.2"]),
-        ("diagnose vehicle --noise 0.2 --policy a.zip", ["diagnose vehicle --eps 0.2 --policy a.zip"]),
-        ("simulate runs/v --start 0 0 --horizon 2", ["hyrl-mj simulate runs/v --start 0 0 --time 2"]),
         ("run vehicle --nose 0.2", ["unknown option '--nose'", "--eps, --seed"]),
         ("run", ["give a TASK, see hyrl-mj list"]),
         ("train", ["train needs RUN: a run directory"]),

@@ -1,10 +1,8 @@
 """Every setting has a type and a range, where it is made and where it is read."""
 
 import inspect
-import json
 import math
 from dataclasses import asdict, fields, replace
-from hashlib import sha256
 
 import numpy as np
 import pytest
@@ -15,8 +13,7 @@ from hyrl_mj.game import Lattice
 from hyrl_mj.learning import Settings, Training, preset, training
 from hyrl_mj.learning.options import OPTIONS, OWN
 from hyrl_mj.policies import algorithms
-from hyrl_mj.run_config import Config
-from hyrl_mj.run_directory import Run
+from hyrl_mj.run_directory import Config
 from hyrl_mj.sets import MOST_NODES, Grid
 
 NAN, INF = math.nan, math.inf
@@ -103,7 +100,7 @@ def test_a_file_with_such_a_setting_is_refused(settings, tmp_path, name, value, 
     assert name in str(refused.value) or "control characters" in str(refused.value)
 
 
-@pytest.mark.parametrize("where", ["resolution", "search", "stage1.episode", "stage6.options"])
+@pytest.mark.parametrize("where", ["resolution", "everywhere", "stage1.episode", "stage6.options"])
 def test_a_file_without_a_setting_is_refused(settings, tmp_path, where):
     content = {"settings": asdict(settings), "versions": {}}
     inner = content["settings"]
@@ -114,21 +111,6 @@ def test_a_file_without_a_setting_is_refused(settings, tmp_path, where):
     artifacts.write_json(tmp_path / "config.json", content, "run")
     with pytest.raises(BadArtifact, match=f"it has no settings.{where}"):
         hyrl_mj.load_run(tmp_path)
-
-
-def test_a_file_of_before_noise_on_all_coordinates_still_loads(settings, tmp_path):
-    content = {"settings": asdict(settings), "versions": {}}
-    del content["settings"]["everywhere"]
-    artifacts.write_json(tmp_path / "config.json", content, "run")
-    run = hyrl_mj.load_run(tmp_path)
-    assert run.settings == settings
-    # Its stages stay done: their digests are those of before.
-    values = content["settings"] | {"horizon": None}
-    del values["task"]
-    text = json.dumps(values, sort_keys=True, default=str)
-    assert run.digests["train"] == sha256(text.encode()).hexdigest()
-    other = Run(tmp_path, replace(settings, everywhere=True))
-    assert other.digests["train"] != run.digests["train"]
 
 
 def test_numbers_of_numpy_become_plain_ones_that_a_file_can_hold(settings, tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -185,7 +185,7 @@ class GameResult:
         curve: what is won against the noise bound.
         profile: the noise that can be borne along M*.
         replays: the replays of what is proved or won at the largest noise bound, at most one for each
-            controller; none of an estimate, and in files of earlier versions.
+            controller; none of an estimate.
     """
 
     everywhere: bool
@@ -261,8 +261,6 @@ class Robustness:
         attacks: counts of the attack, one for each controller, if there was one.
     """
 
-    LATER: ClassVar[tuple[str, ...]] = ("game.lattice.contacts", "game.replays")
-
     eps: float
     everywhere: bool
     game: GameResult | None
@@ -312,12 +310,7 @@ class Robustness:
             BadArtifact: the file is missing, damaged, of another version, or about other controllers.
         """
         remedy = "run hyrl-mj robustness RUN to write it again"
-
-        def record(content: dict[str, Any]) -> Robustness:
-            # Before there were attacks, files had no field for them.
-            return artifacts.parsed({"attacks": [], **content}, Robustness, remedy)
-
-        robustness = artifacts.read_json(path, "robustness", record, remedy)
+        robustness = artifacts.read_record(path, "robustness", Robustness, remedy)
         if of:
             with artifacts.reading(path):
                 robustness.check(of)

@@ -26,9 +26,6 @@ from hyrl_mj.stages import Arrivals
 from hyrl_mj.tasks import Task, check_task, get_task
 from hyrl_mj.viz import beginning
 
-# Names of options in version 0.1, and their names now.
-RENAMED = {"noise": "eps", "preset_name": "preset"}
-
 
 @dataclass(frozen=True)
 class RunOptions:
@@ -107,9 +104,7 @@ def complete(kind: type[Options], options: Options | None, changes: dict[str, An
     if not isinstance(options, kind):
         raise BadInput(f"options {options!r} cannot be used: give {kind.__name__}(...)")
     names = [field.name for field in fields(kind)]  # type: ignore[arg-type]
-    for name, value in changes.items():
-        if new := RENAMED.get(name):
-            raise BadInput(f"the option {name} is now called {new}: give {new}={value!r}")
+    for name in changes:
         if name not in names:
             raise unknown("option", name, names)
     return replace(options, **changes)  # type: ignore[type-var]

@@ -26,7 +26,7 @@ from hyrl_mj.policies.external import (
     reopen_agent,
 )
 from hyrl_mj.policies.functions import from_callable
-from hyrl_mj.policies.memoryless import Asked, check_memoryless
+from hyrl_mj.policies.memoryless import Asked
 from hyrl_mj.policies.mlp import (
     ACTIVATIONS,
     BLAS,
@@ -70,7 +70,6 @@ __all__ = [
     "as_controller",
     "as_function",
     "check_agent_file",
-    "check_memoryless",
     "check_modes",
     "from_callable",
     "infer_algorithm",

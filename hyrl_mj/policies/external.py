@@ -28,14 +28,7 @@ from hyrl_mj.policies.preprocessing import (
     Preprocessing,
     network,
 )
-from hyrl_mj.policies.sb3_zip import (
-    REMEDY,
-    framewise,
-    from_tensors,
-    observed_parts,
-    observes_dict,
-    read_zip,
-)
+from hyrl_mj.policies.sb3_zip import REMEDY, from_zip
 from hyrl_mj.tasks import Task
 
 
@@ -205,27 +198,15 @@ def _load(
             raise BadInput("an .onnx file acts as it is: give neither an activation nor stochastic")
         policy = from_onnx(path, task, REMEDY, n_stack)
     else:
-        plain = str(vecnormalize) == NONE
-        mlp, preprocessing = _load_network(path, task, activation, preprocessing, plain)
+        if path.suffix == ".safetensors":
+            mlp = MlpPolicy.load(path, task, n_stack)
+            if activation not in (None, mlp.activation):
+                raise BadArtifact(f"{path} has activation {mlp.activation!r}: leave activation out")
+        else:
+            plain = str(vecnormalize) == NONE
+            mlp, preprocessing = from_zip(path, task, activation, preprocessing, plain)
         policy = SampledPolicy(mlp, np.random.default_rng(seed)) if stochastic else mlp
     return PreprocessedPolicy(policy, preprocessing) if preprocessing else policy
-
-
-def _load_network(
-    path: Path, task: Task, activation: str | None, preprocessing: Preprocessing, plain: bool
-) -> tuple[MlpPolicy, Preprocessing]:
-    """Returns the network in a zip or a `.safetensors` file, and its preprocessing, frame by frame."""
-    if path.suffix != ".safetensors":
-        with artifacts.reading(path, REMEDY):
-            tensors, about = read_zip(path)
-            policy = from_tensors(tensors, about, task, activation, preprocessing, plain)
-            if observes_dict(about):
-                preprocessing = framewise(preprocessing, task, list(observed_parts(about)))
-        return policy, preprocessing
-    policy = MlpPolicy.load(path, task, preprocessing.n_stack)
-    if activation not in (None, policy.activation):
-        raise BadArtifact(f"{path} has activation {policy.activation!r}: leave activation out")
-    return policy, preprocessing
 
 
 def read_agent(

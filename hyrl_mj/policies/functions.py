@@ -18,7 +18,8 @@ class FunctionPolicy(ObservationPolicy):
 
     Attributes:
         function: observations (n, k) float32 -> inputs (n, m) in the plant's units, which are clipped to
-            the task's limits; or the numbers of a discrete task's levels (n,) int.
+            the task's limits. For a discrete task: the numbers of the levels (n,) int, or preferences
+            (n, levels).
         name: what messages call it.
     """
 
@@ -30,12 +31,14 @@ class FunctionPolicy(ObservationPolicy):
         n, m = len(observation), len(self.task.inputs)
         if not n:
             return np.zeros((0, m))
+        discrete = self.task.input_levels is not None
         try:
             actions = np.asarray(self.function(observation.astype(np.float32)))
+            if discrete and actions.ndim > 1 and actions.dtype.kind == "f":
+                actions = _preferred(actions, self.task)
         except Exception as error:  # a user's code can raise anything
             what = error if isinstance(error, BadInput) else f"it raised {brief(error)}"
             raise BadInput(f"{self.name} cannot be used: {what}") from error
-        discrete = self.task.input_levels is not None
         shape, what = ((n,), "integers") if discrete else ((n, m), "inputs")
         if actions.shape != shape:
             raise BadInput(
@@ -62,8 +65,8 @@ def from_callable(function: Callable[[np.ndarray], Any], task: Task) -> Function
     Args:
         function: observations (n, k) float32, as the task's environments give them -> inputs (n, m) in
             the plant's units, which are clipped to the task's limits. For a discrete task: the numbers of
-            the levels, (n,) integers. Or a `torch.nn.Module` that does so with tensors; for a discrete task
-            it may also give preferences (n, levels). It is put into evaluation mode.
+            the levels, (n,) integers, or preferences (n, levels). Or a `torch.nn.Module` that does so with
+            tensors, which is put into evaluation mode.
         task: the robot and its problem.
 
     Raises:
@@ -75,7 +78,7 @@ def from_callable(function: Callable[[np.ndarray], Any], task: Task) -> Function
             f"{function!r} cannot be called: give a function from observations (n, k) to inputs (n, m)"
         )
     if _is_module(function):
-        return FunctionPolicy(task, _of_arrays(function, task), "the module")
+        return FunctionPolicy(task, _of_arrays(function), "the module")
     return FunctionPolicy(task, function)
 
 
@@ -85,7 +88,7 @@ def _is_module(function: object) -> bool:
     return torch is not None and isinstance(function, torch.nn.Module)
 
 
-def _of_arrays(module: Any, task: Task) -> Callable[[np.ndarray], np.ndarray]:
+def _of_arrays(module: Any) -> Callable[[np.ndarray], np.ndarray]:
     """Returns a `torch.nn.Module` as a function of arrays."""
     import torch
 
@@ -97,13 +100,12 @@ def _of_arrays(module: Any, task: Task) -> Callable[[np.ndarray], np.ndarray]:
         if not isinstance(answer, torch.Tensor):
             raise BadInput(f"it gives {type(answer).__name__}, not a tensor")
         actions: np.ndarray = answer.cpu().numpy()
-        preferences = task.input_levels is not None and actions.dtype.kind == "f"
-        return preferred_levels(actions, task) if preferences else actions
+        return actions
 
     return function
 
 
-def preferred_levels(preferences: np.ndarray, task: Task) -> np.ndarray:
+def _preferred(preferences: np.ndarray, task: Task) -> np.ndarray:
     """Returns the preferred levels (n,) int for preferences (n, levels)."""
     assert task.input_levels is not None
     levels = len(task.input_levels)

@@ -10,7 +10,7 @@ import numpy as np
 
 from hyrl_mj import artifacts, limits
 from hyrl_mj.errors import BadArtifact, BadInput
-from hyrl_mj.policies.functions import FunctionPolicy, preferred_levels
+from hyrl_mj.policies.functions import FunctionPolicy
 from hyrl_mj.tasks import Task
 
 # Limit on a file [bytes]: the largest MLP policies take a few megabytes.
@@ -47,9 +47,7 @@ def from_onnx(path: Path, task: Task, remedy: str, n_stack: int = 1) -> Function
         outputs = [session.run([output_name], {input_name: part})[0] for part in parts]
         actions = np.concatenate(outputs)
         # A wrong number of actions is kept: the policy's check names it.
-        actions = actions[:n] if len(actions) == len(whole) else actions
-        preferences = task.input_levels is not None and np.issubdtype(actions.dtype, np.floating)
-        return preferred_levels(actions, task) if preferences else actions
+        return actions[:n] if len(actions) == len(whole) else actions
 
     policy = FunctionPolicy(task, function, f"the model of {path}")
     try:

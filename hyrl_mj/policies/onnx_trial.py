@@ -109,12 +109,12 @@ def _try(answer: Any, columns: int, rows: int, one: bool) -> None:
     if one:
         parts = np.split(observation[:SINGLY], SINGLY)
         first, again = (np.concatenate([answer(part) for part in parts]) for _ in range(2))
-        if not np.array_equal(first, again, equal_nan=_is_float(first)):
-            raise Refused("it answers the same observations otherwise the second time")
-        return
-    first, again = answer(observation), answer(observation)
-    if not np.array_equal(first, again, equal_nan=_is_float(first)):
+    else:
+        first, again = answer(observation), answer(observation)
+    if not np.array_equal(first, again, equal_nan=first.dtype.kind == "f"):
         raise Refused("it answers the same observations otherwise the second time")
+    if one:
+        return
     if not first.shape or len(first) != rows:
         return  # reported with its shape where it is first used
     one_by_one = [answer(observation[i : i + 1]) for i in range(SINGLY)]
@@ -129,10 +129,6 @@ def _try(answer: Any, columns: int, rows: int, one: bool) -> None:
     same = np.isclose(found, expected, rtol=1e-3, atol=1e-4, equal_nan=True)
     if np.mean(same) < 0.99:
         raise Refused("its answer to an observation depends on the other observations of the batch")
-
-
-def _is_float(answers: np.ndarray) -> bool:
-    return answers.dtype.kind == "f"
 
 
 def main() -> None:

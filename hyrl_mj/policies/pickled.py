@@ -2,6 +2,10 @@
 
 A pickle is a program for a stack machine. This one records each call as a `Call` instead of making it, and
 knows only the instructions that occur where numbers and tensors are pickled.
+
+torch.load(weights_only=True) does not replace it: in torch 2.13 a file of a kilobyte makes it allocate any
+number of bytes, hash nested tuples without end, or crash the process. And it knows no arrays of NumPy, which
+tell in SB3's metadata how an agent was trained.
 """
 
 from __future__ import annotations
@@ -22,13 +26,8 @@ _VALUES = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
 _TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 _IGNORED = {"PROTO", "FRAME", "STOP"}
 _MARK = object()
-
-
-@dataclass(frozen=True)
-class Name:
-    """The name of a function or a class, "module.name"."""
-
-    text: str
+# The functions that make dictionaries, whose entries are the items of the call.
+DICTS = ("dict", "collections.OrderedDict")
 
 
 @dataclass
@@ -36,7 +35,7 @@ class Call:
     """A call that unpickling would make.
 
     Attributes:
-        function: the name of the function or class, "" if it is the result of another call.
+        function: "module.name" of the function or class, "" if it is the result of another call.
         arguments: what it would be called with.
         state: what the result would be given afterwards, None if nothing.
         items: the entries that the result would be given, pairs of key and value.
@@ -48,15 +47,14 @@ class Call:
     items: list[tuple[Any, Any]] = field(default_factory=list)
 
 
-class Items(list[tuple[Any, Any]]):
-    """The entries of a dictionary, pairs of key and value."""
-
-
 def read(content: bytes) -> Any:
-    """Returns the content of a pickle: numbers, strings, bytes, tuples, lists, `Items` and `Call`s.
+    """Returns the content of a pickle: numbers, strings, bytes, tuples, lists, and `Call`s.
+
+    Names of functions are strings, and dictionaries are calls of "dict".
 
     Raises:
-        ValueError, IndexError, KeyError: it is damaged, or holds an instruction that numbers do not need.
+        ValueError, IndexError, KeyError, AttributeError: it is damaged, or holds an instruction that numbers
+            do not need.
     """
     stack: list[Any] = []
     memo: dict[int, Any] = {}
@@ -85,35 +83,32 @@ def _step(name: str, argument: Any, stack: list[Any]) -> None:
         case "EMPTY_LIST":
             stack.append([])
         case "EMPTY_DICT":
-            stack.append(Items())
+            stack.append(Call("dict", ()))
         case "TUPLE":
             stack.append(tuple(_to_mark(stack)))
         case "TUPLE1" | "TUPLE2" | "TUPLE3":
             n = _TUPLES[name]
             stack[-n:] = [tuple(stack[-n:])]
         case "GLOBAL":
-            stack.append(Name(argument.replace(" ", ".", 1)))
+            stack.append(argument.replace(" ", ".", 1))
         case "STACK_GLOBAL":
             module, attribute = stack.pop(-2), stack.pop()
             plain = isinstance(module, str) and isinstance(attribute, str)
-            stack.append(Name(f"{module}.{attribute}" if plain else ""))
+            stack.append(f"{module}.{attribute}" if plain else "")
         case "REDUCE" | "NEWOBJ":
             arguments, function = stack.pop(), stack.pop()
-            stack.append(Call(function.text if isinstance(function, Name) else "", arguments))
+            stack.append(Call(function if isinstance(function, str) else "", arguments))
         case "BINPERSID":
             stack.append(Call("persistent", stack.pop()))
         case "BUILD":
             state = stack.pop()
-            if isinstance(stack[-1], Call):
-                stack[-1].state = state
+            stack[-1].state = state
         case "APPEND" | "APPENDS":
             values = [stack.pop()] if name == "APPEND" else _to_mark(stack)
-            if isinstance(stack[-1], list):
-                stack[-1].extend(values)
+            stack[-1].extend(values)
         case "SETITEM" | "SETITEMS":
             flat = [stack.pop(-2), stack.pop()] if name == "SETITEM" else _to_mark(stack)
-            into = stack[-1].items if isinstance(stack[-1], Call) else stack[-1]
-            into.extend(zip(flat[::2], flat[1::2], strict=True))
+            stack[-1].items.extend(zip(flat[::2], flat[1::2], strict=True))
         case _:
             raise ValueError(f"the pickle has the instruction {name}, which numbers do not need")
 
@@ -137,8 +132,8 @@ def arrays(content: bytes) -> dict[str, np.ndarray]:
         return {}
     try:
         found = read(content)
-        entries = found.items if isinstance(found, Call) and found.items else found
-        named = entries if isinstance(entries, list) else [("", found)]
+        is_dict = isinstance(found, Call) and found.function in DICTS
+        named = found.items if is_dict else [("", found)]
         # Only texts are names: others can be nested so that they have no end.
         values = {name: _array(value) for name, value in named if isinstance(name, str)}
     except Exception:  # a damaged pickle may raise any error

@@ -66,7 +66,7 @@ class Normalization:
             BadArtifact: an array is missing, or has numbers that cannot be.
         """
         with artifacts.reading(path, RECIPE):
-            arrays = archives.read_npz(path, LARGEST)
+            arrays = archives.read_npz(artifacts.read_limited(path), LARGEST)
             if by_key := any(name.startswith(("mean.", "var.")) for name in arrays):
                 arrays = _joined(arrays, parts, n_stack)
             if missing := [name for name in _FIELDS[:3] if name not in arrays]:

@@ -92,13 +92,11 @@ def check_observations(
         normalized = False  # under VecNormalize SB3 keeps it from the first observation on
     elif last is not None and original is not None and _sizes(last) == _sizes(original):
         normalized = _normalized(last, original, seen, on_policy, n_stack)
-    if normalized:
-        assert last is not None
-        assert original is not None
-        raise BadArtifact(
-            "it was trained on normalised observations (VecNormalize): its last one is "
-            f"{_row(_joined(last))}, where {task.name} gave {_row(_joined(original))}; {HOW}"
-        )
+        if normalized:
+            raise BadArtifact(
+                "it was trained on normalised observations (VecNormalize): its last one is "
+                f"{_row(_joined(last))}, where {task.name} gave {_row(_joined(original))}; {HOW}"
+            )
     _check_wrappers(about, last, seen)
     if normalized is None:
         raise BadArtifact(
@@ -124,8 +122,7 @@ def _check_wrappers(about: Mapping[str, Any], last: _Parts | None, seen: _Seen) 
     space = about.get("observation_space")
     limits = [_numbers(space, end) if isinstance(space, dict) else None for end in ("low", "high")]
     ours = np.array([task.observation_low, task.observation_high], dtype=float)
-    if given is False:
-        assert joined is not None
+    if joined is not None and given is False:
         which = f"its last one is {_row(joined)}, which {task.name} never gives"
     elif task.observation_dtype == "float64" and "float32" in types:
         which = f"they are float32, those of {task.name} float64"
@@ -147,26 +144,18 @@ def _normalized(
 
     None if that cannot be told.
     """
-    open_parts = []
+    open_columns: list[bool] = []
     for name, after in last.items():
         before = original[name]
         if after.dtype != before.dtype:
             return True  # VecNormalize gives float32 whatever it gets
         plain = after.dtype == np.float64 and n_stack == 1  # stacks have the type of the space
         # What is constant, a goal say, stays as it is; normalised it would be 0.
-        if not plain and not ((after == before) & (after != 0)).all(axis=0).any():
-            open_parts.append(name)
-    if not open_parts:
+        constant = ((after == before) & (after != 0)).all(axis=0).any()
+        open_columns += [not (plain or constant)] * after.shape[1]
+    if not any(open_columns):
         return False
-    ends = np.cumsum([part.shape[1] for part in last.values()])
-    columns = np.concatenate(
-        [
-            np.arange(end - last[name].shape[1], end)
-            for name, end in zip(last, ends, strict=True)
-            if name in open_parts
-        ]
-    )
-    return seen.normalized(_joined(last), _joined(original), on_policy, columns)
+    return seen.normalized(_joined(last), _joined(original), on_policy, np.array(open_columns))
 
 
 def _observations(about: Mapping[str, Any], key: str, task: Task) -> _Parts | None:
@@ -287,7 +276,7 @@ class _Seen:
     def normalized(
         self, last: np.ndarray, original: np.ndarray, on_policy: bool, columns: np.ndarray
     ) -> bool | None:
-        """Returns whether `columns` of the last observations (n, k) are normalised, unlike the original ones.
+        """Returns whether `columns` (k,) of the last observations (n, k) are normalised, unlike the original.
 
         None if that cannot be told.
         """

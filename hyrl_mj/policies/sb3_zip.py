@@ -12,12 +12,12 @@ from zipfile import is_zipfile
 
 import numpy as np
 
-from hyrl_mj import archives
+from hyrl_mj import archives, artifacts
 from hyrl_mj.errors import BadArtifact, printable
 from hyrl_mj.policies import sb3_metadata, torch_file
 from hyrl_mj.policies.algorithms import ALGORITHMS
 from hyrl_mj.policies.mlp import ACTIVATIONS, TORCH_NAMES, MlpPolicy, check_kind, layer_names
-from hyrl_mj.policies.preprocessing import UNCHANGED, Preprocessing
+from hyrl_mj.policies.preprocessing import Preprocessing
 from hyrl_mj.tasks import Task
 
 REMEDY = "give the zip that SB3's model.save wrote, an .onnx file, or a policy.safetensors of a run"
@@ -47,16 +47,52 @@ CRITICS = (
 )  # fmt: skip
 
 
-def read_zip(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def from_zip(
+    path: Path, task: Task, activation: str | None, preprocessing: Preprocessing, plain: bool
+) -> tuple[MlpPolicy, Preprocessing]:
+    """Returns the network of the agent in a zip, and its preprocessing, both for the task's observation.
+
+    `plain` says that it was trained on plain observations, whatever its metadata tell.
+    """
+    with artifacts.reading(path, REMEDY):
+        tensors, about = _read(path)
+        _check_plain(tensors, about, task)
+        algorithm = infer_algorithm(tensors, about)
+        _check_used(tensors, algorithm)
+        known = ALGORITHMS[algorithm]
+        if known.is_actor_critic:
+            check_kind(task, levels="log_std" not in tensors)
+        weights = {name: t for name, t in tensors.items() if t.dtype == np.float32}
+        if _observes_dict(about):
+            keys = list(_observed_parts(about))
+            order = _by_frames(task, preprocessing.n_stack, keys)
+            first = next(name for part in known.parts for name in layer_names(weights, part))
+            if weights[first].shape[1:] == order.shape:  # else the policy says what does not fit
+                weights[first] = np.ascontiguousarray(weights[first][:, order])
+            preprocessing = _framewise(preprocessing, task, keys)
+        for name, weight in weights.items():
+            if not np.isfinite(weight).all():
+                raise BadArtifact(f"its tensor {_short(name)} has weights that are not finite")
+        activation = _activation(about, activation) or known.activation
+        policy = MlpPolicy(task, algorithm, activation, weights, preprocessing.n_stack)
+        sb3_metadata.check_inputs(about, task)
+        if preprocessing.normalization is None and not plain:
+            n_stack = preprocessing.n_stack
+            sb3_metadata.check_observations(about, task, known.is_actor_critic, n_stack)
+    return policy, preprocessing
+
+
+def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Returns the tensors of an SB3 zip by name, and its metadata, {} if it has none."""
     if not is_zipfile(path):
         raise BadArtifact(f"it is not a zip: {REMEDY}")
-    with archives.open_zip(path.open("rb")) as file:
+    with archives.open_zip(artifacts.read_limited(path)) as file:
         names = set(file.namelist())
         if "policy.pth" not in names:
-            if "data" in names and SBX.search(
-                archives.read_member(file, "data", torch_file.LARGEST)
-            ):
+            data = (
+                archives.read_member(file, "data", torch_file.LARGEST) if "data" in names else b""
+            )
+            if SBX.search(data):
                 raise BadArtifact(
                     "it is an agent of SBX, whose networks are in JAX and saved as a pickle, which is not "
                     f"opened: {INSTEAD}"
@@ -72,68 +108,32 @@ def read_zip(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     return torch_file.read_tensors(content), about
 
 
-def from_tensors(
-    tensors: dict[str, np.ndarray],
-    about: dict[str, Any],
-    task: Task,
-    activation: str | None = None,
-    preprocessing: Preprocessing = UNCHANGED,
-    plain: bool = False,
-) -> MlpPolicy:
-    """Returns the network of an SB3 agent with these tensors and this metadata.
-
-    `plain` says that it was trained on plain observations, whatever its metadata tell.
-    """
-    _check_plain(tensors, about, task)
-    algorithm = infer_algorithm(tensors, about)
-    _check_used(tensors, algorithm)
-    if ALGORITHMS[algorithm].is_actor_critic:
-        check_kind(task, levels="log_std" not in tensors)
-    weights = {name: t for name, t in tensors.items() if t.dtype == np.float32}
-    if observes_dict(about):
-        keys, parts = list(observed_parts(about)), ALGORITHMS[algorithm].parts
-        order = by_frames(task, preprocessing.n_stack, keys)
-        first = next(name for part in parts for name in layer_names(weights, part))
-        if weights[first].shape[1:] == order.shape:  # else the policy says what does not fit
-            weights[first] = np.ascontiguousarray(weights[first][:, order])
-    for name, weight in weights.items():
-        if not np.isfinite(weight).all():
-            raise BadArtifact(f"its tensor {_short(name)} has weights that are not finite")
-    activation = _activation(about, activation) or ALGORITHMS[algorithm].activation
-    policy = MlpPolicy(task, algorithm, activation, weights, preprocessing.n_stack)
-    sb3_metadata.check_inputs(about, task)
-    if preprocessing.normalization is None and not plain:
-        on_policy = ALGORITHMS[algorithm].is_actor_critic
-        sb3_metadata.check_observations(about, task, on_policy, preprocessing.n_stack)
-    return policy
-
-
 def _check_plain(tensors: Mapping[str, np.ndarray], about: Mapping[str, Any], task: Task) -> None:
     """Raises `BadArtifact` if an agent is more than an MLP on a vector, or on a Dict of vectors."""
     for part, what in FOREIGN.items():
         if any(part in name for name in tensors):
             raise BadArtifact(f"{what}: {PLAIN}")
-    of_dict = observes_dict(about)
+    of_dict = _observes_dict(about)
     if of_dict:
         _check_parts(about, task)
     # SB3's extractor of a Dict puts vectors one after the other, in the order of their keys.
     usual = "torch_layers.CombinedExtractor" if of_dict else "torch_layers.FlattenExtractor"
-    extractor = entry(about, "policy_kwargs", "features_extractor_class")
+    extractor = _entry(about, "policy_kwargs", "features_extractor_class")
     if extractor and usual not in extractor:
         raise BadArtifact(f"it has a features extractor of its own, {extractor}: {PLAIN}")
     if "actor.log_std" in tensors or np.ndim(tensors.get("log_std", 0)) == 2:
         raise BadArtifact("it was trained with use_sde: train it without, or export it to .onnx")
 
 
-def observes_dict(about: Mapping[str, Any]) -> bool:
+def _observes_dict(about: Mapping[str, Any]) -> bool:
     """Returns whether an agent with this metadata observes a Dict."""
-    return "spaces.dict" in entry(about, "observation_space", ":type:")
+    return "spaces.dict" in _entry(about, "observation_space", ":type:")
 
 
 def _check_parts(about: Mapping[str, Any], task: Task) -> None:
     """Raises `BadArtifact` if an agent observes a Dict with other keys than that of a task."""
     ours = task.observation_parts
-    theirs = observed_parts(about)
+    theirs = _observed_parts(about)
     # The sizes are those of the task, or all as many times larger as observations are stacked.
     if theirs.keys() == ours.keys() and len({theirs[key] / ours[key] for key in ours}) == 1:
         return
@@ -144,7 +144,7 @@ def _check_parts(about: Mapping[str, Any], task: Task) -> None:
     )
 
 
-def observed_parts(about: Mapping[str, Any]) -> dict[str, int]:
+def _observed_parts(about: Mapping[str, Any]) -> dict[str, int]:
     """Returns the sizes of the vectors of an agent's Dict by key, in the order in which SB3 joins them."""
     text = str(about["observation_space"].get("spaces"))[:LONGEST_SPACES]
     return {key: int(size or 0) for key, size in PART.findall(text)}
@@ -156,7 +156,7 @@ def _dict_of(parts: Mapping[str, int]) -> str:
     return f"Dict({words})" if words else "a Dict"
 
 
-def by_frames(task: Task, n_stack: int, keys: Sequence[str]) -> np.ndarray:
+def _by_frames(task: Task, n_stack: int, keys: Sequence[str]) -> np.ndarray:
     """Returns where an agent of a Dict has the numbers of stacked observations, frame by frame: (n_stack k,).
 
     `VecFrameStack` stacks each vector of a Dict by itself, and SB3 puts these stacks one after the other, in
@@ -168,7 +168,7 @@ def by_frames(task: Task, n_stack: int, keys: Sequence[str]) -> np.ndarray:
     return np.hstack([stacks[key].reshape(n_stack, -1) for key in parts]).ravel()
 
 
-def framewise(preprocessing: Preprocessing, task: Task, keys: list[str]) -> Preprocessing:
+def _framewise(preprocessing: Preprocessing, task: Task, keys: list[str]) -> Preprocessing:
     """Returns the preprocessing of an agent of a Dict with `keys` for the task's order, frame by frame.
 
     Raises:
@@ -184,7 +184,7 @@ def framewise(preprocessing: Preprocessing, task: Task, keys: list[str]) -> Prep
             "be in one order or the other: give arrays mean.KEY and var.KEY for each of them"
         )
     for n in {1, preprocessing.n_stack}:
-        preprocessing = preprocessing.reordered(by_frames(task, n, keys))
+        preprocessing = preprocessing.reordered(_by_frames(task, n, keys))
     return preprocessing
 
 
@@ -218,7 +218,7 @@ def infer_algorithm(weights: Mapping[str, np.ndarray], about: Mapping[str, Any])
 
 def _activation(about: Mapping[str, Any], chosen: str | None) -> str | None:
     """Returns the activation that the metadata names, else the chosen one."""
-    named = entry(about, "policy_kwargs", "activation_fn")
+    named = _entry(about, "policy_kwargs", "activation_fn")
     classes = {f"<class 'torch.nn.modules.activation.{TORCH_NAMES[n]}'>": n for n in ACTIVATIONS}
     name = classes.get(named)
     if named and not name and chosen is None:
@@ -231,7 +231,7 @@ def _activation(about: Mapping[str, Any], chosen: str | None) -> str | None:
     return name or chosen
 
 
-def entry(about: Mapping[str, Any], key: str, part: str) -> str:
+def _entry(about: Mapping[str, Any], key: str, part: str) -> str:
     """Returns a part of an entry of the metadata as text, "" if there is none."""
     found = about.get(key)
     return _short(str(found.get(part, ""))) if isinstance(found, dict) else ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -69,20 +69,18 @@ class ModeResult:
             the worst case cannot be computed, share of the noisy episodes in which it arrives.
         attempts: number of trainings; 0 if nothing was trained.
         policy: what the policy is: "trained", "pi_i" (paper, Step 4), the "agent" itself, or a "table" of
-            inputs; None in files of earlier versions.
+            inputs.
     """
 
     mode: int
     won: float
     attempts: int
-    policy: Kind | None = None
+    policy: Kind = "trained"
 
 
 @dataclass(frozen=True)
 class Retraining:
     """How stage 6 ended: a result for each mode. Saved as `retraining.json`."""
-
-    LATER: ClassVar = ("modes.policy",)
 
     modes: tuple[ModeResult, ...]
 

@@ -13,7 +13,6 @@ from hyrl_mj.sets import MOST_DIMENSIONS
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.mirrored import try_mirror
-from hyrl_mj.tasks.registry import check_current
 from hyrl_mj.tasks.trial import (
     try_control,
     try_extreme,
@@ -52,7 +51,6 @@ def check_task(task: Task) -> Task:
     Raises:
         BadInput: it cannot; the message names the file, the mistake, and the remedy.
     """
-    check_current(task)
     where = task.source or task.name
     try:
         _check_parts(task)

@@ -1,7 +1,6 @@
 """The registry of tasks: those of this package, of other installed packages, and of the user's files."""
 
 import importlib.util
-import inspect
 import sys
 from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
@@ -23,20 +22,14 @@ _FILES: dict[Path, type[Task]] = {}
 _OPENERS: dict[str, Callable[[str], Task]] = {}
 # Names of the tasks that other installed packages offer, as far as they have been loaded.
 _INSTALLED: set[str] = set()
-# Attributes of a task in hyrl_mj 0.1 that a `Scene` or a `Learning` holds now, without "replay_".
-_MOVED = {
-    "Scene": ("replay_starts", "replay_time", "policy_starts", "mode_names"),
-    "Learning": ("levels", "algorithm", "search", "horizon"),
-}
 
 
 def register(task: type[Task]) -> type[Task]:
     """Registers a task by its name, and in Gymnasium by its `env_id`; use it as a class decorator.
 
     Raises:
-        BadInput: another file has a task of that name, or the task was written for 0.1.
+        BadInput: another file has a task of that name.
     """
-    check_current(task)
     here, other = _file(task), _REGISTRY.get(task.name)
     if other is not None and _file(other) != here:
         raise BadInput(
@@ -62,27 +55,6 @@ def register(task: type[Task]) -> type[Task]:
         max_episode_steps=getattr(task, "max_steps", None),  # `check_task` says what is missing
     )
     return task
-
-
-def check_current(task: Task | type[Task]) -> None:
-    """Raises `BadInput` if a task, or its class, has attributes or a reward as in hyrl_mj 0.1."""
-    kind = task if isinstance(task, type) else type(task)
-    bases = [vars(base) for base in kind.__mro__ if issubclass(base, Task) and base is not Task]
-    own = set(vars(task)).union(*bases)
-    changes = []
-    for value, names in _MOVED.items():
-        if old := [name for name in names if name in own]:
-            new = ", ".join(f"{name.removeprefix('replay_')}=..." for name in old)
-            changes.append(f"{', '.join(old)} -> {value.lower()} = hyrl_mj.{value}({new})")
-    try:
-        inspect.signature(kind.reward).bind("self", "measurement", "u")
-    except TypeError:
-        changes.append("reward(self, measurement) -> reward(self, measurement, u)")
-    if changes:
-        raise BadInput(
-            f"the task {getattr(kind, 'name', kind.__name__)} of {_file(kind) or kind.__module__} was "
-            f"written for hyrl_mj 0.1: rename {'; '.join(changes)}"
-        )
 
 
 def task_names() -> list[str]:
@@ -156,11 +128,9 @@ def _offered() -> dict[str, EntryPoint]:
 
 def _instance(kind: type[Task], what: str) -> Task:
     try:
-        task = kind()
+        return kind()
     except TypeError as error:  # methods that a task must have are missing
         raise BadInput(f"the task of {what} is not finished: {error}") from error
-    check_current(task)
-    return task
 
 
 def _file(task: type[Task]) -> Path | None:

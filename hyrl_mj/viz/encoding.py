@@ -1,4 +1,7 @@
-"""Videos, written frame by frame by mediapy, with one clear message where that fails."""
+"""Videos, written frame by frame by mediapy, with one clear message where that fails.
+
+mediapy itself waits for ever for an ffmpeg that takes no frame, and does not see that a file is not whole.
+"""
 
 from __future__ import annotations
 
@@ -116,7 +119,7 @@ class Encoder:
 
     def stop(self) -> None:
         """Ends ffmpeg and the thread, if they have not ended."""
-        # mediapy has no way to give up, and waits for ffmpeg for ever.
+        # mediapy has no way to give up.
         process = getattr(self._writer, "_proc", None)
         if process is not None and process.poll() is None:
             process.kill()

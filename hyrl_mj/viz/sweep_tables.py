@@ -1,4 +1,7 @@
-"""The results of a sweep as tables, for its page and the terminal."""
+"""The results of a sweep as tables, for its page and the terminal.
+
+Only `summary` would be pandas' work: the rest is the text of each figure, and cells that hold no Markdown.
+"""
 
 from __future__ import annotations
 
