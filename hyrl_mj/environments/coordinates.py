@@ -3,33 +3,27 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from gymnasium import spaces
 
 from hyrl_mj import mjcf
 from hyrl_mj.environments.instance import Instance
-from hyrl_mj.environments.observations import columns_of_parts
+from hyrl_mj.environments.observations import columns_of
+from hyrl_mj.environments.opening import AnyChart
 from hyrl_mj.errors import BadInput, unknown
 
-# Chart, as users give it: one name, several, or new names with the names of what they stand for.
-AnyChart = str | Sequence[str] | Mapping[str, str]
 INDEXED = re.compile(r"(.+)\[(\d+)\]")
 # States at which a name is compared with positions and velocities, and how much of these changes [m, rad].
 TRIED, MOVED = 6, 0.05
 AGREES = 1e-6
 AXES = "xyz"
-FREE, SLIDE, HINGE = (
-    int(kind)
-    for kind in (
-        mujoco.mjtJoint.mjJNT_FREE,
-        mujoco.mjtJoint.mjJNT_SLIDE,
-        mujoco.mjtJoint.mjJNT_HINGE,
-    )
+FREE, SLIDE, HINGE = map(
+    int, (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
 )
+JOINT, SITE, BODY = mujoco.mjtObj.mjOBJ_JOINT, mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY
 
 
 @dataclass(frozen=True)
@@ -86,74 +80,43 @@ def all_names(instance: Instance) -> list[str]:
     """Returns the names that a chart may use."""
     model = instance.model
     positions = [f"qpos[{i}]" for i in range(model.nq)] + [f"qvel[{i}]" for i in range(model.nv)]
-    return [*positions, *(n for n in _joints(instance) if n), *_parts(instance), *_places(instance)]
+    parts = columns_of(instance.env.observation_space)
+    return [*positions, *_named(model, JOINT), *parts, *_named(model, SITE, BODY)]
 
 
-def usual_name(model: mujoco.MjModel, joint: int, velocity: bool) -> str:
-    """Returns the name of a coordinate after its joint."""
-    name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint) or f"joint{joint}"
-    name = name.rpartition("/")[2]
-    return f"{name} rate" if velocity else name
-
-
-def _joints(instance: Instance) -> list[str]:
-    return [
-        mujoco.mj_id2name(instance.model, mujoco.mjtObj.mjOBJ_JOINT, i) or ""
-        for i in range(instance.model.njnt)
-    ]
-
-
-def _places(instance: Instance) -> list[str]:
-    kinds = mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY
-    names = [name for kind in kinds for name in mjcf.names(instance.model, kind)]
+def _named(model: mujoco.MjModel, *kinds: mujoco.mjtObj) -> list[str]:
+    """Returns the names of objects of some kinds, of those that have one."""
+    names = [name for kind in kinds for name in mjcf.names(model, kind)]
     return [name for name in dict.fromkeys(names) if not name.startswith("(") and name != "world"]
 
 
-def _parts(instance: Instance) -> dict[str, slice]:
-    """Returns the parts of the observation, with their columns."""
-    space = instance.env.observation_space
-    if not isinstance(space, spaces.Dict):
-        return {"observation": slice(0, int(spaces.flatdim(space)))}
-    return columns_of_parts(space)
-
-
 def _resolved(instance: Instance, new: str, name: str) -> Iterator[Coordinate]:
-    base, index = name, None
-    if match := INDEXED.fullmatch(name):
-        base, index = match.group(1), int(match.group(2))
+    model, parts = instance.model, columns_of(instance.env.observation_space)
+    match = INDEXED.fullmatch(name)
+    base, index = (match.group(1), int(match.group(2))) if match else (name, None)
     if base in ("qpos", "qvel") and index is not None:
-        size = instance.model.nq if base == "qpos" else instance.model.nv
-        if index >= size:
+        if index >= (model.nq if base == "qpos" else model.nv):
             raise unknown("coordinate", name, all_names(instance))
         yield _of_state(instance, new, base, index)
-        return
-    if name in _joints(instance):
-        joint = _joints(instance).index(name)
-        yield _of_state(instance, new, "qpos", int(instance.model.jnt_qposadr[joint]))
-        return
-    parts = _parts(instance)
-    if base in parts:
+    elif name in _named(model, JOINT):
+        yield _of_state(instance, new, "qpos", int(model.joint(name).qposadr[0]))
+    elif base in parts:
         columns = list(range(parts[base].start, parts[base].stop))
         if index is not None and index >= len(columns):
             raise unknown("coordinate", name, [f"{base}[{i}]" for i in range(len(columns))])
         chosen = columns if index is None else [columns[index]]
-
-        def observed(state: np.ndarray) -> np.ndarray:
-            return instance.rested(state)[chosen]
-
-        yield from _fitted(instance, new, name, observed)
-        return
-    if base in _places(instance):
-        kind, i = mjcf.point_of(instance.model, base)
+        yield from _fitted(instance, new, name, lambda state: instance.rested(state)[chosen])
+    elif base in _named(model, SITE, BODY):
+        where, i = mjcf.point_of(model, base)
         axes = [0, 1] if index is None else [index]
 
         def placed(state: np.ndarray) -> np.ndarray:
             instance.physics.write(state)
-            return np.array(getattr(instance.data, kind)[i][axes])
+            return np.array(getattr(instance.data, where)[i][axes])
 
         yield from _fitted(instance, new, name, placed)
-        return
-    raise unknown("coordinate", name, all_names(instance))
+    else:
+        raise unknown("coordinate", name, all_names(instance))
 
 
 def _of_state(
@@ -163,16 +126,13 @@ def _of_state(
     addresses = model.jnt_qposadr if kind == "qpos" else model.jnt_dofadr
     joint = int(np.searchsorted(addresses, index, side="right")) - 1
     kind_of_joint, part = model.jnt_type[joint], index - addresses[joint]
-    name = new or usual_name(model, joint, kind == "qvel")
+    name = new or _usual_name(model, joint, kind)
     if kind_of_joint == FREE and part < len(AXES):
         name = new or f"{AXES[part]} of {name}"
         return Coordinate(name, kind, index, offset, joint, int(part))
     if kind_of_joint not in (SLIDE, HINGE):
-        free = [
-            usual_name(model, j, False)
-            for j in range(model.njnt)
-            if model.jnt_type[j] in (SLIDE, HINGE)
-        ]
+        joints = np.flatnonzero(np.isin(model.jnt_type, (SLIDE, HINGE)))
+        free = [_usual_name(model, j, "qpos") for j in joints.tolist()]
         raise BadInput(
             f"{kind}[{index}] is a part of an orientation of {instance.name}, for which there is no chart: "
             f"name slides, hinges ({', '.join(free) or 'it has none'}) and places of free joints"
@@ -181,33 +141,31 @@ def _of_state(
     return Coordinate(name, kind, index, offset, joint, axis)
 
 
+def _usual_name(model: mujoco.MjModel, joint: int, kind: str) -> str:
+    """Returns the name of a position or velocity after its joint."""
+    name = (model.joint(joint).name or f"joint{joint}").rpartition("/")[2]
+    return f"{name} rate" if kind == "qvel" else name
+
+
 def _fitted(
     instance: Instance, new: str, name: str, get: Callable[[np.ndarray], np.ndarray]
 ) -> Iterator[Coordinate]:
     """Yields the positions or velocities that a function of MuJoCo's state (S,) gives, but for an offset."""
     instance.reset()
     state, places = instance.physics.read(), instance.physics.columns
-    rng, columns = np.random.default_rng(0), {"qpos": instance.model.nq, "qvel": instance.model.nv}
-    moved: dict[str, list[np.ndarray]] = {kind: [] for kind in columns}
-    values = []
-    for _ in range(TRIED):
-        other = state.copy()
-        for kind, count in columns.items():
-            other[places[kind]] += rng.uniform(-MOVED, MOVED, count)
-            moved[kind].append(other[places[kind]])
-        values.append(get(other))
-    for j, column in enumerate(np.array(values).T):
-        match = [
-            (kind, i, offsets.mean())
-            for kind, rows in moved.items()
-            for i, offsets in enumerate((column[:, None] - np.array(rows)).T)
-            if np.ptp(offsets) < AGREES
-        ]
-        if not match:
+    columns = [(kind, i) for kind in ("qpos", "qvel") for i in range(len(places[kind]))]
+    at = np.concatenate([places["qpos"], places["qvel"]])
+    moved = np.tile(state, (TRIED, 1))
+    moved[:, at] += np.random.default_rng(0).uniform(-MOVED, MOVED, (TRIED, len(at)))
+    values = np.array([get(other) for other in moved])
+    for j, column in enumerate(values.T):
+        offsets = column[:, None] - moved[:, at]
+        alike = np.flatnonzero(np.ptp(offsets, axis=0) < AGREES)
+        if not len(alike):
             raise BadInput(
                 f"{name}[{j}] is no single position or velocity of {instance.name}, but follows from several "
                 f"or from none: name coordinates such as {', '.join(all_names(instance)[:4])}"
             )
-        kind, i, offset = match[0]
-        several = f"{new}[{j}]" if new and len(values[0]) > 1 else new
-        yield _of_state(instance, several, kind, i, round(float(offset), 9))
+        several = f"{new}[{j}]" if new and values.shape[1] > 1 else new
+        offset = round(float(offsets[:, alike[0]].mean()), 9)
+        yield _of_state(instance, several, *columns[alike[0]], offset)

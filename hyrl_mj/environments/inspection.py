@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,56 +14,36 @@ from gymnasium import spaces
 from hyrl_mj import mjcf
 from hyrl_mj.chart import Chart
 from hyrl_mj.environments import trials
-from hyrl_mj.environments.coordinates import AnyChart, Coordinate, all_names, coordinates
+from hyrl_mj.environments.coordinates import Coordinate, all_names, coordinates
+from hyrl_mj.environments.draws import check_draws, states_of_resets
 from hyrl_mj.environments.expressions import Expression
 from hyrl_mj.environments.fingerprint import differing, fingerprint
-from hyrl_mj.environments.instance import Instance, Recipe, Worn
-from hyrl_mj.environments.observations import flat
-from hyrl_mj.environments.opening import Source
+from hyrl_mj.environments.instance import EARLIER, UNKNOWN, Instance, Recipe, Worn
+from hyrl_mj.environments.observations import parts_of
+from hyrl_mj.environments.opening import RESET, AnyChart, Description
 from hyrl_mj.environments.pool import Pool
 from hyrl_mj.environments.specification import FORMS, Criterion, EnvironmentSpec
-from hyrl_mj.environments.surroundings import (
-    bounds_of,
-    changed_by_user,
-    check_pins,
-    drawn,
-    groups_of,
-    islands_of,
-    robot_of,
-    states_of_resets,
-)
+from hyrl_mj.environments.surroundings import bounds_of, groups_of, islands_of, robot_of
 from hyrl_mj.errors import BadInput, unknown
 
 # Samples of an episode of an environment that never ends by itself.
 STEPS_WITHOUT_END = 1_000
-# Where episodes start.
-CHART, RESET = "chart", "reset"
-# Each episode begins with a reset: one that takes longer [s] would take hours for a thousand.
-LONGEST_RESET = 3.0
-# And so would steps, of which an episode has hundreds [s].
-LONGEST_STEP = 0.3
+# Each episode begins with a reset, and has hundreds of steps: those that take longer [s] would take hours.
+LONGEST_RESET, LONGEST_STEP = 3.0, 0.3
 # Runs under inputs at random that show how far coordinates go, their steps, and for how long inputs are held.
 RUNS, STEPS, HELD = 16, 150, 15
 # What info calls success.
 SUCCESS = ("success", "is_success")
 # What goes no farther than this stands [m].
 STANDS = 1e-6
+# What is said of an observation that shows derived quantities from before the end of a step.
+LAG = {
+    EARLIER: "is that of a physics step before the end of a step, with noise, too",
+    UNKNOWN: "is from shortly before the end of a step; noise adds what it changes at the end",
+}
 
 
 @dataclass(frozen=True)
-class Given:
-    """What the user says of an environment: the arguments of `from_gymnasium` of these names."""
-
-    chart: AnyChart | None = None
-    noisy: Sequence[float] | None = None
-    success: str | None = None
-    failure: str | None = None
-    bounds: Mapping[str, tuple[float, float]] | None = None
-    steps: int | None = None
-    starts: str = CHART
-
-
-@dataclass
 class Runs:
     """What runs under inputs at random showed.
 
@@ -89,105 +68,122 @@ class Runs:
     harmless: frozenset[int]
 
 
-def inspect(source: Source, given: Given) -> tuple[EnvironmentSpec, Pool, Instance]:
+def inspect(description: Description) -> tuple[EnvironmentSpec, Pool, Instance]:
     """Returns what is known of an environment, what plays its episodes, and an instance to look at.
 
     Raises:
         BadInput: it cannot be used, or one of its instances went another way than a new one.
     """
     found: dict[str, str] = {}
-    instance = Instance(Recipe(source))
-    began = time.monotonic()
-    instance.reset()
-    if (took := time.monotonic() - began) > LONGEST_RESET:
-        raise BadInput(
-            f"reset() of {source.name} takes {took:.1f} s, and each of thousands of episodes begins with it: "
-            f"give an environment whose reset takes less than {LONGEST_RESET:g} s"
-        )
-    began = time.monotonic()
-    instance.stepped(instance.drawn(np.random.default_rng(0)))
-    if (took := time.monotonic() - began) > LONGEST_STEP:
-        raise BadInput(
-            f"step() of {source.name} takes {took:.1f} s, and thousands of episodes take many of them: give "
-            f"an environment whose step takes less than {LONGEST_STEP:g} s"
-        )
+    instance = Instance(Recipe(description))
+    _check_times(instance)
     instance.reset()
     instance.recipe = replace(instance.recipe, observer=trials.observer_of(instance))
-    chosen = _chart_of(instance, given.chart, found)
-    places = instance.physics.columns
-    at = tuple(int(places[c.kind][c.index]) for c in chosen)
-    robot = robot_of(instance.model, chosen)
+    chosen = _chart_of(instance, found)
+    model, columns = instance.model, instance.physics.columns
+    at = [int(columns[c.kind][c.index]) for c in chosen]
     offset = tuple(c.offset for c in chosen)
-    solid = robot[instance.model.geom_bodyid]
-    instance.recipe = replace(instance.recipe, noisy=at, offset=offset, solid=solid)
+    robot = robot_of(model, chosen)
+    solid = robot[model.geom_bodyid]
+    instance.recipe = replace(instance.recipe, noisy=tuple(at), offset=offset, solid=solid)
     runs = _sampled(instance)
-    criterion = _criterion(instance, given, runs, found)
-    points = [
-        (mjcf.point_of(instance.model, a), mjcf.point_of(instance.model, b))
-        for a, b in criterion.places
-    ]
-    instance.recipe = replace(
-        instance.recipe, keys=criterion.keys, places=tuple(points), harmless=runs.harmless
+    criterion = _criterion(instance, runs, found)
+    instance.recipe = recipe = replace(
+        instance.recipe,
+        keys=criterion.keys,
+        places=tuple(
+            (mjcf.point_of(model, a), mjcf.point_of(model, b)) for a, b in criterion.places
+        ),
+        harmless=runs.harmless,
     )
     resets = states_of_resets(instance)
-    _check_drawn(instance, chosen, drawn(instance, resets, robot), found)
-    check_pins(instance)
-    instance = Instance(
-        instance.recipe
-    )  # a new one: something may have outlasted the resets of the other
-    state = _at_rest(instance, places, robot)
-    groups = groups_of(instance, runs.states[:, list(at)][:, :2]) if _in_plane(chosen) else []
-    box, starting = _bounds(
-        instance, chosen, runs.states[:, list(at)] + offset, resets[:, list(at)] + offset, given, groups,
-        found,
-    )  # fmt: skip
-    low, high, levels = _limits(instance)
+    if draws := check_draws(instance, resets, robot):
+        found["goal"] = draws
+    instance = Instance(recipe)  # something may have outlasted the resets of the other
+    state = _at_rest(instance, robot)
+    in_plane = len(chosen) >= 2 and all(c.unit == "m" for c in chosen[:2])
+    groups = groups_of(instance, runs.states[:, at[:2]]) if in_plane else []
+    begun = resets[:, at] + offset
+    samples = np.vstack([runs.states[:, at] + offset, begun])
+    chart = _chart_within(instance, chosen, samples, groups, found)
     space = instance.env.observation_space
-    parts = (
-        {key: int(spaces.flatdim(part)) for key, part in space.spaces.items()}
-        if isinstance(space, spaces.Dict)
-        else {}
-    )
-    max_steps = given.steps or instance.steps or STEPS_WITHOUT_END
+    low, high = _ends([instance.env.action_space])
+    observation_low, observation_high = _ends(parts_of(space).values())
+    start_low, start_high = _starts(description, chart, begun, found)
     found["sample time"] = f"{runs.dt:g} s, of a step"
-    if given.steps is None:
+    max_steps = description.steps or instance.steps or STEPS_WITHOUT_END
+    if description.steps is None:
         found["steps"] = f"{max_steps} ({max_steps * runs.dt:g} s) of an episode"
+    parts = parts_of(space) if isinstance(space, spaces.Dict) else {}
     spec = EnvironmentSpec(
-        name=source.name,
-        recipe=instance.recipe,
-        chart=box,
+        recipe=recipe,
+        chart=chart,
         coordinates=chosen,
         state=state,
-        qpos=places["qpos"],
-        qvel=places["qvel"],
-        columns=int(spaces.flatdim(space)),
-        parts=parts,
-        observation_low=_ends(space, "low"),
-        observation_high=_ends(space, "high"),
-        moves=np.zeros(int(spaces.flatdim(space)), dtype=bool),
+        qpos=columns["qpos"],
+        qvel=columns["qvel"],
+        parts={name: int(spaces.flatdim(part)) for name, part in parts.items()},
+        observation_low=observation_low,
+        observation_high=observation_high,
+        moves=np.zeros(len(observation_low), dtype=bool),
         affine=None,
-        wrapped=instance.env is not instance.inner,
+        wrapped=instance.is_wrapped,
         low=low,
         high=high,
         inputs=_input_names(instance, len(low)),
-        levels=levels,
+        levels=int(high[0]) + 1 if isinstance(instance.env.action_space, spaces.Discrete) else None,
         criterion=criterion,
         depth=runs.deepest,
-        start_low=starting[0],
-        start_high=starting[1],
-        noisy=_shares(chosen, given.noisy, found),
+        start_low=start_low,
+        start_high=start_high,
+        noisy=_shares(description, chosen, found),
         max_steps=max_steps,
         dt=runs.dt,
         worst_reward=min(runs.worst_reward, 0.0),
         islands=islands_of(instance, groups),
         tracked=runs.tracked,
-        memoryless=not runs.memory and instance.env is instance.inner,
+        memoryless=not runs.memory and not instance.is_wrapped,
         found=found,
     )
-    tried = trials.tried(instance, spec)
-    instance = Instance(tried[0].recipe)
+    return _tried(instance, spec)
+
+
+def _tried(instance: Instance, spec: EnvironmentSpec) -> tuple[EnvironmentSpec, Pool, Instance]:
+    """Returns what `inspect` does, with what trials show, which may refuse the environment."""
+    step = trials.MOVED * spec.chart.sides * np.array([share > 0 for share in spec.noisy])
+    trials.check_observer(instance, step)
+    derived, late = trials.derived_of(instance, step)
+    found = dict(spec.found)
+    if late:
+        found["lag"] = f"observation {', '.join(map(str, late))} {LAG[derived]}"
+    recipe = replace(spec.recipe, derived=derived)
+    recipe = replace(recipe, anew=spec.wrapped and trials.changes_by_reset(recipe, spec.state))
+    pool, spec = Pool(recipe), replace(spec, recipe=recipe, found=found)
+    moves, affine = trials.moving(pool, spec)
+    spec = replace(spec, moves=moves, affine=affine)
+    trials.check_instances(pool, spec)
+    spec = replace(spec, memoryless=spec.memoryless and trials.goes_on(pool, spec))
+    instance = Instance(recipe)
     instance.reset()
-    return *tried, instance
+    return spec, pool, instance
+
+
+def _check_times(instance: Instance) -> None:
+    """Raises `BadInput` if a reset or a step takes so long that runs would take hours."""
+    for name, most, why in (
+        ("reset", LONGEST_RESET, "each of thousands of episodes begins with it"),
+        ("step", LONGEST_STEP, "thousands of episodes take many of them"),
+    ):
+        began = time.monotonic()
+        if name == "reset":
+            instance.reset()
+        else:
+            instance.stepped(instance.drawn(np.random.default_rng(0)))
+        if (took := time.monotonic() - began) > most:
+            raise BadInput(
+                f"{name}() of {instance.name} takes {took:.1f} s, and {why}: give an environment whose "
+                f"{name} takes less than {most:g} s"
+            )
 
 
 def _sampled(instance: Instance) -> Runs:
@@ -230,36 +226,44 @@ def _farthest(named: Any, places: Sequence[np.ndarray]) -> str:
     return str(named(int(went.argmax())).name) if went.max() > STANDS else ""
 
 
+def _at_rest(instance: Instance, robot: np.ndarray) -> np.ndarray:
+    """Returns MuJoCo's state (S,) after the reset that all runs begin with, the robot at rest."""
+    instance.reset()
+    state, at = instance.physics.read(), instance.physics.columns["qvel"]
+    pinned = [f"qvel[{i}]" in instance.recipe.description.pinned for i in range(len(at))]
+    state[at[robot[instance.model.dof_bodyid] & ~np.array(pinned, dtype=bool)]] = 0.0
+    return state
+
+
 # ---- what was given or filled in
 
 
-def _chart_of(
-    instance: Instance, chart: AnyChart | None, found: dict[str, str]
-) -> tuple[Coordinate, ...]:
-    if chart is not None:
+def _chart_of(instance: Instance, found: dict[str, str]) -> tuple[Coordinate, ...]:
+    """Returns the coordinates of the chart that is given, or of the usual one."""
+    description, space = instance.recipe.description, instance.env.observation_space
+    if (chart := description.chart) is not None:
         chosen = coordinates(instance, chart)
     else:
-        space = instance.env.observation_space
+        usual: AnyChart = [f"qpos[{i}]" for i in range(min(instance.model.nq, 2))]
         if isinstance(space, spaces.Dict) and "achieved_goal" in space.spaces:
-            proposed: AnyChart = "achieved_goal"
-        else:
-            proposed = [f"qpos[{i}]" for i in range(min(instance.model.nq, 2))]
-        chosen = coordinates(instance, proposed)
+            usual = "achieved_goal"
+        chosen = coordinates(instance, usual)
         names = [c.described() for c in chosen]
-        said = f"{proposed} ({', '.join(names)})" if isinstance(proposed, str) else ", ".join(names)
-        others = [name for name in all_names(instance) if name not in (*names, proposed)]
+        said = f"{usual} ({', '.join(names)})" if isinstance(usual, str) else ", ".join(names)
+        others = [name for name in all_names(instance) if name not in (*names, usual)]
         found["chart"] = f"{said}; others are {', '.join(others[:12])}"
     for c in chosen:
-        if (pinned := f"{c.kind}[{c.index}]") in instance.source.pinned:
+        if c.described() in description.pinned:
             raise BadInput(
-                f"{pinned} is the coordinate {c.name} of the chart, where runs begin anywhere: leave it out "
-                "of what is pinned, or name another chart"
+                f"{c.described()} is the coordinate {c.name} of the chart, where runs begin anywhere: leave "
+                "it out of what is pinned, or name another chart"
             )
     return chosen
 
 
-def _criterion(instance: Instance, given: Given, runs: Runs, found: dict[str, str]) -> Criterion:
-    name, success, failure = instance.name, given.success, given.failure
+def _criterion(instance: Instance, runs: Runs, found: dict[str, str]) -> Criterion:
+    description, name = instance.recipe.description, instance.name
+    success, failure = description.success, description.failure
     if success is None or success.strip() == "info":
         told = [key for key in SUCCESS if key in runs.info]
         if not told:
@@ -270,6 +274,7 @@ def _criterion(instance: Instance, given: Given, runs: Runs, found: dict[str, st
             found["success"] = f'info["{told[0]}"]; or give {FORMS}'
         success = f'info["{told[0]}"]'
     criterion = Criterion(
+        name,
         Expression.parse(success, "success"),
         None if failure is None else Expression.parse(failure, "failure"),
     )
@@ -281,84 +286,48 @@ def _criterion(instance: Instance, given: Given, runs: Runs, found: dict[str, st
     return criterion
 
 
-def _check_drawn(
-    instance: Instance, chosen: Sequence[Coordinate], names: list[str], found: dict[str, str]
-) -> None:
-    """Raises `BadInput` if resets draw what nothing pins."""
-    source, name = instance.source, instance.name
-    changed = changed_by_user(instance) if source.reset or source.pinned else []
-    if source.reset and not changed:
-        draws = f", which draws {', '.join(names)}" if names else ""
-        raise BadInput(
-            f"the options of reset {dict(source.reset)} change nothing in {name}{draws}: name the options as "
-            "its reset does"
-        )
-    if not names:
-        return
-    left = [n for n in names if n not in changed and n.partition("[")[0] not in changed]
-    if not source.pins or (source.seed is None and left):
-        how = 'with options of reset as {"reset": {"goal_cell": [6, 6]}}'
-        if positions := {n: 0.1 for n in left if n.startswith(("qpos[", "qvel[", "mocap_pos["))}:
-            how = f"with values as {json.dumps({'pinned': dict(list(positions.items())[:4])})}"
-        raise BadInput(
-            f"each reset of {name} draws {', '.join(left[:8])}, and what is to be done depends on it: pin it"
-            f', {how}, or as the reset with a seed draws it as {{"seed": 0}}'
-        )
-    given = f" and {dict(source.reset)}" if source.reset else ""
-    pinned = f", with {dict(source.pinned)}" if source.pinned else ""
-    found["goal"] = (
-        f"{', '.join(names[:8])} as the reset with seed {source.first}{given} draws it{pinned}"
-    )
-
-
-def _at_rest(instance: Instance, places: Mapping[str, np.ndarray], robot: np.ndarray) -> np.ndarray:
-    """Returns MuJoCo's state (S,) after the reset that all runs begin with, the robot at rest."""
-    instance.reset()
-    state = instance.physics.read()
-    pinned = [name for name in instance.source.pinned if name.startswith("qvel[")]
-    still = places["qvel"][robot[instance.model.dof_bodyid]]
-    held = [places["qvel"][int(name[5:-1])] for name in pinned]
-    state[np.setdiff1d(still, held)] = 0.0
-    return state
-
-
-def _bounds(
+def _chart_within(
     instance: Instance,
     chosen: Sequence[Coordinate],
-    runs: np.ndarray,
-    begun: np.ndarray,
-    given: Given,
+    samples: np.ndarray,
     groups: Any,
     found: dict[str, str],
-) -> tuple[Chart, tuple[tuple[float, ...], tuple[float, ...]]]:
-    names = [c.name for c in chosen]
-    for name in given.bounds or {}:
+) -> Chart:
+    """Returns the chart of some coordinates, with the bounds that are given or found."""
+    names, given = tuple(c.name for c in chosen), instance.recipe.description.bounds
+    for name in given:
         if name not in names:
             raise BadInput(f"bounds for {name} cannot be used: the chart has {', '.join(names)}")
-    bounds = bounds_of(instance, chosen, np.vstack([runs, begun]), given.bounds or {}, groups)
+    bounds = bounds_of(instance, chosen, samples, given, groups)
     found["bounds"] = ", ".join(
-        f"{c.name} {b.low:.3g} to {b.high:.3g} (from {b.why})"
-        for c, b in zip(chosen, bounds, strict=True)
+        f"{name} {b.low:.3g} to {b.high:.3g} (from {b.why})"
+        for name, b in zip(names, bounds, strict=True)
     )
-    low, high = tuple(b.low for b in bounds), tuple(b.high for b in bounds)
-    units = tuple(c.unit for c in chosen)
-    chart = Chart(tuple(names), units, low, high, tuple(b.periodic for b in bounds))
+    low, high, periodic, _ = zip(*bounds, strict=True)
+    return Chart(names, tuple(c.unit for c in chosen), low, high, periodic)
+
+
+def _starts(
+    description: Description, chart: Chart, begun: np.ndarray, found: dict[str, str]
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Returns the corners of the box of starts; resets have led to chart points (n, d)."""
     first, last = begun.min(axis=0), begun.max(axis=0)
-    lead = ", ".join(f"{n} {a:.3g} to {b:.3g}" for n, a, b in zip(names, first, last, strict=True))
+    ends = zip(chart.names, first, last, strict=True)
     found["starts"] = (
         f"all over the chart, the robot at rest and all else as after a reset; with {RESET!r} where resets "
-        f"lead to: {lead}"
+        f"lead to: {', '.join(f'{name} {a:.3g} to {b:.3g}' for name, a, b in ends)}"
     )
-    if given.starts == RESET:
-        return chart, (
-            tuple(np.clip(first, low, high).tolist()), tuple(np.clip(last, low, high).tolist())
-        )  # fmt: skip
-    return chart, (low, high)
+    if description.starts != RESET:
+        return chart.low, chart.high
+    low, high = (np.clip(end, chart.low, chart.high).tolist() for end in (first, last))
+    return tuple(low), tuple(high)
 
 
 def _shares(
-    chosen: Sequence[Coordinate], noisy: Sequence[float] | None, found: dict[str, str]
+    description: Description, chosen: Sequence[Coordinate], found: dict[str, str]
 ) -> tuple[float, ...]:
+    """Returns the share of the noise bound on each coordinate."""
+    noisy = description.noisy
     if noisy is None:
         noisy = [float(c.kind == "qpos") for c in chosen]
         on = ", ".join(c.name for c in chosen if c.kind == "qpos")
@@ -371,12 +340,17 @@ def _shares(
     return tuple(float(share) for share in noisy)
 
 
-def _limits(instance: Instance) -> tuple[np.ndarray, np.ndarray, int | None]:
-    """Returns lower and upper limits (m,) of the inputs, and the number of values of a discrete action."""
-    space: Any = instance.env.action_space
-    if isinstance(space, spaces.Discrete):
-        return np.zeros(1), np.array([float(space.n - 1)]), int(space.n)
-    return np.ravel(space.low).astype(float), np.ravel(space.high).astype(float), None
+def _ends(parts: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the limits (k,) of boxes one after the other, or of the index of a discrete action."""
+    ends = [
+        (0, space.n - 1) if isinstance(space, spaces.Discrete) else (space.low, space.high)
+        for space in parts
+    ]
+    low, high = (
+        np.concatenate([np.ravel(end) for end in some], dtype=float)
+        for some in zip(*ends, strict=True)
+    )
+    return low, high
 
 
 def _input_names(instance: Instance, m: int) -> tuple[str, ...]:
@@ -384,17 +358,3 @@ def _input_names(instance: Instance, m: int) -> tuple[str, ...]:
     names = [model.actuator(i).name.rpartition("/")[2] for i in range(model.nu)]
     own = len(names) == m and all(names)
     return tuple(names) if own else tuple(f"action[{i}]" for i in range(m))
-
-
-def _ends(space: Any, end: str) -> np.ndarray:
-    """Returns the lower or upper limits (o,) of an observation."""
-    parts = space.spaces if isinstance(space, spaces.Dict) else None
-    values = (
-        getattr(space, end) if parts is None else {k: getattr(p, end) for k, p in parts.items()}
-    )
-    return flat(values, space)
-
-
-def _in_plane(chosen: Sequence[Coordinate]) -> bool:
-    """Returns whether the first two coordinates are a place."""
-    return len(chosen) >= 2 and all(c.unit == "m" for c in chosen[:2])

@@ -16,9 +16,9 @@ import gymnasium as gym
 import numpy as np
 
 from hyrl_mj import limits, trust
-from hyrl_mj.environments.coordinates import AnyChart
-from hyrl_mj.environments.inspection import CHART, RESET, Given, inspect
-from hyrl_mj.environments.opening import Source, register
+from hyrl_mj.environments.inspection import inspect
+from hyrl_mj.environments.instance import kept_generators
+from hyrl_mj.environments.opening import CHART, RESET, AnyChart, Description, register
 from hyrl_mj.environments.specification import FORMS
 from hyrl_mj.environments.task import EnvironmentTask
 from hyrl_mj.errors import BadInput, check_seed, described, unknown
@@ -72,27 +72,23 @@ def from_gymnasium(
     Raises:
         BadInput: it cannot be used; the message says why.
     """
-    given = Given(chart, noisy, success, failure, bounds, steps, starts)
+    given = {
+        name: dict(value) if isinstance(value, Mapping) else value
+        for name, value in locals().items()
+        if value is not None
+    }
     with described(_shown(env)):
-        _check(given, seed)
-        for name, named in (("kwargs", kwargs), ("reset", reset), ("pinned", pinned)):
-            _check_named(name, named)
-        for name, value in (pinned or {}).items():
-            if not _is_numeric(value):
-                raise refused(f"pinned {name}", value, "a number, or a list of numbers")
-    source = Source(env, dict(kwargs or {}), dict(reset or {}), dict(pinned or {}), seed)
-    content = {
-        "env": env if isinstance(env, str) else {"function": _where(env)}, **vars(given),
-        "starts": None if starts == CHART else starts, "kwargs": kwargs, "reset": reset,
-        "pinned": pinned, "seed": seed,
-    }  # fmt: skip
-    told = {key: value for key, value in content.items() if value is not None}
+        _check(given)
+    description = Description(**given)
+    told = given | {"env": env if isinstance(env, str) else {"function": _where(env)}}
+    if starts == CHART:
+        del told["starts"]
     spec = MARK + json.dumps(told, default=_plain)
     if not isinstance(env, str) or spec not in _MADE:
-        with described(_shown(env)):
+        with described(_shown(env)), kept_generators():
             if isinstance(env, str) and (kwargs or reset or pinned or trust.is_received()):
-                _try(source, spec)
-            _MADE[spec] = EnvironmentTask(*inspect(source, given), spec)
+                _try(description, spec)
+            _MADE[spec] = EnvironmentTask(*inspect(description), spec)
     if isinstance(env, str):
         trust.remember_text(_recorded(spec, told))
         if (module := _module_of(env)) is not None:
@@ -104,33 +100,33 @@ def _shown(env: Any) -> str:
     return f"the environment {env[:80]}" if isinstance(env, str) else "the environment"
 
 
-def _try(source: Source, spec: str) -> None:
+def _try(description: Description, spec: str) -> None:
     """Makes, resets and steps an environment in a process with limits, unless that was done before."""
-    told = vars(source)
-    if trust.is_known_text(
-        spec
-    ):  # with names of files it is recorded otherwise, and tried each time
-        return
+    if trust.is_known_text(spec):
+        return  # with names of files it is recorded otherwise, and tried each time
+    given = {
+        name: getattr(description, name) for name in ("env", "kwargs", "reset", "pinned", "seed")
+    }
     try:
-        content = json.dumps(told)
+        content = json.dumps(given)
     except TypeError:
         content = ""
-    if not content or json.loads(content) != told:
+    if not content or json.loads(content) != given:
         return  # arrays and tuples, which only the user's own code gives, and the program would see lists
     try:
         found = limits.tried(Path(__file__).with_name("first_trial.py"), content.encode())
     except limits.Ended as ended:
         raise BadInput(
-            f"the environment {source.name} cannot be used: {ended} where it is made, reset and stepped; "
-            "give it other arguments"
+            f"the environment {description.name} cannot be used: {ended} where it is made, reset and "
+            "stepped; give it other arguments"
         ) from None
     if found["problem"]:
         raise BadInput(found["problem"])
 
 
-def _check(given: Given, seed: Any) -> None:
+def _check(given: Mapping[str, Any]) -> None:
     """Raises `BadInput` if one of the arguments of `from_gymnasium` is of another kind."""
-    chart, noisy, steps = given.chart, given.noisy, given.steps
+    chart, noisy, starts = given.get("chart"), given.get("noisy"), given["starts"]
     names = chart.values() if isinstance(chart, Mapping) else chart
     if chart is not None and not isinstance(chart, str) and not _all(names, str):
         raise refused(
@@ -142,18 +138,22 @@ def _check(given: Given, seed: Any) -> None:
         if not any(noisy):
             raise refused("noisy", noisy, "a share above 0 for at least one coordinate")
     for name in ("success", "failure"):
-        if (condition := getattr(given, name)) is not None and not isinstance(condition, str):
-            raise refused(name, condition, FORMS)
-    _check_named("bounds", given.bounds)
-    for name, ends in (given.bounds or {}).items():
+        if not isinstance(given.get(name, ""), str):
+            raise refused(name, given[name], FORMS)
+    for name in ("bounds", "kwargs", "reset", "pinned"):
+        named = given.get(name, {})
+        if not (isinstance(named, Mapping) and _all([*named], str)):
+            raise refused(name, named, "a dictionary of names and values")
+    for name, ends in given.get("bounds", {}).items():
         if not _all(ends, Real) or len(ends) != 2 or not 0 < ends[1] - ends[0] <= WIDEST:
             raise refused(f"bounds of {name}", ends, "its low and its high end, as [-2, 2]")
-    if steps is not None:
-        Integer(1, MOST_STEPS).checked("steps", steps)
-    if seed is not None:
-        check_seed(seed)
-    if given.starts not in (CHART, RESET):
-        raise unknown("starts", given.starts, (CHART, RESET))
+    for name, value in given.get("pinned", {}).items():
+        if not _is_numeric(value):
+            raise refused(f"pinned {name}", value, "a number, or a list of numbers")
+    Integer(1, MOST_STEPS).checked("steps", given.get("steps", 1))
+    check_seed(given.get("seed", 0))
+    if starts not in (CHART, RESET):
+        raise unknown("starts", starts, (CHART, RESET))
 
 
 def _all(values: Any, kind: type) -> bool:
@@ -168,12 +168,6 @@ def _is_numeric(value: Any) -> bool:
         array = np.asarray(value)
         return array.dtype.kind in "biuf" and bool(np.isfinite(array).all())
     return False
-
-
-def _check_named(name: str, given: Any) -> None:
-    """Raises `BadInput` if an argument is no dictionary of names."""
-    if given is not None and not (isinstance(given, Mapping) and _all([*given], str)):
-        raise refused(name, given, "a dictionary of names and values")
 
 
 def _module_of(env: str) -> Path | None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import time
 import warnings
 from collections import deque
 from collections.abc import Sequence
@@ -22,15 +21,12 @@ import numpy as np
 
 from hyrl_mj import cores
 from hyrl_mj.environments import fingerprint as written
-from hyrl_mj.environments.instance import Instance, Recipe, Worn
-from hyrl_mj.environments.judge import Played, Real
-from hyrl_mj.environments.opening import kept_generators
+from hyrl_mj.environments.instance import Instance, Recipe, Worn, kept_generators
+from hyrl_mj.environments.judge import Played, check
 from hyrl_mj.errors import BadInput, HyrlError, brief
 
 # Fewer episodes than this for each process are played by one.
 FEWEST = 16
-# For how long a process waits awake for another [s]: between two samples it has to for about a millisecond.
-AWAKE = 0.002
 Arrays = tuple[np.ndarray, ...]
 
 
@@ -43,47 +39,43 @@ class Stage:
 
     def __init__(self, recipe: Recipe):
         self.recipe = recipe
-        self._playing: dict[tuple[int, int], Instance] = {}  # by plant and row
+        self._playing: dict[int, Instance] = {}  # by the number of the run
         self._free: list[Instance] = []
+        self._judges: list[Instance] = []  # which play nothing but what they judge
         self._resting: Instance | None = None
-        self._real = Real(recipe)
-        self._shared: written.Fingerprint | None = (
-            None  # what a new instance shares with all others
-        )
+        self._shared: written.Fingerprint | None = None  # by a new instance with all others
 
-    def begin(self, plant: int, rows: np.ndarray, starts: np.ndarray) -> Arrays:
-        """Begins episodes at MuJoCo's states (k, S) and gives each row of a plant an instance."""
-        with kept_generators():  # once for all of them
-            for row, start in zip(rows.tolist(), starts, strict=True):
-                self._playing[plant, row] = self._begun(start)
+    def begin(self, runs: np.ndarray, starts: np.ndarray) -> Arrays:
+        """Gives runs (k,) an instance each, and begins their episodes at MuJoCo's states (k, S)."""
+        for run, start in zip(runs.tolist(), starts, strict=True):
+            instance = self._renewed(self._free)
+            instance.begin(start)
+            self._playing[run] = instance
         return ()
 
-    def act(self, plant: int, rows: np.ndarray, u: np.ndarray) -> Arrays:
-        """Steps episodes with inputs (k, m).
+    def act(self, runs: np.ndarray, u: np.ndarray) -> Arrays:
+        """Steps runs (k,) with inputs (k, m).
 
         Returns:
-            MuJoCo's states (k, S), observations (k, o) and reports (k, r), which with wrappers come from
-            `sense`.
+            MuJoCo's states (k, S), observations (k, o) and reports (k, r); the last two come from `sense`
+            where wrappers lie around the environment.
         """
-        return self._acted([self._playing[plant, row] for row in rows.tolist()], u)
+        return self._acted([self._playing[run] for run in runs.tolist()], u)
 
-    def sense(self, plant: int, rows: np.ndarray, noise: np.ndarray) -> Arrays:
-        """Gives episodes the noise (k, d) of a sample.
+    def sense(self, runs: np.ndarray, noise: np.ndarray) -> Arrays:
+        """Gives runs (k,) the noise (k, d) of a sample; returns observations (k, o) and reports (k, r)."""
+        instances = [self._playing[run] for run in runs.tolist()]
+        for instance, of_run in zip(instances, noise, strict=True):
+            instance.sense(of_run)
+        return np.array([i.observation for i in instances]), np.array([i.report for i in instances])
 
-        Returns:
-            Observations (k, o), and with wrappers reports (k, r).
-        """
-        instances = [self._playing[plant, row] for row in rows.tolist()]
-        reports = [i.sense(n) for i, n in zip(instances, noise, strict=True)]
-        return np.array([instance.observation for instance in instances]), np.array(reports)
-
-    def leave(self, plant: int, rows: np.ndarray) -> Arrays:
-        """Lets the instances of episodes play others.
+    def leave(self, runs: np.ndarray) -> Arrays:
+        """Lets the instances of runs (k,) play others.
 
         Raises:
             BadInput: random numbers were drawn in one of them.
         """
-        instances = [self._playing.pop((plant, row)) for row in rows.tolist()]
+        instances = [self._playing.pop(run) for run in runs.tolist()]
         self._free += instances
         try:
             for instance in instances:
@@ -93,20 +85,17 @@ class Stage:
                 instance.quit()
         return ()
 
-    def rest(self, rows: np.ndarray, starts: np.ndarray) -> Arrays:
+    def rest(self, starts: np.ndarray) -> Arrays:
         """Returns what episodes that begin in states (k, S) observe first (k, o), and depths (k,) [m]."""
         seen, depths = [], []
         for start in starts:
-            try:
-                self._resting = self._resting or self._new()
-                seen.append(self._resting.rested(start))
-            except Worn:
+            if self._resting is None or self.recipe.anew:
                 self._resting = self._new()
-                seen.append(self._resting.rested(start))
+            seen.append(self._resting.rested(start))
             depths.append(self._resting.depth())
         return np.array(seen), np.array(depths)
 
-    def branch(self, rows: np.ndarray, states: np.ndarray, u: np.ndarray) -> Arrays:
+    def branch(self, states: np.ndarray, u: np.ndarray) -> Arrays:
         """Steps an environment without memory from states (k, S), written directly, with inputs u (k, m).
 
         Returns what `act` returns.
@@ -114,56 +103,57 @@ class Stage:
         Raises:
             BadInput: it remembers something after all.
         """
-        instance = self._begun(states[0])
-        before, results = written.fingerprint(instance.env), []
+        instance, results = self._renewed(self._free), []
+        instance.begin(states[0])
+        before = written.fingerprint(instance.env)
         for state, inputs in zip(states, u, strict=True):
             instance.physics.write(state)
             results.append(self._acted([instance], inputs[None]))
         if changed := written.differing(written.fingerprint(instance.env), before):
             raise BadInput(
-                f"{self.recipe.source.name} remembers something in {changed[0]}, as no sampled run showed; "
-                "without a memory that is always there it cannot be tabulated"
+                f"{instance.name} remembers something in {changed[0]}, as no sampled run showed; without a "
+                "memory that is always there it cannot be tabulated"
             )
         self._free.append(instance)
         return tuple(map(np.concatenate, zip(*results, strict=True)))
 
-    def check(self, rows: np.ndarray, runs: np.ndarray) -> Arrays:
+    def check(self, runs: np.ndarray) -> Arrays:
         """Plays runs (k,) of `Played` in new environments; raises `BadInput` if these go another way."""
         for run in runs:
-            self._real.check(run)
+            judge = self._renewed(self._judges)
+            check(run, judge)
+            self._judges.append(judge)
         return ()
 
     def _acted(self, instances: Sequence[Instance], u: np.ndarray) -> Arrays:
         first = instances[0]
         states, seen = (np.empty((len(u), n)) for n in (first.physics.size, len(first.observation)))
-        reports = []
         with first.undrawn():
             for i, (instance, inputs) in enumerate(zip(instances, u, strict=True)):
-                reports.append(instance.act(inputs))
+                instance.act(inputs)
                 instance.physics.read(states[i])
                 seen[i] = instance.observation
-        return states, seen, np.array(reports, dtype=float)
+        return states, seen, np.array([instance.report for instance in instances], dtype=float)
 
     # ---- instances
 
-    def _begun(self, start: np.ndarray) -> Instance:
-        """Returns an instance that begins at a state (S,); a new one takes the place of those worn."""
+    def _renewed(self, spare: list[Instance]) -> Instance:
+        """Returns an instance that can begin an episode: a spare one, or a new one if these are worn."""
         while True:
-            instance = self._free.pop() if self._free else self._new()
+            instance = spare.pop() if spare else self._new()
             try:
-                instance.begin(start)
+                instance.renew()
                 return instance
             except Worn as worn:
-                instance.quit()
                 if written.is_shared(str(worn)):
-                    raise instance.is_shared(str(worn)) from None
+                    raise instance.sharing(str(worn)) from None
 
     def _new(self) -> Instance:
         instance = Instance(self.recipe)
         shared = written.shared(instance.env)
         self._shared = self._shared or shared
         if changed := written.differing(shared, self._shared):
-            raise instance.is_shared(changed[0])
+            raise instance.sharing(changed[0])
         return instance
 
 
@@ -179,83 +169,75 @@ class Pool:
         self._stage, self._owner = Stage(recipe), os.getpid()
         self._hands: list[Connection] = []
         self._lock = Lock()  # a game attacks several controllers in threads
-        # Plants that nobody has any more: their number, their processes, and which rows play (n,).
-        self.left: deque[tuple[int, int, np.ndarray]] = deque()
-
-    def runs(
-        self, what: str, plant: int, processes: int, rows: np.ndarray, *values: np.ndarray
-    ) -> Arrays:
-        """Does what `Stage.begin`, `act`, `sense` or `leave` do, each row in the same process ever again."""
-        while what != "leave" and (gone := self._gone()):
-            self.runs("leave", *gone)
-        return self._spread(what, (plant,), rows % processes, rows, *values)
-
-    def _gone(self) -> tuple[int, int, np.ndarray] | None:
-        """Takes a plant that nobody has any more: its number, its processes, and the rows that play (k,)."""
-        try:  # another thread may take the last one
-            number, processes, plays = self.left.popleft()
-        except IndexError:
-            return None
-        return number, processes, np.flatnonzero(plays)
+        # Runs of plants that nobody has any more: places (n,), numbers (n,), and which are played (n,) bool.
+        self.left: deque[tuple[np.ndarray, np.ndarray, np.ndarray]] = deque()
 
     def rest(self, starts: np.ndarray) -> Arrays:
         """Does what `Stage.rest` does."""
-        return self._any("rest", starts)
+        return self.ask("rest", self.places(len(starts)), starts)
 
     def branch(self, states: np.ndarray, u: np.ndarray) -> Arrays:
         """Does what `Stage.branch` does."""
-        return self._any("branch", states, u)
+        return self.ask("branch", self.places(len(states)), states, u)
 
     def check(self, runs: Sequence[Played]) -> None:
         """Does what `Stage.check` does."""
         array = np.empty(len(runs), dtype=object)
         array[:] = runs
-        self._any("check", array)
+        self.ask("check", self.places(len(runs)), array)
 
-    def _any(self, what: str, *values: np.ndarray) -> Arrays:
-        rows = np.arange(len(values[0]))
-        return self._spread(what, (), rows % self.processes(len(rows)), rows, *values)
+    def places(self, n: int) -> np.ndarray:
+        """Returns the processes (n,) over which so many runs are spread, the number of this one being 0."""
+        count = min(cores.count(), max(n // FEWEST, 1))
+        forks = "fork" in multiprocessing.get_all_start_methods()
+        if not forks or multiprocessing.current_process().daemon:
+            count = 1
+        return np.arange(n) % count
 
-    def _spread(
-        self, what: str, first: tuple[Any, ...], places: np.ndarray, *values: np.ndarray
-    ) -> Arrays:
-        """Does something with rows of values, each in the process of `places` (k,), and joins the answers."""
+    def ask(self, what: str, places: np.ndarray, *values: np.ndarray) -> Arrays:
+        """Has each process do its rows of values (k, ...), by a method of `Stage`; joins the answers.
+
+        Args:
+            what: the name of the method.
+            places: (k,) the process of each row; a run that is played stays in its process.
+            values: the arguments.
+        """
         with self._lock:
-            self._open(int(places.max(initial=0)) + 1)
-            parts = {int(i): np.flatnonzero(places == i) for i in np.unique(places)}
-            jobs = {i: (what, (*first, *(v[rows] for v in values))) for i, rows in parts.items()}
-            answers = self._answers(jobs)
+            while self.left:
+                of_plant, runs, played = self.left.popleft()
+                self._spread("leave", of_plant[played], runs[played])
+            return self._spread(what, places, *values)
+
+    def _spread(self, what: str, places: np.ndarray, *values: np.ndarray) -> Arrays:
+        self._open(int(places.max(initial=0)) + 1)
+        rows_of = {int(i): np.flatnonzero(places == i) for i in np.unique(places)}
+        answers = self._answers(
+            what, {i: [value[rows] for value in values] for i, rows in rows_of.items()}
+        )
         joined = []
         for column in zip(*answers.values(), strict=True):
             whole = np.empty((len(places), *column[0].shape[1:]))
-            for rows, part in zip(parts.values(), column, strict=True):
+            for rows, part in zip(rows_of.values(), column, strict=True):
                 whole[rows] = part
             joined.append(whole)
         return tuple(joined)
 
-    def _answers(self, jobs: dict[int, tuple[str, Any]]) -> dict[int, Any]:
-        """Returns the answer of each process: that of number 0 is this one."""
-        for i, job in jobs.items():
+    def _answers(self, what: str, jobs: dict[int, list[np.ndarray]]) -> dict[int, Any]:
+        """Returns the answer of each process."""
+        for i in jobs:
             if i:
-                self._hands[i - 1].send(job)
-        answers: dict[int, Any] = {}
+                self._hands[i - 1].send((what, jobs[i]))
+        answers: dict[int, Any] = dict.fromkeys(jobs)
         try:
             if 0 in jobs:
-                what, arguments = jobs[0]
-                answers[0] = getattr(self._stage, what)(*arguments)
+                with kept_generators():
+                    answers[0] = getattr(self._stage, what)(*jobs[0])
         finally:  # what was asked for is always taken, or it would be taken for another answer
             answers |= {i: _answer(self._hands[i - 1]) for i in jobs if i}
         for answer in answers.values():
             if isinstance(answer, Exception):
                 raise answer
         return answers
-
-    def processes(self, runs: int) -> int:
-        """Returns over how many processes so many runs are spread, this one included."""
-        forks = "fork" in multiprocessing.get_all_start_methods()
-        if not forks or multiprocessing.current_process().daemon:
-            return 1
-        return min(cores.count(), max(runs // FEWEST, 1))
 
     def _open(self, count: int) -> None:
         """Makes the processes that are missing."""
@@ -278,20 +260,9 @@ class Pool:
         return self
 
 
-def _received(hand: Connection) -> Any:
-    """Returns what comes through a pipe, which is looked at for `AWAKE` before it is waited for in sleep.
-
-    Who sleeps is woken late, and often on the core of who wakes it.
-    """
-    until = time.perf_counter() + AWAKE
-    while not hand.poll() and time.perf_counter() < until:
-        pass
-    return hand.recv()
-
-
 def _answer(hand: Connection) -> Any:
     try:
-        return _received(hand)
+        return hand.recv()
     except EOFError:
         return BadInput(
             "a process that steps an environment has ended: see what it printed, and repair it"
@@ -306,11 +277,11 @@ def _serve(work: Connection, recipe: Recipe, others: Sequence[Connection]) -> No
     stage = Stage(recipe)
     with suppress(EOFError, BrokenPipeError):
         while True:
-            what, arguments = _received(work)
+            what, arguments = work.recv()
             try:
                 answer = getattr(stage, what)(*arguments)
             except HyrlError as error:
                 answer = error
             except Exception as error:
-                answer = BadInput(f"{recipe.source.name} cannot be stepped: {brief(error)}")
+                answer = BadInput(f"{recipe.description.name} cannot be stepped: {brief(error)}")
             work.send(answer)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from hyrl_mj.chart import Chart
 from hyrl_mj.environments.coordinates import Coordinate
-from hyrl_mj.environments.expressions import Expression
+from hyrl_mj.environments.expressions import Expression, Path
 from hyrl_mj.environments.instance import Recipe
 from hyrl_mj.errors import BadInput
 from hyrl_mj.tasks import Outcome
@@ -27,31 +28,34 @@ class Criterion:
     other one has to hold at the end of the episode.
 
     Attributes:
+        name: of the environment, for messages.
         success: the condition of success.
         failure: the condition of failure; by default the environment ends the episode without success.
     """
 
+    name: str
     success: Expression
     failure: Expression | None = None
 
     @property
     def ends(self) -> bool:
         """Whether a success ends the episode."""
-        return (
-            bool(self.success.keys) or re.search(r"\bterminated\b", self.success.text) is not None
-        )
+        asks_end = re.search(r"\bterminated\b", self.success.text) is not None
+        return bool(self.success.keys) or asks_end
 
     @property
-    def keys(self) -> tuple[tuple[str | int, ...], ...]:
+    def keys(self) -> tuple[Path, ...]:
         """The entries of `info` that it needs."""
-        others = () if self.failure is None else self.failure.keys
-        return tuple(dict.fromkeys((*self.success.keys, *others)))
+        return tuple(dict.fromkeys(key for one in self._conditions for key in one.keys))
 
     @property
     def places(self) -> tuple[tuple[str, str], ...]:
         """The pairs of names whose distance it needs."""
-        others = () if self.failure is None else self.failure.places
-        return tuple(dict.fromkeys((*self.success.places, *others)))
+        return tuple(dict.fromkeys(pair for one in self._conditions for pair in one.places))
+
+    @property
+    def _conditions(self) -> tuple[Expression, ...]:
+        return (self.success,) if self.failure is None else (self.success, self.failure)
 
     def judged(self, report: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns whether reports (k, r) are successes, (k,) bool, and the `Outcome` (k,) of their samples.
@@ -59,20 +63,24 @@ class Criterion:
         Raises:
             BadInput: "terminated" alone is the success, and an episode ended in touch with something.
         """
-        values = self._values(report)
+        names: list[Any] = ["reward", "terminated", "truncated", "touch"]
+        names += [("info", key) for key in self.keys]
+        names += [("distance", *pair) for pair in self.places]
+        values = dict(zip(names, report.T, strict=True))
         success = self.success.holds(values)
         terminated, truncated, touches = (report[:, 1:4] > 0).T
         if self.success.text.strip() == TERMINATED and (touches & terminated).any():
             raise BadInput(
-                'an episode ended where the robot touches what it does not touch elsewhere, and "terminated" '
-                'counts that as a success: say which ends are successes, as "terminated and reward >= 1"'
+                f"{self.name}: an episode ended where the robot touches what it does not touch elsewhere, "
+                'and "terminated" counts that as a success: say which ends are successes, as "terminated '
+                'and reward >= 1"'
             )
         failure = terminated & ~success
         if self.failure is not None:
             failure = self.failure.holds(values)
             if (success & failure).any():
                 raise BadInput(
-                    f"at the same sample it is a success ({self.success.text}) and a failure "
+                    f"{self.name}: at the same sample it is a success ({self.success.text}) and a failure "
                     f"({self.failure.text}): let one of the conditions exclude the other"
                 )
         reached = success & (terminated | truncated | self.ends)
@@ -83,31 +91,17 @@ class Criterion:
         )
         return success, outcome.astype(int)
 
-    def _values(self, report: np.ndarray) -> dict[object, np.ndarray]:
-        named: dict[object, np.ndarray] = {
-            "reward": report[:, 0],
-            "terminated": report[:, 1] > 0,
-            "truncated": report[:, 2] > 0,
-        }
-        entries = [("info", key) for key in self.keys]
-        columns = zip(
-            [*entries, *(("distance", *pair) for pair in self.places)], report[:, 4:].T, strict=True
-        )
-        return {**named, **dict(columns)}
-
 
 @dataclass(frozen=True)
 class EnvironmentSpec:
     """What is known of an environment; `inspect` finds it.
 
     Attributes:
-        name: of the environment.
         recipe: how instances are made, and what they report.
         chart: the coordinates of the decision.
         coordinates: where they lie in MuJoCo's state.
         state: MuJoCo's state (S,) from which runs begin, but for the positions of the chart.
         qpos, qvel: the places (nq,), (nv,) of positions and velocities in a state.
-        columns: o, the number of columns of an observation.
         parts: the number of columns of each part of a Dict, in the order of its space; none of a vector.
         observation_low, observation_high: limits (o,).
         moves: (o,) bool, the columns of an observation at rest that follow the chart.
@@ -129,14 +123,12 @@ class EnvironmentSpec:
         found: what was filled in, with the reason, by name.
     """
 
-    name: str
     recipe: Recipe
     chart: Chart
     coordinates: tuple[Coordinate, ...]
     state: np.ndarray
     qpos: np.ndarray
     qvel: np.ndarray
-    columns: int
     parts: Mapping[str, int]
     observation_low: np.ndarray
     observation_high: np.ndarray
@@ -165,6 +157,16 @@ class EnvironmentSpec:
         """d, the number of the chart's coordinates."""
         return len(self.coordinates)
 
+    @property
+    def columns(self) -> int:
+        """o, the number of columns of an observation."""
+        return len(self.observation_low)
+
+    @property
+    def name(self) -> str:
+        """The name of the environment."""
+        return self.recipe.description.name
+
     def z(self, state: np.ndarray) -> np.ndarray:
         """Returns the chart points (n, d) of MuJoCo's states (n, S)."""
         return state[:, list(self.recipe.noisy)] + self.recipe.offset
@@ -174,10 +176,3 @@ class EnvironmentSpec:
         states = np.tile(self.state, (len(z), 1))
         states[:, list(self.recipe.noisy)] = z - self.recipe.offset
         return states
-
-    def judged(self, report: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns what `Criterion.judged` does."""
-        try:
-            return self.criterion.judged(report)
-        except BadInput as error:
-            raise BadInput(f"{self.name}: {error}") from None
