@@ -14,7 +14,15 @@ from gymnasium import spaces
 from hyrl_mj import mjcf
 from hyrl_mj.chart import Chart
 from hyrl_mj.environments import trials
-from hyrl_mj.environments.coordinates import Coordinate, all_names, coordinates
+from hyrl_mj.environments.coordinates import (
+    Coordinate,
+    all_names,
+    bounds_of,
+    coordinates,
+    groups_of,
+    islands_of,
+    robot_of,
+)
 from hyrl_mj.environments.draws import check_draws, states_of_resets
 from hyrl_mj.environments.expressions import Expression
 from hyrl_mj.environments.fingerprint import differing, fingerprint
@@ -23,7 +31,6 @@ from hyrl_mj.environments.observations import parts_of
 from hyrl_mj.environments.opening import RESET, AnyChart, Description
 from hyrl_mj.environments.pool import Pool
 from hyrl_mj.environments.specification import FORMS, Criterion, EnvironmentSpec
-from hyrl_mj.environments.surroundings import bounds_of, groups_of, islands_of, robot_of
 from hyrl_mj.errors import BadInput, unknown
 
 # Samples of an episode of an environment that never ends by itself.

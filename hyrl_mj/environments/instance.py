@@ -40,7 +40,7 @@ class Recipe:
         description: how the environment is made and reset.
         noisy: places (d,) in a state of MuJoCo that the coordinates of the chart are in.
         offset: (d,) what the coordinates are greater by than these.
-        observer: the name of what computes the observation, of those that `observers` gives; "" if none does.
+        observer: the name of what computes the observation, of those that `observers` gives.
         keys: entries of `info` that are reported.
         places: pairs of names whose distance is reported, each as a kind and an index for both.
         solid: (ngeom,) bool, the geoms of the robot.
@@ -292,14 +292,8 @@ class Instance:
 
     def watched(self) -> Any:
         """Returns what the innermost environment observes in its present state."""
-        watch = self._observers.get(self.recipe.observer)
-        if watch is None:
-            raise BadInput(
-                f"{self.name} has no method that computes what it observes in its present state, so nothing "
-                "is known of what it would observe under noise: give it one named _get_obs, without arguments"
-            )
         try:
-            return watch()
+            return self._observers[self.recipe.observer]()
         except Exception as error:
             raise BadInput(
                 f"{self.recipe.observer}() of {self.name} raises {brief(error)}: repair it"

@@ -1,4 +1,4 @@
-"""Tasks are made of environments, and again from the texts that describe them."""
+"""Tasks are made of environments: by arguments, by options, and again from the texts that describe them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import re
 import shlex
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from inspect import signature
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -15,15 +17,15 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from hyrl_mj import limits, trust
+from hyrl_mj import artifacts, limits, trust
 from hyrl_mj.environments.inspection import inspect
 from hyrl_mj.environments.instance import kept_generators
 from hyrl_mj.environments.opening import CHART, RESET, AnyChart, Description, register
 from hyrl_mj.environments.specification import FORMS
 from hyrl_mj.environments.task import EnvironmentTask
-from hyrl_mj.errors import BadInput, check_seed, described, unknown
+from hyrl_mj.errors import BadInput, brief, check_seed, described, unknown
 from hyrl_mj.ranges import Integer, refused
-from hyrl_mj.tasks import Task, register_opener
+from hyrl_mj.tasks import Task, get_task, register_opener
 
 # The texts that describe environments begin with this; those that have been made in this process.
 MARK = "env:"
@@ -258,3 +260,97 @@ def _is_plain(value: Any) -> bool:
 
 
 register_opener(MARK, from_spec)
+
+
+# ---- the command line
+
+
+@dataclass(frozen=True)
+class EnvironmentOptions:
+    """An environment of Gymnasium in place of a task.
+
+    Attributes:
+        env: id of an environment of Gymnasium that MuJoCo simulates, in place of TASK, as
+            PointMaze_Medium-v3; by default none.
+        env_args: a JSON file with arguments of hyrl_mj.from_gymnasium, such as reset, pinned, kwargs, bounds
+            and steps; by default none.
+        chart: names of the coordinates in which the decision falls, as achieved_goal, or
+            shoulder=qpos[0],elbow=qpos[1]; by default what is found.
+        noisy: share of --eps on each coordinate of the chart; by default 1 on positions.
+        success: when an episode is a success, as info, terminated, "reward >= 1" or
+            "distance(fingertip, target) <= 0.05"; by default what info tells.
+        failure: when an episode is a failure, as 'info["collision"]'; by default when it is terminated
+            without success.
+        explain: say what was found out about the environment and how to change it, and do nothing else.
+    """
+
+    env: str | None = None
+    env_args: Path | None = None
+    chart: tuple[str, ...] | None = None
+    noisy: tuple[float, ...] | None = None
+    success: str | None = None
+    failure: str | None = None
+    explain: bool = False
+
+
+def chosen_task(task: str | None, options: EnvironmentOptions) -> Task:
+    """Returns the task of a name or file, or of an environment.
+
+    Raises:
+        BadInput: both or none of them is given, or the environment cannot be used.
+    """
+    if options.env is None:
+        if options != EnvironmentOptions():
+            raise BadInput(
+                "--env-args, --chart, --noisy, --success, --failure and --explain need an --env"
+            )
+        if task is None:
+            raise BadInput("give a TASK, see hyrl-mj list, or an environment with --env ID")
+        return get_task(task)
+    if task is not None:
+        raise BadInput(f"give the task {task} or --env {options.env}, not both")
+    given = {} if options.env_args is None else _arguments(options.env_args)
+    for name in ("chart", "noisy", "success", "failure"):
+        if (value := getattr(options, name)) is not None:
+            given[name] = value
+    return from_gymnasium(options.env, **given)
+
+
+def explained(task: Task) -> str:
+    """Returns what was given and found out about an environment, and how to change it."""
+    assert isinstance(task, EnvironmentTask)
+    lines = [f"{task.name}: {task!r}"]
+    for name, value in json.loads(task.spec.removeprefix(MARK)).items():
+        lines.append(f"  {name}: {value if isinstance(value, str) else json.dumps(value)} (given)")
+    for name, text in task.found.items():
+        lines += [f"  {name}: {text}", f"    (to change it, give {_INSTEAD.get(name, name)})"]
+    return "\n".join(lines)
+
+
+# What to give to change what was found, where it has another name.
+_INSTEAD = {
+    "noise": "noisy",
+    "goal": "reset, pinned or seed",
+    "ways": "chart",
+    "lag": "an environment that calls mj_forward at the end of step()",
+    "sample time": "kwargs, such as frame_skip, if the environment takes it",
+    "camera": "task.scene another one in Python",
+}
+
+
+def _arguments(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(artifacts.read_limited(path).decode())
+    except OSError as error:
+        raise BadInput(f"{path} cannot be read ({error.strerror}): give a JSON file") from None
+    except (ValueError, RecursionError) as error:
+        raise BadInput(f"{path} is no JSON ({brief(error)}): give a JSON file") from None
+    if not isinstance(content, dict):
+        raise BadInput(
+            f"{path} holds no JSON object: give one with arguments of hyrl_mj.from_gymnasium"
+        )
+    allowed = [name for name in signature(from_gymnasium).parameters if name != "env"]
+    for name in content:
+        if name not in allowed:
+            raise unknown(f"argument in {path}", name, allowed)
+    return content

@@ -48,7 +48,6 @@ class EnvironmentPlant:
         self.low, self.high, self.late = spec.low, spec.high, spec.wrapped
         self._runs, self._places = next(_NUMBERS) * MOST + np.arange(n), pool.places(n)
         self._state = np.tile(spec.state, (n, 1))
-        self._starts = self._state.copy()
         self._seen = slice(spec.dimension, spec.dimension + spec.columns)
         self._truth = np.zeros((n, spec.dimension + spec.columns + 3))
         self._unstable = np.zeros(n, dtype=bool)
@@ -114,7 +113,7 @@ class EnvironmentPlant:
                     f"{self.n} episodes of {self.spec.name} side by side need as many environments in "
                     f"memory: give at most {PLAYED}"
                 )
-            self._ask("begin", new, self._starts[new])
+            self._ask("begin", new, self._state[new])
             self._plays[new] = True
 
     def _ask(self, what: str, rows: np.ndarray, *values: np.ndarray) -> Any:
@@ -171,9 +170,8 @@ class EnvironmentPlant:
         given = {"qpos": (self.spec.qpos, qpos), "qvel": (self.spec.qvel, qvel)}
         for name, (columns, values) in given.items():
             self._state[np.ix_(rows, columns)] = checked(name, values, len(columns), rows)
-        self._starts[rows] = self._state[rows]
         self._unstable[rows], self._open[rows] = False, True
-        seen, depths = self._pool.rest(self._starts[rows])
+        seen, depths = self._pool.rest(self._state[rows])
         blocked = depths > self.spec.depth
         outcome = np.where(blocked, Outcome.CRASHED, Outcome.RUNNING)
         nothing = np.zeros((len(rows), 2))

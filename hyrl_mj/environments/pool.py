@@ -1,7 +1,8 @@
 """Instances of an environment in processes, one on each core, which play the episodes of many runs.
 
 Each process is a fork of this one. What an episode does depends on its start, inputs and noise alone, so
-results do not depend on the number of processes.
+results do not depend on the number of processes. The real environment is the judge: a new one, which is only
+put to the same starts and stepped, has to end alike.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import warnings
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from threading import Lock
 from typing import Any
@@ -22,12 +24,31 @@ import numpy as np
 from hyrl_mj import cores
 from hyrl_mj.environments import fingerprint as written
 from hyrl_mj.environments.instance import Instance, Recipe, Worn, kept_generators
-from hyrl_mj.environments.judge import Played, check
+from hyrl_mj.environments.observations import flat
 from hyrl_mj.errors import BadInput, HyrlError, brief
 
 # Fewer episodes than this for each process are played by one.
 FEWEST = 16
 Arrays = tuple[np.ndarray, ...]
+
+
+@dataclass(frozen=True)
+class Played:
+    """Samples of one run.
+
+    Attributes:
+        start: MuJoCo's state (S,) in which it begins.
+        inputs: (k, m).
+        path: (k + 1, d) chart points, before and after each sample.
+        observations: (k + 1, o), or none where noise was on them.
+        rewards: (k, 1) of the samples, or none.
+    """
+
+    start: np.ndarray
+    inputs: np.ndarray
+    path: np.ndarray
+    observations: np.ndarray | None = None
+    rewards: np.ndarray | None = None
 
 
 class Stage:
@@ -120,9 +141,9 @@ class Stage:
     def check(self, runs: np.ndarray) -> Arrays:
         """Plays runs (k,) of `Played` in new environments; raises `BadInput` if these go another way."""
         for run in runs:
-            judge = self._renewed(self._judges)
-            check(run, judge)
-            self._judges.append(judge)
+            real = self._renewed(self._judges)
+            judge(run, real)
+            self._judges.append(real)
         return ()
 
     def _acted(self, instances: Sequence[Instance], u: np.ndarray) -> Arrays:
@@ -155,6 +176,36 @@ class Stage:
         if changed := written.differing(shared, self._shared):
             raise instance.sharing(changed[0])
         return instance
+
+
+def judge(run: Played, real: Instance) -> None:
+    """Raises `BadInput` if a run went otherwise than in an environment that its user would make.
+
+    That is put to the start and stepped, past all that lets episodes be played side by side. There is no
+    tolerance: the same code computes the same from the same numbers.
+    """
+    recipe, space = real.recipe, real.env.observation_space
+    observations, path, rewards = [real.put(run.start)], [run.path[0]], []
+    for u in run.inputs:
+        observation, reward, *_ = real.env.step(real.action(u))
+        observations.append(flat(observation, space))
+        path.append(real.physics.read()[list(recipe.noisy)] + recipe.offset)
+        rewards.append([float(reward)])
+    _compare(real.name, "observation", run.observations, observations)
+    _compare(real.name, "the chart's coordinate", run.path, path)
+    _compare(real.name, "reward", run.rewards, np.reshape(rewards, (-1, 1)))
+
+
+def _compare(name: str, what: str, ours: np.ndarray | None, real: Any) -> None:
+    if ours is None or np.array_equal(ours, real, equal_nan=True):
+        return
+    same = (ours == real) | (np.isnan(ours) & np.isnan(real))
+    k, i = np.argwhere(~same)[0]
+    raise BadInput(
+        f"{name} goes another way than a new one from the same start with the same inputs: {what}[{i}] is "
+        f"{ours[k][i]:.9g} after {k} sample(s), and {real[k][i]:.9g} in the new one; it depends on other "
+        "episodes, on time, on chance, or on what it observes"
+    )
 
 
 class Pool:

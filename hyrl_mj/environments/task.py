@@ -14,11 +14,10 @@ import numpy as np
 from hyrl_mj import mjcf
 from hyrl_mj.environments.fingerprint import of_model
 from hyrl_mj.environments.instance import Instance
-from hyrl_mj.environments.judge import Played
 from hyrl_mj.environments.observations import parts_of
 from hyrl_mj.environments.opening import code_of
 from hyrl_mj.environments.plant import EnvironmentPlant
-from hyrl_mj.environments.pool import Pool
+from hyrl_mj.environments.pool import Played, Pool
 from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.environments.trials import goes_on
 from hyrl_mj.errors import BadInput
@@ -59,17 +58,17 @@ class EnvironmentTask(Task):
     learning = Learning()
 
     def __init__(self, specification: EnvironmentSpec, pool: Pool, instance: Instance, spec: str):
-        env = specification.recipe.description.env
         self.specification, self._pool, self._instance = specification, pool, instance
-        self.name, self.spec = specification.name, spec
-        self.env_id = env if isinstance(env, str) else self.name
+        # What a task and a specification call alike.
+        for name in (
+            "name", "chart", "inputs", "start_low", "start_high", "max_steps", "dt", "worst_reward",
+        ):  # fmt: skip
+            setattr(self, name, getattr(specification, name))
+        env = specification.recipe.description.env
+        self.spec, self.env_id = spec, env if isinstance(env, str) else self.name
         self.found = dict(specification.found)
         self.description = f"the environment {self.name}"
-        self.chart, self.inputs = specification.chart, specification.inputs
         self.input_limits = specification.low, specification.high
-        self.start_low, self.start_high = specification.start_low, specification.start_high
-        self.max_steps, self.dt = specification.max_steps, specification.dt
-        self.worst_reward = specification.worst_reward
         self.arrival_ends = specification.criterion.ends
         self.noisy = (*specification.noisy, *([0.0] * (specification.columns + 3)))
         self.observation_parts = specification.parts

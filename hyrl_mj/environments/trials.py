@@ -9,10 +9,9 @@ import numpy as np
 
 from hyrl_mj.environments.fingerprint import differing, fingerprint
 from hyrl_mj.environments.instance import EARLIER, NOW, UNKNOWN, Instance, Recipe
-from hyrl_mj.environments.judge import Played
 from hyrl_mj.environments.observations import flat, observers
 from hyrl_mj.environments.plant import EnvironmentPlant
-from hyrl_mj.environments.pool import Pool
+from hyrl_mj.environments.pool import Played, Pool
 from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.errors import BadInput
 
@@ -29,7 +28,7 @@ OF_CHART, SAME = 48, 1e-9
 
 
 def observer_of(instance: Instance) -> str:
-    """Returns the name of what computes what an environment observes, "" if nothing is found to."""
+    """Returns the name of what computes what an environment observes; raises `BadInput` if nothing does."""
     rng, space = np.random.default_rng(0), instance.inner.observation_space
     left = observers(instance.env)
 
@@ -43,7 +42,12 @@ def observer_of(instance: Instance) -> str:
             left = agreeing()
         for _ in instance.wander(rng, SAMPLES, HELD):
             left = agreeing()
-    return next(iter(left), "")
+    if not left:
+        raise BadInput(
+            f"{instance.name} has no method that computes what it observes in its present state, so nothing is "
+            "known of what it would observe under noise: give it one named _get_obs, without arguments"
+        )
+    return next(iter(left))
 
 
 def _agrees(get: Any, seen: np.ndarray, space: Any) -> bool:
