@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import mujoco
@@ -14,6 +13,7 @@ from hyrl_mj import mjcf
 from hyrl_mj.environments.instance import Instance
 from hyrl_mj.environments.observations import columns_of
 from hyrl_mj.environments.opening import AnyChart
+from hyrl_mj.environments.specification import Coordinate
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.tasks import touching
 
@@ -28,36 +28,6 @@ FREE, SLIDE, HINGE = map(
     int, (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
 )
 JOINT, SITE, BODY = mujoco.mjtObj.mjOBJ_JOINT, mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY
-
-
-@dataclass(frozen=True)
-class Coordinate:
-    """A coordinate of a chart.
-
-    Attributes:
-        name: in figures and messages.
-        kind: "qpos" or "qvel".
-        index: of the position or the velocity.
-        offset: what the coordinate is greater by.
-        joint: id of the joint.
-        axis: the axis of the world, 0 to 2, along which it moves most; None if it turns.
-    """
-
-    name: str
-    kind: str
-    index: int
-    offset: float
-    joint: int
-    axis: int | None
-
-    @property
-    def unit(self) -> str:
-        """The unit: "m", "rad", "m/s" or "rad/s"."""
-        return ("rad" if self.axis is None else "m") + "/s" * (self.kind == "qvel")
-
-    def described(self) -> str:
-        """Returns what it stands for: "qpos[0]"."""
-        return f"{self.kind}[{self.index}]"
 
 
 def coordinates(instance: Instance, chart: AnyChart) -> tuple[Coordinate, ...]:

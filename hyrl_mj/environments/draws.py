@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 
+from hyrl_mj.environments.coordinates import robot_of
 from hyrl_mj.environments.fingerprint import Fingerprint, differing
 from hyrl_mj.environments.instance import Instance
 from hyrl_mj.environments.observations import flat
@@ -29,20 +30,19 @@ def states_of_resets(instance: Instance) -> np.ndarray:
     return np.array(found)
 
 
-def check_draws(instance: Instance, states: np.ndarray, robot: np.ndarray) -> str:
+def check_draws(instance: Instance, states: np.ndarray) -> str:
     """Returns what resets draw and how it is pinned, to be said to the user; "" if they draw nothing.
 
     Args:
         instance: the environment.
         states: MuJoCo's states (n, S) after resets.
-        robot: (nbody,) bool, the bodies of the robot, whose state they may draw.
 
     Raises:
         BadInput: nothing pins what they draw, or what pins it changes nothing, or contradicts something else.
     """
-    description, name = instance.recipe.description, instance.name
+    description, name = instance.spec.description, instance.name
     options, pinned, seed = description.reset, description.pinned, description.seed
-    names = _drawn(instance, states, robot)
+    names = _drawn(instance, states)
     changed = _changed_by_user(instance) if options or pinned else set()
     if options and not changed:
         draws = f", which draws {', '.join(names)}" if names else ""
@@ -67,9 +67,10 @@ def check_draws(instance: Instance, states: np.ndarray, robot: np.ndarray) -> st
     return f"{', '.join(names[:8])} as the reset with seed {description.first}{by_options} draws it{by_pins}"
 
 
-def _drawn(instance: Instance, states: np.ndarray, robot: np.ndarray) -> list[str]:
+def _drawn(instance: Instance, states: np.ndarray) -> list[str]:
     """Returns the names of what resets draw, beside the robot's own state, and what comes next depends on."""
     model, columns = instance.model, instance.physics.columns
+    robot = robot_of(model, instance.spec.coordinates)
     varies = np.ptp(states, axis=0) > 0
     varies[columns["warmstart"]] = False  # it says nothing of where a run goes
     body_of_qpos = np.repeat(model.jnt_bodyid, np.diff(np.append(model.jnt_qposadr, model.nq)))
@@ -79,7 +80,7 @@ def _drawn(instance: Instance, states: np.ndarray, robot: np.ndarray) -> list[st
     again = [_begun(instance, states[0], 0)[0] for _ in range(2)]
     lasting = set(differing(*again))  # what outlasts a reset is not drawn by it
     begun = [
-        _begun(Instance(instance.recipe) if lasting else instance, states[0], seed)
+        _begun(Instance(instance.spec) if lasting else instance, states[0], seed)
         for seed in range(COMPARED)
     ]
     first, told = begun[0]
@@ -118,7 +119,7 @@ def _names_of_state(instance: Instance) -> list[str]:
 
 def _changed_by_user(instance: Instance) -> set[str]:
     """Returns the names of what the user's options of reset and pinned values change after a reset."""
-    found = set(instance.recipe.description.pinned)
+    found = set(instance.spec.description.pinned)
     for seed in range(COMPARED):
         seen = []
         for plain in (False, True):
@@ -136,7 +137,7 @@ def _check_pins(instance: Instance) -> None:
     An attribute that, after each reset, is a copy of a place in the model or in the state is one after the
     resets that pin it, too.
     """
-    pinned, inner = instance.recipe.description.pinned, instance.inner
+    pinned, inner = instance.spec.description.pinned, instance.inner
     pins = {n: np.ravel(v).astype(float) for n, v in pinned.items() if hasattr(inner, n)}
     if not pins:
         return

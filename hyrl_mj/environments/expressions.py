@@ -61,7 +61,7 @@ class Expression:
     """
 
     text: str
-    what: str
+    what: str = "success"
     keys: tuple[Path, ...] = ()
     places: tuple[tuple[str, str], ...] = ()
     _tree: Any = field(default=None, repr=False, compare=False)

@@ -15,8 +15,9 @@ import numpy as np
 sys.path.append(str(Path(__file__).parents[2]))  # of the package, if it is not installed
 
 from hyrl_mj import limits, trust
-from hyrl_mj.environments.instance import Instance, Recipe
+from hyrl_mj.environments.instance import Instance
 from hyrl_mj.environments.opening import Description, register
+from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.errors import BadInput
 
 
@@ -29,7 +30,7 @@ def problem_of(description: Description, seconds: int, memory: int) -> str:
     limits.limit(seconds, memory)
     try:
         with trust.received():  # code that an argument names does not run
-            instance = Instance(Recipe(description))
+            instance = Instance(EnvironmentSpec(description))
             instance.reset()
             instance.stepped(instance.drawn(np.random.default_rng(0)))
     except BadInput as error:

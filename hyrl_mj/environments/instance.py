@@ -12,7 +12,7 @@ import random
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import replace
 from queue import SimpleQueue
 from threading import Thread
 from typing import Any
@@ -21,44 +21,12 @@ import numpy as np
 from gymnasium import spaces
 
 from hyrl_mj.environments import fingerprint as written
-from hyrl_mj.environments.expressions import Path, entry
+from hyrl_mj.environments.expressions import entry
 from hyrl_mj.environments.observations import flat, observers, shaped
-from hyrl_mj.environments.opening import Description, made, peeled, physics_of, plant_of, steps_of
+from hyrl_mj.environments.opening import made, peeled, physics_of, plant_of, steps_of
 from hyrl_mj.environments.physics import Physics
+from hyrl_mj.environments.specification import EARLIER, NOW, UNKNOWN, EnvironmentSpec
 from hyrl_mj.errors import BadInput, HyrlError, brief
-
-# What derived quantities are, as what is observed after a step shows them: as at the end of the step; as a
-# step of the physics before; or neither.
-NOW, EARLIER, UNKNOWN = "now", "earlier", "unknown"
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """How instances are made, and what they report.
-
-    Attributes:
-        description: how the environment is made and reset.
-        noisy: places (d,) in a state of MuJoCo that the coordinates of the chart are in.
-        offset: (d,) what the coordinates are greater by than these.
-        observer: the name of what computes the observation, of those that `observers` gives.
-        keys: entries of `info` that are reported.
-        places: pairs of names whose distance is reported, each as a kind and an index for both.
-        solid: (ngeom,) bool, the geoms of the robot.
-        harmless: geoms that the robot has touched without an end of the episode.
-        anew: whether a reset changes what the next one does to a wrapper: each episode takes a new instance.
-        derived: `NOW`, `EARLIER` or `UNKNOWN`.
-    """
-
-    description: Description
-    noisy: tuple[int, ...] = ()
-    offset: tuple[float, ...] = ()
-    observer: str = ""
-    keys: tuple[Path, ...] = ()
-    places: tuple[tuple[tuple[str, int], tuple[str, int]], ...] = ()
-    solid: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    harmless: frozenset[int] = frozenset()
-    anew: bool = False
-    derived: str = UNKNOWN
 
 
 class Worn(HyrlError):
@@ -69,7 +37,7 @@ class Instance:
     """An environment that plays episodes, one at a time.
 
     Args:
-        recipe: how it is made.
+        spec: what is known of the environment, of which the description is enough for a first one.
 
     Attributes:
         observation: (o,) what the environment observed last, with its wrappers.
@@ -82,18 +50,19 @@ class Instance:
         BadInput: it cannot be made or reset.
     """
 
-    def __init__(self, recipe: Recipe):
-        env = made(recipe.description)
+    def __init__(self, spec: EnvironmentSpec):
+        env = made(spec.description)
         physics = physics_of(env)
         assert physics is not None
-        self.recipe, self.name, self.steps = recipe, recipe.description.name, steps_of(env)
+        self.spec, self.name, self.steps = spec, spec.name, steps_of(env)
         self.env, (self.model, self.data) = peeled(env), physics
         self.physics = Physics(self.model, self.data, plant_of(env))
         self.inner: Any = self.env.unwrapped
         self._space, self._actions = self.env.observation_space, self.env.action_space
         self._observers = observers(self.env)
         self.observation, self.inner_seen = np.empty(0), None
-        self.report: Sequence[float] = (0.0,) * (4 + len(recipe.keys) + len(recipe.places))
+        numbers = 4 + len(spec.criterion.keys) + len(spec.criterion.points)
+        self.report: Sequence[float] = (0.0,) * numbers
         self.start: np.ndarray | None = None
         self._like: written.Fingerprint | None = None  # after its first reset
         self._begun = written.Fingerprint()  # after the reset of its episode
@@ -106,6 +75,10 @@ class Instance:
         """Whether wrappers lie around the environment."""
         return self.env is not self.inner
 
+    def learn(self, **facts: Any) -> None:
+        """Adds to what is known of the environment."""
+        self.spec = replace(self.spec, **facts)
+
     # ---- an episode
 
     def reset(self, seed: int | None = None, plain: bool = False) -> Any:
@@ -115,7 +88,7 @@ class Instance:
             seed: of the reset, by default the one that all runs begin from.
             plain: whether the options and the pins that the user gives are left out.
         """
-        description = self.recipe.description
+        description = self.spec.description
         seed = description.first if seed is None else seed
         given = {} if plain else description.reset
         options = {k: np.array(v) if isinstance(v, list) else v for k, v in given.items()}
@@ -143,7 +116,7 @@ class Instance:
         # Views of MuJoCo's data, which show where these are at any time.
         self._pairs = [
             (getattr(self.data, a)[i], getattr(self.data, b)[j])
-            for (a, i), (b, j) in self.recipe.places
+            for (a, i), (b, j) in self.spec.criterion.points
         ]
         if not self.is_wrapped:
             self.inner_seen = observation
@@ -180,7 +153,7 @@ class Instance:
 
     def pin(self) -> None:
         """Sets what is pinned."""
-        if not (pinned := self.recipe.description.pinned):
+        if not (pinned := self.spec.description.pinned):
             return
         self.physics.read()
         for name, value in pinned.items():
@@ -231,7 +204,7 @@ class Instance:
             Worn: after its reset it is not like a new one.
         """
         self.quit()
-        if not self.recipe.anew:
+        if not self.spec.anew:
             self.reset()
             self.mark()
         elif self._used:
@@ -293,10 +266,10 @@ class Instance:
     def watched(self) -> Any:
         """Returns what the innermost environment observes in its present state."""
         try:
-            return self._observers[self.recipe.observer]()
+            return self._observers[self.spec.observer]()
         except Exception as error:
             raise BadInput(
-                f"{self.recipe.observer}() of {self.name} raises {brief(error)}: repair it"
+                f"{self.spec.observer}() of {self.name} raises {brief(error)}: repair it"
             ) from error
 
     def rested(self, start: np.ndarray) -> np.ndarray:
@@ -312,7 +285,7 @@ class Instance:
         computed where the robot was then, with the noise. Where it is not known which they are, it is the
         difference of two observations with all of them up to date.
         """
-        state, derived = self.physics.read(), NOW if self._at_start else self.recipe.derived
+        state, derived = self.physics.read(), NOW if self._at_start else self.spec.derived
         with self.physics.kept():
             if derived == UNKNOWN:
                 before = self.seen_as(NOW, state, np.zeros(len(noise)))
@@ -321,7 +294,7 @@ class Instance:
             return self.seen_as(derived, state, noise) - before
 
     def seen_as(self, derived: str, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Returns the innermost observation (o,) of a state (S,) under noise (d,); see `Recipe.derived`.
+        """Returns the innermost observation (o,) of a state (S,) under noise (d,), as `derived` says.
 
         MuJoCo's data are left there.
         """
@@ -336,7 +309,7 @@ class Instance:
     def moved(self, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Returns a state of MuJoCo (S,) with noise (d,) added to the coordinates of the chart."""
         moved = state.copy()
-        moved[list(self.recipe.noisy)] += noise
+        moved[self.spec.places] += noise
         return moved
 
     def depth(self) -> float:
@@ -344,13 +317,13 @@ class Instance:
         contact = self.data.contact
         if not self.data.ncon:
             return 0.0
-        touches = self.recipe.solid[contact.geom].sum(axis=1) == 1
+        touches = self.spec.solid[contact.geom].sum(axis=1) == 1
         return float(-min(contact.dist[touches].min(initial=0.0), 0.0))
 
     def touched(self) -> set[int]:
         """Returns the geoms that the robot touches."""
         pairs = self.data.contact.geom[: self.data.ncon]
-        return {int(g) for pair in pairs if self.recipe.solid[pair].sum() == 1 for g in pair}
+        return {int(g) for pair in pairs if self.spec.solid[pair].sum() == 1 for g in pair}
 
     # ---- steps
 
@@ -392,9 +365,9 @@ class Instance:
         self.observation = flat(observation, self._space)
         if self.physics.is_plant:
             self.physics.read()
-        touch = bool(terminated) and bool(self.touched() - self.recipe.harmless)
+        touch = bool(terminated) and bool(self.touched() - self.spec.harmless)
         report = [float(reward), bool(terminated), bool(truncated), touch]
-        report += [entry(info, key) for key in self.recipe.keys]
+        report += [entry(info, key) for key in self.spec.criterion.keys]
         for a, b in self._pairs:
             away = a - b
             report.append(math.sqrt(away.dot(away)))
@@ -491,7 +464,7 @@ class _Chain:
     def leave(self) -> None:
         """Ends a step that waits for noise."""
         if self._busy:
-            self.answer(np.zeros(len(self._instance.recipe.noisy)))
+            self.answer(np.zeros(self._instance.spec.dimension))
 
     def _step(self, action: Any) -> Any:
         result = self._own_step(action)

@@ -23,8 +23,9 @@ import numpy as np
 
 from hyrl_mj import cores
 from hyrl_mj.environments import fingerprint as written
-from hyrl_mj.environments.instance import Instance, Recipe, Worn, kept_generators
+from hyrl_mj.environments.instance import Instance, Worn, kept_generators
 from hyrl_mj.environments.observations import flat
+from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.errors import BadInput, HyrlError, brief
 
 # Fewer episodes than this for each process are played by one.
@@ -55,11 +56,11 @@ class Stage:
     """The instances of one process, and the episodes that they play.
 
     Args:
-        recipe: how instances are made.
+        spec: what is known of the environment.
     """
 
-    def __init__(self, recipe: Recipe):
-        self.recipe = recipe
+    def __init__(self, spec: EnvironmentSpec):
+        self.spec = spec
         self._playing: dict[int, Instance] = {}  # by the number of the run
         self._free: list[Instance] = []
         self._judges: list[Instance] = []  # which play nothing but what they judge
@@ -110,7 +111,7 @@ class Stage:
         """Returns what episodes that begin in states (k, S) observe first (k, o), and depths (k,) [m]."""
         seen, depths = [], []
         for start in starts:
-            if self._resting is None or self.recipe.anew:
+            if self._resting is None or self.spec.anew:
                 self._resting = self._new()
             seen.append(self._resting.rested(start))
             depths.append(self._resting.depth())
@@ -170,7 +171,7 @@ class Stage:
                     raise instance.sharing(str(worn)) from None
 
     def _new(self) -> Instance:
-        instance = Instance(self.recipe)
+        instance = Instance(self.spec)
         shared = written.shared(instance.env)
         self._shared = self._shared or shared
         if changed := written.differing(shared, self._shared):
@@ -184,12 +185,12 @@ def judge(run: Played, real: Instance) -> None:
     That is put to the start and stepped, past all that lets episodes be played side by side. There is no
     tolerance: the same code computes the same from the same numbers.
     """
-    recipe, space = real.recipe, real.env.observation_space
+    spec, space = real.spec, real.env.observation_space
     observations, path, rewards = [real.put(run.start)], [run.path[0]], []
     for u in run.inputs:
         observation, reward, *_ = real.env.step(real.action(u))
         observations.append(flat(observation, space))
-        path.append(real.physics.read()[list(recipe.noisy)] + recipe.offset)
+        path.append(spec.z(real.physics.read()[None])[0])
         rewards.append([float(reward)])
     _compare(real.name, "observation", run.observations, observations)
     _compare(real.name, "the chart's coordinate", run.path, path)
@@ -212,12 +213,12 @@ class Pool:
     """Plays episodes of an environment on all cores.
 
     Args:
-        recipe: how instances are made.
+        spec: what is known of the environment.
     """
 
-    def __init__(self, recipe: Recipe):
-        self.recipe = recipe
-        self._stage, self._owner = Stage(recipe), os.getpid()
+    def __init__(self, spec: EnvironmentSpec):
+        self.spec = spec
+        self._stage, self._owner = Stage(spec), os.getpid()
         self._hands: list[Connection] = []
         self._lock = Lock()  # a game attacks several controllers in threads
         # Runs of plants that nobody has any more: places (n,), numbers (n,), and which are played (n,) bool.
@@ -294,11 +295,11 @@ class Pool:
         """Makes the processes that are missing."""
         if self._owner != os.getpid():
             # Instances and processes of a process that this one was forked from are not ours.
-            self._stage, self._owner, self._hands = Stage(self.recipe), os.getpid(), []
+            self._stage, self._owner, self._hands = Stage(self.spec), os.getpid(), []
         while len(self._hands) < count - 1:
             context = multiprocessing.get_context("fork")
             ours, theirs = context.Pipe()
-            arguments = theirs, self.recipe, [*self._hands, ours]
+            arguments = theirs, self.spec, [*self._hands, ours]
             worker = context.Process(target=_serve, args=arguments, daemon=True)
             with warnings.catch_warnings():
                 # Python 3.12 warns of threads: those of torch and MuJoCo take no part in the children.
@@ -320,12 +321,12 @@ def _answer(hand: Connection) -> Any:
         )
 
 
-def _serve(work: Connection, recipe: Recipe, others: Sequence[Connection]) -> None:
+def _serve(work: Connection, spec: EnvironmentSpec, others: Sequence[Connection]) -> None:
     """Answers what is asked through a pipe, until the other end is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     for other in others:
         other.close()
-    stage = Stage(recipe)
+    stage = Stage(spec)
     with suppress(EOFError, BrokenPipeError):
         while True:
             what, arguments = work.recv()
@@ -334,5 +335,5 @@ def _serve(work: Connection, recipe: Recipe, others: Sequence[Connection]) -> No
             except HyrlError as error:
                 answer = error
             except Exception as error:
-                answer = BadInput(f"{recipe.description.name} cannot be stepped: {brief(error)}")
+                answer = BadInput(f"{spec.name} cannot be stepped: {brief(error)}")
             work.send(answer)

@@ -64,7 +64,7 @@ class EnvironmentTask(Task):
             "name", "chart", "inputs", "start_low", "start_high", "max_steps", "dt", "worst_reward",
         ):  # fmt: skip
             setattr(self, name, getattr(specification, name))
-        env = specification.recipe.description.env
+        env = specification.description.env
         self.spec, self.env_id = spec, env if isinstance(env, str) else self.name
         self.found = dict(specification.found)
         self.description = f"the environment {self.name}"

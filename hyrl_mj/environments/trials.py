@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from hyrl_mj.environments.fingerprint import differing, fingerprint
-from hyrl_mj.environments.instance import EARLIER, NOW, UNKNOWN, Instance, Recipe
+from hyrl_mj.environments.instance import Instance
 from hyrl_mj.environments.observations import flat, observers
 from hyrl_mj.environments.plant import EnvironmentPlant
 from hyrl_mj.environments.pool import Played, Pool
-from hyrl_mj.environments.specification import EnvironmentSpec
+from hyrl_mj.environments.specification import EARLIER, NOW, UNKNOWN, EnvironmentSpec
 from hyrl_mj.errors import BadInput
 
 # Episodes and samples of a trial, and for how many samples inputs are held.
@@ -38,14 +38,14 @@ def observer_of(instance: Instance) -> str:
 
     for seed in range(EPISODES):
         instance.reset(seed)
-        if not instance.recipe.description.pinned:  # else it was pinned after that observation
+        if not instance.spec.description.pinned:  # else it was pinned after that observation
             left = agreeing()
         for _ in instance.wander(rng, SAMPLES, HELD):
             left = agreeing()
     if not left:
         raise BadInput(
-            f"{instance.name} has no method that computes what it observes in its present state, so nothing is "
-            "known of what it would observe under noise: give it one named _get_obs, without arguments"
+            f"{instance.name} has no method that computes what it observes in its present state, so nothing "
+            "is known of what it would observe under noise: give it one named _get_obs, without arguments"
         )
     return next(iter(left))
 
@@ -79,7 +79,7 @@ def check_observer(instance: Instance, step: np.ndarray) -> None:
         instance.reset(seed)
         state = instance.physics.read()
         instance.physics.write(state)
-        pinned = instance.recipe.description.pinned
+        pinned = instance.spec.description.pinned
         begun = flat(instance.watched() if pinned else instance.inner_seen, space)
         first.append(begun)
         for _ in instance.wander(rng, SAMPLES, HELD):
@@ -123,7 +123,7 @@ def _depends(instance: Instance, column: int, step: np.ndarray) -> bool:
 
 
 def derived_of(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
-    """Returns `Recipe.derived`, with the columns of what is observed that are not as at the end of a step.
+    """Returns `derived` of a spec, and the columns of what is observed that are not from the end of a step.
 
     Args:
         instance: the environment.
@@ -164,14 +164,14 @@ def derived_of(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
     return UNKNOWN, lags
 
 
-def changes_by_reset(recipe: Recipe, start: np.ndarray) -> bool:
-    """Returns whether a start (S,) is another one after a reset before, as with running statistics."""
+def changes_by_reset(spec: EnvironmentSpec) -> bool:
+    """Returns whether the start of a run is another one after a reset before, as with running statistics."""
     found = []
     for resets in (0, 0, 1):
-        instance = Instance(recipe)
+        instance = Instance(spec)
         for _ in range(resets):
             instance.reset()
-        observation = instance.put(start)
+        observation = instance.put(spec.state)
         found.append((observation, instance.remembered()))
     usual = set(differing(found[0][1], found[1][1]))  # such as names of files
     changed = set(differing(found[0][1], found[2][1])) - usual
