@@ -21,28 +21,24 @@ from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.errors import BadInput
 
 
-def problem_of(description: Description, seconds: int, memory: int) -> str:
-    """Returns because of what an environment cannot be used, "" if there is nothing."""
-    assert isinstance(description.env, str)
-    register(description.env)
-    if ":" not in description.env and description.env not in gym.registry:
-        return ""  # code of the user's has registered it, in the other process alone
-    limits.limit(seconds, memory)
-    try:
-        with trust.received():  # code that an argument names does not run
-            instance = Instance(EnvironmentSpec(description))
-            instance.reset()
-            instance.stepped(instance.drawn(np.random.default_rng(0)))
-    except BadInput as error:
-        return str(error)
-    except MemoryError:
-        return f"the environment {description.name} needs more than {memory >> 20} MB of memory"
-    return ""
-
-
 def main() -> None:
     seconds, memory = map(int, sys.argv[1:])
-    problem = problem_of(Description(**json.load(sys.stdin)), seconds, memory)
+    description, problem = Description(**json.load(sys.stdin)), ""
+    assert isinstance(description.env, str)
+    register(description.env)
+    # What code of the user's has registered, in the other process alone, cannot be tried in this one.
+    if ":" in description.env or description.env in gym.registry:
+        limits.limit(seconds, memory)
+        try:
+            with trust.received():  # code that an argument names does not run
+                instance = Instance(EnvironmentSpec(description))
+                instance.reset()
+                instance.stepped(instance.drawn(np.random.default_rng(0)))
+        except BadInput as error:
+            problem = str(error)
+        except MemoryError:
+            needs = f"needs more than {memory >> 20} MB of memory"
+            problem = f"the environment {description.name} {needs}"
     print("\n" + json.dumps({"problem": problem}))
 
 

@@ -113,39 +113,35 @@ def _check_times(instance: Instance) -> None:
 
 def _learn_spaces(instance: Instance) -> None:
     """Finds what is observed and put in."""
-    actions, space = instance.env.action_space, instance.env.observation_space
-    low, high = _ends([actions])
-    observation_low, observation_high = _ends(parts_of(space).values())
-    parts = parts_of(space) if isinstance(space, spaces.Dict) else {}
-    model = instance.model
+    model, space, actions = (
+        instance.model,
+        instance.env.observation_space,
+        instance.env.action_space,
+    )
+    parts = parts_of(space)
+    observation_low, observation_high = (
+        np.concatenate([np.ravel(getattr(part, end)) for part in parts.values()], dtype=float)
+        for end in ("low", "high")
+    )
+    levels = int(actions.n) if isinstance(actions, spaces.Discrete) else None
+    ends: Any = (0, levels - 1) if levels is not None else (actions.low, actions.high)
+    low, high = (np.array(end, dtype=float).ravel() for end in ends)
     names = [model.actuator(i).name.rpartition("/")[2] for i in range(model.nu)]
     if len(names) != len(low) or not all(names):
         names = [f"action[{i}]" for i in range(len(low))]
+    is_dict = isinstance(space, spaces.Dict)
     instance.learn(
         qpos=instance.physics.columns["qpos"],
         qvel=instance.physics.columns["qvel"],
         observation_low=observation_low,
         observation_high=observation_high,
-        parts={name: int(spaces.flatdim(part)) for name, part in parts.items()},
+        parts={n: int(spaces.flatdim(part)) for n, part in parts.items()} if is_dict else {},
         low=low,
         high=high,
         inputs=tuple(names),
-        levels=int(high[0]) + 1 if isinstance(actions, spaces.Discrete) else None,
+        levels=levels,
         wrapped=instance.is_wrapped,
     )
-
-
-def _ends(parts: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the limits (k,) of boxes one after the other, or of the index of a discrete action."""
-    ends = [
-        (0, space.n - 1) if isinstance(space, spaces.Discrete) else (space.low, space.high)
-        for space in parts
-    ]
-    low, high = (
-        np.concatenate([np.ravel(end) for end in some], dtype=float)
-        for some in zip(*ends, strict=True)
-    )
-    return low, high
 
 
 def _learn_coordinates(instance: Instance) -> None:

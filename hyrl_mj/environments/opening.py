@@ -48,21 +48,7 @@ CHART, RESET = "chart", "reset"
 
 @dataclass(frozen=True)
 class Description:
-    """What the user says of an environment: the arguments of `from_gymnasium`, which tells more of them.
-
-    Attributes:
-        env: id of the environment in Gymnasium, or a function that returns one.
-        chart: names of the coordinates in which the decision falls; None if they are to be found.
-        noisy: (d,) share of the noise bound on each coordinate.
-        success, failure: conditions.
-        bounds: (low, high) of coordinates, by name.
-        steps: of an episode.
-        starts: `CHART` or `RESET`.
-        kwargs: arguments of `gymnasium.make`, or of the function.
-        reset: the options of `reset`, such as where the goal is.
-        pinned: values of positions, velocities or attributes after each reset, by name.
-        seed: the seed of the reset that all copies begin from; None if the user gave none.
-    """
+    """What the user says of an environment: the arguments of `from_gymnasium`, which tells what each is."""
 
     env: str | Callable[..., gym.Env]
     chart: AnyChart | None = None

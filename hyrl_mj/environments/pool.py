@@ -234,9 +234,7 @@ class Pool:
 
     def check(self, runs: Sequence[Played]) -> None:
         """Does what `Stage.check` does."""
-        array = np.empty(len(runs), dtype=object)
-        array[:] = runs
-        self.ask("check", self.places(len(runs)), array)
+        self.ask("check", self.places(len(runs)), np.array(runs, dtype=object))
 
     def places(self, n: int) -> np.ndarray:
         """Returns the processes (n,) over which so many runs are spread, the number of this one being 0."""
