@@ -71,17 +71,29 @@ class Unknown:
 
 def fingerprint(env: gym.Env) -> Fingerprint:
     """Returns what an environment remembers outside of MuJoCo's data, by the names of its places."""
-    found, seen = Fingerprint(), set[int]()
-    _walk_shared(env, found, seen)
+    seen: set[int] = set()
+    found = shared(env, seen)
     for layer in layers(env):
         _walk(layer, "" if layer is env.unwrapped else type(layer).__name__, found, seen, 0)
     return found
 
 
-def shared(env: gym.Env) -> Fingerprint:
-    """Returns what all instances of an environment share: variables of its classes and their modules."""
-    found = Fingerprint()
-    _walk_shared(env, found, set())
+def shared(env: gym.Env, seen: set[int] | None = None) -> Fingerprint:
+    """Returns what all instances of an environment share: variables of its classes and their modules.
+
+    The ids of objects that are written down are added to `seen`.
+    """
+    found, seen = Fingerprint(), set() if seen is None else seen
+    for kind in {kind for layer in layers(env) for kind in type(layer).__mro__}:
+        module = kind.__module__ or ""
+        if module.partition(".")[0] in LIBRARIES:
+            continue
+        owners = {f"class {kind.__name__}": kind, f"module {module}": sys.modules.get(module)}
+        for where, owner in owners.items():
+            if owner is not None and id(owner) not in seen:
+                seen.add(id(owner))
+                for name in _data_of(owner, len(vars(owner))):
+                    _walk(vars(owner).get(name), f"{where}.{name}", found, seen, 1)
     return found
 
 
@@ -200,19 +212,6 @@ def _has_no_memory(value: Any) -> bool:
 @cache
 def _is_passed(module: str) -> bool:
     return any(module == name or module.startswith(f"{name}.") for name in PASSED)
-
-
-def _walk_shared(env: gym.Env, found: Fingerprint, seen: set[int]) -> None:
-    for kind in {kind for layer in layers(env) for kind in type(layer).__mro__}:
-        module = kind.__module__ or ""
-        if module.partition(".")[0] in LIBRARIES:
-            continue
-        owners = {f"class {kind.__name__}": kind, f"module {module}": sys.modules.get(module)}
-        for where, owner in owners.items():
-            if owner is not None and id(owner) not in seen:
-                seen.add(id(owner))
-                for name in _data_of(owner, len(vars(owner))):
-                    _walk(vars(owner).get(name), f"{where}.{name}", found, seen, 1)
 
 
 @cache

@@ -40,6 +40,7 @@ class Instance:
         spec: what is known of the environment, of which the description is enough for a first one.
 
     Attributes:
+        is_wrapped: whether wrappers lie around the environment.
         observation: (o,) what the environment observed last, with its wrappers.
         report: numbers (r,) of the last sample: reward, terminated, truncated, whether it ended in touch with
             what the robot does not touch elsewhere, entries of `info`, distances.
@@ -58,6 +59,7 @@ class Instance:
         self.env, (self.model, self.data) = peeled(env), physics
         self.physics = Physics(self.model, self.data, plant_of(env))
         self.inner: Any = self.env.unwrapped
+        self.is_wrapped = self.env is not self.inner
         self._space, self._actions = self.env.observation_space, self.env.action_space
         self._observers = observers(self.env)
         self.observation, self.inner_seen = np.empty(0), None
@@ -69,11 +71,6 @@ class Instance:
         self._used = self._at_start = False
         self._pairs: list[tuple[np.ndarray, np.ndarray]] = []
         self._chain = _Chain(self) if self.is_wrapped else None
-
-    @property
-    def is_wrapped(self) -> bool:
-        """Whether wrappers lie around the environment."""
-        return self.env is not self.inner
 
     def learn(self, **facts: Any) -> None:
         """Adds to what is known of the environment."""

@@ -31,15 +31,8 @@ from hyrl_mj.trust import current_folder
 PACKAGES = {"gymnasium_robotics": "robotics", "ogbench": "robotics", "shimmy": "dm-control"}
 # Wrappers that count or check, and change nothing of what an environment does.
 PEELED = (
-    "TimeLimit",
-    "OrderEnforcing",
-    "PassiveEnvChecker",
-    "Autoreset",
-    "RecordEpisodeStatistics",
-    "Monitor",
-)
-
-
+    "TimeLimit", "OrderEnforcing", "PassiveEnvChecker", "Autoreset", "RecordEpisodeStatistics", "Monitor",
+)  # fmt: skip
 # Chart, as users give it: one name, several, or new names with the names of what they stand for.
 AnyChart = str | Sequence[str] | Mapping[str, str]
 # Where episodes start.

@@ -25,6 +25,7 @@ class Physics:
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, plant: Any):
         self.model, self.data, self._plant = model, data, plant
+        self.is_plant = plant is not None
         self.size = mujoco.mj_stateSize(model, STATE)
         names = [name for name in dir(model) if name.startswith("n") and name.islower()]
         sizes = tuple(v for name in names if isinstance(v := getattr(model, name), int))
@@ -33,11 +34,6 @@ class Physics:
         self._spare = _SPARE[sizes]
         self._other: mujoco.MjData | None = None
         self._left: np.ndarray | None = None
-
-    @property
-    def is_plant(self) -> bool:
-        """Whether a plant of this package holds the state, which `data` only shows."""
-        return self._plant is not None
 
     @cached_property
     def columns(self) -> dict[str, np.ndarray]:

@@ -171,7 +171,7 @@ class EnvironmentPlant:
         for name, (columns, values) in given.items():
             self._state[np.ix_(rows, columns)] = checked(name, values, len(columns), rows)
         self._unstable[rows], self._open[rows] = False, True
-        seen, depths = self._pool.rest(self._state[rows])
+        seen, depths = self._pool.spread("rest", self._state[rows])
         blocked = depths > self.spec.depth
         outcome = np.where(blocked, Outcome.CRASHED, Outcome.RUNNING)
         nothing = np.zeros((len(rows), 2))
@@ -193,7 +193,7 @@ class EnvironmentPlant:
         if not len(rows):
             return
         if self._written:
-            states, seen, reports = self._pool.branch(self._state[rows], u)
+            states, seen, reports = self._pool.spread("branch", self._state[rows], u)
         else:
             if self.spec.wrapped:
                 self._sense(rows[self._open[rows]])

@@ -224,17 +224,9 @@ class Pool:
         # Runs of plants that nobody has any more: places (n,), numbers (n,), and which are played (n,) bool.
         self.left: deque[tuple[np.ndarray, np.ndarray, np.ndarray]] = deque()
 
-    def rest(self, starts: np.ndarray) -> Arrays:
-        """Does what `Stage.rest` does."""
-        return self.ask("rest", self.places(len(starts)), starts)
-
-    def branch(self, states: np.ndarray, u: np.ndarray) -> Arrays:
-        """Does what `Stage.branch` does."""
-        return self.ask("branch", self.places(len(states)), states, u)
-
-    def check(self, runs: Sequence[Played]) -> None:
-        """Does what `Stage.check` does."""
-        self.ask("check", self.places(len(runs)), np.array(runs, dtype=object))
+    def spread(self, what: str, *values: np.ndarray) -> Arrays:
+        """Has all processes do something with values (k, ...): "rest", "branch" or "check"; see `Stage`."""
+        return self.ask(what, self.places(len(values[0])), *values)
 
     def places(self, n: int) -> np.ndarray:
         """Returns the processes (n,) over which so many runs are spread, the number of this one being 0."""
