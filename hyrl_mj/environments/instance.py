@@ -129,12 +129,8 @@ class Instance:
         """
         if not self.is_wrapped:
             self.reset(seed)
-            return self.placed(state)
-        self.start = state
-        try:
-            self.observation = flat(self.reset(seed), self._space)
-        finally:
-            self.start = None
+        self.begin(state, seed)
+        self.sense(np.zeros(self.spec.dimension))
         return self.observation
 
     def placed(self, state: np.ndarray) -> np.ndarray:
@@ -209,13 +205,13 @@ class Instance:
         else:
             self._used, self._begun = True, written.shared(self.env)
 
-    def begin(self, start: np.ndarray) -> None:
+    def begin(self, start: np.ndarray, seed: int | None = None) -> None:
         """Begins an episode at a state of MuJoCo (S,); with wrappers, `sense` gives its first observation."""
         if self._chain is None:
             self.placed(start)
         else:
             self.start = start
-            self._chain.ask(self.reset)
+            self._chain.ask(lambda: self.reset(seed))
 
     def act(self, u: np.ndarray) -> None:
         """Steps the environment with inputs u (m,); with wrappers, `sense` gives what it comes to."""

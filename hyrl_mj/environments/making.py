@@ -128,7 +128,7 @@ def _try(description: Description, spec: str) -> None:
 
 def _check(given: Mapping[str, Any]) -> None:
     """Raises `BadInput` if one of the arguments of `from_gymnasium` is of another kind."""
-    chart, noisy, starts = given.get("chart"), given.get("noisy"), given["starts"]
+    chart, noisy, starts = given.get("chart"), given.get("noisy"), given.get("starts")
     names = chart.values() if isinstance(chart, Mapping) else chart
     if chart is not None and not isinstance(chart, str) and not _all(names, str):
         raise refused(

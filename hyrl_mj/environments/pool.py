@@ -298,9 +298,6 @@ class Pool:
             theirs.close()
             self._hands.append(ours)
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> Pool:
-        return self
-
 
 def _answer(hand: Connection) -> Any:
     try:
