@@ -146,7 +146,8 @@ def _fitted(
             )
         several = f"{new}[{j}]" if new and values.shape[1] > 1 else new
         offset = round(float(offsets[:, alike[0]].mean()), 9)
-        yield _of_state(instance, several, *columns[alike[0]], offset)
+        kind, i = columns[alike[0]]
+        yield _of_state(instance, several, kind, i, offset)
 
 
 # ---- walls, and the bounds that follow

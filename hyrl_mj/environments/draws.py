@@ -64,7 +64,9 @@ def check_draws(instance: Instance, states: np.ndarray) -> str:
         return ""
     by_options = f" and {dict(options)}" if options else ""
     by_pins = f", with {dict(pinned)}" if pinned else ""
-    return f"{', '.join(names[:8])} as the reset with seed {description.first}{by_options} draws it{by_pins}"
+    return (
+        f"{', '.join(names[:8])} as the reset with seed {seed or 0}{by_options} draws it{by_pins}"
+    )
 
 
 def _drawn(instance: Instance, states: np.ndarray) -> list[str]:

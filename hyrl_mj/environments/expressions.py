@@ -219,7 +219,8 @@ class Expression:
             self._refuse(f"{_short(name)!r} is not known: use {FORMS}{hint}")
 
     def _path(self, node: ast.expr) -> Path:
-        inner, steps = node, []
+        inner = node
+        steps: list[Any] = []
         while isinstance(inner, ast.Subscript):
             try:  # a string, a number, or one with a sign
                 steps.insert(0, ast.literal_eval(inner.slice))

@@ -167,7 +167,7 @@ def _parts(value: Any, path: str, found: Fingerprint) -> dict[str, Any]:
     if not hasattr(value, "__dict__"):
         found[path] = _written(value)
         return {}
-    slots = {name: getattr(value, name) for name in _slots(type(value)) if hasattr(value, name)}
+    slots = {name: getattr(value, name) for name in _slots(value.__class__) if hasattr(value, name)}
     own = {name: part for name, part in vars(value).items() if name not in LEFT_OUT}
     return {f"{path}.{name}" if path else name: part for name, part in {**own, **slots}.items()}
 

@@ -86,7 +86,7 @@ class Instance:
             plain: whether the options and the pins that the user gives are left out.
         """
         description = self.spec.description
-        seed = description.first if seed is None else seed
+        seed = description.seed or 0 if seed is None else seed
         given = {} if plain else description.reset
         options = {k: np.array(v) if isinstance(v, list) else v for k, v in given.items()}
         # Some environments draw from the global generators; `kept_generators` puts these back.
@@ -279,25 +279,24 @@ class Instance:
         difference of two observations with all of them up to date.
         """
         state, derived = self.physics.read(), NOW if self._at_start else self.spec.derived
-        with self.physics.kept():
-            if derived == UNKNOWN:
-                before = self.seen_as(NOW, state, np.zeros(len(noise)))
-            else:
-                before = flat(self.inner_seen, self.inner.observation_space)
-            return self.seen_as(derived, state, noise) - before
+        if derived == UNKNOWN:
+            before = self.seen_as(NOW, state, np.zeros(len(noise)))
+        else:
+            before = flat(self.inner_seen, self.inner.observation_space)
+        return self.seen_as(derived, state, noise) - before
 
     def seen_as(self, derived: str, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Returns the innermost observation (o,) of a state (S,) under noise (d,), as `derived` says.
-
-        MuJoCo's data are left there.
-        """
+        """Returns the innermost observation (o,) of a state (S,) under noise (d,), as `derived` says."""
+        self.physics.leave()
         moved = self.moved(state, noise)
         if derived == EARLIER:
             self.physics.write(self.moved(self.physics.earlier(state), noise))
             self.physics.show(moved)
         else:
             self.physics.write(moved)
-        return flat(self.watched(), self.inner.observation_space)
+        seen = flat(self.watched(), self.inner.observation_space)
+        self.physics.come_back()
+        return seen
 
     def moved(self, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Returns a state of MuJoCo (S,) with noise (d,) added to the coordinates of the chart."""
@@ -490,7 +489,9 @@ class _Chain:
                 flat(observation, space) + instance.displaced(noise), observation, space
             )
             # Wrappers that look at MuJoCo's state themselves see it where the sensor does.
-            instance.physics.leave_for(instance.moved(instance.physics.read(), noise))
+            state = instance.physics.read()
+            instance.physics.leave()
+            instance.physics.write(instance.moved(state, noise))
         return (observation, *rest)
 
 

@@ -57,11 +57,6 @@ class Description:
     seed: int | None = None
 
     @property
-    def first(self) -> int:
-        """The seed of the reset that all copies begin from."""
-        return self.seed or 0
-
-    @property
     def name(self) -> str:
         """The name of the environment, which is also that of its task."""
         if isinstance(self.env, str):

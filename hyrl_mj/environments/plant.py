@@ -163,13 +163,12 @@ class EnvironmentPlant:
         Raises:
             BadInput: a wrong shape or a value that is not finite.
         """
-        rows = self._rows(ids)
-        qvel = np.zeros((len(rows), self.model.nv)) if qvel is None else qvel
+        rows, nq, nv = self._rows(ids), len(self.spec.qpos), len(self.spec.qvel)
+        qvel = np.zeros((len(rows), nv)) if qvel is None else qvel
         self._leave(rows)
         self._state[rows] = self.spec.state
-        given = {"qpos": (self.spec.qpos, qpos), "qvel": (self.spec.qvel, qvel)}
-        for name, (columns, values) in given.items():
-            self._state[np.ix_(rows, columns)] = checked(name, values, len(columns), rows)
+        self._state[np.ix_(rows, self.spec.qpos)] = checked("qpos", qpos, nq, rows)
+        self._state[np.ix_(rows, self.spec.qvel)] = checked("qvel", qvel, nv, rows)
         self._unstable[rows], self._open[rows] = False, True
         seen, depths = self._pool.spread("rest", self._state[rows])
         blocked = depths > self.spec.depth

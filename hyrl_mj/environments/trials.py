@@ -141,8 +141,7 @@ def derived_of(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
             seen, state = flat(instance.inner_seen, space), instance.physics.read()
             size.append(np.abs(seen))
             for derived, differences in off.items():
-                with instance.physics.kept():
-                    differences.append(instance.seen_as(derived, state, 0 * step) - seen)
+                differences.append(instance.seen_as(derived, state, 0 * step) - seen)
             moving.append(np.abs(instance.displaced(step)))
     most = {derived: np.abs(differences).max(axis=0) for derived, differences in off.items()}
     differ = {derived: ~_rounds(far, np.array(size)) for derived, far in most.items()}
