@@ -113,18 +113,15 @@ def _check_times(instance: Instance) -> None:
 
 def _learn_spaces(instance: Instance) -> None:
     """Finds what is observed and put in."""
-    model, space, actions = (
-        instance.model,
-        instance.env.observation_space,
-        instance.env.action_space,
-    )
+    model, space = instance.model, instance.env.observation_space
+    actions: Any = instance.env.action_space
     parts = parts_of(space)
     observation_low, observation_high = (
         np.concatenate([np.ravel(getattr(part, end)) for part in parts.values()], dtype=float)
         for end in ("low", "high")
     )
     levels = int(actions.n) if isinstance(actions, spaces.Discrete) else None
-    ends: Any = (0, levels - 1) if levels is not None else (actions.low, actions.high)
+    ends = (0, levels - 1) if levels is not None else (actions.low, actions.high)
     low, high = (np.array(end, dtype=float).ravel() for end in ends)
     names = [model.actuator(i).name.rpartition("/")[2] for i in range(model.nu)]
     if len(names) != len(low) or not all(names):

@@ -74,7 +74,7 @@ def from_gymnasium(
     Raises:
         BadInput: it cannot be used; the message says why.
     """
-    given = {
+    given: dict[str, Any] = {
         name: dict(value) if isinstance(value, Mapping) else value
         for name, value in locals().items()
         if value is not None
