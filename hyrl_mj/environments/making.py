@@ -74,6 +74,7 @@ def from_gymnasium(
     Raises:
         BadInput: it cannot be used; the message says why.
     """
+    # All arguments that are given; there are no other variables yet.
     given: dict[str, Any] = {
         name: dict(value) if isinstance(value, Mapping) else value
         for name, value in locals().items()
