@@ -10,6 +10,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import time
 import warnings
 from collections import deque
 from collections.abc import Sequence
@@ -30,6 +31,8 @@ from hyrl_mj.errors import BadInput, HyrlError, brief
 
 # Fewer episodes than this for each process are played by one.
 FEWEST = 16
+# For how long a process waits awake for another [s]: between two samples it has to for about a millisecond.
+AWAKE = 0.002
 Arrays = tuple[np.ndarray, ...]
 
 
@@ -299,9 +302,20 @@ class Pool:
             self._hands.append(ours)
 
 
+def _received(hand: Connection) -> Any:
+    """Returns what comes through a pipe, which is looked at for `AWAKE` before it is waited for in sleep.
+
+    Who sleeps is woken late, and often on the core of who wakes it.
+    """
+    until = time.perf_counter() + AWAKE
+    while not hand.poll() and time.perf_counter() < until:
+        pass
+    return hand.recv()
+
+
 def _answer(hand: Connection) -> Any:
     try:
-        return hand.recv()
+        return _received(hand)
     except EOFError:
         return BadInput(
             "a process that steps an environment has ended: see what it printed, and repair it"
@@ -316,7 +330,7 @@ def _serve(work: Connection, spec: EnvironmentSpec, others: Sequence[Connection]
     stage = Stage(spec)
     with suppress(EOFError, BrokenPipeError):
         while True:
-            what, arguments = work.recv()
+            what, arguments = _received(work)
             try:
                 answer = getattr(stage, what)(*arguments)
             except HyrlError as error:
