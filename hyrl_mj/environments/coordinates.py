@@ -34,18 +34,14 @@ def coordinates(instance: Instance, chart: AnyChart) -> tuple[Coordinate, ...]:
     """Returns the coordinates that a chart names.
 
     A name is that of a position or velocity, as qpos[0], of a joint, of a part of the observation, as
-    achieved_goal or observation[3], or of a site or a body, which stands for its x and y. In a list, and on
-    the command line, "shoulder=qpos[0]" gives it a new one.
+    achieved_goal or observation[3], or of a site or a body, which stands for its x and y.
 
     Raises:
         BadInput: there is no such name, or it is no single position or velocity.
     """
-    if not isinstance(chart, Mapping):
-        words = [chart] if isinstance(chart, str) else chart
-        pairs = [(new, name) for new, _, name in (word.rpartition("=") for word in words)]
-    else:
-        pairs = list(chart.items())
-    found = [c for new, name in pairs for c in _resolved(instance, new.strip(), name.strip())]
+    names = [chart] if isinstance(chart, str) else chart
+    pairs = names.items() if isinstance(names, Mapping) else (("", name) for name in names)
+    found = [c for new, name in pairs for c in _resolved(instance, str(new), str(name))]
     places = [(c.kind, c.index) for c in found]
     if not found or len(set(places)) < len(places):
         raise BadInput(

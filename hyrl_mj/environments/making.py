@@ -311,7 +311,9 @@ def chosen_task(task: str | None, options: EnvironmentOptions) -> Task:
     if task is not None:
         raise BadInput(f"give the task {task} or --env {options.env}, not both")
     given = {} if options.env_args is None else _arguments(options.env_args)
-    for name in ("chart", "noisy", "success", "failure"):
+    if options.chart is not None:
+        given["chart"] = _chart(options.chart)
+    for name in ("noisy", "success", "failure"):
         if (value := getattr(options, name)) is not None:
             given[name] = value
     return from_gymnasium(options.env, **given)
@@ -355,3 +357,16 @@ def _arguments(path: Path) -> dict[str, Any]:
         if name not in allowed:
             raise unknown(f"argument in {path}", name, allowed)
     return content
+
+
+def _chart(words: tuple[str, ...]) -> AnyChart:
+    """Returns the chart of words such as "achieved_goal" or "shoulder=qpos[0]"."""
+    pairs = [word.partition("=") for word in words]
+    named = [equals for _, equals, _ in pairs]
+    if not any(named):
+        return list(words)
+    if not all(named):
+        raise BadInput(
+            f"--chart {','.join(words)} names some coordinates anew: name all of them, or none"
+        )
+    return {name.strip(): value.strip() for name, _, value in pairs}
