@@ -80,12 +80,12 @@ class Criterion:
         asks_end = re.search(r"\bterminated\b", self.success.text) is not None
         return bool(self.success.keys) or asks_end
 
-    @property
+    @cached_property
     def keys(self) -> tuple[Path, ...]:
         """The entries of `info` that it needs."""
         return tuple(dict.fromkeys(key for one in self._conditions for key in one.keys))
 
-    @property
+    @cached_property
     def places(self) -> tuple[tuple[str, str], ...]:
         """The pairs of names whose distance it needs."""
         return tuple(dict.fromkeys(pair for one in self._conditions for pair in one.places))
