@@ -79,7 +79,7 @@ def test_copies_go_on_as_the_environment_alone_does(name):
         plant.step(u)
         seen.append(task.observation(plant.measurement))
     for i in range(3):  # one after the other, in an environment of its own
-        instance = Instance(task.specification.recipe)
+        instance = Instance(task.specification)
         instance.reset()
         instance.physics.write(task.specification.state_at(z)[i])
         for k, u in enumerate(inputs):
@@ -277,7 +277,7 @@ def test_an_episode_ends_where_info_tells_success(puck):
     late = closed_loop(at_end, Constant(at_end, (0.0, 0.0)), np.array([[1.3, 0.0]]), Noise())
     assert (late.outcome.tolist(), late.length.tolist()) == ([1], [30])
     near = from_gymnasium(Puck, success="distance(puck, goal) < 0.3").specification
-    assert near.recipe.places == ((("xpos", 1), ("site_xpos", 0)),)
+    assert near.criterion.points == ((("xpos", 1), ("site_xpos", 0)),)
 
 
 class Constant:

@@ -1,7 +1,11 @@
 """Environments of others as tasks: any environment of Gymnasium that MuJoCo simulates, as it is."""
 
-from hyrl_mj.environments.making import from_gymnasium
-from hyrl_mj.environments.options import EnvironmentOptions, chosen_task, explained
+from hyrl_mj.environments.making import (
+    EnvironmentOptions,
+    chosen_task,
+    explained,
+    from_gymnasium,
+)
 from hyrl_mj.environments.task import EnvironmentTask
 
 __all__ = [

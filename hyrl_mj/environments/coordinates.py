@@ -1,65 +1,33 @@
-"""Names of coordinates: each stands for one position or velocity of MuJoCo's state."""
+"""Coordinates of a chart: each is one position or velocity of MuJoCo's state, and has bounds."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
-from gymnasium import spaces
 
 from hyrl_mj import mjcf
 from hyrl_mj.environments.instance import Instance
-from hyrl_mj.environments.observations import columns_of_parts
+from hyrl_mj.environments.observations import columns_of
+from hyrl_mj.environments.opening import AnyChart
+from hyrl_mj.environments.specification import Coordinate
 from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.tasks import touching
 
-# Chart, as users give it: one name, several, or new names with the names of what they stand for.
-AnyChart = str | Sequence[str] | Mapping[str, str]
 INDEXED = re.compile(r"(.+)\[(\d+)\]")
 # States at which a name is compared with positions and velocities, and how much of these changes [m, rad].
 TRIED, MOVED = 6, 0.05
 AGREES = 1e-6
+# What is sampled beyond this many times as far is outside of the chart.
+ROOM = 1.2
 AXES = "xyz"
-FREE, SLIDE, HINGE = (
-    int(kind)
-    for kind in (
-        mujoco.mjtJoint.mjJNT_FREE,
-        mujoco.mjtJoint.mjJNT_SLIDE,
-        mujoco.mjtJoint.mjJNT_HINGE,
-    )
+FREE, SLIDE, HINGE = map(
+    int, (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
 )
-
-
-@dataclass(frozen=True)
-class Coordinate:
-    """A coordinate of a chart.
-
-    Attributes:
-        name: in figures and messages.
-        kind: "qpos" or "qvel".
-        index: of the position or the velocity.
-        offset: what the coordinate is greater by.
-        joint: id of the joint.
-        axis: the axis of the world, 0 to 2, along which it moves most; None if it turns.
-    """
-
-    name: str
-    kind: str
-    index: int
-    offset: float
-    joint: int
-    axis: int | None
-
-    @property
-    def unit(self) -> str:
-        """The unit: "m", "rad", "m/s" or "rad/s"."""
-        return ("rad" if self.axis is None else "m") + "/s" * (self.kind == "qvel")
-
-    def described(self) -> str:
-        """Returns what it stands for: "qpos[0]"."""
-        return f"{self.kind}[{self.index}]"
+JOINT, SITE, BODY = mujoco.mjtObj.mjOBJ_JOINT, mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY
 
 
 def coordinates(instance: Instance, chart: AnyChart) -> tuple[Coordinate, ...]:
@@ -71,7 +39,7 @@ def coordinates(instance: Instance, chart: AnyChart) -> tuple[Coordinate, ...]:
     Raises:
         BadInput: there is no such name, or it is no single position or velocity.
     """
-    names = {"": chart} if isinstance(chart, str) else chart
+    names = [chart] if isinstance(chart, str) else chart
     pairs = names.items() if isinstance(names, Mapping) else (("", name) for name in names)
     found = [c for new, name in pairs for c in _resolved(instance, str(new), str(name))]
     places = [(c.kind, c.index) for c in found]
@@ -86,74 +54,43 @@ def all_names(instance: Instance) -> list[str]:
     """Returns the names that a chart may use."""
     model = instance.model
     positions = [f"qpos[{i}]" for i in range(model.nq)] + [f"qvel[{i}]" for i in range(model.nv)]
-    return [*positions, *(n for n in _joints(instance) if n), *_parts(instance), *_places(instance)]
+    parts = columns_of(instance.env.observation_space)
+    return [*positions, *_named(model, JOINT), *parts, *_named(model, SITE, BODY)]
 
 
-def usual_name(model: mujoco.MjModel, joint: int, velocity: bool) -> str:
-    """Returns the name of a coordinate after its joint."""
-    name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint) or f"joint{joint}"
-    name = name.rpartition("/")[2]
-    return f"{name} rate" if velocity else name
-
-
-def _joints(instance: Instance) -> list[str]:
-    return [
-        mujoco.mj_id2name(instance.model, mujoco.mjtObj.mjOBJ_JOINT, i) or ""
-        for i in range(instance.model.njnt)
-    ]
-
-
-def _places(instance: Instance) -> list[str]:
-    kinds = mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY
-    names = [name for kind in kinds for name in mjcf.names(instance.model, kind)]
+def _named(model: mujoco.MjModel, *kinds: mujoco.mjtObj) -> list[str]:
+    """Returns the names of objects of some kinds, of those that have one."""
+    names = [name for kind in kinds for name in mjcf.names(model, kind)]
     return [name for name in dict.fromkeys(names) if not name.startswith("(") and name != "world"]
 
 
-def _parts(instance: Instance) -> dict[str, slice]:
-    """Returns the parts of the observation, with their columns."""
-    space = instance.env.observation_space
-    if not isinstance(space, spaces.Dict):
-        return {"observation": slice(0, int(spaces.flatdim(space)))}
-    return columns_of_parts(space)
-
-
 def _resolved(instance: Instance, new: str, name: str) -> Iterator[Coordinate]:
-    base, index = name, None
-    if match := INDEXED.fullmatch(name):
-        base, index = match.group(1), int(match.group(2))
+    model, parts = instance.model, columns_of(instance.env.observation_space)
+    match = INDEXED.fullmatch(name)
+    base, index = (match.group(1), int(match.group(2))) if match else (name, None)
     if base in ("qpos", "qvel") and index is not None:
-        size = instance.model.nq if base == "qpos" else instance.model.nv
-        if index >= size:
+        if index >= (model.nq if base == "qpos" else model.nv):
             raise unknown("coordinate", name, all_names(instance))
         yield _of_state(instance, new, base, index)
-        return
-    if name in _joints(instance):
-        joint = _joints(instance).index(name)
-        yield _of_state(instance, new, "qpos", int(instance.model.jnt_qposadr[joint]))
-        return
-    parts = _parts(instance)
-    if base in parts:
+    elif name in _named(model, JOINT):
+        yield _of_state(instance, new, "qpos", int(model.joint(name).qposadr[0]))
+    elif base in parts:
         columns = list(range(parts[base].start, parts[base].stop))
         if index is not None and index >= len(columns):
             raise unknown("coordinate", name, [f"{base}[{i}]" for i in range(len(columns))])
         chosen = columns if index is None else [columns[index]]
-
-        def observed(state: np.ndarray) -> np.ndarray:
-            return instance.rested(state)[chosen]
-
-        yield from _fitted(instance, new, name, observed)
-        return
-    if base in _places(instance):
-        kind, i = mjcf.point_of(instance.model, base)
+        yield from _fitted(instance, new, name, lambda state: instance.rested(state)[chosen])
+    elif base in _named(model, SITE, BODY):
+        where, i = mjcf.point_of(model, base)
         axes = [0, 1] if index is None else [index]
 
         def placed(state: np.ndarray) -> np.ndarray:
             instance.physics.write(state)
-            return np.array(getattr(instance.data, kind)[i][axes])
+            return np.array(getattr(instance.data, where)[i][axes])
 
         yield from _fitted(instance, new, name, placed)
-        return
-    raise unknown("coordinate", name, all_names(instance))
+    else:
+        raise unknown("coordinate", name, all_names(instance))
 
 
 def _of_state(
@@ -163,16 +100,13 @@ def _of_state(
     addresses = model.jnt_qposadr if kind == "qpos" else model.jnt_dofadr
     joint = int(np.searchsorted(addresses, index, side="right")) - 1
     kind_of_joint, part = model.jnt_type[joint], index - addresses[joint]
-    name = new or usual_name(model, joint, kind == "qvel")
+    name = new or _usual_name(model, joint, kind)
     if kind_of_joint == FREE and part < len(AXES):
         name = new or f"{AXES[part]} of {name}"
         return Coordinate(name, kind, index, offset, joint, int(part))
     if kind_of_joint not in (SLIDE, HINGE):
-        free = [
-            usual_name(model, j, False)
-            for j in range(model.njnt)
-            if model.jnt_type[j] in (SLIDE, HINGE)
-        ]
+        joints = np.flatnonzero(np.isin(model.jnt_type, (SLIDE, HINGE)))
+        free = [_usual_name(model, j, "qpos") for j in joints.tolist()]
         raise BadInput(
             f"{kind}[{index}] is a part of an orientation of {instance.name}, for which there is no chart: "
             f"name slides, hinges ({', '.join(free) or 'it has none'}) and places of free joints"
@@ -181,33 +115,146 @@ def _of_state(
     return Coordinate(name, kind, index, offset, joint, axis)
 
 
+def _usual_name(model: mujoco.MjModel, joint: int, kind: str) -> str:
+    """Returns the name of a position or velocity after its joint."""
+    name = (model.joint(joint).name or f"joint{joint}").rpartition("/")[2]
+    return f"{name} rate" if kind == "qvel" else name
+
+
 def _fitted(
     instance: Instance, new: str, name: str, get: Callable[[np.ndarray], np.ndarray]
 ) -> Iterator[Coordinate]:
     """Yields the positions or velocities that a function of MuJoCo's state (S,) gives, but for an offset."""
     instance.reset()
     state, places = instance.physics.read(), instance.physics.columns
-    rng, columns = np.random.default_rng(0), {"qpos": instance.model.nq, "qvel": instance.model.nv}
-    moved: dict[str, list[np.ndarray]] = {kind: [] for kind in columns}
-    values = []
-    for _ in range(TRIED):
-        other = state.copy()
-        for kind, count in columns.items():
-            other[places[kind]] += rng.uniform(-MOVED, MOVED, count)
-            moved[kind].append(other[places[kind]])
-        values.append(get(other))
-    for j, column in enumerate(np.array(values).T):
-        match = [
-            (kind, i, offsets.mean())
-            for kind, rows in moved.items()
-            for i, offsets in enumerate((column[:, None] - np.array(rows)).T)
-            if np.ptp(offsets) < AGREES
-        ]
-        if not match:
+    columns = [(kind, i) for kind in ("qpos", "qvel") for i in range(len(places[kind]))]
+    at = np.concatenate([places["qpos"], places["qvel"]])
+    moved = np.tile(state, (TRIED, 1))
+    moved[:, at] += np.random.default_rng(0).uniform(-MOVED, MOVED, (TRIED, len(at)))
+    values = np.array([get(other) for other in moved])
+    for j, column in enumerate(values.T):
+        offsets = column[:, None] - moved[:, at]
+        alike = np.flatnonzero(np.ptp(offsets, axis=0) < AGREES)
+        if not len(alike):
             raise BadInput(
                 f"{name}[{j}] is no single position or velocity of {instance.name}, but follows from several "
                 f"or from none: name coordinates such as {', '.join(all_names(instance)[:4])}"
             )
-        kind, i, offset = match[0]
-        several = f"{new}[{j}]" if new and len(values[0]) > 1 else new
-        yield _of_state(instance, several, kind, i, round(float(offset), 9))
+        several = f"{new}[{j}]" if new and values.shape[1] > 1 else new
+        offset = round(float(offsets[:, alike[0]].mean()), 9)
+        kind, i = columns[alike[0]]
+        yield _of_state(instance, several, kind, i, offset)
+
+
+# ---- walls, and the bounds that follow
+
+
+class Bound(NamedTuple):
+    """Ends of a coordinate of the chart, of a periodic one of one period, and where they were found."""
+
+    low: float
+    high: float
+    periodic: bool
+    why: str
+
+
+class Group(NamedTuple):
+    """Walls that touch each other, and whether a box around them is around all places of the robot."""
+
+    geoms: list[int]
+    encloses: bool
+
+
+def robot_of(model: mujoco.MjModel, chart: Sequence[Coordinate]) -> np.ndarray:
+    """Returns the bodies (nbody,) bool that hang together with the joints of the chart."""
+    trees = {int(model.body_treeid[model.jnt_bodyid[c.joint]]) for c in chart}
+    return np.isin(model.body_treeid, list(trees))
+
+
+def walls(model: mujoco.MjModel) -> np.ndarray:
+    """Returns the geoms that stand still and can be collided with, or are named obstacles, but no planes."""
+    moves = model.body_weldid[model.geom_bodyid] != 0
+    kind, meets = model.geom_contype[:, None], model.geom_conaffinity[None]
+    pairs = (kind & meets) | (kind & meets).T
+    collides = (pairs[:, moves] != 0).any(axis=1)
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+        collides[:] = False
+    named = np.isin(mjcf.names(model, mujoco.mjtObj.mjOBJ_GEOM), mjcf.obstacles(model))
+    is_plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    return np.flatnonzero(~moves & ~is_plane & (collides | named))
+
+
+def groups_of(instance: Instance, places: np.ndarray) -> list[Group]:
+    """Returns the groups of walls that touch each other; the robot has been at places (n, 2)."""
+    model, data, found = instance.model, instance.data, []
+    for geoms in touching(model, data, walls(model).tolist()):
+        centres = data.geom_xpos[geoms][:, :2]
+        size = model.geom_rbound[geoms][:, None]
+        low, high = (centres - size).min(axis=0), (centres + size).max(axis=0)
+        found.append(Group(geoms, bool(((low < places) & (places < high)).all())))
+    return found
+
+
+def islands_of(instance: Instance, groups: Sequence[Group]) -> dict[str, int]:
+    """Returns the groups of walls that can be passed on both sides, by name, each with the id of one geom."""
+    found: dict[str, int] = {}
+    for geoms in [group.geoms for group in groups if not group.encloses]:
+        centres = instance.data.geom_xpos[geoms][:, :2]
+        middle = np.linalg.norm(centres - centres.mean(axis=0), axis=1).argmin()
+        found[f"island {len(found) + 1}"] = geoms[int(middle)]
+    return found
+
+
+def bounds_of(
+    instance: Instance,
+    chart: Sequence[Coordinate],
+    samples: np.ndarray,
+    given: Mapping[str, tuple[float, float]],
+    groups: Sequence[Group],
+) -> list[Bound]:
+    """Returns the ends of the chart's coordinates.
+
+    Args:
+        instance: the environment.
+        chart: its coordinates.
+        samples: (n, d) chart points that sampled runs have met.
+        given: ends that the user has given, by name.
+        groups: walls. Those that enclose all runs are the end of the chart; beside others there is room to
+            pass.
+    """
+    model, found = instance.model, []
+    ids = [g for group in groups if group.encloses for g in group.geoms]
+    others = [g for group in groups if not group.encloses for g in group.geoms]
+    solid = np.flatnonzero(robot_of(model, chart)[model.geom_bodyid])
+    passing = 2 * float(model.geom_rbound[solid].max(initial=0.0))
+    for i, c in enumerate(chart):
+        if c.name in given:
+            low, high = given[c.name]
+            found.append(Bound(float(low), float(high), False, "given"))
+        elif c.kind == "qpos" and model.jnt_limited[c.joint]:
+            low, high = model.jnt_range[c.joint] + c.offset
+            found.append(Bound(float(low), float(high), False, "the range of its joint"))
+        elif c.kind == "qpos" and c.axis is None:
+            found.append(Bound(-np.pi + c.offset, np.pi + c.offset, True, "a joint without limits"))
+        elif c.kind == "qpos" and ids:
+            found.append(Bound(*_extent(instance, ids, c, 0.0), False, "the walls"))
+        else:
+            middle, half = np.median(samples[:, i]), np.ptp(samples[:, i]) / 2
+            half = max(ROOM * half, 1e-3)
+            low, high, why = float(middle - half), float(middle + half), "sampled runs"
+            if c.kind == "qpos" and others:
+                ends = _extent(instance, others, c, passing)
+                low, high, why = min(low, ends[0]), max(high, ends[1]), "sampled runs and walls"
+            found.append(Bound(low, high, False, why))
+    return found
+
+
+def _extent(
+    instance: Instance, geoms: Sequence[int], c: Coordinate, room: float
+) -> tuple[float, float]:
+    """Returns the ends of geoms along the axis of a coordinate, with room beside them."""
+    rows: Any = list(geoms)
+    places, sizes = instance.data.geom_xpos[rows][:, c.axis], instance.model.geom_size[rows]
+    is_box = instance.model.geom_type[rows] == mujoco.mjtGeom.mjGEOM_BOX
+    size = np.where(is_box, sizes[:, c.axis], sizes[:, 0])
+    return float((places - size).min()) - room, float((places + size).max()) + room

@@ -12,6 +12,7 @@ import pickle
 import sys
 from collections import deque
 from collections.abc import Mapping, Set
+from contextlib import suppress
 from functools import cache
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 from typing import Any
@@ -47,6 +48,9 @@ MODEL = (
     "eq_data", "hfield_data",
 )  # fmt: skip
 PLAIN = (type(None), bool, int, float, complex, str, bytes)
+# The kinds of variables of a class or a module whose values can change.
+DATA = (*PLAIN, list, dict, set, deque, tuple, np.ndarray, np.generic, np.random.Generator)
+FUNCTIONS = FunctionType | MethodType
 
 
 class Fingerprint(dict[str, Any]):
@@ -64,27 +68,32 @@ class Fingerprint(dict[str, Any]):
 class Unknown:
     """A value that cannot be written down: it equals no other, and not even itself at another moment."""
 
-    def __init__(self, kind: str):
-        self.kind = kind
-
 
 def fingerprint(env: gym.Env) -> Fingerprint:
     """Returns what an environment remembers outside of MuJoCo's data, by the names of its places."""
-    found = Fingerprint()
     seen: set[int] = set()
+    found = shared(env, seen)
     for layer in layers(env):
-        _walk(layer, "" if layer is env.unwrapped else f"{type(layer).__name__}", found, seen, 0)
-    return _with_shared(env, found, seen)
+        _walk(layer, "" if layer is env.unwrapped else type(layer).__name__, found, seen, 0)
+    return found
 
 
-def shared(env: gym.Env) -> Fingerprint:
-    """Returns what all instances of an environment share: variables of its classes and their modules."""
-    return _with_shared(env, Fingerprint(), set())
+def shared(env: gym.Env, seen: set[int] | None = None) -> Fingerprint:
+    """Returns what all instances of an environment share: variables of its classes and their modules.
 
-
-def _with_shared(env: gym.Env, found: Fingerprint, seen: set[int]) -> Fingerprint:
+    The ids of objects that are written down are added to `seen`.
+    """
+    found, seen = Fingerprint(), set() if seen is None else seen
     for kind in {kind for layer in layers(env) for kind in type(layer).__mro__}:
-        _shared(kind, found, seen)
+        module = kind.__module__ or ""
+        if module.partition(".")[0] in LIBRARIES:
+            continue
+        owners = {f"class {kind.__name__}": kind, f"module {module}": sys.modules.get(module)}
+        for where, owner in owners.items():
+            if owner is not None and id(owner) not in seen:
+                seen.add(id(owner))
+                for name in _data_of(owner, len(vars(owner))):
+                    _walk(vars(owner).get(name), f"{where}.{name}", found, seen, 1)
     return found
 
 
@@ -114,6 +123,7 @@ def state_of(generator: Any) -> bytes:
 
 
 def _walk(value: Any, path: str, found: Fingerprint, seen: set[int], depth: int) -> None:
+    """Writes down a value, and what its parts lead to."""
     if isinstance(value, PLAIN):
         found[path] = marshal.dumps(value, 0)  # NaN equals NaN so
     elif isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "biufcSU":
@@ -123,53 +133,53 @@ def _walk(value: Any, path: str, found: Fingerprint, seen: set[int], depth: int)
     elif _has_no_memory(value) or id(value) in seen:
         return
     elif depth > DEEPEST or len(found) > MOST:
-        found[path] = Unknown(type(value).__name__)
+        found[path] = Unknown()
     else:
         seen.add(id(value))
-        _walk_parts(value, path, found, seen, depth + 1)
+        parts = _parts(value, path, found)
+        for name, part in parts.items():
+            _walk(part, name, found, seen, depth + 1)
 
 
-def _walk_parts(value: Any, path: str, found: Fingerprint, seen: set[int], depth: int) -> None:
+def _parts(value: Any, path: str, found: Fingerprint) -> dict[str, Any]:
+    """Returns the parts of a value by the names of their places; what has none is written down."""
     if isinstance(value, list | tuple | dict):
         try:
             found[path] = marshal.dumps(value, 0)
-            return
+            return {}
         except ValueError:  # something within is not of Python's own types
             pass
     if isinstance(value, Set) and all(isinstance(item, PLAIN) for item in value):
         found[path] = frozenset(value)
-    elif isinstance(value, list | tuple | deque | Set) or (
-        isinstance(value, np.ndarray) and value.dtype.kind == "O"
-    ):
-        items = list(value.ravel() if isinstance(value, np.ndarray) else value)
-        found[f"len({path})"] = len(items)
-        for i, item in enumerate(items):
-            _walk(item, f"{path}[{i}]", found, seen, depth)
-    elif isinstance(value, Mapping):
+        return {}
+    if isinstance(value, np.ndarray) and value.dtype.kind == "O":
+        value = value.ravel().tolist()
+    if isinstance(value, list | tuple | deque | Set):
+        value = dict(enumerate(value))
+    if isinstance(value, Mapping):
         found[f"len({path})"] = len(value)
-        for key, item in list(value.items()):
-            _walk(item, f"{path}[{str(key)[:40]!r}]", found, seen, depth)
-    elif isinstance(value, FunctionType | MethodType):
+        return {f"{path}[{repr(key)[:40]}]": item for key, item in value.items()}
+    if isinstance(value, FUNCTIONS):
         function = getattr(value, "__func__", value)
-        for name, cell in zip(
-            function.__code__.co_freevars, function.__closure__ or (), strict=False
-        ):
-            try:
-                _walk(cell.cell_contents, f"{path}.{name}", found, seen, depth)
-            except ValueError:  # the cell is empty
-                continue
-        _walk(vars(function), f"{path}.__dict__", found, seen, depth)
-    elif type(value).__module__.partition(".")[0] == "torch" and hasattr(value, "detach"):
-        _walk(value.detach().cpu().numpy(), path, found, seen, depth)
-    elif hasattr(value, "__dict__"):
-        for name, item in list(vars(value).items()):
-            if name not in LEFT_OUT:
-                _walk(item, f"{path}.{name}" if path else name, found, seen, depth)
-        for name in _slots(value.__class__):
-            if hasattr(value, name):
-                _walk(getattr(value, name), f"{path}.{name}", found, seen, depth)
-    else:
+        return {f"{path}.{name}": part for name, part in _variables_of(function).items()}
+    if type(value).__module__.partition(".")[0] == "torch" and hasattr(value, "detach"):
+        return {path: value.detach().cpu().numpy()}
+    if not hasattr(value, "__dict__"):
         found[path] = _written(value)
+        return {}
+    slots = {name: getattr(value, name) for name in _slots(value.__class__) if hasattr(value, name)}
+    own = {name: part for name, part in vars(value).items() if name not in LEFT_OUT}
+    return {f"{path}.{name}" if path else name: part for name, part in {**own, **slots}.items()}
+
+
+def _variables_of(function: Any) -> dict[str, Any]:
+    """Returns the variables of its own that a function remembers from call to call, by name."""
+    found = dict(vars(function))
+    cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=False)
+    for name, cell in cells:
+        with suppress(ValueError):  # the cell is empty
+            found[name] = cell.cell_contents
+    return found
 
 
 @cache
@@ -187,11 +197,11 @@ def _written(value: Any) -> Any:
     try:
         return pickle.dumps(value)
     except Exception:  # whatever a foreign class raises
-        return Unknown(type(value).__name__)
+        return Unknown()
 
 
 def _has_no_memory(value: Any) -> bool:
-    if isinstance(value, FunctionType | MethodType):
+    if isinstance(value, FUNCTIONS):
         function = getattr(value, "__func__", value)
         return not (function.__closure__ or vars(function))
     if isinstance(value, type | ModuleType | BuiltinFunctionType | property):
@@ -204,28 +214,7 @@ def _is_passed(module: str) -> bool:
     return any(module == name or module.startswith(f"{name}.") for name in PASSED)
 
 
-def _shared(kind: type, found: Fingerprint, seen: set[int]) -> None:
-    """Writes down the variables that the instances of a class share: its own, and those of its module."""
-    module = kind.__module__ or ""
-    if module.partition(".")[0] in LIBRARIES:
-        return
-    for where, owner in (
-        (f"class {kind.__name__}", kind),
-        (f"module {module}", sys.modules.get(module)),
-    ):
-        if owner is not None and id(owner) not in seen:
-            seen.add(id(owner))
-            for name in _data_of(owner, len(vars(owner))):
-                _walk(vars(owner).get(name), f"{where}.{name}", found, seen, 1)
-
-
 @cache
 def _data_of(owner: Any, size: int) -> list[str]:
     """Returns the names of the variables of a class or module, of so many names, that can change."""
-    return [n for n, v in vars(owner).items() if not n.startswith("__") and _is_data(v)]
-
-
-def _is_data(value: Any) -> bool:
-    """Returns whether a variable of a class or a module is a value that can change."""
-    kinds = (*PLAIN, list, dict, set, deque, tuple, np.ndarray, np.generic, np.random.Generator)
-    return isinstance(value, kinds)
+    return [n for n, v in vars(owner).items() if not n.startswith("__") and isinstance(v, DATA)]

@@ -1,8 +1,8 @@
 """A program that makes, resets and steps an environment within limits of time and memory; see `making`.
 
-It runs in a process of its own, `python first_trial.py SECONDS MEMORY < source`, where the source is a JSON
-object of what `Source` holds. It writes a JSON object with the `problem` because of which the environment is
-refused, "" if there is none.
+It runs in a process of its own, `python first_trial.py SECONDS MEMORY < description`, where that is a JSON
+object of arguments of `Description`. It writes a JSON object with the `problem` because of which the
+environment is refused, "" if there is none.
 """
 
 import json
@@ -15,33 +15,30 @@ import numpy as np
 sys.path.append(str(Path(__file__).parents[2]))  # of the package, if it is not installed
 
 from hyrl_mj import limits, trust
-from hyrl_mj.environments.instance import Instance, Recipe
-from hyrl_mj.environments.opening import Source, register
+from hyrl_mj.environments.instance import Instance
+from hyrl_mj.environments.opening import Description, register
+from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.errors import BadInput
-
-
-def problem_of(source: Source, seconds: int, memory: int) -> str:
-    """Returns because of what an environment cannot be used, "" if there is nothing."""
-    assert isinstance(source.make, str)
-    register(source.make)
-    if ":" not in source.make and source.make not in gym.registry:
-        return ""  # code of the user's has registered it, in the other process alone
-    limits.limit(seconds, memory)
-    try:
-        with trust.received():  # code that an argument names does not run
-            instance = Instance(Recipe(source))
-            instance.reset()
-            instance.stepped(instance.drawn(np.random.default_rng(0)))
-    except BadInput as error:
-        return str(error)
-    except MemoryError:
-        return f"the environment {source.name} needs more than {memory >> 20} MB of memory"
-    return ""
 
 
 def main() -> None:
     seconds, memory = map(int, sys.argv[1:])
-    problem = problem_of(Source(**json.load(sys.stdin)), seconds, memory)
+    description, problem = Description(**json.load(sys.stdin)), ""
+    assert isinstance(description.env, str)
+    register(description.env)
+    # What code of the user's has registered, in the other process alone, cannot be tried in this one.
+    if ":" in description.env or description.env in gym.registry:
+        limits.limit(seconds, memory)
+        try:
+            with trust.received():  # code that an argument names does not run
+                instance = Instance(EnvironmentSpec(description))
+                instance.reset()
+                instance.stepped(instance.drawn(np.random.default_rng(0)))
+        except BadInput as error:
+            problem = str(error)
+        except MemoryError:
+            needs = f"needs more than {memory >> 20} MB of memory"
+            problem = f"the environment {description.name} {needs}"
     print("\n" + json.dumps({"problem": problem}))
 
 

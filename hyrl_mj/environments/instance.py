@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 import random
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import replace
 from queue import SimpleQueue
 from threading import Thread
 from typing import Any
@@ -21,49 +21,12 @@ import numpy as np
 from gymnasium import spaces
 
 from hyrl_mj.environments import fingerprint as written
-from hyrl_mj.environments.expressions import Path, entry
+from hyrl_mj.environments.expressions import entry
 from hyrl_mj.environments.observations import flat, observers, shaped
-from hyrl_mj.environments.opening import Source, global_seed, made, physics_of
+from hyrl_mj.environments.opening import made, peeled, physics_of, plant_of, steps_of
 from hyrl_mj.environments.physics import Physics
+from hyrl_mj.environments.specification import EARLIER, NOW, UNKNOWN, EnvironmentSpec
 from hyrl_mj.errors import BadInput, HyrlError, brief
-
-# What derived quantities are, as what is observed after a step shows them: as at the end of the step; as a
-# step of the physics before; or neither.
-NOW, EARLIER, UNKNOWN = "now", "earlier", "unknown"
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """How instances are made, and what they report.
-
-    Attributes:
-        source: how the environment is made and reset.
-        noisy: places (d,) in a state of MuJoCo that the coordinates of the chart are in.
-        offset: (d,) what the coordinates are greater by than these.
-        observer: the name of what computes the observation, of those that `observers` gives; "" if none does.
-        keys: entries of `info` that are reported.
-        places: pairs of names whose distance is reported, each as a kind and an index for both.
-        solid: (ngeom,) bool, the geoms of the robot.
-        harmless: geoms that the robot has touched without an end of the episode.
-        anew: whether a reset changes what the next one does to a wrapper: each episode takes a new instance.
-        derived: `NOW`, `EARLIER` or `UNKNOWN`.
-    """
-
-    source: Source
-    noisy: tuple[int, ...] = ()
-    offset: tuple[float, ...] = ()
-    observer: str = ""
-    keys: tuple[Path, ...] = ()
-    places: tuple[tuple[tuple[str, int], tuple[str, int]], ...] = ()
-    solid: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    harmless: frozenset[int] = frozenset()
-    anew: bool = False
-    derived: str = UNKNOWN
-
-    @property
-    def width(self) -> int:
-        """The number of columns of a report: reward, terminated, truncated, touch, entries, distances."""
-        return 4 + len(self.keys) + len(self.places)
 
 
 class Worn(HyrlError):
@@ -74,56 +37,71 @@ class Instance:
     """An environment that plays episodes, one at a time.
 
     Args:
-        recipe: how it is made.
+        spec: what is known of the environment, of which the description is enough for a first one.
+
+    Attributes:
+        is_wrapped: whether wrappers lie around the environment.
+        observation: (o,) what the environment observed last, with its wrappers.
+        report: numbers (r,) of the last sample: reward, terminated, truncated, whether it ended in touch with
+            what the robot does not touch elsewhere, entries of `info`, distances.
+        inner_seen: what the innermost environment observed last.
+        start: the state of MuJoCo to which the innermost reset has to lead, below wrappers.
 
     Raises:
         BadInput: it cannot be made or reset.
     """
 
-    def __init__(self, recipe: Recipe):
-        opened = made(recipe.source)
-        self.recipe, self.env, self.steps = recipe, opened.env, opened.steps
-        self.name, self.model, self.data = recipe.source.name, opened.model, opened.data
-        self.physics = Physics(opened.model, opened.data, opened.plant)
+    def __init__(self, spec: EnvironmentSpec):
+        env = made(spec.description)
+        physics = physics_of(env)
+        assert physics is not None
+        self.spec, self.name, self.steps = spec, spec.name, steps_of(env)
+        self.env, (self.model, self.data) = peeled(env), physics
+        self.physics = Physics(self.model, self.data, plant_of(env))
         self.inner: Any = self.env.unwrapped
-        self._space = self.env.observation_space
-        self._actions: Any = self.env.action_space
-        self._discrete = isinstance(self._actions, spaces.Discrete)
+        self.is_wrapped = self.env is not self.inner
+        self._space, self._actions = self.env.observation_space, self.env.action_space
         self._observers = observers(self.env)
-        self.inner_seen: Any = None  # what the innermost environment observed last
-        self.observation = np.empty(0)
+        self.observation, self.inner_seen = np.empty(0), None
+        numbers = 4 + len(spec.criterion.keys) + len(spec.criterion.points)
+        self.report: Sequence[float] = (0.0,) * numbers
+        self.start: np.ndarray | None = None
         self._like: written.Fingerprint | None = None  # after its first reset
-        self._generators: dict[str, tuple[Any, bytes]] = {}
-        self._shared = written.Fingerprint()  # by all instances, after the reset
+        self._begun = written.Fingerprint()  # after the reset of its episode
         self._used = self._at_start = False
         self._pairs: list[tuple[np.ndarray, np.ndarray]] = []
-        # To which the innermost reset has to lead, below wrappers.
-        self.start: np.ndarray | None = None
-        self._chain = None if self.env is self.inner else _Chain(self)
+        self._chain = _Chain(self) if self.is_wrapped else None
 
-    @property
-    def source(self) -> Source:
-        """How the environment is made and reset."""
-        return self.recipe.source
+    def learn(self, **facts: Any) -> None:
+        """Adds to what is known of the environment."""
+        self.spec = replace(self.spec, **facts)
 
     # ---- an episode
 
-    def reset(self, seed: int | None = None, options: Mapping[str, Any] | None = None) -> Any:
-        """Resets the environment as its user would, pins what is pinned, and returns its observation."""
-        seed = self.source.first if seed is None else seed
-        given = self.source.reset if options is None else options
-        plain = {k: np.array(v) if isinstance(v, list) else v for k, v in given.items()}
-        with global_seed(seed):
-            self.env.action_space.seed(seed)
-            try:
-                observation, _ = self.env.reset(seed=seed, options=plain or None)
-            except HyrlError:
-                raise
-            except Exception as error:
-                told = f" with the options {dict(given)}" if given else ""
-                raise BadInput(
-                    f"{self.name} cannot be reset{told} ({brief(error)}): change its options of reset"
-                ) from error
+    def reset(self, seed: int | None = None, plain: bool = False) -> Any:
+        """Resets the environment as its user would, pins what is pinned, and returns its observation.
+
+        Args:
+            seed: of the reset, by default the one that all runs begin from.
+            plain: whether the options and the pins that the user gives are left out.
+        """
+        description = self.spec.description
+        seed = description.seed or 0 if seed is None else seed
+        given = {} if plain else description.reset
+        options = {k: np.array(v) if isinstance(v, list) else v for k, v in given.items()}
+        # Some environments draw from the global generators; `kept_generators` puts these back.
+        np.random.seed(seed)
+        random.seed(seed)
+        self._actions.seed(seed)
+        try:
+            observation, _ = self.env.reset(seed=seed, options=options or None)
+        except HyrlError:
+            raise
+        except Exception as error:
+            told = f" with the options {dict(given)}" if given else ""
+            raise BadInput(
+                f"{self.name} cannot be reset{told} ({brief(error)}): change its options of reset"
+            ) from error
         physics = physics_of(self.env)
         if physics is None or physics[0] is not self.model:
             raise BadInput(
@@ -135,13 +113,12 @@ class Instance:
         # Views of MuJoCo's data, which show where these are at any time.
         self._pairs = [
             (getattr(self.data, a)[i], getattr(self.data, b)[j])
-            for (a, i), (b, j) in self.recipe.places
+            for (a, i), (b, j) in self.spec.criterion.points
         ]
-        if self._chain is None:
+        if not self.is_wrapped:
             self.inner_seen = observation
-        if self.start is None:
+        if self.start is None and not plain:
             self.pin()
-        self._shared = written.shared(self.env)
         return observation
 
     def put(self, state: np.ndarray, seed: int | None = None) -> np.ndarray:
@@ -150,16 +127,14 @@ class Instance:
         Wrappers see the start as the first observation, as if the reset of the innermost environment had led
         there.
         """
-        if self._chain is None:
+        if not self.is_wrapped:
             self.reset(seed)
-            return self._placed(state)
-        self.start = state
-        try:
-            return flat(self.reset(seed), self._space)
-        finally:
-            self.start = None
+        self.begin(state, seed)
+        self.sense(np.zeros(self.spec.dimension))
+        return self.observation
 
-    def _placed(self, state: np.ndarray) -> np.ndarray:
+    def placed(self, state: np.ndarray) -> np.ndarray:
+        """Puts an environment without wrappers to a state (S,); returns what it observes there (o,)."""
         self.arrive(state)
         self.observation = flat(self.inner_seen, self._space)
         return self.observation
@@ -171,10 +146,10 @@ class Instance:
 
     def pin(self) -> None:
         """Sets what is pinned."""
-        if not self.source.pinned:
+        if not (pinned := self.spec.description.pinned):
             return
         self.physics.read()
-        for name, value in self.source.pinned.items():
+        for name, value in pinned.items():
             kind, _, rest = name.partition("[")
             if kind in ("qpos", "qvel", "mocap_pos", "userdata") and rest.endswith("]"):
                 values, i = getattr(self.data, kind).reshape(-1), rest[:-1]
@@ -205,74 +180,68 @@ class Instance:
         return found
 
     def mark(self) -> None:
-        """Notes the generators of random numbers, and compares what is remembered with the first reset.
+        """Notes what is remembered, and compares it with what was after the first reset.
 
         Raises:
             Worn: after this reset the instance is not as it was after its first one.
         """
-        remembered = self.remembered()
-        self._generators = {n: (g, written.state_of(g)) for n, g in remembered.generators.items()}
-        if self._like is None:
-            self._like = remembered
-        elif differ := written.differing(remembered, self._like):
+        self._begun = self.remembered()
+        self._like = self._like or self._begun
+        if differ := written.differing(self._begun, self._like):
             raise Worn(differ[0])
 
-    def begin(self, start: np.ndarray) -> None:
-        """Begins an episode at a state of MuJoCo (S,); with wrappers, `sense` gives its first observation.
+    def renew(self) -> None:
+        """Leaves the episode before, and gets ready for another one.
 
         Raises:
             Worn: after its reset it is not like a new one.
         """
         self.quit()
-        if self.recipe.anew:
-            if self._used:
-                raise Worn("a wrapper")
-            self._used = True
-        else:
-            self.observation = flat(self.reset(), self._space)
+        if not self.spec.anew:
+            self.reset()
             self.mark()
+        elif self._used:
+            raise Worn("a wrapper")
+        else:
+            self._used, self._begun = True, written.shared(self.env)
+
+    def begin(self, start: np.ndarray, seed: int | None = None) -> None:
+        """Begins an episode at a state of MuJoCo (S,); with wrappers, `sense` gives its first observation."""
         if self._chain is None:
-            self._placed(start)
+            self.placed(start)
         else:
             self.start = start
-            self._chain.ask(self.reset)
+            self._chain.ask(lambda: self.reset(seed))
 
-    def act(self, u: np.ndarray) -> Sequence[float]:
-        """Steps the environment with inputs u (m,), and returns its report (see `Recipe.width`).
-
-        With wrappers the report is complete only after `sense`, which returns it.
-        """
+    def act(self, u: np.ndarray) -> None:
+        """Steps the environment with inputs u (m,); with wrappers, `sense` gives what it comes to."""
         if self._chain is None:
-            return self._told(self.stepped(u))
-        self._chain.ask(lambda: self.stepped(u))
-        return [0.0] * self.recipe.width
+            self._take(self.stepped(u))
+        else:
+            self._chain.ask(lambda: self.stepped(u))
 
-    def sense(self, noise: np.ndarray) -> Sequence[float]:
-        """Computes `observation` under noise (d,) on the chart's coordinates.
-
-        Returns:
-            With wrappers the report of the step; zeros at the start, and without wrappers.
-        """
+    def sense(self, noise: np.ndarray) -> None:
+        """Has the environment observe under noise (d,) on the chart's coordinates."""
         if self._chain is None:
             if noise.any():
                 self.observation = self.observation + self.displaced(noise)
-            return [0.0] * self.recipe.width
+            return
         result = self._chain.answer(noise)
         if self.start is None:
-            return self._told(result)
-        self.start, self.observation = None, flat(result, self._space)
-        return [0.0] * self.recipe.width
+            self._take(result)
+        else:
+            self.start, self.observation = None, flat(result, self._space)
 
     def finish(self) -> None:
         """Refuses an episode in which random numbers were drawn, or what all instances share changed."""
-        if changed := written.differing(written.shared(self.env), self._shared):
-            raise self.is_shared(changed[0])
-        generators, self._generators = self._generators, {}
-        for name, (generator, state) in generators.items():
-            if written.state_of(generator) != state:
-                self._drawn(name)
+        differ = written.differing(written.shared(self.env), self._begun)
+        if changed := [name for name in differ if written.is_shared(name)]:
+            raise self.sharing(changed[0])
+        for name, generator in self._begun.generators.items():
+            if written.state_of(generator) != self._begun[name]:
+                raise self._drawing(name)
 
-    def is_shared(self, name: str) -> BadInput:
+    def sharing(self, name: str) -> BadInput:
         """Returns the error that an environment changes what all its instances share."""
         return BadInput(
             f"{self.name} changes {name}, which all its instances share, so its episodes depend on each "
@@ -281,7 +250,6 @@ class Instance:
 
     def quit(self) -> None:
         """Leaves an episode before its end."""
-        self._generators = {}
         if self._chain is not None:
             self._chain.leave()
             self.start = None
@@ -290,26 +258,18 @@ class Instance:
 
     def watched(self) -> Any:
         """Returns what the innermost environment observes in its present state."""
-        watch = self._observers.get(self.recipe.observer)
-        if watch is None:
-            raise BadInput(
-                f"{self.name} has no method that computes what it observes in its present state, so nothing "
-                "is known of what it would observe under noise: give it one named _get_obs, without arguments"
-            )
         try:
-            return watch()
+            return self._observers[self.spec.observer]()
         except Exception as error:
             raise BadInput(
-                f"{self.recipe.observer}() of {self.name} raises {brief(error)}: repair it"
+                f"{self.spec.observer}() of {self.name} raises {brief(error)}: repair it"
             ) from error
 
     def rested(self, start: np.ndarray) -> np.ndarray:
         """Returns what is first observed (o,) of an episode that begins at a state of MuJoCo (S,)."""
-        if self._chain is None and len(self.observation):
-            return self._placed(start)
-        self.begin(start)
-        self.sense(np.zeros(len(self.recipe.noisy)))
-        return self.observation
+        if self.is_wrapped or self.inner_seen is None:
+            return self.put(start)
+        return self.placed(start)
 
     def displaced(self, noise: np.ndarray) -> np.ndarray:
         """Returns by how much the innermost observation changes (o,) where the chart's coordinates do.
@@ -318,31 +278,30 @@ class Instance:
         computed where the robot was then, with the noise. Where it is not known which they are, it is the
         difference of two observations with all of them up to date.
         """
-        state, derived = self.physics.read(), NOW if self._at_start else self.recipe.derived
-        with self.physics.kept():
-            if derived == UNKNOWN:
-                before = self.seen_as(NOW, state, np.zeros(len(noise)))
-            else:
-                before = flat(self.inner_seen, self.inner.observation_space)
-            return self.seen_as(derived, state, noise) - before
+        state, derived = self.physics.read(), NOW if self._at_start else self.spec.derived
+        if derived == UNKNOWN:
+            before = self.seen_as(NOW, state, np.zeros(len(noise)))
+        else:
+            before = flat(self.inner_seen, self.inner.observation_space)
+        return self.seen_as(derived, state, noise) - before
 
     def seen_as(self, derived: str, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Returns the innermost observation (o,) of a state (S,) under noise (d,); see `Recipe.derived`.
-
-        MuJoCo's data are left there.
-        """
+        """Returns the innermost observation (o,) of a state (S,) under noise (d,), as `derived` says."""
+        self.physics.leave()
         moved = self.moved(state, noise)
         if derived == EARLIER:
             self.physics.write(self.moved(self.physics.earlier(state), noise))
             self.physics.show(moved)
         else:
             self.physics.write(moved)
-        return flat(self.watched(), self.inner.observation_space)
+        seen = flat(self.watched(), self.inner.observation_space)
+        self.physics.come_back()
+        return seen
 
     def moved(self, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Returns a state of MuJoCo (S,) with noise (d,) added to the coordinates of the chart."""
         moved = state.copy()
-        moved[list(self.recipe.noisy)] += noise
+        moved[self.spec.places] += noise
         return moved
 
     def depth(self) -> float:
@@ -350,27 +309,27 @@ class Instance:
         contact = self.data.contact
         if not self.data.ncon:
             return 0.0
-        touches = self.recipe.solid[contact.geom].sum(axis=1) == 1
+        touches = self.spec.solid[contact.geom].sum(axis=1) == 1
         return float(-min(contact.dist[touches].min(initial=0.0), 0.0))
 
     def touched(self) -> set[int]:
         """Returns the geoms that the robot touches."""
         pairs = self.data.contact.geom[: self.data.ncon]
-        return {int(g) for pair in pairs if self.recipe.solid[pair].sum() == 1 for g in pair}
+        return {int(g) for pair in pairs if self.spec.solid[pair].sum() == 1 for g in pair}
 
     # ---- steps
 
     def drawn(self, rng: np.random.Generator) -> np.ndarray:
         """Returns inputs (m,) at random."""
-        space = self._actions
-        if self._discrete:
+        space: Any = self._actions
+        if isinstance(space, spaces.Discrete):
             return np.array([float(rng.integers(space.n))])
         return np.ravel(rng.uniform(space.low, space.high)).astype(float)
 
     def action(self, u: np.ndarray) -> Any:
         """Returns the environment's action for inputs u (m,)."""
-        space = self._actions
-        if self._discrete:
+        space: Any = self._actions
+        if isinstance(space, spaces.Discrete):
             return int(space.start + round(float(u[0])))
         return u.astype(space.dtype).reshape(space.shape)
 
@@ -388,23 +347,23 @@ class Instance:
                 f"step() of {self.name} returns a {type(result).__name__}: let it return an observation, a "
                 "reward, terminated, truncated and info"
             )
-        if self._chain is None:
+        if not self.is_wrapped:
             self.inner_seen = result[0]
         return result
 
-    def _told(self, result: Any) -> list[float]:
+    def _take(self, result: Any) -> None:
+        """Notes the observation and the report of what a step has returned."""
         observation, reward, terminated, truncated, info = result
         self.observation = flat(observation, self._space)
         if self.physics.is_plant:
             self.physics.read()
-        ends = bool(terminated)
-        touch = ends and bool(self.touched() - self.recipe.harmless)
-        told = [float(reward), ends, bool(truncated), touch]
-        told += [entry(info, key) for key in self.recipe.keys]
+        touch = bool(terminated) and bool(self.touched() - self.spec.harmless)
+        report = [float(reward), bool(terminated), bool(truncated), touch]
+        report += [entry(info, key) for key in self.spec.criterion.keys]
         for a, b in self._pairs:
             away = a - b
-            told.append(math.sqrt(away.dot(away)))
-        return told
+            report.append(math.sqrt(away.dot(away)))
+        self.report = report
 
     def wander(self, rng: np.random.Generator, samples: int, held: int) -> Iterator[Any]:
         """Yields what each step returns under inputs at random, each held for so many samples, to the end."""
@@ -423,13 +382,24 @@ class Instance:
         before = _global_state()
         yield
         if _global_state() != before:
-            self._drawn("a global generator")
+            raise self._drawing("a global generator")
 
-    def _drawn(self, name: str) -> None:
-        raise BadInput(
+    def _drawing(self, name: str) -> BadInput:
+        return BadInput(
             f"{self.name} draws random numbers in step() ({name}), so its state does not tell what comes "
             "next: make it without that noise"
         )
+
+
+@contextmanager
+def kept_generators() -> Iterator[None]:
+    """Puts the global generators of NumPy and Python back after the block, in which resets seed them."""
+    numpy_state, python_state = np.random.get_state(), random.getstate()
+    try:
+        yield
+    finally:
+        np.random.set_state(numpy_state)
+        random.setstate(python_state)
 
 
 def _global_state() -> tuple[Any, ...]:
@@ -452,7 +422,7 @@ class _Chain:
         self._work: SimpleQueue[Callable[[], Any] | None] = SimpleQueue()
         self._noise: SimpleQueue[np.ndarray] = SimpleQueue()
         self._news: SimpleQueue[tuple[str, Any]] = SimpleQueue()
-        self._asked = self._busy = False
+        self._busy = False  # with a sample that waits to be observed
         self._calls = 0
         Thread(target=_serve, args=(self._work, self._news), daemon=True).start()
         weakref.finalize(self, self._work.put, None)  # the thread ends with the instance
@@ -461,11 +431,11 @@ class _Chain:
         """Begins a step or a reset, up to where the innermost environment would observe."""
         if self._busy:
             raise AssertionError("a sample has not been observed")
-        self._calls, self._asked, self._busy = 0, True, True
+        self._calls, self._busy = 0, True
         self._work.put(work)
         what, value = self._news.get()
         if what != "sensing":
-            self._asked = self._busy = False
+            self._busy = False
             if what == "error":
                 raise value
             raise BadInput(
@@ -477,7 +447,7 @@ class _Chain:
         """Goes on with noise (d,) to the end of the step or reset, and returns its result."""
         self._noise.put(noise)
         what, value = self._news.get()
-        self._asked = self._busy = False
+        self._busy = False
         self._instance.physics.come_back()
         if what == "error":
             raise value
@@ -486,7 +456,7 @@ class _Chain:
     def leave(self) -> None:
         """Ends a step that waits for noise."""
         if self._busy:
-            self.answer(np.zeros(len(self._instance.recipe.noisy)))
+            self.answer(np.zeros(self._instance.spec.dimension))
 
     def _step(self, action: Any) -> Any:
         result = self._own_step(action)
@@ -504,7 +474,7 @@ class _Chain:
 
     def _observed(self, observation: Any, rest: tuple[Any, ...]) -> tuple[Any, ...]:
         instance, space = self._instance, self._instance.inner.observation_space
-        if not self._asked:
+        if not self._busy:
             return (observation, *rest)
         self._calls += 1
         if self._calls > 1:
@@ -519,7 +489,9 @@ class _Chain:
                 flat(observation, space) + instance.displaced(noise), observation, space
             )
             # Wrappers that look at MuJoCo's state themselves see it where the sensor does.
-            instance.physics.leave_for(instance.moved(instance.physics.read(), noise))
+            state = instance.physics.read()
+            instance.physics.leave()
+            instance.physics.write(instance.moved(state, noise))
         return (observation, *rest)
 
 

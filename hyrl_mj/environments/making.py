@@ -1,4 +1,4 @@
-"""Tasks are made of environments, and again from the texts that describe them."""
+"""Tasks are made of environments: by arguments, by options, and again from the texts that describe them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import re
 import shlex
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from inspect import signature
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -15,15 +17,15 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from hyrl_mj import limits, trust
-from hyrl_mj.environments.coordinates import AnyChart
-from hyrl_mj.environments.inspection import CHART, RESET, Given, inspect
-from hyrl_mj.environments.opening import Source, register
+from hyrl_mj import artifacts, limits, trust
+from hyrl_mj.environments.inspection import inspect
+from hyrl_mj.environments.instance import kept_generators
+from hyrl_mj.environments.opening import CHART, RESET, AnyChart, Description, register
 from hyrl_mj.environments.specification import FORMS
 from hyrl_mj.environments.task import EnvironmentTask
-from hyrl_mj.errors import BadInput, check_seed, described, unknown
+from hyrl_mj.errors import BadInput, brief, check_seed, described, unknown
 from hyrl_mj.ranges import Integer, refused
-from hyrl_mj.tasks import Task, register_opener
+from hyrl_mj.tasks import Task, get_task, register_opener
 
 # The texts that describe environments begin with this; those that have been made in this process.
 MARK = "env:"
@@ -72,27 +74,24 @@ def from_gymnasium(
     Raises:
         BadInput: it cannot be used; the message says why.
     """
-    given = Given(chart, noisy, success, failure, bounds, steps, starts)
+    # All arguments that are given; there are no other variables yet.
+    given: dict[str, Any] = {
+        name: dict(value) if isinstance(value, Mapping) else value
+        for name, value in locals().items()
+        if value is not None
+    }
     with described(_shown(env)):
-        _check(given, seed)
-        for name, named in (("kwargs", kwargs), ("reset", reset), ("pinned", pinned)):
-            _check_named(name, named)
-        for name, value in (pinned or {}).items():
-            if not _is_numeric(value):
-                raise refused(f"pinned {name}", value, "a number, or a list of numbers")
-    source = Source(env, dict(kwargs or {}), dict(reset or {}), dict(pinned or {}), seed)
-    content = {
-        "env": env if isinstance(env, str) else {"function": _where(env)}, **vars(given),
-        "starts": None if starts == CHART else starts, "kwargs": kwargs, "reset": reset,
-        "pinned": pinned, "seed": seed,
-    }  # fmt: skip
-    told = {key: value for key, value in content.items() if value is not None}
+        _check(given)
+    description = Description(**given)
+    told = given | {"env": env if isinstance(env, str) else {"function": _where(env)}}
+    if starts == CHART:
+        del told["starts"]
     spec = MARK + json.dumps(told, default=_plain)
     if not isinstance(env, str) or spec not in _MADE:
-        with described(_shown(env)):
+        with described(_shown(env)), kept_generators():
             if isinstance(env, str) and (kwargs or reset or pinned or trust.is_received()):
-                _try(source, spec)
-            _MADE[spec] = EnvironmentTask(*inspect(source, given), spec)
+                _try(description, spec)
+            _MADE[spec] = EnvironmentTask(*inspect(description), spec)
     if isinstance(env, str):
         trust.remember_text(_recorded(spec, told))
         if (module := _module_of(env)) is not None:
@@ -104,33 +103,33 @@ def _shown(env: Any) -> str:
     return f"the environment {env[:80]}" if isinstance(env, str) else "the environment"
 
 
-def _try(source: Source, spec: str) -> None:
+def _try(description: Description, spec: str) -> None:
     """Makes, resets and steps an environment in a process with limits, unless that was done before."""
-    told = vars(source)
-    if trust.is_known_text(
-        spec
-    ):  # with names of files it is recorded otherwise, and tried each time
-        return
+    if trust.is_known_text(spec):
+        return  # with names of files it is recorded otherwise, and tried each time
+    given = {
+        name: getattr(description, name) for name in ("env", "kwargs", "reset", "pinned", "seed")
+    }
     try:
-        content = json.dumps(told)
+        content = json.dumps(given)
     except TypeError:
         content = ""
-    if not content or json.loads(content) != told:
+    if not content or json.loads(content) != given:
         return  # arrays and tuples, which only the user's own code gives, and the program would see lists
     try:
         found = limits.tried(Path(__file__).with_name("first_trial.py"), content.encode())
     except limits.Ended as ended:
         raise BadInput(
-            f"the environment {source.name} cannot be used: {ended} where it is made, reset and stepped; "
-            "give it other arguments"
+            f"the environment {description.name} cannot be used: {ended} where it is made, reset and "
+            "stepped; give it other arguments"
         ) from None
     if found["problem"]:
         raise BadInput(found["problem"])
 
 
-def _check(given: Given, seed: Any) -> None:
+def _check(given: Mapping[str, Any]) -> None:
     """Raises `BadInput` if one of the arguments of `from_gymnasium` is of another kind."""
-    chart, noisy, steps = given.chart, given.noisy, given.steps
+    chart, noisy, starts = given.get("chart"), given.get("noisy"), given.get("starts")
     names = chart.values() if isinstance(chart, Mapping) else chart
     if chart is not None and not isinstance(chart, str) and not _all(names, str):
         raise refused(
@@ -142,18 +141,22 @@ def _check(given: Given, seed: Any) -> None:
         if not any(noisy):
             raise refused("noisy", noisy, "a share above 0 for at least one coordinate")
     for name in ("success", "failure"):
-        if (condition := getattr(given, name)) is not None and not isinstance(condition, str):
-            raise refused(name, condition, FORMS)
-    _check_named("bounds", given.bounds)
-    for name, ends in (given.bounds or {}).items():
+        if not isinstance(given.get(name, ""), str):
+            raise refused(name, given[name], FORMS)
+    for name in ("bounds", "kwargs", "reset", "pinned"):
+        named = given.get(name, {})
+        if not (isinstance(named, Mapping) and _all([*named], str)):
+            raise refused(name, named, "a dictionary of names and values")
+    for name, ends in given.get("bounds", {}).items():
         if not _all(ends, Real) or len(ends) != 2 or not 0 < ends[1] - ends[0] <= WIDEST:
             raise refused(f"bounds of {name}", ends, "its low and its high end, as [-2, 2]")
-    if steps is not None:
-        Integer(1, MOST_STEPS).checked("steps", steps)
-    if seed is not None:
-        check_seed(seed)
-    if given.starts not in (CHART, RESET):
-        raise unknown("starts", given.starts, (CHART, RESET))
+    for name, value in given.get("pinned", {}).items():
+        if not _is_numeric(value):
+            raise refused(f"pinned {name}", value, "a number, or a list of numbers")
+    Integer(1, MOST_STEPS).checked("steps", given.get("steps", 1))
+    check_seed(given.get("seed", 0))
+    if starts not in (CHART, RESET):
+        raise unknown("starts", starts, (CHART, RESET))
 
 
 def _all(values: Any, kind: type) -> bool:
@@ -168,12 +171,6 @@ def _is_numeric(value: Any) -> bool:
         array = np.asarray(value)
         return array.dtype.kind in "biuf" and bool(np.isfinite(array).all())
     return False
-
-
-def _check_named(name: str, given: Any) -> None:
-    """Raises `BadInput` if an argument is no dictionary of names."""
-    if given is not None and not (isinstance(given, Mapping) and _all([*given], str)):
-        raise refused(name, given, "a dictionary of names and values")
 
 
 def _module_of(env: str) -> Path | None:
@@ -264,3 +261,112 @@ def _is_plain(value: Any) -> bool:
 
 
 register_opener(MARK, from_spec)
+
+
+# ---- the command line
+
+
+@dataclass(frozen=True)
+class EnvironmentOptions:
+    """An environment of Gymnasium in place of a task.
+
+    Attributes:
+        env: id of an environment of Gymnasium that MuJoCo simulates, in place of TASK, as
+            PointMaze_Medium-v3; by default none.
+        env_args: a JSON file with arguments of hyrl_mj.from_gymnasium, such as reset, pinned, kwargs, bounds
+            and steps; by default none.
+        chart: names of the coordinates in which the decision falls, as achieved_goal, or
+            shoulder=qpos[0],elbow=qpos[1]; by default what is found.
+        noisy: share of --eps on each coordinate of the chart; by default 1 on positions.
+        success: when an episode is a success, as info, terminated, "reward >= 1" or
+            "distance(fingertip, target) <= 0.05"; by default what info tells.
+        failure: when an episode is a failure, as 'info["collision"]'; by default when it is terminated
+            without success.
+        explain: say what was found out about the environment and how to change it, and do nothing else.
+    """
+
+    env: str | None = None
+    env_args: Path | None = None
+    chart: tuple[str, ...] | None = None
+    noisy: tuple[float, ...] | None = None
+    success: str | None = None
+    failure: str | None = None
+    explain: bool = False
+
+
+def chosen_task(task: str | None, options: EnvironmentOptions) -> Task:
+    """Returns the task of a name or file, or of an environment.
+
+    Raises:
+        BadInput: both or none of them is given, or the environment cannot be used.
+    """
+    if options.env is None:
+        if options != EnvironmentOptions():
+            raise BadInput(
+                "--env-args, --chart, --noisy, --success, --failure and --explain need an --env"
+            )
+        if task is None:
+            raise BadInput("give a TASK, see hyrl-mj list, or an environment with --env ID")
+        return get_task(task)
+    if task is not None:
+        raise BadInput(f"give the task {task} or --env {options.env}, not both")
+    given = {} if options.env_args is None else _arguments(options.env_args)
+    if options.chart is not None:
+        given["chart"] = _chart(options.chart)
+    for name in ("noisy", "success", "failure"):
+        if (value := getattr(options, name)) is not None:
+            given[name] = value
+    return from_gymnasium(options.env, **given)
+
+
+def explained(task: Task) -> str:
+    """Returns what was given and found out about an environment, and how to change it."""
+    assert isinstance(task, EnvironmentTask)
+    lines = [f"{task.name}: {task!r}"]
+    for name, value in json.loads(task.spec.removeprefix(MARK)).items():
+        lines.append(f"  {name}: {value if isinstance(value, str) else json.dumps(value)} (given)")
+    for name, text in task.found.items():
+        lines += [f"  {name}: {text}", f"    (to change it, give {_INSTEAD.get(name, name)})"]
+    return "\n".join(lines)
+
+
+# What to give to change what was found, where it has another name.
+_INSTEAD = {
+    "noise": "noisy",
+    "goal": "reset, pinned or seed",
+    "ways": "chart",
+    "lag": "an environment that calls mj_forward at the end of step()",
+    "sample time": "kwargs, such as frame_skip, if the environment takes it",
+    "camera": "task.scene another one in Python",
+}
+
+
+def _arguments(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(artifacts.read_limited(path).decode())
+    except OSError as error:
+        raise BadInput(f"{path} cannot be read ({error.strerror}): give a JSON file") from None
+    except (ValueError, RecursionError) as error:
+        raise BadInput(f"{path} is no JSON ({brief(error)}): give a JSON file") from None
+    if not isinstance(content, dict):
+        raise BadInput(
+            f"{path} holds no JSON object: give one with arguments of hyrl_mj.from_gymnasium"
+        )
+    allowed = [name for name in signature(from_gymnasium).parameters if name != "env"]
+    for name in content:
+        if name not in allowed:
+            raise unknown(f"argument in {path}", name, allowed)
+    return content
+
+
+def _chart(words: tuple[str, ...]) -> AnyChart:
+    """Returns the chart of words such as "achieved_goal" or "shoulder=qpos[0]"."""
+    pairs = [word.partition("=") for word in words]
+    named = [equals for _, equals, _ in pairs]
+    if not any(named):
+        return list(words)
+    if not all(named):
+        raise BadInput(
+            f"--chart {','.join(words)} names some coordinates anew: name all of them, or none"
+        )
+    return {name.strip(): value.strip() for name, _, value in pairs}

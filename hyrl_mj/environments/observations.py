@@ -15,6 +15,20 @@ from gymnasium import spaces
 OBSERVER = re.compile(r"_?((get|compute|make|build)_?)?(ob|obs|observe|observation)s?")
 
 
+def parts_of(space: spaces.Space[Any]) -> dict[str, Any]:
+    """Returns the parts of a space of observations by name, in their order; of a vector it is one part."""
+    return dict(space.spaces) if isinstance(space, spaces.Dict) else {"observation": space}
+
+
+def columns_of(space: spaces.Space[Any]) -> dict[str, slice]:
+    """Returns the columns of each part of a space of observations, by name."""
+    found, at = {}, 0
+    for name, part in parts_of(space).items():
+        size = int(spaces.flatdim(part))
+        found[name], at = slice(at, at + size), at + size
+    return found
+
+
 def flat(observation: Any, space: spaces.Space[Any]) -> np.ndarray:
     """Returns an observation as a vector, as SB3 does: the parts of a Dict in the order of its space."""
     if isinstance(space, spaces.Dict):
@@ -27,19 +41,12 @@ def shaped(vector: np.ndarray, like: Any, space: spaces.Space[Any]) -> Any:
     if not isinstance(space, spaces.Dict):
         array = np.asarray(like)
         return vector.astype(array.dtype).reshape(array.shape)
-    parts = {}
-    for key, columns in columns_of_parts(space).items():
-        parts[key] = shaped(vector[columns], like[key], space.spaces[key])
-    return {key: parts[key] for key in like if key in parts}
-
-
-def columns_of_parts(space: spaces.Dict) -> dict[str, slice]:
-    """Returns the columns of each part of a Dict, in the order of its space."""
-    found, at = {}, 0
-    for key, part in space.spaces.items():
-        size = int(spaces.flatdim(part))
-        found[key], at = slice(at, at + size), at + size
-    return found
+    columns = columns_of(space)
+    return {
+        key: shaped(vector[columns[key]], like[key], space.spaces[key])
+        for key in like
+        if key in columns
+    }
 
 
 def observers(env: gym.Env) -> dict[str, Callable[[], Any]]:

@@ -6,11 +6,10 @@ import importlib
 import importlib.util
 import inspect
 import io
-import random
 import traceback
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext, redirect_stderr, suppress
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext, redirect_stderr, suppress
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
@@ -23,6 +22,7 @@ from gymnasium import spaces
 
 from hyrl_mj import mjcf, mujoco_log
 from hyrl_mj.artifacts import digest
+from hyrl_mj.environments.observations import parts_of
 from hyrl_mj.errors import BadInput, brief
 from hyrl_mj.plant import Plant
 from hyrl_mj.trust import current_folder
@@ -31,130 +31,64 @@ from hyrl_mj.trust import current_folder
 PACKAGES = {"gymnasium_robotics": "robotics", "ogbench": "robotics", "shimmy": "dm-control"}
 # Wrappers that count or check, and change nothing of what an environment does.
 PEELED = (
-    "TimeLimit",
-    "OrderEnforcing",
-    "PassiveEnvChecker",
-    "Autoreset",
-    "RecordEpisodeStatistics",
-    "Monitor",
-)
+    "TimeLimit", "OrderEnforcing", "PassiveEnvChecker", "Autoreset", "RecordEpisodeStatistics", "Monitor",
+)  # fmt: skip
+# Chart, as users give it: one name, several, or new names with the names of what they stand for.
+AnyChart = str | Sequence[str] | Mapping[str, str]
+# Where episodes start.
+CHART, RESET = "chart", "reset"
 
 
 @dataclass(frozen=True)
-class Source:
-    """How an environment is made and reset.
+class Description:
+    """What the user says of an environment: the arguments of `from_gymnasium`, which tells what each is."""
 
-    Attributes:
-        make: id of the environment in Gymnasium, or a function that returns one.
-        kwargs: arguments of `gymnasium.make`, or of the function.
-        reset: the options of `reset`, such as where the goal is.
-        pinned: values of positions, velocities or attributes after each reset, by name.
-        seed: the seed of the reset that all copies begin from; None if the user gave none.
-    """
-
-    make: str | Callable[..., gym.Env]
+    env: str | Callable[..., gym.Env]
+    chart: AnyChart | None = None
+    noisy: Sequence[float] | None = None
+    success: str | None = None
+    failure: str | None = None
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    steps: int | None = None
+    starts: str = CHART
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     reset: Mapping[str, Any] = field(default_factory=dict)
     pinned: Mapping[str, Any] = field(default_factory=dict)
     seed: int | None = None
 
     @property
-    def first(self) -> int:
-        """The seed of the reset that all copies begin from."""
-        return self.seed or 0
-
-    @property
-    def unpinned(self) -> Source:
-        """The same without what the user pins."""
-        return replace(self, reset={}, pinned={})
-
-    @property
-    def pins(self) -> bool:
-        """Whether the user has said what resets would draw."""
-        return bool(self.reset or self.pinned) or self.seed is not None
-
-    @property
     def name(self) -> str:
         """The name of the environment, which is also that of its task."""
-        if isinstance(self.make, str):
-            return self.make.rpartition(":")[2].rpartition("/")[2]
-        return getattr(self.make, "__name__", type(self.make).__name__).strip("<>") or "environment"
+        if isinstance(self.env, str):
+            return self.env.rpartition(":")[2].rpartition("/")[2]
+        return getattr(self.env, "__name__", type(self.env).__name__).strip("<>") or "environment"
 
 
-_kept = False  # whether a block of `kept_generators` is open
-
-
-@contextmanager
-def kept_generators() -> Iterator[None]:
-    """Puts the global generators of NumPy and Python back after the block; of nested blocks the outermost."""
-    global _kept
-    if _kept:
-        yield
-        return
-    numpy_state, python_state, _kept = np.random.get_state(), random.getstate(), True
-    try:
-        yield
-    finally:
-        np.random.set_state(numpy_state)
-        random.setstate(python_state)
-        _kept = False
-
-
-@contextmanager
-def global_seed(seed: int) -> Iterator[None]:
-    """Seeds the global generators of NumPy and Python in the block, which some environments draw from."""
-    with kept_generators():
-        np.random.seed(seed)
-        random.seed(seed)
-        yield
-
-
-@dataclass(frozen=True)
-class Made:
-    """An environment without the wrappers that count or check.
-
-    Attributes:
-        env: the environment.
-        steps: after how many steps its episodes are truncated; None if it does not say.
-        model, data: of MuJoCo.
-        plant: what holds the state of an environment of this package, whose `data` only shows it; else None.
-    """
-
-    env: gym.Env
-    steps: int | None
-    model: mujoco.MjModel
-    data: mujoco.MjData
-    plant: Plant | None = None
-
-
-def made(source: Source) -> Made:
-    """Returns an environment that can be used.
+def made(description: Description) -> gym.Env:
+    """Returns an environment that can be used, with all of its wrappers.
 
     Raises:
         BadInput: it cannot be made, or it is none that can be used.
     """
     mujoco_log.install()  # what MuJoCo warns of while it reads a model is not written to a file
-    if isinstance(source.make, str):
-        register(source.make)
-        own = ":" in source.make  # of a module of the user's, as "my_module:Puck-v0"
-        try:
-            with current_folder(source.make) if own else nullcontext():
-                env: Any = gym.make(source.make, disable_env_checker=True, **source.kwargs)
-        except Exception as error:  # whatever a foreign constructor raises
-            raise BadInput(_why_not_made(source.make, error)) from error
-    else:
-        try:
-            env = source.make(**source.kwargs)
-        except Exception as error:
-            raise BadInput(
-                f"{source.name} cannot be made ({brief(error)}): repair the function"
-            ) from error
-    physics, plant, steps = _check(env, source.name), _plant_of(env), _steps_of(env)
-    mjcf.check_names(physics[0], source.name)
-    return Made(_peeled(env), steps, *physics, plant)
+    make, name = description.env, description.name
+    try:
+        if isinstance(make, str):
+            register(make)
+            own = ":" in make  # of a module of the user's, as "my_module:Puck-v0"
+            with current_folder(make) if own else nullcontext():
+                env: Any = gym.make(make, disable_env_checker=True, **description.kwargs)
+        else:
+            env = make(**description.kwargs)
+    except Exception as error:  # whatever a foreign constructor raises
+        if isinstance(make, str):
+            raise BadInput(_why_not_made(make, error)) from error
+        raise BadInput(f"{name} cannot be made ({brief(error)}): repair the function") from error
+    mjcf.check_names(_checked(env, name), name)
+    return env
 
 
-def _steps_of(env: gym.Env) -> int | None:
+def steps_of(env: gym.Env) -> int | None:
     """Returns after how many steps an episode of an environment is truncated; None if it does not say."""
     if env.spec is not None and env.spec.max_episode_steps:
         return int(env.spec.max_episode_steps)
@@ -229,8 +163,8 @@ def _why_not_made(name: str, error: Exception) -> str:
     )
 
 
-def _check(env: Any, name: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """Returns model and data of an environment of one agent in MuJoCo, with vectors; refuses others."""
+def _checked(env: Any, name: str) -> mujoco.MjModel:
+    """Returns the model of an environment of one agent in MuJoCo, with vectors; refuses others."""
     if hasattr(env, "possible_agents") or hasattr(env, "agents"):
         raise BadInput(f"{name} has several agents: hyrl_mj takes environments of one agent")
     if isinstance(env, gym.vector.VectorEnv) or not isinstance(env, gym.Env):
@@ -250,9 +184,7 @@ def _check(env: Any, name: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
             f"{name} is not simulated by MuJoCo, as far as its attributes model and data tell: give an "
             "environment of MuJoCo"
         )
-    space = env.observation_space
-    parts = space.spaces.values() if isinstance(space, spaces.Dict) else (space,)
-    for part in parts:
+    for part in parts_of(env.observation_space).values():
         is_image = isinstance(part, spaces.Box) and (len(part.shape) > 2 or part.dtype == np.uint8)
         if is_image or not isinstance(part, spaces.Box):
             what = "images" if is_image else f"a space {type(part).__name__}"
@@ -260,16 +192,12 @@ def _check(env: Any, name: str) -> tuple[mujoco.MjModel, mujoco.MjData]:
                 f"{name} observes {what} {getattr(part, 'shape', '')}: hyrl_mj takes vectors, or a Dict of "
                 "vectors; choose the observation of its state"
             )
-    if not isinstance(env.action_space, spaces.Box | spaces.Discrete):
-        raise BadInput(
-            f"{name} takes actions of {env.action_space}: hyrl_mj takes a Box, or Discrete"
-        )
-    if (
-        isinstance(env.action_space, spaces.Box)
-        and not np.isfinite([env.action_space.low, env.action_space.high]).all()
-    ):
+    actions: Any = env.action_space
+    if not isinstance(actions, spaces.Box | spaces.Discrete):
+        raise BadInput(f"{name} takes actions of {actions}: hyrl_mj takes a Box, or Discrete")
+    if isinstance(actions, spaces.Box) and not np.isfinite([actions.low, actions.high]).all():
         raise BadInput(f"{name} takes actions without limits: wrap it in gymnasium's RescaleAction")
-    return physics
+    return physics[0]
 
 
 def layers(env: gym.Env) -> list[Any]:
@@ -295,41 +223,38 @@ def _digest_of(kind: type) -> str:
     return ""
 
 
-def _plant_of(env: Any) -> Plant | None:
-    """Returns the plant of an environment of this package; None of others."""
+def plant_of(env: gym.Env) -> Plant | None:
+    """Returns the plant that holds the state of an environment of this package; None of others."""
     plant = getattr(getattr(env.unwrapped, "core", None), "plant", None)
     return plant if isinstance(plant, Plant) and plant.n == 1 else None
 
 
-def physics_of(env: Any) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
-    """Returns model and data of an environment, of Gymnasium or of dm_control; None if it has none."""
-    inner = env.unwrapped
-    if (plant := _plant_of(env)) is not None:
+def physics_of(env: gym.Env) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
+    """Returns model and data of an environment, of Gymnasium or of dm_control; None if it has none.
+
+    The data of an environment of this package only show the state.
+    """
+    inner: Any = env.unwrapped
+    if (plant := plant_of(env)) is not None:
         return plant.model, mujoco.MjData(plant.model)
-    model, data = getattr(inner, "model", None), getattr(inner, "data", None)
-    if isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
-        return model, data
-    physics = getattr(getattr(inner, "_env", None), "physics", None)
-    model, data = (getattr(getattr(physics, key, None), "ptr", None) for key in ("model", "data"))
-    if isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
-        return model, data
+    of_control = getattr(getattr(inner, "_env", None), "physics", None)
+    for model, data in (
+        [getattr(inner, key, None) for key in ("model", "data")],
+        [getattr(getattr(of_control, key, None), "ptr", None) for key in ("model", "data")],
+    ):
+        if isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
+            return model, data
     return None
 
 
-def _peeled(env: gym.Env) -> gym.Env:
-    """Takes the wrappers off that count or check."""
-    while _is_peeled(env):
-        env = env.env  # type: ignore[attr-defined]
-    outer = env
-    while isinstance(outer, gym.Wrapper):
-        while _is_peeled(outer.env):
-            outer.env = outer.env.env  # type: ignore[attr-defined]
-        outer = outer.env
-    return env
-
-
-def _is_peeled(env: gym.Env) -> bool:
-    """Returns whether an environment is one of those wrappers, not a user's of the same name."""
-    kind = type(env)
+def peeled(env: gym.Env) -> gym.Env:
+    """Returns an environment without the wrappers of libraries that count or check."""
+    if not isinstance(env, gym.Wrapper):
+        return env
+    kind, inner = type(env), peeled(env.env)
+    # A wrapper of the user's may have such a name.
     library = kind.__module__.partition(".")[0] in ("gymnasium", "stable_baselines3")
-    return isinstance(env, gym.Wrapper) and kind.__name__ in PEELED and library
+    if library and kind.__name__ in PEELED:
+        return inner
+    env.env = inner
+    return env

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
 
@@ -11,8 +9,6 @@ import mujoco
 import numpy as np
 
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-# Data that one instance at a time copies its own into, by all sizes of the model: many take much memory.
-_SPARE: dict[tuple[int, ...], mujoco.MjData] = {}
 
 
 class Physics:
@@ -25,19 +21,10 @@ class Physics:
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, plant: Any):
         self.model, self.data, self._plant = model, data, plant
+        self.is_plant = plant is not None
         self.size = mujoco.mj_stateSize(model, STATE)
-        names = [name for name in dir(model) if name.startswith("n") and name.islower()]
-        sizes = tuple(v for name in names if isinstance(v := getattr(model, name), int))
-        if sizes not in _SPARE:
-            _SPARE[sizes] = mujoco.MjData(model)
-        self._spare = _SPARE[sizes]
-        self._other: mujoco.MjData | None = None
-        self._left: np.ndarray | None = None
-
-    @property
-    def is_plant(self) -> bool:
-        """Whether a plant of this package holds the state, which `data` only shows."""
-        return self._plant is not None
+        self._kept: mujoco.MjData | None = None
+        self._left: Any = None  # the state of the plant, or (), between `leave` and `come_back`
 
     @cached_property
     def columns(self) -> dict[str, np.ndarray]:
@@ -83,28 +70,16 @@ class Physics:
         found[self.columns["qpos"]], found[self.columns["qvel"]] = qpos, qvel - dt * self.data.qacc
         return found
 
-    @contextmanager
-    def kept(self) -> Iterator[None]:
-        """Puts everything back after the block, derived quantities included."""
-        if self._plant is not None:
-            state = self._plant.state
-            yield
-            self._plant.put(state)
-            return
-        mujoco.mj_copyData(self._spare, self.model, self.data)
-        yield
-        mujoco.mj_copyData(self.data, self.model, self._spare)
-
-    def leave_for(self, state: np.ndarray) -> None:
-        """Goes to a state (S,) until `come_back`."""
-        self._left, self._other = self.read(), self._other or mujoco.MjData(self.model)
-        mujoco.mj_copyData(self._other, self.model, self.data)
-        self.write(state)
+    def leave(self) -> None:
+        """Notes everything, derived quantities included, for `come_back`."""
+        self._kept = self._kept or mujoco.MjData(self.model)
+        mujoco.mj_copyData(self._kept, self.model, self.data)
+        self._left = self._plant.state if self.is_plant else ()
 
     def come_back(self) -> None:
-        """Puts everything back as it was before `leave_for`, if that was called."""
+        """Puts everything back as it was at `leave`, if that was called."""
         if self._left is not None:
-            if self._plant is not None:
-                self._plant.put(self._left[None])
-            mujoco.mj_copyData(self.data, self.model, self._other)
+            if self.is_plant:
+                self._plant.put(self._left)
+            mujoco.mj_copyData(self.data, self.model, self._kept)
             self._left = None

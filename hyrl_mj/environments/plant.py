@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Sequence
+from functools import cached_property
 from itertools import count
 from typing import Any
 
@@ -44,19 +45,16 @@ class EnvironmentPlant:
         self.n = Integer(1, MOST).checked("the number of copies of a robot", n)
         self._written = written
         self.spec, self._pool, self.model = spec, pool, model
-        self.low, self.high = spec.low, spec.high
-        self._number, self._processes = next(_NUMBERS), pool.processes(n)
-        self.late = spec.wrapped
+        self.low, self.high, self.late = spec.low, spec.high, spec.wrapped
+        self._runs, self._places = next(_NUMBERS) * MOST + np.arange(n), pool.places(n)
         self._state = np.tile(spec.state, (n, 1))
-        self._starts = self._state.copy()
         self._seen = slice(spec.dimension, spec.dimension + spec.columns)
         self._truth = np.zeros((n, spec.dimension + spec.columns + 3))
         self._unstable = np.zeros(n, dtype=bool)
         self._open = np.zeros(n, dtype=bool)  # whether the sample has not been observed yet
-        self._places: dict[tuple[int, ...], np.ndarray] = {}
         self._plays = np.zeros(n, dtype=bool)  # whether an instance plays the run
         # Not at once: a plant may be collected while the pool is at work.
-        left = self._number, self._processes, self._plays
+        left = self._places, self._runs, self._plays
         weakref.finalize(self, pool.left.append, left).atexit = False
 
     # ---- what is measured
@@ -64,8 +62,8 @@ class EnvironmentPlant:
     @property
     def measurement(self) -> np.ndarray:
         """The current measurement (n, p), a copy; what no noise was given for is observed without."""
-        if self.spec.wrapped and (rows := np.flatnonzero(self._open & self._plays)).size:
-            self._sense(rows, np.zeros((len(rows), self.spec.dimension)))
+        if self.spec.wrapped:
+            self._sense(np.flatnonzero(self._open & self._plays))
         return self._truth.copy()
 
     def truth(self, ids: np.ndarray) -> np.ndarray:
@@ -80,21 +78,24 @@ class EnvironmentPlant:
         d, measured = self.spec.dimension, true.copy()
         needed = noise[:, :d].any(axis=1) | self.spec.wrapped
         some = np.flatnonzero(needed & self._open[ids] & (self._outcome[ids] == Outcome.RUNNING))
-        if len(some):
-            self._sense(ids[some], noise[some, :d])
+        self._sense(ids[some], noise[some, :d])
         self._open[ids] = False
         measured[:, :d] += noise[:, :d]
         measured[:, self._seen] = self._truth[ids, self._seen]
         return measured
 
-    def _sense(self, rows: np.ndarray, noise: np.ndarray) -> None:
+    def _sense(self, rows: np.ndarray, noise: np.ndarray | None = None) -> None:
+        """Has runs (k,) observe under noise (k, d), by default none."""
+        if not len(rows):
+            return
         if self._written:
             raise BadInput(
                 f"{self.spec.name} cannot be observed under noise where states are written"
             )
+        noise = np.zeros((len(rows), self.spec.dimension)) if noise is None else noise
         begun = self._plays[rows]
         self._begin(rows)
-        seen, reports = self._pool.runs("sense", self._number, self._processes, rows, noise)
+        seen, reports = self._ask("sense", rows, noise)
         self._open[rows] = False
         self._truth[rows, self._seen] = seen
         if self.spec.wrapped:
@@ -112,8 +113,12 @@ class EnvironmentPlant:
                     f"{self.n} episodes of {self.spec.name} side by side need as many environments in "
                     f"memory: give at most {PLAYED}"
                 )
-            self._pool.runs("begin", self._number, self._processes, new, self._starts[new])
+            self._ask("begin", new, self._state[new])
             self._plays[new] = True
+
+    def _ask(self, what: str, rows: np.ndarray, *values: np.ndarray) -> Any:
+        """Has the instances of runs (k,) do something with values (k, ...); see `Stage`."""
+        return self._pool.ask(what, self._places[rows], self._runs[rows], *values)
 
     # ---- the state
 
@@ -144,9 +149,11 @@ class EnvironmentPlant:
 
     def geom_positions(self, ids: Sequence[int]) -> np.ndarray:
         """Returns the positions of geoms that do not move: (1, k, 3) [m]."""
-        if (key := tuple(ids)) not in self._places:
-            self._places[key] = mjcf.geom_positions(self.model, list(ids))[None]
-        return self._places[key]
+        return self._geoms[None, list(ids)]
+
+    @cached_property
+    def _geoms(self) -> np.ndarray:
+        return mjcf.geom_positions(self.model, list(range(self.model.ngeom)))
 
     def set_state(
         self, qpos: np.ndarray, qvel: np.ndarray | None = None, ids: np.ndarray | None = None
@@ -156,18 +163,14 @@ class EnvironmentPlant:
         Raises:
             BadInput: a wrong shape or a value that is not finite.
         """
-        rows = self._rows(ids)
-        qvel = np.zeros((len(rows), self.model.nv)) if qvel is None else qvel
+        rows, nq, nv = self._rows(ids), len(self.spec.qpos), len(self.spec.qvel)
+        qvel = np.zeros((len(rows), nv)) if qvel is None else qvel
         self._leave(rows)
         self._state[rows] = self.spec.state
-        for name, columns, values in (
-            ("qpos", self.spec.qpos, qpos),
-            ("qvel", self.spec.qvel, qvel),
-        ):
-            self._state[np.ix_(rows, columns)] = checked(name, values, len(columns), rows)
-        self._starts[rows] = self._state[rows]
+        self._state[np.ix_(rows, self.spec.qpos)] = checked("qpos", qpos, nq, rows)
+        self._state[np.ix_(rows, self.spec.qvel)] = checked("qvel", qvel, nv, rows)
         self._unstable[rows], self._open[rows] = False, True
-        seen, depths = self._pool.rest(self._starts[rows])
+        seen, depths = self._pool.spread("rest", self._state[rows])
         blocked = depths > self.spec.depth
         outcome = np.where(blocked, Outcome.CRASHED, Outcome.RUNNING)
         nothing = np.zeros((len(rows), 2))
@@ -189,12 +192,12 @@ class EnvironmentPlant:
         if not len(rows):
             return
         if self._written:
-            states, seen, reports = self._pool.branch(self._state[rows], u)
+            states, seen, reports = self._pool.spread("branch", self._state[rows], u)
         else:
-            if self.spec.wrapped and (unseen := rows[self._open[rows]]).size:
-                self._sense(unseen, np.zeros((len(unseen), self.spec.dimension)))
+            if self.spec.wrapped:
+                self._sense(rows[self._open[rows]])
             self._begin(rows)
-            states, seen, reports = self._pool.runs("act", self._number, self._processes, rows, u)
+            states, seen, reports = self._ask("act", rows, u)
         self._open[rows] = True
         finite = np.isfinite(states).all(axis=1) & np.isfinite(seen).all(axis=1)
         some = rows[finite]
@@ -220,7 +223,7 @@ class EnvironmentPlant:
 
     def _judge(self, rows: np.ndarray, reports: np.ndarray) -> None:
         """Notes what the environment reported of runs, and lets go of those that are over."""
-        success, outcome = self.spec.judged(reports)
+        success, outcome = self.spec.criterion.judged(reports)
         self._truth[rows, -3:] = np.column_stack([reports[:, 0], success, outcome])
         self._leave(rows[outcome != Outcome.RUNNING])
 
@@ -228,7 +231,7 @@ class EnvironmentPlant:
         self._open[rows] = False
         if len(rows := rows[self._plays[rows]]):
             self._plays[rows] = False
-            self._pool.runs("leave", self._number, self._processes, rows)
+            self._ask("leave", rows)
 
     def _rows(self, ids: np.ndarray | None) -> np.ndarray:
         return np.arange(self.n) if ids is None else np.asarray(ids)

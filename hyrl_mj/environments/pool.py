@@ -1,7 +1,8 @@
 """Instances of an environment in processes, one on each core, which play the episodes of many runs.
 
 Each process is a fork of this one. What an episode does depends on its start, inputs and noise alone, so
-results do not depend on the number of processes.
+results do not depend on the number of processes. The real environment is the judge: a new one, which is only
+put to the same starts and stepped, has to end alike.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import warnings
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from threading import Lock
 from typing import Any
@@ -22,9 +24,9 @@ import numpy as np
 
 from hyrl_mj import cores
 from hyrl_mj.environments import fingerprint as written
-from hyrl_mj.environments.instance import Instance, Recipe, Worn
-from hyrl_mj.environments.judge import Played, Real
-from hyrl_mj.environments.opening import kept_generators
+from hyrl_mj.environments.instance import Instance, Worn, kept_generators
+from hyrl_mj.environments.observations import flat
+from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.errors import BadInput, HyrlError, brief
 
 # Fewer episodes than this for each process are played by one.
@@ -34,56 +36,71 @@ AWAKE = 0.002
 Arrays = tuple[np.ndarray, ...]
 
 
+@dataclass(frozen=True)
+class Played:
+    """Samples of one run.
+
+    Attributes:
+        start: MuJoCo's state (S,) in which it begins.
+        inputs: (k, m).
+        path: (k + 1, d) chart points, before and after each sample.
+        observations: (k + 1, o), or none where noise was on them.
+        rewards: (k, 1) of the samples, or none.
+    """
+
+    start: np.ndarray
+    inputs: np.ndarray
+    path: np.ndarray
+    observations: np.ndarray | None = None
+    rewards: np.ndarray | None = None
+
+
 class Stage:
     """The instances of one process, and the episodes that they play.
 
     Args:
-        recipe: how instances are made.
+        spec: what is known of the environment.
     """
 
-    def __init__(self, recipe: Recipe):
-        self.recipe = recipe
-        self._playing: dict[tuple[int, int], Instance] = {}  # by plant and row
+    def __init__(self, spec: EnvironmentSpec):
+        self.spec = spec
+        self._playing: dict[int, Instance] = {}  # by the number of the run
         self._free: list[Instance] = []
+        self._judges: list[Instance] = []  # which play nothing but what they judge
         self._resting: Instance | None = None
-        self._real = Real(recipe)
-        self._shared: written.Fingerprint | None = (
-            None  # what a new instance shares with all others
-        )
+        self._shared: written.Fingerprint | None = None  # by a new instance with all others
 
-    def begin(self, plant: int, rows: np.ndarray, starts: np.ndarray) -> Arrays:
-        """Begins episodes at MuJoCo's states (k, S) and gives each row of a plant an instance."""
-        with kept_generators():  # once for all of them
-            for row, start in zip(rows.tolist(), starts, strict=True):
-                self._playing[plant, row] = self._begun(start)
+    def begin(self, runs: np.ndarray, starts: np.ndarray) -> Arrays:
+        """Gives runs (k,) an instance each, and begins their episodes at MuJoCo's states (k, S)."""
+        for run, start in zip(runs.tolist(), starts, strict=True):
+            instance = self._renewed(self._free)
+            instance.begin(start)
+            self._playing[run] = instance
         return ()
 
-    def act(self, plant: int, rows: np.ndarray, u: np.ndarray) -> Arrays:
-        """Steps episodes with inputs (k, m).
+    def act(self, runs: np.ndarray, u: np.ndarray) -> Arrays:
+        """Steps runs (k,) with inputs (k, m).
 
         Returns:
-            MuJoCo's states (k, S), observations (k, o) and reports (k, r), which with wrappers come from
-            `sense`.
+            MuJoCo's states (k, S), observations (k, o) and reports (k, r); the last two come from `sense`
+            where wrappers lie around the environment.
         """
-        return self._acted([self._playing[plant, row] for row in rows.tolist()], u)
+        return self._acted([self._playing[run] for run in runs.tolist()], u)
 
-    def sense(self, plant: int, rows: np.ndarray, noise: np.ndarray) -> Arrays:
-        """Gives episodes the noise (k, d) of a sample.
+    def sense(self, runs: np.ndarray, noise: np.ndarray) -> Arrays:
+        """Gives runs (k,) the noise (k, d) of a sample; returns observations (k, o) and reports (k, r)."""
+        instances = [self._playing[run] for run in runs.tolist()]
+        for instance, of_run in zip(instances, noise, strict=True):
+            instance.sense(of_run)
+        return np.array([i.observation for i in instances]), np.array([i.report for i in instances])
 
-        Returns:
-            Observations (k, o), and with wrappers reports (k, r).
-        """
-        instances = [self._playing[plant, row] for row in rows.tolist()]
-        reports = [i.sense(n) for i, n in zip(instances, noise, strict=True)]
-        return np.array([instance.observation for instance in instances]), np.array(reports)
-
-    def leave(self, plant: int, rows: np.ndarray) -> Arrays:
-        """Lets the instances of episodes play others.
+    def leave(self, runs: np.ndarray) -> Arrays:
+        """Lets the instances of runs (k,) play others.
 
         Raises:
             BadInput: random numbers were drawn in one of them.
         """
-        instances = [self._playing.pop((plant, row)) for row in rows.tolist()]
+        instances = [self._playing.pop(run) for run in runs.tolist()]
         self._free += instances
         try:
             for instance in instances:
@@ -93,20 +110,17 @@ class Stage:
                 instance.quit()
         return ()
 
-    def rest(self, rows: np.ndarray, starts: np.ndarray) -> Arrays:
+    def rest(self, starts: np.ndarray) -> Arrays:
         """Returns what episodes that begin in states (k, S) observe first (k, o), and depths (k,) [m]."""
         seen, depths = [], []
         for start in starts:
-            try:
-                self._resting = self._resting or self._new()
-                seen.append(self._resting.rested(start))
-            except Worn:
+            if self._resting is None or self.spec.anew:
                 self._resting = self._new()
-                seen.append(self._resting.rested(start))
+            seen.append(self._resting.rested(start))
             depths.append(self._resting.depth())
         return np.array(seen), np.array(depths)
 
-    def branch(self, rows: np.ndarray, states: np.ndarray, u: np.ndarray) -> Arrays:
+    def branch(self, states: np.ndarray, u: np.ndarray) -> Arrays:
         """Steps an environment without memory from states (k, S), written directly, with inputs u (k, m).
 
         Returns what `act` returns.
@@ -114,21 +128,24 @@ class Stage:
         Raises:
             BadInput: it remembers something after all.
         """
-        instance = self._begun(states[0])
+        instance = self._renewed(self._free)
+        instance.begin(states[0])
         before = written.fingerprint(instance.env)
         results = self._acted([instance] * len(u), u, states)
         if changed := written.differing(written.fingerprint(instance.env), before):
             raise BadInput(
-                f"{self.recipe.source.name} remembers something in {changed[0]}, as no sampled run showed; "
-                "without a memory that is always there it cannot be tabulated"
+                f"{instance.name} remembers something in {changed[0]}, as no sampled run showed; without a "
+                "memory that is always there it cannot be tabulated"
             )
         self._free.append(instance)
         return results
 
-    def check(self, rows: np.ndarray, runs: np.ndarray) -> Arrays:
+    def check(self, runs: np.ndarray) -> Arrays:
         """Plays runs (k,) of `Played` in new environments; raises `BadInput` if these go another way."""
         for run in runs:
-            self._real.check(run)
+            real = self._renewed(self._judges)
+            judge(run, real)
+            self._judges.append(real)
         return ()
 
     def _acted(
@@ -142,110 +159,129 @@ class Stage:
             for i, (instance, inputs) in enumerate(zip(instances, u, strict=True)):
                 if begun is not None:
                     instance.physics.write(begun[i])
-                reports.append(instance.act(inputs))
+                instance.act(inputs)
                 instance.physics.read(states[i])
                 seen[i] = instance.observation
+                reports.append(instance.report)
         return states, seen, np.array(reports, dtype=float)
 
     # ---- instances
 
-    def _begun(self, start: np.ndarray) -> Instance:
-        """Returns an instance that begins at a state (S,); a new one takes the place of those worn."""
+    def _renewed(self, spare: list[Instance]) -> Instance:
+        """Returns an instance that can begin an episode: a spare one, or a new one if these are worn."""
         while True:
-            instance = self._free.pop() if self._free else self._new()
+            instance = spare.pop() if spare else self._new()
             try:
-                instance.begin(start)
+                instance.renew()
                 return instance
             except Worn as worn:
-                instance.quit()
                 if written.is_shared(str(worn)):
-                    raise instance.is_shared(str(worn)) from None
+                    raise instance.sharing(str(worn)) from None
 
     def _new(self) -> Instance:
-        instance = Instance(self.recipe)
+        instance = Instance(self.spec)
         shared = written.shared(instance.env)
         self._shared = self._shared or shared
         if changed := written.differing(shared, self._shared):
-            raise instance.is_shared(changed[0])
+            raise instance.sharing(changed[0])
         return instance
+
+
+def judge(run: Played, real: Instance) -> None:
+    """Raises `BadInput` if a run went otherwise than in an environment that its user would make.
+
+    That is put to the start and stepped, past all that lets episodes be played side by side. There is no
+    tolerance: the same code computes the same from the same numbers.
+    """
+    spec, space = real.spec, real.env.observation_space
+    observations, path, rewards = [real.put(run.start)], [run.path[0]], []
+    for u in run.inputs:
+        observation, reward, *_ = real.env.step(real.action(u))
+        observations.append(flat(observation, space))
+        path.append(spec.z(real.physics.read()[None])[0])
+        rewards.append([float(reward)])
+    _compare(real.name, "observation", run.observations, observations)
+    _compare(real.name, "the chart's coordinate", run.path, path)
+    _compare(real.name, "reward", run.rewards, np.reshape(rewards, (-1, 1)))
+
+
+def _compare(name: str, what: str, ours: np.ndarray | None, real: Any) -> None:
+    if ours is None or np.array_equal(ours, real, equal_nan=True):
+        return
+    same = (ours == real) | (np.isnan(ours) & np.isnan(real))
+    k, i = np.argwhere(~same)[0]
+    raise BadInput(
+        f"{name} goes another way than a new one from the same start with the same inputs: {what}[{i}] is "
+        f"{ours[k][i]:.9g} after {k} sample(s), and {real[k][i]:.9g} in the new one; it depends on other "
+        "episodes, on time, on chance, or on what it observes"
+    )
 
 
 class Pool:
     """Plays episodes of an environment on all cores.
 
     Args:
-        recipe: how instances are made.
+        spec: what is known of the environment.
     """
 
-    def __init__(self, recipe: Recipe):
-        self.recipe = recipe
-        self._stage, self._owner = Stage(recipe), os.getpid()
+    def __init__(self, spec: EnvironmentSpec):
+        self.spec = spec
+        self._stage, self._owner = Stage(spec), os.getpid()
         self._hands: list[Connection] = []
         self._lock = Lock()  # a game attacks several controllers in threads
-        # Plants that nobody has any more: their number, their processes, and which rows play (n,).
-        self.left: deque[tuple[int, int, np.ndarray]] = deque()
+        # Runs of plants that nobody has any more: places (n,), numbers (n,), and which are played (n,) bool.
+        self.left: deque[tuple[np.ndarray, np.ndarray, np.ndarray]] = deque()
 
-    def runs(
-        self, what: str, plant: int, processes: int, rows: np.ndarray, *values: np.ndarray
-    ) -> Arrays:
-        """Does what `Stage.begin`, `act`, `sense` or `leave` do, each row in the same process ever again."""
-        while what != "leave" and (gone := self._gone()):
-            self.runs("leave", *gone)
-        return self._spread(what, (plant,), rows % processes, rows, *values)
+    def spread(self, what: str, *values: np.ndarray) -> Arrays:
+        """Has all processes do something with values (k, ...): "rest", "branch" or "check"; see `Stage`."""
+        return self.ask(what, self.places(len(values[0])), *values)
 
-    def _gone(self) -> tuple[int, int, np.ndarray] | None:
-        """Takes a plant that nobody has any more: its number, its processes, and the rows that play (k,)."""
-        try:  # another thread may take the last one
-            number, processes, plays = self.left.popleft()
-        except IndexError:
-            return None
-        return number, processes, np.flatnonzero(plays)
+    def places(self, n: int) -> np.ndarray:
+        """Returns the processes (n,) over which so many runs are spread, the number of this one being 0."""
+        count = min(cores.count(), max(n // FEWEST, 1))
+        forks = "fork" in multiprocessing.get_all_start_methods()
+        if not forks or multiprocessing.current_process().daemon:
+            count = 1
+        return np.arange(n) % count
 
-    def rest(self, starts: np.ndarray) -> Arrays:
-        """Does what `Stage.rest` does."""
-        return self._any("rest", starts)
+    def ask(self, what: str, places: np.ndarray, *values: np.ndarray) -> Arrays:
+        """Has each process do its rows of values (k, ...), by a method of `Stage`; joins the answers.
 
-    def branch(self, states: np.ndarray, u: np.ndarray) -> Arrays:
-        """Does what `Stage.branch` does."""
-        return self._any("branch", states, u)
-
-    def check(self, runs: Sequence[Played]) -> None:
-        """Does what `Stage.check` does."""
-        array = np.empty(len(runs), dtype=object)
-        array[:] = runs
-        self._any("check", array)
-
-    def _any(self, what: str, *values: np.ndarray) -> Arrays:
-        rows = np.arange(len(values[0]))
-        return self._spread(what, (), rows % self.processes(len(rows)), rows, *values)
-
-    def _spread(
-        self, what: str, first: tuple[Any, ...], places: np.ndarray, *values: np.ndarray
-    ) -> Arrays:
-        """Does something with rows of values, each in the process of `places` (k,), and joins the answers."""
+        Args:
+            what: the name of the method.
+            places: (k,) the process of each row; a run that is played stays in its process.
+            values: the arguments.
+        """
         with self._lock:
-            self._open(int(places.max(initial=0)) + 1)
-            parts = {int(i): np.flatnonzero(places == i) for i in np.unique(places)}
-            jobs = {i: (what, (*first, *(v[rows] for v in values))) for i, rows in parts.items()}
-            answers = self._answers(jobs)
+            while self.left:
+                of_plant, runs, played = self.left.popleft()
+                self._spread("leave", of_plant[played], runs[played])
+            return self._spread(what, places, *values)
+
+    def _spread(self, what: str, places: np.ndarray, *values: np.ndarray) -> Arrays:
+        self._open(int(places.max(initial=0)) + 1)
+        rows_of = {int(i): np.flatnonzero(places == i) for i in np.unique(places)}
+        answers = self._answers(
+            what, {i: [value[rows] for value in values] for i, rows in rows_of.items()}
+        )
         joined = []
         for column in zip(*answers.values(), strict=True):
             whole = np.empty((len(places), *column[0].shape[1:]))
-            for rows, part in zip(parts.values(), column, strict=True):
+            for rows, part in zip(rows_of.values(), column, strict=True):
                 whole[rows] = part
             joined.append(whole)
         return tuple(joined)
 
-    def _answers(self, jobs: dict[int, tuple[str, Any]]) -> dict[int, Any]:
-        """Returns the answer of each process: that of number 0 is this one."""
-        for i, job in jobs.items():
+    def _answers(self, what: str, jobs: dict[int, list[np.ndarray]]) -> dict[int, Any]:
+        """Returns the answer of each process."""
+        for i in jobs:
             if i:
-                self._hands[i - 1].send(job)
-        answers: dict[int, Any] = {}
+                self._hands[i - 1].send((what, jobs[i]))
+        answers: dict[int, Any] = dict.fromkeys(jobs)
         try:
             if 0 in jobs:
-                what, arguments = jobs[0]
-                answers[0] = getattr(self._stage, what)(*arguments)
+                with kept_generators():
+                    answers[0] = getattr(self._stage, what)(*jobs[0])
         finally:  # what was asked for is always taken, or it would be taken for another answer
             answers |= {i: _answer(self._hands[i - 1]) for i in jobs if i}
         for answer in answers.values():
@@ -253,22 +289,15 @@ class Pool:
                 raise answer
         return answers
 
-    def processes(self, runs: int) -> int:
-        """Returns over how many processes so many runs are spread, this one included."""
-        forks = "fork" in multiprocessing.get_all_start_methods()
-        if not forks or multiprocessing.current_process().daemon:
-            return 1
-        return min(cores.count(), max(runs // FEWEST, 1))
-
     def _open(self, count: int) -> None:
         """Makes the processes that are missing."""
         if self._owner != os.getpid():
             # Instances and processes of a process that this one was forked from are not ours.
-            self._stage, self._owner, self._hands = Stage(self.recipe), os.getpid(), []
+            self._stage, self._owner, self._hands = Stage(self.spec), os.getpid(), []
         while len(self._hands) < count - 1:
             context = multiprocessing.get_context("fork")
             ours, theirs = context.Pipe()
-            arguments = theirs, self.recipe, [*self._hands, ours]
+            arguments = theirs, self.spec, [*self._hands, ours]
             worker = context.Process(target=_serve, args=arguments, daemon=True)
             with warnings.catch_warnings():
                 # Python 3.12 warns of threads: those of torch and MuJoCo take no part in the children.
@@ -276,9 +305,6 @@ class Pool:
                 worker.start()
             theirs.close()
             self._hands.append(ours)
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Pool:
-        return self
 
 
 def _received(hand: Connection) -> Any:
@@ -301,12 +327,12 @@ def _answer(hand: Connection) -> Any:
         )
 
 
-def _serve(work: Connection, recipe: Recipe, others: Sequence[Connection]) -> None:
+def _serve(work: Connection, spec: EnvironmentSpec, others: Sequence[Connection]) -> None:
     """Answers what is asked through a pipe, until the other end is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     for other in others:
         other.close()
-    stage = Stage(recipe)
+    stage = Stage(spec)
     with suppress(EOFError, BrokenPipeError):
         while True:
             what, arguments = _received(work)
@@ -315,5 +341,5 @@ def _serve(work: Connection, recipe: Recipe, others: Sequence[Connection]) -> No
             except HyrlError as error:
                 answer = error
             except Exception as error:
-                answer = BadInput(f"{recipe.source.name} cannot be stepped: {brief(error)}")
+                answer = BadInput(f"{spec.name} cannot be stepped: {brief(error)}")
             work.send(answer)

@@ -4,19 +4,54 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 
 from hyrl_mj.chart import Chart
-from hyrl_mj.environments.coordinates import Coordinate
-from hyrl_mj.environments.expressions import Expression
-from hyrl_mj.environments.instance import Recipe
+from hyrl_mj.environments.expressions import Expression, Path
+from hyrl_mj.environments.opening import Description
 from hyrl_mj.errors import BadInput
 from hyrl_mj.tasks import Outcome
 
 TERMINATED = "terminated"
 FORMS = '"terminated and reward >= 1", \'info["solved"]\' or "distance(fingertip, target) <= 0.05"'
+# What derived quantities are, as what is observed after a step shows them: as at the end of the step; as a
+# step of the physics before; or neither.
+NOW, EARLIER, UNKNOWN = "now", "earlier", "unknown"
+_none = partial(np.zeros, 0)  # of what is not known yet
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """A coordinate of a chart.
+
+    Attributes:
+        name: in figures and messages.
+        kind: "qpos" or "qvel".
+        index: of the position or the velocity.
+        offset: what the coordinate is greater by.
+        joint: id of the joint.
+        axis: the axis of the world, 0 to 2, along which it moves most; None if it turns.
+    """
+
+    name: str
+    kind: str
+    index: int
+    offset: float
+    joint: int
+    axis: int | None
+
+    @property
+    def unit(self) -> str:
+        """The unit: "m", "rad", "m/s" or "rad/s"."""
+        return ("rad" if self.axis is None else "m") + "/s" * (self.kind == "qvel")
+
+    def described(self) -> str:
+        """Returns what it stands for: "qpos[0]"."""
+        return f"{self.kind}[{self.index}]"
 
 
 @dataclass(frozen=True)
@@ -27,31 +62,37 @@ class Criterion:
     other one has to hold at the end of the episode.
 
     Attributes:
+        name: of the environment, for messages.
         success: the condition of success.
         failure: the condition of failure; by default the environment ends the episode without success.
+        points: the pairs of names whose distance is needed, each as a kind and an index for both, as
+            `mjcf.point_of` gives them.
     """
 
-    success: Expression
+    name: str = ""
+    success: Expression = field(default_factory=lambda: Expression(""))
     failure: Expression | None = None
+    points: tuple[tuple[tuple[str, int], tuple[str, int]], ...] = ()
 
     @property
     def ends(self) -> bool:
         """Whether a success ends the episode."""
-        return (
-            bool(self.success.keys) or re.search(r"\bterminated\b", self.success.text) is not None
-        )
+        asks_end = re.search(r"\bterminated\b", self.success.text) is not None
+        return bool(self.success.keys) or asks_end
 
-    @property
-    def keys(self) -> tuple[tuple[str | int, ...], ...]:
+    @cached_property
+    def keys(self) -> tuple[Path, ...]:
         """The entries of `info` that it needs."""
-        others = () if self.failure is None else self.failure.keys
-        return tuple(dict.fromkeys((*self.success.keys, *others)))
+        return tuple(dict.fromkeys(key for one in self._conditions for key in one.keys))
 
-    @property
+    @cached_property
     def places(self) -> tuple[tuple[str, str], ...]:
         """The pairs of names whose distance it needs."""
-        others = () if self.failure is None else self.failure.places
-        return tuple(dict.fromkeys((*self.success.places, *others)))
+        return tuple(dict.fromkeys(pair for one in self._conditions for pair in one.places))
+
+    @property
+    def _conditions(self) -> tuple[Expression, ...]:
+        return (self.success,) if self.failure is None else (self.success, self.failure)
 
     def judged(self, report: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns whether reports (k, r) are successes, (k,) bool, and the `Outcome` (k,) of their samples.
@@ -59,20 +100,24 @@ class Criterion:
         Raises:
             BadInput: "terminated" alone is the success, and an episode ended in touch with something.
         """
-        values = self._values(report)
+        names: list[Any] = ["reward", "terminated", "truncated", "touch"]
+        names += [("info", key) for key in self.keys]
+        names += [("distance", *pair) for pair in self.places]
+        values = dict(zip(names, report.T, strict=True))
         success = self.success.holds(values)
         terminated, truncated, touches = (report[:, 1:4] > 0).T
         if self.success.text.strip() == TERMINATED and (touches & terminated).any():
             raise BadInput(
-                'an episode ended where the robot touches what it does not touch elsewhere, and "terminated" '
-                'counts that as a success: say which ends are successes, as "terminated and reward >= 1"'
+                f"{self.name}: an episode ended where the robot touches what it does not touch elsewhere, "
+                'and "terminated" counts that as a success: say which ends are successes, as "terminated '
+                'and reward >= 1"'
             )
         failure = terminated & ~success
         if self.failure is not None:
             failure = self.failure.holds(values)
             if (success & failure).any():
                 raise BadInput(
-                    f"at the same sample it is a success ({self.success.text}) and a failure "
+                    f"{self.name}: at the same sample it is a success ({self.success.text}) and a failure "
                     f"({self.failure.text}): let one of the conditions exclude the other"
                 )
         reached = success & (terminated | truncated | self.ends)
@@ -83,101 +128,109 @@ class Criterion:
         )
         return success, outcome.astype(int)
 
-    def _values(self, report: np.ndarray) -> dict[object, np.ndarray]:
-        named: dict[object, np.ndarray] = {
-            "reward": report[:, 0],
-            "terminated": report[:, 1] > 0,
-            "truncated": report[:, 2] > 0,
-        }
-        entries = [("info", key) for key in self.keys]
-        columns = zip(
-            [*entries, *(("distance", *pair) for pair in self.places)], report[:, 4:].T, strict=True
-        )
-        return {**named, **dict(columns)}
-
 
 @dataclass(frozen=True)
 class EnvironmentSpec:
-    """What is known of an environment; `inspect` finds it.
+    """What is known of an environment; `inspect` finds it, a part after the other.
 
     Attributes:
-        name: of the environment.
-        recipe: how instances are made, and what they report.
-        chart: the coordinates of the decision.
-        coordinates: where they lie in MuJoCo's state.
-        state: MuJoCo's state (S,) from which runs begin, but for the positions of the chart.
-        qpos, qvel: the places (nq,), (nv,) of positions and velocities in a state.
-        columns: o, the number of columns of an observation.
+        description: what the user says of it.
+        qpos, qvel: the places (nq,), (nv,) of positions and velocities in a state of MuJoCo.
+        observation_low, observation_high: limits (o,) of an observation.
         parts: the number of columns of each part of a Dict, in the order of its space; none of a vector.
-        observation_low, observation_high: limits (o,).
-        moves: (o,) bool, the columns of an observation at rest that follow the chart.
-        affine: a matrix (d + 1, o) that gives what is observed at rest at z from (z, 1), if one does.
-        wrapped: whether wrappers lie around the environment.
         low, high: limits (m,) of the inputs.
         inputs: their names.
         levels: number of a discrete action's values; None of continuous ones.
-        criterion: of success and failure.
-        depth: how deep the robot may be inside of something at a start, as it is in sampled runs [m].
-        start_low, start_high: corners (d,) of the box of starts.
+        wrapped: whether wrappers lie around the environment.
+        observer: the name of what computes the observation, of those that `observers` gives.
+        coordinates: of the decision.
         noisy: (d,) share of the noise bound on each coordinate.
-        max_steps: samples of an episode.
+        solid: (ngeom,) bool, the geoms of the robot.
         dt: time of a sample [s].
         worst_reward: the least reward of sampled runs.
-        islands: what can be passed on both sides, by name, each with the id of a geom.
+        depth: how deep the robot may be inside of something at a start, as it is in sampled runs [m].
+        harmless: geoms that the robot has touched without an end of the episode.
         tracked: the name of what goes farthest in sampled runs.
         memoryless: whether MuJoCo's state is all that runs depend on, as far as trials show.
+        criterion: of success and failure.
+        chart: the coordinates with their bounds.
+        state: MuJoCo's state (S,) from which runs begin, but for the positions of the chart.
+        start_low, start_high: corners (d,) of the box of starts.
+        max_steps: samples of an episode.
+        islands: what can be passed on both sides, by name, each with the id of a geom.
+        derived: `NOW`, `EARLIER` or `UNKNOWN`.
+        anew: whether a reset changes what the next one does to a wrapper: each episode takes a new instance.
+        moves: (o,) bool, the columns of an observation at rest that follow the chart.
+        affine: a matrix (d + 1, o) that gives what is observed at rest at z from (z, 1), if one does.
         found: what was filled in, with the reason, by name.
     """
 
-    name: str
-    recipe: Recipe
-    chart: Chart
-    coordinates: tuple[Coordinate, ...]
-    state: np.ndarray
-    qpos: np.ndarray
-    qvel: np.ndarray
-    columns: int
-    parts: Mapping[str, int]
-    observation_low: np.ndarray
-    observation_high: np.ndarray
-    moves: np.ndarray
-    affine: np.ndarray | None
-    wrapped: bool
-    low: np.ndarray
-    high: np.ndarray
-    inputs: tuple[str, ...]
-    levels: int | None
-    criterion: Criterion
-    depth: float
-    start_low: tuple[float, ...]
-    start_high: tuple[float, ...]
-    noisy: tuple[float, ...]
-    max_steps: int
-    dt: float
-    worst_reward: float
-    islands: Mapping[str, int]
-    tracked: str
-    memoryless: bool
-    found: Mapping[str, str]
+    description: Description
+    qpos: np.ndarray = field(default_factory=_none)
+    qvel: np.ndarray = field(default_factory=_none)
+    observation_low: np.ndarray = field(default_factory=_none)
+    observation_high: np.ndarray = field(default_factory=_none)
+    parts: Mapping[str, int] = field(default_factory=dict)
+    low: np.ndarray = field(default_factory=_none)
+    high: np.ndarray = field(default_factory=_none)
+    inputs: tuple[str, ...] = ()
+    levels: int | None = None
+    wrapped: bool = False
+    observer: str = ""
+    coordinates: tuple[Coordinate, ...] = ()
+    noisy: tuple[float, ...] = ()
+    solid: np.ndarray = field(default_factory=_none)
+    dt: float = 0.0
+    worst_reward: float = 0.0
+    depth: float = 0.0
+    harmless: frozenset[int] = frozenset()
+    tracked: str = ""
+    memoryless: bool = False
+    criterion: Criterion = field(default_factory=Criterion)
+    chart: Chart = field(default_factory=lambda: Chart((), (), (), (), ()))
+    state: np.ndarray = field(default_factory=_none)
+    start_low: tuple[float, ...] = ()
+    start_high: tuple[float, ...] = ()
+    max_steps: int = 1
+    islands: Mapping[str, int] = field(default_factory=dict)
+    derived: str = UNKNOWN
+    anew: bool = False
+    moves: np.ndarray = field(default_factory=_none)
+    affine: np.ndarray | None = None
+    found: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """The name of the environment."""
+        return self.description.name
 
     @property
     def dimension(self) -> int:
         """d, the number of the chart's coordinates."""
         return len(self.coordinates)
 
+    @property
+    def columns(self) -> int:
+        """o, the number of columns of an observation."""
+        return len(self.observation_low)
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """Where the coordinates of the chart are in a state of MuJoCo: (d,) int."""
+        kinds = {"qpos": self.qpos, "qvel": self.qvel}
+        return np.array([kinds[c.kind][c.index] for c in self.coordinates], dtype=int)
+
+    @cached_property
+    def offset(self) -> np.ndarray:
+        """What the coordinates of the chart are greater by than these entries of a state: (d,)."""
+        return np.array([c.offset for c in self.coordinates])
+
     def z(self, state: np.ndarray) -> np.ndarray:
         """Returns the chart points (n, d) of MuJoCo's states (n, S)."""
-        return state[:, list(self.recipe.noisy)] + self.recipe.offset
+        return state[:, self.places] + self.offset
 
     def state_at(self, z: np.ndarray) -> np.ndarray:
         """Returns MuJoCo's states (n, S) in which runs begin at chart points (n, d)."""
         states = np.tile(self.state, (len(z), 1))
-        states[:, list(self.recipe.noisy)] = z - self.recipe.offset
+        states[:, self.places] = z - self.offset
         return states
-
-    def judged(self, report: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns what `Criterion.judged` does."""
-        try:
-            return self.criterion.judged(report)
-        except BadInput as error:
-            raise BadInput(f"{self.name}: {error}") from None

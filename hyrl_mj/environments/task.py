@@ -10,16 +10,16 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from gymnasium import spaces
 
 from hyrl_mj import mjcf
 from hyrl_mj.environments.fingerprint import of_model
 from hyrl_mj.environments.instance import Instance
-from hyrl_mj.environments.judge import Played
+from hyrl_mj.environments.observations import parts_of
 from hyrl_mj.environments.opening import code_of
 from hyrl_mj.environments.plant import EnvironmentPlant
-from hyrl_mj.environments.pool import Pool
+from hyrl_mj.environments.pool import Played, Pool
 from hyrl_mj.environments.specification import EnvironmentSpec
+from hyrl_mj.environments.trials import goes_on
 from hyrl_mj.errors import BadInput
 from hyrl_mj.tasks import ANY, Learning, Outcome, Scene, Task, get_task
 
@@ -27,9 +27,6 @@ from hyrl_mj.tasks import ANY, Learning, Outcome, Scene, Task, get_task
 SAMPLES_OF_NODES = 800_000
 # Times that starts are drawn again because they are inside of walls.
 DRAWS = 200
-# Runs that are compared with others at the same chart points, for so many steps, under inputs that are held
-# for some of them, and how much they may differ.
-COMPARED, STEPS_COMPARED, HELD, SAME = 48, 60, 12, 1e-9
 # A joint turns in the plane of the floor if its axis is as upright as this, as a cosine.
 UPRIGHT = 0.9
 # How much a free camera shows, as a share of the extent of a model.
@@ -61,17 +58,17 @@ class EnvironmentTask(Task):
     learning = Learning()
 
     def __init__(self, specification: EnvironmentSpec, pool: Pool, instance: Instance, spec: str):
-        source = specification.recipe.source
         self.specification, self._pool, self._instance = specification, pool, instance
-        self.name, self.spec = source.name, spec
-        self.env_id = source.make if isinstance(source.make, str) else source.name
+        # What a task and a specification call alike.
+        for name in (
+            "name", "chart", "inputs", "start_low", "start_high", "max_steps", "dt", "worst_reward",
+        ):  # fmt: skip
+            setattr(self, name, getattr(specification, name))
+        env = specification.description.env
+        self.spec, self.env_id = spec, env if isinstance(env, str) else self.name
         self.found = dict(specification.found)
-        self.description = f"the environment {source.name}"
-        self.chart, self.inputs = specification.chart, specification.inputs
+        self.description = f"the environment {self.name}"
         self.input_limits = specification.low, specification.high
-        self.start_low, self.start_high = specification.start_low, specification.start_high
-        self.max_steps, self.dt = specification.max_steps, specification.dt
-        self.worst_reward = specification.worst_reward
         self.arrival_ends = specification.criterion.ends
         self.noisy = (*specification.noisy, *([0.0] * (specification.columns + 3)))
         self.observation_parts = specification.parts
@@ -156,8 +153,7 @@ class EnvironmentTask(Task):
 
     @property
     def observation_dtype(self) -> str:  # type: ignore[override]
-        space: Any = self._instance.env.observation_space
-        parts = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
+        parts = parts_of(self._instance.env.observation_space).values()
         types = {str(part.dtype) for part in parts}
         return types.pop() if len(types) == 1 else ""
 
@@ -182,51 +178,39 @@ class EnvironmentTask(Task):
         whole = sorted(c.index for c in spec.coordinates if c.kind == "qpos")
         if whole != list(range(self.model.nq)) or not (self.arrival_ends and self.tabulated):
             return False
-        rng = np.random.default_rng(0)
-        plant, fresh = self.plant(COMPARED), self.tabulating(COMPARED)
-        plant.set_state(*self.state(self.starts(COMPARED, rng)))
-        for k in range(STEPS_COMPARED):
-            if k % HELD == 0:
-                u = rng.uniform(*self.input_limits, (COMPARED, len(self.inputs)))
-            before = plant.measurement
-            goes_on = np.flatnonzero(self.ending(before) == Outcome.RUNNING)
-            fresh.set_state(*self.state(self.z(before)))
-            plant.step(u[goes_on], goes_on)
-            fresh.step(u[goes_on], goes_on)
-            a, b = (copies.measurement[goes_on] for copies in (plant, fresh))
-            if not np.allclose(a, b, rtol=0, atol=SAME, equal_nan=True):
-                return False
-        return True
+        return goes_on(self._pool, spec, of_chart=True)
 
     def verify(self, z0: np.ndarray, u: np.ndarray, path: np.ndarray, lengths: np.ndarray) -> None:
         starts = self.specification.state_at(z0)
         ends = [(i, k) for i, k in enumerate(lengths) if np.isfinite(u[:k, i]).all()]
         inputs = np.clip(u, *self.input_limits)
-        self._pool.check([Played(starts[i], inputs[:k, i], path[: k + 1, i]) for i, k in ends])
+        played = [Played(starts[i], inputs[:k, i], path[: k + 1, i]) for i, k in ends]
+        self._pool.spread("check", np.array(played, dtype=object))
 
     def at(self, z: np.ndarray) -> np.ndarray:
         rest = np.tile([0.0, 0.0, float(Outcome.RUNNING)], (len(z), 1))
-        return np.column_stack([z, self._pool.rest(self.specification.state_at(z))[0], rest])
+        return np.column_stack(
+            [z, self._pool.spread("rest", self.specification.state_at(z))[0], rest]
+        )
 
     def _at_rest(self, z: np.ndarray) -> np.ndarray:
         """Returns what a robot at rest at chart points (n, d) observes (n, o)."""
         if (affine := self.specification.affine) is not None:
             return np.asarray(np.column_stack([z, np.ones(len(z))]) @ affine)
-        return self._pool.rest(self.specification.state_at(z))[0]
+        return self._pool.spread("rest", self.specification.state_at(z))[0]
 
     def with_z(self, measured: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Returns measurements (n, p) with what a robot at rest at chart points z (n, d) would observe.
 
         The columns of the observation that do not follow the chart at rest stay as they are.
         """
-        d, o = self.chart.dimension, self.specification.columns
+        d = self.chart.dimension
         changed, found = np.flatnonzero((measured[:, :d] != z).any(axis=1)), measured.copy()
         if len(changed):
             seen = self._at_rest(z[changed])
             moves = d + np.flatnonzero(self.specification.moves)
             found[changed[:, None], moves] = seen[:, self.specification.moves]
             found[changed, :d] = z[changed]
-        assert found.shape[1] == d + o + 3
         return found
 
     def perturbed(self, measured: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -265,7 +249,7 @@ class EnvironmentTask(Task):
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         z = super().starts(n, rng)
         for _ in range(DRAWS):
-            _, depths = self._pool.rest(self.specification.state_at(z))
+            _, depths = self._pool.spread("rest", self.specification.state_at(z))
             inside = np.flatnonzero(depths > self.specification.depth)
             if not len(inside):
                 return z

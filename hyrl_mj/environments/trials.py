@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from hyrl_mj.environments.fingerprint import differing, fingerprint
-from hyrl_mj.environments.instance import EARLIER, NOW, UNKNOWN, Instance, Recipe
-from hyrl_mj.environments.judge import Played
+from hyrl_mj.environments.instance import Instance
 from hyrl_mj.environments.observations import flat, observers
 from hyrl_mj.environments.plant import EnvironmentPlant
-from hyrl_mj.environments.pool import Pool
-from hyrl_mj.environments.specification import EnvironmentSpec
+from hyrl_mj.environments.pool import Played, Pool
+from hyrl_mj.environments.specification import EARLIER, NOW, UNKNOWN, EnvironmentSpec
 from hyrl_mj.errors import BadInput
 
 # Episodes and samples of a trial, and for how many samples inputs are held.
@@ -24,10 +23,12 @@ ROUNDING = 1e-9
 NEAR = 0.5
 # By how much coordinates are moved to see what follows them, as a share of the side of the chart.
 MOVED = 1e-3
+# Runs that show whether the chart is the state, and how much they may differ from others.
+OF_CHART, SAME = 48, 1e-9
 
 
 def observer_of(instance: Instance) -> str:
-    """Returns the name of what computes what an environment observes, "" if nothing is found to."""
+    """Returns the name of what computes what an environment observes; raises `BadInput` if nothing does."""
     rng, space = np.random.default_rng(0), instance.inner.observation_space
     left = observers(instance.env)
 
@@ -37,11 +38,16 @@ def observer_of(instance: Instance) -> str:
 
     for seed in range(EPISODES):
         instance.reset(seed)
-        if not instance.source.pinned:  # else it was pinned after that observation
+        if not instance.spec.description.pinned:  # else it was pinned after that observation
             left = agreeing()
         for _ in instance.wander(rng, SAMPLES, HELD):
             left = agreeing()
-    return next(iter(left), "")
+    if not left:
+        raise BadInput(
+            f"{instance.name} has no method that computes what it observes in its present state, so nothing "
+            "is known of what it would observe under noise: give it one named _get_obs, without arguments"
+        )
+    return next(iter(left))
 
 
 def _agrees(get: Any, seen: np.ndarray, space: Any) -> bool:
@@ -51,42 +57,21 @@ def _agrees(get: Any, seen: np.ndarray, space: Any) -> bool:
         return False
 
 
-def tried(instance: Instance, spec: EnvironmentSpec) -> tuple[EnvironmentSpec, Pool]:
-    """Returns what is known of an environment after the trials, and what plays its episodes.
-
-    Raises:
-        BadInput: the environment does not observe what it is told, or goes otherwise than a new one.
-    """
-    step = MOVED * spec.chart.sides * np.array([s > 0 for s in spec.noisy])
-    _check_observer(instance, step)
-    found, (derived, columns) = dict(spec.found), _derived(instance, step)
-    if columns:
-        when = {
-            EARLIER: "is that of a physics step before the end of a step, with noise, too",
-            UNKNOWN: "is from shortly before the end of a step; noise adds what it changes at the end",
-        }
-        found["lag"] = f"observation {', '.join(map(str, columns))} {when[derived]}"
-    recipe = replace(spec.recipe, derived=derived)
-    recipe = replace(recipe, anew=spec.wrapped and _changes_by_reset(recipe, spec.state))
-    instance.recipe, pool = recipe, Pool(recipe)
-    spec = replace(spec, recipe=recipe, found=found)
-    moves, affine = _moving(pool, spec)
-    spec = replace(spec, moves=moves, affine=affine)
-    _check_instances(pool, spec)
-    return replace(spec, memoryless=spec.memoryless and _forgets(pool, spec)), pool
-
-
 def _rounds(off: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Returns which differences (o,) are no more than rounding of values (o,)."""
     return np.asarray(off <= ROUNDING * max(float(np.abs(values).max(initial=0.0)), 1.0))
 
 
-def _check_observer(instance: Instance, step: np.ndarray) -> None:
+def check_observer(instance: Instance, step: np.ndarray) -> None:
     """Raises `BadInput` unless what is observed follows the state, as after a reset to that state.
 
     After some steps the state of the reset is written again. What is observed then has to be what the reset
     observed, but for columns that have nothing to do with the place: those that no noise moves, that all
     resets observe alike, and that do not depend on where the run began.
+
+    Args:
+        instance: the environment.
+        step: (d,) by how much the coordinates of the chart are moved to see what follows them.
     """
     rng, name, space = np.random.default_rng(1), instance.name, instance.inner.observation_space
     first, suspects = [], {}
@@ -94,8 +79,9 @@ def _check_observer(instance: Instance, step: np.ndarray) -> None:
         instance.reset(seed)
         state = instance.physics.read()
         instance.physics.write(state)
-        seen = instance.watched() if instance.source.pinned else instance.inner_seen
-        first.append(begun := flat(seen, space))
+        pinned = instance.spec.description.pinned
+        begun = flat(instance.watched() if pinned else instance.inner_seen, space)
+        first.append(begun)
         for _ in instance.wander(rng, SAMPLES, HELD):
             pass
         before = fingerprint(instance.env)
@@ -112,14 +98,14 @@ def _check_observer(instance: Instance, step: np.ndarray) -> None:
                 f"is {begun[column]:.6g} after reset() and differs by {off[column]:.6g} in that state later"
             )
             if moved[column]:
-                _refuse(name, column, suspects[column])
+                raise _stored(name, column, suspects[column])
     for column, why in suspects.items():
         if np.ptp([row[column] for row in first]) > 0 or _depends(instance, column, step):
-            _refuse(name, column, why)
+            raise _stored(name, column, why)
 
 
-def _refuse(name: str, column: int, why: str) -> None:
-    raise BadInput(
+def _stored(name: str, column: int, why: str) -> BadInput:
+    return BadInput(
         f"what {name} observes does not follow its state: observation[{column}] {why}. It is stored by "
         "step(), or computed from what is, so that noise would not reach it: compute it from the state"
     )
@@ -136,24 +122,26 @@ def _depends(instance: Instance, column: int, step: np.ndarray) -> bool:
     return not np.array_equal(ends[0], ends[1], equal_nan=True)
 
 
-def _derived(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
-    """Returns `Recipe.derived`, with the columns of what is observed that are not as at the end of a step.
+def derived_of(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
+    """Returns `derived` of a spec, and the columns of what is observed that are not from the end of a step.
+
+    Args:
+        instance: the environment.
+        step: (d,) by how much the coordinates of the chart are moved to see what follows them.
 
     Raises:
         BadInput: noise on the chart's coordinates moves columns of which it is not known when they are from.
     """
     rng, space = np.random.default_rng(5), instance.inner.observation_space
     off: dict[str, list[np.ndarray]] = {NOW: [], EARLIER: []}
-    step_of_physics, moving, size = [], [], []
+    moving, size = [], []
     for seed in range(EPISODES):
         instance.reset(seed)
         for _ in instance.wander(rng, SAMPLES, HELD):
             seen, state = flat(instance.inner_seen, space), instance.physics.read()
             size.append(np.abs(seen))
             for derived, differences in off.items():
-                with instance.physics.kept():
-                    differences.append(instance.seen_as(derived, state, 0 * step) - seen)
-            step_of_physics.append(np.abs(off[NOW][-1] - off[EARLIER][-1]))
+                differences.append(instance.seen_as(derived, state, 0 * step) - seen)
             moving.append(np.abs(instance.displaced(step)))
     most = {derived: np.abs(differences).max(axis=0) for derived, differences in off.items()}
     differ = {derived: ~_rounds(far, np.array(size)) for derived, far in most.items()}
@@ -162,7 +150,8 @@ def _derived(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
         if not columns.any():
             return derived, lags
     # With the Runge-Kutta method they are from its last stage, which is near the end.
-    far = most[NOW] > NEAR * np.max(step_of_physics, axis=0)
+    step_of_physics = np.abs(np.subtract(off[NOW], off[EARLIER])).max(axis=0)
+    far = most[NOW] > NEAR * step_of_physics
     unknown = differ[NOW] & differ[EARLIER] & far & ~_rounds(np.max(moving, axis=0), np.array(size))
     if unknown.any():
         raise BadInput(
@@ -174,25 +163,25 @@ def _derived(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
     return UNKNOWN, lags
 
 
-def _changes_by_reset(recipe: Recipe, start: np.ndarray) -> bool:
-    """Returns whether a start (S,) is another one after a reset before, as with running statistics."""
+def changes_by_reset(spec: EnvironmentSpec) -> bool:
+    """Returns whether the start of a run is another one after a reset before, as with running statistics."""
     found = []
     for resets in (0, 0, 1):
-        instance = Instance(recipe)
+        instance = Instance(spec)
         for _ in range(resets):
             instance.reset()
-        observation = instance.put(start)
+        observation = instance.put(spec.state)
         found.append((observation, instance.remembered()))
     usual = set(differing(found[0][1], found[1][1]))  # such as names of files
     changed = set(differing(found[0][1], found[2][1])) - usual
     return bool(changed) or not np.array_equal(found[0][0], found[2][0], equal_nan=True)
 
 
-def _moving(pool: Pool, spec: EnvironmentSpec) -> tuple[np.ndarray, np.ndarray | None]:
+def moving(pool: Pool, spec: EnvironmentSpec) -> tuple[np.ndarray, np.ndarray | None]:
     """Returns which columns of an observation at rest follow the chart (o,) bool, and `affine` of a spec."""
     shape = EPISODES * (spec.dimension + 1), spec.dimension
     z = np.random.default_rng(0).uniform(spec.start_low, spec.start_high, shape)
-    seen, _ = pool.rest(spec.state_at(z))
+    seen, _ = pool.spread("rest", spec.state_at(z))
     one = np.column_stack([z, np.ones(len(z))])
     fit = np.linalg.lstsq(one, seen, rcond=None)[0]
     exact = _rounds(np.abs(one @ fit - seen), seen).all()
@@ -202,78 +191,83 @@ def _moving(pool: Pool, spec: EnvironmentSpec) -> tuple[np.ndarray, np.ndarray |
 # ---- runs of several instances
 
 
-def _begun(
-    pool: Pool, spec: EnvironmentSpec, rng: np.random.Generator
-) -> tuple[EnvironmentPlant, np.ndarray]:
-    """Returns runs at starts at random, and these, MuJoCo's states (n, S); as free of walls as some are."""
-    shape = 3 * EPISODES, spec.dimension
-    states = spec.state_at(rng.uniform(spec.start_low, spec.start_high, shape))
-    _, depths = pool.rest(states)
-    states = states[np.argsort(depths > spec.depth, kind="stable")[:EPISODES]]
-    plant = EnvironmentPlant(spec, pool, None, EPISODES)
+def _runs(
+    pool: Pool, spec: EnvironmentSpec, seed: int, n: int = EPISODES
+) -> Iterator[tuple[EnvironmentPlant, np.ndarray]]:
+    """Yields n runs from starts at random, before each sample, with inputs (n, m) at random for it.
+
+    Some starts are drawn more, and of these the ones that are free of walls come first.
+    """
+    rng = np.random.default_rng(seed)
+    states = spec.state_at(rng.uniform(spec.start_low, spec.start_high, (3 * n, spec.dimension)))
+    _, depths = pool.spread("rest", states)
+    states = states[np.argsort(depths > spec.depth, kind="stable")[:n]]
+    plant = EnvironmentPlant(spec, pool, None, n)
     plant.set_state(states[:, spec.qpos], states[:, spec.qvel])
-    return plant, states
+    for k in range(min(SAMPLES, spec.max_steps)):
+        if k % HELD == 0:
+            u = rng.uniform(spec.low, spec.high, (n, len(spec.low)))
+        yield plant, u if spec.levels is None else np.round(u)
 
 
-def _inputs(spec: EnvironmentSpec, rng: np.random.Generator) -> np.ndarray:
-    """Returns inputs (n, m) at random."""
-    u = rng.uniform(spec.low, spec.high, (EPISODES, len(spec.low)))
-    return u if spec.levels is None else np.round(u)
-
-
-def _check_instances(pool: Pool, spec: EnvironmentSpec) -> None:
+def check_instances(pool: Pool, spec: EnvironmentSpec) -> None:
     """Raises `BadInput` unless instances go as new ones after other episodes, with noise and without."""
-    rng, d = np.random.default_rng(3), spec.dimension
-    columns = slice(d, d + spec.columns)
-    for noise in (0.0, 0.0, MOVED):
-        plant, states = _begun(pool, spec, rng)
-        inputs, measured = [], [plant.measurement]
-        for k in range(min(SAMPLES, spec.max_steps)):
-            if k % HELD == 0:
-                u = _inputs(spec, rng)
-            errors = np.zeros_like(measured[0])
-            errors[:, :d] = (
-                noise * rng.uniform(-1, 1, (EPISODES, d)) * spec.chart.sides * spec.noisy
-            )
+    d, o, everyone = spec.dimension, spec.columns, np.arange(EPISODES)
+    for seed, noise in enumerate((0.0, 0.0, MOVED)):
+        rng, inputs, starts, measured = np.random.default_rng(seed), [], None, []
+        for plant, u in _runs(pool, spec, 3 + seed):
+            if starts is None:
+                starts, measured = plant.state, [plant.measurement]
             if noise:
-                everyone = np.arange(EPISODES)
+                errors = np.zeros_like(measured[0])
+                sides = spec.chart.sides * spec.noisy
+                errors[:, :d] = noise * rng.uniform(-1, 1, (EPISODES, d)) * sides
                 plant.observe(plant.truth(everyone), errors, everyone)
             plant.step(u)
             inputs.append(u)
             measured.append(plant.measurement)
-            if (measured[-1][:, -1] != 0).all():
-                break
-        over = np.array(measured)[:, :, -1] != 0
-        ends = np.where(over.any(axis=0), over.argmax(axis=0), len(inputs))
-        pool.check(
-            [
-                Played(
-                    states[i],
-                    np.array(inputs)[:end, i],
-                    np.array(measured)[: end + 1, i, :d],
-                    None if noise else np.array(measured)[: end + 1, i, columns],
-                    np.array(measured)[1 : end + 1, i, columns.stop],
-                )
-                for i, end in enumerate(ends)
-            ]
-        )
+        assert starts is not None
+        u, path = np.array(inputs), np.array(measured)
+        over = path[:, :, -1] != 0
+        ends = np.where(over.any(axis=0), over.argmax(axis=0), len(u))
+        played = [
+            Played(
+                starts[i],
+                u[:end, i],
+                path[: end + 1, i, :d],
+                None if noise else path[: end + 1, i, d : d + o],
+                path[1 : end + 1, i, d + o : d + o + 1],
+            )
+            for i, end in enumerate(ends)
+        ]
+        pool.spread("check", np.array(played, dtype=object))
 
 
-def _forgets(pool: Pool, spec: EnvironmentSpec) -> bool:
-    """Returns whether runs go on from a written state as they did, so that MuJoCo's state is all there is."""
-    rng, columns = np.random.default_rng(4), slice(spec.dimension, spec.dimension + spec.columns)
-    plant, _ = _begun(pool, spec, rng)
-    for _ in range(SAMPLES):
-        before, going = plant.state, np.flatnonzero(plant.measurement[:, -1] == 0)
+def goes_on(pool: Pool, spec: EnvironmentSpec, of_chart: bool = False) -> bool:
+    """Returns whether runs go on from written states as they did, so that these are all there is.
+
+    Args:
+        pool: plays the runs.
+        spec: what is known of the environment.
+        of_chart: whether the states at rest at the chart points of the runs are written, so that the chart is
+            all there is; by default MuJoCo's states of the runs.
+    """
+    for plant, u in _runs(pool, spec, 4, OF_CHART if of_chart else EPISODES):
+        going = np.flatnonzero(plant.measurement[:, -1] == 0)
+        before = plant.state[going]
+        plant.step(u[going], going)
         if not len(going):
-            break
-        u = _inputs(spec, rng)[going]
-        plant.step(u, going)
+            return True
+        written = spec.state_at(spec.z(before)) if of_chart else before
         try:
-            after, seen, _ = pool.branch(before[going], u)
+            after, seen, report = pool.spread("branch", written, u[going])
         except BadInput:
             return False
-        same = np.array_equal(seen, plant.measurement[going, columns])
-        if not (same and np.array_equal(after, plant.state[going])):
+        success, outcome = spec.criterion.judged(report)
+        told = np.column_stack([spec.z(after), seen, report[:, 0], success, outcome])
+        if not np.allclose(told, plant.measurement[going], rtol=0, atol=SAME, equal_nan=True):
+            return False
+        exact = np.array_equal(seen, plant.measurement[going, spec.dimension : -3])
+        if not of_chart and not (exact and np.array_equal(after, plant.state[going])):
             return False
     return True

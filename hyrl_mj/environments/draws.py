@@ -1,0 +1,173 @@
+"""What resets draw beside the robot's own state, which has to be pinned, and what the user's pins change."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+
+from hyrl_mj.environments.coordinates import robot_of
+from hyrl_mj.environments.fingerprint import Fingerprint, differing
+from hyrl_mj.environments.instance import Instance
+from hyrl_mj.environments.observations import flat
+from hyrl_mj.errors import BadInput
+
+# Resets that show where episodes start, and those that are compared for all that they draw, with so many
+# samples of runs after them.
+RESETS, COMPARED, SAMPLES = 64, 4, 20
+# Differences of what is observed that are none, as a share of the largest number.
+SAME = 1e-9
+# What `Instance.remembered` calls the state, of which `names_of_state` tells more.
+STATE = "MuJoCo's state"
+
+
+def states_of_resets(instance: Instance) -> np.ndarray:
+    """Returns MuJoCo's states (RESETS, S) that resets lead to."""
+    found = []
+    for seed in range(RESETS):
+        instance.reset(seed)
+        found.append(instance.physics.read())
+    return np.array(found)
+
+
+def check_draws(instance: Instance, states: np.ndarray) -> str:
+    """Returns what resets draw and how it is pinned, to be said to the user; "" if they draw nothing.
+
+    Args:
+        instance: the environment.
+        states: MuJoCo's states (n, S) after resets.
+
+    Raises:
+        BadInput: nothing pins what they draw, or what pins it changes nothing, or contradicts something else.
+    """
+    description, name = instance.spec.description, instance.name
+    options, pinned, seed = description.reset, description.pinned, description.seed
+    names = _drawn(instance, states)
+    changed = _changed_by_user(instance) if options or pinned else set()
+    if options and not changed:
+        draws = f", which draws {', '.join(names)}" if names else ""
+        raise BadInput(
+            f"the options of reset {dict(options)} change nothing in {name}{draws}: name the options as its "
+            "reset does"
+        )
+    left = [n for n in names if n not in changed and n.partition("[")[0] not in changed]
+    if left and seed is None:
+        how = 'with options of reset as {"reset": {"goal_cell": [6, 6]}}'
+        if positions := {n: 0.1 for n in left if n.startswith(("qpos[", "qvel[", "mocap_pos["))}:
+            how = f"with values as {json.dumps({'pinned': dict(list(positions.items())[:4])})}"
+        raise BadInput(
+            f"each reset of {name} draws {', '.join(left[:8])}, and what is to be done depends on it: pin it"
+            f', {how}, or as the reset with a seed draws it as {{"seed": 0}}'
+        )
+    _check_pins(instance)
+    if not names:
+        return ""
+    by_options = f" and {dict(options)}" if options else ""
+    by_pins = f", with {dict(pinned)}" if pinned else ""
+    return (
+        f"{', '.join(names[:8])} as the reset with seed {seed or 0}{by_options} draws it{by_pins}"
+    )
+
+
+def _drawn(instance: Instance, states: np.ndarray) -> list[str]:
+    """Returns the names of what resets draw, beside the robot's own state, and what comes next depends on."""
+    model, columns = instance.model, instance.physics.columns
+    robot = robot_of(model, instance.spec.coordinates)
+    varies = np.ptp(states, axis=0) > 0
+    varies[columns["warmstart"]] = False  # it says nothing of where a run goes
+    body_of_qpos = np.repeat(model.jnt_bodyid, np.diff(np.append(model.jnt_qposadr, model.nq)))
+    for kind, bodies in (("qpos", body_of_qpos), ("qvel", model.dof_bodyid)):
+        varies[columns[kind][robot[bodies]]] = False
+    names = [name for name, v in zip(_names_of_state(instance), varies, strict=True) if v]
+    again = [_begun(instance, states[0], 0)[0] for _ in range(2)]
+    lasting = set(differing(*again))  # what outlasts a reset is not drawn by it
+    begun = [
+        _begun(Instance(instance.spec) if lasting else instance, states[0], seed)
+        for seed in range(COMPARED)
+    ]
+    first, told = begun[0]
+    changed = dict.fromkeys(n for other, _ in begun[1:] for n in differing(first, other))
+    of_model = [n for n in changed if n.endswith(" of its model") and n not in lasting]
+    most = SAME * max(float(np.abs(told).max(initial=0.0)), 1.0)
+    if all(
+        other.shape == told.shape and np.allclose(other, told, rtol=0, atol=most, equal_nan=True)
+        for _, other in begun
+    ):
+        return names + of_model
+    passed = {
+        *lasting,
+        *of_model,
+        STATE,
+        *(name for found, _ in begun for name in found.generators),
+    }
+    differ = [name for name in changed if "_seed" not in name and name not in passed]
+    goals = [name for name in differ if any(word in name for word in ("goal", "target", "task"))]
+    return names + of_model + (goals or differ) or ["something that no attribute holds"]
+
+
+def _begun(instance: Instance, start: np.ndarray, seed: int) -> tuple[Fingerprint, np.ndarray]:
+    """Returns what is remembered after a reset to a start (S,), and what is told from there."""
+    instance.put(start, seed)
+    remembered, space = instance.remembered(), instance.env.observation_space
+    samples = instance.wander(np.random.default_rng(0), SAMPLES, 1)
+    told = [[*flat(seen, space), reward, ends] for seen, reward, ends, _, _ in samples]
+    return remembered, np.array(told, dtype=float)
+
+
+def _names_of_state(instance: Instance) -> list[str]:
+    """Returns the names of the entries of a state of MuJoCo, as "qpos[0]"."""
+    return [f"{kind}[{i}]" for kind, at in instance.physics.columns.items() for i in range(len(at))]
+
+
+def _changed_by_user(instance: Instance) -> set[str]:
+    """Returns the names of what the user's options of reset and pinned values change after a reset."""
+    found = set(instance.spec.description.pinned)
+    for seed in range(COMPARED):
+        seen = []
+        for plain in (False, True):
+            instance.reset(seed, plain)
+            seen.append(remembered := instance.remembered())
+            state = instance.physics.read().tolist()
+            remembered.update(zip(_names_of_state(instance), state, strict=True))
+        found.update(differing(*seen))
+    return found - {STATE}
+
+
+def _check_pins(instance: Instance) -> None:
+    """Raises `BadInput` if a pinned attribute contradicts what is drawn where the attribute was.
+
+    An attribute that, after each reset, is a copy of a place in the model or in the state is one after the
+    resets that pin it, too.
+    """
+    pinned, inner = instance.spec.description.pinned, instance.inner
+    pins = {n: np.ravel(v).astype(float) for n, v in pinned.items() if hasattr(inner, n)}
+    if not pins:
+        return
+    drawn = []
+    for seed in range(COMPARED):
+        instance.reset(seed, plain=True)
+        drawn.append({n: np.ravel(getattr(inner, n)).copy() for n in pins} | _places(instance))
+    instance.reset()
+    for name, pin in pins.items():
+        if all(np.array_equal(one[name], drawn[0][name]) for one in drawn):
+            continue  # no reset draws it
+        for place, now in _places(instance).items():
+            copies = all(np.array_equal(one[name], one[place][: len(pin)]) for one in drawn)
+            if copies and not np.array_equal(pin, now[: len(pin)]):
+                raise BadInput(
+                    f"pinned {name} is {pin.tolist()}, and {place} of {instance.name}, which each reset puts "
+                    f"at the same place, stays at {now[: len(pin)].tolist()}: pin it by options of reset or "
+                    "by a seed"
+                )
+
+
+def _places(instance: Instance) -> dict[str, np.ndarray]:
+    """Returns places of the model and of the state by name, each as numbers (k,)."""
+    instance.physics.read()
+    model, data = instance.model, instance.data
+    kinds = {"site_pos": model, "body_pos": model, "geom_pos": model, "mocap_pos": data}
+    found = {f"qpos[{i}:]": data.qpos[i:].copy() for i in range(model.nq)}
+    for kind, owner in kinds.items():
+        rows = np.reshape(getattr(owner, kind), (-1, 3)).copy()
+        found |= {f"{kind}[{i}]": row for i, row in enumerate(rows)}
+    return found
