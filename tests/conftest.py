@@ -27,6 +27,16 @@ def no_trace_at_home(tmp_path_factory):
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def coarse_looks():
+    """Figures have few pixels, and what is proved is replayed from few starts."""
+    from planted import coarsen
+
+    with pytest.MonkeyPatch.context() as patch:
+        coarsen(patch)
+        yield
+
+
 @pytest.fixture(scope="session")
 def circle():
     return hyrl_mj.get_task("unit_circle")
@@ -78,14 +88,12 @@ def planted_circle(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def few_cells():
-    """While the tests of a file run, the game of a smoke run on the circle has few cells."""
-    from planted import FEW_CELLS
-
-    from hyrl_mj.learning import presets
+def small_runs():
+    """While the tests of a file run, runs of preset smoke are shorter still."""
+    from planted import shorten
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(presets._LATTICE_SMOKE, 1, FEW_CELLS["lattice"])
+        shorten(patch)
         yield
 
 

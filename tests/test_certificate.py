@@ -213,7 +213,9 @@ def test_an_examination_carries_what_is_proved(vehicle):
     for name in loops:
         for score in result.scores[name]:
             assert score.proved <= score.not_broken
-            assert score.open == result.scores[name][0].open, "what is open has nothing to do with noise"
+            assert score.open == result.scores[name][0].open, (
+                "what is open has nothing to do with noise"
+            )
             assert score.proved_any <= score.proved
             assert score.proved_any <= score.not_broken_any
         wins = result.curve.wins[name]

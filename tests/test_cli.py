@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from command_line import call
 from gl import needs_gl
 from PIL import Image
 from sentences import assert_has_ended
@@ -22,27 +23,20 @@ from hyrl_mj.pipeline import ExamineOptions, examination
 from hyrl_mj.pipeline.steps import STAGES
 from hyrl_mj.viz.figures import FIGURES
 
-pytestmark = pytest.mark.slow  # whole runs, and a process for each command
+pytestmark = pytest.mark.slow  # whole runs
 
 # A run whose training and worst-case game are short.
 SMOKE = ("--preset", "smoke", "--set", "stage1.samples=8192", "lattice=130", "cells=720")
 
 
-def call(*arguments):
-    """Run the command line in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-m", "hyrl_mj.cli", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-
-
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory):
-    """A whole run of the unit circle in the smoke preset, made by the command line."""
+    """A whole run of the unit circle in the smoke preset, made as a person makes it."""
     path = tmp_path_factory.mktemp("runs") / "circle"
-    done = call("run", "unit_circle", *SMOKE, "--out", path)
+    words = ("run", "unit_circle", *SMOKE, "--out", str(path))
+    done = subprocess.run(
+        [sys.executable, "-m", "hyrl_mj.cli", *words], capture_output=True, text=True, timeout=300
+    )
     assert_has_ended(done)
     return path, done.stdout
 
@@ -59,7 +53,7 @@ def contents(path):
 
 def assert_one_sentence(process, *parts):
     assert process.returncode == 2, process.stdout + process.stderr
-    assert "Traceback" not in process.stderr
+    assert len(process.stderr.strip().splitlines()) == 1
     for part in parts:
         assert part in process.stderr
 
@@ -114,14 +108,13 @@ def test_a_new_horizon_is_used_and_kept(copied):
     assert not run.manifest.is_done("retrain")
 
 
-@pytest.mark.parametrize("name", ["mode_1.safetensors", "arcs/start0_hyrl_q1.npz"])
-def test_a_stage_that_was_cut_off_is_not_done(name, copied):
-    (copied / name).unlink()
+def test_a_stage_that_was_cut_off_is_not_done(copied):
+    (copied / "arcs" / "start0_hyrl_q1.npz").unlink()
     again = call("run", "unit_circle", *SMOKE, "--out", copied)
     assert_has_ended(again)
-    stage = "retrain" if name.startswith("mode") else "simulate"
-    assert f"{stage}: done before" not in again.stdout
-    assert (copied / name).is_file()
+    assert "retrain: done before" in again.stdout
+    assert "simulate: done before" not in again.stdout
+    assert (copied / "arcs" / "start0_hyrl_q1.npz").is_file()
 
 
 @needs_gl
@@ -282,10 +275,8 @@ def test_list_and_help():
         (["traim"], ["traim", "critical-set"]),
     ],
 )
-def test_bad_input_before_anything_is_made(arguments, parts, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
-    assert_one_sentence(call(*arguments), *parts)
+def test_bad_input_before_anything_is_made(arguments, parts, tmp_path):
+    assert_one_sentence(call(*arguments, cwd=tmp_path), *parts)
     assert not list(tmp_path.iterdir())
 
 
@@ -375,30 +366,6 @@ def test_a_truncated_artifact_is_named(name, command, copied):
     before = contents(copied)
     assert_one_sentence(call(command, copied), str(damaged))
     assert contents(copied) == before
-
-
-@needs_gl
-def test_without_gl_the_run_is_whole_and_says_why_there_is_no_video(copied):
-    (copied / "replay.mp4").unlink()
-    process = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "hyrl_mj.cli",
-            "run",
-            "unit_circle",
-            *SMOKE,
-            "--out",
-            copied,
-        ],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "MUJOCO_GL": "disable"},
-    )
-    assert_has_ended(process)
-    assert "no video: " in process.stdout
-    assert "apt-get install libegl1" in process.stdout
-    assert "Traceback" not in process.stderr
 
 
 def test_load_run_acts_as_the_contract_says_without_torch(finished):
