@@ -12,10 +12,11 @@ import pytest
 import hyrl_mj
 from hyrl_mj.tasks.scaffold import write_task
 
-# The same examples everywhere, whatever the speed of the machine.
+# The same examples everywhere, whatever the speed of the machine; `scripts/test --long` tries others, too.
 hypothesis.settings.register_profile(
-    "repeatable", derandomize=True, deadline=None, database=None, max_examples=50
+    "repeatable", derandomize=True, deadline=None, database=None, max_examples=25
 )
+hypothesis.settings.register_profile("long", deadline=None, database=None, max_examples=1_000)
 hypothesis.settings.load_profile("repeatable")
 
 

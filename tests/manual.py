@@ -36,6 +36,8 @@ TESTED = (
     "scripts/fields.py",
     "scripts/outside_agents.py",
     "scripts/reproduce_paper.py",
+    "tests/attack.py",
+    "tests/trapped_environments.py",
 )
 
 

@@ -112,7 +112,9 @@ def test_only_in_its_part_does_a_mode_earn_the_reward_of_the_task(circle):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("eps", [0.05, 0.15, 0.25])
+@pytest.mark.parametrize(
+    "eps", [*(pytest.param(eps, marks=pytest.mark.long) for eps in (0.05, 0.15)), 0.25]
+)
 def test_the_modes_of_the_circle_settle_as_early_as_can_be_at_any_noise(circle, eps):
     # No controller settles within 0.3 rad of the set-point under greater noise than that.
     parts, sets = circle_sets(circle, eps, cells=2880)
