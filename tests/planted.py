@@ -25,7 +25,7 @@ FEW_CELLS = {"lattice": 130}
 
 
 def shorten(patch):
-    """Patches preset smoke so that a run takes seconds: less training, coarser grids, a coarser curve."""
+    """Patches preset smoke so that a run takes seconds: less training, coarser grids."""
     for values, new in (
         (presets._SMOKE, {"ppo": 4_096, "dqn": 4_000, "sac": 1_500}),
         (presets._GRIDS, {1: (120, 720), 2: (60, 120)}),
@@ -36,11 +36,11 @@ def shorten(patch):
             patch.setitem(values, key, value)
     patch.setattr(presets, "_SMOKE_MODES", 4_096)
     patch.setattr(training, "CHECKPOINTS", 4)
-    patch.setattr(examination, "CURVE", examination.CURVE[::4])
 
 
 def coarsen(patch):
     """Patches what is shown and played: figures of few pixels in a simple font, few replays of proofs."""
+    patch.setattr(examination, "CURVE", examination.CURVE[::4])
     patch.setattr(style, "DPI", 60)
     patch.setitem(style.STYLE, "pdf.fonttype", 3)
     starts = {"none": 200, "uniform": 200, "alternating": 200, "worst": 100, "cells": 10}

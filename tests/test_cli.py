@@ -18,8 +18,7 @@ from PIL import Image
 from sentences import assert_has_ended
 
 import hyrl_mj
-from hyrl_mj import cli, pipeline
-from hyrl_mj.pipeline import ExamineOptions, examination
+from hyrl_mj import cli
 from hyrl_mj.pipeline.steps import STAGES
 from hyrl_mj.viz.figures import FIGURES
 
@@ -99,22 +98,6 @@ def test_figures_are_drawn_again(copied):
     assert done.returncode == 0, done.stderr
     assert "overview, policy, extended_sets, runs" in done.stdout
     assert (copied / "figures" / "runs.pdf").is_file()
-
-
-def test_a_new_horizon_is_used_and_kept(copied):
-    assert call("extended-sets", copied, "--horizon", "0.2").returncode == 0
-    run = hyrl_mj.load_run(copied)
-    assert run.settings.horizon == run.extended_sets.horizon == 0.2
-    assert not run.manifest.is_done("retrain")
-
-
-def test_a_stage_that_was_cut_off_is_not_done(copied):
-    (copied / "arcs" / "start0_hyrl_q1.npz").unlink()
-    again = call("run", "unit_circle", *SMOKE, "--out", copied)
-    assert_has_ended(again)
-    assert "retrain: done before" in again.stdout
-    assert "simulate: done before" not in again.stdout
-    assert (copied / "arcs" / "start0_hyrl_q1.npz").is_file()
 
 
 @needs_gl
@@ -220,18 +203,6 @@ def test_robustness_prints_the_worst_case_and_the_episodes(copied):
     assert [score.eps for score in robustness.game.scores["hyrl"]] == [0.0, 0.05, 0.1]
     kinds = {(c.noise, c.controller) for c in robustness.episodes}
     assert kinds == {(n, c) for n in ("uniform", "adversarial") for c in ("policy", "hyrl")}
-
-
-def test_an_interrupted_robustness_run_leaves_the_last_one(copied, monkeypatch):
-    before = contents(copied)
-
-    def interrupted(*arguments, **options):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(examination, "noisy_episodes", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        pipeline.examine_run(hyrl_mj.load_run(copied), ExamineOptions(eps=0.2, episodes=10))
-    assert contents(copied) == before
 
 
 @pytest.mark.parametrize(("form", "out"), [("onnx", "circle.onnx"), ("numpy", "circle")])
