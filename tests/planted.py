@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -11,6 +11,7 @@ from hyrl_mj.artifacts import digest
 from hyrl_mj.chart import Chart
 from hyrl_mj.learning import presets, training
 from hyrl_mj.manifest import FILES, Entry, Manifest
+from hyrl_mj.pipeline import steps
 from hyrl_mj.proof import examination, replays
 from hyrl_mj.run_directory import load_run
 from hyrl_mj.sets import Grid, GridSet
@@ -18,6 +19,7 @@ from hyrl_mj.stages.critical_set import CriticalSet
 from hyrl_mj.stages.hybrid import HybridController
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.tasks import Learning, Outcome, Scene, Task
+from hyrl_mj.viz import diagnosis
 from hyrl_mj.viz.figures import style
 
 # Settings of a smoke run on the circle whose worst-case game takes two seconds.
@@ -39,10 +41,13 @@ def shorten(patch):
 
 
 def coarsen(patch):
-    """Patches what is shown and played: figures of few pixels in a simple font, few replays of proofs."""
+    """Patches what is shown and played: few pixels, few frames, a simple font, few replays of proofs."""
     patch.setattr(examination, "CURVE", examination.CURVE[::4])
     patch.setattr(style, "DPI", 60)
     patch.setitem(style.STYLE, "pdf.fonttype", 3)
+    few = {"size": (480, 160), "fps": 4}
+    patch.setattr(steps, "SMOKE", replace(steps.SMOKE, **few))
+    patch.setattr(diagnosis, "REPLAY", replace(diagnosis.REPLAY, **few))
     starts = {"none": 200, "uniform": 200, "alternating": 200, "worst": 100, "cells": 10}
     patch.setattr(replays, "STARTS", starts)
     patch.setattr(replays, "WHOLE", 10)

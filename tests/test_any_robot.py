@@ -151,7 +151,7 @@ def test_a_robot_from_its_own_folder_goes_through_the_whole_pipeline(small_runs,
     done = call("run", os.path.relpath(wasp, tmp_path), "--preset", "smoke", cwd=tmp_path)
     assert_has_ended(done)
     out = tmp_path / "runs" / "wasp"
-    assert (out / "replay.mp4").stat().st_size > 10_000
+    assert (out / "replay.mp4").stat().st_size > 1_000
     assert (out / "report.html").is_file()
     records = json.loads((out / "robustness.json").read_text())["episodes"]
     assert {r["controller"] for r in records} == {"policy", "hyrl"}

