@@ -39,7 +39,7 @@ from hyrl_mj.viz.figures import CLASS_COLOURS
 from hyrl_mj.viz.report import render, write_report
 
 # The page tells what the game says, however coarse it is.
-pytestmark = pytest.mark.usefixtures("small_runs")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_runs")]
 MAGENTA, GREEN = (230, 20, 200), (20, 200, 60)
 POSTER = (642, 240)  # [pixels], like no other picture
 VOID = {"meta", "img", "br", "link", "input", "hr", "source"}
@@ -432,7 +432,7 @@ class Rover(Cube):
         self.noisy = (True, False, False)
 
 
-@pytest.mark.parametrize("game", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.parametrize("game", [True, False])
 def test_in_three_dimensions_the_game_is_an_estimate_beside_the_episodes(
     tmp_path, monkeypatch, game
 ):
@@ -516,7 +516,6 @@ def count(picture, colour):
 
 
 @needs_chromium
-@pytest.mark.slow
 def test_nothing_is_wider_than_the_window(written, tmp_path):
     text = re.sub(r"<meta http-equiv=[^>]*>", "", written.read_text(encoding="utf-8"))
     inner = escape(text.replace("</body>", f"{PROBE}</body>"))
@@ -538,7 +537,6 @@ def test_nothing_is_wider_than_the_window(written, tmp_path):
 
 @needs_chromium
 @pytest.mark.parametrize(("width", "height"), [(360, 3600), (1280, 2400)])
-@pytest.mark.slow
 def test_the_figures_are_seen(written, tmp_path, width, height):
     shot = tmp_path / "shot.png"
     chromium(written, tmp_path / "profile", width, height, f"--screenshot={shot}")
@@ -553,7 +551,6 @@ def test_the_figures_are_seen(written, tmp_path, width, height):
 
 
 @needs_chromium
-@pytest.mark.slow
 def test_on_paper_the_video_is_its_poster(written, tmp_path):
     paper = tmp_path / "paper.pdf"
     chromium(written, tmp_path / "profile", 1280, 6000, f"--print-to-pdf={paper}")
