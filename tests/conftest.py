@@ -99,8 +99,8 @@ def small_runs():
 
 
 # The files that take longest, in this order, each more than half a minute.
-LONGEST = ("docs", "demo", "sweep", "cli", "attack", "robustify", "surroundings", "algorithms")
-LONGEST += ("training", "retraining", "any_robot")
+LONGEST = ("docs", "demo", "sweep", "attack", "trapped_environments", "environments", "robustify")
+LONGEST += ("algorithms", "surroundings", "cli", "report", "retraining", "training", "tables")
 
 
 def pytest_collection_modifyitems(items):

@@ -148,7 +148,8 @@ def command(*arguments, cwd, path):
 @pytest.mark.slow
 def test_a_robot_from_its_own_folder_goes_through_the_whole_pipeline(small_runs, wasp, tmp_path):
     assert len(WASP_PY.strip().splitlines()) <= 90
-    done = call("run", os.path.relpath(wasp, tmp_path), "--preset", "smoke", cwd=tmp_path)
+    words = ("--preset", "smoke", "--set", "rods=8", "cells=14", "lattice=20")
+    done = call("run", os.path.relpath(wasp, tmp_path), *words, cwd=tmp_path)
     assert_has_ended(done)
     out = tmp_path / "runs" / "wasp"
     assert (out / "replay.mp4").stat().st_size > 1_000
