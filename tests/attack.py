@@ -67,16 +67,16 @@ class Attack:
 
 ATTACKS = {
     "crashes": Attack(
-        "crashed before and after every rename, then resumed", crashes.trials, 10_000, 3
+        "crashed before and after every rename, then resumed", crashes.trials, 10_000, 2
     ),
     "kills": Attack("killed at a random moment, then resumed", kills.trials, 50, 1),
-    "artifacts": Attack("truncated, or one bit flipped", damage.trials, 80, 4),
-    "received": Attack("crafted files of a stranger", received.trials, 60, 4),
-    "doors": Attack("generated descriptions of a stranger", doors.trials, 600, 16),
+    "artifacts": Attack("truncated, or one bit flipped", damage.trials, 80, 3),
+    "received": Attack("crafted files of a stranger", received.trials, 60, 3),
+    "doors": Attack("generated descriptions of a stranger", doors.trials, 600, 8),
     "configurations": Attack(
-        "one setting changed, through every stage", configurations.trials, 200, 6
+        "one setting changed, through every stage", configurations.trials, 200, 4
     ),
-    "tasks": Attack("task file or MJCF with one mistake", tasks.trials, 120, 3),
+    "tasks": Attack("task file or MJCF with one mistake", tasks.trials, 120, 2),
     "writers": Attack("two and four writers, and a reader", writers.trials, 20, 1),
     "surroundings": Attack("each pair of bad surroundings", surroundings.trials, 10_000, 1),
 }
