@@ -22,14 +22,14 @@ from hyrl_mj import cli
 from hyrl_mj.pipeline.steps import STAGES
 from hyrl_mj.viz.figures import FIGURES
 
-pytestmark = pytest.mark.slow  # whole runs
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_runs")]  # whole runs
 
 # A run whose training and worst-case game are short.
-SMOKE = ("--preset", "smoke", "--set", "stage1.samples=8192", "lattice=130", "cells=720")
+SMOKE = ("--preset", "smoke", "--set", "stage1.samples=8192")
 
 
-@pytest.fixture(scope="session")
-def finished(tmp_path_factory):
+@pytest.fixture(scope="module")
+def finished(small_runs, tmp_path_factory):
     """A whole run of the unit circle in the smoke preset, made by the command line."""
     path = tmp_path_factory.mktemp("runs") / "circle"
     done = call("run", "unit_circle", *SMOKE, "--out", path)

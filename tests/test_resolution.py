@@ -230,7 +230,7 @@ def test_noise_is_rounded_to_whole_cells_and_never_to_none(rough):
 @pytest.mark.slow
 def test_the_estimate_agrees_with_runs_of_the_plant(unicycle):
     loop = PolicyController(steering_policy(unicycle, gain=0.4))
-    grid = lattice_grid(unicycle, 56)
+    grid = lattice_grid(unicycle, 80)
     everything = [GridSet.from_mask(grid, np.ones(len(grid.nodes), dtype=bool))]
     game = Game(unicycle, everything, {"policy": loop}, 0.1, grid=grid)
     starts = np.flatnonzero(game.starts)[::7]
@@ -239,7 +239,7 @@ def test_the_estimate_agrees_with_runs_of_the_plant(unicycle):
     run = closed_loop(unicycle, loop, grid.nodes[starts], settings=quiet)
     arrived = run.outcome == Outcome.REACHED
     assert 0.1 < arrived.mean() < 0.9, "some starts are won and some are lost"
-    assert (won == arrived).mean() > 0.87
+    assert (won == arrived).mean() > 0.9
     assert abs(won.mean() - arrived.mean()) < 0.03
     noise = game.worst_noise("policy", 0.1)
     worst = closed_loop(unicycle, loop, grid.nodes[starts], noise, settings=quiet)
