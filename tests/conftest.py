@@ -12,10 +12,11 @@ import pytest
 import hyrl_mj
 from hyrl_mj.tasks.scaffold import write_task
 
-# The same examples everywhere, whatever the speed of the machine.
+# The same examples everywhere, whatever the speed of the machine; `scripts/test --long` tries others, too.
 hypothesis.settings.register_profile(
-    "repeatable", derandomize=True, deadline=None, database=None, max_examples=50
+    "repeatable", derandomize=True, deadline=None, database=None, max_examples=25
 )
+hypothesis.settings.register_profile("long", deadline=None, database=None, max_examples=1_000)
 hypothesis.settings.load_profile("repeatable")
 
 
@@ -24,6 +25,16 @@ def no_trace_at_home(tmp_path_factory):
     """Which files of code have run is recorded in a folder of the tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def coarse_looks():
+    """Figures have few pixels, and what is proved is replayed from few starts."""
+    from planted import coarsen
+
+    with pytest.MonkeyPatch.context() as patch:
+        coarsen(patch)
         yield
 
 
@@ -78,20 +89,18 @@ def planted_circle(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def few_cells():
-    """While the tests of a file run, the game of a smoke run on the circle has few cells."""
-    from planted import FEW_CELLS
-
-    from hyrl_mj.learning import presets
+def small_runs():
+    """While the tests of a file run, runs of preset smoke are shorter still."""
+    from planted import shorten
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(presets._LATTICE_SMOKE, 1, FEW_CELLS["lattice"])
+        shorten(patch)
         yield
 
 
 # The files that take longest, in this order, each more than half a minute.
-LONGEST = ("docs", "demo", "sweep", "cli", "attack", "robustify", "surroundings", "algorithms")
-LONGEST += ("training", "retraining", "any_robot")
+LONGEST = ("docs", "demo", "sweep", "attack", "trapped_environments", "environments", "robustify")
+LONGEST += ("algorithms", "surroundings", "cli", "report", "retraining", "training", "tables")
 
 
 def pytest_collection_modifyitems(items):

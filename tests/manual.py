@@ -1,15 +1,18 @@
-"""The blocks of README and the manual, and how each is run: python tests/manual.py PAGE runs those of a page.
+"""The blocks of README and the manual, and how each is run.
 
-Blocks run in order in the current folder, which should hold a finished run; without a PAGE it is made. What
-would take minutes is shortened, and what needs a network, root or a person at the screen is checked without
-running it; `SHORTER` and `instead` say how.
+`python tests/manual.py docs/python.md` runs a page.
+It makes a run in the current folder, and runs the blocks of each page in order in a folder of its own, which
+holds a copy of that run. What would take minutes is shortened, and what needs a network, root or a person at
+the screen is checked without running it; `SHORTER` and `instead` say how.
 """
 
+import json
 import re
 import shlex
 import shutil
 import subprocess
 import sys
+import time
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +36,8 @@ TESTED = (
     "scripts/fields.py",
     "scripts/outside_agents.py",
     "scripts/reproduce_paper.py",
+    "tests/attack.py",
+    "tests/trapped_environments.py",
 )
 
 
@@ -181,17 +186,6 @@ def run_command(words: list[str]) -> None:
             raise AssertionError(f"nothing says how to run {shlex.join(words)}")
 
 
-def shorten() -> None:
-    """Shortens preset smoke further, in this process: no page shows what its policies have learned."""
-    from hyrl_mj.learning import presets
-
-    presets._SMOKE |= {"ppo": 4_096, "dqn": 4_000, "sac": 1_500}
-    presets._SMOKE_MODES = 4_096
-    presets._GRIDS |= {1: (120, 720), 2: (60, 120)}
-    presets._GRIDS_DYNAMIC |= {2: (24, 48)}
-    presets._LATTICE_SMOKE |= {1: 130, 2: 60}
-
-
 def run(page: Path) -> None:
     """Run the blocks of a page. Those of Python share their names, as the cells of a notebook."""
     space: dict[str, object] = {"__name__": "__main__"}
@@ -210,17 +204,66 @@ def run(page: Path) -> None:
             Path("field.json").write_text(block.text)
 
 
-if __name__ == "__main__":
-    # A viewer waits for a person, and the loops of a robot for the time to pass.
-    import time
+def agents() -> None:
+    """Writes the two files of agents that the page about Python loads."""
+    import numpy as np
+    import onnx
+    from stable_baselines3 import PPO
+
+    import hyrl_mj
+    from hyrl_mj.envs import BatchedEnv
+    from hyrl_mj.envs.sb3_env import TaskVecEnv
+
+    circle = hyrl_mj.get_task("unit_circle")
+    PPO("MlpPolicy", TaskVecEnv(BatchedEnv(circle, 1)), device="cpu").save("agent.zip")
+    observed, u = (
+        onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["n", columns])
+        for name, columns in (("observation", 2), ("u", 1))
+    )
+    weight = onnx.numpy_helper.from_array(np.ones((1, 2), dtype=np.float32), "weight")
+    node = onnx.helper.make_node("Gemm", ["observation", "weight"], ["u"], transB=1)
+    graph = onnx.helper.make_graph([node], "policy", [observed], [u], [weight])
+    opset = [onnx.helper.make_opsetid("", 17)]
+    onnx.save(onnx.helper.make_model(graph, ir_version=8, opset_imports=opset), "agent.onnx")
+
+
+def main(pages: list[Path]) -> int:
+    """Runs pages, each in a process forked from this one, which has imported everything.
+
+    Returns the exit status: 1 if a page failed. What happened to each stands in its folder.
+    """
+    import planted
+    import pytest
+    from attacks import child, small
 
     from hyrl_mj.viz import viewing
 
-    shorten()
+    small.import_late()
+    planted.shorten(pytest.MonkeyPatch())
+    planted.coarsen(pytest.MonkeyPatch())
+    # A viewer waits for a person, and the loops of a robot for the time to pass.
     viewing.view = lambda *arguments: print("viewed", arguments[1])
-    time.sleep = lambda seconds: None
-    sys.path.insert(0, "")  # what a block has written can be imported
-    if sys.argv[1:]:
-        run(Path(sys.argv[1]))
-    else:
-        call(shortened(["run", "vehicle"]))
+    made = child(lambda: call(shortened(["run", "vehicle"])), Path.cwd(), seconds=300)
+    assert made.status == 0, made.out + made.err
+
+    def work(page: Path) -> None:
+        time.sleep = lambda seconds: None
+        sys.path.insert(0, "")  # what a block has written can be imported
+        if "agent.onnx" in page.read_text(encoding="utf-8"):
+            agents()
+        run(page)
+
+    failed = 0
+    for page in pages:
+        folder = Path(page.stem)
+        shutil.copytree("runs", folder / "runs")
+        answer = child(lambda page=page: work(page), folder, seconds=300)
+        failed |= answer.status != 0
+        told = {"status": answer.status, "said": answer.out + answer.err, "seconds": answer.seconds}
+        (folder / "answer.json").write_text(json.dumps(told))
+        print(f"{page.name}: {'failed' if answer.status else 'done'}", flush=True)
+    return failed
+
+
+if __name__ == "__main__":
+    sys.exit(main([Path(page).resolve() for page in sys.argv[1:]]))

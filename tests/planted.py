@@ -2,23 +2,55 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 
 from hyrl_mj.artifacts import digest
 from hyrl_mj.chart import Chart
+from hyrl_mj.learning import presets, training
 from hyrl_mj.manifest import FILES, Entry, Manifest
+from hyrl_mj.pipeline import steps
+from hyrl_mj.proof import examination, replays
 from hyrl_mj.run_directory import load_run
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.critical_set import CriticalSet
 from hyrl_mj.stages.hybrid import HybridController
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.tasks import Learning, Outcome, Scene, Task
+from hyrl_mj.viz import diagnosis
+from hyrl_mj.viz.figures import style
 
 # Settings of a smoke run on the circle whose worst-case game takes two seconds.
 FEW_CELLS = {"lattice": 130}
+
+
+def shorten(patch):
+    """Patches preset smoke so that a run takes seconds: less training, coarser grids."""
+    for values, new in (
+        (presets._SMOKE, {"ppo": 4_096, "dqn": 4_000, "sac": 1_500}),
+        (presets._GRIDS, {1: (120, 720), 2: (60, 120)}),
+        (presets._GRIDS_DYNAMIC, {2: (24, 48)}),
+        (presets._LATTICE_SMOKE, {1: 130, 2: 60, 3: 40}),
+    ):
+        for key, value in new.items():
+            patch.setitem(values, key, value)
+    patch.setattr(presets, "_SMOKE_MODES", 4_096)
+    patch.setattr(training, "CHECKPOINTS", 4)
+
+
+def coarsen(patch):
+    """Patches what is shown and played: few pixels, few frames, a simple font, few replays of proofs."""
+    patch.setattr(examination, "CURVE", examination.CURVE[::4])
+    patch.setattr(style, "DPI", 60)
+    patch.setitem(style.STYLE, "pdf.fonttype", 3)
+    few = {"size": (480, 160), "fps": 4}
+    patch.setattr(steps, "SMOKE", replace(steps.SMOKE, **few))
+    patch.setattr(diagnosis, "REPLAY", replace(diagnosis.REPLAY, **few))
+    starts = {"none": 200, "uniform": 200, "alternating": 200, "worst": 100, "cells": 10}
+    patch.setattr(replays, "STARTS", starts)
+    patch.setattr(replays, "WHOLE", 10)
 
 
 def euler(task, z, u):

@@ -27,24 +27,23 @@ PLANTED = {
     ),
     "artifacts": "from hyrl_mj.manifest import Manifest; Manifest.checked = lambda self, path: path",
 }
-# Mends that are taken out, and how many generated descriptions are drawn, some of which must find it.
+# Mends that are taken out, by a generated description that finds it. What would take a minute has a second.
 OPENED = {
-    "spec": (160, "from hyrl_mj import trust; trust.is_received = lambda: False"),
-    "agent": (
-        120,
+    "spec 4226648945": "from hyrl_mj import trust; trust.is_received = lambda: False",
+    "agent 2362031800": (
         "from hyrl_mj.policies import pickled\n"
         "pickled.arrays = lambda content: {str(name): None for name, _ in pickled.read(content).items}",
     ),
-    "field": (
-        120,
+    "field 627631548": (
         "from hyrl_mj.fields import files\n"
         "def once(pairs):\n"
         "    names = [name for name, _ in pairs]\n"
         "    raise files._Repeated(max(names, key=names.count))\n"
-        "files._once = once",
+        "files._once = once"
     ),
-    "arguments": (240, "from hyrl_mj import errors; errors.LONGEST = 10**9"),
+    "arguments 3357133556": "from hyrl_mj import errors; errors.LONGEST = 10**9",
 }
+HURRY = "from attacks import doors; doors._broke.__defaults__ = (1.0,)"
 
 
 def attack(*words, weakness=""):
@@ -64,22 +63,20 @@ def test_the_short_lane_finds_nothing():
     assert answer.returncode == 0, answer.stdout + answer.stderr
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", PLANTED)
-def test_a_planted_weakness_is_found(name):
-    answer = attack("--short", "--only", name, weakness=PLANTED[name])
+@pytest.mark.long
+def test_planted_weaknesses_are_found():
+    words = ("--count", "6", "--only", ",".join(PLANTED))
+    answer = attack(*words, weakness="\n".join(PLANTED.values()))
     assert answer.returncode == 1, answer.stdout + answer.stderr
-    assert f"{name}: " in answer.stdout
+    assert all(f"{name}: " in answer.stdout for name in PLANTED)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", OPENED)
-def test_a_door_that_is_opened_again_is_found(kind):
-    count, weakness = OPENED[kind]
-    words = ("--only", "doors", "--match", kind, "--seed", "1", "--count", str(count))
-    answer = attack(*words, weakness=weakness)
+@pytest.mark.long
+def test_doors_that_are_opened_again_are_found():
+    words = ("--only", "doors", "--match", "|".join(OPENED), "--seed", "1", "--count", "240")
+    answer = attack(*words, weakness="\n".join([*OPENED.values(), HURRY]))
     assert answer.returncode == 1, answer.stdout + answer.stderr
-    assert f"doors: {kind}" in answer.stdout
+    assert [name for name in OPENED if f"doors: {name}: " not in answer.stdout] == []
 
 
 # ---- one process

@@ -79,7 +79,7 @@ def played(game, loop, starts, noise, modes=None, seed=0):
 @pytest.mark.slow
 def test_no_noise_beats_what_is_proved(certified):
     game, loops, certificate = certified
-    rng, cells, n = np.random.default_rng(0), certificate.cells, 3_000
+    rng, cells, n = np.random.default_rng(0), certificate.cells, 1_000
     for name, loop in loops.items():
         outer, inner = certificate.value(name, EPS), game.value(name, EPS)
         noises = [Noise("uniform", EPS), Noise("alternating", EPS), game.worst_noise(name, EPS)]
@@ -95,16 +95,18 @@ def test_no_noise_beats_what_is_proved(certified):
                 assert played(game, loop, starts, noise, modes, seed=k).all(), (name, mode, noise)
 
 
+@pytest.mark.parametrize("certified", ["vehicle"], indirect=True)
 def test_what_the_game_loses_at_a_corner_is_never_proved(certified):
+    """On the vehicle, whose lattice is exact: on the circle the game errs to the adversary's side."""
     game, loops, certificate = certified
-    if not game.lattice.exact:  # there the game errs to the adversary's side
-        return
+    assert game.lattice.exact
     for name in loops:
         for eps in (0.0, 0.05, EPS):
             lost = game.value(name, eps)[:, :-2] >= NEVER
             proved = certificate.value(name, eps)[:, :-2] < NEVER
             for nodes, cells in zip(lost, proved, strict=True):
                 touched = certificate.cells.some_corner(nodes & game.lattice.running)
+                assert touched.any()
                 assert not (touched & cells & certificate.cells.running).any()
 
 
@@ -146,12 +148,14 @@ def test_the_time_to_arrival_is_bounded(certified):
         for noise in (Noise("uniform", EPS), game.worst_noise(name, EPS)):
             settings = LoopSettings(quiet=True)
             run = closed_loop(game.task, loop, starts, noise, seed=3, settings=settings)
-            arrived = np.array([game.task.arrived(z) for z in run.path])
-            failed_verdict = game.task.verdict(run.path[-1]) != Outcome.REACHED
-            first = np.where(arrived.any(axis=0), arrived.argmax(axis=0), len(arrived) - 1)
-            assert not failed_verdict.any()
-            if game.task.name == "unit_circle":
-                assert (first <= value[at]).all()
+            if game.task.name == "unit_circle":  # its episodes go on at the set-point
+                arrived = np.array([game.task.arrived(z) for z in run.path])
+                assert arrived.any(axis=0).all()
+                taken = arrived.argmax(axis=0)
+            else:
+                taken = run.length
+            assert (taken <= value[at]).all()
+            assert np.median(value[at] - taken) <= 2, "the bound is no larger than it must be"
 
 
 def test_starts_that_count_as_broken_are_lost_on_the_plant(certified):
@@ -208,9 +212,10 @@ def test_an_examination_carries_what_is_proved(vehicle):
     )
     for name in loops:
         for score in result.scores[name]:
-            assert score.proved <= score.not_broken <= score.open == result.scores[name][
-                0
-            ].open or (score.proved <= score.not_broken)
+            assert score.proved <= score.not_broken
+            assert score.open == result.scores[name][0].open, (
+                "what is open has nothing to do with noise"
+            )
             assert score.proved_any <= score.proved
             assert score.proved_any <= score.not_broken_any
         wins = result.curve.wins[name]

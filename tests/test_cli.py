@@ -12,34 +12,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from command_line import call
 from gl import needs_gl
 from PIL import Image
 from sentences import assert_has_ended
 
 import hyrl_mj
-from hyrl_mj import cli, pipeline
-from hyrl_mj.pipeline import ExamineOptions, examination
+from hyrl_mj import cli
 from hyrl_mj.pipeline.steps import STAGES
 from hyrl_mj.viz.figures import FIGURES
 
-pytestmark = pytest.mark.slow  # whole runs, and a process for each command
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_runs")]  # whole runs
 
 # A run whose training and worst-case game are short.
-SMOKE = ("--preset", "smoke", "--set", "stage1.samples=8192", "lattice=130", "cells=720")
+SMOKE = ("--preset", "smoke", "--set", "stage1.samples=8192")
 
 
-def call(*arguments):
-    """Run the command line in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-m", "hyrl_mj.cli", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-
-
-@pytest.fixture(scope="session")
-def finished(tmp_path_factory):
+@pytest.fixture(scope="module")
+def finished(small_runs, tmp_path_factory):
     """A whole run of the unit circle in the smoke preset, made by the command line."""
     path = tmp_path_factory.mktemp("runs") / "circle"
     done = call("run", "unit_circle", *SMOKE, "--out", path)
@@ -59,7 +49,7 @@ def contents(path):
 
 def assert_one_sentence(process, *parts):
     assert process.returncode == 2, process.stdout + process.stderr
-    assert "Traceback" not in process.stderr
+    assert len(process.stderr.strip().splitlines()) == 1
     for part in parts:
         assert part in process.stderr
 
@@ -80,7 +70,7 @@ def test_run_ends_with_a_table_and_leaves_every_artifact(finished):
 
 @needs_gl
 def test_run_renders_the_replay(finished):
-    assert (finished[0] / "replay.mp4").stat().st_size > 10_000
+    assert (finished[0] / "replay.mp4").stat().st_size > 1_000
     assert (finished[0] / "replay.png").is_file()
 
 
@@ -105,23 +95,6 @@ def test_figures_are_drawn_again(copied):
     assert done.returncode == 0, done.stderr
     assert "overview, policy, extended_sets, runs" in done.stdout
     assert (copied / "figures" / "runs.pdf").is_file()
-
-
-def test_a_new_horizon_is_used_and_kept(copied):
-    assert call("extended-sets", copied, "--horizon", "0.2").returncode == 0
-    run = hyrl_mj.load_run(copied)
-    assert run.settings.horizon == run.extended_sets.horizon == 0.2
-    assert not run.manifest.is_done("retrain")
-
-
-@pytest.mark.parametrize("name", ["mode_1.safetensors", "arcs/start0_hyrl_q1.npz"])
-def test_a_stage_that_was_cut_off_is_not_done(name, copied):
-    (copied / name).unlink()
-    again = call("run", "unit_circle", *SMOKE, "--out", copied)
-    assert_has_ended(again)
-    stage = "retrain" if name.startswith("mode") else "simulate"
-    assert f"{stage}: done before" not in again.stdout
-    assert (copied / name).is_file()
 
 
 @needs_gl
@@ -213,7 +186,7 @@ def test_simulate_prints_both_ends(finished):
 
 
 def test_robustness_prints_the_worst_case_and_the_episodes(copied):
-    done = call("robustness", copied, "--episodes", "300", "--noise", "uniform,adversarial")
+    done = call("robustness", copied, "--episodes", "60", "--noise", "uniform,adversarial")
     assert done.returncode == 0, done.stderr
     for words in (
         "worst case over all noise",
@@ -227,18 +200,6 @@ def test_robustness_prints_the_worst_case_and_the_episodes(copied):
     assert [score.eps for score in robustness.game.scores["hyrl"]] == [0.0, 0.05, 0.1]
     kinds = {(c.noise, c.controller) for c in robustness.episodes}
     assert kinds == {(n, c) for n in ("uniform", "adversarial") for c in ("policy", "hyrl")}
-
-
-def test_an_interrupted_robustness_run_leaves_the_last_one(copied, monkeypatch):
-    before = contents(copied)
-
-    def interrupted(*arguments, **options):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(examination, "noisy_episodes", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        pipeline.examine_run(hyrl_mj.load_run(copied), ExamineOptions(eps=0.2, episodes=10))
-    assert contents(copied) == before
 
 
 @pytest.mark.parametrize(("form", "out"), [("onnx", "circle.onnx"), ("numpy", "circle")])
@@ -282,10 +243,8 @@ def test_list_and_help():
         (["traim"], ["traim", "critical-set"]),
     ],
 )
-def test_bad_input_before_anything_is_made(arguments, parts, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
-    assert_one_sentence(call(*arguments), *parts)
+def test_bad_input_before_anything_is_made(arguments, parts, tmp_path):
+    assert_one_sentence(call(*arguments, cwd=tmp_path), *parts)
     assert not list(tmp_path.iterdir())
 
 
@@ -375,30 +334,6 @@ def test_a_truncated_artifact_is_named(name, command, copied):
     before = contents(copied)
     assert_one_sentence(call(command, copied), str(damaged))
     assert contents(copied) == before
-
-
-@needs_gl
-def test_without_gl_the_run_is_whole_and_says_why_there_is_no_video(copied):
-    (copied / "replay.mp4").unlink()
-    process = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "hyrl_mj.cli",
-            "run",
-            "unit_circle",
-            *SMOKE,
-            "--out",
-            copied,
-        ],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "MUJOCO_GL": "disable"},
-    )
-    assert_has_ended(process)
-    assert "no video: " in process.stdout
-    assert "apt-get install libegl1" in process.stdout
-    assert "Traceback" not in process.stderr
 
 
 def test_load_run_acts_as_the_contract_says_without_torch(finished):

@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -14,8 +15,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from attacks import doors
+from command_line import call
 
-import hyrl_mj
 from hyrl_mj import mjcf, streams, trust
 from hyrl_mj.chart import Chart
 from hyrl_mj.environments import from_gymnasium
@@ -379,18 +380,13 @@ def test_what_was_not_written_here_is_not_overwritten(tmp_path):
 
 
 @pytest.mark.slow
-def test_export_overwrites_no_file_of_a_run(tmp_path):
-    run = hyrl_mj.run(
-        "unit_circle", out=tmp_path / "run", preset="smoke", set={"stage1.samples": 8192, "lattice": 130}
-    )  # fmt: skip
-    before = (run.path / "config.json").read_bytes()
-    words = ("export", str(run.path), "--to", "onnx", "--out", str(run.path / "config.json"))
-    done = subprocess.run(
-        [sys.executable, "-m", "hyrl_mj.cli", *words], capture_output=True, text=True, check=False
-    )
+def test_export_overwrites_no_file_of_a_run(planted_circle, tmp_path):
+    run = shutil.copytree(planted_circle[0].path, tmp_path / "run")
+    before = (run / "config.json").read_bytes()
+    done = call("export", run, "--to", "onnx", "--out", run / "config.json")
     assert done.returncode == 2
     assert "--force" in done.stderr
-    assert (run.path / "config.json").read_bytes() == before
+    assert (run / "config.json").read_bytes() == before
 
 
 def test_a_file_without_an_end_is_not_read(tmp_path):

@@ -119,6 +119,7 @@ class Ordered(Puck):
         self.observation_space = spaces.Dict(OrderedDict((key, parts[key]) for key in order))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrapped", WRAPPED)
 def test_parts_of_a_dict_are_joined_in_the_order_of_the_agent(wrapped, puck, tmp_path, monkeypatch):
     """Also where the task has them in another order than the agent."""

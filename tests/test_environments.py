@@ -13,6 +13,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from command_line import call as command
 from environments import (
     Delayed,
     Floating,
@@ -473,6 +474,7 @@ def test_wrong_arguments_are_refused_with_what_is_allowed(options, message):
         from_gymnasium(Puck, **options)
 
 
+@pytest.mark.slow
 def test_what_resets_draw_is_pinned_by_options_that_they_heed_or_by_a_seed():
     with pytest.raises(
         BadInput, match=r"change nothing in PointMaze_Medium-v3, which draws .*goal"
@@ -495,6 +497,7 @@ def test_an_obstacle_that_resets_draw_is_pinned_by_a_seed():
     assert from_gymnasium(Moved, reset={"rock": 0.2}).model.geom_pos[0, 1] == 0.2
 
 
+@pytest.mark.slow
 def test_the_code_of_an_environment_is_that_of_its_files(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     path = tmp_path / "my_puck.py"
@@ -643,13 +646,7 @@ def test_free_cameras_are_there_for_every_model():
         camera_of(model, "chase")
 
 
-def command(*words):
-    done = subprocess.run(
-        [sys.executable, "-m", "hyrl_mj.cli", *words], capture_output=True, text=True, check=False
-    )
-    return done.returncode, done.stdout, done.stderr
-
-
+@pytest.mark.slow
 def test_the_command_line_explains_what_was_found(tmp_path):
     path = tmp_path / "goal.json"
     path.write_text(json.dumps({"reset": {"goal_cell": [6, 6]}}))

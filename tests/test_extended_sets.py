@@ -262,6 +262,7 @@ def test_points_of_the_critical_set_that_cannot_be_used_are_refused(on_circle):
             make_partition(case.task, case.policy, points, 30)
 
 
+@pytest.mark.slow
 def test_sets_reach_walls_that_only_stop_the_robot_and_hold_their_inside(monkeypatch):
     puck, noise = from_gymnasium(Puck, steps=120), 0.3
     policy = SimpleNamespace(act=lambda m: np.clip(puck_agent(puck.observation(m)), -4, 4))

@@ -195,6 +195,7 @@ def test_the_first_side_can_be_chosen(field):
         assert (focus[0], chosen_side[0]) == (1, side)
 
 
+@pytest.mark.slow
 def test_the_guard_keeps_robots_off_posts_whatever_the_noise(field):
     rng, noise = np.random.default_rng(0), 0.1
     posts = [(-2.0, 0.0, 0.5), (0.0, 1.7, 0.9), (0.3, -1.4, 0.3), (-3.0, 2.0, 0.4)]

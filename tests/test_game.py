@@ -5,7 +5,7 @@ from itertools import count, pairwise, product
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from planted import (
     circle_controller,
@@ -46,7 +46,6 @@ LAST_CHANCE = 1.5 - 0.751 * np.sqrt(2)
 # ---- pieces of the solver
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.lists(st.integers(0, 20), max_size=200))
 def test_counting_down_and_taking_each_once_are_their_plain_twins(values):
     at = np.array(values, dtype=int)

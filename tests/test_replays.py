@@ -152,6 +152,7 @@ def test_threads_change_nothing(certificate, loops, scores, monkeypatch):
     assert examination._replays(certificate, loops, scores) == several
 
 
+@pytest.mark.slow
 def test_a_run_of_which_too_much_is_proved_says_so_everywhere(
     planted_circle, tmp_path, monkeypatch, capsys
 ):

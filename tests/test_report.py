@@ -21,7 +21,6 @@ from planted import Cube, believe, decisions, halves
 
 from hyrl_mj import BadArtifact, BadInput, MlpPolicy, load_run
 from hyrl_mj.artifacts import replacing, write_json
-from hyrl_mj.learning import presets
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.pipeline import ExamineOptions, examine_run, run_stage
 from hyrl_mj.policies import Agent
@@ -39,6 +38,8 @@ from hyrl_mj.viz.encoding import video
 from hyrl_mj.viz.figures import CLASS_COLOURS
 from hyrl_mj.viz.report import render, write_report
 
+# The page tells what the game says, however coarse it is.
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_runs")]
 MAGENTA, GREEN = (230, 20, 200), (20, 200, 60)
 POSTER = (642, 240)  # [pixels], like no other picture
 VOID = {"meta", "img", "br", "link", "input", "hr", "source"}
@@ -103,17 +104,8 @@ def film(path):
             Image.fromarray(frame).save(temporary)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def coarse():
-    """The game of preset smoke on few cells: the page tells what it says, however coarse it is."""
-    with pytest.MonkeyPatch.context() as patch:
-        for dimension, cells in ((1, 240), (2, 60), (3, 40)):
-            patch.setitem(presets._LATTICE_SMOKE, dimension, cells)
-        yield
-
-
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory):
+def runs(small_runs, tmp_path_factory):
     """A run of each problem, by name."""
     paths = {}
     for name in ("unit_circle", "vehicle"):
@@ -440,7 +432,7 @@ class Rover(Cube):
         self.noisy = (True, False, False)
 
 
-@pytest.mark.parametrize("game", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.parametrize("game", [True, False])
 def test_in_three_dimensions_the_game_is_an_estimate_beside_the_episodes(
     tmp_path, monkeypatch, game
 ):
@@ -524,7 +516,6 @@ def count(picture, colour):
 
 
 @needs_chromium
-@pytest.mark.slow
 def test_nothing_is_wider_than_the_window(written, tmp_path):
     text = re.sub(r"<meta http-equiv=[^>]*>", "", written.read_text(encoding="utf-8"))
     inner = escape(text.replace("</body>", f"{PROBE}</body>"))
@@ -546,7 +537,6 @@ def test_nothing_is_wider_than_the_window(written, tmp_path):
 
 @needs_chromium
 @pytest.mark.parametrize(("width", "height"), [(360, 3600), (1280, 2400)])
-@pytest.mark.slow
 def test_the_figures_are_seen(written, tmp_path, width, height):
     shot = tmp_path / "shot.png"
     chromium(written, tmp_path / "profile", width, height, f"--screenshot={shot}")
@@ -561,7 +551,6 @@ def test_the_figures_are_seen(written, tmp_path, width, height):
 
 
 @needs_chromium
-@pytest.mark.slow
 def test_on_paper_the_video_is_its_poster(written, tmp_path):
     paper = tmp_path / "paper.pdf"
     chromium(written, tmp_path / "profile", 1280, 6000, f"--print-to-pdf={paper}")

@@ -159,7 +159,7 @@ class Docked(Course):
     """The inner loop stops the robot in one place."""
 
     def control(self, u, qpos, qvel):
-        docked = np.linalg.norm(qpos - (0.31, 0.17), axis=1, keepdims=True) < 0.02
+        docked = np.linalg.norm(qpos - (0.31, 0.17), axis=1, keepdims=True) < 0.06
         return np.where(docked, 0.0, super().control(u, qpos, qvel))
 
 
@@ -172,8 +172,8 @@ def test_inputs_that_an_inner_loop_bends_are_tabulated_in_between():
 
 def test_an_inner_loop_that_depends_on_the_place_is_tabulated_everywhere():
     docked = Docked()
-    lattice = Lattice.of(docked, lattice_grid(docked, 240))
-    held = np.linalg.norm(lattice.grid.nodes - (0.31, 0.17), axis=1) < 0.015
+    lattice = Lattice.of(docked, lattice_grid(docked, 80))
+    held = np.linalg.norm(lattice.grid.nodes - (0.31, 0.17), axis=1) < 0.05
     assert held.any()
     stays = (lattice.after[:, 0] == np.arange(lattice.nodes)).all(axis=0)
     assert stays[held].all()

@@ -2,8 +2,6 @@
 
 import json
 import shutil
-import subprocess
-import sys
 import zipfile
 from dataclasses import asdict, replace
 from functools import partial
@@ -11,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import call
 from gl import needs_gl
 from planted import circle_policy
 from sentences import assert_has_ended
@@ -34,19 +33,9 @@ from hyrl_mj.stages.grounds import ByGame, mode_ground
 from hyrl_mj.stages.retraining import retrain, start_policy
 from hyrl_mj.viz.arcs import noisy_arcs
 
-pytestmark = pytest.mark.slow  # whole runs on agents
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_runs")]  # whole runs on agents
 
 SMOKE = {"preset": "smoke", "say": str}
-
-
-def call(*arguments):
-    """Run the command line in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-m", "hyrl_mj.cli", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
 
 
 def contents(path):
@@ -73,7 +62,8 @@ def one_way(observation):
 @pytest.fixture(scope="module")
 def dqn(vehicle, tmp_path_factory):
     """A DQN agent of the vehicle that has learned something, saved by SB3 itself."""
-    learned = training.train(vehicle, preset(vehicle, "smoke").stage1, seed=0)
+    settings = replace(preset(vehicle, "smoke").stage1, samples=10_000)
+    learned = training.train(vehicle, settings, seed=0)
     env = TaskVecEnv(BatchedEnv(vehicle, 1))
     model = DQN("MlpPolicy", env, policy_kwargs={"net_arch": list(learned.hidden)}, buffer_size=10)
     state = {name: training.torch.as_tensor(np.array(w)) for name, w in learned.weights.items()}
@@ -82,7 +72,7 @@ def dqn(vehicle, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def robust(dqn, tmp_path_factory):
+def robust(small_runs, dqn, tmp_path_factory):
     """A whole run on it, made by the command line after a diagnosis in the same folder."""
     path = tmp_path_factory.mktemp("runs") / "vehicle"
     options = ["vehicle", "--policy", dqn, "--preset", "smoke", "--out", path]
@@ -95,7 +85,7 @@ def robust(dqn, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def circle_run(few_cells, tmp_path_factory):
+def circle_run(small_runs, tmp_path_factory):
     """A whole run on a function."""
     path = tmp_path_factory.mktemp("runs") / "circle"
     return hyrl_mj.robustify("unit_circle", off_centre, out=path, **SMOKE)
@@ -231,7 +221,7 @@ def test_another_agent_does_not_overwrite_a_run(circle_run):
     assert contents(circle_run.path) == before
 
 
-def test_an_onnx_file_is_kept_in_the_run(few_cells, circle, tmp_path):
+def test_an_onnx_file_is_kept_in_the_run(circle, tmp_path):
     path = onnx_file(tmp_path, np.array([[0.0, -9.0]]), np.zeros(1))
     run = hyrl_mj.diagnose("unit_circle", path, out=tmp_path / "run", **SMOKE)
     assert run.critical_set.points == pytest.approx(np.pi, abs=0.05)
@@ -294,7 +284,7 @@ def test_episodes_stand_in_for_the_game_where_the_policy_draws(circle, tmp_path)
         noisy_arcs(run, np.zeros((1, 1)), "worst")
 
 
-def test_without_a_critical_set_one_policy_is_trained_under_noise(few_cells, tmp_path):
+def test_without_a_critical_set_one_policy_is_trained_under_noise(tmp_path):
     said = []
     run = hyrl_mj.robustify("unit_circle", one_way, out=tmp_path, preset="smoke", say=said.append)
     assert any("no critical set found at this resolution (grid " in line for line in said)
@@ -431,7 +421,6 @@ def test_bad_commands_leave_nothing(command, arguments, parts, dqn, tmp_path):
     arguments = [word.format(dqn=dqn, here=tmp_path) for word in arguments]
     done = call(command, *arguments, "--out", tmp_path / "run")
     assert done.returncode == 2, done.stdout + done.stderr
-    assert "Traceback" not in done.stderr
     for part in parts:
         assert part in done.stderr
     assert not list(tmp_path.iterdir())

@@ -28,6 +28,8 @@ from hyrl_mj.stages.tables import (
 )
 from hyrl_mj.tasks import Outcome
 
+pytestmark = pytest.mark.slow  # tables take seconds
+
 EPS = 0.15
 
 
@@ -274,7 +276,6 @@ def test_its_lattice_leads_to_where_it_goes_and_never_into_a_wall(slid):
     assert (ends == lattice.nodes).any(), "it arrives"
 
 
-@pytest.mark.slow
 def test_the_game_on_an_environment_is_an_estimate_with_its_reason(slid):
     grid = Grid.with_cells(slid.chart, 24)
     halves = [GridSet.from_mask(grid, sign * grid.nodes[:, 1] >= 0) for sign in (1, -1)]

@@ -17,7 +17,7 @@ from traps.worlds import World
 import hyrl_mj
 
 # Starts of each case here.
-FEW = 3
+FEW = 2
 # What only differs in the second episode of an instance, or only for those who run it otherwise than alone.
 LATER = ("sticky success", "outlives resets")
 HARMLESS = (
@@ -37,8 +37,7 @@ def tried(case):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TRAPS)
 def test_no_trap_is_wrong_in_silence(name):
-    first = 2 * [*TRAPS].index(name)
-    assert not [wrong for i in (first, first + 1) if (wrong := tried(trapped(i)))]
+    assert not tried(trapped(2 * [*TRAPS].index(name)))
 
 
 @pytest.mark.slow

@@ -1,9 +1,5 @@
-"""What is not as it seems is refused, left open, or right: robots with planted traps, each trap by itself.
+"""What is not as it seems is refused, left open, or right: robots with planted traps, each trap by itself."""
 
-All 200 robots: HYRL_MJ_TRAPPED=200 python -m pytest tests/test_trapped_plants.py
-"""
-
-import os
 from dataclasses import replace
 
 import mujoco
@@ -21,15 +17,17 @@ from hyrl_mj.sets import Grid
 from hyrl_mj.tasks import check_task
 from hyrl_mj.tasks.anew import begins_anew
 
-# Robots that are tried: seed k has the trap number k modulo their number.
-TRIED = int(os.environ.get("HYRL_MJ_TRAPPED", "30"))
+# The seeds of robots with every trap once: seed k has the trap number k modulo their number.
+ROUNDS = [range(first, first + len(TRAPS)) for first in range(0, 13 * len(TRAPS), len(TRAPS))]
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:invalid value")
-@pytest.mark.parametrize("part", range(2))
-def test_nothing_that_is_called_won_is_lost_in_mujoco(tmp_path, part):
-    found = [examined(seed, tmp_path) for seed in range(part, TRIED, 2)]
+@pytest.mark.parametrize(
+    "seeds", [ROUNDS[0], *(pytest.param(seeds, marks=pytest.mark.long) for seeds in ROUNDS[1:])]
+)
+def test_nothing_that_is_called_won_is_lost_in_mujoco(tmp_path, seeds):
+    found = [examined(seed, tmp_path) for seed in seeds]
     assert [(f.trap, f.wrong) for f in found if f.wrong] == []
     assert any(f.claims for f in found)
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import call
 from planted import believe
-from test_cli import call
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, HybridArc, artifacts, trust

@@ -208,7 +208,7 @@ def main(argv):
         kind, number = argv[0].split()
         case = {"trapped": trapped, "honest": honest}[kind](int(number))
         print(case.traps, case.given, *judged(case), sep="\n")
-        return
+        return 0
     n, m = int(argv[0]), int(argv[1])
     seed = int(argv[2]) if len(argv) > 2 else 0
     cases = [("trapped", i, seed) for i in range(n)] + [("honest", i, seed) for i in range(m)]
@@ -221,7 +221,8 @@ def main(argv):
                 failures += 1
                 print(f"{name} ({', '.join(traps)}): {verdict}: {why}", flush=True)
     print(f"\n{tabled(verdicts)}\n\n{failures} failures")
+    return int(failures > 0)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(main(sys.argv[1:]))

@@ -31,10 +31,12 @@ class Trial:
     Attributes:
         name: what is done, so that it can be done again.
         attempt: does it in the empty folder that it receives, and returns what broke, "" if nothing did.
+        prepare: makes what it shares with others, before any trial is made.
     """
 
     name: str
     attempt: Callable[[Path], str]
+    prepare: Callable[[], object] = lambda: None
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,6 @@ MODELS = {
 
 def trials(material: Material, draw: Random, count: int) -> list[Trial]:
     """Returns trials of each kind, drawn at random."""
-    material.finished()
     makers = {
         "spec": partial(_spec, material),
         "arguments": _arguments,
@@ -109,7 +108,9 @@ def trials(material: Material, draw: Random, count: int) -> list[Trial]:
     made = []
     for number in range(count):
         kind, seed = kinds[number % len(kinds)], draw.randrange(2**32)
-        made.append(Trial(f"{kind} {seed}", partial(makers[kind], seed)))
+        given = isinstance(makers[kind], partial)  # of the finished runs
+        prepare = material.finished if given else Trial.prepare
+        made.append(Trial(f"{kind} {seed}", partial(makers[kind], seed), prepare))
     return made
 
 

@@ -1,0 +1,29 @@
+"""The command line, called in this process: a process of its own would import everything again."""
+
+import contextlib
+import io
+from pathlib import Path
+from typing import NamedTuple
+
+from hyrl_mj.cli import dispatch
+from hyrl_mj.streams import Streams
+
+
+class Answer(NamedTuple):
+    """What a command has answered: its exit status, and what it wrote to both streams."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def call(*words, cwd="."):
+    """Call `hyrl-mj` with these words in a folder."""
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        contextlib.chdir(Path(cwd)),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        status = Streams().run(lambda: dispatch([*map(str, words)]))
+    return Answer(status, out.getvalue(), err.getvalue())
