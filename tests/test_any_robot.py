@@ -19,8 +19,8 @@ from hyrl_mj import Outcome
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.simulation import WayRuns, way_runs
-from hyrl_mj.tasks.checks import check_task
 from hyrl_mj.tasks import registry
+from hyrl_mj.tasks.checks import check_task
 from hyrl_mj.tasks.registry import reference
 from hyrl_mj.tasks.scaffold import TEMPLATES, write_task
 
