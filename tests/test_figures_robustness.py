@@ -33,6 +33,13 @@ from hyrl_mj.viz.figures import robustness, style
 
 CIRCLE, VEHICLE = hyrl_mj.get_task("unit_circle"), hyrl_mj.get_task("vehicle")
 HYRL = robustness.CURVE_COLOURS[1]
+DPI = style.DPI
+
+
+@pytest.fixture(autouse=True)
+def as_for_people(monkeypatch):
+    """Pictures have as many pixels as people get."""
+    monkeypatch.setattr(style, "DPI", DPI)
 
 
 @pytest.fixture

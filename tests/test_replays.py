@@ -28,6 +28,7 @@ FEW = {"none": 120, "uniform": 120, "alternating": 120, "worst": 60, "cells": 20
 def few_starts(monkeypatch):
     monkeypatch.setattr(replays, "STARTS", FEW)
     monkeypatch.setattr(replays, "BATCH", 100)
+    monkeypatch.setattr(replays, "WHOLE", 100)
 
 
 @pytest.fixture(scope="module")

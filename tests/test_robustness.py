@@ -17,6 +17,7 @@ from planted import (
 from hyrl_mj import BadArtifact, BadInput, Noise, artifacts, simulate
 from hyrl_mj.game import (
     BEATEN,
+    CURVE,
     LIMIT,
     OVER,
     UNCLEAR,
@@ -29,12 +30,20 @@ from hyrl_mj.game import (
 )
 from hyrl_mj.game.solver import NEVER
 from hyrl_mj.policies.controllers import PolicyController
-from hyrl_mj.proof import examine
+from hyrl_mj.proof import examination, examine
 from hyrl_mj.sets import Grid
 
 PI = np.pi
 # On 754 nodes full speed leads from node to node on the circle.
 EXACT = 754
+
+
+@pytest.fixture(scope="module", autouse=True)
+def whole_curve():
+    """The curve goes through all bounds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(examination, "CURVE", CURVE)
+        yield
 
 
 @pytest.fixture(scope="module")
