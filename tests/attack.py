@@ -1,6 +1,6 @@
 """Attacks hyrl_mj: crashes, kills, damaged and crafted files, wrong settings and tasks, rivals, bad machines.
 
-    python tests/attack.py                        # all of it, under ten minutes on two cores
+    python tests/attack.py                        # all of it
     python tests/attack.py --short                # a sample of each attack
     python tests/attack.py --only received --match zip --seed 3
 

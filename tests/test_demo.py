@@ -46,11 +46,9 @@ def test_the_captions_of_the_replay_say_it_too():
     assert all(f"{DEMO['worst_replay']}](" in caption for caption in captions)
 
 
-@pytest.fixture(
-    scope="module", params=[pytest.param("unit_circle", marks=pytest.mark.long), "vehicle"]
-)
+@pytest.fixture(scope="module", params=["unit_circle", "vehicle"])
 def demo(request, tmp_path_factory):
-    """A task of the demo and its run; the run of the other one is made in the long lane."""
+    """A task of the demo and its run."""
     if FOLDER in os.environ:
         return request.param, Path(os.environ[FOLDER]) / request.param
     path = tmp_path_factory.mktemp("demo") / request.param
