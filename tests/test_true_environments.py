@@ -16,6 +16,7 @@ from gymnasium.wrappers import (
 )
 
 from hyrl_mj import BadInput, Noise, closed_loop, from_callable, from_gymnasium, simulate
+from hyrl_mj.environments.instance import _global_state, kept_generators
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import LoopSettings, Programmes, Recorded, Rules
 
@@ -458,3 +459,13 @@ def test_what_all_instances_share_may_not_change_in_an_episode_though_a_reset_se
 def _driven_right(task):
     agent = from_callable(lambda o: np.tile([4.0, 0.0], (len(o), 1)), task)
     return simulate(task, agent, [[1.0, 1.0]] * 2)
+
+
+def test_any_number_of_random_numbers_is_noticed():
+    """Also as many as fill the table of the generator, after which its place is the same."""
+    with kept_generators():
+        np.random.seed(0)
+        for count in (1, 312, 624):
+            before = _global_state()
+            np.random.random(count)
+            assert _global_state() != before

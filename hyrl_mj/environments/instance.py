@@ -267,9 +267,7 @@ class Instance:
 
     def rested(self, start: np.ndarray) -> np.ndarray:
         """Returns what is first observed (o,) of an episode that begins at a state of MuJoCo (S,)."""
-        if self.is_wrapped or self.inner_seen is None:
-            return self.put(start)
-        return self.placed(start)
+        return self.put(start) if self.is_wrapped else self.placed(start)
 
     def displaced(self, noise: np.ndarray) -> np.ndarray:
         """Returns by how much the innermost observation changes (o,) where the chart's coordinates do.
@@ -405,7 +403,8 @@ def kept_generators() -> Iterator[None]:
 def _global_state() -> tuple[Any, ...]:
     """Returns how far the global generators of NumPy and Python are."""
     numpy_state: Any = np.random.get_state()
-    return numpy_state[2], random.getstate()
+    # The place in a table of 624 words, and a word of it: it is filled anew at its end.
+    return numpy_state[2], int(numpy_state[1][0]), random.getstate()
 
 
 class _Chain:

@@ -114,8 +114,8 @@ class Stage:
         """Returns what episodes that begin in states (k, S) observe first (k, o), and depths (k,) [m]."""
         seen, depths = [], []
         for start in starts:
-            if self._resting is None or self.spec.anew:
-                self._resting = self._new()
+            if self._resting is None or self.spec.wrapped:
+                self._resting = self._renewed([self._resting] if self._resting else [])
             seen.append(self._resting.rested(start))
             depths.append(self._resting.depth())
         return np.array(seen), np.array(depths)
