@@ -1,11 +1,11 @@
 """Scattered nodes stand for grids in charts of four to six dimensions: sets, stages, and their accuracy."""
 
-import resource
 import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from memory import Peak
 from planted import Hall, hall_distance, hall_level, hall_policy, hall_slope
 
 from hyrl_mj import BadInput, Chart, Noise, closed_loop
@@ -328,11 +328,12 @@ def test_sets_on_scattered_nodes_survive_being_written(case, tmp_path):
 
 @pytest.mark.slow
 def test_errors_fall_with_the_nodes_within_the_memory(case, close_by):
-    fine = Case(11, 13)
+    with Peak() as memory:
+        fine = Case(11, 13)
     coarse_points, fine_points = (
         np.sqrt(np.mean(hall_distance(c.critical.points) ** 2)) for c in (case, fine)
     )
     assert fine_points < 0.8 * coarse_points
     assert fine.error(close_by) < 0.75 * case.error(close_by)
     assert fine.seconds < 300  # of one core
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < 2e6  # [kB]
+    assert memory.megabytes < 500
