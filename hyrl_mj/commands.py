@@ -12,6 +12,7 @@ from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.fields import DriveOptions, for_posts, read_field
 from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions, SweepOptions
 from hyrl_mj.policies import check_agent_file
+from hyrl_mj.run_arcs import noisy_arcs
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sweeps import DONE
 from hyrl_mj.tasks import Field, Task, get_task, task_names, write_task
@@ -194,8 +195,6 @@ def simulate(
         time: time to simulate [s]; by default the task's.
         seed: seed of the noise.
     """
-    from hyrl_mj.viz.arcs import noisy_arcs
-
     if start is None:
         if (q0, noise, eps, time, seed) != (None, "alternating", None, None, 0):
             raise BadInput("--q0, --noise, --eps, --time and --seed need a --start")
@@ -253,8 +252,8 @@ def replay(
         eps: bound of the noise, in the units of the chart; by default the run's.
         force: overwrite a file that hyrl-mj has not written.
     """
-    from hyrl_mj.viz.arcs import replay_floor, replay_shows
     from hyrl_mj.viz.replay import render_replay
+    from hyrl_mj.viz.shows import replay_floor, replay_shows
 
     usual_out = run.path / "replay.mp4"
     usual = ReplayOptions(camera=options.camera, size=options.size, fps=options.fps)

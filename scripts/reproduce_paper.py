@@ -20,8 +20,8 @@ from rich.table import Table
 import hyrl_mj
 from hyrl_mj import progress
 from hyrl_mj.errors import BadInput
+from hyrl_mj.run_arcs import policy_start_arcs
 from hyrl_mj.viz import figures
-from hyrl_mj.viz.arcs import policy_start_arcs
 
 # A line of the table: the quantity, the paper's value, ours, and a note.
 Line = tuple[str, str, str, str]

@@ -13,8 +13,9 @@ from planted import (
 )
 
 from hyrl_mj import ExtendedSets, Noise, simulate
-from hyrl_mj.viz.arcs import overview_arcs, policy_start_arcs
+from hyrl_mj.run_arcs import overview_arcs, policy_start_arcs
 from hyrl_mj.viz.figures import ShownRun
+from hyrl_mj.viz.section import Section
 
 EPS = 0.1
 
@@ -68,7 +69,7 @@ def shown_of(task, arcs):
     """Returns what the figures show of a planted run with these replays."""
     policy = policy_of(task)
     return ShownRun(
-        task,
+        Section(task),
         "DQN",
         policy,
         decisions(task),
@@ -76,7 +77,6 @@ def shown_of(task, arcs):
         noisy=arcs["critical", "policy"],
         noiseless=tuple(overview_arcs(task, policy)),
         paper=tuple(policy_start_arcs(task, policy, EPS, 0)),
-        whole=task,
         sets=sets_of(task),
         replays=arcs,
     )

@@ -125,7 +125,7 @@ def test_the_demo_gives_these_numbers(demo):
 @pytest.mark.slow
 @pytest.mark.parametrize("demo", ["vehicle"], indirect=True)
 def test_the_demo_gives_this_replay(demo):
-    from hyrl_mj.viz.arcs import replay_shows
+    from hyrl_mj.viz.shows import replay_shows
 
     (show,) = replay_shows(hyrl_mj.load_run(demo[1]), "paper", "worst")
     lost = [Counter(arc.outcome for arc in arcs)["crashed"] for arcs in (show.policy, show.hybrid)]

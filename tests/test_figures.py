@@ -17,11 +17,11 @@ from planted import Cube, decisions, plane_policy
 
 import hyrl_mj
 from hyrl_mj import BadInput, HybridController, Outcome, Scene, simulate
+from hyrl_mj.run_arcs import overview_arcs, policy_start_arcs
 from hyrl_mj.sets import Everything, Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.viz import figures
-from hyrl_mj.viz.arcs import overview_arcs, policy_start_arcs
 from hyrl_mj.viz.figures import charts, extended_sets, runs, style
 from hyrl_mj.viz.report import pictures
 from hyrl_mj.viz.section import Section
@@ -188,7 +188,7 @@ def test_of_one_coordinate_that_is_not_periodic_only_the_runs_are_drawn():
     assert figures.names(Line(), figures.ShownRun) == ("runs",)
     for name in ("overview", "policy", "extended_sets"):
         with pytest.raises(BadInput, match="one coordinate, a, which is not periodic"):
-            draw(name, CIRCLE, task=Line())
+            draw(name, CIRCLE, section=Section(Line()))
 
 
 def test_tints_are_the_colours_with_white():
@@ -391,10 +391,9 @@ def test_of_three_dimensions_a_section_is_drawn_and_the_runs_over_time():
         policy,
         NONE,
         Partition((0, 1), (half, ~half), half.mask),
-        noisy=section.arc(arcs["start0", "policy"]),
-        noiseless=tuple(overview_arcs(section, policy)),
-        paper=tuple(policy_start_arcs(section, policy, EPS, 0)),
-        whole=cube,
+        noisy=arcs["start0", "policy"],
+        noiseless=tuple(overview_arcs(cube, policy)),
+        paper=tuple(policy_start_arcs(cube, policy, EPS, 0)),
         sets=ExtendedSets((0, 1), (half, ~half), (), 0.3, EPS, np.empty((0, 2)), np.empty(0)),
         replays=arcs,
     )
@@ -422,7 +421,7 @@ def test_an_obstacle_of_any_shape_is_drawn_where_runs_end():
             wall = (abs(x - 1) < 0.2) & (y > 0.5)
             return np.where(wall, Outcome.CRASHED, Outcome.RUNNING)
 
-    figure = draw("runs", VEHICLE, whole=Walled())
+    figure = draw("runs", VEHICLE, section=Section(Walled()))
     over = filled(figure.axes[0], style.GREY)
     at = ((1.0, 1.0), (1.0, 0.4), (1.17, 1.4), (1.23, 1.4), (1.5, 0.0))
     assert inside(over, *at) == [True, False, True, False, False]
@@ -448,10 +447,10 @@ def test_a_path_round_a_period_is_broken_at_the_seam():
     z = np.stack([np.linspace(5, 8, 31), np.full(31, 1.0)], axis=1)
     with style.style.context("default"):
         panel = Figure().subplots()
-        view = runs.make_view(panel, Torus())
+        view = runs.plane_view(panel, Section(Torus()))
         x, y = runs.line(panel, view, np.arange(31), z).get_data()
     assert np.isnan(x).sum() == 1
     assert np.nanmax(np.abs(np.diff(x))) < 0.2
     assert np.nanmax(x) < 2 * np.pi
     assert (y[~np.isnan(y)] == 1).all()
-    assert not charts.is_ring(Torus())
+    assert not charts.is_ring(Torus.chart)

@@ -30,6 +30,7 @@ from hyrl_mj.game.scores import CURVE
 from hyrl_mj.sets import Grid
 from hyrl_mj.viz import figures
 from hyrl_mj.viz.figures import robustness, style
+from hyrl_mj.viz.section import Section
 
 CIRCLE, VEHICLE = hyrl_mj.get_task("unit_circle"), hyrl_mj.get_task("vehicle")
 HYRL = robustness.CURVE_COLOURS[1]
@@ -92,12 +93,16 @@ def critical_of(*points):
 
 
 def draw_map(task, result, maps, critical, path=None):
-    return figures.draw_robustness_map(figures.ShownGame(task, critical, result, maps), path)
+    return figures.draw_robustness_map(
+        figures.ShownGame(Section(task), critical, result, maps), path
+    )
 
 
 def draw_curve(task, result, path=None):
     maps = maps_of(task, [], lambda z: np.zeros(len(z)), cells=8)
-    return figures.draw_robustness_curve(figures.ShownGame(task, critical_of(), result, maps), path)
+    return figures.draw_robustness_curve(
+        figures.ShownGame(Section(task), critical_of(), result, maps), path
+    )
 
 
 @pytest.mark.parametrize("task", [CIRCLE, VEHICLE], ids=lambda task: task.name)

@@ -77,7 +77,6 @@ def shown(request):
         noisy=arcs["start0", "policy"],
         noiseless=quiet,
         paper=tuple(arcs[f"start{i}", "policy"] for i in range(3)),
-        whole=task,
         sets=ExtendedSets(modes, sets, winning, 0.3, EPS, np.empty((0, 2)), np.empty(0)),
         replays=arcs,
     )

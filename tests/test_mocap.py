@@ -18,7 +18,6 @@ from hyrl_mj.rendering import SceneRenderer
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import Outcome, Scene, Task, check_task
 from hyrl_mj.viz.replay.marks import tracked_points
-from hyrl_mj.viz.section import Section
 from hyrl_mj.viz.viewing import show
 
 XML = """
@@ -274,9 +273,6 @@ def test_viewers_and_marks_show_them_at_the_phase(swing):
     on_hand.scene = Scene(((0.0, 0.0, 0.0),), 2.0, ("left", "right"), tracked="tip")
     tip = tracked_points(on_hand, np.array([[0.0, 0.0, 1.0]]))
     np.testing.assert_allclose(tip, places(swing, np.array([[0.0, 0.0, 1.0]]))[:, 3:], atol=1e-9)
-    np.testing.assert_array_equal(
-        Section(swing).mocap(np.ones((1, 3))), swing.mocap(np.ones((1, 3)))
-    )
 
 
 # ---- mistakes

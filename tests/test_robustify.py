@@ -27,11 +27,11 @@ from hyrl_mj.learning.presets import preset
 from hyrl_mj.learning.settings import Settings
 from hyrl_mj.pipeline.steps import STAGES
 from hyrl_mj.policies.external import read_agent, reopen_agent
+from hyrl_mj.run_arcs import noisy_arcs
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages import Partition, boundary, with_room
 from hyrl_mj.stages.grounds import ByGame, mode_ground
 from hyrl_mj.stages.retraining import retrain, start_policy
-from hyrl_mj.viz.arcs import noisy_arcs
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_runs")]  # whole runs on agents
 

@@ -5,12 +5,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from environments import Puck
 from planted import ChartPolicy, Cube, sphere_policy
 
 import hyrl_mj
-from hyrl_mj import LoopSettings, Task, closed_loop, find_critical_set
-from hyrl_mj.policies.controllers import PolicyController
+from hyrl_mj import find_critical_set
+from hyrl_mj.run_arcs import overview_arcs
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
@@ -76,123 +75,40 @@ def test_its_critical_set_is_searched_for_in_the_plane(cube, section, monkeypatc
     assert off.max() <= found.resolution
 
 
-def test_runs_in_it_are_those_of_the_whole_task(cube, section):
-    z = np.array([[0.2, 0.1], [-0.5, 0.4]])
-    loop = PolicyController(sphere_policy(cube, RADIUS))
-    seen = closed_loop(section, loop, z, settings=LoopSettings(steps=5))
-    whole = closed_loop(cube, loop, section.lift(z), settings=LoopSettings(steps=5))
-    np.testing.assert_array_equal(seen.path, whole.path[..., :2])
-    np.testing.assert_array_equal(seen.measured, whole.measured)
-
-
 def test_it_says_where_it_is(section):
     chart = section.chart
     assert (chart.names, chart.section) == (("a", "b"), "c = 0.3 m")
     assert section.set_point.tolist() == [0.0, 0.0]
 
 
-# Of `Task`, what has to be cut to the plane.
-CUT = {
-    "arrived", "at", "check_noise", "direction", "for_mode", "goes_on", "may_start", "miss",
-    "noise_in_chart", "noisy_everywhere", "set_point", "starts", "state", "with_noise", "with_z", "z",
-}  # fmt: skip
-
-
-class Other:
-    """A task all of whose parts are told by their names."""
-
-    def __getattr__(self, name):
-        return f"the whole task's {name}"
-
-
-def test_all_that_has_no_chart_in_it_is_that_of_the_whole_task(section):
-    other = object.__new__(Section)
-    vars(other).update(whole=Other())
-    public = {name for name in vars(Task) if not name.startswith("_")}
-    assert public >= CUT
-    for name in public - CUT:
-        assert getattr(other, name) == f"the whole task's {name}"
-
-
-def test_it_has_the_time_of_an_environment_of_several_steps_a_sample():
-    task = hyrl_mj.from_gymnasium(Puck, steps=30)  # five steps of the physics a sample
-    section = Section(task)
-    assert section.dt == task.dt == pytest.approx(0.1)
-    z, ahead = task.scene.starts[0], ChartPolicy(task, lambda z: np.ones((len(z), 2)))
-    arc, whole = (hyrl_mj.simulate(one, ahead, z, horizon=0.5) for one in (section, task))
-    np.testing.assert_array_equal(arc.t, whole.t)
-    np.testing.assert_array_equal(arc.z, whole.z)
-    assert (len(arc.t), arc.t[-1]) == (6, pytest.approx(0.5))
-
-
-def test_noise_and_modes_of_a_section_are_those_of_the_whole(vehicle):
-    section = Section(vehicle)
-    everywhere = section.noisy_everywhere()
-    assert isinstance(everywhere, Section)
-    assert everywhere.noise_on() == vehicle.noisy_everywhere().noise_on() != section.noise_on()
-    assert everywhere.noisy == (True, True)
-    assert isinstance(section.for_mode(0), Section)
-
-
-def test_its_task_is_the_whole_one_but_for_the_chart():
+def test_runs_of_the_whole_task_are_cut_to_it():
     rover = hyrl_mj.get_task("rover")
-    before = dict(vars(rover))
-    task, rng = Section(rover), np.random.default_rng(0)
-    assert {name for name in vars(rover) if name not in before} <= {
-        "arena",
-        "chart",
-        "set_point",
-        "model",
-    }
-    assert (task.name, task.speed) == ("rover", rover.speed)
-    with pytest.raises(AttributeError, match="wheel_count"):
-        task.wheel_count  # noqa: B018
-    z = rover.starts(20, rng)
-    plant = task.plant(20)
-    plant.set_state(*rover.state(z))
-    u = rng.uniform(*task.input_limits, (20, 1))
-    plant.step(u)
-    measured = plant.measurement
-    for ours, theirs in (
-        (task.reward(measured, u), rover.reward(measured, u)),
-        (task.observation(measured), rover.observation(measured)),
-        (task.ending(measured), rover.ending(measured)),
-        (task.verdict(measured), rover.verdict(measured)),
-        (task.danger(measured), rover.danger(measured)),
-        (task.failed(measured), rover.failed(measured)),
-        (task.z(measured), rover.z(measured)[:, :2]),
-        (task.input_levels, rover.input_levels),
-        (
-            task.starts(9, np.random.default_rng(1)),
-            rover.starts(9, np.random.default_rng(1))[:, :2],
-        ),
-    ):
-        np.testing.assert_array_equal(ours, theirs)
-    flat = z * [1, 1, 0]
-    for ours, theirs in (
-        (task.arrived(z[:, :2]), rover.arrived(flat)),
-        (task.miss(z[:, :2]), rover.miss(flat)),
-        (task.state(z[:, :2])[0], rover.state(flat)[0]),
-        (
-            task.direction(np.stack([z, z + 1])[..., :2]),
-            rover.direction(np.stack([flat, flat + 1])),
-        ),
-    ):
-        np.testing.assert_array_equal(ours, theirs)
-    assert task.learning == rover.learning
-    assert task.scene.starts == tuple(start[:2] for start in rover.scene.starts)
-    assert (task.scene.mode_names, task.scene.time) == (("left", "right"), 5.0)
+    section, z = Section(rover), rover.starts(20, np.random.default_rng(0))
+    np.testing.assert_array_equal(section.project(z), z[:, :2])
+    np.testing.assert_array_equal(section.lift(z[:, :2]), z * [1, 1, 0])
+    np.testing.assert_array_equal(section.noise(0.1), rover.noise_in_chart(0.1)[:2])
+    np.testing.assert_array_equal(section.failed(z[:, :2]), rover.failed(rover.at(z * [1, 1, 0])))
+
+
+def test_an_overview_starts_along_the_longest_side_of_the_start_region(cube, vehicle):
+    policy = sphere_policy(cube, RADIUS)
+    starts = np.array([arc.z[0] for arc in overview_arcs(cube, policy)])
+    assert starts.shape == (24, 3), "the region is all of the plane"
+    assert (starts[:, 2] == HEIGHT).all()
+    assert len(np.unique(starts[:, :2], axis=0)) == 24
+    ahead = ChartPolicy(vehicle, lambda z: np.zeros((len(z), 1)))
+    z = np.array([arc.z[0] for arc in overview_arcs(vehicle, ahead)])
+    assert (z[:, 0] == vehicle.start_low[0]).all()
+    np.testing.assert_allclose(np.diff(z[:, 1]), np.diff(z[:2, 1])[0])
 
 
 def test_a_plane_is_left_as_it_is(vehicle):
     section = Section(vehicle)
     assert section.chart == vehicle.chart
-    assert section.scene == vehicle.scene
     assert not section.cut
     something = object()
     assert section.partition(something) is something
     assert section.extended_sets(something) is something
-    assert section.arc(something) is something
 
 
 def test_what_lies_on_the_floor_is_below_who_flies(puck):

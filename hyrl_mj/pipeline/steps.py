@@ -23,6 +23,7 @@ from hyrl_mj.pipeline.examination import (
 )
 from hyrl_mj.policies import Agent, PolicyController, algorithms
 from hyrl_mj.progress import Say
+from hyrl_mj.run_arcs import replay_arcs
 from hyrl_mj.run_directory import Run
 from hyrl_mj.stages import (
     Arrivals,
@@ -158,8 +159,6 @@ def _retrained(
 
 def simulate_stage(run: Run, say: Say) -> None:
     """Stage 7: simulates the paper's replay starts, and one on M*, under the paper's noise."""
-    from hyrl_mj.viz.arcs import replay_arcs
-
     arcs, paths = replay_arcs(run), run.arc_paths()
     for key, arc in arcs.items():
         arc.save(paths[key])
@@ -177,8 +176,8 @@ def figures_stage(run: Run, say: Say) -> None:
 
 def replay_stage(run: Run, say: Say) -> None:
     """Renders the replay of the start on M*; without GL or ffmpeg reports why not."""
-    from hyrl_mj.viz.arcs import replay_floor, replay_shows
     from hyrl_mj.viz.replay import render_replay
+    from hyrl_mj.viz.shows import replay_floor, replay_shows
 
     shows = replay_shows(run)
     options = SMOKE if run.settings.preset == "smoke" else ReplayOptions()

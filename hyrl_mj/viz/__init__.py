@@ -1,6 +1,6 @@
 """Pictures, videos, tables and pages of the results of a run.
 
-The modules `arcs`, `diagnosis`, `drives`, `encoding`, `figures`, `replay`, `report` and `viewing` import
+The modules `diagnosis`, `drives`, `encoding`, `figures`, `replay`, `report`, `shows` and `viewing` import
 matplotlib, Pillow or a GL library, so they are imported only where they are needed.
 """
 
@@ -11,7 +11,6 @@ from hyrl_mj.viz.tables import print_robustness, print_summary, replay_sentence,
 
 __all__ = [
     "ReplayOptions",
-    "arcs",
     "beginning",
     "diagnosis",
     "drives",
@@ -24,6 +23,7 @@ __all__ = [
     "replay_sentence",
     "report",
     "robustness_sentence",
+    "shows",
     "sweep_page",
     "viewing",
 ]

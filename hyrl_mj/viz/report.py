@@ -17,10 +17,10 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.game import LIMIT, MAP_CLASSES, EpisodeCount, GameResult, Robustness
 from hyrl_mj.learning import Training
 from hyrl_mj.policies import Agent, MlpPolicy
+from hyrl_mj.run_arcs import attack_replay
 from hyrl_mj.run_directory import Run
 from hyrl_mj.verdict import NO_NOISE, POLICIES, listed
 from hyrl_mj.viz import tables
-from hyrl_mj.viz.arcs import attack_replay
 from hyrl_mj.viz.commands import changed, commands
 from hyrl_mj.viz.figures import CLASS_COLOURS, FIGURES
 from hyrl_mj.viz.figures.style import task_title

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from operator import attrgetter
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,7 +12,6 @@ from hyrl_mj.chart import Chart
 from hyrl_mj.game import Maps
 from hyrl_mj.run_directory import Run
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.simulation import HybridArc
 from hyrl_mj.stages import CriticalSet, ExtendedSets, Partition, critical_points
 from hyrl_mj.tasks import Task
 
@@ -26,91 +23,59 @@ CELLS = 40
 CELLS_OF_CLOUD = 96
 
 
-def _of_whole(name: str) -> Any:
-    """Returns a property of `Section` with the attribute or method of the whole task."""
-    return property(attrgetter(f"whole.{name}"))
+class Section:
+    """The plane of a chart's first two coordinates, in which results of the whole task are drawn.
 
-
-class Section(Task):
-    """A task on the plane of its chart's first two coordinates, in which results are drawn.
-
-    All else is that of the whole task. A chart of one or two dimensions stays whole.
+    A chart of one or two dimensions stays whole.
 
     Args:
-        whole: the task.
+        task: the whole task.
         rest: (d - 2,) values of the other coordinates, by default those of the scene's first start.
 
     Attributes:
-        whole: the task.
-        cut: whether its chart has more coordinates than the section.
+        task: the whole task.
+        chart: of the plane.
+        cut: whether the whole chart has more coordinates.
         rest: (d - 2,) values of the other coordinates.
+        set_point: the task's, as far as it lies in the plane.
+        start_low, start_high: corners of the task's box of starts in the plane.
     """
 
-    # The abstract ones; the rest of `Task` is forwarded below.
-    observation, reward, ending = (_of_whole(name) for name in ("observation", "reward", "ending"))
-
-    def __init__(self, whole: Task, rest: ArrayLike | None = None):
-        chart, scene = whole.chart, whole.scene
-        self.whole, self.cut = whole, chart.dimension > 2
-        self.rest = np.array(scene.starts[0][2:] if rest is None else rest, dtype=float)
-        where = zip(chart.names[2:], self.rest, chart.units[2:], strict=True)
+    def __init__(self, task: Task, rest: ArrayLike | None = None):
+        whole = task.chart
+        self.task, self.cut = task, whole.dimension > 2
+        self.rest = np.array(task.scene.starts[0][2:] if rest is None else rest, dtype=float)
+        where = zip(whole.names[2:], self.rest, whole.units[2:], strict=True)
         place = ", ".join(f"{name} = {value:g} {unit}" for name, value, unit in where)
-        low, high, periodic = chart.low[:2], chart.high[:2], chart.periodic[:2]
-        names, units, scale = chart.names[:2], chart.units[:2], chart.scale[:2]
+        low, high, periodic = whole.low[:2], whole.high[:2], whole.periodic[:2]
+        names, units, scale = whole.names[:2], whole.units[:2], whole.scale[:2]
         self.chart = Chart(names, units, low, high, periodic, place, scale)
-        self.start_low, self.start_high = whole.start_low[:2], whole.start_high[:2]
-        starts, policy_starts = (
-            tuple(z[:2] for z in points) for points in (scene.starts, scene.policy_starts)
-        )
-        self.scene = replace(scene, starts=starts, policy_starts=policy_starts)
-
-    def __getattr__(self, name: str) -> Any:
-        """Returns what neither this class nor `Task` defines: the robot's own."""
-        return getattr(object.__getattribute__(self, "whole"), name)
+        self.set_point = None if task.set_point is None else task.set_point[:2]
+        self.start_low, self.start_high = task.start_low[:2], task.start_high[:2]
 
     @property
-    def set_point(self) -> np.ndarray | None:
-        return None if self.whole.set_point is None else self.whole.set_point[:2]
+    def where(self) -> str:
+        """Where the section lies: " at heading = 0 rad", "" of a whole chart."""
+        return f" at {self.chart.section}" if self.cut else ""
 
-    def state(
-        self, z: np.ndarray, rng: np.random.Generator | None = None
-    ) -> tuple[np.ndarray, np.ndarray | None]:
-        return self.whole.state(self.lift(z), rng)
-
-    def z(self, measured: np.ndarray) -> np.ndarray:
-        return self.whole.z(measured)[:, :2]
-
-    def at(self, z: np.ndarray) -> np.ndarray:
-        return self.whole.at(self.lift(z))
-
-    def with_z(self, measured: np.ndarray, z: np.ndarray) -> np.ndarray:
-        return self.whole.with_z(measured, np.hstack([z, self.whole.z(measured)[:, 2:]]))
-
-    def arrived(self, z: np.ndarray) -> np.ndarray:
-        return self.whole.arrived(self.lift(z))
-
-    def miss(self, z: np.ndarray) -> np.ndarray:
-        return self.whole.miss(self.lift(z))
-
-    def for_mode(self, mode: int) -> Section:
-        return Section(self.whole.for_mode(mode), self.rest)
-
-    def with_noise(self, shares: Sequence[float]) -> Section:
-        return Section(self.whole.with_noise(shares), self.rest)
-
-    def goes_on(self, z: np.ndarray) -> np.ndarray:
-        return self.whole.goes_on(self.lift(z))
-
-    def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        return self.whole.starts(n, rng)[:, :2]
-
-    def direction(self, path: np.ndarray) -> np.ndarray:
-        return self.whole.direction(self.lift(path))
+    def noise(self, bound: float) -> np.ndarray:
+        """Returns the largest error of a measured point of the plane, by coordinate."""
+        return self.task.noise_in_chart(bound)[:2]
 
     def lift(self, z: np.ndarray) -> np.ndarray:
-        """Returns the points (..., d) of the whole chart at points (..., 2) of the section."""
+        """Returns the points (..., d) of the whole chart at points (..., 2) of the plane."""
         rest = np.broadcast_to(self.rest, (*z.shape[:-1], len(self.rest)))
         return np.concatenate([z, rest], axis=-1)
+
+    def project(self, z: np.ndarray) -> np.ndarray:
+        """Returns points (..., d) of the whole chart without the coordinates that are not drawn."""
+        return z[..., :2]
+
+    def failed(self, z: np.ndarray) -> np.ndarray:
+        """Returns (n,) bool: whether a run ends without success at points (n, 2) of the plane."""
+        plant = self.task.plant(len(z))
+        plant.set_state(*self.task.state(self.lift(z)))
+        return self.task.failed(plant.measurement)
 
     # ---- results in the section
 
@@ -143,26 +108,15 @@ class Section(Task):
         if not self.cut:
             return maps
         nodes = Grid.from_counts(self.chart, maps.grid_counts[:2]).nodes
-        at = maps.grid(self.whole.chart).nearest(self.lift(nodes))
+        at = maps.grid(self.task.chart).nearest(self.lift(nodes))
         classes = {name: values[at] for name, values in maps.map.items()}
         return Maps(maps.eps, maps.grid_counts[:2], classes)
-
-    def arc(self, arc: HybridArc) -> HybridArc:
-        """Returns an arc with the section's coordinates."""
-        return replace(arc, z=arc.z[:, :2]) if self.cut else arc
 
     def _set(self, members: GridSet) -> GridSet:
         whole = members.grid
         counts = whole.counts[:2] if isinstance(whole, Grid) else (CELLS_OF_CLOUD,) * 2
         grid = Grid(self.chart, counts)
         return GridSet(grid, members.signed_distance(self.lift(grid.nodes)))
-
-
-# Of `Task`, what follows from the section's own chart.
-OF_CHART = {"may_start", "noise_in_chart", "check_noise", "noisy_everywhere"}
-for _name in {*vars(Task)} - {*vars(Section)} - OF_CHART:
-    if not _name.startswith("_"):
-        setattr(Section, _name, _of_whole(_name))
 
 
 def sections(task: Task) -> tuple[int | None, list[Section]]:
@@ -190,8 +144,7 @@ def critical_sets(run: Run, cuts: Sequence[Section]) -> list[CriticalSet]:
     firsts = len(grid.nodes) * np.arange(len(cuts))[:, None]
     first, second = ((firsts + ends).ravel() for ends in grid.neighbours())
     rods = first, second
-    whole = cuts[0].whole
-    points = critical_points(whole, run.steady, nodes, rods, grid.cell, resolution, noise)
+    points = critical_points(cuts[0].task, run.steady, nodes, rods, grid.cell, resolution, noise)
     found = []
     for cut in cuts:
         # A point between two nodes of a section lies in it.

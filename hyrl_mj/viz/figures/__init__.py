@@ -91,7 +91,7 @@ def names(task: Task, shows: type[ShownPolicy | ShownGame]) -> tuple[str, ...]:
     return tuple(
         name
         for name, entry in FIGURES.items()
-        if issubclass(shows, entry.shows) and (drawable(task) or not entry.flat)
+        if issubclass(shows, entry.shows) and (drawable(task.chart) or not entry.flat)
     )
 
 

@@ -13,34 +13,36 @@ from matplotlib.patches import Circle, Wedge
 from matplotlib.ticker import MultipleLocator
 from scipy.ndimage import gaussian_filter
 
+from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.figures.style import CASING, GREEN, GREY, INK, PALE, PAPER, angle, axis_label
+from hyrl_mj.viz.section import Section
 
 # Radii of a ring, its ticks, their labels, and the edge of its panel.
 OUTER, INNER, TICK, LABEL, EDGE = 1.0, 0.7, 1.05, 1.18, 1.25
 # Cells along the longest side of the grid that shows where runs are over, and its blur in cells.
 OVER_CELLS, OVER_BLUR = 240, 1.5
-# Where runs are over, by task: a picture has several charts of one.
-_OVER: WeakKeyDictionary[Task, np.ndarray] = WeakKeyDictionary()
+# Where runs are over, by section: a picture has several panels of one.
+_OVER: WeakKeyDictionary[Section, np.ndarray] = WeakKeyDictionary()
 # Periods to either side at which the set-point is drawn over time.
 TURNS = 9
 
 
-def is_ring(task: Task) -> bool:
-    """Returns whether the chart is one periodic coordinate."""
-    return task.chart.periodic == (True,)
+def is_ring(chart: Chart) -> bool:
+    """Returns whether a chart is one periodic coordinate."""
+    return chart.periodic == (True,)
 
 
-def drawable(task: Task) -> bool:
-    """Returns whether the chart, or a section of it, can be shown as a plane or a ring."""
-    return is_ring(task) or task.chart.dimension > 1
+def drawable(chart: Chart) -> bool:
+    """Returns whether a chart, or a section of it, can be shown as a plane or a ring."""
+    return is_ring(chart) or chart.dimension > 1
 
 
 def check_drawable(task: Task) -> None:
-    """Raises `BadInput` unless `drawable`."""
-    if not drawable(task):
+    """Raises `BadInput` unless the task's chart is `drawable`."""
+    if not drawable(task.chart):
         name = task.chart.names[0]
         raise BadInput(
             f"the chart of {task.name} has one coordinate, {name}, which is not periodic, so that there is "
@@ -48,10 +50,10 @@ def check_drawable(task: Task) -> None:
         )
 
 
-def label_axis(axis: Axis, task: Task, coordinate: int) -> None:
+def label_axis(axis: Axis, chart: Chart, coordinate: int) -> None:
     """Labels an axis with its coordinate of the chart; a periodic angle in multiples of pi."""
-    axis.set_label_text(axis_label(task, coordinate))
-    if task.chart.units[coordinate] == "rad" and task.chart.periodic[coordinate]:
+    axis.set_label_text(axis_label(chart, coordinate))
+    if chart.units[coordinate] == "rad" and chart.periodic[coordinate]:
         axis.set_major_locator(MultipleLocator(np.pi / 2))
         axis.set_major_formatter(lambda value, _: angle(value))
 
@@ -59,25 +61,23 @@ def label_axis(axis: Axis, task: Task, coordinate: int) -> None:
 # ---- planes
 
 
-def plane(panel: Axes, task: Task) -> None:
-    """Makes a panel a chart's plane, with the set-point and the states at which runs fail."""
-    (left, bottom), (right, top) = task.chart.low, task.chart.high
+def plane(panel: Axes, section: Section) -> None:
+    """Makes a panel the plane of a section, with the set-point and the states at which runs fail."""
+    (left, bottom), (right, top) = section.chart.low, section.chart.high
     panel.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
-    label_axis(panel.xaxis, task, 0)
-    label_axis(panel.yaxis, task, 1)
-    grid = Grid.with_cells(task.chart, OVER_CELLS)
-    if task not in _OVER:
-        plant = task.plant(grid.size)
-        plant.set_state(*task.state(grid.nodes))
-        _OVER[task] = task.failed(plant.measurement).reshape(grid.counts)
-    over = _OVER[task]
+    label_axis(panel.xaxis, section.chart, 0)
+    label_axis(panel.yaxis, section.chart, 1)
+    grid = Grid.with_cells(section.chart, OVER_CELLS)
+    if section not in _OVER:
+        _OVER[section] = section.failed(grid.nodes).reshape(grid.counts)
+    over = _OVER[section]
     if over.any():
         # Blurred, the mask has a smooth outline where it is one half, without the steps of its cells.
         blurred = gaussian_filter(over.astype(float), OVER_BLUR, mode="nearest")
         region(panel, GridSet(grid, 0.5 - blurred.ravel()), GREY, PALE, zorder=2.2)
         legend_field(panel, "obstacle, or out of bounds", GREY, PALE)
-    if task.set_point is not None:
-        cross(panel, *task.set_point)
+    if section.set_point is not None:
+        cross(panel, *section.set_point)
 
 
 def region(panel: Axes, members: GridSet, face: str, edge: str | None = None, **looks: Any) -> None:
@@ -114,37 +114,37 @@ def legend_field(panel: Axes, label: str, face: str, edge: str = INK) -> None:
 # ---- rings
 
 
-def ring(panel: Axes, task: Task, radii: Sequence[float], note: str = "") -> None:
+def ring(panel: Axes, chart: Chart, radii: Sequence[float], note: str = "") -> None:
     """Makes a panel the ring of a periodic coordinate: circles, quarters, and a label with a note."""
-    low, period = task.chart.low[0], task.chart.sides[0]
+    low, period = chart.low[0], chart.sides[0]
     for radius in radii:
         panel.add_patch(Circle((0, 0), radius, fill=False, edgecolor=INK, linewidth=0.8, zorder=3))
     # Quarters of the period, as hours on a clock face.
     for quarter in low + period * np.arange(4) / 4:
-        at = np.array(on_ring(task, quarter))
+        at = np.array(on_ring(chart, quarter))
         panel.plot(*np.outer(at, (OUTER, TICK)), color=INK, linewidth=0.8)
-        text = angle(quarter) if task.chart.units[0] == "rad" else f"{quarter:g}"
+        text = angle(quarter) if chart.units[0] == "rad" else f"{quarter:g}"
         panel.text(LABEL * at[0], LABEL * at[1], text, ha="center", va="center")
-    panel.text(0, 0, axis_label(task, 0) + note, ha="center", va="center")
+    panel.text(0, 0, axis_label(chart, 0) + note, ha="center", va="center")
     panel.set(xlim=(-EDGE, EDGE), ylim=(-EDGE, EDGE), aspect="equal", anchor="S")
     panel.set_axis_off()
 
 
-def on_ring(task: Task, z: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+def on_ring(chart: Chart, z: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
     """Returns x (n,) and y (n,) on the unit circle of values (n,) of a periodic coordinate."""
-    turned = 2 * np.pi * np.asarray(z) / task.chart.sides[0]
+    turned = 2 * np.pi * np.asarray(z) / chart.sides[0]
     return np.cos(turned), np.sin(turned)
 
 
 def arcs(
-    panel: Axes, task: Task, classes: np.ndarray, colours: Any, outer: float, inner: float
+    panel: Axes, chart: Chart, classes: np.ndarray, colours: Any, outer: float, inner: float
 ) -> None:
     """Draws classes (N,) of equally spaced values of a periodic coordinate as arcs of a ring.
 
     The classes are indices into `colours`, where None leaves the ring blank.
     """
     step = 360 / len(classes)  # [degrees]
-    origin = 360 * task.chart.low[0] / task.chart.sides[0]
+    origin = 360 * chart.low[0] / chart.sides[0]
     # Arcs begin half-way between nodes of different classes; one class all round has no beginning.
     begins = np.flatnonzero(classes != np.roll(classes, 1))
     ends = np.append(begins[1:], begins[:1] + len(classes))
@@ -169,8 +169,8 @@ def cross(panel: Axes, x: float, y: float) -> None:
 
 
 def set_point_lines(panel: Axes, task: Task, coordinate: int = 0) -> None:
-    """Draws the set-point in a panel over time, once a period; a plane has its cross."""
-    if task.set_point is None or task.chart.dimension == 2:
+    """Draws the set-point in a panel over time, once a period."""
+    if task.set_point is None:
         return
     low, high = panel.get_ylim()
     turns = np.arange(-TURNS, TURNS + 1) if task.chart.periodic[coordinate] else np.zeros(1)
@@ -190,9 +190,9 @@ def dots(panel: Axes, points: np.ndarray, colour: str = INK) -> None:
     panel.plot(*points.T, "o", markersize=3.6, color=colour, label="critical set M*", **looks)
 
 
-def spokes(panel: Axes, task: Task, z: np.ndarray, start: float, colour: str = INK) -> None:
+def spokes(panel: Axes, chart: Chart, z: np.ndarray, start: float, colour: str = INK) -> None:
     """Marks points (n, 1) of M* by lines from radius `start` to the ring's edge."""
-    x, y = on_ring(task, z[:, 0])
+    x, y = on_ring(chart, z[:, 0])
     for line, (_, width) in zip((PAPER, colour), CASING, strict=True):
         ends = [start * x, OUTER * x], [start * y, OUTER * y]
         panel.plot(*ends, color=line, linewidth=width, zorder=3)

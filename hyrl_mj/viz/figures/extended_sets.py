@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from hyrl_mj.chart import Chart
 from hyrl_mj.sets import GridSet
-from hyrl_mj.tasks import Task
 from hyrl_mj.viz import colours
 from hyrl_mj.viz.figures import charts, style
 from hyrl_mj.viz.figures.charts import OUTER
@@ -33,9 +33,9 @@ def draw_extended_sets(shown: ShownRun, path: Path | None = None) -> Figure:
     title = f"extended sets for noise up to eps = {sets.noise:g} {task.noise_on()[1]}{horizon}"
     # The nodes (N,) that several sets hold.
     shared = np.asarray(np.sum([members.mask for members in sets.sets], axis=0) > 1)
-    ring = charts.is_ring(task)
+    ring = charts.is_ring(task.chart)
     enlarged = not ring and len(shown.critical.points) > 0 and sets.noise > 0
-    with style.drawing(path, 5.6, task, title) as figure:
+    with style.drawing(path, 5.6, shown.section, title) as figure:
         panels = figure.subplots(1, 1 + enlarged, squeeze=False).ravel()
         for i, mode in enumerate(sets.modes):
             label = f"$M^{{ext}}_{{{mode}}}$, of mode {task.mode_name(mode)}"
@@ -53,46 +53,46 @@ def draw_extended_sets(shown: ShownRun, path: Path | None = None) -> Figure:
 
 def _set_rings(panel: Axes, shown: ShownRun, shared: np.ndarray) -> None:
     """Draws a ring for each set, with its ends beside it."""
-    task, sets = shown.task, shown.sets
-    charts.arcs(panel, task, shared.astype(int), (None, SHARED), OUTER, CORE)
+    chart, sets = shown.task.chart, shown.sets
+    charts.arcs(panel, chart, shared.astype(int), (None, SHARED), OUTER, CORE)
     width = (OUTER - CORE - GAP) / len(sets.sets)
     for i, members in enumerate(sets.sets):
         outer, colour = OUTER - GAP - i * width, style.mode_colour(i)
         inside = members.mask.astype(int)
-        charts.arcs(panel, task, inside, (None, colour), outer, outer - width + GAP)
+        charts.arcs(panel, chart, inside, (None, colour), outer, outer - width + GAP)
         # The first set's ends are written outside the rings, the others' inside, one below the other.
-        _ends(panel, task, members, OUTSIDE if i == 0 else INSIDE - 0.1 * (i - 1), colour)
-    charts.ring(panel, task, (OUTER, CORE))
-    charts.spokes(panel, task, shown.critical.points, CORE - 0.06)
+        _ends(panel, chart, members, OUTSIDE if i == 0 else INSIDE - 0.1 * (i - 1), colour)
+    charts.ring(panel, chart, (OUTER, CORE))
+    charts.spokes(panel, chart, shown.critical.points, CORE - 0.06)
 
 
-def _ends(panel: Axes, task: Task, members: GridSet, radius: float, colour: str) -> None:
+def _ends(panel: Axes, chart: Chart, members: GridSet, radius: float, colour: str) -> None:
     """Writes the ends of the pieces of a set at a radius of its ring."""
     if members.mask.all():
         return
     for value in np.ravel(members.pieces()):
-        x, y = radius * np.array(charts.on_ring(task, value))
-        text = f"{value / np.pi:.2f}π" if task.chart.units[0] == "rad" else f"{value:.3g}"
+        x, y = radius * np.array(charts.on_ring(chart, value))
+        text = f"{value / np.pi:.2f}π" if chart.units[0] == "rad" else f"{value:.3g}"
         panel.text(x, y, text, color=colour, ha="center", va="center", fontsize=9)
 
 
 def _set_plane(panel: Axes, shown: ShownRun, shared: np.ndarray) -> None:
     """Fills the sets in a plane, with outlines."""
-    task, sets = shown.task, shown.sets
+    sets = shown.sets
     for i, members in enumerate(sets.sets):
         charts.region(panel, members, style.mode_tint(i))
     charts.region(panel, GridSet.from_mask(sets.sets[0].grid, shared), SHARED)
     for i, members in enumerate(sets.sets):
         charts.region(panel, members, "none", style.mode_colour(i), zorder=2)
-    charts.plane(panel, task)
+    charts.plane(panel, shown.section)
     charts.dots(panel, shown.critical.points)
 
 
 def _enlarge(whole: Axes, near: Axes, shown: ShownRun) -> None:
     """Shows the neighbourhood of M* in the second panel, with the width that noise requires."""
-    task, points, eps = shown.task, shown.critical.points, shown.sets.noise
-    low = np.maximum(points.min(axis=0) - AROUND * eps, task.chart.low)
-    high = np.minimum(points.max(axis=0) + AROUND * eps, task.chart.high)
+    section, points, eps = shown.section, shown.critical.points, shown.sets.noise
+    low = np.maximum(points.min(axis=0) - AROUND * eps, section.chart.low)
+    high = np.minimum(points.max(axis=0) + AROUND * eps, section.chart.high)
     near.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), title="around M*")
     box = Rectangle(low, *(high - low), fill=False, edgecolor=style.INK, linestyle=":", zorder=3)
     whole.add_patch(box)
@@ -101,10 +101,10 @@ def _enlarge(whole: Axes, near: Axes, shown: ShownRun) -> None:
     # The width is drawn at the middle one of M*'s points.
     middle = points[np.argsort(points.sum(axis=1))[len(points) // 2]]
     # Of the noisy coordinates, that across M*.
-    noisy = task.noise_in_chart(1.0) > 0
+    noisy = section.noise(1.0) > 0
     axis = int(np.where(noisy, np.ptp(points, axis=0), np.inf).argmin())
     step = eps * np.eye(2)[axis]
     ends = np.stack([middle - step, middle + step]).T
     looks: dict[str, Any] = {"color": style.RED, "linewidth": 2, "markersize": 9, "zorder": 4}
-    label = f"2 eps = {2 * eps:g} {task.chart.units[axis]}"
+    label = f"2 eps = {2 * eps:g} {section.chart.units[axis]}"
     near.plot(*ends, marker="_|"[axis == 0], label=label, **looks)

@@ -33,7 +33,7 @@ def draw_overview(shown: ShownPolicy, path: Path | None = None) -> Figure:
     task, arc = shown.task, shown.noisy
     charts.check_drawable(task)
     title = f"the {shown.algorithm} policy, and where noise leads it"
-    with style.drawing(path, 7.6, task, title) as figure:
+    with style.drawing(path, 7.6, shown.section, title) as figure:
         panel = figure.subplots()
         panel.set_title(style.noise_label(task, arc.noise, arc.bound))
         for i, mode in enumerate(shown.partition.modes):
@@ -41,7 +41,7 @@ def draw_overview(shown: ShownPolicy, path: Path | None = None) -> Figure:
             if len(shown.partition.modes) > style.NAMED:  # names are said here, once
                 part = f"only in $M_{{{mode}}}$, of mode {task.mode_name(mode)}"
             charts.legend_field(panel, part, style.mode_tint(i))
-        if charts.is_ring(task):
+        if charts.is_ring(task.chart):
             _spirals(panel, shown)
         else:
             _field(panel, shown)
@@ -51,15 +51,14 @@ def draw_overview(shown: ShownPolicy, path: Path | None = None) -> Figure:
 
 def _field(panel: Axes, shown: ShownPolicy) -> None:
     """Draws the overview of a plane."""
-    task, partition, arc = shown.task, shown.partition, shown.noisy
+    section, partition, arc = shown.section, shown.partition, shown.noisy
     owners = _owners(partition)
     for i in range(len(partition.modes)):
         part = GridSet.from_mask(partition.grid, owners == i)
         charts.region(panel, part, style.mode_tint(i))
-    view = runs.make_view(panel, task)
+    view = runs.plane_view(panel, section)
     _noiseless_runs(panel, shown, view)
-    eps = task.noise_in_chart(arc.bound)
-    band = _band(task.chart.wrap(arc.z), eps, view.longest)
+    band = _band(view.points(arc.t, arc.z), section.noise(arc.bound), view.longest)
     panel.add_collection(PolyCollection(list(band), color=PALE_RED, linewidth=0.3, zorder=2))
     _noisy_run(panel, shown, view)
     ahead = arc.z[-1] - arc.z[0]
@@ -94,17 +93,17 @@ def _spirals(panel: Axes, shown: ShownPolicy) -> None:
     task, partition, arc = shown.task, shown.partition, shown.noisy
     seconds = task.scene.time
     tints = [style.mode_tint(i) for i in range(len(partition.modes))]
-    charts.arcs(panel, task, _owners(partition), [*tints, None], OUTER, CORE)
-    charts.ring(panel, task, (OUTER, CORE), f",\ntime outward:\n0 to {seconds:g} s")
-    view = runs.spiral_view(task, seconds)
+    charts.arcs(panel, task.chart, _owners(partition), [*tints, None], OUTER, CORE)
+    charts.ring(panel, task.chart, (OUTER, CORE), f",\ntime outward:\n0 to {seconds:g} s")
+    view = runs.spiral_view(task.chart, seconds)
     _noiseless_runs(panel, shown, view)
     eps = task.noise_in_chart(arc.bound)
     rim = np.vstack([view.points(arc.t, arc.z - eps), view.points(arc.t, arc.z + eps)[::-1]])
     panel.fill(*rim.T, color=PALE_RED, linewidth=0, zorder=2)
     _noisy_run(panel, shown, view)
     if task.set_point is not None:
-        charts.cross(panel, *np.ravel(charts.on_ring(task, task.set_point)))
-    charts.spokes(panel, task, shown.critical.points, CORE - 0.06)
+        charts.cross(panel, *np.ravel(charts.on_ring(task.chart, task.set_point)))
+    charts.spokes(panel, task.chart, shown.critical.points, CORE - 0.06)
 
 
 def _noiseless_runs(panel: Axes, shown: ShownPolicy, view: View) -> None:
@@ -139,13 +138,14 @@ def _noisy_run(panel: Axes, shown: ShownPolicy, view: View) -> None:
 
 def draw_policy_map(shown: ShownPolicy, path: Path | None = None) -> Figure:
     """Draws a map of each input of the policy, and the policy's runs from the scene's starts."""
-    task = shown.task
+    task, section = shown.task, shown.section
     charts.check_drawable(task)
-    with style.drawing(path, 5.2, task, f"the {shown.algorithm} policy") as figure:
+    chart = section.chart
+    with style.drawing(path, 5.2, section, f"the {shown.algorithm} policy") as figure:
         *maps, panel = figure.subplots(1, len(task.inputs) + 1)
-        ring = charts.is_ring(task)
-        grid = Grid(task.chart, (RING_NODES,)) if ring else Grid.with_cells(task.chart, PLANE_CELLS)
-        inputs = shown.policy.act(task.at(grid.nodes))
+        ring = charts.is_ring(chart)
+        grid = Grid(chart, (RING_NODES,)) if ring else Grid.with_cells(chart, PLANE_CELLS)
+        inputs = shown.policy.act(task.at(section.lift(grid.nodes)))
         for i, input_panel in enumerate(maps):
             _input_map(input_panel, shown, grid, inputs, i)
         _paper_runs(panel, shown)
@@ -157,26 +157,28 @@ def _paper_runs(panel: Axes, shown: ShownPolicy) -> None:
     """Draws the runs from the scene's starts."""
     task, first = shown.task, shown.paper[0]
     panel.set_title(style.noise_label(task, first.noise, first.bound).replace(", ", ",\n"))
-    view = runs.make_view(panel, task)
+    flat = shown.section.chart.dimension == 2
+    view = runs.view_of(panel, shown.section, 0, flat)
     for arc in shown.paper:
         runs.chosen_way(panel, shown, view, arc, linewidth=2.0)
         runs.ends(panel, task, view, arc)
-    charts.set_point_lines(panel, task)
+    if not flat:
+        charts.set_point_lines(panel, task)
 
 
 def _input_map(panel: Axes, shown: ShownPolicy, grid: Grid, inputs: np.ndarray, i: int) -> None:
     """Draws the map of an input, of those (N, m) at the nodes without noise, with its colour bar."""
-    task, ring = shown.task, charts.is_ring(shown.task)
+    task, ring = shown.task, charts.is_ring(shown.task.chart)
     colours, scale, ticks = _input_colours(task, i)
     values = inputs[:, i]
     if ring:
         shades, classes = np.unique(colours(scale(values)), axis=0, return_inverse=True)
-        charts.arcs(panel, task, classes.ravel(), shades, OUTER, INNER)
-        charts.ring(panel, task, (OUTER, INNER))
-        charts.spokes(panel, task, shown.critical.points, 0.6, style.RED)
+        charts.arcs(panel, task.chart, classes.ravel(), shades, OUTER, INNER)
+        charts.ring(panel, task.chart, (OUTER, INNER))
+        charts.spokes(panel, task.chart, shown.critical.points, 0.6, style.RED)
     else:
         charts.image(panel, grid, values, cmap=colours, norm=scale)
-        charts.plane(panel, task)
+        charts.plane(panel, shown.section)
         charts.dots(panel, shown.critical.points, style.RED)
     # After the ring, whose place in the panel the colour bar sets.
     bar = panel.figure.colorbar(

@@ -11,9 +11,9 @@ from matplotlib.colors import ListedColormap, NoNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle, Wedge
 
+from hyrl_mj.chart import Chart
 from hyrl_mj.game import LIMIT, MAP_CLASSES, OVER, Score, Wins
 from hyrl_mj.sets import Grid
-from hyrl_mj.tasks import Task
 from hyrl_mj.viz import colours
 from hyrl_mj.viz.figures import charts, style
 from hyrl_mj.viz.figures.charts import INNER, OUTER, TICK
@@ -44,14 +44,15 @@ TOP, ROW = 105, 5
 def draw_robustness_map(shown: ShownGame, path: Path | None = None) -> Figure:
     """Draws a map for each controller: what becomes of runs from each state."""
     task, result, maps = shown.task, shown.result, shown.maps
-    names, grid = result.controllers, maps.grid(task.chart)
+    section = shown.section
+    names, grid = result.controllers, maps.grid(section.chart)
     columns = min(len(names), style.COLUMNS)
     rows = -(-len(names) // style.COLUMNS)
-    draw = _ring if charts.is_ring(task) else _box
+    draw = _ring if charts.is_ring(section.chart) else _box
     where, unit = task.noise_on(result.everywhere)
     estimated = ", an estimate" if result.estimate else ""
     title = f"the worst noise on {where} up to eps = {maps.eps:g} {unit}{estimated}"
-    with style.drawing(path, 1.6 + rows * _panel_height(task), task, title) as figure:
+    with style.drawing(path, 1.6 + rows * _panel_height(section.chart), section, title) as figure:
         panels = figure.subplots(rows, columns, squeeze=False).ravel()
         for k in np.unique(np.concatenate([maps.map[name] for name in names])):
             charts.legend_field(panels[0], SENTENCES[k], CLASS_COLOURS[k])
@@ -76,28 +77,28 @@ def _note(score: Score) -> str:
     return f"{own} of the winnable starts proved,\n{modes},\n{lost}"
 
 
-def _panel_height(task: Task) -> float:
+def _panel_height(chart: Chart) -> float:
     """Returns the height [inches] of a panel with its title and labels."""
-    if charts.is_ring(task):
+    if charts.is_ring(chart):
         return 4.1
-    sides = task.chart.sides
+    sides = chart.sides
     return 1.1 + (float(3.2 * sides[1] / sides[0]) if len(sides) == 2 else 0.5)
 
 
 def _box(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> None:
     """Draws classes (N,) of nodes as an image over the chart; one coordinate is a strip of height 1."""
-    task, chart = shown.task, shown.task.chart
+    section, chart = shown.section, shown.section.chart
     strip = chart.dimension == 1
     charts.image(panel, grid, classes, cmap=ListedColormap(CLASS_COLOURS), norm=NoNorm())
     low, high = [*chart.low, 0][:2], [*chart.high, 1][:2]
     panel.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    charts.label_axis(panel.xaxis, task, 0)
+    charts.label_axis(panel.xaxis, chart, 0)
     if strip:
         panel.set(yticks=[], aspect=0.12 * chart.sides[0])
     else:
-        charts.label_axis(panel.yaxis, task, 1)
-    x, y = [*task.start_low, 0][:2]
-    width, height = np.subtract([*task.start_high, 1][:2], (x, y))
+        charts.label_axis(panel.yaxis, chart, 1)
+    x, y = [*section.start_low, 0][:2]
+    width, height = np.subtract([*section.start_high, 1][:2], (x, y))
     looks: Looks = {"fill": False, "zorder": 3, "clip_on": False, "label": "start region"}
     for colour, line in style.CASING:
         box = Rectangle((x, y), width, height, edgecolor=colour, linewidth=line, **looks)
@@ -109,14 +110,14 @@ def _box(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> None
 def _ring(panel: Axes, shown: ShownGame, grid: Grid, classes: np.ndarray) -> None:
     """Draws classes (N,) of nodes as arcs of a ring."""
     task = shown.task
-    charts.arcs(panel, task, classes, CLASS_COLOURS, OUTER, INNER)
-    charts.ring(panel, task, (OUTER, INNER))
+    charts.arcs(panel, task.chart, classes, CLASS_COLOURS, OUTER, INNER)
+    charts.ring(panel, task.chart, (OUTER, INNER))
     ends = task.start_low[0], task.start_high[0]
     first, last = (360 * end / task.chart.sides[0] for end in ends)  # [degrees]
     if last - first < 360 - 360 / len(classes):
         looks: Looks = {"width": 0.03, "color": style.INK, "linewidth": 0}
         panel.add_patch(Wedge((0, 0), TICK, first, last, label="start region", **looks))
-    charts.spokes(panel, task, shown.critical.points, CRITICAL)
+    charts.spokes(panel, task.chart, shown.critical.points, CRITICAL)
 
 
 # ---- the curve
@@ -137,7 +138,7 @@ def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
     where, unit = task.noise_on(result.everywhere)
     heights = (3.6, 2.0) if result.lasting else (3.6,)
     title = "what is won against the worst noise"
-    with style.drawing(path, 2.0 + sum(heights), task, title) as figure:
+    with style.drawing(path, 2.0 + sum(heights), shown.section, title) as figure:
         rows: Looks = {"nrows": len(heights), "height_ratios": heights}
         panels = figure.subplots(sharex=True, squeeze=False, **rows).ravel()
         shares, limit = panels[0], curve.wins[LIMIT]

@@ -12,12 +12,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from hyrl_mj.chart import Chart
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import ANY, Task, pattern_of
 from hyrl_mj.viz.colours import place
 from hyrl_mj.viz.figures import charts, style
 from hyrl_mj.viz.figures.shown import ShownPolicy, ShownRun
 from hyrl_mj.viz.figures.style import INK, NAMED, PALE, PAPER, POLICY_COLOUR, RED, mode_colour
+from hyrl_mj.viz.section import Section
 
 # Radius at which spirals begin; they end at 1.
 CORE = 0.4
@@ -40,24 +42,35 @@ class View:
     longest: np.ndarray | float = np.inf
 
 
-def make_view(panel: Axes, task: Task, coordinate: int = 0) -> View:
-    """Makes a panel the plane of a chart of two dimensions, else a coordinate over time."""
-    chart = task.chart
-    if chart.dimension == 2:
-        charts.plane(panel, task)
-        return View(lambda t, z: chart.wrap(z), np.where(chart.periodic, chart.sides / 2, np.inf))
+def plane_view(panel: Axes, section: Section) -> View:
+    """Makes a panel the plane of a section."""
+    chart = section.chart
+    charts.plane(panel, section)
+    longest = np.where(chart.periodic, chart.sides / 2, np.inf)
+    return View(lambda t, z: chart.wrap(section.project(z)), longest)
+
+
+def time_view(panel: Axes, chart: Chart, coordinate: int) -> View:
+    """Makes a panel a coordinate over time."""
     panel.set_xlabel("time [s]")
-    charts.label_axis(panel.yaxis, task, coordinate)
+    charts.label_axis(panel.yaxis, chart, coordinate)
     style.grid_lines(panel)
     return View(lambda t, z: np.stack([t, z[:, coordinate]], axis=1))
 
 
-def spiral_view(task: Task, horizon: float) -> View:
+def view_of(panel: Axes, section: Section, coordinate: int, flat: bool) -> View:
+    """Makes a panel the plane of a section, or not `flat` a coordinate of the whole chart over time."""
+    if flat:
+        return plane_view(panel, section)
+    return time_view(panel, section.task.chart, coordinate)
+
+
+def spiral_view(chart: Chart, horizon: float) -> View:
     """Returns the view of a periodic coordinate as an angle; time goes outward to the horizon [s]."""
 
     def points(t: np.ndarray, z: np.ndarray) -> np.ndarray:
         radius = CORE + (1 - CORE) * t / horizon
-        return np.stack(charts.on_ring(task, z[:, 0]), axis=1) * radius[:, None]
+        return np.stack(charts.on_ring(chart, z[:, 0]), axis=1) * radius[:, None]
 
     return View(points)
 
@@ -156,7 +169,7 @@ def draw_runs(shown: ShownRun, path: Path | None = None) -> Figure:
     each coordinate over time.
     Only the scene's starts ("start0", ...) are drawn.
     """
-    task, replays, policy_title = shown.whole, shown.replays, shown.policy_title
+    task, replays, policy_title = shown.task, shown.replays, shown.policy_title
     loops = list(dict.fromkeys(who for _, who in replays if who != "policy"))
     starts = list(dict.fromkeys(start for start, _ in replays if start.startswith("start")))
     plane, count = task.chart.dimension == 2, len(loops)
@@ -173,14 +186,15 @@ def draw_runs(shown: ShownRun, path: Path | None = None) -> Figure:
             if loop >= count:
                 panel.set_axis_off()
                 continue
-            view = make_view(panel, task, coordinate)
+            view = view_of(panel, shown.section, coordinate, plane)
             for start in starts:
                 hybrid, policy = replays[start, loops[loop]], replays[start, "policy"]
                 hybrid_way(panel, task, view, hybrid, shown.sets.modes)
                 ends(panel, task, view, hybrid)
                 line(panel, view, policy.t, policy.z, label=policy_title, **thin)
                 ends(panel, task, view, policy)
-            charts.set_point_lines(panel, task, coordinate)
+            if not plane:
+                charts.set_point_lines(panel, task, coordinate)
             if coordinate == 0:
                 mode = int(loops[loop].removeprefix("hyrl_q"))
                 name = task.mode_name(mode) if count <= NAMED else mode

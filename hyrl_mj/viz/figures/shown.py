@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 from hyrl_mj.game import GameResult, Maps
 from hyrl_mj.policies import Policy
+from hyrl_mj.run_arcs import overview_arcs, policy_start_arcs
 from hyrl_mj.run_directory import Run
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.stages import CriticalSet, ExtendedSets, Partition
 from hyrl_mj.tasks import Task
-from hyrl_mj.viz.arcs import overview_arcs, policy_start_arcs
 from hyrl_mj.viz.section import Section
 
 
@@ -20,17 +20,17 @@ class ShownPolicy:
     """What the figures of a stage-1 policy show.
 
     Attributes:
-        task: in the section.
+        section: of the chart that is drawn, of a chart of one or two dimensions all of it.
         algorithm: that trained the policy, "DQN".
         policy: of stage 1, at its mean or mode where it is sampled.
-        critical: M*.
-        partition: the parts M_i.
+        critical: M* in the section.
+        partition: the parts M_i in the section.
         noisy: a run under noise, from M* if there is one.
         noiseless: runs from starts all along the start region.
         paper: runs from the scene's starts of the policy, under the paper's noise.
     """
 
-    task: Task
+    section: Section
     algorithm: str
     policy: Policy
     critical: CriticalSet
@@ -38,6 +38,11 @@ class ShownPolicy:
     noisy: HybridArc
     noiseless: tuple[HybridArc, ...]
     paper: tuple[HybridArc, ...]
+
+    @property
+    def task(self) -> Task:
+        """The task, with all of its chart."""
+        return self.section.task
 
     @property
     def policy_title(self) -> str:
@@ -50,13 +55,11 @@ class ShownRun(ShownPolicy):
     """What the figures of a finished run show: its policy, and its hybrid controller.
 
     Attributes:
-        whole: the task with all of its chart.
-        sets: M_ext_i.
-        replays: arcs on the whole chart by start ("start0", ..., "critical") and controller ("policy",
+        sets: M_ext_i in the section.
+        replays: arcs by start ("start0", ..., "critical") and controller ("policy",
             "hyrl_q0", ...), under the same noise.
     """
 
-    whole: Task
     sets: ExtendedSets
     replays: Mapping[tuple[str, str], HybridArc]
 
@@ -66,16 +69,21 @@ class ShownGame:
     """What the figures of the worst-case game show.
 
     Attributes:
-        task: what was played; its chart has two coordinates, or one.
-        critical: M*.
+        section: of the chart that is drawn.
+        critical: M* in the section.
         result: the scores, margins and curves.
-        maps: the class of every node.
+        maps: the class of every node in the section.
     """
 
-    task: Task
+    section: Section
     critical: CriticalSet
     result: GameResult
     maps: Maps
+
+    @property
+    def task(self) -> Task:
+        """The task, with all of its chart."""
+        return self.section.task
 
 
 def shown_policy(run: Run, noisy: HybridArc) -> ShownPolicy:
@@ -91,9 +99,9 @@ def shown_policy(run: Run, noisy: HybridArc) -> ShownPolicy:
         run.steady,
         section.critical_set(run),
         section.partition(run.partition),
-        section.arc(noisy),
-        tuple(overview_arcs(section, run.steady)),
-        tuple(policy_start_arcs(section, run.steady, s.noise, s.seed)),
+        noisy,
+        tuple(overview_arcs(run.task, run.steady)),
+        tuple(policy_start_arcs(run.task, run.steady, s.noise, s.seed)),
     )
 
 
@@ -108,4 +116,4 @@ def shown_run(run: Run) -> ShownRun:
     arcs, sets = run.arcs(), Section(run.task).extended_sets(run.extended_sets)
     start = "critical" if ("critical", "policy") in arcs else "start0"
     policy = shown_policy(run, arcs[start, "policy"])
-    return ShownRun(**vars(policy), whole=run.task, sets=sets, replays=arcs)
+    return ShownRun(**vars(policy), sets=sets, replays=arcs)

@@ -18,8 +18,10 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from hyrl_mj import artifacts
+from hyrl_mj.chart import Chart
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz import colours
+from hyrl_mj.viz.section import Section
 from hyrl_mj.viz.tables import NAMED as NAMED
 
 DPI = 200  # [pixels/inch]
@@ -58,16 +60,16 @@ def mode_tint(place: int) -> str:
 
 
 @contextmanager
-def drawing(path: Path | None, height: float, task: Task, title: str) -> Iterator[Figure]:
+def drawing(path: Path | None, height: float, of: Task | Section, title: str) -> Iterator[Figure]:
     """Gives a figure to draw on, and writes it as PNG and PDF when the block ends without an error.
 
     Args:
         path: where the PNG is written, and the PDF beside it; None writes nothing.
         height: of the figure [inches], before empty margins are cut off.
-        task: the title of the figure begins with its name and, if the chart is cut, where.
+        of: the title of the figure begins with the name of the task and, of a section, where that is.
         title: how the title of the figure goes on.
     """
-    where = f" at {task.chart.section}" if task.chart.section else ""
+    task, where = (of.task, of.where) if isinstance(of, Section) else (of, "")
     # The user's own matplotlibrc must not change the figure.
     with style.context(["default", STYLE]):
         layout = ConstrainedLayoutEngine(compress=True, h_pad=PAD, w_pad=PAD)
@@ -136,9 +138,9 @@ def noise_label(task: Task, kind: str, eps: float) -> str:
     return f"{kind} noise on {where}, eps = {eps:g} {unit}"
 
 
-def axis_label(task: Task, axis: int) -> str:
+def axis_label(chart: Chart, axis: int) -> str:
     """Returns a coordinate of the chart with its unit: "x [m]"."""
-    return f"{task.chart.names[axis]} [{task.chart.units[axis]}]"
+    return f"{chart.names[axis]} [{chart.units[axis]}]"
 
 
 def angle(value: float) -> str:

@@ -15,6 +15,7 @@ from hyrl_mj.stages import CriticalSet, ExtendedSets, Partition
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz import colours
 from hyrl_mj.viz.colours import RGB, rgb
+from hyrl_mj.viz.section import Section
 
 MODE_COLOURS = tuple(map(rgb, colours.MODES))
 POLICY_COLOUR, INK, WHITE = map(rgb, (colours.POLICY, colours.INK, colours.WHITE))
@@ -119,12 +120,16 @@ class Floor:
 
     @staticmethod
     def of(
-        task: Task, critical: CriticalSet, partition: Partition, extended: ExtendedSets | None
+        section: Section,
+        critical: CriticalSet,
+        partition: Partition,
+        extended: ExtendedSets | None,
     ) -> Floor:
-        """Returns the marks of results on a chart of one or two dimensions; without sets no overlap."""
+        """Returns the marks of results in a section; without sets no overlap."""
+        task = section.task
 
         def places(z: np.ndarray) -> np.ndarray:
-            return on_floor(task, tracked_points(task, task.state(z)[0]))
+            return on_floor(task, tracked_points(task, task.state(section.lift(z))[0]))
 
         strips, widths, half = [], [], partition.grid.spacing / 2
         for ends in _strips(critical, partition, extended) if extended else ():

@@ -1,4 +1,4 @@
-"""The arcs of a run: which starts are simulated under which noise, and which of them a replay shows."""
+"""The arcs of a run: which starts are simulated under which noise."""
 
 from __future__ import annotations
 
@@ -14,10 +14,7 @@ from hyrl_mj.run_directory import Run
 from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, noise_kinds, samples, simulate_batch
 from hyrl_mj.stages import Budget, attack
 from hyrl_mj.tasks import Task
-from hyrl_mj.viz.replay import Floor, Floors, Show
-from hyrl_mj.viz.section import critical_sets, sections
 
-STARTS = ("critical", "paper", "latest")  # of a replay
 OVERVIEW_RUNS = 12  # without noise; of an even number none starts in the middle
 PAPER = "alternating"  # the noise of the paper
 WORST = "worst"  # the noise of the worst-case game; the registered kinds do without one
@@ -146,83 +143,29 @@ def attack_replay(run: Run) -> dict[str, HybridArc]:
     return {} if run.exact else run.attack_arcs()
 
 
-def replay_shows(
-    run: Run, starts: str = "critical", noise: str | None = None, eps: float | None = None
-) -> list[Show]:
-    """Returns the shows that a replay plays.
-
-    Args:
-        run: with its arcs.
-        starts: "critical" for the start on M*, once for each start mode, or where no game decides for
-            the strongest signals of the attack; "paper" for all of the paper's
-            starts at once; "latest" for the arcs of the last `hyrl-mj simulate --start`.
-        noise: the kind of noise of a new simulation; by default the arcs on disk are played.
-        eps: the bound of a new simulation, by default the run's; without `noise` that of `replay_arcs`.
-
-    Raises:
-        BadInput: a value that cannot be used.
-    """
-    if starts not in STARTS:
-        raise unknown("starts", starts, STARTS)
-    is_new, modes = noise is not None or eps is not None, run.extended_sets.modes
-    if starts == "latest":
-        if is_new:
-            raise BadInput(
-                "the latest simulation has its noise: give --noise and --eps to simulate"
-            )
-        policy, hybrid = ([run.arc(run.latest_path(who))] for who in ("policy", "hyrl"))
-        return [Show(policy, hybrid, run.policy_title, modes)]
-    if starts == "critical" and not is_new and (attacked := attack_replay(run)):
-        return [Show([attacked["policy"]], [attacked["hyrl"]], run.policy_title, modes)]
-    arcs = replay_arcs(run, noise, eps) if is_new else run.arcs()
-    names = dict.fromkeys(name for name, _ in arcs)
-    loops = [f"hyrl_q{q}" for q in modes]
-    if starts == "paper":
-        names.pop("critical", None)
-        policy = [arcs[name, "policy"] for name in names]
-        hybrid = [arcs[name, loop] for name in names for loop in loops]
-        return [Show(policy, hybrid, run.policy_title, modes)]
-    name = "critical" if "critical" in names else next(iter(names))
-    policy = [arcs[name, "policy"]]
-    return [Show(policy, [arcs[name, loop]], run.policy_title, modes) for loop in loops]
-
-
-def replay_floor(run: Run, overlap: bool = True) -> Floors:
-    """Returns the marks on the floor of a replay, in sections of the task's chart."""
-    axis, cuts = sections(run.task)
-    parts = run.split if overlap else run.partition
-    floors = [
-        Floor.of(
-            cut,
-            critical,
-            cut.partition(parts),
-            cut.extended_sets(run.extended_sets) if overlap else None,
-        )
-        for cut, critical in zip(cuts, critical_sets(run, cuts), strict=True)
-    ]
-    return Floors(run.task.chart, axis, tuple(floors))
-
-
 def overview_arcs(task: Task, policy: Policy) -> list[HybridArc]:
     """Simulates a policy without noise, from starts along the longest side of the start region.
 
-    The other coordinates of the starts are at their lower end. Where the start region is a whole chart of
-    several dimensions, the starts are drawn. The task may be a section's.
+    Only the first two coordinates of the chart tell which side that is; the other of the two is at its lower
+    end, all further ones are those of the scene's first start. Where the region is all of these two, they are
+    drawn.
     """
-    low, high = np.array(task.start_low), np.array(task.start_high)
-    if task.chart.dimension > 1 and np.allclose([low, high], [task.chart.low, task.chart.high]):
-        drawn = task.starts(2 * OVERVIEW_RUNS, np.random.default_rng(0))
-        return simulate_batch(task, policy, drawn, horizon=task.scene.time)
-    starts, axis = np.tile(low, (OVERVIEW_RUNS, 1)), int(np.argmax(high - low))
-    shares = (np.arange(OVERVIEW_RUNS) + 0.5) / OVERVIEW_RUNS
-    starts[:, axis] = low[axis] + shares * (high - low)[axis]
+    chart, low, high = task.chart, np.array(task.start_low), np.array(task.start_high)
+    flat = slice(2)
+    whole = np.allclose([low[flat], high[flat]], [chart.low[flat], chart.high[flat]])
+    starts = np.tile(np.array(task.scene.starts[0], dtype=float), (OVERVIEW_RUNS, 1))
+    if chart.dimension > 1 and whole:
+        starts = np.tile(starts, (2, 1))
+        drawn = task.starts(len(starts), np.random.default_rng(0))
+        starts[:, flat] = drawn[:, flat]
+    else:
+        starts[:, flat], axis = low[flat], int(np.argmax((high - low)[flat]))
+        shares = (np.arange(OVERVIEW_RUNS) + 0.5) / OVERVIEW_RUNS
+        starts[:, axis] = low[axis] + shares * (high - low)[axis]
     return simulate_batch(task, policy, starts, horizon=task.scene.time)
 
 
 def policy_start_arcs(task: Task, policy: Policy, eps: float, seed: int) -> list[HybridArc]:
-    """Simulates a policy from the scene's starts, under the paper's noise (Section III) of bound `eps`.
-
-    The task may be a section's.
-    """
+    """Simulates a policy from the scene's starts, under the paper's noise (Section III) of bound `eps`."""
     starts, noise = task.scene.policy_starts, Noise(PAPER, eps)
     return simulate_batch(task, policy, starts, noise, horizon=task.scene.time, seed=seed)

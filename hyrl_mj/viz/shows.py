@@ -1,0 +1,68 @@
+"""What a replay shows of the arcs of a run, and the marks on its floor."""
+
+from __future__ import annotations
+
+from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.run_arcs import attack_replay, replay_arcs
+from hyrl_mj.run_directory import Run
+from hyrl_mj.viz.replay import Floor, Floors, Show
+from hyrl_mj.viz.section import critical_sets, sections
+
+STARTS = ("critical", "paper", "latest")  # of a replay
+
+
+def replay_shows(
+    run: Run, starts: str = "critical", noise: str | None = None, eps: float | None = None
+) -> list[Show]:
+    """Returns the shows that a replay plays.
+
+    Args:
+        run: with its arcs.
+        starts: "critical" for the start on M*, once for each start mode, or where no game decides for
+            the strongest signals of the attack; "paper" for all of the paper's
+            starts at once; "latest" for the arcs of the last `hyrl-mj simulate --start`.
+        noise: the kind of noise of a new simulation; by default the arcs on disk are played.
+        eps: the bound of a new simulation, by default the run's; without `noise` that of `replay_arcs`.
+
+    Raises:
+        BadInput: a value that cannot be used.
+    """
+    if starts not in STARTS:
+        raise unknown("starts", starts, STARTS)
+    is_new, modes = noise is not None or eps is not None, run.extended_sets.modes
+    if starts == "latest":
+        if is_new:
+            raise BadInput(
+                "the latest simulation has its noise: give --noise and --eps to simulate"
+            )
+        policy, hybrid = ([run.arc(run.latest_path(who))] for who in ("policy", "hyrl"))
+        return [Show(policy, hybrid, run.policy_title, modes)]
+    if starts == "critical" and not is_new and (attacked := attack_replay(run)):
+        return [Show([attacked["policy"]], [attacked["hyrl"]], run.policy_title, modes)]
+    arcs = replay_arcs(run, noise, eps) if is_new else run.arcs()
+    names = dict.fromkeys(name for name, _ in arcs)
+    loops = [f"hyrl_q{q}" for q in modes]
+    if starts == "paper":
+        names.pop("critical", None)
+        policy = [arcs[name, "policy"] for name in names]
+        hybrid = [arcs[name, loop] for name in names for loop in loops]
+        return [Show(policy, hybrid, run.policy_title, modes)]
+    name = "critical" if "critical" in names else next(iter(names))
+    policy = [arcs[name, "policy"]]
+    return [Show(policy, [arcs[name, loop]], run.policy_title, modes) for loop in loops]
+
+
+def replay_floor(run: Run, overlap: bool = True) -> Floors:
+    """Returns the marks on the floor of a replay, in sections of the task's chart."""
+    axis, cuts = sections(run.task)
+    parts = run.split if overlap else run.partition
+    floors = [
+        Floor.of(
+            cut,
+            critical,
+            cut.partition(parts),
+            cut.extended_sets(run.extended_sets) if overlap else None,
+        )
+        for cut, critical in zip(cuts, critical_sets(run, cuts), strict=True)
+    ]
+    return Floors(run.task.chart, axis, tuple(floors))
