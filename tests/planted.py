@@ -9,7 +9,8 @@ import numpy as np
 
 from hyrl_mj.artifacts import digest
 from hyrl_mj.chart import Chart
-from hyrl_mj.learning import presets, training
+from hyrl_mj.environments.task import EnvironmentTask
+from hyrl_mj.learning import presets
 from hyrl_mj.manifest import FILES, Entry, Manifest
 from hyrl_mj.pipeline import steps
 from hyrl_mj.proof import examination, replays
@@ -37,7 +38,13 @@ def shorten(patch):
         for key, value in new.items():
             patch.setitem(values, key, value)
     patch.setattr(presets, "_SMOKE_MODES", 4_096)
-    patch.setattr(training, "CHECKPOINTS", 4)
+    few_checkpoints(patch, 4)
+
+
+def few_checkpoints(patch, count):
+    """Patches at how many checkpoints of a training its policy is judged."""
+    for kind in (Task, EnvironmentTask):
+        patch.setattr(kind, "effort", replace(kind.effort, checkpoints=count))
 
 
 def coarsen(patch):

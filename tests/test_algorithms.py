@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from command_line import call
+from planted import few_checkpoints
 from sentences import assert_has_ended
 
 import hyrl_mj
@@ -142,9 +143,9 @@ def quick(task, algorithm, known=None):
 
 
 @pytest.fixture
-def few_checkpoints(monkeypatch):
+def quickly_judged(monkeypatch):
     """Judging policies takes most of the time of a short training."""
-    monkeypatch.setattr(training, "CHECKPOINTS", 2)
+    few_checkpoints(monkeypatch, 2)
     monkeypatch.setattr(training, "EPISODES", 64)
 
 
@@ -178,7 +179,7 @@ def test_it_trains_a_policy_that_answers_as_sb3_does(learned):
 
 @pytest.mark.parametrize("algorithm", ["a2c", "sac", "td3"])
 @pytest.mark.slow
-def test_the_seed_fixes_the_policy(algorithm, circle, few_checkpoints):
+def test_the_seed_fixes_the_policy(algorithm, circle, quickly_judged):
     first, again = (train(circle, quick(circle, algorithm), 4).weights for _ in range(2))
     assert first.keys() == again.keys()
     assert all(np.array_equal(first[name], again[name]) for name in first)
@@ -215,7 +216,7 @@ def values(critic, o, a):
 @pytest.mark.parametrize("algorithm", ["ppo", "a2c", "sac", "td3", "ddpg"])
 @pytest.mark.slow
 def test_the_smoke_preset_learns_the_circle(algorithm, circle, monkeypatch):
-    monkeypatch.setattr(training, "CHECKPOINTS", 8)
+    few_checkpoints(monkeypatch, 8)
     settings = preset(circle, "smoke", algorithm=algorithm).stage1
     before = evaluate(circle, export(build(circle, settings, 0), circle), hyrl_mj.Noise())[1]
     assert evaluate(circle, train(circle, settings, 0), hyrl_mj.Noise())[1] > before + 10
@@ -296,7 +297,7 @@ def test_what_cannot_be_used_is_one_sentence_before_any_training(
 )
 @pytest.mark.slow
 def test_a_class_of_the_users_trains_with_the_settings_of_its_relative(
-    kind, task, known, mine, few_checkpoints
+    kind, task, known, mine, quickly_judged
 ):
     name = f"{mine}:{kind}"
     task = hyrl_mj.get_task(task)

@@ -13,7 +13,7 @@ from hyrl_mj import BadInput, Outcome, mjcf, mujoco_log
 from hyrl_mj.envs import BatchedEnv
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import LoopSettings, closed_loop
-from hyrl_mj.tasks import check_task, trial
+from hyrl_mj.tasks import SPARING, check_task, trial
 from hyrl_mj.tasks.scaffold import write_task
 
 PY, XML = "py", "xml"
@@ -168,7 +168,7 @@ def test_the_steps_of_a_trial_are_bounded(vehicle, monkeypatch):
 
 def test_a_trial_of_a_slow_plant_has_fewer_episodes(vehicle, monkeypatch):
     usual = trial._side_by_side(vehicle)
-    monkeypatch.setattr(type(vehicle), "slow", True)
+    monkeypatch.setattr(type(vehicle), "effort", SPARING)
     assert trial.FEWEST <= trial._side_by_side(vehicle) < usual
 
 

@@ -28,7 +28,7 @@ from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.stages import ExtendedSets
 from hyrl_mj.stages.grounds import ByEpisodes, ByGame, mode_ground
-from hyrl_mj.tasks import Learning, Outcome
+from hyrl_mj.tasks import Effort, Learning, Outcome
 from hyrl_mj.viz.section import Section
 
 
@@ -60,11 +60,11 @@ def test_the_lattices_of_both_paper_problems_are_the_finest(name, counts):
 
 
 @pytest.mark.parametrize("levels", [None, 9])
-def test_two_inputs_get_as_many_cells_as_fit(monkeypatch, levels):
+def test_two_inputs_get_as_many_cells_as_fit(levels):
     plane = Cube(lambda z: z[:, 0], d=2)
     plane.learning = Learning(levels=levels)
     finest = lattice_grid(plane)
-    monkeypatch.setattr(resolution, "FITTING", 2**20)
+    plane.effort = Effort(transitions=2**20)
     fewer = lattice_grid(plane)
     inputs = math.prod(level_counts(plane, fewer, probed_hops(plane)))
     assert fewer.counts < finest.counts

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 import unmeasured
+from planted import few_checkpoints
 
 import hyrl_mj
 from hyrl_mj import BadInput, MlpPolicy, Noise
@@ -23,7 +24,7 @@ FEW = {"ppo": 8_192, "dqn": 4_000}
 
 @pytest.fixture
 def quick(task, monkeypatch):
-    monkeypatch.setattr(training, "CHECKPOINTS", 2)
+    few_checkpoints(monkeypatch, 2)
     monkeypatch.setattr(training, "EPISODES", 64)
     return replace(preset(task, "smoke").stage1, samples=FEW[task.learning.algorithm])
 
@@ -88,8 +89,9 @@ from dataclasses import replace
 from pathlib import Path
 import hyrl_mj
 from hyrl_mj.learning import preset, training
+from hyrl_mj.tasks import Effort, Task
 
-training.CHECKPOINTS, training.EPISODES = 2, 16
+Task.effort, training.EPISODES = Effort(checkpoints=2), 16
 for name, algorithm, samples in (
     ("unit_circle", "ppo", 4096), ("vehicle", "dqn", 2600), ("unit_circle", "sac", 1500)
 ):
@@ -238,7 +240,7 @@ def test_a_ground_sees_a_policy_from_the_first_checkpoint_and_scores_it_after_ha
             calls.append("scored")
             return (0.0,)
 
-    monkeypatch.setattr(training, "CHECKPOINTS", 8)
+    few_checkpoints(monkeypatch, 8)
     settings = preset(vehicle, "smoke", algorithm="ppo").stage1
     settings = replace(settings, samples=8_192, envs=16, hidden=(8, 8))
     training.train(vehicle, settings, 0, ground=Ground(vehicle, 0.9))

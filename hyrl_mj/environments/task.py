@@ -21,7 +21,7 @@ from hyrl_mj.environments.pool import Played, Pool
 from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.environments.trials import goes_on
 from hyrl_mj.errors import BadInput
-from hyrl_mj.tasks import ANY, Learning, Outcome, Scene, Task, get_task
+from hyrl_mj.tasks import ANY, SPARING, Learning, Outcome, Scene, Task, get_task
 
 # Where every episode takes all of its samples, runs from all nodes of the chart take about so many together.
 SAMPLES_OF_NODES = 800_000
@@ -53,7 +53,7 @@ class EnvironmentTask(Task):
     """
 
     scene: Scene
-    slow = stopped_by_walls = True
+    effort, stopped_by_walls = SPARING, True
     side_by_side = SIDE_BY_SIDE
     learning = Learning()
 

@@ -15,12 +15,9 @@ from hyrl_mj.tasks import Task
 LATTICE = {1: 12_000, 2: 480, 3: 160}
 # The most cells where the game is played many times.
 CURVE_CELLS = {1: 3_000, 2: 240, 3: 80}
-# Transitions of the lattice that is chosen: the whole game takes up to 200 bytes for each. A lattice that
-# is asked for may have twice as many.
-FITTING = 2**23
-MOST_TRANSITIONS = 2 * FITTING
-# As many where each of them is a step in Python, of which a core takes some thousands a second.
-FITTING_SLOW = 2**22
+# Transitions of a lattice that is asked for, at most: the whole game takes up to 200 bytes for each. One that
+# is chosen has as many as the task's effort says.
+MOST_TRANSITIONS = 2**24
 # Share of the cells that is left where a lattice is too large.
 FEWER = 0.97
 # States from which a plant is stepped to find out how far it moves, and values of each of m inputs. Without
@@ -56,7 +53,7 @@ def lattice_grid(task: Task, cells: int = 0, most: int | None = None) -> Grid:
     hops = probed_hops(task)
     if chart.dimension > 2:
         sides = sides / np.maximum(longest(hops), sides / cells)
-    hop_counts, most_of_all = common_hops(task, hops), FITTING_SLOW if task.slow else FITTING
+    hop_counts, most_of_all = common_hops(task, hops), task.effort.transitions
     while True:
         number = np.maximum(np.round(cells * sides / sides.max()).astype(int), 2)
         # Samples that lead from node to node are worth a few cells more or less.

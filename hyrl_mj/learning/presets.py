@@ -246,5 +246,5 @@ def _stage6(task: Task, name: str, algorithm: str) -> Training:
     training = replace(_MODES_CONTINUOUS if continuous else _MODES_DISCRETE, **task.learning.modes)
     if name == "smoke":
         return replace(training, samples=_SMOKE_MODES, attempts=1)
-    # An attempt takes minutes where each sample runs Python code.
-    return replace(training, attempts=1) if task.slow else training
+    most = task.effort.trainings
+    return training if most is None else replace(training, attempts=most)

@@ -40,8 +40,7 @@ ACTIVATIONS = {name: getattr(nn, torch_name) for name, torch_name in TORCH_NAMES
 LOG_ROLLOUTS, LOG_EPISODES = 1, 100
 # The learning rate falls to this share of its first value, not to zero: the last samples count too.
 FINAL_RATE = 0.02
-# Number of checkpoints at which a policy is judged, fewer where samples are slow, and of episodes of each.
-CHECKPOINTS, CHECKPOINTS_SLOW = 32, 8
+# Number of episodes of each checkpoint at which a policy is judged.
 EPISODES = 256
 # The kinds of noise under which a policy that is trained for noise is judged.
 JUDGES = ("none", "uniform", "alternating")
@@ -104,8 +103,7 @@ def train(
     if log_dir is not None:
         model.set_logger(configure(str(log_dir / "tensorboard"), ["tensorboard"]))
     interval = LOG_ROLLOUTS if isinstance(model, OnPolicyAlgorithm) else LOG_EPISODES
-    checkpoints = min(CHECKPOINTS, CHECKPOINTS_SLOW) if task.slow else CHECKPOINTS
-    watch = _Watch(settings.samples, checkpoints, ground, log_dir, label)
+    watch = _Watch(settings.samples, task.effort.checkpoints, ground, log_dir, label)
     try:
         with threads(1):  # faster for small networks
             model.learn(settings.samples, callback=watch, log_interval=interval)

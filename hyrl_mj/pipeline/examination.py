@@ -25,15 +25,12 @@ from hyrl_mj.stages import (
     noisy_episodes,
     shown_arcs,
 )
+from hyrl_mj.tasks import SPARING
 from hyrl_mj.viz import robustness_sentence
 
 # The kinds of noise in episodes by default. Where samples take long, an adversary that looks ahead takes too
 # long; the attack is there.
 KINDS = ("none", "uniform", "alternating", "adversarial")
-KINDS_SLOW = KINDS[:-1]
-# Noisy episodes of a run whose worst case cannot be computed; fewer with preset smoke, and where samples take
-# long.
-EPISODES, EPISODES_FEW = 1_000, 200
 # Starts and rounds of the attack on such a run.
 ATTACKED, ATTACKED_SMOKE = 200, 40
 ROUNDS, ROUNDS_SMOKE = 2, 1
@@ -133,11 +130,11 @@ def examine_loops(
     count, seed = options.episodes, options.seed
     task.check_noise(eps, everywhere)
     if count is None and not run.exact:
-        few = task.slow or run.settings.preset == "smoke"
-        count = EPISODES_FEW if few else EPISODES
+        effort = SPARING if run.settings.preset == "smoke" else task.effort
+        count = effort.episodes
     if count is not None and count < 1:
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
-    kinds = options.noise or (KINDS_SLOW if task.slow else KINDS)
+    kinds = options.noise or (KINDS if task.effort.looks_ahead else KINDS[:-1])
     noises = tuple(Noise(kind, eps, everywhere) for kind in kinds)
     game, maps = None, None
     if run.why_no_game is None:

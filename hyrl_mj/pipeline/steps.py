@@ -112,9 +112,10 @@ def retrain_stage(run: Run, say: Say) -> None:
     algorithms.check_named(s.stage6.algorithm)
     warm_start = partial(start_policy, run.steady, run.partition)
     part_of = partial(part_policy, run.task, run.steady, run.partition, noise=sets.noise)
-    parts, table_of = part_of if run.task.slow else None, None
-    if run.task.slow and (held := Held.of(run.task, sets)) is not None:
-        table_of = partial(table_for, held)
+    parts, table_of = None, None
+    if run.task.effort.attacked:
+        parts, held = part_of, Held.of(run.task, sets)
+        table_of = None if held is None else partial(table_for, held)
     ground_of = partial(
         mode_ground, run.task, sets, parts=run.split, policy=run.steady, table=table_of is not None
     )

@@ -26,9 +26,6 @@ from hyrl_mj.tasks import Outcome
 CANDIDATES = 17
 # Cells without a verdict in which a start is attacked, for each start mode.
 MOST_CELLS = 128
-# Nodes from which a controller is attacked where the game is an estimate, for each start mode; and where each
-# sample runs Python code.
-ATTACKED_NODES, ATTACKED_NODES_SLOW = 1_000, 48
 
 
 @dataclass(frozen=True)
@@ -73,12 +70,12 @@ def attack(
     estimate = game.lattice.estimate or cells is None
     if estimate:
         tried, every = np.zeros_like(region), np.flatnonzero(region)
-        most = ATTACKED_NODES_SLOW if game.task.slow else ATTACKED_NODES
-        tried[rng.choice(every, min(len(every), most), replace=False)] = True
+        count = min(len(every), game.task.effort.nodes)
+        tried[rng.choice(every, count, replace=False)] = True
         attacked = np.ones_like(attacked)
     attacked &= tried
     noises: list[AnyNoise] = [game.worst_noise(name, eps)] if attacked.any() else []
-    if noises and estimate and not game.task.slow:
+    if noises and estimate and game.task.effort.looks_ahead:
         noises.append(Noise("adversarial", eps, game.everywhere))
     nodes = np.zeros_like(attacked)
     for noise in noises:

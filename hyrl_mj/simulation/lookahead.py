@@ -111,7 +111,7 @@ class Lookahead(Signal):
         self._copies: Plant | None = None
 
     def against(self, task: Task, controller: Controller | None) -> Self:
-        if task.slow and self.farthest > 1:
+        if self.farthest > 1 and not task.effort.looks_ahead:
             raise BadInput(
                 f"adversarial noise looks ahead from the middle of episodes, where {task.name} cannot begin: "
                 "use the attack (hyrl-mj robustness RUN --attack-rounds 2), or uniform or alternating noise"

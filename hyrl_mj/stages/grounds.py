@@ -38,8 +38,7 @@ BATCHES = (64, 64, 128, 256, 512)
 PLAYS = list(product(range(len(BATCHES)), JUDGES))
 # Some episodes lost in a thousand may be missed, but not if the noise is so many times as large as the bound.
 MARGIN = 1.2
-# The mirror image of a policy that wins all of its own mode has been judged there, so fewer plays tell; and
-# there is no time for more where samples take long.
+# The mirror image of a policy that wins all of its own mode has been judged there, so fewer plays tell.
 FEW_PLAYS = PLAYS[: 3 * len(JUDGES)]
 # The plays by which policies are compared that are not expected to win them all, and how much less a mirror
 # image may win.
@@ -65,12 +64,12 @@ def mode_ground(
 ) -> ModeGround:
     """Returns the ground of a mode.
 
-    Modes of a slow task are judged by an attack; those of others by the worst-case game where it decides, and
-    otherwise by episodes. `table` tells whether a table of inputs can be made.
+    By an attack where the task's effort says so; otherwise by the worst-case game where it decides, else
+    by episodes. `table` tells whether a table of inputs can be made.
     """
     if task.for_mode(mode) is not task:
         return ByShare(task, extended, mode, parts, policy)
-    if task.slow:
+    if task.effort.attacked:
         return (ByAttackAnywhere if table else ByAttack)(task, extended, mode, parts, policy)
     kind = ByGame if game.Lattice.decides(task, extended.sets[0].grid) else ByEpisodes
     return kind(task, extended, mode, parts, policy)
@@ -290,7 +289,7 @@ class ByEpisodes(ModeGround):
     margin = MARGIN
 
     def _prepare(self, policy: Policy | None) -> None:
-        self.plays = FEW_PLAYS if self.task.slow else PLAYS
+        self.plays = PLAYS[: self.task.effort.batches * len(JUDGES)]
         self.enough = float(len(self.plays)), -1.0
         with np.errstate(divide="ignore"):
             most = (self.task.chart.sides / (2 * self.bound)).min()

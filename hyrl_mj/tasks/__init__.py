@@ -10,6 +10,7 @@ from pkgutil import iter_modules
 from hyrl_mj.tasks.base import Task, at_levels
 from hyrl_mj.tasks.checks import check_task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.effort import SPARING, Effort
 from hyrl_mj.tasks.field import CLEAR, FASTEST, PROJECTED, RADII, TAKEN, Field, FieldTask
 from hyrl_mj.tasks.guard import check_finite
 from hyrl_mj.tasks.layouts import OF_POST, POSE, TURN, Layouts, length, only_post, posts_of
@@ -45,8 +46,10 @@ __all__ = [
     "RADII",
     "RIGHT",
     "SEARCHES",
+    "SPARING",
     "TAKEN",
     "TURN",
+    "Effort",
     "Field",
     "FieldTask",
     "Layouts",

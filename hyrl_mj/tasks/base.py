@@ -17,6 +17,7 @@ from hyrl_mj.errors import BadInput, check_bound
 from hyrl_mj.plant import Plant, input_limits
 from hyrl_mj.tasks.anew import begins_anew
 from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.effort import Effort
 from hyrl_mj.tasks.guard import guard
 from hyrl_mj.tasks.obstacles import (
     ANY,
@@ -79,9 +80,8 @@ class Task(ABC):
     close: float = 0.2
     #: whether `control` depends on the inputs alone: it is then asked once for all physics steps of a sample
     steady_control: bool = False
-    #: whether each sample runs Python code of an environment: it is then judged by fewer episodes, and
-    #: stage 6 first tries the policies of stage 4 as they are
-    slow: bool = False
+    #: how much the stages try: `SPARING` where each sample runs Python code of an environment
+    effort: Effort = Effort()
     #: whether an episode ends where it arrives, and does not go on to be judged at its end
     arrival_ends: bool = True
     #: whether contacts stop the robot, so that no run comes to states inside of walls

@@ -24,8 +24,6 @@ from hyrl_mj.tasks.trial import (
 
 # Number of starts that are tried.
 STARTS = 64
-# Starts that are drawn to see whether they lie in the box of starts.
-DRAWN = 4_000
 # Most combinations of the levels of the inputs.
 MOST_LEVELS = 1_000
 # Most physics steps of a sample.
@@ -212,9 +210,10 @@ def _check_starts(task: Task) -> None:
     _check_shape("z() gives", back, z.shape)
     _check_shape("with_z() gives", task.with_z(measurement, z[::-1]), measurement.shape)
     _check_round_trip(task, z, back)
-    if not task.slow:
-        anywhere = np.random.default_rng(3).uniform(task.chart.low, task.chart.high, (DRAWN, d))
-        whole = task.plant(DRAWN)
+    if task.effort.everywhere:
+        count = task.effort.starts
+        anywhere = np.random.default_rng(3).uniform(task.chart.low, task.chart.high, (count, d))
+        whole = task.plant(count)
         whole.set_state(*task.state(anywhere))
         _check_round_trip(task, anywhere, task.z(whole.measurement))
     ending = task.ending(measurement)
@@ -240,7 +239,7 @@ def _check_round_trip(task: Task, z: np.ndarray, back: np.ndarray) -> None:
 
 def _check_box(task: Task) -> None:
     """Raises `BadInput` unless the starts that are drawn are starts that the task says may be."""
-    drawn = task.starts(STARTS if task.slow else DRAWN, np.random.default_rng(2))
+    drawn = task.starts(task.effort.starts, np.random.default_rng(2))
     off = ~(task.chart.contains(drawn) & task.may_start(drawn))
     if off.any():
         low, high = (task.chart.format(np.array(end)) for end in (task.start_low, task.start_high))

@@ -11,8 +11,8 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import Outcome
 
-# Pairs of runs that are compared, from all over the chart, and their samples.
-RUNS, RUNS_SLOW, SAMPLES = 2_000, 64, 5
+# Samples of the runs that are compared.
+SAMPLES = 5
 # How far images may be off, as a share of the range of what is compared: friction is solved for directions
 # that are no images of each other, which moves the wheels of `rover` by 0.013.
 ALIKE = 0.02
@@ -30,7 +30,7 @@ def try_mirror(task: Task) -> None:
     if task.mirror is None:
         return
     rng, seen = np.random.default_rng(0), np.array(task.mirror.observation)
-    n, chart = (RUNS_SLOW if task.slow else RUNS), task.chart
+    n, chart = task.effort.mirrored, task.chart
     anywhere = rng.uniform(chart.low, chart.high, (n // 2, chart.dimension))
     z = np.vstack([task.starts(n // 4, rng), anywhere, _near_obstacles(task, n // 4, rng)])
     image = _image(task, z, seen)

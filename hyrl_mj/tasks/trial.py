@@ -17,8 +17,8 @@ from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import Outcome
 from hyrl_mj.tasks.guard import check_finite
 
-# Steps of the physics that the episodes of a trial take together, at most; and how many run side by side.
-STEPS, FEWEST, MOST, MOST_SLOW = 200_000, 16, 256, 64
+# Steps of the physics that the episodes of a trial take together, at most; and the fewest side by side.
+STEPS, FEWEST = 200_000, 16
 # Of these, starts as training draws them; the others are nodes of a grid of so many nodes.
 STARTS, NODES = 32, 128
 # Corners of the input limits that are tried, at most.
@@ -198,7 +198,7 @@ def _samples(task: Task) -> int:
 def _side_by_side(task: Task) -> int:
     """Returns the number of episodes side by side."""
     steps = _samples(task) * task.dt / task.model.opt.timestep
-    return int(np.clip(STEPS / steps, FEWEST, MOST_SLOW if task.slow else MOST))
+    return int(np.clip(STEPS / steps, FEWEST, task.effort.side_by_side))
 
 
 def _nodes(task: Task) -> np.ndarray:

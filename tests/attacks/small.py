@@ -20,7 +20,9 @@ import hyrl_mj.stages.results as results
 import hyrl_mj.viz.figures.style as style
 import hyrl_mj.viz.replay as replay
 from hyrl_mj import cli
+from hyrl_mj.environments.task import EnvironmentTask
 from hyrl_mj.learning import presets
+from hyrl_mj.tasks import Task
 from hyrl_mj.tasks.unit_circle import UnitCircle
 from hyrl_mj.viz.figures import FIGURES
 
@@ -70,7 +72,9 @@ def shorten() -> None:
     presets._SMOKE |= {"ppo": 1_024, "dqn": 3_000}
     presets._SMOKE_MODES = 1_024
     examination.CURVE = examination.CURVE[::8]
-    training.CHECKPOINTS, training.EPISODES, results.EPISODES = 2, 64, 64
+    training.EPISODES = results.EPISODES = 64
+    for kind in (Task, EnvironmentTask):
+        kind.effort = replace(kind.effort, checkpoints=2)
     style.DPI = 30
     style.STYLE["pdf.fonttype"] = 3
     for name in FIGURES.keys() - KEPT:
