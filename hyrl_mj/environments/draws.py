@@ -9,16 +9,17 @@ import numpy as np
 from hyrl_mj.environments.coordinates import robot_of
 from hyrl_mj.environments.fingerprint import Fingerprint, differing
 from hyrl_mj.environments.instance import Instance
-from hyrl_mj.environments.observations import flat
 from hyrl_mj.errors import BadInput
 
 # Resets that show where episodes start, and those that are compared for all that they draw, with so many
-# samples of runs after them.
-RESETS, COMPARED, SAMPLES = 64, 4, 20
+# samples of runs after them from so many of these starts.
+RESETS, COMPARED, SAMPLES, STARTS = 64, 4, 100, 3
 # Differences of what is observed that are none, as a share of the largest number.
 SAME = 1e-9
 # What `Instance.remembered` calls the state, of which `names_of_state` tells more.
 STATE = "MuJoCo's state"
+# For how many samples inputs are held.
+HELD = 10
 
 
 def states_of_resets(instance: Instance) -> np.ndarray:
@@ -79,10 +80,10 @@ def _drawn(instance: Instance, states: np.ndarray) -> list[str]:
     for kind, bodies in (("qpos", body_of_qpos), ("qvel", model.dof_bodyid)):
         varies[columns[kind][robot[bodies]]] = False
     names = [name for name, v in zip(_names_of_state(instance), varies, strict=True) if v]
-    again = [_begun(instance, states[0], 0)[0] for _ in range(2)]
+    again = [_begun(instance, states[:1], 0)[0] for _ in range(2)]
     lasting = set(differing(*again))  # what outlasts a reset is not drawn by it
     begun = [
-        _begun(Instance(instance.spec) if lasting else instance, states[0], seed)
+        _begun(Instance(instance.spec) if lasting else instance, states[:STARTS], seed)
         for seed in range(COMPARED)
     ]
     first, told = begun[0]
@@ -93,6 +94,13 @@ def _drawn(instance: Instance, states: np.ndarray) -> list[str]:
         other.shape == told.shape and np.allclose(other, told, rtol=0, atol=most, equal_nan=True)
         for _, other in begun
     ):
+        known = {*lasting, *of_model, STATE, *(n for found, _ in begun for n in found.generators)}
+        unclear = [n for n in changed if n not in known and "_seed" not in n]
+        if unclear:
+            instance.spec.found["kept"] = (
+                f"{', '.join(unclear[:8])}, as the reset that runs begin with leaves it; no trial shows that "
+                "what is to be done depends on it"
+            )
         return names + of_model
     passed = {
         *lasting,
@@ -105,13 +113,18 @@ def _drawn(instance: Instance, states: np.ndarray) -> list[str]:
     return names + of_model + (goals or differ) or ["something that no attribute holds"]
 
 
-def _begun(instance: Instance, start: np.ndarray, seed: int) -> tuple[Fingerprint, np.ndarray]:
-    """Returns what is remembered after a reset to a start (S,), and what is told from there."""
-    instance.put(start, seed)
-    remembered, space = instance.remembered(), instance.env.observation_space
-    samples = instance.wander(np.random.default_rng(0), SAMPLES, 1)
-    told = [[*flat(seen, space), reward, ends] for seen, reward, ends, _, _ in samples]
-    return remembered, np.array(told, dtype=float)
+def _begun(instance: Instance, starts: np.ndarray, seed: int) -> tuple[Fingerprint, np.ndarray]:
+    """Returns what is remembered after a reset to the first start, and what is told from starts (k, S)."""
+    remembered, told, rng = None, [], np.random.default_rng(0)
+    for start in starts:
+        seen = instance.put(start, seed)
+        remembered = remembered or instance.remembered()
+        told.append(seen)
+        for result in instance.wander(rng, SAMPLES, HELD):
+            instance.take(result)
+            told += [instance.observation, np.array(instance.report, dtype=float)]
+    assert remembered is not None
+    return remembered, np.concatenate(told)
 
 
 def _names_of_state(instance: Instance) -> list[str]:

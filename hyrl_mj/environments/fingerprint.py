@@ -13,7 +13,8 @@ import sys
 from collections import deque
 from collections.abc import Mapping, Set
 from contextlib import suppress
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, partial
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 from typing import Any
 
@@ -22,6 +23,7 @@ import mujoco
 import numpy as np
 
 from hyrl_mj.environments.opening import layers
+from hyrl_mj.environments.physics import STATE
 
 # Objects of these modules hold no memory of an environment, or it is in MuJoCo's state.
 PASSED = (
@@ -38,15 +40,13 @@ LEFT_OUT = frozenset(("_ezpickle_args", "_ezpickle_kwargs", "_saved_kwargs", "st
 # How deep attributes of attributes are looked at, and how many values at most. What lies beyond cannot be
 # compared, and counts as different.
 DEEPEST, MOST = 10, 100_000
-# What may be changed in MuJoCo's model so that runs go on differently.
-MODEL = (
-    "qpos0", "qpos_spring", "body_pos", "body_quat", "body_mass", "body_inertia", "body_ipos", "geom_pos",
-    "geom_quat", "geom_size", "geom_friction", "geom_contype", "geom_conaffinity", "geom_solref",
-    "geom_solimp", "geom_margin", "site_pos", "site_quat", "jnt_range", "jnt_axis", "jnt_stiffness",
-    "dof_damping", "dof_armature", "dof_frictionloss", "actuator_gear", "actuator_gainprm",
-    "actuator_biasprm", "actuator_dynprm", "actuator_ctrlrange", "actuator_forcerange", "tendon_range",
-    "eq_data", "hfield_data",
+# Parts of MuJoCo's model that say how it moves, by the first words of their names, and endings of those that
+# only say how it looks.
+MOVES = (
+    "qpos", "body_", "jnt_", "dof_", "geom_", "site_", "tendon_", "wrap_", "actuator_", "sensor_", "eq_",
+    "pair_", "exclude_", "numeric_data", "hfield_data", "flex_",
 )  # fmt: skip
+LOOKS = ("_rgba", "_matid", "_group", "_user")
 PLAIN = (type(None), bool, int, float, complex, str, bytes)
 # The kinds of variables of a class or a module whose values can change.
 DATA = (*PLAIN, list, dict, set, deque, tuple, np.ndarray, np.generic, np.random.Generator)
@@ -65,14 +65,26 @@ class Fingerprint(dict[str, Any]):
         self.generators: dict[str, Any] = {}
 
 
+@dataclass(frozen=True)
 class Unknown:
-    """A value that cannot be written down: it equals no other, and not even itself at another moment."""
+    """A value that cannot be written down: all that is known is whether it is the same object.
+
+    Attributes:
+        number: of the object in this process, None of one that equals no other.
+    """
+
+    number: int | None = None
+
+    def __eq__(self, other: object) -> bool:
+        known = isinstance(other, Unknown) and self.number is not None
+        return known and self.number == getattr(other, "number", None)
 
 
-def fingerprint(env: gym.Env) -> Fingerprint:
-    """Returns what an environment remembers outside of MuJoCo's data, by the names of its places."""
-    seen: set[int] = set()
+def fingerprint(env: gym.Env, model: mujoco.MjModel, data: mujoco.MjData) -> Fingerprint:
+    """Returns what an environment remembers outside of its state in MuJoCo, by the names of its places."""
+    seen = {id(model), id(data)}
     found = shared(env, seen)
+    found.update((f"{name} of its model", value) for name, value in of_model(model).items())
     for layer in layers(env):
         _walk(layer, "" if layer is env.unwrapped else type(layer).__name__, found, seen, 0)
     return found
@@ -90,22 +102,49 @@ def shared(env: gym.Env, seen: set[int] | None = None) -> Fingerprint:
             continue
         owners = {f"class {kind.__name__}": kind, f"module {module}": sys.modules.get(module)}
         for where, owner in owners.items():
-            if owner is not None and id(owner) not in seen:
+            is_module = isinstance(owner, ModuleType)
+            if owner is not None and (is_module or id(owner) not in seen):
                 seen.add(id(owner))
-                for name in _data_of(owner, len(vars(owner))):
+                names = _data_of(owner, len(vars(owner)))
+                if is_module:
+                    # A script or a notebook has variables that are none of the environment's.
+                    names = [name for name in names if name in _names_in(kind)]
+                for name in names:
                     _walk(vars(owner).get(name), f"{where}.{name}", found, seen, 1)
     return found
 
 
 def of_model(model: mujoco.MjModel) -> dict[str, bytes]:
     """Returns what may be changed in MuJoCo's model, by name."""
-    found = {name: getattr(model, name).tobytes() for name in MODEL}
-    options = (model.opt.timestep, *model.opt.gravity, *model.opt.wind, model.opt.disableflags)
-    return {**found, "opt": np.array(options, dtype=float).tobytes()}
+    found = {name: getattr(model, name).tobytes() for name in _parts_of_model()}
+    options = [np.ravel(getattr(model.opt, name)) for name in _options()]
+    return {**found, "opt": np.concatenate(options, dtype=float).tobytes()}
+
+
+@cache
+def _parts_of_model() -> list[str]:
+    model = mujoco.MjModel.from_xml_string("<mujoco/>")
+    return [
+        name
+        for name in dir(model)
+        if name.startswith(MOVES)
+        and not name.endswith(LOOKS)
+        and isinstance(getattr(model, name), np.ndarray)
+    ]
+
+
+@cache
+def _options() -> list[str]:
+    return [name for name in dir(mujoco.MjOption) if not name.startswith("_")]
+
+
+def is_known(found: Fingerprint) -> bool:
+    """Returns whether all that is remembered could be written down."""
+    return not any(isinstance(value, Unknown) for value in found.values())
 
 
 def differing(a: Fingerprint, b: Fingerprint) -> list[str]:
-    """Returns the names of the places at which two fingerprints differ; what is `Unknown` does."""
+    """Returns the names of the places at which two fingerprints differ."""
     if a == b:
         return []
     return [name for name in {**a, **b} if name not in a or name not in b or a[name] != b[name]]
@@ -130,18 +169,23 @@ def _walk(value: Any, path: str, found: Fingerprint, seen: set[int], depth: int)
         found[path] = value.shape, value.dtype.str, value.tobytes()
     elif isinstance(value, np.random.Generator | np.random.RandomState):
         found[path], found.generators[path] = state_of(value), value
-    elif _has_no_memory(value) or id(value) in seen:
+    elif id(value) in seen:
+        return
+    elif isinstance(value, mujoco.MjData | mujoco.MjModel):  # another one than that of its state
+        seen.add(id(value))
+        found[path] = _of_data(value) if isinstance(value, mujoco.MjData) else of_model(value)
+    elif _has_no_memory(value):
         return
     elif depth > DEEPEST or len(found) > MOST:
         found[path] = Unknown()
     else:
         seen.add(id(value))
-        parts = _parts(value, path, found)
+        parts = _parts(value, path, found, depth)
         for name, part in parts.items():
             _walk(part, name, found, seen, depth + 1)
 
 
-def _parts(value: Any, path: str, found: Fingerprint) -> dict[str, Any]:
+def _parts(value: Any, path: str, found: Fingerprint, depth: int) -> dict[str, Any]:
     """Returns the parts of a value by the names of their places; what has none is written down."""
     if isinstance(value, list | tuple | dict):
         try:
@@ -160,21 +204,31 @@ def _parts(value: Any, path: str, found: Fingerprint) -> dict[str, Any]:
         found[f"len({path})"] = len(value)
         return {f"{path}[{repr(key)[:40]}]": item for key, item in value.items()}
     if isinstance(value, FUNCTIONS):
-        function = getattr(value, "__func__", value)
-        return {f"{path}.{name}": part for name, part in _variables_of(function).items()}
+        return {f"{path}.{name}": part for name, part in _variables_of(value).items()}
+    if isinstance(value, partial):
+        return {f"{path}()": [value.func, value.args, value.keywords]}
     if type(value).__module__.partition(".")[0] == "torch" and hasattr(value, "detach"):
         return {path: value.detach().cpu().numpy()}
     if not hasattr(value, "__dict__"):
         found[path] = _written(value)
         return {}
     slots = {name: getattr(value, name) for name in _slots(value.__class__) if hasattr(value, name)}
-    own = {name: part for name, part in vars(value).items() if name not in LEFT_OUT}
+    left_out = LEFT_OUT if depth == 0 else ()
+    own = {name: part for name, part in vars(value).items() if name not in left_out}
     return {f"{path}.{name}" if path else name: part for name, part in {**own, **slots}.items()}
 
 
+def _of_data(data: mujoco.MjData) -> bytes:
+    state = np.empty(mujoco.mj_stateSize(data.model, STATE))
+    mujoco.mj_getState(data.model, data, state, STATE)
+    return state.tobytes()
+
+
 def _variables_of(function: Any) -> dict[str, Any]:
-    """Returns the variables of its own that a function remembers from call to call, by name."""
-    found = dict(vars(function))
+    """Returns what a function, or the object of a method, remembers from call to call, by name."""
+    owner = getattr(function, "__self__", None)
+    function = getattr(function, "__func__", function)
+    found = {**vars(function), **({} if owner is None else {"self": owner})}
     cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=False)
     for name, cell in cells:
         with suppress(ValueError):  # the cell is empty
@@ -197,13 +251,12 @@ def _written(value: Any) -> Any:
     try:
         return pickle.dumps(value)
     except Exception:  # whatever a foreign class raises
-        return Unknown()
+        return Unknown(id(value))
 
 
 def _has_no_memory(value: Any) -> bool:
     if isinstance(value, FUNCTIONS):
-        function = getattr(value, "__func__", value)
-        return not (function.__closure__ or vars(function))
+        return not _variables_of(value)
     if isinstance(value, type | ModuleType | BuiltinFunctionType | property):
         return True
     return _is_passed(type(value).__module__ or "")
@@ -212,6 +265,32 @@ def _has_no_memory(value: Any) -> bool:
 @cache
 def _is_passed(module: str) -> bool:
     return any(module == name or module.startswith(f"{name}.") for name in PASSED)
+
+
+@cache
+def _names_in(kind: type) -> frozenset[str]:
+    """Returns the names that the methods of a class use, and the functions of its module that these call."""
+    module = vars(sys.modules[kind.__module__])
+    codes = [getattr(part, "__code__", None) for part in _methods_of(kind)]
+    names: set[str] = set()
+    while codes:
+        if (code := codes.pop()) is None:
+            continue
+        codes += [part for part in code.co_consts if hasattr(part, "co_names")]
+        for name in set(code.co_names) - names:
+            names.add(name)
+            if isinstance(part := module.get(name), FunctionType):
+                codes.append(part.__code__)
+            elif isinstance(part, type):
+                codes += [getattr(method, "__code__", None) for method in _methods_of(part)]
+    return frozenset(names)
+
+
+def _methods_of(kind: type) -> list[Any]:
+    parts = list(vars(kind).values())
+    functions = [getattr(part, "__func__", part) for part in parts]  # of classes, and static ones
+    properties = [part for part in parts if isinstance(part, property)]
+    return functions + [f for part in properties for f in (part.fget, part.fset) if f is not None]
 
 
 @cache

@@ -24,10 +24,11 @@ from hyrl_mj.environments.coordinates import (
 )
 from hyrl_mj.environments.draws import check_draws, states_of_resets
 from hyrl_mj.environments.expressions import Expression
-from hyrl_mj.environments.fingerprint import differing, fingerprint
+from hyrl_mj.environments.fingerprint import differing, is_known
+from hyrl_mj.environments.fresh import Fresh
 from hyrl_mj.environments.instance import Instance, Worn
 from hyrl_mj.environments.observations import parts_of
-from hyrl_mj.environments.opening import RESET, AnyChart, Description
+from hyrl_mj.environments.opening import RESET, AnyChart, Description, layers
 from hyrl_mj.environments.pool import Pool
 from hyrl_mj.environments.specification import (
     EARLIER,
@@ -36,7 +37,7 @@ from hyrl_mj.environments.specification import (
     Criterion,
     EnvironmentSpec,
 )
-from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.errors import BadInput
 
 # Samples of an episode of an environment that never ends by itself.
 STEPS_WITHOUT_END = 1_000
@@ -61,6 +62,7 @@ def inspect(description: Description) -> tuple[EnvironmentSpec, Pool, Instance]:
     Raises:
         BadInput: it cannot be used, or one of its instances went another way than a new one.
     """
+    fresh = Fresh(description)  # before anything has been made
     instance = Instance(EnvironmentSpec(description))
     _check_times(instance)
     instance.reset()
@@ -82,7 +84,8 @@ def inspect(description: Description) -> tuple[EnvironmentSpec, Pool, Instance]:
         instance.spec.found["lag"] = f"observation {', '.join(map(str, late))} {LAG[derived]}"
     instance.learn(derived=derived)
     instance.learn(anew=instance.is_wrapped and trials.changes_by_reset(instance.spec))
-    pool = Pool(instance.spec)
+    instance.learn(sensing=instance.is_wrapped and trials.senses(instance.spec, step))
+    pool = Pool(instance.spec, fresh)
     moves, affine = trials.moving(pool, instance.spec)
     instance.learn(moves=moves, affine=affine)
     trials.check_instances(pool, instance.spec)
@@ -190,7 +193,7 @@ def _sampled(instance: Instance) -> tuple[np.ndarray, list[str]]:
         instance.reset(seed)
         with suppress(Worn):  # these resets draw from other seeds
             instance.mark()
-        before, began = fingerprint(instance.env), instance.data.time
+        before, began = instance.memory(), instance.data.time
         deepest = max(deepest, instance.depth())
         for _, reward, terminated, truncated, info in instance.wander(rng, STEPS, HELD):
             states.append(instance.physics.read())
@@ -203,7 +206,7 @@ def _sampled(instance: Instance) -> tuple[np.ndarray, list[str]]:
             if not (terminated or truncated):
                 harmless |= instance.touched()
         instance.finish()
-        remembers = remembers or bool(differing(fingerprint(instance.env), before))
+        remembers = remembers or not is_known(before) or bool(differing(instance.memory(), before))
     if not np.isfinite(rewards).all():
         raise BadInput(f"step() of {instance.name} gives rewards that are not finite: repair it")
     instance.learn(
@@ -228,7 +231,7 @@ def _criterion(instance: Instance, info: Sequence[str]) -> Criterion:
     description, name, found = instance.spec.description, instance.name, instance.spec.found
     success, failure = description.success, description.failure
     if success is None or success.strip() == "info":
-        told = [key for key in SUCCESS if key in info]
+        told = [key for key in SUCCESS if key in info or _is_written(instance.env, key)]
         if not told:
             raise BadInput(
                 f"{name} does not tell in its info when it succeeds: say so with success, as {FORMS}"
@@ -242,11 +245,34 @@ def _criterion(instance: Instance, info: Sequence[str]) -> Criterion:
     else:
         criterion = replace(criterion, failure=Expression.parse(failure, "failure"))
     for path in criterion.keys:
-        if path[0] not in info:
-            raise unknown(f"entry of info of {name}", str(path[0]), info)
+        if path[0] not in info and not _is_written(instance.env, path[0]):
+            met = f"it has had {', '.join(info)}" if info else "it has been empty"
+            raise BadInput(
+                f"no sampled run of {name} had {path[0]!r} in its info, and no method of it has that word: "
+                f"name an entry of info; {met}"
+            )
     model = instance.model
     points = [(mjcf.point_of(model, a), mjcf.point_of(model, b)) for a, b in criterion.places]
     return replace(criterion, points=tuple(points))
+
+
+def _is_written(env: Any, word: str | int) -> bool:
+    """Returns whether a word stands in a method of an environment or of one of its wrappers."""
+    kinds = {kind for layer in layers(env) for kind in type(layer).__mro__}
+    methods = [value for kind in kinds for value in vars(kind).values()]
+    codes = [getattr(method, "__code__", None) for method in methods]
+    return any(_holds(code, word) for code in codes if code is not None)
+
+
+def _holds(code: Any, word: str | int) -> bool:
+    """Returns whether a word is a constant of compiled code, functions within included."""
+    parts = [part for part in code.co_consts if isinstance(part, tuple)]
+    inner = [part for part in code.co_consts if hasattr(part, "co_consts")]
+    return (
+        word in code.co_consts
+        or any(word in part for part in parts)
+        or any(_holds(part, word) for part in inner)
+    )
 
 
 def _at_rest(instance: Instance) -> np.ndarray:

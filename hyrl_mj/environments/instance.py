@@ -28,6 +28,9 @@ from hyrl_mj.environments.physics import Physics
 from hyrl_mj.environments.specification import EARLIER, NOW, UNKNOWN, EnvironmentSpec
 from hyrl_mj.errors import BadInput, HyrlError, brief
 
+# Durations of steps are the same if they differ by less than this share: they are differences of the time.
+SAME_TIME = 1e-3
+
 
 class Worn(HyrlError):
     """An instance is not like a new one after its reset."""
@@ -38,6 +41,8 @@ class Instance:
 
     Args:
         spec: what is known of the environment, of which the description is enough for a first one.
+        real: whether it is as its user has it, with the wrappers that end or count episodes; but for the end
+            of episodes if the user gives one.
 
     Attributes:
         is_wrapped: whether wrappers lie around the environment.
@@ -45,18 +50,20 @@ class Instance:
         report: numbers (r,) of the last sample: reward, terminated, truncated, whether it ended in touch with
             what the robot does not touch elsewhere, entries of `info`, distances.
         inner_seen: what the innermost environment observed last.
+        tried: whether wrappers may write to a state that noise has moved, to find out what they do.
         start: the state of MuJoCo to which the innermost reset has to lead, below wrappers.
 
     Raises:
         BadInput: it cannot be made or reset.
     """
 
-    def __init__(self, spec: EnvironmentSpec):
+    def __init__(self, spec: EnvironmentSpec, real: bool = False):
         env = made(spec.description)
         physics = physics_of(env)
         assert physics is not None
         self.spec, self.name, self.steps = spec, spec.name, steps_of(env)
-        self.env, (self.model, self.data) = peeled(env), physics
+        as_it_is = real and spec.description.steps is None
+        self.env, (self.model, self.data) = env if as_it_is else peeled(env), physics
         self.physics = Physics(self.model, self.data, plant_of(env))
         self.inner: Any = self.env.unwrapped
         self.is_wrapped = self.env is not self.inner
@@ -69,6 +76,7 @@ class Instance:
         self._like: written.Fingerprint | None = None  # after its first reset
         self._begun = written.Fingerprint()  # after the reset of its episode
         self._used = self._at_start = False
+        self.tried = False
         self._pairs: list[tuple[np.ndarray, np.ndarray]] = []
         self._chain = _Chain(self) if self.is_wrapped else None
 
@@ -97,7 +105,7 @@ class Instance:
             observation, _ = self.env.reset(seed=seed, options=options or None)
         except HyrlError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             told = f" with the options {dict(given)}" if given else ""
             raise BadInput(
                 f"{self.name} cannot be reset{told} ({brief(error)}): change its options of reset"
@@ -170,12 +178,13 @@ class Instance:
             setattr(self.inner, name, np.array(value) if isinstance(value, list) else value)
         self.physics.write(self.physics.shown())
 
+    def memory(self) -> written.Fingerprint:
+        """Returns what it remembers now outside of its state in MuJoCo: attributes, and MuJoCo's model."""
+        return written.fingerprint(self.env, self.model, self.data)
+
     def remembered(self) -> written.Fingerprint:
-        """Returns what it remembers now, to compare it: attributes, MuJoCo's state and model."""
-        found = written.fingerprint(self.env)
-        found.update(
-            (f"{name} of its model", v) for name, v in written.of_model(self.model).items()
-        )
+        """Returns what it remembers now, to compare it: `memory`, and MuJoCo's state."""
+        found = self.memory()
         found["MuJoCo's state"] = self.physics.read().tobytes()
         return found
 
@@ -216,7 +225,7 @@ class Instance:
     def act(self, u: np.ndarray) -> None:
         """Steps the environment with inputs u (m,); with wrappers, `sense` gives what it comes to."""
         if self._chain is None:
-            self._take(self.stepped(u))
+            self.take(self.stepped(u))
         else:
             self._chain.ask(lambda: self.stepped(u))
 
@@ -228,12 +237,19 @@ class Instance:
             return
         result = self._chain.answer(noise)
         if self.start is None:
-            self._take(result)
+            self.take(result)
         else:
             self.start, self.observation = None, flat(result, self._space)
 
     def finish(self) -> None:
-        """Refuses an episode in which random numbers were drawn, or what all instances share changed."""
+        """Refuses an episode in which random numbers were drawn, or what is shared or looked at changed."""
+        if not self.physics.is_plant:
+            physics = physics_of(self.env)
+            if physics is None or physics[0] is not self.model or physics[1] is not self.data:
+                raise BadInput(
+                    f"{self.name} has another model or data of MuJoCo after an episode than before it: let "
+                    "it keep those that its reset leads to"
+                )
         differ = written.differing(written.shared(self.env), self._begun)
         if changed := [name for name in differ if written.is_shared(name)]:
             raise self.sharing(changed[0])
@@ -333,12 +349,12 @@ class Instance:
 
     def stepped(self, u: np.ndarray) -> Any:
         """Returns what the environment's own step returns for inputs u (m,)."""
-        action, self._at_start = self.action(u), False
+        action, self._at_start, began = self.action(u), False, self.data.time
         try:
             result = self.env.step(action)
         except HyrlError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise BadInput(f"step() of {self.name} raises {brief(error)}: repair it") from error
         if not isinstance(result, tuple) or len(result) != 5:
             raise BadInput(
@@ -347,9 +363,14 @@ class Instance:
             )
         if not self.is_wrapped:
             self.inner_seen = result[0]
+        took, dt = self.data.time - began, self.spec.dt
+        if dt and not self.physics.is_plant and abs(took - dt) > SAME_TIME * dt:
+            raise BadInput(
+                f"a step of {self.name} takes {took:.6g} s, and others {dt:.6g} s: let each take as long"
+            )
         return result
 
-    def _take(self, result: Any) -> None:
+    def take(self, result: Any) -> None:
         """Notes the observation and the report of what a step has returned."""
         observation, reward, terminated, truncated, info = result
         self.observation = flat(observation, self._space)
@@ -423,6 +444,9 @@ class _Chain:
         self._news: SimpleQueue[tuple[str, Any]] = SimpleQueue()
         self._busy = False  # with a sample that waits to be observed
         self._calls = 0
+        self._shown: np.ndarray | None = (
+            None  # the state that wrappers see, if it is not the true one
+        )
         Thread(target=_serve, args=(self._work, self._news), daemon=True).start()
         weakref.finalize(self, self._work.put, None)  # the thread ends with the instance
 
@@ -447,10 +471,26 @@ class _Chain:
         self._noise.put(noise)
         what, value = self._news.get()
         self._busy = False
-        self._instance.physics.come_back()
+        if self._shown is not None and self._come_back(self._shown) and not self._instance.tried:
+            raise BadInput(
+                f"a wrapper of {self._instance.name} reads MuJoCo's state for what it observes, and writes "
+                "to it: let it observe what the environment gives it, or let only the environment write"
+            )
         if what == "error":
             raise value
         return value
+
+    def _come_back(self, shown: np.ndarray) -> bool:
+        """Puts the true state back after wrappers saw another one; returns whether they wrote to it."""
+        physics, self._shown = self._instance.physics, None
+        now = physics.read()
+        wrote = (now != shown) & ~(np.isnan(now) & np.isnan(shown))
+        physics.come_back()
+        if wrote.any():
+            state = physics.read()
+            state[wrote] = now[wrote]
+            physics.show(state)
+        return bool(wrote.any())
 
     def leave(self) -> None:
         """Ends a step that waits for noise."""
@@ -487,10 +527,12 @@ class _Chain:
             observation = shaped(
                 flat(observation, space) + instance.displaced(noise), observation, space
             )
-            # Wrappers that look at MuJoCo's state themselves see it where the sensor does.
-            state = instance.physics.read()
-            instance.physics.leave()
-            instance.physics.write(instance.moved(state, noise))
+            if instance.spec.sensing:
+                # Wrappers that read MuJoCo's state for what they observe see it where the sensor does.
+                shown = instance.moved(instance.physics.read(), noise)
+                instance.physics.leave()
+                instance.physics.write(shown)
+                self._shown = instance.physics.read()
         return (observation, *rest)
 
 

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import re
 import shlex
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Collection, Mapping, MutableMapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from inspect import signature
 from numbers import Real
 from pathlib import Path
 from typing import Any
+from weakref import WeakSet, WeakValueDictionary
 
 import gymnasium as gym
 import numpy as np
@@ -31,7 +34,11 @@ from hyrl_mj.tasks import Task, get_task, register_opener
 MARK = "env:"
 # The longest episode, and the widest coordinate of a chart [m, rad].
 MOST_STEPS, WIDEST = 1_000_000, 1e6
-_MADE: dict[str, EnvironmentTask] = {}
+# The newest task of each text, for as long as somebody has it, and the last ones for longer.
+_MADE: MutableMapping[str, EnvironmentTask] = WeakValueDictionary()
+_RECENT: deque[EnvironmentTask] = deque(maxlen=4)
+# Older tasks of functions of the same name.
+_OLDER: WeakSet[EnvironmentTask] = WeakSet()
 SHOWN = 120  # characters of arguments in a message
 
 
@@ -87,16 +94,21 @@ def from_gymnasium(
     if starts == CHART:
         del told["starts"]
     spec = MARK + json.dumps(told, default=_plain)
-    if not isinstance(env, str) or spec not in _MADE:
+    made_of, task = _made_of(description), _MADE.get(spec)
+    if task is None or task.made_of != made_of or not isinstance(env, str):
+        if task is not None and task.made_of != made_of and not isinstance(env, str):
+            _OLDER.add(task)
         with described(_shown(env)), kept_generators():
             if isinstance(env, str) and (kwargs or reset or pinned or trust.is_received()):
                 _try(description, spec)
-            _MADE[spec] = EnvironmentTask(*inspect(description), spec)
+            task = EnvironmentTask(*inspect(description), spec, made_of)
+        _MADE[spec] = task
+        _RECENT.append(task)
     if isinstance(env, str):
         trust.remember_text(_recorded(spec, told))
         if (module := _module_of(env)) is not None:
             trust.remember(module)
-    return _MADE[spec]
+    return task
 
 
 def _shown(env: Any) -> str:
@@ -184,6 +196,24 @@ def _where(function: Callable[..., gym.Env]) -> str:
     return f"{getattr(function, '__module__', '')}.{name}"
 
 
+def _made_of(description: Description) -> tuple[Any, ...]:
+    """Returns what an environment is made of beside its description: what its id stands for, and files."""
+    env = description.env
+    if not isinstance(env, str):
+        # A cell of a notebook that is run again makes another function of the same code.
+        own = getattr(env, "__closure__", None) or ()
+        return (
+            getattr(env, "__code__", env),
+            *(getattr(cell, "cell_contents", None) for cell in own),
+        )
+    register(env)
+    paths = [Path(value) for value in description.kwargs.values() if isinstance(value, str | Path)]
+    with suppress(OSError, ValueError):
+        paths = [path for path in paths if path.is_file()]
+        return (gym.registry.get(env.rpartition(":")[2]), *map(artifacts.digest, paths))
+    return (gym.registry.get(env.rpartition(":")[2]),)
+
+
 def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.number):
         return value.tolist()
@@ -196,8 +226,17 @@ def from_spec(spec: str) -> Task:
     Raises:
         BadInput: it was made with a function, which no text holds, or the text is damaged.
     """
-    if spec in _MADE:
-        return _MADE[spec]
+    if (task := _MADE.get(spec)) is not None:
+        if any(older.spec == spec for older in _OLDER):
+            gc.collect()  # who lets go of a task has not let go of its parts at once
+        if any(older.spec == spec for older in _OLDER):
+            raise BadInput(
+                f"two functions are called {task.name}, and tasks of both are in use: give them different "
+                "names"
+            )
+        description = task.specification.description
+        if not isinstance(description.env, str) or task.made_of == _made_of(description):
+            return task
     try:
         given = json.loads(spec.removeprefix(MARK))
         env = given["env"]

@@ -80,7 +80,7 @@ def made(description: Description) -> gym.Env:
                 env: Any = gym.make(make, disable_env_checker=True, **description.kwargs)
         else:
             env = make(**description.kwargs)
-    except Exception as error:  # whatever a foreign constructor raises
+    except (Exception, SystemExit) as error:  # whatever a foreign constructor raises
         if isinstance(make, str):
             raise BadInput(_why_not_made(make, error)) from error
         raise BadInput(f"{name} cannot be made ({brief(error)}): repair the function") from error
@@ -88,13 +88,29 @@ def made(description: Description) -> gym.Env:
     return env
 
 
+def preload(description: Description) -> None:
+    """Imports what makes an environment, without making it; what fails is told when it is made."""
+    make = description.env
+    if not isinstance(make, str) or ":" in make:
+        return
+    with suppress(Exception):
+        register(make)
+        entry = gym.spec(make).entry_point
+        if isinstance(entry, str):
+            gym.envs.registration.load_env_creator(entry)
+
+
 def steps_of(env: gym.Env) -> int | None:
     """Returns after how many steps an episode of an environment is truncated; None if it does not say."""
+    limits = [
+        int(layer._max_episode_steps)
+        for layer in layers(env)
+        if isinstance(layer, gym.wrappers.TimeLimit)
+    ]
+    if limits:
+        return min(limits)
     if env.spec is not None and env.spec.max_episode_steps:
         return int(env.spec.max_episode_steps)
-    for layer in layers(env):
-        if isinstance(layer, gym.wrappers.TimeLimit):
-            return int(layer._max_episode_steps)
     limit = getattr(getattr(env.unwrapped, "_env", None), "_step_limit", np.inf)  # of dm_control
     return int(limit) if np.isfinite(limit) else None
 
@@ -132,7 +148,7 @@ def _adapt_dm_control() -> None:
             del table[field_name]
 
 
-def _why_not_made(name: str, error: Exception) -> str:
+def _why_not_made(name: str, error: BaseException) -> str:
     if name not in gym.registry and isinstance(error, gym.error.Error):
         missing = {e: m for m, e in PACKAGES.items() if importlib.util.find_spec(m) is None}
         own = name.rpartition(":")[2]

@@ -199,7 +199,14 @@ class EnvironmentPlant:
             self._begin(rows)
             states, seen, reports = self._ask("act", rows, u)
         self._open[rows] = True
-        finite = np.isfinite(states).all(axis=1) & np.isfinite(seen).all(axis=1)
+        finite = np.isfinite(states).all(axis=1)
+        if (blank := finite & ~np.isfinite(seen).all(axis=1)).any():
+            of_run = seen[int(blank.argmax())]
+            column = int(np.isfinite(of_run).argmin())
+            raise BadInput(
+                f"{self.spec.name} observes {of_run[column]} in observation[{column}], and policies take "
+                "finite numbers: let it observe finite numbers, such as the longest range of a sensor"
+            )
         some = rows[finite]
         self._state[some] = states[finite]
         self._truth[some, : self.spec.dimension] = self.spec.z(states[finite])

@@ -1,8 +1,8 @@
 """Instances of an environment in processes, one on each core, which play the episodes of many runs.
 
 Each process is a fork of this one. What an episode does depends on its start, inputs and noise alone, so
-results do not depend on the number of processes. The real environment is the judge: a new one, which is only
-put to the same starts and stepped, has to end alike.
+results do not depend on the number of processes. The real environment is the judge: a new one in a process of
+its own, as its user has it, which is only put to the same starts and stepped, has to go and to end alike.
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ import numpy as np
 
 from hyrl_mj import cores
 from hyrl_mj.environments import fingerprint as written
+from hyrl_mj.environments.fresh import Fresh
 from hyrl_mj.environments.instance import Instance, Worn, kept_generators
-from hyrl_mj.environments.observations import flat
 from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.errors import BadInput, HyrlError, brief
+from hyrl_mj.tasks import Outcome
 
 # Fewer episodes than this for each process are played by one.
 FEWEST = 16
@@ -44,13 +45,17 @@ class Played:
         start: MuJoCo's state (S,) in which it begins.
         inputs: (k, m).
         path: (k + 1, d) chart points, before and after each sample.
-        observations: (k + 1, o), or none where noise was on them.
+        outcome: how it ended.
+        cut: whether it was cut off after these samples, and its outcome is the verdict on its last state.
+        observations: (k + 1, o) or without the last (k, o), or none where noise was on them.
         rewards: (k, 1) of the samples, or none.
     """
 
     start: np.ndarray
     inputs: np.ndarray
     path: np.ndarray
+    outcome: int
+    cut: bool
     observations: np.ndarray | None = None
     rewards: np.ndarray | None = None
 
@@ -130,9 +135,9 @@ class Stage:
         """
         instance = self._renewed(self._free)
         instance.begin(states[0])
-        before = written.fingerprint(instance.env)
+        before = instance.memory()
         results = self._acted([instance] * len(u), u, states)
-        if changed := written.differing(written.fingerprint(instance.env), before):
+        if changed := written.differing(instance.memory(), before):
             raise BadInput(
                 f"{instance.name} remembers something in {changed[0]}, as no sampled run showed; without a "
                 "memory that is always there it cannot be tabulated"
@@ -140,13 +145,12 @@ class Stage:
         self._free.append(instance)
         return results
 
-    def check(self, runs: np.ndarray) -> Arrays:
-        """Plays runs (k,) of `Played` in new environments; raises `BadInput` if these go another way."""
+    def check(self, runs: Sequence[Played]) -> None:
+        """Plays runs in new environments; raises `BadInput` if these go another way."""
         for run in runs:
-            real = self._renewed(self._judges)
+            real = self._renewed(self._judges, real=True)
             judge(run, real)
             self._judges.append(real)
-        return ()
 
     def _acted(
         self, instances: Sequence[Instance], u: np.ndarray, begun: np.ndarray | None = None
@@ -167,10 +171,10 @@ class Stage:
 
     # ---- instances
 
-    def _renewed(self, spare: list[Instance]) -> Instance:
+    def _renewed(self, spare: list[Instance], real: bool = False) -> Instance:
         """Returns an instance that can begin an episode: a spare one, or a new one if these are worn."""
         while True:
-            instance = spare.pop() if spare else self._new()
+            instance = spare.pop() if spare else self._new(real)
             try:
                 instance.renew()
                 return instance
@@ -178,8 +182,8 @@ class Stage:
                 if written.is_shared(str(worn)):
                     raise instance.sharing(str(worn)) from None
 
-    def _new(self) -> Instance:
-        instance = Instance(self.spec)
+    def _new(self, real: bool) -> Instance:
+        instance = Instance(self.spec, real)
         shared = written.shared(instance.env)
         self._shared = self._shared or shared
         if changed := written.differing(shared, self._shared):
@@ -193,16 +197,31 @@ def judge(run: Played, real: Instance) -> None:
     That is put to the start and stepped, past all that lets episodes be played side by side. There is no
     tolerance: the same code computes the same from the same numbers.
     """
-    spec, space = real.spec, real.env.observation_space
-    observations, path, rewards = [real.put(run.start)], [run.path[0]], []
+    spec = real.spec
+    observations, path, reports = [real.put(run.start)], [run.path[0]], []
     for u in run.inputs:
-        observation, reward, *_ = real.env.step(real.action(u))
-        observations.append(flat(observation, space))
+        real.take(real.stepped(u))
+        observations.append(real.observation)
         path.append(spec.z(real.physics.read()[None])[0])
-        rewards.append([float(reward)])
-    _compare(real.name, "observation", run.observations, observations)
+        reports.append(real.report)
+    real.finish()
+    seen = None if run.observations is None else observations[: len(run.observations)]
+    _compare(real.name, "observation", run.observations, seen)
     _compare(real.name, "the chart's coordinate", run.path, path)
-    _compare(real.name, "reward", run.rewards, np.reshape(rewards, (-1, 1)))
+    if not reports:
+        return
+    told = np.array(reports, dtype=float)
+    _compare(real.name, "reward", run.rewards, told[:, :1])
+    if run.outcome == Outcome.UNSTABLE:
+        return
+    success, ends = spec.criterion.judged(told)
+    if run.cut and ends[-1] == Outcome.RUNNING:
+        ends[-1] = spec.criterion.verdict(success[-1:])[0]
+    expected = np.append(np.full(len(ends) - 1, int(Outcome.RUNNING)), run.outcome)
+    if (wrong := np.flatnonzero(ends != expected)).size:
+        k = int(wrong[0])
+        ours, theirs = (Outcome(int(values[k])).label for values in (expected, ends))
+        raise _goes_another_way(real.name, f"after {k + 1} sample(s) it is {ours}, and {theirs}")
 
 
 def _compare(name: str, what: str, ours: np.ndarray | None, real: Any) -> None:
@@ -210,10 +229,15 @@ def _compare(name: str, what: str, ours: np.ndarray | None, real: Any) -> None:
         return
     same = (ours == real) | (np.isnan(ours) & np.isnan(real))
     k, i = np.argwhere(~same)[0]
-    raise BadInput(
-        f"{name} goes another way than a new one from the same start with the same inputs: {what}[{i}] is "
-        f"{ours[k][i]:.9g} after {k} sample(s), and {real[k][i]:.9g} in the new one; it depends on other "
-        "episodes, on time, on chance, or on what it observes"
+    values = f"{what}[{i}] is {ours[k][i]:.9g} after {k} sample(s), and {real[k][i]:.9g}"
+    raise _goes_another_way(name, values)
+
+
+def _goes_another_way(name: str, how: str) -> BadInput:
+    return BadInput(
+        f"{name} goes another way than a new one from the same start with the same inputs: {how} in the new "
+        "one; it depends on other episodes, on time, on chance, on wrappers around a time limit, or on what "
+        "it observes"
     )
 
 
@@ -222,10 +246,11 @@ class Pool:
 
     Args:
         spec: what is known of the environment.
+        fresh: plays runs in new processes.
     """
 
-    def __init__(self, spec: EnvironmentSpec):
-        self.spec = spec
+    def __init__(self, spec: EnvironmentSpec, fresh: Fresh):
+        self.spec, self.fresh = spec, fresh
         self._stage, self._owner = Stage(spec), os.getpid()
         self._hands: list[Connection] = []
         self._lock = Lock()  # a game attacks several controllers in threads
@@ -233,8 +258,21 @@ class Pool:
         self.left: deque[tuple[np.ndarray, np.ndarray, np.ndarray]] = deque()
 
     def spread(self, what: str, *values: np.ndarray) -> Arrays:
-        """Has all processes do something with values (k, ...): "rest", "branch" or "check"; see `Stage`."""
+        """Has all processes do something with values (k, ...): "rest" or "branch"; see `Stage`."""
         return self.ask(what, self.places(len(values[0])), *values)
+
+    def check(self, runs: Sequence[Played], alone: bool = False) -> None:
+        """Has runs played by the real environment, in new processes: one on each core, or one for each run.
+
+        Raises:
+            BadInput: a run goes another way there.
+        """
+        if not self.fresh.there:
+            with self._lock, kept_generators():
+                self._stage.check(runs)
+            return
+        count = len(runs) if alone else min(cores.count(), len(runs))
+        self.fresh.check(self.spec, [runs[i::count] for i in range(count)])
 
     def places(self, n: int) -> np.ndarray:
         """Returns the processes (n,) over which so many runs are spread, the number of this one being 0."""
@@ -297,7 +335,8 @@ class Pool:
         while len(self._hands) < count - 1:
             context = multiprocessing.get_context("fork")
             ours, theirs = context.Pipe()
-            arguments = theirs, self.spec, [*self._hands, ours]
+            others = [*self._hands, ours, *([self.fresh.hand] if self.fresh.hand else [])]
+            arguments = theirs, self.spec, others
             worker = context.Process(target=_serve, args=arguments, daemon=True)
             with warnings.catch_warnings():
                 # Python 3.12 warns of threads: those of torch and MuJoCo take no part in the children.

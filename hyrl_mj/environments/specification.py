@@ -94,6 +94,11 @@ class Criterion:
     def _conditions(self) -> tuple[Expression, ...]:
         return (self.success,) if self.failure is None else (self.success, self.failure)
 
+    def verdict(self, success: np.ndarray) -> np.ndarray:
+        """Returns the `Outcome` (n,) of episodes that are cut off where `success` (n,) holds or not."""
+        holds = success & (not self.ends)
+        return np.where(holds, Outcome.REACHED, Outcome.STALLED)
+
     def judged(self, report: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns whether reports (k, r) are successes, (k,) bool, and the `Outcome` (k,) of their samples.
 
@@ -159,6 +164,7 @@ class EnvironmentSpec:
         max_steps: samples of an episode.
         islands: what can be passed on both sides, by name, each with the id of a geom.
         derived: `NOW`, `EARLIER` or `UNKNOWN`.
+        sensing: whether wrappers read MuJoCo's state for what they observe, and see it under noise.
         anew: whether a reset changes what the next one does to a wrapper: each episode takes a new instance.
         moves: (o,) bool, the columns of an observation at rest that follow the chart.
         affine: a matrix (d + 1, o) that gives what is observed at rest at z from (z, 1), if one does.
@@ -194,6 +200,7 @@ class EnvironmentSpec:
     max_steps: int = 1
     islands: Mapping[str, int] = field(default_factory=dict)
     derived: str = UNKNOWN
+    sensing: bool = False
     anew: bool = False
     moves: np.ndarray = field(default_factory=_none)
     affine: np.ndarray | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from hashlib import sha256
@@ -50,6 +50,7 @@ class EnvironmentTask(Task):
     Attributes:
         specification: what is known of the environment.
         found: what was filled in, with the reason, by name.
+        made_of: what the environment was made of beside its description, to compare it.
     """
 
     scene: Scene
@@ -57,8 +58,16 @@ class EnvironmentTask(Task):
     side_by_side = SIDE_BY_SIDE
     learning = Learning()
 
-    def __init__(self, specification: EnvironmentSpec, pool: Pool, instance: Instance, spec: str):
+    def __init__(
+        self,
+        specification: EnvironmentSpec,
+        pool: Pool,
+        instance: Instance,
+        spec: str,
+        made_of: tuple[Any, ...],
+    ):
         self.specification, self._pool, self._instance = specification, pool, instance
+        self.made_of = made_of
         # What a task and a specification call alike.
         for name in (
             "name", "chart", "inputs", "start_low", "start_high", "max_steps", "dt", "worst_reward",
@@ -180,12 +189,28 @@ class EnvironmentTask(Task):
             return False
         return goes_on(self._pool, spec, of_chart=True)
 
-    def verify(self, z0: np.ndarray, u: np.ndarray, path: np.ndarray, lengths: np.ndarray) -> None:
-        starts = self.specification.state_at(z0)
-        ends = [(i, k) for i, k in enumerate(lengths) if np.isfinite(u[:k, i]).all()]
-        inputs = np.clip(u, *self.input_limits)
-        played = [Played(starts[i], inputs[:k, i], path[: k + 1, i]) for i, k in ends]
-        self._pool.spread("check", np.array(played, dtype=object))
+    def verify(self, z0: np.ndarray, runs: Any, rows: Sequence[int] | np.ndarray) -> None:
+        starts, d = self.specification.state_at(z0), self.chart.dimension
+        inputs, seen = np.clip(runs.u, *self.input_limits), slice(d, d + self.specification.columns)
+        played = []
+        for i in rows:
+            k = int(runs.length[i])
+            if not np.isfinite(inputs[:k, i]).all():
+                continue
+            measured, true = runs.measured[:k, i], runs.true[:k, i]
+            quiet = np.array_equal(measured[:, :d], true[:, :d])
+            played.append(
+                Played(
+                    starts[i],
+                    inputs[:k, i],
+                    runs.path[: k + 1, i],
+                    outcome=int(runs.outcome[i]),
+                    cut=k == runs.limit[i],
+                    observations=measured[:, seen] if quiet else None,
+                )
+            )
+        if played:
+            self._pool.check(played)
 
     def at(self, z: np.ndarray) -> np.ndarray:
         rest = np.tile([0.0, 0.0, float(Outcome.RUNNING)], (len(z), 1))
@@ -234,8 +259,7 @@ class EnvironmentTask(Task):
         return np.rint(measurement[:, -1]).astype(int)
 
     def verdict(self, measurement: np.ndarray) -> np.ndarray:
-        holds = (measurement[:, -2] > 0) & (not self.arrival_ends)
-        return np.where(holds, Outcome.REACHED, Outcome.STALLED)
+        return self.specification.criterion.verdict(measurement[:, -2] > 0)
 
     def arrived(self, z: np.ndarray) -> np.ndarray:
         return np.ones(len(z), dtype=bool)  # its own criterion tells

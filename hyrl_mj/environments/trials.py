@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from hyrl_mj.environments.fingerprint import differing, fingerprint
+from hyrl_mj.environments.fingerprint import differing
 from hyrl_mj.environments.instance import Instance
 from hyrl_mj.environments.observations import flat, observers
 from hyrl_mj.environments.plant import EnvironmentPlant
 from hyrl_mj.environments.pool import Played, Pool
 from hyrl_mj.environments.specification import EARLIER, NOW, UNKNOWN, EnvironmentSpec
 from hyrl_mj.errors import BadInput
+from hyrl_mj.tasks import Outcome
 
 # Episodes and samples of a trial, and for how many samples inputs are held.
 EPISODES, SAMPLES, HELD = 8, 40, 8
@@ -23,6 +25,8 @@ ROUNDING = 1e-9
 NEAR = 0.5
 # By how much coordinates are moved to see what follows them, as a share of the side of the chart.
 MOVED = 1e-3
+# Places on the chart from which runs of so many samples come to one state, which may show where they were.
+PLACES, AWAY = 64, 2
 # Runs that show whether the chart is the state, and how much they may differ from others.
 OF_CHART, SAME = 48, 1e-9
 
@@ -57,9 +61,17 @@ def _agrees(get: Any, seen: np.ndarray, space: Any) -> bool:
         return False
 
 
+def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Returns the differences (o,) of two observations; equal values that are not finite do not differ."""
+    same = (a == b) | (np.isnan(a) & np.isnan(b))
+    with np.errstate(invalid="ignore"):
+        return np.where(same, 0.0, np.abs(a - b))
+
+
 def _rounds(off: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Returns which differences (o,) are no more than rounding of values (o,)."""
-    return np.asarray(off <= ROUNDING * max(float(np.abs(values).max(initial=0.0)), 1.0))
+    sizes = np.abs(values[np.isfinite(values)])
+    return np.asarray(off <= ROUNDING * max(float(sizes.max(initial=0.0)), 1.0))
 
 
 def check_observer(instance: Instance, step: np.ndarray) -> None:
@@ -74,7 +86,9 @@ def check_observer(instance: Instance, step: np.ndarray) -> None:
         step: (d,) by how much the coordinates of the chart are moved to see what follows them.
     """
     rng, name, space = np.random.default_rng(1), instance.name, instance.inner.observation_space
-    first, suspects = [], {}
+    first: list[np.ndarray] = []
+    states: list[np.ndarray] = []
+    suspects: dict[int, str] = {}
     for seed in range(EPISODES):
         instance.reset(seed)
         state = instance.physics.read()
@@ -82,17 +96,18 @@ def check_observer(instance: Instance, step: np.ndarray) -> None:
         pinned = instance.spec.description.pinned
         begun = flat(instance.watched() if pinned else instance.inner_seen, space)
         first.append(begun)
+        states.append(state)
         for _ in instance.wander(rng, SAMPLES, HELD):
             pass
-        before = fingerprint(instance.env)
+        before = instance.memory()
         moved = instance.displaced(step)
-        if changed := differing(fingerprint(instance.env), before):
+        if changed := differing(instance.memory(), before):
             raise BadInput(
                 f"{name} changes {changed[0]} when it computes what it observes, so that cannot be asked for "
                 "where noise shows the robot: let it only read"
             )
         instance.physics.write(state)
-        off = np.abs(flat(instance.watched(), space) - begun)
+        off = _apart(flat(instance.watched(), space), begun)
         for column in map(int, np.flatnonzero(~_rounds(off, begun))):
             suspects[column] = (
                 f"is {begun[column]:.6g} after reset() and differs by {off[column]:.6g} in that state later"
@@ -100,8 +115,30 @@ def check_observer(instance: Instance, step: np.ndarray) -> None:
             if moved[column]:
                 raise _stored(name, column, suspects[column])
     for column, why in suspects.items():
-        if np.ptp([row[column] for row in first]) > 0 or _depends(instance, column, step):
+        if np.ptp([row[column] for row in first]) > 0 or _depends(instance, column, states):
             raise _stored(name, column, why)
+    _check_places(instance)
+
+
+def _check_places(instance: Instance) -> None:
+    """Raises `BadInput` if what is observed in a state depends on where on the chart a run came from."""
+    spec, rng, space = instance.spec, np.random.default_rng(7), instance.inner.observation_space
+    usual = None
+    for z in rng.uniform(spec.start_low, spec.start_high, (PLACES, spec.dimension)):
+        instance.reset()
+        instance.physics.write(spec.state_at(z[None])[0])
+        if instance.depth() > spec.depth:
+            continue
+        if len([*instance.wander(rng, AWAY, 1)]) < AWAY:
+            continue
+        instance.physics.write(spec.state)
+        seen = flat(instance.watched(), space)
+        usual = seen if usual is None else usual
+        off = _apart(seen, usual)
+        if (stale := ~_rounds(off, usual)).any():
+            column = int(stale.argmax())
+            why = f"differs by {off[column]:.6g} in one state, after runs in different places"
+            raise _stored(instance.name, column, why)
 
 
 def _stored(name: str, column: int, why: str) -> BadInput:
@@ -111,15 +148,19 @@ def _stored(name: str, column: int, why: str) -> BadInput:
     )
 
 
-def _depends(instance: Instance, column: int, step: np.ndarray) -> bool:
+def _depends(instance: Instance, column: int, starts: list[np.ndarray]) -> bool:
     """Returns whether a column of the observation depends on where a run under the same inputs began."""
-    space, ends = instance.inner.observation_space, []
-    for offset in (0.0, 1.0):
+    space, traces = instance.inner.observation_space, []
+    for start in starts:
         instance.reset()
-        instance.physics.write(instance.moved(instance.physics.read(), offset * step))
-        runs = instance.wander(np.random.default_rng(2), HELD, 1)
-        ends.append([flat(instance.inner_seen, space)[column] for _ in runs])
-    return not np.array_equal(ends[0], ends[1], equal_nan=True)
+        instance.physics.write(start)
+        runs = instance.wander(np.random.default_rng(2), SAMPLES, HELD)
+        traces.append([flat(instance.inner_seen, space)[column] for _ in runs])
+    shortest = min(map(len, traces))
+    return any(
+        not np.array_equal(trace[:shortest], traces[0][:shortest], equal_nan=True)
+        for trace in traces
+    )
 
 
 def derived_of(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
@@ -141,7 +182,7 @@ def derived_of(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
             seen, state = flat(instance.inner_seen, space), instance.physics.read()
             size.append(np.abs(seen))
             for derived, differences in off.items():
-                differences.append(instance.seen_as(derived, state, 0 * step) - seen)
+                differences.append(_apart(instance.seen_as(derived, state, 0 * step), seen))
             moving.append(np.abs(instance.displaced(step)))
     most = {derived: np.abs(differences).max(axis=0) for derived, differences in off.items()}
     differ = {derived: ~_rounds(far, np.array(size)) for derived, far in most.items()}
@@ -175,6 +216,64 @@ def changes_by_reset(spec: EnvironmentSpec) -> bool:
     usual = set(differing(found[0][1], found[1][1]))  # such as names of files
     changed = set(differing(found[0][1], found[2][1])) - usual
     return bool(changed) or not np.array_equal(found[0][0], found[2][0], equal_nan=True)
+
+
+def senses(spec: EnvironmentSpec, step: np.ndarray) -> bool:
+    """Returns whether wrappers read MuJoCo's state for what they observe.
+
+    The same runs under noise are played twice, once with the true state shown to the wrappers, and once with
+    the state where the noise shows the robot.
+
+    Args:
+        spec: what is known of the environment.
+        step: (d,) the bound of the noise on the coordinates of the chart.
+
+    Raises:
+        BadInput: wrappers do, and tell from that state as well how the episode goes.
+    """
+    true, shown = (_watched_runs(spec, step, sensing) for sensing in (False, True))
+    differ = {
+        what: any(
+            not np.array_equal(a, b, equal_nan=True)
+            for ours, others in zip(true[what], shown[what], strict=True)
+            for a, b in zip(ours, others, strict=False)  # one may have ended before
+        )
+        for what in ("observation", "report")
+    }
+    if all(differ.values()):
+        raise BadInput(
+            f"a wrapper of {spec.name} reads MuJoCo's state for what it observes, which noise moves, and for "
+            "its reward, its info or the end of an episode, which it must not: let it observe what the "
+            "environment gives it, or let only the environment judge"
+        )
+    return differ["observation"]
+
+
+def _watched_runs(
+    spec: EnvironmentSpec, step: np.ndarray, sensing: bool
+) -> dict[str, list[list[np.ndarray]]]:
+    """Returns observations and reports of runs under noise, each by run and sample."""
+    instance, rng = Instance(replace(spec, sensing=sensing)), np.random.default_rng(6)
+    instance.tried = True
+    found: dict[str, list[list[np.ndarray]]] = {"observation": [], "report": []}
+    samples = min(SAMPLES, spec.max_steps)
+    for seed in range(EPISODES):
+        instance.quit()
+        instance.begin(spec.state, seed)
+        noises = rng.uniform(-step, step, (samples + 1, len(step)))
+        inputs = [instance.drawn(rng) for _ in range(samples)]
+        instance.sense(noises[0])
+        seen, reports = [instance.observation], []
+        for k in range(samples):
+            instance.act(inputs[k - k % HELD])
+            instance.sense(noises[k + 1])
+            seen.append(instance.observation)
+            reports.append(np.array(instance.report, dtype=float))
+            if instance.report[1] or instance.report[2]:
+                break
+        found["observation"].append(seen)
+        found["report"].append(reports)
+    return found
 
 
 def moving(pool: Pool, spec: EnvironmentSpec) -> tuple[np.ndarray, np.ndarray | None]:
@@ -235,12 +334,22 @@ def check_instances(pool: Pool, spec: EnvironmentSpec) -> None:
                 starts[i],
                 u[:end, i],
                 path[: end + 1, i, :d],
+                _ended(spec, path[end, i], end == spec.max_steps),
+                end == spec.max_steps,
                 None if noise else path[: end + 1, i, d : d + o],
                 path[1 : end + 1, i, d + o : d + o + 1],
             )
             for i, end in enumerate(ends)
         ]
-        pool.spread("check", np.array(played, dtype=object))
+        pool.check(played, alone=not seed)
+
+
+def _ended(spec: EnvironmentSpec, measured: np.ndarray, cut: bool) -> int:
+    """Returns the `Outcome` of a run that ends at a measurement (p,), or is cut off there."""
+    outcome = int(measured[-1])
+    if cut and outcome == Outcome.RUNNING:
+        outcome = int(spec.criterion.verdict(measured[-2:-1] > 0)[0])
+    return outcome
 
 
 def goes_on(pool: Pool, spec: EnvironmentSpec, of_chart: bool = False) -> bool:

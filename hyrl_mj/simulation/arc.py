@@ -184,7 +184,7 @@ def simulate_batch(
     steps = None if horizon is None else samples(task, horizon)
     settings = LoopSettings(steps=steps, record=True)
     rollout = closed_loop(task, loop, starts, noise, q0, seed, settings)
-    task.verify(starts, rollout.u, rollout.path, rollout.length)
+    task.verify(starts, rollout, range(n))
     name = "policy" if isinstance(loop, PolicyController) else "hyrl"
     return [_arc(task, name, rollout, i, noise) for i in range(n)]
 

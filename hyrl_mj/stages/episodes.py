@@ -173,7 +173,7 @@ def _outcomes(plants: Mapping[int, Plant], batch: _Batch) -> dict[str, np.ndarra
             judge(task, runs, start, lost_first[:judged])
         else:  # every loss of an environment is played again
             rows = lost_first[: max(judged, int((runs.outcome != Outcome.REACHED).sum()))]
-            task.verify(z0[rows], runs.u[:, rows], runs.path[:, rows], runs.length[rows])
+            task.verify(z0, runs, rows)
     return {
         region: np.bincount(runs.outcome[inside], minlength=len(Outcome))
         for region, inside in regions.split(task, noise.bound, z0).items()

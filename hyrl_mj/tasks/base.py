@@ -277,15 +277,14 @@ class Task(ABC):
         return True
 
     def verify(  # noqa: B027 - most plants are what they are taken for
-        self, z0: np.ndarray, u: np.ndarray, path: np.ndarray, lengths: np.ndarray
+        self, z0: np.ndarray, runs: Any, rows: Sequence[int] | np.ndarray
     ) -> None:
         """Plays runs again on the real thing, where the plant is only thought to be like it.
 
         Args:
             z0: (n, d) starts.
-            u: (K, n, m) inputs, for so many samples of each run as it lasts.
-            path: (K + 1, n, d) chart points.
-            lengths: (n,) samples of the runs.
+            runs: a recorded `Rollout` of n runs.
+            rows: numbers (k,) of the runs that are played again.
 
         Raises:
             BadInput: a run goes another way there; the message names quantity, sample and both values.
