@@ -276,7 +276,7 @@ class Slow(Puck):
 
 REFUSED = {
     "a stored difference": (Difference, {}, r"does not follow its state: observation\[2\]"),
-    "a cached place": (Cached, {}, r"does not follow its state: observation\[0\]"),
+    "a cached place": (Cached, {}, "each reset of Cached draws place"),
     "collisions": (
         Colliding,
         {"success": "terminated"},
@@ -298,7 +298,7 @@ REFUSED = {
     "a key that is not there": (
         Puck,
         {"success": 'info["won"]'},
-        "unknown entry of info of Puck 'won'",
+        "no method of it has that word: name an entry of info; it has had success",
     ),
     "success and failure": (
         Puck,

@@ -89,7 +89,7 @@ def _drawn(instance: Instance, states: np.ndarray) -> list[str]:
     first, told = begun[0]
     changed = dict.fromkeys(n for other, _ in begun[1:] for n in differing(first, other))
     of_model = [n for n in changed if n.endswith(" of its model") and n not in lasting]
-    most = SAME * max(float(np.abs(told).max(initial=0.0)), 1.0)
+    most = SAME * max(float(np.nanmax(np.abs(told), initial=0.0)), 1.0)
     if all(
         other.shape == told.shape and np.allclose(other, told, rtol=0, atol=most, equal_nan=True)
         for _, other in begun

@@ -36,7 +36,7 @@ MARK = "env:"
 MOST_STEPS, WIDEST = 1_000_000, 1e6
 # The newest task of each text, for as long as somebody has it, and the last ones for longer.
 _MADE: MutableMapping[str, EnvironmentTask] = WeakValueDictionary()
-_RECENT: deque[EnvironmentTask] = deque(maxlen=4)
+_RECENT: deque[EnvironmentTask] = deque(maxlen=2)
 # Older tasks of functions of the same name.
 _OLDER: WeakSet[EnvironmentTask] = WeakSet()
 SHOWN = 120  # characters of arguments in a message

@@ -129,7 +129,7 @@ def _check_places(instance: Instance) -> None:
         instance.physics.write(spec.state_at(z[None])[0])
         if instance.depth() > spec.depth:
             continue
-        if len([*instance.wander(rng, AWAY, 1)]) < AWAY:
+        if len([*instance.wander(np.random.default_rng(8), AWAY, 1)]) < AWAY:
             continue
         instance.physics.write(spec.state)
         seen = flat(instance.watched(), space)
