@@ -255,13 +255,15 @@ class Saved:
         write_arrays(path, arrays, self.KIND)
 
     @classmethod
-    def load(cls, path: Path, context: Any = None) -> Self:
-        """Reads an npz file of `save`; sets in a task's chart need the task as `context`.
+    def load(cls, path: Path, context: Any = None, limit: int = LARGEST) -> Self:
+        """Reads an npz file of `save`, whose arrays take no more than the limit [bytes].
+
+        Sets in a task's chart need the task as `context`.
 
         Raises:
             BadArtifact: the file is missing, damaged, or of another kind.
         """
-        arrays, types = read_arrays(path, cls.KIND), get_type_hints(cls)
+        arrays, types = read_arrays(path, cls.KIND, limit), get_type_hints(cls)
         values = {}
         with reading(path):
             for field in fields(cls):
@@ -319,10 +321,10 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], kind: str) -> Non
         np.savez_compressed(temporary, **content)
 
 
-def read_arrays(path: Path, kind: str) -> dict[str, np.ndarray]:
-    """Returns the arrays that `write_arrays` wrote."""
+def read_arrays(path: Path, kind: str, limit: int = LARGEST) -> dict[str, np.ndarray]:
+    """Returns the arrays that `write_arrays` wrote, which take no more than the limit [bytes]."""
     with reading(path):
-        content = archives.read_npz(read_limited(path), LARGEST)
+        content = archives.read_npz(read_limited(path), limit)
         check_version(int(content.pop("version")), str(content.pop("kind")), kind)
         return content
 

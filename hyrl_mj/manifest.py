@@ -44,6 +44,10 @@ FILES = {
 }
 
 
+# The files of a stage are no larger together [bytes].
+LARGEST_STAGE = 2**28
+
+
 class Busy(BadInput):
     """Another process or thread works on the run directory."""
 
@@ -132,7 +136,14 @@ class Manifest:
         """Returns whether a stage is finished, and all of its files are to be believed."""
         entries = self._entries()
         entry = entries.get(stage)
-        return entry is not None and not any(self._doubt(name, entries) for name in entry.outputs)
+        if entry is None or sum(map(self._size, entry.outputs)) > LARGEST_STAGE:
+            return False
+        return not any(self._doubt(name, entries) for name in entry.outputs)
+
+    def _size(self, name: str) -> int:
+        """Returns the size of a file [bytes]; 0 if it is missing."""
+        path = self.folder / name
+        return path.stat().st_size if path.is_file() else 0
 
     def checked(self, path: Path) -> Path:
         """Returns the path of a file of the run directory itself, if the file is to be believed.
@@ -233,8 +244,10 @@ def _remedy(stage: str, folder: Path, done: Collection[str]) -> str:
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path) -> Iterator[Path]:
     """Holds the lock of a run directory, which one thread of one process can hold, more than once.
+
+    Yields the file of the lock.
 
     Raises:
         Busy: another process or thread works there; the message says which and since when.
@@ -264,15 +277,23 @@ def locked(folder: Path) -> Iterator[None]:
             since = time.strftime("%Y-%m-%d %H:%M:%S")
             with suppress(OSError):
                 path.write_text(f"process {os.getpid()}, since {since}\n", encoding="utf-8")
-            for left in folder.glob("**/.*"):  # by a process that was killed
-                if artifacts.TEMPORARY.fullmatch(left.name) and left.is_file():
-                    left.unlink(missing_ok=True)
-        yield
+            for left in _left_in(folder):
+                left.unlink(missing_ok=True)
+        yield path
     finally:
         if lock.lock_counter == 1:
             with suppress(OSError):
                 path.write_text("", encoding="utf-8")  # a finished run directory is always the same
         lock.release()
+
+
+def _left_in(folder: Path) -> Iterator[Path]:
+    """Yields temporary files of a process that was killed, not those in folders with a lock of their own."""
+    for root, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if not Path(root, name, LOCK).exists()]
+        for name in files:
+            if artifacts.TEMPORARY.fullmatch(name):
+                yield Path(root, name)
 
 
 def may_hold(folder: Path, name: str) -> bool:

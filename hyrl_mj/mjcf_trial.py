@@ -11,6 +11,8 @@ from pathlib import Path
 
 import mujoco
 
+LARGEST = 2**27  # [bytes]
+
 
 def main() -> None:
     seconds, memory, path = sys.argv[1:]
@@ -23,6 +25,11 @@ def main() -> None:
     except ValueError as error:
         result["problem"] = " ".join(str(error).split())[:300]
     else:
+        if (size := mujoco.mj_sizeModel(model)) > LARGEST:
+            result["problem"] = (
+                f"its model takes {size / 2**20:.0f} MiB, more than {LARGEST / 2**20:.0f}: give smaller "
+                "textures, meshes or height fields"
+            )
         data = mujoco.MjData(model)
         for _ in range(2):
             mujoco.mj_step(model, data)

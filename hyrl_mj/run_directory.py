@@ -12,6 +12,8 @@ from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 
+import mujoco
+
 from hyrl_mj import artifacts, policies
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.fields import GuardedPolicy
@@ -21,7 +23,7 @@ from hyrl_mj.manifest import FILES, Manifest, check_contents, locked, may_hold
 from hyrl_mj.policies import Agent, AnyPolicy, MlpPolicy, Policy
 from hyrl_mj.proof import why_no_cells
 from hyrl_mj.sets import Grid
-from hyrl_mj.simulation import HybridArc
+from hyrl_mj.simulation import LONGEST, HybridArc
 from hyrl_mj.stages import (
     Arrivals,
     BoundTable,
@@ -40,6 +42,8 @@ from hyrl_mj.verdict import Verdict
 PACKAGES = (
     "hyrl-mj", "mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "mediapy",
 )  # fmt: skip
+# What the headers of an arc's file may take [bytes].
+SLACK = 2**16
 
 
 @dataclass(frozen=True)
@@ -294,8 +298,15 @@ class Run:
 
     def arc(self, path: Path) -> HybridArc:
         """Reads an arc; raises `BadArtifact` if it is damaged, or of another task than the run's."""
-        arc = HybridArc.load(self.manifest.checked(path))
         task = self.task
+        time = task.scene.time if path in self.arc_paths().values() else LONGEST
+        numbers = 3 + task.chart.dimension + task.measurement_columns + len(task.inputs)
+        numbers += mujoco.mj_stateSize(task.model, mujoco.mjtState.mjSTATE_INTEGRATION)
+        # A jump has a row of its own.
+        rows = 2 * round(time / task.dt + 2)
+        arc = HybridArc.load(self.manifest.checked(path), limit=8 * numbers * rows + SLACK)
+        if len(arc.t) > rows:
+            raise BadArtifact(f"{path} is longer than {time:g} s: simulate it again")
         columns = task.chart.dimension, task.measurement_columns, len(task.inputs)
         if arc.task != task.name or arc.columns != columns:
             raise BadArtifact(

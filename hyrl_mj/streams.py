@@ -32,9 +32,10 @@ GRACE = 5.0
 INTERRUPTED, INTERRUPTED_STATUS = "interrupted; finished work is kept, run again to resume", 130
 
 
-# What may be written beside printable characters: breaks, and on a terminal sequences that libraries write.
+# What may be written beside printable characters: breaks, and on a terminal sequences that libraries write:
+# colours, movements of the cursor, lines that are cleared.
 _BREAKS = re.compile("([\\n\\r\\t])")
-_SEQUENCES = re.compile("([\\n\\r\\t]|\\x1b\\[[0-9;?]*[A-Za-z])")
+_SEQUENCES = re.compile("([\\n\\r\\t]|\\x1b\\[[0-9;?]*[mABCDGKhl])")
 
 
 class _Raw(io.FileIO):

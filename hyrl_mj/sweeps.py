@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import unicodedata
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -167,7 +168,14 @@ class Sweep:
         """
         check_contents(folder)
         remedy = "give the folder of a sweep, or make one with hyrl-mj sweep TASK --out DIR"
-        return artifacts.read_record(folder / NAME, "sweep", Sweep, remedy)
+        found = artifacts.read_record(folder / NAME, "sweep", Sweep, remedy)
+        names = Counter(row.name for row in found.rows)
+        if len(names) < len(found.rows):
+            twice = names.most_common(1)[0][0]
+            raise BadArtifact(
+                f"{folder / NAME} has the run {twice[:80]} twice: make the sweep again"
+            )
+        return found
 
     def save(self, folder: Path) -> None:
         """Writes `sweep.json`."""
@@ -190,7 +198,7 @@ class Sweep:
             writer.writerow([*head, *map(_plain, names), "sentence"])
             for row in self.rows:
                 task, algorithm = _plain(row.setting.task), _plain(row.setting.algorithm)
-                values = [row.seed, row.state, _plain(row.verdict), f"{row.seconds:.1f}"]
+                values = [row.seed, row.state, _plain(row.verdict), f"{row.seconds:.6g}"]
                 found = [row.figures.get(name) for name in names]
                 cells = ["" if value is None else f"{value:.6g}" for value in found]
                 sentence = _plain(row.sentence)
@@ -206,7 +214,9 @@ class Sweep:
 
 def _plain(text: str) -> str:
     """Returns a text that a spreadsheet does not take for a formula."""
-    return f"'{text}" if text.startswith(FORMULAS) else text
+    # A spreadsheet passes over spaces, and takes wide characters for the usual ones.
+    seen = unicodedata.normalize("NFKC", text).lstrip()
+    return f"'{text}" if seen.startswith(FORMULAS) or text.startswith(FORMULAS) else text
 
 
 def opened(folder: Path, common: Common, rows: Iterable[Row]) -> Sweep:

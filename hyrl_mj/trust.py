@@ -124,7 +124,8 @@ def output(*paths: Path, force: bool = False) -> Iterator[None]:
     known = _written()
     before = {path: digest(path) for path in paths if path.is_file()}
     for path in paths:
-        if path.exists() and not path.is_dir() and not force:
+        there = path.exists() or path.is_symlink()  # a link may lead to nothing
+        if there and not path.is_dir() and not force:
             record = known.get(str(path.resolve()))
             if record is None or record != before.get(path):
                 raise BadInput(

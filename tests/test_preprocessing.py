@@ -229,7 +229,7 @@ def test_a_normalised_agent_is_a_function_of_the_measurement(circle, tmp_path):
             "cannot be statistics",
         ),
         ({"mean": np.zeros(2), "var": np.ones(2), "clip": 0}, "cannot be statistics"),
-        ({"mean": np.array(["a", "b"]), "var": np.ones(2), "clip": 1}, "cannot be read"),
+        ({"mean": np.array(["a", "b"]), "var": np.ones(2), "clip": 1}, "holds no numbers"),
         ({"mean": np.array([None, 1]), "var": np.ones(2), "clip": 1}, "cannot be read"),
         ({"mean": np.zeros(2**18), "var": np.ones(2), "clip": 1}, "unpacks to more than 1 MiB"),
     ],

@@ -4,6 +4,7 @@ import re
 import socket
 import sys
 import threading
+import urllib.error
 import urllib.request
 from contextlib import contextmanager
 from pathlib import Path
@@ -151,6 +152,10 @@ def test_the_page_is_served_to_this_machine_alone(vehicle, arc, headless, capsys
         said.append(text)
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=20) as page:
             assert b"<html" in page.read().lower()
+        for name, value in (("Host", "evil.example"), ("Origin", "http://evil.example")):
+            request = urllib.request.Request(f"http://127.0.0.1:{port}/", headers={name: value})
+            with pytest.raises(urllib.error.HTTPError, match="403"):
+                urllib.request.urlopen(request, timeout=20)
         if sys.platform == "linux":
             assert listeners(port) == ["0100007F"]
         raise Enough

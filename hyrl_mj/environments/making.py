@@ -26,7 +26,7 @@ from hyrl_mj.environments.instance import kept_generators
 from hyrl_mj.environments.opening import CHART, RESET, AnyChart, Description, register
 from hyrl_mj.environments.specification import FORMS
 from hyrl_mj.environments.task import EnvironmentTask
-from hyrl_mj.errors import BadInput, brief, check_seed, described, unknown
+from hyrl_mj.errors import BadInput, brief, check_seed, described, printable, unknown
 from hyrl_mj.ranges import Integer, refused
 from hyrl_mj.tasks import Task, get_task, register_opener
 
@@ -366,7 +366,7 @@ def explained(task: Task) -> str:
         lines.append(f"  {name}: {value if isinstance(value, str) else json.dumps(value)} (given)")
     for name, text in task.found.items():
         lines += [f"  {name}: {text}", f"    (to change it, give {_INSTEAD.get(name, name)})"]
-    return "\n".join(lines)
+    return "\n".join(map(printable, lines))
 
 
 # What to give to change what was found, where it has another name.
@@ -381,8 +381,10 @@ _INSTEAD = {
 
 
 def _arguments(path: Path) -> dict[str, Any]:
+    if path.exists() and not path.is_file():
+        raise BadInput(f"{path} is no file: give a JSON file")
     try:
-        content = json.loads(artifacts.read_limited(path).decode())
+        content = json.loads(artifacts.read_limited(path, artifacts.LARGEST_JSON).decode())
     except OSError as error:
         raise BadInput(f"{path} cannot be read ({error.strerror}): give a JSON file") from None
     except (ValueError, RecursionError) as error:

@@ -165,7 +165,8 @@ def _write(controller: HybridController | Traceable, folder: Path) -> tuple[Path
         task_part = _constants(controller.task) + "\n\n\n"
         text = text[:begin] + task_part + text[end:rest] + _traced_step(controller, arrays)
     path = folder / TEMPLATE.name
-    path.write_text(text, encoding="utf-8")
+    with artifacts.replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
     artifacts.write_arrays(path.with_suffix(".npz"), arrays, kind="controller")
     return path, path.with_suffix(".npz")
 

@@ -19,7 +19,9 @@ from hyrl_mj.tasks import Layouts, wrapped
 FARTHEST, LONGEST = 1_000.0, 3_600.0
 # How much a file may hold, so that the memory suffices.
 MOST_POSTS, MOST_POSITIONS, MOST_STARTS = 100, 10_000, 1_000
-LARGEST = 2**24  # [bytes]
+LARGEST = 2**22  # [bytes]
+# The longest time of all starts together [s]: each sample of each run is kept.
+MOST_TIME = 100_000.0
 # How long a run lasts, unless the file says so [s].
 TIME = 15.0
 # What the keys hold.
@@ -108,12 +110,19 @@ def read_field(path: str | Path) -> FieldFile:
         interval,
     )
     time = whole["time_s"].positive(LONGEST, "s") if "time_s" in whole else TIME
+    if time * len(starts) > MOST_TIME:
+        raise BadInput(
+            f"{path} has {len(starts):,} starts with runs of {time:g} s each: give at most "
+            f"{MOST_TIME:,.0f} s of all together"
+        )
     places = np.array([start["position_m"].point() for start in starts])
     return FieldFile(str(path), layouts, np.column_stack([places, wrapped(headings)]), time)
 
 
 def _content(path: Path) -> Any:
     """Returns what the JSON file holds."""
+    if path.exists() and not path.is_file():
+        raise BadInput(f"{path} is no file: give the JSON file of a field")
     try:
         with path.open("rb") as file:
             content = file.read(LARGEST + 1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
@@ -132,14 +131,18 @@ def sweep(
 
 @contextmanager
 def _held(folder: Path) -> Iterator[None]:
-    """Holds the lock of a folder, and removes the folder if it was made for a sweep that was never begun."""
+    """Holds the lock of a folder, and removes the folder if it was made for a sweep that was never begun.
+
+    What others have put there meanwhile stays.
+    """
     was_there = folder.exists()
-    try:
-        with locked(folder):
+    with locked(folder) as lock:
+        try:
             yield
-    finally:
-        if not was_there and not (folder / sweeps.NAME).exists():
-            shutil.rmtree(folder, ignore_errors=True)
+        finally:
+            if not was_there and [path.name for path in folder.iterdir()] == [lock.name]:
+                lock.unlink()
+                folder.rmdir()
 
 
 def report(folder: str | Path) -> Sweep:

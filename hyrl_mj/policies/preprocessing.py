@@ -19,6 +19,7 @@ from hyrl_mj.tasks import Task
 EPSILON = 1e-8
 LARGEST = 2**20  # of a file of statistics [bytes]
 LARGEST_STACK = 1000
+LARGEST_NUMBER = 1e30  # of statistics: its square is a number, too
 NONE = "none"  # in place of a file of statistics: the agent saw plain observations
 RECIPE = "write it with mean, var and clip, as docs/your-agent.md shows"
 
@@ -71,19 +72,26 @@ class Normalization:
                 arrays = _joined(arrays, parts, n_stack)
             if missing := [name for name in _FIELDS[:3] if name not in arrays]:
                 raise BadArtifact(f"it has no array {' and no '.join(missing)}: {RECIPE}")
-            values = {n: np.asarray(arrays[n], dtype=float) for n in _FIELDS if n in arrays}
+            found = {n: np.asarray(arrays[n]) for n in _FIELDS if n in arrays}
+            if other := [n for n, array in found.items() if array.dtype.kind not in "biuf"]:
+                raise BadArtifact(f"its {other[0]} holds no numbers: {RECIPE}")
+            values = {n: array.astype(float) for n, array in found.items()}
             mean, var, clip = (values[name] for name in _FIELDS[:3])
             epsilon = values.get("epsilon", np.array(EPSILON))
             if mean.ndim != 1 or var.shape != mean.shape or clip.size != 1 or epsilon.size != 1:
                 raise BadArtifact(
                     f"its mean and var are two rows of numbers, clip is one number: {RECIPE}"
                 )
-            finite = (
-                np.isfinite(mean).all() and np.isfinite(var).all() and np.isfinite(epsilon).all()
-            )
-            if not (finite and (var >= 0).all() and clip.item() > 0 and (var + epsilon > 0).all()):
+            finite = all((np.abs(a) <= LARGEST_NUMBER).all() for a in (mean, var, epsilon))
+            if not (
+                finite
+                and (var >= 0).all()
+                and clip.item() > 0
+                and (var + epsilon > 1 / LARGEST_NUMBER).all()
+            ):
                 raise BadArtifact(
-                    "its numbers cannot be statistics: mean is finite, var >= 0, clip > 0, epsilon > 0"
+                    "its numbers cannot be statistics: mean, var >= 0 and epsilon > 0 are numbers up to "
+                    f"{LARGEST_NUMBER:g}, and clip > 0"
                 )
             return Normalization(mean, var, clip.item(), epsilon.item(), by_key)
 

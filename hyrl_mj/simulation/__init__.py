@@ -8,7 +8,7 @@ folder is imported, so that a new kind of noise takes one new file.
 from importlib import import_module
 from pkgutil import iter_modules
 
-from hyrl_mj.simulation.arc import HybridArc, samples, simulate, simulate_batch
+from hyrl_mj.simulation.arc import LONGEST, HybridArc, samples, simulate, simulate_batch
 from hyrl_mj.simulation.lookahead import Ahead, Lookahead
 from hyrl_mj.simulation.noise import (
     NOT_STARTED,
@@ -29,6 +29,7 @@ from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop
 from hyrl_mj.simulation.way_runs import WayRuns, policy_runs, way_runs
 
 __all__ = [
+    "LONGEST",
     "NOT_STARTED",
     "Ahead",
     "AnyNoise",

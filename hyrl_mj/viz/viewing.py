@@ -11,9 +11,11 @@ import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, redirect_stdout
 from copy import copy
+from inspect import isawaitable
 from io import StringIO
 from types import SimpleNamespace
 from typing import Any
+from urllib.parse import urlsplit
 
 import mujoco
 
@@ -104,7 +106,7 @@ def _web(model: mujoco.MjModel, data: mujoco.MjData, port: int, say: Say) -> Ite
         raise BadInput(
             f"port {port} cannot be used ({error}): give a free one, 1024 to 65535, or none"
         ) from error
-    with redirect_stdout(StringIO()):  # viser prints where it listens
+    with redirect_stdout(StringIO()), _for_this_machine():  # viser prints where it listens
         server = viser.ViserServer(host=LOOPBACK, port=port or FIRST_PORT, verbose=False)
     try:
         # The button would ask a server on the internet for an address that everyone can open.
@@ -124,3 +126,31 @@ def _web(model: mujoco.MjModel, data: mujoco.MjData, port: int, say: Say) -> Ite
     finally:
         with redirect_stdout(StringIO()):
             server.stop()
+
+
+@contextmanager
+def _for_this_machine() -> Iterator[None]:
+    """Lets servers that are begun in the block refuse the pages of other addresses that a browser holds open.
+
+    viser looks neither at the host that a browser asks for nor at the page that asks.
+    """
+    from websockets.asyncio import server
+
+    serve = server.serve
+
+    def checked(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        async def answer(connection: Any, request: Any) -> Any:
+            host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
+            known = host.rpartition(":")[0] in (LOOPBACK, "localhost")
+            if not known or (origin is not None and urlsplit(origin).netloc != host):
+                return connection.respond(403, "This page can only be seen from this machine.\n")
+            found = process_request and process_request(connection, request)
+            return await found if isawaitable(found) else found
+
+        return serve(*arguments, process_request=answer, **options)
+
+    setattr(server, "serve", checked)  # noqa: B010 - mypy takes it for a type
+    try:
+        yield
+    finally:
+        setattr(server, "serve", serve)  # noqa: B010

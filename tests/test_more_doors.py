@@ -1,0 +1,218 @@
+"""Files that lie in the way, fill the memory, speak to the terminal, or belong to somebody else."""
+
+import csv
+import json
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import call
+
+import hyrl_mj
+from hyrl_mj import BadArtifact, BadInput, artifacts, from_gymnasium, mjcf, trust
+from hyrl_mj.environments.making import explained
+from hyrl_mj.fields import read_field
+from hyrl_mj.manifest import locked
+from hyrl_mj.pipeline import sweeping
+from hyrl_mj.policies.preprocessing import Normalization
+from hyrl_mj.streams import _SEQUENCES
+from hyrl_mj.sweeps import Common, Row, Setting, Sweep
+from hyrl_mj.tasks.scaffold import write_task
+
+ENV = "hyrl_mj/UnitCircle-v0"
+
+
+def sweep_of(*rows):
+    return Sweep(Common("smoke", None, {}), rows)
+
+
+def row(seed=0, **values):
+    return Row(Setting("unit_circle", "", 0.1), seed, **values)
+
+
+# ---- what belongs to somebody else
+
+
+def test_a_sweep_that_does_not_begin_leaves_what_others_have_put_there(tmp_path):
+    folder = tmp_path / "sweep"
+
+    def put() -> None:
+        (folder / "mine").mkdir()
+        (folder / "mine" / "data.txt").write_text("mine")
+        raise BadInput("not now")
+
+    with pytest.raises(BadInput, match="not now"), sweeping._held(folder):
+        put()
+    assert (folder / "mine" / "data.txt").read_text() == "mine"
+    with pytest.raises(BadInput, match="not now"), sweeping._held(tmp_path / "other"):
+        raise BadInput("not now")
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_sweep_leaves_the_folder_of_another_one_that_is_at_work(tmp_path, monkeypatch):
+    folder = tmp_path / "sweep"
+    with locked(folder):
+        monkeypatch.setattr(Path, "exists", lambda path: False)  # as it was a moment before
+        code = "import sys; from pathlib import Path; from hyrl_mj.pipeline import sweeping\n"
+        code += "Path.exists = lambda path: False\nwith sweeping._held(Path(sys.argv[1])): pass"
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", code, folder], capture_output=True, text=True
+        )
+        assert "another process is working" in done.stderr
+        assert os.listdir(folder) == [".lock"]
+
+
+def test_temporary_files_of_runs_that_are_at_work_stay(tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / ".lock").write_text("")
+    names = [tmp_path / ".a.mp4.0123456789ab.partial", run / ".b.mp4.0123456789ab.partial"]
+    assert artifacts.TEMPORARY.fullmatch(names[0].name)
+    for path in names:
+        path.write_text("half")
+    with locked(tmp_path):
+        assert [path.exists() for path in names] == [False, True]
+
+
+def test_a_link_that_leads_to_nothing_is_not_replaced(tmp_path):
+    path = tmp_path / "a.html"
+    path.symlink_to(tmp_path / "elsewhere.html")
+    with pytest.raises(BadInput, match="has not written it"), trust.output(path):
+        pass
+
+
+# ---- what lies in the way
+
+
+def test_a_matplotlibrc_of_the_current_folder_has_no_part(tmp_path):
+    code = "from hyrl_mj.cli import spare_matplotlib; spare_matplotlib()\n"
+    code += (
+        "from hyrl_mj.viz.figures import style; import matplotlib; print(matplotlib.get_backend())"
+    )
+    for make in (
+        lambda path: path.write_bytes(b"\xff\xfe\xff: 3\n"),
+        lambda path: path.write_text("evilkey: x\n"),
+        os.mkfifo,
+    ):
+        make(tmp_path / "matplotlibrc")
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", code],
+            cwd=tmp_path, env=os.environ | {"MPLBACKEND": "nonsense"}, timeout=60,
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        assert (done.stdout, done.stderr) == ("agg\n", "")
+        (tmp_path / "matplotlibrc").unlink()
+
+
+@pytest.mark.parametrize("command", ["diagnose", "drive"])
+def test_a_pipe_in_place_of_a_file_is_no_file(command, tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    if command == "drive":
+        with pytest.raises(BadInput, match="is no file: give the JSON file of a field"):
+            read_field(tmp_path / "pipe")
+        return
+    done = call("diagnose", "--explain", "--env", ENV, "--env-args", "pipe", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (2, "hyrl-mj: pipe is no file: give a JSON file\n")
+
+
+# ---- what fills the memory
+
+
+def test_arguments_of_an_environment_have_a_limit(tmp_path):
+    (tmp_path / "large.json").write_text(json.dumps({"kwargs": {"a": [[]] * 2_000_000}}))
+    done = call("diagnose", "--explain", "--env", ENV, "--env-args", "large.json", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "is larger than 4 MiB" in done.stderr
+
+
+def test_runs_in_a_field_have_a_longest_time_together(tmp_path):
+    field = {
+        "goal_m": [500, 500],
+        "posts": [{"radius_m": 0.2, "positions_m": [[0, 0]]}],
+        "starts": [{"position_m": [0.9 * i, -500], "heading_rad": 0} for i in range(100)],
+        "time_s": 3_600,
+    }
+    path = tmp_path / "long.json"
+    path.write_text(json.dumps(field))
+    with pytest.raises(BadInput, match="100 starts with runs of 3600 s each: give at most 100,000"):
+        read_field(path)
+    path.write_text(json.dumps(field | {"time_s": 900}))
+    assert len(read_field(path).starts) == 100
+
+
+def test_a_model_that_is_large_is_refused(tmp_path):
+    write_task("big", tmp_path)
+    path = tmp_path / "big.xml"
+    texture = '<texture name="t" type="2d" builtin="flat" width="8000" height="8000"/>'
+    path.write_text(path.read_text().replace("<worldbody>", f"<asset>{texture}</asset><worldbody>"))
+    with pytest.raises(BadInput, match=r"its model takes 18. MiB, more than 128"):
+        mjcf.load(path)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"mean": np.zeros(2, dtype=complex)}, "its mean holds no numbers"),
+        ({"var": np.ones(2, dtype="m8[s]")}, "its var holds no numbers"),
+        ({"mean": np.array([1e308, -1e308])}, "numbers up to 1e\\+30"),
+        ({"var": np.array([0, 1]), "epsilon": np.array(5e-324)}, "cannot be statistics"),
+    ],
+)
+def test_statistics_are_numbers_of_a_size_that_can_be_reckoned_with(arrays, message, tmp_path):
+    usual = {"mean": np.zeros(2), "var": np.ones(2), "clip": np.array(10.0)}
+    np.savez(tmp_path / "s.npz", **usual | arrays)
+    with pytest.raises(BadArtifact, match=message):
+        Normalization.load(tmp_path / "s.npz")
+
+
+def test_an_arc_is_as_long_as_its_run_at_most(planted_circle, tmp_path):
+    copied = tmp_path / "run"
+    shutil.copytree(planted_circle[0].path, copied)
+    run = hyrl_mj.load_run(copied)
+    path = next(iter(run.arc_paths().values()))
+    arc = run.arc(path)
+    n = 10 * len(arc.t)
+    long = {
+        name: np.zeros((n, getattr(arc, name).shape[1])) for name in ("z", "measured", "u", "state")
+    }
+    rows = {"t": np.arange(n) * 0.05, "j": np.zeros(n, dtype=int), "q": np.zeros(n, dtype=int)}
+    longer = replace(arc, **long, **rows)
+    with run.manifest.stage("simulate"):
+        for other in run.arc_paths().values():
+            longer.save(other)
+    with pytest.raises(BadArtifact, match=r"unpacks to more than|is longer than"):
+        hyrl_mj.load_run(copied).arc(path)
+
+
+def test_a_sweep_has_each_run_once(tmp_path):
+    sweep_of(row(), row()).save(tmp_path)
+    with pytest.raises(BadArtifact, match="twice: make the sweep again"):
+        Sweep.load(tmp_path)
+
+
+# ---- what speaks to the terminal, or to a spreadsheet
+
+
+def test_what_is_explained_cannot_control_the_terminal(circle):
+    task = from_gymnasium(ENV, success="terminated #\x1b[2J")
+    assert "\x1b" not in explained(task)
+
+
+def test_only_colours_and_movements_reach_a_terminal():
+    kept = ["\x1b[31m", "\x1b[1A", "\x1b[2K", "\x1b[?25l", "\n"]
+    assert all(_SEQUENCES.fullmatch(text) for text in kept)
+    assert not any(_SEQUENCES.fullmatch(text) for text in ("\x1b[6n", "\x1b[c", "\x1b[2J"))
+
+
+@pytest.mark.parametrize("text", [" =1+1", "\u3000@x", "\uff1d1", "=1"])
+def test_a_spreadsheet_takes_no_text_for_a_formula(text, tmp_path):
+    sweep_of(row(sentence=text, seconds=1e308)).write_csv(tmp_path)
+    with (tmp_path / "sweep.csv").open(newline="", encoding="utf-8") as file:
+        (line,) = csv.DictReader(file)
+    assert line["sentence"] == f"'{text}"
+    assert line["seconds"] == "1e+308"
