@@ -98,6 +98,8 @@ def from_gymnasium(
     if task is None or task.made_of != made_of or not isinstance(env, str):
         if task is not None and task.made_of != made_of and not isinstance(env, str):
             _OLDER.add(task)
+            with suppress(ValueError):
+                _RECENT.remove(task)
         with described(_shown(env)), kept_generators():
             if isinstance(env, str) and (kwargs or reset or pinned or trust.is_received()):
                 _try(description, spec)

@@ -1,0 +1,374 @@
+"""What runs leave behind, what wrappers look at, what an id stands for: as a new process would have it."""
+
+import itertools
+import sys
+from functools import partial
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from environments import GOAL, XML, Puck
+from gymnasium import spaces
+from gymnasium.wrappers import DtypeObservation, FlattenObservation, TimeLimit
+
+from hyrl_mj import BadInput, from_callable, from_gymnasium, get_task, simulate
+from hyrl_mj.environments.fingerprint import Unknown, fingerprint
+from hyrl_mj.simulation import Recorded
+
+STARTS = np.array([[1.0, 0.9], [0.9, -0.9], [-1.4, 0.5]])
+
+
+def pilot(observation):
+    """Drives around the rock to the goal, by the place alone: observations (n, 6), sorted by name."""
+    place, velocity = observation[:, :2], observation[:, 4:6]
+    corner = np.column_stack([np.full(len(place), 0.9), np.where(place[:, 1] >= 0, 0.8, -0.8)])
+    target = np.where(place[:, :1] < 0.6, corner, GOAL)
+    up = (place[:, 0] < 0.6) & (np.abs(place[:, 1]) < 0.6)
+    target[up, 0] = place[up, 0]
+    ahead = target - place
+    return 3 * ahead / np.maximum(np.linalg.norm(ahead, axis=1), 0.05)[:, None] - 0.5 * velocity
+
+
+def outcomes(make, noise=0.0, steps=60, starts=STARTS, **given):
+    """Returns how the pilot's runs end, and after how many samples."""
+    task = from_gymnasium(make, steps=steps, **given)
+    signal = None
+    if noise:
+        shape = task.max_steps + 1, len(starts), len(task.noisy)
+        values = noise * np.random.default_rng(0).uniform(-1, 1, shape) * task.noisy
+        signal = Recorded(values, noise)
+    agent = from_callable(lambda o: np.clip(pilot(np.asarray(o)), -4, 4), task)
+    return [(arc.outcome, len(arc.t) - 1) for arc in simulate(task, agent, starts, signal)]
+
+
+def plain(noise=0.0):
+    return outcomes(lambda: FlattenObservation(Puck()), noise)
+
+
+# ---- what wrappers look at, and write
+
+
+class Judged(gym.Wrapper):
+    """Tells success from MuJoCo's state."""
+
+    def step(self, action):
+        observation, _, terminated, truncated, _ = self.env.step(action)
+        off = np.linalg.norm(self.unwrapped.data.qpos - GOAL)
+        return observation, -off, terminated, truncated, {"success": bool(off < 0.25)}
+
+
+class Stopwatch(gym.Wrapper):
+    """Counts the samples at the goal in MuJoCo's data."""
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        data = self.unwrapped.data
+        data.userdata[0] += info["success"]
+        info["success"] = bool(data.userdata[0] >= 3)
+        return observation, reward, terminated, truncated, info
+
+
+class Ranging(gym.ObservationWrapper):
+    """Observes the distance of the goal, which it reads from MuJoCo's state."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (7,))
+
+    def observation(self, observation):
+        off = np.linalg.norm(self.unwrapped.data.qpos - GOAL)
+        return np.append(observation, off).astype(np.float32)
+
+
+class RangingJudge(Ranging):
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        info["success"] = bool(observation[-1] < 0.25)
+        return observation, reward, terminated, truncated, info
+
+
+class Counting(Puck):
+    def __init__(self):
+        self.model = mujoco.MjModel.from_xml_string(
+            XML.replace("<worldbody>", '<size nuserdata="1"/><worldbody>')
+        )
+        self.data = mujoco.MjData(self.model)
+        self.action_space = spaces.Box(-4.0, 4.0, (2,), dtype=np.float64)
+
+
+def test_wrappers_judge_from_the_true_state():
+    assert outcomes(lambda: Judged(FlattenObservation(Puck())), 0.2) == plain(0.2)
+
+
+def test_what_wrappers_write_to_the_state_stays():
+    found = outcomes(lambda: Stopwatch(FlattenObservation(Counting())), 0.2)
+    assert {outcome for outcome, _ in found} == {"reached"}
+    assert all(late >= early + 2 for (_, late), (_, early) in zip(found, plain(0.2), strict=True))
+
+
+def test_what_wrappers_observe_of_the_state_is_under_noise():
+    task = from_gymnasium(lambda: Ranging(FlattenObservation(Puck())), steps=5)
+    noise = np.zeros((6, 1, len(task.noisy)))
+    noise[:, :, 0] = 0.1
+    agent = from_callable(lambda o: np.zeros((len(o), 2)), task)
+    (arc,) = simulate(task, agent, [[-1.0, 0.0]], Recorded(noise, 0.1))
+    assert arc.measured[0, 2 + 6] == pytest.approx(2.4, abs=1e-5)
+    with pytest.raises(BadInput, match=r"sample\(s\) it is .*, and .* in the new one"):
+        outcomes(lambda: RangingJudge(FlattenObservation(Puck())), 0.2)
+
+
+# ---- ends of episodes
+
+
+class OnTheLastStep(gym.Wrapper):
+    """Tells success when the time is over."""
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        info["success"] = truncated
+        return observation, reward, terminated, truncated, info
+
+
+def test_the_shortest_of_several_time_limits_counts():
+    env = lambda: TimeLimit(FlattenObservation(TimeLimit(Puck(), 12)), 60)  # noqa: E731
+    assert from_gymnasium(env).max_steps == 12
+    assert max(samples for _, samples in outcomes(env, steps=None)) <= 12
+
+
+def test_what_is_told_at_a_time_limit_is_not_lost_in_silence():
+    make = lambda: OnTheLastStep(TimeLimit(FlattenObservation(Puck()), 10))  # noqa: E731
+    with pytest.raises(BadInput, match=r"after 10 sample\(s\) it is stalled, and reached in the"):
+        outcomes(make, steps=None)
+
+
+# ---- what instances share, and what lasts
+
+
+def curriculum(tolerance):
+    """Returns a puck whose goal is the smaller the more episodes there were."""
+
+    class Learning(Puck):
+        def reset(self, **options):
+            self.tolerance = tolerance()
+            return super().reset(**options)
+
+        def step(self, action):
+            observation, reward, terminated, truncated, info = super().step(action)
+            info["success"] = bool(-reward < self.tolerance)
+            return observation, reward, terminated, truncated, info
+
+    return Learning
+
+
+COUNTER = itertools.count()
+
+
+@pytest.mark.parametrize("where", ["a closure", "a counter of the module", "a bound method"])
+def test_a_curriculum_that_ends_before_it_is_looked_at_is_refused(where):
+    episodes = [0]
+
+    def count():
+        episodes[0] += 1
+        return episodes[0]
+
+    one = {"a closure": count, "a counter of the module": partial(next, COUNTER)}.get(
+        where, itertools.count().__next__
+    )
+    with pytest.raises(BadInput, match=r"goes another way than a new one|all its instances share"):
+        outcomes(curriculum(lambda: max(3.0 - 0.1 * one(), 0.3)))
+
+
+class Sticky(Puck):
+    """Remembers in a place that is not reset whether it has been near the rock."""
+
+    def __init__(self):
+        super().__init__()
+        self.memory = {"model": self.model.opt, "data": mujoco.MjData(self.model)}
+        self.remember = partial(self._remember, self.memory["data"])
+
+    def _remember(self, data):
+        data.time += bool(np.abs(self.data.qpos).max() < 0.9)
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        self.remember()
+        info["success"] = info["success"] and self.memory["data"].time < 5
+        return observation, reward, terminated, truncated, info
+
+
+def test_a_second_state_of_mujoco_that_outlasts_resets_makes_no_difference():
+    first, again = outcomes(Sticky), outcomes(Sticky)
+    assert first == again
+    assert not from_gymnasium(Sticky, steps=60).tabulated
+
+
+def test_variables_of_a_script_are_not_those_of_its_environment(monkeypatch):
+    script = type(sys)("a_script")
+    monkeypatch.setitem(sys.modules, "a_script", script)
+    scripted = type("Scripted", (Puck,), {"__module__": "a_script"})
+    script.results = []
+    task = from_gymnasium(scripted, steps=60)
+    agent = from_callable(lambda o: np.clip(pilot(np.asarray(o)), -4, 4), task)
+    for _ in range(2):
+        script.results.append(simulate(task, agent, STARTS[0]).outcome)
+    assert script.results == ["reached"] * 2
+
+
+def test_what_cannot_be_written_down_is_compared_as_an_object():
+    env = Puck()
+    env.rows = (number for number in range(3))
+    before = fingerprint(env, env.model, env.data)
+    assert isinstance(before["rows"], Unknown)
+    assert before == fingerprint(env, env.model, env.data)
+    env.rows = (number for number in range(3))
+    assert before != fingerprint(env, env.model, env.data)
+    assert Unknown() != Unknown()
+    assert (
+        outcomes(lambda: setattr(env := Puck(), "rows", iter([1])) or FlattenObservation(env))
+        == plain()
+    )
+
+
+# ---- steps, data and observations
+
+
+class Braking(Puck):
+    def step(self, action):
+        if self.data.qpos[0] > 0.2:
+            self.model.opt.timestep = 0.01
+        return super().step(action)
+
+
+class Replaced(Puck):
+    def step(self, action):
+        result = super().step(action)
+        if self.data.qpos[0] > 0.2:
+            fresh = mujoco.MjData(self.model)
+            fresh.qpos[:], fresh.qvel[:] = self.data.qpos, self.data.qvel
+            self.data = fresh
+        return result
+
+
+class Blind(Puck):
+    def _get_obs(self):
+        seen = super()._get_obs()
+        seen["to_goal"] = seen["to_goal"] / (self.data.qpos[0] < 1.2)
+        return seen
+
+
+class Exiting(Puck):
+    def step(self, action):
+        sys.exit("emergency stop")
+
+
+@pytest.mark.filterwarnings("ignore:divide by zero")
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (Braking, "a step of Braking takes|changes|goes another way"),
+        (Replaced, "has another model or data of MuJoCo after an episode|goes another way"),
+        (Blind, "Blind observes -?(inf|nan) in observation"),
+        (Exiting, "step\\(\\) of Exiting raises SystemExit: emergency stop: repair it"),
+    ],
+)
+def test_steps_that_are_unlike_others_are_refused(make, message):
+    with pytest.raises(BadInput, match=message):
+        outcomes(make)
+
+
+class Proximity(Puck):
+    """Shows how far the rock is, as step() has found it, and 1 beyond 0.4 m."""
+
+    observation_space = spaces.Dict(
+        {**Puck.observation_space.spaces, "proximity": spaces.Box(0, 1, (1,))}
+    )
+    proximity = 1.0
+
+    def step(self, action):
+        result = super().step(action)
+        off = np.linalg.norm(np.maximum(np.abs(self.data.qpos) - 0.3, 0))
+        self.proximity = min(1.0, off / 0.4)
+        return self._get_obs(), *result[1:]
+
+    def _get_obs(self):
+        return super()._get_obs() | {"proximity": np.array([self.proximity])}
+
+
+class Since(Puck):
+    """Has arrived when it is far from where it started."""
+
+    def reset(self, **options):
+        result = super().reset(**options)
+        self.begun = self.data.qpos.copy()
+        return result
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        info["success"] = bool(np.linalg.norm(self.data.qpos - self.begun) > 0.3)
+        return observation, reward, terminated, truncated, info
+
+
+def test_a_sensor_that_step_reads_is_found_where_it_shows_something():
+    with pytest.raises(BadInput, match=r"does not follow its state.*runs in different places"):
+        from_gymnasium(Proximity)
+
+
+def test_what_a_reset_notes_of_its_own_start_is_refused():
+    with pytest.raises(BadInput, match="each reset of Since draws begun"):
+        from_gymnasium(Since)
+
+
+class Rare(Puck):
+    """Says that it has arrived only where it has."""
+
+    def step(self, action):
+        observation, reward, terminated, truncated, _ = super().step(action)
+        return (
+            observation,
+            reward,
+            terminated,
+            truncated,
+            {"is_success": True} if reward > -0.25 else {},
+        )
+
+
+def test_an_entry_of_info_that_only_a_success_brings_is_taken():
+    assert outcomes(Rare, success='info["is_success"]') == outcomes(Puck)
+    assert outcomes(Rare) == outcomes(Puck)
+    with pytest.raises(BadInput, match="no method of it has that word"):
+        from_gymnasium(Rare, success='info["solved"]')
+
+
+# ---- what an id, or a name, stands for
+
+
+def test_an_id_that_is_registered_again_stands_for_another_environment():
+    def register(kind):
+        gym.register("Again-v0", kind, max_episode_steps=60)
+
+    register(Puck)
+    try:
+        first = outcomes("Again-v0", steps=None)
+        assert from_gymnasium("Again-v0") is from_gymnasium("Again-v0")
+        gym.registry.pop("Again-v0")
+        register(type("Weak", (Puck,), {"step": lambda self, a: Puck.step(self, 0.1 * a)}))
+        assert outcomes("Again-v0", steps=None) != first
+    finally:
+        gym.registry.pop("Again-v0", None)
+
+
+def test_of_two_functions_of_one_name_neither_is_taken_for_the_other():
+    def made(scale):
+        def make():
+            return DtypeObservation(FlattenObservation(Puck()), np.float64 if scale else np.float32)
+
+        return make
+
+    one = from_gymnasium(made(True))
+    assert get_task(one.spec) is one
+    two = from_gymnasium(made(False))
+    with pytest.raises(BadInput, match="two functions are called make"):
+        get_task(one.spec)
+    one = None
+    assert get_task(two.spec) is two
