@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
 from typing import ClassVar
@@ -143,76 +143,129 @@ def extend(
             the other way, but stage 6 trains the mode to do so: W_i is then where way i is open. Without a
             horizon, every set reaches 2 eps and one sample over the boundary of its part.
     """
-    points = check_points(task, points)
-    grid, parts = partition.grid, partition.parts
-    eps, hop = task.noise_in_chart(noise), longest_hop(task, policy, grid)
-    near = neighbourhood(partition, noise, hop)
-    pis = part_policies(task, policy, partition, near)
-    wanted = [part.dilated_by_box(2 * eps + hop * (task.noise_in_chart(1.0) > 0)) for part in parts]
-    # The extended sets lie among these candidates.
-    radius = 3 * noise + near + (0.0 if horizon is None else horizon / task.dt * near)
-    candidates = [part.dilated(radius).mask for part in parts]
-    # Only M* has to be covered: where parts meet elsewhere, as at the set-point, nothing is left to decide.
-    off = distance_to(task, points, grid.nodes)
-    around = off <= float(np.linalg.norm((2 * eps + hop) / task.chart.scale))
-    # The cells that backward runs visit are those of a grid.
-    backward = task.kinematic and isinstance(grid, Grid)
-    rims = [part.mask & (off <= near) for part in parts]
-    # The same runs from outside of a part tell from where its way succeeds, and when they enter the part.
-    told = [
-        cache(partial(
-            spread, task, grid, candidate & ~part.mask, points, radius,
-            partial(_outside, task, pi, partition, part, None if backward else rim), 2,
-        ))
-        for pi, part, rim, candidate in zip(pis, parts, rims, candidates, strict=True)
-    ]  # fmt: skip
-    if ways is None:
-        winning = tuple(
-            (partition.succeeds & part.mask) | (known()[:, 0] > 0)
-            for part, known in zip(parts, told, strict=True)
-        )
+    case = _Case(task, policy, check_points(task, points), partition, noise, horizon)
+    winning = case.winning() if ways is None else open_ways(ways, partition.grid)
+    roomy = case.trim(winning)
+    if ways is None or horizon is not None:
+        reached, propagated = case.reach(roomy)
     else:
-        winning = open_ways(ways, grid)
-    # Noise that shows the robot in a wall that only stops it does not show it where its mode fails.
-    walls = ~task.goes_on(grid.nodes) if task.stopped_by_walls else np.zeros(grid.size, dtype=bool)
-    roomy = [
-        GridSet.from_mask(grid, wins | ~candidate | walls).eroded_by_box(eps)
-        for wins, candidate in zip(winning, candidates, strict=True)
-    ]
-    propagated = horizon or 0.0
-    if len(parts) > 1 and (ways is None or horizon is not None):
+        reached, propagated = case.wanted, 0.0
+    rows, pair, room = least_room(case.points, case.parts, winning, case.eps)
+    return ExtendedSets(
+        partition.modes,
+        case.widen(reached, roomy),
+        winning,
+        propagated,
+        noise,
+        case.points[rows],
+        2 * noise * room,
+        np.array(partition.modes)[pair],
+    )
+
+
+class _Case:
+    """What is extended, step by step; the arguments are those of `extend`.
+
+    Attributes:
+        eps, hop: (d,) the noise, and the longest hop in one sample, along each coordinate.
+        wanted: each part with 2 eps and one sample around it.
+        around: (N,) bool, the nodes so near to M* that they have to be covered: where parts meet elsewhere,
+            as at the set-point, nothing is left to decide.
+        walls: (N,) bool, the nodes in walls that only stop the robot.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        policy: Policy,
+        points: np.ndarray,
+        partition: Partition,
+        noise: float,
+        horizon: float | None,
+    ):
+        self.task, self.points, self.partition, self.horizon = task, points, partition, horizon
+        self.grid, self.parts = partition.grid, partition.parts
+        self.eps, self.hop = task.noise_in_chart(noise), longest_hop(task, policy, self.grid)
+        near = neighbourhood(partition, noise, self.hop)
+        self._pis = part_policies(task, policy, partition, near)
+        by = 2 * self.eps + self.hop * (task.noise_in_chart(1.0) > 0)
+        self.wanted = [part.dilated_by_box(by) for part in self.parts]
+        # The extended sets lie among these candidates.
+        radius = 3 * noise + near + (0.0 if horizon is None else horizon / task.dt * near)
+        self._candidates = [part.dilated(radius).mask for part in self.parts]
+        off = distance_to(task, points, self.grid.nodes)
+        self.around = off <= float(np.linalg.norm((2 * self.eps + self.hop) / task.chart.scale))
+        # The cells that backward runs visit are those of a grid.
+        self._backward = task.kinematic and isinstance(self.grid, Grid)
+        self._rims = [part.mask & (off <= near) for part in self.parts]
+        # The same runs from outside of a part tell from where its way succeeds, and when they enter the part.
+        self._told = [
+            cache(partial(
+                spread, task, self.grid, candidate & ~part.mask, points, radius,
+                partial(_outside, task, pi, partition, part, None if self._backward else rim), 2,
+            ))
+            for pi, part, rim, candidate in zip(
+                self._pis, self.parts, self._rims, self._candidates, strict=True
+            )
+        ]  # fmt: skip
+        nowhere = np.zeros(self.grid.size, dtype=bool)
+        self.walls = ~task.goes_on(self.grid.nodes) if task.stopped_by_walls else nowhere
+
+    def winning(self) -> tuple[np.ndarray, ...]:
+        """Returns W_i, the nodes (N,) bool from which the policy of a part arrives by its own way."""
+        return tuple(
+            (self.partition.succeeds & part.mask) | (known()[:, 0] > 0)
+            for part, known in zip(self.parts, self._told, strict=True)
+        )
+
+    def trim(self, winning: Sequence[np.ndarray]) -> list[GridSet]:
+        """Returns W_i (N,) bool with room for the noise.
+
+        Noise that shows the robot in a wall that only stops it does not show it where its mode fails.
+        """
+        return [
+            GridSet.from_mask(self.grid, wins | ~candidate | self.walls).eroded_by_box(self.eps)
+            for wins, candidate in zip(winning, self._candidates, strict=True)
+        ]
+
+    def reach(self, roomy: Sequence[GridSet]) -> tuple[list[GridSet], float]:
+        """Returns M_i u X_i, and the time T of the propagation [s]."""
+        if len(self.parts) < 2:
+            return (self.wanted if self.horizon is None else [*self.parts]), self.horizon or 0.0
         reach = [
-            _backward_reach(task, pi, part, rim)
-            if backward
+            _backward_reach(self.task, pi, part, rim)
+            if self._backward
             else _forward_reach(part, known()[:, 2])
-            for pi, part, rim, known in zip(pis, parts, rims, told, strict=True)
+            for pi, part, rim, known in zip(
+                self._pis, self.parts, self._rims, self._told, strict=True
+            )
         ]
         goals = [
-            (w & room).mask & ~part.mask & around
-            for w, room, part in zip(wanted, roomy, parts, strict=True)
+            (w & room).mask & ~part.mask & self.around
+            for w, room, part in zip(self.wanted, roomy, self.parts, strict=True)
         ]
-        k = max(round(horizon / task.dt), 1) if horizon else _shortest(task, reach, goals)
-        reached = [part | within(k) for part, within in zip(parts, reach, strict=True)]
-        propagated = horizon or k * task.dt
-        if horizon is None:
-            reached = [r & w for r, w in zip(reached, wanted, strict=True)]
-    else:
-        reached = wanted if horizon is None else list(parts)
-    # With inertia a run goes on for a sample before the new mode tells: chattering would cross a set that is
-    # just as wide as the noise.
-    wide = eps if task.kinematic else eps + hop * (eps > 0)
-    sets = tuple(
-        (r & room) | part.dilated_by_box(wide)
-        for r, room, part in zip(reached, roomy, parts, strict=True)
-    )
-    if walls.any():  # where noise shows the robot in a wall, it is beside it
-        beside = nearest_of(grid, ~walls)
-        sets = tuple(GridSet.from_mask(grid, own.mask[beside]) for own in sets)
-    rows, pair, room = least_room(points, parts, winning, eps)
-    between = np.array(partition.modes)[pair]
-    return ExtendedSets(
-        partition.modes, sets, winning, propagated, noise, points[rows], 2 * noise * room, between
-    )
+        given = max(round(self.horizon / self.task.dt), 1) if self.horizon else None
+        k = given or _shortest(self.task, reach, goals)
+        reached = [part | within(k) for part, within in zip(self.parts, reach, strict=True)]
+        if self.horizon is None:
+            reached = [r & w for r, w in zip(reached, self.wanted, strict=True)]
+        return reached, self.horizon or k * self.task.dt
+
+    def widen(self, reached: Sequence[GridSet], roomy: Sequence[GridSet]) -> tuple[GridSet, ...]:
+        """Returns M_ext_i.
+
+        With inertia a run goes on for a sample before the new mode tells: chattering would cross a set that
+        is just as wide as the noise.
+        """
+        wide = self.eps if self.task.kinematic else self.eps + self.hop * (self.eps > 0)
+        sets = tuple(
+            (r & room) | part.dilated_by_box(wide)
+            for r, room, part in zip(reached, roomy, self.parts, strict=True)
+        )
+        if self.walls.any():  # where noise shows the robot in a wall, it is beside it
+            beside = nearest_of(self.grid, ~self.walls)
+            sets = tuple(GridSet.from_mask(self.grid, own.mask[beside]) for own in sets)
+        return sets
 
 
 def _shortest(task: Task, reach: list[Callable[[int], GridSet]], goals: list[np.ndarray]) -> int:
