@@ -13,6 +13,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import DtypeObservation, FlattenObservation, TimeLimit
 
 from hyrl_mj import BadInput, from_callable, from_gymnasium, get_task, simulate
+from hyrl_mj.environments import making
 from hyrl_mj.environments.fingerprint import Unknown, fingerprint
 from hyrl_mj.simulation import Recorded
 
@@ -372,3 +373,74 @@ def test_of_two_functions_of_one_name_neither_is_taken_for_the_other():
         get_task(one.spec)
     one = None
     assert get_task(two.spec) is two
+
+
+class Legs(Puck):
+    """Succeeds at the last of several goals, which options give as a list."""
+
+    def reset(self, *, seed=None, options=None):
+        self.goals = (options or {"goals": [0.0]})["goals"] * 2
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = super().step(action)
+        info["success"] = info["success"] and len(self.goals) == 4
+        return observation, reward, terminated, truncated, info
+
+
+def test_options_of_a_reset_are_what_they_were_given_as(monkeypatch):
+    assert outcomes(Legs, reset={"goals": [1.0, 2.0]}) == outcomes(Puck)
+    assert outcomes(Legs, reset={"goals": np.array([1.0, 2.0])}) != outcomes(Puck)
+    gym.register("Legs-v0", Legs, max_episode_steps=60)
+    try:
+        task = from_gymnasium("Legs-v0", reset={"goals": np.array([1.0, 2.0])})
+        assert '{"array": [1.0, 2.0]}' in task.spec
+        monkeypatch.setattr(making, "_MADE", {})
+        again = get_task(task.spec).specification.description.reset["goals"]
+        assert isinstance(again, np.ndarray)
+    finally:
+        gym.registry.pop("Legs-v0")
+
+
+class Clipping(Puck):
+    """What it observes is what one of its two observers says: they differ where it is fast."""
+
+    def get_obs(self):
+        return super()._get_obs()
+
+    def observe(self):
+        seen = self.get_obs()
+        return seen | {"position": np.clip(seen["position"], -1.45, 1.45)}
+
+    def reset(self, **options):
+        super().reset(**options)
+        self.data.qpos[0] = max(self.data.qpos[0], -1.4)
+        mujoco.mj_forward(self.model, self.data)
+        return self.observe(), {}
+
+    def step(self, action):
+        result = super().step(0 * action)
+        return self.observe(), *result[1:]
+
+
+def test_of_several_observers_the_one_that_is_called_counts():
+    task = from_gymnasium(Clipping, steps=5)
+    noise = np.zeros((6, 1, len(task.noisy)))
+    noise[:, :, 0] = -0.1
+    agent = from_callable(lambda o: np.zeros((len(o), 2)), task)
+    (arc,) = simulate(task, agent, [[-1.4, 0.0]], Recorded(noise, 0.1))
+    assert arc.measured[0, 2] == -1.45
+
+
+def test_sensors_that_hold_their_values_are_refused():
+    class Held(Puck):
+        def __init__(self):
+            super().__init__()
+            sensor = (
+                '<sensor><jointpos name="px" joint="x" delay="0.1" nsample="6"/></sensor></mujoco>'
+            )
+            self.model = mujoco.MjModel.from_xml_string(XML.replace("</mujoco>", sensor))
+            self.data = mujoco.MjData(self.model)
+
+    with pytest.raises(BadInput, match=r"hold or delay what they measure \(px\)"):
+        from_gymnasium(Held)

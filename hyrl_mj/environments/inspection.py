@@ -117,6 +117,13 @@ def _check_times(instance: Instance) -> None:
 def _learn_spaces(instance: Instance) -> None:
     """Finds what is observed and put in."""
     model, space = instance.model, instance.env.observation_space
+    held = np.flatnonzero((model.sensor_delay != 0) | (model.sensor_interval != 0).any(axis=1))
+    if len(held):
+        named = ", ".join(model.sensor(i).name or f"sensor {i}" for i in held[:4])
+        raise BadInput(
+            f"sensors of {instance.name} hold or delay what they measure ({named}), which noise on the state "
+            "would not reach: leave out delay and interval, and put a DelayObservation around it"
+        )
     actions: Any = instance.env.action_space
     parts = parts_of(space)
     observation_low, observation_high = (

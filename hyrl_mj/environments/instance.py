@@ -7,6 +7,7 @@ so that stacks, delays, filters and normalisation see what a sensor would have s
 
 from __future__ import annotations
 
+import copy
 import math
 import random
 import weakref
@@ -96,7 +97,7 @@ class Instance:
         description = self.spec.description
         seed = description.seed or 0 if seed is None else seed
         given = {} if plain else description.reset
-        options = {k: np.array(v) if isinstance(v, list) else v for k, v in given.items()}
+        options = copy.deepcopy(dict(given))  # which the environment may change
         # Some environments draw from the global generators; `kept_generators` puts these back.
         np.random.seed(seed)
         random.seed(seed)
@@ -175,7 +176,8 @@ class Instance:
                     f"{self.name} has no attribute {name} of shape {np.shape(value)} to pin: name a "
                     "position as qpos[2], or an attribute"
                 )
-            setattr(self.inner, name, np.array(value) if isinstance(value, list) else value)
+            like: Any = np.array if isinstance(old, np.ndarray) else type(old)
+            setattr(self.inner, name, like(value) if np.ndim(value) else value)
         self.physics.write(self.physics.shown())
 
     def memory(self) -> written.Fingerprint:

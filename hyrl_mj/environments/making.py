@@ -39,6 +39,7 @@ _MADE: MutableMapping[str, EnvironmentTask] = WeakValueDictionary()
 _RECENT: deque[EnvironmentTask] = deque(maxlen=2)
 # Older tasks of functions of the same name.
 _OLDER: WeakSet[EnvironmentTask] = WeakSet()
+ARRAY = "array"  # the key of an object in JSON that stands for an array
 SHOWN = 120  # characters of arguments in a message
 
 
@@ -198,6 +199,11 @@ def _where(function: Callable[..., gym.Env]) -> str:
     return f"{getattr(function, '__module__', '')}.{name}"
 
 
+def _with_arrays(content: dict[str, Any]) -> Any:
+    """Returns the array that an object of JSON stands for, as `_plain` writes it; else the object."""
+    return np.array(content[ARRAY]) if content.keys() == {ARRAY} else content
+
+
 def _made_of(description: Description) -> tuple[Any, ...]:
     """Returns what an environment is made of beside its description: what its id stands for, and files."""
     env = description.env
@@ -217,8 +223,10 @@ def _made_of(description: Description) -> tuple[Any, ...]:
 
 
 def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.number):
-        return value.tolist()
+    if isinstance(value, np.ndarray):
+        return {ARRAY: value.tolist()}
+    if isinstance(value, np.number):
+        return value.item()
     raise BadInput(f"{value!r} cannot be written down: give numbers, texts, lists and dictionaries")
 
 
@@ -240,7 +248,7 @@ def from_spec(spec: str) -> Task:
         if not isinstance(description.env, str) or task.made_of == _made_of(description):
             return task
     try:
-        given = json.loads(spec.removeprefix(MARK))
+        given = json.loads(spec.removeprefix(MARK), object_hook=_with_arrays)
         env = given["env"]
     except (ValueError, TypeError, KeyError, RecursionError):
         raise BadInput(f"{spec[:80]!r} describes no environment: start a new run") from None
@@ -386,7 +394,8 @@ def _arguments(path: Path) -> dict[str, Any]:
     if path.exists() and not path.is_file():
         raise BadInput(f"{path} is no file: give a JSON file")
     try:
-        content = json.loads(artifacts.read_limited(path, artifacts.LARGEST_JSON).decode())
+        text = artifacts.read_limited(path, artifacts.LARGEST_JSON).decode()
+        content = json.loads(text, object_hook=_with_arrays)
     except OSError as error:
         raise BadInput(f"{path} cannot be read ({error.strerror}): give a JSON file") from None
     except (ValueError, RecursionError) as error:

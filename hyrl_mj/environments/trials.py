@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -51,7 +52,40 @@ def observer_of(instance: Instance) -> str:
             f"{instance.name} has no method that computes what it observes in its present state, so nothing "
             "is known of what it would observe under noise: give it one named _get_obs, without arguments"
         )
-    return next(iter(left))
+    return _called(instance, left) or next(iter(left))
+
+
+def _called(instance: Instance, names: Iterable[str]) -> str:
+    """Returns which of some methods of the environment a step calls last, outside of others; "" if none."""
+    inner, within, last = instance.inner, [0], [""]
+
+    def watched(name: str, own: Any) -> Any:
+        def method(*arguments: Any, **options: Any) -> Any:
+            if not within[0]:
+                last[0] = name
+            within[0] += 1
+            try:
+                return own(*arguments, **options)
+            finally:
+                within[0] -= 1
+
+        return method
+
+    replaced = []
+    for name in names:
+        # What is made of several methods, or put in already, stays as it is.
+        if hasattr(type(inner), name) and name not in getattr(inner, "__dict__", {name: None}):
+            with suppress(Exception):  # it may allow no attributes
+                setattr(inner, name, watched(name, getattr(inner, name)))
+                replaced.append(name)
+    try:
+        instance.reset()
+        last[0] = ""
+        instance.stepped(instance.drawn(np.random.default_rng(0)))
+    finally:
+        for name in replaced:
+            delattr(inner, name)
+    return last[0]
 
 
 def _agrees(get: Any, seen: np.ndarray, space: Any) -> bool:
