@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import atexit
 import gc
-import importlib
-import os
 import sys
 import textwrap
 from collections.abc import Sequence
-from contextlib import chdir
-from pathlib import Path
 
 from hyrl_mj import __version__, progress
 from hyrl_mj.commands import COMMANDS
 from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.gl import spare_matplotlib
 from hyrl_mj.parsing import call, documented
 from hyrl_mj.streams import Streams
 
@@ -50,25 +47,18 @@ def dispatch(words: Sequence[str]) -> None:
             raise BadInput(f"give a command, one of {', '.join(COMMANDS)}: see hyrl-mj --help")
 
 
-def spare_matplotlib() -> None:
-    """Lets a file `matplotlibrc` of the current folder, and a backend, have no part in figures.
-
-    matplotlib reads that file when it is imported, whatever it is.
-    """
-    os.environ["MPLBACKEND"] = "agg"
-    if os.path.lexists("matplotlibrc"):
-        with chdir(Path(__file__).parent):
-            importlib.import_module("matplotlib")
-
-
 def main() -> None:
     """The console script `hyrl-mj`."""
     streams = Streams()
     progress.enabled = streams.has_room_for_bars
-    spare_matplotlib()
     # Python would look for garbage among torch's modules for most of a second before it ends.
     atexit.register(gc.freeze)
-    sys.exit(streams.run(lambda: dispatch(sys.argv[1:])))
+
+    def work() -> None:
+        spare_matplotlib()
+        dispatch(sys.argv[1:])
+
+    sys.exit(streams.run(work))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What a forked process cannot use: MuJoCo's threads and GL contexts stay in the process that made them."""
+"""What a forked process cannot use: threads of MuJoCo, GL contexts, and ends of pipes of who made them."""
 
 import ctypes
 import os
@@ -7,6 +7,7 @@ from weakref import WeakSet
 
 _OWN: WeakSet[Any] = WeakSet()
 _LEFT: WeakSet[Any] = WeakSet()
+_ENDS: WeakSet[Any] = WeakSet()
 
 
 def own(thing: Any) -> None:
@@ -19,7 +20,19 @@ def is_left(thing: Any) -> bool:
     return thing in _LEFT
 
 
+def own_end(end: Any) -> Any:
+    """Returns an end of a pipe that is closed in every process that is forked from this one.
+
+    Who waits at the other end learns only so that this process has let go of it.
+    """
+    _ENDS.add(end)
+    return end
+
+
 def _after_fork() -> None:
+    for end in list(_ENDS):
+        end.close()
+    _ENDS.clear()
     for thing in list(_OWN):
         _LEFT.add(thing)
         # It is never deleted: to delete it waits for threads or drivers that do not answer here.

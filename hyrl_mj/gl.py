@@ -13,6 +13,8 @@ the versions of PyOpenGL and MuJoCo; an attempt in a child process would double 
 import importlib
 import os
 import sys
+from contextlib import chdir
+from pathlib import Path
 
 # GL backends that need no screen, in the order in which they are tried.
 HEADLESS = ("egl", "osmesa")
@@ -69,3 +71,14 @@ def _attempt(backend: str) -> str:
 
 # Why all GL backends failed; empty if one was loaded or none was needed.
 GL_PROBLEM = import_mujoco()
+
+
+def spare_matplotlib() -> None:
+    """Lets a file `matplotlibrc` of the current folder, and a backend, have no part in figures.
+
+    matplotlib reads that file when it is imported, whatever it is.
+    """
+    os.environ["MPLBACKEND"] = "agg"
+    if os.path.lexists("matplotlibrc"):
+        with chdir(Path(__file__).parent):
+            importlib.import_module("matplotlib")

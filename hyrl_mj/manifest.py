@@ -42,9 +42,7 @@ FILES = {
     "replay": r"replay\.(mp4|png)",
     "report": r"report\.html",
 }
-
-
-# The files of a stage are no larger together [bytes].
+# The files of a stage are no larger together [bytes]: all of them are hashed where a run is opened.
 LARGEST_STAGE = 2**28
 
 

@@ -35,7 +35,7 @@ INTERRUPTED, INTERRUPTED_STATUS = "interrupted; finished work is kept, run again
 # What may be written beside printable characters: breaks, and on a terminal sequences that libraries write:
 # colours, movements of the cursor, lines that are cleared.
 _BREAKS = re.compile("([\\n\\r\\t])")
-_SEQUENCES = re.compile("([\\n\\r\\t]|\\x1b\\[[0-9;?]*[mABCDGKhl])")
+_SEQUENCES = re.compile("([\\n\\r\\t]|\\x1b\\[(?:[0-9;]*[mABCDGK]|\\?25[hl]))")
 
 
 class _Raw(io.FileIO):

@@ -90,7 +90,7 @@ def test_a_link_that_leads_to_nothing_is_not_replaced(tmp_path):
 
 
 def test_a_matplotlibrc_of_the_current_folder_has_no_part(tmp_path):
-    code = "from hyrl_mj.cli import spare_matplotlib; spare_matplotlib()\n"
+    code = "from hyrl_mj.gl import spare_matplotlib; spare_matplotlib()\n"
     code += (
         "from hyrl_mj.viz.figures import style; import matplotlib; print(matplotlib.get_backend())"
     )

@@ -89,26 +89,20 @@ def _drawn(instance: Instance, states: np.ndarray) -> list[str]:
     first, told = begun[0]
     changed = dict.fromkeys(n for other, _ in begun[1:] for n in differing(first, other))
     of_model = [n for n in changed if n.endswith(" of its model") and n not in lasting]
-    most = SAME * max(float(np.nanmax(np.abs(told), initial=0.0)), 1.0)
+    passed = {*lasting, *of_model, STATE, *(n for found, _ in begun for n in found.generators)}
+    differ = [name for name in changed if name not in passed and "_seed" not in name]
+    sizes = np.abs(told[np.isfinite(told)])
+    most = SAME * max(float(sizes.max(initial=0.0)), 1.0)
     if all(
         other.shape == told.shape and np.allclose(other, told, rtol=0, atol=most, equal_nan=True)
         for _, other in begun
     ):
-        known = {*lasting, *of_model, STATE, *(n for found, _ in begun for n in found.generators)}
-        unclear = [n for n in changed if n not in known and "_seed" not in n]
-        if unclear:
+        if differ:
             instance.spec.found["kept"] = (
-                f"{', '.join(unclear[:8])}, as the reset that runs begin with leaves it; no trial shows that "
+                f"{', '.join(differ[:8])}, as the reset that runs begin with leaves it; no trial shows that "
                 "what is to be done depends on it"
             )
         return names + of_model
-    passed = {
-        *lasting,
-        *of_model,
-        STATE,
-        *(name for found, _ in begun for name in found.generators),
-    }
-    differ = [name for name in changed if "_seed" not in name and name not in passed]
     goals = [name for name in differ if any(word in name for word in ("goal", "target", "task"))]
     return names + of_model + (goals or differ) or ["something that no attribute holds"]
 

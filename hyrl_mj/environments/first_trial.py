@@ -16,14 +16,14 @@ sys.path.append(str(Path(__file__).parents[2]))  # of the package, if it is not 
 
 from hyrl_mj import limits, trust
 from hyrl_mj.environments.instance import Instance
-from hyrl_mj.environments.opening import Description, register
+from hyrl_mj.environments.opening import Description, register, with_arrays
 from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.errors import BadInput
 
 
 def main() -> None:
     seconds, memory = map(int, sys.argv[1:])
-    description, problem = Description(**json.load(sys.stdin)), ""
+    description, problem = Description(**json.load(sys.stdin, object_hook=with_arrays)), ""
     assert isinstance(description.env, str)
     register(description.env)
     # What code of the user's has registered, in the other process alone, cannot be tried in this one.

@@ -10,45 +10,47 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import fields
 from multiprocessing.connection import Connection
+from threading import Lock
 from typing import Any
 
 from hyrl_mj.environments.opening import Description, preload
 from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.errors import BadInput, HyrlError, brief
+from hyrl_mj.forked import own_end
 
 
 class Fresh:
     """Plays runs in new processes.
 
     Args:
-        description: of the environment, of which no instance has been made yet.
+        description: of the environment, of which this package has made no instance yet.
     """
 
     def __init__(self, description: Description):
         preload(description)
-        self._owner = os.getpid()
-        self.hand: Connection | None = None
+        self._owner, self._lock = os.getpid(), Lock()
+        self._hand: Connection | None = None
         forks = "fork" in multiprocessing.get_all_start_methods()
         if forks and not multiprocessing.current_process().daemon:
             context = multiprocessing.get_context("fork")
-            self.hand, theirs = context.Pipe()
-            server = context.Process(
-                target=_serve, args=(theirs, description, self.hand), daemon=True
-            )
+            ours, theirs = context.Pipe()
+            self._hand = own_end(ours)
+            server = context.Process(target=_serve, args=(theirs, description), daemon=True)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", DeprecationWarning)  # of threads, which stay here
                 server.start()
             theirs.close()
 
     @property
-    def there(self) -> bool:
-        """Whether there are new processes: not where none can be forked, and not in forks of this one."""
-        return self.hand is not None and self._owner == os.getpid()
+    def available(self) -> bool:
+        """Whether runs can be played in new processes, from this process and after no interrupt."""
+        return self._hand is not None and self._owner == os.getpid()
 
     def check(self, spec: EnvironmentSpec, parts: Sequence[Sequence[Any]]) -> None:
         """Has each part of some runs, which are `Played`, judged in a process of its own.
@@ -56,13 +58,18 @@ class Fresh:
         Raises:
             BadInput: a run goes another way there.
         """
-        assert self.hand is not None
+        assert self._hand is not None
         facts = {f.name: getattr(spec, f.name) for f in fields(spec) if f.name != "description"}
-        try:
-            self.hand.send((facts, parts))
-            answers = self.hand.recv()
-        except (EOFError, BrokenPipeError):
-            answers = [_ended(spec.name)]
+        with self._lock:  # several threads may simulate at once
+            try:
+                self._hand.send((facts, parts))
+                answers = self._hand.recv()
+            except (EOFError, ConnectionError):
+                answers = [_ended(spec.name)]
+            except BaseException:  # an answer that comes too late would be taken for the next one
+                self._hand.close()
+                self._hand = None
+                raise
         for answer in answers:
             if answer is not None:
                 raise answer
@@ -74,11 +81,10 @@ def _ended(name: str) -> BadInput:
     )
 
 
-def _serve(work: Connection, description: Description, other: Connection) -> None:
+def _serve(work: Connection, description: Description) -> None:
     """Answers what is asked through a pipe, until the other end is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    other.close()
-    with suppress(EOFError, BrokenPipeError):
+    with suppress(EOFError, ConnectionError):
         while True:
             facts, parts = work.recv()
             judges = [_fork(description, facts, runs) for runs in parts]
@@ -91,9 +97,11 @@ def _fork(
     """Forks a process that judges runs, and returns its id and where its answer comes from."""
     ours, theirs = multiprocessing.Pipe(duplex=False)
     if not (pid := os.fork()):
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # it may be at work without end
         try:
             theirs.send(_judged(EnvironmentSpec(description, **facts), runs))
         finally:
+            sys.stdout.flush()
             os._exit(0)
     theirs.close()
     return pid, ours

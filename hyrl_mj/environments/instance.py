@@ -42,8 +42,8 @@ class Instance:
 
     Args:
         spec: what is known of the environment, of which the description is enough for a first one.
-        real: whether it is as its user has it, with the wrappers that end or count episodes; but for the end
-            of episodes if the user gives one.
+        real: whether it has all wrappers of its user, also those that end or count episodes; they are left
+            out where the user gives `steps`.
 
     Attributes:
         is_wrapped: whether wrappers lie around the environment.
@@ -366,7 +366,13 @@ class Instance:
         if not self.is_wrapped:
             self.inner_seen = result[0]
         took, dt = self.data.time - began, self.spec.dt
-        if dt and not self.physics.is_plant and abs(took - dt) > SAME_TIME * dt:
+        if took < 0 and not self.physics.is_plant:
+            raise BadInput(
+                f"the time of {self.name} goes back in step(), as where a simulation diverges and MuJoCo "
+                "resets it: limit its inputs, or take a smaller timestep"
+            )
+        goes_on = dt and not self.physics.is_plant and not (result[2] or result[3])
+        if goes_on and abs(took - dt) > SAME_TIME * dt:
             raise BadInput(
                 f"a step of {self.name} takes {took:.6g} s, and others {dt:.6g} s: let each take as long"
             )
@@ -446,9 +452,9 @@ class _Chain:
         self._news: SimpleQueue[tuple[str, Any]] = SimpleQueue()
         self._busy = False  # with a sample that waits to be observed
         self._calls = 0
-        self._shown: np.ndarray | None = (
-            None  # the state that wrappers see, if it is not the true one
-        )
+        self._inside = False  # of the environment's own reset, which may step it
+        # The state that wrappers see, if it is not the true one.
+        self._shown: np.ndarray | None = None
         Thread(target=_serve, args=(self._work, self._news), daemon=True).start()
         weakref.finalize(self, self._work.put, None)  # the thread ends with the instance
 
@@ -473,13 +479,14 @@ class _Chain:
         self._noise.put(noise)
         what, value = self._news.get()
         self._busy = False
-        if self._shown is not None and self._come_back(self._shown) and not self._instance.tried:
+        wrote = self._shown is not None and self._come_back(self._shown)
+        if what == "error":
+            raise value
+        if wrote and not self._instance.tried:
             raise BadInput(
                 f"a wrapper of {self._instance.name} reads MuJoCo's state for what it observes, and writes "
                 "to it: let it observe what the environment gives it, or let only the environment write"
             )
-        if what == "error":
-            raise value
         return value
 
     def _come_back(self, shown: np.ndarray) -> bool:
@@ -501,11 +508,17 @@ class _Chain:
 
     def _step(self, action: Any) -> Any:
         result = self._own_step(action)
+        if self._inside:
+            return result
         self._instance.inner_seen = result[0]
         return self._observed(result[0], result[1:])
 
     def _reset(self, **options: Any) -> Any:
-        instance, result = self._instance, self._own_reset(**options)
+        instance, self._inside = self._instance, True
+        try:
+            result = self._own_reset(**options)
+        finally:
+            self._inside = False
         instance.inner_seen = result[0]
         if instance.start is None:
             return result

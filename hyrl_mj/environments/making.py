@@ -23,7 +23,15 @@ import numpy as np
 from hyrl_mj import artifacts, limits, trust
 from hyrl_mj.environments.inspection import inspect
 from hyrl_mj.environments.instance import kept_generators
-from hyrl_mj.environments.opening import CHART, RESET, AnyChart, Description, register
+from hyrl_mj.environments.opening import (
+    ARRAY,
+    CHART,
+    RESET,
+    AnyChart,
+    Description,
+    register,
+    with_arrays,
+)
 from hyrl_mj.environments.specification import FORMS
 from hyrl_mj.environments.task import EnvironmentTask
 from hyrl_mj.errors import BadInput, brief, check_seed, described, printable, unknown
@@ -39,7 +47,6 @@ _MADE: MutableMapping[str, EnvironmentTask] = WeakValueDictionary()
 _RECENT: deque[EnvironmentTask] = deque(maxlen=2)
 # Older tasks of functions of the same name.
 _OLDER: WeakSet[EnvironmentTask] = WeakSet()
-ARRAY = "array"  # the key of an object in JSON that stands for an array
 SHOWN = 120  # characters of arguments in a message
 
 
@@ -95,16 +102,17 @@ def from_gymnasium(
     if starts == CHART:
         del told["starts"]
     spec = MARK + json.dumps(told, default=_plain)
-    made_of, task = _made_of(description), _MADE.get(spec)
-    if task is None or task.made_of != made_of or not isinstance(env, str):
-        if task is not None and task.made_of != made_of and not isinstance(env, str):
+    task = _MADE.get(spec)
+    same = task is not None and _same(task.made_of, _made_of(description))
+    if task is None or not same or not isinstance(env, str):
+        if task is not None and not same and not isinstance(env, str):
             _OLDER.add(task)
             with suppress(ValueError):
                 _RECENT.remove(task)
         with described(_shown(env)), kept_generators():
             if isinstance(env, str) and (kwargs or reset or pinned or trust.is_received()):
                 _try(description, spec)
-            task = EnvironmentTask(*inspect(description), spec, made_of)
+            task = EnvironmentTask(*inspect(description), spec, _made_of(description))
         _MADE[spec] = task
         _RECENT.append(task)
     if isinstance(env, str):
@@ -126,11 +134,9 @@ def _try(description: Description, spec: str) -> None:
         name: getattr(description, name) for name in ("env", "kwargs", "reset", "pinned", "seed")
     }
     try:
-        content = json.dumps(given)
-    except TypeError:
-        content = ""
-    if not content or json.loads(content) != given:
-        return  # arrays and tuples, which only the user's own code gives, and the program would see lists
+        content = json.dumps(given, default=_plain)
+    except (TypeError, BadInput):
+        return  # objects, which only the user's own code gives
     try:
         found = limits.tried(Path(__file__).with_name("first_trial.py"), content.encode())
     except limits.Ended as ended:
@@ -199,27 +205,34 @@ def _where(function: Callable[..., gym.Env]) -> str:
     return f"{getattr(function, '__module__', '')}.{name}"
 
 
-def _with_arrays(content: dict[str, Any]) -> Any:
-    """Returns the array that an object of JSON stands for, as `_plain` writes it; else the object."""
-    return np.array(content[ARRAY]) if content.keys() == {ARRAY} else content
-
-
 def _made_of(description: Description) -> tuple[Any, ...]:
     """Returns what an environment is made of beside its description: what its id stands for, and files."""
     env = description.env
     if not isinstance(env, str):
         # A cell of a notebook that is run again makes another function of the same code.
-        own = getattr(env, "__closure__", None) or ()
-        return (
-            getattr(env, "__code__", env),
-            *(getattr(cell, "cell_contents", None) for cell in own),
+        names = "__self__", "__defaults__", "__kwdefaults__"
+        cells = []
+        for cell in getattr(env, "__closure__", None) or ():
+            with suppress(ValueError):  # it is empty
+                cells.append(cell.cell_contents)
+        parts = (getattr(env, name, None) for name in names)
+        return (getattr(env, "__code__", env), *parts, *cells)
+    digests = []
+    for value in description.kwargs.values():
+        with suppress(OSError, ValueError):
+            if isinstance(value, str) and Path(value).is_file():
+                digests.append(artifacts.digest(Path(value)))
+    return (gym.registry.get(env.rpartition(":")[2]), *digests)
+
+
+def _same(made_of: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
+    """Returns whether two environments of one description are made of the same."""
+    try:
+        return len(made_of) == len(other) and all(
+            a is b or bool(np.array_equal(a, b)) for a, b in zip(made_of, other, strict=True)
         )
-    register(env)
-    paths = [Path(value) for value in description.kwargs.values() if isinstance(value, str | Path)]
-    with suppress(OSError, ValueError):
-        paths = [path for path in paths if path.is_file()]
-        return (gym.registry.get(env.rpartition(":")[2]), *map(artifacts.digest, paths))
-    return (gym.registry.get(env.rpartition(":")[2]),)
+    except Exception:  # whatever objects of the user's do when they are compared
+        return False
 
 
 def _plain(value: Any) -> Any:
@@ -245,10 +258,12 @@ def from_spec(spec: str) -> Task:
                 "names"
             )
         description = task.specification.description
-        if not isinstance(description.env, str) or task.made_of == _made_of(description):
+        if not isinstance(description.env, str) or _same(task.made_of, _made_of(description)):
             return task
     try:
-        given = json.loads(spec.removeprefix(MARK), object_hook=_with_arrays)
+        given = json.loads(spec.removeprefix(MARK), object_hook=with_arrays)
+        if not isinstance(given, dict):
+            raise ValueError
         env = given["env"]
     except (ValueError, TypeError, KeyError, RecursionError):
         raise BadInput(f"{spec[:80]!r} describes no environment: start a new run") from None
@@ -282,7 +297,7 @@ def _check_received(env: str, given: Mapping[str, Any], spec: str) -> None:
         args = {name: value for name, value in given.items() if name != "env"}
         how = f"--env {shlex.quote(env)}"
         if args:
-            text = json.dumps(args)
+            text = json.dumps(args, default=_plain)
             held = text if len(text) <= SHOWN else "its arguments, which stand in config.json"
             how += f" --env-args FILE, where FILE holds {held}"
         raise BadInput(
@@ -306,7 +321,9 @@ def _is_plain(value: Any) -> bool:
         return all(_is_plain(part) for pair in value.items() for part in pair)
     if isinstance(value, list | tuple):
         return all(map(_is_plain, value))
-    return value is None or isinstance(value, int | float | np.number | np.ndarray)
+    if isinstance(value, np.ndarray):
+        return value.dtype.kind in "biuf"
+    return value is None or isinstance(value, int | float | np.number)
 
 
 register_opener(MARK, from_spec)
@@ -382,6 +399,7 @@ def explained(task: Task) -> str:
 # What to give to change what was found, where it has another name.
 _INSTEAD = {
     "noise": "noisy",
+    "kept": "reset, pinned or seed",
     "goal": "reset, pinned or seed",
     "ways": "chart",
     "lag": "an environment that calls mj_forward at the end of step()",
@@ -395,7 +413,7 @@ def _arguments(path: Path) -> dict[str, Any]:
         raise BadInput(f"{path} is no file: give a JSON file")
     try:
         text = artifacts.read_limited(path, artifacts.LARGEST_JSON).decode()
-        content = json.loads(text, object_hook=_with_arrays)
+        content = json.loads(text, object_hook=with_arrays)
     except OSError as error:
         raise BadInput(f"{path} cannot be read ({error.strerror}): give a JSON file") from None
     except (ValueError, RecursionError) as error:

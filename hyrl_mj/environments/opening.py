@@ -35,6 +35,8 @@ PEELED = (
 )  # fmt: skip
 # Chart, as users give it: one name, several, or new names with the names of what they stand for.
 AnyChart = str | Sequence[str] | Mapping[str, str]
+# The key of an object in JSON that stands for an array of NumPy.
+ARRAY = "array"
 # Where episodes start.
 CHART, RESET = "chart", "reset"
 
@@ -64,6 +66,11 @@ class Description:
         return getattr(self.env, "__name__", type(self.env).__name__).strip("<>") or "environment"
 
 
+def with_arrays(content: dict[str, Any]) -> Any:
+    """Returns the array that an object of JSON stands for, else the object."""
+    return np.array(content[ARRAY]) if content.keys() == {ARRAY} else content
+
+
 def made(description: Description) -> gym.Env:
     """Returns an environment that can be used, with all of its wrappers.
 
@@ -91,11 +98,14 @@ def made(description: Description) -> gym.Env:
 def preload(description: Description) -> None:
     """Imports what makes an environment, without making it; what fails is told when it is made."""
     make = description.env
-    if not isinstance(make, str) or ":" in make:
+    if not isinstance(make, str):
         return
-    with suppress(Exception):
+    with suppress(Exception, SystemExit):
         register(make)
-        entry = gym.spec(make).entry_point
+        if ":" in make:
+            with current_folder(make):
+                importlib.import_module(make.partition(":")[0])
+        entry = gym.spec(make.rpartition(":")[2]).entry_point
         if isinstance(entry, str):
             gym.envs.registration.load_env_creator(entry)
 

@@ -28,6 +28,7 @@ from hyrl_mj.environments.fresh import Fresh
 from hyrl_mj.environments.instance import Instance, Worn, kept_generators
 from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.errors import BadInput, HyrlError, brief
+from hyrl_mj.forked import own_end
 from hyrl_mj.tasks import Outcome
 
 # Fewer episodes than this for each process are played by one.
@@ -71,7 +72,8 @@ class Stage:
         self.spec = spec
         self._playing: dict[int, Instance] = {}  # by the number of the run
         self._free: list[Instance] = []
-        self._judges: list[Instance] = []  # which play nothing but what they judge
+        # Which play nothing but what they judge, as their user has them, or without time limits.
+        self._judges: dict[bool, list[Instance]] = {True: [], False: []}
         self._resting: Instance | None = None
         self._shared: written.Fingerprint | None = None  # by a new instance with all others
 
@@ -148,9 +150,11 @@ class Stage:
     def check(self, runs: Sequence[Played]) -> None:
         """Plays runs in new environments; raises `BadInput` if these go another way."""
         for run in runs:
-            real = self._renewed(self._judges, real=True)
+            # A time limit of its own would end a run that is simulated for longer.
+            as_it_is = len(run.inputs) <= self.spec.max_steps
+            real = self._renewed(self._judges[as_it_is], as_it_is)
             judge(run, real)
-            self._judges.append(real)
+            self._judges[as_it_is].append(real)
 
     def _acted(
         self, instances: Sequence[Instance], u: np.ndarray, begun: np.ndarray | None = None
@@ -205,11 +209,11 @@ def judge(run: Played, real: Instance) -> None:
         path.append(spec.z(real.physics.read()[None])[0])
         reports.append(real.report)
     real.finish()
+    if not reports:
+        return
     seen = None if run.observations is None else observations[: len(run.observations)]
     _compare(real.name, "observation", run.observations, seen)
     _compare(real.name, "the chart's coordinate", run.path, path)
-    if not reports:
-        return
     told = np.array(reports, dtype=float)
     _compare(real.name, "reward", run.rewards, told[:, :1])
     if run.outcome == Outcome.UNSTABLE:
@@ -253,7 +257,7 @@ class Pool:
         self.spec, self.fresh = spec, fresh
         self._stage, self._owner = Stage(spec), os.getpid()
         self._hands: list[Connection] = []
-        self._lock = Lock()  # a game attacks several controllers in threads
+        self._lock = Lock()  # several threads may simulate at once
         # Runs of plants that nobody has any more: places (n,), numbers (n,), and which are played (n,) bool.
         self.left: deque[tuple[np.ndarray, np.ndarray, np.ndarray]] = deque()
 
@@ -267,8 +271,9 @@ class Pool:
         Raises:
             BadInput: a run goes another way there.
         """
-        if not self.fresh.there:
+        if not self.fresh.available:
             with self._lock, kept_generators():
+                self._open(1)
                 self._stage.check(runs)
             return
         count = len(runs) if alone else min(cores.count(), len(runs))
@@ -335,9 +340,8 @@ class Pool:
         while len(self._hands) < count - 1:
             context = multiprocessing.get_context("fork")
             ours, theirs = context.Pipe()
-            others = [*self._hands, ours, *([self.fresh.hand] if self.fresh.hand else [])]
-            arguments = theirs, self.spec, others
-            worker = context.Process(target=_serve, args=arguments, daemon=True)
+            own_end(ours)
+            worker = context.Process(target=_serve, args=(theirs, self.spec), daemon=True)
             with warnings.catch_warnings():
                 # Python 3.12 warns of threads: those of torch and MuJoCo take no part in the children.
                 warnings.simplefilter("ignore", DeprecationWarning)
@@ -366,13 +370,11 @@ def _answer(hand: Connection) -> Any:
         )
 
 
-def _serve(work: Connection, spec: EnvironmentSpec, others: Sequence[Connection]) -> None:
+def _serve(work: Connection, spec: EnvironmentSpec) -> None:
     """Answers what is asked through a pipe, until the other end is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    for other in others:
-        other.close()
     stage = Stage(spec)
-    with suppress(EOFError, BrokenPipeError):
+    with suppress(EOFError, ConnectionError):
         while True:
             what, arguments = _received(work)
             try:

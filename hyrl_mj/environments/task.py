@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from hashlib import sha256
-from typing import Any
+from typing import Any, Self
 
 import mujoco
 import numpy as np
@@ -56,6 +56,7 @@ class EnvironmentTask(Task):
     scene: Scene
     effort, stopped_by_walls = SPARING, True
     side_by_side = SIDE_BY_SIDE
+    _original: Task | None = None
     learning = Learning()
 
     def __init__(
@@ -91,6 +92,11 @@ class EnvironmentTask(Task):
 
     def __reduce__(self) -> tuple[Callable[..., Task], tuple[Any, ...]]:
         return _again, (self.spec, self.noisy)
+
+    def with_noise(self, shares: Sequence[float]) -> Self:
+        task = super().with_noise(shares)
+        task._original = self  # by which its text is found as long as somebody has this one
+        return task
 
     def _set_scene(self, tracked: str) -> None:
         if self._in_plane:

@@ -57,17 +57,18 @@ def observer_of(instance: Instance) -> str:
 
 def _called(instance: Instance, names: Iterable[str]) -> str:
     """Returns which of some methods of the environment a step calls last, outside of others; "" if none."""
-    inner, within, last = instance.inner, [0], [""]
+    inner, within, last = instance.inner, 0, ""
 
     def watched(name: str, own: Any) -> Any:
         def method(*arguments: Any, **options: Any) -> Any:
-            if not within[0]:
-                last[0] = name
-            within[0] += 1
+            nonlocal within, last
+            if not within:
+                last = name
+            within += 1
             try:
                 return own(*arguments, **options)
             finally:
-                within[0] -= 1
+                within -= 1
 
         return method
 
@@ -80,12 +81,12 @@ def _called(instance: Instance, names: Iterable[str]) -> str:
                 replaced.append(name)
     try:
         instance.reset()
-        last[0] = ""
+        last = ""
         instance.stepped(instance.drawn(np.random.default_rng(0)))
     finally:
         for name in replaced:
             delattr(inner, name)
-    return last[0]
+    return last
 
 
 def _agrees(get: Any, seen: np.ndarray, space: Any) -> bool:

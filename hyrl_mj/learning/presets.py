@@ -247,4 +247,4 @@ def _stage6(task: Task, name: str, algorithm: str) -> Training:
     if name == "smoke":
         return replace(training, samples=_SMOKE_MODES, attempts=1)
     most = task.effort.trainings
-    return training if most is None else replace(training, attempts=most)
+    return training if most is None else replace(training, attempts=min(training.attempts, most))

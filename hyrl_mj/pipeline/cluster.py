@@ -14,6 +14,7 @@ from typing import Any
 
 from hyrl_mj import cores
 from hyrl_mj.errors import BadInput, HyrlError, brief
+from hyrl_mj.gl import spare_matplotlib
 from hyrl_mj.manifest import Busy
 from hyrl_mj.pipeline.runs import RunOptions, run
 from hyrl_mj.sweeps import Row
@@ -36,6 +37,7 @@ def make(row: Row, options: RunOptions, share: int, journal: Any = None, folder:
     began = time.monotonic()
     if folder and os.path.isdir(folder):
         os.chdir(folder)
+    spare_matplotlib()
     cores.allowed = share
 
     def say(text: str) -> None:

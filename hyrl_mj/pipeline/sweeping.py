@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from itertools import islice, product
 from pathlib import Path
@@ -140,9 +140,12 @@ def _held(folder: Path) -> Iterator[None]:
         try:
             yield
         finally:
-            if not was_there and [path.name for path in folder.iterdir()] == [lock.name]:
-                lock.unlink()
-                folder.rmdir()
+            with suppress(
+                OSError
+            ):  # somebody puts something there, or an open file cannot be removed
+                if not was_there and [path.name for path in folder.iterdir()] == [lock.name]:
+                    lock.unlink()
+                    folder.rmdir()
 
 
 def report(folder: str | Path) -> Sweep:

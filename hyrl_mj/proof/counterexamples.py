@@ -48,11 +48,11 @@ def attack(
 ) -> Broken:
     """Attacks a controller where it may lose, and returns where it lost.
 
-    From the nodes that are lost in the game its adversary gives the noise. Where the game is an estimate, up
-    to `ATTACKED_NODES` nodes are attacked, won or lost, and adversarial noise is tried, too. Cells that are
-    neither proved nor lost at a corner, up to `MOST_CELLS` of them for each start mode, are attacked from a
-    start inside: at each sample the noise tries measurements in its range, and takes the answer that leads
-    to the worst state.
+    From the nodes that are lost in the game its adversary gives the noise. Where the game is an estimate, as
+    many nodes as the task's effort says are attacked, won or lost, and adversarial noise is tried, too. Cells
+    that are neither proved nor lost at a corner, up to `MOST_CELLS` of them for each start mode, are attacked
+    from a start inside: at each sample the noise tries measurements in its range, and takes the answer that
+    leads to the worst state.
 
     Args:
         certificate: what is proved.
