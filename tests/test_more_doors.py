@@ -15,6 +15,7 @@ from command_line import call
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, artifacts, from_gymnasium, mjcf, trust
+from hyrl_mj.environments import making
 from hyrl_mj.environments.making import explained
 from hyrl_mj.fields import read_field
 from hyrl_mj.manifest import locked
@@ -216,3 +217,10 @@ def test_a_spreadsheet_takes_no_text_for_a_formula(text, tmp_path):
         (line,) = csv.DictReader(file)
     assert line["sentence"] == f"'{text}"
     assert line["seconds"] == "1e+308"
+
+
+def test_arrays_in_a_received_description_are_numbers():
+    assert not making._is_plain(np.array(["/home/u/x.xml"]))
+    assert making._is_plain(np.array([6, 6]))
+    with pytest.raises(BadInput, match="describes no environment"):
+        making.from_spec('env:{"array": [1]}')

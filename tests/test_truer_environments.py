@@ -1,7 +1,10 @@
 """What runs leave behind, what wrappers look at, what an id stands for: as a new process would have it."""
 
+import gc
 import itertools
+import multiprocessing
 import sys
+import time
 from functools import partial
 
 import gymnasium as gym
@@ -444,3 +447,67 @@ def test_sensors_that_hold_their_values_are_refused():
 
     with pytest.raises(BadInput, match=r"hold or delay what they measure \(px\)"):
         from_gymnasium(Held)
+
+
+# ---- what is honest
+
+
+class Settling(Puck):
+    """Its reset takes some steps."""
+
+    def reset(self, **options):
+        super().reset(**options)
+        for _ in range(2):
+            self.step(np.zeros(2))
+        self.data.qvel[:] = 0
+        mujoco.mj_forward(self.model, self.data)
+        return self._get_obs(), {}
+
+
+@pytest.mark.parametrize("wrap", [lambda env: env, FlattenObservation])
+def test_a_reset_may_step_the_environment(wrap):
+    (found,) = outcomes(lambda: wrap(Settling()), starts=STARTS[:1])
+    assert found == plain()[0]
+
+
+def test_a_run_may_be_simulated_for_longer_than_the_time_limit():
+    task = from_gymnasium(lambda: TimeLimit(FlattenObservation(Puck()), 10))
+    still = from_callable(lambda o: np.zeros((len(o), 2)), task)
+    (arc,) = simulate(task, still, [[-1.4, 0.5]], horizon=2.0)
+    assert len(arc.t) - 1 == 20
+
+
+def test_a_run_that_begins_in_a_wall_is_over():
+    task = from_gymnasium(lambda: FlattenObservation(Puck()), steps=10)
+    still = from_callable(lambda o: np.zeros((len(o), 2)), task)
+    (arc,) = simulate(task, still, [[0.0, 0.0]])
+    assert (arc.outcome, len(arc.t)) == ("crashed", 1)
+
+
+def test_an_episode_may_end_in_the_middle_of_a_step():
+    class Short(Puck):
+        def step(self, action):
+            self.data.ctrl[:] = np.clip(action, -4, 4)
+            for _ in range(5):
+                mujoco.mj_step(self.model, self.data)
+                off = float(np.linalg.norm(self.data.qpos - GOAL))
+                if off < 0.25:
+                    break
+            return self._get_obs(), -off, off < 0.25, False, {"success": off < 0.25}
+
+    assert {outcome for outcome, _ in outcomes(Short)} == {"reached"}
+
+
+def test_processes_of_a_task_that_nobody_has_end():
+    making._RECENT.clear()
+    gc.collect()
+    before = len(multiprocessing.active_children())
+    tasks = [from_gymnasium(lambda: FlattenObservation(Puck()), steps=10) for _ in range(3)]
+    assert len(multiprocessing.active_children()) >= before + 3
+    del tasks
+    making._RECENT.clear()
+    gc.collect()
+    until = time.monotonic() + 10
+    while len(multiprocessing.active_children()) > before and time.monotonic() < until:
+        time.sleep(0.05)
+    assert len(multiprocessing.active_children()) <= before
