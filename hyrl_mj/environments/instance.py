@@ -10,20 +10,18 @@ from __future__ import annotations
 import copy
 import math
 import random
-import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from queue import SimpleQueue
-from threading import Thread
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
 from hyrl_mj.environments import fingerprint as written
+from hyrl_mj.environments.chain import Chain
 from hyrl_mj.environments.expressions import entry
-from hyrl_mj.environments.observations import flat, observers, shaped
+from hyrl_mj.environments.observations import flat, observers
 from hyrl_mj.environments.opening import made, peeled, physics_of, plant_of, steps_of
 from hyrl_mj.environments.physics import Physics
 from hyrl_mj.environments.specification import EARLIER, NOW, UNKNOWN, EnvironmentSpec
@@ -79,7 +77,7 @@ class Instance:
         self._used = self._at_start = False
         self.tried = False
         self._pairs: list[tuple[np.ndarray, np.ndarray]] = []
-        self._chain = _Chain(self) if self.is_wrapped else None
+        self._chain = Chain(self) if self.is_wrapped else None
 
     def learn(self, **facts: Any) -> None:
         """Adds to what is known of the environment."""
@@ -434,128 +432,3 @@ def _global_state() -> tuple[Any, ...]:
     numpy_state: Any = np.random.get_state()
     # The place in a table of 624 words, and a word of it: it is filled anew at its end.
     return numpy_state[2], int(numpy_state[1][0]), random.getstate()
-
-
-class _Chain:
-    """Plays the steps of wrapped environments in a thread that waits for noise inside of the innermost.
-
-    Args:
-        instance: of the environment, whose innermost `step` and `reset` are replaced.
-    """
-
-    def __init__(self, instance: Instance):
-        self._instance = instance
-        self._own_step, self._own_reset = instance.inner.step, instance.inner.reset
-        instance.inner.step, instance.inner.reset = self._step, self._reset
-        self._work: SimpleQueue[Callable[[], Any] | None] = SimpleQueue()
-        self._noise: SimpleQueue[np.ndarray] = SimpleQueue()
-        self._news: SimpleQueue[tuple[str, Any]] = SimpleQueue()
-        self._busy = False  # with a sample that waits to be observed
-        self._calls = 0
-        self._inside = False  # of the environment's own reset, which may step it
-        # The state that wrappers see, if it is not the true one.
-        self._shown: np.ndarray | None = None
-        Thread(target=_serve, args=(self._work, self._news), daemon=True).start()
-        weakref.finalize(self, self._work.put, None)  # the thread ends with the instance
-
-    def ask(self, work: Callable[[], Any]) -> None:
-        """Begins a step or a reset, up to where the innermost environment would observe."""
-        if self._busy:
-            raise AssertionError("a sample has not been observed")
-        self._calls, self._busy = 0, True
-        self._work.put(work)
-        what, value = self._news.get()
-        if what != "sensing":
-            self._busy = False
-            if what == "error":
-                raise value
-            raise BadInput(
-                f"a wrapper of {self._instance.name} does not step the environment in each of its steps: "
-                "leave it out"
-            )
-
-    def answer(self, noise: np.ndarray) -> Any:
-        """Goes on with noise (d,) to the end of the step or reset, and returns its result."""
-        self._noise.put(noise)
-        what, value = self._news.get()
-        self._busy = False
-        wrote = self._shown is not None and self._come_back(self._shown)
-        if what == "error":
-            raise value
-        if wrote and not self._instance.tried:
-            raise BadInput(
-                f"a wrapper of {self._instance.name} reads MuJoCo's state for what it observes, and writes "
-                "to it: let it observe what the environment gives it, or let only the environment write"
-            )
-        return value
-
-    def _come_back(self, shown: np.ndarray) -> bool:
-        """Puts the true state back after wrappers saw another one; returns whether they wrote to it."""
-        physics, self._shown = self._instance.physics, None
-        now = physics.read()
-        wrote = (now != shown) & ~(np.isnan(now) & np.isnan(shown))
-        physics.come_back()
-        if wrote.any():
-            state = physics.read()
-            state[wrote] = now[wrote]
-            physics.show(state)
-        return bool(wrote.any())
-
-    def leave(self) -> None:
-        """Ends a step that waits for noise."""
-        if self._busy:
-            self.answer(np.zeros(self._instance.spec.dimension))
-
-    def _step(self, action: Any) -> Any:
-        result = self._own_step(action)
-        if self._inside:
-            return result
-        self._instance.inner_seen = result[0]
-        return self._observed(result[0], result[1:])
-
-    def _reset(self, **options: Any) -> Any:
-        instance, self._inside = self._instance, True
-        try:
-            result = self._own_reset(**options)
-        finally:
-            self._inside = False
-        instance.inner_seen = result[0]
-        if instance.start is None:
-            return result
-        instance.pin()
-        instance.arrive(instance.start)
-        return self._observed(instance.inner_seen, result[1:])
-
-    def _observed(self, observation: Any, rest: tuple[Any, ...]) -> tuple[Any, ...]:
-        instance, space = self._instance, self._instance.inner.observation_space
-        if not self._busy:
-            return (observation, *rest)
-        self._calls += 1
-        if self._calls > 1:
-            raise BadInput(
-                f"a wrapper of {instance.name} steps or resets the environment more than once in a step, and "
-                "noise comes once a sample: give the environment a frame_skip instead"
-            )
-        self._news.put(("sensing", None))
-        noise = self._noise.get()
-        if noise.any():
-            observation = shaped(
-                flat(observation, space) + instance.displaced(noise), observation, space
-            )
-            if instance.spec.sensing:
-                # Wrappers that read MuJoCo's state for what they observe see it where the sensor does.
-                shown = instance.moved(instance.physics.read(), noise)
-                instance.physics.leave()
-                instance.physics.write(shown)
-                self._shown = instance.physics.read()
-        return (observation, *rest)
-
-
-def _serve(work: SimpleQueue[Any], news: SimpleQueue[Any]) -> None:
-    """Does what is asked for in turn, until that is None; it holds on to nothing in between."""
-    while (job := work.get()) is not None:
-        try:
-            news.put(("done", job()))
-        except BaseException as error:
-            news.put(("error", error))
-        del job
