@@ -167,9 +167,10 @@ def test_a_bad_file_is_one_sentence(content, parts, written):
 
 
 def test_a_file_that_is_not_there_or_no_file_is_said(tmp_path):
-    for path in (tmp_path / "none.json", tmp_path):
-        with pytest.raises(BadInput, match=r"cannot be read \(.*\): give the JSON file of a field"):
-            read_field(path)
+    with pytest.raises(BadInput, match=r"cannot be read \(.*\): give the JSON file of a field"):
+        read_field(tmp_path / "none.json")
+    with pytest.raises(BadInput, match="is no file: give the JSON file of a field"):
+        read_field(tmp_path)
     (tmp_path / "x.json").write_bytes(b"\xff\xfe{")
     with pytest.raises(BadInput, match="is not JSON"):
         read_field(tmp_path / "x.json")
