@@ -2,7 +2,7 @@
 
 Everything that attributes of the environment and of its wrappers lead to is looked at, closures included,
 and what all instances share: variables of the modules and classes that define it. Values are only compared,
-never set.
+never set: pickles of them are written, and none is read.
 """
 
 from __future__ import annotations
