@@ -20,13 +20,13 @@ from command_line import call
 from hyrl_mj import mjcf, streams, trust
 from hyrl_mj.chart import Chart
 from hyrl_mj.environments import from_gymnasium
-from hyrl_mj.environments.making import MARK, from_spec
+from hyrl_mj.environments.making import from_spec
 from hyrl_mj.errors import LONGEST, BadInput
 from hyrl_mj.fields import read_field
 from hyrl_mj.fields.driving import Driving
 from hyrl_mj.policies import pickled
 from hyrl_mj.sweeps import Common, Row, Setting, Sweep
-from hyrl_mj.tasks import get_task
+from hyrl_mj.tasks import ENVIRONMENT, get_task
 from hyrl_mj.viz.sweep_tables import markdown
 from hyrl_mj.viz.tables import Table
 
@@ -34,7 +34,7 @@ CIRCLE = "hyrl_mj/UnitCircle-v0"
 
 
 def spec_of(env, **given):
-    return MARK + json.dumps({"env": env, **given})
+    return ENVIRONMENT + json.dumps({"env": env, **given})
 
 
 def code(folder, name="notes.py"):
@@ -163,7 +163,7 @@ def test_an_argument_that_is_none_is_one_sentence(given):
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"env":', "null", '{"env": {"a": 1}}', "[]", "1"])
 def test_a_damaged_description_is_one_sentence(text):
-    refusal(lambda: get_task(MARK + text))
+    refusal(lambda: get_task(ENVIRONMENT + text))
 
 
 # ---- limits

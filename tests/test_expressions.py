@@ -5,8 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from hyrl_mj.environments.expressions import DEPTH, LENGTH, Expression, entry
 from hyrl_mj.errors import BadInput

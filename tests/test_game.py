@@ -5,8 +5,7 @@ from itertools import count, pairwise, product
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from planted import (
     circle_controller,
     circle_policy,

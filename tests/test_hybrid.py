@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 from drawn import points
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from planted import AnalyticSet, ChartPolicy, ideal_controller, random_states
 
 import hyrl_mj

@@ -32,8 +32,7 @@ from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.tasks import Scene, registry
 from hyrl_mj.viz import tables
-from hyrl_mj.viz.commands import beginning
-from hyrl_mj.viz.commands import changed as changed_settings
+from hyrl_mj.viz.commands import beginning, changed as changed_settings
 from hyrl_mj.viz.encoding import video
 from hyrl_mj.viz.figures import CLASS_COLOURS
 from hyrl_mj.viz.report import render, write_report

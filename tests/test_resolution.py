@@ -13,8 +13,14 @@ from planted import UNICYCLE, ChartPolicy, Cube, Unicycle, steering_policy
 import hyrl_mj
 from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput
-from hyrl_mj.game import Game, Lattice, curve_grid, lattice_grid, resolution
-from hyrl_mj.game import lattice as lattice_module
+from hyrl_mj.game import (
+    Game,
+    Lattice,
+    curve_grid,
+    lattice as lattice_module,
+    lattice_grid,
+    resolution,
+)
 from hyrl_mj.game.resolution import level_counts, longest, probed_hops, resolves
 from hyrl_mj.game.solver import NEVER, nodes_within
 from hyrl_mj.learning import preset

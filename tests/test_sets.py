@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-from drawn import grid_sets
-from drawn import points as drawn_points
-from hypothesis import given
-from hypothesis import strategies as st
+from drawn import grid_sets, points as drawn_points
+from hypothesis import given, strategies as st
 
 from hyrl_mj import BadInput, Chart
 from hyrl_mj.sets import Complement, Everything, Grid, GridSet

@@ -36,10 +36,8 @@ from hyrl_mj.environments.specification import FORMS
 from hyrl_mj.environments.task import EnvironmentTask
 from hyrl_mj.errors import BadInput, brief, check_seed, described, printable, unknown
 from hyrl_mj.ranges import Integer, refused
-from hyrl_mj.tasks import Task, get_task, register_opener
+from hyrl_mj.tasks import ENVIRONMENT, Task, get_task
 
-# The texts that describe environments begin with this; those that have been made in this process.
-MARK = "env:"
 # The longest episode, and the widest coordinate of a chart [m, rad].
 MOST_STEPS, WIDEST = 1_000_000, 1e6
 # The newest task of each text, for as long as somebody has it, and the last ones for longer.
@@ -101,7 +99,7 @@ def from_gymnasium(
     told = given | {"env": env if isinstance(env, str) else {"function": _where(env)}}
     if starts == CHART:
         del told["starts"]
-    spec = MARK + json.dumps(told, default=_plain)
+    spec = ENVIRONMENT + json.dumps(told, default=_plain)
     task = _MADE.get(spec)
     same = task is not None and _same(task.made_of, _made_of(description))
     if task is None or not same or not isinstance(env, str):
@@ -261,7 +259,7 @@ def from_spec(spec: str) -> Task:
         if not isinstance(description.env, str) or _same(task.made_of, _made_of(description)):
             return task
     try:
-        given = json.loads(spec.removeprefix(MARK), object_hook=with_arrays)
+        given = json.loads(spec.removeprefix(ENVIRONMENT), object_hook=with_arrays)
         if not isinstance(given, dict):
             raise ValueError
         env = given["env"]
@@ -326,9 +324,6 @@ def _is_plain(value: Any) -> bool:
     return value is None or isinstance(value, int | float | np.number)
 
 
-register_opener(MARK, from_spec)
-
-
 # ---- the command line
 
 
@@ -389,7 +384,7 @@ def explained(task: Task) -> str:
     """Returns what was given and found out about an environment, and how to change it."""
     assert isinstance(task, EnvironmentTask)
     lines = [f"{task.name}: {task!r}"]
-    for name, value in json.loads(task.spec.removeprefix(MARK)).items():
+    for name, value in json.loads(task.spec.removeprefix(ENVIRONMENT)).items():
         lines.append(f"  {name}: {value if isinstance(value, str) else json.dumps(value)} (given)")
     for name, text in task.found.items():
         lines += [f"  {name}: {text}", f"    (to change it, give {_INSTEAD.get(name, name)})"]

@@ -26,11 +26,11 @@ from hyrl_mj.tasks.obstacles import (
     wrapped,
 )
 from hyrl_mj.tasks.registry import (
+    ENVIRONMENT,
     described_task,
     get_task,
     reference,
     register,
-    register_opener,
     task_names,
 )
 from hyrl_mj.tasks.scaffold import write_task
@@ -38,6 +38,7 @@ from hyrl_mj.tasks.scaffold import write_task
 __all__ = [
     "ANY",
     "CLEAR",
+    "ENVIRONMENT",
     "FASTEST",
     "LEFT",
     "OF_POST",
@@ -70,7 +71,6 @@ __all__ = [
     "posts_of",
     "reference",
     "register",
-    "register_opener",
     "sides",
     "task_names",
     "touching",

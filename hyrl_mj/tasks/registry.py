@@ -1,5 +1,6 @@
 """The registry of tasks: those of this package, of other installed packages, and of the user's files."""
 
+import importlib
 import importlib.util
 import sys
 from collections.abc import Callable
@@ -18,8 +19,8 @@ GROUP = "hyrl_mj.tasks"
 PACKAGE = Path(__file__).resolve().parents[1]
 _REGISTRY: dict[str, type[Task]] = {}
 _FILES: dict[Path, type[Task]] = {}
-# What makes the tasks of texts that begin with these marks, such as environments.
-_OPENERS: dict[str, Callable[[str], Task]] = {}
+# The text of an environment begins with this; a module above this one makes its task.
+ENVIRONMENT, MAKER = "env:", "hyrl_mj.environments.making"
 # Names of the tasks that other installed packages offer, as far as they have been loaded.
 _INSTALLED: set[str] = set()
 
@@ -62,11 +63,6 @@ def task_names() -> list[str]:
     return sorted(_REGISTRY.keys() | _offered().keys())
 
 
-def register_opener(mark: str, opener: Callable[[str], Task]) -> None:
-    """Registers what makes the tasks of texts that begin with a mark; see `Task.spec`."""
-    _OPENERS[mark] = opener
-
-
 def get_task(name: str | Path | Task) -> Task:
     """Returns a task, by its name or by the Python file that defines it; a task itself as it is.
 
@@ -78,9 +74,9 @@ def get_task(name: str | Path | Task) -> Task:
     """
     if isinstance(name, Task):
         return name
-    for mark, opener in _OPENERS.items():
-        if str(name).startswith(mark):
-            return opener(str(name))
+    if str(name).startswith(ENVIRONMENT):
+        made: Task = importlib.import_module(MAKER).from_spec(str(name))
+        return made
     if str(name).endswith(".py"):
         path = Path(name)
         has_run = path.resolve() in _FILES

@@ -17,13 +17,20 @@ from hyrl_mj.tasks import Task
 from hyrl_mj.viz.figures.charts import drawable
 from hyrl_mj.viz.figures.extended_sets import draw_extended_sets
 from hyrl_mj.viz.figures.policy import draw_overview, draw_policy_map
-from hyrl_mj.viz.figures.robustness import CLASS_COLOURS as CLASS_COLOURS
-from hyrl_mj.viz.figures.robustness import draw_robustness_curve, draw_robustness_map
+from hyrl_mj.viz.figures.robustness import (
+    CLASS_COLOURS as CLASS_COLOURS,
+    draw_robustness_curve,
+    draw_robustness_map,
+)
 from hyrl_mj.viz.figures.runs import draw_runs
-from hyrl_mj.viz.figures.shown import ShownGame, ShownPolicy, ShownRun
-from hyrl_mj.viz.figures.shown import shown_game as shown_game
-from hyrl_mj.viz.figures.shown import shown_policy as shown_policy
-from hyrl_mj.viz.figures.shown import shown_run as shown_run
+from hyrl_mj.viz.figures.shown import (
+    ShownGame,
+    ShownPolicy,
+    ShownRun,
+    shown_game as shown_game,
+    shown_policy as shown_policy,
+    shown_run as shown_run,
+)
 
 
 @dataclass(frozen=True)
