@@ -1,0 +1,110 @@
+from . import (
+    environments as environments,
+    envs as envs,
+    export as export,
+    fields as fields,
+    game as game,
+    gl as gl,
+    learning as learning,
+    pipeline as pipeline,
+    plant as plant,
+    policies as policies,
+    proof as proof,
+    sets as sets,
+    simulation as simulation,
+    stages as stages,
+    tasks as tasks,
+    viz as viz,
+)
+from .chart import Chart
+from .cores import using_pool
+from .environments import from_gymnasium
+from .errors import BadArtifact, BadInput, HyrlError, NoRenderer
+from .export import export_numpy, export_onnx
+from .game import Game, Robustness, Score
+from .learning import Settings
+from .pipeline import AgentOptions, RunOptions, SweepOptions, diagnose, robustify, run, sweep
+from .policies import Controller, MlpPolicy, Policy, from_callable, load_agent
+from .run_directory import Run, load_run
+from .sets import StateSet
+from .simulation import (
+    HybridArc,
+    LoopSettings,
+    Noise,
+    Recorded,
+    Sample,
+    Signal,
+    closed_loop,
+    register_noise,
+    simulate,
+    simulate_batch,
+)
+from .stages import (
+    CriticalSet,
+    ExtendedSets,
+    HybridController,
+    Partition,
+    extend,
+    find_critical_set,
+    make_partition,
+)
+from .tasks import Learning, Mirror, Outcome, Scene, Task, get_task, register, task_names
+from .verdict import Verdict
+
+__version__: str
+__all__ = [
+    "AgentOptions",
+    "BadArtifact",
+    "BadInput",
+    "Chart",
+    "Controller",
+    "CriticalSet",
+    "ExtendedSets",
+    "Game",
+    "HybridArc",
+    "HybridController",
+    "HyrlError",
+    "Learning",
+    "LoopSettings",
+    "Mirror",
+    "MlpPolicy",
+    "NoRenderer",
+    "Noise",
+    "Outcome",
+    "Partition",
+    "Policy",
+    "Recorded",
+    "Robustness",
+    "Run",
+    "RunOptions",
+    "Sample",
+    "Scene",
+    "Score",
+    "Settings",
+    "Signal",
+    "StateSet",
+    "SweepOptions",
+    "Task",
+    "Verdict",
+    "closed_loop",
+    "diagnose",
+    "export_numpy",
+    "export_onnx",
+    "extend",
+    "find_critical_set",
+    "from_callable",
+    "from_gymnasium",
+    "get_task",
+    "load_agent",
+    "load_run",
+    "make_partition",
+    "register",
+    "register_noise",
+    "robustify",
+    "run",
+    "simulate",
+    "simulate_batch",
+    "sweep",
+    "task_names",
+    "using_pool",
+]
