@@ -6,27 +6,28 @@ from . import (
     game as game,
     gl as gl,
     learning as learning,
+    physics as physics,
     pipeline as pipeline,
-    plant as plant,
     policies as policies,
     proof as proof,
+    runs as runs,
     sets as sets,
     simulation as simulation,
     stages as stages,
     tasks as tasks,
     viz as viz,
 )
-from .chart import Chart
-from .cores import using_pool
 from .environments import from_gymnasium
 from .errors import BadArtifact, BadInput, HyrlError, NoRenderer
 from .export import export_numpy, export_onnx
 from .game import Game, Robustness, Score
 from .learning import Settings
+from .physics import mjcf as mjcf
 from .pipeline import AgentOptions, RunOptions, SweepOptions, diagnose, robustify, run, sweep
 from .policies import Controller, MlpPolicy, Policy, from_callable, load_agent
-from .run_directory import Run, load_run
-from .sets import StateSet
+from .runs.directory import Run, load_run
+from .runs.verdict import Verdict
+from .sets import Chart, StateSet
 from .simulation import (
     HybridArc,
     LoopSettings,
@@ -48,8 +49,8 @@ from .stages import (
     find_critical_set,
     make_partition,
 )
+from .system.cores import using_pool
 from .tasks import Learning, Mirror, Outcome, Scene, Task, get_task, register, task_names
-from .verdict import Verdict
 
 __version__: str
 __all__ = [

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import hyrl_mj
 from hyrl_mj.policies import ALGORITHMS
-from hyrl_mj.sweeps import DONE
+from hyrl_mj.runs.sweeps import DONE
 from hyrl_mj.viz import print_sweep
 from hyrl_mj.viz.tables import arrivals
 

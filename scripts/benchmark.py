@@ -26,7 +26,7 @@ from benchmarks.runs import Runs
 from rich.console import Console
 from rich.table import Table
 
-from hyrl_mj import artifacts
+from hyrl_mj.files import artifacts
 
 GROUPS: dict[str, Callable[[Runs], Iterator[Figure]]] = {
     "engine": engine.figures,

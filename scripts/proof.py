@@ -19,10 +19,10 @@ import numpy as np
 import hyrl_mj
 from hyrl_mj import Noise
 from hyrl_mj.game import NEVER, Game
-from hyrl_mj.progress import progress_bar
 from hyrl_mj.proof import CellNoise, Certificate
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import LoopSettings, Sample, Signal, closed_loop
+from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Outcome
 
 BATCH = 5_000

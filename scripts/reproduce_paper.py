@@ -18,9 +18,9 @@ from rich.console import Console
 from rich.table import Table
 
 import hyrl_mj
-from hyrl_mj import progress
 from hyrl_mj.errors import BadInput
-from hyrl_mj.run_arcs import policy_start_arcs
+from hyrl_mj.runs.arcs import policy_start_arcs
+from hyrl_mj.system import progress
 from hyrl_mj.viz import figures
 
 # A line of the table: the quantity, the paper's value, ours, and a note.

@@ -19,11 +19,11 @@ from rich.console import Console
 from rich.table import Table
 
 import hyrl_mj
-from hyrl_mj import progress
 from hyrl_mj.policies import Controller, PolicyController
+from hyrl_mj.runs.sweeps import DONE, Row
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.stages import Regions, noisy_episodes
-from hyrl_mj.sweeps import DONE, Row
+from hyrl_mj.system import progress
 
 KINDS = ("alternating", "adversarial")
 # Starts for the comparison with the expert.

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hyrl_mj.cli import dispatch
-from hyrl_mj.streams import Streams
+from hyrl_mj.system.streams import Streams
 
 
 class Answer(NamedTuple):

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from hyrl_mj.chart import Chart
+from hyrl_mj.sets import Chart
 from hyrl_mj.simulation import WayRuns
 from hyrl_mj.simulation.passing import Follower
 from hyrl_mj.tasks import Outcome, Scene, Task

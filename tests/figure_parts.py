@@ -13,7 +13,7 @@ from planted import (
 )
 
 from hyrl_mj import ExtendedSets, Noise, simulate
-from hyrl_mj.run_arcs import overview_arcs, policy_start_arcs
+from hyrl_mj.runs.arcs import overview_arcs, policy_start_arcs
 from hyrl_mj.viz.figures import ShownRun
 from hyrl_mj.viz.section import Section
 

@@ -5,7 +5,7 @@ import os
 import pytest
 
 from hyrl_mj import NoRenderer, get_task
-from hyrl_mj.rendering import SceneRenderer
+from hyrl_mj.physics.rendering import SceneRenderer
 
 
 def can_render() -> bool:

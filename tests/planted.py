@@ -7,15 +7,14 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 
-from hyrl_mj.artifacts import digest
-from hyrl_mj.chart import Chart
 from hyrl_mj.environments.task import EnvironmentTask
+from hyrl_mj.files.artifacts import digest
+from hyrl_mj.files.manifest import FILES, Entry, Manifest
 from hyrl_mj.learning import presets
-from hyrl_mj.manifest import FILES, Entry, Manifest
 from hyrl_mj.pipeline import steps
 from hyrl_mj.proof import examination, replays
-from hyrl_mj.run_directory import load_run
-from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.runs.directory import load_run
+from hyrl_mj.sets import Chart, Grid, GridSet
 from hyrl_mj.stages.critical_set import CriticalSet
 from hyrl_mj.stages.hybrid import HybridController
 from hyrl_mj.stages.partition import Partition

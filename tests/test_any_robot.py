@@ -65,7 +65,8 @@ import hyrl_mj
 from hyrl_mj import Outcome
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.envs.core import BatchedEnv
-from hyrl_mj import Chart, Learning, Mirror, Outcome, Scene, mjcf
+from hyrl_mj import Chart, Learning, Mirror, Outcome, Scene
+from hyrl_mj import mjcf
 
 
 class Wasp(hyrl_mj.Task):

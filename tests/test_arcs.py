@@ -9,7 +9,7 @@ from planted import decisions, halves, ideal_controller, sign_policy
 from hyrl_mj import BadArtifact, BadInput, Run
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.policies.controllers import PolicyController
-from hyrl_mj.run_arcs import noisy_arcs, replay_arcs, replay_starts
+from hyrl_mj.runs.arcs import noisy_arcs, replay_arcs, replay_starts
 from hyrl_mj.viz.shows import replay_shows
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from sentences import assert_one_sentence_about
 
-from hyrl_mj import BadArtifact, artifacts
+from hyrl_mj import BadArtifact
+from hyrl_mj.files import artifacts
 
 ARRAYS = {"a": np.arange(500.0).reshape(50, 10), "name": np.array("word"), "flag": np.array([True])}
 CONTENT = {"x": 1.5, "items": [1, 2, 3]}

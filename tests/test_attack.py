@@ -19,17 +19,17 @@ HERE = str(Path(__file__).parent)
 # Weaknesses that are planted, and the attacks that must find them.
 PLANTED = {
     "crashes": (
-        "import re; from hyrl_mj.manifest import FILES, Manifest\n"
+        "import re; from hyrl_mj.files.manifest import FILES, Manifest\n"
         "def there(self, stage):\n"
         "    names = [path.relative_to(self.folder).as_posix() for path in self.folder.rglob('*')]\n"
         "    return any(re.fullmatch(FILES[stage], name) for name in names)\n"
         "Manifest.is_done = there"
     ),
-    "artifacts": "from hyrl_mj.manifest import Manifest; Manifest.checked = lambda self, path: path",
+    "artifacts": "from hyrl_mj.files.manifest import Manifest; Manifest.checked = lambda self, path: path",
 }
 # Mends that are taken out, by a generated description that finds it. What would take a minute has a second.
 OPENED = {
-    "spec 4226648945": "from hyrl_mj import trust; trust.is_received = lambda: False",
+    "spec 4226648945": "from hyrl_mj.files import trust; trust.is_received = lambda: False",
     "agent 2362031800": (
         "from hyrl_mj.policies import pickled\n"
         "pickled.arrays = lambda content: {str(name): None for name, _ in pickled.read(content).items}",

@@ -15,17 +15,18 @@ from planted import (
     sign_policy,
 )
 
-from hyrl_mj import BadInput, Noise, Outcome, Recorded, Sample, cores, simulate
+from hyrl_mj import BadInput, Noise, Outcome, Recorded, Sample, simulate
 from hyrl_mj.game import NEVER, Game
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.policies import PolicyController
-from hyrl_mj.run_directory import Run
+from hyrl_mj.runs.directory import Run
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import Programmes, Rules, closed_loop
 from hyrl_mj.stages.attacks import POPULATION, Budget, _Search, attack, attack_starts
 from hyrl_mj.stages.episodes import Regions
 from hyrl_mj.stages.hybrid import HybridController
 from hyrl_mj.stages.partition import PartPolicy
+from hyrl_mj.system import cores
 
 EPS = 0.1
 ON_THE_LEFT = np.array([[0.0, 1.0], [0.05, 1.0], [0.1, 1.0], [0.0, 1.02]])

@@ -12,9 +12,9 @@ import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, load_run
 from hyrl_mj.game import AttackCount, Robustness
 from hyrl_mj.pipeline import ExamineOptions, examine_run, run_stage
-from hyrl_mj.run_arcs import noisy_arcs
-from hyrl_mj.run_directory import Run
-from hyrl_mj.verdict import FAILED, HELD, WEAK, Verdict
+from hyrl_mj.runs.arcs import noisy_arcs
+from hyrl_mj.runs.directory import Run
+from hyrl_mj.runs.verdict import FAILED, HELD, WEAK, Verdict
 from hyrl_mj.viz.commands import commands
 from hyrl_mj.viz.report import render
 from hyrl_mj.viz.shows import replay_shows

@@ -9,8 +9,9 @@ import pytest
 from dm_control.mujoco.wrapper import core
 
 import hyrl_mj
-from hyrl_mj import BadInput, Outcome, mjcf, mujoco_log
+from hyrl_mj import BadInput, Outcome
 from hyrl_mj.envs import BatchedEnv
+from hyrl_mj.physics import mjcf, mujoco_log
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import SPARING, check_task, trial

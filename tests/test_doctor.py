@@ -10,8 +10,9 @@ import pytest
 from gl import needs_gl
 
 import hyrl_mj
-from hyrl_mj import doctor, mjcf
+from hyrl_mj.cli import doctor
 from hyrl_mj.errors import NoRenderer
+from hyrl_mj.physics import mjcf
 
 
 @pytest.fixture
@@ -23,7 +24,7 @@ def healthy(monkeypatch):
 
 def test_versions_without_importing():
     code = (
-        "import sys; from hyrl_mj import doctor; lines, missing = doctor.versions();"
+        "import sys; from hyrl_mj.cli import doctor; lines, missing = doctor.versions();"
         "print(*lines, sep='\\n'); print('missing:', missing);"
         "print('imported:', {'torch', 'stable_baselines3', 'mediapy', 'matplotlib'} & set(sys.modules))"
     )

@@ -17,15 +17,17 @@ import pytest
 from attacks import doors
 from command_line import call
 
-from hyrl_mj import mjcf, streams, trust
-from hyrl_mj.chart import Chart
 from hyrl_mj.environments import from_gymnasium
 from hyrl_mj.environments.making import from_spec
 from hyrl_mj.errors import LONGEST, BadInput
 from hyrl_mj.fields import read_field
 from hyrl_mj.fields.driving import Driving
+from hyrl_mj.files import trust
+from hyrl_mj.physics import mjcf
 from hyrl_mj.policies import pickled
-from hyrl_mj.sweeps import Common, Row, Setting, Sweep
+from hyrl_mj.runs.sweeps import Common, Row, Setting, Sweep
+from hyrl_mj.sets import Chart
+from hyrl_mj.system import streams
 from hyrl_mj.tasks import ENVIRONMENT, get_task
 from hyrl_mj.viz.sweep_tables import markdown
 from hyrl_mj.viz.tables import Table
@@ -182,7 +184,7 @@ def test_a_model_of_the_users_own_is_tried_once(tmp_path, monkeypatch):
     path = tmp_path / "robot.xml"
     path.write_text("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
     assert mjcf.load(path).ngeom == 1
-    monkeypatch.setattr("hyrl_mj.limits.tried", None)  # not called again
+    monkeypatch.setattr("hyrl_mj.system.limits.tried", None)  # not called again
     mjcf.load.cache_clear()
     assert mjcf.load(path).ngeom == 1
 

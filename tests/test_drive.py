@@ -13,7 +13,8 @@ from gl import needs_gl
 from PIL import Image
 
 import hyrl_mj
-from hyrl_mj import BadInput, MlpPolicy, cli, parsing
+from hyrl_mj import BadInput, MlpPolicy, cli
+from hyrl_mj.cli import parsing
 from hyrl_mj.fields import (
     DriveOptions,
     cautions,

@@ -32,13 +32,14 @@ from gl import needs_gl
 from gymnasium.wrappers import TimeLimit
 
 import hyrl_mj
-from hyrl_mj import BadInput, Outcome, cores, from_gymnasium
+from hyrl_mj import BadInput, Outcome, from_gymnasium
 from hyrl_mj.environments import making
 from hyrl_mj.environments.instance import Instance, flat
 from hyrl_mj.learning import presets
-from hyrl_mj.mjcf import camera_of, point_of, rests
-from hyrl_mj.rendering import SceneRenderer
+from hyrl_mj.physics.mjcf import camera_of, point_of, rests
+from hyrl_mj.physics.rendering import SceneRenderer
 from hyrl_mj.simulation import Noise, Recorded, closed_loop
+from hyrl_mj.system import cores
 from hyrl_mj.tasks import check_task, described_task, reference
 from hyrl_mj.viz.replay.marks import tracked_points
 

@@ -4,7 +4,7 @@ import mujoco
 import pytest
 
 import hyrl_mj
-from hyrl_mj import mjcf
+from hyrl_mj.physics import mjcf
 from hyrl_mj.task_tests import *  # noqa: F403
 
 

@@ -17,7 +17,7 @@ from planted import Cube, decisions, plane_policy
 
 import hyrl_mj
 from hyrl_mj import BadInput, HybridController, Outcome, Scene, simulate
-from hyrl_mj.run_arcs import overview_arcs, policy_start_arcs
+from hyrl_mj.runs.arcs import overview_arcs, policy_start_arcs
 from hyrl_mj.sets import Everything, Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition

@@ -11,8 +11,8 @@ from test_gate import expert, met
 
 import hyrl_mj
 from hyrl_mj import Noise, simulate
-from hyrl_mj.chart import Chart
-from hyrl_mj.rendering import Canvas
+from hyrl_mj.physics.rendering import Canvas
+from hyrl_mj.sets import Chart
 from hyrl_mj.viz import section as section_module
 from hyrl_mj.viz.replay.marks import CRITICAL, Floor, Floors
 from hyrl_mj.viz.replay.panel import Panel, Track

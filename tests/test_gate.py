@@ -6,7 +6,8 @@ import pytest
 from planted import ChartPolicy
 
 import hyrl_mj
-from hyrl_mj import Outcome, mjcf
+from hyrl_mj import Outcome
+from hyrl_mj.physics import mjcf
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.stages import find_critical_set

@@ -8,11 +8,10 @@ import pytest
 from planted import Cube
 
 import hyrl_mj
-from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput
 from hyrl_mj.game import lattice as lattice_module
 from hyrl_mj.game.lattice import Lattice
-from hyrl_mj.sets import Grid
+from hyrl_mj.sets import Chart, Grid
 from hyrl_mj.tasks import Outcome, Task, get_task
 from hyrl_mj.tasks.vehicle import Vehicle
 

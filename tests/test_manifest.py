@@ -7,8 +7,9 @@ import threading
 
 import pytest
 
-from hyrl_mj import BadArtifact, BadInput, artifacts, manifest
-from hyrl_mj.manifest import FILES, LOCK, NAME, Manifest, check_contents, locked, may_hold
+from hyrl_mj import BadArtifact, BadInput
+from hyrl_mj.files import artifacts, manifest
+from hyrl_mj.files.manifest import FILES, LOCK, NAME, Manifest, check_contents, locked, may_hold
 
 SETTINGS = dict.fromkeys(FILES, "these")
 
@@ -147,7 +148,7 @@ def test_inputs_in_a_circle_end(folder):
 def test_a_second_process_is_told_who_works_there(tmp_path):
     code = f"""
 import pathlib, sys
-from hyrl_mj.manifest import locked
+from hyrl_mj.files.manifest import locked
 with locked(pathlib.Path({str(tmp_path)!r})):
     print("locked", flush=True)
     sys.stdin.read()

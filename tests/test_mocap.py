@@ -10,11 +10,12 @@ import pytest
 from gl import needs_gl
 from planted import ChartPolicy
 
-from hyrl_mj import BadInput, mjcf
-from hyrl_mj.chart import Chart
-from hyrl_mj.plant import Plant
+from hyrl_mj import BadInput
+from hyrl_mj.physics import mjcf
+from hyrl_mj.physics.plant import Plant
+from hyrl_mj.physics.rendering import SceneRenderer
 from hyrl_mj.policies import PolicyController
-from hyrl_mj.rendering import SceneRenderer
+from hyrl_mj.sets import Chart
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import Outcome, Scene, Task, check_task
 from hyrl_mj.viz.replay.marks import tracked_points

@@ -14,15 +14,17 @@ import pytest
 from command_line import call
 
 import hyrl_mj
-from hyrl_mj import BadArtifact, BadInput, artifacts, from_gymnasium, mjcf, trust
+from hyrl_mj import BadArtifact, BadInput, from_gymnasium
 from hyrl_mj.environments import making
 from hyrl_mj.environments.making import explained
 from hyrl_mj.fields import read_field
-from hyrl_mj.manifest import locked
+from hyrl_mj.files import artifacts, trust
+from hyrl_mj.files.manifest import locked
+from hyrl_mj.physics import mjcf
 from hyrl_mj.pipeline import sweeping
 from hyrl_mj.policies.preprocessing import Normalization
-from hyrl_mj.streams import _SEQUENCES
-from hyrl_mj.sweeps import Common, Row, Setting, Sweep
+from hyrl_mj.runs.sweeps import Common, Row, Setting, Sweep
+from hyrl_mj.system.streams import _SEQUENCES
 from hyrl_mj.tasks.scaffold import write_task
 
 ENV = "hyrl_mj/UnitCircle-v0"

@@ -9,18 +9,8 @@ import numpy as np
 import pytest
 from planted import decisions, ideal_controller, sign_policy
 
-from hyrl_mj import (
-    BadInput,
-    HybridArc,
-    Noise,
-    Run,
-    Signal,
-    cli,
-    commands,
-    parsing,
-    register_noise,
-    simulate,
-)
+from hyrl_mj import BadInput, HybridArc, Noise, Run, Signal, cli, register_noise, simulate
+from hyrl_mj.cli import commands, parsing
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.simulation.noise import _KINDS

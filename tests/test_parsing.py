@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from hyrl_mj import __version__, cli
+from hyrl_mj.cli.parsing import arguments, call, documented
 from hyrl_mj.errors import BadInput
-from hyrl_mj.parsing import arguments, call, documented
 
 
 @dataclass(frozen=True)

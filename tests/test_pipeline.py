@@ -15,7 +15,7 @@ import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput
 from hyrl_mj.pipeline import ExamineOptions, examine_run, extend_again, run_stage
 from hyrl_mj.pipeline.steps import STAGES
-from hyrl_mj.run_arcs import noisy_arcs
+from hyrl_mj.runs.arcs import noisy_arcs
 from hyrl_mj.viz.commands import beginning, commands
 
 pytestmark = pytest.mark.slow  # a planted run goes through all later stages

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from planted import euler, random_states
 
-from hyrl_mj import mjcf
 from hyrl_mj.errors import BadInput
-from hyrl_mj.plant import Plant
+from hyrl_mj.physics import mjcf
+from hyrl_mj.physics.plant import Plant
 from hyrl_mj.task_tests import random_inputs
 from hyrl_mj.tasks import get_task
 from hyrl_mj.tasks.vehicle import Vehicle

@@ -8,7 +8,8 @@ import pytest
 from planted import random_states
 from threadpoolctl import threadpool_limits
 
-from hyrl_mj import BadArtifact, BadInput, MlpPolicy, artifacts
+from hyrl_mj import BadArtifact, BadInput, MlpPolicy
+from hyrl_mj.files import artifacts
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.learning.training import build, export
 

@@ -8,7 +8,8 @@ from scored import SPACING, replays, score
 from sentences import assert_one_sentence_about
 
 import hyrl_mj
-from hyrl_mj import BadArtifact, artifacts
+from hyrl_mj import BadArtifact
+from hyrl_mj.files import artifacts
 from hyrl_mj.game.result import (
     LIMIT,
     Curve,
@@ -19,7 +20,7 @@ from hyrl_mj.game.result import (
     Wins,
 )
 from hyrl_mj.learning import preset
-from hyrl_mj.run_directory import Config
+from hyrl_mj.runs.directory import Config
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import pytest
 from gl import needs_gl
 
 from hyrl_mj import BadInput
-from hyrl_mj.rendering import Canvas, SceneRenderer
+from hyrl_mj.physics.rendering import Canvas, SceneRenderer
 
 CAMERAS = ("overhead", "chase", "three_quarter")
 POSITIONS = {"vehicle": [0.4, 0.7], "unit_circle": [2.4]}
@@ -173,7 +173,7 @@ def test_an_unknown_camera_lists_the_cameras(vehicle):
 def test_without_gl_one_message_says_what_to_install(backend):
     code = (
         "import hyrl_mj\n"
-        "from hyrl_mj.rendering import Canvas, SceneRenderer\n"
+        "from hyrl_mj.physics.rendering import Canvas, SceneRenderer\n"
         "try: SceneRenderer(hyrl_mj.get_task('vehicle').model, 64, 48)\n"
         "except hyrl_mj.NoRenderer as error: print(error)\n"
     )
@@ -195,7 +195,7 @@ def test_without_gl_one_message_says_what_to_install(backend):
 def test_who_imports_mujoco_first_gets_pictures_too():
     code = (
         "import mujoco, hyrl_mj\n"
-        "from hyrl_mj.rendering import Canvas, SceneRenderer\n"
+        "from hyrl_mj.physics.rendering import Canvas, SceneRenderer\n"
         "renderer = SceneRenderer(hyrl_mj.get_task('vehicle').model, 64, 48)\n"
         "renderer.place([0, 0], 'overhead')\n"
         "print(renderer.draw().std() > 5)\n"

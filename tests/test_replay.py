@@ -17,8 +17,8 @@ from planted import circle_controller, circle_policy, decisions, halves
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, HybridArc, HybridController, Noise, NoRenderer
-from hyrl_mj.mjcf import models_dir
-from hyrl_mj.rendering import Canvas
+from hyrl_mj.physics.mjcf import models_dir
+from hyrl_mj.physics.rendering import Canvas
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.viz import ReplayOptions

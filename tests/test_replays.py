@@ -15,11 +15,11 @@ from hyrl_mj import BadInput, Noise, pipeline
 from hyrl_mj.game import NEVER, Game
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.proof import Certificate, examination, examine, replays
+from hyrl_mj.runs.verdict import Verdict
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import NOT_STARTED, LoopSettings, closed_loop, judge, judge_task
 from hyrl_mj.tasks import Outcome
 from hyrl_mj.tasks.vehicle import Vehicle
-from hyrl_mj.verdict import Verdict
 
 FEW = {"none": 120, "uniform": 120, "alternating": 120, "worst": 60, "cells": 20}
 
@@ -297,7 +297,7 @@ def test_a_run_of_such_a_task_is_refused_before_it_trains(kind, tmp_path, monkey
     with pytest.raises(BadInput, match="vehicle is not simulated as MuJoCo alone simulates it"):
         judge_task(kind())
     monkeypatch.setattr("hyrl_mj.pipeline.runs.check_task", lambda task: task)
-    monkeypatch.setattr(hyrl_mj.run_directory.Run, "task", kind())
+    monkeypatch.setattr(hyrl_mj.runs.directory.Run, "task", kind())
     with pytest.raises(BadInput, match="something keeps a memory between episodes or copies"):
         hyrl_mj.run("vehicle", preset="smoke", out=tmp_path / "run")
     assert not (tmp_path / "run" / "policy.safetensors").exists()

@@ -11,7 +11,7 @@ from planted import decisions, halves
 
 import hyrl_mj
 from hyrl_mj.learning.presets import preset
-from hyrl_mj.run_directory import Run, write_config
+from hyrl_mj.runs.directory import Run, write_config
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "reproduce_paper.py"
 spec = importlib.util.spec_from_file_location("reproduce_paper", SCRIPT)

@@ -11,7 +11,6 @@ import pytest
 from planted import UNICYCLE, ChartPolicy, Cube, Unicycle, steering_policy
 
 import hyrl_mj
-from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput
 from hyrl_mj.game import (
     Game,
@@ -29,8 +28,8 @@ from hyrl_mj.policies import PolicyController
 from hyrl_mj.proof import examine
 from hyrl_mj.proof.affine import Unbounded
 from hyrl_mj.proof.cells import Cells
-from hyrl_mj.run_directory import Run
-from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.runs.directory import Run
+from hyrl_mj.sets import Chart, Grid, GridSet
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.stages import ExtendedSets
 from hyrl_mj.stages.grounds import ByEpisodes, ByGame, mode_ground

@@ -17,9 +17,10 @@ from stable_baselines3 import DQN, PPO
 from test_agents import onnx_file, rewritten, saved, untrained
 
 import hyrl_mj
-from hyrl_mj import BadInput, MlpPolicy, artifacts, manifest
+from hyrl_mj import BadInput, MlpPolicy
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.envs.sb3_env import TaskVecEnv
+from hyrl_mj.files import artifacts, manifest
 from hyrl_mj.game.lattice import Lattice
 from hyrl_mj.game.limit import Limit
 from hyrl_mj.learning import training
@@ -27,7 +28,7 @@ from hyrl_mj.learning.presets import preset
 from hyrl_mj.learning.settings import Settings
 from hyrl_mj.pipeline.steps import STAGES
 from hyrl_mj.policies.external import read_agent, reopen_agent
-from hyrl_mj.run_arcs import noisy_arcs
+from hyrl_mj.runs.arcs import noisy_arcs
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages import Partition, boundary, with_room
 from hyrl_mj.stages.grounds import ByGame, mode_ground

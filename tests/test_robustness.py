@@ -14,7 +14,8 @@ from planted import (
     sign_policy,
 )
 
-from hyrl_mj import BadArtifact, BadInput, Noise, artifacts, simulate
+from hyrl_mj import BadArtifact, BadInput, Noise, simulate
+from hyrl_mj.files import artifacts
 from hyrl_mj.game import (
     BEATEN,
     CURVE,

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from sentences import assert_one_sentence_about
 
-from hyrl_mj import BadArtifact, BadInput, CriticalSet, artifacts
+from hyrl_mj import BadArtifact, BadInput, CriticalSet
+from hyrl_mj.files import artifacts
 from hyrl_mj.game import Maps
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import HybridArc

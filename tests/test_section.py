@@ -9,7 +9,7 @@ from planted import ChartPolicy, Cube, sphere_policy
 
 import hyrl_mj
 from hyrl_mj import find_critical_set
-from hyrl_mj.run_arcs import overview_arcs
+from hyrl_mj.runs.arcs import overview_arcs
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 import hyrl_mj
-from hyrl_mj import BadArtifact, BadInput, Outcome, artifacts
+from hyrl_mj import BadArtifact, BadInput, Outcome
+from hyrl_mj.files import artifacts
 from hyrl_mj.game import Lattice
 from hyrl_mj.learning import Settings, Training, preset, training
 from hyrl_mj.learning.options import OPTIONS, OWN
 from hyrl_mj.policies import algorithms
-from hyrl_mj.run_directory import Config
+from hyrl_mj.runs.directory import Config
 from hyrl_mj.sets import MOST_NODES, Grid
 
 NAN, INF = math.nan, math.inf

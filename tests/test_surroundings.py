@@ -130,7 +130,7 @@ def test_every_width_can_be_read(columns):
 def test_a_narrow_terminal_gets_no_bars(columns, shown):
     ours, theirs = os.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
-    code = "from hyrl_mj.streams import Streams; print(Streams().has_room_for_bars)"
+    code = "from hyrl_mj.system.streams import Streams; print(Streams().has_room_for_bars)"
     done = subprocess.run(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=theirs, text=True,
         env={**os.environ, "PYTHONPATH": str(PACKAGE)}, timeout=60,
@@ -179,7 +179,7 @@ def test_a_working_directory_that_is_gone_is_named(tmp_path):
 # An interrupt leaves a lock locked, which the end of the block then waits for.
 STUCK = """
 import threading, time
-from hyrl_mj.streams import Streams
+from hyrl_mj.system.streams import Streams
 
 def command():
     lock = threading.Lock()
@@ -197,7 +197,7 @@ raise SystemExit(Streams().run(command))
 # An interrupt strikes where Python ignores errors, and the work goes on.
 DEAF = """
 import time
-from hyrl_mj.streams import Streams
+from hyrl_mj.system.streams import Streams
 
 class Slow:
     def __del__(self):

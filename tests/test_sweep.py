@@ -20,24 +20,18 @@ from attacks.doors import plant_modules
 from command_line import call
 
 import hyrl_mj
-from hyrl_mj import (
-    BadArtifact,
-    BadInput,
-    NoRenderer,
-    artifacts,
-    cores,
-    mjcf,
-    pipeline,
-    progress,
-    sweeps,
-)
+from hyrl_mj import BadArtifact, BadInput, NoRenderer, pipeline
+from hyrl_mj.files import artifacts
 from hyrl_mj.learning import changed, preset
+from hyrl_mj.physics import mjcf
 from hyrl_mj.pipeline import cluster, report
 from hyrl_mj.pipeline.board import Board
 from hyrl_mj.policies import PolicyController
-from hyrl_mj.run_directory import Run, write_config
+from hyrl_mj.runs import sweeps
+from hyrl_mj.runs.directory import Run, write_config
+from hyrl_mj.runs.sweeps import DONE, Common, Row, Setting, Sweep
 from hyrl_mj.stages import Regions, episodes, noisy_episodes
-from hyrl_mj.sweeps import DONE, Common, Row, Setting, Sweep
+from hyrl_mj.system import cores, progress
 from hyrl_mj.viz import commands, sweep_tables
 
 CIRCLE = Setting("unit_circle", "", 0.1)
@@ -440,7 +434,7 @@ def test_a_machine_that_keeps_its_files_is_told_of(tmp_path):
 
 
 def test_a_run_directory_that_is_held_is_waited_for(monkeypatch, tmp_path):
-    from hyrl_mj.manifest import Busy
+    from hyrl_mj.files.manifest import Busy
 
     tries = []
 

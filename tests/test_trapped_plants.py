@@ -194,7 +194,7 @@ def test_an_end_with_a_memory_is_refused(tmp_path, monkeypatch, code):
 
 
 def test_a_callback_is_a_memory(vehicle):
-    from hyrl_mj import memory
+    from hyrl_mj.physics import memory
 
     assert memory.remembers(vehicle.model) == ""
     try:

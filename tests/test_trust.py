@@ -12,11 +12,12 @@ from command_line import call
 from planted import believe
 
 import hyrl_mj
-from hyrl_mj import BadArtifact, BadInput, HybridArc, artifacts, trust
-from hyrl_mj.manifest import check_contents
+from hyrl_mj import BadArtifact, BadInput, HybridArc
+from hyrl_mj.files import artifacts, trust
+from hyrl_mj.files.manifest import check_contents
 from hyrl_mj.pipeline import run_stage
 from hyrl_mj.policies import algorithms
-from hyrl_mj.run_directory import Run, write_config
+from hyrl_mj.runs.directory import Run, write_config
 from hyrl_mj.sets import GridSet
 from hyrl_mj.tasks import described_task
 

@@ -7,12 +7,13 @@ import pytest
 from planted import one_way_policy
 from scored import SPACING, replays, score
 
-from hyrl_mj import BadArtifact, artifacts
+from hyrl_mj import BadArtifact
+from hyrl_mj.files import artifacts
 from hyrl_mj.game import LIMIT, AttackCount, Curve, EpisodeCount, GameResult, Profile, Robustness
 from hyrl_mj.policies import PolicyController
+from hyrl_mj.runs.verdict import FAILED, HELD, PROVED, WEAK, WON, Verdict
 from hyrl_mj.simulation import simulate
 from hyrl_mj.stages import Arrivals, ModeResult, Retraining
-from hyrl_mj.verdict import FAILED, HELD, PROVED, WEAK, WON, Verdict
 from hyrl_mj.viz.tables import print_verdict
 
 EPS = 0.1

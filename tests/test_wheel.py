@@ -52,9 +52,13 @@ def test_the_wheel_holds_package_models_and_licence(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     models = {"unit_circle.xml", "vehicle.xml", "common/scene.xml"}
     assert {f"hyrl_mj/models/{name}" for name in models} <= names
-    assert {"hyrl_mj/py.typed", "hyrl_mj/cli.py", "hyrl_mj/tasks/vehicle.py"} <= names
-    templates = {"report.html", "report.css", "controller.py"}
-    assert {f"hyrl_mj/templates/{name}" for name in templates} <= names
+    assert {"hyrl_mj/py.typed", "hyrl_mj/cli/main.py", "hyrl_mj/tasks/vehicle.py"} <= names
+    templates = {
+        "viz/templates/report.html",
+        "viz/templates/report.css",
+        "export/templates/controller.py",
+    }
+    assert {f"hyrl_mj/{name}" for name in templates} <= names
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert not any(name.startswith(("tests/", "scripts/", "models/")) for name in names)
 

@@ -14,11 +14,12 @@ import numpy as np
 
 sys.path.append(str(Path(__file__).parents[2]))  # of the package, if it is not installed
 
-from hyrl_mj import limits, trust
 from hyrl_mj.environments.instance import Instance
 from hyrl_mj.environments.opening import Description, register, with_arrays
 from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.errors import BadInput
+from hyrl_mj.files import trust
+from hyrl_mj.system import limits
 
 
 def main() -> None:

@@ -22,7 +22,7 @@ from typing import Any
 from hyrl_mj.environments.opening import Description, preload
 from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.errors import BadInput, HyrlError, brief
-from hyrl_mj.forked import own_end
+from hyrl_mj.system.forked import own_end
 
 
 class Fresh:

@@ -11,8 +11,6 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from hyrl_mj import mjcf
-from hyrl_mj.chart import Chart
 from hyrl_mj.environments import trials
 from hyrl_mj.environments.coordinates import (
     all_names,
@@ -38,6 +36,8 @@ from hyrl_mj.environments.specification import (
     EnvironmentSpec,
 )
 from hyrl_mj.errors import BadInput
+from hyrl_mj.physics import mjcf
+from hyrl_mj.sets import Chart
 
 # Samples of an episode of an environment that never ends by itself.
 STEPS_WITHOUT_END = 1_000

@@ -20,7 +20,6 @@ from weakref import WeakSet, WeakValueDictionary
 import gymnasium as gym
 import numpy as np
 
-from hyrl_mj import artifacts, limits, trust
 from hyrl_mj.environments.inspection import inspect
 from hyrl_mj.environments.instance import kept_generators
 from hyrl_mj.environments.opening import (
@@ -35,7 +34,9 @@ from hyrl_mj.environments.opening import (
 from hyrl_mj.environments.specification import FORMS
 from hyrl_mj.environments.task import EnvironmentTask
 from hyrl_mj.errors import BadInput, brief, check_seed, described, printable, unknown
+from hyrl_mj.files import artifacts, trust
 from hyrl_mj.ranges import Integer, refused
+from hyrl_mj.system import limits
 from hyrl_mj.tasks import ENVIRONMENT, Task, get_task
 
 # The longest episode, and the widest coordinate of a chart [m, rad].

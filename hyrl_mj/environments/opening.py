@@ -20,12 +20,12 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 
-from hyrl_mj import mjcf, mujoco_log
-from hyrl_mj.artifacts import digest
 from hyrl_mj.environments.observations import parts_of
 from hyrl_mj.errors import BadInput, brief
-from hyrl_mj.plant import Plant
-from hyrl_mj.trust import current_folder
+from hyrl_mj.files.artifacts import digest
+from hyrl_mj.files.trust import current_folder
+from hyrl_mj.physics import mjcf, mujoco_log
+from hyrl_mj.physics.plant import Plant
 
 # Packages that offer environments, with the extra that brings each.
 PACKAGES = {"gymnasium_robotics": "robotics", "ogbench": "robotics", "shimmy": "dm-control"}

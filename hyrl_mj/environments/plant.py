@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from hyrl_mj import mjcf
 from hyrl_mj.environments.pool import Pool
 from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.errors import BadInput
-from hyrl_mj.plant import MOST, checked, checked_inputs
+from hyrl_mj.physics import mjcf
+from hyrl_mj.physics.plant import MOST, checked, checked_inputs
 from hyrl_mj.ranges import Integer
 from hyrl_mj.tasks import Outcome
 
@@ -24,7 +24,7 @@ _NUMBERS = count()
 
 
 class EnvironmentPlant:
-    """n runs of an environment, with the interface of `hyrl_mj.plant.Plant`.
+    """n runs of an environment, with the interface of `hyrl_mj.physics.plant.Plant`.
 
     A run is played from its start: nothing is saved or restored on its way. `observe` gives it the noise of a
     sample before it is stepped; a run that is stepped without has none.

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from hyrl_mj.chart import Chart
 from hyrl_mj.environments.expressions import Expression, Path
 from hyrl_mj.environments.opening import Description
 from hyrl_mj.errors import BadInput
+from hyrl_mj.sets import Chart
 from hyrl_mj.tasks import Outcome
 
 TERMINATED = "terminated"

@@ -11,7 +11,6 @@ from typing import Any, Self
 import mujoco
 import numpy as np
 
-from hyrl_mj import mjcf
 from hyrl_mj.environments.fingerprint import of_model
 from hyrl_mj.environments.instance import Instance
 from hyrl_mj.environments.observations import parts_of
@@ -21,6 +20,7 @@ from hyrl_mj.environments.pool import Played, Pool
 from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.environments.trials import goes_on
 from hyrl_mj.errors import BadInput
+from hyrl_mj.physics import mjcf
 from hyrl_mj.tasks import ANY, SPARING, Learning, Outcome, Scene, Task, get_task
 
 # Where every episode takes all of its samples, runs from all nodes of the chart take about so many together.

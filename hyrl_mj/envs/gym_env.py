@@ -10,9 +10,9 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from hyrl_mj import mjcf
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.physics import mjcf
 from hyrl_mj.simulation import AnyNoise
 from hyrl_mj.tasks import Outcome, Task, described_task
 
@@ -99,7 +99,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         if self.render_mode is None:
             return None
         if self._renderer is None:
-            from hyrl_mj.rendering import SceneRenderer
+            from hyrl_mj.physics.rendering import SceneRenderer
 
             task = self.core.task
             self._renderer = SceneRenderer(task.model, *self._size, mocap=task.mocap)

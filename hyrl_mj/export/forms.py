@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from hyrl_mj import artifacts
 from hyrl_mj.errors import BadInput, brief, unknown
 from hyrl_mj.export.source import write_function
+from hyrl_mj.files import artifacts
 from hyrl_mj.policies import ACTIVATIONS, Controller, MlpPolicy
 from hyrl_mj.sets import Cloud, Everything, Grid, GridSet, StateSet
 from hyrl_mj.stages import ON_EDGE, HybridController
@@ -22,7 +22,7 @@ from hyrl_mj.tracing import BATCH, trace
 if TYPE_CHECKING:
     import onnx
 
-TEMPLATE = Path(__file__).parents[1] / "templates" / "controller.py"
+TEMPLATE = Path(__file__).parent / "templates" / "controller.py"
 # The task's part of the template begins and ends with these; the rest of a controller that is no
 # `HybridController` begins where the template's own does.
 BEGIN, END = "# ---- the task", "# ---- the controller\n"

@@ -9,9 +9,9 @@ from functools import cached_property
 import mujoco
 import numpy as np
 
-from hyrl_mj import mjcf
-from hyrl_mj.chart import Chart
 from hyrl_mj.fields.modes import SIDE_NAMES, decoded
+from hyrl_mj.physics import mjcf
+from hyrl_mj.sets import Chart
 from hyrl_mj.tasks import Field, FieldTask, Layouts, Scene, length
 
 # How far around posts, starts and goals the world reaches [m], and how much of that a camera shows.

@@ -20,8 +20,8 @@ from hyrl_mj.game.resolution import (
     resolves,
     transitions,
 )
-from hyrl_mj.progress import progress_bar
 from hyrl_mj.sets import Cloud, Grid, Nodes
+from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Outcome, Task
 
 # A sample that ends this close to a node, in cells, ends on it.

@@ -9,11 +9,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from hyrl_mj import artifacts
-from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadArtifact
+from hyrl_mj.files import artifacts
 from hyrl_mj.game.counts import AttackCount, EpisodeCount, ReplayCount
-from hyrl_mj.sets import Grid
+from hyrl_mj.sets import Chart, Grid
 
 # Name of the limit, a controller that is scored beside the examined ones.
 LIMIT = "limit"

@@ -9,7 +9,7 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.learning.settings import Training
 from hyrl_mj.learning.training import build, export, threads
 from hyrl_mj.policies import ALGORITHMS, MlpPolicy, Policy
-from hyrl_mj.progress import progress_bar
+from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Task
 
 # A function that draws n chart points (n, d).

@@ -30,8 +30,8 @@ from hyrl_mj.policies import (
     algorithms,
     infer_algorithm,
 )
-from hyrl_mj.progress import progress_bar
 from hyrl_mj.simulation import Noise
+from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Outcome, Task
 
 Score = tuple[float, ...]

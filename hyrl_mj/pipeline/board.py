@@ -6,8 +6,8 @@ import sys
 import time
 from typing import Any, Self
 
-from hyrl_mj.progress import Say
-from hyrl_mj.sweeps import DONE, Row
+from hyrl_mj.runs.sweeps import DONE, Row
+from hyrl_mj.system.progress import Say
 
 
 class Board:

@@ -12,12 +12,12 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-from hyrl_mj import cores
 from hyrl_mj.errors import BadInput, HyrlError, brief
+from hyrl_mj.files.manifest import Busy
 from hyrl_mj.gl import spare_matplotlib
-from hyrl_mj.manifest import Busy
 from hyrl_mj.pipeline.runs import RunOptions, run
-from hyrl_mj.sweeps import Row
+from hyrl_mj.runs.sweeps import Row
+from hyrl_mj.system import cores
 
 # Seconds within which an address must answer, and for which a killed process may keep a run directory.
 PATIENCE, HELD = 7.0, 30.0

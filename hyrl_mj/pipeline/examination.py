@@ -10,9 +10,8 @@ import numpy as np
 from hyrl_mj.errors import BadInput
 from hyrl_mj.game import LATTICE, OVER, UNWINNABLE, EpisodeCount, Maps, Robustness
 from hyrl_mj.policies import Controller
-from hyrl_mj.progress import Say
 from hyrl_mj.proof import examine
-from hyrl_mj.run_directory import Run
+from hyrl_mj.runs.directory import Run
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import Noise
 from hyrl_mj.stages import (
@@ -25,6 +24,7 @@ from hyrl_mj.stages import (
     noisy_episodes,
     shown_arcs,
 )
+from hyrl_mj.system.progress import Say
 from hyrl_mj.tasks import SPARING
 from hyrl_mj.viz import robustness_sentence
 

@@ -13,16 +13,16 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.files.manifest import locked
 from hyrl_mj.learning import Settings, Training, changed, preset
-from hyrl_mj.manifest import locked
 from hyrl_mj.pipeline.examination import examination_plan
 from hyrl_mj.pipeline.steps import DIAGNOSIS, STAGES, extended_sets_stage, run_stage
 from hyrl_mj.policies import ALGORITHMS, FUNCTION, AnyPolicy, algorithms, read_agent
-from hyrl_mj.progress import Say
-from hyrl_mj.run_directory import Run, load_run, opened, write_config
+from hyrl_mj.runs.directory import Run, load_run, opened, write_config
 from hyrl_mj.sets import coarseness
 from hyrl_mj.simulation import judge_task
 from hyrl_mj.stages import Arrivals
+from hyrl_mj.system.progress import Say
 from hyrl_mj.tasks import Task, check_task, get_task
 from hyrl_mj.viz import beginning
 

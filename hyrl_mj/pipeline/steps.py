@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 from threadpoolctl import threadpool_limits
 
-from hyrl_mj import cores, mujoco_log
 from hyrl_mj.errors import BadInput, NoRenderer, unknown
 from hyrl_mj.game import Lattice, Limit, Robustness
 from hyrl_mj.learning import Settings
+from hyrl_mj.physics import mujoco_log
 from hyrl_mj.pipeline.examination import (
     USUAL,
     ExamineOptions,
@@ -22,9 +22,9 @@ from hyrl_mj.pipeline.examination import (
     examine_stage,
 )
 from hyrl_mj.policies import Agent, PolicyController, algorithms
-from hyrl_mj.progress import Say
-from hyrl_mj.run_arcs import replay_arcs
-from hyrl_mj.run_directory import Run
+from hyrl_mj.runs.arcs import replay_arcs
+from hyrl_mj.runs.directory import Run
+from hyrl_mj.runs.verdict import mode_sentence
 from hyrl_mj.stages import (
     Arrivals,
     Held,
@@ -40,7 +40,8 @@ from hyrl_mj.stages import (
     table_for,
     with_room,
 )
-from hyrl_mj.verdict import mode_sentence
+from hyrl_mj.system import cores
+from hyrl_mj.system.progress import Say
 from hyrl_mj.viz import ReplayOptions, replay_sentence
 
 if TYPE_CHECKING:

@@ -10,16 +10,16 @@ from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
-from hyrl_mj import sweeps
 from hyrl_mj.errors import BadInput, check_bound, check_seed
+from hyrl_mj.files.manifest import locked
 from hyrl_mj.learning import setting_value
-from hyrl_mj.manifest import locked
 from hyrl_mj.pipeline import cluster
 from hyrl_mj.pipeline.board import Board
 from hyrl_mj.pipeline.runs import RunOptions, complete, settings_of
-from hyrl_mj.progress import Say
 from hyrl_mj.ranges import Integer, Number
-from hyrl_mj.sweeps import DONE, MOST_RUNS, OPEN, STOPPED, Common, Row, Setting, Sweep
+from hyrl_mj.runs import sweeps
+from hyrl_mj.runs.sweeps import DONE, MOST_RUNS, OPEN, STOPPED, Common, Row, Setting, Sweep
+from hyrl_mj.system.progress import Say
 from hyrl_mj.tasks import check_task, get_task, reference
 
 

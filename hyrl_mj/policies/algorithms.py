@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hyrl_mj import trust
 from hyrl_mj.errors import BadInput, brief, unknown
+from hyrl_mj.files import trust
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from hyrl_mj import artifacts
 from hyrl_mj.errors import BadArtifact, BadInput, check_seed, unknown
+from hyrl_mj.files import artifacts
 from hyrl_mj.policies import algorithms
 from hyrl_mj.policies.functions import from_callable
 from hyrl_mj.policies.memoryless import answers, check_memoryless

@@ -13,8 +13,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from hyrl_mj import artifacts
 from hyrl_mj.errors import BadArtifact, BadInput
+from hyrl_mj.files import artifacts
 from hyrl_mj.policies.algorithms import ALGORITHMS, Algorithm
 from hyrl_mj.tasks import Task, get_task, task_names
 

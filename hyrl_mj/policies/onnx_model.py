@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from hyrl_mj import artifacts, limits
 from hyrl_mj.errors import BadArtifact, BadInput
+from hyrl_mj.files import artifacts
 from hyrl_mj.policies.functions import FunctionPolicy
+from hyrl_mj.system import limits
 from hyrl_mj.tasks import Task
 
 # Limit on a file [bytes]: the largest MLP policies take a few megabytes.

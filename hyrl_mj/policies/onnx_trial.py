@@ -134,7 +134,7 @@ def _try(answer: Any, columns: int, rows: int, one: bool) -> None:
 def main() -> None:
     seconds, memory, columns, rows = map(int, sys.argv[1:])
     content = sys.stdin.buffer.read()
-    limits = runpy.run_path(str(Path(__file__).parents[1] / "limits.py"))
+    limits = runpy.run_path(str(Path(__file__).parents[1] / "system" / "limits.py"))
     limits["limit"](seconds, memory)
     result: dict[str, Any]
     try:

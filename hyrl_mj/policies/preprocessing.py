@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hyrl_mj import archives, artifacts
 from hyrl_mj.errors import BadArtifact, BadInput
+from hyrl_mj.files import archives, artifacts
 from hyrl_mj.policies.mlp import MlpPolicy, ObservationPolicy, Policy, SampledPolicy
 from hyrl_mj.tasks import Task
 

@@ -12,8 +12,8 @@ from zipfile import is_zipfile
 
 import numpy as np
 
-from hyrl_mj import archives, artifacts
 from hyrl_mj.errors import BadArtifact, printable
+from hyrl_mj.files import archives, artifacts
 from hyrl_mj.policies import sb3_metadata, torch_file
 from hyrl_mj.policies.algorithms import ALGORITHMS
 from hyrl_mj.policies.mlp import ACTIVATIONS, TORCH_NAMES, MlpPolicy, check_kind, layer_names

@@ -12,8 +12,8 @@ from zipfile import ZIP_STORED, ZipFile
 
 import numpy as np
 
-from hyrl_mj import archives
 from hyrl_mj.errors import BadArtifact
+from hyrl_mj.files import archives
 from hyrl_mj.policies import pickled
 from hyrl_mj.policies.pickled import Call
 

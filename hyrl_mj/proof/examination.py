@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from hyrl_mj import cores
 from hyrl_mj.game import (
     CURVE,
     LARGEST,
@@ -34,13 +33,14 @@ from hyrl_mj.game import (
     share,
 )
 from hyrl_mj.policies import BLAS, Controller
-from hyrl_mj.progress import progress_bar
 from hyrl_mj.proof.cells import decides
 from hyrl_mj.proof.certificate import Certificate, Proved
 from hyrl_mj.proof.counterexamples import Broken, attack
 from hyrl_mj.proof.replays import Replays, play
 from hyrl_mj.sets import GridSet
 from hyrl_mj.simulation import LoopSettings, closed_loop
+from hyrl_mj.system import cores
+from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Task
 
 # Approximate number of episodes without noise.

@@ -4,6 +4,7 @@ A `GridSet` holds it at the nodes of a `Grid`, or of a `Cloud`, whose nodes are 
 dimensions; `covering` and `resolving` say which of them a chart gets.
 """
 
+from hyrl_mj.sets.chart import Chart
 from hyrl_mj.sets.choice import MOST_DIMENSIONS, coarseness, covering, enough_cells, resolving
 from hyrl_mj.sets.clouds import MOST_NODES, Cloud
 from hyrl_mj.sets.grids import Grid, within_reach
@@ -13,6 +14,7 @@ from hyrl_mj.sets.planes import surface_distance
 __all__ = [
     "MOST_DIMENSIONS",
     "MOST_NODES",
+    "Chart",
     "Cloud",
     "Complement",
     "Everything",

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput
+from hyrl_mj.sets.chart import Chart
 from hyrl_mj.sets.clouds import MOST_NODES, Cloud
 from hyrl_mj.sets.grids import Grid
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput
 from hyrl_mj.sets import planes
+from hyrl_mj.sets.chart import Chart
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree

@@ -9,8 +9,8 @@ from functools import cached_property, partial, reduce
 
 import numpy as np
 
-from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput
+from hyrl_mj.sets.chart import Chart
 from hyrl_mj.sets.clouds import MOST_NODES
 
 

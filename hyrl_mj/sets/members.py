@@ -9,8 +9,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from hyrl_mj.artifacts import MOST_ROWS
 from hyrl_mj.errors import BadInput
+from hyrl_mj.files.artifacts import MOST_ROWS
 from hyrl_mj.sets.clouds import Cloud, evenly
 from hyrl_mj.sets.grids import Grid
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hyrl_mj.chart import Chart
+from hyrl_mj.sets.chart import Chart
 
 # Steps of the fit of a plane between two classes of points, and the weight of the size of its normal.
 FITS, RIDGE = 12, 1e-4

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hyrl_mj.artifacts import Saved
 from hyrl_mj.errors import BadInput, check_seed
+from hyrl_mj.files.artifacts import Saved
 from hyrl_mj.policies import Controller, Policy, PolicyController, as_controller, check_modes
 from hyrl_mj.simulation.noise import AnyNoise, Noise
 from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop

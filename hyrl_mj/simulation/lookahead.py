@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.plant import Plant
+from hyrl_mj.physics.plant import Plant
 from hyrl_mj.policies import Controller, answer, nothing_past, remembering
 from hyrl_mj.simulation.noise import NOT_STARTED, Sample, Signal, register_noise
 from hyrl_mj.tasks import Outcome, Task

@@ -14,7 +14,7 @@ from typing import Literal, Self, TypeVar, get_args
 import numpy as np
 
 from hyrl_mj.errors import BadInput, brief, check_bound, unknown
-from hyrl_mj.plant import Plant
+from hyrl_mj.physics.plant import Plant
 from hyrl_mj.policies import Controller
 from hyrl_mj.tasks import Task
 

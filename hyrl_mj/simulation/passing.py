@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hyrl_mj.plant import Plant
+from hyrl_mj.physics.plant import Plant
 from hyrl_mj.tasks import Task, wrapped
 
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from hyrl_mj import mjcf
 from hyrl_mj.errors import BadInput
+from hyrl_mj.physics import mjcf
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop
 from hyrl_mj.tasks import Outcome, Task

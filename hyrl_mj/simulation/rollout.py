@@ -5,11 +5,11 @@ from itertools import count
 
 import numpy as np
 
-from hyrl_mj.plant import Plant
+from hyrl_mj.physics.plant import Plant
 from hyrl_mj.policies import Asked, Controller, nothing_past, remembering
-from hyrl_mj.progress import progress_bar
 from hyrl_mj.simulation.noise import NOT_STARTED, AnyNoise, Sample, Signal, drawn, signal_for
 from hyrl_mj.simulation.passing import Follower, Passing
+from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Outcome, Task
 
 # Samples for which a record has room at first; then it doubles.

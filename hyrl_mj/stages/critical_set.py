@@ -7,11 +7,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from hyrl_mj.artifacts import Saved
-from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.files.artifacts import Saved
 from hyrl_mj.policies import Policy
-from hyrl_mj.sets import Nodes, covering, surface_distance
+from hyrl_mj.sets import Chart, Nodes, covering, surface_distance
 from hyrl_mj.simulation import WayRuns, policy_runs, way_runs
 from hyrl_mj.stages.search import critical_points
 from hyrl_mj.tasks import SEARCHES, Task

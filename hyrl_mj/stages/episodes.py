@@ -10,15 +10,15 @@ from itertools import product
 
 import numpy as np
 
-from hyrl_mj import cores
 from hyrl_mj.errors import BadInput, check_seed
 from hyrl_mj.game import EpisodeCount
-from hyrl_mj.plant import Plant
+from hyrl_mj.physics.plant import Plant
 from hyrl_mj.policies import Controller
-from hyrl_mj.progress import progress_bar
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import LoopSettings, Noise, closed_loop, judge
 from hyrl_mj.stages.critical_set import check_points, distance_to
+from hyrl_mj.system import cores
+from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Outcome, Task
 
 # Episodes that are simulated at once, which limits the memory.

@@ -9,8 +9,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from hyrl_mj.artifacts import Saved
 from hyrl_mj.errors import BadInput
+from hyrl_mj.files.artifacts import Saved
 from hyrl_mj.game import Limit, nearest_of
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import Cloud, Grid, GridSet

@@ -7,8 +7,7 @@ from itertools import product
 
 import numpy as np
 
-from hyrl_mj.chart import Chart
-from hyrl_mj.sets import Cloud, GridSet, Nodes
+from hyrl_mj.sets import Chart, Cloud, GridSet, Nodes
 from hyrl_mj.stages.critical_set import ranges
 from hyrl_mj.tasks import Task
 

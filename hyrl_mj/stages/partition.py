@@ -9,9 +9,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from hyrl_mj import artifacts
-from hyrl_mj.artifacts import Saved
 from hyrl_mj.errors import BadInput
+from hyrl_mj.files import artifacts
+from hyrl_mj.files.artifacts import Saved
 from hyrl_mj.game import NEVER, Limit
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import GridSet, Nodes, resolving

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from hyrl_mj import artifacts
+from hyrl_mj.files import artifacts
 from hyrl_mj.policies import Policy, PolicyController
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import Outcome, Task

@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from hyrl_mj.artifacts import Saved
 from hyrl_mj.errors import BadInput
+from hyrl_mj.files.artifacts import Saved
 from hyrl_mj.game import nearest_of
-from hyrl_mj.progress import progress_bar
 from hyrl_mj.sets import Grid, Nodes
+from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Outcome, Task
 
 if TYPE_CHECKING:

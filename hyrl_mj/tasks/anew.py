@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hyrl_mj import mujoco_log
+from hyrl_mj.physics import mujoco_log
 from hyrl_mj.tasks.description import Outcome
 
 if TYPE_CHECKING:

@@ -10,11 +10,11 @@ from typing import Any, Self
 import mujoco
 import numpy as np
 
-from hyrl_mj import mjcf
-from hyrl_mj.artifacts import digest
-from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput, check_bound
-from hyrl_mj.plant import Plant, input_limits
+from hyrl_mj.files.artifacts import digest
+from hyrl_mj.physics import mjcf
+from hyrl_mj.physics.plant import Plant, input_limits
+from hyrl_mj.sets import Chart
 from hyrl_mj.tasks.anew import begins_anew
 from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.effort import Effort

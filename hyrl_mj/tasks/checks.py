@@ -5,11 +5,10 @@ import re
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hyrl_mj import memory, mjcf
-from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput, brief, line_in, unknown
+from hyrl_mj.physics import memory, mjcf
 from hyrl_mj.ranges import Flag, Integer, Number, Optional, Rule, Several, Text
-from hyrl_mj.sets import MOST_DIMENSIONS
+from hyrl_mj.sets import MOST_DIMENSIONS, Chart
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.mirrored import try_mirror

@@ -4,8 +4,8 @@ from functools import cached_property
 
 import numpy as np
 
-from hyrl_mj import mjcf
-from hyrl_mj.chart import Chart
+from hyrl_mj.physics import mjcf
+from hyrl_mj.sets import Chart
 from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.pillar import PillarTask
 from hyrl_mj.tasks.registry import register

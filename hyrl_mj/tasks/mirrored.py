@@ -6,8 +6,8 @@ from itertools import product
 
 import numpy as np
 
-from hyrl_mj import mjcf, mujoco_log
 from hyrl_mj.errors import BadInput
+from hyrl_mj.physics import mjcf, mujoco_log
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import Outcome
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from hyrl_mj import mjcf
 from hyrl_mj.errors import BadInput
+from hyrl_mj.physics import mjcf
 
 LEFT, RIGHT, ANY = 0, 1, -1
 # A way past more obstacles has no number.

@@ -5,8 +5,8 @@ from functools import cached_property
 
 import numpy as np
 
-from hyrl_mj import mjcf
-from hyrl_mj.chart import Chart
+from hyrl_mj.physics import mjcf
+from hyrl_mj.sets import Chart
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import Outcome
 

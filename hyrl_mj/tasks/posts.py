@@ -4,7 +4,7 @@ from functools import cached_property
 
 import numpy as np
 
-from hyrl_mj import mjcf
+from hyrl_mj.physics import mjcf
 from hyrl_mj.tasks.description import Learning, Outcome
 from hyrl_mj.tasks.pillar import PillarTask
 

@@ -10,8 +10,8 @@ from types import ModuleType
 
 import gymnasium as gym
 
-from hyrl_mj import trust
 from hyrl_mj.errors import BadInput, brief, line_in, unknown
+from hyrl_mj.files import trust
 from hyrl_mj.tasks.base import Task
 
 # The group of entry points under which an installed package offers tasks: name = "its.module:Class".

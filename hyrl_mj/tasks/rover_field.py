@@ -5,7 +5,7 @@ from functools import cached_property
 import mujoco
 import numpy as np
 
-from hyrl_mj import mjcf
+from hyrl_mj.physics import mjcf
 from hyrl_mj.tasks.field import Field
 from hyrl_mj.tasks.field_robots import FieldRobot
 from hyrl_mj.tasks.registry import register

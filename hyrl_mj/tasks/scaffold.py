@@ -5,11 +5,11 @@ import re
 from importlib.util import find_spec
 from pathlib import Path
 
-from hyrl_mj import artifacts
 from hyrl_mj.errors import BadInput
+from hyrl_mj.files import artifacts
 from hyrl_mj.tasks.registry import task_names
 
-TEMPLATES = Path(__file__).parents[1] / "templates" / "task"
+TEMPLATES = Path(__file__).with_name("templates")
 
 
 def write_task(name: str, folder: Path) -> list[Path]:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from hyrl_mj import mujoco_log
 from hyrl_mj.errors import BadInput
+from hyrl_mj.physics import mujoco_log
 from hyrl_mj.sets import Grid
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import Outcome

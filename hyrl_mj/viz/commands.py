@@ -11,7 +11,7 @@ from hyrl_mj import learning
 from hyrl_mj.game import Robustness
 from hyrl_mj.learning import STAGES, Settings, preset
 from hyrl_mj.policies import ALGORITHMS
-from hyrl_mj.run_directory import Run
+from hyrl_mj.runs.directory import Run
 
 
 def commands(run: Run, robustness: Robustness | None) -> list[str]:

@@ -20,7 +20,7 @@ from hyrl_mj.fields import (
     read_field,
 )
 from hyrl_mj.policies import MlpPolicy
-from hyrl_mj.run_directory import Run
+from hyrl_mj.runs.directory import Run
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import LEFT, RIGHT, Field
 from hyrl_mj.viz.options import ReplayOptions

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hyrl_mj import artifacts
 from hyrl_mj.errors import NoRenderer, brief
+from hyrl_mj.files import artifacts
 
 if TYPE_CHECKING:
     import mediapy

@@ -12,14 +12,14 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 
-from hyrl_mj import artifacts
 from hyrl_mj.errors import BadInput
+from hyrl_mj.files import artifacts
 from hyrl_mj.game import LIMIT, MAP_CLASSES, EpisodeCount, GameResult, Robustness
 from hyrl_mj.learning import Training
 from hyrl_mj.policies import Agent, MlpPolicy
-from hyrl_mj.run_arcs import attack_replay
-from hyrl_mj.run_directory import Run
-from hyrl_mj.verdict import NO_NOISE, POLICIES, listed
+from hyrl_mj.runs.arcs import attack_replay
+from hyrl_mj.runs.directory import Run
+from hyrl_mj.runs.verdict import NO_NOISE, POLICIES, listed
 from hyrl_mj.viz import tables
 from hyrl_mj.viz.commands import changed, commands
 from hyrl_mj.viz.figures import CLASS_COLOURS, FIGURES
@@ -277,7 +277,7 @@ def fill(template: str, run: Run, robustness: Robustness | None, **values: Any) 
 def environment() -> Environment:
     """Returns the environment of all templates, which escapes what it fills in."""
     return Environment(
-        loader=PackageLoader("hyrl_mj"),
+        loader=PackageLoader("hyrl_mj.viz"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hyrl_mj.chart import Chart
 from hyrl_mj.game import Maps
-from hyrl_mj.run_directory import Run
-from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.runs.directory import Run
+from hyrl_mj.sets import Chart, Grid, GridSet
 from hyrl_mj.stages import CriticalSet, ExtendedSets, Partition, critical_points
 from hyrl_mj.tasks import Task
 

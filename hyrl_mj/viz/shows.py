@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from hyrl_mj.errors import BadInput, unknown
-from hyrl_mj.run_arcs import attack_replay, replay_arcs
-from hyrl_mj.run_directory import Run
+from hyrl_mj.runs.arcs import attack_replay, replay_arcs
+from hyrl_mj.runs.directory import Run
 from hyrl_mj.viz.replay import Floor, Floors, Show
 from hyrl_mj.viz.section import critical_sets, sections
 

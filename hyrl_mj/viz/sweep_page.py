@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from hyrl_mj.game import Curve
-from hyrl_mj.run_directory import load_run
-from hyrl_mj.sweeps import DONE, Row, Setting, Sweep
+from hyrl_mj.runs.directory import load_run
+from hyrl_mj.runs.sweeps import DONE, Row, Setting, Sweep
 from hyrl_mj.viz import colours, sweep_tables as tables
 from hyrl_mj.viz.figures import style
 from hyrl_mj.viz.report import Picture, data_uri, environment, write

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from hyrl_mj.game import percent
-from hyrl_mj.sweeps import DONE, Row, Sweep, summary
+from hyrl_mj.runs.sweeps import DONE, Row, Sweep, summary
 from hyrl_mj.viz.tables import Table, print_table
 
 

@@ -17,10 +17,10 @@ from hyrl_mj.game import (
     Robustness,
     percent,
 )
-from hyrl_mj.run_directory import Run
+from hyrl_mj.runs.directory import Run
+from hyrl_mj.runs.verdict import NO_NOISE
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
-from hyrl_mj.verdict import NO_NOISE
 
 # No table is wider [columns].
 WIDEST = 10_000

@@ -16,7 +16,7 @@ import torch
 from safetensors.numpy import save
 
 from attacks import MARKER
-from hyrl_mj import artifacts
+from hyrl_mj.files import artifacts
 
 ESCAPE = "\x1b[31mred"
 MANY = 2**29  # bytes of a bomb

@@ -10,7 +10,7 @@ from typing import Any
 
 from attacks import Trial, child, command, differences
 from attacks.material import RUN, TASK, Material
-from hyrl_mj import artifacts
+from hyrl_mj.files import artifacts
 
 HORIZON = ("--horizon", "0.3")
 # The commands that crash, by what they make; all but the first change a finished run.

@@ -10,7 +10,7 @@ import hyrl_mj
 from attacks import Answer, Trial, child, command, differences, files
 from attacks.material import RUN, TASK, Material
 from hyrl_mj.errors import HyrlError
-from hyrl_mj.run_directory import Run
+from hyrl_mj.runs.directory import Run
 
 # Files whose damage no command can mend, because they say what the run is.
 FOUNDATION = ("config.json",)

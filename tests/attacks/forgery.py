@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hyrl_mj import artifacts
+from hyrl_mj.files import artifacts
 
 KINDS = {
     "config.json": "run",

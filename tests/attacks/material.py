@@ -12,7 +12,7 @@ from attacks import Answer, child, command
 from attacks.small import shorten  # noqa: F401
 from hyrl_mj.learning import preset
 from hyrl_mj.policies import MlpPolicy
-from hyrl_mj.run_directory import Run, write_config
+from hyrl_mj.runs.directory import Run, write_config
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages import Arrivals, ExtendedSets, ModeResult, Retraining
 

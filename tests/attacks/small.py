@@ -34,7 +34,7 @@ NOBODY = "ATTACK_AS_NOBODY"
 # What commands import when they need it.
 LATE = (
     "hyrl_mj.export",
-    "hyrl_mj.run_arcs",
+    "hyrl_mj.runs.arcs",
     "hyrl_mj.viz.shows",
     "hyrl_mj.viz.diagnosis",
     "hyrl_mj.viz.report",

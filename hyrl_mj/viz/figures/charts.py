@@ -13,9 +13,8 @@ from matplotlib.patches import Circle, Wedge
 from matplotlib.ticker import MultipleLocator
 from scipy.ndimage import gaussian_filter
 
-from hyrl_mj.chart import Chart
 from hyrl_mj.errors import BadInput
-from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.sets import Chart, Grid, GridSet
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.figures.style import CASING, GREEN, GREY, INK, PALE, PAPER, angle, axis_label
 from hyrl_mj.viz.section import Section

@@ -10,8 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from hyrl_mj.chart import Chart
-from hyrl_mj.sets import GridSet
+from hyrl_mj.sets import Chart, GridSet
 from hyrl_mj.viz import colours
 from hyrl_mj.viz.figures import charts, style
 from hyrl_mj.viz.figures.charts import OUTER

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from hyrl_mj.chart import Chart
+from hyrl_mj.sets import Chart
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import ANY, Task, pattern_of
 from hyrl_mj.viz.colours import place

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from hyrl_mj.game import GameResult, Maps
 from hyrl_mj.policies import Policy
-from hyrl_mj.run_arcs import overview_arcs, policy_start_arcs
-from hyrl_mj.run_directory import Run
+from hyrl_mj.runs.arcs import overview_arcs, policy_start_arcs
+from hyrl_mj.runs.directory import Run
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.stages import CriticalSet, ExtendedSets, Partition
 from hyrl_mj.tasks import Task

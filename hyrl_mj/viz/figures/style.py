@@ -17,8 +17,8 @@ from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from hyrl_mj import artifacts
-from hyrl_mj.chart import Chart
+from hyrl_mj.files import artifacts
+from hyrl_mj.sets import Chart
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz import colours
 from hyrl_mj.viz.section import Section

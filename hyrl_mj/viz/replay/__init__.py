@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 
-from hyrl_mj import artifacts, mjcf
 from hyrl_mj.errors import BadInput, unknown
-from hyrl_mj.progress import progress_bar
+from hyrl_mj.files import artifacts
+from hyrl_mj.physics import mjcf
+from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.encoding import ENCODERS, video
 from hyrl_mj.viz.options import ReplayOptions

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 from scipy import ndimage
 
-from hyrl_mj import mjcf
-from hyrl_mj.chart import Chart
+from hyrl_mj.physics import mjcf
+from hyrl_mj.sets import Chart
 from hyrl_mj.stages import CriticalSet, ExtendedSets, Partition
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz import colours

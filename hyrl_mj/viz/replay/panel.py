@@ -10,9 +10,9 @@ from itertools import pairwise
 import mujoco
 import numpy as np
 
-from hyrl_mj import mjcf
 from hyrl_mj.errors import BadArtifact
-from hyrl_mj.rendering import GEOMS, HIDDEN, Box, Canvas, SceneRenderer
+from hyrl_mj.physics import mjcf
+from hyrl_mj.physics.rendering import GEOMS, HIDDEN, Box, Canvas, SceneRenderer
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.colours import RGB

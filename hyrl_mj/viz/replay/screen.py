@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.rendering import LARGEST, Canvas
+from hyrl_mj.physics.rendering import LARGEST, Canvas
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.options import ReplayOptions

@@ -19,9 +19,9 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from hyrl_mj import artifacts
-from hyrl_mj.artifacts import digest
 from hyrl_mj.errors import BadArtifact, BadInput
+from hyrl_mj.files import artifacts
+from hyrl_mj.files.artifacts import digest
 
 NAME, LOCK = "manifest.json", ".lock"
 # The largest manifest [bytes], which is read many times, and the most folders within each other.

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_args, get_ty
 import numpy as np
 from safetensors.numpy import load, save
 
-from hyrl_mj import archives
 from hyrl_mj.errors import BadArtifact, BadInput, brief, has_controls
+from hyrl_mj.files import archives
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter

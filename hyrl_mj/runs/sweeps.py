@@ -13,11 +13,11 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from hyrl_mj import artifacts
+from hyrl_mj.files import artifacts
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.game import LIMIT, Robustness
-from hyrl_mj.manifest import check_contents, may_hold
-from hyrl_mj.run_directory import Run, load_run
+from hyrl_mj.files.manifest import check_contents, may_hold
+from hyrl_mj.runs.directory import Run, load_run
 
 NAME = "sweep.json"
 MOST_RUNS = 1_000

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from hyrl_mj import mjcf
+from hyrl_mj.physics import mjcf
 
 # Parts of MuJoCo's state that remember nothing: they are given anew by `Plant.set_state` and at each sample,
 # or solved anew from there. Nothing but callbacks writes userdata.

@@ -16,7 +16,7 @@ LARGEST = 2**27  # [bytes]
 
 def main() -> None:
     seconds, memory, path = sys.argv[1:]
-    limits = runpy.run_path(str(Path(__file__).with_name("limits.py")))
+    limits = runpy.run_path(str(Path(__file__).parents[1] / "system" / "limits.py"))
     limits["limit"](int(seconds), int(memory))
     mujoco.set_mju_user_warning(lambda text: None)  # or they are written to a file
     result = {}

@@ -8,12 +8,13 @@ import sys
 import textwrap
 from collections.abc import Sequence
 
-from hyrl_mj import __version__, progress
-from hyrl_mj.commands import COMMANDS
+from hyrl_mj import __version__
+from hyrl_mj.cli.commands import COMMANDS
+from hyrl_mj.cli.parsing import call, documented
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.gl import spare_matplotlib
-from hyrl_mj.parsing import call, documented
-from hyrl_mj.streams import Streams
+from hyrl_mj.system import progress
+from hyrl_mj.system.streams import Streams
 
 HEAD = """\
 usage: hyrl-mj [-h] [--version] COMMAND ...
@@ -59,7 +60,3 @@ def main() -> None:
         dispatch(sys.argv[1:])
 
     sys.exit(streams.run(work))
-
-
-if __name__ == "__main__":
-    main()

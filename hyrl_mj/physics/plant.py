@@ -7,9 +7,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from hyrl_mj import cores, forked, memory, mjcf, mujoco_log
 from hyrl_mj.errors import BadInput
+from hyrl_mj.physics import memory, mjcf, mujoco_log
 from hyrl_mj.ranges import Integer
+from hyrl_mj.system import cores, forked
 
 # Sensor values (n, sensors) -> measurement (n, p).
 Measure = Callable[[np.ndarray], np.ndarray]

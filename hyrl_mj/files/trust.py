@@ -20,8 +20,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from hyrl_mj.artifacts import digest, replacing
 from hyrl_mj.errors import BadInput
+from hyrl_mj.files.artifacts import digest, replacing
 
 # The keys of the hashes of texts and of written files, which are no paths, and how many are kept of each.
 _TEXT, _WRITTEN, MOST = "texts", "written", 1_000

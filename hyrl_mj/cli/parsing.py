@@ -21,8 +21,8 @@ from typing import Annotated, Any, get_type_hints
 import tyro
 
 from hyrl_mj.errors import BadInput, unknown
-from hyrl_mj.run_directory import Run, load_run
-from hyrl_mj.sweeps import MOST_RUNS
+from hyrl_mj.runs.directory import Run, load_run
+from hyrl_mj.runs.sweeps import MOST_RUNS
 
 
 @dataclass(frozen=True)

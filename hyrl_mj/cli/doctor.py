@@ -14,9 +14,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from hyrl_mj import mjcf
 from hyrl_mj.errors import NoRenderer
-from hyrl_mj.rendering import GL_CURE
+from hyrl_mj.physics import mjcf
+from hyrl_mj.physics.rendering import GL_CURE
 from hyrl_mj.viz.encoding import video
 
 # Distributions whose versions matter. Read from their metadata: importing torch takes seconds.
@@ -41,7 +41,7 @@ RENDER_TIMEOUT = 60.0  # [s]
 _FRAMES = """
 from time import perf_counter
 from hyrl_mj.errors import HyrlError
-from hyrl_mj.rendering import SceneRenderer
+from hyrl_mj.physics.rendering import SceneRenderer
 from hyrl_mj.tasks import get_task
 try:
     model = get_task("vehicle").model

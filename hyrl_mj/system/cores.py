@@ -9,8 +9,8 @@ from contextvars import ContextVar
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
-from hyrl_mj import progress
 from hyrl_mj.errors import BadInput
+from hyrl_mj.system import progress
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

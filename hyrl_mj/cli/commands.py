@@ -6,17 +6,18 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from hyrl_mj import pipeline, trust
+from hyrl_mj import pipeline
 from hyrl_mj.environments import EnvironmentOptions, chosen_task, explained
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.fields import DriveOptions, for_posts, read_field
+from hyrl_mj.files import trust
 from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions, SweepOptions
 from hyrl_mj.policies import check_agent_file
-from hyrl_mj.run_arcs import noisy_arcs
-from hyrl_mj.run_directory import Run
-from hyrl_mj.sweeps import DONE
+from hyrl_mj.runs.arcs import noisy_arcs
+from hyrl_mj.runs.directory import Run
+from hyrl_mj.runs.sweeps import DONE
+from hyrl_mj.runs.verdict import FAILED
 from hyrl_mj.tasks import Field, Task, get_task, task_names, write_task
-from hyrl_mj.verdict import FAILED
 from hyrl_mj.viz import ReplayOptions, print_robustness, print_summary, print_sweep
 
 
@@ -371,7 +372,7 @@ def export(run: Run, *, to: str, out: Path, field: Path | None = None, force: bo
 
 def doctor() -> None:
     """Say whether this machine can train, render and encode, and what it lacks."""
-    from hyrl_mj.doctor import report
+    from hyrl_mj.cli.doctor import report
 
     lines, healthy = report()
     print("\n".join(lines))

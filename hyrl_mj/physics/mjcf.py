@@ -7,8 +7,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from hyrl_mj import limits, mujoco_log, trust
 from hyrl_mj.errors import BadInput, has_controls, unknown
+from hyrl_mj.files import trust
+from hyrl_mj.physics import mujoco_log
+from hyrl_mj.system import limits
 
 # Positions (n, nq) of the joints -> positions (n, k, 3) [m] or poses (n, k, 7) of the mocap bodies.
 Mocap = Callable[[np.ndarray], np.ndarray]
@@ -35,7 +37,7 @@ FREE_CAMERAS = "overhead", "free"
 
 def models_dir() -> Path:
     """Returns the folder of the MJCF files: in the installed package, else beside it in the checkout."""
-    package = Path(__file__).resolve().parent
+    package = Path(__file__).resolve().parents[1]
     installed = package / "models"
     return installed if installed.is_dir() else package.parent / "models"
 

@@ -1,0 +1,3 @@
+"""What the machine gives: cores, processes with limits, output streams and progress bars."""
+
+__all__ = ["cores", "forked", "limits", "progress", "streams"]
