@@ -15,14 +15,15 @@ from pathlib import Path
 import mujoco
 
 from hyrl_mj import policies
-from hyrl_mj.files import artifacts
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.fields import GuardedPolicy
+from hyrl_mj.files import artifacts
+from hyrl_mj.files.manifest import FILES, Manifest, check_contents, locked, may_hold
 from hyrl_mj.game import Lattice, Robustness, lattice_grid
 from hyrl_mj.learning import Settings, differing
-from hyrl_mj.files.manifest import FILES, Manifest, check_contents, locked, may_hold
 from hyrl_mj.policies import Agent, AnyPolicy, MlpPolicy, Policy
 from hyrl_mj.proof import why_no_cells
+from hyrl_mj.runs.verdict import Verdict
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import LONGEST, HybridArc
 from hyrl_mj.stages import (
@@ -37,7 +38,6 @@ from hyrl_mj.stages import (
     TablePolicy,
 )
 from hyrl_mj.tasks import Field, Task, described_task, get_task, reference
-from hyrl_mj.runs.verdict import Verdict
 
 # The packages whose versions `config.json` records.
 PACKAGES = (
