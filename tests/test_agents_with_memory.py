@@ -87,7 +87,7 @@ class Plain:
     [
         ("input", "changes the measurements that it is given"),
         ("answer", "changes an answer that it gave before"),
-        ("shape", r"of shape \(256,\) for 256 measurements"),
+        ("shape", r"of shape \(1280,\) for 1280 measurements"),
         ("number", "not finite"),
         ("error", "raised LookupError"),
     ],

@@ -185,7 +185,7 @@ def test_a_model_of_the_users_own_is_tried_once(tmp_path, monkeypatch):
     path.write_text("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
     assert mjcf.load(path).ngeom == 1
     monkeypatch.setattr("hyrl_mj.system.limits.tried", None)  # not called again
-    mjcf.load.cache_clear()
+    mjcf._LOADED.clear()
     assert mjcf.load(path).ngeom == 1
 
 

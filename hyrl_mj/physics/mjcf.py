@@ -1,7 +1,9 @@
 """MJCF models: compiles them and reads their geometry, so that it is written down nowhere else."""
 
 from collections.abc import Callable
-from functools import lru_cache
+from contextlib import suppress
+from difflib import get_close_matches
+from hashlib import sha256
 from pathlib import Path
 
 import mujoco
@@ -33,6 +35,8 @@ _OF_VELOCITY = {
 
 # Cameras that every model has.
 FREE_CAMERAS = "overhead", "free"
+# The models that were compiled, each with the digest of its files at that time.
+_LOADED: dict[tuple[Path, str], mujoco.MjModel] = {}
 
 
 def models_dir() -> Path:
@@ -42,19 +46,45 @@ def models_dir() -> Path:
     return installed if installed.is_dir() else package.parent / "models"
 
 
-@lru_cache
 def load(path: Path) -> mujoco.MjModel:
     """Returns a compiled MJCF file. Compiled models are shared: do not write to them.
 
-    One that is not of this package is compiled and stepped in a process with limits first.
+    One that is not of this package is compiled and stepped in a process with limits first. A file that has
+    changed, or of which another one has that it includes, is compiled again.
 
     Raises:
         BadInput: the file is missing, MuJoCo cannot compile it, or it takes too much time or memory.
     """
     if not path.is_file():
         raise BadInput(f"there is no MJCF model at {path}")
-    if models_dir() not in path.resolve().parents:
+    if models_dir() not in path.resolve().parents and not any(
+        path == known for known, _ in _LOADED
+    ):
         _try(path.absolute())
+    key = path, file_digest(path)
+    if key not in _LOADED:
+        _LOADED[key] = _compiled(path)
+    return _LOADED[key]
+
+
+def file_digest(path: Path) -> str:
+    """Returns the SHA-256 of an MJCF file, with all that it includes and the assets that it names."""
+    content = path.read_bytes()
+    found = sha256(content)
+    if b"file" in content and models_dir() not in path.resolve().parents:
+        with suppress(mujoco.FatalError):  # the compiler will tell
+            for part in sorted(map(Path, mujoco.mju_getXMLDependencies(str(path)))):
+                if part.is_file():
+                    found.update(sha256(part.read_bytes()).digest())
+    return found.hexdigest()
+
+
+def read_digest(model: mujoco.MjModel) -> str:
+    """Returns the `file_digest` of a model that `load` compiled, as it was then; "" of another model."""
+    return next((digest for (_, digest), loaded in _LOADED.items() if loaded is model), "")
+
+
+def _compiled(path: Path) -> mujoco.MjModel:
     mujoco_log.install()
     try:
         with mujoco_log.kept() as warnings:
@@ -285,7 +315,13 @@ def place(
 
 def sample_time(model: mujoco.MjModel) -> float:
     """Returns the controller's sample time [s]: the custom numeric `sample_time`, else the timestep."""
-    if "sample_time" not in names(model, mujoco.mjtObj.mjOBJ_NUMERIC):
+    known = names(model, mujoco.mjtObj.mjOBJ_NUMERIC)
+    if "sample_time" not in known:
+        for name in get_close_matches("sample_time", known, cutoff=0.8):
+            raise BadInput(
+                f"the numeric {name} of {model_name(model)} means nothing: the sample time of the controller "
+                "is called sample_time"
+            )
         return float(model.opt.timestep)
     return float(numeric(model, "sample_time", 1)[0])
 

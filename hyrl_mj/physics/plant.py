@@ -76,7 +76,12 @@ class Plant:
         limited = model.actuator_ctrllimited.astype(bool)[:, None]
         ranges = np.where(limited, model.actuator_ctrlrange, [-np.inf, np.inf])
         self._ctrl_low, self._ctrl_high = ranges.T
-        self._held = model.key_ctrl[0].copy() if model.nkey else np.zeros(model.nu)
+        # MuJoCo clamps the other controls; without clamping it is done here.
+        self._held = np.zeros(model.nu)
+        if model.nkey:
+            clamps = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
+            held = model.key_ctrl[0]
+            self._held[:] = np.clip(held, self._ctrl_low, self._ctrl_high) if clamps else held
         self._unstable = np.zeros(n, dtype=bool)
         # Some sensors are read from the state; MuJoCo has to compute others after each step.
         self._columns_of_state = mjcf.state_columns(self.model)
@@ -86,6 +91,8 @@ class Plant:
             self._stage = mujoco.mjtStage(int(self.model.sensor_needstage.max()))
         self._open()
         self._drive(np.arange(n))
+        if model.nkey and model.na:
+            self._batch.bind("act")[:] = model.key_act[0]
         self._initial = self._batch.state[0].copy()
 
     def _open(self, state: np.ndarray | None = None) -> None:
@@ -93,7 +100,13 @@ class Plant:
         from mujoco.batch import Batch  # slow to import
 
         mujoco_log.install()
-        self._batch = Batch(self.model, self.n, self._threads or cores.allowed)
+        try:
+            self._batch = Batch(self.model, self.n, self._threads or cores.allowed)
+        except ValueError as error:
+            raise BadInput(
+                f"MuJoCo cannot simulate copies of {mjcf.model_name(self.model)} side by side ({error}): "
+                "leave that out of its MJCF"
+            ) from error
         forked.own(self._batch)
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._ctrl = self._batch.bind("ctrl")

@@ -23,7 +23,7 @@ from hyrl_mj.sets import coarseness
 from hyrl_mj.simulation import judge_task
 from hyrl_mj.stages import Arrivals
 from hyrl_mj.system.progress import Say
-from hyrl_mj.tasks import Task, check_task, get_task
+from hyrl_mj.tasks import Task, check_as_made, check_task, get_task
 from hyrl_mj.viz import beginning
 
 
@@ -125,7 +125,7 @@ def run(
         BadInput: a value that cannot be used.
     """
     options = complete(RunOptions, options, changes)
-    checked = check_task(get_task(task))
+    checked = _checked(task)
     settings = settings_of(checked, options)
     if options.algorithm is not None:
         algorithms.remember(options.algorithm)
@@ -176,6 +176,14 @@ def diagnose(
     """
     with _with_agent(task, policy, complete(AgentOptions, options, changes)) as run:
         return _run_all(run, say, DIAGNOSIS)
+
+
+def _checked(task: str | Path | Task) -> Task:
+    """Returns a task that can be trained, and that a run directory leads to."""
+    found = get_task(task)
+    if found is task:
+        check_as_made(found)
+    return check_task(found)
 
 
 def extend_again(run: Run, horizon: float, say: Say = print) -> Run:
@@ -239,7 +247,7 @@ def _settings(task: Task, options: RunOptions | AgentOptions, **changes: Any) ->
 @contextmanager
 def _with_agent(task: str | Path | Task, policy: AnyPolicy, options: AgentOptions) -> Iterator[Run]:
     """Opens the run directory of an agent, which then holds the agent, and holds its lock in the block."""
-    checked = check_task(get_task(task))
+    checked = _checked(task)
     _settings(checked, options)  # a wrong value is reported before the agent is read
     o = options
     external = read_agent(

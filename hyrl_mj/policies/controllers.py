@@ -69,14 +69,34 @@ def answer(
     return controller.step(q, measured)
 
 
+def check_inputs(u: np.ndarray, n: int, m: int) -> np.ndarray:
+    """Returns inputs for n measurements themselves; raises `BadInput` unless their shape is (n, m)."""
+    if np.shape(u) != (n, m):
+        raise BadInput(
+            f"a policy gives inputs of shape {np.shape(u)} for {n} measurements: give ({n}, {m})"
+        )
+    return u
+
+
 def remembering(past: np.ndarray, measured: np.ndarray) -> np.ndarray:
     """Returns the past (n, memory, p) after measurements (n, p)."""
     return np.concatenate([past[:, 1:], measured[:, None]], axis=1) if past.shape[1] else past
 
 
 def as_controller(loop: Controller | Policy) -> Controller:
-    """Returns a controller itself, or a policy as a controller."""
-    return PolicyController(loop) if isinstance(loop, Policy) else loop
+    """Returns a controller itself, or a policy as a controller.
+
+    Raises:
+        BadInput: it is neither.
+    """
+    if isinstance(loop, Policy):
+        return PolicyController(loop)
+    if not callable(getattr(loop, "step", None)):
+        raise BadInput(
+            f"{loop!r:.80} can close no loop: give a controller or a policy, and a function as "
+            "hyrl_mj.from_callable(function, task)"
+        )
+    return loop
 
 
 def check_modes(q: np.ndarray, modes: Sequence[int]) -> np.ndarray:

@@ -95,7 +95,7 @@ STATISTICS = "vecnormalize.npz"
 # Kinds of agents besides those that SB3 trains.
 ONNX, FUNCTION = "onnx", "function"
 # The fingerprint of a function: its number of measurements, and the decimals that count.
-PROBES, DECIMALS = 256, 6
+PROBES, HOPS, DECIMALS = 256, 4, 6
 
 
 @dataclass(frozen=True)
@@ -307,10 +307,17 @@ def _seeing(agent: Agent, policy: Policy) -> Agent:
 
 
 def _fingerprint(policy: Policy, task: Task) -> str:
-    """Returns a hash of a function's answers to fixed measurements."""
-    rng = np.random.default_rng(0)
+    """Returns a hash of a function's answers to fixed measurements.
+
+    These are of starts, of places all over the chart, and of where random inputs lead from both.
+    """
+    rng, half = np.random.default_rng(0), PROBES // 2
+    anywhere = rng.uniform(task.chart.low, task.chart.high, (half, task.chart.dimension))
     plant = task.plant(PROBES)
-    plant.set_state(*task.state(task.starts(PROBES, rng), rng))
-    measured = plant.measurement
-    first = answers(policy, task, measured, "the policy")
+    plant.set_state(*task.state(np.vstack([task.starts(half, rng), anywhere]), rng))
+    met = [plant.measurement]
+    for _ in range(HOPS):
+        plant.step(rng.uniform(*task.input_limits, (PROBES, len(task.inputs))))
+        met.append(plant.measurement)
+    first = answers(policy, task, np.concatenate(met), "the policy")
     return sha256((np.round(first.astype(float), DECIMALS) + 0.0).tobytes()).hexdigest()

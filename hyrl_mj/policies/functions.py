@@ -9,7 +9,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput, brief
 from hyrl_mj.policies.mlp import ObservationPolicy
-from hyrl_mj.tasks import Task, at_levels
+from hyrl_mj.tasks import Task, at_levels, get_task
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,13 @@ class FunctionPolicy(ObservationPolicy):
             return np.zeros((0, m))
         discrete = self.task.input_levels is not None
         try:
-            actions = np.asarray(self.function(observation.astype(np.float32)))
+            answer = self.function(observation.astype(np.float32))
+            if isinstance(answer, tuple):
+                raise BadInput(
+                    "it returns a tuple, as the predict() of SB3 does: give its first part, as lambda o: "
+                    "model.predict(o)[0]"
+                )
+            actions = np.asarray(answer)
             if discrete and actions.ndim > 1 and actions.dtype.kind == "f":
                 actions = _preferred(actions, self.task)
         except Exception as error:  # a user's code can raise anything
@@ -48,6 +54,8 @@ class FunctionPolicy(ObservationPolicy):
         if discrete:
             return at_levels(self.task, actions)
         try:
+            if actions.dtype.kind == "c":
+                raise TypeError
             actions = actions.astype(float)
         except (TypeError, ValueError):
             raise BadInput(f"{self.name} gives {actions.flat[0]!r}: an input is a number") from None
@@ -73,6 +81,7 @@ def from_callable(function: Callable[[np.ndarray], Any], task: Task) -> Function
         BadInput: it is not callable. `act` of the policy raises it, too, if the function raises, or
             returns another shape, a number that is not finite, or an integer out of range.
     """
+    task = get_task(task)
     if not callable(function):
         raise BadInput(
             f"{function!r} cannot be called: give a function from observations (n, k) to inputs (n, m)"

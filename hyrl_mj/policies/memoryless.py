@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hyrl_mj.errors import BadInput, brief
-from hyrl_mj.policies.controllers import Controller, PolicyController, answer
+from hyrl_mj.policies.controllers import Controller, PolicyController, answer, check_inputs
 from hyrl_mj.policies.mlp import Policy, SampledPolicy
 from hyrl_mj.policies.preprocessing import PreprocessedPolicy, as_function
 from hyrl_mj.tasks import Outcome, Task
@@ -231,6 +231,7 @@ class Asked:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Returns inputs (n, m) and next modes (n,) at sample k of runs, as `answer`."""
         u, after = answer(self.controller, q, measured, past)
+        check_inputs(u, len(measured), len(self.task.inputs))
         if k == self._next and (k < 2 or len(measured) <= FEW):
             rows = (q, measured, past, np.column_stack([u, after]))
             self._kept.append(tuple(values.copy() for values in rows))

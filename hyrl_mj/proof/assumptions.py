@@ -28,6 +28,8 @@ DEFAULTS = (
 FOLLOWED = ("observation", "ending", "verdict")
 # States at which the operations that were followed are compared with the method.
 COMPARED = 1_000
+# Sizes of other batches in which it is asked for the same rows.
+SIZES = (1, 2, 7, 33, 150, 600)
 
 
 def check_assumptions(task: Task) -> None:
@@ -92,7 +94,7 @@ def _check_program(task: Task, name: str, program: Program) -> None:
     found = bounds_of(program, _method(task, name), Affine.box(z, np.zeros(chart.dimension)))
     order = rng.permutation(COMPARED)
     try:
-        parts = [method(z), method(z[order])[np.argsort(order)], method(z[:1])]
+        parts = [method(z), method(z[order])[np.argsort(order)], *(method(z[:k]) for k in SIZES)]
     except BadInput as error:
         raise Unbounded(f"{_method(task, name)} cannot be followed: {error}") from error
     for given in parts:

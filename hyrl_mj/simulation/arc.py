@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -12,7 +13,8 @@ from numpy.typing import ArrayLike
 from hyrl_mj.errors import BadInput, check_seed
 from hyrl_mj.files.artifacts import Saved
 from hyrl_mj.policies import Controller, Policy, PolicyController, as_controller, check_modes
-from hyrl_mj.simulation.noise import AnyNoise, Noise
+from hyrl_mj.simulation.noise import AnyNoise, Noise, is_own
+from hyrl_mj.simulation.real import judge
 from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop
 from hyrl_mj.tasks import Outcome, Task, get_task, task_names
 
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
 
 # The longest time that `simulate` records [s]: an hour.
 LONGEST = 3600.0
+# Of a user's robot, so many of the runs are played again by plain MuJoCo.
+JUDGED = 4
 
 
 @dataclass(frozen=True)
@@ -172,6 +176,7 @@ def simulate_batch(
     seed: int = 0,
 ) -> list[HybridArc]:
     """Simulates the closed loop from n starts (n, d), or from one, as `simulate`, and returns a list."""
+    task = get_task(task)
     starts = task.chart.check(z0, task.name)
     check_seed(seed)
     loop, n = as_controller(controller), len(starts)
@@ -185,6 +190,8 @@ def simulate_batch(
     settings = LoopSettings(steps=steps, record=True)
     rollout = closed_loop(task, loop, starts, noise, q0, seed, settings)
     task.verify(starts, rollout, range(n))
+    if not is_own(task) and type(task).plant is Task.plant:
+        judge(task, rollout, task.state(starts), np.arange(n)[:JUDGED])
     name = "policy" if isinstance(loop, PolicyController) else "hyrl"
     return [_arc(task, name, rollout, i, noise) for i in range(n)]
 
@@ -195,9 +202,9 @@ def samples(task: Task, horizon: float) -> int:
     Raises:
         BadInput: the time is not positive, or longer than an hour.
     """
-    if not (math.isfinite(horizon) and 0 < horizon <= LONGEST):
+    if not (isinstance(horizon, Real) and math.isfinite(horizon) and 0 < horizon <= LONGEST):
         raise BadInput(
-            f"horizon {horizon:g} s cannot be used: give a time > 0 and <= {LONGEST:g} s"
+            f"horizon {horizon!r} cannot be used: give a time > 0 and <= {LONGEST:g} [s]"
         )
     return max(round(horizon / task.dt), 1)
 

@@ -9,14 +9,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Literal, Self, TypeVar, get_args
+from typing import Any, Literal, Self, TypeVar, get_args
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput, brief, check_bound, unknown
 from hyrl_mj.physics.plant import Plant
 from hyrl_mj.policies import Controller
-from hyrl_mj.tasks import Task
+from hyrl_mj.tasks import Task, read_only, writes
 
 # The mode of a run before its first measurement, from which the controller picks its start mode.
 NOT_STARTED = -1
@@ -185,6 +185,7 @@ class Recorded(Signal):
         if self.after not in get_args(After):
             raise unknown("way to go on after a recorded noise", self.after, get_args(After))
         values = np.asarray(self.values)
+        single = values.dtype == np.float32
         if values.ndim != 3 or not values.size or values.dtype.kind not in "iuf":
             raise BadInput(
                 f"a recorded noise of type {values.dtype} and shape {values.shape} cannot be used: give "
@@ -196,10 +197,12 @@ class Recorded(Signal):
             raise BadInput(f"a recorded noise on {columns} columns has shares of {shares.shape}")
         object.__setattr__(self, "values", values.astype(float, copy=False))
         object.__setattr__(self, "shares", shares)
-        bad = ~_within(self.values, self.limits)
+        bad = ~_within(values if single else self.values, self.limits)
         if bad.any():
             k, row, column = np.argwhere(bad)[0]
             raise _too_large(self, k, row, column, self.values[k, row, column])
+        if single:
+            object.__setattr__(self, "values", np.clip(self.values, -self.limits, self.limits))
 
     def reset(self, n: int, rng: np.random.Generator) -> None:
         if self.values.shape[1] != n:
@@ -276,7 +279,9 @@ def signal_for(noise: AnyNoise | None, task: Task, controller: Controller | None
     """
     noise = Noise() if noise is None else noise
     if not isinstance(noise, AnyNoise):
-        raise BadInput(f'noise {noise!r} cannot be used: give a hyrl_mj.Noise("uniform", 0.1), say')
+        raise BadInput(
+            f'noise {noise!r:.80} cannot be used: give a hyrl_mj.Noise("uniform", 0.1), say'
+        )
     return noise.against(task, controller)
 
 
@@ -287,31 +292,62 @@ def drawn(signal: Signal, now: Sample) -> np.ndarray:
         BadInput: it raises an error, changes what it is shown, gives another shape or type, or noise that is
             not finite or larger than its bound times the share of its column.
     """
-    shown = replace(now, measurement=_read_only(now.measurement), q=_read_only(now.q))
+    arrays = {
+        name: read_only(getattr(now, name)) for name in ("rows", "k", "measurement", "q", "past")
+    }
+    plant: Any = _Seen(now.plant)
+    shown = replace(now, plant=plant, **arrays)
     try:
         noise = signal.sample(shown)
     except BadInput:
         raise
     except Exception as error:  # a user's code can raise anything
+        if writes(error):
+            raise BadInput(
+                f"{signal.kind} noise writes to an array that it is shown: let it work on a copy"
+            ) from error
         raise BadInput(f"{signal.kind} noise cannot be used: it raised {brief(error)}") from error
-    true = now.measurement
+    true, limits = now.measurement, _limits(signal)
     if not isinstance(noise, np.ndarray) or noise.shape != true.shape or noise.dtype.kind != "f":
         given = np.asarray(noise)
         raise BadInput(
             f"{signal.kind} noise gives {given.dtype} of shape {given.shape}, where {true.shape} floats are "
             "needed: a row for each simulation, a column for each of the measurement"
         )
-    bad = ~_within(noise, _limits(signal), true)
+    bad = ~_within(noise, limits, true)
     if bad.any():
         row, column = np.argwhere(bad)[0]
         raise _too_large(signal, now.k[row], now.rows[row], column, noise[row, column])
-    return noise
+    return noise if noise.dtype == float else np.clip(noise.astype(float), -limits, limits)
 
 
-def _read_only(array: np.ndarray) -> np.ndarray:
-    view = array.view()
-    view.setflags(write=False)
-    return view
+def is_own(thing: object) -> bool:
+    """Returns whether the class of a signal or of a task is of this package."""
+    return type(thing).__module__.startswith("hyrl_mj.")
+
+
+def check_repeats(signal: Signal, noise: np.ndarray, twin: Signal, now: Sample) -> None:
+    """Raises `BadInput` unless a twin of a signal, begun with the same seed, gives the same noise."""
+    if not np.array_equal(drawn(twin, now), noise):
+        raise BadInput(
+            f"{signal.kind} noise gives other values where it begins anew with the same seed: let it draw "
+            "from self.rng alone, and remember in attributes that its reset() sets"
+        )
+
+
+class _Seen:
+    """A plant that noise may look at; the simulation alone moves it."""
+
+    def __init__(self, plant: Any):
+        self._plant = plant
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("step", "step_backward", "set_state", "put", "observe", "end"):
+            raise BadInput(
+                f"noise calls {name}() of the plant that is simulated: look ahead with one of its own, made "
+                "by task.plant(n)"
+            )
+        return getattr(self._plant, name)
 
 
 def _limits(signal: Signal) -> np.ndarray:
@@ -332,7 +368,8 @@ def _within(
     within = largest <= limits
     if not within.all():  # seldom, so that the usual case stays cheap
         scale = limits if measured is None else limits + np.abs(measured)
-        within = largest <= limits + ULPS * np.finfo(float).eps * np.where(limits > 0, scale, 0.0)
+        eps = np.finfo(noise.dtype if noise.dtype.kind == "f" else float).eps
+        within = largest <= limits + ULPS * eps * np.where(limits > 0, scale, 0.0)
     return np.asarray(within)
 
 

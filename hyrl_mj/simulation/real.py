@@ -114,9 +114,14 @@ def judge_task(task: Task) -> int:
 
 def fresh_model(task: Task) -> mujoco.MjModel:
     """Returns the task's MJCF compiled anew, or if no file holds its model a copy of that."""
-    path = task.model_path
-    from_file = path.is_file() and task.model is mjcf.load(path)
-    return mujoco.MjModel.from_xml_path(str(path)) if from_file else copy.copy(task.model)
+    path, digest = task.model_path, mjcf.read_digest(task.model)
+    if not digest:
+        return copy.copy(task.model)
+    if not path.is_file() or mjcf.file_digest(path) != digest:
+        raise BadInput(
+            f"{path} has changed since the task {task.name} was made of it: make the task again"
+        )
+    return mujoco.MjModel.from_xml_path(str(path))
 
 
 def _played(
@@ -140,17 +145,19 @@ def _played(
     data.qpos[:] = qpos
     data.qvel[:] = 0.0 if qvel is None else qvel
     mujoco.mj_normalizeQuat(model, data.qpos)
-    held = model.key_ctrl[0] if model.nkey else np.zeros(model.nu)
+    if model.nkey:
+        data.ctrl[:] = model.key_ctrl[0]
+        data.act[:] = model.key_act[0]
     loop = task.has_inner_loop
     columns = [] if loop else [model.actuator(name).id for name in task.inputs]
     steps = max(round(task.dt / model.opt.timestep), 1)
-    data.ctrl[:] = held
     _move_mocap(task, model, data)
     sensed = [_sensed(model, data)]
     for k, u in enumerate(np.clip(inputs, *task.input_limits)):
         for _ in range(steps):
             if loop:
-                data.ctrl[:] = task.control(u[None], data.qpos[None].copy(), data.qvel[None].copy())
+                state = data.qpos[None].copy(), data.qvel[None].copy()
+                data.ctrl[:] = task.control(u[None].copy(), *state)
             else:
                 data.ctrl[columns] = u
             mujoco.mj_step(model, data)
@@ -266,5 +273,6 @@ def _differs(
     return BadInput(
         f"{task.name} is not simulated as MuJoCo alone simulates it: from {start} {what} at sample {sample} "
         f"is {ours}, and {real} where the same inputs are played again in a simulation of its own; something "
-        "keeps a memory between episodes or copies, or depends on the others of a batch"
+        "keeps a memory between episodes or copies, depends on the others of a batch, or has written to the "
+        "model"
     )

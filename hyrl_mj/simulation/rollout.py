@@ -7,13 +7,24 @@ import numpy as np
 
 from hyrl_mj.physics.plant import Plant
 from hyrl_mj.policies import Asked, Controller, nothing_past, remembering
-from hyrl_mj.simulation.noise import NOT_STARTED, AnyNoise, Sample, Signal, drawn, signal_for
+from hyrl_mj.simulation.noise import (
+    NOT_STARTED,
+    AnyNoise,
+    Sample,
+    Signal,
+    check_repeats,
+    drawn,
+    is_own,
+    signal_for,
+)
 from hyrl_mj.simulation.passing import Follower, Passing
 from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Outcome, Task
 
 # Samples for which a record has room at first; then it doubles.
 GROWS = 64
+# Samples in which noise of a user's class is drawn twice, to see whether its seed decides it.
+TWINS = 8
 
 
 @dataclass(frozen=True)
@@ -114,6 +125,9 @@ def closed_loop(
     plant.set_state(*task.state(z0, settings.rng_of_starts(seed)))
     signal = signal_for(noise, task, controller)
     signal.reset(n, np.random.default_rng(seed))
+    twin = None if is_own(signal) else signal_for(noise, task, controller)
+    if twin is not None:
+        twin.reset(n, np.random.default_rng(seed))
     ahead: list[np.ndarray] | None = [] if signal.unseeing and not together else None
     ask, measurement = Asked(task, controller), plant.measurement
     past = nothing_past(controller, n, measurement.shape[1])
@@ -139,7 +153,10 @@ def closed_loop(
             break
         rows = every if together else active
         now = Sample(rows, k[rows], measurement[rows], q[rows], plant, past[rows])
-        measured = plant.observe(now.measurement, _noise(signal, now, ahead, measurement), rows)
+        errors = _noise(signal, now, ahead, measurement)
+        if twin is not None and ahead is None and tick < TWINS:
+            check_repeats(signal, errors, twin, now)
+        measured = plant.observe(now.measurement, errors, rows)
         if plant.late:  # what the last step came to is known only now
             outcome[active] = task.outcome(plant.truth(active), plant.unstable[active])
             active = active[outcome[active] == Outcome.RUNNING]

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.policies import Policy, check_modes
+from hyrl_mj.policies import Policy, check_inputs, check_modes
 from hyrl_mj.sets import Complement, StateSet
 from hyrl_mj.tasks import Task
 
@@ -88,17 +88,22 @@ class HybridController:
         q_next = self._jump(q, self.task.z(measured), rows_of)
         if q_next is not q:
             rows_of = self._rows(q_next)
-        u = np.empty((n, len(self.task.inputs)))
+        m = len(self.task.inputs)
+        u = np.empty((n, m))
         for mode, rows in rows_of.items():
-            u[rows] = self.policies[mode].act(measured[rows])
+            asked = measured[rows]
+            u[rows] = check_inputs(self.policies[mode].act(asked), len(asked), m)
         return u, q_next.astype(int)
 
     def _jump(self, q: np.ndarray, z: np.ndarray, rows_of: dict[int, Rows]) -> np.ndarray:
         """Returns the modes (n,) after the jumps from z (n, d); q itself without jumps."""
         q_next = q
         for mode, rows in rows_of.items():
-            jumps = self.flow_sets[mode].signed_distance(z[rows]) > ON_EDGE
+            # What is not a number is looked at where it jumps.
+            distance = self.flow_sets[mode].signed_distance(z[rows])
+            jumps = ~np.less_equal(distance, ON_EDGE)
             if len(self.modes) > 1 and np.count_nonzero(jumps):
+                self._check_distance(mode, distance, z[rows])
                 others = [other for other in self.modes if other != mode]
                 q_next = q.copy() if q_next is q else q_next
                 jumping = np.arange(len(q))[rows][jumps]
@@ -112,7 +117,24 @@ class HybridController:
         if len(modes) == 1:
             return np.full(len(z), modes[0])
         distances = [sets[q].signed_distance(z) for q in modes]
+        for mode, distance in zip(modes, distances, strict=True):
+            self._check_distance(mode, distance, z)
         return np.array(modes)[np.argmin(distances, axis=0)]
+
+    def _check_distance(self, mode: int, distance: np.ndarray, z: np.ndarray) -> None:
+        """Raises `BadInput` unless a set of a mode, maybe a user's, gives a number for each point (n, d)."""
+        found = np.asarray(distance)
+        if found.shape != (len(z),) or found.dtype.kind != "f":
+            raise BadInput(
+                f"the set of mode {mode} gives signed distances of {found.dtype} and shape {found.shape} for "
+                f"{len(z)} points: give floats of shape ({len(z)},)"
+            )
+        if (blank := np.isnan(found)).any():
+            point = self.task.chart.format(z[int(blank.argmax())])
+            raise BadInput(
+                f"the signed distance to the set of mode {mode} is nan at {point}: give numbers, negative "
+                "inside and positive outside"
+            )
 
     def _rows(self, q: np.ndarray) -> dict[int, Rows]:
         """Returns the rows of q (n,) in each mode that occurs; refuses unknown modes."""

@@ -12,7 +12,7 @@ from hyrl_mj.tasks.checks import check_task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.effort import SPARING, Effort
 from hyrl_mj.tasks.field import CLEAR, FASTEST, PROJECTED, RADII, TAKEN, Field, FieldTask
-from hyrl_mj.tasks.guard import check_finite
+from hyrl_mj.tasks.guard import check_finite, read_only, writes
 from hyrl_mj.tasks.layouts import OF_POST, POSE, TURN, Layouts, length, only_post, posts_of
 from hyrl_mj.tasks.obstacles import (
     ANY,
@@ -27,6 +27,7 @@ from hyrl_mj.tasks.obstacles import (
 )
 from hyrl_mj.tasks.registry import (
     ENVIRONMENT,
+    check_as_made,
     described_task,
     get_task,
     reference,
@@ -60,6 +61,7 @@ __all__ = [
     "Scene",
     "Task",
     "at_levels",
+    "check_as_made",
     "check_finite",
     "check_task",
     "described_task",
@@ -69,6 +71,7 @@ __all__ = [
     "only_post",
     "pattern_of",
     "posts_of",
+    "read_only",
     "reference",
     "register",
     "sides",
@@ -77,6 +80,7 @@ __all__ = [
     "way_name",
     "wrapped",
     "write_task",
+    "writes",
 ]
 
 for _module in iter_modules(__path__, f"{__name__}."):

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from copy import copy
 from functools import cached_property
 from itertools import compress, product
 from pathlib import Path
@@ -108,19 +109,14 @@ class Task(ABC):
 
     @cached_property
     def code(self) -> str:
-        """SHA-256 of the files that define a task of the user's; "" for one of this package.
-
-        That of the Python file is taken once, because Python imports a file once.
-        """
+        """SHA-256 of the files of a user's task, as they were read; "" for one of this package."""
         if self.source is None:
             return ""
-        kind = type(self)
-        if "_digest" not in vars(kind):
-            kind._digest = digest(self.source)
-        return f"{kind._digest[:32]}{digest(self.model_path)[:32]}"
+        of_model = mjcf.read_digest(self.model) or digest(self.model_path)
+        return f"{self._digest[:32]}{of_model[:32]}"
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        return self  # nothing writes to it
+        return copy(self)  # but for its own attributes nothing is written to
 
     @cached_property
     def model(self) -> mujoco.MjModel:

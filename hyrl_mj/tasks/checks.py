@@ -191,6 +191,10 @@ def _check_starts(task: Task) -> None:
     d, p = task.chart.dimension, task.measurement_columns
     z = task.starts(STARTS, np.random.default_rng(0))
     _check_shape(f"starts({STARTS}) gives", z, (STARTS, d))
+    if not np.array_equal(z, task.starts(STARTS, np.random.default_rng(0))):
+        raise BadInput(
+            "starts() draws other starts from a generator of the same seed: let it draw from that alone"
+        )
     outside = z[~task.chart.contains(z)]
     if len(outside):
         point = task.chart.format(outside[0])

@@ -56,6 +56,20 @@ def guard(kind: type[Task]) -> None:
             setattr(kind, name, _guarded(name, method))
 
 
+def read_only(value: Any) -> Any:
+    """Returns an array that cannot be written to, as users' code gets what simulations go on with."""
+    if not isinstance(value, np.ndarray):
+        return value
+    view = value.view()
+    view.flags.writeable = False
+    return view
+
+
+def writes(error: BaseException) -> bool:
+    """Returns whether an error is that of NumPy about code that writes to a `read_only` array."""
+    return isinstance(error, ValueError) and "read-only" in str(error)
+
+
 def check_finite(task: Task, name: str, values: np.ndarray, measurement: np.ndarray) -> None:
     """Raises `BadInput` if the values (n,) that method `name` gave for measurements (n, p) are not finite."""
     if not math.isfinite(values.sum()) and not (finite := np.isfinite(values)).all():
@@ -74,10 +88,15 @@ def _guarded(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
         ):  # an array that is traced for an export, say
             return method(self, *args, **kwargs)
         try:
-            result = method(self, *args, **kwargs)
+            result = method(self, *map(read_only, args), **kwargs)
         except HyrlError:
             raise
         except (Exception, SystemExit) as error:  # whatever the user's own code raises
+            if writes(error):
+                raise BadInput(
+                    f"{name}() of the task {self.name} writes to an array that it is given"
+                    f"{line_in(error, self.source)}, with which the simulation goes on: let it work on a copy"
+                ) from error
             row = _row_of(lambda *rows: method(self, *rows), args, name)
             raise BadInput(
                 f"{name}() of the task {self.name} raises {brief(error)}{line_in(error, self.source)}"
@@ -87,7 +106,9 @@ def _guarded(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
             _check_result(self, name, args, result)
         elif name == "state":
             _check_state(self, args, result)
-        return result
+        # Part of what was shown is read-only, too, and the caller may write to what it gets.
+        shown = isinstance(result, np.ndarray) and not result.flags.writeable
+        return result.copy() if shown else result
 
     return checked
 

@@ -3,22 +3,26 @@
 import importlib
 import importlib.util
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
 
 import gymnasium as gym
+import numpy as np
 
 from hyrl_mj.errors import BadInput, brief, line_in, unknown
 from hyrl_mj.files import trust
 from hyrl_mj.tasks.base import Task
+from hyrl_mj.tasks.sources import digest_of, forget_helpers
 
 # The group of entry points under which an installed package offers tasks: name = "its.module:Class".
 GROUP = "hyrl_mj.tasks"
 PACKAGE = Path(__file__).resolve().parents[1]
 _REGISTRY: dict[str, type[Task]] = {}
-_FILES: dict[Path, type[Task]] = {}
+# The task that each file defines, as the file is at that time.
+_FILES: dict[tuple[Path, str], type[Task]] = {}
 # The text of an environment begins with this; a module above this one makes its task.
 ENVIRONMENT, MAKER = "env:", "hyrl_mj.environments.making"
 # Names of the tasks that other installed packages offer, as far as they have been loaded.
@@ -37,7 +41,7 @@ def register(task: type[Task]) -> type[Task]:
             f"{here} defines a task {task.name}, and so does {_file(other)}: rename one of them"
         )
     if here is not None and PACKAGE not in here.parents:
-        task.source = here
+        task.source, task._digest = here, digest_of(here)
     if "env_id" not in vars(task):
         task.env_id = f"hyrl_mj/{task.__name__}-v0"
     registered = gym.registry.pop(task.env_id, None)  # of this very class if it was decorated, too
@@ -78,16 +82,24 @@ def get_task(name: str | Path | Task) -> Task:
         made: Task = importlib.import_module(MAKER).from_spec(str(name))
         return made
     if str(name).endswith(".py"):
-        path = Path(name)
-        has_run = path.resolve() in _FILES
+        path = Path(name).resolve()
+        if not path.is_file():
+            remedy = f"hyrl-mj new-task {path.stem} writes one to start from"
+            if trust.is_received():
+                remedy = (
+                    "if it lies elsewhere, name it with --task FILE, in Python with "
+                    "load_run(path, task=FILE)"
+                )
+            raise BadInput(f"there is no task file {path}: {remedy}")
+        has_run = (path, digest_of(path)) in _FILES
         if trust.is_received() and not has_run and not trust.is_known(path):
             raise BadInput(
                 f"the task is defined in {path}, and opening a run executes no file that you have not run "
                 "before, as it is now: if you trust the file, name it with --task FILE, in Python with "
                 "load_run(path, task=FILE)"
             )
-        task = _instance(_from_file(Path(name)), str(name))
-        trust.remember(Path(name))
+        task = _instance(_from_file(path), str(name))
+        trust.remember(path)
         return task
     name = str(name)
     if name not in _REGISTRY and name in (offered := _offered()):
@@ -155,12 +167,8 @@ def _from_entry_point(entry: EntryPoint) -> None:
 
 
 def _from_file(path: Path) -> type[Task]:
-    path = path.resolve()
-    if path not in _FILES:
-        if not path.is_file():
-            raise BadInput(
-                f"there is no task file {path}: hyrl-mj new-task {path.stem} writes one to start from"
-            )
+    key = path, digest_of(path)
+    if key not in _FILES:
         module = _run(path)
         tasks = [
             value
@@ -175,13 +183,62 @@ def _from_file(path: Path) -> type[Task]:
             raise BadInput(
                 f"{path} must define one task, a subclass of hyrl_mj.Task with a name: it has {names}"
             )
-        _FILES[path] = register(tasks[0])
+        _FILES[key] = register(tasks[0])
         # Another process finds the class by its file, not by the name of the module here.
-        _FILES[path].__reduce__ = _by_reference  # type: ignore[assignment]
-    return _FILES[path]
+        _FILES[key].__reduce__ = _by_reference  # type: ignore[assignment]
+    elif _REGISTRY.get(_FILES[key].name) is not _FILES[key]:
+        register(_FILES[key])  # the file is again as it was before
+    return _FILES[key]
+
+
+def check_as_made(task: Task, but: Collection[str] = ()) -> None:
+    """Raises `BadInput` unless a task is as `get_task` makes it, by which runs and processes find it.
+
+    A run directory holds no objects: attributes that were given to an object, or changed after it was made,
+    would be lost. What is only computed from others is compared where both have computed it.
+
+    Args:
+        task: the task.
+        but: names of attributes that may differ.
+    """
+    made = get_task(reference(task))
+    if type(made) is not type(task):
+        raise BadInput(
+            f"the task {task.name} is of code that has been defined anew since it was made: make it again, "
+            f"as by get_task({reference(task)[:80]!r})"
+        )
+    names = vars(task).keys() | vars(made).keys()
+    for name in sorted(names, key=lambda name: (name.startswith("_"), name)):
+        computed = isinstance(getattr(type(task), name, None), cached_property)
+        if name in but or (computed and not (name in vars(task) and name in vars(made))):
+            continue
+        own, usual = (getattr(one, name, None) for one in (task, made))
+        if not _alike(own, usual):
+            raise BadInput(
+                f"the task {task.name} has {name} = {own!r:.60}, and runs and processes find it by "
+                f"{reference(task)[:80]}, where {name} is {usual!r:.60}: change it in its class, or give it "
+                "a class and a name of its own"
+            )
+
+
+def _alike(a: object, b: object) -> bool:
+    """Returns whether two attributes are the same, as far as can be told."""
+    if a is b:
+        return True
+    try:
+        return bool(np.array_equal(a, b, equal_nan=True))  # type: ignore[arg-type]
+    except TypeError:  # no numbers
+        pass
+    except Exception:
+        return False
+    try:
+        return bool(a == b)
+    except Exception:  # whatever a user's class does
+        return False
 
 
 def _by_reference(task: Task) -> tuple[Callable[[str], Task], tuple[str], dict[str, object]]:
+    check_as_made(task, but=("noisy",))
     own = {name: value for name, value in vars(task).items() if name == "noisy"}
     return get_task, (reference(task),), own
 
@@ -189,6 +246,7 @@ def _by_reference(task: Task) -> tuple[Callable[[str], Task], tuple[str], dict[s
 def _run(path: Path) -> ModuleType:
     """Imports a file as a module of its own, which can import from its folder as a script can."""
     name = f"hyrl_mj_task_{path.stem}_{len(_FILES)}"
+    forget_helpers(path)
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None

@@ -1,0 +1,342 @@
+"""What users' own robots, noise, sets and functions do that no sample shows: right, or refused by name."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+from trapped_plants import CALM, MJCF, TASK, VELOCITY, vehicle
+
+import hyrl_mj
+from hyrl_mj import BadInput, HybridController, Noise, from_callable, get_task, simulate
+from hyrl_mj.policies.external import read_agent
+from hyrl_mj.simulation import Recorded, Signal, judge_task, register_noise
+from hyrl_mj.simulation import noise as noises
+from hyrl_mj.simulation.real import fresh_model
+from hyrl_mj.tasks import Outcome, check_task, described_task
+
+_, XML, PY, *_ = vehicle()
+NAMES = iter(range(1_000))
+CRASH = "<= 0.6]"
+# A robot that is the same at each physics step, whose inner loop the task gives.
+DRIVEN = VELOCITY.format(name="ahead", joint="x", kv=1e7, more="") + VELOCITY.format(
+    name="side", joint="y", kv=1e7, more=""
+)
+
+
+def write(folder, py=None, actuators="", text=lambda xml: xml, top=""):
+    """The files of a vehicle that passes a pillar, with some parts of its own; returns its path."""
+    name = f"truer_{next(NAMES)}"
+    held = VELOCITY.format(name="ahead", joint="x", kv=1e9, more="")
+    steered = VELOCITY.format(name="u", joint="y", kv=1e9, more='ctrlrange="-1 1"')
+    sensors = '<jointpos joint="x"/><jointpos joint="y"/>'
+    xml = MJCF.format(name=name, actuators=actuators or held + steered, sensors=sensors, **XML)
+    (folder / f"{name}.xml").write_text(text(xml))
+    path = folder / f"{name}.py"
+    path.write_text(top + TASK.format(name=name, **(PY | (py or {}))))
+    return path
+
+
+class Steer:
+    """Past the pillar on the side where the robot is."""
+
+    def act(self, measured):
+        y = measured[:, 1]
+        return np.where(np.abs(y) >= 0.95, 0.0, np.where(y >= 0, 1.0, -1.0))[:, None]
+
+
+# ---- what runs and processes find a task by
+
+
+@pytest.fixture
+def wide(tmp_path):
+    """A task whose pillar is as wide as the object that is made says."""
+    ending = PY["ending"].replace(CRASH, "<= self.radius]")
+    own = "    def __init__(self, radius=0.6):\n        self.radius = radius\n"
+    return get_task(write(tmp_path, {"ending": ending, "methods": own}))
+
+
+def test_an_object_that_no_run_leads_to_is_refused(wide, tmp_path):
+    other, closer, noisy = type(wide)(0.9), copy.deepcopy(wide), wide.with_noise((1.0, 1.0))
+    closer.close = 0.9
+    assert wide.close == 0.3
+    for task, name in ((other, "radius = 0.9"), (closer, "close = 0.9"), (noisy, "noisy = ")):
+        with pytest.raises(BadInput, match=f"has {name}.*runs and processes find it by"):
+            hyrl_mj.run(task, preset="smoke", out=tmp_path / "run")
+        if task is not noisy:
+            with pytest.raises(BadInput, match=name):
+                pickle.dumps(task)
+    assert pickle.loads(pickle.dumps(noisy)).noisy == (1.0, 1.0)
+    assert pickle.loads(pickle.dumps(wide)).radius == 0.6
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_task_file_is_read_as_it_is_now(tmp_path):
+    path = write(tmp_path)
+    first = get_task(path)
+    text = path.read_text()
+    path.write_text(text.replace(CRASH, "<= 0.9]"))
+    second, beside = get_task(path), np.array([[1.5, 0.8]])
+    assert [Outcome(t.ending(beside)[0]).label for t in (first, second)] == ["running", "crashed"]
+    assert first.code != second.code
+    with pytest.raises(BadInput, match="of code that has been defined anew"):
+        hyrl_mj.run(first, preset="smoke", out=tmp_path / "run")
+    path.write_text(text)
+    assert type(described_task(str(path))) is type(first)
+
+
+def test_a_model_is_compiled_as_its_files_are_now(tmp_path):
+    part = tmp_path / "pillar.xml"
+    part.write_text('<mujoco><worldbody><geom name="mark" size="0.1"/></worldbody></mujoco>')
+    include = '<include file="pillar.xml"/>\n</mujoco>'
+    path = write(tmp_path, text=lambda xml: xml.replace("</mujoco>", include))
+    first = get_task(path)
+    assert first.model.geom("mark").size[0] == 0.1
+    part.write_text(part.read_text().replace("0.1", "0.2"))
+    with pytest.raises(BadInput, match="has changed since"):
+        fresh_model(first)
+    second = get_task(path)
+    assert second.model.geom("mark").size[0] == 0.2
+    assert first.code != second.code
+
+
+def test_what_lies_beside_a_task_is_part_of_it(tmp_path):
+    tasks = []
+    for radius in (0.6, 0.9):
+        folder = tmp_path / str(radius)
+        folder.mkdir()
+        (folder / "pillars.py").write_text(f"RADIUS = {radius}\n")
+        ending = PY["ending"].replace(CRASH, "<= RADIUS]")
+        tasks.append(write(folder, {"ending": ending}, top="from pillars import RADIUS\n"))
+    first = get_task(tasks[0])
+    with pytest.raises(BadInput, match=r"another module of that name, .*pillars.py: rename"):
+        get_task(tasks[1])
+    (tasks[0].parent / "pillars.py").write_text("RADIUS = 0.9\n")
+    again = get_task(tasks[0])
+    assert first.code != again.code
+    assert again.ending(np.array([[1.5, 0.8]]))[0] == Outcome.CRASHED
+
+
+def test_a_missing_task_file_is_said_to_be_missing(tmp_path):
+    with pytest.raises(BadInput, match="there is no task file .*: if it lies elsewhere, .*--task"):
+        described_task(str(tmp_path / "gone.py"))
+
+
+# ---- what simulations go on with
+
+
+@pytest.mark.parametrize(
+    "own",
+    [
+        {"ending": "measured[:, 1] = np.abs(measured[:, 1])\n        " + PY["ending"]},
+        {"observation": "measured *= 0.5\n        return measured"},
+        {
+            "methods": "    def measure(self, sensors):\n"
+            "        sensors[:, 1] %= 1.0\n        return sensors\n"
+        },
+    ],
+    ids=["ending", "observation", "measure"],
+)
+def test_a_method_that_writes_to_what_it_is_given_is_refused(own, tmp_path):
+    task = get_task(write(tmp_path, own))
+    with pytest.raises(BadInput, match=r"writes to an array that it is given, line \d+.*a copy"):
+        check_task(task)
+    with pytest.raises(BadInput, match="writes to an array"):
+        simulate(task, from_callable(lambda seen: np.full(len(seen), 2), task), [0.0, 0.5])
+
+
+def test_an_inner_loop_gets_its_inputs_at_each_step(tmp_path):
+    own = (
+        "    def control(self, u, qpos, qvel):\n        u *= 0.5\n"
+        "        return np.hstack([np.ones((len(u), 1)), u])\n"
+    )
+
+    def text(xml):
+        numeric = '<numeric name="side" data="-1 1"/></custom>'
+        return xml.replace("</custom>", numeric).replace('timestep="0.05"', 'timestep="0.01"')
+
+    path = write(tmp_path, {"methods": own}, DRIVEN, text)
+    path.write_text(path.read_text().replace('inputs = ("u",)', 'inputs = ("side",)'))
+    with pytest.raises(BadInput, match=r"control\(\) .* writes to an array"):
+        simulate(get_task(path), Steer(), [0.0, 0.5])
+
+
+def test_runs_of_a_user_s_robot_are_played_again_where_they_are_simulated(tmp_path):
+    own = (
+        "    def state(self, z, rng=None):\n"
+        "        return z, 0.1 * np.random.standard_normal(z.shape)\n"
+    )
+    soft = VELOCITY.format(name="ahead", joint="x", kv=20, more="") + VELOCITY.format(
+        name="u", joint="y", kv=5, more='ctrlrange="-1 1"'
+    )
+    task = get_task(write(tmp_path, {"methods": own}, soft))
+    with pytest.raises(BadInput, match="is not simulated as MuJoCo alone simulates it"):
+        simulate(task, Steer(), [0.0, 0.5])
+
+
+@pytest.mark.parametrize(("key", "speed"), [('ctrl="3 0"', 0.5), ('ctrl="0.25 0"', 0.25)])
+def test_a_held_control_is_clamped_as_mujoco_does(key, speed, tmp_path):
+    held = VELOCITY.format(name="ahead", joint="x", kv=1e9, more='ctrlrange="-0.5 0.5"')
+    steered = VELOCITY.format(name="u", joint="y", kv=1e9, more='ctrlrange="-1 1"')
+    path = write(tmp_path, None, held + steered, lambda xml: xml.replace('ctrl="1 0"', key))
+    task = get_task(path)
+    judge_task(task)
+    plant = task.plant(1)
+    plant.set_state(np.zeros((1, 2)))
+    plant.step(np.zeros((1, 1)))
+    assert plant.qpos[0, 0] == pytest.approx(0.05 * speed)
+
+
+def test_the_activation_of_the_keyframe_holds(tmp_path):
+    held = '<intvelocity name="ahead" joint="x" kp="200" kv="20" actrange="-9 9"/>'
+    steered = VELOCITY.format(name="u", joint="y", kv=1e9, more='ctrlrange="-1 1"')
+    path = write(
+        tmp_path, None, held + steered, lambda xml: xml.replace('ctrl="1 0"', 'ctrl="0 0" act="1"')
+    )
+    task = get_task(path)
+    judge_task(task)
+    plant = task.plant(1)
+    plant.set_state(np.zeros((1, 2)))
+    for _ in range(40):
+        plant.step(np.zeros((1, 1)))
+    assert plant.qpos[0, 0] > 0.5
+
+
+def test_a_sample_time_of_another_name_is_noticed(tmp_path):
+    path = write(tmp_path, text=lambda xml: xml.replace('"sample_time"', '"sampletime"'))
+    with pytest.raises(BadInput, match="the numeric sampletime .* is called sample_time"):
+        check_task(get_task(path))
+
+
+def test_starts_of_one_seed_are_the_same(tmp_path):
+    own = (
+        "    def starts(self, n, rng):\n"
+        "        return np.random.uniform(self.start_low, self.start_high, (n, 2))\n"
+    )
+    with pytest.raises(BadInput, match="draws other starts from a generator of the same seed"):
+        check_task(get_task(write(tmp_path, {"methods": own})))
+
+
+def test_sleeping_models_are_refused_with_a_sentence(tmp_path):
+    sleeps = CALM.replace("/>", ' sleep="enable"/>')
+    task = get_task(write(tmp_path, text=lambda xml: xml.replace(CALM, sleeps)))
+    with pytest.raises(BadInput, match="cannot simulate copies of .* side by side"):
+        task.plant(2)
+
+
+# ---- noise
+
+
+@pytest.fixture
+def kinds(monkeypatch):
+    """The kinds of noise, of which those of a test are forgotten after it."""
+    monkeypatch.setattr(noises, "_KINDS", dict(noises._KINDS))
+
+
+def registered(sample, **own):
+    """A kind of noise whose method `sample` is given."""
+    own |= {"kind": "own", "sample": sample}
+    register_noise(type("Own", (Signal,), own))
+    return Noise("own", 0.1)
+
+
+def saw(self, now):
+    k = now.k
+    k %= 4
+    return ((k - 1.5) / 1.5 * self.bound)[:, None] * self.shares
+
+
+def looks_ahead(self, now):
+    now.plant.step(np.ones((1, 1)))
+    return np.zeros_like(now.measurement)
+
+
+def unseeded(self, now):
+    return np.random.default_rng().uniform(-0.1, 0.1, now.measurement.shape) * self.shares
+
+
+def counting(self, now):
+    type(self).count += 1
+    return np.full(now.measurement.shape, (-0.1) ** (type(self).count % 2 + 1)) * self.shares
+
+
+@pytest.mark.parametrize(
+    ("sample", "message"),
+    [
+        (saw, "writes to an array that it is shown"),
+        (looks_ahead, r"noise calls step\(\) of the plant that is simulated"),
+        (unseeded, "gives other values where it begins anew with the same seed"),
+        (counting, "gives other values where it begins anew"),
+    ],
+)
+def test_noise_that_its_seed_does_not_decide_is_refused(sample, message, vehicle, kinds):
+    noise = registered(sample, count=0)
+    with pytest.raises(BadInput, match=message):
+        simulate(vehicle, Steer(), [0.0, 0.5], noise)
+
+
+def test_single_precision_reaches_the_bound_and_not_beyond_it(vehicle, kinds):
+    noise = registered(lambda self, now: np.tile(np.float32([0.0, 0.1]), (len(now.k), 1)))
+    arc = simulate(vehicle, Steer(), [0.0, 0.5], noise)
+    assert np.abs(arc.measured[:-1, 1] - arc.z[:-1, 1]).max() <= 0.1 + 1e-15
+    assert Recorded(np.full((3, 1, 2), 0.1, dtype=np.float32), 0.1).values.max() == 0.1
+
+
+# ---- sets, functions and their users' mistakes
+
+
+@pytest.mark.parametrize(
+    ("distance", "message"),
+    [
+        (lambda z: np.sqrt(1 - z[:, 0]), "is nan at x = 1.5 m"),
+        (lambda z: z[:, :1], r"of float64 and shape \(2, 1\)"),
+        (lambda z: z[:, 0] < 0, "of bool"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_sets_of_users_give_a_number_for_each_point(distance, message, vehicle):
+    own = type("Own", (), {"signed_distance": lambda self, z: distance(z)})()
+    whole = type("All", (), {"signed_distance": lambda self, z: np.full(len(z), -1.0)})()
+    controller = HybridController(vehicle, {0: Steer(), 1: Steer()}, {0: own, 1: whole})
+    with pytest.raises(BadInput, match=message):
+        controller.initial_mode(np.array([[1.5, -0.9], [1.5, 0.3]]))
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_a_mode_does_not_stay_where_its_set_is_no_number(vehicle):
+    own = type("Own", (), {"signed_distance": lambda self, z: np.sqrt(1 - z[:, 0]) - 9})()
+    whole = type("All", (), {"signed_distance": lambda self, z: np.full(len(z), -1.0)})()
+    controller = HybridController(vehicle, {0: Steer(), 1: Steer()}, {0: own, 1: whole})
+    with pytest.raises(BadInput, match="is nan at"):
+        controller.step(np.zeros(1, dtype=int), np.array([[1.5, -0.9]]))
+
+
+def test_functions_that_differ_away_from_the_starts_are_told_apart(vehicle):
+    def near(seen):
+        return np.full(len(seen), 2)
+
+    def far(seen):
+        return np.where(seen[:, 1] < 1.0, 4, 2)  # close to the set-point
+
+    hashes = {read_agent(vehicle, function).agent.sha256 for function in (near, far)}
+    assert len(hashes) == 2
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (lambda seen: (np.zeros((len(seen), 1)), None), "returns a tuple, as the predict"),
+        (lambda seen: np.zeros((len(seen), 1), dtype=complex), "an input is a number"),
+    ],
+)
+def test_functions_that_give_something_else_are_told_what(answer, message, circle):
+    with pytest.raises(BadInput, match=message):
+        simulate(circle, from_callable(answer, "unit_circle"), [3.0])
+
+
+def test_what_closes_no_loop_is_refused(vehicle):
+    with pytest.raises(BadInput, match="can close no loop.*from_callable"):
+        simulate(vehicle, lambda measured: measured, [0.0, 0.5])
+    flat = type("Flat", (), {"act": lambda self, measured: np.zeros(len(measured))})()
+    with pytest.raises(BadInput, match=r"inputs of shape \(2,\) for 2 measurements: give \(2, 1\)"):
+        simulate("vehicle", flat, [[0.0, 0.5], [0.0, 0.4]])
