@@ -389,7 +389,7 @@ def by_chance(observation):
 @pytest.mark.parametrize(
     ("policy", "options", "message"),
     [
-        (wrong_shape, {}, r"shape \(256, 7\) for 256"),
+        (wrong_shape, {}, r"shape \(1280, 7\) for 1280"),
         (not_a_number, {}, "gives nan"),
         (by_chance, {}, "without chance or memory"),
         (3, {}, "cannot be called"),

@@ -10,8 +10,7 @@ from trapped_plants import CALM, MJCF, TASK, VELOCITY, vehicle
 import hyrl_mj
 from hyrl_mj import BadInput, HybridController, Noise, from_callable, get_task, simulate
 from hyrl_mj.policies.external import read_agent
-from hyrl_mj.simulation import Recorded, Signal, judge_task, register_noise
-from hyrl_mj.simulation import noise as noises
+from hyrl_mj.simulation import Recorded, Signal, judge_task, noise as noises, register_noise
 from hyrl_mj.simulation.real import fresh_model
 from hyrl_mj.tasks import Outcome, check_task, described_task
 
@@ -118,7 +117,7 @@ def test_what_lies_beside_a_task_is_part_of_it(tmp_path):
 
 
 def test_a_missing_task_file_is_said_to_be_missing(tmp_path):
-    with pytest.raises(BadInput, match="there is no task file .*: if it lies elsewhere, .*--task"):
+    with pytest.raises(BadInput, match=r"there is no task file .*: if it lies elsewhere, .*--task"):
         described_task(str(tmp_path / "gone.py"))
 
 
@@ -204,7 +203,7 @@ def test_the_activation_of_the_keyframe_holds(tmp_path):
 
 def test_a_sample_time_of_another_name_is_noticed(tmp_path):
     path = write(tmp_path, text=lambda xml: xml.replace('"sample_time"', '"sampletime"'))
-    with pytest.raises(BadInput, match="the numeric sampletime .* is called sample_time"):
+    with pytest.raises(BadInput, match=r"the numeric sampletime .* is called sample_time"):
         check_task(get_task(path))
 
 
@@ -220,7 +219,7 @@ def test_starts_of_one_seed_are_the_same(tmp_path):
 def test_sleeping_models_are_refused_with_a_sentence(tmp_path):
     sleeps = CALM.replace("/>", ' sleep="enable"/>')
     task = get_task(write(tmp_path, text=lambda xml: xml.replace(CALM, sleeps)))
-    with pytest.raises(BadInput, match="cannot simulate copies of .* side by side"):
+    with pytest.raises(BadInput, match=r"cannot simulate copies of .* side by side"):
         task.plant(2)
 
 
@@ -335,7 +334,7 @@ def test_functions_that_give_something_else_are_told_what(answer, message, circl
 
 
 def test_what_closes_no_loop_is_refused(vehicle):
-    with pytest.raises(BadInput, match="can close no loop.*from_callable"):
+    with pytest.raises(BadInput, match=r"can close no loop.*from_callable"):
         simulate(vehicle, lambda measured: measured, [0.0, 0.5])
     flat = type("Flat", (), {"act": lambda self, measured: np.zeros(len(measured))})()
     with pytest.raises(BadInput, match=r"inputs of shape \(2,\) for 2 measurements: give \(2, 1\)"):

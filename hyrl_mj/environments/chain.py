@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hyrl_mj.environments.observations import flat, shaped
-from hyrl_mj.errors import BadInput
+from hyrl_mj.errors import BadInput, brief
 
 if TYPE_CHECKING:
     from hyrl_mj.environments.instance import Instance
@@ -30,13 +30,21 @@ class Chain:
     def __init__(self, instance: Instance):
         self._instance = instance
         self._own_step, self._own_reset = instance.inner.step, instance.inner.reset
-        instance.inner.step, instance.inner.reset = self._step, self._reset
+        try:
+            instance.inner.step, instance.inner.reset = self._step, self._reset
+        except Exception as error:
+            raise BadInput(
+                f"{instance.name} allows no attributes beside its own ({brief(error)}), and noise comes in "
+                "by its step() below the wrappers: let it allow them, or leave the wrappers out"
+            ) from error
         self._work: SimpleQueue[Callable[[], Any] | None] = SimpleQueue()
         self._noise: SimpleQueue[np.ndarray] = SimpleQueue()
         self._news: SimpleQueue[tuple[str, Any]] = SimpleQueue()
         self._busy = False  # with a sample that waits to be observed
         self._calls = 0
         self._inside = False  # of the environment's own reset, which may step it
+        # What is done to the result of a step before wrappers get it, in a trial.
+        self.tamper: Callable[[tuple[Any, ...]], tuple[Any, ...]] = lambda rest: rest
         # The state that wrappers see, if it is not the true one.
         self._shown: np.ndarray | None = None
         Thread(target=_serve, args=(self._work, self._news), daemon=True).start()
@@ -114,6 +122,7 @@ class Chain:
         instance, space = self._instance, self._instance.inner.observation_space
         if not self._busy:
             return (observation, *rest)
+        rest = self.tamper(rest)
         self._calls += 1
         if self._calls > 1:
             raise BadInput(

@@ -100,6 +100,18 @@ class Expression:
         with np.errstate(all="ignore"):  # what is not finite is made missing
             return np.asarray(self._truth(self._tree, values))
 
+    def needs(self, name: str) -> bool:
+        """Returns whether the expression asks for a name otherwise than by `not`."""
+
+        def holds(node: ast.AST) -> bool:
+            if isinstance(node, ast.Name):
+                return node.id == name
+            negated = isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not)
+            parts = ast.iter_child_nodes(node)
+            return not negated and any(holds(part) for part in parts)
+
+        return self._tree is not None and holds(self._tree)
+
     def _refuse(self, why: str) -> NoReturn:
         raise BadInput(f"{self.what} {_short(str(self.text))!r} cannot be used: {why}")
 

@@ -35,6 +35,7 @@ from hyrl_mj.environments.specification import (
     Criterion,
     EnvironmentSpec,
 )
+from hyrl_mj.environments.told import check_told
 from hyrl_mj.errors import BadInput
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
@@ -84,6 +85,8 @@ def inspect(description: Description) -> tuple[EnvironmentSpec, Pool, Instance]:
         instance.spec.found["lag"] = f"observation {', '.join(map(str, late))} {LAG[derived]}"
     instance.learn(derived=derived)
     instance.learn(anew=instance.is_wrapped and trials.changes_by_reset(instance.spec))
+    if instance.is_wrapped:
+        check_told(instance.spec, step)
     instance.learn(sensing=instance.is_wrapped and trials.senses(instance.spec, step))
     pool = Pool(instance.spec, fresh)
     moves, affine = trials.moving(pool, instance.spec)
@@ -214,6 +217,11 @@ def _sampled(instance: Instance) -> tuple[np.ndarray, list[str]]:
                 harmless |= instance.touched()
         instance.finish()
         remembers = remembers or not is_known(before) or bool(differing(instance.memory(), before))
+    if dt <= 0:
+        raise BadInput(
+            f"the time of {instance.name} stands still in step(), so nothing tells how long a step is: let "
+            "it call mj_step, or add its duration to data.time"
+        )
     if not np.isfinite(rewards).all():
         raise BadInput(f"step() of {instance.name} gives rewards that are not finite: repair it")
     instance.learn(
@@ -320,8 +328,8 @@ def _learn_bounds(instance: Instance, met: np.ndarray, begun: np.ndarray) -> Non
     ends = [begun.min(axis=0), begun.max(axis=0)]
     lead = ", ".join(f"{n} {a:.3g} to {b:.3g}" for n, a, b in zip(names, *ends, strict=True))
     found["starts"] = (
-        f"all over the chart, the robot at rest and all else as after a reset; with {RESET!r} where resets "
-        f"lead to: {lead}"
+        "all over the chart, the robot at rest and all else as after a reset (deeper than "
+        f"{spec.depth:.2g} m inside of something it has crashed); with {RESET!r} where resets lead to: {lead}"
     )
     start_low, start_high = low, high
     if given.starts == RESET:

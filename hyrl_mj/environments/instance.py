@@ -21,7 +21,7 @@ from gymnasium import spaces
 from hyrl_mj.environments import fingerprint as written
 from hyrl_mj.environments.chain import Chain
 from hyrl_mj.environments.expressions import entry
-from hyrl_mj.environments.observations import flat, observers
+from hyrl_mj.environments.observations import flat, observers, shaped
 from hyrl_mj.environments.opening import made, peeled, physics_of, plant_of, steps_of
 from hyrl_mj.environments.physics import Physics
 from hyrl_mj.environments.specification import EARLIER, NOW, UNKNOWN, EnvironmentSpec
@@ -50,6 +50,7 @@ class Instance:
             what the robot does not touch elsewhere, entries of `info`, distances.
         inner_seen: what the innermost environment observed last.
         tried: whether wrappers may write to a state that noise has moved, to find out what they do.
+        draws_globally: whether a reset has drawn from a global generator.
         start: the state of MuJoCo to which the innermost reset has to lead, below wrappers.
 
     Raises:
@@ -75,7 +76,8 @@ class Instance:
         self._like: written.Fingerprint | None = None  # after its first reset
         self._begun = written.Fingerprint()  # after the reset of its episode
         self._used = self._at_start = False
-        self.tried = False
+        self.tried = self.draws_globally = False
+        self._samples = 0
         self._pairs: list[tuple[np.ndarray, np.ndarray]] = []
         self._chain = Chain(self) if self.is_wrapped else None
 
@@ -100,8 +102,10 @@ class Instance:
         np.random.seed(seed)
         random.seed(seed)
         self._actions.seed(seed)
+        given_options = {"options": options} if options else {}
+        before = _global_state()
         try:
-            observation, _ = self.env.reset(seed=seed, options=options or None)
+            result = self.env.reset(seed=seed, **given_options)
         except HyrlError:
             raise
         except (Exception, SystemExit) as error:
@@ -109,6 +113,13 @@ class Instance:
             raise BadInput(
                 f"{self.name} cannot be reset{told} ({brief(error)}): change its options of reset"
             ) from error
+        if not isinstance(result, tuple) or len(result) != 2:
+            raise BadInput(
+                f"reset() of {self.name} returns a {type(result).__name__}: let it return an observation and "
+                "info"
+            )
+        observation = result[0]
+        self.draws_globally |= _global_state() != before
         physics = physics_of(self.env)
         if physics is None or physics[0] is not self.model:
             raise BadInput(
@@ -128,8 +139,12 @@ class Instance:
             self.pin()
         return observation
 
-    def put(self, state: np.ndarray, seed: int | None = None) -> np.ndarray:
+    def put(
+        self, state: np.ndarray, seed: int | None = None, noise: np.ndarray | None = None
+    ) -> np.ndarray:
         """Resets the environment and puts it to a state of MuJoCo (S,); returns what it observes there (o,).
+
+        It observes under noise (d,), by default none.
 
         Wrappers see the start as the first observation, as if the reset of the innermost environment had led
         there.
@@ -137,19 +152,19 @@ class Instance:
         if not self.is_wrapped:
             self.reset(seed)
         self.begin(state, seed)
-        self.sense(np.zeros(self.spec.dimension))
+        self.sense(np.zeros(self.spec.dimension) if noise is None else noise)
         return self.observation
 
     def placed(self, state: np.ndarray) -> np.ndarray:
         """Puts an environment without wrappers to a state (S,); returns what it observes there (o,)."""
         self.arrive(state)
-        self.observation = flat(self.inner_seen, self._space)
+        self.observation = self._flat(self.inner_seen)
         return self.observation
 
     def arrive(self, state: np.ndarray) -> None:
         """Puts the innermost environment to a start (S,), and has it observe."""
         self.physics.write(state)
-        self.inner_seen, self._at_start = self.watched(), True
+        self.inner_seen, self._at_start, self._samples = self.watched(), True, 0
 
     def pin(self) -> None:
         """Sets what is pinned."""
@@ -187,6 +202,11 @@ class Instance:
         found = self.memory()
         found["MuJoCo's state"] = self.physics.read().tobytes()
         return found
+
+    def tamper(self, change: Any) -> None:
+        """Changes what wrappers get beside the observation, in a trial; see `Chain`."""
+        assert self._chain is not None
+        self._chain.tamper = change
 
     def mark(self) -> None:
         """Notes what is remembered, and compares it with what was after the first reset.
@@ -233,13 +253,14 @@ class Instance:
         """Has the environment observe under noise (d,) on the chart's coordinates."""
         if self._chain is None:
             if noise.any():
-                self.observation = self.observation + self.displaced(noise)
+                moved = self.observation + self.displaced(noise)
+                self.observation = self._flat(shaped(moved, self.inner_seen, self._space))
             return
         result = self._chain.answer(noise)
         if self.start is None:
             self.take(result)
         else:
-            self.start, self.observation = None, flat(result, self._space)
+            self.start, self.observation = None, self._flat(result)
 
     def finish(self) -> None:
         """Refuses an episode in which random numbers were drawn, or what is shared or looked at changed."""
@@ -272,6 +293,22 @@ class Instance:
 
     # ---- what it observes
 
+    def _flat(self, observation: Any) -> np.ndarray:
+        """Returns an observation as a vector (o,), which its space describes."""
+        try:
+            vector = flat(observation, self._space)
+        except KeyError as error:
+            raise BadInput(
+                f"an observation of {self.name} has no {error}, as its space has"
+            ) from None
+        columns = int(spaces.flatdim(self._space))
+        if len(vector) != columns:
+            raise BadInput(
+                f"{self.name} observes {len(vector)} number(s), and its observation_space has {columns}: let "
+                "them be as many"
+            )
+        return vector
+
     def watched(self) -> Any:
         """Returns what the innermost environment observes in its present state."""
         try:
@@ -293,11 +330,20 @@ class Instance:
         difference of two observations with all of them up to date.
         """
         state, derived = self.physics.read(), NOW if self._at_start else self.spec.derived
+        given = flat(self.inner_seen, self.inner.observation_space)
+        before = given
         if derived == UNKNOWN:
             before = self.seen_as(NOW, state, np.zeros(len(noise)))
-        else:
-            before = flat(self.inner_seen, self.inner.observation_space)
-        return self.seen_as(derived, state, noise) - before
+        moved = self.seen_as(derived, state, noise) - before
+        again = flat(self.watched(), self.inner.observation_space)
+        if not np.array_equal(again, given, equal_nan=True):
+            column = int(((again != given) & ~(np.isnan(again) & np.isnan(given))).argmax())
+            raise BadInput(
+                f"{self.name} has observed {given[column]:.6g} in observation[{column}], and "
+                f"{self.spec.observer}() gives {again[column]:.6g} in the same state: let it compute all "
+                "that is observed, and remember nothing"
+            )
+        return moved
 
     def seen_as(self, derived: str, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Returns the innermost observation (o,) of a state (S,) under noise (d,), as `derived` says."""
@@ -366,9 +412,11 @@ class Instance:
         took, dt = self.data.time - began, self.spec.dt
         if took < 0 and not self.physics.is_plant:
             raise BadInput(
-                f"the time of {self.name} goes back in step(), as where a simulation diverges and MuJoCo "
-                "resets it: limit its inputs, or take a smaller timestep"
+                f"the time of {self.name} goes back in step(): it is reset at its ends, which its user has "
+                "to do, or its simulation diverges and MuJoCo resets it (limit its inputs, or take a smaller "
+                "timestep)"
             )
+        self._samples += 1
         goes_on = dt and not self.physics.is_plant and not (result[2] or result[3])
         if goes_on and abs(took - dt) > SAME_TIME * dt:
             raise BadInput(
@@ -379,11 +427,18 @@ class Instance:
     def take(self, result: Any) -> None:
         """Notes the observation and the report of what a step has returned."""
         observation, reward, terminated, truncated, info = result
-        self.observation = flat(observation, self._space)
+        self.observation = self._flat(observation)
+        if np.size(reward) != 1 or not isinstance(info, dict):
+            raise BadInput(
+                f"step() of {self.name} returns {reward!r:.60} as its reward and a {type(info).__name__} as "
+                "its info: let it return a number and a dictionary"
+            )
+        # The limit of `steps`, or that of a wrapper which episodes are played without.
+        truncated |= self.spec.criterion.asks("truncated") and self._samples == self.spec.max_steps
         if self.physics.is_plant:
             self.physics.read()
         touch = bool(terminated) and bool(self.touched() - self.spec.harmless)
-        report = [float(reward), bool(terminated), bool(truncated), touch]
+        report = [float(np.ravel(reward)[0]), bool(terminated), bool(truncated), touch]
         report += [entry(info, key) for key in self.spec.criterion.keys]
         for a, b in self._pairs:
             away = a - b

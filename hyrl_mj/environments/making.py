@@ -221,7 +221,12 @@ def _made_of(description: Description) -> tuple[Any, ...]:
         with suppress(OSError, ValueError):
             if isinstance(value, str) and Path(value).is_file():
                 digests.append(artifacts.digest(Path(value)))
-    return (gym.registry.get(env.rpartition(":")[2]), *digests)
+    entry = gym.registry.get(env.rpartition(":")[2])
+    maker: Any = None if entry is None else entry.entry_point
+    if isinstance(maker, str):  # a module that is imported again has another class of that name
+        with suppress(Exception):
+            maker = gym.envs.registration.load_env_creator(maker)
+    return (entry, maker, *digests)
 
 
 def _same(made_of: tuple[Any, ...], other: tuple[Any, ...]) -> bool:

@@ -191,7 +191,7 @@ def _why_not_made(name: str, error: BaseException) -> str:
 
 def _checked(env: Any, name: str) -> mujoco.MjModel:
     """Returns the model of an environment of one agent in MuJoCo, with vectors; refuses others."""
-    if hasattr(env, "possible_agents") or hasattr(env, "agents"):
+    if {"possible_agents", "agents"} & {*dir(env)}:  # not what a `__getattr__` may say
         raise BadInput(f"{name} has several agents: hyrl_mj takes environments of one agent")
     if isinstance(env, gym.vector.VectorEnv) or not isinstance(env, gym.Env):
         raise BadInput(

@@ -186,6 +186,8 @@ class EnvironmentPlant:
         """
         rows = self._rows(ids)
         u = checked_inputs(u, self.low, self.high, rows, self.spec.name)
+        if self.spec.wrapped and not self._written:  # what the last step came to may be an end
+            self._sense(rows[self._open[rows] & self._plays[rows]])
         # A run that is over stays where it ended.
         goes_on = (self._outcome[rows] == Outcome.RUNNING) & ~self._unstable[rows]
         rows, u = rows[goes_on], u[goes_on]

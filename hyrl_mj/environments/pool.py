@@ -48,7 +48,8 @@ class Played:
         path: (k + 1, d) chart points, before and after each sample.
         outcome: how it ended.
         cut: whether it was cut off after these samples, and its outcome is the verdict on its last state.
-        observations: (k + 1, o) or without the last (k, o), or none where noise was on them.
+        observations: (k + 1, o), or without the last (k, o).
+        noise: (k + 1, d) on the chart's coordinates.
         rewards: (k, 1) of the samples, or none.
     """
 
@@ -57,7 +58,8 @@ class Played:
     path: np.ndarray
     outcome: int
     cut: bool
-    observations: np.ndarray | None = None
+    observations: np.ndarray
+    noise: np.ndarray
     rewards: np.ndarray | None = None
 
 
@@ -152,9 +154,13 @@ class Stage:
         for run in runs:
             # A time limit of its own would end a run that is simulated for longer.
             as_it_is = len(run.inputs) <= self.spec.max_steps
-            real = self._renewed(self._judges[as_it_is], as_it_is)
-            judge(run, real)
-            self._judges[as_it_is].append(real)
+            noises = [run.noise]
+            if self.spec.wrapped and run.noise.any():
+                noises.append(np.zeros_like(run.noise))
+            for noise in noises:
+                real = self._renewed(self._judges[as_it_is], as_it_is)
+                judge(run, real, noise)
+                self._judges[as_it_is].append(real)
 
     def _acted(
         self, instances: Sequence[Instance], u: np.ndarray, begun: np.ndarray | None = None
@@ -195,27 +201,39 @@ class Stage:
         return instance
 
 
-def judge(run: Played, real: Instance) -> None:
-    """Raises `BadInput` if a run went otherwise than in an environment that its user would make.
+def judge(run: Played, real: Instance, noise: np.ndarray) -> None:
+    """Plays a run in an environment that its user would make.
 
     That is put to the start and stepped, past all that lets episodes be played side by side. There is no
-    tolerance: the same code computes the same from the same numbers.
+    tolerance: the same code computes the same from the same numbers. Without the run's noise the inputs may
+    lead another way, as where a controller of a wrapper sees it; where they lead the same way, the run ends
+    alike.
+
+    Args:
+        run: the run.
+        real: the environment.
+        noise: (k + 1, d) that of the run, or none.
+
+    Raises:
+        BadInput: the run went otherwise.
     """
-    spec = real.spec
-    observations, path, reports = [real.put(run.start)], [run.path[0]], []
-    for u in run.inputs:
-        real.take(real.stepped(u))
-        observations.append(real.observation)
+    spec, heard = real.spec, noise is run.noise
+    observations, path, reports = [real.put(run.start, noise=noise[0])], [run.path[0]], []
+    for u, of_sample in zip(run.inputs, noise[1:], strict=True):
+        real.act(u)
         path.append(spec.z(real.physics.read()[None])[0])
+        real.sense(of_sample)
+        observations.append(real.observation)
         reports.append(real.report)
     real.finish()
-    if not reports:
+    if not reports or (not heard and not np.array_equal(path, run.path)):
         return
-    seen = None if run.observations is None else observations[: len(run.observations)]
-    _compare(real.name, "observation", run.observations, seen)
-    _compare(real.name, "the chart's coordinate", run.path, path)
     told = np.array(reports, dtype=float)
-    _compare(real.name, "reward", run.rewards, told[:, :1])
+    if heard:
+        seen = observations[: len(run.observations)]
+        _compare(real.name, "observation", run.observations, seen)
+        _compare(real.name, "the chart's coordinate", run.path, path)
+        _compare(real.name, "reward", run.rewards, told[:, :1])
     if run.outcome == Outcome.UNSTABLE:
         return
     success, ends = spec.criterion.judged(told)
@@ -225,7 +243,10 @@ def judge(run: Played, real: Instance) -> None:
     if (wrong := np.flatnonzero(ends != expected)).size:
         k = int(wrong[0])
         ours, theirs = (Outcome(int(values[k])).label for values in (expected, ends))
-        raise _goes_another_way(real.name, f"after {k + 1} sample(s) it is {ours}, and {theirs}")
+        how = "" if heard else " without the noise, which must not judge"
+        raise _goes_another_way(
+            real.name, f"after {k + 1} sample(s) it is {ours}, and {theirs}{how}"
+        )
 
 
 def _compare(name: str, what: str, ours: np.ndarray | None, real: Any) -> None:

@@ -58,8 +58,8 @@ class Coordinate:
 class Criterion:
     """When an episode is a success, and when a failure.
 
-    Both are asked at every sample. A success that asks for `terminated` or for `info` ends the episode; any
-    other one has to hold at the end of the episode.
+    Both are asked at every sample. A success that needs `terminated`, or asks for `info`, ends the episode;
+    any other one, such as "not terminated", has to hold at the end of the episode.
 
     Attributes:
         name: of the environment, for messages.
@@ -77,8 +77,11 @@ class Criterion:
     @property
     def ends(self) -> bool:
         """Whether a success ends the episode."""
-        asks_end = re.search(r"\bterminated\b", self.success.text) is not None
-        return bool(self.success.keys) or asks_end
+        return bool(self.success.keys) or self.success.needs("terminated")
+
+    def asks(self, name: str) -> bool:
+        """Returns whether a condition asks for a name, such as "truncated"."""
+        return any(re.search(rf"\b{name}\b", one.text) for one in self._conditions)
 
     @cached_property
     def keys(self) -> tuple[Path, ...]:

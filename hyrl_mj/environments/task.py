@@ -203,16 +203,21 @@ class EnvironmentTask(Task):
             k = int(runs.length[i])
             if not np.isfinite(inputs[:k, i]).all():
                 continue
-            measured, true = runs.measured[:k, i], runs.true[:k, i]
-            quiet = np.array_equal(measured[:, :d], true[:, :d])
+            cut = k == runs.limit[i]
+            noise = np.zeros((k + 1, d))
+            # What wrappers observed at an end is known where the run went on to it.
+            last = k if cut or not self.specification.wrapped else k + 1
+            known = runs.noise[:last, i, :d]
+            noise[: len(known)] = known
             played.append(
                 Played(
                     starts[i],
                     inputs[:k, i],
                     runs.path[: k + 1, i],
                     outcome=int(runs.outcome[i]),
-                    cut=k == runs.limit[i],
-                    observations=measured[:, seen] if quiet else None,
+                    cut=cut,
+                    observations=runs.measured[:k, i, seen],
+                    noise=np.nan_to_num(noise),
                 )
             )
         if played:

@@ -20,14 +20,17 @@ from hyrl_mj.tasks import Outcome
 
 # Episodes and samples of a trial, and for how many samples inputs are held.
 EPISODES, SAMPLES, HELD = 8, 40, 8
+# Samples of runs from these places that show whether wrappers read MuJoCo's state there.
+NEAR_PLACES = 3
 # Rounding of what is computed again from the same state, as a share of the largest number.
 ROUNDING = 1e-9
 # What differs by less than this share of what a physics step changes is from near the end of a step.
 NEAR = 0.5
 # By how much coordinates are moved to see what follows them, as a share of the side of the chart.
 MOVED = 1e-3
-# Places on the chart from which runs of so many samples come to one state, which may show where they were.
-PLACES, AWAY = 64, 2
+# Places on the chart from which runs of so many samples come to one state, which may show where they were;
+# from the first places longer ones, in which slow sensors measure.
+PLACES, AWAY, LONG = 64, 2, 120
 # Runs that show whether the chart is the state, and how much they may differ from others.
 OF_CHART, SAME = 48, 1e-9
 
@@ -158,19 +161,21 @@ def check_observer(instance: Instance, step: np.ndarray) -> None:
 def _check_places(instance: Instance) -> None:
     """Raises `BadInput` if what is observed in a state depends on where on the chart a run came from."""
     spec, rng, space = instance.spec, np.random.default_rng(7), instance.inner.observation_space
-    usual = None
-    for z in rng.uniform(spec.start_low, spec.start_high, (PLACES, spec.dimension)):
+    usual: dict[int, np.ndarray] = {}
+    places = rng.uniform(spec.start_low, spec.start_high, (PLACES, spec.dimension))
+    long = min(LONG, spec.max_steps)
+    for z, away in [*((z, AWAY) for z in places), *((z, long) for z in places[:EPISODES])]:
         instance.reset()
         instance.physics.write(spec.state_at(z[None])[0])
         if instance.depth() > spec.depth:
             continue
-        if len([*instance.wander(np.random.default_rng(8), AWAY, 1)]) < AWAY:
+        if len([*instance.wander(np.random.default_rng(8), away, HELD)]) < away:
             continue
         instance.physics.write(spec.state)
         seen = flat(instance.watched(), space)
-        usual = seen if usual is None else usual
-        off = _apart(seen, usual)
-        if (stale := ~_rounds(off, usual)).any():
+        usual.setdefault(away, seen)
+        off = _apart(seen, usual[away])
+        if (stale := ~_rounds(off, seen)).any():
             column = int(stale.argmax())
             why = f"differs by {off[column]:.6g} in one state, after runs in different places"
             raise _stored(instance.name, column, why)
@@ -219,6 +224,11 @@ def derived_of(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
             for derived, differences in off.items():
                 differences.append(_apart(instance.seen_as(derived, state, 0 * step), seen))
             moving.append(np.abs(instance.displaced(step)))
+    if not np.any(moving):
+        raise BadInput(
+            f"noise on {', '.join(noisy_names(instance.spec))} changes nothing that {instance.name} "
+            "observes, so there is nothing to find out: name a chart of what it observes"
+        )
     most = {derived: np.abs(differences).max(axis=0) for derived, differences in off.items()}
     differ = {derived: ~_rounds(far, np.array(size)) for derived, far in most.items()}
     lags = np.flatnonzero(differ[NOW]).tolist()
@@ -237,6 +247,11 @@ def derived_of(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
             "step()"
         )
     return UNKNOWN, lags
+
+
+def noisy_names(spec: EnvironmentSpec) -> list[str]:
+    """Returns the names of the coordinates on which there is noise."""
+    return [c.name for c, share in zip(spec.coordinates, spec.noisy, strict=True) if share]
 
 
 def changes_by_reset(spec: EnvironmentSpec) -> bool:
@@ -291,10 +306,12 @@ def _watched_runs(
     instance, rng = Instance(replace(spec, sensing=sensing)), np.random.default_rng(6)
     instance.tried = True
     found: dict[str, list[list[np.ndarray]]] = {"observation": [], "report": []}
-    samples = min(SAMPLES, spec.max_steps)
-    for seed in range(EPISODES):
+    starts = [(spec.state, min(SAMPLES, spec.max_steps))] * EPISODES
+    places = rng.uniform(spec.start_low, spec.start_high, (PLACES, spec.dimension))
+    starts += [(state, min(NEAR_PLACES, spec.max_steps)) for state in spec.state_at(places)]
+    for seed, (start, samples) in enumerate(starts):
         instance.quit()
-        instance.begin(spec.state, seed)
+        instance.begin(start, seed % EPISODES)
         noises = rng.uniform(-step, step, (samples + 1, len(step)))
         inputs = [instance.drawn(rng) for _ in range(samples)]
         instance.sense(noises[0])
@@ -347,31 +364,41 @@ def _runs(
 def check_instances(pool: Pool, spec: EnvironmentSpec) -> None:
     """Raises `BadInput` unless instances go as new ones after other episodes, with noise and without."""
     d, o, everyone = spec.dimension, spec.columns, np.arange(EPISODES)
-    for seed, noise in enumerate((0.0, 0.0, MOVED)):
-        rng, inputs, starts, measured = np.random.default_rng(seed), [], None, []
+    for seed, share in enumerate((0.0, 0.0, MOVED)):
+        rng, inputs, told, errors = np.random.default_rng(seed), [], [], []
+        starts: list[np.ndarray] = []
+        bound = share * spec.chart.sides * spec.noisy
+
+        def observe(plant: EnvironmentPlant, noise: np.ndarray) -> np.ndarray:
+            """Returns what n runs are at, with the observation under noise (n, d)."""
+            errors = np.zeros((EPISODES, d + o + 3))
+            errors[:, :d] = noise
+            seen = plant.observe(plant.truth(everyone), errors, everyone)
+            found = plant.truth(everyone).copy()
+            found[:, d : d + o] = seen[:, d : d + o]
+            return found
+
         for plant, u in _runs(pool, spec, 3 + seed):
-            if starts is None:
-                starts, measured = plant.state, [plant.measurement]
-            if noise:
-                errors = np.zeros_like(measured[0])
-                sides = spec.chart.sides * spec.noisy
-                errors[:, :d] = noise * rng.uniform(-1, 1, (EPISODES, d)) * sides
-                plant.observe(plant.truth(everyone), errors, everyone)
+            starts = starts or [plant.state]
+            errors.append(rng.uniform(-bound, bound, (EPISODES, d)))
+            told.append(observe(plant, errors[-1]))
             plant.step(u)
             inputs.append(u)
-            measured.append(plant.measurement)
-        assert starts is not None
-        u, path = np.array(inputs), np.array(measured)
+        told.append(observe(plant, 0.0 * errors[-1]))
+        u, path, noise = np.array(inputs), np.array(told), np.array([*errors, 0.0 * errors[-1]])
         over = path[:, :, -1] != 0
         ends = np.where(over.any(axis=0), over.argmax(axis=0), len(u))
+        if not spec.wrapped:  # at an end that is known nothing is observed any more
+            noise[ends, everyone] = 0.0
         played = [
             Played(
-                starts[i],
+                starts[0][i],
                 u[:end, i],
                 path[: end + 1, i, :d],
                 _ended(spec, path[end, i], end == spec.max_steps),
                 end == spec.max_steps,
-                None if noise else path[: end + 1, i, d : d + o],
+                path[: end + 1, i, d : d + o],
+                noise[: end + 1, i],
                 path[1 : end + 1, i, d + o : d + o + 1],
             )
             for i, end in enumerate(ends)

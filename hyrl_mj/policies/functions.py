@@ -17,8 +17,8 @@ class FunctionPolicy(ObservationPolicy):
     """A function of the observation as a policy.
 
     Attributes:
-        function: observations (n, k) float32 -> inputs (n, m) in the plant's units, which are clipped to
-            the task's limits. For a discrete task: the numbers of the levels (n,) int, or preferences
+        function: observations (n, k) -> inputs (n, m) in the plant's units, which are clipped to the task's
+            limits. For a discrete task: the numbers of the levels (n,) int, or preferences
             (n, levels).
         name: what messages call it.
     """
@@ -33,7 +33,8 @@ class FunctionPolicy(ObservationPolicy):
             return np.zeros((0, m))
         discrete = self.task.input_levels is not None
         try:
-            answer = self.function(observation.astype(np.float32))
+            kind = np.float64 if self.task.observation_dtype == "float64" else np.float32
+            answer = self.function(observation.astype(kind))
             if isinstance(answer, tuple):
                 raise BadInput(
                     "it returns a tuple, as the predict() of SB3 does: give its first part, as lambda o: "
@@ -71,8 +72,9 @@ def from_callable(function: Callable[[np.ndarray], Any], task: Task) -> Function
     """Returns a function of the observation as a policy.
 
     Args:
-        function: observations (n, k) float32, as the task's environments give them -> inputs (n, m) in
-            the plant's units, which are clipped to the task's limits. For a discrete task: the numbers of
+        function: observations (n, k) of the type that the task's environments give, float32 but for
+            environments of others -> inputs (n, m) in the plant's units, which are clipped to the task's
+            limits. For a discrete task: the numbers of
             the levels, (n,) integers, or preferences (n, levels). Or a `torch.nn.Module` that does so with
             tensors, which is put into evaluation mode.
         task: the robot and its problem.
@@ -105,7 +107,7 @@ def _of_arrays(module: Any) -> Callable[[np.ndarray], np.ndarray]:
         module.eval()
         weight = next(module.parameters(), torch.empty(0))
         with torch.no_grad():
-            answer = module(torch.from_numpy(observation).to(weight.device))
+            answer = module(torch.from_numpy(observation).to(weight.device, weight.dtype))
         if not isinstance(answer, torch.Tensor):
             raise BadInput(f"it gives {type(answer).__name__}, not a tensor")
         actions: np.ndarray = answer.cpu().numpy()

@@ -34,6 +34,7 @@ LONGEST_TEXT = 120  # of a file, in messages
 # What the metadata of SBX, which has SB3's interface, says of its policy.
 SBX = re.compile(rb"[\"']sbx\.")
 # Parts of tensor names of agents that are no plain MLPs on a vector, and what they mean.
+OF_SB3 = "stable_baselines3.", "sb3_contrib."
 FOREIGN = {
     "lstm": "it has a recurrent policy (lstm)",
     "features_extractor.extractors.": "its observations are a dict",
@@ -121,6 +122,8 @@ def _check_plain(tensors: Mapping[str, np.ndarray], about: Mapping[str, Any], ta
     extractor = _entry(about, "policy_kwargs", "features_extractor_class")
     if extractor and usual not in extractor:
         raise BadArtifact(f"it has a features extractor of its own, {extractor}: {PLAIN}")
+    if (own := _entry(about, "policy_class", "__module__")) and not own.startswith(OF_SB3):
+        raise BadArtifact(f"its policy is of a class of its own, of {own:.80}: {PLAIN}")
     if "actor.log_std" in tensors or np.ndim(tensors.get("log_std", 0)) == 2:
         raise BadArtifact("it was trained with use_sde: train it without, or export it to .onnx")
 

@@ -203,9 +203,8 @@ def samples(task: Task, horizon: float) -> int:
         BadInput: the time is not positive, or longer than an hour.
     """
     if not (isinstance(horizon, Real) and math.isfinite(horizon) and 0 < horizon <= LONGEST):
-        raise BadInput(
-            f"horizon {horizon!r} cannot be used: give a time > 0 and <= {LONGEST:g} [s]"
-        )
+        given = f"{horizon:g} s" if isinstance(horizon, Real) else repr(horizon)
+        raise BadInput(f"horizon {given} cannot be used: give a time > 0 and <= {LONGEST:g} s")
     return max(round(horizon / task.dt), 1)
 
 

@@ -73,6 +73,7 @@ class Rollout:
         true: (K + 1, n, p) measurements without noise.
         measured: (K, n, p) noisy measurements.
         u: (K, n, m) inputs.
+        noise: (K + 1, n, p) of the samples; of the last one, where the task looks at it, else any.
         state: (K + 1, n, nstate) MuJoCo's states.
         passing: how the runs pass the obstacles; None without `passing` in the settings.
     """
@@ -87,6 +88,7 @@ class Rollout:
     true: np.ndarray
     measured: np.ndarray
     u: np.ndarray
+    noise: np.ndarray
     state: np.ndarray
     passing: Passing | None = None
 
@@ -136,7 +138,8 @@ def closed_loop(
     k, length, first_mode = np.zeros(n, dtype=int), np.zeros(n, dtype=int), q.copy()
     path = np.empty((longest + 1, n, task.chart.dimension))
     path[0] = task.chart.near(task.z(measurement), z0)
-    shapes = {"before": (), "q": (), "measured": (len(task.noisy),), "u": (len(task.inputs),)}
+    p, m = len(task.noisy), len(task.inputs)
+    shapes = {"before": (), "q": (), "measured": (p,), "u": (m,), "noise": (p,)}
     kept = {name: _Table(n, shape) for name, shape in shapes.items() if record}
     every = np.arange(n)
     if record:
@@ -188,7 +191,7 @@ def closed_loop(
             outcome[over] = task.verdict(measurement[over])
             plant.end(over)
         if record:
-            for name, values in zip(shapes, (before, q[rows], measured, u), strict=True):
+            for name, values in zip(shapes, (before, q[rows], measured, u, errors), strict=True):
                 kept[name].put(now.k, rows, values)
             kept["true"].put(k[rows], rows, measurement[rows])
         if "state" in kept:
@@ -199,13 +202,13 @@ def closed_loop(
     if not together:
         _stay(path, length)
         for name, table in kept.items():
-            if name != "u":
+            if name not in ("u", "noise"):
                 _stay(table.values, length - (name in shapes))
     samples = length.max(initial=0)
     arrays = {name: np.empty((0, n, *shape)) for name, shape in shapes.items()}
     arrays |= {"true": np.empty(0), "state": np.empty(0)}
     for name, table in kept.items():
-        arrays[name] = table.values[: samples + (name not in shapes)]
+        arrays[name] = table.values[: samples + (name not in shapes or name == "noise")]
     for name in ("before", "q"):  # of runs that were over before they began, none
         arrays[name] = np.nan_to_num(arrays[name], nan=NOT_STARTED).astype(int)
     passing = None if follower is None else follower.passing

@@ -21,7 +21,7 @@ STARTS, ALONE = 12, 3
 SIGNALS = {"no noise": 0.0, "noise": 0.03, "larger noise": 0.15}
 # Both do the same arithmetic, so they differ by rounding at most, where the offset of a coordinate is added
 # and taken away again. This share of the larger of a value and 1 is far above rounding, and below what traps
-# do. What an agent is shown is rounded to float32: one number of a hundred million then makes 6e-8 of 1e-16.
+# do.
 SAME = 1e-9
 # "Said" is what differs under noise where `task.found` tells that an observation lags behind the state.
 VERDICTS = ("right", "refused", "refused at run", "said", "wrong", "crash")
@@ -89,7 +89,7 @@ def played(case, agent, z0, noise, arrival_ends=False, env=None):
     begun = inner.data.time
     t, z, u = [0.0], [inner.charted()], []
     for k in count(1):
-        answer = agent(_flat(env, observation)[None].astype(np.float32))[0]
+        answer = agent(_flat(env, observation)[None])[0]
         u.append(np.atleast_1d(answer).astype(float))
         observation, reward, terminated, truncated, info = env.step(_action(env, answer))
         t.append(inner.data.time - begun)
@@ -108,9 +108,11 @@ def played(case, agent, z0, noise, arrival_ends=False, env=None):
 def _flat(env, observation):
     """Returns an observation as a vector, the parts of a Dict in the order of their space."""
     space = env.observation_space
-    if isinstance(space, spaces.Dict):
-        return np.concatenate([np.ravel(observation[key]) for key in space.spaces])
-    return np.ravel(observation)
+    parts = list(space.spaces) if isinstance(space, spaces.Dict) else [...]
+    kinds = {(space[p] if p is not ... else space).dtype for p in parts}
+    kind = np.float64 if kinds == {np.dtype(np.float64)} else np.float32
+    found = [np.ravel(observation[p] if p is not ... else observation) for p in parts]
+    return np.concatenate(found).astype(kind)
 
 
 def _action(env, answer):
