@@ -42,6 +42,10 @@ def coordinates(instance: Instance, chart: AnyChart) -> tuple[Coordinate, ...]:
     names = [chart] if isinstance(chart, str) else chart
     pairs = names.items() if isinstance(names, Mapping) else (("", name) for name in names)
     found = [c for new, name in pairs for c in _resolved(instance, str(new), str(name))]
+    if not instance.model.nq:
+        raise BadInput(
+            f"{instance.name} has no joints, so nothing of it is a position that noise could show elsewhere"
+        )
     places = [(c.kind, c.index) for c in found]
     if not found or len(set(places)) < len(places):
         raise BadInput(

@@ -60,10 +60,11 @@ def check_draws(instance: Instance, states: np.ndarray) -> str:
             f"each reset of {name} draws {', '.join(left[:8])}, and what is to be done depends on it: pin it"
             f', {how}, or as the reset with a seed draws it as {{"seed": 0}}'
         )
-    if left and instance.draws_globally:
+    kept = instance.spec.found.get("kept", "").partition(", as ")[0]
+    if instance.draws_globally and (left or kept):
         raise BadInput(
-            f"each reset of {name} draws {', '.join(left[:8])} from a global generator of NumPy or Python, "
-            "which the seed of reset() does not decide: let it draw from self.np_random"
+            f"each reset of {name} draws {', '.join(left[:8]) or kept} from a global generator of NumPy or "
+            "Python, which the seed of reset() does not decide: let it draw from self.np_random"
         )
     _check_pins(instance)
     if not names:

@@ -401,12 +401,24 @@ class Instance:
         except HyrlError:
             raise
         except (Exception, SystemExit) as error:
+            if "SimpleQueue" in str(error):  # of the chain below the wrappers
+                raise BadInput(
+                    f"a wrapper of {self.name} copies the environment, and noise reaches no copies: let it "
+                    "look ahead in an environment of its own"
+                ) from error
             raise BadInput(f"step() of {self.name} raises {brief(error)}: repair it") from error
         if not isinstance(result, tuple) or len(result) != 5:
             raise BadInput(
                 f"step() of {self.name} returns a {type(result).__name__}: let it return an observation, a "
                 "reward, terminated, truncated and info"
             )
+        reward, info = np.asarray(result[1]), result[4]
+        if reward.size != 1 or reward.dtype.kind not in "biuf" or not isinstance(info, dict):
+            raise BadInput(
+                f"step() of {self.name} returns {result[1]!r:.60} as its reward and a {type(info).__name__} "
+                "as its info: let it return a number and a dictionary"
+            )
+        result = (result[0], float(reward.item()), *result[2:])
         if not self.is_wrapped:
             self.inner_seen = result[0]
         took, dt = self.data.time - began, self.spec.dt
@@ -428,17 +440,12 @@ class Instance:
         """Notes the observation and the report of what a step has returned."""
         observation, reward, terminated, truncated, info = result
         self.observation = self._flat(observation)
-        if np.size(reward) != 1 or not isinstance(info, dict):
-            raise BadInput(
-                f"step() of {self.name} returns {reward!r:.60} as its reward and a {type(info).__name__} as "
-                "its info: let it return a number and a dictionary"
-            )
         # The limit of `steps`, or that of a wrapper which episodes are played without.
         truncated |= self.spec.criterion.asks("truncated") and self._samples == self.spec.max_steps
         if self.physics.is_plant:
             self.physics.read()
         touch = bool(terminated) and bool(self.touched() - self.spec.harmless)
-        report = [float(np.ravel(reward)[0]), bool(terminated), bool(truncated), touch]
+        report = [reward, bool(terminated), bool(truncated), touch]
         report += [entry(info, key) for key in self.spec.criterion.keys]
         for a, b in self._pairs:
             away = a - b
