@@ -27,7 +27,7 @@ from hyrl_mj.physics import mjcf
 from hyrl_mj.policies import pickled
 from hyrl_mj.runs.sweeps import Common, Row, Setting, Sweep
 from hyrl_mj.sets import Chart
-from hyrl_mj.system import streams
+from hyrl_mj.system import limits, streams
 from hyrl_mj.tasks import ENVIRONMENT, get_task
 from hyrl_mj.viz.sweep_tables import markdown
 from hyrl_mj.viz.tables import Table
@@ -54,6 +54,12 @@ def refusal(work):
     assert len(sentence) <= LONGEST + 10
     assert sentence.isprintable()
     return sentence
+
+
+@pytest.fixture(autouse=True)
+def hurried(monkeypatch):
+    """What never ends is stopped after two seconds of the processor, and not after twelve."""
+    monkeypatch.setitem(limits.tried.__kwdefaults__, "seconds", 2)
 
 
 # ---- what a file describes
@@ -174,6 +180,7 @@ def test_a_damaged_description_is_one_sentence(text):
 @pytest.mark.parametrize("name", doors.MODELS)
 def test_a_hostile_model_is_one_sentence(name, tmp_path, monkeypatch):
     monkeypatch.setattr(doors, "MODELS", {name: doors.MODELS[name]})
+    monkeypatch.setitem(limits.tried.__kwdefaults__, "longest", 5)
     path = doors._written(Random(0), tmp_path)
     began = time.monotonic()
     refusal(lambda: mjcf.load(path))

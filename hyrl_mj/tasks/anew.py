@@ -10,7 +10,7 @@ from hyrl_mj.physics import mujoco_log
 from hyrl_mj.tasks.description import Outcome
 
 if TYPE_CHECKING:
-    from hyrl_mj.tasks.base import Task
+    from hyrl_mj.tasks.problem import Problem
 
 # Runs that are compared, samples of each, and the starts that are drawn for them.
 RUNS, SAMPLES, DRAWN = 50, 20, 500
@@ -23,7 +23,7 @@ ALIKE = 1e-3
 ROUNDING = 1e-12  # of positions
 
 
-def begins_anew(task: Task, of_chart: bool = False) -> bool:
+def begins_anew(task: Problem, of_chart: bool = False) -> bool:
     """Returns whether runs go on as copies do that are made anew at each of their samples.
 
     The runs start all over the chart. A third of them has random inputs, a third random ones of the limits,
@@ -61,7 +61,7 @@ def begins_anew(task: Task, of_chart: bool = False) -> bool:
     return bool((np.concatenate(off) <= ALIKE * longest + ROUNDING).all())
 
 
-def _inputs(task: Task, n: int, rng: np.random.Generator) -> np.ndarray:
+def _inputs(task: Problem, n: int, rng: np.random.Generator) -> np.ndarray:
     """Returns the inputs (SAMPLES, n, m) of the runs."""
     low, high = task.input_limits
     shape = (SAMPLES, n, len(low))

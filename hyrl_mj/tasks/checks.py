@@ -12,6 +12,8 @@ from hyrl_mj.sets import MOST_DIMENSIONS, Chart
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.mirrored import try_mirror
+from hyrl_mj.tasks.problem import Problem
+from hyrl_mj.tasks.robot import Robot
 from hyrl_mj.tasks.trial import (
     try_control,
     try_extreme,
@@ -66,7 +68,12 @@ def check_task(task: Task) -> Task:
 
 
 def _check_parts(task: Task) -> None:
-    if missing := [name for name in Task.__annotations__ if not hasattr(task, name)]:
+    if missing := [
+        name
+        for part in (Task, Problem, Robot)
+        for name in part.__annotations__
+        if not hasattr(task, name)
+    ]:
         raise BadInput(f"it has no {', '.join(missing)}: add what is missing")
     for name, kind in (("chart", Chart), ("scene", Scene), ("learning", Learning)):
         if not isinstance(value := getattr(task, name), kind):
