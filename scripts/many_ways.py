@@ -36,7 +36,9 @@ def confirmed(run: hyrl_mj.Run) -> float:
     parted = np.zeros(len(critical.points), dtype=bool)
     for aside in np.diag(np.multiply(critical.spacing, task.chart.scale)):
         first, second = (
-            WayRuns.of(task, way_runs(task, run.steady, task.chart.wrap(critical.points + way)))
+            WayRuns.from_rollout(
+                task, way_runs(task, run.steady, task.chart.wrap(critical.points + way))
+            )
             for way in (aside, -aside)
         )
         parted |= first.shows & second.shows & first.differ(second)
@@ -50,7 +52,7 @@ def equal_returns(run: hyrl_mj.Run) -> np.ndarray:
     crosses the line through the post, across the road, on that side.
     """
     task, gamma = run.task, run.settings.stage1.gamma
-    lattice = Lattice.of(task, run.lattice_grid)
+    lattice = Lattice.tabulate(task, run.lattice_grid)
     nodes, after = lattice.grid.nodes, lattice.after[:, 0]
     centres, _ = task.posts
     end = np.minimum(

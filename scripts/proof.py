@@ -48,7 +48,7 @@ def main() -> None:
     task, eps, loop = run.task, run.settings.noise, run.loops["hyrl"]
     grid = Grid.with_cells(task.chart, run.settings.lattice)
     game = Game(task, run.split, {"hyrl": loop}, eps, grid=grid)
-    certificate = Certificate.of(game, {"hyrl": loop})
+    certificate = Certificate.certify(game, {"hyrl": loop})
     assert certificate.cells is not None, certificate.why_not
     cells, outer = certificate.cells, certificate.value("hyrl", eps)
     shares = np.array(task.noisy, dtype=float)

@@ -374,7 +374,7 @@ def test_a_simulation_that_breaks_down_ends_its_episode_alone(tmp_path, monkeypa
     assert rollout.outcome.tolist() == [Outcome.REACHED, Outcome.UNSTABLE, Outcome.REACHED]
     assert rollout.length[1] == 1
     np.testing.assert_array_equal(rollout.path[1:, 1], rollout.path[:-1, 1])
-    runs = WayRuns.of(task, rollout)
+    runs = WayRuns.from_rollout(task, rollout)
     assert runs.usable.tolist() == [True, False, True]
     assert runs[np.array([0])].differ(runs[np.array([2])]).tolist() == [True]
     calm = hyrl_mj.closed_loop(task, PolicyController(Push()), z0[[0, 2]])

@@ -84,7 +84,7 @@ def test_its_joints_follow_their_inputs(arm):
 @pytest.mark.slow
 def test_the_lattice_of_its_game_is_exact(arm):
     """A sample moves a joint by whole cells: what is proved on the nodes holds for the arm."""
-    assert Lattice.of(arm).exact
+    assert Lattice.tabulate(arm).exact
 
 
 def test_link_1_cannot_pass_the_post(arm):

@@ -165,7 +165,7 @@ def test_held_takes_that_the_attack_breaks_nearly_nothing(circle, lost, expected
     every = {"none": 1000, "uniform": 1000}
     found = episodes(every, every)
     robustness = Robustness(EPS, False, None, found.episodes, 0, attacked(*lost))
-    verdict = Verdict.of(circle, EPS, robustness, HOLDS, ALL)
+    verdict = Verdict.judge(circle, EPS, robustness, HOLDS, ALL)
     assert verdict.word == expected
     said = f"the attack breaks HyRL from {lost[1]} of 200 starts"
     assert f"{said}, the policy from {lost[0]} of 200 starts" in verdict.reasons
@@ -175,5 +175,5 @@ def test_held_takes_that_the_attack_breaks_nearly_nothing(circle, lost, expected
 def test_the_attack_alone_may_be_the_noise(circle):
     found = episodes({"none": 1000}, {"none": 1000})
     robustness = Robustness(EPS, False, None, found.episodes, 0, attacked(9, 0))
-    verdict = Verdict.of(circle, EPS, robustness, HOLDS, ALL)
+    verdict = Verdict.judge(circle, EPS, robustness, HOLDS, ALL)
     assert str(verdict) == "HELD: the attack breaks HyRL from 0 of 200 starts"

@@ -126,7 +126,7 @@ def test_the_levels_that_a_network_chooses_in_a_box_are_among_those_that_are_pos
 ):
     policy, rng = network(vehicle, activation), RNG(0)
     centre = rng.uniform(vehicle.chart.low, vehicle.chart.high, (300, 2))
-    possible = BoundedPolicy.of(policy).levels(centre, np.full(2, size))
+    possible = BoundedPolicy.from_policy(policy).levels(centre, np.full(2, size))
     chosen = np.zeros_like(possible)
     for x in inside(centre, size, rng, 60):
         u = policy.act(x)[:, 0]
@@ -142,13 +142,17 @@ def test_the_inputs_that_a_network_gives_in_a_box_lie_between_its_ends(circle, a
     policy, rng = network(circle, activation), RNG(0)
     centre = rng.uniform(0, 2 * np.pi, (300, 1))
     for half in (0.001, 0.05):
-        low, high = np.moveaxis(BoundedPolicy.of(policy).inputs(centre, np.array([half])), 1, 0)
+        low, high = np.moveaxis(
+            BoundedPolicy.from_policy(policy).inputs(centre, np.array([half])), 1, 0
+        )
         for x in inside(centre, half, rng):
             u = policy.act(x)
             assert ((low <= u) & (u <= high)).all()
     # The ends are no farther apart than the policy is steep, but for a remainder.
     steep = np.abs(np.diff(policy.act(np.linspace(0, 2 * np.pi, 20_000)[:, None])[:, 0])).max()
-    narrow = np.ptp(BoundedPolicy.of(policy).inputs(centre, np.array([1e-3])), axis=1).max()
+    narrow = np.ptp(
+        BoundedPolicy.from_policy(policy).inputs(centre, np.array([1e-3])), axis=1
+    ).max()
     assert narrow <= 2.5 * steep * 1e-3 / (np.pi / 20_000) + 1e-4
 
 
@@ -157,7 +161,7 @@ def test_a_normalised_observation_is_bounded_too(vehicle):
     policy = PreprocessedPolicy(network(vehicle), Preprocessing(statistics))
     rng = RNG(0)
     centre = rng.uniform(vehicle.chart.low, vehicle.chart.high, (300, 2))
-    possible = BoundedPolicy.of(policy).levels(centre, np.full(2, 0.02))
+    possible = BoundedPolicy.from_policy(policy).levels(centre, np.full(2, 0.02))
     for x in inside(centre, 0.02, rng):
         level = np.abs(policy.act(x) - vehicle.input_levels[:, 0]).argmin(axis=1)
         assert possible[np.arange(len(x)), level].all()
@@ -171,14 +175,16 @@ def test_the_observation_of_a_task_that_builds_on_another_is_bounded(vehicle):
     policy, own = network(vehicle), network(vehicle)
     object.__setattr__(own, "task", Own())
     centre = RNG(0).uniform(vehicle.chart.low, vehicle.chart.high, (300, 2))
-    expected, found = (BoundedPolicy.of(p).levels(centre, np.full(2, 0.02)) for p in (policy, own))
+    expected, found = (
+        BoundedPolicy.from_policy(p).levels(centre, np.full(2, 0.02)) for p in (policy, own)
+    )
     assert not (expected & ~found).any()
     assert (expected != found).mean() < 0.01
 
 
 def test_what_is_no_network_is_refused(vehicle):
     with pytest.raises(Unbounded, match="a policy that is a PreprocessedPolicy"):
-        BoundedPolicy.of(PreprocessedPolicy(network(vehicle), Preprocessing(None, 2)))
+        BoundedPolicy.from_policy(PreprocessedPolicy(network(vehicle), Preprocessing(None, 2)))
 
 
 @pytest.mark.parametrize("operation", ["sort", "argmax"])
@@ -193,7 +199,7 @@ def test_an_observation_without_bounds_is_told_with_its_operation(vehicle, opera
     object.__setattr__(policy, "task", Ordered())
     message = rf"the method observation of vehicle cannot be bounded: it uses np\.{operation}"
     with pytest.raises(Unbounded, match=message):
-        BoundedPolicy.of(policy).levels(np.zeros((3, 2)), np.full(2, 0.1))
+        BoundedPolicy.from_policy(policy).levels(np.zeros((3, 2)), np.full(2, 0.1))
 
 
 # ---- sets and cells
@@ -201,12 +207,12 @@ def test_an_observation_without_bounds_is_told_with_its_operation(vehicle, opera
 
 @pytest.fixture(scope="module")
 def cells(vehicle):
-    return Cells.of(Lattice.of(vehicle, Grid.with_cells(vehicle.chart, 120)))
+    return Cells.cover(Lattice.tabulate(vehicle, Grid.with_cells(vehicle.chart, 120)))
 
 
 @pytest.fixture(scope="module")
 def ring(circle):
-    return Cells.of(Lattice.of(circle, Grid.with_cells(circle.chart, 600)))
+    return Cells.cover(Lattice.tabulate(circle, Grid.with_cells(circle.chart, 600)))
 
 
 def test_the_distances_of_a_set_in_a_box_are_those_of_points_in_it(vehicle, circle, cells, ring):
@@ -214,7 +220,7 @@ def test_the_distances_of_a_set_in_a_box_are_those_of_points_in_it(vehicle, circ
         grid, rng = Grid.with_cells(task.chart, count), RNG(2)
         near = np.abs(grid.nodes - grid.nodes[len(grid.nodes) // 3]).max(axis=1) < 0.4
         members = GridSet.from_mask(grid, near ^ (rng.random(len(grid.nodes)) < 0.01))
-        boxes = Boxes.of(of, task.noise_in_chart(0.1))
+        boxes = Boxes.around(of, task.noise_in_chart(0.1))
         least, greatest = boxes.distances(members)
         index = np.stack(np.unravel_index(np.arange(least.size), boxes.counts), axis=-1)
         for _ in range(20):
@@ -284,10 +290,10 @@ def test_corners_and_neighbours_of_cells(cells, ring):
 
 
 def test_a_plant_that_moves_states_differently_is_refused(vehicle):
-    lattice = Lattice.of(vehicle, Grid.with_cells(vehicle.chart, 60))
+    lattice = Lattice.tabulate(vehicle, Grid.with_cells(vehicle.chart, 60))
     object.__setattr__(lattice, "uneven", np.array([0.01, 0.0]))
     with pytest.raises(Unbounded, match="does not move all states alike"):
-        Cells.of(lattice)
+        Cells.cover(lattice)
 
 
 def test_a_chart_that_is_not_the_position_is_refused(vehicle):
@@ -295,11 +301,11 @@ def test_a_chart_that_is_not_the_position_is_refused(vehicle):
         def z(self, measured):
             return 1.0 * measured[:, :2]
 
-    lattice = Lattice.of(Moved(), Grid.with_cells(vehicle.chart, 60))
+    lattice = Lattice.tabulate(Moved(), Grid.with_cells(vehicle.chart, 60))
     with pytest.raises(
         Unbounded, match=r"computes its chart, measurement or state in methods of its own \(z\)"
     ):
-        Cells.of(lattice)
+        Cells.cover(lattice)
 
 
 @pytest.mark.parametrize(
@@ -326,14 +332,14 @@ def test_constraints_have_to_be_switched_off(vehicle):
             model.opt.disableflags = 0
             return model
 
-    lattice = Lattice.of(Constrained(), Grid.with_cells(vehicle.chart, 60))
+    lattice = Lattice.tabulate(Constrained(), Grid.with_cells(vehicle.chart, 60))
     with pytest.raises(Unbounded, match='<flag constraint="disable"/>'):
-        Cells.of(lattice)
+        Cells.cover(lattice)
 
 
 def test_the_inputs_of_a_box_move_cells_wherever_some_of_them_does(circle):
     """On a lattice on which full speed moves nodes onto nodes, speeds in between do not."""
-    ring = Cells.of(Lattice.of(circle, Grid.with_cells(circle.chart, 1_256)))
+    ring = Cells.cover(Lattice.tabulate(circle, Grid.with_cells(circle.chart, 1_256)))
     assert not ring.exact.any()
     first, last = ring.shifts(np.array([[0.3001]]), np.array([[0.3001]]))
     h = ring.lattice.grid.spacing[0]

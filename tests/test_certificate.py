@@ -66,7 +66,7 @@ def certified(request, vehicle, circle):
     else:
         loops, task, cells = {"policy": PolicyController(turning(circle))}, circle, 2_000
     game = Game(task, halves(task), loops, EPS, grid=Grid.with_cells(task.chart, cells))
-    return game, loops, Certificate.of(game, loops)
+    return game, loops, Certificate.certify(game, loops)
 
 
 def played(game, loop, starts, noise, modes=None, seed=0):
@@ -117,7 +117,7 @@ def test_the_gap_closes_as_the_cells_become_smaller(vehicle):
         game = Game(
             vehicle, halves(vehicle), loops, EPS, grid=Grid.with_cells(vehicle.chart, cells)
         )
-        certificate = Certificate.of(game, loops)
+        certificate = Certificate.certify(game, loops)
         own, some, time, _ = certificate.wins("hyrl", EPS)
         broken = attack(certificate, "hyrl", loops["hyrl"], EPS)
         region = certificate.region(EPS)
@@ -181,7 +181,7 @@ def test_noise_between_the_nodes_beats_what_the_game_calls_won(vehicle):
     """A start set that flips right beside a node of the game, as nobody can see on the nodes."""
     loops = {"hyrl": hybrid(vehicle, overlap=EPS - 0.004)}
     game = Game(vehicle, halves(vehicle), loops, EPS, grid=Grid.with_cells(vehicle.chart, 120))
-    certificate = Certificate.of(game, loops)
+    certificate = Certificate.certify(game, loops)
     broken, region = attack(certificate, "hyrl", loops["hyrl"], EPS), certificate.region(EPS)
     nodes = game.score("hyrl", EPS)
     own, *_ = certificate.wins("hyrl", EPS)
@@ -191,7 +191,7 @@ def test_noise_between_the_nodes_beats_what_the_game_calls_won(vehicle):
 def test_what_cannot_be_bounded_is_attacked_all_the_same(vehicle):
     loops = {"policy": PolicyController(sign_policy(vehicle)), "hyrl": ideal_controller(vehicle)}
     game = Game(vehicle, halves(vehicle), loops, EPS, grid=Grid.with_cells(vehicle.chart, 120))
-    certificate = Certificate.of(game, loops)
+    certificate = Certificate.certify(game, loops)
     assert certificate.why_not == {
         "policy": "a policy that is a ChartPolicy cannot be bounded",
         "hyrl": "a AnalyticSet cannot be bounded: give sets on grids",
@@ -235,7 +235,7 @@ def test_where_runs_never_end_what_is_proved_stays_at_the_set_point(circle):
     loops = {"policy": PolicyController(turning(circle))}
     grid = Grid.with_cells(circle.chart, 1_000)
     game = Game(circle, halves(circle), loops, 0.35, grid=grid)
-    certificate = Certificate.of(game, loops)
+    certificate = Certificate.certify(game, loops)
     own, *_ = certificate.wins("policy", 0.05)
     assert own > 0.9
     cells, value = certificate.cells, certificate.value("policy", 0.05)[-1, :-2]
@@ -257,7 +257,7 @@ def test_nothing_is_proved_of_a_start_region_that_is_thinner_than_a_cell(vehicle
 
     task, loops = Line(), {"hyrl": hybrid(vehicle)}
     game = Game(task, halves(task), loops, EPS, grid=Grid.with_cells(task.chart, 60))
-    certificate = Certificate.of(game, loops)
+    certificate = Certificate.certify(game, loops)
     assert certificate.wins("hyrl", EPS) == (0.0, 0.0, 0.0, 0.0)
     result, _ = examine(task, np.empty((0, 2)), halves(task), loops, (EPS,), cells=60)
     score = result.scores["hyrl"][0]

@@ -404,7 +404,7 @@ def test_the_least_clearance_is_that_of_a_fine_look(planted, read):
 def test_the_bounds_are_those_that_were_asked_for(planted, read):
     trained = Bounds.trained(planted.task, 0.1)
     assert trained == Bounds(0.1, 0.05, 0.0, 0.0)
-    bounds = Bounds.of(DriveOptions(eps=0.2, eps_posts=0.3), trained)
+    bounds = Bounds.from_options(DriveOptions(eps=0.2, eps_posts=0.3), trained)
     assert bounds == Bounds(0.2, 0.1, 0.3, 0.0)
     assert str(bounds) == "0.2 m, 0.1 rad, 0.3 m on the posts"
     # Without noise on the position, the others still act.

@@ -56,7 +56,8 @@ def floors(gate, cuts, found):
     """The marks on the floor at each phase, without an overlap."""
     parts = SimpleNamespace(grid=halves(hyrl_mj.get_task("vehicle"), 8).grid)
     marks = [
-        Floor.of(cut, critical, parts, None) for cut, critical in zip(cuts, found, strict=True)
+        Floor.from_sets(cut, critical, parts, None)
+        for cut, critical in zip(cuts, found, strict=True)
     ]
     return Floors(gate.chart, 2, tuple(marks))
 

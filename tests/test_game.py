@@ -152,10 +152,10 @@ TWINS = [
 @pytest.mark.slow
 def test_the_game_is_its_slow_twin(vehicle, circle, name, counts, controller, bound):
     task, bound = {"vehicle": vehicle, "unit_circle": circle}[name], np.array(bound)
-    lattice, loop = Lattice.of(task, Grid(task.chart, counts)), controller(task)
+    lattice, loop = Lattice.tabulate(task, Grid(task.chart, counts)), controller(task)
     loop = loop if isinstance(loop, HybridController) else PolicyController(loop)
     plain = twin_moves(lattice, loop, bound)
-    moves = noisy_moves(Answers.of(lattice, loop, bound), bound)
+    moves = noisy_moves(Answers.ask(lattice, loop, bound), bound)
     assert moves.rows == len(loop.modes) + 1
     value = solve(moves)
     np.testing.assert_array_equal(value, twin_values(lattice, plain, moves.rows))
@@ -172,9 +172,9 @@ def test_the_game_is_its_slow_twin(vehicle, circle, name, counts, controller, bo
 
 
 def test_answers_for_more_noise_serve_for_less(vehicle):
-    lattice = Lattice.of(vehicle, Grid.with_cells(vehicle.chart, 60))
+    lattice = Lattice.tabulate(vehicle, Grid.with_cells(vehicle.chart, 60))
     loop, bound = ideal_controller(vehicle, 0.07), np.array([0.0, 0.1])
-    tight, wide = (Answers.of(lattice, loop, most) for most in (bound, np.array([0.2, 0.4])))
+    tight, wide = (Answers.ask(lattice, loop, most) for most in (bound, np.array([0.2, 0.4])))
     np.testing.assert_array_equal(solve(noisy_moves(tight, bound)), solve(noisy_moves(wide, bound)))
 
 
@@ -183,9 +183,9 @@ def test_a_controller_that_goes_to_a_mode_it_does_not_have_is_refused(vehicle):
         def step(self, q, measured):
             return self.policy.act(measured), q + 3
 
-    lattice = Lattice.of(vehicle, Grid.with_cells(vehicle.chart, 60))
+    lattice = Lattice.tabulate(vehicle, Grid.with_cells(vehicle.chart, 60))
     with pytest.raises(BadInput, match=r"went to mode 3, it has \(0,\)"):
-        Answers.of(lattice, Lost(sign_policy(vehicle)), np.zeros(2))
+        Answers.ask(lattice, Lost(sign_policy(vehicle)), np.zeros(2))
 
 
 # ---- vehicle: planted controllers
@@ -402,10 +402,10 @@ def test_values_converge_as_the_lattice_gets_finer(circle):
 
 @pytest.mark.parametrize("eps", [0.0, 0.05, 0.1])
 def test_a_deadbeat_policy_is_held_within_the_noise(circle, eps):
-    lattice = Lattice.of(circle, Grid.with_cells(circle.chart, EXACT))
+    lattice = Lattice.tabulate(circle, Grid.with_cells(circle.chart, EXACT))
     loop, bound = PolicyController(homing_policy(circle)), np.array([eps])
     near = circle.miss(lattice.grid.nodes) < 1
-    held = lasting(noisy_moves(Answers.of(lattice, loop, bound), bound), near)
+    held = lasting(noisy_moves(Answers.ask(lattice, loop, bound), bound), near)
     cell = lattice.grid.cell
     assert eps - cell <= circle.miss(lattice.grid.nodes[held]).max() <= eps + 2 * cell
 
@@ -413,19 +413,19 @@ def test_a_deadbeat_policy_is_held_within_the_noise(circle, eps):
 @pytest.mark.parametrize("dead", [0.1, 0.3])
 def test_a_policy_with_a_dead_zone_is_held_at_its_edge_and_the_noise(circle, dead):
     eps = 0.1
-    lattice = Lattice.of(circle, Grid.with_cells(circle.chart, EXACT))
+    lattice = Lattice.tabulate(circle, Grid.with_cells(circle.chart, EXACT))
     loop, bound = PolicyController(homing_policy(circle, dead)), np.array([eps])
     near = circle.miss(lattice.grid.nodes) < 1
-    held = lasting(noisy_moves(Answers.of(lattice, loop, bound), bound), near)
+    held = lasting(noisy_moves(Answers.ask(lattice, loop, bound), bound), near)
     reach = circle.miss(lattice.grid.nodes[held]).max()
     assert reach == pytest.approx(dead + eps, abs=2 * lattice.grid.cell)
 
 
 def test_runs_are_not_held_where_they_never_come(circle):
     # At the far side noise can hold a memoryless policy; runs from near the set-point never get there.
-    lattice = Lattice.of(circle, Grid.with_cells(circle.chart, EXACT))
+    lattice = Lattice.tabulate(circle, Grid.with_cells(circle.chart, EXACT))
     loop, bound = PolicyController(homing_policy(circle)), np.array([0.1])
-    moves = noisy_moves(Answers.of(lattice, loop, bound), bound)
+    moves = noisy_moves(Answers.ask(lattice, loop, bound), bound)
     miss = circle.miss(lattice.grid.nodes)
     assert miss[lasting(moves)].max() == pytest.approx(PI, abs=lattice.grid.cell)
     assert miss[lasting(moves, miss > 3)].max() == pytest.approx(PI, abs=lattice.grid.cell)
@@ -433,9 +433,9 @@ def test_runs_are_not_held_where_they_never_come(circle):
 
 
 def test_runs_are_held_where_they_come_in_the_end(circle):
-    lattice = Lattice.of(circle, Grid.with_cells(circle.chart, EXACT))
+    lattice = Lattice.tabulate(circle, Grid.with_cells(circle.chart, EXACT))
     loop, bound = PolicyController(homing_policy(circle)), np.array([0.1])
-    moves = noisy_moves(Answers.of(lattice, loop, bound), bound)
+    moves = noisy_moves(Answers.ask(lattice, loop, bound), bound)
     miss = circle.miss(lattice.grid.nodes)
     from_afar = lasting(moves, (miss > 1) & (miss < 3))
     np.testing.assert_array_equal(from_afar, lasting(moves, miss < 1))
@@ -443,9 +443,9 @@ def test_runs_are_held_where_they_come_in_the_end(circle):
 
 
 def test_a_run_that_swings_for_ever_is_held_at_both_ends(circle):
-    lattice = Lattice.of(circle, Grid.with_cells(circle.chart, EXACT))
+    lattice = Lattice.tabulate(circle, Grid.with_cells(circle.chart, EXACT))
     loop, bound = PolicyController(circle_policy(circle)), np.zeros(1)
-    moves = noisy_moves(Answers.of(lattice, loop, bound), bound)
+    moves = noisy_moves(Answers.ask(lattice, loop, bound), bound)
     start = np.arange(EXACT) == 3  # 0.025 rad: one sample from there to the other side, and back
     assert np.flatnonzero(lasting(moves, start)).tolist() == [3, EXACT - 3]
 

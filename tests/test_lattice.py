@@ -19,12 +19,12 @@ from hyrl_mj.tasks.vehicle import Vehicle
 @pytest.fixture(scope="module")
 def lattices(vehicle):
     """By number of cells."""
-    return {n: Lattice.of(vehicle, Grid.with_cells(vehicle.chart, n)) for n in (60, 240, 480)}
+    return {n: Lattice.tabulate(vehicle, Grid.with_cells(vehicle.chart, n)) for n in (60, 240, 480)}
 
 
 @pytest.fixture(scope="module")
 def around_circle(circle):
-    return Lattice.of(circle, Grid.with_cells(circle.chart, 720))
+    return Lattice.tabulate(circle, Grid.with_cells(circle.chart, 720))
 
 
 def stepped(lattice, level, node):
@@ -89,7 +89,7 @@ def test_between_nodes_a_sample_leads_to_those_around_its_end(lattices):
 def test_leaving_the_chart_is_a_failure(vehicle):
     alley = hyrl_mj.get_task("vehicle")
     alley.chart = Chart(("x", "y"), ("m", "m"), (0.0, -1.0), (3.0, 1.0), (False, False))
-    lattice = Lattice.of(alley, Grid.with_cells(alley.chart, 60))
+    lattice = Lattice.tabulate(alley, Grid.with_cells(alley.chart, 60))
     left, straight = (lattice.after[k, 0, lattice.grid.nearest([[0.5, 1.0]])[0]] for k in (-1, 2))
     assert left == lattice.nodes + 1
     np.testing.assert_allclose(lattice.grid.nodes[straight], [0.55, 1.0])
@@ -109,7 +109,7 @@ Alley.verdict = Task.verdict
 
 def test_where_episodes_end_as_a_success_to_be_close_to_the_set_point_is_not_enough():
     alley = Alley()
-    lattice = Lattice.of(alley, Grid.with_cells(alley.chart, 60))
+    lattice = Lattice.tabulate(alley, Grid.with_cells(alley.chart, 60))
     assert (alley.verdict(np.array([[0.5, 0.0]])) == Outcome.REACHED).all()
     assert not lattice.arrived.any()
     assert (lattice.after == lattice.nodes).any(), "the samples over the line arrive"
@@ -137,7 +137,7 @@ def test_the_circle_s_samples_end_between_the_two_nodes_that_they_lead_to(circle
 
 @pytest.mark.parametrize("cells", [240, 720])
 def test_neighbouring_levels_lead_a_cell_apart_at_most(circle, cells):
-    lattice = Lattice.of(circle, Grid.with_cells(circle.chart, cells))
+    lattice = Lattice.tabulate(circle, Grid.with_cells(circle.chart, cells))
     reach = 2 * 0.05 / lattice.grid.cell  # of one sample, in cells
     assert len(lattice.levels) == int(np.ceil(reach)) + 1
     np.testing.assert_allclose(lattice.levels[[0, -1], 0], [-1, 1])
@@ -159,7 +159,7 @@ def test_the_circle_s_nodes_have_arrived_within_the_band(around_circle):
 def test_a_chart_of_four_dimensions_is_refused():
     cube = Cube(lambda z: z[:, 0], d=4)
     with pytest.raises(BadInput, match=r"1 to 3 dimensions, that of cube has 4.*--episodes"):
-        Lattice.of(cube)
+        Lattice.tabulate(cube)
     assert not Lattice.possible(cube)
 
 
@@ -168,7 +168,7 @@ def test_a_plant_whose_state_is_more_than_the_chart_is_refused(circle):
     heavy.model = copy.copy(circle.model)
     heavy.model.actuator_biasprm[0, 2] = -1.0  # a weak servo: the pointer's speed matters
     with pytest.raises(BadInput, match=r"unit_circle has a larger state.*--episodes"):
-        Lattice.of(heavy)
+        Lattice.tabulate(heavy)
     assert not Lattice.possible(heavy)
 
 
@@ -212,9 +212,9 @@ def test_a_plant_that_moves_all_states_alike_is_stepped_from_few(name, monkeypat
     task = get_task(name)
     grid = Grid.with_cells(task.chart, 150)
     monkeypatch.setattr(lattice_module, "SAMPLE", 20)
-    few = Lattice.of(task, grid)
+    few = Lattice.tabulate(task, grid)
     monkeypatch.setattr(lattice_module, "SAMPLE", 10**9)
-    every = Lattice.of(task, grid)
+    every = Lattice.tabulate(task, grid)
     np.testing.assert_array_equal(few.after, every.after)
     np.testing.assert_allclose(few.hops, every.hops, atol=1e-12)
     np.testing.assert_allclose(every.uneven, 0, atol=1e-12)
@@ -224,6 +224,6 @@ def test_where_some_states_move_differently_all_are_stepped(vehicle, monkeypatch
     monkeypatch.setattr(lattice_module, "ALIKE", -1.0)
     monkeypatch.setattr(lattice_module, "SAMPLE", 20)
     grid = Grid.with_cells(vehicle.chart, 60)
-    stepped = Lattice.of(vehicle, grid)
+    stepped = Lattice.tabulate(vehicle, grid)
     monkeypatch.undo()
-    np.testing.assert_array_equal(stepped.after, Lattice.of(vehicle, grid).after)
+    np.testing.assert_array_equal(stepped.after, Lattice.tabulate(vehicle, grid).after)

@@ -137,7 +137,7 @@ def test_everything_is_winnable_on_the_circle(on_circle, eps):
 
 def test_the_planted_parts_are_those_of_stage_3(vehicle, on_vehicle):
     partition = make_partition(vehicle, sign_policy(vehicle), decisions(vehicle).points, 60)
-    limit = Limit.of(on_vehicle.lattice, partition)
+    limit = Limit.solve(on_vehicle.lattice, partition)
     for eps in (0.0, 0.1):
         bound = on_vehicle.bound(eps)
         off = limit.winnable(bound) != on_vehicle.winnable(eps)
@@ -146,7 +146,7 @@ def test_the_planted_parts_are_those_of_stage_3(vehicle, on_vehicle):
 
 def test_a_single_part_leaves_nothing_to_decide(vehicle):
     partition = make_partition(vehicle, one_way_policy(vehicle), np.empty((0, 2)), 60)
-    limit = Limit.of(Lattice.of(vehicle, Grid.with_cells(vehicle.chart, 120)), partition)
+    limit = Limit.solve(Lattice.tabulate(vehicle, Grid.with_cells(vehicle.chart, 120)), partition)
     x, y = limit.lattice.grid.nodes.T
     free = (x <= 0.4) & (np.abs(y) <= 1)
     assert limit.winnable(np.array([0.0, 0.2]))[free].all()
@@ -211,7 +211,7 @@ def plain_samples(lattice, after, allowed):
 @pytest.mark.parametrize("share", [1.0, 0.6])
 def test_the_fewest_samples_are_those_of_a_plain_twin(name, cells, share):
     task = get_task(name)
-    lattice = Lattice.of(task, Grid.with_cells(task.chart, cells))
+    lattice = Lattice.tabulate(task, Grid.with_cells(task.chart, cells))
     allowed = np.random.default_rng(0).random(lattice.after.shape) < share
     samples, level = fewest_samples(lattice, lattice.after, allowed)
     expected, levels = plain_samples(lattice, lattice.after, allowed)

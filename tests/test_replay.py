@@ -301,7 +301,7 @@ def test_critical_set_and_overlap_lie_on_the_floor(jump):
     won = np.ones(len(x), dtype=bool)
     none = (np.empty((0, 2)), np.empty(0))
     extended = ExtendedSets((0, 1), sets, (won, won), 0.3, 0.1, *none)
-    floor = Floor.of(Section(TASK), decisions(TASK), halves(TASK, 120), extended)
+    floor = Floor.from_sets(Section(TASK), decisions(TASK), halves(TASK, 120), extended)
     floors = Floors(TASK.chart, None, (floor,))
     picture, pixel = drawn([Track(TASK, jump)], 0.0, size=(640, 640), floor=floors)
     plain, _ = drawn([Track(TASK, jump)], 0.0, size=(640, 640))
@@ -324,7 +324,7 @@ def test_the_overlap_of_the_circle_is_around_its_critical_point(circle):
     sets = tuple(GridSet(grid, controller.flow_set(q).signed_distance(grid.nodes)) for q in (0, 1))
     won = np.ones(len(grid.nodes), dtype=bool)
     extended = ExtendedSets((0, 1), sets, (won, won), 0.5, 0.1, np.empty((0, 1)), np.empty(0))
-    floor = Floor.of(Section(circle), decisions(circle), halves(circle, 600), extended)
+    floor = Floor.from_sets(Section(circle), decisions(circle), halves(circle, 600), extended)
     angles = np.arctan2(floor.strips[..., 1], -floor.strips[..., 0])
     assert np.abs(angles).max() == pytest.approx(0.4, abs=0.011)
     lengths = np.linalg.norm(floor.strips[:, 0] - floor.strips[:, 1], axis=1)
@@ -347,7 +347,7 @@ def test_the_set_of_one_mode_overlaps_with_nothing():
     grid = Grid.with_cells(TASK.chart, 120)
     whole, won = GridSet(grid, np.full(len(grid.nodes), -1.0)), np.ones(len(grid.nodes), dtype=bool)
     extended = ExtendedSets((1,), (whole,), (won,), 0.3, 0.1, np.empty((0, 2)), np.empty(0))
-    floor = Floor.of(Section(TASK), decisions(TASK), halves(TASK, 120), extended)
+    floor = Floor.from_sets(Section(TASK), decisions(TASK), halves(TASK, 120), extended)
     assert len(floor.strips) == 0
     assert len(floor.critical) > 0
 

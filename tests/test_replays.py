@@ -39,14 +39,14 @@ def loops(vehicle):
 @pytest.fixture
 def certificate(vehicle, loops):
     game = Game(vehicle, halves(vehicle), loops, EPS, grid=Grid.with_cells(vehicle.chart, 240))
-    return Certificate.of(game, loops)
+    return Certificate.certify(game, loops)
 
 
 @pytest.fixture(scope="module")
 def scores(vehicle, loops):
     game = Game(vehicle, halves(vehicle), loops, EPS, grid=Grid.with_cells(vehicle.chart, 240))
     names = ["hyrl", "limit"]
-    return examination._scores(Certificate.of(game, loops), names, loops, (EPS,))[0]
+    return examination._scores(Certificate.certify(game, loops), names, loops, (EPS,))[0]
 
 
 def delayed(samples):
@@ -86,9 +86,11 @@ def test_a_proof_of_everything_is_refuted(vehicle, monkeypatch):
     """From one side to the other no policy can change in front of the pillar."""
     lost = {"hyrl": ideal_controller(vehicle, overlap=0.6)}
     game = Game(vehicle, halves(vehicle), lost, EPS, grid=Grid.with_cells(vehicle.chart, 120))
-    everything = Certificate.of(game, lost)
+    everything = Certificate.certify(game, lost)
     grid = {"hyrl": hybrid(vehicle, cells=60)}
-    cells = Certificate.of(Game(vehicle, halves(vehicle), grid, EPS, grid=game.lattice.grid), grid)
+    cells = Certificate.certify(
+        Game(vehicle, halves(vehicle), grid, EPS, grid=game.lattice.grid), grid
+    )
     everything = replace(everything, cells=cells.cells)
     places = np.zeros((3, cells.cells.places), dtype=int)
     monkeypatch.setattr(Certificate, "value", lambda self, name, eps: places)
@@ -169,7 +171,7 @@ def test_a_run_of_which_too_much_is_proved_says_so_everywhere(
     unseen = replace(found, lost=dict.fromkeys(found.lost, 0), first=None)
     believed = replace(run.robustness, game=replace(game, replays=(unseen,)))
     facts = run.retraining, run.arrivals
-    assert Verdict.of(run.task, EPS, believed, *facts).word == "PROVED"
+    assert Verdict.judge(run.task, EPS, believed, *facts).word == "PROVED"
     assert run.verdict.word == "FAILED"
     assert "withdrawn: a proved start was lost in a replay: from theta = " in run.verdict.sentence
     assert f"HyRL lost {found.failures:,} of {found.played:,} replays" in capsys.readouterr().out

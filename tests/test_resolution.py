@@ -45,7 +45,7 @@ def unicycle():
 @pytest.fixture(scope="module")
 def rough(unicycle):
     """A lattice whose cells are as long as a sample."""
-    return Lattice.of(unicycle, lattice_grid(unicycle, 40))
+    return Lattice.tabulate(unicycle, lattice_grid(unicycle, 40))
 
 
 def steps_of(lattice, level, node):
@@ -74,7 +74,7 @@ def test_two_inputs_get_as_many_cells_as_fit(levels):
     inputs = math.prod(level_counts(plane, fewer, probed_hops(plane)))
     assert fewer.counts < finest.counts
     assert 0.8 * 2**20 < len(fewer.nodes) * inputs <= 2**20
-    assert len(Lattice.of(plane, fewer).levels) == inputs
+    assert len(Lattice.tabulate(plane, fewer).levels) == inputs
 
 
 def test_all_combinations_of_the_levels_of_two_inputs_can_be_chosen():
@@ -82,14 +82,14 @@ def test_all_combinations_of_the_levels_of_two_inputs_can_be_chosen():
     plane.learning = Learning(levels=3)
     assert plane.input_levels.shape == (9, 2)
     assert {*map(tuple, plane.input_levels)} == {(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)}
-    lattice = Lattice.of(plane, lattice_grid(plane, 40))
+    lattice = Lattice.tabulate(plane, lattice_grid(plane, 40))
     np.testing.assert_array_equal(lattice.level_of(plane.input_levels), np.arange(9))
     assert lattice.exact, "a sample moves it by whole cells"
 
 
 def test_inputs_between_the_levels_of_the_lattice_are_not_exact():
     plane = Cube(lambda z: z[:, 0], d=2)
-    lattice = Lattice.of(plane, lattice_grid(plane, 40))
+    lattice = Lattice.tabulate(plane, lattice_grid(plane, 40))
     assert lattice.after.shape[1] == 1, "a sample moves it by whole cells"
     assert not lattice.exact
 
@@ -170,14 +170,14 @@ class Docked(Course):
 
 def test_inputs_that_an_inner_loop_bends_are_tabulated_in_between():
     course = Course()
-    lattice = Lattice.of(course, lattice_grid(course, 60))
+    lattice = Lattice.tabulate(course, lattice_grid(course, 60))
     assert len(lattice.levels) > 6
     assert np.ptp(lattice.hops, axis=0).min() > 0.09, "it goes every way"
 
 
 def test_an_inner_loop_that_depends_on_the_place_is_tabulated_everywhere():
     docked = Docked()
-    lattice = Lattice.of(docked, lattice_grid(docked, 80))
+    lattice = Lattice.tabulate(docked, lattice_grid(docked, 80))
     held = np.linalg.norm(lattice.grid.nodes - (0.31, 0.17), axis=1) < 0.05
     assert held.any()
     stays = (lattice.after[:, 0] == np.arange(lattice.nodes)).all(axis=0)
@@ -187,7 +187,7 @@ def test_an_inner_loop_that_depends_on_the_place_is_tabulated_everywhere():
 def test_nothing_is_proved_of_a_robot_with_an_inner_loop():
     course = Course()
     with pytest.raises(Unbounded, match="an inner loop"):
-        Cells.of(Lattice.of(course, lattice_grid(course, 60)))
+        Cells.cover(Lattice.tabulate(course, lattice_grid(course, 60)))
 
 
 def test_an_inner_loop_with_a_memory_makes_no_kinematic_robot():

@@ -354,7 +354,7 @@ def test_a_late_decision_is_taken_from_the_agent(vehicle):
     left = y > np.maximum(0.4 - x, 0)
     parts = tuple(GridSet.from_mask(grid, part | joined) for part in (left, ~left))
     partition = Partition((0, 1), parts, np.ones(len(x), dtype=bool))
-    ways = Limit.of(Lattice.of(vehicle, Grid.with_cells(vehicle.chart, 240)), partition)
+    ways = Limit.solve(Lattice.tabulate(vehicle, Grid.with_cells(vehicle.chart, 240)), partition)
     policy = hyrl_mj.from_callable(lambda o: np.where(o[:, 2] > 0, 0, 4), vehicle)
     found = with_room(vehicle, policy, partition, ways, 0.1)
     points = np.array([[0.0, 0.35], [0.1, 0.2], [0.0, -0.2], [0.0, 0.6], [0.3, 0.05]])

@@ -163,14 +163,14 @@ def test_grids_and_lattices_fit_the_memory(circle, vehicle):
     with pytest.raises(BadInput, match=rf"at most {MOST_NODES:,}"):
         Grid.with_cells(vehicle.chart, 800)
     with pytest.raises(BadInput, match=r"100,000 nodes and .* inputs does not fit into the memory"):
-        Lattice.of(circle, Grid.with_cells(circle.chart, 100_000))
+        Lattice.tabulate(circle, Grid.with_cells(circle.chart, 100_000))
 
 
 def test_a_lattice_without_a_node_to_start_from_is_refused(vehicle, monkeypatch):
     assert vehicle.chart_is_state  # which is found out once, from runs that go on
     monkeypatch.setattr(type(vehicle), "ending", lambda self, m: np.full(len(m), Outcome.CRASHED))
     with pytest.raises(BadInput, match="none at which vehicle goes on: give more cells"):
-        Lattice.of(vehicle, Grid.with_cells(vehicle.chart, 4))
+        Lattice.tabulate(vehicle, Grid.with_cells(vehicle.chart, 4))
 
 
 def test_where_many_runs_take_too_long_there_are_fewer_and_the_bisection_is_coarser(

@@ -61,7 +61,9 @@ def held(puck):
     """Mode 0 passes on the upper side of the rock, mode 1 on any."""
     grid = Grid.with_cells(puck.chart, 24)
     x, y = grid.nodes.T
-    return Held.of(puck, extended(grid, (y > -0.3) | (x > 0.6), np.ones(grid.size, dtype=bool)))
+    return Held.from_sets(
+        puck, extended(grid, (y > -0.3) | (x > 0.6), np.ones(grid.size, dtype=bool))
+    )
 
 
 def test_held_inputs_lead_where_the_environment_leads_under_them(puck, held):
@@ -118,7 +120,7 @@ def test_a_held_input_leaves_the_set_if_it_does_after_some_sample(puck):
     """A strip that the robot jumps over in the time for which an input is held is not passed."""
     grid = Grid.with_cells(puck.chart, 24)
     column = np.unique(grid.nodes[:, 0])[5]
-    held = Held.of(puck, extended(grid, np.abs(grid.nodes[:, 0] - column) > 1e-9))
+    held = Held.from_sets(puck, extended(grid, np.abs(grid.nodes[:, 0] - column) > 1e-9))
     starts, ends = grid.nodes[held.rows][:, 0], held.ends[..., 0]
     over = (starts < column) & (ends > column + 0.6 * grid.spacing[0])
     assert over.any()
@@ -247,7 +249,7 @@ def test_a_policy_is_judged_without_noise_and_by_an_attack(puck):
 def test_no_table_where_arrival_does_not_end_an_episode(puck, held):
     kept = from_gymnasium(Puck, steps=40, success="reward >= -0.25")
     grid = Grid.with_cells(kept.chart, 8)
-    assert Held.of(kept, extended(grid, np.ones(grid.size, dtype=bool))) is None
+    assert Held.from_sets(kept, extended(grid, np.ones(grid.size, dtype=bool))) is None
     assert kept.learning.cells == round((800_000 / 40) ** 0.5 - 0.5), (
         "fewer cells for whole episodes"
     )
@@ -265,7 +267,7 @@ def test_whether_the_chart_is_the_state_is_tried_out(puck, slid):
 
 
 def test_its_lattice_leads_to_where_it_goes_and_never_into_a_wall(slid):
-    lattice = Lattice.of(slid, lattice_grid(slid, 40))
+    lattice = Lattice.tabulate(slid, lattice_grid(slid, 40))
     assert lattice.estimate
     ends = lattice.after[:, 0][:, lattice.running]
     inside = ends < lattice.nodes

@@ -89,7 +89,7 @@ def test_an_end_by_nan_is_not_proved(tmp_path, monkeypatch, code, bad):
 
     crash = f"ends[~({code}) & (x > 0.5)] = Outcome.CRASHED"
     task = task_of(ends(vehicle(), crash), tmp_path, monkeypatch)
-    cells = Cells.of(Lattice.of(task, Grid.with_cells(task.chart, 60)))
+    cells = Cells.cover(Lattice.tabulate(task, Grid.with_cells(task.chart, 60)))
     x = cells.middle(np.arange(cells.nodes))[:, 0]
     assert cells.failed[(x > 0.6) & eval(bad)].all()
 
@@ -208,7 +208,7 @@ def test_hops_between_the_nodes_count(vehicle, monkeypatch):
     """A plant that moves some states farther, but no node."""
     from hyrl_mj.proof import cells as module
 
-    lattice = Lattice.of(vehicle, Grid.with_cells(vehicle.chart, 60))
+    lattice = Lattice.tabulate(vehicle, Grid.with_cells(vehicle.chart, 60))
     plant = type(vehicle.plant(1))
     stepped = plant.step
 
@@ -220,4 +220,4 @@ def test_hops_between_the_nodes_count(vehicle, monkeypatch):
 
     monkeypatch.setattr(plant, "step", step)
     with pytest.raises(Unbounded, match="does not move all states alike"):
-        module.Cells.of(replace(lattice))
+        module.Cells.cover(replace(lattice))

@@ -57,7 +57,7 @@ def episodes(policy, hyrl, eps=EPS):
 
 
 def word(circle, robustness, retraining=HOLDS, arrivals=ALL, bound=EPS):
-    return Verdict.of(circle, bound, robustness, retraining, arrivals).word
+    return Verdict.judge(circle, bound, robustness, retraining, arrivals).word
 
 
 # ---- where the game can be played
@@ -104,7 +104,7 @@ def test_a_game_that_is_an_estimate_stands_beside_the_episodes_that_decide(circl
     assert rough.estimate
     assert not estimate.estimate
     counted = episodes({"none": 990, "adversarial": 500}, {"none": 1_000, "adversarial": 1_000})
-    found = Verdict.of(circle, EPS, replace(counted, game=rough), HOLDS, ALL)
+    found = Verdict.judge(circle, EPS, replace(counted, game=rough), HOLDS, ALL)
     assert found.word == HELD
     (told,) = [reason for reason in found.reasons if "estimate" in reason]
     assert "beats HyRL from 0.20%" in told
@@ -119,19 +119,19 @@ def test_what_only_the_attack_finds_counts_beside_the_game(circle):
         for who, lost in (("policy", 150), ("hyrl", 3))
     )
     attacked = replace(won, attacks=counts)
-    found = Verdict.of(circle, EPS, attacked, HOLDS, ALL)
+    found = Verdict.judge(circle, EPS, attacked, HOLDS, ALL)
     assert found.word == WEAK
     assert "HyRL loses 1.50%" in found.sentence
     assert any("the attack breaks HyRL from 3 of 200 starts" in r for r in found.reasons)
 
 
 def test_a_proof_is_told_with_what_is_known_to_be_lost(circle):
-    found = Verdict.of(circle, EPS, game((1.0, 0.9), (1.0, 0.999), proved=0.995), HOLDS, ALL)
+    found = Verdict.judge(circle, EPS, game((1.0, 0.9), (1.0, 0.999), proved=0.995), HOLDS, ALL)
     assert str(found) == (
         f"PROVED: whatever the {NOISE}, HyRL is proved to win 99.50% and known to lose 0.10% of the "
         "winnable starts"
     )
-    whole = Verdict.of(circle, EPS, game((1.0, 0.9), (1.0, 1.0), proved=1.0), HOLDS, ALL)
+    whole = Verdict.judge(circle, EPS, game((1.0, 0.9), (1.0, 1.0), proved=1.0), HOLDS, ALL)
     assert whole.sentence.endswith(
         "is proved to win 100% and not known to lose any of the winnable starts"
     )
@@ -147,7 +147,7 @@ def test_without_noise_all_that_counts_is_that_everything_is_won(circle):
 def test_one_lost_replay_withdraws_the_word_and_is_named(circle, proved):
     of = "won" if proved is None else "proved"
     lost = game((1.0, 0.9), (1.0, 1.0), proved=proved, replayed=(replays(lost=1, of=of),))
-    verdict = Verdict.of(circle, EPS, lost, HOLDS, ALL)
+    verdict = Verdict.judge(circle, EPS, lost, HOLDS, ALL)
     said = "a proved start" if proved else "a start that no known noise beats"
     sentence = (
         f"withdrawn: {said} was lost in a replay: from theta = 3 rad in mode 1 (counter-clockwise) without "
@@ -159,31 +159,31 @@ def test_one_lost_replay_withdraws_the_word_and_is_named(circle, proved):
     assert "HyRL loses 0.25% of the winnable starts or of those replayed" in verdict.sentence
     assert sentence in verdict.reasons
     poor = game((0.9, 0.9), (1.0, 1.0), proved=proved, replayed=(replays(lost=1, of=of),))
-    verdict = Verdict.of(circle, EPS, poor, HOLDS, ALL)
+    verdict = Verdict.judge(circle, EPS, poor, HOLDS, ALL)
     assert (verdict.word, verdict.sentence) == (WEAK, sentence)
 
 
 def test_no_word_is_said_without_a_replay(circle):
     for proved in (1.0, None):
         none = game((1.0, 0.9), (1.0, 1.0), proved=proved, replayed=())
-        verdict = Verdict.of(circle, EPS, none, HOLDS, ALL)
+        verdict = Verdict.judge(circle, EPS, none, HOLDS, ALL)
         assert verdict.word == WEAK
         assert "was not replayed in MuJoCo, which hyrl-mj robustness RUN does" in verdict.sentence
     of_another = game((1.0, 0.9), (1.0, 1.0), replayed=(replays("policy"),))
     assert word(circle, of_another) == WEAK
     nothing = game((1.0, 0.9), (1.0, 0.95), replayed=())
-    assert "replayed" not in str(Verdict.of(circle, EPS, nothing, HOLDS, ALL))
+    assert "replayed" not in str(Verdict.judge(circle, EPS, nothing, HOLDS, ALL))
 
 
 def test_everything_of_nothing_is_not_won(circle):
-    verdict = Verdict.of(circle, EPS, game((1.0, 1.0), (1.0, 1.0), winnable=0.0), HOLDS, ALL)
+    verdict = Verdict.judge(circle, EPS, game((1.0, 1.0), (1.0, 1.0), winnable=0.0), HOLDS, ALL)
     assert verdict.word == FAILED
     assert "no start is winnable under noise of up to 0.1 rad on theta" in verdict.sentence
 
 
 def test_stage_6_has_given_up_where_a_mode_does_not_hold_its_set(circle):
     lost = Retraining((ModeResult(0, 0.6, 3), ModeResult(1, 1.0, 1)))
-    verdict = Verdict.of(circle, EPS, game((1.0, 0.5), (1.0, 0.9)), lost, ALL)
+    verdict = Verdict.judge(circle, EPS, game((1.0, 0.5), (1.0, 0.9)), lost, ALL)
     assert verdict.word == FAILED
     assert verdict.sentence == "stage 6 gave up on mode 0 (clockwise)"
     assert any("60.00% of its set, after 3 trainings" in reason for reason in verdict.reasons)
@@ -193,14 +193,16 @@ def test_stage_6_has_given_up_where_a_mode_does_not_hold_its_set(circle):
 
 def test_a_policy_that_does_not_arrive_is_said_with_its_number(circle):
     poor = Arrivals(430, 0, 1_000)
-    verdict = Verdict.of(circle, EPS, game((0.4, 0.4), (0.4, 0.4)), HOLDS, poor)
+    verdict = Verdict.judge(circle, EPS, game((0.4, 0.4), (0.4, 0.4)), HOLDS, poor)
     assert verdict.word == WEAK
     assert "arrives from 430 of 1,000 starts without noise" in verdict.sentence
 
 
 def test_less_noise_than_the_run_s_is_not_enough_and_more_is(circle):
     assert word(circle, game((1.0, 0.9), (1.0, 1.0), bounds=(0.0, 0.05))) == WEAK
-    verdict = Verdict.of(circle, EPS, game((1.0, 0.9), (1.0, 1.0), bounds=(0.0, 0.2)), HOLDS, ALL)
+    verdict = Verdict.judge(
+        circle, EPS, game((1.0, 0.9), (1.0, 1.0), bounds=(0.0, 0.2)), HOLDS, ALL
+    )
     assert verdict.word == WON
     assert "0.2 rad" in verdict.sentence
 
@@ -231,7 +233,7 @@ def test_the_word_of_episodes(circle, policy, hyrl, expected):
 
 def test_it_says_how_many_of_how_many(circle):
     shares = {"none": 1000, "uniform": 998}
-    verdict = Verdict.of(circle, EPS, episodes(shares, shares), HOLDS, ALL)
+    verdict = Verdict.judge(circle, EPS, episodes(shares, shares), HOLDS, ALL)
     assert verdict.word == HELD
     assert "998 of 1,000 episodes" in verdict.sentence
 
@@ -241,7 +243,7 @@ def test_it_says_how_many_of_how_many(circle):
 
 def test_a_verdict_reads_as_a_sentence_with_reasons(circle, capsys):
     class Planted:
-        verdict = Verdict.of(circle, EPS, game((1.0, 0.9), (1.0, 1.0), 0.9), HOLDS, ALL)
+        verdict = Verdict.judge(circle, EPS, game((1.0, 0.9), (1.0, 1.0), 0.9), HOLDS, ALL)
 
     print_verdict(Planted)
     first, *rest = capsys.readouterr().out.splitlines()
@@ -284,7 +286,7 @@ def test_a_share_that_is_a_word_is_refused(tmp_path):
 
 def test_arrivals_are_those_of_simulations(vehicle):
     policy = one_way_policy(vehicle, 1.0)  # it goes on beside the set-point
-    found = Arrivals.of(vehicle, policy)
+    found = Arrivals.measure(vehicle, policy)
     arcs = simulate(
         vehicle, PolicyController(policy), vehicle.starts(1_000, np.random.default_rng(0))
     )

@@ -415,7 +415,7 @@ def examined(seed: int, folder: Path) -> Found:
         everywhere = GridSet.from_mask(grid, np.ones(len(grid.nodes), dtype=bool))
         parts = Partition((0, 1), (everywhere,) * 2, np.ones(len(grid.nodes), dtype=bool))
         game = Game(task, parts, {"policy": loop}, EPS, grid=grid)
-        certificate = Certificate.of(game, {"policy": loop})
+        certificate = Certificate.certify(game, {"policy": loop})
         if certificate.cells is None or "policy" not in certificate.answers:
             why = certificate.why_not["policy"]
             return Found(trap, "estimate", why, tuple(wrong), STARTS)

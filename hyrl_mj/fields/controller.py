@@ -88,7 +88,7 @@ class GuardedPolicy:
         side, sense = np.full(len(measured), self.side), np.zeros(len(measured))
         way = way_past(self.task, measured[:, :TURN], side, sense)
         u = self.policy.inputs(way.observed)
-        seen = Seen.of(measured)
+        seen = Seen.from_measurement(measured)
         return guard_of(self.task, self.noise).inputs(seen, u, way.turn, way.sense)
 
 
@@ -171,7 +171,7 @@ class FocusController:
 
         The mode -1 stands for none: the answer begins in the initial mode.
         """
-        seen, (focus, side, sense) = Seen.of(measured), decoded(q)
+        seen, (focus, side, sense) = Seen.from_measurement(measured), decoded(q)
         pair = choose(seen, focus, side, self.swing, self.guard.margin)
         side = pair.side
         if self.first_side is not None:
@@ -212,7 +212,7 @@ class WithoutMemory:
         """
         measured = self.task.check_measurement(measured)
         nothing = np.full(len(measured), -1)
-        view = only_post(measured, choose(Seen.of(measured), nothing, nothing).focus)
+        view = only_post(measured, choose(Seen.from_measurement(measured), nothing, nothing).focus)
         return self.policy.inputs(
             self.local.observation(np.hstack([view, np.zeros_like(view[:, :1])]))
         )

@@ -65,7 +65,7 @@ class Bounds:
         return Bounds(*(noise * float(local.noisy[column]) for column in COLUMNS))
 
     @staticmethod
-    def of(options: DriveOptions, trained: Bounds) -> Bounds:
+    def from_options(options: DriveOptions, trained: Bounds) -> Bounds:
         """Returns the bounds that options stand for; `trained` are those that the policies were made for.
 
         Raises:
@@ -145,7 +145,7 @@ def drive(
         BadInput: a noise or a seed that cannot be used.
     """
     check_seed(options.seed)
-    bounds = Bounds.of(options, Bounds.trained(local, made_for))
+    bounds = Bounds.from_options(options, Bounds.trained(local, made_for))
     if options.attack and not bounds.largest:
         raise BadInput("--attack looks for the worst noise within bounds: give an --eps > 0")
     reached = REACHED + bounds.place
@@ -230,7 +230,7 @@ def noise_cautions(local: Field, made_for: float, options: DriveOptions) -> list
     if options.noise == "none" and not options.attack:
         return []
     trained = Bounds.trained(local, made_for)
-    bounds = Bounds.of(options, trained)
+    bounds = Bounds.from_options(options, trained)
     names = {
         "place": ("the robot's position", "m"),
         "heading": ("its heading", "rad"),

@@ -78,7 +78,7 @@ class Seen:
     radius: np.ndarray
 
     @staticmethod
-    def of(measured: np.ndarray) -> Seen:
+    def from_measurement(measured: np.ndarray) -> Seen:
         posts, x, y = posts_of(measured), measured[:, 0], measured[:, 1]
         return Seen(
             posts, x, y, measured[:, 3] - x, measured[:, 4] - y, measured[:, 2],

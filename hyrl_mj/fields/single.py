@@ -72,7 +72,7 @@ class _Seen:
     room: list[float]
 
     @staticmethod
-    def of(row: list[float]) -> _Seen:
+    def from_row(row: list[float]) -> _Seen:
         place_x, place_y, heading, goal_x, goal_y = row[:POSE]
         end = len(row) - (len(row) - POSE) % OF_POST
         columns = [row[POSE + i : end : OF_POST] for i in range(OF_POST)]
@@ -102,7 +102,7 @@ class Single:
 
     def __call__(self, q: int, row: list[float]) -> tuple[float, float, int]:
         """Returns speed [m/s], rate of turn [rad/s] and next mode, for a mode and a measurement."""
-        seen = _Seen.of(row)
+        seen = _Seen.from_row(row)
         focus, rest = divmod(q, MODES_OF_POST)
         side, sense = rest // 2, 1 - 2 * (rest % 2)
         focus, side = self._choose(seen, focus, side)

@@ -146,7 +146,7 @@ class Lattice:
         return Lattice.why_estimate(task) is None and Lattice.why_not(task, grid) is None
 
     @staticmethod
-    def of(task: Task, grid: Grid | None = None) -> Lattice:
+    def tabulate(task: Task, grid: Grid | None = None) -> Lattice:
         """Returns the lattice of a task, by default the finest: 12,000 cells along a line, 480 in the plane.
 
         Raises:

@@ -43,7 +43,7 @@ class Limit:
     hop: np.ndarray
 
     @staticmethod
-    def of(lattice: Lattice, parts: Iterable[GridSet]) -> Limit:
+    def solve(lattice: Lattice, parts: Iterable[GridSet]) -> Limit:
         """Returns the limit on a lattice for the parts M_i, by backward recursion over the best input.
 
         A run goes mode i's way if it enters M_i and then stays there until it arrives; before that it may

@@ -53,13 +53,13 @@ class Game:
         if grid is None:
             Lattice.check(task)
             Lattice.check(task, grid := lattice_grid(task))
-        self.lattice = Lattice.of(task, grid)
-        self.limit = Limit.of(self.lattice, parts)
+        self.lattice = Lattice.tabulate(task, grid)
+        self.limit = Limit.solve(self.lattice, parts)
         self._noises: dict[tuple[str, float], Signal] = {}
         self._values: dict[tuple[str, float], np.ndarray] = {}
         most = self.bound(largest)
         self.answers = {
-            name: Answers.of(self.lattice, as_controller(loop), most)
+            name: Answers.ask(self.lattice, as_controller(loop), most)
             for name, loop in controllers.items()
         }
 

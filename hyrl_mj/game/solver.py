@@ -53,7 +53,7 @@ class Answers:
     settled: np.ndarray
 
     @staticmethod
-    def of(lattice: Lattice, controller: Controller, bound: np.ndarray) -> Answers:
+    def ask(lattice: Lattice, controller: Controller, bound: np.ndarray) -> Answers:
         """Returns the answers of a controller to measurements with noise of at most `bound` (d,).
 
         Raises:

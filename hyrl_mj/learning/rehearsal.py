@@ -59,7 +59,7 @@ class Rehearsal:
         )
         self._lost, weight = z[lost], run.length[lost].astype(float)
         self._weight = weight / max(weight.sum(), 1.0)
-        self._deciding = self._between(z, WayRuns.of(self._task, run))
+        self._deciding = self._between(z, WayRuns.from_rollout(self._task, run))
 
     def _between(self, z: np.ndarray, runs: WayRuns) -> np.ndarray:
         """Returns the middles (k, d) between neighbours among z (n, d) from which runs go different ways."""

@@ -259,7 +259,7 @@ def _with_agent(task: str | Path | Task, policy: AnyPolicy, options: AgentOption
     with opened(path, settings, function) as run:
         if not run.manifest.is_done("train"):
             with run.stage("train"):
-                arrivals = Arrivals.of(checked, external.policy)
+                arrivals = Arrivals.measure(checked, external.policy)
                 external.store(run.path)
                 arrivals.save(run.path / "arrivals.json")
         yield run

@@ -65,7 +65,7 @@ def train_stage(run: Run, say: Say) -> None:
     algorithms.check_named(s.stage1.algorithm)
     log_dir = run.path / "logs" / "stage1"
     policy = train(run.task, s.stage1, s.seed, log_dir=log_dir, label="stage 1")
-    arrivals = Arrivals.of(run.task, policy)
+    arrivals = Arrivals.measure(run.task, policy)
     policy.save(run.path / "policy.safetensors")
     arrivals.save(run.path / "arrivals.json")
     say(f"a policy of {sum(w.size for w in policy.weights.values())} weights {arrivals}")
@@ -93,10 +93,10 @@ def extended_sets_stage(run: Run, say: Say) -> None:
     points, split, ways = run.critical_set.points, run.partition, None
     if run.agent:
         if Lattice.possible(task) and Lattice.decides(task, run.lattice_grid):
-            lattice = Lattice.of(task, run.lattice_grid)
-            ways = Limit.of(lattice, split)
+            lattice = Lattice.tabulate(task, run.lattice_grid)
+            ways = Limit.solve(lattice, split)
             split = with_room(task, run.steady, split, ways, s.noise)
-            ways = Limit.of(lattice, split)
+            ways = Limit.solve(lattice, split)
             points = boundary(split)
         split.save(run.path / "split.npz")
     sets = extend(task, run.steady, points, split, s.noise, s.horizon, ways)
@@ -115,7 +115,7 @@ def retrain_stage(run: Run, say: Say) -> None:
     part_of = partial(part_policy, run.task, run.steady, run.partition, noise=sets.noise)
     parts, table_of = None, None
     if run.task.effort.attacked:
-        parts, held = part_of, Held.of(run.task, sets)
+        parts, held = part_of, Held.from_sets(run.task, sets)
         table_of = None if held is None else partial(table_for, held)
     ground_of = partial(
         mode_ground, run.task, sets, parts=run.split, policy=run.steady, table=table_of is not None

@@ -191,7 +191,7 @@ def _load(
     if activation is not None and activation not in ACTIVATIONS:
         raise unknown("activation", activation, ACTIVATIONS)
     check_seed(seed)
-    preprocessing = Preprocessing.of(vecnormalize, n_stack, task)
+    preprocessing = Preprocessing.from_files(vecnormalize, n_stack, task)
     policy: ObservationPolicy
     if path.suffix == ".onnx":
         if stochastic or activation is not None:

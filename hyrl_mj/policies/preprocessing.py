@@ -135,7 +135,7 @@ class Preprocessing:
     n_stack: int = 1
 
     @staticmethod
-    def of(vecnormalize: str | Path | None, n_stack: int, task: Task) -> Preprocessing:
+    def from_files(vecnormalize: str | Path | None, n_stack: int, task: Task) -> Preprocessing:
         """Returns the preprocessing of a file of statistics and a number of observations.
 
         Raises:

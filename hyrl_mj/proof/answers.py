@@ -38,7 +38,7 @@ class Boxes:
     pad: np.ndarray
 
     @staticmethod
-    def of(cells: Cells, bound: np.ndarray) -> Boxes:
+    def around(cells: Cells, bound: np.ndarray) -> Boxes:
         """Returns the boxes for noise within bounds (d,)."""
         grid = cells.lattice.grid
         fine = np.where(bound > 0, FINE, 1)
@@ -206,13 +206,13 @@ class BoundedAnswers:
     shifts: tuple[tuple[tuple[np.ndarray, np.ndarray], ...], ...]
 
     @staticmethod
-    def of(cells: Cells, controller: Controller, bound: np.ndarray) -> BoundedAnswers:
+    def enclose(cells: Cells, controller: Controller, bound: np.ndarray) -> BoundedAnswers:
         """Returns the answers of a controller to measurements with noise of at most `bound` (d,).
 
         Raises:
             Unbounded: the controller, one of its policies or sets, or the task cannot be bounded.
         """
-        boxes = Boxes.of(cells, bound)
+        boxes = Boxes.around(cells, bound)
         if isinstance(controller, PolicyController):
             policies, goes = [controller.policy], np.ones((2, 1, *boxes.counts), dtype=bool)
         elif isinstance(controller, HybridController):
@@ -220,7 +220,9 @@ class BoundedAnswers:
             goes = _modes_after(boxes, controller)
         else:
             raise Unbounded(f"a controller that is a {type(controller).__name__} cannot be bounded")
-        shifts = tuple(tuple(_shifts(boxes, BoundedPolicy.of(policy))) for policy in policies)
+        shifts = tuple(
+            tuple(_shifts(boxes, BoundedPolicy.from_policy(policy))) for policy in policies
+        )
         return BoundedAnswers(boxes, controller.modes, goes, shifts)
 
     def possible(self, bound: np.ndarray) -> Iterator[Iterator[tuple[int, np.ndarray, np.ndarray]]]:

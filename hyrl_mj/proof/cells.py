@@ -83,7 +83,7 @@ class Cells:
         return ~(self.arrived | self.failed)
 
     @staticmethod
-    def of(lattice: Lattice, spacing: np.ndarray | None = None) -> Cells:
+    def cover(lattice: Lattice, spacing: np.ndarray | None = None) -> Cells:
         """Returns the cells of a lattice; its plant has to be even on nodes `spacing` (d,) apart.
 
         Raises:
@@ -294,7 +294,7 @@ def why_no_cells(task: Task, grid: Grid) -> str | None:
 def _why_no_cells(task: Task, counts: tuple[int, ...]) -> str | None:
     few = tuple(min(count, FEW) for count in counts)
     try:
-        Cells.of(Lattice.of(task, Grid(task.chart, few)), Grid(task.chart, counts).spacing)
+        Cells.cover(Lattice.tabulate(task, Grid(task.chart, few)), Grid(task.chart, counts).spacing)
     except (Unbounded, BadInput) as error:
         return str(error)
     return None

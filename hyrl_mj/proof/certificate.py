@@ -46,18 +46,18 @@ class Certificate:
     _values: dict[tuple[str, float], np.ndarray] = field(default_factory=dict, repr=False)
 
     @staticmethod
-    def of(game: Game, controllers: Mapping[str, Controller]) -> Certificate:
+    def certify(game: Game, controllers: Mapping[str, Controller]) -> Certificate:
         """Returns the certificate of some controllers of a game."""
         answers, why_not = {}, {}
         if why := game.lattice.why_estimate(game.task):
             return Certificate(game, None, {}, dict.fromkeys(controllers, why))
         try:
-            cells = Cells.of(game.lattice)
+            cells = Cells.cover(game.lattice)
         except Unbounded as error:
             return Certificate(game, None, {}, dict.fromkeys(controllers, str(error)))
         for name, controller in controllers.items():
             try:
-                answers[name] = BoundedAnswers.of(cells, controller, game.bound(game.largest))
+                answers[name] = BoundedAnswers.enclose(cells, controller, game.bound(game.largest))
             except Unbounded as error:
                 why_not[name] = str(error)
         return Certificate(game, cells, answers, why_not)

@@ -80,7 +80,7 @@ def examine(
     largest = max(*bounds, LARGEST) if exact else max(bounds)
     fine = Game(task, parts, controllers, largest, everywhere, grid)
     names = [*controllers, LIMIT]
-    certificate = Certificate.of(fine, controllers)
+    certificate = Certificate.certify(fine, controllers)
     scores, maps = _scores(certificate, names, controllers, bounds)
     replays = _replays(certificate, controllers, scores)
     if not exact:  # a coarser lattice would estimate nothing
@@ -88,7 +88,7 @@ def examine(
         curve, profile = _known(bounds, scores), Profile((), dict.fromkeys(names, ()))
     else:
         coarse = Game(task, parts, controllers, LARGEST, everywhere, curve_grid(task, cells))
-        curve, profile = _sweep(Certificate.of(coarse, controllers), names, points)
+        curve, profile = _sweep(Certificate.certify(coarse, controllers), names, points)
         likely = [(name, _last_won(curve, curve.wins[name])) for name in controllers]
         margins = dict(zip(controllers, _in_threads("margins", fine.margin, likely), strict=True))
     spacing, curve_spacing = (tuple(g.lattice.grid.spacing.tolist()) for g in (fine, coarse))

@@ -67,7 +67,7 @@ class BoundedPolicy:
     normalization: Program | None = None
 
     @staticmethod
-    def of(policy: Policy) -> BoundedPolicy:
+    def from_policy(policy: Policy) -> BoundedPolicy:
         """Returns the bounded form of a policy.
 
         Raises:

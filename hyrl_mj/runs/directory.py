@@ -272,7 +272,7 @@ class Run:
     def verdict(self) -> Verdict:
         """What the run is worth, in one word with its reasons."""
         facts = self.robustness, self.retraining, self.arrivals
-        return Verdict.of(self.task, self.settings.noise, *facts)
+        return Verdict.judge(self.task, self.settings.noise, *facts)
 
     @property
     def is_examined_as_usual(self) -> bool:

@@ -55,7 +55,7 @@ class Verdict:
         return f"{self.word}: {self.sentence}"
 
     @staticmethod
-    def of(
+    def judge(
         task: Task,
         bound: float,
         robustness: Robustness,
@@ -97,7 +97,7 @@ class _Wins:
     noisy: float | None
 
     @staticmethod
-    def of(robustness: Robustness, who: str) -> _Wins:
+    def count(robustness: Robustness, who: str) -> _Wins:
         """Returns what "policy" or "hyrl" wins."""
         attacked = [1 - c.lost / c.starts for c in robustness.attacks if c.controller == who]
         if robustness.deciding:
@@ -118,7 +118,7 @@ class _Wins:
 
 @dataclass(frozen=True)
 class _Case:
-    """What a verdict is decided by; the attributes are those of `Verdict.of`."""
+    """What a verdict is decided by; the attributes are those of `Verdict.judge`."""
 
     task: Task
     bound: float
@@ -128,11 +128,11 @@ class _Case:
 
     @property
     def policy(self) -> _Wins:
-        return _Wins.of(self.robustness, "policy")
+        return _Wins.count(self.robustness, "policy")
 
     @property
     def hyrl(self) -> _Wins:
-        return _Wins.of(self.robustness, "hyrl")
+        return _Wins.count(self.robustness, "hyrl")
 
     @property
     def noise(self) -> str:

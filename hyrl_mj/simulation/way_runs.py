@@ -38,7 +38,7 @@ class WayRuns:
     passing: Passing | None
 
     @staticmethod
-    def of(task: Task, rollout: Rollout) -> WayRuns:
+    def from_rollout(task: Task, rollout: Rollout) -> WayRuns:
         """Returns the ways of the runs of a rollout, of `way_runs`."""
         outcome = rollout.outcome
         arrived = outcome == Outcome.REACHED
@@ -112,5 +112,5 @@ def policy_runs(task: Task, policy: Policy, z0: np.ndarray, **settings: Any) -> 
 
 
 def way_runs(task: Task, policy: Policy, z: np.ndarray, **settings: Any) -> Rollout:
-    """Returns the runs of `policy_runs`, with all that `WayRuns.of` has to know of them."""
+    """Returns the runs of `policy_runs`, with all that `WayRuns.from_rollout` has to know of them."""
     return policy_runs(task, policy, z, passing=not task.gives_direction, **settings)

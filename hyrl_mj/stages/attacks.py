@@ -100,7 +100,7 @@ class Attack:
     strongest: int
 
     @staticmethod
-    def of(
+    def from_arcs(
         arcs: Sequence[HybridArc],
         signal: Recorded,
         dangerous: int,
@@ -142,7 +142,7 @@ class Attack:
         starts = np.array([arc.z[0] for arc in self.arcs])
         arcs = simulate_batch(task, controller, starts, self.signal)
         count = self.count
-        return Attack.of(
+        return Attack.from_arcs(
             arcs, self.signal, self.strongest, name, count.everywhere, count.rounds, count.seconds
         )
 
@@ -348,4 +348,4 @@ class _Search:
         recorded = Recorded(self.signals, rules.bound, Programmes.kind, "none", rules.shares)
         arcs = simulate_batch(self.task, self.controller, self.starts, recorded)
         dangerous = int(np.argmax(self._worst))
-        return Attack.of(arcs, recorded, dangerous, name, everywhere, rounds, seconds)
+        return Attack.from_arcs(arcs, recorded, dangerous, name, everywhere, rounds, seconds)

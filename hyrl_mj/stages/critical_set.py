@@ -148,7 +148,7 @@ def _by_rods(task: Task, policy: Policy, grid: Nodes, resolution: float) -> np.n
     if not len(centre):
         return centre
     ends = _ends(task, centre, axis, length).reshape(-1, d)
-    runs = WayRuns.of(task, way_runs(task, policy, ends))
+    runs = WayRuns.from_rollout(task, way_runs(task, policy, ends))
     first, second = np.split(np.arange(2 * len(centre)), 2)
     works = runs.usable
     return centre[runs[first].differ(runs[second]) & works[first] & works[second]]

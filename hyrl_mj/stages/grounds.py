@@ -223,14 +223,14 @@ class ByGame(ModeGround):
     noise = Noise()  # the game finds the worst
 
     def _prepare(self, policy: Policy | None) -> None:
-        self.lattice = game.Lattice.of(self.task, self.within.regular)
+        self.lattice = game.Lattice.tabulate(self.task, self.within.regular)
         after = self.lattice.after
         inside = np.append(self.within.mask, [True, False])[after]
         fewest, _ = game.fewest_samples(self.lattice, after, inside)
         self.fewest = int(fewest[self.nodes][fewest[self.nodes] < game.NEVER].max(initial=0))
 
     def score(self, policy: Policy) -> Score:
-        answers = game.Answers.of(self.lattice, PolicyController(policy), self.bound)
+        answers = game.Answers.ask(self.lattice, PolicyController(policy), self.bound)
         moves = game.noisy_moves(answers, self.bound)
         value = game.solve(moves)[0, :-2]
         lost = np.flatnonzero(self.wanted & (value >= game.NEVER))
@@ -247,7 +247,7 @@ class ByGame(ModeGround):
         return few and not self._selected[self.lost].any()
 
     def won(self, policy: Policy) -> float:
-        answers = game.Answers.of(self.lattice, PolicyController(policy), self.bound)
+        answers = game.Answers.ask(self.lattice, PolicyController(policy), self.bound)
         moves = game.noisy_moves(answers, self.bound)
         value = game.solve(moves, self.task.max_steps)[0, :-2]
         return float((value[self.nodes] < game.NEVER).mean())

@@ -139,7 +139,9 @@ def make_partition(
     points = check_points(task, points)
     grid = resolving(task.chart, cells, points, task.noise_in_chart(max(noise, 1e-6)))
     simulated, neighbours = thinned(task, grid)
-    first = WayRuns.of(task, way_runs(task, policy, grid.nodes[simulated], label="partition"))
+    first = WayRuns.from_rollout(
+        task, way_runs(task, policy, grid.nodes[simulated], label="partition")
+    )
     nodes, near = grid.nodes[simulated], None
     if first.passing is not None and noise and len(points):
         width = strips.width(task, noise, longest_hop(task, policy, grid))
@@ -151,14 +153,16 @@ def make_partition(
         def near(rows: np.ndarray) -> np.ndarray:
             return strips.around_walls(task, nodes, (a, b), first.alive, rows, width) <= width
 
-    ways = Ways.of(task, first, neighbours, near)
+    ways = Ways.from_runs(task, first, neighbours, near)
     modes = ways.modes if len(points) else ()
 
     def tell(rows: np.ndarray) -> np.ndarray:
         """Returns the modes of nodes, whether their runs work, and whether they arrive: (k, Q + 2)."""
         runs = first
         if not np.array_equal(rows, simulated):
-            runs = WayRuns.of(task, way_runs(task, policy, grid.nodes[rows], label="partition"))
+            runs = WayRuns.from_rollout(
+                task, way_runs(task, policy, grid.nodes[rows], label="partition")
+            )
         return np.column_stack([ways.members(runs), ways.works(runs), runs.arrived])
 
     everywhere, columns = np.ones(grid.size, dtype=bool), len(ways.modes) + 2

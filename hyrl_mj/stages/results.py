@@ -36,7 +36,7 @@ class Arrivals:
         return f"arrives from {self.arrived:,} of {self.episodes:,} starts without noise{missed}"
 
     @staticmethod
-    def of(task: Task, policy: Policy) -> Arrivals:
+    def measure(task: Task, policy: Policy) -> Arrivals:
         """Counts the arrivals of a policy from starts of the task, which are the same each time."""
         starts = task.starts(EPISODES, np.random.default_rng(0))
         settings = LoopSettings(vary=True, label="arrivals")

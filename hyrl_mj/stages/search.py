@@ -36,8 +36,8 @@ def critical_points(
         cell: the usual distance between two neighbours, in scaled units.
     """
     rollout = way_runs(task, policy, nodes, label="critical set")
-    runs, paths = WayRuns.of(task, rollout), _paths(task, rollout)
-    ways = Ways.of(task, runs, neighbours)
+    runs, paths = WayRuns.from_rollout(task, rollout), _paths(task, rollout)
+    ways = Ways.from_runs(task, runs, neighbours)
     works = ways.works(runs)
     if not works.any():
         return np.empty((0, task.chart.dimension))
@@ -147,7 +147,7 @@ def _bisected(
         if len(left):
             middle = (a.z[left] + c[left]) / 2
             rollout = way_runs(task, policy, middle)
-            found = _Side(middle, WayRuns.of(task, rollout), _paths(task, rollout))
+            found = _Side(middle, WayRuns.from_rollout(task, rollout), _paths(task, rollout))
             works = ways.works(found.runs)
             same = works & ~found.runs.differ(a.runs[left])
             other = works & ~same

@@ -122,7 +122,7 @@ class Held:
     leaves: np.ndarray
 
     @staticmethod
-    def of(task: Task, extended: ExtendedSets) -> Held | None:
+    def from_sets(task: Task, extended: ExtendedSets) -> Held | None:
         """Returns these runs, None where no table is `possible`, or the robot takes too long to get away."""
         grid = extended.sets[0].grid
         if not possible(task, grid):

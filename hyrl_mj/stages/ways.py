@@ -51,7 +51,7 @@ class Ways:
     arriving: bool
 
     @staticmethod
-    def of(
+    def from_runs(
         task: Task,
         runs: WayRuns,
         neighbours: tuple[np.ndarray, np.ndarray],

@@ -57,7 +57,7 @@ def replay_floor(run: Run, overlap: bool = True) -> Floors:
     axis, cuts = sections(run.task)
     parts = run.split if overlap else run.partition
     floors = [
-        Floor.of(
+        Floor.from_sets(
             cut,
             critical,
             cut.partition(parts),

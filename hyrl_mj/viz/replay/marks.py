@@ -119,7 +119,7 @@ class Floor:
     widths: np.ndarray
 
     @staticmethod
-    def of(
+    def from_sets(
         section: Section,
         critical: CriticalSet,
         partition: Partition,
