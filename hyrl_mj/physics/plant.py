@@ -101,7 +101,7 @@ class Plant:
 
         mujoco_log.install()
         try:
-            self._batch = Batch(self.model, self.n, self._threads or cores.allowed)
+            self._batch = Batch(self.model, self.n, self._threads or cores.count())
         except ValueError as error:
             raise BadInput(
                 f"MuJoCo cannot simulate copies of {mjcf.model_name(self.model)} side by side ({error}): "
