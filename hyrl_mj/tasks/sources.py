@@ -8,11 +8,12 @@ from pathlib import Path
 from hyrl_mj.errors import BadInput
 
 OWN = "hyrl_mj"  # this package may lie beside a task, too
+INSTALLED = "site-packages", "dist-packages"  # in these folders everything lies beside everything
 
 
 def sources(path: Path) -> list[Path]:
     """Returns a file of code, and the files in its folder that it imports, by whatever way."""
-    found, left = {path: None}, [path]
+    found, left = {path: None}, [] if path.parent.name in INSTALLED else [path]
     while left:
         for name in _imported(left.pop()):
             files = [path.with_name(f"{name}.py"), *sorted((path.parent / name).rglob("*.py"))]
