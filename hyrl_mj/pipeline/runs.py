@@ -125,7 +125,7 @@ def run(
         BadInput: a value that cannot be used.
     """
     options = complete(RunOptions, options, changes)
-    checked = _checked(task)
+    checked = usable_task(task)
     settings = settings_of(checked, options)
     if options.algorithm is not None:
         algorithms.remember(options.algorithm)
@@ -178,7 +178,7 @@ def diagnose(
         return _run_all(run, say, DIAGNOSIS)
 
 
-def _checked(task: str | Path | Task) -> Task:
+def usable_task(task: str | Path | Task) -> Task:
     """Returns a task that can be trained, and that a run directory leads to."""
     found = get_task(task)
     if found is task:
@@ -247,7 +247,7 @@ def _settings(task: Task, options: RunOptions | AgentOptions, **changes: Any) ->
 @contextmanager
 def _with_agent(task: str | Path | Task, policy: AnyPolicy, options: AgentOptions) -> Iterator[Run]:
     """Opens the run directory of an agent, which then holds the agent, and holds its lock in the block."""
-    checked = _checked(task)
+    checked = usable_task(task)
     _settings(checked, options)  # a wrong value is reported before the agent is read
     o = options
     external = read_agent(

@@ -15,12 +15,12 @@ from hyrl_mj.files.manifest import locked
 from hyrl_mj.learning import setting_value
 from hyrl_mj.pipeline import cluster
 from hyrl_mj.pipeline.board import Board
-from hyrl_mj.pipeline.runs import RunOptions, complete, settings_of
+from hyrl_mj.pipeline.runs import RunOptions, complete, settings_of, usable_task
 from hyrl_mj.ranges import Integer, Number
 from hyrl_mj.runs import sweeps
 from hyrl_mj.runs.sweeps import DONE, MOST_RUNS, OPEN, STOPPED, Common, Row, Setting, Sweep
 from hyrl_mj.system.progress import Say
-from hyrl_mj.tasks import check_task, get_task, reference
+from hyrl_mj.tasks import reference
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ def _jobs(names: tuple[str | Path, ...], options: SweepOptions) -> Iterator[tupl
     _check(names, options)
     seen: set[str] = set()
     for name in names:
-        task = check_task(get_task(name))
+        task = usable_task(name)
         if task.source is None and type(task).__module__ == "__main__":
             raise BadInput(
                 f"the task {task.name} is defined in this session alone, where the processes of a sweep do "
