@@ -16,9 +16,9 @@ from gymnasium.wrappers import (
 )
 
 from hyrl_mj import BadInput, Noise, closed_loop, from_callable, from_gymnasium, simulate
-from hyrl_mj.environments.instance import _global_state, kept_generators
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import LoopSettings, Programmes, Recorded, Rules
+from hyrl_mj.system.generators import global_state, kept_generators
 
 BOX = spaces.Box(-np.inf, np.inf, (4,))
 
@@ -466,6 +466,6 @@ def test_any_number_of_random_numbers_is_noticed():
     with kept_generators():
         np.random.seed(0)
         for count in (1, 312, 624):
-            before = _global_state()
+            before = global_state()
             np.random.random(count)
-            assert _global_state() != before
+            assert global_state() != before

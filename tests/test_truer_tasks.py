@@ -1,6 +1,7 @@
 """What users' own robots, noise, sets and functions do that no sample shows: right, or refused by name."""
 
 import copy
+import importlib
 import pickle
 
 import numpy as np
@@ -12,7 +13,7 @@ from hyrl_mj import BadInput, HybridController, Noise, from_callable, get_task, 
 from hyrl_mj.policies.external import read_agent
 from hyrl_mj.simulation import Recorded, Signal, judge_task, noise as noises, register_noise
 from hyrl_mj.simulation.real import fresh_model
-from hyrl_mj.tasks import Outcome, check_task, described_task
+from hyrl_mj.tasks import Outcome, check_as_made, check_task, described_task
 
 _, XML, PY, *_ = vehicle()
 NAMES = iter(range(1_000))
@@ -60,11 +61,10 @@ def test_an_object_that_no_run_leads_to_is_refused(wide, tmp_path):
     closer.close = 0.9
     assert wide.close == 0.3
     for task, name in ((other, "radius = 0.9"), (closer, "close = 0.9"), (noisy, "noisy = ")):
-        with pytest.raises(BadInput, match=f"has {name}.*runs and processes find it by"):
+        with pytest.raises(BadInput, match=f"has {name}.*runs find it by"):
             hyrl_mj.run(task, preset="smoke", out=tmp_path / "run")
-        if task is not noisy:
-            with pytest.raises(BadInput, match=name):
-                pickle.dumps(task)
+    assert pickle.loads(pickle.dumps(other)).radius == 0.9
+    assert pickle.loads(pickle.dumps(closer)).close == 0.9
     assert pickle.loads(pickle.dumps(noisy)).noisy == (1.0, 1.0)
     assert pickle.loads(pickle.dumps(wide)).radius == 0.6
     assert not (tmp_path / "run").exists()
@@ -121,6 +121,73 @@ def test_a_missing_task_file_is_said_to_be_missing(tmp_path):
         described_task(str(tmp_path / "gone.py"))
 
 
+def imported(path, monkeypatch):
+    """The class of a task file that is imported as a module, as users do, and registers it."""
+    monkeypatch.syspath_prepend(str(path.parent))
+    text = path.read_text().replace("\nclass Robot", "\n@hyrl_mj.register\nclass Robot")
+    path.write_text(f"COUNT = []\n{text}")
+    return importlib.import_module(path.stem)
+
+
+def test_a_class_that_is_imported_is_what_a_run_finds(tmp_path, monkeypatch):
+    module = imported(write(tmp_path), monkeypatch)
+    check_as_made(module.Robot())
+    path = tmp_path / f"{module.__name__}.py"
+    check_as_made(get_task(path))
+    check_as_made(module.Robot())  # of the same code
+    path.write_text(path.read_text() + "# changed\n")
+    with pytest.raises(BadInput, match="of code that has been defined anew"):
+        check_as_made(module.Robot())
+
+
+def test_what_cannot_be_compared_does_not_matter(tmp_path):
+    own = (
+        "    def __init__(self):\n"
+        "        self.tree = cKDTree(np.eye(3))\n        self.rows = [[1, 2], [3]]\n"
+        "        self.table = {'a': np.arange(3)}\n        self.rule = lambda z: z\n"
+        "        self._kept = None\n"
+    )
+    task = get_task(write(tmp_path, {"methods": own}, top="from scipy.spatial import cKDTree\n"))
+    task._kept = 3
+    check_as_made(task)
+    assert pickle.loads(pickle.dumps(task)).rows == [[1, 2], [3]]
+    task.rows[1].append(4)
+    with pytest.raises(BadInput, match="has rows = "):
+        check_as_made(task)
+
+
+def test_copies_of_a_task_keep_what_they_are_given(tmp_path):
+    task = get_task(write(tmp_path))
+    for one in (copy.copy(task), copy.deepcopy(task)):
+        one.side = 1
+        assert pickle.loads(pickle.dumps(one)).side == 1
+    assert not hasattr(task, "side")
+
+
+def test_a_package_beside_a_task_is_read_as_it_is_now(tmp_path):
+    package = tmp_path / "pillars_of"
+    (package / "logging").mkdir(parents=True)
+    (package / "__init__.py").write_text("from .sizes import RADIUS\n")
+    (package / "logging" / "__init__.py").write_text("")
+    (package / "sizes.py").write_text("from . import logging\nRADIUS = 0.6\n")
+    ending = PY["ending"].replace(CRASH, "<= RADIUS]")
+    path = write(tmp_path, {"ending": ending}, top="from pillars_of import RADIUS\n")
+    first, beside = get_task(path), np.array([[1.5, 0.8]])
+    (package / "sizes.py").write_text("RADIUS = 0.95\n")
+    second = get_task(path)
+    assert [t.ending(beside)[0] == Outcome.CRASHED for t in (first, second)] == [False, True]
+    assert first.code != second.code
+
+
+def test_a_model_of_another_file_is_judged_by_that(tmp_path):
+    other = write(tmp_path)
+    own = "    @property\n    def model(self):\n        return hyrl_mj.mjcf.load(MODEL)\n"
+    top = f"from pathlib import Path\nMODEL = Path({str(other.with_suffix('.xml'))!r})\n"
+    path = write(tmp_path, {"methods": own}, top=top)
+    path.with_suffix(".xml").unlink()
+    assert simulate(get_task(path), Steer(), [0.0, 0.5]).outcome == "reached"
+
+
 # ---- what simulations go on with
 
 
@@ -138,7 +205,7 @@ def test_a_missing_task_file_is_said_to_be_missing(tmp_path):
 )
 def test_a_method_that_writes_to_what_it_is_given_is_refused(own, tmp_path):
     task = get_task(write(tmp_path, own))
-    with pytest.raises(BadInput, match=r"writes to an array that it is given, line \d+.*a copy"):
+    with pytest.raises(BadInput, match=r"writes to an array that is read-only, line \d+.*a copy"):
         check_task(task)
     with pytest.raises(BadInput, match="writes to an array"):
         simulate(task, from_callable(lambda seen: np.full(len(seen), 2), task), [0.0, 0.5])
@@ -272,6 +339,44 @@ def test_noise_that_its_seed_does_not_decide_is_refused(sample, message, vehicle
     noise = registered(sample, count=0)
     with pytest.raises(BadInput, match=message):
         simulate(vehicle, Steer(), [0.0, 0.5], noise)
+
+
+class Filter:
+    """A filter that noise of a user's has."""
+
+    def begin(self, n):
+        self.value = np.zeros((n, 2))
+
+
+class Coloured(Signal):
+    kind = "coloured"
+
+    def __init__(self, bound, shares):
+        super().__init__(bound, shares)
+        self.filter = Filter()
+
+    def reset(self, n, rng):
+        super().reset(n, rng)
+        self.filter.begin(n)
+
+    def sample(self, now):
+        white = self.rng.uniform(-self.bound, self.bound, now.measurement.shape)
+        self.filter.value = 0.5 * self.filter.value + 0.5 * white
+        return self.filter.value * self.shares
+
+
+def late(self, now):
+    if (now.k > 20).any():
+        np.random.random()
+    return np.zeros_like(now.measurement)
+
+
+def test_noise_with_a_memory_of_its_own_is_taken(vehicle, kinds):
+    noise = Coloured(0.1, np.array([0.0, 1.0]))
+    one, other = (simulate(vehicle, Steer(), [0.0, 0.5], noise, seed=3) for _ in range(2))
+    np.testing.assert_array_equal(one.measured, other.measured)
+    with pytest.raises(BadInput, match="draws from a global generator"):
+        simulate(vehicle, Steer(), [0.0, 0.5], registered(late))
 
 
 def test_single_precision_reaches_the_bound_and_not_beyond_it(vehicle, kinds):

@@ -96,6 +96,39 @@ class ByAttribute(gym.Wrapper):
         return np.append(self.unwrapped.pose, observation[2:]), *rest
 
 
+class Nested(Telling):
+    def step(self, action):
+        *found, info = super().step(action)
+        return *found, {"success": info["success"], "pose": {"x": info["x"]}}
+
+
+class ByNested(gym.Wrapper):
+    def step(self, action):
+        observation, *rest = self.env.step(action)
+        return np.append(rest[-1]["pose"]["x"], observation[1:]), *rest
+
+
+def test_wrappers_that_observe_what_lies_deeper_in_info_are_refused():
+    with pytest.raises(BadInput, match=r"observes .*info pose"):
+        from_gymnasium(lambda: ByNested(Nested()))
+
+
+class Ragged(Flat):
+    walls = [[1, 2], [3]]
+
+    def __init__(self):
+        super().__init__()
+        self.rooms = [[1, 2], [3]]
+
+    def step(self, action):
+        observation, reward, terminated, _, info = super().step(action)
+        return observation, reward, terminated, None, info
+
+
+def test_attributes_of_any_kind_are_taken():
+    assert outcomes(lambda: DtypeObservation(Ragged(), np.float64)) == outcomes(Flat)
+
+
 @pytest.mark.parametrize(("wrapper", "way"), [(ByInfo, "info x"), (ByAttribute, "attribute pose")])
 def test_wrappers_that_observe_the_place_past_the_noise_are_refused(wrapper, way):
     with pytest.raises(BadInput, match=f"a wrapper of .* observes .*{way}.* does not reach"):

@@ -26,6 +26,7 @@ from hyrl_mj.environments.opening import made, peeled, physics_of, plant_of, ste
 from hyrl_mj.environments.physics import Physics
 from hyrl_mj.environments.specification import EARLIER, NOW, UNKNOWN, EnvironmentSpec
 from hyrl_mj.errors import BadInput, HyrlError, brief
+from hyrl_mj.system.generators import global_state
 
 # Durations of steps are the same if they differ by less than this share: they are differences of the time.
 SAME_TIME = 1e-3
@@ -103,7 +104,7 @@ class Instance:
         random.seed(seed)
         self._actions.seed(seed)
         given_options = {"options": options} if options else {}
-        before = _global_state()
+        before = global_state()
         try:
             result = self.env.reset(seed=seed, **given_options)
         except HyrlError:
@@ -119,7 +120,7 @@ class Instance:
                 "info"
             )
         observation = result[0]
-        self.draws_globally |= _global_state() != before
+        self.draws_globally |= global_state() != before
         physics = physics_of(self.env)
         if physics is None or physics[0] is not self.model:
             raise BadInput(
@@ -441,7 +442,8 @@ class Instance:
         observation, reward, terminated, truncated, info = result
         self.observation = self._flat(observation)
         # The limit of `steps`, or that of a wrapper which episodes are played without.
-        truncated |= self.spec.criterion.asks("truncated") and self._samples == self.spec.max_steps
+        over = self.spec.criterion.asks("truncated") and self._samples == self.spec.max_steps
+        truncated = bool(truncated) or over
         if self.physics.is_plant:
             self.physics.read()
         touch = bool(terminated) and bool(self.touched() - self.spec.harmless)
@@ -466,9 +468,9 @@ class Instance:
     @contextmanager
     def undrawn(self) -> Iterator[None]:
         """Raises `BadInput` after steps that draw from a global generator of random numbers."""
-        before = _global_state()
+        before = global_state()
         yield
-        if _global_state() != before:
+        if global_state() != before:
             raise self._drawing("a global generator")
 
     def _drawing(self, name: str) -> BadInput:
@@ -476,21 +478,3 @@ class Instance:
             f"{self.name} draws random numbers in step() ({name}), so its state does not tell what comes "
             "next: make it without that noise"
         )
-
-
-@contextmanager
-def kept_generators() -> Iterator[None]:
-    """Puts the global generators of NumPy and Python back after the block, in which resets seed them."""
-    numpy_state, python_state = np.random.get_state(), random.getstate()
-    try:
-        yield
-    finally:
-        np.random.set_state(numpy_state)
-        random.setstate(python_state)
-
-
-def _global_state() -> tuple[Any, ...]:
-    """Returns how far the global generators of NumPy and Python are."""
-    numpy_state: Any = np.random.get_state()
-    # The place in a table of 624 words, and a word of it: it is filled anew at its end.
-    return numpy_state[2], int(numpy_state[1][0]), random.getstate()

@@ -21,7 +21,6 @@ import gymnasium as gym
 import numpy as np
 
 from hyrl_mj.environments.inspection import inspect
-from hyrl_mj.environments.instance import kept_generators
 from hyrl_mj.environments.opening import (
     ARRAY,
     CHART,
@@ -37,6 +36,7 @@ from hyrl_mj.errors import BadInput, brief, check_seed, described, printable, un
 from hyrl_mj.files import artifacts, trust
 from hyrl_mj.ranges import Integer, refused
 from hyrl_mj.system import limits
+from hyrl_mj.system.generators import kept_generators
 from hyrl_mj.tasks import ENVIRONMENT, Task, get_task
 
 # The longest episode, and the widest coordinate of a chart [m, rad].

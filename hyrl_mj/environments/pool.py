@@ -24,11 +24,12 @@ import numpy as np
 
 from hyrl_mj.environments import fingerprint as written
 from hyrl_mj.environments.fresh import Fresh
-from hyrl_mj.environments.instance import Instance, Worn, kept_generators
+from hyrl_mj.environments.instance import Instance, Worn
 from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.errors import BadInput, HyrlError, brief
 from hyrl_mj.system import cores
 from hyrl_mj.system.forked import own_end
+from hyrl_mj.system.generators import kept_generators
 from hyrl_mj.tasks import Outcome
 
 # Fewer episodes than this for each process are played by one.

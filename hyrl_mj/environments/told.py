@@ -103,23 +103,30 @@ def _run(
 
 
 def _told(inner: Any, info: Any) -> Told:
-    """Returns the numbers in `info` and in attributes of an environment."""
+    """Returns the numbers in `info` and in attributes of an environment, not those of its objects."""
     attributes = dict(getattr(inner, "__dict__", {}))
     found = {f"info {key}": value for key, value in dict(info).items()}
     found |= {f"attribute {key}": value for key, value in attributes.items()}
-    return {name: copy.deepcopy(value) for name, value in found.items() if _is_number(value)}
+    return {name: copy.deepcopy(value) for name, value in found.items() if _is_numeric(value)}
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float | np.number) or (
-        isinstance(value, np.ndarray | list | tuple)
-        and len(np.shape(value)) > 0
-        and np.asarray(value).dtype.kind in "iuf"
-    )
+def _is_numeric(value: Any) -> bool:
+    """Returns whether a value is a number, an array of them, or a dictionary of such values."""
+    if isinstance(value, dict):
+        return bool(value) and all(map(_is_numeric, value.values()))
+    if not isinstance(value, int | float | np.number | np.ndarray | list | tuple):
+        return False
+    try:
+        return np.asarray(value).dtype.kind in "iuf"
+    except ValueError:  # lists of different lengths
+        return False
 
 
 def _far(here: Any, there: Any, least: float) -> bool:
     """Returns whether two values differ by as much as what follows the place does."""
-    if there is None or np.shape(here) != np.shape(there):
+    if isinstance(here, dict):
+        same = isinstance(there, dict) and here.keys() == there.keys()
+        return same and any(_far(value, there[key], least) for key, value in here.items())
+    if there is None or isinstance(there, dict) or np.shape(here) != np.shape(there):
         return False
     return bool(np.abs(np.subtract(here, there, dtype=float)).max(initial=0.0) >= least)

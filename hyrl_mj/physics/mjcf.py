@@ -37,6 +37,8 @@ _OF_VELOCITY = {
 FREE_CAMERAS = "overhead", "free"
 # The models that were compiled, each with the digest of its files at that time.
 _LOADED: dict[tuple[Path, str], mujoco.MjModel] = {}
+# The files that were tried in a process with limits, each with the digest of its own content.
+_TRIED: set[tuple[Path, str]] = set()
 
 
 def models_dir() -> Path:
@@ -57,12 +59,14 @@ def load(path: Path) -> mujoco.MjModel:
     """
     if not path.is_file():
         raise BadInput(f"there is no MJCF model at {path}")
-    if models_dir() not in path.resolve().parents and not any(
-        path == known for known, _ in _LOADED
-    ):
+    main = path, sha256(path.read_bytes()).hexdigest()
+    if new := models_dir() not in path.resolve().parents and main not in _TRIED:
         _try(path.absolute())
+        _TRIED.add(main)
     key = path, file_digest(path)
     if key not in _LOADED:
+        if main in _TRIED and not new:  # what it names has changed
+            _try(path.absolute())
         _LOADED[key] = _compiled(path)
     return _LOADED[key]
 
@@ -79,9 +83,9 @@ def file_digest(path: Path) -> str:
     return found.hexdigest()
 
 
-def read_digest(model: mujoco.MjModel) -> str:
-    """Returns the `file_digest` of a model that `load` compiled, as it was then; "" of another model."""
-    return next((digest for (_, digest), loaded in _LOADED.items() if loaded is model), "")
+def origin(model: mujoco.MjModel) -> tuple[Path, str] | None:
+    """Returns the file of a model that `load` compiled and its `file_digest` then; None of another model."""
+    return next((key for key, loaded in _LOADED.items() if loaded is model), None)
 
 
 def _compiled(path: Path) -> mujoco.MjModel:

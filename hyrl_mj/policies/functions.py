@@ -35,7 +35,7 @@ class FunctionPolicy(ObservationPolicy):
         try:
             kind = np.float64 if self.task.observation_dtype == "float64" else np.float32
             answer = self.function(observation.astype(kind))
-            if isinstance(answer, tuple):
+            if isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[0], np.ndarray):
                 raise BadInput(
                     "it returns a tuple, as the predict() of SB3 does: give its first part, as lambda o: "
                     "model.predict(o)[0]"
@@ -72,11 +72,10 @@ def from_callable(function: Callable[[np.ndarray], Any], task: Task) -> Function
     """Returns a function of the observation as a policy.
 
     Args:
-        function: observations (n, k) of the type that the task's environments give, float32 but for
-            environments of others -> inputs (n, m) in the plant's units, which are clipped to the task's
-            limits. For a discrete task: the numbers of
-            the levels, (n,) integers, or preferences (n, levels). Or a `torch.nn.Module` that does so with
-            tensors, which is put into evaluation mode.
+        function: observations (n, k), float32, or float64 where an environment of others observes that ->
+            inputs (n, m) in the plant's units, which are clipped to the task's limits. For a discrete task:
+            the numbers of the levels, (n,) integers, or preferences (n, levels). Or a `torch.nn.Module` that
+            does so with tensors, which is put into evaluation mode.
         task: the robot and its problem.
 
     Raises:

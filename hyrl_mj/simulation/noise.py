@@ -16,6 +16,7 @@ import numpy as np
 from hyrl_mj.errors import BadInput, brief, check_bound, unknown
 from hyrl_mj.physics.plant import Plant
 from hyrl_mj.policies import Controller
+from hyrl_mj.system.generators import global_state
 from hyrl_mj.tasks import Task, read_only, writes
 
 # The mode of a run before its first measurement, from which the controller picks its start mode.
@@ -292,6 +293,7 @@ def drawn(signal: Signal, now: Sample) -> np.ndarray:
         BadInput: it raises an error, changes what it is shown, gives another shape or type, or noise that is
             not finite or larger than its bound times the share of its column.
     """
+    before = None if is_own(signal) else global_state()
     arrays = {
         name: read_only(getattr(now, name)) for name in ("rows", "k", "measurement", "q", "past")
     }
@@ -307,6 +309,11 @@ def drawn(signal: Signal, now: Sample) -> np.ndarray:
                 f"{signal.kind} noise writes to an array that it is shown: let it work on a copy"
             ) from error
         raise BadInput(f"{signal.kind} noise cannot be used: it raised {brief(error)}") from error
+    if before is not None and global_state() != before:
+        raise BadInput(
+            f"{signal.kind} noise draws from a global generator, which no seed decides: let it draw from "
+            "self.rng"
+        )
     true, limits = now.measurement, _limits(signal)
     if not isinstance(noise, np.ndarray) or noise.shape != true.shape or noise.dtype.kind != "f":
         given = np.asarray(noise)
@@ -342,6 +349,8 @@ class _Seen:
         self._plant = plant
 
     def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):  # as Python asks where it copies
+            raise AttributeError(name)
         if name in ("step", "step_backward", "set_state", "put", "observe", "end"):
             raise BadInput(
                 f"noise calls {name}() of the plant that is simulated: look ahead with one of its own, made "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -24,6 +24,7 @@ ROUNDING = 1e-8
 ALONE = 2
 # Episodes that are tried when a run begins, and their longest duration [samples].
 TRIED, SAMPLES = 50, 40
+LONGER = 10**9  # than any episode [samples]
 # MuJoCo's warnings about states that it resets.
 BAD = [
     int(kind)
@@ -112,11 +113,32 @@ def judge_task(task: Task) -> int:
     return judge(task, run, start, np.arange(TRIED)[::-1])
 
 
+def judge_beginning(
+    task: Task, run: Rollout, start: tuple[np.ndarray, np.ndarray | None], rows: np.ndarray
+) -> None:
+    """Judges the first samples of some of the episodes (k,), in which nothing has grown from a rounding.
+
+    Raises:
+        BadInput: something differs, as in `judge`.
+    """
+    cut = run.length > SAMPLES
+    beginning = replace(
+        run,
+        length=np.minimum(run.length, SAMPLES),
+        limit=np.where(cut, LONGER, run.limit),
+        outcome=np.where(cut, Outcome.RUNNING, run.outcome),
+        true=run.true[: SAMPLES + 1],
+        u=run.u[:SAMPLES],
+    )
+    judge(task, beginning, start, rows)
+
+
 def fresh_model(task: Task) -> mujoco.MjModel:
     """Returns the task's MJCF compiled anew, or if no file holds its model a copy of that."""
-    path, digest = task.model_path, mjcf.read_digest(task.model)
-    if not digest:
+    read = mjcf.origin(task.model)
+    if read is None:
         return copy.copy(task.model)
+    path, digest = read
     if not path.is_file() or mjcf.file_digest(path) != digest:
         raise BadInput(
             f"{path} has changed since the task {task.name} was made of it: make the task again"

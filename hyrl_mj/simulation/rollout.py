@@ -1,5 +1,7 @@
 """The closed loop of task, noise and controller, for many starts at once."""
 
+from contextlib import suppress
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from itertools import count
 
@@ -126,10 +128,13 @@ def closed_loop(
     plant = settings.plant or task.plant(n)
     plant.set_state(*task.state(z0, settings.rng_of_starts(seed)))
     signal = signal_for(noise, task, controller)
-    signal.reset(n, np.random.default_rng(seed))
-    twin = None if is_own(signal) else signal_for(noise, task, controller)
-    if twin is not None:
-        twin.reset(n, np.random.default_rng(seed))
+    twin = None
+    if not is_own(signal):
+        with suppress(Exception):  # what cannot be copied has no twin
+            twin = deepcopy(signal, {id(task): task, id(controller): controller})
+    for one in (signal, twin):
+        if one is not None:
+            one.reset(n, np.random.default_rng(seed))
     ahead: list[np.ndarray] | None = [] if signal.unseeing and not together else None
     ask, measurement = Asked(task, controller), plant.measurement
     past = nothing_past(controller, n, measurement.shape[1])

@@ -1,3 +1,3 @@
-"""What the machine gives: cores, processes with limits, output streams and progress bars."""
+"""What the machine gives: cores, processes with limits, generators, output streams and progress bars."""
 
-__all__ = ["cores", "forked", "limits", "progress", "streams"]
+__all__ = ["cores", "forked", "generators", "limits", "progress", "streams"]

@@ -59,8 +59,14 @@ class Task(Problem):
         """SHA-256 of the files of a user's task, as they were read; "" for one of this package."""
         if self.source is None:
             return ""
-        of_model = mjcf.read_digest(self.model) or digest(self.model_path)
+        read = mjcf.origin(self.model)
+        of_model = digest(self.model_path) if read is None else read[1]
         return f"{self._digest[:32]}{of_model[:32]}"
+
+    def __copy__(self) -> Self:
+        task = object.__new__(type(self))
+        vars(task).update(vars(self))
+        return task
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         return copy(self)  # but for its own attributes nothing is written to
@@ -84,8 +90,8 @@ class Task(Problem):
 
     def with_noise(self, shares: Sequence[float]) -> Self:
         """Returns this task with other shares (p,) of the noise bound on the columns of the measurement."""
-        task = object.__new__(type(self))
-        vars(task).update(vars(self), noisy=tuple(shares))
+        task = copy(self)
+        task.noisy = tuple(shares)
         return task
 
     def noise_on(self, everywhere: bool = False) -> tuple[str, str]:

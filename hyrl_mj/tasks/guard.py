@@ -94,8 +94,8 @@ def _guarded(name: str, method: Callable[..., Any]) -> Callable[..., Any]:
         except (Exception, SystemExit) as error:  # whatever the user's own code raises
             if writes(error):
                 raise BadInput(
-                    f"{name}() of the task {self.name} writes to an array that it is given"
-                    f"{line_in(error, self.source)}, with which the simulation goes on: let it work on a copy"
+                    f"{name}() of the task {self.name} writes to an array that is read-only"
+                    f"{line_in(error, self.source)}, as those are that it is given: let it work on a copy"
                 ) from error
             row = _row_of(lambda *rows: method(self, *rows), args, name)
             raise BadInput(

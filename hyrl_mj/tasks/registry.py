@@ -3,11 +3,12 @@
 import importlib
 import importlib.util
 import sys
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -15,7 +16,7 @@ import numpy as np
 from hyrl_mj.errors import BadInput, brief, line_in, unknown
 from hyrl_mj.files import trust
 from hyrl_mj.tasks.base import Task
-from hyrl_mj.tasks.sources import digest_of, forget_helpers
+from hyrl_mj.tasks.sources import check_helpers, digest_of, forget_helpers
 
 # The group of entry points under which an installed package offers tasks: name = "its.module:Class".
 GROUP = "hyrl_mj.tasks"
@@ -41,7 +42,7 @@ def register(task: type[Task]) -> type[Task]:
             f"{here} defines a task {task.name}, and so does {_file(other)}: rename one of them"
         )
     if here is not None and PACKAGE not in here.parents:
-        task.source, task._digest = here, digest_of(here)
+        task.source, task._digest = here, digest_of(here) if here.is_file() else ""
     if "env_id" not in vars(task):
         task.env_id = f"hyrl_mj/{task.__name__}-v0"
     registered = gym.registry.pop(task.env_id, None)  # of this very class if it was decorated, too
@@ -191,62 +192,95 @@ def _from_file(path: Path) -> type[Task]:
     return _FILES[key]
 
 
-def check_as_made(task: Task, but: Collection[str] = ()) -> None:
-    """Raises `BadInput` unless a task is as `get_task` makes it, by which runs and processes find it.
+def check_as_made(task: Task) -> None:
+    """Raises `BadInput` unless a task is as `get_task` makes it, by which a run directory finds it.
 
-    A run directory holds no objects: attributes that were given to an object, or changed after it was made,
-    would be lost. What is only computed from others is compared where both have computed it.
-
-    Args:
-        task: the task.
-        but: names of attributes that may differ.
+    That holds no objects: attributes that were given to an object, or changed after it was made, would be
+    lost. What cannot be compared is not, and what is computed from others only where both have computed it.
     """
-    made = get_task(reference(task))
-    if type(made) is not type(task):
-        raise BadInput(
-            f"the task {task.name} is of code that has been defined anew since it was made: make it again, "
-            f"as by get_task({reference(task)[:80]!r})"
-        )
-    names = vars(task).keys() | vars(made).keys()
-    for name in sorted(names, key=lambda name: (name.startswith("_"), name)):
-        computed = isinstance(getattr(type(task), name, None), cached_property)
-        if name in but or (computed and not (name in vars(task) and name in vars(made))):
-            continue
-        own, usual = (getattr(one, name, None) for one in (task, made))
-        if not _alike(own, usual):
+    kind, registered = type(task), _REGISTRY.get(task.name)
+    if task.spec:
+        made = get_task(task.spec)
+    else:
+        code = kind.__qualname__, kind._digest
+        if registered is None:
             raise BadInput(
-                f"the task {task.name} has {name} = {own!r:.60}, and runs and processes find it by "
-                f"{reference(task)[:80]}, where {name} is {usual!r:.60}: change it in its class, or give it "
-                "a class and a name of its own"
+                f"the task {task.name} is not registered: put @hyrl_mj.register before its class, or write "
+                "it into a file and give that"
             )
+        changed = task.source is not None and kind._digest != digest_of(task.source)
+        if changed or (registered.__qualname__, registered._digest) != code:
+            raise BadInput(
+                f"the task {task.name} is of code that has been defined anew since it was made: make it "
+                f"again, as by get_task({reference(task)[:80]!r})"
+            )
+        made = _instance(kind, task.name)
+    if differing := _differing(task, made):
+        name = differing[0]
+        own, usual = (getattr(one, name, None) for one in (task, made))
+        raise BadInput(
+            f"the task {task.name} has {name} = {own!r:.60}, and runs find it by {reference(task)[:80]}, "
+            f"where {name} is {usual!r:.60}: change it in its class, or give it a class and a name of its own"
+        )
 
 
-def _alike(a: object, b: object) -> bool:
+def _differing(task: Task, made: Task) -> list[str]:
+    """Returns the names of attributes in which a task differs from another one, public ones first."""
+    names = vars(task).keys() | vars(made).keys()
+    found = []
+    for name in sorted(names, key=lambda name: (name.startswith("_"), name)):
+        if isinstance(getattr(type(task), name, None), cached_property) and not (
+            name in vars(task) and name in vars(made)
+        ):
+            continue
+        own, usual = getattr(task, name, None), getattr(made, name, None)
+        filled = usual is None and name.startswith("_")  # as a cache is
+        if not filled and not _alike(own, usual):
+            found.append(name)
+    return found
+
+
+def _alike(a: Any, b: Any) -> bool:
     """Returns whether two attributes are the same, as far as can be told."""
     if a is b:
         return True
-    try:
-        return bool(np.array_equal(a, b, equal_nan=True))  # type: ignore[arg-type]
-    except TypeError:  # no numbers
-        pass
-    except Exception:
+    if type(a) is not type(b):
         return False
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(_alike(value, b[key]) for key, value in a.items())
+    if isinstance(a, list | tuple):
+        return len(a) == len(b) and all(map(_alike, a, b))
+    if isinstance(a, np.ndarray):
+        return np.array_equal(a, b, equal_nan=a.dtype.kind in "fc")
+    if type(a).__eq__ is object.__eq__:  # nothing tells
+        return True
     try:
         return bool(a == b)
     except Exception:  # whatever a user's class does
-        return False
+        return True
 
 
 def _by_reference(task: Task) -> tuple[Callable[[str], Task], tuple[str], dict[str, object]]:
-    check_as_made(task, but=("noisy",))
-    own = {name: value for name, value in vars(task).items() if name == "noisy"}
-    return get_task, (reference(task),), own
+    """Returns how another process makes a task: by its file, with the attributes in which it differs."""
+    try:
+        names = _differing(task, type(task)())
+    except Exception:  # it takes arguments
+        names = [
+            n for n in vars(task) if not isinstance(getattr(type(task), n, None), cached_property)
+        ]
+    return (
+        get_task,
+        (reference(task),),
+        {name: vars(task)[name] for name in names if name in vars(task)},
+    )
 
 
 def _run(path: Path) -> ModuleType:
     """Imports a file as a module of its own, which can import from its folder as a script can."""
     name = f"hyrl_mj_task_{path.stem}_{len(_FILES)}"
-    forget_helpers(path)
+    check_helpers(path)
+    if any(known == path for known, _ in _FILES):  # something has changed
+        forget_helpers(path)
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None

@@ -2,6 +2,7 @@
 
 import ast
 import sys
+from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
 
@@ -12,14 +13,17 @@ INSTALLED = "site-packages", "dist-packages"  # in these folders everything lies
 
 
 def sources(path: Path) -> list[Path]:
-    """Returns a file of code, and the files in its folder that it imports, by whatever way."""
+    """Returns a file of code, and the files in its folder that its import statements name."""
     found, left = {path: None}, [] if path.parent.name in INSTALLED else [path]
     while left:
-        for name in _imported(left.pop()):
-            files = [path.with_name(f"{name}.py"), *sorted((path.parent / name).rglob("*.py"))]
-            new = [file for file in files if file.is_file() and file not in found]
-            found |= dict.fromkeys(new)
-            left += new
+        file = left.pop()
+        now = file.stat()
+        for name in _imported(file, now.st_mtime_ns, now.st_size):
+            for folder in {path.parent, file.parent}:
+                files = [folder / f"{name}.py", *sorted((folder / name).rglob("*.py"))]
+                new = [file for file in files if file.is_file() and file not in found]
+                found |= dict.fromkeys(new)
+                left += new
     return list(found)
 
 
@@ -31,42 +35,47 @@ def digest_of(path: Path) -> str:
     return digest.hexdigest()
 
 
-def forget_helpers(path: Path) -> None:
-    """Lets what a task imports from its folder be imported anew.
+def check_helpers(path: Path) -> None:
+    """Raises `BadInput` if Python has a module of another place that is called as one beside a task.
 
-    Raises:
-        BadInput: Python has a module of such a name from another place, and would give that one.
+    It would give that one to the task.
     """
-    for file in sources(path)[1:]:
-        if file.parent != path.parent and file.name != "__init__.py":
-            continue
-        name = file.stem if file.parent == path.parent else file.parent.name
-        other = getattr(sys.modules.get(name), "__file__", None)
-        if other is None:
-            continue
-        if Path(other).resolve() != file.resolve():
+    for name in _beside(path):
+        module = sys.modules.get(name)
+        places = [getattr(module, "__file__", None), *getattr(module, "__path__", [])]
+        places = [str(Path(place).resolve()) for place in places if place]
+        own = str(path.parent.resolve() / name)
+        if places and not any(place == f"{own}.py" or place.startswith(own) for place in places):
             raise BadInput(
                 f"{path} imports {name}, which lies beside it, and this process has another module of that "
-                f"name, {other}: rename {file.name}"
+                f"name, {places[0]}: rename {name}"
             )
-        del sys.modules[name]
 
 
-def _imported(path: Path) -> set[str]:
-    """Returns the names of the top-level modules that a file imports anywhere."""
+def forget_helpers(path: Path) -> None:
+    """Lets what a task imports from its folder be imported anew."""
+    names = _beside(path)
+    for module in [m for m in sys.modules if m.partition(".")[0] in names]:
+        del sys.modules[module]
+
+
+def _beside(path: Path) -> set[str]:
+    """Returns the names of the modules and packages beside a task that it imports."""
+    files = [file.relative_to(path.parent) for file in sources(path)[1:]]
+    return {file.parts[0].removesuffix(".py") for file in files}
+
+
+@lru_cache(maxsize=10_000)
+def _imported(path: Path, changed: int, size: int) -> frozenset[str]:
+    """Returns the first names of the modules that a file imports anywhere, as it is at that time."""
     try:
         tree = ast.parse(path.read_bytes())
     except (SyntaxError, ValueError):  # which running it tells of
-        return set()
-    names = {
-        alias.name
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Import)
-        for alias in node.names
-    }
-    names |= {
-        node.module
-        for node in ast.walk(tree)
-        if isinstance(node, ast.ImportFrom) and node.module and not node.level
-    }
-    return {name.partition(".")[0] for name in names} - {OWN}
+        return frozenset()
+    names: list[str] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            names += [node.module] if node.module else [alias.name for alias in node.names]
+    return frozenset(name.partition(".")[0] for name in names) - {OWN}
