@@ -222,7 +222,8 @@ def test_an_environment_that_this_process_registered_takes_arguments():
     assert task.max_steps == 50
 
 
-def test_a_step_that_takes_long_is_one_sentence():
+def test_a_step_that_takes_long_is_one_sentence(monkeypatch):
+    monkeypatch.setitem(limits.tried.__kwdefaults__, "seconds", limits.SECONDS)
     given = {"pinned": {"qpos[2]": -0.15, "qpos[3]": 0.0}, "success": "reward >= 1"}
     sentence = refusal(
         lambda: from_gymnasium("Reacher-v5", kwargs={"frame_skip": 150_000}, **given)

@@ -162,8 +162,8 @@ def jumping(self, now):
         (lambda self, now: now.measurement * np.nan, "noise is nan at sample 0 of simulation 0"),
         (lambda self, now: np.where(now.k[:, None] > 9, 1.0, [0, 0.1]), "is 1 at sample 10 of"),
         (lambda self, now: 1 / 0, "it raised ZeroDivisionError"),
-        (moving, "it raised ValueError: .* read-only"),
-        (jumping, "it raised ValueError: .* read-only"),
+        (moving, "writes to an array that it is shown"),
+        (jumping, "writes to an array that it is shown"),
     ],
 )
 def test_each_sample_of_a_noise_is_checked(sample, message, vehicle, monkeypatch):

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from hyrl_mj.errors import BadInput, check_seed
 from hyrl_mj.files.artifacts import Saved
 from hyrl_mj.policies import Controller, Policy, PolicyController, as_controller, check_modes
-from hyrl_mj.simulation.noise import AnyNoise, Noise, is_own
+from hyrl_mj.simulation.noise import AnyNoise, Noise
 from hyrl_mj.simulation.real import judge_beginning
 from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop
 from hyrl_mj.tasks import Outcome, Task, get_task, task_names
@@ -190,7 +190,7 @@ def simulate_batch(
     settings = LoopSettings(steps=steps, record=True)
     rollout = closed_loop(task, loop, starts, noise, q0, seed, settings)
     task.verify(starts, rollout, range(n))
-    if not is_own(task) and type(task).plant is Task.plant:
+    if task.source is not None and type(task).plant is Task.plant:
         judge_beginning(task, rollout, task.state(starts), np.arange(n)[:JUDGED])
     name = "policy" if isinstance(loop, PolicyController) else "hyrl"
     return [_arc(task, name, rollout, i, noise) for i in range(n)]

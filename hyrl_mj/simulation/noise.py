@@ -328,9 +328,9 @@ def drawn(signal: Signal, now: Sample) -> np.ndarray:
     return noise if noise.dtype == float else np.clip(noise.astype(float), -limits, limits)
 
 
-def is_own(thing: object) -> bool:
-    """Returns whether the class of a signal or of a task is of this package."""
-    return type(thing).__module__.startswith("hyrl_mj.")
+def is_own(signal: Signal) -> bool:
+    """Returns whether the class of a signal is of this package."""
+    return type(signal).__module__.startswith("hyrl_mj.")
 
 
 def check_repeats(signal: Signal, noise: np.ndarray, twin: Signal, now: Sample) -> None:
