@@ -2,7 +2,10 @@
 
 import copy
 import importlib
+import os
 import pickle
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -186,6 +189,26 @@ def test_a_model_of_another_file_is_judged_by_that(tmp_path):
     path = write(tmp_path, {"methods": own}, top=top)
     path.with_suffix(".xml").unlink()
     assert simulate(get_task(path), Steer(), [0.0, 0.5]).outcome == "reached"
+
+
+def test_the_digest_of_a_task_is_the_same_in_each_process(tmp_path):
+    names = [f"part_{i}" for i in range(8)]
+    for name in names:
+        (tmp_path / f"{name}.py").write_text(f"VALUE = {name!r}\n")
+    path = tmp_path / "whole.py"
+    path.write_text("".join(f"import {name}\n" for name in names))
+    code = (
+        "from pathlib import Path; from hyrl_mj.tasks.sources import digest_of; "
+        f"print(digest_of(Path({str(path)!r})))"
+    )
+    told = {
+        subprocess.run(
+            [sys.executable, "-c", code], env=os.environ | {"PYTHONHASHSEED": str(seed)},
+            capture_output=True, text=True, check=True,
+        ).stdout
+        for seed in (1, 2)
+    }  # fmt: skip
+    assert len(told) == 1
 
 
 # ---- what simulations go on with

@@ -69,6 +69,7 @@ class Instance:
         self.inner: Any = self.env.unwrapped
         self.is_wrapped = self.env is not self.inner
         self._space, self._actions = self.env.observation_space, self.env.action_space
+        self._columns = int(spaces.flatdim(self._space))
         self._observers = observers(self.env)
         self.observation, self.inner_seen = np.empty(0), None
         numbers = 4 + len(spec.criterion.keys) + len(spec.criterion.points)
@@ -204,6 +205,11 @@ class Instance:
         found["MuJoCo's state"] = self.physics.read().tobytes()
         return found
 
+    def jump(self, state: np.ndarray) -> None:
+        """Puts an environment without memory into a state (S,), anywhere in an episode."""
+        self.physics.write(state)
+        self._samples = 0  # the time limit of an episode is no part of a state
+
     def tamper(self, change: Any) -> None:
         """Changes what wrappers get beside the observation, in a trial; see `Chain`."""
         assert self._chain is not None
@@ -302,11 +308,10 @@ class Instance:
             raise BadInput(
                 f"an observation of {self.name} has no {error}, as its space has"
             ) from None
-        columns = int(spaces.flatdim(self._space))
-        if len(vector) != columns:
+        if len(vector) != self._columns:
             raise BadInput(
-                f"{self.name} observes {len(vector)} number(s), and its observation_space has {columns}: let "
-                "them be as many"
+                f"{self.name} observes {len(vector)} number(s), and its observation_space has "
+                f"{self._columns}: let them be as many"
             )
         return vector
 

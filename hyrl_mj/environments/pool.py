@@ -173,7 +173,7 @@ class Stage:
         with first.undrawn():
             for i, (instance, inputs) in enumerate(zip(instances, u, strict=True)):
                 if begun is not None:
-                    instance.physics.write(begun[i])
+                    instance.jump(begun[i])
                 instance.act(inputs)
                 instance.physics.read(states[i])
                 seen[i] = instance.observation

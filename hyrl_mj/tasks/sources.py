@@ -24,7 +24,8 @@ def sources(path: Path) -> list[Path]:
                 new = [file for file in files if file.is_file() and file not in found]
                 found |= dict.fromkeys(new)
                 left += new
-    return list(found)
+    del found[path]
+    return [path, *sorted(found)]  # sets are in another order in another process
 
 
 def digest_of(path: Path) -> str:
