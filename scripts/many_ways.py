@@ -101,7 +101,7 @@ def measure(run: hyrl_mj.Run, count: int) -> dict[str, str]:
     noises = tuple(hyrl_mj.Noise(kind, eps) for kind in KINDS)
     starts = near.draw(task, eps, count, np.random.default_rng(0))
     for name, loop in run.loops.items():
-        ends = noisy_episodes(task, near, {name: loop}, noises, count)
+        ends = noisy_episodes(task, near, {name: loop}, noises, count).counts
         lost = " / ".join(str(end.lost) for end in ends)
         found = attack(task, {name: loop}, starts, eps, Budget(rounds=1))[name]
         row[f"{name} lost: {' / '.join(KINDS)} / attack"] = f"{lost} / {found.count.lost}"

@@ -87,7 +87,7 @@ def measure(made: Row, count: int, folder: Path) -> list[str]:
     for loop, controller in run.loops.items():
         n = min(count, SHARE) if loop == "policy" else count
         regions = Regions(run.critical_set.points, near=True)
-        for ends in noisy_episodes(run.task, regions, {loop: controller}, noises, n):
+        for ends in noisy_episodes(run.task, regions, {loop: controller}, noises, n).counts:
             share = ends.lost / ends.episodes
             good = share >= 0.2 if loop == "policy" else ends.lost == 0
             shown = f"{share:.1%}" if loop == "policy" else f"{ends.lost} of {ends.episodes}"

@@ -1,5 +1,6 @@
 """The search for noise signals finds those that are planted, and reports only what is lost again."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,12 +22,14 @@ from hyrl_mj.learning.presets import preset
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.sets import Grid
-from hyrl_mj.simulation import Programmes, Rules, closed_loop
-from hyrl_mj.stages.attacks import POPULATION, Budget, _Search, attack, attack_starts
+from hyrl_mj.simulation import GIVEN, Programmes, Rules, closed_loop
+from hyrl_mj.stages.attack_search import POPULATION, Search, Waves
+from hyrl_mj.stages.attacks import Budget, attack, attack_starts
 from hyrl_mj.stages.episodes import Regions
 from hyrl_mj.stages.hybrid import HybridController
 from hyrl_mj.stages.partition import PartPolicy
 from hyrl_mj.system import cores
+from hyrl_mj.tasks import Effort
 
 EPS = 0.1
 ON_THE_LEFT = np.array([[0.0, 1.0], [0.05, 1.0], [0.1, 1.0], [0.0, 1.02]])
@@ -36,11 +39,12 @@ ON_THE_LEFT = np.array([[0.0, 1.0], [0.05, 1.0], [0.1, 1.0], [0.0, 1.02]])
 class Lock:
     """A controller of the vehicle that only one order of noise opens, from a start at y = 1.
 
-    A measurement above 1.05 at x = 0.5 to 0.7 opens it, and another one from x = 0.8 on closes it again. If
-    it is open, it leaves the arena after a measurement below 0.95 at x = 1.6 to 1.8.
+    After a measurement below 0.95 at x = 0.2 to 0.4, one above 1.05 at x = 0.5 to 0.7 opens it, and another
+    one from x = 0.8 on closes it again. If it is open, it leaves the arena after a measurement below 0.95 at
+    x = 1.6 to 1.8.
     """
 
-    modes = (0, 1, 2)
+    modes = (0, 1, 2, 3)
 
     def initial_mode(self, measured):
         return np.zeros(len(measured), dtype=int)
@@ -48,7 +52,8 @@ class Lock:
     def step(self, q, measured):
         x, y = measured.T
         high, low = y > 1.05, y < 0.95
-        following = np.where((q == 0) & (x > 0.49) & (x < 0.71) & high, 1, q)
+        following = np.where((q == 0) & (x > 0.19) & (x < 0.41) & low, 3, q)
+        following = np.where((q == 3) & (x > 0.49) & (x < 0.71) & high, 1, following)
         following = np.where((q == 1) & (x > 0.79) & high, 0, following)
         following = np.where((q == 1) & (x > 1.59) & (x < 1.81) & low, 2, following)
         return np.where(following == 2, 1.0, 0.0)[:, None], following
@@ -72,7 +77,7 @@ def test_all_that_the_game_loses_is_lost_and_nothing_that_is_won_by_far(vehicle)
     found = on(vehicle, sign, nodes[picked])
     broken = np.array([arc.outcome != "reached" for arc in found.arcs])
     np.testing.assert_array_equal(broken, lost[picked])
-    assert found.count.lost == lost[picked].sum() == 30
+    assert found.count.unaided + found.count.lost == lost[picked].sum() == 30
 
 
 def test_a_run_that_only_stalls_is_lost(circle):
@@ -192,7 +197,7 @@ def test_seconds_only_decide_how_many_rounds_are_done(vehicle):
 
 
 def test_the_seed_decides_what_is_tried(vehicle):
-    one, two = (on(vehicle, Lock(), ON_THE_LEFT, rounds=6, seed=seed) for seed in (0, 1))
+    one, two = (on(vehicle, Lock(), ON_THE_LEFT, rounds=12, seed=seed) for seed in (0, 1))
     signals = [np.concatenate([arc.measured for arc in found.arcs]) for found in (one, two)]
     assert signals[0].shape != signals[1].shape or not np.array_equal(*signals, equal_nan=True)
 
@@ -203,10 +208,10 @@ def test_no_round_is_done_once_all_is_lost(vehicle):
 
 
 def test_no_round_follows_one_by_which_enough_is_lost(vehicle):
-    usual = on(vehicle, Lock(), ON_THE_LEFT, rounds=6)
+    usual = on(vehicle, Lock(), ON_THE_LEFT, rounds=16)
     assert usual.count.lost > 1
     assert usual.count.rounds > 1
-    loop, some = {"it": Lock()}, Budget(rounds=6, enough=1)
+    loop, some = {"it": Lock()}, Budget(rounds=16, enough=1)
     found = attack(vehicle, loop, ON_THE_LEFT, EPS, some)["it"]
     assert found.count.lost >= 1
     before = on(vehicle, Lock(), ON_THE_LEFT, rounds=found.count.rounds - 1)
@@ -278,51 +283,94 @@ def test_where_hardly_a_start_is_winnable_fewer_are_attacked(vehicle):
 
 
 def test_the_first_rounds_hold_every_rule(vehicle):
-    loop = PolicyController(sign_policy(vehicle))
-    rules = Rules(vehicle, loop, EPS, np.array([0.0, 1.0]))
-    search = _Search(vehicle, loop, np.array([[0.0, 0.5]]), rules, seed=0)
-    rounds = range(1, 2 + len(rules) // POPULATION)
-    held = np.concatenate([search._population(np.array([0]), k)[0] for k in rounds])
-    constant = {int(row[0]) for row in held if (row == row[0]).all()}
-    assert {*range(rules.nothing), rules.ahead} <= constant
-    second = search._population(np.array([0]), 2)[0]
-    assert (second == rules.ahead).all(axis=1).any(), "two rounds are usual, and look ahead"
+    for loop in (PolicyController(sign_policy(vehicle)), ideal_controller(vehicle)):
+        starts = np.array([[0.0, 0.5]])
+        search = Search(vehicle, loop, starts, EPS, np.array([0.0, 1.0]), seed=0)
+        search.prepare(search.length)
+        held = []
+        search._try = lambda rows, programmes, held=held: held.append(programmes[0])
+        rounds = math.ceil(len(search.rules.common) / POPULATION)
+        for number in range(1, rounds + 1):
+            search.round(number)
+        constant = {int(row[0]) for row in np.concatenate(held) if (row == row[0]).all()}
+        assert {*search.rules.common, *search.rules.own} <= constant
+        first = {int(row[0]) for row in held[0]}
+        assert {*search.rules.own} <= first, "the rules about modes come on top"
+        assert {*search.rules.common[:POPULATION]} <= first
+        assert rounds < Effort().attack_rounds, "some rounds are left to search"
 
 
 @pytest.mark.parametrize(
     ("shares", "candidates", "ends"),
-    [((0.0, 1.0), 9, 2), ((1.0, 0.5), 25, 4), ((1.0, 1.0, 1.0), 27, 8), ((1.0,) * 5, 13, 12)],
+    [((0.0, 1.0), 9, 1), ((1.0, 0.5), 25, 4), ((1.0, 1.0, 1.0), 27, 13), ((1.0,) * 5, 13, 6)],
 )
 def test_rules_stay_within_the_bound_of_each_column(vehicle, shares, candidates, ends):
-    rules = Rules(vehicle, Lock(), EPS, np.array(shares))
+    rules, limits = Rules(vehicle, Lock(), EPS, np.array(shares)), EPS * np.array(shares) + 1e-15
     assert rules.candidates.shape == (candidates, len(shares))
     assert not rules.candidates[0].any()
-    assert (np.abs(rules.candidates) <= EPS * np.array(shares) + 1e-15).all()
-    constant = np.array([wish is None for wish in rules.wishes]) & ~rules.alternates
-    assert constant.sum() == ends + 2  # none, and the one that simulates ahead
-    assert rules.alternates.sum() == ends / 2
-    assert not rules.fixed[rules.nothing].any()
+    assert (np.abs(rules.candidates) <= limits).all()
+    assert (np.abs(rules.noise) <= limits).all()
+    kinds = [rule.kind for rule in rules.all]
+    # Each end with both signs, once with an alternating one, and on some columns alone.
+    assert kinds.count("constant") == kinds.count("turn") == 2 * ends
+    assert kinds.count("alternating") == ends
+    assert kinds.count("flip") == 16
+    assert rules.all[rules.nothing].kind == "none"
+    assert not rules.noise[rules.nothing].any()
+    assert np.isin(rules.own, rules.common).sum() == 0
+
+
+def test_the_rules_of_all_controllers_are_the_same_but_for_modes(vehicle):
+    one, several = (
+        Rules(vehicle, loop, EPS, np.array([0.0, 1.0]), 40)
+        for loop in (PolicyController(sign_policy(vehicle)), Lock())
+    )
+    kinds = [[rules.all[number].kind for number in rules.common] for rules in (one, several)]
+    assert kinds[0] == kinds[1]
+    assert len(one.own) == 0
+    assert {several.all[number].kind for number in several.own} == {"jump", "stay", "turn"}
 
 
 def test_rules_are_held_for_their_segments(vehicle):
     loop = PolicyController(one_way_policy(vehicle))
     rules = Rules(vehicle, loop, EPS, np.array([0.0, 1.0]))
-    plus, minus = (
-        next(i for i in range(len(rules)) if not rules.alternates[i] and rules.fixed[i, 1] == value)
-        for value in (EPS, -EPS)
-    )
-    swings = int(np.flatnonzero(rules.alternates)[0])
-    signal = Programmes(vehicle, loop, rules, np.array([[plus, minus, swings]]), segment=3)
-    run = closed_loop(vehicle, loop, np.array([[0.0, 1.0]]), signal)
-    assert run.outcome[0] == Outcome.REACHED
+    kinds = [rule.kind for rule in rules.all]
+    plus = kinds.index("constant")
+    period = next(i for i, rule in enumerate(rules.all) if rule.period == 5)
+    flip = kinds.index("flip")
+    programmes = np.array([[plus, plus + 1, kinds.index("alternating")], [period] * 3, [flip] * 3])
+    given = np.full((4, 3, 2), [0.0, EPS / 2])
+    more = np.vstack([programmes, [[GIVEN] * 3]])
+    given = np.tile([0.0, EPS / 2], (4, 4, 1))
+    signal = Programmes(vehicle, loop, rules, more, segment=3, given=given)
+    run = closed_loop(vehicle, loop, np.array([[0.0, 1.0]] * 4), signal)
+    assert (run.outcome == Outcome.REACHED).all()
     expected = [EPS] * 3 + [-EPS] * 3 + [EPS, -EPS, EPS, -EPS]
-    np.testing.assert_allclose([noise[0, 1] for noise in signal.values[:10]], expected)
+    np.testing.assert_allclose(signal.values[:10, 0, 1], expected)
+    signs = [1, 1, 1, -1, -1, 1, 1, 1, -1, -1]  # the sign changes after every 2.5 samples
+    np.testing.assert_allclose(signal.values[:10, 1, 1], EPS * np.array(signs))
+    at = rules.all[flip].flip
+    np.testing.assert_allclose(signal.values[: at + 1, 2, 1], [EPS] * at + [-EPS])
+    np.testing.assert_allclose(signal.values[:10, 3, 1], [EPS / 2] * 4 + [0.0] * 6)
+
+
+def test_levels_and_times_that_evolve_stay_within_the_bound():
+    waves = Waves(np.array([0.0, EPS, 2 * EPS]), 40, 60)
+    signals = waves(np.random.default_rng(0).normal(0, 2, (200, waves.size)))
+    assert signals.shape == (60, 200, 3)
+    assert not signals[:, :, 0].any()
+    assert (np.abs(signals) <= waves.limits + 1e-15).all()
+    at_ends = np.isclose(np.abs(signals[:, :, 1]), EPS).mean()
+    assert at_ends > 0.5, "most signals are at the ends of the bound"
+    changes = (np.diff(signals[:, :, 1], axis=0) != 0).sum(axis=0)
+    assert changes.min() <= 3 < changes.max(), "some swing"
 
 
 def test_wishes_pick_the_answers_that_they_name(vehicle):
     loop = PolicyController(sign_policy(vehicle))
     rules = Rules(vehicle, loop, EPS, np.array([0.0, 1.0]))
-    assert rules.wishes[:5] == ["contrary", "straight", "reverse", (0, 1), (0, -1)]
+    wishes = [rule.wish for rule in rules.all[:5]]
+    assert wishes == ["contrary", "straight", "reverse", (0, 1), (0, -1)]
     starts = np.array([[0.0, 0.05]] * 5 + [[0.0, 0.95]])
     programmes = np.array([[0], [1], [2], [3], [4], [1]])
     signal = Programmes(vehicle, loop, rules, programmes, segment=1)

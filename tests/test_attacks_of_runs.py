@@ -6,21 +6,27 @@ import numpy as np
 import pytest
 from planted import decisions, halves
 from test_report import Page, plant
-from test_verdict import ALL, EPS, HOLDS, episodes
+from test_verdict import ALL, EPS, HOLDS, enough, episodes
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, load_run
-from hyrl_mj.game import AttackCount, Robustness
+from hyrl_mj.game import AttackCount, Robustness, wilson
 from hyrl_mj.pipeline import ExamineOptions, examine_run, run_stage
 from hyrl_mj.runs.arcs import noisy_arcs
 from hyrl_mj.runs.directory import Run
-from hyrl_mj.runs.verdict import FAILED, HELD, WEAK, Verdict
+from hyrl_mj.runs.verdict import HELD, Verdict
+from hyrl_mj.tasks import SPARING
 from hyrl_mj.viz.commands import commands
 from hyrl_mj.viz.report import render
 from hyrl_mj.viz.shows import replay_shows
-from hyrl_mj.viz.tables import attack_table, print_robustness, robustness_sentence
+from hyrl_mj.viz.tables import (
+    attack_table,
+    comparison_table,
+    print_robustness,
+    robustness_sentence,
+)
 
-FEW = {"episodes": 20, "noise": ("uniform",)}
+FEW = {"episodes": 20, "noise": ("none", "uniform")}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -48,7 +54,21 @@ def copied(examined, tmp_path):
 def attacked(policy, hyrl, starts=200):
     """The counts of an attack."""
     return tuple(
-        AttackCount(who, EPS, False, starts, lost, (0.0, 1.0), 3, None, (0.0, 0.05), "crashed")
+        AttackCount(
+            who,
+            EPS,
+            False,
+            starts,
+            0,
+            lost,
+            (0.0, 1.0),
+            3,
+            None,
+            9,
+            {"none": starts},
+            (0.0, 0.05),
+            "crashed",
+        )
         for who, lost in (("policy", policy), ("hyrl", hyrl))
     )
 
@@ -59,10 +79,26 @@ def attacked(policy, hyrl, starts=200):
 def test_a_run_without_a_game_is_attacked_by_default(examined):
     policy, hyrl = load_run(examined).robustness.attacks
     assert (policy.controller, hyrl.controller) == ("policy", "hyrl")
-    assert (policy.rounds, policy.starts, policy.seconds) == (1, 40, None)
-    assert hyrl.starts == 40
-    assert policy.interval[0] <= policy.lost / 40 <= policy.interval[1]
-    assert policy.lost > 0
+    assert policy.rounds <= SPARING.attack_rounds
+    assert (policy.starts, policy.seconds) == (SPARING.attack_starts, None)
+    assert hyrl.starts == 100
+    assert policy.interval == wilson(policy.lost, policy.attacked)
+    assert policy.unaided + policy.lost > 0
+
+
+def test_both_controllers_are_compared_from_the_same_starts(examined):
+    robustness = load_run(examined).robustness
+    by_kind = {compared.noise: compared for compared in robustness.comparisons}
+    assert [*by_kind] == ["uniform", "attack"]
+    assert by_kind["uniform"].starts == 20
+    attack, counts = by_kind["attack"], {c.controller: c for c in robustness.attacks}
+    assert attack.unaided == {name: count.unaided for name, count in counts.items()}
+    assert max(attack.unaided.values()) <= attack.starts - attack.compared
+    for name, count in counts.items():
+        assert attack.lost[name] <= count.lost
+        assert attack.time[name][0] >= 1
+    table = comparison_table(load_run(examined).task, robustness.comparisons)
+    assert [row[0] for row in table.rows] == [*by_kind]
 
 
 def test_a_run_with_a_game_is_attacked_only_on_request(examined, monkeypatch):
@@ -71,6 +107,7 @@ def test_a_run_with_a_game_is_attacked_only_on_request(examined, monkeypatch):
     assert ExamineOptions().budget(run) is None
     assert ExamineOptions(attack_seconds=2.0).budget(run).seconds == 2.0
     assert ExamineOptions(attack_rounds=5).budget(run).rounds == 5
+    assert ExamineOptions(attack_starts=9).budget(run).rounds == SPARING.attack_rounds
 
 
 def test_the_rounds_of_a_time_repeat_it(copied):
@@ -81,13 +118,15 @@ def test_the_rounds_of_a_time_repeat_it(copied):
     again = examine_run(load_run(copied), ExamineOptions(**FEW, attack_rounds=rounds), say=str)
     assert [c.lost for c in again.attacks] == [c.lost for c in timed.attacks]
     assert {path: path.read_bytes() for path in files} == files
-    assert f"--attack-rounds {rounds} --seed 0" in commands(load_run(copied), again)[-1]
+    assert f"--attack-rounds {rounds} --attack-starts 100 --seed 0" in commands(load_run(copied), again)[-1]
 
 
-@pytest.mark.parametrize("options", [{"attack_seconds": 0.0}, {"attack_rounds": -1}])
+@pytest.mark.parametrize(
+    "options", [{"attack_seconds": 0.0}, {"attack_rounds": -1}, {"attack_starts": 0}]
+)
 def test_an_impossible_budget_is_refused_before_any_work(copied, options):
     before = {path: path.read_bytes() for path in copied.rglob("*") if path.is_file()}
-    with pytest.raises(BadInput, match="an attack cannot"):
+    with pytest.raises(BadInput, match=r"an attack cannot|starts cannot be attacked"):
         examine_run(load_run(copied), ExamineOptions(**options), say=str)
     assert {path: path.read_bytes() for path in copied.rglob("*") if path.is_file()} == before
 
@@ -112,10 +151,11 @@ def test_a_record_of_half_an_attack_is_refused(tmp_path, attacks):
 def test_the_table_and_the_sentence_tell_what_is_lost(vehicle, examined, capsys):
     run = load_run(examined)
     table = attack_table(vehicle, attacked(91, 2))
-    assert table.rows[0][:4] == ["RL policy", "200", "91", "45.50%"]
-    assert table.rows[1][-2:] == ["3", "crashed from (0.000, 0.050)"]
+    assert table.rows[0][:5] == ["RL policy", "200", "0", "91", "45.50%"]
+    assert table.rows[1][-1] == "crashed from (0.000, 0.050)"
     lost = [count.lost for count in run.robustness.attacks]
-    said = f"the attack breaks RL policy from {lost[0]} of 40 starts, HyRL from {lost[1]} of 40"
+    won = [count.attacked for count in run.robustness.attacks]
+    said = f"the attack breaks RL policy from {lost[0]} of {won[0]} starts, HyRL from {lost[1]} of {won[1]}"
     assert said in robustness_sentence(run.robustness)
     print_robustness(run)
     assert "attack, a search for noise on y of up to 0.1 m" in capsys.readouterr().out
@@ -157,23 +197,9 @@ def test_a_start_of_ones_own_is_attacked_in_each_mode(examined):
 # ---- the verdict
 
 
-@pytest.mark.parametrize(
-    ("lost", "expected"),
-    [((91, 0), HELD), ((91, 2), HELD), ((91, 3), WEAK), ((3, 3), FAILED), ((0, 50), FAILED)],
-)
-def test_held_takes_that_the_attack_breaks_nearly_nothing(circle, lost, expected):
-    every = {"none": 1000, "uniform": 1000}
-    found = episodes(every, every)
-    robustness = Robustness(EPS, False, None, found.episodes, 0, attacked(*lost))
-    verdict = Verdict.judge(circle, EPS, robustness, HOLDS, ALL)
-    assert verdict.word == expected
-    said = f"the attack breaks HyRL from {lost[1]} of 200 starts"
-    assert f"{said}, the policy from {lost[0]} of 200 starts" in verdict.reasons
-    assert (said in verdict.sentence) == (expected == HELD)
-
-
-def test_the_attack_alone_may_be_the_noise(circle):
-    found = episodes({"none": 1000}, {"none": 1000})
-    robustness = Robustness(EPS, False, None, found.episodes, 0, attacked(9, 0))
-    verdict = Verdict.judge(circle, EPS, robustness, HOLDS, ALL)
-    assert str(verdict) == "HELD: the attack breaks HyRL from 0 of 200 starts"
+def test_what_the_attack_breaks_is_among_the_reasons(circle):
+    verdict = Verdict.judge(circle, EPS, enough({}, lost=0), HOLDS, ALL)
+    assert verdict.word == HELD
+    said = "the attack breaks HyRL from 0 of 400 starts"
+    assert said in verdict.sentence
+    assert f"{said}, the policy from 200 of 400 starts" in verdict.reasons

@@ -5,6 +5,7 @@ import pytest
 from planted import decisions, halves, ideal_controller, one_way_policy, sign_policy
 
 from hyrl_mj import BadInput, LoopSettings, Noise, closed_loop
+from hyrl_mj.game import Ends, compare
 from hyrl_mj.game.scores import Game
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid
@@ -44,7 +45,7 @@ def records(vehicle, on_vehicle):
         {name: controllers[name] for name in ("sign", "ideal")},
         noises,
         600,
-    )
+    ).counts
 
 
 @pytest.mark.slow
@@ -71,7 +72,7 @@ def test_starts_near_the_critical_set_are_those_within_twice_the_noise(vehicle, 
     for eps in (0.05, 0.1):
         records = noisy_episodes(
             vehicle, Regions(decisions(vehicle).points), left, (Noise("uniform", eps),), 2000
-        )
+        ).counts
         assert {r.region for r in records} == {"near M*", "elsewhere"}
         near = record(records, "left", "near M*").episodes / 2000
         assert near == pytest.approx(2 * eps, abs=0.03)
@@ -121,7 +122,8 @@ def test_batches_add_up_and_none_is_the_same(vehicle, on_vehicle, monkeypatch):
     sign, noises = {"sign": on_vehicle[1]["sign"]}, (Noise("uniform", 0.1),)
 
     def near(count):
-        records = noisy_episodes(vehicle, Regions(decisions(vehicle).points), sign, noises, count)
+        found = noisy_episodes(vehicle, Regions(decisions(vehicle).points), sign, noises, count)
+        records = found.counts
         assert sum(r.episodes for r in records) == count
         return record(records, "sign", "near M*").episodes
 
@@ -155,3 +157,71 @@ def test_noise_everywhere_acts_on_every_column(vehicle, kind):
         n = rollout.measured[0] - rollout.path[0]
         assert np.abs(n).max() <= 0.1 + 1e-12
         assert (np.abs(n).max(axis=0) > 0.05).tolist() == columns
+
+
+def test_controllers_are_compared_from_starts_that_all_win_without_noise(vehicle, on_vehicle):
+    loops = {name: on_vehicle[1][name] for name in ("sign", "left")}
+    noises = (Noise("none", 0.1), Noise("adversarial", 0.1))
+    found = noisy_episodes(vehicle, Regions(decisions(vehicle).points), loops, noises, 400)
+    (compared,) = found.comparisons
+    counted = {
+        (c.noise, c.controller): sum(
+            d.lost for d in found.counts if (d.noise, d.controller) == (c.noise, c.controller)
+        )
+        for c in found.counts
+    }
+    assert compared.unaided == {name: counted["none", name] for name in loops}
+    assert compared.starts == 400
+    assert compared.compared >= 400 - sum(compared.unaided.values())
+    assert 0 < compared.lost["sign"] <= counted["adversarial", "sign"] - compared.unaided["sign"]
+    assert compared.lost["left"] == 0
+    assert compared.alone["sign"] <= compared.lost["sign"]
+    low, high = compared.interval
+    assert low <= compared.difference <= high
+    assert (
+        compared.difference == (compared.lost["sign"] - compared.lost["left"]) / compared.compared
+    )
+    quiet = noisy_episodes(vehicle, Regions(np.empty((0, 2))), loops, (noises[1],), 40)
+    assert quiet.comparisons == (), "without noise nothing was played"
+
+
+def test_a_comparison_counts_what_it_says():
+    no, yes, one = np.zeros(6, dtype=bool), np.ones(6, dtype=bool), np.ones(6)
+    quiet = {
+        "policy": Ends(np.array([1, 0, 0, 0, 0, 0], dtype=bool), one, one),
+        "hyrl": Ends(no, one, 2 * one),
+    }
+    noisy = {
+        "policy": Ends(
+            np.array([1, 1, 1, 0, 0, 0], dtype=bool), np.array([9, 9, 9, 1, 2, 3.0]), one
+        ),
+        "hyrl": Ends(
+            np.array([0, 1, 0, 0, 0, 0], dtype=bool), np.array([9, 9, 1, 1, 1, 1.0]), 3 * one
+        ),
+    }
+    compared = compare("uniform", quiet, noisy)
+    assert (compared.starts, compared.compared) == (6, 5)
+    assert compared.unaided == {"policy": 1, "hyrl": 0}
+    assert compared.lost == {"policy": 2, "hyrl": 1}
+    assert compared.alone == {"policy": 1, "hyrl": 0}
+    assert compared.difference == 1 / 5
+    assert compared.late == {"policy": 1, "hyrl": 0}, "three times as long, and twice is not late"
+    assert compared.time["policy"][0] == 2
+    assert compared.way["hyrl"] == (1.5, 1.5)
+    assert compare("uniform", quiet, dict.fromkeys(quiet, Ends(yes, one, one))).late["hyrl"] == 0
+
+
+def test_the_interval_of_a_paired_difference_covers_it():
+    # Both controllers lose together more often than apart; 95% of the intervals hold the difference.
+    rng, both, first, last, n = np.random.default_rng(0), 0.1, 0.08, 0.02, 200
+    held = []
+    for _ in range(2_000):
+        kind = rng.choice(4, n, p=(both, first, last, 1 - both - first - last))
+        ends = {
+            "policy": Ends(np.isin(kind, (0, 1)), np.ones(n), np.ones(n)),
+            "hyrl": Ends(np.isin(kind, (0, 2)), np.ones(n), np.ones(n)),
+        }
+        won = dict.fromkeys(ends, Ends(np.zeros(n, dtype=bool), np.ones(n), np.ones(n)))
+        low, high = compare("uniform", won, ends).interval
+        held.append(low <= first - last <= high)
+    assert 0.94 <= np.mean(held) <= 0.98

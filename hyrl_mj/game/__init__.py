@@ -6,12 +6,18 @@ The plant is tabulated on a lattice of states, and the game is solved on it by b
 
 from hyrl_mj.game.adversary import WorstNoise
 from hyrl_mj.game.counts import (
+    LATE,
+    NO_NOISE,
     PROVED_STARTS,
     WON_STARTS,
     AttackCount,
+    Comparison,
+    Ends,
     EpisodeCount,
     LostReplay,
     ReplayCount,
+    compare,
+    wilson,
 )
 from hyrl_mj.game.lattice import EPISODES_INSTEAD, Lattice, nearest_of
 from hyrl_mj.game.limit import Limit, fewest_samples
@@ -57,12 +63,14 @@ __all__ = [
     "EPISODES_INSTEAD",
     "FIRST",
     "LARGEST",
+    "LATE",
     "LATTICE",
     "LIMIT",
     "LOST",
     "MAP_CLASSES",
     "NEARLY",
     "NEVER",
+    "NO_NOISE",
     "OVER",
     "PROVED_STARTS",
     "UNCLEAR",
@@ -72,7 +80,9 @@ __all__ = [
     "WON_STARTS",
     "Answers",
     "AttackCount",
+    "Comparison",
     "Curve",
+    "Ends",
     "EpisodeCount",
     "Game",
     "GameResult",
@@ -91,6 +101,7 @@ __all__ = [
     "Wins",
     "WorstNoise",
     "aligned_cells",
+    "compare",
     "curve_grid",
     "fewest_samples",
     "lasting",
@@ -100,5 +111,6 @@ __all__ = [
     "percent",
     "share",
     "solve",
+    "wilson",
     "worst_signal",
 ]

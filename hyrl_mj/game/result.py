@@ -11,7 +11,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadArtifact
 from hyrl_mj.files import artifacts
-from hyrl_mj.game.counts import AttackCount, EpisodeCount, ReplayCount
+from hyrl_mj.game.counts import AttackCount, Comparison, EpisodeCount, ReplayCount
 from hyrl_mj.sets import Chart, Grid
 
 # Name of the limit, a controller that is scored beside the examined ones.
@@ -258,6 +258,7 @@ class Robustness:
         episodes: counts of noisy episodes.
         seed: seed of the starts and the noise of these episodes and attacks.
         attacks: counts of the attack, one for each controller, if there was one.
+        comparisons: of the controllers, from the same starts, by kind of noise; that of the attack is last.
     """
 
     eps: float
@@ -266,6 +267,7 @@ class Robustness:
     episodes: tuple[EpisodeCount, ...]
     seed: int
     attacks: tuple[AttackCount, ...] = ()
+    comparisons: tuple[Comparison, ...] = ()
 
     @property
     def deciding(self) -> GameResult | None:
@@ -287,6 +289,14 @@ class Robustness:
         attacked = [count.controller for count in self.attacks if count.is_whole]
         if self.attacks and attacked != [*controllers]:
             raise BadArtifact(f"its attacks are not those of {' and '.join(controllers)}")
+        wanted = {c.noise for c in self.episodes} | {*(("attack",) if self.attacks else ())}
+        if "none" not in {c.noise for c in self.episodes}:
+            wanted &= {"attack"}
+        compared = {c.noise for c in self.comparisons if c.is_whole and [*c.lost] == [*controllers]}
+        if compared != wanted - {"none"} or len(compared) != len(self.comparisons):
+            raise BadArtifact(
+                f"it does not compare {' and '.join(controllers)} from the same starts"
+            )
 
     def __repr__(self) -> str:
         game = f"{self.game}, " if self.game else ""

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.game import LATTICE, OVER, UNWINNABLE, EpisodeCount, Maps, Robustness
+from hyrl_mj.game import LATTICE, OVER, UNWINNABLE, Maps, Robustness, compare
 from hyrl_mj.policies import Controller
 from hyrl_mj.proof import examine
 from hyrl_mj.runs.directory import Run
@@ -17,6 +17,7 @@ from hyrl_mj.simulation import Noise
 from hyrl_mj.stages import (
     Attack,
     Budget,
+    NoisyEpisodes,
     Partition,
     Regions,
     attack,
@@ -25,15 +26,14 @@ from hyrl_mj.stages import (
     shown_arcs,
 )
 from hyrl_mj.system.progress import Say
-from hyrl_mj.tasks import SPARING
+from hyrl_mj.tasks import SPARING, Effort
 from hyrl_mj.viz import robustness_sentence
 
 # The kinds of noise in episodes by default. Where samples take long, an adversary that looks ahead takes too
 # long; the attack is there.
 KINDS = ("none", "uniform", "alternating", "adversarial")
-# Starts and rounds of the attack on such a run.
-ATTACKED, ATTACKED_SMOKE = 200, 40
-ROUNDS, ROUNDS_SMOKE = 2, 1
+# The most starts of an attack: each keeps signals of a whole episode.
+MOST_STARTS = 100_000
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,8 @@ class ExamineOptions:
             task; always, if the run was made so.
         near_critical: start all episodes within twice the bound of the critical set.
         seed: seed of starts and noise of the episodes and of the attack.
+        attack_starts: number of starts of an attack; by default 400, or 100 in environments of others and
+            with preset smoke.
         attack_seconds: time [s] of an attack, a search for noise that makes policy and hybrid controller
             fail; by default a few rounds where the worst case cannot be computed, else none.
         attack_rounds: number of rounds of the attack instead of a time, which repeats an earlier one of as
@@ -62,6 +64,7 @@ class ExamineOptions:
     all_coordinates: bool = False
     near_critical: bool = False
     seed: int = 0
+    attack_starts: int | None = None
     attack_seconds: float | None = None
     attack_rounds: int | None = None
 
@@ -71,13 +74,22 @@ class ExamineOptions:
         Raises:
             BadInput: an impossible time or number of rounds, or both.
         """
+        if self.attack_starts is not None and not 1 <= self.attack_starts <= MOST_STARTS:
+            raise BadInput(
+                f"{self.attack_starts} starts cannot be attacked: give a number from 1 to {MOST_STARTS:,}"
+            )
         if self.attack_seconds is None and self.attack_rounds is None:
-            rounds = ROUNDS_SMOKE if run.settings.preset == "smoke" else ROUNDS
-            return None if run.exact else Budget(rounds=rounds)
+            attacked = self.attack_starts is not None or not run.exact
+            return Budget(rounds=effort_of(run).attack_rounds) if attacked else None
         return Budget(self.attack_seconds, self.attack_rounds)
 
 
 USUAL = ExamineOptions()
+
+
+def effort_of(run: Run) -> Effort:
+    """Returns what may be spent on the examination of a run."""
+    return SPARING if run.settings.preset == "smoke" else run.task.effort
 
 
 def examination_plan(run: Run) -> str:
@@ -102,7 +114,10 @@ def examine_stage(run: Run, say: Say, options: ExamineOptions = USUAL) -> None:
         regions = Regions(run.critical_set.points, _winnable(run, maps))
         attacks = attack_loops(run, run.loops, regions, budget, options)
         counts = tuple(found.count for found in attacks.values())
-        robustness = replace(robustness, attacks=counts)
+        quiet = {name: found.quiet for name, found in attacks.items()}
+        under = compare("attack", quiet, {name: found.ends for name, found in attacks.items()})
+        comparisons = (*robustness.comparisons, under)
+        robustness = replace(robustness, attacks=counts, comparisons=comparisons)
         for name, arc in shown_arcs(attacks).items():
             arc.save(run.attack_path(name))
     if maps is not None:
@@ -130,8 +145,7 @@ def examine_loops(
     count, seed = options.episodes, options.seed
     task.check_noise(eps, everywhere)
     if count is None and not run.exact:
-        effort = SPARING if run.settings.preset == "smoke" else task.effort
-        count = effort.episodes
+        count = effort_of(run).episodes
     if count is not None and count < 1:
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
     kinds = options.noise or (KINDS if task.effort.looks_ahead else KINDS[:-1])
@@ -142,11 +156,14 @@ def examine_loops(
         game, maps = examine(
             task, points, partition, loops, bounds, everywhere, run.settings.lattice
         )
-    counts: tuple[EpisodeCount, ...] = ()
+    episodes = NoisyEpisodes((), ())
     if count is not None:
         regions = Regions(points, _winnable(run, maps), options.near_critical)
-        counts = noisy_episodes(task, regions, loops, noises, count, seed)
-    return Robustness(eps, everywhere, game, counts, seed), maps
+        episodes = noisy_episodes(task, regions, loops, noises, count, seed)
+    counted = Robustness(
+        eps, everywhere, game, episodes.counts, seed, comparisons=episodes.comparisons
+    )
+    return counted, maps
 
 
 def _winnable(run: Run, maps: Maps | None) -> tuple[Grid, np.ndarray] | None:
@@ -170,7 +187,7 @@ def attack_loops(
     and is tried under the signals that were found against the agent.
     """
     task, eps = run.task, run.settings.noise if options.eps is None else options.eps
-    n = ATTACKED_SMOKE if run.settings.preset == "smoke" else ATTACKED
+    n = options.attack_starts or effort_of(run).attack_starts
     starts = attack_starts(task, regions, eps, n, options.seed)
     everywhere = options.all_coordinates or run.settings.everywhere
     if not run.keeps_agent:

@@ -24,7 +24,7 @@ from hyrl_mj.pipeline.examination import (
 from hyrl_mj.policies import Agent, PolicyController, algorithms
 from hyrl_mj.runs.arcs import replay_arcs
 from hyrl_mj.runs.directory import Run
-from hyrl_mj.runs.verdict import mode_sentence
+from hyrl_mj.runs.sentences import mode_sentence
 from hyrl_mj.stages import (
     Arrivals,
     Held,

@@ -2,18 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numpy as np
-
-from hyrl_mj.game import NEARLY, PROVED_STARTS, ReplayCount, Robustness, Score, percent
-from hyrl_mj.stages import Arrivals, ModeResult, Retraining
+from hyrl_mj.game import (
+    NEARLY,
+    NO_NOISE,
+    ReplayCount,
+    Robustness,
+    percent,
+)
+from hyrl_mj.runs.evidence import KINDS, Sample, Wins, by_kind
+from hyrl_mj.runs.sentences import (
+    POLICIES,
+    comparison_sentence,
+    listed,
+    mode_sentence,
+    replays_sentence,
+    share_sentence,
+)
+from hyrl_mj.stages import Arrivals, Retraining
 from hyrl_mj.tasks import Task
 
-PROVED, WON, HELD, WEAK, FAILED = "PROVED", "WON", "HELD", "WEAK", "FAILED"
-# The kind of noise of episodes without noise.
-NO_NOISE = "none"
+PROVED, WON, HELD, UNDECIDED, WEAK, FAILED = (
+    "PROVED",
+    "WON",
+    "HELD",
+    "UNDECIDED",
+    "WEAK",
+    "FAILED",
+)
+# PROVED and WON speak of winnable starts: at least this share of those that are open to one who sees the
+# state. Else a split that makes most starts unwinnable would have the first word.
+LEAST_WINNABLE = 0.9
 
 
 @dataclass(frozen=True)
@@ -23,26 +44,32 @@ class Verdict:
     `word` is the first of these whose condition holds. To win is to arrive within the task's `max_steps`;
     nearly all are 99%.
 
-    - PROVED: HyRL is proved to win nearly all winnable starts, whatever the noise within the run's bound.
-    - WON: the worst-case game decides, and of no winnable start a noise signal is known that beats
-      HyRL, from the attack, if there was one, either.
-    - HELD: the game cannot be played or is an estimate, HyRL arrives in nearly all episodes under each kind
-      of noise, and the attack, if there was one, breaks it from nearly no start.
+    - PROVED: HyRL is proved to win nearly all winnable starts, whatever the noise within the run's bound,
+      and at least 90% of the open starts are winnable.
+    - WON: the worst-case game decides, of no winnable start a noise signal is known that beats HyRL, from
+      the attack, if there was one, either, and at least 90% of the open starts are winnable.
+    - HELD: the game cannot be played or is an estimate, and HyRL wins nearly all, at the lower end of the
+      95% interval, of at least 1,000 episodes without noise and under each kind of noise, and of at least
+      300 starts that were attacked.
+    - UNDECIDED: as HELD, but there are too few episodes or attacked starts, or too few of them are won, for
+      HELD to be said; and not too many are lost for it to be said after more of them.
     - FAILED: no start is winnable, or HyRL wins less than the policy without noise, or stage 6 gave up: for
       some mode no attempt gave a policy that wins nearly all of its set. Tasks with a reward for each mode,
       as `field`, may draw episodes that no policy wins: there stage 6 does not give up.
-    - WEAK: HyRL wins more than the policy under noise, or the policy does not arrive from nearly all of its
-      starts without noise, or the examination was under less noise than the run's bound.
+    - WEAK: HyRL wins more than the policy under noise; where the game does not decide, so much more from the
+      same starts that the 95% interval of the difference is above 0. Or the policy does not arrive from
+      nearly all of its starts without noise, or the examination was under less noise than the run's bound,
+      or too few of the open starts are winnable.
     - FAILED: none of these. HyRL loses, and is no better than the policy.
 
     PROVED and WON are said only after starts that are proved, or not known to be lost, were replayed in
     MuJoCo: a single one that is lost withdraws both words, and is named.
 
     In the game, HyRL picks its start mode. In episodes, the kind of noise that stops a controller most often
-    counts; the attack is one of these kinds.
+    counts; the attack is one of these kinds. It is counted from starts that are won without noise.
 
     Attributes:
-        word: "PROVED", "WON", "HELD", "WEAK" or "FAILED".
+        word: "PROVED", "WON", "HELD", "UNDECIDED", "WEAK" or "FAILED".
         sentence: what decided.
         reasons: the results behind it, a sentence each.
     """
@@ -76,44 +103,13 @@ class Verdict:
         for word, grounds in (
             (PROVED, case.proofs()),
             (WON if robustness.deciding else HELD, case.success()),
+            (UNDECIDED, case.doubts()),
             (FAILED, case.failures()),
             (WEAK, case.weaknesses()),
         ):
             if sentence := "; ".join(grounds):
                 return Verdict(word, sentence, reasons)
         return Verdict(FAILED, f"HyRL is no better than the policy under {case.noise}", reasons)
-
-
-@dataclass(frozen=True)
-class _Wins:
-    """What a controller is not known to lose: shares of the winnable starts, or of the episodes.
-
-    Attributes:
-        quiet: without noise, None if that was not examined.
-        noisy: under noise, None if that was not examined.
-    """
-
-    quiet: float | None
-    noisy: float | None
-
-    @staticmethod
-    def count(robustness: Robustness, who: str) -> _Wins:
-        """Returns what "policy" or "hyrl" wins."""
-        attacked = [1 - c.lost / c.starts for c in robustness.attacks if c.controller == who]
-        if robustness.deciding:
-            scores = robustness.deciding.scores[who]
-            replays = robustness.deciding.replays_of(who)
-            replayed = replays.shares if replays else (1.0, 1.0)
-            quiet = [min(score.not_broken, replayed[0]) for score in scores if score.eps == 0]
-            noisy = min(scores[-1].not_broken, replayed[1], *attacked, 1.0)
-            return _Wins(quiet[0] if quiet else None, noisy)
-        shares = {
-            kind: arrived / episodes
-            for kind, (arrived, episodes) in _by_kind(robustness, who).items()
-        }
-        quiet_share = shares.pop(NO_NOISE, None)
-        under_noise = [*shares.values(), *attacked]
-        return _Wins(quiet_share, min(under_noise) if under_noise else None)
 
 
 @dataclass(frozen=True)
@@ -127,12 +123,12 @@ class _Case:
     arrivals: Arrivals
 
     @property
-    def policy(self) -> _Wins:
-        return _Wins.count(self.robustness, "policy")
+    def policy(self) -> Wins:
+        return Wins.count(self.robustness, "policy")
 
     @property
-    def hyrl(self) -> _Wins:
-        return _Wins.count(self.robustness, "hyrl")
+    def hyrl(self) -> Wins:
+        return Wins.count(self.robustness, "hyrl")
 
     @property
     def noise(self) -> str:
@@ -201,23 +197,78 @@ class _Case:
         if not game or not self.examined or not self.winnable:
             return
         score = game.scores["hyrl"][-1]
-        if score.proved is not None and score.proved >= NEARLY:
-            yield f"whatever the {self.noise}, HyRL {_share(score)} of {self.whole}"
+        if self.fair and score.proved is not None and score.proved >= NEARLY:
+            own, some = score.proved * score.winnable, (score.proved_any or 0.0) * score.winnable
+            sentence = (
+                f"whatever the {self.noise}, HyRL is proved to win {percent(own)} of all starts "
+                f"({percent(some)} from every start mode), which is {percent(score.proved)} of the winnable "
+                "ones"
+            )
+            if score.not_broken < 1:
+                sentence += (
+                    f"; of what is not proved, {percent(1 - score.not_broken)} of the winnable ones are "
+                    "known to be lost"
+                )
+            yield sentence
 
     def _won(self) -> Iterator[str]:
         """Yields why the run is WON or HELD, if the game is to be believed."""
         won = self.hyrl.noisy
         if not self.examined or not self.winnable or won is None:
             return
-        if self.robustness.deciding and won == 1:
-            yield f"HyRL lost none of {self.whole} that were tried under the worst {self.noise}"
-        elif not self.robustness.deciding and won >= NEARLY:
-            counts = _by_kind(self.robustness, "hyrl")
+        if self.robustness.deciding and won == 1 and self.fair:
+            yield (
+                f"HyRL lost none of {self.whole}, {percent(self.winnable)} of all, that were tried under "
+                f"the worst {self.noise}"
+            )
+        elif not self.robustness.deciding and all(sample.held for sample in self.samples):
+            counts = by_kind(self.robustness, "hyrl")
             counts.pop(NO_NOISE, None)
             arrived, total = (sum(column) for column in zip(*counts.values(), (0, 0), strict=True))
-            if total:
-                yield f"HyRL arrives in {arrived:,} of {total:,} episodes, with {self.noise}"
+            yield f"HyRL arrives in {arrived:,} of {total:,} episodes, with {self.noise}"
             yield from self._attacked("hyrl")
+
+    def doubts(self) -> Iterator[str]:
+        """Yields why the run is UNDECIDED, if it is: what is missing for HELD, and what to run."""
+        if self.robustness.deciding or not self.examined:
+            return
+        samples = self.samples
+        if any(sample.refuted for sample in samples) or all(sample.held for sample in samples):
+            return
+        words, episodes, starts = [], 0, 0
+        for sample in samples:
+            if not sample.held:
+                words.append(str(sample))
+                if sample.attack:
+                    starts = max(starts, sample.enough)
+                else:
+                    episodes = max(episodes, sample.enough)
+        command = "hyrl-mj robustness RUN"
+        command += f" --episodes {episodes}" * (episodes > 0)
+        command += f" --attack-starts {starts}" * (starts > 0)
+        yield (
+            f"HyRL may win nearly all under {self.noise}, but this is too little to say so: "
+            f"{', '.join(words)}; {command} decides"
+        )
+
+    @property
+    def samples(self) -> list[Sample]:
+        """What HELD rests on: episodes without noise and of each kind of noise, and attacked starts."""
+        counts = by_kind(self.robustness, "hyrl")
+        kinds = KINDS if self.task.effort.looks_ahead else KINDS[:-1]
+        samples = [
+            Sample(kind, *counts.get(kind, (0, 0)), False)
+            for kind in dict.fromkeys((*kinds, *counts))
+        ]
+        attacks = [c for c in self.robustness.attacks if c.controller == "hyrl"]
+        won, total = next(((c.attacked - c.lost, c.attacked) for c in attacks), (0, 0))
+        return [*samples, Sample("attack", won, total, True)]
+
+    @property
+    def fair(self) -> bool:
+        """Whether most of the starts that are open to one who sees the state are winnable."""
+        game = self.robustness.deciding
+        return game is None or self.winnable >= LEAST_WINNABLE * game.scores["hyrl"][-1].open
 
     def failures(self) -> Iterator[str]:
         """Yields why the run FAILED, if it did for sure."""
@@ -254,7 +305,7 @@ class _Case:
         if self.arrivals.arrived < NEARLY * self.arrivals.episodes:
             yield f"the policy {self.arrivals}"
         policy, hyrl = self.policy.noisy, self.hyrl.noisy
-        if policy is not None and hyrl is not None and policy < hyrl < 1:
+        if policy is not None and hyrl is not None and policy < hyrl < 1 and self.better:
             whole = self.lost_of
             if self.robustness.attacks:
                 whole = f"{whole} or of those attacked"
@@ -262,15 +313,34 @@ class _Case:
                 f"HyRL loses {percent(1 - hyrl)} of {whole} under {self.noise}, but fewer than the policy "
                 f"({percent(1 - policy)})"
             )
+        if not self.fair:
+            assert self.robustness.deciding
+            open_ = self.robustness.deciding.scores["hyrl"][-1].open
+            yield (
+                f"this split can win only {percent(self.winnable)} of the starts under {self.noise}, where "
+                f"{percent(open_)} are open to one who sees the state"
+            )
         if not self.examined:
             yield (
                 f"HyRL was not examined under the run's noise bound {self.bound:g}, which "
                 "hyrl-mj robustness RUN does"
             )
 
+    @property
+    def better(self) -> bool:
+        """Whether HyRL wins more than the policy under noise, as far as comparisons tell.
+
+        Where the game decides, or nothing is compared, shares alone tell.
+        """
+        comparisons = self.robustness.comparisons
+        if self.robustness.deciding or not comparisons:
+            return True
+        return any(c.interval[0] > 0 for c in comparisons)
+
     def reasons(self) -> Iterator[str]:
         """Yields the results behind the verdict."""
         yield from self._shares() if self.robustness.deciding else self._counts()
+        yield from map(comparison_sentence, self.robustness.comparisons)
         yield f"stage 1: the policy {self.arrivals}"
         for result in self.retraining.modes:
             yield f"stage 6: {mode_sentence(self.task, result)}"
@@ -289,15 +359,17 @@ class _Case:
         for ours, theirs in zip(hyrl, policy, strict=True):
             if ours.eps in (0, self.robustness.eps):
                 when = f"under the worst {self.noise}" if ours.eps else "without noise"
-                yield f"{when} HyRL {_share(ours)} of {self.whole}, the policy {_share(theirs)}"
+                yield (
+                    f"{when} HyRL {share_sentence(ours)} of {self.whole}, the policy {share_sentence(theirs)}"
+                )
         for count in self.robustness.deciding.replays:
             yield replays_sentence(self.task, count)
         yield from self._attacked("hyrl", "policy")
 
     def _counts(self) -> Iterator[str]:
         """Yields the numbers of episodes that arrive, by kind of noise."""
-        policy = _by_kind(self.robustness, "policy")
-        for kind, (arrived, episodes) in _by_kind(self.robustness, "hyrl").items():
+        policy = by_kind(self.robustness, "policy")
+        for kind, (arrived, episodes) in by_kind(self.robustness, "hyrl").items():
             when = "without noise" if kind == NO_NOISE else f"under {kind} {self.noise}"
             theirs, _ = policy[kind]
             yield f"{when} HyRL arrives in {arrived:,} of {episodes:,} episodes, the policy in {theirs:,}"
@@ -317,69 +389,3 @@ class _Case:
         breaks = [f"{names[who]} from {found[who].broken}" for who in controllers if who in found]
         if breaks:
             yield f"the attack breaks {', '.join(breaks)}"
-
-
-def replays_sentence(task: Task, count: ReplayCount) -> str:
-    """Returns how many replays a controller lost, and the first of them."""
-    who = "the policy" if count.controller == "policy" else "HyRL"
-    said = "proved" if count.of == PROVED_STARTS else "winnable"
-    if count.first is None:
-        return (
-            f"{who} lost none of {count.played:,} {said} starts when they were replayed in MuJoCo"
-        )
-    first = count.first
-    mode = "" if first.q0 is None else f" in mode {task.mode_name(first.q0)}"
-    noise = "without noise" if first.noise == NO_NOISE else f"under {first.noise} noise"
-    said = "a proved start" if count.of == PROVED_STARTS else "a start that no known noise beats"
-    withdrawn = "withdrawn: " if count.controller == "hyrl" else ""
-    return (
-        f"{withdrawn}{said} was lost in a replay: from {task.chart.format(np.array(first.start))}{mode} "
-        f"{noise} {who} ends {first.outcome.replace('_', ' ')}, and {count.failures:,} of "
-        f"{count.played:,} such replays in MuJoCo are lost"
-    )
-
-
-def _share(score: Score) -> str:
-    """Returns what is proved, and what is known to be lost."""
-    lost = f"known to lose {percent(1 - score.not_broken)}"
-    if score.not_broken == 1:
-        lost = "not known to lose any"
-    return (
-        f"is {lost}"
-        if score.proved is None
-        else f"is proved to win {percent(score.proved)} and {lost}"
-    )
-
-
-def _by_kind(robustness: Robustness, who: str) -> dict[str, tuple[int, int]]:
-    """Returns how many of a controller's episodes arrive, and of how many, by kind of noise."""
-    counts: dict[str, tuple[int, int]] = {}
-    for count in robustness.episodes:
-        if count.controller == who:
-            arrived, episodes = counts.get(count.noise, (0, 0))
-            counts[count.noise] = arrived + count.episodes - count.lost, episodes + count.episodes
-    return counts
-
-
-# What the policy of a mode is, unless it was trained.
-POLICIES = {
-    "pi_i": ", the agent as on its own side of M*,",
-    "agent": ", the agent itself,",
-    "table": ", a table of inputs,",
-}
-
-
-def mode_sentence(task: Task, result: ModeResult) -> str:
-    """Returns how well the policy of a mode holds its set."""
-    trainings = f"{result.attempts} training{'' if result.attempts == 1 else 's'}"
-    how = f"after {trainings}" if result.attempts else "without a training of its own"
-    mode = f"the policy of mode {task.mode_name(result.mode)}{POLICIES.get(result.policy, '')}"
-    won = (
-        "all of its set that was tried" if result.won == 1 else f"{percent(result.won)} of its set"
-    )
-    return f"{mode} wins {won}, {how}"
-
-
-def listed(words: Sequence[str]) -> str:
-    """Returns "a, b and c"."""
-    return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))

@@ -23,12 +23,14 @@ from hyrl_mj.simulation.noise import (
     signal_for,
 )
 from hyrl_mj.simulation.passing import Passing, windings
-from hyrl_mj.simulation.programmes import Programmes, Rules
+from hyrl_mj.simulation.programmes import GIVEN, Programmes
 from hyrl_mj.simulation.real import judge, judge_task
 from hyrl_mj.simulation.rollout import LoopSettings, Rollout, closed_loop
+from hyrl_mj.simulation.rules import Rule, Rules
 from hyrl_mj.simulation.way_runs import WayRuns, policy_runs, way_runs
 
 __all__ = [
+    "GIVEN",
     "LONGEST",
     "NOT_STARTED",
     "Ahead",
@@ -41,6 +43,7 @@ __all__ = [
     "Programmes",
     "Recorded",
     "Rollout",
+    "Rule",
     "Rules",
     "Sample",
     "Signal",

@@ -2,107 +2,20 @@
 
 from __future__ import annotations
 
-from itertools import product
 from typing import Self
 
 import numpy as np
 
 from hyrl_mj.policies import Controller, answer, nothing_past
-from hyrl_mj.simulation.lookahead import Lookahead, each_answer
+from hyrl_mj.simulation.lookahead import each_answer
 from hyrl_mj.simulation.noise import NOT_STARTED, Sample, Signal
+from hyrl_mj.simulation.rules import CONTRARY, JUMP, REVERSE, STAY, STRAIGHT, Rules
 from hyrl_mj.tasks import Outcome, Task
 
-# What the answers of a controller to noise are chosen for, beside steering to either end of an input.
-CONTRARY, STRAIGHT, REVERSE, JUMP, STAY = "contrary", "straight", "reverse", "jump", "stay"
 # A change of the mode counts for more than any change of the inputs.
 DECISIVE = 1e3
-
-
-class Rules:
-    """The rules for a task and a controller: each gives the noise at a sample.
-
-    A rule is a constant noise at the ends of the bound, one whose sign alternates, or a wish about the
-    controller's answer: of a few candidates it takes the noise whose answer fulfils the wish best.
-
-    - contrary: the answer that differs most from that to no noise, which keeps a run undecided.
-    - straight: the answer nearest to the middle of the input limits, which turns neither way.
-    - reverse: the answer that differs most from the one before.
-    - jump, stay: as contrary, but before all else with another mode, or with the same.
-    - to the lower or upper end of an input.
-    - ahead: not asked but simulated, the noise of `Lookahead`, which takes far longer than the others.
-
-    Args:
-        task, controller: of the closed loop.
-        bound: largest magnitude eps >= 0 of the noise, in the unit of the measurement.
-        shares: (p,) how much of the bound acts on each column of the measurement.
-
-    Attributes:
-        bound, shares: as above.
-        candidates: (c, p) noise that wishes choose from, the first of which is none.
-        fixed: (rules, p) noise of the rules that are no wishes; zero for the others.
-        alternates: (rules,) bool, whether the sign of this noise alternates.
-        wishes: for each rule its wish: None, a word, or the column and direction to steer to.
-        lookahead: gives the noise of the rule `ahead`; None where nothing can be simulated ahead.
-    """
-
-    def __init__(self, task: Task, controller: Controller, bound: float, shares: np.ndarray):
-        self.bound, self.shares = bound, shares
-        self.candidates = bound * _directions(shares != 0) * shares
-        wishes: list[str | tuple[int, int]] = [CONTRARY, STRAIGHT, REVERSE]
-        if len(controller.modes) > 1:
-            wishes += [JUMP, STAY]
-        wishes += list(product(range(len(task.inputs)), (1, -1)))
-        at_ends = np.abs(self.candidates) == bound * np.abs(shares)
-        # With many noisy columns the candidates are not all ends, because there are too many of those.
-        ends = self.candidates[at_ends.all(axis=1) | (np.count_nonzero(shares) > 3)]
-        ends = ends[ends.any(axis=1)]
-        first_noise = ends[np.arange(len(ends)), (ends != 0).argmax(axis=1)]
-        alternating = ends[first_noise > 0]
-        no_noise = np.zeros((len(wishes), len(shares)))
-        # Searches try the rules in this order: wishes break the most, and episodes have alternating noise.
-        self.fixed = np.vstack([no_noise, ends, alternating, no_noise[:2]])
-        self.alternates = np.zeros(len(self.fixed), dtype=bool)
-        self.alternates[len(wishes) + len(ends) : -2] = True
-        self.wishes = [*wishes, *[None] * (len(self.fixed) - len(wishes))]
-        # An environment cannot be simulated ahead from the middle of an episode.
-        self.lookahead = (
-            Lookahead(bound, shares).against(task, controller)
-            if task.tabulated and task.effort.looks_ahead
-            else None
-        )
-
-    def __len__(self) -> int:
-        return len(self.fixed)
-
-    @property
-    def nothing(self) -> int:
-        """The rule without noise."""
-        return len(self) - 2
-
-    @property
-    def ahead(self) -> int:
-        """The rule that simulates ahead, which is the last one."""
-        return len(self) - 1
-
-
-def _directions(noisy: np.ndarray) -> np.ndarray:
-    """Returns the candidates (c, p) as shares of the bound, for the noisy columns (p,) bool.
-
-    These are all combinations of zero and the ends, of one or two columns of their halves too, and of one of
-    the quarters; with more than three columns the ends of each alone, and of all together.
-    """
-    columns = np.flatnonzero(noisy)
-    count = len(columns)
-    if count <= 3:
-        factors = (0.0, 1.0, -1.0, 0.5, -0.5, 0.25, -0.25, 0.75, -0.75)
-        some = factors[: {1: 9, 2: 5}.get(count, 3)]
-        table = np.array(list(product(some, repeat=count)))
-    else:
-        one = np.vstack([np.ones((1, count)), np.eye(count)])
-        table = np.vstack([np.zeros((1, count)), one, -one])
-    directions = np.zeros((len(table), len(noisy)))
-    directions[:, columns] = table
-    return directions
+# The number of a signal that is given, in a programme: no rule.
+GIVEN = -1
 
 
 class Programmes(Signal):
@@ -115,8 +28,9 @@ class Programmes(Signal):
     Args:
         task, controller: of the closed loop.
         rules: what the programmes are made of.
-        programmes: (n, segments) int, rules.
+        programmes: (n, segments) int, rules, or `GIVEN`.
         segment: number of samples in a segment.
+        given: (K, n, p) noise where a programme is `GIVEN`, and none after it; by default none at all.
 
     Attributes:
         danger: (n,) the greatest danger that each run has met, by the task's own measure.
@@ -129,15 +43,23 @@ class Programmes(Signal):
     needs_controller = True
 
     def __init__(
-        self, task: Task, controller: Controller, rules: Rules, programmes: np.ndarray, segment: int
+        self,
+        task: Task,
+        controller: Controller,
+        rules: Rules,
+        programmes: np.ndarray,
+        segment: int,
+        given: np.ndarray | None = None,
     ):
-        n, columns = len(programmes), rules.fixed.shape[1]
+        n, columns = len(programmes), len(rules.shares)
         super().__init__(rules.bound, rules.shares)
         self.task, self.controller, self.rules = task, controller, rules
         self.programmes, self.segment = programmes, segment
+        self.given = np.zeros((0, n, columns)) if given is None else given
         self._noise, self._samples = np.zeros((task.max_steps, n, columns)), 0
         self.danger, self.reversals, self.rewards = np.full(n, -np.inf), np.zeros(n), np.zeros(n)
         self._last = np.full((n, len(task.inputs)), np.nan)
+        self._first_mode = np.full(n, NOT_STARTED)
 
     @property
     def values(self) -> np.ndarray:
@@ -159,9 +81,11 @@ class Programmes(Signal):
         )
         segment = np.minimum(now.k[rows] // self.segment, self.programmes.shape[1] - 1)
         rule = self.programmes[now.rows[rows], segment]
-        odd = (now.k[rows] % 2).astype(bool)
-        sign = np.where(self.rules.alternates[rule] & odd, -1.0, 1.0)
-        noise[rows] = self.rules.fixed[rule] * sign[:, None]
+        turned = self._turned(now.rows, now.q)[rows]
+        noise[rows] = self.rules.noise[rule] * self.rules.signs(rule, now.k[rows], turned)[:, None]
+        given = rows[(rule == GIVEN) & (now.k[rows] < len(self.given))]
+        noise[rows[rule == GIVEN]] = 0.0
+        noise[given] = self.given[now.k[given], now.rows[given]]
         past = nothing_past(self.controller, *true.shape) if now.past is None else now.past
         self._fulfil(noise, rows, rule, now, past)
         mine = rows[rule == self.rules.ahead]
@@ -176,11 +100,17 @@ class Programmes(Signal):
         self._noise[now.k, now.rows] = noise
         return noise
 
+    def _turned(self, rows: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """Returns which of the runs `rows` (r,) in modes q (r,) have left their first mode: (r,) bool."""
+        first = self._first_mode[rows]
+        self._first_mode[rows] = first = np.where(first == NOT_STARTED, q, first)
+        return np.asarray(q != first)
+
     def _fulfil(
         self, noise: np.ndarray, rows: np.ndarray, rule: np.ndarray, now: Sample, past: np.ndarray
     ) -> None:
         """Writes the noise of those `rows` (r,) whose `rule` (r,) is a wish into `noise` (n, p)."""
-        wishful = np.array([wish is not None for wish in self.rules.wishes])[rule]
+        wishful = self.rules.wishful[rule] & (rule != GIVEN)
         rows, rule = rows[wishful], rule[wishful]
         if not len(rows):
             return
@@ -201,7 +131,7 @@ class Programmes(Signal):
             STAY: contrary - jumps,
         }
         for number in np.unique(rule):
-            wish, mine = self.rules.wishes[number], rule == number
+            wish, mine = self.rules.all[number].wish, rule == number
             if isinstance(wish, str):
                 value = values[wish]
             else:

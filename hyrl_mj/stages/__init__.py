@@ -7,7 +7,7 @@ where needed.
 
 from hyrl_mj.stages.attacks import Attack, Budget, attack, attack_starts, shown_arcs
 from hyrl_mj.stages.critical_set import CriticalSet, critical_points, find_critical_set
-from hyrl_mj.stages.episodes import Regions, noisy_episodes
+from hyrl_mj.stages.episodes import NoisyEpisodes, Regions, noisy_episodes
 from hyrl_mj.stages.extended_sets import ExtendedSets, extend
 from hyrl_mj.stages.hybrid import ON_EDGE, HybridController
 from hyrl_mj.stages.losses import Losses, sort_losses
@@ -34,6 +34,7 @@ __all__ = [
     "HybridController",
     "Losses",
     "ModeResult",
+    "NoisyEpisodes",
     "PartPolicy",
     "Partition",
     "Regions",

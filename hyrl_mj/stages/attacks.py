@@ -1,7 +1,8 @@
 """An attack on closed loops: a search for noise signals that make them fail, where no game decides.
 
-The search goes over programmes of simple rules by the cross-entropy method. What it reports as lost has been
-lost again under the recorded signal, which knows nothing of the loop any more.
+Every controller is tried with the same rules in the same order, and then with what is drawn and evolved from
+the most dangerous signals. What is reported as lost has been lost again under the recorded signal, which
+knows nothing of the loop any more.
 """
 
 from __future__ import annotations
@@ -15,40 +16,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hyrl_mj.errors import BadInput, check_seed
-from hyrl_mj.game import AttackCount
+from hyrl_mj.game import AttackCount, Ends, wilson
 from hyrl_mj.policies import Controller
 from hyrl_mj.simulation import (
     HybridArc,
-    LoopSettings,
     Noise,
     Programmes,
     Recorded,
-    Rules,
     closed_loop,
     simulate_batch,
 )
-from hyrl_mj.stages.episodes import Regions
+from hyrl_mj.stages.attack_search import Search
+from hyrl_mj.stages.episodes import Regions, ends_of
 from hyrl_mj.tasks import Outcome, Task
 
 # The longest attack [s], a day, and the most rounds.
 LONGEST, MOST_ROUNDS = 86_400.0, 100_000
-# Segments of a programme, each of the same time; together as long as a run without noise.
-SEGMENTS = 10
-# What is looked for in programmes that do not win yet: danger on the way, late arrival, dithering.
-GOALS = 3
-# Programmes that are tried in a round from each start: some that won from starts nearby, and one a goal.
-COPIED = 1
-POPULATION = COPIED + GOALS
-# The place, among the rules that the first rounds hold throughout, of the noise of `Lookahead`. It takes
-# longer than others, and two rounds are usual.
-LOOKS_AHEAD = 2 * POPULATION - 1
-# The best programmes so far, for each start and goal, that new ones are drawn from; and the share of the
-# segments that take any rule instead.
-ELITES, EXPLORE = 3, 0.25
 # How often starts are drawn until enough of them are winnable.
 MOST_DRAWS = 100
-# Runs that are simulated at once, which limits the memory.
-BATCH = 4_096
 
 
 @dataclass(frozen=True)
@@ -90,6 +75,7 @@ class Attack:
         count: from how many starts it loses.
         signal: the strongest signal that is known for each start.
         arcs: the run from each start under its signal.
+        quiet: how the runs end without noise.
         strongest: index of the start of the strongest signal: of the earliest failure, or where nothing is
             lost of the run with the greatest danger.
     """
@@ -97,54 +83,57 @@ class Attack:
     count: AttackCount
     signal: Recorded
     arcs: tuple[HybridArc, ...]
+    quiet: Ends
     strongest: int
+
+    @property
+    def ends(self) -> Ends:
+        """How the runs end under the signals."""
+        return Ends(
+            lost=np.array([arc.outcome != Outcome.REACHED.label for arc in self.arcs]),
+            time=np.array([arc.t[-1] for arc in self.arcs]),
+            way=np.array(
+                [np.linalg.norm(np.diff(arc.z, axis=0), axis=1).sum() for arc in self.arcs]
+            ),
+        )
 
     @staticmethod
     def from_arcs(
         arcs: Sequence[HybridArc],
         signal: Recorded,
+        quiet: Ends,
         dangerous: int,
-        controller: str,
-        everywhere: bool,
-        rounds: int,
-        seconds: float | None,
+        begun: AttackCount,
     ) -> Attack:
         """Returns the attack of recorded signals, with the arcs under them.
 
         Args:
             arcs: of the controller, from each start.
             signal: the signals.
+            quiet: how the runs end without noise.
             dangerous: index of the start of the greatest danger.
-            controller, everywhere, rounds, seconds: as in `AttackCount`.
+            begun: the count, in which the losses are put.
         """
-        from scipy.stats import binomtest  # slow to import, and seldom needed
-
-        lost = np.array([arc.outcome != Outcome.REACHED.label for arc in arcs])
+        lost = np.array([arc.outcome != Outcome.REACHED.label for arc in arcs]) & ~quiet.lost
         ends = np.where(lost, [arc.t[-1] for arc in arcs], np.inf)
-        strongest = int(np.argmin(ends)) if lost.any() else dangerous
-        interval = binomtest(int(lost.sum()), len(lost)).proportion_ci(0.95, method="wilson")
-        count = AttackCount(
-            controller=controller,
-            eps=signal.bound,
-            everywhere=everywhere,
-            starts=len(lost),
-            lost=int(lost.sum()),
-            interval=(float(interval.low), float(interval.high)),
-            rounds=rounds,
-            seconds=seconds,
+        strongest, losses = int(np.argmin(ends)) if lost.any() else dangerous, int(lost.sum())
+        count = replace(
+            begun,
+            unaided=int(quiet.lost.sum()),
+            lost=losses,
+            interval=wilson(losses, int(np.sum(~quiet.lost))),
             start=tuple(map(float, arcs[strongest].z[0])),
             outcome=arcs[strongest].outcome,
         )
-        return Attack(count, signal, tuple(arcs), strongest)
+        return Attack(count, signal, tuple(arcs), quiet, strongest)
 
     def on(self, name: str, task: Task, controller: Controller) -> Attack:
         """Returns the attack of the same signals on another controller, of a name."""
         starts = np.array([arc.z[0] for arc in self.arcs])
         arcs = simulate_batch(task, controller, starts, self.signal)
-        count = self.count
-        return Attack.from_arcs(
-            arcs, self.signal, self.strongest, name, count.everywhere, count.rounds, count.seconds
-        )
+        quiet = ends_of(task, closed_loop(task, controller, starts))
+        begun = replace(self.count, controller=name)
+        return Attack.from_arcs(arcs, self.signal, quiet, self.strongest, begun)
 
 
 def attack_starts(task: Task, regions: Regions, bound: float, n: int, seed: int) -> np.ndarray:
@@ -194,10 +183,11 @@ def attack(
 ) -> dict[str, Attack]:
     """Searches for noise signals that make closed loops fail.
 
-    Each round tries `POPULATION` signals from every start of every controller that nothing has broken yet.
-    The first rounds hold each rule of `Rules` throughout, the second among others that which simulates ahead.
-    Later ones
-    follow programmes that vary and join the best so far, and those that won from starts nearby. The
+    All controllers are tried with the same rules in the same order, from the same starts, as often as the
+    budget says; those with several modes are tried with rules about their modes on top. A start that a
+    controller loses without noise is left alone, and so is one that it has lost. The rules that are held
+    throughout come first; programmes of segments, and levels and switching times, which are drawn and
+    evolved from the most dangerous of them (the cross-entropy method, CMA-ES), come after them. The
     coordinates outside the chart begin at their usual values.
 
     Args:
@@ -220,9 +210,11 @@ def attack(
     shares = Noise("none", bound, everywhere).against(task, None).shares
     began = time.monotonic()
     searches = {
-        name: _Search(task, loop, starts, Rules(task, loop, bound, shares), seed)
-        for name, loop in controllers.items()
+        name: Search(task, loop, starts, bound, shares, seed) for name, loop in controllers.items()
     }
+    length = max(search.length for search in searches.values())
+    for search in searches.values():
+        search.prepare(length)
     rounds, enough = 0, min(budget.enough or len(starts), len(starts))
     while any(np.sum(~search.open) < enough for search in searches.values()) or not rounds:
         rounds, before = rounds + 1, time.monotonic() - began
@@ -233,119 +225,25 @@ def attack(
         late = budget.seconds is not None and after + (after - before) > budget.seconds
         if late or rounds == budget.rounds:
             break
-    return {
-        name: search.result(name, everywhere, rounds, budget.seconds)
-        for name, search in searches.items()
-    }
-
-
-class _Search:
-    """The search for signals against one controller.
-
-    Attributes:
-        open: (n,) bool, the starts that nothing has broken yet.
-        signals: (K, n, p) the strongest signal for each start so far.
-    """
-
-    def __init__(
-        self, task: Task, controller: Controller, starts: np.ndarray, rules: Rules, seed: int
-    ):
-        self.task, self.controller, self.starts = task, controller, starts
-        self.rules, self.seed = rules, seed
-        self._label = "attack, without noise"
-        n, self.segment = len(starts), task.max_steps
-        self.open = np.ones(n, dtype=bool)
-        self.signals = np.zeros((task.max_steps, n, rules.fixed.shape[1]))
-        self._worst = np.full(n, -np.inf)
-        self._winners = np.zeros((n, SEGMENTS), dtype=int)
-        self._elites = np.full((n, GOALS, ELITES, SEGMENTS), rules.nothing)
-        self._values = np.full((n, GOALS, ELITES), -np.inf)
-        self._tried: list[set[bytes]] = [set() for _ in starts]
-        without = np.full((n, 1, SEGMENTS), rules.nothing)
-        lengths = self._try(np.arange(n), without)
-        self.segment = max(math.ceil(np.median(lengths) / SEGMENTS), 1)
-
-    def round(self, number: int) -> None:
-        """Tries some programmes from each open start; the rounds are numbered from 1."""
-        rows, self._label = np.flatnonzero(self.open), f"attack, round {number}"
-        if len(rows):
-            self._try(rows, self._population(rows, number))
-
-    def _population(self, rows: np.ndarray, number: int) -> np.ndarray:
-        """Returns the programmes (r, POPULATION, SEGMENTS) that a round tries from the starts `rows` (r,)."""
-        rng = np.random.default_rng([self.seed, number])
-        shape = len(rows), POPULATION, SEGMENTS
-        goal = np.broadcast_to(np.arange(POPULATION)[:, None] % GOALS, shape)
-        elite, segment = rng.integers(ELITES, size=shape), np.arange(SEGMENTS)
-        drawn = self._elites[rows[:, None, None], goal, elite, segment]
-        explores = rng.random(shape) < EXPLORE
-        programmes = np.where(explores, rng.integers(self.rules.ahead, size=shape), drawn)
-        rules = np.arange(self.rules.nothing)
-        if self.rules.lookahead is not None:
-            rules = np.insert(rules, min(LOOKS_AHEAD, len(rules)), self.rules.ahead)
-        held = rules[(number - 1) * POPULATION : number * POPULATION]
-        programmes[:, : len(held)] = held[:, None]
-        lost = np.flatnonzero(~self.open)
-        for row, mine in zip(rows, programmes[:, len(held) :][:, :COPIED], strict=True):
-            copies = self._from_nearby(row, lost)[: len(mine)]
-            mine[: len(copies)] = np.reshape(copies, (-1, SEGMENTS))
-        return programmes
-
-    def _from_nearby(self, row: int, lost: np.ndarray) -> list[np.ndarray]:
-        """Returns programmes that broke the starts `lost`, the nearest first, but were not tried at a row."""
-        if not len(lost):
-            return []
-        chart = self.task.chart
-        away = chart.difference(self.starts[lost], self.starts[row]) / chart.sides
-        nearest = lost[np.argsort(np.linalg.norm(away, axis=1), kind="stable")]
-        programmes = {self._winners[i].tobytes(): self._winners[i] for i in nearest}
-        return [p for key, p in programmes.items() if key not in self._tried[row]]
-
-    def _try(self, rows: np.ndarray, programmes: np.ndarray) -> np.ndarray:
-        """Simulates programmes (r, population, SEGMENTS) from the starts `rows` (r,), and keeps the best.
-
-        Returns:
-            (r, population) the lengths of the runs [samples].
-        """
-        r, population = programmes.shape[:2]
-        each, flat = np.repeat(rows, population), programmes.reshape(-1, SEGMENTS)
-        length = np.empty(len(each), dtype=int)
-        for first in range(0, len(each), BATCH):
-            batch = slice(first, first + BATCH)
-            length[batch] = self._simulate(each[batch], flat[batch])
-        return length.reshape(r, population)
-
-    def _simulate(self, rows: np.ndarray, programmes: np.ndarray) -> np.ndarray:
-        """Simulates a programme from each of the starts `rows` (k,), and returns the lengths (k,)."""
-        signal = Programmes(self.task, self.controller, self.rules, programmes, self.segment)
-        settings = LoopSettings(label=self._label)
-        run = closed_loop(self.task, self.controller, self.starts[rows], signal, settings=settings)
-        lost = run.outcome != Outcome.REACHED
-        mean = signal.rewards / np.maximum(run.length, 1)
-        # Among runs of equal length the one with the least reward counts as the latest.
-        late = run.length - mean / (1 + np.abs(mean)) / 2
-        values = np.stack([signal.danger, late, signal.reversals], axis=1)
-        noise = np.reshape(signal.values, (-1, len(rows), self.signals.shape[2]))
-        for i, row in enumerate(rows):
-            self._tried[row].add(programmes[i].tobytes())
-            if not self.open[row]:
-                continue
-            if lost[i] or signal.danger[i] > self._worst[row]:
-                self._worst[row] = signal.danger[i]
-                self.signals[: len(noise), row], self.signals[len(noise) :, row] = noise[:, i], 0.0
-            if lost[i]:
-                self.open[row], self._winners[row] = False, programmes[i]
-            for goal, value in enumerate(values[i]):
-                elites, least = self._elites[row, goal], self._values[row, goal].argmin()
-                if value > self._values[row, goal, least]:
-                    elites[least], self._values[row, goal, least] = programmes[i], value
-        return run.length
-
-    def result(self, name: str, everywhere: bool, rounds: int, seconds: float | None) -> Attack:
-        """Simulates the strongest signals again, as records, and returns what they do."""
-        rules = self.rules
+    found = {}
+    for name, search in searches.items():
         # Replays may be longer than an episode, in which alone the attack acts.
-        recorded = Recorded(self.signals, rules.bound, Programmes.kind, "none", rules.shares)
-        arcs = simulate_batch(self.task, self.controller, self.starts, recorded)
-        dangerous = int(np.argmax(self._worst))
-        return Attack.from_arcs(arcs, recorded, dangerous, name, everywhere, rounds, seconds)
+        signal = Recorded(search.signals, bound, Programmes.kind, "none", shares)
+        arcs = simulate_batch(task, controllers[name], starts, signal)
+        begun = AttackCount(
+            controller=name,
+            eps=bound,
+            everywhere=everywhere,
+            starts=len(starts),
+            unaided=0,
+            lost=0,
+            interval=(0.0, 1.0),
+            rounds=rounds,
+            seconds=budget.seconds,
+            samples=search.samples,
+            tried=dict(search.tried),
+            start=(),
+            outcome="",
+        )
+        found[name] = Attack.from_arcs(arcs, signal, search.quiet, search.most_dangerous, begun)
+    return found

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import astuple, dataclass
 from functools import partial
 from itertools import product
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput, check_seed
-from hyrl_mj.game import EpisodeCount
+from hyrl_mj.game import NO_NOISE, Comparison, Ends, EpisodeCount, compare, wilson
 from hyrl_mj.physics.plant import Plant
 from hyrl_mj.policies import Controller
 from hyrl_mj.sets import Grid
-from hyrl_mj.simulation import LoopSettings, Noise, closed_loop, judge
+from hyrl_mj.simulation import LoopSettings, Noise, Rollout, closed_loop, judge
 from hyrl_mj.stages.critical_set import check_points, distance_to
 from hyrl_mj.system import cores
 from hyrl_mj.system.progress import progress_bar
@@ -88,6 +88,20 @@ class Regions:
         return np.asarray(distance_to(task, self.points, z) <= 2 * bound)
 
 
+@dataclass(frozen=True)
+class NoisyEpisodes:
+    """The results of noisy episodes.
+
+    Attributes:
+        counts: by noise, controller and start region.
+        comparisons: of the controllers under each noise, from the same starts; none where no episodes are
+            without noise.
+    """
+
+    counts: tuple[EpisodeCount, ...]
+    comparisons: tuple[Comparison, ...]
+
+
 def noisy_episodes(
     task: Task,
     regions: Regions,
@@ -95,10 +109,13 @@ def noisy_episodes(
     noises: Sequence[Noise],
     count: int,
     seed: int = 0,
-) -> tuple[EpisodeCount, ...]:
+) -> NoisyEpisodes:
     """Simulates noisy episodes, and counts their outcomes by noise, controller and start region.
 
     All controllers get the same starts, and the same noise signals unless these depend on the loop.
+
+    Returns:
+        The counts and comparisons.
 
     Args:
         task: the robot and its problem.
@@ -127,17 +144,27 @@ def noisy_episodes(
     ]
     # The plants are used again: new ones for each batch would fragment the memory.
     plants = {} if cores.given() else {n: task.plant(n) for n in {batch.n for batch in batches}}
-    ends: list[EpisodeCount] = []
+    counts: list[EpisodeCount] = []
+    ends: dict[Noise, dict[str, Ends]] = {}
     with progress_bar(None, "noisy episodes", "episodes", count * len(pairs)) as progress:
-        ended = cores.spread(partial(_outcomes, plants), batches)
+        ended = cores.spread(partial(_play, plants), batches)
         for noise, name in pairs:
-            counts: dict[str, np.ndarray] = {}
-            for first, outcomes in zip(firsts, ended):  # noqa: B905 - the next pair goes on
-                for region, number in outcomes.items():
-                    counts[region] = counts.get(region, 0) + number
+            played = []
+            for first, batch in zip(firsts, ended):  # noqa: B905 - the next pair goes on
+                played.append(batch)
                 progress.update(min(BATCH, count - first))
-            ends += [_count(noise, name, r, number) for r, number in counts.items() if number.any()]
-    return tuple(ends)
+            counts += _count(noise, name, played)
+            ends.setdefault(noise, {})[name] = _joined([batch.ends for batch in played])
+    quiet = next((own for noise, own in ends.items() if noise.kind == NO_NOISE), None)
+    noisy = [noise for noise in ends if noise.kind != NO_NOISE]
+    comparisons = [compare(noise.kind, quiet, ends[noise]) for noise in noisy] if quiet else []
+    return NoisyEpisodes(tuple(counts), tuple(comparisons))
+
+
+def ends_of(task: Task, run: Rollout) -> Ends:
+    """Returns how runs end."""
+    way = np.linalg.norm(np.diff(run.path, axis=0), axis=2).sum(axis=0)
+    return Ends(run.outcome != Outcome.REACHED, run.length * task.dt, way)
 
 
 @dataclass(frozen=True)
@@ -157,8 +184,17 @@ class _Batch:
     judged: int = 0
 
 
-def _outcomes(plants: Mapping[int, Plant], batch: _Batch) -> dict[str, np.ndarray]:
-    """Returns the number (outcomes,) of each outcome in a batch, by start region."""
+@dataclass(frozen=True)
+class _Played:
+    """How the episodes of a batch end, the outcome (n,) of each, and which lie in each region, (n,) bool."""
+
+    ends: Ends
+    outcome: np.ndarray
+    regions: dict[str, np.ndarray]
+
+
+def _play(plants: Mapping[int, Plant], batch: _Batch) -> _Played:
+    """Plays a batch of episodes."""
     task, noise, regions, n = batch.task, batch.noise, batch.regions, batch.n
     seeds = np.random.SeedSequence([batch.seed, batch.first]).generate_state(2)
     z0 = regions.draw(task, noise.bound, n, np.random.default_rng(seeds[0]))
@@ -174,26 +210,30 @@ def _outcomes(plants: Mapping[int, Plant], batch: _Batch) -> dict[str, np.ndarra
         else:  # every loss of an environment is played again
             rows = lost_first[: max(judged, int((runs.outcome != Outcome.REACHED).sum()))]
             task.verify(z0, runs, rows)
-    return {
-        region: np.bincount(runs.outcome[inside], minlength=len(Outcome))
-        for region, inside in regions.split(task, noise.bound, z0).items()
-    }
+    return _Played(ends_of(task, runs), runs.outcome, regions.split(task, noise.bound, z0))
 
 
-def _count(noise: Noise, name: str, region: str, outcomes: np.ndarray) -> EpisodeCount:
-    """Returns how the episodes of one region ended, from the number (outcomes,) of each outcome."""
-    from scipy.stats import binomtest  # slow to import, and seldom needed
+def _joined(parts: Sequence[Ends]) -> Ends:
+    """Returns the ends of several batches as one."""
+    return Ends(*(np.concatenate(arrays) for arrays in zip(*map(astuple, parts), strict=True)))
 
-    reached, total = int(outcomes[Outcome.REACHED]), int(outcomes.sum())
-    interval = binomtest(reached, total).proportion_ci(0.95, method="wilson")
-    return EpisodeCount(
-        noise=noise.kind,
-        eps=noise.bound,
-        everywhere=noise.everywhere,
-        controller=name,
-        region=region,
-        episodes=total,
-        outcomes={Outcome(i).label: int(n) for i, n in enumerate(outcomes) if n},
-        reached=reached / total,
-        interval=(float(interval.low), float(interval.high)),
-    )
+
+def _count(noise: Noise, name: str, batches: Sequence[_Played]) -> Iterator[EpisodeCount]:
+    """Yields how the episodes of each region ended."""
+    outcome = np.concatenate([batch.outcome for batch in batches])
+    for region in batches[0].regions:
+        inside = np.concatenate([batch.regions[region] for batch in batches])
+        numbers = np.bincount(outcome[inside], minlength=len(Outcome))
+        reached, total = int(numbers[Outcome.REACHED]), int(numbers.sum())
+        if total:
+            yield EpisodeCount(
+                noise=noise.kind,
+                eps=noise.bound,
+                everywhere=noise.everywhere,
+                controller=name,
+                region=region,
+                episodes=total,
+                outcomes={Outcome(i).label: int(n) for i, n in enumerate(numbers) if n},
+                reached=reached / total,
+                interval=wilson(reached, total),
+            )

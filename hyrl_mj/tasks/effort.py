@@ -24,6 +24,9 @@ class Effort:
         transitions: of a lattice that is fitted into the memory, at most.
         nodes: from which a controller is attacked where the game is an estimate, for each start mode.
         episodes: of each kind of noise where the worst case cannot be computed.
+        attack_starts, attack_rounds: starts and rounds of an attack where the worst case cannot be computed.
+            Of so many starts none may be lost for 99% to be within the 95% interval of what is won (Wilson);
+            so many rounds try every rule, and search for a few rounds more.
     """
 
     starts: int = 4_000
@@ -38,6 +41,8 @@ class Effort:
     transitions: int = 2**23
     nodes: int = 1_000
     episodes: int = 1_000
+    attack_starts: int = 400
+    attack_rounds: int = 8
 
 
 # Where each sample runs the Python code of an environment it takes about a hundred times as long.
@@ -54,4 +59,6 @@ SPARING = Effort(
     transitions=2**22,
     nodes=48,
     episodes=200,
+    attack_starts=100,
+    attack_rounds=3,
 )

@@ -60,6 +60,7 @@ def _examination(robustness: Robustness) -> str:
         command += ["--episodes", f"{sum(c.episodes for c in one)}", "--noise", ",".join(kinds)]
     if robustness.attacks:
         command += ["--attack-rounds", f"{robustness.attacks[0].rounds}"]
+        command += ["--attack-starts", f"{robustness.attacks[0].starts}"]
     if counts or robustness.attacks:
         command += ["--seed", f"{robustness.seed}"]
     return shlex.join(command)

@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from hyrl_mj.errors import BadInput, NoRenderer
-from hyrl_mj.game import Game, Robustness, worst_signal
+from hyrl_mj.game import NO_NOISE, Game, Robustness, worst_signal
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.runs.arcs import critical_start, from_middle
 from hyrl_mj.runs.directory import Run
-from hyrl_mj.runs.verdict import NO_NOISE, replays_sentence
+from hyrl_mj.runs.sentences import replays_sentence
 from hyrl_mj.simulation import HybridArc, Noise, simulate_batch
 from hyrl_mj.stages import Budget, Losses, Regions, attack, attack_starts, sort_losses
 from hyrl_mj.viz.commands import beginning

@@ -14,12 +14,12 @@ from PIL import Image
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files import artifacts
-from hyrl_mj.game import LIMIT, MAP_CLASSES, EpisodeCount, GameResult, Robustness
+from hyrl_mj.game import LIMIT, MAP_CLASSES, NO_NOISE, EpisodeCount, GameResult, Robustness
 from hyrl_mj.learning import Training
 from hyrl_mj.policies import Agent, MlpPolicy
 from hyrl_mj.runs.arcs import attack_replay
 from hyrl_mj.runs.directory import Run
-from hyrl_mj.runs.verdict import NO_NOISE, POLICIES, listed
+from hyrl_mj.runs.sentences import POLICIES, listed
 from hyrl_mj.viz import tables
 from hyrl_mj.viz.commands import changed, commands
 from hyrl_mj.viz.figures import CLASS_COLOURS, FIGURES
@@ -126,8 +126,9 @@ def _numbers(
         numbers += _episode_numbers(robustness.episodes)
     if robustness and robustness.attacks:
         attacks = robustness.attacks
-        shares = [tables.percent(c.lost / c.starts, surely=False) for c in attacks]
-        note = f"of {attacks[0].starts} starts, {attacks[0].rounds} rounds of search"
+        shares = [tables.percent(c.lost / max(c.attacked, 1), surely=False) for c in attacks]
+        won = " and ".join(f"{c.attacked:,}" for c in attacks)
+        note = f"of {won} starts that are won without noise; {attacks[0].rounds} rounds of search"
         numbers.append(Number("starts from which the attack breaks it", shares, note))
     if arrived:
         counts = [f"{count} of {total}" for count, total in arrived.values()]
@@ -246,6 +247,7 @@ def fill(template: str, run: Run, robustness: Robustness | None, **values: Any) 
     task, game = run.task, robustness.game if robustness else None
     episodes = robustness.episodes if robustness else ()
     attacks = robustness.attacks if robustness else ()
+    compared = robustness.comparisons if robustness else ()
     return (
         environment()
         .get_template(template)
@@ -269,6 +271,8 @@ def fill(template: str, run: Run, robustness: Robustness | None, **values: Any) 
             replayed=tables.replays_table(task, game.replays) if game and game.replays else None,
             episodes=tables.episode_table(task, episodes) if episodes else None,
             attacks=tables.attack_table(task, attacks) if attacks else None,
+            signals=tables.signals_table(task, attacks) if attacks else None,
+            comparisons=tables.comparison_table(task, compared) if compared else None,
             **values,
         )
     )

@@ -10,7 +10,9 @@ import numpy as np
 from hyrl_mj.game import (
     LIMIT,
     NEARLY,
+    NO_NOISE,
     AttackCount,
+    Comparison,
     EpisodeCount,
     GameResult,
     ReplayCount,
@@ -18,7 +20,6 @@ from hyrl_mj.game import (
     percent,
 )
 from hyrl_mj.runs.directory import Run
-from hyrl_mj.runs.verdict import NO_NOISE
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
 
@@ -207,13 +208,75 @@ def attack_table(task: Task, counts: Sequence[AttackCount]) -> Table:
     rows = []
     for c in counts:
         low, high = (percent(share) for share in c.interval)
-        row = [NAMES[c.controller], f"{c.starts:,}", f"{c.lost:,}"]
-        row.append(percent(c.lost / c.starts, surely=False))
-        row += [f"{low} - {high}", f"{c.rounds:,}"]
+        row = [NAMES[c.controller], f"{c.starts:,}", f"{c.unaided:,}", f"{c.lost:,}"]
+        row.append(percent(c.lost / max(c.attacked, 1), surely=False))
+        row += [f"{low} - {high}", f"{c.rounds:,}", f"{sum(c.tried.values()):,}", f"{c.samples:,}"]
         rows.append([*row, f"{c.outcome.replace('_', ' ')} from {_point(np.array(c.start))}"])
-    headings = ("controller", "starts", "lost", "share", "95%", "rounds", "strongest signal")
+    headings = (
+        "controller",
+        "starts",
+        "lost without noise",
+        "lost",
+        "share of the others",
+        "95%",
+        "rounds",
+        "runs",
+        "samples",
+        "strongest signal",
+    )
     title = f"{task.name}: attack, a search for noise on {where} of up to {counts[0].eps:g} {unit}"
     return Table(title, headings, rows)
+
+
+def signals_table(task: Task, counts: Sequence[AttackCount]) -> Table:
+    """Returns in how many runs each controller was tried with each kind of signal."""
+    kinds = dict.fromkeys(kind for count in counts for kind in count.tried)
+    rows = [[kind, *(f"{count.tried.get(kind, 0):,}" for count in counts)] for kind in kinds]
+    headings = ("signal", *(f"runs of {NAMES[count.controller]}" for count in counts))
+    return Table(f"{task.name}: signals that the attack tried", headings, rows)
+
+
+def comparison_table(task: Task, comparisons: Sequence[Comparison]) -> Table:
+    """Returns what each kind of noise does to both controllers from the same starts: a row for each."""
+    rows = []
+    for c in comparisons:
+        low, high = (f"{100 * end:.1f}" for end in c.interval)
+        rows.append(
+            [
+                c.noise,
+                _both(c.unaided),
+                f"{c.compared:,} of {c.starts:,}",
+                _both(c.lost),
+                f"{100 * c.difference:.1f} ({low} to {high})",
+                _both(c.late),
+                _both(c.time),
+                _both(c.way),
+            ]
+        )
+    headings = (
+        "noise",
+        "lost without noise",
+        "starts compared",
+        "lost under noise",
+        "difference, 95% [points]",
+        "late",
+        "time, median and 99%",
+        "way, median and 99%",
+    )
+    names = " and ".join(NAMES[name] for name in comparisons[0].lost)
+    return Table(
+        f"{task.name}: {names} from the same starts; time and way are relative to those without noise",
+        headings,
+        rows,
+    )
+
+
+def _both(values: Mapping[str, int | tuple[float, float]]) -> str:
+    """Returns the values of both controllers, as "20, 3"."""
+    texts = [
+        f"{v[0]:.2f} {v[1]:.2f}" if isinstance(v, tuple) else f"{v:,}" for v in values.values()
+    ]
+    return ("; " if any(isinstance(v, tuple) for v in values.values()) else ", ").join(texts)
 
 
 def attack_sentence(counts: Sequence[AttackCount]) -> str:
@@ -317,6 +380,9 @@ def print_robustness(run: Run) -> None:
         print_table(episode_table(run.task, episodes))
     if attacks := run.robustness.attacks:
         print_table(attack_table(run.task, attacks))
+        print_table(signals_table(run.task, attacks))
+    if comparisons := run.robustness.comparisons:
+        print_table(comparison_table(run.task, comparisons))
 
 
 def print_table(table: Table) -> None:

@@ -1,0 +1,102 @@
+"""The evidence that a verdict rests on: what controllers win, and whether it is enough for HELD."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hyrl_mj.game import NEARLY, NO_NOISE, Robustness, wilson
+
+# What HELD needs at least: kinds of noise in the episodes, where noise can look ahead and where not,
+# episodes of each kind, and attacked starts. Of 300 starts none is lost if 99% are won at the lower end of a
+# one-sided 95% interval (3 / 300 = 1%); the two-sided one that is asked for takes about 400.
+KINDS = ("none", "uniform", "alternating", "adversarial")
+LEAST_EPISODES, LEAST_ATTACKED, ENOUGH_ATTACKED = 1_000, 300, 400
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What was won of some episodes, or attacked starts.
+
+    Attributes:
+        kind: the kind of noise.
+        won, total: how many were won, and of how many.
+        attack: whether they are starts that were attacked.
+    """
+
+    kind: str
+    won: int
+    total: int
+    attack: bool
+
+    def __str__(self) -> str:
+        what = "attacked starts" if self.attack else f"episodes under {self.kind} noise"
+        if self.kind == NO_NOISE:
+            what = "episodes without noise"
+        return f"{self.won:,} of {self.total:,} {what}"
+
+    @property
+    def least(self) -> int:
+        """The fewest that HELD needs."""
+        return LEAST_ATTACKED if self.attack else LEAST_EPISODES
+
+    @property
+    def held(self) -> bool:
+        """Whether they are enough, and nearly all are won at the lower end of the interval."""
+        return self.total >= self.least and wilson(self.won, self.total)[0] >= NEARLY
+
+    @property
+    def refuted(self) -> bool:
+        """Whether fewer than nearly all are won even at the upper end of the interval."""
+        return self.total > 0 and wilson(self.won, self.total)[1] < NEARLY
+
+    @property
+    def enough(self) -> int:
+        """How many may be enough: four times as many where there were enough, but too many lost."""
+        least = ENOUGH_ATTACKED if self.attack else LEAST_EPISODES
+        return max(least, 4 * self.total if self.total >= self.least else 0)
+
+
+@dataclass(frozen=True)
+class Wins:
+    """What a controller is not known to lose: shares of the winnable starts, or of the episodes.
+
+    Attributes:
+        quiet: without noise, None if that was not examined.
+        noisy: under noise, None if that was not examined.
+    """
+
+    quiet: float | None
+    noisy: float | None
+
+    @staticmethod
+    def count(robustness: Robustness, who: str) -> Wins:
+        """Returns what "policy" or "hyrl" wins."""
+        attacked = [
+            1 - c.lost / c.attacked
+            for c in robustness.attacks
+            if c.controller == who and c.attacked
+        ]
+        if robustness.deciding:
+            scores = robustness.deciding.scores[who]
+            replays = robustness.deciding.replays_of(who)
+            replayed = replays.shares if replays else (1.0, 1.0)
+            quiet = [min(score.not_broken, replayed[0]) for score in scores if score.eps == 0]
+            noisy = min(scores[-1].not_broken, replayed[1], *attacked, 1.0)
+            return Wins(quiet[0] if quiet else None, noisy)
+        shares = {
+            kind: arrived / episodes
+            for kind, (arrived, episodes) in by_kind(robustness, who).items()
+        }
+        quiet_share = shares.pop(NO_NOISE, None)
+        under_noise = [*shares.values(), *attacked]
+        return Wins(quiet_share, min(under_noise) if under_noise else None)
+
+
+def by_kind(robustness: Robustness, who: str) -> dict[str, tuple[int, int]]:
+    """Returns how many of a controller's episodes arrive, and of how many, by kind of noise."""
+    counts: dict[str, tuple[int, int]] = {}
+    for count in robustness.episodes:
+        if count.controller == who:
+            arrived, episodes = counts.get(count.noise, (0, 0))
+            counts[count.noise] = arrived + count.episodes - count.lost, episodes + count.episodes
+    return counts

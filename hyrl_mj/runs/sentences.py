@@ -1,0 +1,80 @@
+"""Sentences about the results of an examination and of stage 6."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hyrl_mj.game import NO_NOISE, PROVED_STARTS, Comparison, ReplayCount, Score, percent
+from hyrl_mj.stages import ModeResult
+from hyrl_mj.tasks import Task
+
+
+def comparison_sentence(compared: Comparison) -> str:
+    """Returns what one kind of noise does to both controllers from the same starts."""
+    how = "attack" if compared.noise == "attack" else f"{compared.noise} noise"
+    low, high = compared.interval
+    lost = compared.lost
+    return (
+        f"{how}: of {compared.compared:,} starts that both win without noise the policy loses "
+        f"{lost['policy']:,} and HyRL {lost['hyrl']:,} (difference {100 * compared.difference:.1f} points, "
+        f"95% interval {100 * low:.1f} to {100 * high:.1f}); late are {compared.late['policy']:,} and "
+        f"{compared.late['hyrl']:,}"
+    )
+
+
+def replays_sentence(task: Task, count: ReplayCount) -> str:
+    """Returns how many replays a controller lost, and the first of them."""
+    who = "the policy" if count.controller == "policy" else "HyRL"
+    said = "proved" if count.of == PROVED_STARTS else "winnable"
+    if count.first is None:
+        return (
+            f"{who} lost none of {count.played:,} {said} starts when they were replayed in MuJoCo"
+        )
+    first = count.first
+    mode = "" if first.q0 is None else f" in mode {task.mode_name(first.q0)}"
+    noise = "without noise" if first.noise == NO_NOISE else f"under {first.noise} noise"
+    said = "a proved start" if count.of == PROVED_STARTS else "a start that no known noise beats"
+    withdrawn = "withdrawn: " if count.controller == "hyrl" else ""
+    return (
+        f"{withdrawn}{said} was lost in a replay: from {task.chart.format(np.array(first.start))}{mode} "
+        f"{noise} {who} ends {first.outcome.replace('_', ' ')}, and {count.failures:,} of "
+        f"{count.played:,} such replays in MuJoCo are lost"
+    )
+
+
+def share_sentence(score: Score) -> str:
+    """Returns what is proved, and what is known to be lost."""
+    lost = f"known to lose {percent(1 - score.not_broken)}"
+    if score.not_broken == 1:
+        lost = "not known to lose any"
+    return (
+        f"is {lost}"
+        if score.proved is None
+        else f"is proved to win {percent(score.proved)} and {lost}"
+    )
+
+
+# What the policy of a mode is, unless it was trained.
+POLICIES = {
+    "pi_i": ", the agent as on its own side of M*,",
+    "agent": ", the agent itself,",
+    "table": ", a table of inputs,",
+}
+
+
+def mode_sentence(task: Task, result: ModeResult) -> str:
+    """Returns how well the policy of a mode holds its set."""
+    trainings = f"{result.attempts} training{'' if result.attempts == 1 else 's'}"
+    how = f"after {trainings}" if result.attempts else "without a training of its own"
+    mode = f"the policy of mode {task.mode_name(result.mode)}{POLICIES.get(result.policy, '')}"
+    won = (
+        "all of its set that was tried" if result.won == 1 else f"{percent(result.won)} of its set"
+    )
+    return f"{mode} wins {won}, {how}"
+
+
+def listed(words: Sequence[str]) -> str:
+    """Returns "a, b and c"."""
+    return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))

@@ -1,0 +1,208 @@
+"""The rules that noise signals of an attack are made of, in one order for every controller."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from hyrl_mj.policies import Controller
+from hyrl_mj.simulation.lookahead import Lookahead
+from hyrl_mj.tasks import Task
+
+# What the answers of a controller to noise are chosen for, beside steering to either end of an input.
+CONTRARY, STRAIGHT, REVERSE, JUMP, STAY = "contrary", "straight", "reverse", "jump", "stay"
+# The kinds of the other rules.
+STEER, CONSTANT, ALTERNATING, FLIP, PERIODIC = (
+    "steer",
+    "constant",
+    "alternating",
+    "flip",
+    "periodic",
+)
+TURN, NOTHING, AHEAD = "turn", "none", "ahead"
+# A flip is tried at so many times, spread over the length of a run, and two neighbouring periods have this
+# ratio: a resonance with a quality factor of five still answers to the nearer of them.
+FLIPS, PERIOD_RATIO = 8, 1.2
+# With more noisy columns than this, rules of noise act on each of them alone and on all together, since
+# their combinations are too many.
+COMBINED = 3
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What noise does during a segment of a programme.
+
+    Attributes:
+        kind: its kind; the same for both signs and for all columns, periods and times.
+        noise: (p,) the noise; zero of a rule that chooses it.
+        wish: what an answer is chosen for: a word, or the column and direction of the input to steer to;
+            None of a rule that does not ask the controller.
+        period: number of samples after which the sign has changed twice; 0 where it never changes.
+        flip: the sample from which the sign is the other one; 0 where it stays.
+        turns: whether the sign is the other one while the mode is not the first of the run.
+    """
+
+    kind: str
+    noise: np.ndarray
+    wish: str | tuple[int, int] | None = None
+    period: int = 0
+    flip: int = 0
+    turns: bool = False
+
+
+class Rules:
+    """The rules for a task and a controller: each gives the noise at a sample.
+
+    A rule is a constant noise at the ends of the bound; one whose sign changes once, with a period, or with
+    the mode; or a wish about the controller's answer: of a few candidates it takes the noise whose answer
+    fulfils the wish best.
+
+    - contrary: the answer that differs most from that to no noise, which keeps a run undecided.
+    - straight: the answer nearest to the middle of the input limits, which turns neither way.
+    - reverse: the answer that differs most from the one before.
+    - steer: to the lower or upper end of an input.
+    - jump, stay: as contrary, but before all else with another mode, or with the same.
+    - ahead: not asked but simulated, the noise of `Lookahead`, which takes far longer than the others.
+
+    `common` does not depend on the controller. What only a controller with several modes can be tried with
+    is in `own`, beside it.
+
+    Args:
+        task, controller: of the closed loop.
+        bound: largest magnitude eps >= 0 of the noise, in the unit of the measurement.
+        shares: (p,) how much of the bound acts on each column of the measurement.
+        length: the length of a run without noise [samples], over which the times of flips are spread; by
+            default that of an episode.
+
+    Attributes:
+        bound, shares: as above.
+        candidates: (c, p) noise that wishes choose from, the first of which is none.
+        all: the rules; the last two are that without noise, and `ahead`.
+        common: indices of the rules that every controller is tried with, in this order.
+        own: indices of the rules for a controller with several modes; none for others.
+        parts: indices of the rules that programmes of several segments are drawn from.
+        lookahead: gives the noise of the rule `ahead`; None where nothing can be simulated ahead.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        controller: Controller,
+        bound: float,
+        shares: np.ndarray,
+        length: int | None = None,
+    ):
+        self.bound, self.shares = bound, shares
+        self.candidates = bound * _directions(shares != 0) * shares
+        none, inputs = np.zeros(len(shares)), len(task.inputs)
+        ends = list(self._ends())
+        first, *others = ends if ends else [none]
+        wishes = [Rule(wish, none, wish) for wish in (CONTRARY, STRAIGHT, REVERSE)]
+        wishes += [Rule(STEER, none, wish) for wish in product(range(inputs), (1, -1))]
+        own = []
+        if len(controller.modes) > 1:
+            own = [Rule(wish, none, wish) for wish in (JUMP, STAY)]
+            own += [Rule(TURN, sign * noise, turns=True) for noise in ends for sign in (1, -1)]
+        common = [*wishes, *_simple(first), *self._timed(first, length or task.max_steps)]
+        for noise in others:
+            common += _simple(noise)
+        self.all = [*common, *own, Rule(NOTHING, none), Rule(AHEAD, none)]
+        self.own = np.arange(len(common), len(common) + len(own))
+        # An environment cannot be simulated ahead from the middle of an episode.
+        self.lookahead = (
+            Lookahead(bound, shares).against(task, controller)
+            if task.tabulated and task.effort.looks_ahead
+            else None
+        )
+        self.common = np.arange(len(common))
+        if self.lookahead is not None:  # it is the strongest, and takes longer than the others
+            self.common = np.insert(self.common, len(wishes) + 3, self.ahead)
+        held = [number for number, r in enumerate(self.all) if not r.flip and r.kind != PERIODIC]
+        self.parts = np.array(held[:-1])  # without `ahead`
+        self.noise = np.array([rule.noise for rule in self.all])
+        self.period = np.array([rule.period for rule in self.all])
+        self.flip = np.array([rule.flip for rule in self.all])
+        self.turns = np.array([rule.turns for rule in self.all])
+        self.wishful = np.array([rule.wish is not None for rule in self.all])
+
+    def __len__(self) -> int:
+        return len(self.all)
+
+    @property
+    def nothing(self) -> int:
+        """The rule without noise."""
+        return len(self) - 2
+
+    @property
+    def ahead(self) -> int:
+        """The rule that simulates ahead, which is the last one."""
+        return len(self) - 1
+
+    def signs(self, rule: np.ndarray, k: np.ndarray, turned: np.ndarray) -> np.ndarray:
+        """Returns the signs (r,) of the noise of rules (r,) at samples k (r,).
+
+        `turned` (r,) bool tells which runs have left their first mode.
+        """
+        period, flip = self.period[rule], self.flip[rule]
+        halves = np.where(period > 0, 2 * k // np.maximum(period, 1), 0)
+        other = (halves % 2 == 1) ^ ((flip > 0) & (k >= flip)) ^ (self.turns[rule] & turned)
+        return np.where(other, -1.0, 1.0)
+
+    def _ends(self) -> Iterator[np.ndarray]:
+        """Yields the ends (p,) of the noise, up to their sign: of all columns together, then of fewer."""
+        noisy = np.flatnonzero(self.shares)
+        full = self.bound * np.abs(self.shares)
+        table = np.vstack([np.ones((min(len(noisy), 1), len(noisy))), np.eye(len(noisy))])
+        if len(noisy) <= COMBINED:
+            table = np.array([*product((1.0, -1.0, 0.0), repeat=len(noisy))])
+            table = table[np.argsort(-np.abs(table).sum(axis=1), kind="stable")]
+        seen: set[bytes] = set()
+        for factors in table:
+            if not factors.any():
+                continue
+            factors = factors * factors[np.flatnonzero(factors)[0]] + 0.0  # no -0.0
+            if (key := factors.tobytes()) not in seen:
+                seen.add(key)
+                noise = np.zeros(len(self.shares))
+                noise[noisy] = factors * full[noisy]
+                yield noise
+
+    @staticmethod
+    def _timed(noise: np.ndarray, length: int) -> Iterator[Rule]:
+        """Yields the rules of a noise (p,) that turns once, or with a period, in runs of a length."""
+        times = np.ceil(length * np.arange(1, FLIPS + 1) / (FLIPS + 1)).astype(int)
+        for flip in np.unique(times[times > 0]):
+            yield from (Rule(FLIP, sign * noise, flip=int(flip)) for sign in (1, -1))
+        periods = 3 * PERIOD_RATIO ** np.arange(math.ceil(math.log(max(length, 3), PERIOD_RATIO)))
+        for period in np.unique(np.rint(periods[periods <= length]).astype(int)):
+            yield Rule(PERIODIC, noise, period=int(period))
+
+
+def _simple(noise: np.ndarray) -> list[Rule]:
+    """Returns the rules of a noise (p,) of both signs and of alternating ones."""
+    constant = [Rule(CONSTANT, sign * noise) for sign in (1, -1)]
+    return [*constant, Rule(ALTERNATING, noise, period=2)]
+
+
+def _directions(noisy: np.ndarray) -> np.ndarray:
+    """Returns the candidates (c, p) as shares of the bound, for the noisy columns (p,) bool.
+
+    These are all combinations of zero and the ends, of one or two columns of their halves too, and of one of
+    the quarters; with more than `COMBINED` columns the ends of each alone, and of all together.
+    """
+    columns = np.flatnonzero(noisy)
+    count = len(columns)
+    if count <= COMBINED:
+        factors = (0.0, 1.0, -1.0, 0.5, -0.5, 0.25, -0.25, 0.75, -0.75)
+        some = factors[: {1: 9, 2: 5}.get(count, 3)]
+        table = np.array(list(product(some, repeat=count)))
+    else:
+        one = np.vstack([np.ones((1, count)), np.eye(count)])
+        table = np.vstack([np.zeros((1, count)), one, -one])
+    directions = np.zeros((len(table), len(noisy)))
+    directions[:, columns] = table
+    return directions

@@ -1,0 +1,258 @@
+"""The search for noise signals against one controller, which `attack` makes in rounds."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import Any
+
+import numpy as np
+from scipy.stats import rankdata
+
+from hyrl_mj.game import Ends
+from hyrl_mj.policies import Controller
+from hyrl_mj.simulation import GIVEN, LoopSettings, Programmes, Rules, closed_loop
+from hyrl_mj.stages.episodes import ends_of
+from hyrl_mj.tasks import Outcome, Task
+
+# Segments of a programme, each of the same time; together as long as a run without noise.
+SEGMENTS = 10
+# What is looked for in programmes that do not win yet: danger on the way, late arrival, dithering.
+GOALS = 3
+# Signals that are tried in a round from each start, after one that won from a start nearby.
+POPULATION = 8
+# Kinds of signals beside the rules that are held throughout.
+SEGMENTED, EVOLVED = "segments", "evolved"
+# The best programmes so far, for each start and goal, that new ones are drawn from; and the share of the
+# segments that take any rule instead.
+ELITES, EXPLORE = 3, 0.25
+# Runs that are simulated at once, which limits the memory.
+BATCH = 4_096
+# At so many open starts, the most dangerous ones, levels and switching times are evolved, by so many
+# signals in a generation.
+FOCUSED, CMA_POPULATION = 16, 12
+# Pieces of such a signal, and the spread in which the search begins, where 1 is the whole bound.
+PIECES, SPREAD = 4, 0.5
+
+
+class Waves:
+    """Noise that is constant in pieces, or changes its sign with a period in them, from vectors of numbers.
+
+    A vector holds the levels of `PIECES` pieces on each noisy column, the times of the pieces, and the
+    period. Levels beyond -1 and 1 are the ends of the bound, so that most signals are at its ends, where
+    noise is strongest.
+
+    Args:
+        limits: (p,) the largest magnitude of the noise on each column.
+        length: length of a run without noise [samples]; switching times are spread over 1.5 times of it.
+        samples: number of samples of the signals.
+    """
+
+    def __init__(self, limits: np.ndarray, length: int, samples: int):
+        self.limits, self.length, self.samples = limits, length, samples
+        self.noisy = np.flatnonzero(limits)
+        self.size = PIECES * len(self.noisy) + PIECES + 1
+
+    def __call__(self, vectors: np.ndarray) -> np.ndarray:
+        """Returns the signals (samples, n, p) of vectors (n, size)."""
+        n, k = len(vectors), np.arange(self.samples)[:, None]
+        levels, times, period = np.split(vectors, [-PIECES - 1, -1], axis=1)
+        shares = np.exp(2 * times)
+        begins = np.cumsum(shares, axis=1) / shares.sum(axis=1, keepdims=True) * 1.5 * self.length
+        piece = (k[:, :, None] >= begins[None, :, :-1]).sum(axis=2)
+        levels = np.clip(2 * levels, -1, 1).reshape(n, PIECES, len(self.noisy))
+        half = np.maximum(self.length ** np.clip(np.abs(period[:, 0]), 0, 1), 1)
+        swings = (period[:, 0] > 0) & ((k // half) % 2 == 1)
+        sign = np.where(swings, -1.0, 1.0)
+        signals = np.zeros((self.samples, n, len(self.limits)))
+        chosen = levels[np.arange(n)[None], piece] * sign[:, :, None]
+        signals[:, :, self.noisy] = chosen * self.limits[self.noisy]
+        return signals
+
+
+class Search:
+    """The search for signals against one controller.
+
+    Attributes:
+        quiet: how the runs end without noise.
+        length: the length of a run without noise [samples], the median over the starts.
+        unaided: (n,) bool, the starts that are lost without noise.
+        open: (n,) bool, the other starts that nothing has broken yet.
+        signals: (K, n, p) the strongest signal for each start so far.
+        samples: number of samples that were simulated.
+        tried: for each kind of rule, in how many runs it was held throughout; and in how many there were
+            other signals.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        controller: Controller,
+        starts: np.ndarray,
+        bound: float,
+        shares: np.ndarray,
+        seed: int,
+    ):
+        self.task, self.controller, self.starts, self.seed = task, controller, starts, seed
+        self.rules = Rules(task, controller, bound, shares)
+        self._label, n = "attack, without noise", len(starts)
+        self.open, self.segment = np.ones(n, dtype=bool), task.max_steps
+        self.signals = np.zeros((task.max_steps, n, len(shares)))
+        self._worst = np.full(n, -np.inf)
+        self._winners = np.full((n, SEGMENTS), self.rules.nothing)
+        self._values = np.full((n, GOALS, ELITES), -np.inf)
+        self._elites = np.full((n, GOALS, ELITES, SEGMENTS), self.rules.nothing)
+        self._known: list[set[bytes]] = [set() for _ in starts]
+        self._evolved: dict[int, Any] = {}
+        self.samples, self.tried = 0, Counter[str]()
+        self.quiet, _ = self._simulate(np.arange(n), self._elites[:, 0, 0])
+        self.unaided = ~self.open
+        self.length = max(int(np.median(self.quiet.time) / task.dt), 1)
+
+    @property
+    def most_dangerous(self) -> int:
+        """The index of the start of the greatest danger so far."""
+        return int(np.argmax(self._worst))
+
+    def prepare(self, length: int) -> None:
+        """Prepares the rounds, for runs of a length [samples], which is the same for all controllers."""
+        nothing, bound, shares = self.rules.nothing, self.rules.bound, self.rules.shares
+        self.rules = Rules(self.task, self.controller, bound, shares, length)
+        self._elites[self._elites == nothing] = self.rules.nothing
+        self.waves = Waves(bound * np.abs(shares), length, self.task.max_steps)
+        self.segment = max(math.ceil(length / SEGMENTS), 1)
+
+    def round(self, number: int) -> None:
+        """Tries some signals from each open start; the rounds are numbered from 1.
+
+        The first rounds hold each rule throughout; those that only controllers with several modes have come
+        on top in the first. The later ones draw programmes of segments, and every second of them evolves
+        levels and switching times.
+        """
+        self._label = f"attack, round {number}"
+        first = (number - 1) * POPULATION
+        held = self.rules.common[first : first + POPULATION]
+        if number == 1:
+            held = np.concatenate([held, self.rules.own])
+        self._copy()
+        late = number - math.ceil(len(self.rules.common) / POPULATION)
+        rows, rng = np.flatnonzero(self.open), np.random.default_rng([self.seed, number])
+        if not len(rows):
+            return
+        if late > 0 and late % 2 == 0:
+            self._evolve(rows)
+        else:
+            self._try(rows, self._population(rows, held, rng))
+
+    def _copy(self) -> None:
+        """Tries from the open starts what won from the start nearby."""
+        lost, chart = np.flatnonzero(~self.open & ~self.unaided), self.task.chart
+        keys, pairs = [self._key(int(at)) for at in lost], []
+        for row in np.flatnonzero(self.open) if len(lost) else ():
+            away = chart.difference(self.starts[lost], self.starts[row]) / chart.sides
+            new = np.array([key not in self._known[row] for key in keys])
+            if new.any():
+                nearest = np.where(new, np.linalg.norm(away, axis=1), np.inf).argmin()
+                pairs.append((row, lost[nearest]))
+                self._known[row].add(keys[nearest])
+        for first in range(0, len(pairs), BATCH):
+            rows, at = np.array(pairs[first : first + BATCH]).T
+            self._simulate(rows, self._winners[at], self.signals[:, at])
+
+    def _key(self, at: int) -> bytes:
+        """Returns what tells the winner of a start from others."""
+        programme = self._winners[at]
+        return bytes(programme.tobytes() + (b"%d" % at if programme[0] == GIVEN else b""))
+
+    def _population(
+        self, rows: np.ndarray, held: np.ndarray, rng: np.random.Generator
+    ) -> np.ndarray:
+        """Returns programmes (r, c, SEGMENTS) for the starts `rows` (r,): rules held, then drawn ones."""
+        shape = len(rows), max(POPULATION, len(held)), SEGMENTS
+        goal = np.broadcast_to(np.arange(shape[1])[:, None] % GOALS, shape)
+        elite, segment = rng.integers(ELITES, size=shape), np.arange(SEGMENTS)
+        drawn = self._elites[rows[:, None, None], goal, elite, segment]
+        explores = rng.random(shape) < EXPLORE
+        programmes = np.where(explores, rng.choice(self.rules.parts, size=shape), drawn)
+        programmes[:, : len(held)] = held[:, None]
+        return programmes
+
+    def _try(self, rows: np.ndarray, programmes: np.ndarray) -> None:
+        """Simulates programmes (r, c, SEGMENTS) from the starts `rows` (r,), and keeps the best."""
+        each, flat = np.repeat(rows, programmes.shape[1]), programmes.reshape(-1, SEGMENTS)
+        for first in range(0, len(each), BATCH):
+            self._simulate(each[first : first + BATCH], flat[first : first + BATCH])
+
+    def _evolve(self, rows: np.ndarray) -> None:
+        """Evolves levels and switching times by CMA-ES, at the most dangerous of the starts `rows` (r,)."""
+        import cma  # slow to import, and seldom needed
+
+        focused = rows[np.argsort(-self._worst[rows], kind="stable")[:FOCUSED]]
+        for row in focused:
+            if row not in self._evolved:
+                own = np.random.default_rng([self.seed, 1, row])
+                options = {
+                    "popsize": CMA_POPULATION,
+                    "randn": lambda *shape, own=own: own.standard_normal(shape),
+                    "seed": np.nan,  # the global generator stays as it is
+                    "verbose": -9,
+                }
+                begin = own.normal(0, SPREAD, self.waves.size)
+                self._evolved[row] = cma.CMAEvolutionStrategy(begin, SPREAD, options)
+        generations = math.ceil(len(rows) / len(focused) * POPULATION / CMA_POPULATION)
+        for _ in range(generations):
+            focused = focused[self.open[focused]]
+            if not len(focused):
+                return
+            asked = [np.array(self._evolved[row].ask()) for row in focused]
+            each = np.repeat(focused, [len(vectors) for vectors in asked])
+            given = self.waves(np.concatenate(asked))
+            _, values = self._simulate(each, np.full((len(each), SEGMENTS), GIVEN), given)
+            for row, vectors in zip(focused, asked, strict=True):
+                # The better rank in danger or in lateness counts; CMA-ES minimises.
+                ranks = rankdata(-values[each == row, :2], method="min", axis=0)
+                self._evolved[row].tell(list(vectors), list(ranks.min(axis=1) + ranks.sum(axis=1)))
+
+    def _simulate(
+        self, rows: np.ndarray, programmes: np.ndarray, given: np.ndarray | None = None
+    ) -> tuple[Ends, np.ndarray]:
+        """Simulates a programme, or a given signal, from each of the starts `rows` (k,), and keeps the best.
+
+        Returns:
+            How the runs end, and their danger, lateness and reversals (k, 3).
+        """
+        signal = Programmes(self.task, self.controller, self.rules, programmes, self.segment, given)
+        settings = LoopSettings(label=self._label)
+        run = closed_loop(self.task, self.controller, self.starts[rows], signal, settings=settings)
+        lost = run.outcome != Outcome.REACHED
+        self.samples += int(run.length.sum())
+        mean = signal.rewards / np.maximum(run.length, 1)
+        # Among runs of equal length the one with the least reward counts as the latest.
+        late = run.length - mean / (1 + np.abs(mean)) / 2
+        values = np.stack([signal.danger, late, signal.reversals], axis=1)
+        noise = np.reshape(signal.values, (-1, len(rows), self.signals.shape[2]))
+        for i, row in enumerate(rows):
+            programme = programmes[i]
+            self.tried[self._kind(programme)] += 1
+            if programme[0] != GIVEN:
+                self._known[row].add(programme.tobytes())
+            if not self.open[row]:
+                continue
+            if lost[i] or signal.danger[i] > self._worst[row]:
+                self._worst[row] = signal.danger[i]
+                self.signals[: len(noise), row], self.signals[len(noise) :, row] = noise[:, i], 0.0
+            if lost[i]:
+                self.open[row], self._winners[row] = False, programme
+            if programme[0] == GIVEN:
+                continue
+            for goal, value in enumerate(values[i]):
+                elites, least = self._elites[row, goal], self._values[row, goal].argmin()
+                if value > self._values[row, goal, least]:
+                    elites[least], self._values[row, goal, least] = programme, value
+        return ends_of(self.task, run), values
+
+    def _kind(self, programme: np.ndarray) -> str:
+        """Returns the kind of a programme (SEGMENTS,), for the count of what was tried."""
+        if programme[0] == GIVEN:
+            return EVOLVED
+        return self.rules.all[programme[0]].kind if np.ptp(programme) == 0 else SEGMENTED
