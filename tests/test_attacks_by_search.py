@@ -302,7 +302,7 @@ def test_the_first_rounds_hold_every_rule(vehicle):
 
 @pytest.mark.parametrize(
     ("shares", "candidates", "ends"),
-    [((0.0, 1.0), 9, 1), ((1.0, 0.5), 25, 4), ((1.0, 1.0, 1.0), 27, 13), ((1.0,) * 5, 13, 6)],
+    [((0.0, 1.0), 9, 1), ((1.0, 0.5), 25, 4), ((1.0, 1.0, 1.0), 27, 7), ((1.0,) * 5, 13, 6)],
 )
 def test_rules_stay_within_the_bound_of_each_column(vehicle, shares, candidates, ends):
     rules, limits = Rules(vehicle, Lock(), EPS, np.array(shares)), EPS * np.array(shares) + 1e-15

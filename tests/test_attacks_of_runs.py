@@ -118,7 +118,10 @@ def test_the_rounds_of_a_time_repeat_it(copied):
     again = examine_run(load_run(copied), ExamineOptions(**FEW, attack_rounds=rounds), say=str)
     assert [c.lost for c in again.attacks] == [c.lost for c in timed.attacks]
     assert {path: path.read_bytes() for path in files} == files
-    assert f"--attack-rounds {rounds} --attack-starts 100 --seed 0" in commands(load_run(copied), again)[-1]
+    assert (
+        f"--attack-rounds {rounds} --attack-starts 100 --seed 0"
+        in commands(load_run(copied), again)[-1]
+    )
 
 
 @pytest.mark.parametrize(

@@ -107,9 +107,10 @@ class Rules:
         if len(controller.modes) > 1:
             own = [Rule(wish, none, wish) for wish in (JUMP, STAY)]
             own += [Rule(TURN, sign * noise, turns=True) for noise in ends for sign in (1, -1)]
-        common = [*wishes, *_simple(first), *self._timed(first, length or task.max_steps)]
+        common = [*wishes, *_simple(first)]
         for noise in others:
             common += _simple(noise)
+        common += self._timed(first, length or task.max_steps)
         self.all = [*common, *own, Rule(NOTHING, none), Rule(AHEAD, none)]
         self.own = np.arange(len(common), len(common) + len(own))
         # An environment cannot be simulated ahead from the middle of an episode.
@@ -153,23 +154,14 @@ class Rules:
         return np.where(other, -1.0, 1.0)
 
     def _ends(self) -> Iterator[np.ndarray]:
-        """Yields the ends (p,) of the noise, up to their sign: of all columns together, then of fewer."""
+        """Yields the ends (p,) of the noise, up to their sign: on all columns, then on each of them alone."""
         noisy = np.flatnonzero(self.shares)
-        full = self.bound * np.abs(self.shares)
-        table = np.vstack([np.ones((min(len(noisy), 1), len(noisy))), np.eye(len(noisy))])
-        if len(noisy) <= COMBINED:
-            table = np.array([*product((1.0, -1.0, 0.0), repeat=len(noisy))])
-            table = table[np.argsort(-np.abs(table).sum(axis=1), kind="stable")]
-        seen: set[bytes] = set()
-        for factors in table:
-            if not factors.any():
-                continue
-            factors = factors * factors[np.flatnonzero(factors)[0]] + 0.0  # no -0.0
-            if (key := factors.tobytes()) not in seen:
-                seen.add(key)
-                noise = np.zeros(len(self.shares))
-                noise[noisy] = factors * full[noisy]
-                yield noise
+        signs = [(1.0, -1.0) if len(noisy) <= COMBINED else (1.0,)] * max(len(noisy) - 1, 0)
+        together = [(1.0, *rest) for rest in product(*signs)] if len(noisy) > 1 else []
+        for factors in (*together, *np.eye(len(noisy))):
+            noise = np.zeros(len(self.shares))
+            noise[noisy] = np.array(factors) * self.bound * np.abs(self.shares[noisy])
+            yield noise
 
     @staticmethod
     def _timed(noise: np.ndarray, length: int) -> Iterator[Rule]:

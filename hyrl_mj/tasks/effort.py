@@ -42,7 +42,7 @@ class Effort:
     nodes: int = 1_000
     episodes: int = 1_000
     attack_starts: int = 400
-    attack_rounds: int = 8
+    attack_rounds: int = 10
 
 
 # Where each sample runs the Python code of an environment it takes about a hundred times as long.

@@ -23,7 +23,7 @@ from hyrl_mj.viz.tables import margin_text, percent
 
 # In the run directory: the page, and the folder with its pictures and data.
 PAGE, FOLDER = "diagnosis.html", "diagnosis"
-BUDGET = Budget(rounds=2, enough=1)  # of an attack
+BUDGET = Budget(rounds=1, enough=1)  # of an attack
 LARGER = (1, 2, 4, 8)  # times the bound that attacks try
 ATTACKED, AGAIN = 48, 3  # starts that are attacked; every third of them is with larger noise
 # Where every episode is played to its end, attacked starts have about so many samples together.
