@@ -274,7 +274,7 @@ def _figures(robustness: Robustness) -> dict[str, float | None]:
         for count in robustness.episodes:
             name = f"{count.controller}_reached_{count.noise}"
             least[name] = min(count.reached, least.get(name, 1.0))
-        return {**least}
+        return {**least, **_compared(robustness)}
     last = game.scores["hyrl"][-1]
     figures: dict[str, float | None] = {"open": last.open, "winnable": last.winnable}
     for i, when in ((0, "_without_noise"), (-1, "")):
@@ -292,6 +292,23 @@ def _figures(robustness: Robustness) -> dict[str, float | None]:
     for who, margin in game.margin.items():
         figures[f"{who}_margin"] = margin
         figures[f"{who}_miss_without_noise"] = game.miss_without_noise[who]
+    return {**figures, **_compared(robustness)}
+
+
+def _compared(robustness: Robustness) -> dict[str, float]:
+    """Returns what comparisons from the same starts tell of both controllers, of the worst kind of noise."""
+    figures: dict[str, float] = {}
+    for compared in robustness.comparisons:
+        n = max(compared.compared, 1)
+        for who in compared.lost:
+            if compared.noise == "attack":
+                figures[f"{who}_withstood_attack"] = 1 - compared.lost[who] / n
+                figures[f"{who}_lost_without_noise"] = compared.unaided[who] / compared.starts
+            for name, value in (
+                ("late", compared.late[who] / n),
+                ("longest", compared.time[who][1]),
+            ):
+                figures[f"{who}_{name}"] = max(value, figures.get(f"{who}_{name}", 0.0))
     return figures
 
 

@@ -15,6 +15,7 @@ from PIL import Image
 
 from hyrl_mj.game import Curve
 from hyrl_mj.runs.directory import load_run
+from hyrl_mj.runs.improvement import LEAST_SEEDS, profile
 from hyrl_mj.runs.sweeps import DONE, Row, Setting, Sweep
 from hyrl_mj.viz import colours, sweep_tables as tables
 from hyrl_mj.viz.figures import style
@@ -41,7 +42,8 @@ def write_page(sweep: Sweep, folder: Path) -> None:
             common=sweep.common,
             summary=(summary := tables.summary_table(sweep)),
             markdown=tables.markdown(summary),
-            picture=_picture(groups, folder),
+            improved=tables.improvement_table(sweep),
+            pictures=[p for p in (_picture(groups, folder), _profiles(sweep)) if p is not None],
             groups=[
                 (setting, tables.run_table(rows), _links(rows), tables.worst(rows))
                 for setting, rows in groups.items()
@@ -69,16 +71,56 @@ def _picture(groups: dict[Setting, list[Row]], folder: Path) -> Picture | None:
                 curves.setdefault(setting, []).append(game.curve)
     if not curves:
         return None
-    figure = draw_curves(curves)
-    content = BytesIO()
-    figure.savefig(content, format="png", dpi=style.DPI, bbox_inches="tight", pad_inches=style.PAD)
-    with Image.open(content) as image:
-        size = image.size
     caption = (
         "What is won of the winnable starts against the worst noise of up to a bound: the line is the median "
         "over the seeds, the band reaches from the least to the greatest."
     )
-    return Picture("curves", data_uri(content.getvalue(), "image/png"), *size, caption)
+    return _as_picture("curves", draw_curves(curves), caption)
+
+
+def _as_picture(name: str, figure: Figure, caption: str) -> Picture:
+    content = BytesIO()
+    figure.savefig(content, format="png", dpi=style.DPI, bbox_inches="tight", pad_inches=style.PAD)
+    with Image.open(content) as image:
+        size = image.size
+    return Picture(name, data_uri(content.getvalue(), "image/png"), *size, caption)
+
+
+def _profiles(sweep: Sweep) -> Picture | None:
+    """Returns the performance profiles of both controllers, or None with fewer than three runs."""
+    figure = draw_profiles(sweep)
+    if figure is None:
+        return None
+    caption = (
+        "Performance profiles: the share of the runs of the sweep, over all settings and seeds, in which a "
+        "controller wins at least so much."
+    )
+    return _as_picture("profiles", figure, caption)
+
+
+def draw_profiles(sweep: Sweep) -> Figure | None:
+    """Draws the share of runs that win at least so much, a panel for each figure; None with few runs."""
+    thresholds = np.linspace(0, 1, 201)
+    names = ("proved", "not_broken", "withstood_attack")
+    found = {name: profile(sweep.rows, name, thresholds) for name in names}
+    shown = {name: shares for name, shares in found.items() if len(shares) == 2}
+    if not shown or sum(row.state == DONE for row in sweep.rows) < LEAST_SEEDS:
+        return None
+    with matplotlib_style.context(["default", style.STYLE]):
+        figure = Figure(figsize=(style.WIDTH, 3.2), layout="constrained")
+        panels = figure.subplots(1, len(shown), squeeze=False, sharey=True).ravel()
+        for panel, (name, shares) in zip(panels, shown.items(), strict=True):
+            for who, label, colour in (
+                ("policy", "RL policy", colours.POLICY),
+                ("hyrl", "HyRL", colours.MODES[0]),
+            ):
+                panel.plot(100 * thresholds, 100 * shares[who], color=colour, label=label)
+            panel.set(xlim=(0, 100), ylim=(0, 102), xlabel=f"{tables.FIGURES[name][0]} [%]")
+            style.grid_lines(panel)
+            panel.spines[["top", "right"]].set_visible(False)
+        panels[0].set_ylabel("runs with at least so much [%]")
+        style.legend(figure, handlelength=3.2)
+    return figure
 
 
 def draw_curves(curves: dict[Setting, list[Curve]]) -> Figure:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from hyrl_mj.game import percent
+from hyrl_mj.runs.improvement import Mean, improvements
 from hyrl_mj.runs.sweeps import DONE, Row, Sweep, summary
 from hyrl_mj.viz.tables import Table, print_table
 
@@ -64,6 +65,29 @@ COLUMNS = {
     for kind in ("none", "uniform", "alternating", "adversarial")
     for word in ("no" if kind == "none" else kind,)
 }
+COLUMNS |= {
+    f"{who}_{name}": Column(f"{title} {heading}", show, least if who == "hyrl" else None)
+    for name, heading, show, least in (
+        ("withstood_attack", "not lost under attack", _tried, True),
+        ("lost_without_noise", "lost without noise", percent, False),
+        ("late", "late", percent, False),
+        ("longest", "time, 99%", _number, False),
+    )
+    for who, title in (("policy", "RL policy"), ("hyrl", "HyRL"))
+}
+# The headings of figures that both controllers have.
+FIGURES = {
+    "proved": ("proved, own q0", percent),
+    "not_broken": ("not broken, own q0", _tried),
+    "margin": ("margin", _number),
+    "reached_none": ("arrives, no noise", percent),
+    "reached_uniform": ("arrives, uniform noise", percent),
+    "reached_alternating": ("arrives, alternating noise", percent),
+    "reached_adversarial": ("arrives, adversarial noise", percent),
+    "withstood_attack": ("not lost under attack", _tried),
+    "late": ("late", percent),
+    "longest": ("time relative to that without noise, 99%", _number),
+}
 
 
 def shown(rows: Iterable[Row]) -> list[str]:
@@ -86,6 +110,29 @@ def summary_table(sweep: Sweep) -> Table:
         rows.append([COLUMNS[name].heading, *cells])
     title = "median over the seeds (least to greatest)"
     return Table(title, ["figure", *(setting.title for setting in groups)], rows)
+
+
+def improvement_table(sweep: Sweep) -> Table | None:
+    """Returns what HyRL improves over all runs that are done; None if nothing can be compared."""
+    found = improvements(sweep.rows)
+    if not found:
+        return None
+    rows = []
+    for one in found:
+        heading, show = FIGURES[one.figure]
+        signed = (lambda v: f"{v:+.3g}") if show is _number else (lambda v: f"{100 * v:+.2f}%")
+        cells = [_with_interval(one.policy, show), _with_interval(one.hyrl, show)]
+        rows.append([heading, f"{one.runs}", *cells, _with_interval(one.difference, signed)])
+        rows[-1].append(f"{one.better:.2f}")
+    title = "HyRL against the RL policy: means, 95% intervals (bootstrap over the seeds)"
+    headings = ("figure", "runs", "RL policy", "HyRL", "difference", "probability of improvement")
+    return Table(title, headings, rows)
+
+
+def _with_interval(mean: Mean, show: Callable[[float], str]) -> str:
+    if mean.interval is None:
+        return show(mean.value)
+    return f"{show(mean.value)} ({' to '.join(map(show, mean.interval))})"
 
 
 def _verdicts(group: list[Row]) -> str:
@@ -138,6 +185,8 @@ def _escaped(cells: Iterable[object]) -> list[str]:
 def print_sweep(sweep: Sweep) -> None:
     """Prints the summary, and the runs that are not done."""
     print_table(summary_table(sweep))
+    if (improved := improvement_table(sweep)) is not None:
+        print_table(improved)
     for row in sweep.rows:
         if row.state != DONE:
             print(f"{row.name}: {row.state}{f': {row.sentence}' if row.sentence else ''}")

@@ -1,0 +1,81 @@
+"""HyRL against the policy over the runs of a sweep."""
+
+import numpy as np
+import pytest
+
+from hyrl_mj.runs.improvement import improvements, profile
+from hyrl_mj.runs.sweeps import DONE, Common, Row, Setting, Sweep
+from hyrl_mj.viz.sweep_page import draw_profiles
+from hyrl_mj.viz.sweep_tables import improvement_table
+
+CIRCLE, VEHICLE = Setting("unit_circle", "", 0.1), Setting("vehicle", "", 0.1)
+
+
+def row(setting, seed, policy, hyrl, figure="proved"):
+    figures = {f"policy_{figure}": policy, f"hyrl_{figure}": hyrl}
+    return Row(setting, seed, DONE, "all is well", "WON", 10.0, figures)
+
+
+def test_means_differences_and_the_probability_of_improvement():
+    rows = [row(CIRCLE, i, p, h) for i, (p, h) in enumerate([(0.5, 1), (0.9, 1), (1, 1)])]
+    rows += [row(VEHICLE, i, 0.0, 0.9) for i in range(3)]
+    rows += [Row(VEHICLE, 3), row(VEHICLE, 4, None, 0.9)]
+    (found,) = improvements(rows)
+    assert (found.figure, found.runs) == ("proved", 6)
+    assert found.policy.value == pytest.approx(0.4)
+    assert found.hyrl.value == pytest.approx(0.95)
+    assert found.difference.value == pytest.approx(0.55)
+    low, high = found.difference.interval
+    # The vehicle's runs are alike: only the circle's seeds vary.
+    assert low == pytest.approx((0.0 + 0.9) / 2, abs=0.01)
+    assert high == pytest.approx((0.5 + 0.9) / 2, abs=0.01)
+    # On the circle one seed of three ties with all; on the vehicle HyRL is always better.
+    assert found.better == pytest.approx((5 / 6 + 1) / 2)
+    assert improvements(rows) == [found], "the same numbers again"
+
+
+def test_less_is_better_where_it_is():
+    rows = [row(CIRCLE, i, 0.2, 0.1, "late") for i in range(3)]
+    (found,) = improvements(rows)
+    assert found.better == 1
+    assert found.difference.value == pytest.approx(-0.1)
+    assert found.difference.interval == pytest.approx((-0.1, -0.1))
+
+
+def test_an_interval_takes_three_seeds_of_each_setting():
+    rows = [*(row(CIRCLE, i, 0.5, i / 4) for i in range(4)), row(VEHICLE, 0, 0.5, 1.0)]
+    assert improvements(rows)[0].hyrl.interval is None
+    low, high = improvements(rows[:4])[0].hyrl.interval
+    assert 0 <= low < 0.375 < high <= 0.75
+
+
+def test_a_bootstrap_covers_the_mean():
+    rng, held = np.random.default_rng(0), []
+    for _ in range(60):
+        rows = [row(CIRCLE, i, 0.0, x) for i, x in enumerate(rng.normal(0.5, 0.1, 12))]
+        low, high = improvements(rows)[0].hyrl.interval
+        held.append(low <= 0.5 <= high)
+    assert 0.8 <= np.mean(held) <= 1
+
+
+def test_profiles_are_shares_of_runs_that_reach_a_threshold():
+    rows = [row(CIRCLE, i, p, 1.0) for i, p in enumerate((0.5, 0.9, 1.0))]
+    shares = profile(rows, "proved", np.array([0.0, 0.6, 0.95, 1.0]))
+    np.testing.assert_allclose(shares["policy"], [1, 2 / 3, 1 / 3, 1 / 3])
+    np.testing.assert_allclose(shares["hyrl"], 1)
+    assert profile(rows, "late", np.array([0.0])) == {}
+    sweep = Sweep(Common("fast", None, {}), tuple(rows))
+    assert [panel.get_xlabel() for panel in draw_profiles(sweep).axes] == ["proved, own q0 [%]"]
+    assert draw_profiles(Sweep(sweep.common, tuple(rows[:2]))) is None
+
+
+def test_the_table_reads_with_intervals():
+    rows = tuple(row(CIRCLE, i, 0.5, 1.0) for i in range(3))
+    table = improvement_table(Sweep(Common("fast", None, {}), rows))
+    assert table.rows == [
+        [
+            "proved, own q0", "3", "50.00% (50.00% to 50.00%)", "100% (100% to 100%)",
+            "+50.00% (+50.00% to +50.00%)", "1.00",
+        ]
+    ]  # fmt: skip
+    assert improvement_table(Sweep(Common("fast", None, {}), (Row(CIRCLE, 0),))) is None
