@@ -8,7 +8,6 @@ import numpy as np
 MODES_OF_POST = 4
 # Stands for no mode yet.
 NO_MODE = -1
-SIDE_NAMES = ("left", "right")
 
 
 def encoded(focus: np.ndarray, side: np.ndarray, sense: np.ndarray) -> np.ndarray:
