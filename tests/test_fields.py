@@ -29,10 +29,9 @@ def measured(pose, posts, goal=(0.0, 0.0)):
 
 
 def chosen(pose, posts, focus=-1, side=-1):
-    pair = choose(
-        Seen.from_measurement(measured(pose, posts)), np.array([focus]), np.array([side]), 0.28
-    )
-    return int(pair.focus[0]), int(pair.side[0])
+    seen = Seen(measured(pose, posts))
+    focuses, sides = choose(seen, np.array([focus]), np.array([side]), 0.28)
+    return int(focuses[0]), int(sides[0])
 
 
 def test_posts_follow_their_tracks():
@@ -231,7 +230,7 @@ def guard(noise=0.1):
 
 def guarded(pose, posts, u, turn, sense=1, goal=(5.0, 0.0), noise=0.1):
     """Returns the inputs that the guard makes of inputs u, with the goal ahead."""
-    seen = Seen.from_measurement(measured(pose, posts, goal))
+    seen = Seen(measured(pose, posts, goal))
     values = np.array([u]), np.array([turn]), np.array([sense])
     return guard(noise).inputs(seen, *values)[0]
 
@@ -241,7 +240,7 @@ FAR_OFF = [(0.0, 50.0, 0.5)]
 
 def test_between_two_posts_that_are_too_near_a_robot_stands():
     posts = [(0.6, 0.3, 0.4), (0.6, -0.3, 0.4)]
-    least, most, _ = guard(0.15).bounds(Seen.from_measurement(measured((0, 0, 0.0), posts)))
+    least, most, _ = guard(0.15).bounds(Seen(measured((0, 0, 0.0), posts)))
     assert most[0] == 0
     assert least[0] < 0
     u = guarded((0, 0, 0.0), posts, (1.0, -1.0), 0.1, noise=0.15)
@@ -275,7 +274,7 @@ def test_a_post_that_does_not_hold_a_robot_back_does_not_turn_it():
 
 
 def test_a_robot_retreats_from_a_post_that_comes():
-    seen = Seen.from_measurement(measured((0, 0, 0.0), [(0.8, 0.0, -0.4, 0.0, 0.5)]))
+    seen = Seen(measured((0, 0, 0.0), [(0.8, 0.0, -0.4, 0.0, 0.5)]))
     _, most, _ = guard().bounds(seen)
     assert -0.5 < most[0] < 0
 

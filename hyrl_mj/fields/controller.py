@@ -28,32 +28,27 @@ from hyrl_mj.tasks import LEFT, RIGHT, TURN, Field, FieldTask, Layouts, only_pos
 LEAST_SWING = 0.1
 
 
-@dataclass(frozen=True)
-class Way:
-    """The way past a post, for n robots.
-
-    Attributes:
-        turn: (n,) angle from the heading to the way [rad].
-        sense: (n,) in which to turn, 1 against the clock, -1 with it.
-        observed: (n, 17) what the policies observe.
-    """
-
-    turn: np.ndarray
-    sense: np.ndarray
-    observed: np.ndarray
-
-
-def way_past(local: Field, view: np.ndarray, side: np.ndarray, sense: np.ndarray) -> Way:
+def way_past(
+    local: Field, view: np.ndarray, side: np.ndarray, sense: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns the ways on sides (n,) of the one post of measurements (n, 10).
 
-    `local` is the task of the policies, and `sense` (n,) the senses of turning of before, 0 for none.
+    Args:
+        local: the task of the policies.
+        view: (n, 10) measurements.
+        side: (n,) on which the post is passed.
+        sense: (n,) in which robots turned before, 0 for none.
+
+    Returns:
+        (n,) angles from the heading to the way [rad]; (n,) in which sense to turn, 1 against the clock, -1
+        with it; (n, 17) what the policies observe.
     """
     directions, lengths = local.directions(view)
     direction = np.where(side == LEFT, directions[:, 0], directions[:, 1])
     turn = wrapped(direction - view[:, 2])
     sense = turn_sense(turn, sense)
     view = np.concatenate([view, sense[:, None]], axis=1)
-    return Way(turn, sense, local.observed(view, directions, lengths))
+    return turn, sense, local.observed(view, directions, lengths)
 
 
 def guard_of(task: FieldTask, noise: float) -> Guard:
@@ -86,10 +81,9 @@ class GuardedPolicy:
         """
         measured = self.task.check_measurement(measured)
         side, sense = np.full(len(measured), self.side), np.zeros(len(measured))
-        way = way_past(self.task, measured[:, :TURN], side, sense)
-        u = self.policy.inputs(way.observed)
-        seen = Seen.from_measurement(measured)
-        return guard_of(self.task, self.noise).inputs(seen, u, way.turn, way.sense)
+        turn, sense, observed = way_past(self.task, measured[:, :TURN], side, sense)
+        u = self.policy.inputs(observed)
+        return guard_of(self.task, self.noise).inputs(Seen(measured), u, turn, sense)
 
 
 @dataclass(frozen=True)
@@ -171,14 +165,13 @@ class FocusController:
 
         The mode -1 stands for none: the answer begins in the initial mode.
         """
-        seen, (focus, side, sense) = Seen.from_measurement(measured), decoded(q)
-        pair = choose(seen, focus, side, self.swing, self.guard.margin)
-        side = pair.side
+        seen, (focus, side, sense) = Seen(measured), decoded(q)
+        focus, side = choose(seen, focus, side, self.swing, self.guard.margin)
         if self.first_side is not None:
             side = np.where(q < 0, self.first_side, side)
-        way = way_past(self.local, only_post(measured, pair.focus), side, sense)
-        u = self.guard.inputs(seen, self._of_policies(way.observed, side), way.turn, way.sense)
-        return u, encoded(pair.focus, side, way.sense)
+        turn, sense, observed = way_past(self.local, only_post(measured, focus), side, sense)
+        u = self.guard.inputs(seen, self._of_policies(observed, side), turn, sense)
+        return u, encoded(focus, side, sense)
 
     def _of_policies(self, observed: np.ndarray, side: np.ndarray) -> np.ndarray:
         """Returns the inputs (n, m) of the policies of sides (n,) for observations (n, 17)."""
@@ -212,7 +205,8 @@ class WithoutMemory:
         """
         measured = self.task.check_measurement(measured)
         nothing = np.full(len(measured), -1)
-        view = only_post(measured, choose(Seen.from_measurement(measured), nothing, nothing).focus)
+        focus, _ = choose(Seen(measured), nothing, nothing)
+        view = only_post(measured, focus)
         return self.policy.inputs(
             self.local.observation(np.hstack([view, np.zeros_like(view[:, :1])]))
         )

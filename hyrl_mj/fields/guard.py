@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hyrl_mj.fields.seen import TINY, Seen, cross, dot, norm, only, pick
+from hyrl_mj.fields.seen import TINY, Seen, cross, dot, norm, pick
 
 # The clearance beyond the margin may shrink by this share of itself in a second [1/s].
 RATE = 3.0
@@ -109,9 +109,9 @@ class Guard:
         most = np.where(close & (towards < STEEP), np.maximum(most, 0.0), most)
         least = np.where(behind > 0, -allowed / np.maximum(behind, 1e-3), -np.inf)
         least = np.where(close & (towards > -STEEP), np.minimum(least, 0.0), least)
-        first = only(most.argmin(axis=1), seen.count)
-        post = seen.post(first)
-        aside = np.where(cross(seen.cos, seen.sin, post.x, post.y) > 0, -1.0, 1.0)
+        first = seen.only(most.argmin(axis=1))
+        left = cross(seen.cos, seen.sin, pick(seen.x, first), pick(seen.y, first)) > 0
+        aside = np.where(left, -1.0, 1.0)
         aside = np.where(pick(towards, first) < STEEP, aside, 0.0)
         low, high = self.low, self.high
         return (
