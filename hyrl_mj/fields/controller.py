@@ -15,7 +15,6 @@ from hyrl_mj.fields.focus import choose, turn_sense
 from hyrl_mj.fields.guard import Guard
 from hyrl_mj.fields.modes import MODES_OF_POST, NO_MODE, decoded, encoded
 from hyrl_mj.fields.seen import Seen
-from hyrl_mj.fields.single import Single
 from hyrl_mj.policies import (
     Controller,
     ObservationPolicy,
@@ -122,18 +121,6 @@ class FocusController:
         """What keeps the robot away from posts, and going."""
         return guard_of(self.task, self.noise)
 
-    @cached_property
-    def single(self) -> Single | None:
-        """Does `answer` for one robot, several times as fast; None if the policies observe something else."""
-        own = type(self.local)
-        if own.observed is not Field.observed or own.directions is not Field.directions:
-            return None
-
-        def inputs(side: int, observed: list[float]) -> list[float]:
-            return self.policies[side].inputs(np.array([observed]))[0].tolist()
-
-        return Single(self.guard, self.swing, inputs)
-
     def on_side(self, side: int) -> FocusController:
         """Returns this controller with the side on which it passes the first post in focus."""
         return replace(self, first_side=side)
@@ -154,10 +141,6 @@ class FocusController:
             BadInput: a mode that the field does not have, a wrong shape, or a measurement that is not finite.
         """
         measured = self.task.check_measurement(measured)
-        q = np.asarray(q)
-        if len(measured) == 1 and q.shape == (1,) and self.single and 0 <= q[0] <= self.modes[-1]:
-            speed, rate, q_next = self.single(int(q[0]), measured[0].tolist())
-            return np.array([[speed, rate]]), np.array([q_next])
         return self.answer(check_modes(q, self.modes), measured)
 
     def answer(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
