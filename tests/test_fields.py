@@ -45,7 +45,9 @@ def test_posts_follow_their_tracks():
     np.testing.assert_allclose(speeds, [[0.5, 0], [0.5, 0], [0, 1], [0, 1], [0, 0]])
 
 
-def test_the_posts_of_the_plant_are_where_its_measurement_says(field):
+@pytest.mark.parametrize("name", ["field", "rover_field"])
+def test_the_posts_of_the_plant_are_where_its_measurement_says(name):
+    field = hyrl_mj.get_task(name)
     plant, rng = field.plant(50), np.random.default_rng(0)
     plant.set_state(*field.state(field.starts(50, rng), rng))
     before = plant.measurement

@@ -21,10 +21,7 @@ from hyrl_mj.policies import (
     PolicyController,
     check_modes,
 )
-from hyrl_mj.tasks import LEFT, RIGHT, TURN, Field, FieldTask, Layouts, only_post, wrapped
-
-# The swing of measurements without noise: decisions must not follow rounding errors [m].
-LEAST_SWING = 0.1
+from hyrl_mj.tasks import LEFT, RIGHT, Field, FieldTask, Layouts, only_post, wrapped
 
 
 def way_past(
@@ -80,7 +77,7 @@ class GuardedPolicy:
         """
         measured = self.task.check_measurement(measured)
         side, sense = np.full(len(measured), self.side), np.zeros(len(measured))
-        turn, sense, observed = way_past(self.task, measured[:, :TURN], side, sense)
+        turn, sense, observed = way_past(self.task, measured[:, :-1], side, sense)
         u = self.policy.inputs(observed)
         return guard_of(self.task, self.noise).inputs(Seen(measured), u, turn, sense)
 
@@ -114,7 +111,8 @@ class FocusController:
     @cached_property
     def swing(self) -> float:
         """How far two measurements of the same place can be from each other [m], or a little more."""
-        return max(2 * float(np.sqrt(2.0)) * self.noise, LEAST_SWING)
+        # Without noise, decisions must not follow rounding errors.
+        return max(2 * float(np.sqrt(2.0)) * self.noise, 0.1)
 
     @cached_property
     def guard(self) -> Guard:

@@ -12,15 +12,12 @@ import numpy as np
 from hyrl_mj.fields.seen import TINY, Seen, cross, dot, norm, pick
 from hyrl_mj.tasks import CLEAR, LEFT, PROJECTED, RIGHT
 
-# Posts that leave less room between them than this, now or after so long, are one obstacle [m], [s].
-ROOM, CLOSING = 0.3, 2.0
-# How many posts the way may bend around one after the other before the focus is found.
-BENDS = 4
+# Posts that leave less room between them than this, now or in 2 s, are one obstacle [m].
+ROOM = 0.3
 # Where nothing blocks the way, a post that is this near comes into focus [m].
 NEARBY = 0.7
 # A robot at full speed comes so close to a post, within the next second, before the post takes the focus [m].
 CLOSE = 0.3
-GLANCES, GLANCE = 4, 0.25
 # A post ahead holds a robot back that is nearer to it than the margin of the guard and this [m].
 HOLDING = 0.05
 # The post in focus is passed on its other side if that way is shorter by more than this [m].
@@ -52,7 +49,7 @@ def neighbours(posts: np.ndarray) -> np.ndarray:
     """Returns between which posts (n, K, 5) there is no room now or soon: (n, K, K), 1 or 0."""
     x, y, vx, vy, radius = (posts[:, :, i] for i in range(5))
     dx, dy = x[:, :, None] - x[:, None], y[:, :, None] - y[:, None]
-    sx, sy = x + CLOSING * vx, y + CLOSING * vy
+    sx, sy = x + 2.0 * vx, y + 2.0 * vy
     sx, sy = sx[:, :, None] - sx[:, None], sy[:, :, None] - sy[:, None]
     reach = radius[:, :, None] + (radius + ROOM)[:, None]
     least = np.minimum(dx * dx + dy * dy, sx * sx + sy * sy)
@@ -112,7 +109,8 @@ def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float) ->
     x, y, far = seen.goal_x, seen.goal_y, seen.goal_far
     passed = seen.radius < 0
     best, best_side, kept_side = np.full_like(focus, -1), np.full_like(focus, LEFT), side
-    for bend in range(BENDS):
+    # Before the focus is found, the way may bend around four posts, one after the other.
+    for bend in range(4):
         # How near robots come to the posts on straight ways at 1 m/s, and when.
         vx, vy = (x / far)[:, None] - seen.vx, (y / far)[:, None] - seen.vy
         when = dot(seen.x, seen.y, vx, vy) / np.maximum(dot(vx, vy, vx, vy), TINY)
@@ -156,16 +154,17 @@ def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float) ->
 def least_room(seen: Seen, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Returns how close robots come to the posts' surfaces, while they turn to x, y (n,): (n, K) [m].
 
-    This looks `GLANCES` times `GLANCE` ahead.
+    This looks a second ahead, four times a quarter of it.
     """
+    glances, glance = 4, 0.25  # [s]
     turn = np.arctan2(cross(seen.cos, seen.sin, x, y), dot(seen.cos, seen.sin, x, y))[:, None]
-    most = GLANCE * (np.arange(GLANCES) + 0.5)
+    most = glance * (np.arange(glances) + 0.5)
     heading = seen.heading[:, None] + np.minimum(np.maximum(turn, -most), most)
-    step = norm(x, y)[:, None] - GLANCE * np.arange(GLANCES)
-    step = np.minimum(np.maximum(step, 0.0), GLANCE)
-    sums = np.triu(np.ones((GLANCES, GLANCES)))  # of the steps so far
+    step = norm(x, y)[:, None] - glance * np.arange(glances)
+    step = np.minimum(np.maximum(step, 0.0), glance)
+    sums = np.triu(np.ones((glances, glances)))  # of the steps so far
     place_x, place_y = (step * np.cos(heading)) @ sums, (step * np.sin(heading)) @ sums
-    time = GLANCE * np.arange(1, GLANCES + 1)[:, None]
+    time = glance * np.arange(1, glances + 1)[:, None]
     away_x = seen.x[:, None] + time * seen.vx[:, None] - place_x[:, :, None]
     away_y = seen.y[:, None] + time * seen.vy[:, None] - place_y[:, :, None]
     return norm(away_x, away_y).min(axis=1) - seen.radius

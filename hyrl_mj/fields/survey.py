@@ -27,7 +27,7 @@ def check_passable(field: FieldFile, body: float) -> None:
     radii, standing = field.layouts.radii[0], field.standing
     for number, start in enumerate(field.starts):
         room = length(tracks[0] - start[:2]) - radii
-        if (post := int(room.argmin())) >= 0 and room[post] <= body:
+        if room[post := int(room.argmin())] <= body:
             raise BadInput(
                 f"{field.name}: post {post} is {_gap(room[post])} from start {number}, where the robot of "
                 f"radius {body:g} m touches it: move one of the two"

@@ -15,7 +15,7 @@ from hyrl_mj.sets import Chart
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.field_robots import FieldRobot, Unicycle
-from hyrl_mj.tasks.layouts import OF_POST, POSE, TURN, Layouts, length, posts_of
+from hyrl_mj.tasks.layouts import OF_POST, POSE, Layouts, length, posts_of
 from hyrl_mj.tasks.obstacles import wrapped
 from hyrl_mj.tasks.registry import register
 
@@ -110,10 +110,6 @@ class FieldTask(Task):
     robot: FieldRobot
 
     @cached_property
-    def noisy(self) -> tuple[float, ...]:  # type: ignore[override]
-        return (1.0, 1.0, 0.5, 0.0, 0.0, *([0.0] * OF_POST * self.layouts.posts))
-
-    @cached_property
     def body(self) -> float:
         """Radius of the robot [m]."""
         return float(mjcf.geom_size(self.model, self.robot.hull)[0])
@@ -185,6 +181,7 @@ class Field(FieldTask):
     name = "field"
     robot = Unicycle()
     description = "drive to a goal among posts, with policies trained on one (PPO)"
+    noisy = (1.0, 1.0, 0.5, *[0.0] * 8)
     max_steps = 300
     worst_reward = -10.0
     start_low, start_high = (-4.0, -3.0, -np.pi), (3.0, 3.0, np.pi)
@@ -232,10 +229,6 @@ class Field(FieldTask):
         tracks = np.stack([first, first + 100 * slope], axis=1)[:, :, None]
         return Layouts(tracks, radii[:, None], np.zeros((drawn, 2)), interval=100.0)
 
-    @cached_property
-    def noisy(self) -> tuple[float, ...]:  # type: ignore[override]
-        return (*super().noisy, 0.0)
-
     def measure(self, sensors: np.ndarray) -> np.ndarray:
         # A mode is trained with both senses of turning, by turns.
         sense = np.zeros(len(sensors))
@@ -264,10 +257,8 @@ class Field(FieldTask):
         z = super().starts(n, rng)
         # Starts hold for the usual layout, too.
         least = self.layouts.radii[-1, 0] + self.body + ROOM
-        inside = length(z[:, :2]) < least
-        while inside.any():
+        while (inside := length(z[:, :2]) < least).any():
             z[inside] = super().starts(int(inside.sum()), rng)
-            inside = length(z[:, :2]) < least
         return z
 
     def z(self, measured: np.ndarray) -> np.ndarray:
@@ -299,7 +290,7 @@ class Field(FieldTask):
         heading, goal, post = measured[:, 2], self.to_goal(measured), posts_of(measured)[:, 0]
         to_post = post[:, :2] - measured[:, :2]
         left, right = (directions - heading[:, None]).T
-        turns = turns_to(directions - heading[:, None], measured[:, TURN : TURN + 1])
+        turns = turns_to(directions - heading[:, None], measured[:, -1:])
         cos, sin = np.cos(heading), np.sin(heading)
 
         def turned(v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -347,7 +338,7 @@ class Field(FieldTask):
         # Backward, at up to 3: what is behind may be another post than the one that the robot knows of.
         backward = 3.0 * np.maximum(-u[:, 0], 0.0)
         # Turning the other way, at up to 3, where more than a right angle is left.
-        turn = turns_to(direction - measurement[:, 2], measurement[:, TURN])
+        turn = turns_to(direction - measurement[:, 2], measurement[:, -1])
         wrong = np.where(np.abs(turn) > np.pi / 2, np.maximum(-np.sign(turn) * u[:, 1], 0.0), 0.0)
         # Where a post stands on the goal, waiting in front of it costs nothing.
         base = np.where(self.waits(measurement), 0.0, progress - 1)
