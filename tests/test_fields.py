@@ -163,7 +163,7 @@ def drive_of(field, posts, goal=(0.0, 0.0), **options):
 def straight(field, posts, noise=0.1, **options):
     """A controller of such a task, with policies that drive ahead."""
     task = drive_of(field, posts, **options)
-    return FocusController(task, field, {LEFT: Straight(), RIGHT: Straight()}, noise)
+    return FocusController(task, {LEFT: Straight(), RIGHT: Straight()}, noise)
 
 
 def test_wrong_modes_and_measurements_are_refused(field):
@@ -306,7 +306,7 @@ class Weighted:
 def test_a_robot_is_driven_alone_as_among_others(field, posts):
     rng, n = np.random.default_rng(posts), 100
     task = drive_of(field, np.column_stack([rng.uniform(-4, 4, (posts, 2)), np.full(posts, 0.4)]))
-    controller = FocusController(task, field, {LEFT: Weighted(0), RIGHT: Weighted(1)}, 0.1)
+    controller = FocusController(task, {LEFT: Weighted(0), RIGHT: Weighted(1)}, 0.1)
     poses = np.column_stack([rng.uniform(-6, 6, (n, 2)), rng.uniform(-4, 4, n)])
     goals = rng.uniform(-6, 6, (n, 2))
     # Of some rows all posts stand, and in some others they touch one another and the robot.

@@ -91,14 +91,12 @@ class FocusController:
 
     Attributes:
         task: the field.
-        local: the task on which the policies were trained.
-        policies: the policy of each side.
+        policies: the policy of each side, trained on `task.local`.
         noise: largest error of a measured coordinate [m] that the guard keeps away from posts for.
         first_side: the side on which the first post in focus is passed; None for the shorter way.
     """
 
-    task: FieldTask
-    local: Field
+    task: Driving
     policies: Mapping[int, ObservationPolicy]
     noise: float
     first_side: int | None = None
@@ -150,7 +148,7 @@ class FocusController:
         focus, side = choose(seen, focus, side, self.swing, self.guard.margin)
         if self.first_side is not None:
             side = np.where(q < 0, self.first_side, side)
-        turn, sense, observed = way_past(self.local, only_post(measured, focus), side, sense)
+        turn, sense, observed = way_past(self.task.local, only_post(measured, focus), side, sense)
         u = self.guard.inputs(seen, self._of_policies(observed, side), turn, sense)
         return u, encoded(focus, side, sense)
 
@@ -170,12 +168,10 @@ class WithoutMemory:
 
     Attributes:
         task: the field.
-        local: the task on which the policy was trained.
-        policy: such as the stage-1 policy.
+        policy: trained on `task.local`, such as the stage-1 policy.
     """
 
-    task: FieldTask
-    local: Field
+    task: Driving
     policy: ObservationPolicy
 
     def act(self, measured: np.ndarray) -> np.ndarray:
@@ -187,10 +183,9 @@ class WithoutMemory:
         measured = self.task.check_measurement(measured)
         nothing = np.full(len(measured), -1)
         focus, _ = choose(Seen(measured), nothing, nothing)
-        view = only_post(measured, focus)
-        return self.policy.inputs(
-            self.local.observation(np.hstack([view, np.zeros_like(view[:, :1])]))
-        )
+        no_sense = np.zeros((len(measured), 1))
+        view = np.hstack([only_post(measured, focus), no_sense])
+        return self.policy.inputs(self.task.local.observation(view))
 
 
 def for_posts(
@@ -213,7 +208,7 @@ def for_posts(
     number = np.arange(posts)
     places = np.stack([-2.0 - 2 * (number // 5), 2.0 * (number % 5) - 4], axis=1)
     layouts = Layouts(places[None, None], np.full((1, posts), 0.5), np.zeros((1, 2)))
-    return FocusController(Driving(local, layouts), local, policies, noise)
+    return FocusController(Driving(local, layouts), policies, noise)
 
 
 def controllers(
@@ -227,6 +222,6 @@ def controllers(
     The noise [m] is what the hybrid controller has to bear.
     """
     return {
-        "policy": PolicyController(WithoutMemory(task, task.local, policy)),
-        "hyrl": FocusController(task, task.local, policies, noise),
+        "policy": PolicyController(WithoutMemory(task, policy)),
+        "hyrl": FocusController(task, policies, noise),
     }
