@@ -13,7 +13,7 @@ from hyrl_mj.fields.driving import Driving
 from hyrl_mj.fields.files import MOST_POSTS
 from hyrl_mj.fields.focus import choose, turn_sense
 from hyrl_mj.fields.guard import Guard
-from hyrl_mj.fields.modes import MODES_OF_POST, NO_MODE, decoded, encoded
+from hyrl_mj.fields.modes import MODES_OF_POST, decoded, encoded
 from hyrl_mj.fields.seen import Seen
 from hyrl_mj.policies import (
     Controller,
@@ -128,7 +128,7 @@ class FocusController:
             BadInput: a wrong shape, or a measurement that is not finite.
         """
         measured = self.task.check_measurement(measured)
-        return self.answer(np.full(len(measured), NO_MODE), measured)[1]
+        return self.answer(np.full(len(measured), -1), measured)[1]
 
     def step(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns inputs (n, m) and next modes (n,) for modes (n,) and measurements (n, p).
