@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 import hyrl_mj
-from hyrl_mj.fields import Driving, Shares, controllers, decoded
+from hyrl_mj.fields import Bounds, Driving, controllers, decoded
 from hyrl_mj.policies import Controller
 from hyrl_mj.simulation import AnyNoise, LoopSettings, Noise, Recorded, closed_loop
 from hyrl_mj.stages import Budget, attack
@@ -233,7 +233,7 @@ def try_published(run: hyrl_mj.Run, path: Path, rounds: int, table: Table) -> No
     pairs = json.loads(path.read_text())["noise"]
     for name, layouts, starts in published(path):
         for place, heading in pairs:
-            task = Driving(run.task, layouts, Shares(), 0.1 + place, TIME, starts)
+            task = Driving(run.task, layouts, Bounds(), 0.1 + place, TIME, starts)
             for who, loop in loops_of(run, task).items():
                 tally = Tally()
                 for side in (None, 0, 1) if who == "hyrl" else (None,):
@@ -247,7 +247,7 @@ def try_published(run: hyrl_mj.Run, path: Path, rounds: int, table: Table) -> No
                     )
                 table.add_row(name, f"{place:g}, {heading:g}", who, *tally.row())
         if rounds:
-            task = Driving(run.task, layouts, Shares(), 0.2, TIME, starts)
+            task = Driving(run.task, layouts, Bounds(), 0.2, TIME, starts)
             for who, loop in loops_of(run, task).items():
                 tally = Tally()
                 for side in (None, 0, 1) if who == "hyrl" else (None,):
@@ -260,11 +260,11 @@ def try_random(
     run: hyrl_mj.Run, count: int, each: int, moving: bool, rounds: int, seed: int, table: Table
 ) -> None:
     tallies: dict[tuple[str, str, str], Tally] = {}
-    shares = Shares(speeds=0.5) if moving else Shares()
+    bounds = Bounds(speeds=0.5) if moving else Bounds()
     for posts in range(3, 13):
         rng = np.random.default_rng([seed, posts])
         layouts = drawn(rng, posts, max(count // 10, 2), moving)
-        task = Driving(run.task, layouts, shares, 0.2, LONG)
+        task = Driving(run.task, layouts, bounds, 0.2, LONG)
         points = run.critical_set.points
         from_where = {
             "M*": starts_on_critical(layouts, points, each, rng),
@@ -286,7 +286,7 @@ def try_many(run: hyrl_mj.Run) -> None:
     rng = np.random.default_rng(0)
     layouts = drawn(rng, 12, 1_000, False)
     z0 = starts_anywhere(layouts, 1, rng)
-    task = Driving(run.task, layouts, Shares(), 0.2, LONG)
+    task = Driving(run.task, layouts, Bounds(), 0.2, LONG)
     began = time.monotonic()
     loop, settings = loops_of(run, task)["hyrl"], LoopSettings(quiet=True)
     closed_loop(task, loop, z0, Noise("alternating", 0.1), settings=settings)

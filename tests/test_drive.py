@@ -16,6 +16,7 @@ import hyrl_mj
 from hyrl_mj import BadInput, MlpPolicy, cli
 from hyrl_mj.cli import parsing
 from hyrl_mj.fields import (
+    Bounds,
     DriveOptions,
     cautions,
     changes,
@@ -27,7 +28,7 @@ from hyrl_mj.fields import (
     noise_cautions,
     read_field,
 )
-from hyrl_mj.fields.drives import Bounds
+from hyrl_mj.fields.drives import bounds_asked_for, bounds_made_for
 from hyrl_mj.policies import ObservationPolicy
 from hyrl_mj.tasks import LEFT, RIGHT
 from hyrl_mj.viz.drives import drive_sentences
@@ -402,9 +403,9 @@ def test_the_least_clearance_is_that_of_a_fine_look(planted, read):
 
 
 def test_the_bounds_are_those_that_were_asked_for(planted, read):
-    trained = Bounds.trained(planted.task, 0.1)
-    assert trained == Bounds(0.1, 0.05, 0.0, 0.0)
-    bounds = Bounds.from_options(DriveOptions(eps=0.2, eps_posts=0.3), trained)
+    made_for = bounds_made_for(planted.task, 0.1)
+    assert made_for == Bounds(0.1, 0.05, 0.0, 0.0)
+    bounds = bounds_asked_for(DriveOptions(eps=0.2, eps_posts=0.3), made_for)
     assert bounds == Bounds(0.2, 0.1, 0.3, 0.0)
     assert str(bounds) == "0.2 m, 0.1 rad, 0.3 m on the posts"
     # Without noise on the position, the others still act.

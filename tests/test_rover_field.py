@@ -70,18 +70,6 @@ def test_its_pose_is_that_of_the_middle_of_its_bumper(rover):
     np.testing.assert_allclose(seen, plant.measurement[:, :2], atol=2e-3)
 
 
-def test_the_posts_of_the_plant_are_where_its_measurement_says(rover):
-    plant, rng = rover.plant(50), np.random.default_rng(0)
-    plant.set_state(*rover.state(rover.starts(50, rng), rng))
-    before = plant.measurement
-    for _ in range(20):
-        plant.step(np.tile([[0.5, 0.3]], (50, 1)))
-    after = plant.measurement
-    np.testing.assert_allclose(after[:, 5:7], before[:, 5:7] + before[:, 7:9], atol=1e-5)
-    seen = plant.geom_positions(list(rover.obstacles.values()))[:, 0, :2]
-    np.testing.assert_allclose(seen, after[:, 5:7], atol=1e-6)
-
-
 class Ahead:
     """Drives straight ahead."""
 

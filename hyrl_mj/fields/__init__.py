@@ -10,19 +10,19 @@ from hyrl_mj.fields.drives import (
     least_clearance,
     noise_cautions,
 )
-from hyrl_mj.fields.driving import Driving, Shares
+from hyrl_mj.fields.driving import Bounds, Driving
 from hyrl_mj.fields.files import FieldFile, read_field
 from hyrl_mj.fields.modes import decoded, encoded
 from hyrl_mj.fields.survey import cautions, check_passable
 
 __all__ = [
+    "Bounds",
     "DriveOptions",
     "Drives",
     "Driving",
     "FieldFile",
     "FocusController",
     "GuardedPolicy",
-    "Shares",
     "cautions",
     "changes",
     "check_passable",

@@ -13,47 +13,38 @@ from hyrl_mj.fields.driving import Driving
 from hyrl_mj.fields.files import MOST_POSTS
 from hyrl_mj.fields.focus import choose, turn_sense
 from hyrl_mj.fields.guard import Guard
-from hyrl_mj.fields.modes import MODES_OF_POST, NO_MODE, decoded, encoded
+from hyrl_mj.fields.modes import MODES_OF_POST, decoded, encoded
 from hyrl_mj.fields.seen import Seen
-from hyrl_mj.fields.single import Single
 from hyrl_mj.policies import (
     Controller,
     ObservationPolicy,
     PolicyController,
     check_modes,
 )
-from hyrl_mj.tasks import LEFT, RIGHT, TURN, Field, FieldTask, Layouts, only_post, wrapped
-
-# The swing of measurements without noise: decisions must not follow rounding errors [m].
-LEAST_SWING = 0.1
+from hyrl_mj.tasks import LEFT, RIGHT, Field, FieldTask, Layouts, only_post, wrapped
 
 
-@dataclass(frozen=True)
-class Way:
-    """The way past a post, for n robots.
-
-    Attributes:
-        turn: (n,) angle from the heading to the way [rad].
-        sense: (n,) in which to turn, 1 against the clock, -1 with it.
-        observed: (n, 17) what the policies observe.
-    """
-
-    turn: np.ndarray
-    sense: np.ndarray
-    observed: np.ndarray
-
-
-def way_past(local: Field, view: np.ndarray, side: np.ndarray, sense: np.ndarray) -> Way:
+def way_past(
+    local: Field, view: np.ndarray, side: np.ndarray, sense: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns the ways on sides (n,) of the one post of measurements (n, 10).
 
-    `local` is the task of the policies, and `sense` (n,) the senses of turning of before, 0 for none.
+    Args:
+        local: the task of the policies.
+        view: (n, 10) measurements.
+        side: (n,) on which the post is passed.
+        sense: (n,) in which robots turned before, 0 for none.
+
+    Returns:
+        (n,) angles from the heading to the way [rad]; (n,) in which sense to turn, 1 against the clock, -1
+        with it; (n, 17) what the policies observe.
     """
     directions, lengths = local.directions(view)
     direction = np.where(side == LEFT, directions[:, 0], directions[:, 1])
     turn = wrapped(direction - view[:, 2])
     sense = turn_sense(turn, sense)
     view = np.concatenate([view, sense[:, None]], axis=1)
-    return Way(turn, sense, local.observed(view, directions, lengths))
+    return turn, sense, local.observed(view, directions, lengths)
 
 
 def guard_of(task: FieldTask, noise: float) -> Guard:
@@ -86,10 +77,9 @@ class GuardedPolicy:
         """
         measured = self.task.check_measurement(measured)
         side, sense = np.full(len(measured), self.side), np.zeros(len(measured))
-        way = way_past(self.task, measured[:, :TURN], side, sense)
-        u = self.policy.inputs(way.observed)
-        seen = Seen.from_measurement(measured)
-        return guard_of(self.task, self.noise).inputs(seen, u, way.turn, way.sense)
+        turn, sense, observed = way_past(self.task, measured[:, :-1], side, sense)
+        u = self.policy.inputs(observed)
+        return guard_of(self.task, self.noise).inputs(Seen(measured), u, turn, sense)
 
 
 @dataclass(frozen=True)
@@ -101,14 +91,12 @@ class FocusController:
 
     Attributes:
         task: the field.
-        local: the task on which the policies were trained.
-        policies: the policy of each side.
+        policies: the policy of each side, trained on `task.local`.
         noise: largest error of a measured coordinate [m] that the guard keeps away from posts for.
         first_side: the side on which the first post in focus is passed; None for the shorter way.
     """
 
-    task: FieldTask
-    local: Field
+    task: Driving
     policies: Mapping[int, ObservationPolicy]
     noise: float
     first_side: int | None = None
@@ -121,24 +109,13 @@ class FocusController:
     @cached_property
     def swing(self) -> float:
         """How far two measurements of the same place can be from each other [m], or a little more."""
-        return max(2 * float(np.sqrt(2.0)) * self.noise, LEAST_SWING)
+        # Without noise, decisions must not follow rounding errors.
+        return max(2 * float(np.sqrt(2.0)) * self.noise, 0.1)
 
     @cached_property
     def guard(self) -> Guard:
         """What keeps the robot away from posts, and going."""
         return guard_of(self.task, self.noise)
-
-    @cached_property
-    def single(self) -> Single | None:
-        """Does `answer` for one robot, several times as fast; None if the policies observe something else."""
-        own = type(self.local)
-        if own.observed is not Field.observed or own.directions is not Field.directions:
-            return None
-
-        def inputs(side: int, observed: list[float]) -> list[float]:
-            return self.policies[side].inputs(np.array([observed]))[0].tolist()
-
-        return Single(self.guard, self.swing, inputs)
 
     def on_side(self, side: int) -> FocusController:
         """Returns this controller with the side on which it passes the first post in focus."""
@@ -151,7 +128,7 @@ class FocusController:
             BadInput: a wrong shape, or a measurement that is not finite.
         """
         measured = self.task.check_measurement(measured)
-        return self.answer(np.full(len(measured), NO_MODE), measured)[1]
+        return self.answer(np.full(len(measured), -1), measured)[1]
 
     def step(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns inputs (n, m) and next modes (n,) for modes (n,) and measurements (n, p).
@@ -160,10 +137,6 @@ class FocusController:
             BadInput: a mode that the field does not have, a wrong shape, or a measurement that is not finite.
         """
         measured = self.task.check_measurement(measured)
-        q = np.asarray(q)
-        if len(measured) == 1 and q.shape == (1,) and self.single and 0 <= q[0] <= self.modes[-1]:
-            speed, rate, q_next = self.single(int(q[0]), measured[0].tolist())
-            return np.array([[speed, rate]]), np.array([q_next])
         return self.answer(check_modes(q, self.modes), measured)
 
     def answer(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -171,14 +144,13 @@ class FocusController:
 
         The mode -1 stands for none: the answer begins in the initial mode.
         """
-        seen, (focus, side, sense) = Seen.from_measurement(measured), decoded(q)
-        pair = choose(seen, focus, side, self.swing, self.guard.margin)
-        side = pair.side
+        seen, (focus, side, sense) = Seen(measured), decoded(q)
+        focus, side = choose(seen, focus, side, self.swing, self.guard.margin)
         if self.first_side is not None:
             side = np.where(q < 0, self.first_side, side)
-        way = way_past(self.local, only_post(measured, pair.focus), side, sense)
-        u = self.guard.inputs(seen, self._of_policies(way.observed, side), way.turn, way.sense)
-        return u, encoded(pair.focus, side, way.sense)
+        turn, sense, observed = way_past(self.task.local, only_post(measured, focus), side, sense)
+        u = self.guard.inputs(seen, self._of_policies(observed, side), turn, sense)
+        return u, encoded(focus, side, sense)
 
     def _of_policies(self, observed: np.ndarray, side: np.ndarray) -> np.ndarray:
         """Returns the inputs (n, m) of the policies of sides (n,) for observations (n, 17)."""
@@ -196,12 +168,10 @@ class WithoutMemory:
 
     Attributes:
         task: the field.
-        local: the task on which the policy was trained.
-        policy: such as the stage-1 policy.
+        policy: trained on `task.local`, such as the stage-1 policy.
     """
 
-    task: FieldTask
-    local: Field
+    task: Driving
     policy: ObservationPolicy
 
     def act(self, measured: np.ndarray) -> np.ndarray:
@@ -212,10 +182,10 @@ class WithoutMemory:
         """
         measured = self.task.check_measurement(measured)
         nothing = np.full(len(measured), -1)
-        view = only_post(measured, choose(Seen.from_measurement(measured), nothing, nothing).focus)
-        return self.policy.inputs(
-            self.local.observation(np.hstack([view, np.zeros_like(view[:, :1])]))
-        )
+        focus, _ = choose(Seen(measured), nothing, nothing)
+        no_sense = np.zeros((len(measured), 1))
+        view = np.hstack([only_post(measured, focus), no_sense])
+        return self.policy.inputs(self.task.local.observation(view))
 
 
 def for_posts(
@@ -238,7 +208,7 @@ def for_posts(
     number = np.arange(posts)
     places = np.stack([-2.0 - 2 * (number // 5), 2.0 * (number % 5) - 4], axis=1)
     layouts = Layouts(places[None, None], np.full((1, posts), 0.5), np.zeros((1, 2)))
-    return FocusController(Driving(local, layouts), local, policies, noise)
+    return FocusController(Driving(local, layouts), policies, noise)
 
 
 def controllers(
@@ -252,6 +222,6 @@ def controllers(
     The noise [m] is what the hybrid controller has to bear.
     """
     return {
-        "policy": PolicyController(WithoutMemory(task, task.local, policy)),
-        "hyrl": FocusController(task, task.local, policies, noise),
+        "policy": PolicyController(WithoutMemory(task, policy)),
+        "hyrl": FocusController(task, policies, noise),
     }

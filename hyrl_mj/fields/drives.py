@@ -9,7 +9,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput, check_bound, check_seed
 from hyrl_mj.fields.controller import controllers
-from hyrl_mj.fields.driving import Driving, Shares
+from hyrl_mj.fields.driving import Bounds, Driving
 from hyrl_mj.fields.files import FieldFile
 from hyrl_mj.fields.modes import decoded
 from hyrl_mj.policies import MlpPolicy, ObservationPolicy
@@ -17,12 +17,8 @@ from hyrl_mj.simulation import HybridArc, Noise, simulate_batch
 from hyrl_mj.stages import Budget, attack
 from hyrl_mj.tasks import POSE, Field, length
 
-# How close a robot without noise comes to the goal [m], and the rounds of the attack.
-REACHED, ROUNDS = 0.1, 4
-# Columns of a measurement: x, heading, and x and its velocity of the first post.
-COLUMNS = (0, 2, POSE, POSE + 2)
-# What an arc has a row of for each sample.
-ROWS = ("t", "j", "z", "measured", "q", "u", "state")
+# The rounds of the attack.
+ROUNDS = 4
 
 
 @dataclass(frozen=True)
@@ -48,59 +44,25 @@ class DriveOptions:
     attack: bool = False
 
 
-@dataclass(frozen=True)
-class Bounds:
-    """Bounds of the noise on position [m] and heading [rad] of the robot, and on positions [m] and velocities
-    [m/s] of the posts.
+def bounds_made_for(local: Field, noise: float) -> Bounds:
+    """Returns the bounds that policies were made for, on a task with a bound of the noise [m]."""
+    # Position and heading of the robot, position and velocity of the post.
+    return Bounds(*(noise * float(local.noisy[column]) for column in (0, 2, POSE, POSE + 2)))
+
+
+def bounds_asked_for(options: DriveOptions, made_for: Bounds) -> Bounds:
+    """Returns the bounds that options stand for; `made_for` are those that the policies were made for.
+
+    Raises:
+        BadInput: a bound is negative or not finite, or no heading could be told from another.
     """
-
-    place: float
-    heading: float
-    posts: float
-    speeds: float
-
-    @staticmethod
-    def trained(local: Field, noise: float) -> Bounds:
-        """Returns the bounds that policies were made for, on a task with a bound of the noise [m]."""
-        return Bounds(*(noise * float(local.noisy[column]) for column in COLUMNS))
-
-    @staticmethod
-    def from_options(options: DriveOptions, trained: Bounds) -> Bounds:
-        """Returns the bounds that options stand for; `trained` are those that the policies were made for.
-
-        Raises:
-            BadInput: a bound is negative or not finite, or no heading could be told from another.
-        """
-        place = check_bound(trained.place if options.eps is None else options.eps)
-        heading = place / 2 if options.eps_heading is None else check_bound(options.eps_heading)
-        if heading >= np.pi:
-            raise BadInput(
-                f"noise bound {heading:g} rad hides the heading: give an --eps-heading below {np.pi:.3g}"
-            )
-        return Bounds(
-            place, heading, check_bound(options.eps_posts), check_bound(options.eps_speeds)
+    place = check_bound(made_for.place if options.eps is None else options.eps)
+    heading = place / 2 if options.eps_heading is None else check_bound(options.eps_heading)
+    if heading >= np.pi:
+        raise BadInput(
+            f"noise bound {heading:g} rad hides the heading: give an --eps-heading below {np.pi:.3g}"
         )
-
-    @property
-    def largest(self) -> float:
-        """The bound that the others are shares of: that on the position, unless it is 0."""
-        return self.place or max(self.heading, self.posts, self.speeds)
-
-    @property
-    def shares(self) -> Shares:
-        """Which part of `largest` acts on what is measured."""
-        whole = self.largest or 1.0
-        parts = (self.place, self.heading, self.posts, self.speeds)
-        return Shares(*(part / whole for part in parts))
-
-    def __str__(self) -> str:
-        parts = {
-            f"{self.place:g} m": self.place,
-            f"{self.heading:g} rad": self.heading,
-            f"{self.posts:g} m on the posts": self.posts,
-            f"{self.speeds:g} m/s on their velocities": self.speeds,
-        }
-        return ", ".join(text for text, bound in parts.items() if bound) or "0 m"
+    return Bounds(place, heading, check_bound(options.eps_posts), check_bound(options.eps_speeds))
 
 
 @dataclass(frozen=True)
@@ -145,11 +107,11 @@ def drive(
         BadInput: a noise or a seed that cannot be used.
     """
     check_seed(options.seed)
-    bounds = Bounds.from_options(options, Bounds.trained(local, made_for))
+    bounds = bounds_asked_for(options, bounds_made_for(local, made_for))
     if options.attack and not bounds.largest:
         raise BadInput("--attack looks for the worst noise within bounds: give an --eps > 0")
-    reached = REACHED + bounds.place
-    task = Driving(local, field.layouts, bounds.shares, reached, field.time, field.starts)
+    reached = 0.1 + bounds.place  # [m]
+    task = Driving(local, field.layouts, bounds, reached, field.time, field.starts)
     noise = Noise(options.noise, bounds.largest)
     loops = controllers(task, policy, policies, made_for)
     arcs = {
@@ -215,7 +177,8 @@ def _checked(task: Driving, arcs: Iterable[HybridArc]) -> list[HybridArc]:
         if len(hits) and arc.outcome != "crashed":
             # The first row at the next sample, as where a crash was seen.
             end = int(np.searchsorted(arc.t, times[hits[0]])) + 1
-            rows = {name: getattr(arc, name)[:end].copy() for name in ROWS}
+            names = ("t", "j", "z", "measured", "q", "u", "state")
+            rows = {name: getattr(arc, name)[:end].copy() for name in names}
             rows["measured"][-1] = rows["u"][-1] = np.nan
             arc = replace(arc, outcome="crashed", **rows)
         checked.append(arc)
@@ -229,8 +192,8 @@ def noise_cautions(local: Field, made_for: float, options: DriveOptions) -> list
     """
     if options.noise == "none" and not options.attack:
         return []
-    trained = Bounds.trained(local, made_for)
-    bounds = Bounds.from_options(options, trained)
+    usual = bounds_made_for(local, made_for)
+    bounds = bounds_asked_for(options, usual)
     names = {
         "place": ("the robot's position", "m"),
         "heading": ("its heading", "rad"),
@@ -239,10 +202,10 @@ def noise_cautions(local: Field, made_for: float, options: DriveOptions) -> list
     }
     texts = []
     for name, (what, unit) in names.items():
-        bound, usual = getattr(bounds, name), getattr(trained, name)
-        if bound > usual * (1 + 1e-9):
+        bound, known = getattr(bounds, name), getattr(usual, name)
+        if bound > known * (1 + 1e-9):
             texts.append(
-                f"noise of {bound:g} {unit} on {what} is more than the {usual:g} {unit} that the run was "
+                f"noise of {bound:g} {unit} on {what} is more than the {known:g} {unit} that the run was "
                 "made for"
             )
     return texts

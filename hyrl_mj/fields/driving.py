@@ -8,26 +8,17 @@ from functools import cached_property
 
 import mujoco
 import numpy as np
+from mujoco import mjtProjection
 
-from hyrl_mj.fields.modes import SIDE_NAMES, decoded
+from hyrl_mj.fields.modes import decoded
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
 from hyrl_mj.tasks import Field, FieldTask, Layouts, Scene, length
 
-# How far around posts, starts and goals the world reaches [m], and how much of that a camera shows.
-AROUND, SHOWN = 6.0, 1.0
-# The least radius of what is drawn [m]: MuJoCo refuses 0.
-LEAST_DRAWN = 1e-6
-# Columns of the pose.
-POSE = 3
-ORTHOGRAPHIC = mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC
-
 
 @dataclass(frozen=True)
-class Shares:
-    """Shares of the noise bound that act on the columns of a measurement.
-
-    With a bound of 0.1, a share of 0.5 on the heading stands for 0.05 rad.
+class Bounds:
+    """Bounds of the noise on what a robot measures; a task takes no more from them than their ratios.
 
     Attributes:
         place: of the robot's position [m].
@@ -41,10 +32,25 @@ class Shares:
     posts: float = 0.0
     speeds: float = 0.0
 
-    def of_columns(self, posts: int) -> tuple[float, ...]:
-        """Returns the share of each column of a measurement of so many posts."""
+    @property
+    def largest(self) -> float:
+        """The bound that the others are shares of: that on the position, unless it is 0."""
+        return self.place or max(self.heading, self.posts, self.speeds)
+
+    def shares(self, posts: int) -> tuple[float, ...]:
+        """Returns which share of `largest` acts on each column of a measurement of so many posts."""
         each = (self.posts, self.posts, self.speeds, self.speeds, 0.0)
-        return (self.place, self.place, self.heading, 0.0, 0.0, *(each * posts))
+        columns = (self.place, self.place, self.heading, 0.0, 0.0, *(each * posts))
+        return tuple(bound / (self.largest or 1.0) for bound in columns)
+
+    def __str__(self) -> str:
+        parts = {
+            f"{self.place:g} m": self.place,
+            f"{self.heading:g} rad": self.heading,
+            f"{self.posts:g} m on the posts": self.posts,
+            f"{self.speeds:g} m/s on their velocities": self.speeds,
+        }
+        return ", ".join(text for text, bound in parts.items() if bound) or "0 m"
 
 
 class Driving(FieldTask):
@@ -57,7 +63,7 @@ class Driving(FieldTask):
     Args:
         local: the task on which the policies were trained.
         layouts: the fields.
-        shares: of the noise bound.
+        bounds: of the noise; the shares of its bound that act on the columns follow from them.
         reached: distance from the goal at which the robot has arrived [m].
         time: longest time of a run [s].
         starts: (n, 3) poses x, y, heading that have to lie in the chart.
@@ -74,7 +80,7 @@ class Driving(FieldTask):
         self,
         local: Field,
         layouts: Layouts,
-        shares: Shares = Shares(),
+        bounds: Bounds = Bounds(),
         reached: float = 0.1,
         time: float = 15.0,
         starts: np.ndarray | None = None,
@@ -87,7 +93,8 @@ class Driving(FieldTask):
         middle, half = (known.min(axis=0) + known.max(axis=0)) / 2, np.ptp(known, axis=0) / 2
         self._middle, self._half = middle, float(half.max())
         several = self._several = len(layouts) > 1
-        low, high = middle - self._half - AROUND, middle + self._half + AROUND
+        # The world reaches 6 m beyond them.
+        low, high = middle - self._half - 6.0, middle + self._half + 6.0
         self.start_low = (*low, -np.pi, *[0.0] * several)
         self.start_high = (*high, np.pi, *[len(layouts) - 1.0] * several)
         fields = [("field", "", 1.0)] * several
@@ -96,7 +103,7 @@ class Driving(FieldTask):
         )
         periodic = (False, False, True, *[False] * several)
         self.chart = Chart(names, units, self.start_low, self.start_high, periodic, scale=scale)
-        self.noisy = (*shares.of_columns(layouts.posts), *[0.0] * several)
+        self.noisy = (*bounds.shares(layouts.posts), *[0.0] * several)
         self.reached = reached
         self.max_steps = max(round(time / self.dt), 1)
         first = np.zeros((1, 3)) if starts is None else np.asarray(starts, dtype=float)[:1]
@@ -119,7 +126,7 @@ class Driving(FieldTask):
         highest = (
             *high[:2], turned, *high[:2], *(*high[:2], fastest, fastest, radius) * layouts.posts
         )  # fmt: skip
-        return (*lowest, *low[POSE:]), (*highest, *high[POSE:])
+        return (*lowest, *low[3:]), (*highest, *high[3:])
 
     @cached_property
     def dt(self) -> float:
@@ -143,16 +150,16 @@ class Driving(FieldTask):
                 number = int(body.name.partition("_")[2] or 0)
                 for geom in body.geoms:
                     larger = radii[number] - mjcf.geom_size(self.local.model, "obstacle")[0]
-                    # The rim of a thin post is thinner, too.
-                    geom.size[0] = max(geom.size[0] + larger, radii[number] / 2, LEAST_DRAWN)
+                    # The rim of a thin post is thinner, too. MuJoCo refuses a radius of 0.
+                    geom.size[0] = max(geom.size[0] + larger, radii[number] / 2, 1e-6)
         for geom in spec.worldbody.geoms:
             if geom.name.startswith("goal"):
                 geom.pos[:2] += goal
-        wide = self._half + max(SHOWN, float(self.layouts.radii.max()) + 0.1)
+        wide = self._half + max(1.0, float(self.layouts.radii.max()) + 0.1)
         self._aim(spec, wide)
         model = spec.compile()
         # What an orthographic camera sees is a length, but the compiler refuses 180 m as if it were an angle.
-        model.cam_fovy[model.cam_projection == ORTHOGRAPHIC] = 2 * wide
+        model.cam_fovy[model.cam_projection == mjtProjection.mjPROJ_ORTHOGRAPHIC] = 2 * wide
         return model
 
     def _aim(self, spec: mujoco.MjSpec, wide: float) -> None:
@@ -163,7 +170,7 @@ class Driving(FieldTask):
         overhead = self.local.model.cam("overhead")
         seen = np.append(overhead.pos[:2], 0.0)
         for camera in spec.worldbody.cameras:
-            if camera.proj == ORTHOGRAPHIC:
+            if camera.proj == mjtProjection.mjPROJ_ORTHOGRAPHIC:
                 camera.pos[:2] = self._middle
             else:
                 closer = (camera.pos - seen) * 2 * wide / overhead.fovy[0]
@@ -185,7 +192,7 @@ class Driving(FieldTask):
     def mode_name(self, mode: int) -> str:
         """Returns post and side of a mode: "post 3, left"."""
         focus, side, _ = (int(part[0]) for part in decoded(np.array([mode])))
-        return f"post {focus}, {SIDE_NAMES[side]}"
+        return f"post {focus}, {('left', 'right')[side]}"
 
     def colour_of(self, mode: int, modes: Sequence[int]) -> int:
         """The colour of a mode is that of its side."""
@@ -204,21 +211,15 @@ class Driving(FieldTask):
     def state(
         self, z: np.ndarray, rng: np.random.Generator | None = None
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        number = z[:, POSE] if self._several else np.zeros(len(z))
-        return self.robot.state(z[:, :POSE], np.rint(number))
+        number = z[:, 3] if self._several else np.zeros(len(z))
+        return self.robot.state(z[:, :3], np.rint(number))
 
     def z(self, measured: np.ndarray) -> np.ndarray:
-        return (
-            np.hstack([measured[:, :POSE], measured[:, -1:]])
-            if self._several
-            else measured[:, :POSE]
-        )
+        pose, number = measured[:, :3], measured[:, -1:]
+        return np.hstack([pose, number]) if self._several else pose
 
     def with_z(self, measured: np.ndarray, z: np.ndarray) -> np.ndarray:
-        return np.hstack([z[:, :POSE], measured[:, POSE:]])
-
-    def where(self, measured: np.ndarray) -> np.ndarray:
-        return measured[:, :2]
+        return np.hstack([z[:, :3], measured[:, 3:]])
 
     def observation(self, measured: np.ndarray) -> np.ndarray:
         return measured
@@ -230,8 +231,5 @@ class Driving(FieldTask):
         return np.full(len(u), self.worst_reward)  # the time
 
     def miss(self, z: np.ndarray) -> np.ndarray:
-        number = z[:, POSE].astype(int) if self._several else np.zeros(len(z), dtype=int)
+        number = z[:, 3].astype(int) if self._several else np.zeros(len(z), dtype=int)
         return np.asarray(length(z[:, :2] - self.layouts.goals[number]))
-
-    def arrived(self, z: np.ndarray) -> np.ndarray:
-        return np.ones(len(z), dtype=bool)  # episodes end at the goal

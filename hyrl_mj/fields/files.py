@@ -17,13 +17,8 @@ from hyrl_mj.tasks import Layouts, wrapped
 # How far from the origin anything may be, and the largest radius [m]; the longest run and time between two
 # positions [s].
 FARTHEST, LONGEST = 1_000.0, 3_600.0
-# How much a file may hold, so that the memory suffices.
-MOST_POSTS, MOST_POSITIONS, MOST_STARTS = 100, 10_000, 1_000
-LARGEST = 2**22  # [bytes]
-# The longest time of all starts together [s]: each sample of each run is kept.
-MOST_TIME = 100_000.0
-# How long a run lasts, unless the file says so [s].
-TIME = 15.0
+# How many posts a field may have, so that the memory suffices.
+MOST_POSTS = 100
 # What the keys hold.
 MEANING = {
     "goal_m": "the goal [x, y] in m",
@@ -36,7 +31,6 @@ MEANING = {
     "position_m": "the position [x, y] in m",
     "heading_rad": "the heading in rad",
 }
-UNITS = ("m", "rad", "s")
 SHOWN = 40  # characters of a value in a message
 
 
@@ -83,13 +77,13 @@ def read_field(path: str | Path) -> FieldFile:
         for post in whole["posts"].items("posts", MOST_POSTS)
     ]
     tracks = [
-        [place.point() for place in post["positions_m"].items("positions", MOST_POSITIONS)]
+        [place.point() for place in post["positions_m"].items("positions", 10_000)]
         for post in posts
     ]
     longest = max(map(len, tracks))
     interval = 1.0
     if "interval_s" in whole:
-        interval = whole["interval_s"].positive(LONGEST, "s")
+        interval = whole["interval_s"].number(LONGEST, "s", positive=True)
     elif longest > 1:
         moving = next(i for i, track in enumerate(tracks) if len(track) > 1)
         raise BadInput(
@@ -100,20 +94,23 @@ def read_field(path: str | Path) -> FieldFile:
     full = [track + track[-1:] * (longest - len(track)) for track in tracks]
     starts = [
         start.object(("position_m", "heading_rad"))
-        for start in whole["starts"].items("starts", MOST_STARTS)
+        for start in whole["starts"].items("starts", 1_000)
     ]
     headings = np.array([start["heading_rad"].number(FARTHEST, "rad") for start in starts])
     layouts = Layouts(
         np.array(full).transpose(1, 0, 2)[None],
-        np.array([[post["radius_m"].positive(FARTHEST, "m") for post in posts]]),
+        np.array([[post["radius_m"].number(FARTHEST, "m", positive=True) for post in posts]]),
         np.array([whole["goal_m"].point()]),
         interval,
     )
-    time = whole["time_s"].positive(LONGEST, "s") if "time_s" in whole else TIME
-    if time * len(starts) > MOST_TIME:
+    time = 15.0
+    if "time_s" in whole:
+        time = whole["time_s"].number(LONGEST, "s", positive=True)
+    most = 100_000.0  # [s]: each sample of each run is kept
+    if time * len(starts) > most:
         raise BadInput(
             f"{path} has {len(starts):,} starts with runs of {time:g} s each: give at most "
-            f"{MOST_TIME:,.0f} s of all together"
+            f"{most:,.0f} s of all together"
         )
     places = np.array([start["position_m"].point() for start in starts])
     return FieldFile(str(path), layouts, np.column_stack([places, wrapped(headings)]), time)
@@ -121,41 +118,36 @@ def read_field(path: str | Path) -> FieldFile:
 
 def _content(path: Path) -> Any:
     """Returns what the JSON file holds."""
+
+    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        counts = Counter(name for name, _ in pairs)
+        for name, count in counts.items():
+            if count > 1:
+                raise BadInput(f"{path} has the key {name[:SHOWN]!r} twice in a row: give it once")
+        return dict(pairs)
+
+    largest = 2**22  # [bytes]
     if path.exists() and not path.is_file():
         raise BadInput(f"{path} is no file: give the JSON file of a field")
     try:
         with path.open("rb") as file:
-            content = file.read(LARGEST + 1)
+            content = file.read(largest + 1)
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
         raise BadInput(f"{path} cannot be read ({why}): give the JSON file of a field") from None
-    if len(content) > LARGEST:
+    if len(content) > largest:
         raise BadInput(
-            f"{path} is larger than {LARGEST / 2**20:g} MiB: give a JSON file of a field, with at most "
+            f"{path} is larger than {largest / 2**20:g} MiB: give a JSON file of a field, with at most "
             f"{MOST_POSTS} posts"
         )
     try:
-        return json.loads(content.decode(), object_pairs_hook=_once)
-    except _Repeated as error:
-        raise BadInput(
-            f"{path} has the key {error.args[0][:SHOWN]!r} twice in a row: give it once"
-        ) from None
+        return json.loads(content.decode(), object_pairs_hook=once)
+    except BadInput:
+        raise
     except (ValueError, RecursionError) as error:
         raise BadInput(
             f"{path} is not JSON ({brief(error)}): give the JSON file of a field"
         ) from None
-
-
-class _Repeated(Exception):
-    """A key that is twice in one object."""
-
-
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    content = dict(pairs)
-    if len(content) < len(pairs):
-        counts = Counter(name for name, _ in pairs)
-        raise _Repeated(next(name for name, count in counts.items() if count > 1))
-    return content
 
 
 @dataclass(frozen=True)
@@ -198,23 +190,14 @@ class _Part:
         parts = [_Part(self.path, f"{self.place}[{i}]", v) for i, v in enumerate(self.value)]
         return [part.number(FARTHEST, "m") for part in parts]
 
-    def number(self, most: float, unit: str) -> float:
+    def number(self, most: float, unit: str, positive: bool = False) -> float:
         """Returns a number of that magnitude at most, or raises `BadInput`."""
-        return self._number(f"a number from {-most:g} to {most:g} {unit}", most)
-
-    def positive(self, most: float, unit: str) -> float:
-        """Returns a number > 0 and at most that one, or raises `BadInput`."""
-        meaning = f"a number > 0 and at most {most:g} {unit}"
-        if (value := self._number(meaning, most)) <= 0:
-            raise self._refused(meaning)
-        return value
-
-    def _number(self, meaning: str, most: float) -> float:
         # In Python true and false are numbers. NaN is not within any limits.
         is_number = isinstance(self.value, int | float) and not isinstance(self.value, bool)
-        if not is_number or not -most <= self.value <= most:
-            raise self._refused(meaning)
-        return float(self.value)
+        if is_number and -most <= self.value <= most and not (positive and self.value <= 0):
+            return float(self.value)
+        limits = f"> 0 and at most {most:g}" if positive else f"from {-most:g} to {most:g}"
+        raise self._refused(f"a number {limits} {unit}")
 
     def _refused(self, meaning: str) -> BadInput:
         given = json.dumps(self.value)
@@ -227,7 +210,7 @@ def _unknown(key: str, where: str, allowed: list[str]) -> BadInput:
     stem = key.rpartition("_")[0] or key
     for known in allowed:
         name, _, unit = known.rpartition("_")
-        if unit in UNITS and name in (key, stem):
+        if unit in ("m", "rad", "s") and name in (key, stem):
             return BadInput(
                 f"{where} has {key!r}, but this is measured in {unit}: give {known!r}, {MEANING[known]}"
             )

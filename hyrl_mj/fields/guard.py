@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hyrl_mj.fields.seen import TINY, Seen, cross, dot, norm, only, pick
+from hyrl_mj.fields.seen import TINY, Seen, cross, dot, norm, pick
 
 # The clearance beyond the margin may shrink by this share of itself in a second [1/s].
 RATE = 3.0
@@ -18,14 +18,6 @@ RATE = 3.0
 STEEP = 0.5
 # With its face to its way a robot drives ahead with at least this speed [m/s].
 LEAST = 0.3
-# Near its goal a robot need not be slower than this: a circle of this radius is within reach of it [m/s].
-SLOWEST = 0.1
-# Posts that come faster than this are evaded [m/s]: more than the noise on the velocity of one that stands.
-COMING = 0.1
-# A robot looks so often, and each time so much farther ahead, at where posts that come will be [s].
-LOOKS, LOOK = 5, 0.2
-# It changes its speed and its rate of turn for as much more room [m].
-GAIN = 0.1
 
 
 @dataclass(frozen=True)
@@ -87,7 +79,8 @@ class Guard:
         behind = dot(seen.cos, seen.sin, x, y) < 0
         aside = np.where(behind, far, np.abs(cross(seen.cos, seen.sin, x, y)))
         fastest = self.rate * far * far / (2 * np.maximum(aside, TINY))
-        return np.maximum(fastest, SLOWEST)
+        # At 0.1 m/s the circle is so small that the goal is within reach of it.
+        return np.maximum(fastest, 0.1)
 
     def bounds(self, seen: Seen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns the least and the greatest speed (n,) that keep the distance from all posts [m/s].
@@ -109,9 +102,9 @@ class Guard:
         most = np.where(close & (towards < STEEP), np.maximum(most, 0.0), most)
         least = np.where(behind > 0, -allowed / np.maximum(behind, 1e-3), -np.inf)
         least = np.where(close & (towards > -STEEP), np.minimum(least, 0.0), least)
-        first = only(most.argmin(axis=1), seen.count)
-        post = seen.post(first)
-        aside = np.where(cross(seen.cos, seen.sin, post.x, post.y) > 0, -1.0, 1.0)
+        first = seen.only(most.argmin(axis=1))
+        left = cross(seen.cos, seen.sin, pick(seen.x, first), pick(seen.y, first)) > 0
+        aside = np.where(left, -1.0, 1.0)
         aside = np.where(pick(towards, first) < STEEP, aside, 0.0)
         low, high = self.low, self.high
         return (
@@ -124,7 +117,8 @@ class Guard:
         self, seen: Seen, speed: np.ndarray, rate: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Returns speeds (n,) and rates of turn (n,) that evade posts which come, instead of these."""
-        coming = seen.coming > COMING
+        # This is more than the noise on the velocity of a post that stands [m/s].
+        coming = seen.coming > 0.1
         if isinstance(coming, np.ndarray) and not coming.any():  # an export does not know
             return speed, rate
         one = np.ones_like(speed)
@@ -134,7 +128,8 @@ class Guard:
         rooms = self._rooms(seen, np.stack(speeds, axis=1), np.stack(rates, axis=1))
         least = rooms.min(axis=2)
         threat = np.where(coming, rooms[:, 0], np.inf).min(axis=1) < self.margin
-        best = np.minimum(least[:, 0] + GAIN, self.margin)
+        # Speed and rate of turn change for 0.1 m of more room.
+        best = np.minimum(least[:, 0] + 0.1, self.margin)
         for i, (v, w) in enumerate(others, 1):
             better = threat & (least[:, i] > best)
             best = np.where(better, least[:, i], best)
@@ -143,7 +138,7 @@ class Guard:
 
     def _rooms(self, seen: Seen, speed: np.ndarray, rate: np.ndarray) -> np.ndarray:
         """Returns how close robots soon are to posts (n, S, K) at speeds and rates (n, S) [m]."""
-        time = LOOK * np.arange(1, LOOKS + 1)
+        time = 0.2 * np.arange(1, 6)  # five looks ahead [s]
         # Axes: robots, speeds, times, posts.
         heading = seen.heading[:, None, None] + rate[:, :, None] * (time / 2)
         step = speed[:, :, None] * time

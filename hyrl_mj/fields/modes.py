@@ -6,9 +6,6 @@ import numpy as np
 
 # Modes of a post: two sides, with two senses of turning each.
 MODES_OF_POST = 4
-# Stands for no mode yet.
-NO_MODE = -1
-SIDE_NAMES = ("left", "right")
 
 
 def encoded(focus: np.ndarray, side: np.ndarray, sense: np.ndarray) -> np.ndarray:

@@ -15,8 +15,6 @@ from hyrl_mj.tasks import FASTEST, RADII, TAKEN, length
 MADE_FOR = 0.8
 # How many posts, or gaps, a sentence names.
 NAMED = 4
-# Cells of the flood: their side [m] at best, and how many there are along a side at most.
-CELL, MOST_CELLS = 0.02, 1_000
 
 
 def check_passable(field: FieldFile, body: float) -> None:
@@ -29,7 +27,7 @@ def check_passable(field: FieldFile, body: float) -> None:
     radii, standing = field.layouts.radii[0], field.standing
     for number, start in enumerate(field.starts):
         room = length(tracks[0] - start[:2]) - radii
-        if (post := int(room.argmin())) >= 0 and room[post] <= body:
+        if room[post := int(room.argmin())] <= body:
             raise BadInput(
                 f"{field.name}: post {post} is {_gap(room[post])} from start {number}, where the robot of "
                 f"radius {body:g} m touches it: move one of the two"
@@ -55,7 +53,7 @@ def _check_ways(field: FieldFile, body: float) -> None:
     posts, reach = field.layouts.tracks[0][0, standing], field.layouts.radii[0, standing] + body
     # Around all posts a robot can pass: what is farther away is free.
     low, high = (posts - reach[:, None]).min(axis=0), (posts + reach[:, None]).max(axis=0)
-    cell = max(CELL, float((high - low).max()) / MOST_CELLS)
+    cell = max(0.02, float((high - low).max()) / 1_000)  # [m]
     low, high = low - 3 * cell, high + 3 * cell
     x, y = (np.arange(a, b + cell, cell) for a, b in zip(low, high, strict=True))
     room = np.full((len(x), len(y)), np.inf)

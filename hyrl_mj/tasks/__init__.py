@@ -13,7 +13,7 @@ from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.effort import SPARING, Effort
 from hyrl_mj.tasks.field import CLEAR, FASTEST, PROJECTED, RADII, TAKEN, Field, FieldTask
 from hyrl_mj.tasks.guard import check_finite, read_only, writes
-from hyrl_mj.tasks.layouts import OF_POST, POSE, TURN, Layouts, length, only_post, posts_of
+from hyrl_mj.tasks.layouts import POSE, Layouts, length, only_post, posts_of
 from hyrl_mj.tasks.obstacles import (
     ANY,
     LEFT,
@@ -42,7 +42,6 @@ __all__ = [
     "ENVIRONMENT",
     "FASTEST",
     "LEFT",
-    "OF_POST",
     "POSE",
     "PROJECTED",
     "RADII",
@@ -50,7 +49,6 @@ __all__ = [
     "SEARCHES",
     "SPARING",
     "TAKEN",
-    "TURN",
     "Effort",
     "Field",
     "FieldTask",

@@ -15,33 +15,16 @@ from hyrl_mj.sets import Chart
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.field_robots import FieldRobot, Unicycle
-from hyrl_mj.tasks.layouts import OF_POST, POSE, TURN, Layouts, length, posts_of
+from hyrl_mj.tasks.layouts import OF_POST, POSE, Layouts, length, posts_of
 from hyrl_mj.tasks.obstacles import wrapped
 from hyrl_mj.tasks.registry import register
 
-# What the layouts of a training are drawn from: radii of the post, distances of the goal from its surface
-# [m], and its greatest speed [m/s]. Shares of the posts stand still, and come towards the goal.
-RADII, TO_GOAL, FASTEST = (0.3, 0.9), (0.35, 8.0), 0.4
-STANDING, BLOCKING = 0.4, 0.2
-DRAWN = 4_096
+# The radii of posts in training [m], and their greatest speed [m/s].
+RADII, FASTEST = (0.3, 0.9), 0.4
 # Distance of the robot's middle from a post's surface at which the shortest way passes it [m].
 CLEAR = 0.35
-# Distance from a post's surface within which the reward is less, and by how much at most [m].
-NEAR, GRAZING = 0.2, 2.0
 # A post this close to the goal leaves no room to arrive [m].
 TAKEN = 0.25
-# Distance from a post on the goal up to which a robot waits for it to go [m].
-WAITING = 1.0
-# What a crash costs: more than any way round.
-CRASH = -100.0
-# What driving backward at full speed costs, more than standing.
-REVERSE = 3.0
-# Shares of the noise bound on x, y and heading under which modes are trained: more than they have to bear.
-TRAINED = (1.5, 1.5, 2.5)
-# What turning the other way costs at full rate, where more than a right angle is left.
-WRONG = 3.0
-# Share of the layouts whose post leaves no room at the goal.
-ON_GOAL = 0.1
 # What the post leaves the robot at the start, at least: this room [m], for so long [s].
 ROOM = 0.05
 HEADWAY = 0.8
@@ -60,8 +43,6 @@ PPO: dict[str, Any] = {
         "gae_lambda": 0.95,
     },
 }
-# The sense in which ways turn from the post to its sides, `LEFT` and `RIGHT`.
-SIGNS = np.array([1.0, -1.0])
 # How far ahead the way of a moving post counts [s].
 PROJECTED = 2.0
 
@@ -91,14 +72,15 @@ def ways_round(
     radius = np.minimum(radius, away)
     bearing, goal = np.arctan2(post_y, post_x), np.arctan2(goal_y, goal_x)
     # The angle to turn about the disc, against the clock on its right.
-    turn = SIGNS * (np.arctan2(-post_y, -post_x) - np.arctan2(from_y, from_x))
+    signs = np.array([1.0, -1.0])
+    turn = signs * (np.arctan2(-post_y, -post_x) - np.arctan2(from_y, from_x))
     own = np.arccos(radius / away)
     both = own + np.arccos(radius / np.maximum(goal_away, 1e-9))
     free = np.abs(wrapped(turn)) <= both
     # Inside of the disc the way leads out of it, the more so the deeper it is, and no nearer to the post.
     half = np.pi / 2 - own + np.minimum(deep / CLEAR, 1.0) * (np.pi / 2)
     off = wrapped(goal - bearing)
-    out = bearing + np.where(free, np.where(off >= 0, 1.0, -1.0), SIGNS) * half
+    out = bearing + np.where(free, np.where(off >= 0, 1.0, -1.0), signs) * half
     direction = np.where(free & ((np.abs(off) >= half) | (deep == 0)), goal, out)
     legs = np.sqrt(away * away - radius * radius) + np.sqrt(goal_away * goal_away - radius * radius)
     around = radius * np.maximum(turn % (2 * np.pi) - both, 0.0)
@@ -126,10 +108,6 @@ class FieldTask(Task):
     inputs, input_units = ("forward_speed", "turn_rate"), ("m/s", "rad/s")
     layouts: Layouts
     robot: FieldRobot
-
-    @cached_property
-    def noisy(self) -> tuple[float, ...]:  # type: ignore[override]
-        return (1.0, 1.0, 0.5, 0.0, 0.0, *([0.0] * OF_POST * self.layouts.posts))
 
     @cached_property
     def body(self) -> float:
@@ -185,10 +163,17 @@ class FieldTask(Task):
         posts = posts_of(measurement)
         away = length(posts[..., :2] - measurement[:, None, 3:5])
         at_goal = away < posts[..., 4] + TAKEN
-        return np.asarray((at_goal & (self.clearances(measurement) < WAITING)).any(axis=1))
+        # Up to 1 m from such a post a robot waits for it to go.
+        return np.asarray((at_goal & (self.clearances(measurement) < 1.0)).any(axis=1))
 
     def danger(self, measurement: np.ndarray) -> np.ndarray:
         return -self.clearances(measurement).min(axis=1)
+
+    def where(self, measured: np.ndarray) -> np.ndarray:
+        return measured[:, :2]
+
+    def arrived(self, z: np.ndarray) -> np.ndarray:
+        return np.ones(len(z), dtype=bool)  # episodes end at the goal
 
 
 @register
@@ -196,6 +181,7 @@ class Field(FieldTask):
     name = "field"
     robot = Unicycle()
     description = "drive to a goal among posts, with policies trained on one (PPO)"
+    noisy = (1.0, 1.0, 0.5, *[0.0] * 8)
     max_steps = 300
     worst_reward = -10.0
     start_low, start_high = (-4.0, -3.0, -np.pi), (3.0, 3.0, np.pi)
@@ -225,26 +211,23 @@ class Field(FieldTask):
     @cached_property
     def layouts(self) -> Layouts:  # type: ignore[override]
         """Layouts with one post, by the room that it needs; the usual one is the last."""
-        rng = np.random.default_rng(0)
-        radii = rng.uniform(*RADII, DRAWN)
-        distance = rng.uniform(*TO_GOAL, DRAWN)
-        on_goal = rng.uniform(-RADII[0] / 2, TO_GOAL[0], DRAWN)
-        distance = np.where(rng.random(DRAWN) < ON_GOAL, on_goal, distance)
-        speed = np.where(rng.random(DRAWN) < STANDING, 0.0, rng.uniform(0, FASTEST, DRAWN))
-        course = rng.uniform(-np.pi, np.pi, DRAWN)
-        # Some posts come towards the goal.
-        course = np.where(rng.random(DRAWN) < BLOCKING, rng.normal(0, 0.3, DRAWN), course)
+        rng, drawn = np.random.default_rng(0), 4_096
+        radii = rng.uniform(*RADII, drawn)
+        # From the post's surface to the goal [m]. One post in ten leaves no room there.
+        distance = rng.uniform(0.35, 8.0, drawn)
+        on_goal = rng.uniform(-RADII[0] / 2, 0.35, drawn)
+        distance = np.where(rng.random(drawn) < 0.1, on_goal, distance)
+        # Two in five posts stand, and one in five comes towards the goal.
+        speed = np.where(rng.random(drawn) < 0.4, 0.0, rng.uniform(0, FASTEST, drawn))
+        course = rng.uniform(-np.pi, np.pi, drawn)
+        course = np.where(rng.random(drawn) < 0.2, rng.normal(0, 0.3, drawn), course)
         order = np.argsort(radii + HEADWAY * speed)
         radii, distance, speed, course = (x[order] for x in (radii, distance, speed, course))
         radii[-1], distance[-1], speed[-1] = 0.5, 3.0, 0.0
-        first = np.stack([-radii - distance, np.zeros(DRAWN)], axis=1)
+        first = np.stack([-radii - distance, np.zeros(drawn)], axis=1)
         slope = speed[:, None] * np.stack([np.cos(course), np.sin(course)], axis=1)
         tracks = np.stack([first, first + 100 * slope], axis=1)[:, :, None]
-        return Layouts(tracks, radii[:, None], np.zeros((DRAWN, 2)), interval=100.0)
-
-    @cached_property
-    def noisy(self) -> tuple[float, ...]:  # type: ignore[override]
-        return (*super().noisy, 0.0)
+        return Layouts(tracks, radii[:, None], np.zeros((drawn, 2)), interval=100.0)
 
     def measure(self, sensors: np.ndarray) -> np.ndarray:
         # A mode is trained with both senses of turning, by turns.
@@ -256,7 +239,7 @@ class Field(FieldTask):
     def state(
         self, z: np.ndarray, rng: np.random.Generator | None = None
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        number = np.full(len(z), DRAWN - 1)
+        number = np.full(len(z), len(self.layouts) - 1)
         if rng is not None:  # a post that leaves the robot room to act
             fits = np.maximum(np.searchsorted(self._needs, length(z[:, :2]) - self.body - ROOM), 1)
             number = (rng.random(len(z)) * fits).astype(int)
@@ -266,17 +249,16 @@ class Field(FieldTask):
     @cached_property
     def _needs(self) -> np.ndarray:
         """How far each layout's post reaches within a moment (F - 1,), growing [m]."""
-        speed = length(self.layouts.velocities(np.arange(DRAWN), np.zeros(DRAWN)))[:, 0]
+        number = np.arange(len(self.layouts))
+        speed = length(self.layouts.velocities(number, np.zeros(len(number))))[:, 0]
         return (self.layouts.radii[:, 0] + HEADWAY * speed)[:-1]
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         z = super().starts(n, rng)
         # Starts hold for the usual layout, too.
         least = self.layouts.radii[-1, 0] + self.body + ROOM
-        inside = length(z[:, :2]) < least
-        while inside.any():
+        while (inside := length(z[:, :2]) < least).any():
             z[inside] = super().starts(int(inside.sum()), rng)
-            inside = length(z[:, :2]) < least
         return z
 
     def z(self, measured: np.ndarray) -> np.ndarray:
@@ -298,9 +280,6 @@ class Field(FieldTask):
         axis = axis / np.maximum(length(axis), 1e-9)[:, None]
         return axis, measured[:, :2] - post
 
-    def where(self, measured: np.ndarray) -> np.ndarray:
-        return measured[:, :2]
-
     def observation(self, measured: np.ndarray) -> np.ndarray:
         return self.observed(measured, *self.directions(measured))
 
@@ -311,7 +290,7 @@ class Field(FieldTask):
         heading, goal, post = measured[:, 2], self.to_goal(measured), posts_of(measured)[:, 0]
         to_post = post[:, :2] - measured[:, :2]
         left, right = (directions - heading[:, None]).T
-        turns = turns_to(directions - heading[:, None], measured[:, TURN : TURN + 1])
+        turns = turns_to(directions - heading[:, None], measured[:, -1:])
         cos, sin = np.cos(heading), np.sin(heading)
 
         def turned(v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -344,7 +323,8 @@ class Field(FieldTask):
 
     def for_mode(self, mode: int) -> Self:
         task = copy(self)
-        vars(task).update(side=mode, noisy=(*TRAINED, *self.noisy[len(TRAINED) :]))
+        # More noise on x, y and heading than the mode has to bear.
+        vars(task).update(side=mode, noisy=(1.5, 1.5, 2.5, *self.noisy[3:]))
         return task
 
     def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -352,23 +332,23 @@ class Field(FieldTask):
         side = lengths.argmin(axis=1) if self.side is None else np.full(len(u), self.side)
         direction = directions[np.arange(len(u)), side]
         progress = np.maximum(u[:, 0], 0.0) * np.cos(direction - measurement[:, 2])
+        # The last 0.2 m to a post cost up to 2.
         clearance = self.clearances(measurement).min(axis=1)
-        near = np.clip(1 - clearance / NEAR, 0.0, 1.0)
-        # What is behind the robot may be another post than the one that it knows of.
-        backward = REVERSE * np.maximum(-u[:, 0], 0.0)
-        turn = turns_to(direction - measurement[:, 2], measurement[:, TURN])
+        near = 2.0 * np.clip(1 - clearance / 0.2, 0.0, 1.0)
+        # Backward, at up to 3: what is behind may be another post than the one that the robot knows of.
+        backward = 3.0 * np.maximum(-u[:, 0], 0.0)
+        # Turning the other way, at up to 3, where more than a right angle is left.
+        turn = turns_to(direction - measurement[:, 2], measurement[:, -1])
         wrong = np.where(np.abs(turn) > np.pi / 2, np.maximum(-np.sign(turn) * u[:, 1], 0.0), 0.0)
         # Where a post stands on the goal, waiting in front of it costs nothing.
         base = np.where(self.waits(measurement), 0.0, progress - 1)
-        reward = base - WRONG * wrong - backward - GRAZING * near
-        return np.where(self.ending(measurement) == Outcome.CRASHED, CRASH, reward)
+        reward = base - 3.0 * wrong - backward - near
+        # A crash costs more than any way round.
+        return np.where(self.ending(measurement) == Outcome.CRASHED, -100.0, reward)
 
     def verdict(self, measurement: np.ndarray) -> np.ndarray:
         # The training asks a robot to wait where a post stands on the goal.
         return np.where(self.waits(measurement), Outcome.REACHED, super().verdict(measurement))
-
-    def arrived(self, z: np.ndarray) -> np.ndarray:
-        return np.ones(len(z), dtype=bool)  # episodes end there
 
     def miss(self, z: np.ndarray) -> np.ndarray:
         return np.zeros(len(z))

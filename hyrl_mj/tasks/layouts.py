@@ -9,8 +9,6 @@ import numpy as np
 # Columns of a measurement before those of the posts: x, y, heading, and x and y of the goal. Columns of each
 # post: x, y, their velocities, and its radius.
 POSE, OF_POST = 5, 5
-# The column after a single post: the sense in which to turn round.
-TURN = POSE + OF_POST
 
 
 @dataclass(frozen=True)
