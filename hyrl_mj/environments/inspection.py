@@ -35,7 +35,7 @@ from hyrl_mj.environments.specification import (
     Criterion,
     EnvironmentSpec,
 )
-from hyrl_mj.environments.told import check_told
+from hyrl_mj.environments.wrappers import changes_by_reset, check_told, senses
 from hyrl_mj.errors import BadInput
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
@@ -84,10 +84,10 @@ def inspect(description: Description) -> tuple[EnvironmentSpec, Pool, Instance]:
     if late:
         instance.spec.found["lag"] = f"observation {', '.join(map(str, late))} {LAG[derived]}"
     instance.learn(derived=derived)
-    instance.learn(anew=instance.is_wrapped and trials.changes_by_reset(instance.spec))
     if instance.is_wrapped:
+        instance.learn(anew=changes_by_reset(instance.spec))
         check_told(instance.spec, step)
-    instance.learn(sensing=instance.is_wrapped and trials.senses(instance.spec, step))
+        instance.learn(sensing=senses(instance.spec, step))
     pool = Pool(instance.spec, fresh)
     moves, affine = trials.moving(pool, instance.spec)
     instance.learn(moves=moves, affine=affine)

@@ -50,7 +50,6 @@ class Instance:
         report: numbers (r,) of the last sample: reward, terminated, truncated, whether it ended in touch with
             what the robot does not touch elsewhere, entries of `info`, distances.
         inner_seen: what the innermost environment observed last.
-        tried: whether wrappers may write to a state that noise has moved, to find out what they do.
         draws_globally: whether a reset has drawn from a global generator.
         start: the state of MuJoCo to which the innermost reset has to lead, below wrappers.
 
@@ -78,7 +77,7 @@ class Instance:
         self._like: written.Fingerprint | None = None  # after its first reset
         self._begun = written.Fingerprint()  # after the reset of its episode
         self._used = self._at_start = False
-        self.tried = self.draws_globally = False
+        self.draws_globally = False
         self._samples = 0
         self._pairs: list[tuple[np.ndarray, np.ndarray]] = []
         self._chain = Chain(self) if self.is_wrapped else None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,8 +19,6 @@ from hyrl_mj.tasks import Outcome
 
 # Episodes and samples of a trial, and for how many samples inputs are held.
 EPISODES, SAMPLES, HELD = 8, 40, 8
-# Samples of runs from these places that show whether wrappers read MuJoCo's state there.
-NEAR_PLACES = 3
 # Rounding of what is computed again from the same state, as a share of the largest number.
 ROUNDING = 1e-9
 # What differs by less than this share of what a physics step changes is from near the end of a step.
@@ -30,7 +27,7 @@ NEAR = 0.5
 MOVED = 1e-3
 # Places on the chart from which runs of so many samples come to one state, which may show where they were;
 # from the first places longer ones, in which slow sensors measure.
-PLACES, AWAY, LONG = 64, 2, 120
+PLACES, AWAY, LONG = 64, 2, (SAMPLES, 120)
 # Runs that show whether the chart is the state, and how much they may differ from others.
 OF_CHART, SAME = 48, 1e-9
 
@@ -113,94 +110,45 @@ def _rounds(off: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def check_observer(instance: Instance, step: np.ndarray) -> None:
-    """Raises `BadInput` unless what is observed follows the state, as after a reset to that state.
+    """Raises `BadInput` if what is observed in a state depends on where on the chart a run came from.
 
-    After some steps the state of the reset is written again. What is observed then has to be what the reset
-    observed, but for columns that have nothing to do with the place: those that no noise moves, that all
-    resets observe alike, and that do not depend on where the run began.
+    Runs under the same inputs are put into one state. What they observe there has to be the same to the bit:
+    what is stored on the way differs, if only by rounding.
 
     Args:
         instance: the environment.
         step: (d,) by how much the coordinates of the chart are moved to see what follows them.
     """
-    rng, name, space = np.random.default_rng(1), instance.name, instance.inner.observation_space
-    first: list[np.ndarray] = []
-    states: list[np.ndarray] = []
-    suspects: dict[int, str] = {}
-    for seed in range(EPISODES):
-        instance.reset(seed)
-        state = instance.physics.read()
-        instance.physics.write(state)
-        pinned = instance.spec.description.pinned
-        begun = flat(instance.watched() if pinned else instance.inner_seen, space)
-        first.append(begun)
-        states.append(state)
-        for _ in instance.wander(rng, SAMPLES, HELD):
-            pass
-        before = instance.memory()
-        moved = instance.displaced(step)
-        if changed := differing(instance.memory(), before):
-            raise BadInput(
-                f"{name} changes {changed[0]} when it computes what it observes, so that cannot be asked for "
-                "where noise shows the robot: let it only read"
-            )
-        instance.physics.write(state)
-        off = _apart(flat(instance.watched(), space), begun)
-        for column in map(int, np.flatnonzero(~_rounds(off, begun))):
-            suspects[column] = (
-                f"is {begun[column]:.6g} after reset() and differs by {off[column]:.6g} in that state later"
-            )
-            if moved[column]:
-                raise _stored(name, column, suspects[column])
-    for column, why in suspects.items():
-        if np.ptp([row[column] for row in first]) > 0 or _depends(instance, column, states):
-            raise _stored(name, column, why)
-    _check_places(instance)
-
-
-def _check_places(instance: Instance) -> None:
-    """Raises `BadInput` if what is observed in a state depends on where on the chart a run came from."""
-    spec, rng, space = instance.spec, np.random.default_rng(7), instance.inner.observation_space
+    spec, rng, name = instance.spec, np.random.default_rng(7), instance.name
     usual: dict[int, np.ndarray] = {}
     places = rng.uniform(spec.start_low, spec.start_high, (PLACES, spec.dimension))
-    long = min(LONG, spec.max_steps)
-    for z, away in [*((z, AWAY) for z in places), *((z, long) for z in places[:EPISODES])]:
+    runs = [(z, AWAY) for z in places]
+    runs += [(z, min(away, spec.max_steps)) for away in LONG for z in places[:EPISODES]]
+    for z, away in runs:
         instance.reset()
         instance.physics.write(spec.state_at(z[None])[0])
         if instance.depth() > spec.depth:
             continue
         if len([*instance.wander(np.random.default_rng(8), away, HELD)]) < away:
             continue
+        if away != AWAY:
+            before = instance.memory()
+            instance.displaced(step)
+            if changed := differing(instance.memory(), before):
+                raise BadInput(
+                    f"{name} changes {changed[0]} when it computes what it observes, so that cannot be asked "
+                    "for where noise shows the robot: let it only read"
+                )
         instance.physics.write(spec.state)
-        seen = flat(instance.watched(), space)
-        usual.setdefault(away, seen)
-        off = _apart(seen, usual[away])
-        if (stale := ~_rounds(off, seen)).any():
-            column = int(stale.argmax())
-            why = f"differs by {off[column]:.6g} in one state, after runs in different places"
-            raise _stored(instance.name, column, why)
-
-
-def _stored(name: str, column: int, why: str) -> BadInput:
-    return BadInput(
-        f"what {name} observes does not follow its state: observation[{column}] {why}. It is stored by "
-        "step(), or computed from what is, so that noise would not reach it: compute it from the state"
-    )
-
-
-def _depends(instance: Instance, column: int, starts: list[np.ndarray]) -> bool:
-    """Returns whether a column of the observation depends on where a run under the same inputs began."""
-    space, traces = instance.inner.observation_space, []
-    for start in starts:
-        instance.reset()
-        instance.physics.write(start)
-        runs = instance.wander(np.random.default_rng(2), SAMPLES, HELD)
-        traces.append([flat(instance.inner_seen, space)[column] for _ in runs])
-    shortest = min(map(len, traces))
-    return any(
-        not np.array_equal(trace[:shortest], traces[0][:shortest], equal_nan=True)
-        for trace in traces
-    )
+        seen = flat(instance.watched(), instance.inner.observation_space)
+        off = _apart(seen, usual.setdefault(away, seen))
+        if off.any():
+            column = int((off != 0).argmax())
+            raise BadInput(
+                f"what {name} observes does not follow its state: observation[{column}] differs by "
+                f"{off[column]:.6g} in one state, after runs in different places. It is stored by step(), or "
+                "computed from what is, so that noise would not reach it: compute it from the state"
+            )
 
 
 def derived_of(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
@@ -252,80 +200,6 @@ def derived_of(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
 def noisy_names(spec: EnvironmentSpec) -> list[str]:
     """Returns the names of the coordinates on which there is noise."""
     return [c.name for c, share in zip(spec.coordinates, spec.noisy, strict=True) if share]
-
-
-def changes_by_reset(spec: EnvironmentSpec) -> bool:
-    """Returns whether the start of a run is another one after a reset before, as with running statistics."""
-    found = []
-    for resets in (0, 0, 1):
-        instance = Instance(spec)
-        for _ in range(resets):
-            instance.reset()
-        observation = instance.put(spec.state)
-        found.append((observation, instance.remembered()))
-    usual = set(differing(found[0][1], found[1][1]))  # such as names of files
-    changed = set(differing(found[0][1], found[2][1])) - usual
-    return bool(changed) or not np.array_equal(found[0][0], found[2][0], equal_nan=True)
-
-
-def senses(spec: EnvironmentSpec, step: np.ndarray) -> bool:
-    """Returns whether wrappers read MuJoCo's state for what they observe.
-
-    The same runs under noise are played twice, once with the true state shown to the wrappers, and once with
-    the state where the noise shows the robot.
-
-    Args:
-        spec: what is known of the environment.
-        step: (d,) the bound of the noise on the coordinates of the chart.
-
-    Raises:
-        BadInput: wrappers do, and tell from that state as well how the episode goes.
-    """
-    true, shown = (_watched_runs(spec, step, sensing) for sensing in (False, True))
-    differ = {
-        what: any(
-            not np.array_equal(a, b, equal_nan=True)
-            for ours, others in zip(true[what], shown[what], strict=True)
-            for a, b in zip(ours, others, strict=False)  # one may have ended before
-        )
-        for what in ("observation", "report")
-    }
-    if all(differ.values()):
-        raise BadInput(
-            f"a wrapper of {spec.name} reads MuJoCo's state for what it observes, which noise moves, and for "
-            "its reward, its info or the end of an episode, which it must not: let it observe what the "
-            "environment gives it, or let only the environment judge"
-        )
-    return differ["observation"]
-
-
-def _watched_runs(
-    spec: EnvironmentSpec, step: np.ndarray, sensing: bool
-) -> dict[str, list[list[np.ndarray]]]:
-    """Returns observations and reports of runs under noise, each by run and sample."""
-    instance, rng = Instance(replace(spec, sensing=sensing)), np.random.default_rng(6)
-    instance.tried = True
-    found: dict[str, list[list[np.ndarray]]] = {"observation": [], "report": []}
-    starts = [(spec.state, min(SAMPLES, spec.max_steps))] * EPISODES
-    places = rng.uniform(spec.start_low, spec.start_high, (PLACES, spec.dimension))
-    starts += [(state, min(NEAR_PLACES, spec.max_steps)) for state in spec.state_at(places)]
-    for seed, (start, samples) in enumerate(starts):
-        instance.quit()
-        instance.begin(start, seed % EPISODES)
-        noises = rng.uniform(-step, step, (samples + 1, len(step)))
-        inputs = [instance.drawn(rng) for _ in range(samples)]
-        instance.sense(noises[0])
-        seen, reports = [instance.observation], []
-        for k in range(samples):
-            instance.act(inputs[k - k % HELD])
-            instance.sense(noises[k + 1])
-            seen.append(instance.observation)
-            reports.append(np.array(instance.report, dtype=float))
-            if instance.report[1] or instance.report[2]:
-                break
-        found["observation"].append(seen)
-        found["report"].append(reports)
-    return found
 
 
 def moving(pool: Pool, spec: EnvironmentSpec) -> tuple[np.ndarray, np.ndarray | None]:
