@@ -16,8 +16,9 @@ from hyrl_mj.environments.instance import Instance
 from hyrl_mj.environments.observations import parts_of
 from hyrl_mj.environments.opening import code_of
 from hyrl_mj.environments.plant import EnvironmentPlant
-from hyrl_mj.environments.pool import Played, Pool
+from hyrl_mj.environments.pool import Pool
 from hyrl_mj.environments.specification import EnvironmentSpec
+from hyrl_mj.environments.stage import Played
 from hyrl_mj.environments.trials import goes_on
 from hyrl_mj.errors import BadInput
 from hyrl_mj.physics import mjcf

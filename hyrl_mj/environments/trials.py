@@ -12,8 +12,9 @@ from hyrl_mj.environments.fingerprint import differing
 from hyrl_mj.environments.instance import Instance
 from hyrl_mj.environments.observations import flat, observers
 from hyrl_mj.environments.plant import EnvironmentPlant
-from hyrl_mj.environments.pool import Played, Pool
+from hyrl_mj.environments.pool import Pool
 from hyrl_mj.environments.specification import EARLIER, NOW, UNKNOWN, EnvironmentSpec
+from hyrl_mj.environments.stage import Played
 from hyrl_mj.errors import BadInput
 from hyrl_mj.tasks import Outcome
 
