@@ -24,6 +24,7 @@ from hyrl_mj.environments.opening import Description, preload
 from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.environments.stage import Stage
 from hyrl_mj.errors import BadInput, HyrlError, brief
+from hyrl_mj.system import limits
 from hyrl_mj.system.forked import own_end
 
 # For how long a process waits awake for another [s]: between two samples it has to for about a millisecond.
@@ -71,6 +72,25 @@ class Fresh:
                 self._hand.close()
                 self._hand = None
                 raise
+
+    def try_out(self, spec: EnvironmentSpec) -> None:
+        """Has the environment made, reset and stepped within limits of time and memory.
+
+        Raises:
+            BadInput: it cannot be, or takes more.
+        """
+        hand, found = self.process(spec), None
+        hand.send(("try_out", []))
+        with suppress(EOFError, ConnectionError):
+            found = hand.recv() if hand.poll(limits.LONGEST) else None
+        if found is None:
+            raise BadInput(
+                f"the environment {spec.name} cannot be used: where it is made, reset and stepped, its "
+                f"process crashes, takes longer than {limits.SECONDS} s, or needs more than {limits.MEMORY >> 20} MB "
+                "of memory; give it other arguments"
+            )
+        if isinstance(found, Exception):
+            raise found
 
 
 def received(hand: Connection) -> Any:

@@ -57,14 +57,22 @@ LAG = {
 }
 
 
-def inspect(description: Description) -> tuple[EnvironmentSpec, Pool, Instance]:
+def inspect(
+    description: Description, untried: bool = False
+) -> tuple[EnvironmentSpec, Pool, Instance]:
     """Returns what is known of an environment, what plays its episodes, and an instance to look at.
+
+    Args:
+        description: what the user says of it.
+        untried: whether it is made, reset and stepped first within limits of time and memory.
 
     Raises:
         BadInput: it cannot be used, or one of its instances went another way than a new one.
     """
-    fresh = Fresh(description)  # before anything has been made
-    instance = Instance(EnvironmentSpec(description))
+    fresh, spec = Fresh(description), EnvironmentSpec(description)  # before anything has been made
+    if untried and fresh.available:
+        fresh.try_out(spec)
+    instance = Instance(spec)
     _check_times(instance)
     instance.reset()
     _learn_spaces(instance)

@@ -35,7 +35,6 @@ from hyrl_mj.environments.task import EnvironmentTask
 from hyrl_mj.errors import BadInput, brief, check_seed, described, printable, unknown
 from hyrl_mj.files import artifacts, trust
 from hyrl_mj.ranges import Integer, refused
-from hyrl_mj.system import limits
 from hyrl_mj.system.generators import kept_generators
 from hyrl_mj.tasks import ENVIRONMENT, Task, get_task
 
@@ -109,9 +108,11 @@ def from_gymnasium(
             with suppress(ValueError):
                 _RECENT.remove(task)
         with described(_shown(env)), kept_generators():
-            if isinstance(env, str) and (kwargs or reset or pinned or trust.is_received()):
-                _try(description, spec)
-            task = EnvironmentTask(*inspect(description), spec, _made_of(description))
+            # With names of files it is recorded otherwise, and tried each time.
+            known = not isinstance(env, str) or trust.is_known_text(spec)
+            untried = not known and (kwargs or reset or pinned or trust.is_received())
+            found = inspect(description, bool(untried))
+            task = EnvironmentTask(*found, spec, _made_of(description))
         _MADE[spec] = task
         _RECENT.append(task)
     if isinstance(env, str):
@@ -123,28 +124,6 @@ def from_gymnasium(
 
 def _shown(env: Any) -> str:
     return f"the environment {env[:80]}" if isinstance(env, str) else "the environment"
-
-
-def _try(description: Description, spec: str) -> None:
-    """Makes, resets and steps an environment in a process with limits, unless that was done before."""
-    if trust.is_known_text(spec):
-        return  # with names of files it is recorded otherwise, and tried each time
-    given = {
-        name: getattr(description, name) for name in ("env", "kwargs", "reset", "pinned", "seed")
-    }
-    try:
-        content = json.dumps(given, default=_plain)
-    except (TypeError, BadInput):
-        return  # objects, which only the user's own code gives
-    try:
-        found = limits.tried(Path(__file__).with_name("first_trial.py"), content.encode())
-    except limits.Ended as ended:
-        raise BadInput(
-            f"the environment {description.name} cannot be used: {ended} where it is made, reset and "
-            "stepped; give it other arguments"
-        ) from None
-    if found["problem"]:
-        raise BadInput(found["problem"])
 
 
 def _check(given: Mapping[str, Any]) -> None:

@@ -16,6 +16,8 @@ from hyrl_mj.environments import fingerprint as written
 from hyrl_mj.environments.instance import Instance, Worn
 from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.errors import BadInput
+from hyrl_mj.files import trust
+from hyrl_mj.system import limits
 from hyrl_mj.tasks import Outcome
 
 Arrays = tuple[np.ndarray, ...]
@@ -61,6 +63,15 @@ class Stage:
         self._judges: dict[bool, list[Instance]] = {True: [], False: []}
         self._resting: Instance | None = None
         self._shared: written.Fingerprint | None = None  # by a new instance with all others
+
+    def try_out(self) -> Arrays:
+        """Makes, resets and steps an environment within limits of time and memory of this process."""
+        limits.limit()
+        with trust.received():  # code that an argument names does not run
+            instance = self._new(real=False)
+            instance.reset()
+            instance.stepped(instance.drawn(np.random.default_rng(0)))
+        return ()
 
     def begin(self, runs: np.ndarray, starts: np.ndarray) -> Arrays:
         """Gives runs (k,) an instance each, and begins their episodes at MuJoCo's states (k, S)."""
