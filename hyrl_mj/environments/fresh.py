@@ -86,8 +86,8 @@ class Fresh:
         if found is None:
             raise BadInput(
                 f"the environment {spec.name} cannot be used: where it is made, reset and stepped, its "
-                f"process crashes, takes longer than {limits.SECONDS} s, or needs more than {limits.MEMORY >> 20} MB "
-                "of memory; give it other arguments"
+                f"process crashes, takes longer than {limits.SECONDS} s, or needs more than "
+                f"{limits.MEMORY >> 20} MB of memory; give it other arguments"
             )
         if isinstance(found, Exception):
             raise found
