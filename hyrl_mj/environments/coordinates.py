@@ -17,13 +17,6 @@ from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.physics import mjcf
 from hyrl_mj.tasks import touching
 
-INDEXED = re.compile(r"(.+)\[(\d+)\]")
-# States at which a name is compared with positions and velocities, and how much of these changes [m, rad].
-TRIED, MOVED = 6, 0.05
-AGREES = 1e-6
-# What is sampled beyond this many times as far is outside of the chart.
-ROOM = 1.2
-AXES = "xyz"
 FREE, SLIDE, HINGE = map(
     int, (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
 )
@@ -70,7 +63,7 @@ def _named(model: mujoco.MjModel, *kinds: mujoco.mjtObj) -> list[str]:
 
 def _resolved(instance: Instance, new: str, name: str) -> Iterator[Coordinate]:
     model, parts = instance.model, columns_of(instance.env.observation_space)
-    match = INDEXED.fullmatch(name)
+    match = re.fullmatch(r"(.+)\[(\d+)\]", name)
     base, index = (match.group(1), int(match.group(2))) if match else (name, None)
     if base in ("qpos", "qvel") and index is not None:
         if index >= (model.nq if base == "qpos" else model.nv):
@@ -105,8 +98,8 @@ def _of_state(
     joint = int(np.searchsorted(addresses, index, side="right")) - 1
     kind_of_joint, part = model.jnt_type[joint], index - addresses[joint]
     name = new or _usual_name(model, joint, kind)
-    if kind_of_joint == FREE and part < len(AXES):
-        name = new or f"{AXES[part]} of {name}"
+    if kind_of_joint == FREE and part < 3:
+        name = new or f"{'xyz'[part]} of {name}"
         return Coordinate(name, kind, index, offset, joint, int(part))
     if kind_of_joint not in (SLIDE, HINGE):
         joints = np.flatnonzero(np.isin(model.jnt_type, (SLIDE, HINGE)))
@@ -133,12 +126,12 @@ def _fitted(
     state, places = instance.physics.read(), instance.physics.columns
     columns = [(kind, i) for kind in ("qpos", "qvel") for i in range(len(places[kind]))]
     at = np.concatenate([places["qpos"], places["qvel"]])
-    moved = np.tile(state, (TRIED, 1))
-    moved[:, at] += np.random.default_rng(0).uniform(-MOVED, MOVED, (TRIED, len(at)))
+    moved = np.tile(state, (6, 1))
+    moved[:, at] += np.random.default_rng(0).uniform(-0.05, 0.05, (6, len(at)))
     values = np.array([get(other) for other in moved])
     for j, column in enumerate(values.T):
         offsets = column[:, None] - moved[:, at]
-        alike = np.flatnonzero(np.ptp(offsets, axis=0) < AGREES)
+        alike = np.flatnonzero(np.ptp(offsets, axis=0) < 1e-6)
         if not len(alike):
             raise BadInput(
                 f"{name}[{j}] is no single position or velocity of {instance.name}, but follows from several "
@@ -244,7 +237,7 @@ def bounds_of(
             found.append(Bound(*_extent(instance, ids, c, 0.0), False, "the walls"))
         else:
             middle, half = np.median(samples[:, i]), np.ptp(samples[:, i]) / 2
-            half = max(ROOM * half, 1e-3)
+            half = max(1.2 * half, 1e-3)  # what is farther than sampled runs go is outside
             low, high, why = float(middle - half), float(middle + half), "sampled runs"
             if c.kind == "qpos" and others:
                 ends = _extent(instance, others, c, passing)

@@ -35,18 +35,14 @@ PASSED = (
 LIBRARIES = {
     "gymnasium", "dm_control", "shimmy", "numpy", "mujoco", "hyrl_mj", *sys.stdlib_module_names,
 }  # fmt: skip
-# Attributes that hold the arguments of a constructor, and methods that are put in by `Instance`.
-LEFT_OUT = frozenset(("_ezpickle_args", "_ezpickle_kwargs", "_saved_kwargs", "step", "reset"))
 # How deep attributes of attributes are looked at, and how many values at most. What lies beyond cannot be
 # compared, and counts as different.
 DEEPEST, MOST = 10, 100_000
-# Parts of MuJoCo's model that say how it moves, by the first words of their names, and endings of those that
-# only say how it looks.
+# Parts of MuJoCo's model that say how it moves, by the first words of their names.
 MOVES = (
     "qpos", "body_", "jnt_", "dof_", "geom_", "site_", "tendon_", "wrap_", "actuator_", "sensor_", "eq_",
     "pair_", "exclude_", "numeric_data", "hfield_data", "flex_",
 )  # fmt: skip
-LOOKS = ("_rgba", "_matid", "_group", "_user")
 PLAIN = (type(None), bool, int, float, complex, str, bytes)
 # The kinds of variables of a class or a module whose values can change.
 DATA = (*PLAIN, list, dict, set, deque, tuple, np.ndarray, np.generic, np.random.Generator)
@@ -128,7 +124,7 @@ def _parts_of_model() -> list[str]:
         name
         for name in dir(model)
         if name.startswith(MOVES)
-        and not name.endswith(LOOKS)
+        and not name.endswith(("_rgba", "_matid", "_group", "_user"))  # how it looks
         and isinstance(getattr(model, name), np.ndarray)
     ]
 
@@ -213,7 +209,9 @@ def _parts(value: Any, path: str, found: Fingerprint, depth: int) -> dict[str, A
         found[path] = _written(value)
         return {}
     slots = {name: getattr(value, name) for name in _slots(value.__class__) if hasattr(value, name)}
-    left_out = LEFT_OUT if depth == 0 else ()
+    # Arguments of a constructor, and methods that are put in by `Chain`.
+    passed = "_ezpickle_args", "_ezpickle_kwargs", "_saved_kwargs", "step", "reset"
+    left_out = passed if depth == 0 else ()
     own = {name: part for name, part in vars(value).items() if name not in left_out}
     return {f"{path}.{name}" if path else name: part for name, part in {**own, **slots}.items()}
 

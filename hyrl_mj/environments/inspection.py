@@ -26,12 +26,10 @@ from hyrl_mj.environments.fingerprint import differing, is_known
 from hyrl_mj.environments.fresh import Fresh
 from hyrl_mj.environments.instance import Instance, Worn
 from hyrl_mj.environments.observations import parts_of
-from hyrl_mj.environments.opening import RESET, AnyChart, Description, layers
+from hyrl_mj.environments.opening import AnyChart, Description, layers
 from hyrl_mj.environments.pool import Pool
 from hyrl_mj.environments.specification import (
-    EARLIER,
     FORMS,
-    UNKNOWN,
     Criterion,
     EnvironmentSpec,
 )
@@ -40,20 +38,10 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
 
-# Samples of an episode of an environment that never ends by itself.
-STEPS_WITHOUT_END = 1_000
-# Each episode begins with a reset, and has hundreds of steps: those that take longer [s] would take hours.
-LONGEST_RESET, LONGEST_STEP = 3.0, 0.3
-# Runs under inputs at random that show how far coordinates go, their steps, and for how long inputs are held.
-RUNS, STEPS, HELD = 16, 150, 15
-# What info calls success.
-SUCCESS = ("success", "is_success")
-# What goes no farther than this stands [m].
-STANDS = 1e-6
 # What is said of an observation that shows derived quantities from before the end of a step.
 LAG = {
-    EARLIER: "is that of a physics step before the end of a step, with noise, too",
-    UNKNOWN: "is from shortly before the end of a step; noise adds what it changes at the end",
+    "earlier": "is that of a physics step before the end of a step, with noise, too",
+    "unknown": "is from shortly before the end of a step; noise adds what it changes at the end",
 }
 
 
@@ -110,8 +98,8 @@ def inspect(
 def _check_times(instance: Instance) -> None:
     """Raises `BadInput` if a reset or a step takes so long that runs would take hours."""
     for name, most, why in (
-        ("reset", LONGEST_RESET, "each of thousands of episodes begins with it"),
-        ("step", LONGEST_STEP, "thousands of episodes take many of them"),
+        ("reset", 3.0, "each of thousands of episodes begins with it"),
+        ("step", 0.3, "thousands of episodes take many of them"),
     ):
         began = time.monotonic()
         if name == "reset":
@@ -207,13 +195,13 @@ def _sampled(instance: Instance) -> tuple[np.ndarray, list[str]]:
     states, rewards, bodies, geoms = [], [], [], []
     info_keys: dict[str, None] = {}
     deepest, dt, harmless, remembers = 0.0, 0.0, set[int](), False
-    for seed in range(RUNS):
+    for seed in range(16):
         instance.reset(seed)
         with suppress(Worn):  # these resets draw from other seeds
             instance.mark()
         before, began = instance.memory(), instance.data.time
         deepest = max(deepest, instance.depth())
-        for _, reward, terminated, truncated, info in instance.wander(rng, STEPS, HELD):
+        for _, reward, terminated, truncated, info in instance.wander(rng, samples=150, held=15):
             states.append(instance.physics.read())
             dt = dt or float(instance.data.time - began)
             deepest = max(deepest, instance.depth())
@@ -246,7 +234,7 @@ def _sampled(instance: Instance) -> tuple[np.ndarray, list[str]]:
 def _farthest(named: Any, places: Sequence[np.ndarray]) -> str:
     """Returns the name of what goes farthest, of places (k, n, 3) [m]; none if nothing does."""
     went = np.ptp(places, axis=0).sum(axis=1)
-    return str(named(int(went.argmax())).name) if went.max() > STANDS else ""
+    return str(named(int(went.argmax())).name) if went.max() > 1e-6 else ""
 
 
 def _criterion(instance: Instance, info: Sequence[str]) -> Criterion:
@@ -254,9 +242,10 @@ def _criterion(instance: Instance, info: Sequence[str]) -> Criterion:
     description, name, found = instance.spec.description, instance.name, instance.spec.found
     success, failure = description.success, description.failure
     if success is None or success.strip() == "info":
-        told = [key for key in SUCCESS if key in info]
+        usual = "success", "is_success"
+        told = [key for key in usual if key in info]
         if not told:  # what only a success brings is found in the code
-            told = [key for key in SUCCESS if _is_written(instance.env, key)]
+            told = [key for key in usual if _is_written(instance.env, key)]
             told = told if len(told) == 1 else []
         if not told:
             raise BadInput(
@@ -337,12 +326,12 @@ def _learn_bounds(instance: Instance, met: np.ndarray, begun: np.ndarray) -> Non
     lead = ", ".join(f"{n} {a:.3g} to {b:.3g}" for n, a, b in zip(names, *ends, strict=True))
     found["starts"] = (
         "all over the chart, the robot at rest and all else as after a reset (deeper than "
-        f"{spec.depth:.2g} m inside of something it has crashed); with {RESET!r} where resets lead to: {lead}"
+        f"{spec.depth:.2g} m inside of something it has crashed); with 'reset' where resets lead to: {lead}"
     )
     start_low, start_high = low, high
-    if given.starts == RESET:
+    if given.starts == "reset":
         start_low, start_high = (tuple(np.clip(end, low, high).tolist()) for end in ends)
-    max_steps = given.steps or instance.steps or STEPS_WITHOUT_END
+    max_steps = given.steps or instance.steps or 1_000  # of one that never ends by itself
     found["sample time"] = f"{spec.dt:g} s, of a step"
     if given.steps is None:
         found["steps"] = f"{max_steps} ({max_steps * spec.dt:g} s) of an episode"

@@ -24,12 +24,9 @@ from hyrl_mj.environments.expressions import entry
 from hyrl_mj.environments.observations import flat, observers, shaped
 from hyrl_mj.environments.opening import made, peeled, physics_of, plant_of, steps_of
 from hyrl_mj.environments.physics import Physics
-from hyrl_mj.environments.specification import EARLIER, NOW, UNKNOWN, EnvironmentSpec
+from hyrl_mj.environments.specification import Derived, EnvironmentSpec
 from hyrl_mj.errors import BadInput, HyrlError, brief
 from hyrl_mj.system.generators import global_state
-
-# Durations of steps are the same if they differ by less than this share: they are differences of the time.
-SAME_TIME = 1e-3
 
 
 class Worn(HyrlError):
@@ -152,14 +149,14 @@ class Instance:
         """
         if not self.is_wrapped:
             self.reset(seed)
-        self.begin(state, seed)
-        self.sense(np.zeros(self.spec.dimension) if noise is None else noise)
-        return self.observation
+        return self.rested(state, seed, noise)
 
-    def placed(self, state: np.ndarray) -> np.ndarray:
-        """Puts an environment without wrappers to a state (S,); returns what it observes there (o,)."""
-        self.arrive(state)
-        self.observation = self._flat(self.inner_seen)
+    def rested(
+        self, start: np.ndarray, seed: int | None = None, noise: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Returns what is first observed (o,) of an episode that begins at a state of MuJoCo (S,)."""
+        self.begin(start, seed)
+        self.sense(np.zeros(self.spec.dimension) if noise is None else noise)
         return self.observation
 
     def arrive(self, state: np.ndarray) -> None:
@@ -243,7 +240,8 @@ class Instance:
     def begin(self, start: np.ndarray, seed: int | None = None) -> None:
         """Begins an episode at a state of MuJoCo (S,); with wrappers, `sense` gives its first observation."""
         if self._chain is None:
-            self.placed(start)
+            self.arrive(start)
+            self.observation = self._flat(self.inner_seen)
         else:
             self.start = start
             self._chain.ask(lambda: self.reset(seed))
@@ -323,10 +321,6 @@ class Instance:
                 f"{self.spec.observer}() of {self.name} raises {brief(error)}: repair it"
             ) from error
 
-    def rested(self, start: np.ndarray) -> np.ndarray:
-        """Returns what is first observed (o,) of an episode that begins at a state of MuJoCo (S,)."""
-        return self.put(start) if self.is_wrapped else self.placed(start)
-
     def displaced(self, noise: np.ndarray) -> np.ndarray:
         """Returns by how much the innermost observation changes (o,) where the chart's coordinates do.
 
@@ -334,11 +328,12 @@ class Instance:
         computed where the robot was then, with the noise. Where it is not known which they are, it is the
         difference of two observations with all of them up to date.
         """
-        state, derived = self.physics.read(), NOW if self._at_start else self.spec.derived
+        state = self.physics.read()
+        derived: Derived = "now" if self._at_start else self.spec.derived
         given = flat(self.inner_seen, self.inner.observation_space)
         before = given
-        if derived == UNKNOWN:
-            before = self.seen_as(NOW, state, np.zeros(len(noise)))
+        if derived == "unknown":
+            before = self.seen_as("now", state, np.zeros(len(noise)))
         moved = self.seen_as(derived, state, noise) - before
         again = flat(self.watched(), self.inner.observation_space)
         if not np.array_equal(again, given, equal_nan=True):
@@ -350,11 +345,11 @@ class Instance:
             )
         return moved
 
-    def seen_as(self, derived: str, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    def seen_as(self, derived: Derived, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Returns the innermost observation (o,) of a state (S,) under noise (d,), as `derived` says."""
         self.physics.leave()
         moved = self.moved(state, noise)
-        if derived == EARLIER:
+        if derived == "earlier":
             self.physics.write(self.moved(self.physics.earlier(state), noise))
             self.physics.show(moved)
         else:
@@ -435,7 +430,7 @@ class Instance:
             )
         self._samples += 1
         goes_on = dt and not self.physics.is_plant and not (result[2] or result[3])
-        if goes_on and abs(took - dt) > SAME_TIME * dt:
+        if goes_on and abs(took - dt) > 1e-3 * dt:  # rounding of differences of the time
             raise BadInput(
                 f"a step of {self.name} takes {took:.6g} s, and others {dt:.6g} s: let each take as long"
             )

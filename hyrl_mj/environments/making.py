@@ -22,9 +22,6 @@ import numpy as np
 
 from hyrl_mj.environments.inspection import inspect
 from hyrl_mj.environments.opening import (
-    ARRAY,
-    CHART,
-    RESET,
     AnyChart,
     Description,
     register,
@@ -38,14 +35,11 @@ from hyrl_mj.ranges import Integer, refused
 from hyrl_mj.system.generators import kept_generators
 from hyrl_mj.tasks import ENVIRONMENT, Task, get_task
 
-# The longest episode, and the widest coordinate of a chart [m, rad].
-MOST_STEPS, WIDEST = 1_000_000, 1e6
 # The newest task of each text, for as long as somebody has it, and the last ones for longer.
 _MADE: MutableMapping[str, EnvironmentTask] = WeakValueDictionary()
 _RECENT: deque[EnvironmentTask] = deque(maxlen=2)
 # Older tasks of functions of the same name.
 _OLDER: WeakSet[EnvironmentTask] = WeakSet()
-SHOWN = 120  # characters of arguments in a message
 
 
 def from_gymnasium(
@@ -57,7 +51,7 @@ def from_gymnasium(
     failure: str | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     steps: int | None = None,
-    starts: str = CHART,
+    starts: str = "chart",
     kwargs: Mapping[str, Any] | None = None,
     reset: Mapping[str, Any] | None = None,
     pinned: Mapping[str, Any] | None = None,
@@ -97,7 +91,7 @@ def from_gymnasium(
         _check(given)
     description = Description(**given)
     told = given | {"env": env if isinstance(env, str) else {"function": _where(env)}}
-    if starts == CHART:
+    if starts == "chart":
         del told["starts"]
     spec = ENVIRONMENT + json.dumps(told, default=_plain)
     task = _MADE.get(spec)
@@ -147,15 +141,15 @@ def _check(given: Mapping[str, Any]) -> None:
         if not (isinstance(named, Mapping) and _all([*named], str)):
             raise refused(name, named, "a dictionary of names and values")
     for name, ends in given.get("bounds", {}).items():
-        if not _all(ends, Real) or len(ends) != 2 or not 0 < ends[1] - ends[0] <= WIDEST:
+        if not _all(ends, Real) or len(ends) != 2 or not 0 < ends[1] - ends[0] <= 1e6:
             raise refused(f"bounds of {name}", ends, "its low and its high end, as [-2, 2]")
     for name, value in given.get("pinned", {}).items():
         if not _is_numeric(value):
             raise refused(f"pinned {name}", value, "a number, or a list of numbers")
-    Integer(1, MOST_STEPS).checked("steps", given.get("steps", 1))
+    Integer(1, 1_000_000).checked("steps", given.get("steps", 1))
     check_seed(given.get("seed", 0))
-    if starts not in (CHART, RESET):
-        raise unknown("starts", starts, (CHART, RESET))
+    if starts not in ("chart", "reset"):
+        raise unknown("starts", starts, ("chart", "reset"))
 
 
 def _all(values: Any, kind: type) -> bool:
@@ -220,7 +214,7 @@ def _same(made_of: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
-        return {ARRAY: value.tolist()}
+        return {"array": value.tolist()}
     if isinstance(value, np.number):
         return value.item()
     raise BadInput(f"{value!r} cannot be written down: give numbers, texts, lists and dictionaries")
@@ -281,7 +275,7 @@ def _check_received(env: str, given: Mapping[str, Any], spec: str) -> None:
         how = f"--env {shlex.quote(env)}"
         if args:
             text = json.dumps(args, default=_plain)
-            held = text if len(text) <= SHOWN else "its arguments, which stand in config.json"
+            held = text if len(text) <= 120 else "its arguments, which stand in config.json"
             how += f" --env-args FILE, where FILE holds {held}"
         raise BadInput(
             f"the environment is {env}, and opening a run imports no module that you have not used before, "

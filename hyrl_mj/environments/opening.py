@@ -35,10 +35,6 @@ PEELED = (
 )  # fmt: skip
 # Chart, as users give it: one name, several, or new names with the names of what they stand for.
 AnyChart = str | Sequence[str] | Mapping[str, str]
-# The key of an object in JSON that stands for an array of NumPy.
-ARRAY = "array"
-# Where episodes start.
-CHART, RESET = "chart", "reset"
 
 
 @dataclass(frozen=True)
@@ -52,7 +48,7 @@ class Description:
     failure: str | None = None
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     steps: int | None = None
-    starts: str = CHART
+    starts: str = "chart"
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     reset: Mapping[str, Any] = field(default_factory=dict)
     pinned: Mapping[str, Any] = field(default_factory=dict)
@@ -68,7 +64,7 @@ class Description:
 
 def with_arrays(content: dict[str, Any]) -> Any:
     """Returns the array that an object of JSON stands for, else the object."""
-    return np.array(content[ARRAY]) if content.keys() == {ARRAY} else content
+    return np.array(content["array"]) if content.keys() == {"array"} else content
 
 
 def made(description: Description) -> gym.Env:

@@ -13,24 +13,17 @@ from hyrl_mj.environments.instance import Instance
 from hyrl_mj.environments.observations import flat, observers
 from hyrl_mj.environments.plant import EnvironmentPlant
 from hyrl_mj.environments.pool import Pool
-from hyrl_mj.environments.specification import EARLIER, NOW, UNKNOWN, EnvironmentSpec
+from hyrl_mj.environments.specification import Derived, EnvironmentSpec
 from hyrl_mj.environments.stage import Played
 from hyrl_mj.errors import BadInput
-from hyrl_mj.tasks import Outcome
 
 # Episodes and samples of a trial, and for how many samples inputs are held.
 EPISODES, SAMPLES, HELD = 8, 40, 8
-# Rounding of what is computed again from the same state, as a share of the largest number.
-ROUNDING = 1e-9
-# What differs by less than this share of what a physics step changes is from near the end of a step.
-NEAR = 0.5
 # By how much coordinates are moved to see what follows them, as a share of the side of the chart.
 MOVED = 1e-3
 # Places on the chart from which runs of so many samples come to one state, which may show where they were;
 # from the first places longer ones, in which slow sensors measure.
 PLACES, AWAY, LONG = 64, 2, (SAMPLES, 120)
-# Runs that show whether the chart is the state, and how much they may differ from others.
-OF_CHART, SAME = 48, 1e-9
 
 
 def observer_of(instance: Instance) -> str:
@@ -107,7 +100,7 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _rounds(off: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Returns which differences (o,) are no more than rounding of values (o,)."""
     sizes = np.abs(values[np.isfinite(values)])
-    return np.asarray(off <= ROUNDING * max(float(sizes.max(initial=0.0)), 1.0))
+    return np.asarray(off <= 1e-9 * max(float(sizes.max(initial=0.0)), 1.0))
 
 
 def check_observer(instance: Instance, step: np.ndarray) -> None:
@@ -152,7 +145,7 @@ def check_observer(instance: Instance, step: np.ndarray) -> None:
             )
 
 
-def derived_of(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
+def derived_of(instance: Instance, step: np.ndarray) -> tuple[Derived, list[int]]:
     """Returns `derived` of a spec, and the columns of what is observed that are not from the end of a step.
 
     Args:
@@ -163,7 +156,7 @@ def derived_of(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
         BadInput: noise on the chart's coordinates moves columns of which it is not known when they are from.
     """
     rng, space = np.random.default_rng(5), instance.inner.observation_space
-    off: dict[str, list[np.ndarray]] = {NOW: [], EARLIER: []}
+    off: dict[Derived, list[np.ndarray]] = {"now": [], "earlier": []}
     moving, size = [], []
     for seed in range(EPISODES):
         instance.reset(seed)
@@ -174,20 +167,24 @@ def derived_of(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
                 differences.append(_apart(instance.seen_as(derived, state, 0 * step), seen))
             moving.append(np.abs(instance.displaced(step)))
     if not np.any(moving):
+        spec = instance.spec
+        noisy = [c.name for c, share in zip(spec.coordinates, spec.noisy, strict=True) if share]
         raise BadInput(
-            f"noise on {', '.join(noisy_names(instance.spec))} changes nothing that {instance.name} "
+            f"noise on {', '.join(noisy)} changes nothing that {instance.name} "
             "observes, so there is nothing to find out: name a chart of what it observes"
         )
     most = {derived: np.abs(differences).max(axis=0) for derived, differences in off.items()}
     differ = {derived: ~_rounds(far, np.array(size)) for derived, far in most.items()}
-    lags = np.flatnonzero(differ[NOW]).tolist()
+    lags = np.flatnonzero(differ["now"]).tolist()
     for derived, columns in differ.items():
         if not columns.any():
             return derived, lags
     # With the Runge-Kutta method they are from its last stage, which is near the end.
-    step_of_physics = np.abs(np.subtract(off[NOW], off[EARLIER])).max(axis=0)
-    far = most[NOW] > NEAR * step_of_physics
-    unknown = differ[NOW] & differ[EARLIER] & far & ~_rounds(np.max(moving, axis=0), np.array(size))
+    step_of_physics = np.abs(np.subtract(off["now"], off["earlier"])).max(axis=0)
+    far = most["now"] > 0.5 * step_of_physics
+    unknown = (
+        differ["now"] & differ["earlier"] & far & ~_rounds(np.max(moving, axis=0), np.array(size))
+    )
     if unknown.any():
         raise BadInput(
             f"observation[{unknown.argmax()}] of {instance.name} comes neither from the end of a step nor "
@@ -195,12 +192,7 @@ def derived_of(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
             "forces of contacts by include_cfrc_ext_in_observation=False, or call mj_forward at the end of "
             "step()"
         )
-    return UNKNOWN, lags
-
-
-def noisy_names(spec: EnvironmentSpec) -> list[str]:
-    """Returns the names of the coordinates on which there is noise."""
-    return [c.name for c, share in zip(spec.coordinates, spec.noisy, strict=True) if share]
+    return "unknown", lags
 
 
 def moving(pool: Pool, spec: EnvironmentSpec) -> tuple[np.ndarray, np.ndarray | None]:
@@ -240,29 +232,23 @@ def check_instances(pool: Pool, spec: EnvironmentSpec) -> None:
     """Raises `BadInput` unless instances go as new ones after other episodes, with noise and without."""
     d, o, everyone = spec.dimension, spec.columns, np.arange(EPISODES)
     for seed, share in enumerate((0.0, 0.0, MOVED)):
-        rng, inputs, told, errors = np.random.default_rng(seed), [], [], []
-        starts: list[np.ndarray] = []
-        bound = share * spec.chart.sides * spec.noisy
-
-        def observe(plant: EnvironmentPlant, noise: np.ndarray) -> np.ndarray:
-            """Returns what n runs are at, with the observation under noise (n, d)."""
-            errors = np.zeros((EPISODES, d + o + 3))
-            errors[:, :d] = noise
-            seen = plant.observe(plant.truth(everyone), errors, everyone)
-            found = plant.truth(everyone).copy()
-            found[:, d : d + o] = seen[:, d : d + o]
-            return found
-
+        rng, bound = np.random.default_rng(seed), share * spec.chart.sides * spec.noisy
+        starts, inputs, noises, told = [], [], [], []
         for plant, u in _runs(pool, spec, 3 + seed):
-            starts = starts or [plant.state]
-            errors.append(rng.uniform(-bound, bound, (EPISODES, d)))
-            told.append(observe(plant, errors[-1]))
+            starts.append(plant.state)
+            noises.append(rng.uniform(-bound, bound, (EPISODES, d)))
+            told.append(_observed(plant, noises[-1]))
             plant.step(u)
             inputs.append(u)
-        told.append(observe(plant, 0.0 * errors[-1]))
-        u, path, noise = np.array(inputs), np.array(told), np.array([*errors, 0.0 * errors[-1]])
+        noises.append(np.zeros((EPISODES, d)))
+        told.append(_observed(plant, noises[-1]))
+        u, path, noise = np.array(inputs), np.array(told), np.array(noises)
         over = path[:, :, -1] != 0
         ends = np.where(over.any(axis=0), over.argmax(axis=0), len(u))
+        last, cut = path[ends, everyone], ends == spec.max_steps
+        outcome = np.where(
+            cut & (last[:, -1] == 0), spec.criterion.verdict(last[:, -2] > 0), last[:, -1]
+        )
         if not spec.wrapped:  # at an end that is known nothing is observed any more
             noise[ends, everyone] = 0.0
         played = [
@@ -270,8 +256,8 @@ def check_instances(pool: Pool, spec: EnvironmentSpec) -> None:
                 starts[0][i],
                 u[:end, i],
                 path[: end + 1, i, :d],
-                _ended(spec, path[end, i], end == spec.max_steps),
-                end == spec.max_steps,
+                int(outcome[i]),
+                bool(cut[i]),
                 path[: end + 1, i, d : d + o],
                 noise[: end + 1, i],
                 path[1 : end + 1, i, d + o : d + o + 1],
@@ -281,12 +267,14 @@ def check_instances(pool: Pool, spec: EnvironmentSpec) -> None:
         pool.check(played, alone=not seed)
 
 
-def _ended(spec: EnvironmentSpec, measured: np.ndarray, cut: bool) -> int:
-    """Returns the `Outcome` of a run that ends at a measurement (p,), or is cut off there."""
-    outcome = int(measured[-1])
-    if cut and outcome == Outcome.RUNNING:
-        outcome = int(spec.criterion.verdict(measured[-2:-1] > 0)[0])
-    return outcome
+def _observed(plant: EnvironmentPlant, noise: np.ndarray) -> np.ndarray:
+    """Returns the measurements (n, p) of runs with the observation under noise (n, d)."""
+    d, o, everyone = plant.spec.dimension, plant.spec.columns, np.arange(plant.n)
+    errors = np.pad(noise, ((0, 0), (0, o + 3)))
+    seen = plant.observe(plant.truth(everyone), errors, everyone)[:, d : d + o]
+    found = plant.truth(everyone)
+    found[:, d : d + o] = seen
+    return found
 
 
 def goes_on(pool: Pool, spec: EnvironmentSpec, of_chart: bool = False) -> bool:
@@ -298,7 +286,7 @@ def goes_on(pool: Pool, spec: EnvironmentSpec, of_chart: bool = False) -> bool:
         of_chart: whether the states at rest at the chart points of the runs are written, so that the chart is
             all there is; by default MuJoCo's states of the runs.
     """
-    for plant, u in _runs(pool, spec, 4, OF_CHART if of_chart else EPISODES):
+    for plant, u in _runs(pool, spec, 4, 48 if of_chart else EPISODES):
         going = np.flatnonzero(plant.measurement[:, -1] == 0)
         before = plant.state[going]
         plant.step(u[going], going)
@@ -311,7 +299,7 @@ def goes_on(pool: Pool, spec: EnvironmentSpec, of_chart: bool = False) -> bool:
             return False
         success, outcome = spec.criterion.judged(report)
         told = np.column_stack([spec.z(after), seen, report[:, 0], success, outcome])
-        if not np.allclose(told, plant.measurement[going], rtol=0, atol=SAME, equal_nan=True):
+        if not np.allclose(told, plant.measurement[going], rtol=0, atol=1e-9, equal_nan=True):
             return False
         exact = np.array_equal(seen, plant.measurement[going, spec.dimension : -3])
         if not of_chart and not (exact and np.array_equal(after, plant.state[going])):
