@@ -171,7 +171,6 @@ def _check_pins(instance: Instance) -> None:
 
 def _places(instance: Instance) -> dict[str, np.ndarray]:
     """Returns places of the model and of the state by name, each as numbers (k,)."""
-    instance.physics.read()
     model, data = instance.model, instance.data
     kinds = {"site_pos": model, "body_pos": model, "geom_pos": model, "mocap_pos": data}
     found = {f"qpos[{i}:]": data.qpos[i:].copy() for i in range(model.nq)}

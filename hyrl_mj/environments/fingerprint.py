@@ -15,7 +15,7 @@ from collections.abc import Mapping, Set
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, partial
-from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
+from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import gymnasium as gym
@@ -268,27 +268,29 @@ def _is_passed(module: str) -> bool:
 @cache
 def _names_in(kind: type) -> frozenset[str]:
     """Returns the names that the methods of a class use, and the functions of its module that these call."""
-    module = vars(sys.modules[kind.__module__])
-    codes = [getattr(part, "__code__", None) for part in _methods_of(kind)]
-    names: set[str] = set()
+    module, codes, names = vars(sys.modules[kind.__module__]), codes_of(kind), set[str]()
     while codes:
-        if (code := codes.pop()) is None:
-            continue
-        codes += [part for part in code.co_consts if hasattr(part, "co_names")]
-        for name in set(code.co_names) - names:
+        for name in set(codes.pop().co_names) - names:
             names.add(name)
             if isinstance(part := module.get(name), FunctionType):
-                codes.append(part.__code__)
+                codes += _with_inner(part.__code__)
             elif isinstance(part, type):
-                codes += [getattr(method, "__code__", None) for method in _methods_of(part)]
+                codes += codes_of(part)
     return frozenset(names)
 
 
-def _methods_of(kind: type) -> list[Any]:
+def codes_of(kind: type) -> list[CodeType]:
+    """Returns the compiled code of the methods of a class, functions within them included."""
     parts = list(vars(kind).values())
-    functions = [getattr(part, "__func__", part) for part in parts]  # of classes, and static ones
-    properties = [part for part in parts if isinstance(part, property)]
-    return functions + [f for part in properties for f in (part.fget, part.fset) if f is not None]
+    methods = [getattr(part, "__func__", part) for part in parts]  # of classes, and static ones
+    methods += [f for part in parts if isinstance(part, property) for f in (part.fget, part.fset)]
+    codes = [method.__code__ for method in methods if hasattr(method, "__code__")]
+    return [inner for code in codes for inner in _with_inner(code)]
+
+
+def _with_inner(code: CodeType) -> list[CodeType]:
+    parts = [part for part in code.co_consts if isinstance(part, CodeType)]
+    return [code, *(inner for part in parts for inner in _with_inner(part))]
 
 
 @cache

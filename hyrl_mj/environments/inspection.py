@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -22,9 +21,9 @@ from hyrl_mj.environments.coordinates import (
 )
 from hyrl_mj.environments.draws import check_draws, states_of_resets
 from hyrl_mj.environments.expressions import Expression
-from hyrl_mj.environments.fingerprint import differing, is_known
+from hyrl_mj.environments.fingerprint import codes_of, differing, is_known
 from hyrl_mj.environments.fresh import Fresh
-from hyrl_mj.environments.instance import Instance, Worn
+from hyrl_mj.environments.instance import Instance
 from hyrl_mj.environments.observations import parts_of
 from hyrl_mj.environments.opening import AnyChart, Description, layers
 from hyrl_mj.environments.pool import Pool
@@ -197,8 +196,7 @@ def _sampled(instance: Instance) -> tuple[np.ndarray, list[str]]:
     deepest, dt, harmless, remembers = 0.0, 0.0, set[int](), False
     for seed in range(16):
         instance.reset(seed)
-        with suppress(Worn):  # these resets draw from other seeds
-            instance.mark()
+        instance.mark()
         before, began = instance.memory(), instance.data.time
         deepest = max(deepest, instance.depth())
         for _, reward, terminated, truncated, info in instance.wander(rng, samples=150, held=15):
@@ -274,20 +272,8 @@ def _criterion(instance: Instance, info: Sequence[str]) -> Criterion:
 def _is_written(env: Any, word: str | int) -> bool:
     """Returns whether a word stands in a method of an environment or of one of its wrappers."""
     kinds = {kind for layer in layers(env) for kind in type(layer).__mro__}
-    methods = [value for kind in kinds for value in vars(kind).values()]
-    codes = [getattr(method, "__code__", None) for method in methods]
-    return any(_holds(code, word) for code in codes if code is not None)
-
-
-def _holds(code: Any, word: str | int) -> bool:
-    """Returns whether a word is a constant of compiled code, functions within included."""
-    parts = [part for part in code.co_consts if isinstance(part, tuple)]
-    inner = [part for part in code.co_consts if hasattr(part, "co_consts")]
-    return (
-        word in code.co_consts
-        or any(word in part for part in parts)
-        or any(_holds(part, word) for part in inner)
-    )
+    constants = [one for kind in kinds for code in codes_of(kind) for one in code.co_consts]
+    return any(word == one or (isinstance(one, tuple) and word in one) for one in constants)
 
 
 def _at_rest(instance: Instance) -> np.ndarray:

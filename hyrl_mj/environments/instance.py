@@ -22,15 +22,11 @@ from hyrl_mj.environments import fingerprint as written
 from hyrl_mj.environments.chain import Chain
 from hyrl_mj.environments.expressions import entry
 from hyrl_mj.environments.observations import flat, observers, shaped
-from hyrl_mj.environments.opening import made, peeled, physics_of, plant_of, steps_of
+from hyrl_mj.environments.opening import made, peeled, physics_of, steps_of
 from hyrl_mj.environments.physics import Physics
 from hyrl_mj.environments.specification import Derived, EnvironmentSpec
 from hyrl_mj.errors import BadInput, HyrlError, brief
 from hyrl_mj.system.generators import global_state
-
-
-class Worn(HyrlError):
-    """An instance is not like a new one after its reset."""
 
 
 class Instance:
@@ -61,7 +57,7 @@ class Instance:
         self.spec, self.name, self.steps = spec, spec.name, steps_of(env)
         as_it_is = real and spec.description.steps is None
         self.env, (self.model, self.data) = env if as_it_is else peeled(env), physics
-        self.physics = Physics(self.model, self.data, plant_of(env))
+        self.physics = Physics(self.model, self.data)
         self.inner: Any = self.env.unwrapped
         self.is_wrapped = self.env is not self.inner
         self._space, self._actions = self.env.observation_space, self.env.action_space
@@ -124,8 +120,7 @@ class Instance:
                 f"reset() of {self.name} builds another model of MuJoCo, and runs are compared on one: let "
                 "it keep its model"
             )
-        if not self.physics.is_plant:
-            self.data = self.physics.data = physics[1]
+        self.data = self.physics.data = physics[1]
         # Views of MuJoCo's data, which show where these are at any time.
         self._pairs = [
             (getattr(self.data, a)[i], getattr(self.data, b)[j])
@@ -168,7 +163,6 @@ class Instance:
         """Sets what is pinned."""
         if not (pinned := self.spec.description.pinned):
             return
-        self.physics.read()
         for name, value in pinned.items():
             kind, _, rest = name.partition("[")
             if kind in ("qpos", "qvel", "mocap_pos", "userdata") and rest.endswith("]"):
@@ -189,7 +183,7 @@ class Instance:
                 )
             like: Any = np.array if isinstance(old, np.ndarray) else type(old)
             setattr(self.inner, name, like(value) if np.ndim(value) else value)
-        self.physics.write(self.physics.shown())
+        self.physics.write(self.physics.read())
 
     def memory(self) -> written.Fingerprint:
         """Returns what it remembers now outside of its state in MuJoCo: attributes, and MuJoCo's model."""
@@ -211,31 +205,24 @@ class Instance:
         assert self._chain is not None
         self._chain.tamper = change
 
-    def mark(self) -> None:
-        """Notes what is remembered, and compares it with what was after the first reset.
-
-        Raises:
-            Worn: after this reset the instance is not as it was after its first one.
-        """
+    def mark(self) -> str:
+        """Notes what is remembered after a reset; returns what is not as after the first, "" if all is."""
         self._begun = self.remembered()
         self._like = self._like or self._begun
-        if differ := written.differing(self._begun, self._like):
-            raise Worn(differ[0])
+        return next(iter(written.differing(self._begun, self._like)), "")
 
-    def renew(self) -> None:
+    def renew(self) -> str:
         """Leaves the episode before, and gets ready for another one.
 
-        Raises:
-            Worn: after its reset it is not like a new one.
+        Returns:
+            What of it is not like a new one, so that it can play no other; "" if all is.
         """
         self.quit()
         if not self.spec.anew:
             self.reset()
-            self.mark()
-        elif self._used:
-            raise Worn("a wrapper")
-        else:
-            self._used, self._begun = True, written.shared(self.env)
+            return self.mark()
+        worn, self._used, self._begun = self._used, True, written.shared(self.env)
+        return "a wrapper" if worn else ""
 
     def begin(self, start: np.ndarray, seed: int | None = None) -> None:
         """Begins an episode at a state of MuJoCo (S,); with wrappers, `sense` gives its first observation."""
@@ -268,13 +255,12 @@ class Instance:
 
     def finish(self) -> None:
         """Refuses an episode in which random numbers were drawn, or what is shared or looked at changed."""
-        if not self.physics.is_plant:
-            physics = physics_of(self.env)
-            if physics is None or physics[0] is not self.model or physics[1] is not self.data:
-                raise BadInput(
-                    f"{self.name} has another model or data of MuJoCo after an episode than before it: let "
-                    "it keep those that its reset leads to"
-                )
+        physics = physics_of(self.env)
+        if physics is None or physics[0] is not self.model or physics[1] is not self.data:
+            raise BadInput(
+                f"{self.name} has another model or data of MuJoCo after an episode than before it: let it "
+                "keep those that its reset leads to"
+            )
         differ = written.differing(written.shared(self.env), self._begun)
         if changed := [name for name in differ if written.is_shared(name)]:
             raise self.sharing(changed[0])
@@ -422,14 +408,14 @@ class Instance:
         if not self.is_wrapped:
             self.inner_seen = result[0]
         took, dt = self.data.time - began, self.spec.dt
-        if took < 0 and not self.physics.is_plant:
+        if took < 0:
             raise BadInput(
                 f"the time of {self.name} goes back in step(): it is reset at its ends, which its user has "
                 "to do, or its simulation diverges and MuJoCo resets it (limit its inputs, or take a smaller "
                 "timestep)"
             )
         self._samples += 1
-        goes_on = dt and not self.physics.is_plant and not (result[2] or result[3])
+        goes_on = dt and not (result[2] or result[3])
         if goes_on and abs(took - dt) > 1e-3 * dt:  # rounding of differences of the time
             raise BadInput(
                 f"a step of {self.name} takes {took:.6g} s, and others {dt:.6g} s: let each take as long"
@@ -443,8 +429,6 @@ class Instance:
         # The limit of `steps`, or that of a wrapper which episodes are played without.
         over = self.spec.criterion.asks("truncated") and self._samples == self.spec.max_steps
         truncated = bool(truncated) or over
-        if self.physics.is_plant:
-            self.physics.read()
         touch = bool(terminated) and bool(self.touched() - self.spec.harmless)
         report = [reward, bool(terminated), bool(truncated), touch]
         report += [entry(info, key) for key in self.spec.criterion.keys]

@@ -25,7 +25,6 @@ from hyrl_mj.errors import BadInput, brief
 from hyrl_mj.files.artifacts import digest
 from hyrl_mj.files.trust import current_folder
 from hyrl_mj.physics import mjcf, mujoco_log
-from hyrl_mj.physics.plant import Plant
 
 # Packages that offer environments, with the extra that brings each.
 PACKAGES = {"gymnasium_robotics": "robotics", "ogbench": "robotics", "shimmy": "dm-control"}
@@ -245,20 +244,9 @@ def _digest_of(kind: type) -> str:
     return ""
 
 
-def plant_of(env: gym.Env) -> Plant | None:
-    """Returns the plant that holds the state of an environment of this package; None of others."""
-    plant = getattr(getattr(env.unwrapped, "core", None), "plant", None)
-    return plant if isinstance(plant, Plant) and plant.n == 1 else None
-
-
 def physics_of(env: gym.Env) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
-    """Returns model and data of an environment, of Gymnasium or of dm_control; None if it has none.
-
-    The data of an environment of this package only show the state.
-    """
+    """Returns model and data of an environment, of Gymnasium or of dm_control; None if it has none."""
     inner: Any = env.unwrapped
-    if (plant := plant_of(env)) is not None:
-        return plant.model, mujoco.MjData(plant.model)
     of_control = getattr(getattr(inner, "_env", None), "physics", None)
     for model, data in (
         [getattr(inner, key, None) for key in ("model", "data")],

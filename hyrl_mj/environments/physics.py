@@ -1,9 +1,8 @@
-"""MuJoCo's state in an environment: read, written, moved by noise, and put back."""
+"""MuJoCo's state in an environment: read, written, and put back."""
 
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -12,19 +11,17 @@ STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
 class Physics:
-    """MuJoCo's state in an environment, or in the plant of an environment of this package.
+    """MuJoCo's state in an environment.
 
     Args:
         model, data: of MuJoCo.
-        plant: what holds the state of an environment of this package, which `data` only shows; else None.
     """
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, plant: Any):
-        self.model, self.data, self._plant = model, data, plant
-        self.is_plant = plant is not None
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
+        self.model, self.data = model, data
         self.size = mujoco.mj_stateSize(model, STATE)
         self._kept: mujoco.MjData | None = None
-        self._left: Any = None  # the state of the plant, or (), between `leave` and `come_back`
+        self._left = False
 
     @cached_property
     def columns(self) -> dict[str, np.ndarray]:
@@ -39,12 +36,6 @@ class Physics:
 
     def read(self, into: np.ndarray | None = None) -> np.ndarray:
         """Returns MuJoCo's state (S,), a new array or one that is given."""
-        if self._plant is not None:
-            self.show(self._plant.state[0])
-        return self.shown(into)
-
-    def shown(self, into: np.ndarray | None = None) -> np.ndarray:
-        """Returns the state (S,) in MuJoCo's data, a new array or one that is given."""
         state = np.empty(self.size) if into is None else into
         mujoco.mj_getState(self.model, self.data, state, STATE)
         return state
@@ -55,8 +46,6 @@ class Physics:
         mujoco.mj_forward(self.model, self.data)
         mujoco.mj_rnePostConstraint(self.model, self.data)  # forces of contacts on bodies
         self.show(state)
-        if self._plant is not None:
-            self._plant.put(state[None])
 
     def show(self, state: np.ndarray) -> None:
         """Sets MuJoCo's state (S,) and leaves what follows from it as it is."""
@@ -74,12 +63,10 @@ class Physics:
         """Notes everything, derived quantities included, for `come_back`."""
         self._kept = self._kept or mujoco.MjData(self.model)
         mujoco.mj_copyData(self._kept, self.model, self.data)
-        self._left = self._plant.state if self.is_plant else ()
+        self._left = True
 
     def come_back(self) -> None:
         """Puts everything back as it was at `leave`, if that was called."""
-        if self._left is not None:
-            if self.is_plant:
-                self._plant.put(self._left)
+        if self._left:
             mujoco.mj_copyData(self.data, self.model, self._kept)
-            self._left = None
+            self._left = False

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hyrl_mj.environments import fingerprint as written
-from hyrl_mj.environments.instance import Instance, Worn
+from hyrl_mj.environments.instance import Instance
 from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files import trust
@@ -179,12 +179,10 @@ class Stage:
         """Returns an instance that can begin an episode: a spare one, or a new one if these are worn."""
         while True:
             instance = spare.pop() if spare else self._new(real)
-            try:
-                instance.renew()
+            if not (worn := instance.renew()):
                 return instance
-            except Worn as worn:
-                if written.is_shared(str(worn)):
-                    raise instance.sharing(str(worn)) from None
+            if written.is_shared(worn):
+                raise instance.sharing(worn)
 
     def _new(self, real: bool) -> Instance:
         instance = Instance(self.spec, real)
