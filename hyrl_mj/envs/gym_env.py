@@ -40,7 +40,7 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
     `info["z"]` is the true chart point (d,). When an episode is over, `info["outcome"]` is "reached",
     "crashed", "out_of_bounds" or "stalled", and `info["is_success"]` whether it is "reached".
 
-    `model` and `data` are MuJoCo's, as in environments of Gymnasium's own: writing to the data moves the robot.
+    `model` and `data` are MuJoCo's, as in environments of Gymnasium's own: who writes to the data moves it.
 
     Args:
         task: name of the task, or a file of one that this machine has run before.
