@@ -25,10 +25,9 @@ from hyrl_mj.environments.fingerprint import codes_of, differing, is_known
 from hyrl_mj.environments.fresh import Fresh
 from hyrl_mj.environments.instance import Instance
 from hyrl_mj.environments.observations import parts_of
-from hyrl_mj.environments.opening import AnyChart, Description, layers
+from hyrl_mj.environments.opening import FORMS, AnyChart, Description, layers
 from hyrl_mj.environments.pool import Pool
 from hyrl_mj.environments.specification import (
-    FORMS,
     Criterion,
     EnvironmentSpec,
 )
@@ -198,17 +197,17 @@ def _sampled(instance: Instance) -> tuple[np.ndarray, list[str]]:
         instance.reset(seed)
         instance.mark()
         before, began = instance.memory(), instance.data.time
-        deepest = max(deepest, instance.depth())
+        deepest = max(deepest, instance.physics.depth(instance.spec.solid))
         for _, reward, terminated, truncated, info in instance.wander(rng, samples=150, held=15):
             states.append(instance.physics.read())
             dt = dt or float(instance.data.time - began)
-            deepest = max(deepest, instance.depth())
+            deepest = max(deepest, instance.physics.depth(instance.spec.solid))
             rewards.append(float(reward))
             info_keys |= dict.fromkeys(key for key in info if isinstance(key, str))
             bodies.append(instance.data.xpos.copy())
             geoms.append(instance.data.geom_xpos.copy())
             if not (terminated or truncated):
-                harmless |= instance.touched()
+                harmless |= instance.physics.touched(instance.spec.solid)
         instance.finish()
         remembers = remembers or not is_known(before) or bool(differing(instance.memory(), before))
     if dt <= 0:

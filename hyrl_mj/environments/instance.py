@@ -22,8 +22,8 @@ from hyrl_mj.environments import fingerprint as written
 from hyrl_mj.environments.chain import Chain
 from hyrl_mj.environments.expressions import entry
 from hyrl_mj.environments.observations import flat, observers, shaped
-from hyrl_mj.environments.opening import made, peeled, physics_of, steps_of
-from hyrl_mj.environments.physics import Physics
+from hyrl_mj.environments.opening import checked_step, made, peeled, physics_of, steps_of
+from hyrl_mj.environments.physics import Physics, set_pins
 from hyrl_mj.environments.specification import Derived, EnvironmentSpec
 from hyrl_mj.errors import BadInput, HyrlError, brief
 from hyrl_mj.system.generators import global_state
@@ -161,29 +161,9 @@ class Instance:
 
     def pin(self) -> None:
         """Sets what is pinned."""
-        if not (pinned := self.spec.description.pinned):
-            return
-        for name, value in pinned.items():
-            kind, _, rest = name.partition("[")
-            if kind in ("qpos", "qvel", "mocap_pos", "userdata") and rest.endswith("]"):
-                values, i = getattr(self.data, kind).reshape(-1), rest[:-1]
-                if not i.isdigit() or int(i) >= len(values):
-                    held = f"{kind}[0] to [{len(values) - 1}]" if len(values) else f"no {kind}"
-                    raise BadInput(f"{self.name} has no {name}: there are {held}")
-                if np.ndim(value):
-                    raise BadInput(f"pinned {name} is {value}: give one number")
-                values[int(i)] = value
-                continue
-            old: Any = getattr(self.inner, name, None)
-            numbers = isinstance(old, bool | int | float | list | tuple | np.ndarray | np.generic)
-            if not numbers or np.shape(old) != np.shape(value):
-                raise BadInput(
-                    f"{self.name} has no attribute {name} of shape {np.shape(value)} to pin: name a "
-                    "position as qpos[2], or an attribute"
-                )
-            like: Any = np.array if isinstance(old, np.ndarray) else type(old)
-            setattr(self.inner, name, like(value) if np.ndim(value) else value)
-        self.physics.write(self.physics.read())
+        if pinned := self.spec.description.pinned:
+            set_pins(self.inner, self.data, pinned, self.name)
+            self.physics.write(self.physics.read())
 
     def memory(self) -> written.Fingerprint:
         """Returns what it remembers now outside of its state in MuJoCo: attributes, and MuJoCo's model."""
@@ -350,19 +330,6 @@ class Instance:
         moved[self.spec.places] += noise
         return moved
 
-    def depth(self) -> float:
-        """Returns how deep the robot is inside of something else [m], 0 if it touches nothing."""
-        contact = self.data.contact
-        if not self.data.ncon:
-            return 0.0
-        touches = self.spec.solid[contact.geom].sum(axis=1) == 1
-        return float(-min(contact.dist[touches].min(initial=0.0), 0.0))
-
-    def touched(self) -> set[int]:
-        """Returns the geoms that the robot touches."""
-        pairs = self.data.contact.geom[: self.data.ncon]
-        return {int(g) for pair in pairs if self.spec.solid[pair].sum() == 1 for g in pair}
-
     # ---- steps
 
     def drawn(self, rng: np.random.Generator) -> np.ndarray:
@@ -393,18 +360,7 @@ class Instance:
                     "look ahead in an environment of its own"
                 ) from error
             raise BadInput(f"step() of {self.name} raises {brief(error)}: repair it") from error
-        if not isinstance(result, tuple) or len(result) != 5:
-            raise BadInput(
-                f"step() of {self.name} returns a {type(result).__name__}: let it return an observation, a "
-                "reward, terminated, truncated and info"
-            )
-        reward, info = np.asarray(result[1]), result[4]
-        if reward.size != 1 or reward.dtype.kind not in "biuf" or not isinstance(info, dict):
-            raise BadInput(
-                f"step() of {self.name} returns {result[1]!r:.60} as its reward and a {type(info).__name__} "
-                "as its info: let it return a number and a dictionary"
-            )
-        result = (result[0], float(reward.item()), *result[2:])
+        result = checked_step(result, self.name)
         if not self.is_wrapped:
             self.inner_seen = result[0]
         took, dt = self.data.time - began, self.spec.dt
@@ -429,7 +385,9 @@ class Instance:
         # The limit of `steps`, or that of a wrapper which episodes are played without.
         over = self.spec.criterion.asks("truncated") and self._samples == self.spec.max_steps
         truncated = bool(truncated) or over
-        touch = bool(terminated) and bool(self.touched() - self.spec.harmless)
+        touch = bool(terminated) and bool(
+            self.physics.touched(self.spec.solid) - self.spec.harmless
+        )
         report = [reward, bool(terminated), bool(truncated), touch]
         report += [entry(info, key) for key in self.spec.criterion.keys]
         for a, b in self._pairs:

@@ -8,11 +8,10 @@ import os
 import re
 import shlex
 from collections import deque
-from collections.abc import Callable, Collection, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from inspect import signature
-from numbers import Real
 from pathlib import Path
 from typing import Any
 from weakref import WeakSet, WeakValueDictionary
@@ -27,11 +26,9 @@ from hyrl_mj.environments.opening import (
     register,
     with_arrays,
 )
-from hyrl_mj.environments.specification import FORMS
 from hyrl_mj.environments.task import EnvironmentTask
-from hyrl_mj.errors import BadInput, brief, check_seed, described, printable, unknown
+from hyrl_mj.errors import BadInput, brief, described, printable, unknown
 from hyrl_mj.files import artifacts, trust
-from hyrl_mj.ranges import Integer, refused
 from hyrl_mj.system.generators import kept_generators
 from hyrl_mj.tasks import ENVIRONMENT, Task, get_task
 
@@ -88,8 +85,7 @@ def from_gymnasium(
         if value is not None
     }
     with described(_shown(env)):
-        _check(given)
-    description = Description(**given)
+        description = Description(**given)
     told = given | {"env": env if isinstance(env, str) else {"function": _where(env)}}
     if starts == "chart":
         del told["starts"]
@@ -118,52 +114,6 @@ def from_gymnasium(
 
 def _shown(env: Any) -> str:
     return f"the environment {env[:80]}" if isinstance(env, str) else "the environment"
-
-
-def _check(given: Mapping[str, Any]) -> None:
-    """Raises `BadInput` if one of the arguments of `from_gymnasium` is of another kind."""
-    chart, noisy, starts = given.get("chart"), given.get("noisy"), given.get("starts")
-    names = chart.values() if isinstance(chart, Mapping) else chart
-    if chart is not None and not isinstance(chart, str) and not _all(names, str):
-        raise refused(
-            "chart", chart, "a name, a list of names, or new names with those they stand for"
-        )
-    if noisy is not None:
-        if not _all(noisy, Real) or not np.isfinite([*noisy]).all() or min([*noisy, 0]) < 0:
-            raise refused("noisy", noisy, "a list of numbers from 0 on, one for each coordinate")
-        if not any(noisy):
-            raise refused("noisy", noisy, "a share above 0 for at least one coordinate")
-    for name in ("success", "failure"):
-        if not isinstance(given.get(name, ""), str):
-            raise refused(name, given[name], FORMS)
-    for name in ("bounds", "kwargs", "reset", "pinned"):
-        named = given.get(name, {})
-        if not (isinstance(named, Mapping) and _all([*named], str)):
-            raise refused(name, named, "a dictionary of names and values")
-    for name, ends in given.get("bounds", {}).items():
-        if not _all(ends, Real) or len(ends) != 2 or not 0 < ends[1] - ends[0] <= 1e6:
-            raise refused(f"bounds of {name}", ends, "its low and its high end, as [-2, 2]")
-    for name, value in given.get("pinned", {}).items():
-        if not _is_numeric(value):
-            raise refused(f"pinned {name}", value, "a number, or a list of numbers")
-    Integer(1, 1_000_000).checked("steps", given.get("steps", 1))
-    check_seed(given.get("seed", 0))
-    if starts not in ("chart", "reset"):
-        raise unknown("starts", starts, ("chart", "reset"))
-
-
-def _all(values: Any, kind: type) -> bool:
-    """Returns whether a value is a list, or another collection, of one kind."""
-    several = isinstance(values, Collection) and not isinstance(values, str | Mapping)
-    return several and all(isinstance(value, kind) for value in values)
-
-
-def _is_numeric(value: Any) -> bool:
-    """Returns whether a value is a finite number, or an array of them."""
-    with suppress(ValueError):  # lists of different lengths
-        array = np.asarray(value)
-        return array.dtype.kind in "biuf" and bool(np.isfinite(array).all())
-    return False
 
 
 def _module_of(env: str) -> Path | None:

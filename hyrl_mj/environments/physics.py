@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
+from typing import Any
 
 import mujoco
 import numpy as np
+
+from hyrl_mj.errors import BadInput
 
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
@@ -51,6 +55,19 @@ class Physics:
         """Sets MuJoCo's state (S,) and leaves what follows from it as it is."""
         mujoco.mj_setState(self.model, self.data, state, STATE)
 
+    def depth(self, robot: np.ndarray) -> float:
+        """Returns how deep geoms (ngeom,) bool are inside of others [m], 0 if they touch nothing."""
+        if not self.data.ncon:
+            return 0.0
+        contact = self.data.contact
+        touches = robot[contact.geom].sum(axis=1) == 1
+        return float(-min(contact.dist[touches].min(initial=0.0), 0.0))
+
+    def touched(self, robot: np.ndarray) -> set[int]:
+        """Returns which geoms meet at contacts of some geoms (ngeom,) bool with others."""
+        pairs = self.data.contact.geom[: self.data.ncon]
+        return {int(g) for pair in pairs if robot[pair].sum() == 1 for g in pair}
+
     def earlier(self, state: np.ndarray) -> np.ndarray:
         """Returns the state (S,) a step of the physics before, as the semi-implicit Euler method has it."""
         found, dt = state.copy(), self.model.opt.timestep
@@ -70,3 +87,37 @@ class Physics:
         if self._left:
             mujoco.mj_copyData(self.data, self.model, self._kept)
             self._left = False
+
+
+def set_pins(env: Any, data: mujoco.MjData, pinned: Mapping[str, Any], name: str) -> None:
+    """Sets positions, velocities and attributes of an environment to pinned values, by name.
+
+    Args:
+        env: the environment, without wrappers.
+        data: of MuJoCo.
+        pinned: the values.
+        name: of the environment, for messages.
+
+    Raises:
+        BadInput: it has no such place, or one of another shape.
+    """
+    for place, value in pinned.items():
+        kind, _, rest = place.partition("[")
+        if kind in ("qpos", "qvel", "mocap_pos", "userdata") and rest.endswith("]"):
+            values, i = getattr(data, kind).reshape(-1), rest[:-1]
+            if not i.isdigit() or int(i) >= len(values):
+                held = f"{kind}[0] to [{len(values) - 1}]" if len(values) else f"no {kind}"
+                raise BadInput(f"{name} has no {place}: there are {held}")
+            if np.ndim(value):
+                raise BadInput(f"pinned {place} is {value}: give one number")
+            values[int(i)] = value
+            continue
+        old: Any = getattr(env, place, None)
+        numbers = isinstance(old, bool | int | float | list | tuple | np.ndarray | np.generic)
+        if not numbers or np.shape(old) != np.shape(value):
+            raise BadInput(
+                f"{name} has no attribute {place} of shape {np.shape(value)} to pin: name a position as "
+                "qpos[2], or an attribute"
+            )
+        like: Any = np.array if isinstance(old, np.ndarray) else type(old)
+        setattr(env, place, like(value) if np.ndim(value) else value)

@@ -16,7 +16,6 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.sets import Chart
 from hyrl_mj.tasks import Outcome
 
-FORMS = '"terminated and reward >= 1", \'info["solved"]\' or "distance(fingertip, target) <= 0.05"'
 # What derived quantities are, as what is observed after a step shows them: as at the end of the step; as a
 # step of the physics before; or neither.
 Derived = Literal["now", "earlier", "unknown"]

@@ -120,7 +120,7 @@ class Stage:
             if self._resting is None or self.spec.wrapped:
                 self._resting = self._renewed([self._resting] if self._resting else [])
             seen.append(self._resting.rested(start))
-            depths.append(self._resting.depth())
+            depths.append(self._resting.physics.depth(self.spec.solid))
         return np.array(seen), np.array(depths)
 
     def branch(self, states: np.ndarray, u: np.ndarray) -> Arrays:

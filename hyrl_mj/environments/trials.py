@@ -121,7 +121,7 @@ def check_observer(instance: Instance, step: np.ndarray) -> None:
     for z, away in runs:
         instance.reset()
         instance.physics.write(spec.state_at(z[None])[0])
-        if instance.depth() > spec.depth:
+        if instance.physics.depth(instance.spec.solid) > spec.depth:
             continue
         if len([*instance.wander(np.random.default_rng(8), away, HELD)]) < away:
             continue
