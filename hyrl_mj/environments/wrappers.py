@@ -65,10 +65,8 @@ def check_told(spec: EnvironmentSpec, step: np.ndarray) -> None:
         if len(plain) != len(elsewhere):
             continue
         follow = [
-            {k: there[k] for k in here if _far(here[k], there.get(k), least)}
-            for here, there in zip(
-                [one.told for one in plain], [one.told for one in elsewhere], strict=True
-            )
+            {name: there.told[name] for name in here.told if _far(name, here, there, least)}
+            for here, there in zip(plain, elsewhere, strict=True)
         ]
         if not any(follow):
             continue
@@ -172,26 +170,27 @@ def _told(inner: Any, info: Any) -> Told:
     attributes = dict(getattr(inner, "__dict__", {}))
     found = {f"info {key}": value for key, value in dict(info).items()}
     found |= {f"attribute {key}": value for key, value in attributes.items()}
-    return {name: copy.deepcopy(value) for name, value in found.items() if _is_numeric(value)}
+    return {k: copy.deepcopy(value) for k, value in found.items() if _numbers(value) is not None}
 
 
-def _is_numeric(value: Any) -> bool:
-    """Returns whether a value is a number, an array of them, or a dictionary of such values."""
+def _numbers(value: Any) -> np.ndarray | None:
+    """Returns the numbers (k,) that a value holds, or all values of a dictionary; None if it holds others."""
     if isinstance(value, dict):
-        return bool(value) and all(map(_is_numeric, value.values()))
+        parts = [_numbers(part) for part in value.values()]
+        numbers = [part for part in parts if part is not None]
+        return np.concatenate(numbers) if 0 < len(numbers) == len(parts) else None
     if not isinstance(value, int | float | np.number | np.ndarray | list | tuple):
-        return False
+        return None
     try:
-        return np.asarray(value).dtype.kind in "iuf"
+        array = np.asarray(value)
     except ValueError:  # lists of different lengths
-        return False
+        return None
+    return array.ravel().astype(float) if array.dtype.kind in "iuf" else None
 
 
-def _far(here: Any, there: Any, least: float) -> bool:
-    """Returns whether two values differ by as much as what follows the place does."""
-    if isinstance(here, dict):
-        same = isinstance(there, dict) and here.keys() == there.keys()
-        return same and any(_far(value, there[key], least) for key, value in here.items())
-    if there is None or isinstance(there, dict) or np.shape(here) != np.shape(there):
+def _far(name: str, here: Seen, there: Seen, least: float) -> bool:
+    """Returns whether what is told at two places differs by as much as what follows the place does."""
+    a, b = _numbers(here.told[name]), _numbers(there.told.get(name))
+    if a is None or b is None or len(a) != len(b):
         return False
-    return bool(np.abs(np.subtract(here, there, dtype=float)).max(initial=0.0) >= least)
+    return bool(np.abs(a - b).max(initial=0.0) >= least)
