@@ -209,14 +209,6 @@ def _adapt_dm_control() -> None:
 def _why_not_made(name: str, error: BaseException) -> str:
     if name not in gym.registry and isinstance(error, gym.error.Error):
         missing = {e: m for m, e in PACKAGES.items() if importlib.util.find_spec(m) is None}
-        own = name.rpartition(":")[2]
-        namespace = own.partition("/")[0] if "/" in own else None
-        known = {spec.namespace for spec in gym.registry.values()} | {"dm_control"}
-        if namespace and namespace not in known:
-            return (
-                f"nothing that is installed has environments {namespace}/...: install their package, and "
-                f"name the module that registers them, as module:{own}"
-            )
         close = get_close_matches(name, list(gym.registry), n=3, cutoff=0.5)
         near = f"; near it are {', '.join(close)}" if close else ""
         install = "".join(
@@ -224,7 +216,8 @@ def _why_not_made(name: str, error: BaseException) -> str:
             for extra, module in missing.items()
         )
         return (
-            f"there is no environment {name!r}: give the id of one that is installed{near}{install}"
+            f"there is no environment {name!r}: give the id of one that is installed{near}{install}; if "
+            f"another package has it, name the module that registers it, as module:{name.rpartition(':')[2]}"
         )
     if isinstance(error, ImportError):
         module = name.partition(":")[0] if ":" in name else ""
