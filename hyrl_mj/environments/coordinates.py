@@ -155,13 +155,6 @@ class Bound(NamedTuple):
     why: str
 
 
-class Group(NamedTuple):
-    """Walls that touch each other, and whether a box around them is around all places of the robot."""
-
-    geoms: list[int]
-    encloses: bool
-
-
 def robot_of(model: mujoco.MjModel, chart: Sequence[Coordinate]) -> np.ndarray:
     """Returns the bodies (nbody,) bool that hang together with the joints of the chart."""
     trees = {int(model.body_treeid[model.jnt_bodyid[c.joint]]) for c in chart}
@@ -181,21 +174,28 @@ def walls(model: mujoco.MjModel) -> np.ndarray:
     return np.flatnonzero(~moves & ~is_plane & (collides | named))
 
 
-def groups_of(instance: Instance, places: np.ndarray) -> list[Group]:
-    """Returns the groups of walls that touch each other; the robot has been at places (n, 2)."""
-    model, data, found = instance.model, instance.data, []
+def groups_of(instance: Instance, places: np.ndarray) -> tuple[list[list[int]], list[list[int]]]:
+    """Returns the groups of walls that touch each other: those around all places, and those beside them.
+
+    Args:
+        instance: the environment.
+        places: (n, 2) where the robot has been; a group is around them if a box around it is.
+    """
+    model, data = instance.model, instance.data
+    around: list[list[int]] = []
+    beside: list[list[int]] = []
     for geoms in touching(model, data, walls(model).tolist()):
         centres = data.geom_xpos[geoms][:, :2]
         size = model.geom_rbound[geoms][:, None]
         low, high = (centres - size).min(axis=0), (centres + size).max(axis=0)
-        found.append(Group(geoms, bool(((low < places) & (places < high)).all())))
-    return found
+        (around if ((low < places) & (places < high)).all() else beside).append(geoms)
+    return around, beside
 
 
-def islands_of(instance: Instance, groups: Sequence[Group]) -> dict[str, int]:
+def islands_of(instance: Instance, beside: Sequence[list[int]]) -> dict[str, int]:
     """Returns the groups of walls that can be passed on both sides, by name, each with the id of one geom."""
     found: dict[str, int] = {}
-    for geoms in [group.geoms for group in groups if not group.encloses]:
+    for geoms in beside:
         centres = instance.data.geom_xpos[geoms][:, :2]
         middle = np.linalg.norm(centres - centres.mean(axis=0), axis=1).argmin()
         found[f"island {len(found) + 1}"] = geoms[int(middle)]
@@ -207,7 +207,8 @@ def bounds_of(
     chart: Sequence[Coordinate],
     samples: np.ndarray,
     given: Mapping[str, tuple[float, float]],
-    groups: Sequence[Group],
+    around: Sequence[list[int]],
+    beside: Sequence[list[int]],
 ) -> list[Bound]:
     """Returns the ends of the chart's coordinates.
 
@@ -216,12 +217,11 @@ def bounds_of(
         chart: its coordinates.
         samples: (n, d) chart points that sampled runs have met.
         given: ends that the user has given, by name.
-        groups: walls. Those that enclose all runs are the end of the chart; beside others there is room to
-            pass.
+        around, beside: groups of walls. Those around all runs are the end of the chart; the others can be
+            passed, and there is room for that.
     """
     model, found = instance.model, []
-    ids = [g for group in groups if group.encloses for g in group.geoms]
-    others = [g for group in groups if not group.encloses for g in group.geoms]
+    ids, others = ([g for geoms in groups for g in geoms] for groups in (around, beside))
     solid = np.flatnonzero(robot_of(model, chart)[model.geom_bodyid])
     passing = 2 * float(model.geom_rbound[solid].max(initial=0.0))
     for i, c in enumerate(chart):

@@ -299,9 +299,9 @@ def _learn_bounds(instance: Instance, met: np.ndarray, begun: np.ndarray) -> Non
         if name not in names:
             raise BadInput(f"bounds for {name} cannot be used: the chart has {', '.join(names)}")
     in_plane = len(names) >= 2 and all(c.unit == "m" for c in spec.coordinates[:2])
-    groups = groups_of(instance, (met - spec.offset)[:, :2]) if in_plane else []
+    around, beside = groups_of(instance, (met - spec.offset)[:, :2]) if in_plane else ([], [])
     samples = np.vstack([met, begun])
-    bounds = bounds_of(instance, spec.coordinates, samples, given.bounds, groups)
+    bounds = bounds_of(instance, spec.coordinates, samples, given.bounds, around, beside)
     found["bounds"] = ", ".join(
         f"{name} {b.low:.3g} to {b.high:.3g} (from {b.why})"
         for name, b in zip(names, bounds, strict=True)
@@ -322,7 +322,7 @@ def _learn_bounds(instance: Instance, met: np.ndarray, begun: np.ndarray) -> Non
         found["steps"] = f"{max_steps} ({max_steps * spec.dt:g} s) of an episode"
     instance.learn(
         chart=Chart(names, tuple(c.unit for c in spec.coordinates), low, high, periodic),
-        islands=islands_of(instance, groups),
+        islands=islands_of(instance, beside),
         start_low=start_low,
         start_high=start_high,
         max_steps=max_steps,
