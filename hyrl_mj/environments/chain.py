@@ -43,8 +43,9 @@ class Chain:
         self._busy = False  # with a sample that waits to be observed
         self._calls = 0
         self._inside = False  # of the environment's own reset, which may step it
-        # What is done to the result of a step before wrappers get it, in a trial.
-        self.tamper: Callable[[tuple[Any, ...]], tuple[Any, ...]] = lambda rest: rest
+        # What is done to the result of a step before wrappers get it, in a trial, in which they may write to
+        # a state that noise has moved.
+        self.tamper: Callable[[tuple[Any, ...]], tuple[Any, ...]] | None = None
         # The state that wrappers see, if it is not the true one.
         self._shown: np.ndarray | None = None
         Thread(target=_serve, args=(self._work, self._news), daemon=True).start()
@@ -74,7 +75,7 @@ class Chain:
         wrote = self._shown is not None and self._come_back(self._shown)
         if what == "error":
             raise value
-        if wrote and not self._instance.tried:
+        if wrote and self.tamper is None:
             raise BadInput(
                 f"a wrapper of {self._instance.name} reads MuJoCo's state for what it observes, and writes "
                 "to it: let it observe what the environment gives it, or let only the environment write"
@@ -122,7 +123,8 @@ class Chain:
         instance, space = self._instance, self._instance.inner.observation_space
         if not self._busy:
             return (observation, *rest)
-        rest = self.tamper(rest)
+        if self.tamper is not None:
+            rest = self.tamper(rest)
         self._calls += 1
         if self._calls > 1:
             raise BadInput(

@@ -17,13 +17,6 @@ from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.physics import mjcf
 from hyrl_mj.tasks import touching
 
-INDEXED = re.compile(r"(.+)\[(\d+)\]")
-# States at which a name is compared with positions and velocities, and how much of these changes [m, rad].
-TRIED, MOVED = 6, 0.05
-AGREES = 1e-6
-# What is sampled beyond this many times as far is outside of the chart.
-ROOM = 1.2
-AXES = "xyz"
 FREE, SLIDE, HINGE = map(
     int, (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
 )
@@ -70,7 +63,7 @@ def _named(model: mujoco.MjModel, *kinds: mujoco.mjtObj) -> list[str]:
 
 def _resolved(instance: Instance, new: str, name: str) -> Iterator[Coordinate]:
     model, parts = instance.model, columns_of(instance.env.observation_space)
-    match = INDEXED.fullmatch(name)
+    match = re.fullmatch(r"(.+)\[(\d+)\]", name)
     base, index = (match.group(1), int(match.group(2))) if match else (name, None)
     if base in ("qpos", "qvel") and index is not None:
         if index >= (model.nq if base == "qpos" else model.nv):
@@ -105,8 +98,8 @@ def _of_state(
     joint = int(np.searchsorted(addresses, index, side="right")) - 1
     kind_of_joint, part = model.jnt_type[joint], index - addresses[joint]
     name = new or _usual_name(model, joint, kind)
-    if kind_of_joint == FREE and part < len(AXES):
-        name = new or f"{AXES[part]} of {name}"
+    if kind_of_joint == FREE and part < 3:
+        name = new or f"{'xyz'[part]} of {name}"
         return Coordinate(name, kind, index, offset, joint, int(part))
     if kind_of_joint not in (SLIDE, HINGE):
         joints = np.flatnonzero(np.isin(model.jnt_type, (SLIDE, HINGE)))
@@ -133,12 +126,12 @@ def _fitted(
     state, places = instance.physics.read(), instance.physics.columns
     columns = [(kind, i) for kind in ("qpos", "qvel") for i in range(len(places[kind]))]
     at = np.concatenate([places["qpos"], places["qvel"]])
-    moved = np.tile(state, (TRIED, 1))
-    moved[:, at] += np.random.default_rng(0).uniform(-MOVED, MOVED, (TRIED, len(at)))
+    moved = np.tile(state, (6, 1))
+    moved[:, at] += np.random.default_rng(0).uniform(-0.05, 0.05, (6, len(at)))
     values = np.array([get(other) for other in moved])
     for j, column in enumerate(values.T):
         offsets = column[:, None] - moved[:, at]
-        alike = np.flatnonzero(np.ptp(offsets, axis=0) < AGREES)
+        alike = np.flatnonzero(np.ptp(offsets, axis=0) < 1e-6)
         if not len(alike):
             raise BadInput(
                 f"{name}[{j}] is no single position or velocity of {instance.name}, but follows from several "
@@ -162,13 +155,6 @@ class Bound(NamedTuple):
     why: str
 
 
-class Group(NamedTuple):
-    """Walls that touch each other, and whether a box around them is around all places of the robot."""
-
-    geoms: list[int]
-    encloses: bool
-
-
 def robot_of(model: mujoco.MjModel, chart: Sequence[Coordinate]) -> np.ndarray:
     """Returns the bodies (nbody,) bool that hang together with the joints of the chart."""
     trees = {int(model.body_treeid[model.jnt_bodyid[c.joint]]) for c in chart}
@@ -188,21 +174,28 @@ def walls(model: mujoco.MjModel) -> np.ndarray:
     return np.flatnonzero(~moves & ~is_plane & (collides | named))
 
 
-def groups_of(instance: Instance, places: np.ndarray) -> list[Group]:
-    """Returns the groups of walls that touch each other; the robot has been at places (n, 2)."""
-    model, data, found = instance.model, instance.data, []
+def groups_of(instance: Instance, places: np.ndarray) -> tuple[list[list[int]], list[list[int]]]:
+    """Returns the groups of walls that touch each other: those around all places, and those beside them.
+
+    Args:
+        instance: the environment.
+        places: (n, 2) where the robot has been; a group is around them if a box around it is.
+    """
+    model, data = instance.model, instance.data
+    around: list[list[int]] = []
+    beside: list[list[int]] = []
     for geoms in touching(model, data, walls(model).tolist()):
         centres = data.geom_xpos[geoms][:, :2]
         size = model.geom_rbound[geoms][:, None]
         low, high = (centres - size).min(axis=0), (centres + size).max(axis=0)
-        found.append(Group(geoms, bool(((low < places) & (places < high)).all())))
-    return found
+        (around if ((low < places) & (places < high)).all() else beside).append(geoms)
+    return around, beside
 
 
-def islands_of(instance: Instance, groups: Sequence[Group]) -> dict[str, int]:
+def islands_of(instance: Instance, beside: Sequence[list[int]]) -> dict[str, int]:
     """Returns the groups of walls that can be passed on both sides, by name, each with the id of one geom."""
     found: dict[str, int] = {}
-    for geoms in [group.geoms for group in groups if not group.encloses]:
+    for geoms in beside:
         centres = instance.data.geom_xpos[geoms][:, :2]
         middle = np.linalg.norm(centres - centres.mean(axis=0), axis=1).argmin()
         found[f"island {len(found) + 1}"] = geoms[int(middle)]
@@ -214,7 +207,8 @@ def bounds_of(
     chart: Sequence[Coordinate],
     samples: np.ndarray,
     given: Mapping[str, tuple[float, float]],
-    groups: Sequence[Group],
+    around: Sequence[list[int]],
+    beside: Sequence[list[int]],
 ) -> list[Bound]:
     """Returns the ends of the chart's coordinates.
 
@@ -223,12 +217,11 @@ def bounds_of(
         chart: its coordinates.
         samples: (n, d) chart points that sampled runs have met.
         given: ends that the user has given, by name.
-        groups: walls. Those that enclose all runs are the end of the chart; beside others there is room to
-            pass.
+        around, beside: groups of walls. Those around all runs are the end of the chart; the others can be
+            passed, and there is room for that.
     """
     model, found = instance.model, []
-    ids = [g for group in groups if group.encloses for g in group.geoms]
-    others = [g for group in groups if not group.encloses for g in group.geoms]
+    ids, others = ([g for geoms in groups for g in geoms] for groups in (around, beside))
     solid = np.flatnonzero(robot_of(model, chart)[model.geom_bodyid])
     passing = 2 * float(model.geom_rbound[solid].max(initial=0.0))
     for i, c in enumerate(chart):
@@ -244,7 +237,7 @@ def bounds_of(
             found.append(Bound(*_extent(instance, ids, c, 0.0), False, "the walls"))
         else:
             middle, half = np.median(samples[:, i]), np.ptp(samples[:, i]) / 2
-            half = max(ROOM * half, 1e-3)
+            half = max(1.2 * half, 1e-3)  # what is farther than sampled runs go is outside
             low, high, why = float(middle - half), float(middle + half), "sampled runs"
             if c.kind == "qpos" and others:
                 ends = _extent(instance, others, c, passing)

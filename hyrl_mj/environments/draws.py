@@ -11,21 +11,16 @@ from hyrl_mj.environments.fingerprint import Fingerprint, differing
 from hyrl_mj.environments.instance import Instance
 from hyrl_mj.errors import BadInput
 
-# Resets that show where episodes start, and those that are compared for all that they draw, with so many
-# samples of runs after them from so many of these starts.
-RESETS, COMPARED, SAMPLES, STARTS = 64, 4, 100, 3
-# Differences of what is observed that are none, as a share of the largest number.
-SAME = 1e-9
+# Resets that are compared for all that they draw.
+COMPARED = 4
 # What `Instance.remembered` calls the state, of which `names_of_state` tells more.
 STATE = "MuJoCo's state"
-# For how many samples inputs are held.
-HELD = 10
 
 
 def states_of_resets(instance: Instance) -> np.ndarray:
-    """Returns MuJoCo's states (RESETS, S) that resets lead to."""
+    """Returns MuJoCo's states (64, S) that resets lead to."""
     found = []
-    for seed in range(RESETS):
+    for seed in range(64):
         instance.reset(seed)
         found.append(instance.physics.read())
     return np.array(found)
@@ -89,7 +84,7 @@ def _drawn(instance: Instance, states: np.ndarray) -> list[str]:
     again = [_begun(instance, states[:1], 0)[0] for _ in range(2)]
     lasting = set(differing(*again))  # what outlasts a reset is not drawn by it
     begun = [
-        _begun(Instance(instance.spec) if lasting else instance, states[:STARTS], seed)
+        _begun(Instance(instance.spec) if lasting else instance, states[:3], seed)
         for seed in range(COMPARED)
     ]
     first, told = begun[0]
@@ -98,7 +93,7 @@ def _drawn(instance: Instance, states: np.ndarray) -> list[str]:
     passed = {*lasting, *of_model, STATE, *(n for found, _ in begun for n in found.generators)}
     differ = [name for name in changed if name not in passed and "_seed" not in name]
     sizes = np.abs(told[np.isfinite(told)])
-    most = SAME * max(float(sizes.max(initial=0.0)), 1.0)
+    most = 1e-9 * max(float(sizes.max(initial=0.0)), 1.0)
     if all(
         other.shape == told.shape and np.allclose(other, told, rtol=0, atol=most, equal_nan=True)
         for _, other in begun
@@ -120,7 +115,7 @@ def _begun(instance: Instance, starts: np.ndarray, seed: int) -> tuple[Fingerpri
         seen = instance.put(start, seed)
         remembered = remembered or instance.remembered()
         told.append(seen)
-        for result in instance.wander(rng, SAMPLES, HELD):
+        for result in instance.wander(rng, samples=100, held=10):
             instance.take(result)
             told += [instance.observation, np.array(instance.report, dtype=float)]
     assert remembered is not None
@@ -176,7 +171,6 @@ def _check_pins(instance: Instance) -> None:
 
 def _places(instance: Instance) -> dict[str, np.ndarray]:
     """Returns places of the model and of the state by name, each as numbers (k,)."""
-    instance.physics.read()
     model, data = instance.model, instance.data
     kinds = {"site_pos": model, "body_pos": model, "geom_pos": model, "mocap_pos": data}
     found = {f"qpos[{i}:]": data.qpos[i:].copy() for i in range(model.nq)}

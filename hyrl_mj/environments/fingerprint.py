@@ -15,7 +15,7 @@ from collections.abc import Mapping, Set
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, partial
-from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
+from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import gymnasium as gym
@@ -35,18 +35,14 @@ PASSED = (
 LIBRARIES = {
     "gymnasium", "dm_control", "shimmy", "numpy", "mujoco", "hyrl_mj", *sys.stdlib_module_names,
 }  # fmt: skip
-# Attributes that hold the arguments of a constructor, and methods that are put in by `Instance`.
-LEFT_OUT = frozenset(("_ezpickle_args", "_ezpickle_kwargs", "_saved_kwargs", "step", "reset"))
 # How deep attributes of attributes are looked at, and how many values at most. What lies beyond cannot be
 # compared, and counts as different.
 DEEPEST, MOST = 10, 100_000
-# Parts of MuJoCo's model that say how it moves, by the first words of their names, and endings of those that
-# only say how it looks.
+# Parts of MuJoCo's model that say how it moves, by the first words of their names.
 MOVES = (
     "qpos", "body_", "jnt_", "dof_", "geom_", "site_", "tendon_", "wrap_", "actuator_", "sensor_", "eq_",
     "pair_", "exclude_", "numeric_data", "hfield_data", "flex_",
 )  # fmt: skip
-LOOKS = ("_rgba", "_matid", "_group", "_user")
 PLAIN = (type(None), bool, int, float, complex, str, bytes)
 # The kinds of variables of a class or a module whose values can change.
 DATA = (*PLAIN, list, dict, set, deque, tuple, np.ndarray, np.generic, np.random.Generator)
@@ -128,7 +124,7 @@ def _parts_of_model() -> list[str]:
         name
         for name in dir(model)
         if name.startswith(MOVES)
-        and not name.endswith(LOOKS)
+        and not name.endswith(("_rgba", "_matid", "_group", "_user"))  # how it looks
         and isinstance(getattr(model, name), np.ndarray)
     ]
 
@@ -213,7 +209,9 @@ def _parts(value: Any, path: str, found: Fingerprint, depth: int) -> dict[str, A
         found[path] = _written(value)
         return {}
     slots = {name: getattr(value, name) for name in _slots(value.__class__) if hasattr(value, name)}
-    left_out = LEFT_OUT if depth == 0 else ()
+    # Arguments of a constructor, and methods that are put in by `Chain`.
+    passed = "_ezpickle_args", "_ezpickle_kwargs", "_saved_kwargs", "step", "reset"
+    left_out = passed if depth == 0 else ()
     own = {name: part for name, part in vars(value).items() if name not in left_out}
     return {f"{path}.{name}" if path else name: part for name, part in {**own, **slots}.items()}
 
@@ -270,27 +268,29 @@ def _is_passed(module: str) -> bool:
 @cache
 def _names_in(kind: type) -> frozenset[str]:
     """Returns the names that the methods of a class use, and the functions of its module that these call."""
-    module = vars(sys.modules[kind.__module__])
-    codes = [getattr(part, "__code__", None) for part in _methods_of(kind)]
-    names: set[str] = set()
+    module, codes, names = vars(sys.modules[kind.__module__]), codes_of(kind), set[str]()
     while codes:
-        if (code := codes.pop()) is None:
-            continue
-        codes += [part for part in code.co_consts if hasattr(part, "co_names")]
-        for name in set(code.co_names) - names:
+        for name in set(codes.pop().co_names) - names:
             names.add(name)
             if isinstance(part := module.get(name), FunctionType):
-                codes.append(part.__code__)
+                codes += _with_inner(part.__code__)
             elif isinstance(part, type):
-                codes += [getattr(method, "__code__", None) for method in _methods_of(part)]
+                codes += codes_of(part)
     return frozenset(names)
 
 
-def _methods_of(kind: type) -> list[Any]:
+def codes_of(kind: type) -> list[CodeType]:
+    """Returns the compiled code of the methods of a class, functions within them included."""
     parts = list(vars(kind).values())
-    functions = [getattr(part, "__func__", part) for part in parts]  # of classes, and static ones
-    properties = [part for part in parts if isinstance(part, property)]
-    return functions + [f for part in properties for f in (part.fget, part.fset) if f is not None]
+    methods = [getattr(part, "__func__", part) for part in parts]  # of classes, and static ones
+    methods += [f for part in parts if isinstance(part, property) for f in (part.fget, part.fset)]
+    codes = [method.__code__ for method in methods if hasattr(method, "__code__")]
+    return [inner for code in codes for inner in _with_inner(code)]
+
+
+def _with_inner(code: CodeType) -> list[CodeType]:
+    parts = [part for part in code.co_consts if isinstance(part, CodeType)]
+    return [code, *(inner for part in parts for inner in _with_inner(part))]
 
 
 @cache

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -22,49 +21,44 @@ from hyrl_mj.environments.coordinates import (
 )
 from hyrl_mj.environments.draws import check_draws, states_of_resets
 from hyrl_mj.environments.expressions import Expression
-from hyrl_mj.environments.fingerprint import differing, is_known
+from hyrl_mj.environments.fingerprint import codes_of, differing, is_known
 from hyrl_mj.environments.fresh import Fresh
-from hyrl_mj.environments.instance import Instance, Worn
+from hyrl_mj.environments.instance import Instance
 from hyrl_mj.environments.observations import parts_of
-from hyrl_mj.environments.opening import RESET, AnyChart, Description, layers
+from hyrl_mj.environments.opening import FORMS, AnyChart, Description, layers
 from hyrl_mj.environments.pool import Pool
 from hyrl_mj.environments.specification import (
-    EARLIER,
-    FORMS,
-    UNKNOWN,
     Criterion,
     EnvironmentSpec,
 )
-from hyrl_mj.environments.told import check_told
+from hyrl_mj.environments.wrappers import changes_by_reset, check_told, senses
 from hyrl_mj.errors import BadInput
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
 
-# Samples of an episode of an environment that never ends by itself.
-STEPS_WITHOUT_END = 1_000
-# Each episode begins with a reset, and has hundreds of steps: those that take longer [s] would take hours.
-LONGEST_RESET, LONGEST_STEP = 3.0, 0.3
-# Runs under inputs at random that show how far coordinates go, their steps, and for how long inputs are held.
-RUNS, STEPS, HELD = 16, 150, 15
-# What info calls success.
-SUCCESS = ("success", "is_success")
-# What goes no farther than this stands [m].
-STANDS = 1e-6
 # What is said of an observation that shows derived quantities from before the end of a step.
 LAG = {
-    EARLIER: "is that of a physics step before the end of a step, with noise, too",
-    UNKNOWN: "is from shortly before the end of a step; noise adds what it changes at the end",
+    "earlier": "is that of a physics step before the end of a step, with noise, too",
+    "unknown": "is from shortly before the end of a step; noise adds what it changes at the end",
 }
 
 
-def inspect(description: Description) -> tuple[EnvironmentSpec, Pool, Instance]:
+def inspect(
+    description: Description, untried: bool = False
+) -> tuple[EnvironmentSpec, Pool, Instance]:
     """Returns what is known of an environment, what plays its episodes, and an instance to look at.
+
+    Args:
+        description: what the user says of it.
+        untried: whether it is made, reset and stepped first within limits of time and memory.
 
     Raises:
         BadInput: it cannot be used, or one of its instances went another way than a new one.
     """
-    fresh = Fresh(description)  # before anything has been made
-    instance = Instance(EnvironmentSpec(description))
+    fresh, spec = Fresh(description), EnvironmentSpec(description)  # before anything has been made
+    if untried and fresh.available:
+        fresh.try_out(spec)
+    instance = Instance(spec)
     _check_times(instance)
     instance.reset()
     _learn_spaces(instance)
@@ -84,10 +78,10 @@ def inspect(description: Description) -> tuple[EnvironmentSpec, Pool, Instance]:
     if late:
         instance.spec.found["lag"] = f"observation {', '.join(map(str, late))} {LAG[derived]}"
     instance.learn(derived=derived)
-    instance.learn(anew=instance.is_wrapped and trials.changes_by_reset(instance.spec))
     if instance.is_wrapped:
+        instance.learn(anew=changes_by_reset(instance.spec))
         check_told(instance.spec, step)
-    instance.learn(sensing=instance.is_wrapped and trials.senses(instance.spec, step))
+        instance.learn(sensing=senses(instance.spec, step))
     pool = Pool(instance.spec, fresh)
     moves, affine = trials.moving(pool, instance.spec)
     instance.learn(moves=moves, affine=affine)
@@ -102,8 +96,8 @@ def inspect(description: Description) -> tuple[EnvironmentSpec, Pool, Instance]:
 def _check_times(instance: Instance) -> None:
     """Raises `BadInput` if a reset or a step takes so long that runs would take hours."""
     for name, most, why in (
-        ("reset", LONGEST_RESET, "each of thousands of episodes begins with it"),
-        ("step", LONGEST_STEP, "thousands of episodes take many of them"),
+        ("reset", 3.0, "each of thousands of episodes begins with it"),
+        ("step", 0.3, "thousands of episodes take many of them"),
     ):
         began = time.monotonic()
         if name == "reset":
@@ -199,22 +193,21 @@ def _sampled(instance: Instance) -> tuple[np.ndarray, list[str]]:
     states, rewards, bodies, geoms = [], [], [], []
     info_keys: dict[str, None] = {}
     deepest, dt, harmless, remembers = 0.0, 0.0, set[int](), False
-    for seed in range(RUNS):
+    for seed in range(16):
         instance.reset(seed)
-        with suppress(Worn):  # these resets draw from other seeds
-            instance.mark()
+        instance.mark()
         before, began = instance.memory(), instance.data.time
-        deepest = max(deepest, instance.depth())
-        for _, reward, terminated, truncated, info in instance.wander(rng, STEPS, HELD):
+        deepest = max(deepest, instance.physics.depth(instance.spec.solid))
+        for _, reward, terminated, truncated, info in instance.wander(rng, samples=150, held=15):
             states.append(instance.physics.read())
             dt = dt or float(instance.data.time - began)
-            deepest = max(deepest, instance.depth())
+            deepest = max(deepest, instance.physics.depth(instance.spec.solid))
             rewards.append(float(reward))
             info_keys |= dict.fromkeys(key for key in info if isinstance(key, str))
             bodies.append(instance.data.xpos.copy())
             geoms.append(instance.data.geom_xpos.copy())
             if not (terminated or truncated):
-                harmless |= instance.touched()
+                harmless |= instance.physics.touched(instance.spec.solid)
         instance.finish()
         remembers = remembers or not is_known(before) or bool(differing(instance.memory(), before))
     if dt <= 0:
@@ -238,7 +231,7 @@ def _sampled(instance: Instance) -> tuple[np.ndarray, list[str]]:
 def _farthest(named: Any, places: Sequence[np.ndarray]) -> str:
     """Returns the name of what goes farthest, of places (k, n, 3) [m]; none if nothing does."""
     went = np.ptp(places, axis=0).sum(axis=1)
-    return str(named(int(went.argmax())).name) if went.max() > STANDS else ""
+    return str(named(int(went.argmax())).name) if went.max() > 1e-6 else ""
 
 
 def _criterion(instance: Instance, info: Sequence[str]) -> Criterion:
@@ -246,9 +239,10 @@ def _criterion(instance: Instance, info: Sequence[str]) -> Criterion:
     description, name, found = instance.spec.description, instance.name, instance.spec.found
     success, failure = description.success, description.failure
     if success is None or success.strip() == "info":
-        told = [key for key in SUCCESS if key in info]
+        usual = "success", "is_success"
+        told = [key for key in usual if key in info]
         if not told:  # what only a success brings is found in the code
-            told = [key for key in SUCCESS if _is_written(instance.env, key)]
+            told = [key for key in usual if _is_written(instance.env, key)]
             told = told if len(told) == 1 else []
         if not told:
             raise BadInput(
@@ -277,20 +271,8 @@ def _criterion(instance: Instance, info: Sequence[str]) -> Criterion:
 def _is_written(env: Any, word: str | int) -> bool:
     """Returns whether a word stands in a method of an environment or of one of its wrappers."""
     kinds = {kind for layer in layers(env) for kind in type(layer).__mro__}
-    methods = [value for kind in kinds for value in vars(kind).values()]
-    codes = [getattr(method, "__code__", None) for method in methods]
-    return any(_holds(code, word) for code in codes if code is not None)
-
-
-def _holds(code: Any, word: str | int) -> bool:
-    """Returns whether a word is a constant of compiled code, functions within included."""
-    parts = [part for part in code.co_consts if isinstance(part, tuple)]
-    inner = [part for part in code.co_consts if hasattr(part, "co_consts")]
-    return (
-        word in code.co_consts
-        or any(word in part for part in parts)
-        or any(_holds(part, word) for part in inner)
-    )
+    constants = [one for kind in kinds for code in codes_of(kind) for one in code.co_consts]
+    return any(word == one or (isinstance(one, tuple) and word in one) for one in constants)
 
 
 def _at_rest(instance: Instance) -> np.ndarray:
@@ -317,9 +299,9 @@ def _learn_bounds(instance: Instance, met: np.ndarray, begun: np.ndarray) -> Non
         if name not in names:
             raise BadInput(f"bounds for {name} cannot be used: the chart has {', '.join(names)}")
     in_plane = len(names) >= 2 and all(c.unit == "m" for c in spec.coordinates[:2])
-    groups = groups_of(instance, (met - spec.offset)[:, :2]) if in_plane else []
+    around, beside = groups_of(instance, (met - spec.offset)[:, :2]) if in_plane else ([], [])
     samples = np.vstack([met, begun])
-    bounds = bounds_of(instance, spec.coordinates, samples, given.bounds, groups)
+    bounds = bounds_of(instance, spec.coordinates, samples, given.bounds, around, beside)
     found["bounds"] = ", ".join(
         f"{name} {b.low:.3g} to {b.high:.3g} (from {b.why})"
         for name, b in zip(names, bounds, strict=True)
@@ -329,18 +311,18 @@ def _learn_bounds(instance: Instance, met: np.ndarray, begun: np.ndarray) -> Non
     lead = ", ".join(f"{n} {a:.3g} to {b:.3g}" for n, a, b in zip(names, *ends, strict=True))
     found["starts"] = (
         "all over the chart, the robot at rest and all else as after a reset (deeper than "
-        f"{spec.depth:.2g} m inside of something it has crashed); with {RESET!r} where resets lead to: {lead}"
+        f"{spec.depth:.2g} m inside of something it has crashed); with 'reset' where resets lead to: {lead}"
     )
     start_low, start_high = low, high
-    if given.starts == RESET:
+    if given.starts == "reset":
         start_low, start_high = (tuple(np.clip(end, low, high).tolist()) for end in ends)
-    max_steps = given.steps or instance.steps or STEPS_WITHOUT_END
+    max_steps = given.steps or instance.steps or 1_000  # of one that never ends by itself
     found["sample time"] = f"{spec.dt:g} s, of a step"
     if given.steps is None:
         found["steps"] = f"{max_steps} ({max_steps * spec.dt:g} s) of an episode"
     instance.learn(
         chart=Chart(names, tuple(c.unit for c in spec.coordinates), low, high, periodic),
-        islands=islands_of(instance, groups),
+        islands=islands_of(instance, beside),
         start_low=start_low,
         start_high=start_high,
         max_steps=max_steps,

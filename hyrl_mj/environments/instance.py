@@ -22,18 +22,11 @@ from hyrl_mj.environments import fingerprint as written
 from hyrl_mj.environments.chain import Chain
 from hyrl_mj.environments.expressions import entry
 from hyrl_mj.environments.observations import flat, observers, shaped
-from hyrl_mj.environments.opening import made, peeled, physics_of, plant_of, steps_of
-from hyrl_mj.environments.physics import Physics
-from hyrl_mj.environments.specification import EARLIER, NOW, UNKNOWN, EnvironmentSpec
+from hyrl_mj.environments.opening import checked_step, made, peeled, physics_of, steps_of
+from hyrl_mj.environments.physics import Physics, set_pins
+from hyrl_mj.environments.specification import Derived, EnvironmentSpec
 from hyrl_mj.errors import BadInput, HyrlError, brief
 from hyrl_mj.system.generators import global_state
-
-# Durations of steps are the same if they differ by less than this share: they are differences of the time.
-SAME_TIME = 1e-3
-
-
-class Worn(HyrlError):
-    """An instance is not like a new one after its reset."""
 
 
 class Instance:
@@ -50,7 +43,6 @@ class Instance:
         report: numbers (r,) of the last sample: reward, terminated, truncated, whether it ended in touch with
             what the robot does not touch elsewhere, entries of `info`, distances.
         inner_seen: what the innermost environment observed last.
-        tried: whether wrappers may write to a state that noise has moved, to find out what they do.
         draws_globally: whether a reset has drawn from a global generator.
         start: the state of MuJoCo to which the innermost reset has to lead, below wrappers.
 
@@ -65,7 +57,7 @@ class Instance:
         self.spec, self.name, self.steps = spec, spec.name, steps_of(env)
         as_it_is = real and spec.description.steps is None
         self.env, (self.model, self.data) = env if as_it_is else peeled(env), physics
-        self.physics = Physics(self.model, self.data, plant_of(env))
+        self.physics = Physics(self.model, self.data)
         self.inner: Any = self.env.unwrapped
         self.is_wrapped = self.env is not self.inner
         self._space, self._actions = self.env.observation_space, self.env.action_space
@@ -78,7 +70,7 @@ class Instance:
         self._like: written.Fingerprint | None = None  # after its first reset
         self._begun = written.Fingerprint()  # after the reset of its episode
         self._used = self._at_start = False
-        self.tried = self.draws_globally = False
+        self.draws_globally = False
         self._samples = 0
         self._pairs: list[tuple[np.ndarray, np.ndarray]] = []
         self._chain = Chain(self) if self.is_wrapped else None
@@ -128,8 +120,7 @@ class Instance:
                 f"reset() of {self.name} builds another model of MuJoCo, and runs are compared on one: let "
                 "it keep its model"
             )
-        if not self.physics.is_plant:
-            self.data = self.physics.data = physics[1]
+        self.data = self.physics.data = physics[1]
         # Views of MuJoCo's data, which show where these are at any time.
         self._pairs = [
             (getattr(self.data, a)[i], getattr(self.data, b)[j])
@@ -153,14 +144,14 @@ class Instance:
         """
         if not self.is_wrapped:
             self.reset(seed)
-        self.begin(state, seed)
-        self.sense(np.zeros(self.spec.dimension) if noise is None else noise)
-        return self.observation
+        return self.rested(state, seed, noise)
 
-    def placed(self, state: np.ndarray) -> np.ndarray:
-        """Puts an environment without wrappers to a state (S,); returns what it observes there (o,)."""
-        self.arrive(state)
-        self.observation = self._flat(self.inner_seen)
+    def rested(
+        self, start: np.ndarray, seed: int | None = None, noise: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Returns what is first observed (o,) of an episode that begins at a state of MuJoCo (S,)."""
+        self.begin(start, seed)
+        self.sense(np.zeros(self.spec.dimension) if noise is None else noise)
         return self.observation
 
     def arrive(self, state: np.ndarray) -> None:
@@ -170,30 +161,9 @@ class Instance:
 
     def pin(self) -> None:
         """Sets what is pinned."""
-        if not (pinned := self.spec.description.pinned):
-            return
-        self.physics.read()
-        for name, value in pinned.items():
-            kind, _, rest = name.partition("[")
-            if kind in ("qpos", "qvel", "mocap_pos", "userdata") and rest.endswith("]"):
-                values, i = getattr(self.data, kind).reshape(-1), rest[:-1]
-                if not i.isdigit() or int(i) >= len(values):
-                    held = f"{kind}[0] to [{len(values) - 1}]" if len(values) else f"no {kind}"
-                    raise BadInput(f"{self.name} has no {name}: there are {held}")
-                if np.ndim(value):
-                    raise BadInput(f"pinned {name} is {value}: give one number")
-                values[int(i)] = value
-                continue
-            old: Any = getattr(self.inner, name, None)
-            numbers = isinstance(old, bool | int | float | list | tuple | np.ndarray | np.generic)
-            if not numbers or np.shape(old) != np.shape(value):
-                raise BadInput(
-                    f"{self.name} has no attribute {name} of shape {np.shape(value)} to pin: name a "
-                    "position as qpos[2], or an attribute"
-                )
-            like: Any = np.array if isinstance(old, np.ndarray) else type(old)
-            setattr(self.inner, name, like(value) if np.ndim(value) else value)
-        self.physics.write(self.physics.shown())
+        if pinned := self.spec.description.pinned:
+            set_pins(self.inner, self.data, pinned, self.name)
+            self.physics.write(self.physics.read())
 
     def memory(self) -> written.Fingerprint:
         """Returns what it remembers now outside of its state in MuJoCo: attributes, and MuJoCo's model."""
@@ -215,36 +185,30 @@ class Instance:
         assert self._chain is not None
         self._chain.tamper = change
 
-    def mark(self) -> None:
-        """Notes what is remembered, and compares it with what was after the first reset.
-
-        Raises:
-            Worn: after this reset the instance is not as it was after its first one.
-        """
+    def mark(self) -> str:
+        """Notes what is remembered after a reset; returns what is not as after the first, "" if all is."""
         self._begun = self.remembered()
         self._like = self._like or self._begun
-        if differ := written.differing(self._begun, self._like):
-            raise Worn(differ[0])
+        return next(iter(written.differing(self._begun, self._like)), "")
 
-    def renew(self) -> None:
+    def renew(self) -> str:
         """Leaves the episode before, and gets ready for another one.
 
-        Raises:
-            Worn: after its reset it is not like a new one.
+        Returns:
+            What of it is not like a new one, so that it can play no other; "" if all is.
         """
         self.quit()
         if not self.spec.anew:
             self.reset()
-            self.mark()
-        elif self._used:
-            raise Worn("a wrapper")
-        else:
-            self._used, self._begun = True, written.shared(self.env)
+            return self.mark()
+        worn, self._used, self._begun = self._used, True, written.shared(self.env)
+        return "a wrapper" if worn else ""
 
     def begin(self, start: np.ndarray, seed: int | None = None) -> None:
         """Begins an episode at a state of MuJoCo (S,); with wrappers, `sense` gives its first observation."""
         if self._chain is None:
-            self.placed(start)
+            self.arrive(start)
+            self.observation = self._flat(self.inner_seen)
         else:
             self.start = start
             self._chain.ask(lambda: self.reset(seed))
@@ -271,13 +235,12 @@ class Instance:
 
     def finish(self) -> None:
         """Refuses an episode in which random numbers were drawn, or what is shared or looked at changed."""
-        if not self.physics.is_plant:
-            physics = physics_of(self.env)
-            if physics is None or physics[0] is not self.model or physics[1] is not self.data:
-                raise BadInput(
-                    f"{self.name} has another model or data of MuJoCo after an episode than before it: let "
-                    "it keep those that its reset leads to"
-                )
+        physics = physics_of(self.env)
+        if physics is None or physics[0] is not self.model or physics[1] is not self.data:
+            raise BadInput(
+                f"{self.name} has another model or data of MuJoCo after an episode than before it: let it "
+                "keep those that its reset leads to"
+            )
         differ = written.differing(written.shared(self.env), self._begun)
         if changed := [name for name in differ if written.is_shared(name)]:
             raise self.sharing(changed[0])
@@ -324,10 +287,6 @@ class Instance:
                 f"{self.spec.observer}() of {self.name} raises {brief(error)}: repair it"
             ) from error
 
-    def rested(self, start: np.ndarray) -> np.ndarray:
-        """Returns what is first observed (o,) of an episode that begins at a state of MuJoCo (S,)."""
-        return self.put(start) if self.is_wrapped else self.placed(start)
-
     def displaced(self, noise: np.ndarray) -> np.ndarray:
         """Returns by how much the innermost observation changes (o,) where the chart's coordinates do.
 
@@ -335,11 +294,12 @@ class Instance:
         computed where the robot was then, with the noise. Where it is not known which they are, it is the
         difference of two observations with all of them up to date.
         """
-        state, derived = self.physics.read(), NOW if self._at_start else self.spec.derived
+        state = self.physics.read()
+        derived: Derived = "now" if self._at_start else self.spec.derived
         given = flat(self.inner_seen, self.inner.observation_space)
         before = given
-        if derived == UNKNOWN:
-            before = self.seen_as(NOW, state, np.zeros(len(noise)))
+        if derived == "unknown":
+            before = self.seen_as("now", state, np.zeros(len(noise)))
         moved = self.seen_as(derived, state, noise) - before
         again = flat(self.watched(), self.inner.observation_space)
         if not np.array_equal(again, given, equal_nan=True):
@@ -351,11 +311,11 @@ class Instance:
             )
         return moved
 
-    def seen_as(self, derived: str, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    def seen_as(self, derived: Derived, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Returns the innermost observation (o,) of a state (S,) under noise (d,), as `derived` says."""
         self.physics.leave()
         moved = self.moved(state, noise)
-        if derived == EARLIER:
+        if derived == "earlier":
             self.physics.write(self.moved(self.physics.earlier(state), noise))
             self.physics.show(moved)
         else:
@@ -369,19 +329,6 @@ class Instance:
         moved = state.copy()
         moved[self.spec.places] += noise
         return moved
-
-    def depth(self) -> float:
-        """Returns how deep the robot is inside of something else [m], 0 if it touches nothing."""
-        contact = self.data.contact
-        if not self.data.ncon:
-            return 0.0
-        touches = self.spec.solid[contact.geom].sum(axis=1) == 1
-        return float(-min(contact.dist[touches].min(initial=0.0), 0.0))
-
-    def touched(self) -> set[int]:
-        """Returns the geoms that the robot touches."""
-        pairs = self.data.contact.geom[: self.data.ncon]
-        return {int(g) for pair in pairs if self.spec.solid[pair].sum() == 1 for g in pair}
 
     # ---- steps
 
@@ -413,30 +360,19 @@ class Instance:
                     "look ahead in an environment of its own"
                 ) from error
             raise BadInput(f"step() of {self.name} raises {brief(error)}: repair it") from error
-        if not isinstance(result, tuple) or len(result) != 5:
-            raise BadInput(
-                f"step() of {self.name} returns a {type(result).__name__}: let it return an observation, a "
-                "reward, terminated, truncated and info"
-            )
-        reward, info = np.asarray(result[1]), result[4]
-        if reward.size != 1 or reward.dtype.kind not in "biuf" or not isinstance(info, dict):
-            raise BadInput(
-                f"step() of {self.name} returns {result[1]!r:.60} as its reward and a {type(info).__name__} "
-                "as its info: let it return a number and a dictionary"
-            )
-        result = (result[0], float(reward.item()), *result[2:])
+        result = checked_step(result, self.name)
         if not self.is_wrapped:
             self.inner_seen = result[0]
         took, dt = self.data.time - began, self.spec.dt
-        if took < 0 and not self.physics.is_plant:
+        if took < 0:
             raise BadInput(
                 f"the time of {self.name} goes back in step(): it is reset at its ends, which its user has "
                 "to do, or its simulation diverges and MuJoCo resets it (limit its inputs, or take a smaller "
                 "timestep)"
             )
         self._samples += 1
-        goes_on = dt and not self.physics.is_plant and not (result[2] or result[3])
-        if goes_on and abs(took - dt) > SAME_TIME * dt:
+        goes_on = dt and not (result[2] or result[3])
+        if goes_on and abs(took - dt) > 1e-3 * dt:  # rounding of differences of the time
             raise BadInput(
                 f"a step of {self.name} takes {took:.6g} s, and others {dt:.6g} s: let each take as long"
             )
@@ -449,9 +385,9 @@ class Instance:
         # The limit of `steps`, or that of a wrapper which episodes are played without.
         over = self.spec.criterion.asks("truncated") and self._samples == self.spec.max_steps
         truncated = bool(truncated) or over
-        if self.physics.is_plant:
-            self.physics.read()
-        touch = bool(terminated) and bool(self.touched() - self.spec.harmless)
+        touch = bool(terminated) and bool(
+            self.physics.touched(self.spec.solid) - self.spec.harmless
+        )
         report = [reward, bool(terminated), bool(truncated), touch]
         report += [entry(info, key) for key in self.spec.criterion.keys]
         for a, b in self._pairs:

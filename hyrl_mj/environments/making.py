@@ -8,11 +8,10 @@ import os
 import re
 import shlex
 from collections import deque
-from collections.abc import Callable, Collection, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from inspect import signature
-from numbers import Real
 from pathlib import Path
 from typing import Any
 from weakref import WeakSet, WeakValueDictionary
@@ -22,31 +21,22 @@ import numpy as np
 
 from hyrl_mj.environments.inspection import inspect
 from hyrl_mj.environments.opening import (
-    ARRAY,
-    CHART,
-    RESET,
     AnyChart,
     Description,
     register,
     with_arrays,
 )
-from hyrl_mj.environments.specification import FORMS
 from hyrl_mj.environments.task import EnvironmentTask
-from hyrl_mj.errors import BadInput, brief, check_seed, described, printable, unknown
+from hyrl_mj.errors import BadInput, brief, described, printable, unknown
 from hyrl_mj.files import artifacts, trust
-from hyrl_mj.ranges import Integer, refused
-from hyrl_mj.system import limits
 from hyrl_mj.system.generators import kept_generators
 from hyrl_mj.tasks import ENVIRONMENT, Task, get_task
 
-# The longest episode, and the widest coordinate of a chart [m, rad].
-MOST_STEPS, WIDEST = 1_000_000, 1e6
 # The newest task of each text, for as long as somebody has it, and the last ones for longer.
 _MADE: MutableMapping[str, EnvironmentTask] = WeakValueDictionary()
 _RECENT: deque[EnvironmentTask] = deque(maxlen=2)
 # Older tasks of functions of the same name.
 _OLDER: WeakSet[EnvironmentTask] = WeakSet()
-SHOWN = 120  # characters of arguments in a message
 
 
 def from_gymnasium(
@@ -58,7 +48,7 @@ def from_gymnasium(
     failure: str | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     steps: int | None = None,
-    starts: str = CHART,
+    starts: str = "chart",
     kwargs: Mapping[str, Any] | None = None,
     reset: Mapping[str, Any] | None = None,
     pinned: Mapping[str, Any] | None = None,
@@ -95,10 +85,9 @@ def from_gymnasium(
         if value is not None
     }
     with described(_shown(env)):
-        _check(given)
-    description = Description(**given)
+        description = Description(**given)
     told = given | {"env": env if isinstance(env, str) else {"function": _where(env)}}
-    if starts == CHART:
+    if starts == "chart":
         del told["starts"]
     spec = ENVIRONMENT + json.dumps(told, default=_plain)
     task = _MADE.get(spec)
@@ -109,9 +98,11 @@ def from_gymnasium(
             with suppress(ValueError):
                 _RECENT.remove(task)
         with described(_shown(env)), kept_generators():
-            if isinstance(env, str) and (kwargs or reset or pinned or trust.is_received()):
-                _try(description, spec)
-            task = EnvironmentTask(*inspect(description), spec, _made_of(description))
+            # With names of files it is recorded otherwise, and tried each time.
+            known = not isinstance(env, str) or trust.is_known_text(spec)
+            untried = not known and (kwargs or reset or pinned or trust.is_received())
+            found = inspect(description, bool(untried))
+            task = EnvironmentTask(*found, spec, _made_of(description))
         _MADE[spec] = task
         _RECENT.append(task)
     if isinstance(env, str):
@@ -123,74 +114,6 @@ def from_gymnasium(
 
 def _shown(env: Any) -> str:
     return f"the environment {env[:80]}" if isinstance(env, str) else "the environment"
-
-
-def _try(description: Description, spec: str) -> None:
-    """Makes, resets and steps an environment in a process with limits, unless that was done before."""
-    if trust.is_known_text(spec):
-        return  # with names of files it is recorded otherwise, and tried each time
-    given = {
-        name: getattr(description, name) for name in ("env", "kwargs", "reset", "pinned", "seed")
-    }
-    try:
-        content = json.dumps(given, default=_plain)
-    except (TypeError, BadInput):
-        return  # objects, which only the user's own code gives
-    try:
-        found = limits.tried(Path(__file__).with_name("first_trial.py"), content.encode())
-    except limits.Ended as ended:
-        raise BadInput(
-            f"the environment {description.name} cannot be used: {ended} where it is made, reset and "
-            "stepped; give it other arguments"
-        ) from None
-    if found["problem"]:
-        raise BadInput(found["problem"])
-
-
-def _check(given: Mapping[str, Any]) -> None:
-    """Raises `BadInput` if one of the arguments of `from_gymnasium` is of another kind."""
-    chart, noisy, starts = given.get("chart"), given.get("noisy"), given.get("starts")
-    names = chart.values() if isinstance(chart, Mapping) else chart
-    if chart is not None and not isinstance(chart, str) and not _all(names, str):
-        raise refused(
-            "chart", chart, "a name, a list of names, or new names with those they stand for"
-        )
-    if noisy is not None:
-        if not _all(noisy, Real) or not np.isfinite([*noisy]).all() or min([*noisy, 0]) < 0:
-            raise refused("noisy", noisy, "a list of numbers from 0 on, one for each coordinate")
-        if not any(noisy):
-            raise refused("noisy", noisy, "a share above 0 for at least one coordinate")
-    for name in ("success", "failure"):
-        if not isinstance(given.get(name, ""), str):
-            raise refused(name, given[name], FORMS)
-    for name in ("bounds", "kwargs", "reset", "pinned"):
-        named = given.get(name, {})
-        if not (isinstance(named, Mapping) and _all([*named], str)):
-            raise refused(name, named, "a dictionary of names and values")
-    for name, ends in given.get("bounds", {}).items():
-        if not _all(ends, Real) or len(ends) != 2 or not 0 < ends[1] - ends[0] <= WIDEST:
-            raise refused(f"bounds of {name}", ends, "its low and its high end, as [-2, 2]")
-    for name, value in given.get("pinned", {}).items():
-        if not _is_numeric(value):
-            raise refused(f"pinned {name}", value, "a number, or a list of numbers")
-    Integer(1, MOST_STEPS).checked("steps", given.get("steps", 1))
-    check_seed(given.get("seed", 0))
-    if starts not in (CHART, RESET):
-        raise unknown("starts", starts, (CHART, RESET))
-
-
-def _all(values: Any, kind: type) -> bool:
-    """Returns whether a value is a list, or another collection, of one kind."""
-    several = isinstance(values, Collection) and not isinstance(values, str | Mapping)
-    return several and all(isinstance(value, kind) for value in values)
-
-
-def _is_numeric(value: Any) -> bool:
-    """Returns whether a value is a finite number, or an array of them."""
-    with suppress(ValueError):  # lists of different lengths
-        array = np.asarray(value)
-        return array.dtype.kind in "biuf" and bool(np.isfinite(array).all())
-    return False
 
 
 def _module_of(env: str) -> Path | None:
@@ -241,7 +164,7 @@ def _same(made_of: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
-        return {ARRAY: value.tolist()}
+        return {"array": value.tolist()}
     if isinstance(value, np.number):
         return value.item()
     raise BadInput(f"{value!r} cannot be written down: give numbers, texts, lists and dictionaries")
@@ -302,7 +225,7 @@ def _check_received(env: str, given: Mapping[str, Any], spec: str) -> None:
         how = f"--env {shlex.quote(env)}"
         if args:
             text = json.dumps(args, default=_plain)
-            held = text if len(text) <= SHOWN else "its arguments, which stand in config.json"
+            held = text if len(text) <= 120 else "its arguments, which stand in config.json"
             how += f" --env-args FILE, where FILE holds {held}"
         raise BadInput(
             f"the environment is {env}, and opening a run imports no module that you have not used before, "

@@ -7,11 +7,12 @@ import importlib.util
 import inspect
 import io
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext, redirect_stderr, suppress
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import cache
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,11 @@ import numpy as np
 from gymnasium import spaces
 
 from hyrl_mj.environments.observations import parts_of
-from hyrl_mj.errors import BadInput, brief
+from hyrl_mj.errors import BadInput, brief, check_seed
 from hyrl_mj.files.artifacts import digest
 from hyrl_mj.files.trust import current_folder
 from hyrl_mj.physics import mjcf, mujoco_log
-from hyrl_mj.physics.plant import Plant
+from hyrl_mj.ranges import Integer, OneOf, Optional, refused
 
 # Packages that offer environments, with the extra that brings each.
 PACKAGES = {"gymnasium_robotics": "robotics", "ogbench": "robotics", "shimmy": "dm-control"}
@@ -33,17 +34,19 @@ PACKAGES = {"gymnasium_robotics": "robotics", "ogbench": "robotics", "shimmy": "
 PEELED = (
     "TimeLimit", "OrderEnforcing", "PassiveEnvChecker", "Autoreset", "RecordEpisodeStatistics", "Monitor",
 )  # fmt: skip
+# Conditions, as messages name them.
+FORMS = '"terminated and reward >= 1", \'info["solved"]\' or "distance(fingertip, target) <= 0.05"'
 # Chart, as users give it: one name, several, or new names with the names of what they stand for.
 AnyChart = str | Sequence[str] | Mapping[str, str]
-# The key of an object in JSON that stands for an array of NumPy.
-ARRAY = "array"
-# Where episodes start.
-CHART, RESET = "chart", "reset"
 
 
 @dataclass(frozen=True)
 class Description:
-    """What the user says of an environment: the arguments of `from_gymnasium`, which tells what each is."""
+    """What the user says of an environment: the arguments of `from_gymnasium`, which tells what each is.
+
+    Raises:
+        BadInput: one of them is of another kind.
+    """
 
     env: str | Callable[..., gym.Env]
     chart: AnyChart | None = None
@@ -52,11 +55,42 @@ class Description:
     failure: str | None = None
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     steps: int | None = None
-    starts: str = CHART
+    starts: str = "chart"
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     reset: Mapping[str, Any] = field(default_factory=dict)
     pinned: Mapping[str, Any] = field(default_factory=dict)
     seed: int | None = None
+
+    def __post_init__(self) -> None:
+        chart, noisy = self.chart, self.noisy
+        names = chart.values() if isinstance(chart, Mapping) else chart
+        if chart is not None and not isinstance(chart, str) and not _all(names, str):
+            raise refused(
+                "chart", chart, "a name, a list of names, or new names with those they stand for"
+            )
+        if noisy is not None:
+            if not _all(noisy, Real) or not np.isfinite([*noisy]).all() or min([*noisy, 0]) < 0:
+                raise refused(
+                    "noisy", noisy, "a list of numbers from 0 on, one for each coordinate"
+                )
+            if not any(noisy):
+                raise refused("noisy", noisy, "a share above 0 for at least one coordinate")
+        for name in ("success", "failure"):
+            if not isinstance(condition := getattr(self, name), str | None):
+                raise refused(name, condition, FORMS)
+        for name in ("bounds", "kwargs", "reset", "pinned"):
+            named = getattr(self, name)
+            if not (isinstance(named, Mapping) and _all([*named], str)):
+                raise refused(name, named, "a dictionary of names and values")
+        for name, ends in self.bounds.items():
+            if not _all(ends, Real) or len(ends) != 2 or not 0 < ends[1] - ends[0] <= 1e6:
+                raise refused(f"bounds of {name}", ends, "its low and its high end, as [-2, 2]")
+        for name, value in self.pinned.items():
+            if not _is_numeric(value):
+                raise refused(f"pinned {name}", value, "a number, or a list of numbers")
+        Optional(Integer(1, 1_000_000)).checked("steps", self.steps)
+        check_seed(0 if self.seed is None else self.seed)
+        OneOf(("chart", "reset")).checked("starts", self.starts)
 
     @property
     def name(self) -> str:
@@ -66,9 +100,23 @@ class Description:
         return getattr(self.env, "__name__", type(self.env).__name__).strip("<>") or "environment"
 
 
+def _all(values: Any, kind: type) -> bool:
+    """Returns whether a value is a list, or another collection, of one kind."""
+    several = isinstance(values, Collection) and not isinstance(values, str | Mapping)
+    return several and all(isinstance(value, kind) for value in values)
+
+
+def _is_numeric(value: Any) -> bool:
+    """Returns whether a value is a finite number, or an array of them."""
+    with suppress(ValueError):  # lists of different lengths
+        array = np.asarray(value)
+        return array.dtype.kind in "biuf" and bool(np.isfinite(array).all())
+    return False
+
+
 def with_arrays(content: dict[str, Any]) -> Any:
     """Returns the array that an object of JSON stands for, else the object."""
-    return np.array(content[ARRAY]) if content.keys() == {ARRAY} else content
+    return np.array(content["array"]) if content.keys() == {"array"} else content
 
 
 def made(description: Description) -> gym.Env:
@@ -161,14 +209,6 @@ def _adapt_dm_control() -> None:
 def _why_not_made(name: str, error: BaseException) -> str:
     if name not in gym.registry and isinstance(error, gym.error.Error):
         missing = {e: m for m, e in PACKAGES.items() if importlib.util.find_spec(m) is None}
-        own = name.rpartition(":")[2]
-        namespace = own.partition("/")[0] if "/" in own else None
-        known = {spec.namespace for spec in gym.registry.values()} | {"dm_control"}
-        if namespace and namespace not in known:
-            return (
-                f"nothing that is installed has environments {namespace}/...: install their package, and "
-                f"name the module that registers them, as module:{own}"
-            )
         close = get_close_matches(name, list(gym.registry), n=3, cutoff=0.5)
         near = f"; near it are {', '.join(close)}" if close else ""
         install = "".join(
@@ -176,7 +216,8 @@ def _why_not_made(name: str, error: BaseException) -> str:
             for extra, module in missing.items()
         )
         return (
-            f"there is no environment {name!r}: give the id of one that is installed{near}{install}"
+            f"there is no environment {name!r}: give the id of one that is installed{near}{install}; if "
+            f"another package has it, name the module that registers it, as module:{name.rpartition(':')[2]}"
         )
     if isinstance(error, ImportError):
         module = name.partition(":")[0] if ":" in name else ""
@@ -226,6 +267,23 @@ def _checked(env: Any, name: str) -> mujoco.MjModel:
     return physics[0]
 
 
+def checked_step(result: Any, name: str) -> tuple[Any, float, Any, Any, dict[str, Any]]:
+    """Returns what the step of an environment of a name returns; refuses what no step returns."""
+    if not isinstance(result, tuple) or len(result) != 5:
+        raise BadInput(
+            f"step() of {name} returns a {type(result).__name__}: let it return an observation, a reward, "
+            "terminated, truncated and info"
+        )
+    observation, reward, terminated, truncated, info = result
+    number = np.asarray(reward)
+    if number.size != 1 or number.dtype.kind not in "biuf" or not isinstance(info, dict):
+        raise BadInput(
+            f"step() of {name} returns {reward!r:.60} as its reward and a {type(info).__name__} as its info: "
+            "let it return a number and a dictionary"
+        )
+    return observation, float(number.item()), terminated, truncated, info
+
+
 def layers(env: gym.Env) -> list[Any]:
     """Returns the wrappers of an environment, the outermost first, and the environment within."""
     found: list[Any] = [env]
@@ -249,20 +307,9 @@ def _digest_of(kind: type) -> str:
     return ""
 
 
-def plant_of(env: gym.Env) -> Plant | None:
-    """Returns the plant that holds the state of an environment of this package; None of others."""
-    plant = getattr(getattr(env.unwrapped, "core", None), "plant", None)
-    return plant if isinstance(plant, Plant) and plant.n == 1 else None
-
-
 def physics_of(env: gym.Env) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
-    """Returns model and data of an environment, of Gymnasium or of dm_control; None if it has none.
-
-    The data of an environment of this package only show the state.
-    """
+    """Returns model and data of an environment, of Gymnasium or of dm_control; None if it has none."""
     inner: Any = env.unwrapped
-    if (plant := plant_of(env)) is not None:
-        return plant.model, mujoco.MjData(plant.model)
     of_control = getattr(getattr(inner, "_env", None), "physics", None)
     for model, data in (
         [getattr(inner, key, None) for key in ("model", "data")],

@@ -1,30 +1,31 @@
-"""MuJoCo's state in an environment: read, written, moved by noise, and put back."""
+"""MuJoCo's state in an environment: read, written, and put back."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from hyrl_mj.errors import BadInput
+
 STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
 class Physics:
-    """MuJoCo's state in an environment, or in the plant of an environment of this package.
+    """MuJoCo's state in an environment.
 
     Args:
         model, data: of MuJoCo.
-        plant: what holds the state of an environment of this package, which `data` only shows; else None.
     """
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, plant: Any):
-        self.model, self.data, self._plant = model, data, plant
-        self.is_plant = plant is not None
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
+        self.model, self.data = model, data
         self.size = mujoco.mj_stateSize(model, STATE)
         self._kept: mujoco.MjData | None = None
-        self._left: Any = None  # the state of the plant, or (), between `leave` and `come_back`
+        self._left = False
 
     @cached_property
     def columns(self) -> dict[str, np.ndarray]:
@@ -39,12 +40,6 @@ class Physics:
 
     def read(self, into: np.ndarray | None = None) -> np.ndarray:
         """Returns MuJoCo's state (S,), a new array or one that is given."""
-        if self._plant is not None:
-            self.show(self._plant.state[0])
-        return self.shown(into)
-
-    def shown(self, into: np.ndarray | None = None) -> np.ndarray:
-        """Returns the state (S,) in MuJoCo's data, a new array or one that is given."""
         state = np.empty(self.size) if into is None else into
         mujoco.mj_getState(self.model, self.data, state, STATE)
         return state
@@ -55,12 +50,23 @@ class Physics:
         mujoco.mj_forward(self.model, self.data)
         mujoco.mj_rnePostConstraint(self.model, self.data)  # forces of contacts on bodies
         self.show(state)
-        if self._plant is not None:
-            self._plant.put(state[None])
 
     def show(self, state: np.ndarray) -> None:
         """Sets MuJoCo's state (S,) and leaves what follows from it as it is."""
         mujoco.mj_setState(self.model, self.data, state, STATE)
+
+    def depth(self, robot: np.ndarray) -> float:
+        """Returns how deep geoms (ngeom,) bool are inside of others [m], 0 if they touch nothing."""
+        if not self.data.ncon:
+            return 0.0
+        contact = self.data.contact
+        touches = robot[contact.geom].sum(axis=1) == 1
+        return float(-min(contact.dist[touches].min(initial=0.0), 0.0))
+
+    def touched(self, robot: np.ndarray) -> set[int]:
+        """Returns which geoms meet at contacts of some geoms (ngeom,) bool with others."""
+        pairs = self.data.contact.geom[: self.data.ncon]
+        return {int(g) for pair in pairs if robot[pair].sum() == 1 for g in pair}
 
     def earlier(self, state: np.ndarray) -> np.ndarray:
         """Returns the state (S,) a step of the physics before, as the semi-implicit Euler method has it."""
@@ -74,12 +80,44 @@ class Physics:
         """Notes everything, derived quantities included, for `come_back`."""
         self._kept = self._kept or mujoco.MjData(self.model)
         mujoco.mj_copyData(self._kept, self.model, self.data)
-        self._left = self._plant.state if self.is_plant else ()
+        self._left = True
 
     def come_back(self) -> None:
         """Puts everything back as it was at `leave`, if that was called."""
-        if self._left is not None:
-            if self.is_plant:
-                self._plant.put(self._left)
+        if self._left:
             mujoco.mj_copyData(self.data, self.model, self._kept)
-            self._left = None
+            self._left = False
+
+
+def set_pins(env: Any, data: mujoco.MjData, pinned: Mapping[str, Any], name: str) -> None:
+    """Sets positions, velocities and attributes of an environment to pinned values, by name.
+
+    Args:
+        env: the environment, without wrappers.
+        data: of MuJoCo.
+        pinned: the values.
+        name: of the environment, for messages.
+
+    Raises:
+        BadInput: it has no such place, or one of another shape.
+    """
+    for place, value in pinned.items():
+        kind, _, rest = place.partition("[")
+        if kind in ("qpos", "qvel", "mocap_pos", "userdata") and rest.endswith("]"):
+            values, i = getattr(data, kind).reshape(-1), rest[:-1]
+            if not i.isdigit() or int(i) >= len(values):
+                held = f"{kind}[0] to [{len(values) - 1}]" if len(values) else f"no {kind}"
+                raise BadInput(f"{name} has no {place}: there are {held}")
+            if np.ndim(value):
+                raise BadInput(f"pinned {place} is {value}: give one number")
+            values[int(i)] = value
+            continue
+        old: Any = getattr(env, place, None)
+        numbers = isinstance(old, bool | int | float | list | tuple | np.ndarray | np.generic)
+        if not numbers or np.shape(old) != np.shape(value):
+            raise BadInput(
+                f"{name} has no attribute {place} of shape {np.shape(value)} to pin: name a position as "
+                "qpos[2], or an attribute"
+            )
+        like: Any = np.array if isinstance(old, np.ndarray) else type(old)
+        setattr(env, place, like(value) if np.ndim(value) else value)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -16,11 +16,9 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.sets import Chart
 from hyrl_mj.tasks import Outcome
 
-TERMINATED = "terminated"
-FORMS = '"terminated and reward >= 1", \'info["solved"]\' or "distance(fingertip, target) <= 0.05"'
 # What derived quantities are, as what is observed after a step shows them: as at the end of the step; as a
 # step of the physics before; or neither.
-NOW, EARLIER, UNKNOWN = "now", "earlier", "unknown"
+Derived = Literal["now", "earlier", "unknown"]
 _none = partial(np.zeros, 0)  # of what is not known yet
 
 
@@ -114,7 +112,7 @@ class Criterion:
         values = dict(zip(names, report.T, strict=True))
         success = self.success.holds(values)
         terminated, truncated, touches = (report[:, 1:4] > 0).T
-        if self.success.text.strip() == TERMINATED and (touches & terminated).any():
+        if self.success.text.strip() == "terminated" and (touches & terminated).any():
             raise BadInput(
                 f"{self.name}: an episode ended where the robot touches what it does not touch elsewhere, "
                 'and "terminated" counts that as a success: say which ends are successes, as "terminated '
@@ -166,7 +164,7 @@ class EnvironmentSpec:
         start_low, start_high: corners (d,) of the box of starts.
         max_steps: samples of an episode.
         islands: what can be passed on both sides, by name, each with the id of a geom.
-        derived: `NOW`, `EARLIER` or `UNKNOWN`.
+        derived: `Derived`.
         sensing: whether wrappers read MuJoCo's state for what they observe, and see it under noise.
         anew: whether a reset changes what the next one does to a wrapper: each episode takes a new instance.
         moves: (o,) bool, the columns of an observation at rest that follow the chart.
@@ -202,7 +200,7 @@ class EnvironmentSpec:
     start_high: tuple[float, ...] = ()
     max_steps: int = 1
     islands: Mapping[str, int] = field(default_factory=dict)
-    derived: str = UNKNOWN
+    derived: Derived = "unknown"
     sensing: bool = False
     anew: bool = False
     moves: np.ndarray = field(default_factory=_none)

@@ -16,8 +16,9 @@ from hyrl_mj.environments.instance import Instance
 from hyrl_mj.environments.observations import parts_of
 from hyrl_mj.environments.opening import code_of
 from hyrl_mj.environments.plant import EnvironmentPlant
-from hyrl_mj.environments.pool import Played, Pool
+from hyrl_mj.environments.pool import Pool
 from hyrl_mj.environments.specification import EnvironmentSpec
+from hyrl_mj.environments.stage import Played
 from hyrl_mj.environments.trials import goes_on
 from hyrl_mj.errors import BadInput
 from hyrl_mj.physics import mjcf
@@ -25,16 +26,8 @@ from hyrl_mj.tasks import ANY, SPARING, Learning, Outcome, Scene, Task, get_task
 
 # Where every episode takes all of its samples, runs from all nodes of the chart take about so many together.
 SAMPLES_OF_NODES = 800_000
-# Times that starts are drawn again because they are inside of walls.
-DRAWS = 200
-# A joint turns in the plane of the floor if its axis is as upright as this, as a cosine.
-UPRIGHT = 0.9
-# How much a free camera shows, as a share of the extent of a model.
-SEEN = 1.2
 # A run that turns by less than this decides nothing [rad].
 DECIDED = 0.5
-# Episodes that are played side by side, each by an instance.
-SIDE_BY_SIDE = 128
 
 
 class EnvironmentTask(Task):
@@ -55,7 +48,7 @@ class EnvironmentTask(Task):
 
     scene: Scene
     effort, stopped_by_walls = SPARING, True
-    side_by_side = SIDE_BY_SIDE
+    side_by_side = 128
     _original: Task | None = None
     learning = Learning()
 
@@ -126,12 +119,12 @@ class EnvironmentTask(Task):
 
     def _widen_view(self) -> None:
         """Lets the free cameras see all of a chart in the plane."""
-        shown = self.model.stat
+        shown, seen = self.model.stat, 1.2  # how much such a camera shows, as a share of the extent
         low, high = np.array(self.chart.low[:2]), np.array(self.chart.high[:2])
-        reach = shown.extent * SEEN / 2
+        reach = shown.extent * seen / 2
         low = np.minimum(low, shown.center[:2] - reach)
         high = np.maximum(high, shown.center[:2] + reach)
-        shown.center[:2], shown.extent = (low + high) / 2, (high - low).max() / SEEN
+        shown.center[:2], shown.extent = (low + high) / 2, (high - low).max() / seen
 
     def _camera(self) -> str:
         """Returns the camera of replays: from above on a plane, else the model's first, or the free one."""
@@ -139,7 +132,7 @@ class EnvironmentTask(Task):
             n for n in mjcf.names(self.model, mujoco.mjtObj.mjOBJ_CAMERA) if not n.startswith("(")
         ]
         axis = self.model.jnt_axis[self.specification.coordinates[0].joint]
-        flat = self._in_plane or abs(axis[2]) > UPRIGHT
+        flat = self._in_plane or abs(axis[2]) > 0.9  # it turns in the plane of the floor
         if "overhead" in own or (flat and not own):
             return "overhead"
         return own[0] if own else "free"
@@ -283,7 +276,7 @@ class EnvironmentTask(Task):
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         z = super().starts(n, rng)
-        for _ in range(DRAWS):
+        for _ in range(200):
             _, depths = self._pool.spread("rest", self.specification.state_at(z))
             inside = np.flatnonzero(depths > self.specification.depth)
             if not len(inside):

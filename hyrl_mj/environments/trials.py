@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,26 +12,18 @@ from hyrl_mj.environments.fingerprint import differing
 from hyrl_mj.environments.instance import Instance
 from hyrl_mj.environments.observations import flat, observers
 from hyrl_mj.environments.plant import EnvironmentPlant
-from hyrl_mj.environments.pool import Played, Pool
-from hyrl_mj.environments.specification import EARLIER, NOW, UNKNOWN, EnvironmentSpec
+from hyrl_mj.environments.pool import Pool
+from hyrl_mj.environments.specification import Derived, EnvironmentSpec
+from hyrl_mj.environments.stage import Played
 from hyrl_mj.errors import BadInput
-from hyrl_mj.tasks import Outcome
 
 # Episodes and samples of a trial, and for how many samples inputs are held.
 EPISODES, SAMPLES, HELD = 8, 40, 8
-# Samples of runs from these places that show whether wrappers read MuJoCo's state there.
-NEAR_PLACES = 3
-# Rounding of what is computed again from the same state, as a share of the largest number.
-ROUNDING = 1e-9
-# What differs by less than this share of what a physics step changes is from near the end of a step.
-NEAR = 0.5
 # By how much coordinates are moved to see what follows them, as a share of the side of the chart.
 MOVED = 1e-3
 # Places on the chart from which runs of so many samples come to one state, which may show where they were;
 # from the first places longer ones, in which slow sensors measure.
-PLACES, AWAY, LONG = 64, 2, 120
-# Runs that show whether the chart is the state, and how much they may differ from others.
-OF_CHART, SAME = 48, 1e-9
+PLACES, AWAY, LONG = 64, 2, (SAMPLES, 120)
 
 
 def observer_of(instance: Instance) -> str:
@@ -109,101 +100,52 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _rounds(off: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Returns which differences (o,) are no more than rounding of values (o,)."""
     sizes = np.abs(values[np.isfinite(values)])
-    return np.asarray(off <= ROUNDING * max(float(sizes.max(initial=0.0)), 1.0))
+    return np.asarray(off <= 1e-9 * max(float(sizes.max(initial=0.0)), 1.0))
 
 
 def check_observer(instance: Instance, step: np.ndarray) -> None:
-    """Raises `BadInput` unless what is observed follows the state, as after a reset to that state.
+    """Raises `BadInput` if what is observed in a state depends on where on the chart a run came from.
 
-    After some steps the state of the reset is written again. What is observed then has to be what the reset
-    observed, but for columns that have nothing to do with the place: those that no noise moves, that all
-    resets observe alike, and that do not depend on where the run began.
+    Runs under the same inputs are put into one state. What they observe there has to be the same to the bit:
+    what is stored on the way differs, if only by rounding.
 
     Args:
         instance: the environment.
         step: (d,) by how much the coordinates of the chart are moved to see what follows them.
     """
-    rng, name, space = np.random.default_rng(1), instance.name, instance.inner.observation_space
-    first: list[np.ndarray] = []
-    states: list[np.ndarray] = []
-    suspects: dict[int, str] = {}
-    for seed in range(EPISODES):
-        instance.reset(seed)
-        state = instance.physics.read()
-        instance.physics.write(state)
-        pinned = instance.spec.description.pinned
-        begun = flat(instance.watched() if pinned else instance.inner_seen, space)
-        first.append(begun)
-        states.append(state)
-        for _ in instance.wander(rng, SAMPLES, HELD):
-            pass
-        before = instance.memory()
-        moved = instance.displaced(step)
-        if changed := differing(instance.memory(), before):
-            raise BadInput(
-                f"{name} changes {changed[0]} when it computes what it observes, so that cannot be asked for "
-                "where noise shows the robot: let it only read"
-            )
-        instance.physics.write(state)
-        off = _apart(flat(instance.watched(), space), begun)
-        for column in map(int, np.flatnonzero(~_rounds(off, begun))):
-            suspects[column] = (
-                f"is {begun[column]:.6g} after reset() and differs by {off[column]:.6g} in that state later"
-            )
-            if moved[column]:
-                raise _stored(name, column, suspects[column])
-    for column, why in suspects.items():
-        if np.ptp([row[column] for row in first]) > 0 or _depends(instance, column, states):
-            raise _stored(name, column, why)
-    _check_places(instance)
-
-
-def _check_places(instance: Instance) -> None:
-    """Raises `BadInput` if what is observed in a state depends on where on the chart a run came from."""
-    spec, rng, space = instance.spec, np.random.default_rng(7), instance.inner.observation_space
+    spec, rng, name = instance.spec, np.random.default_rng(7), instance.name
     usual: dict[int, np.ndarray] = {}
     places = rng.uniform(spec.start_low, spec.start_high, (PLACES, spec.dimension))
-    long = min(LONG, spec.max_steps)
-    for z, away in [*((z, AWAY) for z in places), *((z, long) for z in places[:EPISODES])]:
+    runs = [(z, AWAY) for z in places]
+    runs += [(z, min(away, spec.max_steps)) for away in LONG for z in places[:EPISODES]]
+    for z, away in runs:
         instance.reset()
         instance.physics.write(spec.state_at(z[None])[0])
-        if instance.depth() > spec.depth:
+        if instance.physics.depth(instance.spec.solid) > spec.depth:
             continue
         if len([*instance.wander(np.random.default_rng(8), away, HELD)]) < away:
             continue
+        if away != AWAY:
+            before = instance.memory()
+            instance.displaced(step)
+            if changed := differing(instance.memory(), before):
+                raise BadInput(
+                    f"{name} changes {changed[0]} when it computes what it observes, so that cannot be asked "
+                    "for where noise shows the robot: let it only read"
+                )
         instance.physics.write(spec.state)
-        seen = flat(instance.watched(), space)
-        usual.setdefault(away, seen)
-        off = _apart(seen, usual[away])
-        if (stale := ~_rounds(off, seen)).any():
-            column = int(stale.argmax())
-            why = f"differs by {off[column]:.6g} in one state, after runs in different places"
-            raise _stored(instance.name, column, why)
+        seen = flat(instance.watched(), instance.inner.observation_space)
+        off = _apart(seen, usual.setdefault(away, seen))
+        if off.any():
+            column = int((off != 0).argmax())
+            raise BadInput(
+                f"what {name} observes does not follow its state: observation[{column}] differs by "
+                f"{off[column]:.6g} in one state, after runs in different places. It is stored by step(), or "
+                "computed from what is, so that noise would not reach it: compute it from the state"
+            )
 
 
-def _stored(name: str, column: int, why: str) -> BadInput:
-    return BadInput(
-        f"what {name} observes does not follow its state: observation[{column}] {why}. It is stored by "
-        "step(), or computed from what is, so that noise would not reach it: compute it from the state"
-    )
-
-
-def _depends(instance: Instance, column: int, starts: list[np.ndarray]) -> bool:
-    """Returns whether a column of the observation depends on where a run under the same inputs began."""
-    space, traces = instance.inner.observation_space, []
-    for start in starts:
-        instance.reset()
-        instance.physics.write(start)
-        runs = instance.wander(np.random.default_rng(2), SAMPLES, HELD)
-        traces.append([flat(instance.inner_seen, space)[column] for _ in runs])
-    shortest = min(map(len, traces))
-    return any(
-        not np.array_equal(trace[:shortest], traces[0][:shortest], equal_nan=True)
-        for trace in traces
-    )
-
-
-def derived_of(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
+def derived_of(instance: Instance, step: np.ndarray) -> tuple[Derived, list[int]]:
     """Returns `derived` of a spec, and the columns of what is observed that are not from the end of a step.
 
     Args:
@@ -214,7 +156,7 @@ def derived_of(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
         BadInput: noise on the chart's coordinates moves columns of which it is not known when they are from.
     """
     rng, space = np.random.default_rng(5), instance.inner.observation_space
-    off: dict[str, list[np.ndarray]] = {NOW: [], EARLIER: []}
+    off: dict[Derived, list[np.ndarray]] = {"now": [], "earlier": []}
     moving, size = [], []
     for seed in range(EPISODES):
         instance.reset(seed)
@@ -225,20 +167,24 @@ def derived_of(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
                 differences.append(_apart(instance.seen_as(derived, state, 0 * step), seen))
             moving.append(np.abs(instance.displaced(step)))
     if not np.any(moving):
+        spec = instance.spec
+        noisy = [c.name for c, share in zip(spec.coordinates, spec.noisy, strict=True) if share]
         raise BadInput(
-            f"noise on {', '.join(noisy_names(instance.spec))} changes nothing that {instance.name} "
+            f"noise on {', '.join(noisy)} changes nothing that {instance.name} "
             "observes, so there is nothing to find out: name a chart of what it observes"
         )
     most = {derived: np.abs(differences).max(axis=0) for derived, differences in off.items()}
     differ = {derived: ~_rounds(far, np.array(size)) for derived, far in most.items()}
-    lags = np.flatnonzero(differ[NOW]).tolist()
+    lags = np.flatnonzero(differ["now"]).tolist()
     for derived, columns in differ.items():
         if not columns.any():
             return derived, lags
     # With the Runge-Kutta method they are from its last stage, which is near the end.
-    step_of_physics = np.abs(np.subtract(off[NOW], off[EARLIER])).max(axis=0)
-    far = most[NOW] > NEAR * step_of_physics
-    unknown = differ[NOW] & differ[EARLIER] & far & ~_rounds(np.max(moving, axis=0), np.array(size))
+    step_of_physics = np.abs(np.subtract(off["now"], off["earlier"])).max(axis=0)
+    far = most["now"] > 0.5 * step_of_physics
+    unknown = (
+        differ["now"] & differ["earlier"] & far & ~_rounds(np.max(moving, axis=0), np.array(size))
+    )
     if unknown.any():
         raise BadInput(
             f"observation[{unknown.argmax()}] of {instance.name} comes neither from the end of a step nor "
@@ -246,86 +192,7 @@ def derived_of(instance: Instance, step: np.ndarray) -> tuple[str, list[int]]:
             "forces of contacts by include_cfrc_ext_in_observation=False, or call mj_forward at the end of "
             "step()"
         )
-    return UNKNOWN, lags
-
-
-def noisy_names(spec: EnvironmentSpec) -> list[str]:
-    """Returns the names of the coordinates on which there is noise."""
-    return [c.name for c, share in zip(spec.coordinates, spec.noisy, strict=True) if share]
-
-
-def changes_by_reset(spec: EnvironmentSpec) -> bool:
-    """Returns whether the start of a run is another one after a reset before, as with running statistics."""
-    found = []
-    for resets in (0, 0, 1):
-        instance = Instance(spec)
-        for _ in range(resets):
-            instance.reset()
-        observation = instance.put(spec.state)
-        found.append((observation, instance.remembered()))
-    usual = set(differing(found[0][1], found[1][1]))  # such as names of files
-    changed = set(differing(found[0][1], found[2][1])) - usual
-    return bool(changed) or not np.array_equal(found[0][0], found[2][0], equal_nan=True)
-
-
-def senses(spec: EnvironmentSpec, step: np.ndarray) -> bool:
-    """Returns whether wrappers read MuJoCo's state for what they observe.
-
-    The same runs under noise are played twice, once with the true state shown to the wrappers, and once with
-    the state where the noise shows the robot.
-
-    Args:
-        spec: what is known of the environment.
-        step: (d,) the bound of the noise on the coordinates of the chart.
-
-    Raises:
-        BadInput: wrappers do, and tell from that state as well how the episode goes.
-    """
-    true, shown = (_watched_runs(spec, step, sensing) for sensing in (False, True))
-    differ = {
-        what: any(
-            not np.array_equal(a, b, equal_nan=True)
-            for ours, others in zip(true[what], shown[what], strict=True)
-            for a, b in zip(ours, others, strict=False)  # one may have ended before
-        )
-        for what in ("observation", "report")
-    }
-    if all(differ.values()):
-        raise BadInput(
-            f"a wrapper of {spec.name} reads MuJoCo's state for what it observes, which noise moves, and for "
-            "its reward, its info or the end of an episode, which it must not: let it observe what the "
-            "environment gives it, or let only the environment judge"
-        )
-    return differ["observation"]
-
-
-def _watched_runs(
-    spec: EnvironmentSpec, step: np.ndarray, sensing: bool
-) -> dict[str, list[list[np.ndarray]]]:
-    """Returns observations and reports of runs under noise, each by run and sample."""
-    instance, rng = Instance(replace(spec, sensing=sensing)), np.random.default_rng(6)
-    instance.tried = True
-    found: dict[str, list[list[np.ndarray]]] = {"observation": [], "report": []}
-    starts = [(spec.state, min(SAMPLES, spec.max_steps))] * EPISODES
-    places = rng.uniform(spec.start_low, spec.start_high, (PLACES, spec.dimension))
-    starts += [(state, min(NEAR_PLACES, spec.max_steps)) for state in spec.state_at(places)]
-    for seed, (start, samples) in enumerate(starts):
-        instance.quit()
-        instance.begin(start, seed % EPISODES)
-        noises = rng.uniform(-step, step, (samples + 1, len(step)))
-        inputs = [instance.drawn(rng) for _ in range(samples)]
-        instance.sense(noises[0])
-        seen, reports = [instance.observation], []
-        for k in range(samples):
-            instance.act(inputs[k - k % HELD])
-            instance.sense(noises[k + 1])
-            seen.append(instance.observation)
-            reports.append(np.array(instance.report, dtype=float))
-            if instance.report[1] or instance.report[2]:
-                break
-        found["observation"].append(seen)
-        found["report"].append(reports)
-    return found
+    return "unknown", lags
 
 
 def moving(pool: Pool, spec: EnvironmentSpec) -> tuple[np.ndarray, np.ndarray | None]:
@@ -365,29 +232,23 @@ def check_instances(pool: Pool, spec: EnvironmentSpec) -> None:
     """Raises `BadInput` unless instances go as new ones after other episodes, with noise and without."""
     d, o, everyone = spec.dimension, spec.columns, np.arange(EPISODES)
     for seed, share in enumerate((0.0, 0.0, MOVED)):
-        rng, inputs, told, errors = np.random.default_rng(seed), [], [], []
-        starts: list[np.ndarray] = []
-        bound = share * spec.chart.sides * spec.noisy
-
-        def observe(plant: EnvironmentPlant, noise: np.ndarray) -> np.ndarray:
-            """Returns what n runs are at, with the observation under noise (n, d)."""
-            errors = np.zeros((EPISODES, d + o + 3))
-            errors[:, :d] = noise
-            seen = plant.observe(plant.truth(everyone), errors, everyone)
-            found = plant.truth(everyone).copy()
-            found[:, d : d + o] = seen[:, d : d + o]
-            return found
-
+        rng, bound = np.random.default_rng(seed), share * spec.chart.sides * spec.noisy
+        starts, inputs, noises, told = [], [], [], []
         for plant, u in _runs(pool, spec, 3 + seed):
-            starts = starts or [plant.state]
-            errors.append(rng.uniform(-bound, bound, (EPISODES, d)))
-            told.append(observe(plant, errors[-1]))
+            starts.append(plant.state)
+            noises.append(rng.uniform(-bound, bound, (EPISODES, d)))
+            told.append(_observed(plant, noises[-1]))
             plant.step(u)
             inputs.append(u)
-        told.append(observe(plant, 0.0 * errors[-1]))
-        u, path, noise = np.array(inputs), np.array(told), np.array([*errors, 0.0 * errors[-1]])
+        noises.append(np.zeros((EPISODES, d)))
+        told.append(_observed(plant, noises[-1]))
+        u, path, noise = np.array(inputs), np.array(told), np.array(noises)
         over = path[:, :, -1] != 0
         ends = np.where(over.any(axis=0), over.argmax(axis=0), len(u))
+        last, cut = path[ends, everyone], ends == spec.max_steps
+        outcome = np.where(
+            cut & (last[:, -1] == 0), spec.criterion.verdict(last[:, -2] > 0), last[:, -1]
+        )
         if not spec.wrapped:  # at an end that is known nothing is observed any more
             noise[ends, everyone] = 0.0
         played = [
@@ -395,8 +256,8 @@ def check_instances(pool: Pool, spec: EnvironmentSpec) -> None:
                 starts[0][i],
                 u[:end, i],
                 path[: end + 1, i, :d],
-                _ended(spec, path[end, i], end == spec.max_steps),
-                end == spec.max_steps,
+                int(outcome[i]),
+                bool(cut[i]),
                 path[: end + 1, i, d : d + o],
                 noise[: end + 1, i],
                 path[1 : end + 1, i, d + o : d + o + 1],
@@ -406,12 +267,14 @@ def check_instances(pool: Pool, spec: EnvironmentSpec) -> None:
         pool.check(played, alone=not seed)
 
 
-def _ended(spec: EnvironmentSpec, measured: np.ndarray, cut: bool) -> int:
-    """Returns the `Outcome` of a run that ends at a measurement (p,), or is cut off there."""
-    outcome = int(measured[-1])
-    if cut and outcome == Outcome.RUNNING:
-        outcome = int(spec.criterion.verdict(measured[-2:-1] > 0)[0])
-    return outcome
+def _observed(plant: EnvironmentPlant, noise: np.ndarray) -> np.ndarray:
+    """Returns the measurements (n, p) of runs with the observation under noise (n, d)."""
+    d, o, everyone = plant.spec.dimension, plant.spec.columns, np.arange(plant.n)
+    errors = np.pad(noise, ((0, 0), (0, o + 3)))
+    seen = plant.observe(plant.truth(everyone), errors, everyone)[:, d : d + o]
+    found = plant.truth(everyone)
+    found[:, d : d + o] = seen
+    return found
 
 
 def goes_on(pool: Pool, spec: EnvironmentSpec, of_chart: bool = False) -> bool:
@@ -423,7 +286,7 @@ def goes_on(pool: Pool, spec: EnvironmentSpec, of_chart: bool = False) -> bool:
         of_chart: whether the states at rest at the chart points of the runs are written, so that the chart is
             all there is; by default MuJoCo's states of the runs.
     """
-    for plant, u in _runs(pool, spec, 4, OF_CHART if of_chart else EPISODES):
+    for plant, u in _runs(pool, spec, 4, 48 if of_chart else EPISODES):
         going = np.flatnonzero(plant.measurement[:, -1] == 0)
         before = plant.state[going]
         plant.step(u[going], going)
@@ -436,7 +299,7 @@ def goes_on(pool: Pool, spec: EnvironmentSpec, of_chart: bool = False) -> bool:
             return False
         success, outcome = spec.criterion.judged(report)
         told = np.column_stack([spec.z(after), seen, report[:, 0], success, outcome])
-        if not np.allclose(told, plant.measurement[going], rtol=0, atol=SAME, equal_nan=True):
+        if not np.allclose(told, plant.measurement[going], rtol=0, atol=1e-9, equal_nan=True):
             return False
         exact = np.array_equal(seen, plant.measurement[going, spec.dimension : -3])
         if not of_chart and not (exact and np.array_equal(after, plant.state[going])):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -15,6 +16,8 @@ from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.physics import mjcf
 from hyrl_mj.simulation import AnyNoise
 from hyrl_mj.tasks import Outcome, Task, described_task
+
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 def observation_space(task: Task) -> spaces.Box:
@@ -36,6 +39,8 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
 
     `info["z"]` is the true chart point (d,). When an episode is over, `info["outcome"]` is "reached",
     "crashed", "out_of_bounds" or "stalled", and `info["is_success"]` whether it is "reached".
+
+    `model` and `data` are MuJoCo's, as in environments of Gymnasium's own: who writes to the data moves it.
 
     Args:
         task: name of the task, or a file of one that this machine has run before.
@@ -70,6 +75,8 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         self._camera = str(camera or self.core.task.scene.camera)
         mjcf.camera_of(self.core.task.model, self._camera)
         self._renderer: Any = None  # a `SceneRenderer`, opened by the first picture
+        self.model = self.core.task.model
+        self.data = mujoco.MjData(self.model)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -77,11 +84,15 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
         """Starts an episode, at the chart point `options["z"]` if given."""
         super().reset(seed=seed)
         self.core.seed(int(self.np_random.integers(2**63)))
-        return self.core.reset(z=starts(self.core.task, options))[0], {"z": self.core.z[0]}
+        observation = self.core.reset(z=starts(self.core.task, options))[0]
+        self._show()
+        return observation, {"z": self.core.z[0]}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Applies one action for one sample; see `gymnasium.Env.step`."""
+        self._take()
         result = self.core.step(self.core.inputs([action]))
+        self._show()
         info: dict[str, Any] = {"z": self.core.z[0]}
         if result.done[0]:
             info["outcome"] = Outcome(result.outcome[0]).label
@@ -91,8 +102,23 @@ class TaskEnv(gym.Env[np.ndarray, Any]):
 
     def _get_obs(self) -> np.ndarray:
         """Returns the observation of the present state, as environments of Gymnasium's own have it."""
+        self._take()
         measured = self.core.task.observation(self.core._measure(np.arange(1)))
         return np.asarray(measured[0].astype(np.float32))
+
+    def _show(self) -> None:
+        """Puts the state into MuJoCo's data, with what follows from it."""
+        state = self.core.plant.state[0]
+        mujoco.mj_setState(self.model, self.data, state, _STATE)
+        mujoco.mj_forward(self.model, self.data)
+        mujoco.mj_setState(self.model, self.data, state, _STATE)
+
+    def _take(self) -> None:
+        """Takes the state from MuJoCo's data, if somebody has written there."""
+        state = np.empty(mujoco.mj_stateSize(self.model, _STATE))
+        mujoco.mj_getState(self.model, self.data, state, _STATE)
+        if not np.array_equal(state, self.core.plant.state[0], equal_nan=True):
+            self.core.plant.put(state[None])
 
     def render(self) -> np.ndarray | None:
         """Returns the scene as (height, width, 3) uint8 in render mode "rgb_array", else None."""

@@ -1,0 +1,258 @@
+"""Episodes of an environment in one process: instances that play them, and others that judge.
+
+The real environment is the judge: a new one, as its user has it, which is only put to the same starts and
+stepped, has to go and to end alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hyrl_mj.environments import fingerprint as written
+from hyrl_mj.environments.instance import Instance
+from hyrl_mj.environments.specification import EnvironmentSpec
+from hyrl_mj.errors import BadInput
+from hyrl_mj.files import trust
+from hyrl_mj.system import limits
+from hyrl_mj.tasks import Outcome
+
+Arrays = tuple[np.ndarray, ...]
+
+
+@dataclass(frozen=True)
+class Played:
+    """Samples of one run.
+
+    Attributes:
+        start: MuJoCo's state (S,) in which it begins.
+        inputs: (k, m).
+        path: (k + 1, d) chart points, before and after each sample.
+        outcome: how it ended.
+        cut: whether it was cut off after these samples, and its outcome is the verdict on its last state.
+        observations: (k + 1, o), or without the last (k, o).
+        noise: (k + 1, d) on the chart's coordinates.
+        rewards: (k, 1) of the samples, or none.
+    """
+
+    start: np.ndarray
+    inputs: np.ndarray
+    path: np.ndarray
+    outcome: int
+    cut: bool
+    observations: np.ndarray
+    noise: np.ndarray
+    rewards: np.ndarray | None = None
+
+
+class Stage:
+    """The instances of one process, and the episodes that they play.
+
+    Args:
+        spec: what is known of the environment.
+    """
+
+    def __init__(self, spec: EnvironmentSpec):
+        self.spec = spec
+        self._playing: dict[int, Instance] = {}  # by the number of the run
+        self._free: list[Instance] = []
+        # Which play nothing but what they judge, as their user has them, or without time limits.
+        self._judges: dict[bool, list[Instance]] = {True: [], False: []}
+        self._resting: Instance | None = None
+        self._shared: written.Fingerprint | None = None  # by a new instance with all others
+
+    def try_out(self) -> Arrays:
+        """Makes, resets and steps an environment within limits of time and memory of this process."""
+        limits.limit()
+        with trust.received():  # code that an argument names does not run
+            instance = self._new(real=False)
+            instance.reset()
+            instance.stepped(instance.drawn(np.random.default_rng(0)))
+        return ()
+
+    def begin(self, runs: np.ndarray, starts: np.ndarray) -> Arrays:
+        """Gives runs (k,) an instance each, and begins their episodes at MuJoCo's states (k, S)."""
+        for run, start in zip(runs.tolist(), starts, strict=True):
+            instance = self._renewed(self._free)
+            instance.begin(start)
+            self._playing[run] = instance
+        return ()
+
+    def act(self, runs: np.ndarray, u: np.ndarray) -> Arrays:
+        """Steps runs (k,) with inputs (k, m).
+
+        Returns:
+            MuJoCo's states (k, S), observations (k, o) and reports (k, r); the last two come from `sense`
+            where wrappers lie around the environment.
+        """
+        return self._acted([self._playing[run] for run in runs.tolist()], u)
+
+    def sense(self, runs: np.ndarray, noise: np.ndarray) -> Arrays:
+        """Gives runs (k,) the noise (k, d) of a sample; returns observations (k, o) and reports (k, r)."""
+        instances = [self._playing[run] for run in runs.tolist()]
+        for instance, of_run in zip(instances, noise, strict=True):
+            instance.sense(of_run)
+        return np.array([i.observation for i in instances]), np.array([i.report for i in instances])
+
+    def leave(self, runs: np.ndarray) -> Arrays:
+        """Lets the instances of runs (k,) play others.
+
+        Raises:
+            BadInput: random numbers were drawn in one of them.
+        """
+        instances = [self._playing.pop(run) for run in runs.tolist()]
+        self._free += instances
+        try:
+            for instance in instances:
+                instance.finish()
+        finally:
+            for instance in instances:
+                instance.quit()
+        return ()
+
+    def rest(self, starts: np.ndarray) -> Arrays:
+        """Returns what episodes that begin in states (k, S) observe first (k, o), and depths (k,) [m]."""
+        seen, depths = [], []
+        for start in starts:
+            if self._resting is None or self.spec.wrapped:
+                self._resting = self._renewed([self._resting] if self._resting else [])
+            seen.append(self._resting.rested(start))
+            depths.append(self._resting.physics.depth(self.spec.solid))
+        return np.array(seen), np.array(depths)
+
+    def branch(self, states: np.ndarray, u: np.ndarray) -> Arrays:
+        """Steps an environment without memory from states (k, S), written directly, with inputs u (k, m).
+
+        Returns what `act` returns.
+
+        Raises:
+            BadInput: it remembers something after all.
+        """
+        instance = self._renewed(self._free)
+        instance.begin(states[0])
+        before = instance.memory()
+        results = self._acted([instance] * len(u), u, states)
+        if changed := written.differing(instance.memory(), before):
+            raise BadInput(
+                f"{instance.name} remembers something in {changed[0]}, as no sampled run showed; without a "
+                "memory that is always there it cannot be tabulated"
+            )
+        self._free.append(instance)
+        return results
+
+    def check(self, runs: Sequence[Played]) -> None:
+        """Plays runs in new environments; raises `BadInput` if these go another way."""
+        for run in runs:
+            # A time limit of its own would end a run that is simulated for longer.
+            as_it_is = len(run.inputs) <= self.spec.max_steps
+            noises = [run.noise]
+            if self.spec.wrapped and run.noise.any():
+                noises.append(np.zeros_like(run.noise))
+            for noise in noises:
+                real = self._renewed(self._judges[as_it_is], as_it_is)
+                judge(run, real, noise)
+                self._judges[as_it_is].append(real)
+
+    def _acted(
+        self, instances: Sequence[Instance], u: np.ndarray, begun: np.ndarray | None = None
+    ) -> Arrays:
+        """Steps instances with inputs (k, m), from where they are or from states (k, S) written before."""
+        first = instances[0]
+        states, seen = (np.empty((len(u), n)) for n in (first.physics.size, len(first.observation)))
+        reports = []
+        with first.undrawn():
+            for i, (instance, inputs) in enumerate(zip(instances, u, strict=True)):
+                if begun is not None:
+                    instance.jump(begun[i])
+                instance.act(inputs)
+                instance.physics.read(states[i])
+                seen[i] = instance.observation
+                reports.append(instance.report)
+        return states, seen, np.array(reports, dtype=float)
+
+    # ---- instances
+
+    def _renewed(self, spare: list[Instance], real: bool = False) -> Instance:
+        """Returns an instance that can begin an episode: a spare one, or a new one if these are worn."""
+        while True:
+            instance = spare.pop() if spare else self._new(real)
+            if not (worn := instance.renew()):
+                return instance
+            if written.is_shared(worn):
+                raise instance.sharing(worn)
+
+    def _new(self, real: bool) -> Instance:
+        instance = Instance(self.spec, real)
+        shared = written.shared(instance.env)
+        self._shared = self._shared or shared
+        if changed := written.differing(shared, self._shared):
+            raise instance.sharing(changed[0])
+        return instance
+
+
+def judge(run: Played, real: Instance, noise: np.ndarray) -> None:
+    """Plays a run in an environment that its user would make.
+
+    That is put to the start and stepped, past all that lets episodes be played side by side. There is no
+    tolerance: the same code computes the same from the same numbers. Without the run's noise the inputs may
+    lead another way, as where a controller of a wrapper sees it; where they lead the same way, the run ends
+    alike.
+
+    Args:
+        run: the run.
+        real: the environment.
+        noise: (k + 1, d) that of the run, or none.
+
+    Raises:
+        BadInput: the run went otherwise.
+    """
+    spec, heard = real.spec, noise is run.noise
+    observations, path, reports = [real.put(run.start, noise=noise[0])], [run.path[0]], []
+    for u, of_sample in zip(run.inputs, noise[1:], strict=True):
+        real.act(u)
+        path.append(spec.z(real.physics.read()[None])[0])
+        real.sense(of_sample)
+        observations.append(real.observation)
+        reports.append(real.report)
+    real.finish()
+    if not reports or (not heard and not np.array_equal(path, run.path)):
+        return
+    told = np.array(reports, dtype=float)
+    if heard:
+        seen = observations[: len(run.observations)]
+        _compare(real.name, "observation", run.observations, seen)
+        _compare(real.name, "the chart's coordinate", run.path, path)
+        _compare(real.name, "reward", run.rewards, told[:, :1])
+    if run.outcome == Outcome.UNSTABLE:
+        return
+    success, ends = spec.criterion.judged(told)
+    if run.cut and ends[-1] == Outcome.RUNNING:
+        ends[-1] = spec.criterion.verdict(success[-1:])[0]
+    expected = np.append(np.full(len(ends) - 1, int(Outcome.RUNNING)), run.outcome)
+    if (wrong := np.flatnonzero(ends != expected)).size:
+        k = int(wrong[0])
+        ours, theirs = (Outcome(int(values[k])).label for values in (expected, ends))
+        how = "" if heard else " without the noise, which must not judge"
+        raise _goes_another_way(
+            real.name, f"after {k + 1} sample(s) it is {ours}, and {theirs}{how}"
+        )
+
+
+def _compare(name: str, what: str, ours: np.ndarray | None, real: Any) -> None:
+    if ours is None or np.array_equal(ours, real, equal_nan=True):
+        return
+    same = (ours == real) | (np.isnan(ours) & np.isnan(real))
+    k, i = np.argwhere(~same)[0]
+    values = f"{what}[{i}] is {ours[k][i]:.9g} after {k} sample(s), and {real[k][i]:.9g}"
+    raise _goes_another_way(name, values)
+
+
+def _goes_another_way(name: str, how: str) -> BadInput:
+    return BadInput(
+        f"{name} goes another way than a new one from the same start with the same inputs: {how} in the new "
+        "one; it depends on other episodes, on time, on chance, on wrappers around a time limit, or on what "
+        "it observes"
+    )
