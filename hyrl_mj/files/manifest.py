@@ -245,8 +245,8 @@ def _remedy(stage: str, folder: Path, done: Collection[str]) -> str:
 def locked(folder: Path) -> Iterator[None]:
     """Holds the lock of a run directory, which one thread of one process can hold, more than once.
 
-    The directory is made if it is missing. A block that writes nothing leaves neither the lock nor a directory
-    that were not there before.
+    The directory is made if it is missing. A block that writes nothing leaves no lock and no directory that
+    were not there before.
 
     Raises:
         Busy: another process or thread works there; the message says which and since when.
