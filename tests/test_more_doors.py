@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from attacks import crafted_agents
+from attacks import child, crafted_agents
 from command_line import call
 
 import hyrl_mj
@@ -26,6 +27,7 @@ from hyrl_mj.policies.preprocessing import Normalization
 from hyrl_mj.runs.sweeps import Common, Row, Setting, Sweep
 from hyrl_mj.system.streams import _SEQUENCES
 from hyrl_mj.tasks.scaffold import write_task
+from hyrl_mj.viz.figures import style
 
 ENV = "hyrl_mj/UnitCircle-v0"
 
@@ -162,7 +164,25 @@ def test_a_pipe_in_place_of_a_file_is_no_file(command, tmp_path):
     assert (done.returncode, done.stderr) == (2, "hyrl-mj: pipe is no file: give a JSON file\n")
 
 
-# ---- what fills the memory
+# ---- what fills the disk and the memory
+
+
+def test_a_figure_on_a_full_disk_is_one_sentence(tmp_path, monkeypatch, circle):
+    monkeypatch.setattr(style, "DPI", 5)
+
+    def work():
+        with style.drawing(Path("a.png"), 3.0, circle, "title"):
+            pass
+        room = (Path("a.png").stat().st_size + Path("a.pdf").stat().st_size) // 2
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))  # the PNG is the smaller one
+        with style.drawing(Path("b.png"), 3.0, circle, "title"):
+            pass
+
+    answer = child(work, tmp_path)
+    assert answer.err.splitlines()[-1].startswith(
+        "hyrl_mj.errors.BadInput: b.pdf cannot be written"
+    )
+    assert sorted(os.listdir(tmp_path)) == ["a.pdf", "a.png"]
 
 
 def test_arguments_of_an_environment_have_a_limit(tmp_path):
