@@ -160,7 +160,7 @@ def marked(folder: Path, flag: int, method: int) -> str:
 
 def vast(folder: Path, **about: int) -> str:
     """A zip64 whose directory says of policy.pth what 32 bits cannot: its sizes, or where it begins."""
-    write_zip(folder)
+    write_zip(folder, bytes(2**20))
     with zipfile.ZipFile(folder / "agent.zip", "a") as file:
         file.writestr("more", b"")  # so that the directory is written again
         for name, number in about.items():
