@@ -97,7 +97,7 @@ class Text:
 
     def checked(self, name: str, value: Any) -> str:
         if not (isinstance(value, str) and value and not has_controls(value)):
-            raise refused(name, value, "a text")
+            raise refused(name, value, "a text that can be printed")
         return str(value)
 
 

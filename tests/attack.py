@@ -34,6 +34,7 @@ from attacks import (
     configurations,
     crashes,
     damage,
+    disks,
     doors,
     kills,
     received,
@@ -69,7 +70,10 @@ ATTACKS = {
     "crashes": Attack(
         "crashed before and after every rename, then resumed", crashes.trials, 10_000, 2
     ),
-    "kills": Attack("killed at a random moment, then resumed", kills.trials, 50, 1),
+    "kills": Attack(
+        "killed at a random moment, resumed while the clock is set back", kills.trials, 50, 1
+    ),
+    "disks": Attack("a disk that is full, and then has room", disks.trials, 15, 1),
     "artifacts": Attack("truncated, or one bit flipped", damage.trials, 80, 3),
     "received": Attack("crafted files of a stranger", received.trials, 60, 3),
     "doors": Attack("generated descriptions of a stranger", doors.trials, 600, 8),

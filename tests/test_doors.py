@@ -5,6 +5,7 @@ import io
 import json
 import os
 import shutil
+import socket
 import subprocess
 import sys
 import time
@@ -14,7 +15,7 @@ from random import Random
 import gymnasium as gym
 import numpy as np
 import pytest
-from attacks import doors
+from attacks import doors, folders
 from command_line import call
 
 from hyrl_mj.environments import from_gymnasium
@@ -283,18 +284,27 @@ def test_a_nested_pickle_takes_no_time(seed):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "words", [("doctor",), ("diagnose", "--env", "Reacher-v5"), ("list",), ("report", ".")]
+    "words",
+    [
+        ("doctor",),
+        ("diagnose", "--env", "Reacher-v5"),
+        ("list",),
+        ("report", "."),
+        ("sweep", "unit_circle", "--address", "127.0.0.1:{port}"),
+    ],
 )
 def test_nothing_is_imported_from_the_current_folder(words, tmp_path):
-    for name in doors.MODULES:
+    for name in folders.MODULES:
         code(tmp_path, f"{name}.py")
     program = "import sys; from hyrl_mj.cli import main; sys.argv[0] = 'hyrl-mj'; main()"
-    subprocess.run(
-        [sys.executable, "-P", "-c", program, *words],
-        cwd=tmp_path,
-        capture_output=True,
-        check=False,
-    )
+    with socket.create_server(("127.0.0.1", 0)) as listener:  # it answers, and is no cluster
+        port = listener.getsockname()[1]
+        subprocess.run(
+            [sys.executable, "-P", "-c", program, *(word.format(port=port) for word in words)],
+            cwd=tmp_path,
+            capture_output=True,
+            check=False,
+        )
     assert not (tmp_path / "executed").exists()
 
 

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from attacks import child, crafted_agents
 from command_line import call
 
 import hyrl_mj
@@ -21,11 +23,11 @@ from hyrl_mj.fields import read_field
 from hyrl_mj.files import artifacts, trust
 from hyrl_mj.files.manifest import locked
 from hyrl_mj.physics import mjcf
-from hyrl_mj.pipeline import sweeping
 from hyrl_mj.policies.preprocessing import Normalization
 from hyrl_mj.runs.sweeps import Common, Row, Setting, Sweep
 from hyrl_mj.system.streams import _SEQUENCES
 from hyrl_mj.tasks.scaffold import write_task
+from hyrl_mj.viz.figures import style
 
 ENV = "hyrl_mj/UnitCircle-v0"
 
@@ -41,7 +43,7 @@ def row(seed=0, **values):
 # ---- what belongs to somebody else
 
 
-def test_a_sweep_that_does_not_begin_leaves_what_others_have_put_there(tmp_path):
+def test_what_does_not_begin_leaves_what_others_have_put_there_and_nothing_else(tmp_path):
     folder = tmp_path / "sweep"
 
     def put() -> None:
@@ -49,20 +51,24 @@ def test_a_sweep_that_does_not_begin_leaves_what_others_have_put_there(tmp_path)
         (folder / "mine" / "data.txt").write_text("mine")
         raise BadInput("not now")
 
-    with pytest.raises(BadInput, match="not now"), sweeping._held(folder):
+    with pytest.raises(BadInput, match="not now"), locked(folder):
         put()
     assert (folder / "mine" / "data.txt").read_text() == "mine"
-    with pytest.raises(BadInput, match="not now"), sweeping._held(tmp_path / "other"):
+    with pytest.raises(BadInput, match="not now"), locked(tmp_path / "other"):
         raise BadInput("not now")
     assert not (tmp_path / "other").exists()
+    (tmp_path / "empty").mkdir()
+    with locked(tmp_path / "empty"):
+        pass
+    assert os.listdir(tmp_path / "empty") == []
 
 
-def test_a_sweep_leaves_the_folder_of_another_one_that_is_at_work(tmp_path, monkeypatch):
+def test_the_folder_of_another_process_that_is_at_work_stays(tmp_path, monkeypatch):
     folder = tmp_path / "sweep"
     with locked(folder):
         monkeypatch.setattr(Path, "exists", lambda path: False)  # as it was a moment before
-        code = "import sys; from pathlib import Path; from hyrl_mj.pipeline import sweeping\n"
-        code += "Path.exists = lambda path: False\nwith sweeping._held(Path(sys.argv[1])): pass"
+        code = "import sys; from pathlib import Path; from hyrl_mj.files.manifest import locked\n"
+        code += "Path.exists = lambda path: False\nwith locked(Path(sys.argv[1])): pass"
         done = subprocess.run(
             [sys.executable, "-P", "-c", code, folder], capture_output=True, text=True
         )
@@ -87,6 +93,41 @@ def test_a_link_that_leads_to_nothing_is_not_replaced(tmp_path):
     path.symlink_to(tmp_path / "elsewhere.html")
     with pytest.raises(BadInput, match="has not written it"), trust.output(path):
         pass
+
+
+# ---- names
+
+
+def test_the_name_of_an_agent_that_no_file_can_hold_leaves_no_folder(tmp_path):
+    crafted_agents.write_zip(tmp_path)
+    (tmp_path / "agent.zip").rename(tmp_path / "a\nb.zip")
+    words = ("unit_circle", "--policy", "a\nb.zip", "--vecnormalize", "none", "--out", "out")
+    done = call("diagnose", *words, cwd=tmp_path)
+    assert done.returncode == 2
+    assert "config.json cannot hold 'a\\nb.zip'" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_task_in_a_folder_that_is_not_in_utf_8_is_one_sentence(tmp_path):
+    folder = tmp_path / "x\udcff"  # as Python reads a byte that is no character
+    done = call("new-task", "robot_1", "--folder", folder)
+    assert done.stdout.count("\n") == 3
+    assert "x\\udcff/robot_1.py" in done.stdout
+    with pytest.raises(BadInput, match=r"is not in UTF-8.*export LC_ALL=C\.UTF-8"):
+        _ = hyrl_mj.get_task(folder / "robot_1.py").model
+
+
+def test_the_hint_of_a_new_task_can_be_copied(tmp_path):
+    done = call("new-task", "robot_2", "--folder", "a b\nc", cwd=tmp_path)
+    assert done.stdout.count("\n") == 3
+    assert "hyrl-mj run 'a b\\nc/robot_2.py'\n" in done.stdout
+
+
+@pytest.mark.slow
+def test_a_run_in_a_folder_that_is_not_in_utf_8_is_reported(planted_circle, tmp_path):
+    path = shutil.copytree(planted_circle[0].path, tmp_path / "x\udcff")
+    assert call("report", path).returncode == 0
+    assert (path / "report.html").exists()
 
 
 # ---- what lies in the way
@@ -123,7 +164,25 @@ def test_a_pipe_in_place_of_a_file_is_no_file(command, tmp_path):
     assert (done.returncode, done.stderr) == (2, "hyrl-mj: pipe is no file: give a JSON file\n")
 
 
-# ---- what fills the memory
+# ---- what fills the disk and the memory
+
+
+def test_a_figure_on_a_full_disk_is_one_sentence(tmp_path, monkeypatch, circle):
+    monkeypatch.setattr(style, "DPI", 5)
+
+    def work():
+        with style.drawing(Path("a.png"), 3.0, circle, "title"):
+            pass
+        room = (Path("a.png").stat().st_size + Path("a.pdf").stat().st_size) // 2
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))  # the PNG is the smaller one
+        with style.drawing(Path("b.png"), 3.0, circle, "title"):
+            pass
+
+    answer = child(work, tmp_path)
+    assert answer.err.splitlines()[-1].startswith(
+        "hyrl_mj.errors.BadInput: b.pdf cannot be written"
+    )
+    assert sorted(os.listdir(tmp_path)) == ["a.pdf", "a.png"]
 
 
 def test_arguments_of_an_environment_have_a_limit(tmp_path):

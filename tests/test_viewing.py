@@ -1,5 +1,6 @@
 """The viewers: how an arc is played, who can reach the page, and what is said where none opens."""
 
+import os
 import re
 import socket
 import sys
@@ -145,7 +146,18 @@ def free_port():
         return port
 
 
-def test_the_page_is_served_to_this_machine_alone(vehicle, arc, headless, capsys):
+def page_of(port, **options):
+    """The web socket of the page, as a browser opens it."""
+    import viser
+    from websockets.sync.client import connect
+
+    kind = [f"viser-v{viser.__version__}"]
+    return connect(f"ws://127.0.0.1:{port}", subprotocols=kind, max_size=None, **options)
+
+
+def test_the_page_is_served_to_this_machine_alone(vehicle, arc, headless, capsys, caplog):
+    from websockets.exceptions import InvalidStatus
+
     port, said = free_port(), []
 
     def look(text):
@@ -156,6 +168,15 @@ def test_the_page_is_served_to_this_machine_alone(vehicle, arc, headless, capsys
             request = urllib.request.Request(f"http://127.0.0.1:{port}/", headers={name: value})
             with pytest.raises(urllib.error.HTTPError, match="403"):
                 urllib.request.urlopen(request, timeout=20)
+        for headers in ({"Host": "evil.example"}, {"Origin": "null"}, {"Origin": "http://["}):
+            with pytest.raises(InvalidStatus), page_of(port, additional_headers=headers):
+                raise AssertionError  # a second host, or a page of somebody else's
+        for content in (b"\xdd\xff\xff\xff\xff", b"\x91" * 100_000, "text", os.urandom(1_000)):
+            with page_of(port) as page:
+                page.recv(timeout=10)
+                page.send(content)
+        with page_of(port) as page:
+            page.recv(timeout=10)  # it still serves who asks for more
         if sys.platform == "linux":
             assert listeners(port) == ["0100007F"]
         raise Enough
@@ -164,7 +185,8 @@ def test_the_page_is_served_to_this_machine_alone(vehicle, arc, headless, capsys
         viewing.view(vehicle, arc, port, look)
     assert port_of(said[0]) == port
     assert "only from this machine" in said[0]
-    assert capsys.readouterr().out == ""  # viser's own words are not ours
+    assert not [record for record in caplog.records if record.exc_info]
+    assert capsys.readouterr() == ("", "")  # viser's own words are not ours
     with pytest.raises(ConnectionRefusedError):  # and nobody listens any more
         socket.create_connection(("127.0.0.1", port), timeout=5)
 
@@ -190,14 +212,11 @@ def test_without_a_port_the_first_free_one_from_8080_on_is_taken(vehicle, arc, h
 
 
 def test_who_has_the_page_open_sees_the_robot_move(vehicle, arc, headless, monkeypatch):
-    import viser
-    from websockets.sync.client import connect
-
     received = []
     open_page = threading.Event()
 
-    def watch(address):
-        with connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None) as page:
+    def watch(port):
+        with page_of(port) as page:
             try:
                 while True:  # first the scene, and then a long time nothing
                     page.recv(timeout=1)
@@ -218,7 +237,7 @@ def test_who_has_the_page_open_sees_the_robot_move(vehicle, arc, headless, monke
 
     def say(text):
         nonlocal thread
-        thread = threading.Thread(target=watch, args=(f"ws://127.0.0.1:{port_of(text)}",))
+        thread = threading.Thread(target=watch, args=(port_of(text),))
         thread.start()
 
     thread = None

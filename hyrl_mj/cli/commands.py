@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 from hyrl_mj import pipeline
 from hyrl_mj.environments import EnvironmentOptions, chosen_task, explained
-from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.errors import BadInput, printable, unknown
 from hyrl_mj.fields import DriveOptions, for_posts, read_field
 from hyrl_mj.files import trust
 from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions, SweepOptions
@@ -38,8 +39,8 @@ def new_task(name: str, *, folder: Path = Path()) -> None:
         name: the name of the task and of its files: letters, digits and _.
         folder: the folder to write to.
     """
-    paths = write_task(name, folder)
-    print(f"wrote {', '.join(map(str, paths))}")
+    paths = [shlex.quote(printable(str(path))) for path in write_task(name, folder)]
+    print(f"wrote {', '.join(paths)}")
     print(f"try them with python -m pytest {paths[-1]}, after pip install pytest")
     print(f"then run all stages with hyrl-mj run {paths[0]}")
 

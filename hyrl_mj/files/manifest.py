@@ -242,10 +242,11 @@ def _remedy(stage: str, folder: Path, done: Collection[str]) -> str:
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[Path]:
+def locked(folder: Path) -> Iterator[None]:
     """Holds the lock of a run directory, which one thread of one process can hold, more than once.
 
-    Yields the file of the lock.
+    The directory is made if it is missing. A block that writes nothing leaves no lock and no directory that
+    were not there before.
 
     Raises:
         Busy: another process or thread works there; the message says which and since when.
@@ -254,6 +255,7 @@ def locked(folder: Path) -> Iterator[Path]:
     path = folder.resolve() / LOCK
     check_contents(folder)
     lock = FileLock(path, is_singleton=True)
+    had_folder, had_lock = folder.exists(), path.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock.acquire(blocking=False)
@@ -277,11 +279,17 @@ def locked(folder: Path) -> Iterator[Path]:
                 path.write_text(f"process {os.getpid()}, since {since}\n", encoding="utf-8")
             for left in _left_in(folder):
                 left.unlink(missing_ok=True)
-        yield path
+        yield
     finally:
         if lock.lock_counter == 1:
-            with suppress(OSError):
+            with suppress(
+                OSError
+            ):  # somebody puts something there, or an open file cannot be removed
                 path.write_text("", encoding="utf-8")  # a finished run directory is always the same
+                if not had_lock and os.listdir(folder) == [LOCK]:
+                    path.unlink()
+                    if not had_folder:
+                        folder.rmdir()
         lock.release()
 
 

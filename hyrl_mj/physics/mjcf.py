@@ -59,6 +59,11 @@ def load(path: Path) -> mujoco.MjModel:
     """
     if not path.is_file():
         raise BadInput(f"there is no MJCF model at {path}")
+    if any("\ud800" <= c <= "\udfff" for c in str(path)):  # a byte that Python could not read
+        raise BadInput(
+            f"the name of {path} is not in UTF-8, or the locale is another one: rename the folder or the "
+            "file, or set the locale, as with export LC_ALL=C.UTF-8"
+        )
     main = path, sha256(path.read_bytes()).hexdigest()
     if new := models_dir() not in path.resolve().parents and main not in _TRIED:
         _try(path.absolute())

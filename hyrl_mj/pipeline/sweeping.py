@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from itertools import islice, product
 from pathlib import Path
@@ -105,7 +105,7 @@ def sweep(
     rows = [row.on_disk(folder) for row in result.rows if row.name in jobs]
     missing = [(row, jobs[row.name][1]) for row in rows if row.state != DONE]
     with ExitStack() as stack:
-        stack.enter_context(_held(folder))
+        stack.enter_context(locked(folder))
         result = sweeps.opened(folder, common, planned)  # what others have added meanwhile
         engine = None
         if missing:
@@ -127,25 +127,6 @@ def sweep(
                     board.end(row)
         write(result, folder)
     return result
-
-
-@contextmanager
-def _held(folder: Path) -> Iterator[None]:
-    """Holds the lock of a folder, and removes the folder if it was made for a sweep that was never begun.
-
-    What others have put there meanwhile stays.
-    """
-    was_there = folder.exists()
-    with locked(folder) as lock:
-        try:
-            yield
-        finally:
-            with suppress(
-                OSError
-            ):  # somebody puts something there, or an open file cannot be removed
-                if not was_there and [path.name for path in folder.iterdir()] == [lock.name]:
-                    lock.unlink()
-                    folder.rmdir()
 
 
 def report(folder: str | Path) -> Sweep:

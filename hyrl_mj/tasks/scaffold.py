@@ -37,7 +37,6 @@ def write_task(name: str, folder: Path) -> list[Path]:
     }
     if existing := [path for path in texts if path.exists()]:
         raise BadInput(f"{existing[0]} exists already: choose another name, or another folder")
-    folder.mkdir(parents=True, exist_ok=True)
     for path, text in texts.items():
         with artifacts.replacing(path) as temporary:
             temporary.write_text(text, encoding="utf-8")

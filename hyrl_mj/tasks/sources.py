@@ -17,8 +17,7 @@ def sources(path: Path) -> list[Path]:
     found, left = {path: None}, [] if path.parent.name in INSTALLED else [path]
     while left:
         file = left.pop()
-        now = file.stat()
-        for name in _imported(file, now.st_mtime_ns, now.st_size):
+        for name in _imported(file.read_bytes()):
             for folder in {path.parent, file.parent}:
                 files = [folder / f"{name}.py", *sorted((folder / name).rglob("*.py"))]
                 new = [file for file in files if file.is_file() and file not in found]
@@ -66,11 +65,11 @@ def _beside(path: Path) -> set[str]:
     return {file.parts[0].removesuffix(".py") for file in files}
 
 
-@lru_cache(maxsize=10_000)
-def _imported(path: Path, changed: int, size: int) -> frozenset[str]:
-    """Returns the first names of the modules that a file imports anywhere, as it is at that time."""
+@lru_cache(maxsize=1_000)
+def _imported(code: bytes) -> frozenset[str]:
+    """Returns the first names of the modules that the code of a file imports anywhere."""
     try:
-        tree = ast.parse(path.read_bytes())
+        tree = ast.parse(code)
     except (SyntaxError, ValueError):  # which running it tells of
         return frozenset()
     names: list[str] = []

@@ -239,7 +239,8 @@ def _text(value: object) -> str:
 def write(path: Path, text: str) -> None:
     """Writes a page, whole or not at all."""
     with artifacts.replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        # The name of a folder may have bytes that are no characters.
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def fill(template: str, run: Run, robustness: Robustness | None, **values: Any) -> str:

@@ -6,6 +6,7 @@ web viewer that MuJoCo 4 brings along listens to the whole network, and has no s
 
 from __future__ import annotations
 
+import logging
 import socket
 import time
 from collections.abc import Iterator
@@ -132,22 +133,24 @@ def _web(model: mujoco.MjModel, data: mujoco.MjData, port: int, say: Say) -> Ite
 def _for_this_machine() -> Iterator[None]:
     """Lets servers that are begun in the block refuse the pages of other addresses that a browser holds open.
 
-    viser looks neither at the host that a browser asks for nor at the page that asks.
+    viser looks neither at the host that a browser asks for nor at the page that asks. What else a stranger
+    sends ends the connection, and writes nothing to the terminal.
     """
     from websockets.asyncio import server
 
-    serve = server.serve
+    serve, silent = server.serve, logging.getLogger("hyrl_mj.viewer")
+    silent.disabled = True
 
     def checked(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
         async def answer(connection: Any, request: Any) -> Any:
-            host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
-            known = host.rpartition(":")[0] in (LOOPBACK, "localhost")
-            if not known or (origin is not None and urlsplit(origin).netloc != host):
+            hosts, origins = map(request.headers.get_all, ("Host", "Origin"))
+            known = [host.rpartition(":")[0] in (LOOPBACK, "localhost") for host in hosts] == [True]
+            if not known or any(urlsplit(origin).netloc != hosts[0] for origin in origins):
                 return connection.respond(403, "This page can only be seen from this machine.\n")
             found = process_request and process_request(connection, request)
             return await found if isawaitable(found) else found
 
-        return serve(*arguments, process_request=answer, **options)
+        return serve(*arguments, process_request=answer, **{**options, "logger": silent})
 
     setattr(server, "serve", checked)  # noqa: B010 - mypy takes it for a type
     try:

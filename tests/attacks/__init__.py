@@ -22,6 +22,9 @@ from hyrl_mj import cli
 # What a payload leaves behind when it runs, in the folder of its trial.
 MARKER = "executed"
 PATIENCE = 4
+# Limits on what is hostile: seconds of the processor to refuse it, memory beyond that of something honest and
+# memory that it may ask for [MB], and characters of the sentence.
+SECONDS, MEMORY, MOST, LONGEST = 10.0, 200.0, 2_000, 600
 
 
 @dataclass(frozen=True)
@@ -209,6 +212,34 @@ def limited(work: Callable[[], object], more: int) -> Callable[[], None]:
         work()
 
     return done
+
+
+def resisted(
+    work: Callable[[], object],
+    folder: Path,
+    most: float,
+    ended: tuple[int, ...] = (0, 1, 2),
+    seconds: float = SECONDS,
+) -> str:
+    """Returns what is wrong with the answer of the command line to something hostile, "" if nothing is.
+
+    Args:
+        most: the memory that something honest takes [MB].
+        ended: the exit statuses that it may have.
+        seconds: within which it must be refused; what is accepted takes as long as it takes.
+    """
+    answer = child(limited(work, MOST), folder, seconds=3 * seconds)
+    if broke := answer.broke(ended):
+        return broke
+    if any(folder.rglob(MARKER)):
+        return "code of a stranger's was executed"
+    if answer.memory > most + MEMORY:
+        return f"takes {answer.memory - most:.0f} MB more than something honest"
+    if answer.status == 2 and len(answer.err.strip()) > LONGEST:
+        return f"a sentence of {len(answer.err)} characters"
+    if answer.status == 2 and answer.seconds[1] > seconds:
+        return f"takes {answer.seconds[1]:.0f} s to be refused"
+    return ""
 
 
 def files(folder: Path) -> dict[str, Path]:

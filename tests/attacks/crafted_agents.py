@@ -5,8 +5,9 @@ import json
 import pickle
 import struct
 import zipfile
+import zlib
 from base64 import b64encode
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -157,6 +158,33 @@ def marked(folder: Path, flag: int, method: int) -> str:
     return "agent.zip"
 
 
+def vast(folder: Path, **about: int) -> str:
+    """A zip64 whose directory says of policy.pth what 32 bits cannot: its sizes, or where it begins."""
+    write_zip(folder, bytes(2**20))
+    with zipfile.ZipFile(folder / "agent.zip", "a") as file:
+        file.writestr("more", b"")  # so that the directory is written again
+        for name, number in about.items():
+            setattr(file.getinfo("policy.pth"), name, number)
+    return "agent.zip"
+
+
+def overlapping(names: Sequence[str], content: bytes) -> bytes:
+    """Returns a zip whose members all unpack the same bytes: what is between them counts as their heads."""
+    packer = zlib.compressobj(9, zlib.DEFLATED, -15)
+    packed = packer.compress(content) + packer.flush()
+    about = 20, 0, zipfile.ZIP_DEFLATED, 0, 33, zlib.crc32(content), len(packed), len(content)
+    heads, directory, at = b"", b"", 0
+    for name in reversed(names):
+        head = struct.pack("<4s5H3L2H", b"PK\3\4", *about, len(name), len(heads))
+        heads = head + name.encode() + heads
+    for name in names:
+        head = struct.pack("<4sH5H3L5H2L", b"PK\1\2", 20, *about, len(name), 0, 0, 0, 0, 0, at)
+        directory += head + name.encode()
+        at += 30 + len(name)
+    end = (0, 0, len(names), len(names), len(directory), len(heads) + len(packed), 0)
+    return heads + packed + directory + struct.pack("<4s4H2LH", b"PK\5\6", *end)
+
+
 def cut(folder: Path) -> str:
     write_zip(folder)
     path = folder / "agent.zip"
@@ -213,9 +241,12 @@ def header(content: object, size: int | None = None, rest: bytes = b"") -> bytes
     return struct.pack("<Q", len(text) if size is None else size) + text + rest
 
 
-def tensor_of(shape: list[int], end: int) -> bytes:
-    entry = {"dtype": "F32", "shape": shape, "data_offsets": [0, end]}
-    return header({"action_net.weight": entry}, rest=bytes(64))
+def tensors_of(*places: tuple[list[int], list[int]]) -> bytes:
+    """Returns a file of tensors with these shapes at these places, of 64 bytes of numbers."""
+    entries = [{"dtype": "F32", "shape": shape, "data_offsets": ends} for shape, ends in places]
+    return header(
+        {f"{number}.weight": entry for number, entry in enumerate(entries)}, rest=bytes(64)
+    )
 
 
 def naming(folder: Path, task: str) -> str:
@@ -248,6 +279,15 @@ FILES: dict[str, Callable[[Path], str]] = {
     "zip, encrypted": partial(marked, flag=1, method=0),
     "zip, of an unknown compression": partial(marked, flag=0, method=77),
     "zip, cut in half": cut,
+    "zip64, a policy.pth of 2**60 bytes": partial(vast, file_size=2**60, compress_size=2**60),
+    "zip64, a policy.pth packed in 2**60 bytes": partial(vast, compress_size=2**60),
+    "zip64, a policy.pth at 2**62": partial(vast, header_offset=2**62),
+    "zip, members that overlap": lambda folder: garbage(
+        folder, "agent.zip", overlapping(("policy.pth", "data", *map(str, range(1_000))), bytes(2**24))
+    ),
+    "zip, tensors whose zip has members that overlap": lambda folder: write_zip(
+        folder, overlapping(("a/data.pkl", *(f"a/data/{n}" for n in range(1_000))), bytes(2**24))
+    ),
     "zip, 20,000 layers": deep_layers,
     "zip, a list of tensors": partial(write_zip, policy=[torch.zeros(2)]),
     "zip, a strided tensor of 2**40 numbers": lambda folder: write_zip(
@@ -307,7 +347,16 @@ FILES: dict[str, Callable[[Path], str]] = {
         folder, header(b"{}", size=2**60)
     ),
     "safetensors, a tensor of 2**62 numbers": lambda folder: write_safetensors(
-        folder, tensor_of([2**31, 2**31], 64)
+        folder, tensors_of(([2**31, 2**31], [0, 64]))
+    ),
+    "safetensors, tensors that overlap": lambda folder: write_safetensors(
+        folder, tensors_of(*[([16], [0, 64])] * 10_000)
+    ),
+    "safetensors, tensors that overlap in part": lambda folder: write_safetensors(
+        folder, tensors_of(([12], [0, 48]), ([12], [16, 64]))
+    ),
+    "safetensors, a gap between tensors": lambda folder: write_safetensors(
+        folder, tensors_of(([4], [0, 16]), ([4], [48, 64]))
     ),
     "safetensors, a deep header": lambda folder: write_safetensors(
         folder, header(b"[" * 10**5 + b"]" * 10**5)

@@ -25,12 +25,14 @@ def model(
     output: tuple[int, Any] | None = (FLOAT, ("n", 1)),
     given: tuple[int, Any] = (FLOAT, ("n", 2)),
     opset: int = 17,
+    **more: Any,
 ) -> str:
     """Writes a model from "obs" to "u"."""
     outputs = [] if output is None else [helper.make_tensor_value_info("u", *output)]
     inputs = [helper.make_tensor_value_info("obs", *given)]
     graph = helper.make_graph(list(nodes), "g", inputs, outputs, list(constants))
-    made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=8)
+    opsets = more.pop("opsets", [helper.make_opsetid("", opset)])
+    made = helper.make_model(graph, opset_imports=opsets, ir_version=8, **more)
     (folder / "agent.onnx").write_bytes(made.SerializeToString())
     return "agent.onnx"
 
@@ -99,15 +101,23 @@ def expanded(folder: Path) -> str:
     return model(folder, [big, total, summed, node("Add", ("sum", "most"))], [shape, SUM[1]])
 
 
-def elsewhere(folder: Path, location: str) -> str:
-    """Weights that lie in another file of the user's."""
+def elsewhere(folder: Path, location: str, inside: str = "", **more: int) -> str:
+    """Weights that lie in another file, named by the graph, inside a node, or inside a function."""
     weights = constant("w", np.zeros((2, 1), np.float32))
     weights.ClearField("raw_data")
     weights.data_location = TensorProto.EXTERNAL
-    for key, value in (("location", location), ("offset", "0"), ("length", "8")):
+    for key, value in {"location": location, "offset": 0, "length": 8, **more}.items():
         entry = weights.external_data.add()
-        entry.key, entry.value = key, value
-    return model(folder, [node("MatMul", ("obs", "w"))], [weights])
+        entry.key, entry.value = key, f"{value}"
+    product = node("MatMul", ("obs", "w"))
+    if not inside:
+        return model(folder, [product], [weights])
+    nodes = [node("Constant", (), "w", value=weights), product]
+    if inside == "node":
+        return model(folder, nodes)
+    opsets = [helper.make_opsetid("", 17), helper.make_opsetid("own", 1)]
+    function = helper.make_function("own", "F", ["obs"], ["u"], nodes, opsets[:1])
+    return model(folder, [node("F", ("obs",), domain="own")], functions=[function], opsets=opsets)
 
 
 def nested(folder: Path) -> str:
@@ -141,6 +151,13 @@ FILES: dict[str, Callable[[Path], str]] = {
     "onnx, an input that fills the memory": expanded,
     "onnx, weights in another file": partial(elsewhere, location="victim/secret.txt"),
     "onnx, weights in a file above": partial(elsewhere, location="../../../../../../etc/passwd"),
+    "onnx, weights in a device": partial(elsewhere, location="/dev/zero", length=2**40),
+    "onnx, weights of a node in another file": partial(
+        elsewhere, location="victim/secret.txt", inside="node"
+    ),
+    "onnx, weights of a function in another file": partial(
+        elsewhere, location="victim/secret.txt", inside="function", offset=2**60
+    ),
     "onnx, without outputs": lambda folder: model(folder, SUM[:1], SUM[1:], output=None),
     "onnx, an output of no node": lambda folder: model(folder, [], []),
     "onnx, strings": lambda folder: model(

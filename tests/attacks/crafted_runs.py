@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from attacks import MARKER
-from attacks.crafted_agents import ESCAPE, Payload, header, zeros
+from attacks.crafted_agents import ESCAPE, Payload, header, overlapping, zeros
 from attacks.forgery import arrays, changed, forged, replaced, setting
 
 SCRIPT = "<script>alert('executed')</script>"
@@ -79,6 +79,13 @@ def npy(shape: str, descr: str = "<f8", rest: bytes = b"") -> bytes:
     text = f"{{'descr': {descr!r}, 'fortran_order': False, 'shape': {shape}}}"
     raw = text.encode().ljust(117) + b"\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(raw)) + raw + rest
+
+
+def overlapping_arrays(folder: Path, path: Path) -> None:
+    """A thousand arrays of 16 MB that share their bytes."""
+    content = npy("(16777216,)", "|u1", bytes(2**24))
+    names = [f"{number}.npy" for number in range(1_000)]
+    replaced(path, "partition.npz", overlapping(names, content))
 
 
 def array_bomb(folder: Path, path: Path) -> None:
@@ -206,6 +213,7 @@ DIRECTORIES: dict[str, Callable[[Path, Path], None]] = {
     "a call in the header of an array": calls_in_header,
     "a pickle for a JSON file": pickle_for_json,
     "an npz bomb": array_bomb,
+    "an npz whose arrays overlap": overlapping_arrays,
     "an array of 2**50 numbers": lambda folder, path: arrays(
         path, "partition.npz", succeeds=npy("(1125899906842624,)")
     ),

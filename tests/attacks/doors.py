@@ -8,35 +8,21 @@ import os
 import sys
 from base64 import b64encode
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Any
 
-import numpy as np
-
-import hyrl_mj
-from attacks import MARKER, Trial, child, command, crafted_agents, limited
+from attacks import Trial, child, command, crafted_agents, folders, resisted
 from attacks.crafted_runs import evil
-from attacks.forgery import setting, write
+from attacks.folders import ESCAPE, plant_modules
+from attacks.forgery import setting
+from attacks.honest import diagnose, drive, explain, most
 from attacks.material import TASK, Material
+from hyrl_mj.errors import BadInput
 
-# Limits on what is refused: seconds of the processor, and memory in MB; and in all for what is tried in a
-# process of its own.
-SECONDS, MEMORY, LONGEST = 10.0, 200.0, 20.0
-# Modules that an installed one might import, and modules of a stranger's: all lie in the current folder.
-MODULES = (
-    "imageio",
-    "glfw",
-    "yaml",
-    "click",
-    "mujoco",
-    "evil",
-    "gymnasium_robotics",
-    "sitecustomize",
-)
-ESCAPE = "\x1b]0;owned\x07"
+# Seconds of the processor within which what is tried in a process of its own must be refused.
+LONGEST = 20.0
 IDS = (
     *4 * ("hyrl_mj/UnitCircle-v0", "hyrl_mj/Vehicle-v0", "Reacher-v5", "Ant-v5"), "CartPole-v1",
     "evil:Env-v0", "evil:UnitCircle-v0", "os:Env-v0", "evil", "", ".", "../evil", "a" * 5_000, ESCAPE,
@@ -57,11 +43,6 @@ NAMES = (
 EXPRESSIONS = (
     "__import__('os').system('touch executed')", "open('executed', 'w')", "(" * 5_000, "x" * 100_000,
     "info['a'].__class__", "reward >= 1e400", "distance('a', 'b') <= 1 ** 99999999", ESCAPE, "lambda: 1",
-)  # fmt: skip
-# Names of run directories that a shell, a format or a parser could take for something else.
-PATHS = (
-    " a b ", "it's", 'q"q', "-dash", "--out", "x" * 200, "über", "$(touch executed)", "`touch executed`",
-    "a;touch executed", "%s%n", "{0}", "back\\slash", "#", "~", "a&b<c>", "*", "\u202egnp", "new\nline",
 )  # fmt: skip
 # Hostile models: the text of an MJCF, in which {fifo} is a file that nobody writes to.
 # fmt: off
@@ -94,23 +75,26 @@ MODELS = {
 
 def trials(material: Material, draw: Random, count: int) -> list[Trial]:
     """Returns trials of each kind, drawn at random."""
-    makers = {
-        "spec": partial(_spec, material),
-        "arguments": _arguments,
-        "model": _model,
-        "agent": _agent,
-        "field": _field,
-        "sweep": partial(_sweep, material),
-        "path": partial(_path, material),
-        "threads": partial(_threads, material),
+    # What makes a trial, what its memory is compared with, and how many of twenty are of this kind.
+    kinds = {
+        "spec": (_spec, "run", 4),
+        "arguments": (_arguments, "environment", 4),
+        "agent": (_agent, "agent", 4),
+        "model": (_model, "model", 3),
+        "field": (_field, "field", 2),
+        "sweep": (folders.sweep, "run", 1),
+        "path": (folders.path, "run", 1),
+        "threads": (folders.threads, "run", 1),
+        "user": (folders.user, "run", 1),
     }
-    kinds = [*makers]
+    turns = [kind for turn in range(4) for kind in kinds if kinds[kind][2] > turn]
     made = []
     for number in range(count):
-        kind, seed = kinds[number % len(kinds)], draw.randrange(2**32)
-        given = isinstance(makers[kind], partial)  # of the finished runs
-        prepare = material.finished if given else Trial.prepare
-        made.append(Trial(f"{kind} {seed}", partial(makers[kind], seed), prepare))
+        kind, seed = turns[number % len(turns)], draw.randrange(2**32)
+        make, compared, _ = kinds[kind]
+        honest = partial(most, material, compared)
+        attempt = partial(_attempt, make, material, honest, seed)
+        made.append(Trial(f"{kind} {seed}", attempt, honest))
     return made
 
 
@@ -153,9 +137,16 @@ def _described(draw: Random, folder: Path) -> dict[str, Any]:
     """Returns the arguments of `from_gymnasium` as a stranger may write them."""
     given: dict[str, Any] = {}
     keys = ("task", "xml_file", "frame_skip", "width", "noise", "id", "entry_point", "evil")
+    meant: dict[str, Callable[[], Any]] = {
+        "task": lambda: str(evil(folder)),
+        "xml_file": lambda: str(_written(draw, folder)),
+        "frame_skip": lambda: 10**9,
+    }
     if draw.random() < 0.7:
+        chosen = {draw.choice(keys) for _ in range(draw.randint(1, 2))}
         given["kwargs"] = {
-            draw.choice(keys): _value(draw, folder) for _ in range(draw.randint(1, 2))
+            key: meant[key]() if key in meant and draw.random() < 0.5 else _value(draw, folder)
+            for key in sorted(chosen)
         }
     for name in draw.sample(("reset", "pinned", "chart", "noisy", "bounds", "success", "failure",
                              "steps", "starts", "seed", "evil", "reset"), draw.randrange(3)):  # fmt: skip
@@ -186,32 +177,22 @@ def _written(draw: Random, folder: Path) -> Path:
     return path
 
 
-def plant_modules(folder: Path) -> None:
-    """Puts modules into the current folder that leave the marker behind."""
-    for name in MODULES:
-        evil(folder, f"{name}.py")
+# ---- the trials: each is of some finished runs, the memory of what is honest, and random numbers
 
 
-def _broke(work: Callable[[], object], folder: Path, seconds: float = SECONDS) -> str:
-    """Returns what is wrong with the answer to something hostile."""
-    answer = child(limited(work, 4_000), folder, seconds=3 * seconds)
-    if broke := answer.broke(ended=(0, 1, 2)):
-        return broke
-    if any(folder.rglob(MARKER)):
-        return "code of the stranger's was executed"
-    if answer.status == 2 and len(answer.err.strip()) > 600:
-        return f"a sentence of {len(answer.err)} characters"
-    if answer.status == 2 and answer.seconds[1] > seconds:
-        return f"takes {answer.seconds[1]:.0f} s to be refused"
-    return ""
+def _attempt(
+    make: Callable[[Material, float, Random, Path], str],
+    material: Material,
+    honest: Callable[[], float],
+    seed: int,
+    folder: Path,
+) -> str:
+    return make(material, honest(), Random(seed), folder)
 
 
-# ---- the trials
-
-
-def _spec(material: Material, seed: int, folder: Path) -> str:
+def _spec(material: Material, memory: float, draw: Random, folder: Path) -> str:
     """A received run whose task is an environment."""
-    draw, path = Random(seed), material.copy(folder)
+    path = material.copy(folder)
     plant_modules(folder)
     spec = f"env:{json.dumps({'env': draw.choice(IDS), **_described(draw, folder)})}"
     spec = draw.choice(
@@ -226,46 +207,41 @@ def _spec(material: Material, seed: int, folder: Path) -> str:
             command("replay", TASK),
         )
     )
-    return _broke(work, folder)
+    return resisted(work, folder, memory)
 
 
-def _arguments(seed: int, folder: Path) -> str:
+def _arguments(material: Material, memory: float, draw: Random, folder: Path) -> str:
     """A file of arguments that a stranger wrote, for an environment that the user names."""
-    draw = Random(seed)
     plant_modules(folder)
     given = _described(draw, folder)
     text = json.dumps(given)
     text = draw.choice([text] * 9 + ["[" * 100_000, "{" * 1_000, '{"a":' * 50_000, "null", "1e400"])
     (folder / "arguments.json").write_text(text, encoding="utf-8")
     env = draw.choice(("Reacher-v5", "hyrl_mj/UnitCircle-v0", "Ant-v5"))
-    words = ("diagnose", "--explain", "--env", env, "--env-args", "arguments.json")
+    if draw.random() < 0.2:  # nothing is wrong but a name
+        env, text = "hyrl_mj/UnitCircle-v0", json.dumps({"chart": {draw.choice(NAMES): "theta"}})
+        (folder / "arguments.json").write_text(text, encoding="utf-8")
     # The user's own command may import a task that the file names: `task` is code by its name.
     if "evil" in text:
-        for name in folder.glob("*.py"):
-            if name.stem == "evil":
-                name.write_text("raise SystemExit", encoding="utf-8")
-    return _broke(command(*words), folder, LONGEST)
+        (folder / "evil.py").write_text("raise SystemExit", encoding="utf-8")
+    return resisted(explain(env), folder, memory, seconds=LONGEST)
 
 
-def _model(seed: int, folder: Path) -> str:
+def _model(material: Material, memory: float, draw: Random, folder: Path) -> str:
     """A robot whose MJCF is hostile."""
-    draw = Random(seed)
-    written = child(command("new-task", "robot"), folder)
-    if broke := written.broke(ended=(0,)):
+    if broke := child(command("new-task", "robot"), folder).broke(ended=(0,)):
         return broke
     _written(draw, folder)
-    return _broke(command("run", "robot.py", "--preset", "smoke"), folder, LONGEST)
+    work = command("run", "robot.py", "--preset", "smoke")
+    return resisted(work, folder, memory, seconds=LONGEST)
 
 
-def _agent(seed: int, folder: Path) -> str:
+def _agent(material: Material, memory: float, draw: Random, folder: Path) -> str:
     """An agent whose pickles are nested, shared, or refer to themselves."""
-    draw = Random(seed)
     keys = ("_last_obs", "_last_original_obs", "observation_space", "action_space")
     pickled = {":type:": "x", ":serialized:": b64encode(_pickle(draw)).decode()}
     data = {"num_timesteps": 1_000, **dict.fromkeys(draw.sample(keys, 3), pickled)}
-    name = crafted_agents.write_zip(folder, data=data)
-    words = ("diagnose", TASK, "--policy", name, "--preset", "smoke", "--out", "out")
-    return _broke(command(*words), folder)
+    return resisted(diagnose(crafted_agents.write_zip(folder, data=data)), folder, memory)
 
 
 def _pickle(draw: Random) -> bytes:
@@ -289,9 +265,8 @@ def _pickle(draw: Random) -> bytes:
     return b"\x80\x04" + bodies[kind] + b"."
 
 
-def _field(seed: int, folder: Path) -> str:
+def _field(material: Material, memory: float, draw: Random, folder: Path) -> str:
     """A field at the limits of what a file may hold."""
-    draw = Random(seed)
     far = draw.choice((0.01, 1.0, 200.0, 999.0))
 
     def point() -> list[float]:
@@ -311,78 +286,11 @@ def _field(seed: int, folder: Path) -> str:
         text = "{" + ",".join(f'"k{i % 20_000}":1' for i in range(40_000)) + "}"
 
     def work() -> None:
-        from hyrl_mj.errors import BadInput
-        from hyrl_mj.fields import read_field
-        from hyrl_mj.fields.driving import Driving
-        from hyrl_mj.tasks import get_task
-
         try:
-            field = read_field("field.json")
-            local = get_task("field")
-            drive = Driving(local, field.layouts, time=field.time, starts=field.starts)
-            assert drive.model is not None
+            drive()
         except BadInput as error:
             print(f"hyrl-mj: {error}", file=sys.stderr)
             sys.exit(2)
 
     (folder / "field.json").write_text(text, encoding="utf-8")
-    return _broke(work, folder)
-
-
-def _path(material: Material, seed: int, folder: Path) -> str:
-    """A run directory, and a file to write, with odd names."""
-    draw = Random(seed)
-    run, out = draw.choice(PATHS), draw.choice(PATHS)
-    material.copy(folder).rename(folder / run)
-    words = draw.choice(
-        (
-            ("report", run, "--out", f"{out}.html"),
-            ("export", run, "--to", "numpy", "--out", out),
-            ("replay", run, "--out", f"{out}.png"),
-            ("simulate", run),
-        )
-    )
-    return _broke(command(*words), folder)
-
-
-def _threads(material: Material, seed: int, folder: Path) -> str:
-    """A run that several threads open and use at once."""
-    path = material.copy(folder)
-
-    def work() -> None:
-        def used(number: int) -> bytes:
-            run = hyrl_mj.load_run(path)
-            q, measured = np.zeros(8, dtype=int), np.full((8, 1), 0.5 + number % 2)
-            return b"".join(np.asarray(part).tobytes() for part in run.controller.step(q, measured))
-
-        with ThreadPoolExecutor(8) as pool:
-            found = list(pool.map(used, range(16)))
-        assert len({*found[::2]}) == 1
-        assert len({*found[1::2]}) == 1
-
-    return _broke(work, folder)
-
-
-def _sweep(material: Material, seed: int, folder: Path) -> str:
-    """A received folder of a sweep, whose texts are formulas, links, escapes and elements."""
-    draw = Random(seed)
-    plant_modules(folder)
-    (folder / "sweep").mkdir()
-    path = material.copy(folder / "sweep")
-    texts = (
-        "=cmd|'/c calc'!A0", "@SUM(1)", "| a |", "<img src=x onerror=alert(1)>", ESCAPE, "evil.py",
-        "[x](javascript:alert(1))", "env:{}", "../..", f"env:{json.dumps({'env': 'evil:X-v0'})}",
-    )  # fmt: skip
-    setting(path, "task", draw.choice(texts))
-    row: dict[str, Any] = {
-        "setting": {"task": draw.choice(texts), "algorithm": draw.choice(texts), "eps": 0.1},
-        "seed": 0, "state": draw.choice(("done", "stopped")), "verdict": draw.choice(texts),
-        "sentence": draw.choice(texts), "seconds": 1.0, "figures": {draw.choice(texts): 1.0},
-    }  # fmt: skip
-    common = {"preset": "fast", "horizon": None, "set": {}, "everywhere": False}
-    write(folder / "sweep" / "sweep.json", {"common": common, "rows": [row]})
-    broke = _broke(command("sweep", "--report", "sweep"), folder)
-    page = folder / "sweep" / "sweep.html"
-    if not broke and page.exists() and "<img src=x" in page.read_text(encoding="utf-8"):
-        return "sweep.html holds an element of the stranger's"
-    return broke
+    return resisted(work, folder, memory)

@@ -1,14 +1,19 @@
-"""Commands that are killed at a random moment, and given again."""
+"""Commands that are killed at a random moment, and given again while the clock goes back."""
 
 import json
+import os
 import shutil
 import signal
+import time
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from random import Random
 
 from attacks import Trial, child, command, crafted_agents, differences
+from attacks.honest import FIELD
 from attacks.material import RUN, TASK, Material
 
 SIGNALS = (signal.SIGKILL, signal.SIGINT, signal.SIGTERM)
@@ -23,12 +28,9 @@ AGENT = (
     "--out",
     TASK,
 )
-FIELD = {
-    "goal_m": [4.0, 0.0],
-    "posts": [{"radius_m": 0.3, "positions_m": [[2.0, 0.1]]}],
-    "starts": [{"position_m": [0.0, 0.0], "heading_rad": 0.0}],
-    "time_s": 1.0,
-}
+# Where a process has the folder of its trial in its environment, and how long it may outlive a command [s].
+TRIAL, ENDED = "ATTACK_TRIAL", 10.0
+DAY = 86_400.0  # [s]
 PICTURE = "drive.png"
 SWEEP = ("sweep", TASK, "--preset", "smoke", "--seeds", "0", "--cores", "1", "--out", "sweep")
 COMMANDS = {
@@ -38,8 +40,6 @@ COMMANDS = {
     "drive": ("drive", "field", "--field", "field.json", "--out", PICTURE),
     "sweep": SWEEP,
 }
-# What is compared of what a command makes.
-MADE = {"drive": PICTURE, "sweep": f"sweep/{TASK}-0.1-0"}
 # A sweep takes half a minute, of which Ray takes most: it is killed once where others are several times.
 OFTEN = {"sweep": 1 / 5}
 
@@ -56,28 +56,41 @@ def trials(material: Material, draw: Random, count: int) -> list[Trial]:
     """Returns trials at moments that are spread over the time that each command takes."""
     found, chosen = [], [*COMMANDS][:count]
     for place, name in enumerate(chosen):
-        whole, several = _whole(material, name), len(range(place, count, len(chosen)))
+        made, several = whole(material, name), len(range(place, count, len(chosen)))
         several = max(round(several * OFTEN.get(name, 1)), 1)
         for number in range(several):
-            moment = whole.seconds * (number + draw.random()) / several
+            moment = made.seconds * (number + draw.random()) / several
             sent = SIGNALS[number % len(SIGNALS)]
             what = f"{name}, {sent.name} after {moment:.2f} s"
-            attempt = partial(_killed, material, name, whole.path, (moment, int(sent)))
+            attempt = partial(_killed, material, name, made.path, (moment, int(sent)))
             found.append(Trial(what, attempt))
     return found
 
 
-def _whole(material: Material, name: str) -> Whole:
+@cache
+def whole(material: Material, name: str) -> Whole:
+    """Gives a command that nothing disturbs."""
     folder = material.folder / f"whole_{name}"
     folder.mkdir()
-    _prepare(material, name, folder)
+    prepare(material, name, folder)
     (answer,) = material.do(folder, [COMMANDS[name]])
-    made = folder / MADE.get(name, TASK)
-    assert made.exists(), name
-    return Whole(made, answer.seconds[0])
+    assert (folder / made_by(name)).exists(), name
+    return Whole(folder / made_by(name), answer.seconds[0])
 
 
-def _prepare(material: Material, name: str, folder: Path) -> None:
+def made_by(name: str) -> str:
+    """Returns what is compared of what a command makes."""
+    return {"drive": PICTURE, "sweep": f"sweep/{TASK}-0.1-0"}.get(name, TASK)
+
+
+def differing(made: Path, other: Path) -> str:
+    """Returns in what the same command has made something else, "" if it has not."""
+    if made.is_dir():
+        return differences(made, other)
+    return "" if made.read_bytes() == other.read_bytes() else f"another {made.name}"
+
+
+def prepare(material: Material, name: str, folder: Path) -> None:
     """Puts what a command reads into a folder."""
     crafted_agents.write_zip(folder)
     (folder / "field.json").write_text(json.dumps(FIELD), encoding="utf-8")
@@ -86,21 +99,58 @@ def _prepare(material: Material, name: str, folder: Path) -> None:
 
 
 def _killed(
-    material: Material, name: str, whole: Path, sent: tuple[float, int], folder: Path
+    material: Material, name: str, other: Path, sent: tuple[float, int], folder: Path
 ) -> str:
     """Kills a command, gives it again, and compares what it made with what one made that was not killed."""
-    _prepare(material, name, folder)
-    work, made = command(*COMMANDS[name]), folder / MADE.get(name, TASK)
-    killed = child(work, folder, sent=sent)
+    prepare(material, name, folder)
+    work, made = command(*COMMANDS[name]), folder / made_by(name)
+    killed = child(partial(_marked, work, folder), folder, sent=sent)
     ended = (0, 1, 130, -signal.SIGKILL, -signal.SIGTERM)
     if broke := killed.broke(ended):
         return broke
-    if made.is_file() and made.read_bytes() != whole.read_bytes():
-        return f"an uninterrupted {name} writes another {made.name}"
-    if broke := child(work, folder).broke(ended=(0, 1)):
+    if left := _left_by(folder):
+        return f"killed, {name} leaves processes: {left}"
+    if made.is_file() and differing(made, other):
+        return f"killed, {name} has written another {made.name}"
+    if broke := child(partial(_set_back, work, folder), folder).broke(ended=(0, 1)):
         return broke
-    if made.is_file():
-        same = made.read_bytes() == whole.read_bytes()
-        return "" if same else f"not the {made.name} of an uninterrupted {name}"
-    wrong = differences(made, whole)
+    wrong = differing(made, other)
     return f"not as an uninterrupted {name}: {wrong}" if wrong else ""
+
+
+def _set_back(work: Callable[[], None], folder: Path) -> None:
+    """Does some work among files of the future, while the clock is set back by a day."""
+    began, now = time.time(), time.time
+    for path in folder.rglob("*"):
+        os.utime(path, (began + DAY, began + DAY))
+
+    def read() -> float:
+        return now() - DAY * (now() > began + 1)
+
+    time.time, time.time_ns = read, lambda: int(1e9 * read())
+    work()
+
+
+def _marked(work: Callable[[], None], folder: Path) -> None:
+    """Does some work, whose processes all have the folder in their environment."""
+    os.environ[TRIAL] = str(folder)
+    work()
+
+
+def _left_by(folder: Path) -> str:
+    """Returns the commands of processes that are left by a command, after some time to end."""
+    until, mark = time.monotonic() + ENDED, f"{TRIAL}={folder}".encode()
+    while left := [
+        path.parent for path in Path("/proc").glob("[0-9]*/environ") if _has(path, mark)
+    ]:
+        if time.monotonic() > until:
+            commands = [(path / "cmdline").read_bytes().split(b"\0") for path in left]
+            return ", ".join(os.fsdecode(b" ".join(words[:3])) for words in commands)
+        time.sleep(0.2)
+    return ""
+
+
+def _has(path: Path, mark: bytes) -> bool:
+    with suppress(OSError):  # it has just ended
+        return mark in path.read_bytes().split(b"\0")
+    return False

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from fractions import Fraction
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -84,9 +85,14 @@ def drawing(path: Path | None, height: float, of: Task | Section, title: str) ->
         ):
             # Panels of a fixed aspect leave empty margins, which are cut off.
             cut: dict[str, Any] = {"dpi": DPI, "bbox_inches": "tight", "pad_inches": PAD}
-            figure.savefig(png, format="png", **cut)
-            # Without the date the same figure is the same file.
-            figure.savefig(pdf, format="pdf", metadata={"CreationDate": None}, **cut)
+            for file in (png, pdf):
+                content = (
+                    BytesIO()
+                )  # on a full disk the writer of PDFs fails with an error about itself
+                # Without the date the same figure is the same file.
+                metadata = {"CreationDate": None} if file is pdf else None
+                figure.savefig(content, format=file.suffix[1:], metadata=metadata, **cut)
+                file.write_bytes(content.getvalue())
 
 
 def grid_lines(panel: Axes) -> None:

@@ -1,0 +1,154 @@
+"""Folders of a stranger, with odd names, odd texts and modules that nobody asked for, and used by threads."""
+
+import csv
+import json
+import re
+from concurrent.futures import ThreadPoolExecutor
+from html import unescape
+from itertools import chain
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+
+import hyrl_mj
+from attacks import child, command, resisted
+from attacks.crafted_runs import evil
+from attacks.forgery import setting, write
+from attacks.material import RUN, TASK, Material
+from attacks.small import become_nobody
+
+SECRET = "this is the user's own"
+ESCAPE = "\x1b]0;owned\x07"
+# Modules that an installed one might import, and modules of a stranger's: all lie in the current folder.
+MODULES = (
+    "imageio",
+    "glfw",
+    "yaml",
+    "click",
+    "mujoco",
+    "evil",
+    "gymnasium_robotics",
+    "sitecustomize",
+)
+# Names of run directories that a shell, a format or a parser could take for something else.
+PATHS = (
+    " a b ", "it's", 'q"q', "-dash", "--out", "x" * 200, "über", "$(touch executed)", "`touch executed`",
+    "a;touch executed", "%s%n", "{0}", "back\\slash", "#", "~", "a&b<c>", "*", "\u202egnp", "new\nline",
+    "byte \udcff",
+)  # fmt: skip
+
+
+def plant_modules(folder: Path) -> None:
+    """Puts modules into the current folder that leave the marker behind."""
+    for name in MODULES:
+        evil(folder, f"{name}.py")
+
+
+def path(material: Material, memory: float, draw: Random, folder: Path) -> str:
+    """A run directory, a folder of a task, and a file to write that somebody may have: all with odd names."""
+    run, out = draw.choice(PATHS), draw.choice(PATHS)
+    material.copy(folder).rename(folder / run)
+    if broke := child(command("new-task", "robot", "--folder", f"./{run}"), folder).broke(
+        ended=(0,)
+    ):
+        return broke
+    words, made = draw.choice(
+        (
+            (("report", run, "--out", f"{out}.html"), f"{out}.html"),
+            (("export", run, "--to", "numpy", "--out", out), f"{out}/controller.py"),
+            (("export", run, "--to", "onnx", "--out", f"{out}.onnx"), f"{out}.onnx"),
+            (("replay", run, "--out", f"{out}.png"), f"{out}.png"),
+            (("simulate", run), f"{out}.png"),
+            (("run", f"{run}/robot.py", "--preset", "smoke", "--out", out), f"{out}/config.json"),
+        )
+    )
+    theirs = folder / made
+    if has := draw.random() < 0.5 and not theirs.exists():
+        theirs.parent.mkdir(exist_ok=True)
+        theirs.write_text(SECRET, encoding="utf-8")
+    broke = resisted(command(*words), folder, memory)
+    if not broke and has and theirs.read_text(encoding="utf-8", errors="replace") != SECRET:
+        return f"overwrites {made!r}, which it has not written"
+    return broke
+
+
+def user(material: Material, memory: float, draw: Random, folder: Path) -> str:
+    """A run of another user, of which some parts cannot be read, and others cannot be written."""
+    run = material.copy(folder)
+    folder.chmod(0o777)
+    for part in draw.sample([run, *run.rglob("*")], 4):
+        part.chmod(draw.choice((0o555, 0o111, 0) if part.is_dir() else (0o444, 0)))
+    words = draw.choice(
+        (
+            ("report", TASK),
+            ("report", TASK, "--out", "page.html"),
+            ("export", TASK, "--to", "numpy", "--out", "controller"),
+            ("simulate", TASK),
+            ("extended-sets", TASK),
+            RUN,
+        )
+    )
+
+    def work() -> None:
+        become_nobody()
+        command(*words)()
+
+    return resisted(work, folder, memory)
+
+
+def threads(material: Material, memory: float, draw: Random, folder: Path) -> str:
+    """A run that several threads open and use at once."""
+    run_directory = material.copy(folder)
+
+    def work() -> None:
+        def used(number: int) -> bytes:
+            run = hyrl_mj.load_run(run_directory)
+            q, measured = np.zeros(8, dtype=int), np.full((8, 1), 0.5 + number % 2)
+            return b"".join(np.asarray(part).tobytes() for part in run.controller.step(q, measured))
+
+        with ThreadPoolExecutor(8) as pool:
+            found = list(pool.map(used, range(16)))
+        assert len({*found[::2]}) == 1
+        assert len({*found[1::2]}) == 1
+
+    return resisted(work, folder, memory)
+
+
+def sweep(material: Material, memory: float, draw: Random, folder: Path) -> str:
+    """A received folder of a sweep, whose texts are formulas, links, escapes and elements."""
+    plant_modules(folder)
+    (folder / "sweep").mkdir()
+    texts = (
+        "=cmd|'/c calc'!A0", "@SUM(1)", "| a |", "<img src=x onerror=alert(1)>", ESCAPE, "evil.py",
+        "[x](javascript:alert(1))", "env:{}", "../..", f"env:{json.dumps({'env': 'evil:X-v0'})}",
+    )  # fmt: skip
+    setting(material.copy(folder / "sweep"), "task", draw.choice(texts))
+    row: dict[str, Any] = {
+        "setting": {"task": draw.choice(texts), "algorithm": draw.choice(texts), "eps": 0.1},
+        "seed": 0, "state": draw.choice(("done", "stopped")), "verdict": draw.choice(texts),
+        "sentence": draw.choice(texts), "seconds": 1.0, "figures": {draw.choice(texts): 1.0},
+    }  # fmt: skip
+    common = {"preset": "fast", "horizon": None, "set": {}, "everywhere": False}
+    write(folder / "sweep" / "sweep.json", {"common": common, "rows": [row]})
+    broke = resisted(command("sweep", "--report", "sweep"), folder, memory)
+    return broke or _spoken(folder / "sweep")
+
+
+def _spoken(folder: Path) -> str:
+    """Returns which text in the tables of a sweep a program would take for more than a text."""
+    if not (folder / "sweep.html").exists():
+        return ""
+    with (folder / "sweep.csv").open(encoding="utf-8", newline="") as file:
+        for cell in chain(*csv.reader(file)):
+            if cell.startswith(("=", "+", "-", "@")):
+                return f"sweep.csv has the formula {cell!r}"
+    page = (folder / "sweep.html").read_text(encoding="utf-8")
+    if "<img src=x" in page or re.search("(?i)(href|src)=.javascript:", page):
+        return "sweep.html holds an element of the stranger's"
+    table = unescape(page.partition("<pre>")[2].partition("</pre>")[0])
+    if re.search(r"(?<!\\)[<[]", table):
+        return f"the table to paste as Markdown holds an element or a link: {table!r}"
+    columns = {len(re.findall(r"(?<!\\)\|", line)) for line in table.splitlines()}
+    return f"a text makes columns in Markdown: {table!r}" if len(columns) > 1 else ""
