@@ -204,9 +204,7 @@ class _Seen:
     @cached_property
     def _plant(self) -> Any:
         """Copies of the robot, until `by_step` at its start."""
-        plant = self.task.plant(EPISODES)
-        plant.set_state(*self.task.state(self.task.starts(EPISODES, self._rng), self._rng))
-        return plant
+        return self.task.placed(self.task.starts(EPISODES, self._rng), self._rng)
 
     @cached_property
     def _measured(self) -> np.ndarray:

@@ -11,13 +11,6 @@ from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.registry import register
 
 PI = np.pi
-# Weights of the reward: of a sample, and of the distance from the goal as a share of the largest. A crash
-# costs 1: as much as going on for 1 / (HASTE + DISTANCE) samples far from the goal.
-HASTE, DISTANCE = 0.01, 0.04
-# Distance from the post within which the reward is less [m], and by how much at the post.
-NEAR, CLOSE_BY = 0.05, 0.05
-# Starts keep this distance from the post [m].
-START_CLEARANCE = 0.01
 
 
 @register
@@ -78,8 +71,9 @@ class Arm(Task):
 
     def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
         away = np.abs(self.chart.difference(measurement, self.set_point)).sum(axis=1) / (2 * PI)
-        near = np.clip(1 - self.clearance(measurement) / NEAR, 0.0, 1.0)
-        reward = -HASTE - DISTANCE * away - CLOSE_BY * near
+        near = np.clip(1 - self.clearance(measurement) / 0.05, 0.0, 1.0)
+        # A crash costs 1: as much as going on for twenty samples as far from the goal as can be.
+        reward = -0.01 - 0.04 * away - 0.05 * near
         return np.where(self.failed(measurement), self.worst_reward, reward)
 
     def ending(self, measurement: np.ndarray) -> np.ndarray:
@@ -87,7 +81,7 @@ class Arm(Task):
         return np.where(self.clearance(measurement) <= 0, Outcome.CRASHED, ends)
 
     def may_start(self, z: np.ndarray) -> np.ndarray:
-        return (self.clearance(z) >= START_CLEARANCE) & ~self.arrived(z)
+        return (self.clearance(z) >= 0.01) & ~self.arrived(z)
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         drawn = np.empty((0, 2))

@@ -10,10 +10,6 @@ from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.pillar import PillarTask
 from hyrl_mj.tasks.registry import register
 
-# Distance from the pillar within which the reward is less [m].
-NEAR = 0.25
-# Weights of the reward: of arriving (in samples), and of the distance off the middle behind the pillar [1/m].
-FINISH, BEHIND = 10, 0.3
 ON_THE_LINE = 1e-6  # [m] the error that sixty samples of the kinematic actuators add up to
 
 
@@ -95,12 +91,12 @@ class Gate(PillarTask):
 
     def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
         x, y = measurement[:, :2].T
-        near = np.clip(1 - self.clearance(measurement) / NEAR, 0.0, 1.0)
+        near = np.clip(1 - self.clearance(measurement) / 0.25, 0.0, 1.0)
         # A weight before the pillar, too, would draw the vehicle to one side, wherever it starts.
-        off = np.abs(y) * np.where(x < self.obstacle[0], 0.0, BEHIND)
+        off = np.abs(y) * np.where(x < self.obstacle[0], 0.0, 0.3)
         reward = np.maximum(3 - off - near, 0.0)
         # Arriving must pay more than going on.
-        reward = np.where(self.ending(measurement) == Outcome.REACHED, FINISH * reward, reward)
+        reward = np.where(self.ending(measurement) == Outcome.REACHED, 10 * reward, reward)
         return np.where(self.failed(measurement), 0.0, reward)
 
     def ending(self, measurement: np.ndarray) -> np.ndarray:

@@ -8,11 +8,6 @@ from hyrl_mj.physics import mjcf
 from hyrl_mj.tasks.description import Learning, Outcome
 from hyrl_mj.tasks.pillar import PillarTask
 
-# Distance from a post, or from a wall, within which the reward is less [m].
-NEAR = 0.2
-# Weight of the inputs in the reward: turning early costs less than turning late.
-EFFORT = 0.1
-
 
 class PostsTask(PillarTask):
     """A vehicle, x' = 1 m/s and y' = u, among round posts: the geoms whose names begin with "obstacle"."""
@@ -51,8 +46,8 @@ class PostsTask(PillarTask):
 
     def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
         wall = self.arena[1][1] - np.abs(measurement[:, 1])
-        near = np.clip(1 - np.minimum(self.clearance(measurement), wall) / NEAR, 0.0, 1.0)
-        reward = 1.5 - EFFORT * np.abs(u[:, 0]) - near
+        near = np.clip(1 - np.minimum(self.clearance(measurement), wall) / 0.2, 0.0, 1.0)
+        reward = 1.5 - 0.1 * np.abs(u[:, 0]) - near  # turning early costs less than turning late
         return np.where(self.failed(measurement), 0.0, reward)
 
     def miss(self, z: np.ndarray) -> np.ndarray:

@@ -18,14 +18,11 @@ from hyrl_mj.files import trust
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.sources import check_helpers, digest_of, forget_helpers
 
-# The group of entry points under which an installed package offers tasks: name = "its.module:Class".
-GROUP = "hyrl_mj.tasks"
-PACKAGE = Path(__file__).resolve().parents[1]
 _REGISTRY: dict[str, type[Task]] = {}
 # The task that each file defines, as the file is at that time.
 _FILES: dict[tuple[Path, str], type[Task]] = {}
-# The text of an environment begins with this; a module above this one makes its task.
-ENVIRONMENT, MAKER = "env:", "hyrl_mj.environments.making"
+# The text of an environment begins with this.
+ENVIRONMENT = "env:"
 # Names of the tasks that other installed packages offer, as far as they have been loaded.
 _INSTALLED: set[str] = set()
 
@@ -41,7 +38,7 @@ def register(task: type[Task]) -> type[Task]:
         raise BadInput(
             f"{here} defines a task {task.name}, and so does {_file(other)}: rename one of them"
         )
-    if here is not None and PACKAGE not in here.parents:
+    if here is not None and Path(__file__).resolve().parents[1] not in here.parents:
         task.source, task._digest = here, digest_of(here) if here.is_file() else ""
     if "env_id" not in vars(task):
         task.env_id = f"hyrl_mj/{task.__name__}-v0"
@@ -80,7 +77,8 @@ def get_task(name: str | Path | Task) -> Task:
     if isinstance(name, Task):
         return name
     if str(name).startswith(ENVIRONMENT):
-        made: Task = importlib.import_module(MAKER).from_spec(str(name))
+        maker = importlib.import_module("hyrl_mj.environments.making")  # it lies above
+        made: Task = maker.from_spec(str(name))
         return made
     if str(name).endswith(".py"):
         path = Path(name).resolve()
@@ -132,7 +130,8 @@ def described_task(name: str) -> Task:
 
 
 def _offered() -> dict[str, EntryPoint]:
-    return {entry.name: entry for entry in entry_points(group=GROUP)}
+    """Returns the tasks that installed packages offer, as hyrl_mj.tasks: name = "its.module:Class"."""
+    return {entry.name: entry for entry in entry_points(group="hyrl_mj.tasks")}
 
 
 def _instance(kind: type[Task], what: str) -> Task:

@@ -9,7 +9,6 @@ from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.pillar import PillarTask
 from hyrl_mj.tasks.registry import register
 
-CRASH_DISTANCE = 1e-3  # [m] from the obstacle's surface
 ON_THE_LINE = 1e-6  # [m] the error that sixty samples of the kinematic actuator add up to
 
 
@@ -92,7 +91,7 @@ class Vehicle(PillarTask):
         ends = np.full(len(measurement), Outcome.RUNNING)
         ends[x > self.set_point[0] + ON_THE_LINE] = Outcome.REACHED
         ends[(y <= low[1] + ON_THE_LINE) | (y >= high[1] - ON_THE_LINE)] = Outcome.OUT_OF_BOUNDS
-        ends[self.clearance(measurement) <= CRASH_DISTANCE] = Outcome.CRASHED
+        ends[self.clearance(measurement) <= 1e-3] = Outcome.CRASHED
         return ends
 
     def verdict(self, measurement: np.ndarray) -> np.ndarray:
