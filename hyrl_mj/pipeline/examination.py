@@ -28,13 +28,6 @@ from hyrl_mj.system.progress import Say
 from hyrl_mj.tasks import SPARING
 from hyrl_mj.viz import robustness_sentence
 
-# The kinds of noise in episodes by default. Where samples take long, an adversary that looks ahead takes too
-# long; the attack is there.
-KINDS = ("none", "uniform", "alternating", "adversarial")
-# Starts and rounds of the attack on such a run.
-ATTACKED, ATTACKED_SMOKE = 200, 40
-ROUNDS, ROUNDS_SMOKE = 2, 1
-
 
 @dataclass(frozen=True)
 class ExamineOptions:
@@ -72,7 +65,7 @@ class ExamineOptions:
             BadInput: an impossible time or number of rounds, or both.
         """
         if self.attack_seconds is None and self.attack_rounds is None:
-            rounds = ROUNDS_SMOKE if run.settings.preset == "smoke" else ROUNDS
+            rounds = 1 if run.settings.preset == "smoke" else 2
             return None if run.exact else Budget(rounds=rounds)
         return Budget(self.attack_seconds, self.attack_rounds)
 
@@ -134,8 +127,9 @@ def examine_loops(
         count = effort.episodes
     if count is not None and count < 1:
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
-    kinds = options.noise or (KINDS if task.effort.looks_ahead else KINDS[:-1])
-    noises = tuple(Noise(kind, eps, everywhere) for kind in kinds)
+    # Where samples take long, an adversary that looks ahead takes too long; the attack is there.
+    usual = ("none", "uniform", "alternating", *["adversarial"] * task.effort.looks_ahead)
+    noises = tuple(Noise(kind, eps, everywhere) for kind in options.noise or usual)
     game, maps = None, None
     if run.why_no_game is None:
         bounds = tuple(dict.fromkeys((0.0, eps / 2, eps)))
@@ -170,7 +164,7 @@ def attack_loops(
     and is tried under the signals that were found against the agent.
     """
     task, eps = run.task, run.settings.noise if options.eps is None else options.eps
-    n = ATTACKED_SMOKE if run.settings.preset == "smoke" else ATTACKED
+    n = 40 if run.settings.preset == "smoke" else 200
     starts = attack_starts(task, regions, eps, n, options.seed)
     everywhere = options.all_coordinates or run.settings.everywhere
     if not run.keeps_agent:

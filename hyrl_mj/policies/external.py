@@ -23,7 +23,6 @@ from hyrl_mj.policies.mlp import (
 from hyrl_mj.policies.onnx_model import from_onnx
 from hyrl_mj.policies.preprocessing import (
     NONE,
-    UNCHANGED,
     PreprocessedPolicy,
     Preprocessing,
     network,
@@ -294,7 +293,7 @@ def _network(policy: Policy, task: Task, source: str = "", vecnormalize: str = "
 
 
 def _preprocessing(policy: Policy) -> Preprocessing:
-    return policy.preprocessing if isinstance(policy, PreprocessedPolicy) else UNCHANGED
+    return policy.preprocessing if isinstance(policy, PreprocessedPolicy) else Preprocessing()
 
 
 def _seeing(agent: Agent, policy: Policy) -> Agent:

@@ -234,23 +234,25 @@ def _differing(task: Task, made: Task) -> list[str]:
             continue
         own, usual = getattr(task, name, None), getattr(made, name, None)
         filled = usual is None and name.startswith("_")  # as a cache is
-        if not filled and not _alike(own, usual):
+        if not filled and not alike(own, usual):
             found.append(name)
     return found
 
 
-def _alike(a: Any, b: Any) -> bool:
+def alike(a: Any, b: Any) -> bool:
     """Returns whether two attributes are the same, as far as can be told."""
     if a is b:
         return True
     if type(a) is not type(b):
         return False
     if isinstance(a, dict):
-        return a.keys() == b.keys() and all(_alike(value, b[key]) for key, value in a.items())
+        return a.keys() == b.keys() and all(alike(value, b[key]) for key, value in a.items())
     if isinstance(a, list | tuple):
-        return len(a) == len(b) and all(map(_alike, a, b))
-    if isinstance(a, np.ndarray):
-        return np.array_equal(a, b, equal_nan=a.dtype.kind in "fc")
+        return len(a) == len(b) and all(map(alike, a, b))
+    if isinstance(a, np.random.Generator):
+        return repr(a.bit_generator.state) == repr(b.bit_generator.state)
+    if isinstance(a, np.ndarray | np.generic | float):
+        return np.array_equal(a, b, equal_nan=np.asarray(a).dtype.kind in "fc")
     if type(a).__eq__ is object.__eq__:  # nothing tells
         return True
     try:

@@ -16,6 +16,7 @@ from hyrl_mj.sets import Grid
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import Outcome
 from hyrl_mj.tasks.guard import check_finite
+from hyrl_mj.tasks.registry import alike
 
 # Steps of the physics that the episodes of a trial take together, at most; and the fewest side by side.
 STEPS, FEWEST = 200_000, 16
@@ -88,7 +89,7 @@ def try_methods(task: Task) -> None:
     after = _attributes(task)
     lazy = {name for name in after if isinstance(getattr(type(task), name, None), cached_property)}
     for name in after.keys() - lazy:
-        if name not in before or not _same(before[name], after[name]):
+        if name not in before or not alike(before[name], after[name]):
             raise BadInput(
                 f"its methods change its attribute {name} when they are asked: a task remembers nothing, so "
                 "compute it from the measurement"
@@ -99,14 +100,6 @@ def _attributes(task: Task) -> dict[str, Any]:
     """Returns copies of a task's plain attributes by name."""
     kinds = (bool, int, float, str, list, dict, set, np.ndarray, np.generic, np.random.Generator)
     return {n: copy.deepcopy(v) for n, v in vars(task).items() if isinstance(v, kinds)}
-
-
-def _same(a: Any, b: Any) -> bool:
-    if isinstance(a, np.random.Generator):
-        return repr(a.bit_generator.state) == repr(b.bit_generator.state)
-    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
-        return type(a) is type(b) and np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
-    return repr(a) == repr(b)
 
 
 def try_inputs(task: Task) -> None:

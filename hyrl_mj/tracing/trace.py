@@ -21,11 +21,6 @@ from hyrl_mj.errors import BadInput, brief
 from hyrl_mj.tracing.traced_array import Operation, Program, Traced, apply, take
 from hyrl_mj.tracing.vocabulary import BATCH, Untraceable
 
-# Packages whose code is not copied: it accepts no foreign arrays, or handles them itself.
-LEFT_AS_THEY_ARE = {*sys.stdlib_module_names, "numpy", "scipy", "mujoco", "torch"}
-# Members that a copy of a class must not have: they would act when it is created or deleted.
-NOT_COPIED = {"__init_subclass__", "__del__", "__abstractmethods__", "_abc_impl"}
-
 
 def trace(
     function: Callable[..., Any],
@@ -86,10 +81,12 @@ def _take(x: Any, indices: Any, *args: Any, **kwargs: Any) -> Any:
     return (take if isinstance(indices, Traced) else np.take)(x, indices, *args, **kwargs)
 
 
-FILLING, CONVERTING = "empty zeros ones full", "array asarray asanyarray ascontiguousarray"
 REPLACEMENTS: dict[str, Callable[..., Any]] = {
-    **{name: partial(_filled, getattr(np, name)) for name in FILLING.split()},
-    **{name: partial(_converted, getattr(np, name)) for name in CONVERTING.split()},
+    **{name: partial(_filled, getattr(np, name)) for name in ("empty", "zeros", "ones", "full")},
+    **{
+        name: partial(_converted, getattr(np, name))
+        for name in ("array", "asarray", "asanyarray", "ascontiguousarray")
+    },
     "take": _take,
 }
 
@@ -169,10 +166,12 @@ class _PrivateCopies:
         for base in reversed(type(original).__mro__):
             if _is_copied(base.__module__):
                 last = self._keep(base, type(base.__name__, (last,), {}))
+                # These would act when the class is created, or an object of it is deleted.
+                acting = {"__init_subclass__", "__del__", "__abstractmethods__", "_abc_impl"}
                 for name, member in vars(base).items():
                     # Properties are computed by the original: they do not see the arguments of methods.
                     is_method = isinstance(member, FunctionType | staticmethod | classmethod)
-                    if name not in NOT_COPIED and (is_method or not hasattr(member, "__get__")):
+                    if name not in acting and (is_method or not hasattr(member, "__get__")):
                         setattr(last, name, self.of(member))
         members = {
             "__class__": property(lambda _: type(original)),  # for isinstance()
@@ -188,7 +187,9 @@ class _PrivateCopies:
 
 
 def _is_copied(module: str | None) -> bool:
-    return (module or "").partition(".")[0] not in LEFT_AS_THEY_ARE
+    """Returns whether code is copied; other code accepts no foreign arrays, or handles them itself."""
+    top = (module or "").partition(".")[0]
+    return top not in ("numpy", "scipy", "mujoco", "torch") and top not in sys.stdlib_module_names
 
 
 def _names(code: CodeType) -> set[str]:
