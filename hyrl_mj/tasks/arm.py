@@ -10,14 +10,14 @@ from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.registry import register
 
-PI = np.pi
-
 
 @register
 class Arm(Task):
     name = "arm"
     description = "fold two links beside a post, the second turned one way or the other (PPO)"
-    chart = Chart(("shoulder", "elbow"), ("rad", "rad"), (-PI, -PI), (PI, PI), (True, True))
+    chart = Chart(
+        ("shoulder", "elbow"), ("rad", "rad"), (-np.pi, -np.pi), (np.pi, np.pi), (True, True)
+    )
     inputs, input_units = ("shoulder_rate", "elbow_rate"), ("rad/s", "rad/s")
     noisy = (1.0, 1.0)
     max_steps = 120
@@ -70,7 +70,7 @@ class Arm(Task):
         return self.chart.wrap(np.arctan2(observation[:, 2:], observation[:, :2]))
 
     def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
-        away = np.abs(self.chart.difference(measurement, self.set_point)).sum(axis=1) / (2 * PI)
+        away = np.abs(self.chart.difference(measurement, self.set_point)).sum(axis=1) / (2 * np.pi)
         near = np.clip(1 - self.clearance(measurement) / 0.05, 0.0, 1.0)
         # A crash costs 1: as much as going on for twenty samples as far from the goal as can be.
         reward = -0.01 - 0.04 * away - 0.05 * near
