@@ -90,10 +90,10 @@ def examination_plan(run: Run) -> str:
 def examine_stage(run: Run, say: Say, options: ExamineOptions = USUAL) -> None:
     """Examines policy and hybrid controller under noise; all files are written at the end."""
     budget = options.budget(run)  # a wrong one is refused before the work
-    robustness, maps = examine_loops(run, run.loops, run.split, options)
+    robustness, maps = examine_controllers(run, run.loops, run.split, options)
     if budget is not None:
         regions = Regions(run.critical_set.points, _winnable(run, maps))
-        attacks = attack_loops(run, run.loops, regions, budget, options)
+        attacks = attack_controllers(run, run.loops, regions, budget, options)
         counts = tuple(found.count for found in attacks.values())
         robustness = replace(robustness, attacks=counts)
         for name, arc in shown_arcs(attacks).items():
@@ -107,9 +107,9 @@ def examine_stage(run: Run, say: Say, options: ExamineOptions = USUAL) -> None:
     say(robustness_sentence(robustness))
 
 
-def examine_loops(
+def examine_controllers(
     run: Run,
-    loops: dict[str, Controller],
+    controllers: dict[str, Controller],
     partition: Partition,
     options: ExamineOptions = USUAL,
 ) -> tuple[Robustness, Maps | None]:
@@ -134,12 +134,12 @@ def examine_loops(
     if run.why_no_game is None:
         bounds = tuple(dict.fromkeys((0.0, eps / 2, eps)))
         game, maps = examine(
-            task, points, partition, loops, bounds, everywhere, run.settings.lattice
+            task, points, partition, controllers, bounds, everywhere, run.settings.lattice
         )
     counts: tuple[EpisodeCount, ...] = ()
     if count is not None:
         regions = Regions(points, _winnable(run, maps), options.near_critical)
-        counts = noisy_episodes(task, regions, loops, noises, count, seed)
+        counts = noisy_episodes(task, regions, controllers, noises, count, seed)
     return Robustness(eps, everywhere, game, counts, seed), maps
 
 
@@ -151,9 +151,9 @@ def _winnable(run: Run, maps: Maps | None) -> tuple[Grid, np.ndarray] | None:
     return maps.grid(run.task.chart), ~np.isin(classes, (UNWINNABLE, OVER))
 
 
-def attack_loops(
+def attack_controllers(
     run: Run,
-    loops: dict[str, Controller],
+    controllers: dict[str, Controller],
     regions: Regions,
     budget: Budget,
     options: ExamineOptions,
@@ -168,10 +168,13 @@ def attack_loops(
     starts = attack_starts(task, regions, eps, n, options.seed)
     everywhere = options.all_coordinates or run.settings.everywhere
     if not run.keeps_agent:
-        return attack(task, loops, starts, eps, budget, everywhere, options.seed)
-    alone = {"policy": loops["policy"]}
+        return attack(task, controllers, starts, eps, budget, everywhere, options.seed)
+    alone = {"policy": controllers["policy"]}
     found = attack(task, alone, starts, eps, budget, everywhere, options.seed)["policy"]
-    return {name: found if name in alone else found.on(name, task, loops[name]) for name in loops}
+    return {
+        name: found if name in alone else found.on(name, task, controllers[name])
+        for name in controllers
+    }
 
 
 def draw_robustness(run: Run, robustness: Robustness, maps: Maps, folder: Path) -> None:

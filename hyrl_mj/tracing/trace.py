@@ -42,7 +42,7 @@ def trace(
     inputs = tuple(Operation("input", (key,), {}, value) for key, value in samples.items())
     try:
         with np.errstate(all="ignore"):
-            results = _PrivateCopies().of(function)(*map(Traced, inputs))
+            results = _PrivateCopies().copy_of(function)(*map(Traced, inputs))
     except Untraceable as error:
         raise BadInput(f"{name} cannot be {purpose}: it {error}") from error
     except Exception as error:  # code that gets another kind of array fails in many ways
@@ -112,24 +112,24 @@ class _PrivateCopies:
         self._copies[id(original)] = original, copy
         return copy
 
-    def of(self, x: Any) -> Any:
+    def copy_of(self, x: Any) -> Any:
         """Returns the copy of a function, a method, a module or an object; anything else itself."""
         if id(x) in self._copies:
             return self._copies[id(x)][1]
         if isinstance(x, MethodType):
             owner = self._object(x.__self__)  # first: its methods refer to its class
-            return MethodType(self.of(x.__func__), owner)
+            return MethodType(self.copy_of(x.__func__), owner)
         if isinstance(x, staticmethod | classmethod):
-            return type(x)(self.of(x.__func__))
+            return type(x)(self.copy_of(x.__func__))
         if isinstance(x, partial):
-            return partial(self.of(x.func), *x.args, **x.keywords)
+            return partial(self.copy_of(x.func), *x.args, **x.keywords)
         if isinstance(x, FunctionType) and _is_copied(x.__globals__.get("__name__")):
             return self._function(x)
         if type(x).__module__.startswith("hyrl_mj."):
             return self._object(x)
         if isinstance(x, ModuleType) and _is_copied(x.__name__):
             view = self._keep(x, ModuleType(x.__name__))
-            view.__getattr__ = lambda name: self.of(getattr(x, name))
+            view.__getattr__ = lambda name: self.copy_of(getattr(x, name))
             return view
         return x
 
@@ -141,19 +141,21 @@ class _PrivateCopies:
             self._keep(names, {**names, "__builtins__": own_builtins})
         namespace = self._copies[id(names)][1]
         cells = tuple(CellType() for _ in original.__closure__ or ())
-        defaults = tuple(map(self.of, original.__defaults__ or ()))
+        defaults = tuple(map(self.copy_of, original.__defaults__ or ()))
         copy = FunctionType(original.__code__, namespace, original.__name__, defaults, cells)
         copy.__kwdefaults__ = original.__kwdefaults__
         # Kept before the functions that it calls are copied: it may call itself.
         self._keep(original, copy)
         for cell, original_cell in zip(cells, original.__closure__ or (), strict=True):
             with suppress(ValueError):  # an empty cell stays empty
-                cell.cell_contents = self.of(original_cell.cell_contents)
-        namespace.update({n: self.of(names[n]) for n in _names(original.__code__) & names.keys()})
+                cell.cell_contents = self.copy_of(original_cell.cell_contents)
+        namespace.update(
+            {n: self.copy_of(names[n]) for n in _names(original.__code__) & names.keys()}
+        )
         return copy
 
     def _import(self, *args: Any, **options: Any) -> Any:
-        return self.of(builtins.__import__(*args, **options))
+        return self.copy_of(builtins.__import__(*args, **options))
 
     def _object(self, original: Any) -> Any:
         """Returns a stand-in for an object, with copies of its methods and its own properties."""
@@ -172,7 +174,7 @@ class _PrivateCopies:
                     # Properties are computed by the original: they do not see the arguments of methods.
                     is_method = isinstance(member, FunctionType | staticmethod | classmethod)
                     if name not in acting and (is_method or not hasattr(member, "__get__")):
-                        setattr(last, name, self.of(member))
+                        setattr(last, name, self.copy_of(member))
         members = {
             "__class__": property(lambda _: type(original)),  # for isinstance()
             "__getattr__": lambda _, name: getattr(original, name),
@@ -181,8 +183,8 @@ class _PrivateCopies:
         self._keep(original, stand_in)
         attributes = getattr(original, "__dict__", {})
         for name, value in attributes.items():
-            parts = {k: self.of(v) for k, v in value.items()} if type(value) is dict else value
-            vars(stand_in)[name] = self.of(parts)
+            parts = {k: self.copy_of(v) for k, v in value.items()} if type(value) is dict else value
+            vars(stand_in)[name] = self.copy_of(parts)
         return stand_in
 
 
