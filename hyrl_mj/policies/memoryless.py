@@ -23,7 +23,6 @@ from hyrl_mj.tasks import Outcome, Task
 RUNS, SAMPLES, SOME = 16, 64, 4
 # Sums of 256 numbers in another order differ by some 16 roundings of float32; a network has a few of them.
 ROUNDING = 32 * float(np.finfo(np.float32).eps)
-REMEDY = "give one whose answer depends on its own observation alone, without chance or memory"
 
 # Returns answers (n, m) to n measurements, of the given rows of some table, moved by (n, p).
 Ask = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -199,7 +198,8 @@ def compare(
         if (off[i] > 0).any():
             raise BadInput(
                 f"{name} answers the measurement {_row(rows[i])} with {_row(first[i])} and, {words}, with "
-                f"{_row(again[i])}: {REMEDY}"
+                f"{_row(again[i])}: give one whose answer depends on its own observation alone, without "
+                "chance or memory"
             )
 
 
