@@ -16,6 +16,7 @@ from hyrl_mj.system import cores, forked
 Measure = Callable[[np.ndarray], np.ndarray]
 # Inputs (n, m), positions (n, nq), velocities (n, nv) -> controls of all actuators (n, nu).
 Control = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+MOST = 2**24  # copies
 # Tolerated excess over an input limit: float32 policies have rounding errors.
 INPUT_TOLERANCE = 1e-6
 
@@ -58,7 +59,7 @@ class Plant:
     ):
         if problem := mjcf.wrong_physics(model) or memory.late_sensor(model):
             raise BadInput(problem)
-        n = Integer(1, 2**24).checked("the number of copies of a robot", n)
+        n = Integer(1, MOST).checked("the number of copies of a robot", n)
         self.n, self._threads, self._measure, self._control = n, threads, measure, control
         self._mocap = mocap if model.nmocap else None
         self._steady = control is None or steady
