@@ -286,7 +286,8 @@ MISTAKES = {
     "a limit is missing": (XML, ' ctrlrange="-1 1"', "", r"lateral needs a ctrlrange"),
     "a chart of the wrong dimension": (PY, r'\("m", "m"\)', '("m",)', r"2 name.*1 value.*units"),
     "a z of the wrong dimension": (
-        PY, r":, :2\]\n\n    def with", ":, :1]\n\n    def with", r"z\(\) .* gives shape \(64, 1\)",
+        PY, "    def obs", "    def z(self, m):\n        return m[:, :1]\n\n    def obs",
+        r"z\(\) .* gives shape \(64, 1\)",
     ),
     "starts of the wrong dimension": (PY, r"\(0\.0, -0\.8\)", "(0.0,)", r"start_low has 1 value"),
     "a measurement of the wrong size": (

@@ -184,14 +184,17 @@ class Late:
 
 
 LATE_END = "        assert (measured[:, 0] < 1).all()\n        return ends\n"
-LATE_Z = "return np.where(measured[:, :2] > 1, np.nan, measured[:, :2])\n"
+OBSERVES = "    def observation"
+LATE_Z = (
+    "    def z(self, m):\n        return np.where(m[:, :2] > 1, np.nan, m[:, :2])\n\n" + OBSERVES
+)
 
 
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
         (ENDED, LATE_END, r"ending\(\) .*AssertionError.* at x = 1"),
-        (r"return measured\[:, :2\]\n", LATE_Z, r"z\(\) of the task .* gives \[nan"),
+        (OBSERVES, LATE_Z, r"z\(\) of the task .* gives \[nan"),
     ],
 )
 def test_a_failure_in_a_simulation_names_method_and_state(tmp_path, old, new, says):

@@ -1,5 +1,6 @@
 """Extended sets reach over the critical set as far as backward motion, room and noise say."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -275,7 +276,7 @@ def test_sets_reach_walls_that_only_stop_the_robot_and_hold_their_inside(monkeyp
     for own in stopped:
         for held, distance in zip(own.mask[walls], off, strict=True):
             assert held in own.mask[~walls][distance < distance.min() + 1e-9]
-    monkeypatch.setattr(type(puck), "stopped_by_walls", False)
+    monkeypatch.setattr(puck, "abilities", replace(puck.abilities, stopped_by_walls=False))
     crashed = extend(puck, policy, points, partition, noise).sets
     for own, other in zip(stopped, crashed, strict=True):
         assert (other.mask <= own.mask)[~walls].all()

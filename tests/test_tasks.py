@@ -19,21 +19,6 @@ PI = np.pi
 # ---- every task
 
 
-def test_the_tasks_of_this_package_are_registered():
-    robots = {
-        "unit_circle",
-        "vehicle",
-        "rover",
-        "quadrotor",
-        "slalom",
-        "gaps",
-        "gate",
-        "arm",
-        "beam",
-    }
-    assert robots <= set(hyrl_mj.task_names())
-
-
 def test_its_mirror_image_earns_the_same_reward(task):
     rng = np.random.default_rng(0)
     z = random_states(task, 500, rng)

@@ -1,6 +1,7 @@
 """Environments of which a sample misleads: they are run as they are, or refused by name."""
 
 import time
+from dataclasses import replace
 
 import gymnasium as gym
 import mujoco
@@ -373,9 +374,9 @@ def test_runs_do_not_depend_on_how_many_are_played_side_by_side(wrap, kind):
     task, rng = from_gymnasium(lambda: wrap(Puck()), steps=25), np.random.default_rng(0)
     loop = PolicyController(from_callable(east, task))
     z, found, settings = task.starts(9, rng), [], LoopSettings(record=True, passing=True)
-    assert task.side_by_side > 9
+    assert task.abilities.side_by_side > 9
     for side in (9, 2):
-        task.side_by_side = side
+        task.abilities = replace(task.abilities, side_by_side=side)
         noise = Noise() if kind in ("none", "attack") else Noise(kind, 0.1)
         if kind == "attack":
             rules = Rules(task, loop, 0.1, np.array(task.noisy))

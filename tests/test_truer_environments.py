@@ -204,7 +204,7 @@ class Sticky(Puck):
 def test_a_second_state_of_mujoco_that_outlasts_resets_makes_no_difference():
     first, again = outcomes(Sticky), outcomes(Sticky)
     assert first == again
-    assert not from_gymnasium(Sticky, steps=60).tabulated
+    assert not from_gymnasium(Sticky, steps=60).abilities.restarts
 
 
 def test_variables_of_a_script_are_not_those_of_its_environment(monkeypatch):

@@ -22,7 +22,7 @@ from hyrl_mj.environments.stage import Played
 from hyrl_mj.environments.trials import goes_on
 from hyrl_mj.errors import BadInput
 from hyrl_mj.physics import mjcf
-from hyrl_mj.tasks import ANY, SPARING, Learning, Outcome, Scene, Task, get_task
+from hyrl_mj.tasks import ANY, SPARING, Abilities, Learning, Outcome, Scene, Task, get_task
 
 # Where every episode takes all of its samples, runs from all nodes of the chart take about so many together.
 SAMPLES_OF_NODES = 800_000
@@ -47,8 +47,7 @@ class EnvironmentTask(Task):
     """
 
     scene: Scene
-    effort, stopped_by_walls = SPARING, True
-    side_by_side = 128
+    effort = SPARING
     _original: Task | None = None
     learning = Learning()
 
@@ -72,13 +71,18 @@ class EnvironmentTask(Task):
         self.found = dict(specification.found)
         self.description = f"the environment {self.name}"
         self.input_limits = specification.low, specification.high
-        self.arrival_ends = specification.criterion.ends
+        self.abilities = Abilities(
+            stopped_by_walls=True,
+            restarts=specification.memoryless,
+            arrival_ends=specification.criterion.ends,
+            side_by_side=128,
+        )
         self.noisy = (*specification.noisy, *([0.0] * (specification.columns + 3)))
         self.observation_parts = specification.parts
         self.observation_low = tuple(specification.observation_low)
         self.observation_high = tuple(specification.observation_high)
         self.learning = Learning(levels=specification.levels)
-        if not self.arrival_ends:
+        if not self.abilities.arrival_ends:
             nodes = int((SAMPLES_OF_NODES / self.max_steps) ** (1 / self.chart.dimension))
             self.learning = replace(self.learning, cells=max(nodes, 2))
         self._set_scene(specification.tracked)
@@ -175,16 +179,12 @@ class EnvironmentTask(Task):
     def kinematic(self) -> bool:
         return False
 
-    @property
-    def tabulated(self) -> bool:
-        return self.specification.memoryless
-
     @cached_property
     def chart_is_state(self) -> bool:
         """As of other tasks; it is tried out, by runs that begin anew at the chart point of others."""
-        spec = self.specification
+        spec, can = self.specification, self.abilities
         whole = sorted(c.index for c in spec.coordinates if c.kind == "qpos")
-        if whole != list(range(self.model.nq)) or not (self.arrival_ends and self.tabulated):
+        if whole != list(range(self.model.nq)) or not (can.arrival_ends and can.restarts):
             return False
         return goes_on(self._pool, spec, of_chart=True)
 

@@ -103,7 +103,9 @@ class WorstEstimate(Lookahead):
         samples = np.where(value > NEVER, LOST - value, value) / lattice.task.max_steps
         worth = [3 - samples, samples]
         self._worth = np.select([value > NEVER, value < NEVER], worth, 1.5)[:, :-2]
-        if lattice.task.stopped_by_walls:  # beside a wall, what lies inside of it is not worse
+        if (
+            lattice.task.abilities.stopped_by_walls
+        ):  # beside a wall, what lies inside of it is not worse
             self._worth = self._worth[:, nearest_of(lattice.grid, lattice.running)]
 
     def _simulate(self, begun: Ahead, past: np.ndarray, samples: int) -> Ahead:

@@ -98,7 +98,7 @@ class Lattice:
         """Returns why what is won on nodes of this task's chart is an estimate, None if it is none."""
         if task.chart.dimension > 2:
             return "the game is an estimate on a chart of three dimensions"
-        if task.stopped_by_walls:
+        if task.abilities.stopped_by_walls:
             return "the game is an estimate where contacts stop the robot between the nodes"
         return None
 
@@ -176,7 +176,7 @@ class Lattice:
             )
         direct = measurement.shape == nodes.shape and bool((measurement == nodes).all())
         estimate = Lattice.why_estimate(task) is not None
-        occurs = nearest_of(grid, running) if task.stopped_by_walls else None
+        occurs = nearest_of(grid, running) if task.abilities.stopped_by_walls else None
         ends = _Ends(grid, len(levels), estimate, occurs)
         hops, uneven = np.empty((len(levels), nodes.shape[1])), np.zeros(nodes.shape[1])
         for a, measurement in enumerate(_one_sample_on(task, nodes[alive], levels, direct)):

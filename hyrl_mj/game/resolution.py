@@ -89,7 +89,7 @@ def probed_hops(task: Task) -> np.ndarray:
     values = levels or (VALUES.get(m, 3) if task.has_inner_loop else ENDS)
     rng, chart = np.random.default_rng(0), task.chart
     z = rng.uniform(chart.low, chart.high, (PROBES, chart.dimension))
-    if task.stopped_by_walls:  # outside of them
+    if task.abilities.stopped_by_walls:  # outside of them
         z = task.starts(PROBES, rng)
     plant, hops = task.plant(PROBES), []
     for u in product(*np.linspace(low, high, values).T):
@@ -98,7 +98,7 @@ def probed_hops(task: Task) -> np.ndarray:
         plant.step(np.tile(u, (PROBES, 1)))
         hops.append(chart.difference(task.z(plant.measurement), before))
     moved = np.array(hops).reshape(*(values,) * m, PROBES, chart.dimension)
-    return np.median(moved, axis=-2, keepdims=True) if task.stopped_by_walls else moved
+    return np.median(moved, axis=-2, keepdims=True) if task.abilities.stopped_by_walls else moved
 
 
 def aligned_cells(task: Task, cells: int) -> int:
@@ -126,7 +126,11 @@ def common_hops(task: Task, hops: np.ndarray) -> np.ndarray:
     flat = hops.reshape(-1, hops.shape[-1])
     for along, side in zip(flat.T, task.chart.sides, strict=True):
         exact = SAME * side
-        if task.learning.levels is None and np.ptp(along) > exact and not task.stopped_by_walls:
+        if (
+            task.learning.levels is None
+            and np.ptp(along) > exact
+            and not task.abilities.stopped_by_walls
+        ):
             counts.append(1)  # between its extremes an input leads anywhere
             continue
         step = 0.0

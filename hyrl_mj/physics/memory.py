@@ -7,34 +7,26 @@ import numpy as np
 
 from hyrl_mj.physics import mjcf
 
-# Parts of MuJoCo's state that remember nothing: they are given anew by `Plant.set_state` and at each sample,
-# or solved anew from there. Nothing but callbacks writes userdata.
-NO_MEMORY = (
-    "TIME", "QPOS", "QVEL", "WARMSTART", "CTRL", "QFRC_APPLIED", "XFRC_APPLIED", "EQ_ACTIVE", "MOCAP_POS",
-    "MOCAP_QUAT", "USERDATA",
-)  # fmt: skip
-# What other parts are of; later versions of MuJoCo have more.
-MEMORIES = {
-    "ACT": "activations of actuators (dyntype)",
-    "HISTORY": "histories of actuators or sensors (delay, nsample)",
-    "PLUGIN": "states of plugins",
-}
-CALLBACKS = [
-    f"get_mjcb_{name}"
-    for name in ["control", "passive", "act_dyn", "act_gain", "act_bias", "sensor"]
-]
-# Coefficients of springs and dampers that are not linear; older versions of MuJoCo do not have them.
-BENT = ("jnt_stiffnesspoly", "dof_dampingpoly", "actuator_dampingpoly", "jnt_springyield")
-
 
 def remembers(model: mujoco.MjModel) -> str:
     """Returns what else than positions and velocities a model carries from step to step; "" if nothing."""
-    bits = {int(getattr(mujoco.mjtState, f"mjSTATE_{name}")) for name in NO_MEMORY}
+    # These parts of MuJoCo's state remember nothing: `Plant.set_state` and each sample give them anew, or
+    # they are solved anew from there. Nothing but callbacks writes userdata.
+    anew = (
+        "TIME", "QPOS", "QVEL", "WARMSTART", "CTRL", "QFRC_APPLIED", "XFRC_APPLIED", "EQ_ACTIVE",
+        "MOCAP_POS", "MOCAP_QUAT", "USERDATA",
+    )  # fmt: skip
+    memories = {  # later versions of MuJoCo have more
+        "ACT": "activations of actuators (dyntype)",
+        "HISTORY": "histories of actuators or sensors (delay, nsample)",
+        "PLUGIN": "states of plugins",
+    }
     for bit in (1 << k for k in range(int(mujoco.mjtState.mjNSTATE))):
-        if bit not in bits and mujoco.mj_stateSize(model, bit):
-            name = mujoco.mjtState(bit).name.removeprefix("mjSTATE_")
-            return MEMORIES.get(name, f"a state {name} beside positions and velocities")
-    if any(getattr(mujoco, name)() is not None for name in CALLBACKS):
+        name = mujoco.mjtState(bit).name.removeprefix("mjSTATE_")
+        if name not in anew and mujoco.mj_stateSize(model, bit):
+            return memories.get(name, f"a state {name} beside positions and velocities")
+    callbacks = ("control", "passive", "act_dyn", "act_gain", "act_bias", "sensor")
+    if any(getattr(mujoco, f"get_mjcb_{name}")() is not None for name in callbacks):
         return "what a callback of MuJoCo knows (mujoco.set_mjcb_...)"
     return ""
 
@@ -76,6 +68,8 @@ def why_not_direct(model: mujoco.MjModel) -> str:
         return "tendons can pull from place to place"
     if model.nplugin or getattr(model, "nflex", 0):
         return "plugins and flexible bodies can move it"
-    if any(np.any(getattr(model, name, 0)) for name in BENT):
+    # Older versions of MuJoCo do not have these coefficients.
+    bent = ("jnt_stiffnesspoly", "dof_dampingpoly", "actuator_dampingpoly", "jnt_springyield")
+    if any(np.any(getattr(model, name, 0)) for name in bent):
         return "springs or dampers that are not linear can move it"
     return ""

@@ -20,21 +20,6 @@ Mocap = Callable[[np.ndarray], np.ndarray]
 # The version of MuJoCo that computes wrong constraint forces where the Jacobian is sparse.
 WRONG_VERSION = "4.0.0"
 
-# Sensors whose values are entries of the state: which entries of the joint, the first one and their number.
-_OF_POSITION = {
-    mujoco.mjtSensor.mjSENS_JOINTPOS: (0, 1),
-    mujoco.mjtSensor.mjSENS_FRAMEPOS: (0, 3),
-    mujoco.mjtSensor.mjSENS_FRAMEQUAT: (3, 4),
-}
-_OF_VELOCITY = {
-    mujoco.mjtSensor.mjSENS_JOINTVEL: (0, 1),
-    mujoco.mjtSensor.mjSENS_FRAMELINVEL: (0, 3),
-    mujoco.mjtSensor.mjSENS_GYRO: (3, 3),
-}
-
-
-# Cameras that every model has.
-FREE_CAMERAS = "overhead", "free"
 # The models that were compiled, each with the digest of its files at that time.
 _LOADED: dict[tuple[Path, str], mujoco.MjModel] = {}
 # The files that were tried in a process with limits, each with the digest of its own content.
@@ -177,10 +162,9 @@ def camera_of(model: mujoco.MjModel, name: str) -> mujoco.MjvCamera:
         camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         camera.fixedcamid = own.index(name)
         return camera
-    if name not in FREE_CAMERAS:
-        raise unknown(
-            f"camera in model {model_name(model)}", name, dict.fromkeys([*own, *FREE_CAMERAS])
-        )
+    if name not in ("overhead", "free"):
+        known = dict.fromkeys([*own, "overhead", "free"])
+        raise unknown(f"camera in model {model_name(model)}", name, known)
     mujoco.mjv_defaultFreeCamera(model, camera)
     if name == "overhead":
         camera.azimuth, camera.elevation = 90.0, -90.0
@@ -388,15 +372,27 @@ def state_columns(model: mujoco.MjModel) -> np.ndarray | None:
 def _columns_of(model: mujoco.MjModel, sensor: int) -> range | None:
     """Returns the columns of a state that a sensor measures, None if it measures something else."""
     kind, joint = mujoco.mjtSensor(model.sensor_type[sensor]), _measured_joint(model, sensor)
+    # Which entries of the joint they are, the first one and their number.
+    of_position = {
+        mujoco.mjtSensor.mjSENS_JOINTPOS: (0, 1),
+        mujoco.mjtSensor.mjSENS_FRAMEPOS: (0, 3),
+        mujoco.mjtSensor.mjSENS_FRAMEQUAT: (3, 4),
+    }
+    of_velocity = {
+        mujoco.mjtSensor.mjSENS_JOINTVEL: (0, 1),
+        mujoco.mjtSensor.mjSENS_FRAMELINVEL: (0, 3),
+        mujoco.mjtSensor.mjSENS_GYRO: (3, 3),
+    }
     # The state begins with time, qpos and qvel.
     qpos = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_TIME)
-    qvel = qpos + model.nq
-    if joint is None or kind not in {**_OF_POSITION, **_OF_VELOCITY}:
+    if joint is None:
         return None
-    if kind in _OF_POSITION:
-        of_joint, (first, count) = qpos + model.jnt_qposadr[joint], _OF_POSITION[kind]
+    if kind in of_position:
+        of_joint, (first, count) = qpos + model.jnt_qposadr[joint], of_position[kind]
+    elif kind in of_velocity:
+        of_joint, (first, count) = qpos + model.nq + model.jnt_dofadr[joint], of_velocity[kind]
     else:
-        of_joint, (first, count) = qvel + model.jnt_dofadr[joint], _OF_VELOCITY[kind]
+        return None
     return range(of_joint + first, of_joint + first + count)
 
 

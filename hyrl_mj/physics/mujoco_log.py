@@ -11,7 +11,6 @@ import mujoco
 
 # How often MuJoCo has warned in this process, by kind: the text of its warning with # in place of numbers.
 counts: Counter[str] = Counter()
-_NUMBER = re.compile(r"-?\d[\d.e+-]*")
 # The last text of each kind that has not been said yet, and the kinds that have.
 _new: dict[str, str] = {}
 _said: set[str] = set()
@@ -63,7 +62,7 @@ def since(before: Counter[str]) -> str:
 def _count(text: str) -> None:
     """Counts a warning; called by MuJoCo, also from its own threads."""
     line = " ".join(text.split())
-    kind = _NUMBER.sub("#", line)
+    kind = re.sub(r"-?\d[\d.e+-]*", "#", line)
     counts[kind] += 1
     if _kept or kind not in _said:
         _new[kind] = line

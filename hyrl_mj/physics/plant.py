@@ -19,8 +19,6 @@ Control = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 MOST = 2**24  # copies
 # Tolerated excess over an input limit: float32 policies have rounding errors.
 INPUT_TOLERANCE = 1e-6
-# Quaternions whose length differs from 1 by no more are left as they are.
-UNIT_TOLERANCE = 1e-9
 
 
 class Plant:
@@ -222,7 +220,7 @@ class Plant:
         self._qpos[rows], self._qvel[rows] = qpos, qvel
         for columns in self._quaternions:
             norm = np.linalg.norm(qpos[:, columns], axis=1, keepdims=True)
-            if (np.abs(norm - 1) > UNIT_TOLERANCE).any():  # MuJoCo takes quaternions of any length
+            if (np.abs(norm - 1) > 1e-9).any():  # MuJoCo takes quaternions of any length
                 self._qpos[rows, columns] = qpos[:, columns] / np.maximum(norm, mujoco.mjMINVAL)
         self._ctrl[rows] = self._held
         self._unstable[rows] = False

@@ -19,11 +19,9 @@ from hyrl_mj.pipeline.runs import RunOptions, run
 from hyrl_mj.runs.sweeps import Row
 from hyrl_mj.system import cores
 
-# Seconds within which an address must answer, and for which a killed process may keep a run directory.
-PATIENCE, HELD = 7.0, 30.0
+PATIENCE = 7.0  # seconds within which an address must answer
 # How often the process of a run may die before the run is given up.
 DEATHS = 20
-POLL = 0.25  # [s]
 GB = 10**9
 # Receives a line about a run: its row, and the text.
 Tell = Callable[[Row, str], None]
@@ -56,7 +54,7 @@ def make(row: Row, options: RunOptions, share: int, journal: Any = None, folder:
 
 def _patient_run(row: Row, options: RunOptions, say: Callable[[str], None]) -> None:
     """Runs, as soon as a process that was killed has let go of the run directory."""
-    until = time.monotonic() + HELD
+    until = time.monotonic() + 30.0
     while True:
         try:
             run(row.setting.task, options, say=say)
@@ -102,7 +100,7 @@ def work(
     pending = {remote.remote(row, options, share, journal, here): row for row, options in jobs}
     try:
         while pending:
-            done, _ = ray.wait([*pending], num_returns=len(pending), timeout=POLL)
+            done, _ = ray.wait([*pending], num_returns=len(pending), timeout=0.25)
             for name, text in ray.get(journal.take.remote()):
                 tell(rows[name], text)
             for reference in done:

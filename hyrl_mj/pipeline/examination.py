@@ -29,9 +29,6 @@ from hyrl_mj.system.progress import Say
 from hyrl_mj.tasks import SPARING, Effort
 from hyrl_mj.viz import robustness_sentence
 
-# The kinds of noise in episodes by default. Where samples take long, an adversary that looks ahead takes too
-# long; the attack is there.
-KINDS = ("none", "uniform", "alternating", "adversarial")
 # The most starts of an attack: each keeps signals of a whole episode.
 MOST_STARTS = 100_000
 
@@ -109,10 +106,10 @@ def examination_plan(run: Run) -> str:
 def examine_stage(run: Run, say: Say, options: ExamineOptions = USUAL) -> None:
     """Examines policy and hybrid controller under noise; all files are written at the end."""
     budget = options.budget(run)  # a wrong one is refused before the work
-    robustness, maps = examine_loops(run, run.loops, run.split, options)
+    robustness, maps = examine_controllers(run, run.loops, run.split, options)
     if budget is not None:
         regions = Regions(run.critical_set.points, _winnable(run, maps))
-        attacks = attack_loops(run, run.loops, regions, budget, options)
+        attacks = attack_controllers(run, run.loops, regions, budget, options)
         counts = tuple(found.count for found in attacks.values())
         quiet = {name: found.quiet for name, found in attacks.items()}
         under = compare("attack", quiet, {name: found.ends for name, found in attacks.items()})
@@ -129,9 +126,9 @@ def examine_stage(run: Run, say: Say, options: ExamineOptions = USUAL) -> None:
     say(robustness_sentence(robustness))
 
 
-def examine_loops(
+def examine_controllers(
     run: Run,
-    loops: dict[str, Controller],
+    controllers: dict[str, Controller],
     partition: Partition,
     options: ExamineOptions = USUAL,
 ) -> tuple[Robustness, Maps | None]:
@@ -148,18 +145,19 @@ def examine_loops(
         count = effort_of(run).episodes
     if count is not None and count < 1:
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
-    kinds = options.noise or (KINDS if task.effort.looks_ahead else KINDS[:-1])
-    noises = tuple(Noise(kind, eps, everywhere) for kind in kinds)
+    # Where samples take long, an adversary that looks ahead takes too long; the attack is there.
+    usual = ("none", "uniform", "alternating", *["adversarial"] * task.effort.looks_ahead)
+    noises = tuple(Noise(kind, eps, everywhere) for kind in options.noise or usual)
     game, maps = None, None
     if run.why_no_game is None:
         bounds = tuple(dict.fromkeys((0.0, eps / 2, eps)))
         game, maps = examine(
-            task, points, partition, loops, bounds, everywhere, run.settings.lattice
+            task, points, partition, controllers, bounds, everywhere, run.settings.lattice
         )
     episodes = NoisyEpisodes((), ())
     if count is not None:
         regions = Regions(points, _winnable(run, maps), options.near_critical)
-        episodes = noisy_episodes(task, regions, loops, noises, count, seed)
+        episodes = noisy_episodes(task, regions, controllers, noises, count, seed)
     counted = Robustness(
         eps, everywhere, game, episodes.counts, seed, comparisons=episodes.comparisons
     )
@@ -174,9 +172,9 @@ def _winnable(run: Run, maps: Maps | None) -> tuple[Grid, np.ndarray] | None:
     return maps.grid(run.task.chart), ~np.isin(classes, (UNWINNABLE, OVER))
 
 
-def attack_loops(
+def attack_controllers(
     run: Run,
-    loops: dict[str, Controller],
+    controllers: dict[str, Controller],
     regions: Regions,
     budget: Budget,
     options: ExamineOptions,
@@ -191,10 +189,13 @@ def attack_loops(
     starts = attack_starts(task, regions, eps, n, options.seed)
     everywhere = options.all_coordinates or run.settings.everywhere
     if not run.keeps_agent:
-        return attack(task, loops, starts, eps, budget, everywhere, options.seed)
-    alone = {"policy": loops["policy"]}
+        return attack(task, controllers, starts, eps, budget, everywhere, options.seed)
+    alone = {"policy": controllers["policy"]}
     found = attack(task, alone, starts, eps, budget, everywhere, options.seed)["policy"]
-    return {name: found if name in alone else found.on(name, task, loops[name]) for name in loops}
+    return {
+        name: found if name in alone else found.on(name, task, controllers[name])
+        for name in controllers
+    }
 
 
 def draw_robustness(run: Run, robustness: Robustness, maps: Maps, folder: Path) -> None:

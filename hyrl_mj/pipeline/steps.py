@@ -18,7 +18,7 @@ from hyrl_mj.pipeline.examination import (
     USUAL,
     ExamineOptions,
     draw_robustness,
-    examine_loops,
+    examine_controllers,
     examine_stage,
 )
 from hyrl_mj.policies import Agent, PolicyController, algorithms
@@ -205,7 +205,9 @@ def diagnose_stage(run: Run, say: Say) -> None:
     from hyrl_mj.viz import diagnosis, figures
 
     folder = run.path / diagnosis.FOLDER
-    robustness, maps = examine_loops(run, {"policy": PolicyController(run.policy)}, run.partition)
+    robustness, maps = examine_controllers(
+        run, {"policy": PolicyController(run.policy)}, run.partition
+    )
     losses = diagnosis.losses_of(run)
     arc = diagnosis.worst_arc(run, losses)
     figures.draw_all(figures.shown_policy(run, arc or diagnosis.usual_arc(run)), folder)

@@ -44,21 +44,25 @@ class Algorithm:
     @property
     def is_actor_critic(self) -> bool:
         """Whether it trains the policy network directly, beside a value function (PPO and A2C)."""
-        return self.parts == _ON_POLICY_PARTS
+        return "action_net." in self.parts
 
 
-# SB3 1.x had layers that policy and value function share.
-_ON_POLICY_PARTS = ("mlp_extractor.shared_net.", "mlp_extractor.policy_net.", "action_net.")
-_ACTOR_CRITIC = Algorithm(None, _ON_POLICY_PARTS, "tanh", log_std="log_std")
-_DETERMINISTIC = Algorithm(False, ("actor.mu.",), "relu", squashed=True)
-_SAC = Algorithm(False, ("actor.latent_pi.", "actor.mu."), "relu", True, "actor.log_std")
 ALGORITHMS = {
-    "ppo": _ACTOR_CRITIC,
-    "a2c": _ACTOR_CRITIC,
+    **dict.fromkeys(
+        ("ppo", "a2c"),
+        Algorithm(
+            None,
+            # SB3 1.x had layers that policy and value function share.
+            ("mlp_extractor.shared_net.", "mlp_extractor.policy_net.", "action_net."),
+            "tanh",
+            log_std="log_std",
+        ),
+    ),
     "dqn": Algorithm(True, ("q_net.q_net.",), "relu"),
-    "sac": _SAC,
-    "td3": _DETERMINISTIC,
-    "ddpg": _DETERMINISTIC,
+    "sac": Algorithm(
+        False, ("actor.latent_pi.", "actor.mu."), "relu", squashed=True, log_std="actor.log_std"
+    ),
+    **dict.fromkeys(("td3", "ddpg"), Algorithm(False, ("actor.mu.",), "relu", squashed=True)),
 }
 
 

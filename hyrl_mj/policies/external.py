@@ -23,7 +23,6 @@ from hyrl_mj.policies.mlp import (
 from hyrl_mj.policies.onnx_model import from_onnx
 from hyrl_mj.policies.preprocessing import (
     NONE,
-    UNCHANGED,
     PreprocessedPolicy,
     Preprocessing,
     network,
@@ -94,8 +93,6 @@ AnyPolicy = str | Path | Policy | Callable[[np.ndarray], Any]
 STATISTICS = "vecnormalize.npz"
 # Kinds of agents besides those that SB3 trains.
 ONNX, FUNCTION = "onnx", "function"
-# The fingerprint of a function: its number of measurements, and the decimals that count.
-PROBES, HOPS, DECIMALS = 256, 4, 6
 
 
 @dataclass(frozen=True)
@@ -296,7 +293,7 @@ def _network(policy: Policy, task: Task, source: str = "", vecnormalize: str = "
 
 
 def _preprocessing(policy: Policy) -> Preprocessing:
-    return policy.preprocessing if isinstance(policy, PreprocessedPolicy) else UNCHANGED
+    return policy.preprocessing if isinstance(policy, PreprocessedPolicy) else Preprocessing()
 
 
 def _seeing(agent: Agent, policy: Policy) -> Agent:
@@ -311,13 +308,13 @@ def _fingerprint(policy: Policy, task: Task) -> str:
 
     These are of starts, of places all over the chart, and of where random inputs lead from both.
     """
-    rng, half = np.random.default_rng(0), PROBES // 2
-    anywhere = rng.uniform(task.chart.low, task.chart.high, (half, task.chart.dimension))
-    plant = task.plant(PROBES)
-    plant.set_state(*task.state(np.vstack([task.starts(half, rng), anywhere]), rng))
+    rng = np.random.default_rng(0)
+    anywhere = task.chart.draw(128, rng)
+    z = np.vstack([task.starts(128, rng), anywhere])
+    plant = task.placed(z, rng)
     met = [plant.measurement]
-    for _ in range(HOPS):
-        plant.step(rng.uniform(*task.input_limits, (PROBES, len(task.inputs))))
+    for _ in range(4):
+        plant.step(task.draw_inputs(len(z), rng))
         met.append(plant.measurement)
     first = answers(policy, task, np.concatenate(met), "the policy")
-    return sha256((np.round(first.astype(float), DECIMALS) + 0.0).tobytes()).hexdigest()
+    return sha256((np.round(first.astype(float), 6) + 0.0).tobytes()).hexdigest()

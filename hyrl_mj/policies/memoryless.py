@@ -18,18 +18,11 @@ from hyrl_mj.policies.mlp import Policy, SampledPolicy
 from hyrl_mj.policies.preprocessing import PreprocessedPolicy, as_function
 from hyrl_mj.tasks import Outcome, Task
 
-# The trial of an agent: runs side by side, half of them by random inputs that are held for so many samples;
-# their samples; and measurements that it is asked about one by one. Of what takes a call a batch, some do.
-RUNS, HELD, SAMPLES, ALONE, SOME = 16, 8, 64, 128, 4
-# A closed loop asks again about its samples 0, 1, 4, 16, ...; with more runs than a few, which takes longer,
-# about the first two. Of so many runs it asks about all these samples at once.
-FACTOR, FEW, KEPT = 4, 256, 8
+# The trial of an agent: runs side by side, half of them by random inputs; and their samples. Of what takes a
+# call a batch, every fourth one does.
+RUNS, SAMPLES, SOME = 16, 64, 4
 # Sums of 256 numbers in another order differ by some 16 roundings of float32; a network has a few of them.
 ROUNDING = 32 * float(np.finfo(np.float32).eps)
-# A difference larger than that is a rounding, too, where the answer changes as much over a rounding of the
-# measurement. So many measurements that far apart are asked about, for so many of the largest differences.
-SHIFTS, DOUBTS = 32, 4
-REMEDY = "give one whose answer depends on its own observation alone, without chance or memory"
 
 # Returns answers (n, m) to n measurements, of the given rows of some table, moved by (n, p).
 Ask = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -115,7 +108,7 @@ class _Trial:
         for order in orders:
             self._compare(rows, first, order, self._ask(rows[order]), f"in a batch of {len(order)}")
         one = np.empty((1, rows.shape[1]))
-        for i in rng.permutation(len(rows))[:ALONE]:
+        for i in rng.permutation(len(rows))[:128]:
             one[:] = rows[i]
             self._compare(rows, first, np.array([i]), self._ask(one), "alone")
         for k in range(0, len(self.batches), SOME):
@@ -135,7 +128,7 @@ class _Trial:
                 measured, active = plant.measurement, np.arange(RUNS)
             self.batches.append(measured[active])
             self.answers.append(self._ask(self.batches[-1]))
-            if k % HELD == 0:
+            if k % 8 == 0:  # inputs are held for so many samples
                 low, high = task.input_limits
                 drawn = rng.uniform(low, high, (RUNS, len(low)))
             mine = (active < RUNS // 2)[:, None]
@@ -193,18 +186,20 @@ def compare(
     off = np.abs(again - first) - margin
     if not (off > 0).any():
         return
-    for i in np.argsort(-off.max(axis=1))[:DOUBTS]:
+    # A larger difference is a rounding, too, where the answer changes as much over one of the measurement.
+    for i in np.argsort(-off.max(axis=1))[:4]:
         if ask is not None:
             # A network rounds sums of all that it sees, also where a column is zero.
             size = np.abs(rows).max(axis=0)
-            signs = np.random.default_rng(0).uniform(-1, 1, (SHIFTS, len(size)))
+            signs = np.random.default_rng(0).uniform(-1, 1, (32, len(size)))
             shifts = np.vstack([np.zeros_like(size), ROUNDING * size * signs])
             near = ask(np.full(len(shifts), i), shifts)
             off[i] -= np.abs(near - near[0]).max(axis=0)
         if (off[i] > 0).any():
             raise BadInput(
                 f"{name} answers the measurement {_row(rows[i])} with {_row(first[i])} and, {words}, with "
-                f"{_row(again[i])}: {REMEDY}"
+                f"{_row(again[i])}: give one whose answer depends on its own observation alone, without "
+                "chance or memory"
             )
 
 
@@ -232,10 +227,11 @@ class Asked:
         """Returns inputs (n, m) and next modes (n,) at sample k of runs, as `answer`."""
         u, after = answer(self.controller, q, measured, past)
         check_inputs(u, len(measured), len(self.task.inputs))
-        if k == self._next and (k < 2 or len(measured) <= FEW):
+        # Samples 0, 1, 4, 16, ...; with many runs, which takes longer, the first two.
+        if k == self._next and (k < 2 or len(measured) <= 256):
             rows = (q, measured, past, np.column_stack([u, after]))
             self._kept.append(tuple(values.copy() for values in rows))
-            self._next = max(FACTOR * k, 1)
+            self._next = max(4 * k, 1)
         return u, after
 
     def again(self) -> None:
@@ -257,7 +253,7 @@ class Asked:
             compare(name, measured, first, again, margin, words)
         if not self._kept:
             return
-        few = ([values[:KEPT] for values in batch] for batch in self._kept)
+        few = ([values[:8] for values in batch] for batch in self._kept)
         q, measured, past, first = map(np.concatenate, zip(*few, strict=True))
 
         def ask(rows: np.ndarray, shift: np.ndarray) -> np.ndarray:

@@ -29,7 +29,7 @@ def _gelu(x: np.ndarray) -> np.ndarray:
     return np.asarray(0.5 * x * (1 + erf(x / np.sqrt(np.float32(2)))))
 
 
-# The functions between the layers, of arrays of any shape, and their classes in `torch.nn`.
+# The functions between the layers, of arrays of any shape.
 ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "relu": lambda x: np.maximum(x, 0),
     "tanh": np.tanh,
@@ -39,8 +39,11 @@ ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "gelu": _gelu,
     "sigmoid": _sigmoid,
 }
-_CLASSES = ("ReLU", "Tanh", "ELU", "LeakyReLU", "SiLU", "GELU", "Sigmoid")
-TORCH_NAMES = dict(zip(ACTIVATIONS, _CLASSES, strict=True))
+# Their classes in `torch.nn`.
+TORCH_NAMES = {
+    "relu": "ReLU", "tanh": "Tanh", "elu": "ELU", "leaky_relu": "LeakyReLU", "silu": "SiLU",
+    "gelu": "GELU", "sigmoid": "Sigmoid",
+}  # fmt: skip
 # A linear layer: weight (outputs, inputs) and bias (outputs,).
 Layer = tuple[np.ndarray, np.ndarray]
 # Rows that go through a network at a time: the hidden layers then stay in the processor's cache.
@@ -48,8 +51,6 @@ CHUNK = 4096
 # The last bits of a matrix product depend on the number of threads, and threads that wait for a busy core
 # take ten times as long as one: batches run on a single thread.
 BLAS = ThreadpoolController()
-# The range to which SB3 clips the log_std of a layer.
-LOG_STD_RANGE = (-20, 2)
 
 
 @runtime_checkable
@@ -187,7 +188,7 @@ class MlpPolicy(ObservationPolicy):
         layer = _linear(self.weights, f"{name}.")
         if not layer:
             raise BadArtifact(f"the {self.algorithm} policy has no log_std to draw with")
-        return np.clip(self._run(observation, layer[0]), *LOG_STD_RANGE)
+        return np.clip(self._run(observation, layer[0]), -20, 2)  # as SB3 does
 
     def _chosen(self, outputs: np.ndarray) -> np.ndarray:
         """Returns inputs (n, m) for the outputs of the last layer."""

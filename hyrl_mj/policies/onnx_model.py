@@ -14,13 +14,8 @@ from hyrl_mj.policies.functions import FunctionPolicy
 from hyrl_mj.system import limits
 from hyrl_mj.tasks import Task
 
-# Limit on a file [bytes]: the largest MLP policies take a few megabytes.
-LARGEST = 2**25
 # Rows that a model answers at a time: so many as were tried.
 ROWS = 1024
-# The longest that the trial may last [s], of which its model may use the processor; and its memory [bytes].
-LONGEST, SECONDS, MEMORY = 60, 4, 200 * 2**20
-INSTEAD = "in Python, give a function of your own that runs it"
 
 
 def from_onnx(path: Path, task: Task, remedy: str, n_stack: int = 1) -> FunctionPolicy:
@@ -33,16 +28,17 @@ def from_onnx(path: Path, task: Task, remedy: str, n_stack: int = 1) -> Function
             raise BadInput(f'an .onnx file needs {package}: pip install "hyrl-mj[onnx]"')
     columns = n_stack * len(task.observation_low)
     with artifacts.reading(path, remedy):
-        model = artifacts.read_limited(path, LARGEST)
-        found = _examined(model, columns)
-        takes_batches = _check_input(found["inputs"], task, columns)
-        session = _session(model)
-    input_name, output_name = found["inputs"][0][0], found["outputs"][0]
+        model = artifacts.read_limited(path, 2**25)  # the largest MLP policies take a few megabytes
+        found = _examined(model, columns, task)
+        from hyrl_mj.policies.onnx_trial import session_of  # slow to import, and only needed here
+
+        session = session_of(model)
+    input_name, output_name = found["input"], found["output"]
 
     def function(observation: np.ndarray) -> np.ndarray:
         n = len(observation)
         # No other numbers of rows than were tried.
-        rows = ROWS if takes_batches and n > 1 else 1
+        rows = ROWS if found["batches"] and n > 1 else 1
         whole = np.pad(observation, ((0, -n % rows), (0, 0)))
         parts = [whole[i : i + rows] for i in range(0, len(whole), rows)]
         outputs = [session.run([output_name], {input_name: part})[0] for part in parts]
@@ -58,50 +54,25 @@ def from_onnx(path: Path, task: Task, remedy: str, n_stack: int = 1) -> Function
     return policy
 
 
-def _session(model: bytes) -> Any:
-    """Returns onnxruntime's session of a model, on one thread."""
-    import onnxruntime  # slow to import, and only needed here
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4  # errors are raised, too
-    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-
-
-def _examined(model: bytes, columns: int) -> dict[str, Any]:
-    """Returns inputs and outputs of a model that was tried in another process.
+def _examined(model: bytes, columns: int, task: Task) -> dict[str, Any]:
+    """Returns what is known of a model that was tried in another process: see `onnx_trial`.
 
     Raises:
         BadArtifact: it is not to be run.
         ValueError: it is no model.
     """
-    trial, shape = Path(__file__).with_name("onnx_trial.py"), (str(columns), str(ROWS))
-    most = {"seconds": SECONDS, "longest": LONGEST, "memory": MEMORY}
+    trial = Path(__file__).with_name("onnx_trial.py")
+    instead = "in Python, give a function of your own that runs it"
     try:
-        found = limits.tried(trial, model, *shape, **most)
+        # So long the model may use the processor, and so long all may last [s]; and its memory [bytes].
+        found = limits.tried(
+            trial, model, str(columns), str(ROWS), task.name,
+            seconds=4, longest=60, memory=200 * 2**20,
+        )  # fmt: skip
     except limits.Ended as ended:
-        raise BadArtifact(f"for {ROWS} observations {ended}; {INSTEAD}") from None
+        raise BadArtifact(f"for {ROWS} observations {ended}; {instead}") from None
     if "error" in found:
         raise ValueError(found["error"])
     if "problem" in found:
-        raise BadArtifact(f"{found['problem']}; {INSTEAD}")
+        raise BadArtifact(f"{found['problem']}; {instead}")
     return dict(found)
-
-
-def _check_input(inputs: list[list[Any]], task: Task, k: int) -> bool:
-    """Returns whether a model takes batches; other models take one observation at a time."""
-    if len(inputs) != 1 or inputs[0][1] != "tensor(float)" or len(inputs[0][2]) != 2:
-        takes = ", ".join(f"{name}: {kind} of shape {shape}" for name, kind, shape in inputs)
-        raise BadArtifact(
-            f"the model takes {takes or 'nothing'}: it has to take one input, observations (n, {k}) float32"
-        )
-    rows, columns = inputs[0][2]
-    if isinstance(columns, int) and columns != k:
-        raise BadArtifact(
-            f"the model takes {columns} numbers, an observation of {task.name} has {k}"
-        )
-    if isinstance(rows, int) and rows != 1:
-        raise BadArtifact(
-            f"the model takes {rows} observations at a time: export it for any number of them, or for one"
-        )
-    return rows != 1

@@ -1,8 +1,8 @@
 """A program that examines and tries an ONNX model within limits of time and memory; see `onnx_model`.
 
-It runs in a process of its own, `python onnx_trial.py SECONDS MEMORY COLUMNS ROWS < model`, and writes a JSON
-object: the `inputs` and `outputs` of the model, or the `problem` because of which it is refused, or an
-`error` of the reader.
+It runs in a process of its own, `python onnx_trial.py SECONDS MEMORY COLUMNS ROWS TASK < model`, and writes a
+JSON object: the names of `input` and `output` of the model, and whether it takes `batches` or one observation
+at a time; or the `problem` because of which it is refused, or an `error` of the reader.
 """
 
 import json
@@ -79,28 +79,41 @@ def check(model: onnx.ModelProto) -> None:
         raise Refused("its numbers are in another file (external data): save it in one file")
 
 
-def examine(content: bytes, columns: int, rows: int) -> dict[str, Any]:
-    """Returns inputs and outputs of a model, after it has answered random observations more than once.
+def session_of(content: bytes) -> Any:
+    """Returns onnxruntime's session of a model, on one thread."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4  # errors are raised, too
+    return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+
+
+def examine(content: bytes, columns: int, rows: int, task: str) -> dict[str, Any]:
+    """Returns what is known of a model, after it has answered random observations more than once.
 
     Raises:
         Refused: it is not run, or it is no function of the observation.
     """
     check(onnx.load_model_from_string(content))
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4
-    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    inputs = [[i.name, i.type, list(i.shape)] for i in session.get_inputs()]
+    session = session_of(content)
+    inputs = session.get_inputs()
     outputs = [o.name for o in session.get_outputs()]
     if not outputs:
         raise Refused("it gives no output")
-    if len(inputs) == 1 and inputs[0][1] == "tensor(float)" and len(inputs[0][2]) == 2:
-        (name, _, (batch, width)), *_ = inputs
-        if width in (None, columns) or isinstance(width, str):
-            one = batch == 1
-            if one or not isinstance(batch, int):
-                _try(lambda o: session.run(outputs[:1], {name: o})[0], columns, rows, one)
-    return {"inputs": inputs, "outputs": outputs}
+    if len(inputs) != 1 or inputs[0].type != "tensor(float)" or len(inputs[0].shape) != 2:
+        takes = ", ".join(f"{i.name}: {i.type} of shape {list(i.shape)}" for i in inputs)
+        raise Refused(
+            f"the model takes {takes or 'nothing'}: it has to take one input, observations (n, {columns}) "
+            "float32"
+        )
+    name, (batch, width) = inputs[0].name, inputs[0].shape
+    if isinstance(width, int) and width != columns:
+        raise Refused(f"the model takes {width} numbers, an observation of {task} has {columns}")
+    if isinstance(batch, int) and batch != 1:
+        raise Refused(
+            f"the model takes {batch} observations at a time: export it for any number of them, or for one"
+        )
+    _try(lambda o: session.run(outputs[:1], {name: o})[0], columns, rows, batch == 1)
+    return {"input": name, "output": outputs[0], "batches": batch != 1}
 
 
 def _try(answer: Any, columns: int, rows: int, one: bool) -> None:
@@ -132,13 +145,14 @@ def _try(answer: Any, columns: int, rows: int, one: bool) -> None:
 
 
 def main() -> None:
-    seconds, memory, columns, rows = map(int, sys.argv[1:])
+    *numbers, task = sys.argv[1:]
+    seconds, memory, columns, rows = map(int, numbers)
     content = sys.stdin.buffer.read()
     limits = runpy.run_path(str(Path(__file__).parents[1] / "system" / "limits.py"))
     limits["limit"](seconds, memory)
     result: dict[str, Any]
     try:
-        result = examine(content, columns, rows)
+        result = examine(content, columns, rows, task)
     except Refused as refused:
         result = {"problem": str(refused)}
     except MemoryError:

@@ -15,10 +15,6 @@ from hyrl_mj.files import archives, artifacts
 from hyrl_mj.policies.mlp import MlpPolicy, ObservationPolicy, Policy, SampledPolicy
 from hyrl_mj.tasks import Task
 
-# SB3's, where a file of statistics does not give it.
-EPSILON = 1e-8
-LARGEST = 2**20  # of a file of statistics [bytes]
-LARGEST_STACK = 1000
 LARGEST_NUMBER = 1e30  # of statistics: its square is a number, too
 NONE = "none"  # in place of a file of statistics: the agent saw plain observations
 RECIPE = "write it with mean, var and clip, as docs/your-agent.md shows"
@@ -38,7 +34,7 @@ class Normalization:
     mean: np.ndarray
     var: np.ndarray
     clip: float
-    epsilon: float = EPSILON
+    epsilon: float = 1e-8
     by_key: bool = False
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
@@ -67,7 +63,7 @@ class Normalization:
             BadArtifact: an array is missing, or has numbers that cannot be.
         """
         with artifacts.reading(path, RECIPE):
-            arrays = archives.read_npz(artifacts.read_limited(path), LARGEST)
+            arrays = archives.read_npz(artifacts.read_limited(path), 2**20)
             if by_key := any(name.startswith(("mean.", "var.")) for name in arrays):
                 arrays = _joined(arrays, parts, n_stack)
             if missing := [name for name in _FIELDS[:3] if name not in arrays]:
@@ -77,7 +73,7 @@ class Normalization:
                 raise BadArtifact(f"its {other[0]} holds no numbers: {RECIPE}")
             values = {n: array.astype(float) for n, array in found.items()}
             mean, var, clip = (values[name] for name in _FIELDS[:3])
-            epsilon = values.get("epsilon", np.array(EPSILON))
+            epsilon = values.get("epsilon", np.array(Normalization.epsilon))
             if mean.ndim != 1 or var.shape != mean.shape or clip.size != 1 or epsilon.size != 1:
                 raise BadArtifact(
                     f"its mean and var are two rows of numbers, clip is one number: {RECIPE}"
@@ -142,10 +138,10 @@ class Preprocessing:
             BadInput: they cannot be used, or do not fit the task.
         """
         whole = isinstance(n_stack, int) and not isinstance(n_stack, bool)
-        if not whole or not 1 <= n_stack <= LARGEST_STACK:
+        if not whole or not 1 <= n_stack <= 1000:
             raise BadInput(
                 f"n_stack {n_stack!r} cannot be used: give the number of observations that the agent sees at "
-                f"once, from 1 to {LARGEST_STACK}"
+                "once, from 1 to 1000"
             )
         if vecnormalize is None or str(vecnormalize) == NONE:
             return Preprocessing(None, n_stack)
@@ -184,10 +180,6 @@ class Preprocessing:
         if normalize is not None and len(normalize.mean) != k:
             seen = normalize(seen)
         return seen
-
-
-# An agent that sees the observation of the task itself.
-UNCHANGED = Preprocessing()
 
 
 @dataclass(frozen=True)

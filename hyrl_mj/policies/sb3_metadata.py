@@ -20,21 +20,12 @@ from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.policies import pickled
 from hyrl_mj.tasks import Task
 
-# Episodes and samples of random inputs from which the possible observations of a task are judged.
-EPISODES, SAMPLES = 256, 20
-# The noise on the measurements that a training may have had, in the units of the chart.
-NOISE = 0.1
 # The error of an observation in float32, with room to spare.
 ROUNDING = 1e-3
-# Normalised numbers have about the density of the standard normal distribution, at most so much. That all of
-# them lie by chance where plain ones may has to be less likely than this.
-DENSITY, CHANCE = 0.4, 1e-3
 HOW = (
     "give its statistics with --vecnormalize FILE.npz, which docs/your-agent.md shows how to write, or "
     "--vecnormalize none if it saw plain observations, also for norm_obs=False"
 )
-SHOWN = 6  # numbers of a range in messages
-NUMBER = re.compile(r"[-+]?(?:inf|nan|\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+)")
 
 
 def check_inputs(about: Mapping[str, Any], task: Task) -> None:
@@ -65,14 +56,16 @@ def check_inputs(about: Mapping[str, Any], task: Task) -> None:
 def _numbers(space: Mapping[str, Any], part: str) -> np.ndarray | None:
     """Returns the numbers in a part of a space, which metadata hold as text; None if there are none."""
     text = space.get(part)
-    found = NUMBER.findall(text) if isinstance(text, str) and "..." not in text else []
+    if not isinstance(text, str) or "..." in text:
+        return None
+    found = re.findall(r"[-+]?(?:inf|nan|\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+)", text)
     return np.array(found, dtype=float) if found else None
 
 
 def _box(low: np.ndarray, high: np.ndarray) -> str:
     """Returns "[-1, 1]", or "[-1, 1] x [0, 2]"."""
-    text = [f"[{a:g}, {b:g}]" for a, b in zip(low[:SHOWN], high[:SHOWN], strict=False)]
-    return " x ".join(text + ["..."] * (max(len(low), len(high)) > SHOWN))
+    text = [f"[{a:g}, {b:g}]" for a, b in zip(low[:6], high[:6], strict=False)]
+    return " x ".join(text + ["..."] * (max(len(low), len(high)) > 6))
 
 
 def check_observations(
@@ -87,17 +80,17 @@ def check_observations(
     last, original = (
         _observations(about, f"_last_{name}", task) for name in ("obs", "original_obs")
     )
-    seen, normalized = _Seen(task), None
+    possible, normalized = _Possible(task), None
     if on_policy and "_last_original_obs" in about and about["_last_original_obs"] is None:
         normalized = False  # under VecNormalize SB3 keeps it from the first observation on
     elif last is not None and original is not None and _sizes(last) == _sizes(original):
-        normalized = _normalized(last, original, seen, on_policy, n_stack)
+        normalized = _normalized(last, original, possible, on_policy, n_stack)
         if normalized:
             raise BadArtifact(
                 "it was trained on normalised observations (VecNormalize): its last one is "
                 f"{_row(_joined(last))}, where {task.name} gave {_row(_joined(original))}; {HOW}"
             )
-    _check_wrappers(about, last, seen)
+    _check_wrappers(about, last, possible)
     if normalized is None:
         raise BadArtifact(
             "nothing in it tells whether it was trained on normalised observations (VecNormalize), as "
@@ -109,13 +102,13 @@ def check_observations(
 _Parts = dict[str, np.ndarray]
 
 
-def _check_wrappers(about: Mapping[str, Any], last: _Parts | None, seen: _Seen) -> None:
+def _check_wrappers(about: Mapping[str, Any], last: _Parts | None, possible: _Possible) -> None:
     """Raises `BadArtifact` if an agent saw observations that the task does not give.
 
     So it is with `NormalizeObservation` and other wrappers inside of the environment of the training.
     """
-    task, joined = seen.task, None if last is None else _joined(last)
-    given = None if joined is None else seen.given(joined)
+    task, joined = possible.task, None if last is None else _joined(last)
+    given = None if joined is None else possible.include(joined)
     if given:
         return
     which, types = "", {str(part.dtype) for part in (last or {}).values()}
@@ -138,7 +131,7 @@ def _check_wrappers(about: Mapping[str, Any], last: _Parts | None, seen: _Seen) 
 
 
 def _normalized(
-    last: _Parts, original: _Parts, seen: _Seen, on_policy: bool, n_stack: int
+    last: _Parts, original: _Parts, possible: _Possible, on_policy: bool, n_stack: int
 ) -> bool | None:
     """Returns whether the last observations are normalised, the original ones being not.
 
@@ -155,7 +148,7 @@ def _normalized(
         open_columns += [not (plain or constant)] * after.shape[1]
     if not any(open_columns):
         return False
-    return seen.normalized(_joined(last), _joined(original), on_policy, np.array(open_columns))
+    return possible.normalized(_joined(last), _joined(original), on_policy, np.array(open_columns))
 
 
 def _observations(about: Mapping[str, Any], key: str, task: Task) -> _Parts | None:
@@ -195,8 +188,8 @@ def _row(observations: np.ndarray) -> str:
     return "(" + ", ".join(f"{value:.3g}" for value in observations[0]) + ")"
 
 
-class _Seen:
-    """What a task lets an agent see, found by random inputs."""
+class _Possible:
+    """The observations that a task gives, found by random inputs."""
 
     def __init__(self, task: Task):
         self.task, self._rng = task, np.random.default_rng(0)
@@ -204,9 +197,7 @@ class _Seen:
     @cached_property
     def _plant(self) -> Any:
         """Copies of the robot, until `by_step` at its start."""
-        plant = self.task.plant(EPISODES)
-        plant.set_state(*self.task.state(self.task.starts(EPISODES, self._rng), self._rng))
-        return plant
+        return self.task.placed(self.task.starts(256, self._rng), self._rng)
 
     @cached_property
     def _measured(self) -> np.ndarray:
@@ -221,7 +212,8 @@ class _Seen:
     def by_noise(self) -> np.ndarray:
         """The largest difference (k,) between two observations that noise makes."""
         shares = np.array(self.task.noisy, dtype=float)
-        noise = self._rng.uniform(-NOISE, NOISE, self._measured.shape) * shares
+        # A training may have had noise on the measurements of 0.1, in the units of the chart.
+        noise = self._rng.uniform(-0.1, 0.1, self._measured.shape) * shares
         noisy = self.task.observation(self._measured + noise)
         return np.asarray(2 * np.abs(noisy - self.starts).max(axis=0))
 
@@ -231,8 +223,8 @@ class _Seen:
         task, low, high = self.task, *self.task.input_limits
         before = self.starts
         longest = np.zeros(before.shape[1])
-        for _ in range(SAMPLES):
-            self._plant.step(np.where(self._rng.random((EPISODES, len(low))) < 0.5, low, high))
+        for _ in range(20):
+            self._plant.step(np.where(self._rng.random((len(before), len(low))) < 0.5, low, high))
             after = task.observation(self._plant.measurement)
             going = ~self._plant.unstable
             longest = np.maximum(longest, np.abs(after - before)[going].max(axis=0, initial=0.0))
@@ -258,7 +250,7 @@ class _Seen:
         low, high = self._limits
         return np.asarray(self.by_noise + self.by_step + 1e-3 * (high - low))
 
-    def given(self, last: np.ndarray) -> bool | None:
+    def include(self, last: np.ndarray) -> bool | None:
         """Returns whether a task gives such observations (n, k); None if that cannot be told."""
         low, high = self._limits
         outside = (
@@ -280,7 +272,7 @@ class _Seen:
 
         None if that cannot be told.
         """
-        given = self.given(last)
+        given = self.include(last)
         if given is not None:
             return not given
         if on_policy:
@@ -295,8 +287,10 @@ class _Seen:
         if not (goes_on | began).all():
             return True
         widths = np.where(goes_on[:, None], 2 * change[:, columns], (final - first)[columns])
-        chance = np.minimum(DENSITY * widths, 1.0).prod(axis=1)
-        return False if chance.min() < CHANCE else None
+        # Normalised numbers have about the density of the standard normal distribution, at most 0.4. That all
+        # of them lie by chance where plain ones may has to be less likely than one in a thousand.
+        chance = np.minimum(0.4 * widths, 1.0).prod(axis=1)
+        return False if chance.min() < 1e-3 else None
 
     def _off(self, observation: np.ndarray) -> np.ndarray:
         """Returns how far (n,) observations are from any that a measurement gives."""

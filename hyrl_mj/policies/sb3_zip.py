@@ -26,26 +26,6 @@ INSTEAD = "export it to .onnx, or give a function that calls model.predict in Py
 PLAIN = f"only plain multilayer perceptrons on a vector of numbers can be used: {INSTEAD}"
 # Limit on the metadata [bytes]: those of SB3 take some ten kilobytes.
 LARGEST_METADATA = 2**22
-# A part of a Dict, in the text of metadata: "'goal': Box(-inf, inf, (2,), float32)", or "('goal', Box(..." of
-# an OrderedDict. Only vectors have a size.
-PART = re.compile(r"'([^']*)'(?::|,) Box\([^()]*\((?:(\d{1,9}),|[^()]*)\)[^()]*\)")
-LONGEST_SPACES = 2**14
-LONGEST_TEXT = 120  # of a file, in messages
-# What the metadata of SBX, which has SB3's interface, says of its policy.
-SBX = re.compile(rb"[\"']sbx\.")
-# Parts of tensor names of agents that are no plain MLPs on a vector, and what they mean.
-OF_SB3 = "stable_baselines3.", "sb3_contrib."
-FOREIGN = {
-    "lstm": "it has a recurrent policy (lstm)",
-    "features_extractor.extractors.": "its observations are a dict",
-    "features_extractor.cnn.": "it has a CNN policy, which looks at images",
-    "features_extractor.": "it has a features extractor of its own",
-    ".ra_mean": "it has batch renormalisation between its layers (ra_mean), as CrossQ's",
-}
-# Beginnings of the names of tensors that only the training needs.
-CRITICS = (
-    "value_net.", "mlp_extractor.value_net.", "critic.", "critic_target.", "actor_target.", "q_net_target.",
-)  # fmt: skip
 
 
 def from_zip(
@@ -93,7 +73,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             data = (
                 archives.read_member(file, "data", torch_file.LARGEST) if "data" in names else b""
             )
-            if SBX.search(data):
+            if re.search(rb"[\"']sbx\.", data):  # SBX has SB3's interface
                 raise BadArtifact(
                     "it is an agent of SBX, whose networks are in JAX and saved as a pickle, which is not "
                     f"opened: {INSTEAD}"
@@ -111,7 +91,15 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 def _check_plain(tensors: Mapping[str, np.ndarray], about: Mapping[str, Any], task: Task) -> None:
     """Raises `BadArtifact` if an agent is more than an MLP on a vector, or on a Dict of vectors."""
-    for part, what in FOREIGN.items():
+    # Parts of tensor names, and what they mean.
+    foreign = {
+        "lstm": "it has a recurrent policy (lstm)",
+        "features_extractor.extractors.": "its observations are a dict",
+        "features_extractor.cnn.": "it has a CNN policy, which looks at images",
+        "features_extractor.": "it has a features extractor of its own",
+        ".ra_mean": "it has batch renormalisation between its layers (ra_mean), as CrossQ's",
+    }
+    for part, what in foreign.items():
         if any(part in name for name in tensors):
             raise BadArtifact(f"{what}: {PLAIN}")
     of_dict = _observes_dict(about)
@@ -122,7 +110,8 @@ def _check_plain(tensors: Mapping[str, np.ndarray], about: Mapping[str, Any], ta
     extractor = _entry(about, "policy_kwargs", "features_extractor_class")
     if extractor and usual not in extractor:
         raise BadArtifact(f"it has a features extractor of its own, {extractor}: {PLAIN}")
-    if (own := _entry(about, "policy_class", "__module__")) and not own.startswith(OF_SB3):
+    own = _entry(about, "policy_class", "__module__")
+    if own and not own.startswith(("stable_baselines3.", "sb3_contrib.")):
         raise BadArtifact(f"its policy is of a class of its own, of {own:.80}: {PLAIN}")
     if "actor.log_std" in tensors or np.ndim(tensors.get("log_std", 0)) == 2:
         raise BadArtifact("it was trained with use_sde: train it without, or export it to .onnx")
@@ -149,8 +138,10 @@ def _check_parts(about: Mapping[str, Any], task: Task) -> None:
 
 def _observed_parts(about: Mapping[str, Any]) -> dict[str, int]:
     """Returns the sizes of the vectors of an agent's Dict by key, in the order in which SB3 joins them."""
-    text = str(about["observation_space"].get("spaces"))[:LONGEST_SPACES]
-    return {key: int(size or 0) for key, size in PART.findall(text)}
+    text = str(about["observation_space"].get("spaces"))[: 2**14]
+    # "'goal': Box(-inf, inf, (2,), float32)", or "('goal', Box(..." of an OrderedDict; vectors have a size.
+    part = r"'([^']*)'(?::|,) Box\([^()]*\((?:(\d{1,9}),|[^()]*)\)[^()]*\)"
+    return {key: int(size or 0) for key, size in re.findall(part, text)}
 
 
 def _dict_of(parts: Mapping[str, int]) -> str:
@@ -197,7 +188,11 @@ def _check_used(tensors: Mapping[str, np.ndarray], algorithm: str) -> None:
     spread = known.log_std or ""
     prefixes = (*known.parts, f"{spread}.") if spread else known.parts
     used = {name for prefix in prefixes for name in layer_names(tensors, prefix)} | {spread}
-    other = [n for n in tensors if n not in used and not n.startswith(CRITICS)]
+    of_training = (
+        "value_net.", "mlp_extractor.value_net.", "critic.", "critic_target.", "actor_target.",
+        "q_net_target.",
+    )  # fmt: skip
+    other = [n for n in tensors if n not in used and not n.startswith(of_training)]
     if other:
         names = _short(", ".join(other[:3])) + (", ..." if len(other) > 3 else "")
         raise BadArtifact(f"no {algorithm} policy of SB3 has its tensors {names}: {PLAIN}")
@@ -242,4 +237,4 @@ def _entry(about: Mapping[str, Any], key: str, part: str) -> str:
 
 def _short(text: str) -> str:
     """Returns the beginning of a text from a file, for messages."""
-    return text if len(text) <= LONGEST_TEXT else f"{text[:LONGEST_TEXT]}..."
+    return text if len(text) <= 120 else f"{text[:120]}..."

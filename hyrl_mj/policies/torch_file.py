@@ -19,7 +19,6 @@ from hyrl_mj.policies.pickled import Call
 
 # Limit on the file, and on the tensors as float32 [bytes]: the largest MLP policies take a few megabytes.
 LARGEST = 2**25
-DIMENSIONS = 8  # of a tensor
 _TYPES = {
     "Float": "f4", "Double": "f8", "Half": "f2", "BFloat16": "u2", "Long": "i8", "Int": "i4", "Short": "i2",
     "Char": "i1", "Byte": "u1", "Bool": "?",
@@ -103,5 +102,5 @@ def _is_tensor(value: Any) -> bool:
         ):
             numbers = (offset, *size, *stride)
             plain = all(isinstance(n, int) and 0 <= n < 2**40 for n in numbers)
-            return plain and len(size) <= DIMENSIONS
+            return plain and len(size) <= 8
     return False

@@ -22,8 +22,8 @@ from hyrl_mj.tracing import Program
 
 # Methods that a proof reads as the default ones; the others it follows operation by operation.
 DEFAULTS = (
-    "z", "at", "with_z", "state", "measure", "mocap", "outcome", "plant", "check_measurement", "check_noise",
-    "noise_in_chart",
+    "z", "at", "with_z", "state", "measure", "mocap", "outcome", "plant", "placed", "check_measurement",
+    "check_noise", "noise_in_chart",
 )  # fmt: skip
 FOLLOWED = ("observation", "ending", "verdict")
 # States at which the operations that were followed are compared with the method.

@@ -94,7 +94,7 @@ def examine(
     spacing, curve_spacing = (tuple(g.lattice.grid.spacing.tolist()) for g in (fine, coarse))
     lattice = LatticeSpacing(
         spacing, fine.lattice.exact, certificate.cells is not None, curve_spacing,
-        task.stopped_by_walls,
+        task.abilities.stopped_by_walls,
     )  # fmt: skip
     proved = {name: _proved_margin(curve, curve.wins[name]) for name in controllers}
     misses = _misses(coarse, controllers)

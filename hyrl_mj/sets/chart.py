@@ -54,6 +54,10 @@ class Chart:
     def dimension(self) -> int:
         return len(self.names)
 
+    def draw(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """Returns random points (n, d) all over the charted box."""
+        return rng.uniform(self.low, self.high, (n, self.dimension))
+
     @cached_property
     def origin(self) -> np.ndarray:
         """The lower ends (d,), as an array."""

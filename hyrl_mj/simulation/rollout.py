@@ -123,7 +123,7 @@ def closed_loop(
     limit = np.broadcast_to(task.max_steps if settings.steps is None else settings.steps, n)
     longest = int(limit.max(initial=0))
     # Where each run takes an environment of its own, the next one begins where one ends.
-    most = n if task.side_by_side is None else task.side_by_side
+    most = n if task.abilities.side_by_side is None else task.abilities.side_by_side
     together = n <= most
     plant = settings.plant or task.plant(n)
     plant.set_state(*task.state(z0, settings.rng_of_starts(seed)))

@@ -116,7 +116,7 @@ class Rules:
         # An environment cannot be simulated ahead from the middle of an episode.
         self.lookahead = (
             Lookahead(bound, shares).against(task, controller)
-            if task.tabulated and task.effort.looks_ahead
+            if task.abilities.restarts and task.effort.looks_ahead
             else None
         )
         self.common = np.arange(len(common))

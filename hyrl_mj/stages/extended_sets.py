@@ -209,7 +209,7 @@ class _Case:
             )
         ]  # fmt: skip
         nowhere = np.zeros(self.grid.size, dtype=bool)
-        self.walls = ~task.goes_on(self.grid.nodes) if task.stopped_by_walls else nowhere
+        self.walls = ~task.goes_on(self.grid.nodes) if task.abilities.stopped_by_walls else nowhere
 
     def winning(self) -> tuple[np.ndarray, ...]:
         """Returns W_i, the nodes (N,) bool from which the policy of a part arrives by its own way."""

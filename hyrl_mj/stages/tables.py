@@ -218,8 +218,8 @@ def possible(task: Task, grid: Nodes) -> bool:
         isinstance(grid, Grid)
         and len(grid.counts) <= 2
         and few
-        and task.arrival_ends
-        and task.tabulated
+        and task.abilities.arrival_ends
+        and task.abilities.restarts
     )
 
 

@@ -9,7 +9,7 @@ from pkgutil import iter_modules
 
 from hyrl_mj.tasks.base import Task, at_levels
 from hyrl_mj.tasks.checks import check_task
-from hyrl_mj.tasks.description import SEARCHES, Learning, Mirror, Outcome, Scene
+from hyrl_mj.tasks.description import SEARCHES, Abilities, Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.effort import SPARING, Effort
 from hyrl_mj.tasks.field import CLEAR, FASTEST, PROJECTED, RADII, TAKEN, Field, FieldTask
 from hyrl_mj.tasks.guard import check_finite, read_only, writes
@@ -49,6 +49,7 @@ __all__ = [
     "SEARCHES",
     "SPARING",
     "TAKEN",
+    "Abilities",
     "Effort",
     "Field",
     "FieldTask",

@@ -12,15 +12,12 @@ from hyrl_mj.tasks.description import Outcome
 if TYPE_CHECKING:
     from hyrl_mj.tasks.problem import Problem
 
-# Runs that are compared, samples of each, and the starts that are drawn for them.
-RUNS, SAMPLES, DRAWN = 50, 20, 500
 # How far a sample may lead beside that of a copy that is made anew, as a share of the longest one. A velocity
 # actuator of strength kv keeps m / (m + h kv) of the velocity of a mass m in a physics step of h seconds:
 # 2e-5 at 1 kg, kv 1e6 and 0.05 s, but 0.67 at 1e5 kg. The finest lattice has cells of about a hundredth of a
 # sample, of which this is a tenth; and it does not add up, because what lags behind once has caught up later.
 # A proof takes the lag that it measures into account.
 ALIKE = 1e-3
-ROUNDING = 1e-12  # of positions
 
 
 def begins_anew(task: Problem, of_chart: bool = False) -> bool:
@@ -34,12 +31,11 @@ def begins_anew(task: Problem, of_chart: bool = False) -> bool:
         of_chart: whether copies are made at the measured chart points; by default at the positions, at rest.
     """
     rng, chart = np.random.default_rng(0), task.chart
-    z = rng.uniform(chart.low, chart.high, (DRAWN, chart.dimension))
-    z = z[task.goes_on(z)][:RUNS]
+    z = chart.draw(500, rng)
+    z = z[task.goes_on(z)][:50]
     if not len(z):
         return False
-    plant, anew = task.plant(len(z)), task.plant(len(z))
-    plant.set_state(*task.state(z, rng))
+    plant, anew = task.placed(z, rng), task.plant(len(z))
     inputs, off, hops, goes_on = _inputs(task, len(z), rng), [], [], np.ones(len(z), dtype=bool)
     with mujoco_log.kept():
         for u in inputs:
@@ -58,15 +54,16 @@ def begins_anew(task: Problem, of_chart: bool = False) -> bool:
             off.append(np.abs(hop - (anew.qpos - copied))[goes_on])
             hops.append(np.abs(hop)[goes_on])
     longest = np.concatenate(hops).max(axis=0)
-    return bool((np.concatenate(off) <= ALIKE * longest + ROUNDING).all())
+    rounding = 1e-12  # of positions
+    return bool((np.concatenate(off) <= ALIKE * longest + rounding).all())
 
 
 def _inputs(task: Problem, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Returns the inputs (SAMPLES, n, m) of the runs."""
+    """Returns the inputs (20, n, m) of the runs, sample by sample."""
     low, high = task.input_limits
-    shape = (SAMPLES, n, len(low))
+    shape = (20, n, len(low))
     corners = np.where(rng.random(shape) < 0.5, low, high)
-    turns = (np.arange(SAMPLES) % 2 == 1)[:, None, None]
+    turns = (np.arange(len(corners)) % 2 == 1)[:, None, None]
     alternating = np.where(turns, low + high - corners[:1], corners[:1])
     kind = (np.arange(n) % 3)[:, None]
     drawn = rng.uniform(low, high, shape)

@@ -10,21 +10,14 @@ from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.registry import register
 
-PI = np.pi
-# Weights of the reward: of a sample, and of the distance from the goal as a share of the largest. A crash
-# costs 1: as much as going on for 1 / (HASTE + DISTANCE) samples far from the goal.
-HASTE, DISTANCE = 0.01, 0.04
-# Distance from the post within which the reward is less [m], and by how much at the post.
-NEAR, CLOSE_BY = 0.05, 0.05
-# Starts keep this distance from the post [m].
-START_CLEARANCE = 0.01
-
 
 @register
 class Arm(Task):
     name = "arm"
     description = "fold two links beside a post, the second turned one way or the other (PPO)"
-    chart = Chart(("shoulder", "elbow"), ("rad", "rad"), (-PI, -PI), (PI, PI), (True, True))
+    chart = Chart(
+        ("shoulder", "elbow"), ("rad", "rad"), (-np.pi, -np.pi), (np.pi, np.pi), (True, True)
+    )
     inputs, input_units = ("shoulder_rate", "elbow_rate"), ("rad/s", "rad/s")
     noisy = (1.0, 1.0)
     max_steps = 120
@@ -77,9 +70,10 @@ class Arm(Task):
         return self.chart.wrap(np.arctan2(observation[:, 2:], observation[:, :2]))
 
     def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
-        away = np.abs(self.chart.difference(measurement, self.set_point)).sum(axis=1) / (2 * PI)
-        near = np.clip(1 - self.clearance(measurement) / NEAR, 0.0, 1.0)
-        reward = -HASTE - DISTANCE * away - CLOSE_BY * near
+        away = np.abs(self.chart.difference(measurement, self.set_point)).sum(axis=1) / (2 * np.pi)
+        near = np.clip(1 - self.clearance(measurement) / 0.05, 0.0, 1.0)
+        # A crash costs 1: as much as going on for twenty samples as far from the goal as can be.
+        reward = -0.01 - 0.04 * away - 0.05 * near
         return np.where(self.failed(measurement), self.worst_reward, reward)
 
     def ending(self, measurement: np.ndarray) -> np.ndarray:
@@ -87,7 +81,7 @@ class Arm(Task):
         return np.where(self.clearance(measurement) <= 0, Outcome.CRASHED, ends)
 
     def may_start(self, z: np.ndarray) -> np.ndarray:
-        return (self.clearance(z) >= START_CLEARANCE) & ~self.arrived(z)
+        return (self.clearance(z) >= 0.01) & ~self.arrived(z)
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         drawn = np.empty((0, 2))

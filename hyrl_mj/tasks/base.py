@@ -151,8 +151,7 @@ class Task(Problem):
             (n,) int: the mode whose way the run went, -1 where there was nothing to decide.
         """
         z = path.reshape(-1, path.shape[2])
-        plant = self.plant(len(z))
-        plant.set_state(*self.state(z))
+        plant = self.placed(z)
         places = self.where(plant.measurement).reshape(*path.shape[:2], 2)
         centres = plant.geom_positions(list(self.obstacles.values()))[..., list(self.plane)]
         if len(centres) == len(z):  # some of them move

@@ -11,22 +11,6 @@ from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.flight import Rotors
 from hyrl_mj.tasks.registry import register
 
-# Least and largest upward thrust that the inner loop commands, as shares of the weight.
-LIFT = (0.4, 1.6)
-# Distance from the beam and from the edge of the arena within which the reward is less [m]; room to the side
-# that is worth going for [m].
-NEAR, ROOM = 0.3, 0.25
-# Weights of the reward: of arriving (in samples), of the distance to the nearest side [1/m] and the inputs
-# [s/m] until the beam is passed, of the distance from the middle behind it [1/m], of being near.
-FINISH, BLOCKED, EFFORT, OFF, BESIDE = 10, 0.8, 0.05, 0.5, 0.5
-# Largest speed of a start to the side and upward [m/s].
-START_DRIFT = 0.1
-# For the danger, a distance from the edge of the arena counts as so many times that distance from the beam.
-EDGE = 4.0
-# A start has this time [s] more than it takes to clear the beam at full speed to the nearest side: enough for
-# the next side, too, where noise has picked the wrong one.
-TO_SPARE = 0.95
-
 
 @register
 class Beam(Task):
@@ -84,7 +68,7 @@ class Beam(Task):
     @cached_property
     def rotors(self) -> Rotors:
         """The rotors and the loop that commands them."""
-        return Rotors(self.model, LIFT)
+        return Rotors(self.model, lift=(0.4, 1.6))
 
     @cached_property
     def speed(self) -> float:
@@ -104,7 +88,7 @@ class Beam(Task):
         qpos, qvel = np.zeros((len(z), 7)), np.zeros((len(z), 6))
         qpos[:, :3], qpos[:, 3], qvel[:, 0] = z, 1.0, self.speed
         if rng is not None:
-            qvel[:, 1:3] = rng.uniform(-START_DRIFT, START_DRIFT, (len(z), 2))
+            qvel[:, 1:3] = rng.uniform(-0.1, 0.1, (len(z), 2))
         return qpos, qvel
 
     def observation(self, measured: np.ndarray) -> np.ndarray:
@@ -127,15 +111,15 @@ class Beam(Task):
 
     def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
         free = np.minimum(self.clearance(measurement), self.to_edge(measurement))
-        near = BESIDE * np.clip(1 - free / NEAR, 0.0, 1.0)
+        near = 0.5 * np.clip(1 - free / 0.3, 0.0, 1.0)
         # Before the beam it pays to get clear of it on the nearest side, at once: a crash far ahead is
         # discounted, and a pull to the middle would make every way as good as the nearest.
-        to_go = self.to_side(measurement, ROOM).min(axis=1).clip(0.0)
+        to_go = self.to_side(measurement, room=0.25).min(axis=1).clip(0.0)
         off = np.abs(measurement[:, 1:3] - self.set_point[1:]).sum(axis=1)
-        before = BLOCKED * to_go + EFFORT * np.abs(u).sum(axis=1)
-        cost = np.where(measurement[:, 0] < self.passed, before, OFF * off)
+        before = 0.8 * to_go + 0.05 * np.abs(u).sum(axis=1)
+        cost = np.where(measurement[:, 0] < self.passed, before, 0.5 * off)
         reward = np.maximum(1 - near - cost, 0.0)
-        reward = np.where(measurement[:, 0] >= self.set_point[0], FINISH * reward, reward)
+        reward = np.where(measurement[:, 0] >= self.set_point[0], 10 * reward, reward)
         return np.where(self.failed(measurement), 0.0, reward)
 
     def ending(self, measurement: np.ndarray) -> np.ndarray:
@@ -165,7 +149,8 @@ class Beam(Task):
         centre, half = self.beam
         left = centre[0] - half[0] - mjcf.geom_size(self.model, "hull")[0] - z[:, 0]
         to_side = (self.to_side(z) / self.input_limits[1]).min(axis=1)
-        return super().may_start(z) & (left / self.speed - TO_SPARE > np.maximum(to_side, 0.0))
+        # Time to spare [s] is enough for the next side, too, where noise has picked the wrong one.
+        return super().may_start(z) & (left / self.speed - 0.95 > np.maximum(to_side, 0.0))
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         drawn = np.empty((0, 3))
@@ -175,8 +160,8 @@ class Beam(Task):
         return drawn[:n]
 
     def danger(self, measurement: np.ndarray) -> np.ndarray:
-        # Where it is near, the edge of the arena is as dangerous.
-        return -np.minimum(self.clearance(measurement), EDGE * self.to_edge(measurement))
+        # Where it is near, the edge of the arena is as dangerous as the beam at four times the distance.
+        return -np.minimum(self.clearance(measurement), 4.0 * self.to_edge(measurement))
 
     def direction(self, path: np.ndarray) -> np.ndarray:
         """Returns the side of the beam on which runs passed: the quarter of the angle about the axis.

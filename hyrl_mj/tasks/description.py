@@ -75,6 +75,23 @@ class Scene:
 
 
 @dataclass(frozen=True)
+class Abilities:
+    """What a task's plant can do. Environments of others can do less than copies of a model.
+
+    Attributes:
+        stopped_by_walls: whether contacts stop the robot, so that no run comes to states inside of walls.
+        restarts: whether it can begin anywhere in the middle of an episode, as tables and the game have it.
+        arrival_ends: whether an episode ends where it arrives, and does not go on to be judged at its end.
+        side_by_side: how many episodes it can play side by side; None for any number.
+    """
+
+    stopped_by_walls: bool = False
+    restarts: bool = True
+    arrival_ends: bool = True
+    side_by_side: int | None = None
+
+
+@dataclass(frozen=True)
 class Learning:
     """Defaults of a task's training and of the stages after it; a run's settings can differ.
 

@@ -5,11 +5,6 @@ from functools import cached_property
 import mujoco
 import numpy as np
 
-# Gains of the inner loop: velocity, tilt and its rate [1/s, 1/s^2, 1/s].
-VELOCITY, TILT, RATE = 4.0, 225.0, 24.0
-# Largest tilt that the inner loop commands, as sideways over upward acceleration.
-STEEPEST = 0.6
-
 
 class Rotors:
     """The rotors of the body "quadrotor" (`models/common/quadrotor.xml`), and the loop that commands them.
@@ -44,10 +39,10 @@ class Rotors:
         (mass, inertia), gravity = self.body, -self.model.opt.gravity[2]
         axes = rotation(qpos[:, 3:7])
         error = velocity - qvel[:, :3]
-        push = VELOCITY * error + [0.0, 0.0, gravity]
+        push = 4.0 * error + [0.0, 0.0, gravity]
         push[:, 2] = np.clip(push[:, 2], *np.multiply(self.lift, gravity))
         sideways = np.linalg.norm(push[:, :2], axis=1)
-        room = STEEPEST * push[:, 2]
+        room = 0.6 * push[:, 2]  # the largest tilt: sideways over upward acceleration
         push[:, :2] *= np.minimum(1.0, room / np.maximum(sideways, 1e-9))[:, None]
         up = axes[:, :, 2]
         thrust = mass * (push * up).sum(axis=1)
@@ -55,7 +50,7 @@ class Rotors:
         goal = push / np.linalg.norm(push, axis=1, keepdims=True)
         turn = np.einsum("nji,nj->ni", axes, _cross(up, goal))
         turn[:, 2] = -np.arctan2(axes[:, 1, 0], axes[:, 0, 0])
-        torque = inertia * (TILT * turn - RATE * qvel[:, 3:6])
+        torque = inertia * (225.0 * turn - 24.0 * qvel[:, 3:6])
         return self.share_out(thrust, torque)
 
     def share_out(self, thrust: np.ndarray, torque: np.ndarray) -> np.ndarray:

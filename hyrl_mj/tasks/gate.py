@@ -10,12 +10,6 @@ from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.pillar import PillarTask
 from hyrl_mj.tasks.registry import register
 
-# Distance from the pillar within which the reward is less [m].
-NEAR = 0.25
-# Weights of the reward: of arriving (in samples), and of the distance off the middle behind the pillar [1/m].
-FINISH, BEHIND = 10, 0.3
-ON_THE_LINE = 1e-6  # [m] the error that sixty samples of the kinematic actuators add up to
-
 
 @register
 class Gate(PillarTask):
@@ -37,7 +31,7 @@ class Gate(PillarTask):
     learning = Learning(algorithm="ppo", levels=5)
     # Half a period later the pillar is on the other side.
     mirror = Mirror((1, -1, -1, -1), (-1,))
-    close = 0.3
+    close, on_the_line = 0.3, 1e-6
     observation_low = (-5.0, -4.0, -1.0, -1.0)
     observation_high = (5.0, 4.0, 1.0, 1.0)
 
@@ -95,18 +89,10 @@ class Gate(PillarTask):
 
     def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
         x, y = measurement[:, :2].T
-        near = np.clip(1 - self.clearance(measurement) / NEAR, 0.0, 1.0)
+        near = np.clip(1 - self.clearance(measurement) / 0.25, 0.0, 1.0)
         # A weight before the pillar, too, would draw the vehicle to one side, wherever it starts.
-        off = np.abs(y) * np.where(x < self.obstacle[0], 0.0, BEHIND)
+        off = np.abs(y) * np.where(x < self.obstacle[0], 0.0, 0.3)
         reward = np.maximum(3 - off - near, 0.0)
         # Arriving must pay more than going on.
-        reward = np.where(self.ending(measurement) == Outcome.REACHED, FINISH * reward, reward)
+        reward = np.where(self.ending(measurement) == Outcome.REACHED, 10 * reward, reward)
         return np.where(self.failed(measurement), 0.0, reward)
-
-    def ending(self, measurement: np.ndarray) -> np.ndarray:
-        x, y, _ = measurement.T
-        ends = np.full(len(measurement), Outcome.RUNNING)
-        ends[x >= self.set_point[0] - ON_THE_LINE] = Outcome.REACHED
-        ends[np.abs(y) >= self.chart.high[1] - ON_THE_LINE] = Outcome.OUT_OF_BOUNDS
-        ends[self.clearance(measurement) <= 0] = Outcome.CRASHED
-        return ends

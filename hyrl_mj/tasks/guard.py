@@ -38,20 +38,11 @@ COLUMNS = {
     "direction": "",
     "where": "plane",
 }
-# Methods whose results have other shapes.
-PASSED_ON = ("measure", "state", "control", "mocap")
-# Methods whose results have to be finite wherever they are asked for.
-FINITE = ("z", "with_z", "observation")
-OUTCOMES = ("ending", "verdict")
-# Methods of chart points; the other ones take measurements, or what no chart point can be told from.
-OF_POINTS, UNPLACED = ("state", "arrived", "miss"), ("measure", "measured", "control", "mocap")
-# The most rows that are tried one by one in search of the one that raises an error.
-TRIED = 4_096
 
 
 def guard(kind: type[Task]) -> None:
     """Guards the methods that a subclass of `Task` defines itself."""
-    for name in (*COLUMNS, *PASSED_ON):
+    for name in (*COLUMNS, "measure", "state", "control", "mocap"):
         if isfunction(method := vars(kind).get(name)):
             setattr(kind, name, _guarded(name, method))
 
@@ -131,12 +122,12 @@ def _check_result(task: Task, name: str, args: tuple[Any, ...], result: Any) -> 
         raise BadInput(
             f"{name}() of the task {task.name} gives {result.dtype}: give an array of real numbers"
         )
-    if name in OUTCOMES and n and not _are_outcomes(result):
+    if name in ("ending", "verdict") and n and not _are_outcomes(result):
         raise BadInput(
             f"{name}() of the task {task.name} gives {result.dtype} from {result.min()} to "
             f"{result.max()}: give a hyrl_mj.Outcome for each row"
         )
-    if name in FINITE and not math.isfinite(result.sum()):
+    if name in ("z", "with_z", "observation") and not math.isfinite(result.sum()):
         finite = np.isfinite(result).all(axis=1)
         if not finite.all():
             row = int(np.argmin(finite))
@@ -171,7 +162,7 @@ def _row_of(method: Callable[..., Any], args: tuple[Any, ...], name: str) -> int
     """Returns the first row for which a method raises an error on its own; None if there is none."""
     axis = 1 if name == "direction" else 0
     n = args[0].shape[axis] if args[0].ndim > axis else 0
-    for row in range(min(n, TRIED)):
+    for row in range(min(n, 4_096)):  # or it takes long
         rows = [
             np.take(a, [row], axis) if isinstance(a, np.ndarray) and a.ndim > axis else a
             for a in args
@@ -186,9 +177,10 @@ def _row_of(method: Callable[..., Any], args: tuple[Any, ...], name: str) -> int
 def _place(task: Task, name: str, args: Any, row: int | None) -> str:
     """Returns where a method failed: " at x = 0.1 m, y = 0.2 m"; "" if that cannot be told."""
     with suppress(Exception):  # the method that tells the chart point may be the one that failed
-        if row is not None and name not in UNPLACED:
+        # No chart point can be told from what these methods take.
+        if row is not None and name not in ("measure", "measured", "control", "mocap"):
             first = args[0][0] if name == "direction" else args[0]
-            placed = name in (*OF_POINTS, "direction")
+            placed = name in ("state", "arrived", "miss", "direction")
             point = first[row] if placed else task.z(first[[row]])[0]
             return f" at {task.chart.format(point)}"
     if row is None:

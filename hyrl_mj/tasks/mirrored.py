@@ -11,8 +11,6 @@ from hyrl_mj.physics import mjcf, mujoco_log
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import Outcome
 
-# Samples of the runs that are compared.
-SAMPLES = 5
 # How far images may be off, as a share of the range of what is compared: friction is solved for directions
 # that are no images of each other, which moves the wheels of `rover` by 0.013.
 ALIKE = 0.02
@@ -31,7 +29,7 @@ def try_mirror(task: Task) -> None:
         return
     rng, seen = np.random.default_rng(0), np.array(task.mirror.observation)
     n, chart = task.effort.mirrored, task.chart
-    anywhere = rng.uniform(chart.low, chart.high, (n // 2, chart.dimension))
+    anywhere = chart.draw(n // 2, rng)
     z = np.vstack([task.starts(n // 4, rng), anywhere, _near_obstacles(task, n // 4, rng)])
     image = _image(task, z, seen)
     inside = chart.contains(image) & chart.contains(z)
@@ -41,16 +39,14 @@ def try_mirror(task: Task) -> None:
             "its mirror cannot be tried: the images of all states lie outside of the chart"
         )
     z, image = z[inside], image[inside]
-    plant, other = task.plant(len(z)), task.plant(len(z))
-    plant.set_state(*task.state(z))
-    other.set_state(*task.state(image))
+    plant, other = task.placed(z), task.placed(image)
     u = np.zeros((len(z), len(task.inputs)))
     running = np.ones(len(z), dtype=bool)
     with mujoco_log.kept():
-        for sample in range(SAMPLES + 1):
+        for sample in range(6):
             running &= _compare(task, z, running, sample, u, (plant.measurement, other.measurement))
             running &= task.ending(plant.measurement) == Outcome.RUNNING
-            u = rng.uniform(*task.input_limits, u.shape)
+            u = task.draw_inputs(len(z), rng)
             plant.step(u)
             other.step(np.clip(u * task.mirror.inputs, *task.input_limits))
             running &= ~(plant.unstable | other.unstable)
@@ -61,7 +57,7 @@ def _near_obstacles(task: Task, n: int, rng: np.random.Generator) -> np.ndarray:
     ids = [task.model.geom(name).id for name in mjcf.obstacles(task.model)]
     if type(task).where is not Task.where or task.chart.dimension < 2 or not ids:
         return np.empty((0, task.chart.dimension))
-    z = rng.uniform(task.chart.low, task.chart.high, (n, task.chart.dimension))
+    z = task.chart.draw(n, rng)
     which = rng.integers(len(ids), size=n)
     centres = mjcf.geom_positions(task.model, ids)[:, list(task.plane)][which]
     wide = 1.5 * np.minimum(task.model.geom_rbound[ids], task.chart.sides[:2].max())[which]
@@ -75,10 +71,8 @@ def _image(task: Task, z: np.ndarray, seen: np.ndarray) -> np.ndarray:
     Raises:
         BadInput: there are none that can be found.
     """
-    plant = task.plant(len(z))
-    plant.set_state(*task.state(z))
-    measured = plant.measurement
-    observed = task.observation(measured)
+    plant = task.placed(z)
+    observed = task.observation(plant.measurement)
     if type(task).measured is not Task.measured:
         return task.z(task.measured(observed * seen))
     wide = np.maximum(np.ptp(observed, axis=0), SAME)

@@ -1,6 +1,7 @@
 """What a task's runs pass: the obstacles of its MJCF, and the numbers and names of the ways past them."""
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import mujoco
 import numpy as np
@@ -38,16 +39,13 @@ def islands(model: mujoco.MjModel) -> dict[str, int]:
 
 def touching(model: mujoco.MjModel, data: mujoco.MjData, ids: Sequence[int]) -> list[list[int]]:
     """Returns the geoms of ids (k,) in groups of those that touch each other, and do not move."""
-    first = list(range(len(ids)))  # of each geom, the first one of its group
-    for i, geom in enumerate(ids):
-        for k in range(i):
-            if first[k] != first[i] and _touch(model, data, geom, ids[k]):
-                low, high = sorted((first[i], first[k]))
-                first = [low if one == high else one for one in first]
-    groups: dict[int, list[int]] = {}
-    for geom, of in zip(ids, first, strict=True):
-        groups.setdefault(of, []).append(geom)
-    return [groups[of] for of in sorted(groups)]
+    from scipy.sparse.csgraph import connected_components  # slow to import
+
+    touch = np.zeros((len(ids), len(ids)), dtype=bool)
+    for k, i in combinations(range(len(ids)), 2):
+        touch[i, k] = _touch(model, data, ids[i], ids[k])
+    count, group = connected_components(touch, directed=False)
+    return [[ids[i] for i in np.flatnonzero(group == number)] for number in range(count)]
 
 
 def _touch(model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int) -> bool:

@@ -13,9 +13,6 @@ from hyrl_mj.tasks.description import Outcome
 from hyrl_mj.tasks.effort import Effort
 from hyrl_mj.tasks.robot import Robot
 
-# States in which an inner loop is tried with and without speed.
-TRIED = 50
-
 
 class Problem(Robot):
     """A robot with something to do: what it is told, what it gets for it, and when it is over."""
@@ -35,8 +32,6 @@ class Problem(Robot):
     close: float = 0.2
     #: how much the stages try: `SPARING` where each sample runs Python code of an environment
     effort: Effort = Effort()
-    #: whether an episode ends where it arrives, and does not go on to be judged at its end
-    arrival_ends: bool = True
     #: bounds of the observation (k,), (k,), noise included
     observation_low: tuple[float, ...]
     observation_high: tuple[float, ...]
@@ -52,15 +47,13 @@ class Problem(Robot):
 
         An inner loop must give the speeds from the inputs and the positions alone. Both are tried out.
         """
-        plant = self.plant(TRIED)
-        if not plant.invertible:
+        if not self.plant(1).invertible:
             return False
         if self.has_inner_loop:
             rng = np.random.default_rng(0)
-            qpos, _ = self.state(
-                rng.uniform(self.chart.low, self.chart.high, (TRIED, self.chart.dimension))
-            )
-            u = rng.uniform(*self.input_limits, (TRIED, len(self.inputs)))
+            z = self.chart.draw(50, rng)
+            qpos, _ = self.state(z)
+            u = self.draw_inputs(len(z), rng)
             qvel = rng.normal(size=qpos.shape)
             still = self.control(u, qpos, np.zeros_like(qvel))
             if not np.allclose(self.control(u, qpos, qvel), still, rtol=0, atol=1e-9):
@@ -90,9 +83,7 @@ class Problem(Robot):
         """Returns the measurements (n, p) of a robot at chart points z (n, d), without noise."""
         if self.measurement_columns == self.chart.dimension:
             return z
-        plant = self.plant(len(z))
-        plant.set_state(*self.state(z))
-        return plant.measurement
+        return self.placed(z).measurement
 
     def with_z(self, measured: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Returns measurements (n, p) changed so that their chart points are z (n, d)."""
@@ -142,9 +133,7 @@ class Problem(Robot):
 
     def goes_on(self, z: np.ndarray) -> np.ndarray:
         """Returns (n,) bool: whether episodes that begin at chart points z (n, d) do not end at once."""
-        plant = self.plant(len(z))
-        plant.set_state(*self.state(z))
-        return np.asarray(self.ending(plant.measurement) == Outcome.RUNNING)
+        return np.asarray(self.ending(self.placed(z).measurement) == Outcome.RUNNING)
 
     def verdict(self, measurement: np.ndarray) -> np.ndarray:
         """Returns the `Outcome` (n,) int of episodes that still ran when they were truncated."""

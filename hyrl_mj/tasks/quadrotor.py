@@ -10,19 +10,12 @@ from hyrl_mj.tasks.flight import Rotors, rotation
 from hyrl_mj.tasks.pillar import PillarTask
 from hyrl_mj.tasks.registry import register
 
-# Gain of the inner loop for the height [1/s]; least and largest upward thrust, as shares of the weight.
-HEIGHT, LIFT = 2.0, (0.5, 1.3)
-# Distance from the pillar within which the reward is less [m]; largest drift to the side in the chart [m/s].
-NEAR, FASTEST = 0.3, 1.2
-# Largest tilt to the side of a start [rad].
-START_TILT = 0.05
-
 
 @register
 class Quadrotor(PillarTask):
     name = "quadrotor"
     description = "fly past a pillar on its left or on its right (PPO)"
-    coordinates, units, largest = ("x", "y", "drift"), ("m", "m", "m/s"), (FASTEST,)
+    coordinates, units, largest = ("x", "y", "drift"), ("m", "m", "m/s"), (1.2,)
     inputs, input_units = ("lateral_velocity",), ("m/s",)
     # Columns of the measurement: x, y, velocity to the side, tilt to the side, height.
     noisy = (1.0, 1.0, 0.0, 0.0, 0.0)
@@ -55,7 +48,7 @@ class Quadrotor(PillarTask):
     @cached_property
     def rotors(self) -> Rotors:
         """The rotors and the loop that commands them."""
-        return Rotors(self.model, LIFT)
+        return Rotors(self.model, lift=(0.5, 1.3))
 
     def measure(self, sensors: np.ndarray) -> np.ndarray:
         tilt = rotation(sensors[:, 6:10])[:, 1, 2]
@@ -63,14 +56,14 @@ class Quadrotor(PillarTask):
 
     def control(self, u: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         speed, height = self.cruise
-        climb = HEIGHT * (height - qpos[:, 2])
+        climb = 2.0 * (height - qpos[:, 2])
         velocity = np.column_stack([np.full(len(u), speed), u[:, 0], climb])
         return self.rotors.thrusts(velocity, qpos, qvel)
 
     def state(
         self, z: np.ndarray, rng: np.random.Generator | None = None
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        tilt = np.zeros(len(z)) if rng is None else rng.uniform(-1, 1, len(z)) * START_TILT
+        tilt = np.zeros(len(z)) if rng is None else rng.uniform(-1, 1, len(z)) * 0.05
         speed, height = self.cruise
         qpos, qvel = np.zeros((len(z), 7)), np.zeros((len(z), 6))
         qpos[:, :2], qpos[:, 2] = z[:, :2], height
@@ -92,7 +85,7 @@ class Quadrotor(PillarTask):
 
     def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
         x, y = measurement[:, :2].T
-        near = np.clip(1 - self.clearance(measurement) / NEAR, 0.0, 1.0)
+        near = np.clip(1 - self.clearance(measurement) / 0.3, 0.0, 1.0)
         # Before the pillar y is free: else the middle would pay, and who gets there from one side passes on
         # the other.
         reward = np.maximum(3 - np.where(x < self.obstacle[0], 0.0, np.abs(y)) - near, 0.0)

@@ -18,14 +18,11 @@ from hyrl_mj.files import trust
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.sources import check_helpers, digest_of, forget_helpers
 
-# The group of entry points under which an installed package offers tasks: name = "its.module:Class".
-GROUP = "hyrl_mj.tasks"
-PACKAGE = Path(__file__).resolve().parents[1]
 _REGISTRY: dict[str, type[Task]] = {}
 # The task that each file defines, as the file is at that time.
 _FILES: dict[tuple[Path, str], type[Task]] = {}
-# The text of an environment begins with this; a module above this one makes its task.
-ENVIRONMENT, MAKER = "env:", "hyrl_mj.environments.making"
+# The text of an environment begins with this.
+ENVIRONMENT = "env:"
 # Names of the tasks that other installed packages offer, as far as they have been loaded.
 _INSTALLED: set[str] = set()
 
@@ -41,7 +38,7 @@ def register(task: type[Task]) -> type[Task]:
         raise BadInput(
             f"{here} defines a task {task.name}, and so does {_file(other)}: rename one of them"
         )
-    if here is not None and PACKAGE not in here.parents:
+    if here is not None and Path(__file__).resolve().parents[1] not in here.parents:
         task.source, task._digest = here, digest_of(here) if here.is_file() else ""
     if "env_id" not in vars(task):
         task.env_id = f"hyrl_mj/{task.__name__}-v0"
@@ -80,7 +77,8 @@ def get_task(name: str | Path | Task) -> Task:
     if isinstance(name, Task):
         return name
     if str(name).startswith(ENVIRONMENT):
-        made: Task = importlib.import_module(MAKER).from_spec(str(name))
+        maker = importlib.import_module("hyrl_mj.environments.making")  # it lies above
+        made: Task = maker.from_spec(str(name))
         return made
     if str(name).endswith(".py"):
         path = Path(name).resolve()
@@ -132,7 +130,8 @@ def described_task(name: str) -> Task:
 
 
 def _offered() -> dict[str, EntryPoint]:
-    return {entry.name: entry for entry in entry_points(group=GROUP)}
+    """Returns the tasks that installed packages offer, as hyrl_mj.tasks: name = "its.module:Class"."""
+    return {entry.name: entry for entry in entry_points(group="hyrl_mj.tasks")}
 
 
 def _instance(kind: type[Task], what: str) -> Task:
@@ -235,23 +234,25 @@ def _differing(task: Task, made: Task) -> list[str]:
             continue
         own, usual = getattr(task, name, None), getattr(made, name, None)
         filled = usual is None and name.startswith("_")  # as a cache is
-        if not filled and not _alike(own, usual):
+        if not filled and not alike(own, usual):
             found.append(name)
     return found
 
 
-def _alike(a: Any, b: Any) -> bool:
+def alike(a: Any, b: Any) -> bool:
     """Returns whether two attributes are the same, as far as can be told."""
     if a is b:
         return True
     if type(a) is not type(b):
         return False
     if isinstance(a, dict):
-        return a.keys() == b.keys() and all(_alike(value, b[key]) for key, value in a.items())
+        return a.keys() == b.keys() and all(alike(value, b[key]) for key, value in a.items())
     if isinstance(a, list | tuple):
-        return len(a) == len(b) and all(map(_alike, a, b))
-    if isinstance(a, np.ndarray):
-        return np.array_equal(a, b, equal_nan=a.dtype.kind in "fc")
+        return len(a) == len(b) and all(map(alike, a, b))
+    if isinstance(a, np.random.Generator):
+        return repr(a.bit_generator.state) == repr(b.bit_generator.state)
+    if isinstance(a, np.ndarray | np.generic | float):
+        return np.array_equal(a, b, equal_nan=np.asarray(a).dtype.kind in "fc")
     if type(a).__eq__ is object.__eq__:  # nothing tells
         return True
     try:

@@ -13,7 +13,7 @@ import numpy as np
 from hyrl_mj.errors import BadInput
 from hyrl_mj.physics import mjcf
 from hyrl_mj.physics.plant import Plant, input_limits
-from hyrl_mj.tasks.description import Learning
+from hyrl_mj.tasks.description import Abilities, Learning
 
 
 class Robot(ABC):
@@ -32,10 +32,8 @@ class Robot(ABC):
     noisy: tuple[float, ...]
     #: whether `control` depends on the inputs alone: it is then asked once for all physics steps of a sample
     steady_control: bool = False
-    #: whether contacts stop the robot, so that no run comes to states inside of walls
-    stopped_by_walls: bool = False
-    #: how many episodes are played side by side where each takes an instance of its own; None for any number
-    side_by_side: int | None = None
+    #: what its plant can do
+    abilities: Abilities = Abilities()
     #: what trains it by default
     learning: Learning = Learning()
 
@@ -74,6 +72,10 @@ class Robot(ABC):
         ]
         return np.array(list(product(*axes)))
 
+    def draw_inputs(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """Returns random inputs (n, m) within their limits."""
+        return rng.uniform(*self.input_limits, (n, len(self.inputs)))
+
     @property
     def measurement_columns(self) -> int:
         """p, the number of columns of the measurement."""
@@ -87,14 +89,15 @@ class Robot(ABC):
             measure=self.measure, control=control, mocap=self.mocap, steady=self.steady_control,
         )  # fmt: skip
 
+    def placed(self, z: np.ndarray, rng: np.random.Generator | None = None) -> Plant:
+        """Returns a copy of the robot at each chart point z (n, d), in the full states of `state`."""
+        plant = self.plant(len(z))
+        plant.set_state(*self.state(z, rng))
+        return plant
+
     def tabulating(self, n: int) -> Any:
         """Returns n copies of the robot that are put to states, for a sample or a few from each."""
         return self.plant(n)
-
-    @property
-    def tabulated(self) -> bool:
-        """Whether a plant can begin anywhere in the middle of an episode, as tables and the game have it."""
-        return True
 
     def verify(  # noqa: B027 - most plants are what they are taken for
         self, z0: np.ndarray, runs: Any, rows: Sequence[int] | np.ndarray

@@ -11,13 +11,6 @@ from hyrl_mj.tasks.flight import rotation
 from hyrl_mj.tasks.pillar import PillarTask
 from hyrl_mj.tasks.registry import register
 
-# Largest heading [rad], and distance from the pillar within which the reward is less [m].
-ASTRAY, NEAR = 1.4, 0.25
-# Weights of the reward: of arriving (in samples), and of the heading [1/rad2].
-FINISH, TURNED = 10, 0.15
-# Largest rate of turn of a start [rad/s].
-START_RATE = 0.3
-
 
 def wheels_of(model: mujoco.MjModel) -> tuple[float, float]:
     """Returns the radius of a rover's wheel, and half the distance between the two [m]."""
@@ -56,7 +49,7 @@ def positions(pose: np.ndarray, height: float) -> np.ndarray:
 class Rover(PillarTask):
     name = "rover"
     description = "drive on wheels past a pillar on its left or on its right (PPO)"
-    coordinates, units, largest = ("x", "y", "heading"), ("m", "m", "rad"), (ASTRAY,)
+    coordinates, units, largest = ("x", "y", "heading"), ("m", "m", "rad"), (1.4,)
     inputs, input_units = ("turn_rate",), ("rad/s",)
     # Columns of the measurement: x, y, heading, rate of turn.
     noisy = (0.0, 1.0, 0.5, 0.0)
@@ -99,7 +92,7 @@ class Rover(PillarTask):
     def state(
         self, z: np.ndarray, rng: np.random.Generator | None = None
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        turn = np.zeros(len(z)) if rng is None else rng.uniform(-1, 1, len(z)) * START_RATE
+        turn = np.zeros(len(z)) if rng is None else rng.uniform(-1, 1, len(z)) * 0.3
         heading, nothing = z[:, 2], np.zeros(len(z))
         qpos = positions(z, float(self.model.body("rover").pos[2]))
         ahead = [self.speed * np.cos(heading), self.speed * np.sin(heading), nothing]
@@ -124,17 +117,17 @@ class Rover(PillarTask):
 
     def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
         x, y, heading = measurement[:, :3].T
-        near = np.clip(1 - self.clearance(measurement) / NEAR, 0.0, 1.0)
+        near = np.clip(1 - self.clearance(measurement) / 0.25, 0.0, 1.0)
         # Before the pillar y is free: else the middle would pay, and who gets there from one side passes on
         # the other.
-        off = np.where(x < self.obstacle[0], 0.0, np.abs(y)) + TURNED * heading**2
+        off = np.where(x < self.obstacle[0], 0.0, np.abs(y)) + 0.15 * heading**2
         reward = np.maximum(3 - off - near, 0.0)
         # Arriving must pay more than going on in detours.
-        reward = np.where(x >= self.set_point[0], FINISH * reward, reward)
+        reward = np.where(x >= self.set_point[0], 10 * reward, reward)
         return np.where(self.failed(measurement), 0.0, reward)
 
     def ending(self, measurement: np.ndarray) -> np.ndarray:
         ends = super().ending(measurement)
-        astray = np.abs(measurement[:, 2]) >= ASTRAY
+        astray = np.abs(measurement[:, 2]) >= self.largest[0]
         ends[astray & (ends != Outcome.CRASHED)] = Outcome.OUT_OF_BOUNDS
         return ends

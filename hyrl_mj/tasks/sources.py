@@ -8,13 +8,12 @@ from pathlib import Path
 
 from hyrl_mj.errors import BadInput
 
-OWN = "hyrl_mj"  # this package may lie beside a task, too
-INSTALLED = "site-packages", "dist-packages"  # in these folders everything lies beside everything
-
 
 def sources(path: Path) -> list[Path]:
     """Returns a file of code, and the files in its folder that its import statements name."""
-    found, left = {path: None}, [] if path.parent.name in INSTALLED else [path]
+    # Among installed packages everything lies beside everything.
+    installed = path.parent.name in ("site-packages", "dist-packages")
+    found, left = {path: None}, [] if installed else [path]
     while left:
         file = left.pop()
         for name in _imported(file.read_bytes()):
@@ -78,4 +77,5 @@ def _imported(code: bytes) -> frozenset[str]:
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             names += [node.module] if node.module else [alias.name for alias in node.names]
-    return frozenset(name.partition(".")[0] for name in names) - {OWN}
+    # This package may lie beside a task, too.
+    return frozenset(name.partition(".")[0] for name in names) - {"hyrl_mj"}

@@ -16,21 +16,13 @@ from hyrl_mj.sets import Grid
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import Outcome
 from hyrl_mj.tasks.guard import check_finite
+from hyrl_mj.tasks.registry import alike
 
 # Steps of the physics that the episodes of a trial take together, at most; and the fewest side by side.
 STEPS, FEWEST = 200_000, 16
-# Of these, starts as training draws them; the others are nodes of a grid of so many nodes.
-STARTS, NODES = 32, 128
-# Corners of the input limits that are tried, at most.
-CORNERS = 16
-
+STARTS = 32  # as training draws them
 # Samples after which an input must have changed something.
 EFFECT = 10
-# Rows that are asked for one by one.
-ALONE = 32
-# Places in the plane that spread no wider than this, as a share of their length, lie on a line.
-ON_A_LINE = 1e-6
-
 # Number of the sample -> inputs (n, m).
 Inputs = Callable[[int], np.ndarray]
 
@@ -43,9 +35,7 @@ def try_random(task: Task) -> np.ndarray:
     """
     n, rng = _side_by_side(task), np.random.default_rng(0)
     z = task.starts(n, rng)
-    return _play(
-        task, z, lambda k: rng.uniform(*task.input_limits, (n, len(task.inputs))), "random"
-    )
+    return _play(task, z, lambda k: task.draw_inputs(n, rng), "random")
 
 
 def try_extreme(task: Task) -> np.ndarray:
@@ -58,8 +48,7 @@ def try_extreme(task: Task) -> np.ndarray:
     """
     rng = np.random.default_rng(0)
     m = len(task.inputs)
-    every = 2**m <= CORNERS
-    upper = [*product((False, True), repeat=m)] if every else rng.random((CORNERS, m)) < 0.5
+    upper = [*product((False, True), repeat=m)] if m <= 4 else rng.random((16, m)) < 0.5
     corners = np.where(upper, task.input_limits[1], task.input_limits[0])
     places = np.vstack([task.starts(STARTS, rng), task.scene.starts, _nodes(task)])
     chosen = rng.permutation(2 * len(corners) * len(places))[: _side_by_side(task)]
@@ -79,22 +68,15 @@ def try_methods(task: Task) -> None:
     hold. Nor may it change an attribute of the task.
     """
     rng, before = np.random.default_rng(0), _attributes(task)
-    z = np.vstack(
-        [
-            task.starts(STARTS, rng),
-            rng.uniform(task.chart.low, task.chart.high, (STARTS, task.chart.dimension)),
-        ]
-    )
-    plant = task.plant(len(z))
-    plant.set_state(*task.state(z))
-    measured, order = plant.measurement, rng.permutation(len(z))
+    z = np.vstack([task.starts(STARTS, rng), task.chart.draw(STARTS, rng)])
+    measured, order = task.placed(z).measurement, rng.permutation(len(z))
     for name in ("z", "observation", "ending", "verdict"):
         method = getattr(task, name)
         first = method(measured)
         shuffled = np.empty_like(first)
         shuffled[order] = method(measured[order])
         alone = first.copy()
-        for row in order[:ALONE]:
+        for row in order[:STARTS]:
             alone[row] = method(measured[[row]])[0]
         for again in (shuffled, method(measured), alone):
             same = np.isclose(again, first, rtol=0, atol=1e-9, equal_nan=True)
@@ -107,7 +89,7 @@ def try_methods(task: Task) -> None:
     after = _attributes(task)
     lazy = {name for name in after if isinstance(getattr(type(task), name, None), cached_property)}
     for name in after.keys() - lazy:
-        if name not in before or not _same(before[name], after[name]):
+        if name not in before or not alike(before[name], after[name]):
             raise BadInput(
                 f"its methods change its attribute {name} when they are asked: a task remembers nothing, so "
                 "compute it from the measurement"
@@ -120,14 +102,6 @@ def _attributes(task: Task) -> dict[str, Any]:
     return {n: copy.deepcopy(v) for n, v in vars(task).items() if isinstance(v, kinds)}
 
 
-def _same(a: Any, b: Any) -> bool:
-    if isinstance(a, np.random.Generator):
-        return repr(a.bit_generator.state) == repr(b.bit_generator.state)
-    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
-        return type(a) is type(b) and np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
-    return repr(a) == repr(b)
-
-
 def try_inputs(task: Task) -> None:
     """Raises `BadInput` if one of the inputs changes nothing that is measured."""
     low, high = task.input_limits
@@ -136,9 +110,8 @@ def try_inputs(task: Task) -> None:
     for i, name in enumerate(task.inputs):
         seen = []
         for limit in (low, high):
-            plant, u = task.plant(STARTS), np.tile((low + high) / 2, (STARTS, 1))
+            plant, u = task.placed(z), np.tile((low + high) / 2, (STARTS, 1))
             u[:, i] = limit[i]
-            plant.set_state(*task.state(z))
             with mujoco_log.kept():  # the episodes tell more
                 for _ in range(min(EFFECT, _samples(task))):
                     plant.step(u)
@@ -155,8 +128,8 @@ def try_control(task: Task) -> None:
     if not (task.has_inner_loop and task.steady_control):
         return
     rng = np.random.default_rng(0)
-    z = rng.uniform(task.chart.low, task.chart.high, (STARTS, task.chart.dimension))
-    u = rng.uniform(*task.input_limits, (STARTS, len(task.inputs)))
+    z = task.chart.draw(STARTS, rng)
+    u = task.draw_inputs(STARTS, rng)
     qpos, qvel = task.state(z, rng)
     qvel = rng.normal(size=(STARTS, task.model.nv)) if qvel is None else qvel
     if not np.array_equal(task.control(u, qpos, qvel), task.control(u, qpos[::-1], qvel[::-1])):
@@ -169,19 +142,18 @@ def try_control(task: Task) -> None:
 def try_where(task: Task) -> None:
     """Raises `BadInput` if where() puts all states of the chart, and those soon after, on a line."""
     rng = np.random.default_rng(0)
-    z = rng.uniform(task.chart.low, task.chart.high, (STARTS, task.chart.dimension))
-    plant, places = task.plant(STARTS), []
-    plant.set_state(*task.state(z))
+    z = task.chart.draw(STARTS, rng)
+    plant, places = task.placed(z), []
     with mujoco_log.kept():
         for _ in range(min(EFFECT, _samples(task)) + 1):
             places.append(task.where(plant.measurement))
-            plant.step(rng.uniform(*task.input_limits, (STARTS, len(task.inputs))))
+            plant.step(task.draw_inputs(STARTS, rng))
     if not (finite := np.isfinite(places[0]).all(axis=1)).all():
         row = int(np.argmin(finite))
         raise BadInput(f"where() gives {places[0][row].tolist()} at {task.chart.format(z[row])}")
     all_places = np.concatenate(places)
     along, across = np.linalg.svd(all_places - all_places.mean(axis=0), compute_uv=False)
-    if across <= ON_A_LINE * max(along, 1e-6):
+    if across <= 1e-6 * max(along, 1e-6):
         shape = "on a line" if along > 1e-6 else "at one place"
         raise BadInput(
             f"where() puts all states of the chart {shape}, as {places[0][0].tolist()}: give two coordinates "
@@ -202,21 +174,19 @@ def _side_by_side(task: Task) -> int:
 
 
 def _nodes(task: Task) -> np.ndarray:
-    """Returns the nodes (k, d) of a coarse grid of the chart, at which episodes go on."""
+    """Returns up to 128 nodes (k, d) of a coarse grid of the chart, at which episodes go on."""
     cells = 1
-    while np.prod(Grid.with_cells(task.chart, cells + 1).counts) <= NODES:
+    while np.prod(Grid.with_cells(task.chart, cells + 1).counts) <= 128:
         cells += 1
     nodes = Grid.with_cells(task.chart, cells).nodes
-    nodes = nodes[np.random.default_rng(0).permutation(len(nodes))[:NODES]]
+    nodes = nodes[np.random.default_rng(0).permutation(len(nodes))[:128]]
     return nodes[task.goes_on(nodes)]
 
 
 def _play(task: Task, z: np.ndarray, inputs: Inputs, kind: str) -> np.ndarray:
     """Plays episodes from starts z (n, d), checks each sample, and returns the outcomes (n,)."""
-    n, rng = len(z), np.random.default_rng(1)
-    plant = task.plant(n)
-    plant.set_state(*task.state(z, rng))
-    outcome, path = np.full(n, Outcome.RUNNING), [task.z(plant.measurement)]
+    plant = task.placed(z, np.random.default_rng(1))
+    outcome, path = np.full(len(z), Outcome.RUNNING), [task.z(plant.measurement)]
     _check_observation(task, plant.measurement, 0)
     for sample in range(1, _samples(task) + 1):
         active = np.flatnonzero(outcome == Outcome.RUNNING)

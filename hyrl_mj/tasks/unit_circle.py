@@ -10,15 +10,13 @@ from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.registry import register
 
-PI = np.pi
-
 
 @register
 class UnitCircle(Task):
     name = "unit_circle"
     env_id = "hyrl_mj/UnitCircle-v0"
     description = "turn a pointer to the set-point, clockwise or counter-clockwise (PPO)"
-    chart = Chart(("theta",), ("rad",), (0.0,), (2 * PI,), (True,))
+    chart = Chart(("theta",), ("rad",), (0.0,), (2 * np.pi,), (True,))
     inputs, input_units = ("turn_rate",), ("rad/s",)
     noisy = (True,)
     max_steps = 150
@@ -26,11 +24,11 @@ class UnitCircle(Task):
     start_low, start_high = chart.low, chart.high
     precision, close = 0.015, 0.3
     scene = Scene(
-        starts=tuple((factor * PI,) for factor in (0.75, 0.9, 1.0, 1.1, 1.25)),
+        starts=tuple((factor * np.pi,) for factor in (0.75, 0.9, 1.0, 1.1, 1.25)),
         time=4.0,
         mode_names=("clockwise", "counter-clockwise"),
         policy_starts=tuple(
-            (float(np.arctan2(y, x)) % (2 * PI),)
+            (float(np.arctan2(y, x)) % (2 * np.pi),)
             for x, y in ((-0.81, 0.59), (-0.95, -0.31), (-1.0, 0.0))
         ),
     )
@@ -65,7 +63,7 @@ class UnitCircle(Task):
         return self.chart.wrap(np.arctan2(sine, cosine))
 
     def reward(self, measurement: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return -np.abs(self.error(measurement)) / PI
+        return -np.abs(self.error(measurement)) / np.pi
 
     def ending(self, measurement: np.ndarray) -> np.ndarray:
         return np.full(len(measurement), Outcome.RUNNING)
@@ -75,7 +73,7 @@ class UnitCircle(Task):
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         # Half of them are the paper's, around the decision; the others lie all over the circle.
-        opposite = self.set_point + PI + rng.uniform(-0.2, 0.2, (n, 1))
+        opposite = self.set_point + np.pi + rng.uniform(-0.2, 0.2, (n, 1))
         anywhere = rng.uniform(self.chart.low, self.chart.high, (n, 1))
         return np.where(rng.random((n, 1)) < 0.5, opposite, anywhere)
 

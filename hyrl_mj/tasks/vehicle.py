@@ -9,9 +9,6 @@ from hyrl_mj.tasks.description import Learning, Mirror, Outcome, Scene
 from hyrl_mj.tasks.pillar import PillarTask
 from hyrl_mj.tasks.registry import register
 
-CRASH_DISTANCE = 1e-3  # [m] from the obstacle's surface
-ON_THE_LINE = 1e-6  # [m] the error that sixty samples of the kinematic actuator add up to
-
 
 def distance(z: np.ndarray, point: np.ndarray) -> np.ndarray:
     """Returns the distance (n,) of points (n, 2) from one (2,)."""
@@ -29,7 +26,7 @@ class Vehicle(PillarTask):
     inputs, input_units = ("lateral_velocity",), ("m/s",)
     noisy = (False, True)
     max_steps = 60
-    worst_reward = 0.0
+    worst_reward, on_the_line = 0.0, 1e-6
     start_low, start_high = (0.0, -1.0), (0.5, 1.0)
     precision, close = 0.04, 0.2
     scene = Scene(
@@ -88,15 +85,15 @@ class Vehicle(PillarTask):
 
     def ending(self, measurement: np.ndarray) -> np.ndarray:
         x, y = measurement.T
-        low, high = self.arena
+        (low, high), slack = self.arena, self.on_the_line
         ends = np.full(len(measurement), Outcome.RUNNING)
-        ends[x > self.set_point[0] + ON_THE_LINE] = Outcome.REACHED
-        ends[(y <= low[1] + ON_THE_LINE) | (y >= high[1] - ON_THE_LINE)] = Outcome.OUT_OF_BOUNDS
-        ends[self.clearance(measurement) <= CRASH_DISTANCE] = Outcome.CRASHED
+        ends[x > self.set_point[0] + slack] = Outcome.REACHED
+        ends[(y <= low[1] + slack) | (y >= high[1] - slack)] = Outcome.OUT_OF_BOUNDS
+        ends[self.clearance(measurement) <= 1e-3] = Outcome.CRASHED
         return ends
 
     def verdict(self, measurement: np.ndarray) -> np.ndarray:
-        passed = measurement[:, 0] >= self.set_point[0] - ON_THE_LINE
+        passed = measurement[:, 0] >= self.set_point[0] - self.on_the_line
         return np.where(passed, Outcome.REACHED, Outcome.RUNNING)
 
     def direction(self, path: np.ndarray) -> np.ndarray:

@@ -21,11 +21,6 @@ from hyrl_mj.errors import BadInput, brief
 from hyrl_mj.tracing.traced_array import Operation, Program, Traced, apply, take
 from hyrl_mj.tracing.vocabulary import BATCH, Untraceable
 
-# Packages whose code is not copied: it accepts no foreign arrays, or handles them itself.
-LEFT_AS_THEY_ARE = {*sys.stdlib_module_names, "numpy", "scipy", "mujoco", "torch"}
-# Members that a copy of a class must not have: they would act when it is created or deleted.
-NOT_COPIED = {"__init_subclass__", "__del__", "__abstractmethods__", "_abc_impl"}
-
 
 def trace(
     function: Callable[..., Any],
@@ -47,7 +42,7 @@ def trace(
     inputs = tuple(Operation("input", (key,), {}, value) for key, value in samples.items())
     try:
         with np.errstate(all="ignore"):
-            results = _PrivateCopies().of(function)(*map(Traced, inputs))
+            results = _PrivateCopies().copy_of(function)(*map(Traced, inputs))
     except Untraceable as error:
         raise BadInput(f"{name} cannot be {purpose}: it {error}") from error
     except Exception as error:  # code that gets another kind of array fails in many ways
@@ -86,10 +81,12 @@ def _take(x: Any, indices: Any, *args: Any, **kwargs: Any) -> Any:
     return (take if isinstance(indices, Traced) else np.take)(x, indices, *args, **kwargs)
 
 
-FILLING, CONVERTING = "empty zeros ones full", "array asarray asanyarray ascontiguousarray"
 REPLACEMENTS: dict[str, Callable[..., Any]] = {
-    **{name: partial(_filled, getattr(np, name)) for name in FILLING.split()},
-    **{name: partial(_converted, getattr(np, name)) for name in CONVERTING.split()},
+    **{name: partial(_filled, getattr(np, name)) for name in ("empty", "zeros", "ones", "full")},
+    **{
+        name: partial(_converted, getattr(np, name))
+        for name in ("array", "asarray", "asanyarray", "ascontiguousarray")
+    },
     "take": _take,
 }
 
@@ -115,24 +112,24 @@ class _PrivateCopies:
         self._copies[id(original)] = original, copy
         return copy
 
-    def of(self, x: Any) -> Any:
+    def copy_of(self, x: Any) -> Any:
         """Returns the copy of a function, a method, a module or an object; anything else itself."""
         if id(x) in self._copies:
             return self._copies[id(x)][1]
         if isinstance(x, MethodType):
             owner = self._object(x.__self__)  # first: its methods refer to its class
-            return MethodType(self.of(x.__func__), owner)
+            return MethodType(self.copy_of(x.__func__), owner)
         if isinstance(x, staticmethod | classmethod):
-            return type(x)(self.of(x.__func__))
+            return type(x)(self.copy_of(x.__func__))
         if isinstance(x, partial):
-            return partial(self.of(x.func), *x.args, **x.keywords)
+            return partial(self.copy_of(x.func), *x.args, **x.keywords)
         if isinstance(x, FunctionType) and _is_copied(x.__globals__.get("__name__")):
             return self._function(x)
         if type(x).__module__.startswith("hyrl_mj."):
             return self._object(x)
         if isinstance(x, ModuleType) and _is_copied(x.__name__):
             view = self._keep(x, ModuleType(x.__name__))
-            view.__getattr__ = lambda name: self.of(getattr(x, name))
+            view.__getattr__ = lambda name: self.copy_of(getattr(x, name))
             return view
         return x
 
@@ -144,19 +141,21 @@ class _PrivateCopies:
             self._keep(names, {**names, "__builtins__": own_builtins})
         namespace = self._copies[id(names)][1]
         cells = tuple(CellType() for _ in original.__closure__ or ())
-        defaults = tuple(map(self.of, original.__defaults__ or ()))
+        defaults = tuple(map(self.copy_of, original.__defaults__ or ()))
         copy = FunctionType(original.__code__, namespace, original.__name__, defaults, cells)
         copy.__kwdefaults__ = original.__kwdefaults__
         # Kept before the functions that it calls are copied: it may call itself.
         self._keep(original, copy)
         for cell, original_cell in zip(cells, original.__closure__ or (), strict=True):
             with suppress(ValueError):  # an empty cell stays empty
-                cell.cell_contents = self.of(original_cell.cell_contents)
-        namespace.update({n: self.of(names[n]) for n in _names(original.__code__) & names.keys()})
+                cell.cell_contents = self.copy_of(original_cell.cell_contents)
+        namespace.update(
+            {n: self.copy_of(names[n]) for n in _names(original.__code__) & names.keys()}
+        )
         return copy
 
     def _import(self, *args: Any, **options: Any) -> Any:
-        return self.of(builtins.__import__(*args, **options))
+        return self.copy_of(builtins.__import__(*args, **options))
 
     def _object(self, original: Any) -> Any:
         """Returns a stand-in for an object, with copies of its methods and its own properties."""
@@ -169,11 +168,13 @@ class _PrivateCopies:
         for base in reversed(type(original).__mro__):
             if _is_copied(base.__module__):
                 last = self._keep(base, type(base.__name__, (last,), {}))
+                # These would act when the class is created, or an object of it is deleted.
+                acting = {"__init_subclass__", "__del__", "__abstractmethods__", "_abc_impl"}
                 for name, member in vars(base).items():
                     # Properties are computed by the original: they do not see the arguments of methods.
                     is_method = isinstance(member, FunctionType | staticmethod | classmethod)
-                    if name not in NOT_COPIED and (is_method or not hasattr(member, "__get__")):
-                        setattr(last, name, self.of(member))
+                    if name not in acting and (is_method or not hasattr(member, "__get__")):
+                        setattr(last, name, self.copy_of(member))
         members = {
             "__class__": property(lambda _: type(original)),  # for isinstance()
             "__getattr__": lambda _, name: getattr(original, name),
@@ -182,13 +183,15 @@ class _PrivateCopies:
         self._keep(original, stand_in)
         attributes = getattr(original, "__dict__", {})
         for name, value in attributes.items():
-            parts = {k: self.of(v) for k, v in value.items()} if type(value) is dict else value
-            vars(stand_in)[name] = self.of(parts)
+            parts = {k: self.copy_of(v) for k, v in value.items()} if type(value) is dict else value
+            vars(stand_in)[name] = self.copy_of(parts)
         return stand_in
 
 
 def _is_copied(module: str | None) -> bool:
-    return (module or "").partition(".")[0] not in LEFT_AS_THEY_ARE
+    """Returns whether code is copied; other code accepts no foreign arrays, or handles them itself."""
+    top = (module or "").partition(".")[0]
+    return top not in ("numpy", "scipy", "mujoco", "torch") and top not in sys.stdlib_module_names
 
 
 def _names(code: CodeType) -> set[str]:

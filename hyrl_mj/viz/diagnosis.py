@@ -58,7 +58,7 @@ def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
         noise = worst_signal(game, "policy", loop, z0, eps)
         return _first_lost(simulate_batch(task, loop, z0, noise))
     count = ATTACKED
-    if not task.arrival_ends:
+    if not task.abilities.arrival_ends:
         count = int(np.clip(SAMPLES / task.max_steps, FEWEST, ATTACKED))
     starts = attack_starts(task, Regions(run.critical_set.points), eps, count, run.settings.seed)
     for factor in LARGER:

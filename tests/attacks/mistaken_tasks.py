@@ -9,7 +9,7 @@ REWARD = "return np.where(self.failed(measured), 0.0, 3 - np.abs(measured[:, 1])
 ENDS = "        return ends\n"
 STATE = "return z, np.stack([np.ones(len(z)), drift], axis=1)"
 MISS = "return np.abs(z[:, 1])"
-Z, WITH_Z = "return measured[:, :2]\n\n    def with_z", "return np.hstack([z, measured[:, 2:]])"
+OBSERVED = "    def observation(self, measured):"
 DANGER = "return -self.clearance(measured)"
 LATE = "(measured[:, 0] > 2.2)"  # where a run is after two seconds
 
@@ -27,6 +27,17 @@ def part(name: str, old: str, *values: str) -> Mistakes:
 def returns(name: str, old: str, **values: str) -> Mistakes:
     """Returns the mistakes of letting a method return something else."""
     return {f"{name} {what}": (old, new) for what, new in values.items()}
+
+
+def method(signature: str, bodies: dict[str, str]) -> Mistakes:
+    """Returns the mistakes of a method that the template leaves to its base class."""
+    return {
+        f"{signature.partition('(')[0]}() {what}": (
+            OBSERVED,
+            f"    def {signature}:\n        {body}\n\n{OBSERVED}",
+        )
+        for what, body in bodies.items()
+    }
 
 
 def values_of(name: str, old: str, value: str, kind: str = "float") -> Mistakes:
@@ -124,14 +135,16 @@ TASKS: Mistakes = {
     "ending() returns outcomes that do not exist": (ENDS, "        return ends + 40\n"),
     "ending() ends every start": (ENDS, "        return np.full(len(measured), Outcome.CRASHED)\n"),
     "ending() arrives at once": (ENDS, "        return np.full(len(measured), Outcome.REACHED)\n"),
-    "z() returns the columns in another order": (Z, Z.replace("[:, :2]", "[:, 1::-1]")),
-    "z() returns NaN": (Z, Z.replace("measured[:, :2]", "measured[:, :2] * np.nan")),
-    "z() returns one column": (Z, Z.replace("[:, :2]", "[:, :1]")),
-    "z() returns NaN late": (
-        Z, Z.replace("measured[:, :2]", f"np.where({LATE}[:, None], np.nan, measured[:, :2])")
-    ),
-    "with_z() forgets a column": (WITH_Z, "return np.hstack([z, measured[:, 3:]])"),
-    "with_z() returns nothing": (WITH_Z, "pass"),
+    **method("z(self, measured)", {
+        "returns the columns in another order": "return measured[:, 1::-1]",
+        "returns NaN": "return measured[:, :2] * np.nan",
+        "returns one column": "return measured[:, :1]",
+        "returns NaN late": f"return np.where({LATE}[:, None], np.nan, measured[:, :2])",
+    }),
+    **method("with_z(self, measured, z)", {
+        "forgets a column": "return np.hstack([z, measured[:, 3:]])",
+        "returns nothing": "pass",
+    }),
     "state() forgets the velocities' shape": (STATE, "return z, np.ones(len(z))"),
     "state() returns NaN": (STATE, "return z * np.nan, np.stack([np.ones(len(z)), drift], axis=1)"),
     "state() is elsewhere": (STATE, "return z + 0.5, np.stack([np.ones(len(z)), drift], axis=1)"),

@@ -199,7 +199,8 @@ def _compared(case, task, starts):
         key = agent.course, name, i
         if key not in truths:
             try:
-                truths[key] = played(case, agent, starts[i], signals[name][:, i], task.arrival_ends)
+                ends = task.abilities.arrival_ends
+                truths[key] = played(case, agent, starts[i], signals[name][:, i], ends)
             except Exception as error:
                 raise _Untrue from error
         return truths[key]

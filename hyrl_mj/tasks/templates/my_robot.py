@@ -40,12 +40,6 @@ class MyRobot(hyrl_mj.Task):
         drift = np.zeros(len(z)) if rng is None else rng.uniform(-0.2, 0.2, len(z))
         return z, np.stack([np.ones(len(z)), drift], axis=1)
 
-    def z(self, measured):
-        return measured[:, :2]
-
-    def with_z(self, measured, z):
-        return np.hstack([z, measured[:, 2:]])
-
     def observation(self, measured):
         return measured[:, :3]
 
