@@ -16,7 +16,7 @@ import mujoco
 
 from hyrl_mj import policies
 from hyrl_mj.errors import BadArtifact, BadInput
-from hyrl_mj.fields import GuardedPolicy
+from hyrl_mj.fields import acting_policy
 from hyrl_mj.files import artifacts
 from hyrl_mj.files.manifest import FILES, Manifest, check_contents, locked, may_hold
 from hyrl_mj.game import Lattice, Robustness, lattice_grid
@@ -37,7 +37,7 @@ from hyrl_mj.stages import (
     Retraining,
     TablePolicy,
 )
-from hyrl_mj.tasks import Field, Task, described_task, get_task, reference
+from hyrl_mj.tasks import Task, described_task, get_task, reference
 
 # The packages whose versions `config.json` records.
 PACKAGES = (
@@ -236,12 +236,10 @@ class Run:
     def controller(self) -> HybridController:
         """The hybrid controller, from stage 7."""
         extended, starts = self.extended_sets, None
-        mode_policies: dict[int, Policy] = {**self.mode_policies}
-        if isinstance(self.task, Field):
-            mode_policies = {
-                q: GuardedPolicy(self.task, policy, q, self.settings.noise)
-                for q, policy in self.mode_networks.items()
-            }
+        mode_policies = {
+            q: acting_policy(self.task, policy, q, self.settings.noise)
+            for q, policy in self.mode_policies.items()
+        }
         flow_sets = dict(zip(extended.modes, extended.sets, strict=True))
         if self.agent is not None:
             # The flow sets of an agent may reach farther to one side of its decision than to the other.

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Real
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -135,6 +136,31 @@ class HybridArc(Saved):
         return int(np.searchsorted(self.t, t + 1e-9, side="right") - 1)
 
 
+@overload
+def simulate(
+    task: Task,
+    controller: Controller | Policy,
+    z0: Sequence[float],
+    noise: AnyNoise | None = None,
+    q0: int | np.ndarray | None = None,
+    horizon: float | None = None,
+    seed: int = 0,
+) -> HybridArc: ...
+
+
+@overload
+def simulate(
+    task: Task,
+    controller: Controller | Policy,
+    z0: Sequence[Sequence[float]],
+    noise: AnyNoise | None = None,
+    q0: int | np.ndarray | None = None,
+    horizon: float | None = None,
+    seed: int = 0,
+) -> list[HybridArc]: ...
+
+
+@overload
 def simulate(
     task: Task,
     controller: Controller | Policy,
@@ -143,7 +169,18 @@ def simulate(
     q0: int | np.ndarray | None = None,
     horizon: float | None = None,
     seed: int = 0,
-) -> Any:
+) -> HybridArc | list[HybridArc]: ...
+
+
+def simulate(
+    task: Task,
+    controller: Controller | Policy,
+    z0: ArrayLike,
+    noise: AnyNoise | None = None,
+    q0: int | np.ndarray | None = None,
+    horizon: float | None = None,
+    seed: int = 0,
+) -> HybridArc | list[HybridArc]:
     """Simulates the closed loop in MuJoCo.
 
     Args:

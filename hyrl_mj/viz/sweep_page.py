@@ -22,7 +22,7 @@ from hyrl_mj.viz.report import Picture, data_uri, environment, write
 
 # Curves: controller, column of its `Wins`, label, colour and line style.
 LINES = (
-    ("policy", "won", "RL policy", style.POLICY_COLOUR, "-"),
+    ("policy", "won", "RL policy", colours.POLICY, "-"),
     ("hyrl", "proved", "HyRL proved, own q0", colours.MODES[0], "-"),
     ("hyrl", "proved_any", "HyRL proved, any q0", colours.MODES[0], "--"),
 )
@@ -92,7 +92,7 @@ def draw_curves(curves: dict[Setting, list[Curve]]) -> Figure:
             _draw(panel, group)
             panel.set_title(f"{setting.title} ({len(group)} seeds)", parse_math=False)
             panel.axvline(
-                setting.eps, color=style.INK, linewidth=1, linestyle=(0, (1, 2)), zorder=1
+                setting.eps, color=colours.INK, linewidth=1, linestyle=(0, (1, 2)), zorder=1
             )
             panel.set_xlabel("noise bound eps")
         for panel in panels[len(curves) :]:

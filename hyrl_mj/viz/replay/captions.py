@@ -12,14 +12,11 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from hyrl_mj.simulation import HybridArc
-from hyrl_mj.viz.colours import RGB, light
-from hyrl_mj.viz.replay.marks import BAD, GOOD, INK, OPEN, PAPER, WHITE
+from hyrl_mj.viz.colours import BAD, GOOD, INK, OPEN, PAPER, WHITE, is_light
 from hyrl_mj.viz.replay.panel import Track
 
 Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
-EDGE = (205, 208, 213)
-SMALLEST_TEXT = 8  # [pixels]
-OUTCOMES: dict[str, tuple[str, RGB]] = {
+OUTCOMES = {
     "reached": ("arrived", GOOD),
     "crashed": ("crashed", BAD),
     "out_of_bounds": ("left the arena", BAD),
@@ -46,7 +43,7 @@ class Layout:
     def text(self) -> int:
         """Height of the letters [pixels]."""
         seen = min(self.width / 32, self.height / 30) / self.finer
-        return max(SMALLEST_TEXT, int(seen)) * self.finer
+        return max(8, int(seen)) * self.finer
 
     @property
     def bar(self) -> int:
@@ -105,7 +102,7 @@ class _Line:
         self._gap, self._middle = layout.text, layout.bar // 2
         self._x = self._gap / 2
         edge = layout.width - 1
-        self._draw.line([(edge, 0), (edge, layout.bar)], EDGE)
+        self._draw.line([(edge, 0), (edge, layout.bar)], "#cdd0d5")
 
     @property
     def pixels(self) -> np.ndarray:
@@ -118,18 +115,18 @@ class _Line:
         ends = self._x + font.getlength(words) + beside + 2 * self._gap
         return words if ends <= self._image.width else re.sub(r" \(.*\)", "", words)
 
-    def words(self, words: str, colour: RGB, *, large: bool = False, room: str = "") -> None:
+    def words(self, words: str, colour: str, *, large: bool = False, room: str = "") -> None:
         """Writes words, which take at least as much room as the text `room`."""
         font = self._large if large else self._small
         self._draw.text((self._x, self._middle), words, colour, font, anchor="lm")
         self._x += max(font.getlength(words), font.getlength(room)) + self._gap
 
-    def badge(self, words: str, colour: RGB) -> None:
+    def badge(self, words: str, colour: str) -> None:
         """Writes words on a coloured plate: white ones, or dark ones if it is light."""
         pad, half = self._gap / 3, 0.75 * self._gap
         end = self._x + self._small.getlength(words) + 2 * pad
         self._draw.rectangle((self._x, self._middle - half, end, self._middle + half), colour)
-        ink = INK if light(colour) else WHITE
+        ink = INK if is_light(colour) else WHITE
         self._draw.text((self._x + pad, self._middle), words, ink, self._small, anchor="lm")
         self._x = end + self._gap / 2
 
