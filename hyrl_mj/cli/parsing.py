@@ -114,7 +114,6 @@ KINDS: dict[Any, Kind] = {
         "WIDTHxHEIGHT", "WIDTHxHEIGHT in pixels, as 640x480", _size, "{0[0]}x{0[1]}".format
     ),
 }
-BY_DEFAULT = "; by default "
 
 
 @dataclass(frozen=True)
@@ -145,7 +144,7 @@ class Argument:
 
         tyro marks required arguments in its help; `call` has the better sentence when one is missing.
         """
-        text, _, by_default = self.text.rstrip(".").partition(BY_DEFAULT)
+        text, _, by_default = self.text.rstrip(".").partition("; by default ")
         required = self.default is MISSING
         hint = "required" if required else f"default: {by_default or self.kind.show(self.default)}"
         shown = tyro.conf.arg(help=f"{text}.", help_behavior_hint=f"({hint})")

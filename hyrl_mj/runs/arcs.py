@@ -15,11 +15,9 @@ from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, noise_kinds, samples,
 from hyrl_mj.stages import Budget, attack
 from hyrl_mj.tasks import Task
 
-OVERVIEW_RUNS = 12  # without noise; of an even number none starts in the middle
 PAPER = "alternating"  # the noise of the paper
 WORST = "worst"  # the noise of the worst-case game; the registered kinds do without one
-ATTACK = "attack"  # the strongest noise that a search finds
-ROUNDS = 4  # of this search
+ATTACK = "attack"  # the strongest noise that a search of four rounds finds
 
 
 def from_middle(task: Task, z: np.ndarray) -> np.ndarray:
@@ -80,7 +78,7 @@ def noisy_arcs(
             signal: AnyNoise
             if noise == ATTACK:
                 begun = loop if q0 is None else _Begun(loop, q0)
-                signal = attack(task, {name: begun}, z0, bound, Budget(rounds=ROUNDS))[name].signal
+                signal = attack(task, {name: begun}, z0, bound, Budget(rounds=4))[name].signal
             elif game is None:
                 signal = Noise(noise, bound)
             else:
@@ -153,14 +151,15 @@ def overview_arcs(task: Task, policy: Policy) -> list[HybridArc]:
     chart, low, high = task.chart, np.array(task.start_low), np.array(task.start_high)
     flat = slice(2)
     whole = np.allclose([low[flat], high[flat]], [chart.low[flat], chart.high[flat]])
-    starts = np.tile(np.array(task.scene.starts[0], dtype=float), (OVERVIEW_RUNS, 1))
+    runs = 12  # of an even number none starts in the middle
+    starts = np.tile(np.array(task.scene.starts[0], dtype=float), (runs, 1))
     if chart.dimension > 1 and whole:
         starts = np.tile(starts, (2, 1))
         drawn = task.starts(len(starts), np.random.default_rng(0))
         starts[:, flat] = drawn[:, flat]
     else:
         starts[:, flat], axis = low[flat], int(np.argmax((high - low)[flat]))
-        shares = (np.arange(OVERVIEW_RUNS) + 0.5) / OVERVIEW_RUNS
+        shares = (np.arange(runs) + 0.5) / runs
         starts[:, axis] = low[axis] + shares * (high - low)[axis]
     return simulate_batch(task, policy, starts, horizon=task.scene.time)
 

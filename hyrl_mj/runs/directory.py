@@ -43,8 +43,6 @@ from hyrl_mj.tasks import Task, described_task, get_task, reference
 PACKAGES = (
     "hyrl-mj", "mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "mediapy",
 )  # fmt: skip
-# What the headers of an arc's file may take [bytes].
-SLACK = 2**16
 
 
 @dataclass(frozen=True)
@@ -304,7 +302,7 @@ class Run:
         numbers += mujoco.mj_stateSize(task.model, mujoco.mjtState.mjSTATE_INTEGRATION)
         # A jump has a row of its own.
         rows = 2 * round(time / task.dt + 2)
-        limit = min(8 * numbers * rows + SLACK, artifacts.LARGEST)
+        limit = min(8 * numbers * rows + 2**16, artifacts.LARGEST)  # with headers [bytes]
         arc = HybridArc.load(self.manifest.checked(path), limit=limit)
         if len(arc.t) > rows:
             raise BadArtifact(f"{path} is longer than {time:g} s: simulate it again")

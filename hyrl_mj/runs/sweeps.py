@@ -21,14 +21,10 @@ from hyrl_mj.runs.directory import Run, load_run
 
 NAME = "sweep.json"
 MOST_RUNS = 1_000
-# A spreadsheet takes a text that begins so for a formula.
-FORMULAS = ("=", "+", "-", "@", "\t", "\r")
 # States of a run.
 OPEN: Final = "open"
 DONE: Final = "done"
 STOPPED: Final = "stopped"
-# The stages that have to be finished. Pictures are missing where nothing can be drawn.
-STAGES = ("train", "critical-set", "partition", "extended-sets", "retrain", "robustness", "report")
 
 
 @dataclass(frozen=True)
@@ -214,9 +210,10 @@ class Sweep:
 
 def _plain(text: str) -> str:
     """Returns a text that a spreadsheet does not take for a formula."""
+    formulas = ("=", "+", "-", "@", "\t", "\r")
     # A spreadsheet passes over spaces, and takes wide characters for the usual ones.
     seen = unicodedata.normalize("NFKC", text).lstrip()
-    return f"'{text}" if seen.startswith(FORMULAS) or text.startswith(FORMULAS) else text
+    return f"'{text}" if seen.startswith(formulas) or text.startswith(formulas) else text
 
 
 def opened(folder: Path, common: Common, rows: Iterable[Row]) -> Sweep:
@@ -259,9 +256,19 @@ def finished_run(path: Path) -> Run | None:
     """
     if not (path / "config.json").is_file():
         return None
+    # Not those that draw: pictures are missing where nothing can be drawn.
+    stages = (
+        "train",
+        "critical-set",
+        "partition",
+        "extended-sets",
+        "retrain",
+        "robustness",
+        "report",
+    )
     try:
         run = load_run(path)
-        done = all(run.manifest.is_done(stage) for stage in STAGES) and run.is_examined_as_usual
+        done = all(map(run.manifest.is_done, stages)) and run.is_examined_as_usual
     except BadArtifact:
         return None
     return run if done else None

@@ -26,17 +26,6 @@ from hyrl_mj.viz.figures import CLASS_COLOURS, FIGURES
 from hyrl_mj.viz.figures.style import task_title
 
 CONTROLLERS = ("policy", "hyrl")  # the columns of the numbers
-# What the classes of the maps mean, in the order of MAP_CLASSES.
-MEANINGS = (
-    "Whatever the noise does, in whichever mode the controller starts, the run ends well. This is proved for "
-    "all states around.",
-    "Whatever the noise does, the run ends well if the controller picks its start mode from the first "
-    "measurement, which is proved. Started in the other mode it may be lost.",
-    "No noise that makes the run fail was found on the nodes, but that there is none is not proved.",
-    "Some noise within the bound makes the run fail, although it could be won.",
-    "Decided by what is measured, neither way can be held against the worst noise.",
-    "Nothing is left to be decided: an obstacle, the edge of the arena, or the goal.",
-)
 
 
 @dataclass(frozen=True)
@@ -108,7 +97,7 @@ def render(run: Run) -> str:
         versions=run.versions,
         commands=commands(run, robustness),
         changed=changed(run),
-        classes=list(zip(MAP_CLASSES, CLASS_COLOURS, MEANINGS, strict=True)),
+        classes=list(zip(MAP_CLASSES, CLASS_COLOURS, strict=True)),
     )
 
 

@@ -14,12 +14,9 @@ from hyrl_mj.sets import Chart, Grid, GridSet
 from hyrl_mj.stages import CriticalSet, ExtendedSets, Partition, critical_points
 from hyrl_mj.tasks import Task
 
-# Sections over the period of a coordinate.
-SECTIONS = 24
+SECTIONS = 24  # over the period of a coordinate
 # Least number of cells along the longest side in the search for the critical points of a section.
 CELLS = 40
-# Nodes along each side of a section through sets on scattered nodes.
-CELLS_OF_CLOUD = 96
 
 
 class Section:
@@ -113,7 +110,7 @@ class Section:
 
     def _set(self, members: GridSet) -> GridSet:
         whole = members.grid
-        counts = whole.counts[:2] if isinstance(whole, Grid) else (CELLS_OF_CLOUD,) * 2
+        counts = whole.counts[:2] if isinstance(whole, Grid) else (96, 96)  # nodes are scattered
         grid = Grid(self.chart, counts)
         return GridSet(grid, members.signed_distance(self.lift(grid.nodes)))
 

@@ -26,7 +26,6 @@ LINES = (
     ("hyrl", "proved", "HyRL proved, own q0", colours.MODES[0], "-"),
     ("hyrl", "proved_any", "HyRL proved, any q0", colours.MODES[0], "--"),
 )
-HEIGHT = 2.7  # [inches] of a row of panels
 
 
 def write_page(sweep: Sweep, folder: Path) -> None:
@@ -86,7 +85,7 @@ def draw_curves(curves: dict[Setting, list[Curve]]) -> Figure:
     columns = min(len(curves), style.COLUMNS)
     count = -(-len(curves) // columns)
     with matplotlib_style.context(["default", style.STYLE]):
-        figure = Figure(figsize=(style.WIDTH, 0.8 + HEIGHT * count), layout="constrained")
+        figure = Figure(figsize=(style.WIDTH, 0.8 + 2.7 * count), layout="constrained")
         panels = figure.subplots(count, columns, squeeze=False, sharey=True).ravel()
         for panel, (setting, group) in zip(panels, curves.items(), strict=False):
             _draw(panel, group)

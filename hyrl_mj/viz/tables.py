@@ -22,8 +22,6 @@ from hyrl_mj.runs.verdict import NO_NOISE
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
 
-# No table is wider [columns].
-WIDEST = 10_000
 # With more modes than these, headings hold their numbers alone.
 NAMED = 2
 NAMES = {"policy": "RL policy", "hyrl": "HyRL", LIMIT: "limit"}
@@ -331,7 +329,7 @@ def print_table(table: Table) -> None:
     # Off a terminal rich assumes 80 columns, which would cut the cells.
     width = None if Console().is_terminal else 160
     console = Console(width=width, markup=False, emoji=False, highlight=False)
-    wide = console.options.update(max_width=WIDEST)
+    wide = console.options.update(max_width=10_000)  # no table is wider
     if Measurement.get(console, wide, drawn).minimum <= console.width:
         console.print(drawn)
         return
