@@ -15,7 +15,6 @@ from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions, SweepOpti
 from hyrl_mj.policies import check_agent_file
 from hyrl_mj.runs.arcs import noisy_arcs
 from hyrl_mj.runs.directory import Run
-from hyrl_mj.runs.sweeps import DONE
 from hyrl_mj.runs.verdict import FAILED
 from hyrl_mj.tasks import Task, get_task, task_names, write_task
 from hyrl_mj.viz import ReplayOptions, print_robustness, print_summary, print_sweep
@@ -127,7 +126,7 @@ def sweep(
         result, folder = pipeline.sweep(tasks, options), Path(options.out)
     print_sweep(result)
     print(f"tables in {folder}/sweep.html, sweep.csv and sweep.json")
-    if any(row.state != DONE or row.verdict == FAILED for row in result.rows):
+    if any(not row.done or row.verdict == FAILED for row in result.rows):
         raise SystemExit(1)
 
 

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cache
-from hashlib import sha256
+from hashlib import file_digest, sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_args, get_type_hints
 
@@ -105,14 +105,10 @@ def read_limited(path: Path, limit: int = LARGEST) -> bytes:
     return content
 
 
-def digest(*paths: Path) -> str:
-    """Returns the SHA-256 of the content of files."""
-    content = sha256()
-    for path in paths:
-        with path.open("rb") as file:
-            while part := file.read(2**20):
-                content.update(part)
-    return content.hexdigest()
+def digest(path: Path) -> str:
+    """Returns the SHA-256 of the content of a file."""
+    with path.open("rb") as file:
+        return file_digest(file, "sha256").hexdigest()
 
 
 def write_json(path: Path, content: Any, kind: str) -> None:

@@ -39,11 +39,6 @@ from hyrl_mj.stages import (
 )
 from hyrl_mj.tasks import Task, described_task, get_task, reference
 
-# The packages whose versions `config.json` records.
-PACKAGES = (
-    "hyrl-mj", "mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "mediapy",
-)  # fmt: skip
-
 
 @dataclass(frozen=True)
 class Config:
@@ -382,7 +377,10 @@ def load_run(
 def write_config(run: Run, versions: dict[str, str] | None = None) -> None:
     """Writes `config.json`: every setting, and the versions of Python and the packages, by default of now."""
     if versions is None:
-        versions = {name: version(name) for name in PACKAGES}
+        packages = (
+            "hyrl-mj", "mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "mediapy",
+        )  # fmt: skip
+        versions = {name: version(name) for name in packages}
         versions["python"] = platform.python_version()
     artifacts.write_json(run.path / "config.json", Config(run.settings, versions), kind="run")
 

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -21,10 +21,6 @@ from hyrl_mj.runs.directory import Run, load_run
 
 NAME = "sweep.json"
 MOST_RUNS = 1_000
-# States of a run.
-OPEN: Final = "open"
-DONE: Final = "done"
-STOPPED: Final = "stopped"
 
 
 @dataclass(frozen=True)
@@ -65,7 +61,7 @@ class Row:
     Attributes:
         setting: all but the seed.
         seed: the seed.
-        state: `OPEN`, `DONE`, or `STOPPED` by an error.
+        state: "open", "done", or "stopped" by an error.
         sentence: the verdict in a sentence, or the error.
         verdict: the word of the verdict, "" if there is none.
         seconds: how long the stages took that this sweep has run [s].
@@ -74,7 +70,7 @@ class Row:
 
     setting: Setting
     seed: int
-    state: Literal["open", "done", "stopped"] = OPEN
+    state: Literal["open", "done", "stopped"] = "open"
     sentence: str = ""
     verdict: str = ""
     seconds: float = 0.0
@@ -84,6 +80,11 @@ class Row:
     def name(self) -> str:
         """The name of the run directory."""
         return f"{self.setting.stem}-{self.seed}"
+
+    @property
+    def done(self) -> bool:
+        """Whether the run is finished."""
+        return self.state == "done"
 
     def on_disk(self, folder: Path) -> Row:
         """Returns the row with what its run directory holds: its results if it is finished, else none."""
@@ -97,7 +98,7 @@ class Row:
         verdict = run.verdict
         return replace(
             row,
-            state=DONE,
+            state="done",
             sentence=verdict.sentence,
             verdict=verdict.word,
             figures=_figures(run.robustness),
@@ -105,7 +106,7 @@ class Row:
 
     def stopped(self, sentence: str) -> Row:
         """Returns the row without results, because of an error."""
-        return Row(self.setting, self.seed, STOPPED, sentence, seconds=self.seconds)
+        return Row(self.setting, self.seed, "stopped", sentence, seconds=self.seconds)
 
 
 @dataclass(frozen=True)

@@ -131,6 +131,11 @@ class HybridArc(Saved):
         """Returns whether the arc ends at the set-point, not elsewhere on the finishing line."""
         return self.outcome == "reached" and bool(task.arrived(self.z[-1:])[0])
 
+    def ending(self, task: Task) -> str:
+        """Returns the outcome; "missed" if the arc ends on the finishing line off the set-point."""
+        missed = self.outcome == "reached" and not self.arrives(task)
+        return "missed" if missed else self.outcome
+
     def at(self, t: float) -> int:
         """Returns the last row at or before a time [s]."""
         return int(np.searchsorted(self.t, t + 1e-9, side="right") - 1)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.ndimage import gaussian_filter
 
 from hyrl_mj.game import Maps
 from hyrl_mj.runs.directory import Run
@@ -72,6 +74,15 @@ class Section:
         plant = self.task.plant(len(z))
         plant.set_state(*self.task.state(self.lift(z)))
         return self.task.failed(plant.measurement)
+
+    @cached_property
+    def over(self) -> GridSet | None:
+        """The points at which a run ends without success, with a smooth outline; None if there are none."""
+        grid = Grid.with_cells(self.chart, 240)
+        over = self.failed(grid.nodes).reshape(grid.counts)
+        # Blurred, the mask has a smooth outline where it is one half, without the steps of its cells.
+        blurred = gaussian_filter(over.astype(float), 1.5, mode="nearest")
+        return GridSet(grid, 0.5 - blurred.ravel()) if over.any() else None
 
     # ---- results in the section
 

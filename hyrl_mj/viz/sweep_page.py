@@ -15,17 +15,10 @@ from PIL import Image
 
 from hyrl_mj.game import Curve
 from hyrl_mj.runs.directory import load_run
-from hyrl_mj.runs.sweeps import DONE, Row, Setting, Sweep
+from hyrl_mj.runs.sweeps import Row, Setting, Sweep
 from hyrl_mj.viz import colours, sweep_tables as tables
 from hyrl_mj.viz.figures import style
 from hyrl_mj.viz.report import Picture, data_uri, environment, write
-
-# Curves: controller, column of its `Wins`, label, colour and line style.
-LINES = (
-    ("policy", "won", "RL policy", colours.POLICY, "-"),
-    ("hyrl", "proved", "HyRL proved, own q0", colours.MODES[0], "-"),
-    ("hyrl", "proved_any", "HyRL proved, any q0", colours.MODES[0], "--"),
-)
 
 
 def write_page(sweep: Sweep, folder: Path) -> None:
@@ -45,8 +38,8 @@ def write_page(sweep: Sweep, folder: Path) -> None:
                 (setting, tables.run_table(rows), _links(rows), tables.worst(rows))
                 for setting, rows in groups.items()
             ],
-            open_rows=[row for row in sweep.rows if row.state != DONE],
-            done=sum(row.state == DONE for row in sweep.rows),
+            open_rows=[row for row in sweep.rows if not row.done],
+            done=sum(row.done for row in sweep.rows),
             total=len(sweep.rows),
         )
     )
@@ -55,7 +48,7 @@ def write_page(sweep: Sweep, folder: Path) -> None:
 
 def _links(rows: list[Row]) -> dict[str, str]:
     """Returns the addresses of the reports of the finished runs, by name."""
-    return {row.name: f"{quote(row.name)}/report.html" for row in rows if row.state == DONE}
+    return {row.name: f"{quote(row.name)}/report.html" for row in rows if row.done}
 
 
 def _picture(groups: dict[Setting, list[Row]], folder: Path) -> Picture | None:
@@ -63,7 +56,7 @@ def _picture(groups: dict[Setting, list[Row]], folder: Path) -> Picture | None:
     curves: dict[Setting, list[Curve]] = {}
     for setting, rows in groups.items():
         for row in rows:
-            game = load_run(folder / row.name).robustness.deciding if row.state == DONE else None
+            game = load_run(folder / row.name).robustness.deciding if row.done else None
             if game is not None:
                 curves.setdefault(setting, []).append(game.curve)
     if not curves:
@@ -106,7 +99,11 @@ def _draw(panel: Axes, curves: list[Curve]) -> None:
     """Draws the median and the band of each controller."""
     eps = np.array(curves[0].eps)
     alike = [curve.wins for curve in curves if curve.eps == curves[0].eps]
-    for who, column, label, colour, dashes in LINES:
+    for who, column, label, colour, dashes in (  # of `Wins`
+        ("policy", "won", "RL policy", colours.POLICY, "-"),
+        ("hyrl", "proved", "HyRL proved, own q0", colours.MODES[0], "-"),
+        ("hyrl", "proved_any", "HyRL proved, any q0", colours.MODES[0], "--"),
+    ):
         shares = 100 * np.array([getattr(wins[who], column) for wins in alike])
         panel.fill_between(
             eps, shares.min(axis=0), shares.max(axis=0), color=colour, alpha=0.18, lw=0

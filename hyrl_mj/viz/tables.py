@@ -74,11 +74,10 @@ def replay_table(run: Run, arcs: Arcs) -> Table:
 
 
 def _ending(task: Task, arc: HybridArc) -> Ending:
-    """Returns how an arc ended; "missed" if it ended as a success off the set-point."""
-    end, success = _point(task.chart.wrap(arc.z[-1:])[0]), arc.arrives(task)
-    outcome = arc.outcome.replace("_", " ") if success or arc.outcome != "reached" else "missed"
+    """Returns how an arc ended, as `HybridArc.ending`."""
+    end = _point(task.chart.wrap(arc.z[-1:])[0])
     details = f"{arc.t[-1]:.2f} s, {arc.j[-1]} jump{'' if arc.j[-1] == 1 else 's'}"
-    return Ending(outcome, details, end, success)
+    return Ending(arc.ending(task).replace("_", " "), details, end, arc.arrives(task))
 
 
 def arrivals(run: Run, arcs: Arcs, policy: bool) -> tuple[int, int]:

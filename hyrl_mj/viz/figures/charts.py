@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.patches import Circle, Wedge
 from matplotlib.ticker import MultipleLocator
-from scipy.ndimage import gaussian_filter
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.sets import Chart, Grid, GridSet
@@ -21,8 +19,6 @@ from hyrl_mj.viz.figures.style import angle, axis_label
 from hyrl_mj.viz.section import Section
 
 OUTER, INNER, TICK = 1.0, 0.7, 1.05  # radii of a ring, and the ends of its ticks
-# Where runs are over, by section: a picture has several panels of one.
-_OVER: WeakKeyDictionary[Section, np.ndarray] = WeakKeyDictionary()
 
 
 def is_ring(chart: Chart) -> bool:
@@ -62,14 +58,8 @@ def plane(panel: Axes, section: Section) -> None:
     panel.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
     label_axis(panel.xaxis, section.chart, 0)
     label_axis(panel.yaxis, section.chart, 1)
-    grid = Grid.with_cells(section.chart, 240)
-    if section not in _OVER:
-        _OVER[section] = section.failed(grid.nodes).reshape(grid.counts)
-    over = _OVER[section]
-    if over.any():
-        # Blurred, the mask has a smooth outline where it is one half, without the steps of its cells.
-        blurred = gaussian_filter(over.astype(float), 1.5, mode="nearest")
-        region(panel, GridSet(grid, 0.5 - blurred.ravel()), GREY, PALE, zorder=2.2)
+    if section.over is not None:
+        region(panel, section.over, GREY, PALE, zorder=2.2)
         legend_field(panel, "obstacle, or out of bounds", GREY, PALE)
     if section.set_point is not None:
         cross(panel, *section.set_point)

@@ -25,13 +25,14 @@ Looks = dict[str, Any]
 # The curves by controller: every sixth node has a marker. Where curves coincide that of the policy is thin
 # and lies on the thicker one, and no marker hides another. The limit is broad and pale, so that curves on it
 # can be seen.
-_MARKED: Looks = {"markersize": 6, "clip_on": False}
 CURVES: dict[str, Looks] = {
-    "policy": _MARKED
-    | {"color": colours.POLICY, "linewidth": 1.5, "zorder": 4, "marker": "o", "markevery": (0, 6)},
-    "hyrl": _MARKED
-    | {
-        "color": colours.MODES[0], "linewidth": 2.8, "zorder": 3.5, "marker": "s", "markevery": (2, 6)
+    "policy": {
+        "color": colours.POLICY, "linewidth": 1.5, "zorder": 4, "clip_on": False,
+        "marker": "o", "markersize": 6, "markevery": (0, 6),
+    },
+    "hyrl": {
+        "color": colours.MODES[0], "linewidth": 2.8, "zorder": 3.5, "clip_on": False,
+        "marker": "s", "markersize": 6, "markevery": (2, 6),
     },
     LIMIT: {"color": "#a9dcc9", "linewidth": 7, "solid_capstyle": "butt"},
 }  # fmt: skip

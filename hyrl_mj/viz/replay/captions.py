@@ -78,13 +78,13 @@ class Layout:
             if len(groups) > 1:
                 line.words(title, INK)
             if len(tracks) == 1 and tracks[0].modes:
-                arc, row = tracks[0].arc, tracks[0].arc.at(t)
-                jumps = int((tracks[0].jumps <= row).sum())
-                line.words(f"j = {jumps}", INK, room="j = 00")
-                room = self.fonts[1].getlength(OUTCOMES[_outcome(tracks[0])][0]) + self.text
-                mode = tracks[0].task.mode_name(int(arc.q[row]))
-                line.badge(line.fitting(f"q = {mode}", room), tracks[0].colour(row))
-            ended = Counter(_outcome(track) for track in tracks if t >= track.end)
+                (track,) = tracks
+                task, arc, row = track.task, track.arc, track.arc.at(t)
+                line.words(f"j = {int((track.jumps <= row).sum())}", INK, room="j = 00")
+                room = self.fonts[1].getlength(OUTCOMES[arc.ending(task)][0]) + self.text
+                mode = task.mode_name(int(arc.q[row]))
+                line.badge(line.fitting(f"q = {mode}", room), track.colour(row))
+            ended = Counter(track.arc.ending(track.task) for track in tracks if t >= track.end)
             for outcome, number in sorted(ended.items()):
                 words, colour = OUTCOMES[outcome]
                 share = f"{number} of {len(tracks)} " if len(tracks) > 1 else ""
@@ -134,9 +134,3 @@ class _Line:
         """Writes words at the right end."""
         x = self._image.width - self._gap / 2
         self._draw.text((x, self._middle), words, OPEN, self._small, anchor="rm")
-
-
-def _outcome(track: Track) -> str:
-    """Returns the outcome of an arc; "missed" if it crosses the finishing line off the set-point."""
-    arc = track.arc
-    return "missed" if arc.outcome == "reached" and not arc.arrives(track.task) else arc.outcome
