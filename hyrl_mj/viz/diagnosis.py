@@ -122,7 +122,7 @@ def sentences(
         elif score.proved is not None:
             results.append(f"it is proved to win {percent(score.proved)} of them")
         if losses is not None:
-            results.append(losses.sentence())
+            results.append(losses_sentence(losses))
         if (margin := robustness.deciding.margin["policy"]) is None:
             results.append("on the nodes it does not win all of them even without noise")
         else:
@@ -155,6 +155,28 @@ def sentences(
     if alone.outcome != "reached":
         end += ", and without noise, too"
     return [*results, f"from {start} {end}"]
+
+
+def losses_sentence(losses: Losses) -> str:
+    """Returns why starts are lost: the shares, what is lost without noise first, and what to do."""
+    alone, n, close = len(losses.unaided), len(losses.undecided), len(losses.grazing)
+    total = alone + n + close
+    if not total:
+        return "it loses none of them on the nodes"
+    fails = "it fails there by itself, train it further first"
+    if alone == total:
+        return f"it loses all {total:,} lost nodes without noise, too: {fails}"
+    first = (
+        f"loses {alone:,} without noise, too ({100 * alone / total:.0f}%: {fails}), "
+        if alone
+        else ""
+    )
+    return (
+        f"of {total:,} lost nodes it {first}would win {n:,} if it held the way of its first measurement "
+        f"({100 * n / total:.0f}%: noise at M* keeps it undecided, hysteresis cures that), and loses "
+        f"{close:,} all the same ({100 * close / total:.0f}%: it passes closer than the noise, "
+        "training under noise cures that); hyrl-mj robustify does both"
+    )
 
 
 def write_page(run: Run, robustness: Robustness, arc: HybridArc | None, results: list[str]) -> None:
