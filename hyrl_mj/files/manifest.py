@@ -68,7 +68,7 @@ class _Stages:
 
 
 # What the stage at work has read, as `Entry.inputs`.
-_READ: ContextVar[dict[str, str] | None] = ContextVar("read", default=None)
+_read: ContextVar[dict[str, str] | None] = ContextVar("read", default=None)
 
 
 @dataclass(frozen=True)
@@ -109,11 +109,11 @@ class Manifest:
                         self._write(entries)
 
             read: dict[str, str] = {}
-            tokens = _READ.set(read), artifacts.before_writing.set(before_writing)
+            tokens = _read.set(read), artifacts.before_writing.set(before_writing)
             try:
                 yield
             finally:
-                _READ.reset(tokens[0])
+                _read.reset(tokens[0])
                 artifacts.before_writing.reset(tokens[1])
             if not written:
                 return
@@ -199,7 +199,7 @@ class Manifest:
 
     def _note(self, name: str, content: str) -> None:
         """Records that the stage at work has read a file."""
-        if (read := _READ.get()) is not None:
+        if (read := _read.get()) is not None:
             read[name] = content
 
     def _name(self, path: Path) -> str:

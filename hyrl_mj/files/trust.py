@@ -26,7 +26,7 @@ from hyrl_mj.files.artifacts import digest, replacing
 # The records hold hashes of files by path, and of texts and written files by keys that are no paths: of each
 # of these two as many.
 MOST = 1_000
-_RECEIVED: ContextVar[bool] = ContextVar("received", default=False)
+_received: ContextVar[bool] = ContextVar("received", default=False)
 
 
 @contextmanager
@@ -35,16 +35,16 @@ def received() -> Iterator[None]:
 
     Tasks and environments ask `is_received` before they run code or open a file that has been named.
     """
-    token = _RECEIVED.set(True)
+    token = _received.set(True)
     try:
         yield
     finally:
-        _RECEIVED.reset(token)
+        _received.reset(token)
 
 
 def is_received() -> bool:
     """Returns whether what is made now is described by a file."""
-    return _RECEIVED.get()
+    return _received.get()
 
 
 @contextmanager
