@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 from PIL import ImageColor
 
-INK, WHITE, PAPER = "#232830", "#ffffff", "#f6f7f9"
+INK, WHITE = "#232830", "#ffffff"
 GREY, PALE = "#dcdee2", "#8b919b"  # states at which a run is over, and what counts less
 # Of the first, second, ... mode of a run: blue and vermilion of Okabe and Ito, then teal, wine, sand, brown,
 # yellow and indigo, which normal, protan and deutan eyes tell apart.

@@ -1,6 +1,7 @@
 """Videos, written frame by frame by mediapy, with one clear message where that fails.
 
 mediapy itself waits for ever for an ffmpeg that takes no frame, and does not see that a file is not whole.
+To kill ffmpeg does not end the wait, because a child of it may hold the pipe: so a thread of its own waits.
 """
 
 from __future__ import annotations

@@ -65,10 +65,6 @@ class Section:
         rest = np.broadcast_to(self.rest, (*z.shape[:-1], len(self.rest)))
         return np.concatenate([z, rest], axis=-1)
 
-    def project(self, z: np.ndarray) -> np.ndarray:
-        """Returns points (..., d) of the whole chart without the coordinates that are not drawn."""
-        return z[..., :2]
-
     def failed(self, z: np.ndarray) -> np.ndarray:
         """Returns (n,) bool: whether a run ends without success at points (n, 2) of the plane."""
         plant = self.task.plant(len(z))

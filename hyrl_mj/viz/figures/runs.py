@@ -42,7 +42,7 @@ def plane_view(panel: Axes, section: Section) -> View:
     chart = section.chart
     charts.plane(panel, section)
     longest = np.where(chart.periodic, chart.sides / 2, np.inf)
-    return View(lambda t, z: chart.wrap(section.project(z)), longest)
+    return View(lambda t, z: chart.wrap(z[..., :2]), longest)
 
 
 def time_view(panel: Axes, chart: Chart, coordinate: int) -> View:

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from hyrl_mj.simulation import HybridArc
-from hyrl_mj.viz.colours import BAD, GOOD, INK, OPEN, PAPER, WHITE, is_light
+from hyrl_mj.viz.colours import BAD, GOOD, INK, OPEN, WHITE, is_light
 from hyrl_mj.viz.replay.panel import Track
 
 Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
@@ -97,7 +97,7 @@ class _Line:
 
     def __init__(self, layout: Layout):
         self._large, self._small = layout.fonts
-        self._image = Image.new("RGB", (layout.width, layout.bar), PAPER)
+        self._image = Image.new("RGB", (layout.width, layout.bar), "#f6f7f9")
         self._draw = ImageDraw.Draw(self._image)
         self._gap, self._middle = layout.text, layout.bar // 2
         self._x = self._gap / 2
