@@ -12,7 +12,6 @@ from pathlib import Path
 
 import hyrl_mj
 from hyrl_mj.policies import ALGORITHMS
-from hyrl_mj.runs.sweeps import DONE
 from hyrl_mj.viz import print_sweep
 from hyrl_mj.viz.tables import arrivals
 
@@ -42,7 +41,7 @@ def main() -> int:
         )  # fmt: skip
         print_sweep(result)
         for row in result.rows:
-            if row.state != DONE:
+            if not row.done:
                 lost.append(f"{row.name}: {row.sentence}")
                 continue
             run = hyrl_mj.load_run(options.out / task / row.name)

@@ -20,7 +20,7 @@ from rich.table import Table
 
 import hyrl_mj
 from hyrl_mj.policies import Controller, PolicyController
-from hyrl_mj.runs.sweeps import DONE, Row
+from hyrl_mj.runs.sweeps import Row
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.stages import Regions, noisy_episodes
 from hyrl_mj.system import progress
@@ -116,7 +116,7 @@ def main() -> int:
         table.add_column(heading)
     missed = 0
     for made in hyrl_mj.sweep(options.tasks, seeds=tuple(options.seeds), out=options.out).rows:
-        if made.state != DONE:
+        if not made.done:
             raise SystemExit(f"{made.name}: {made.sentence}")
         row = measure(made, options.episodes, options.out)
         missed += sum(cell.endswith("!") for cell in row)

@@ -81,7 +81,7 @@ def test_without_noise_nothing_is_lost(run):
     vars(quiet).update({name: getattr(run, name) for name in results})
     losses = diagnosis.losses_of(quiet)
     assert diagnosis.worst_arc(quiet, losses) is None
-    assert losses.sentence() == "it loses none of them on the nodes"
+    assert diagnosis.losses_sentence(losses) == "it loses none of them on the nodes"
 
 
 def test_the_usual_arc_begins_on_the_critical_set_under_alternating_noise(run):

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from gl import needs_gl
-from PIL import Image
+from PIL import Image, ImageColor
 
 import hyrl_mj
 from hyrl_mj import BadInput, MlpPolicy, cli
@@ -31,8 +31,8 @@ from hyrl_mj.fields import (
 from hyrl_mj.fields.drives import bounds_asked_for, bounds_made_for
 from hyrl_mj.policies import ObservationPolicy
 from hyrl_mj.tasks import LEFT, RIGHT
+from hyrl_mj.viz.colours import MODES
 from hyrl_mj.viz.drives import drive_sentences
-from hyrl_mj.viz.replay.marks import MODE_COLOURS
 
 BODY = 0.1
 POST = {"radius_m": 0.5, "positions_m": [[-3.0, 0.0]]}
@@ -521,7 +521,7 @@ def test_what_is_wrong_with_the_run_or_the_file_is_one_sentence(command, written
 
 def near(picture, colour, off=60):
     """(height, width) bool: which pixels are about of a colour, in the light of the scene."""
-    return np.abs(picture.astype(int) - np.array(colour)).sum(axis=2) < off
+    return np.abs(picture.astype(int) - ImageColor.getrgb(colour)).sum(axis=2) < off
 
 
 @needs_gl
@@ -538,9 +538,7 @@ def test_the_post_in_focus_has_the_colour_of_its_side(command, written, tmp_path
             picture = np.asarray(image.convert("RGB"))
         # The middle of the post is in the middle of each panel, which both show the same field.
         panels = picture[40:-40, :320], picture[40:-40, 320:]
-        shares.append(
-            [[near(panel, colour).mean() for colour in MODE_COLOURS[:2]] for panel in panels]
-        )
+        shares.append([[near(panel, colour).mean() for colour in MODES[:2]] for panel in panels])
     (policy, left), (_, right) = shares
     assert max(policy) < 0.001  # the policy has no focus
     assert left[0] > 0.005 > 0.001 > left[1]

@@ -21,8 +21,8 @@ from hyrl_mj.runs.arcs import overview_arcs, policy_start_arcs
 from hyrl_mj.sets import Everything, Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition
-from hyrl_mj.viz import figures
-from hyrl_mj.viz.figures import charts, extended_sets, runs, style
+from hyrl_mj.viz import colours, figures
+from hyrl_mj.viz.figures import charts, runs, style
 from hyrl_mj.viz.report import pictures
 from hyrl_mj.viz.section import Section
 
@@ -93,7 +93,7 @@ def test_it_is_written_as_png_and_as_pdf_of_one_page(tmp_path, monkeypatch, task
     assert pdf.startswith(b"%PDF")
     assert len(re.findall(rb"/Type /Page\b", pdf)) == 1
     for mode in (0, 1) if name in OURS else ():
-        colour = style.mode_colour(mode)
+        colour = colours.mode_colour(mode)
         if name == "extended_sets" and task is VEHICLE:
             colour = style.mode_tint(mode)
         assert len(where(path, colour)) > 20, "each mode is there in its colour"
@@ -192,7 +192,7 @@ def test_of_one_coordinate_that_is_not_periodic_only_the_runs_are_drawn():
 
 
 def test_tints_are_the_colours_with_white():
-    for tint, colour in ((style.mode_tint(i), style.mode_colour(i)) for i in range(4)):
+    for tint, colour in ((style.mode_tint(i), colours.mode_colour(i)) for i in range(4)):
         hue = np.subtract(1, to_rgb(tint)) / np.subtract(1, to_rgb(colour))
         assert np.ptp(hue) < 0.1
 
@@ -204,24 +204,24 @@ def test_overview_of_a_plane():
     figure = draw("overview", VEHICLE)
     panel, noisy = figure.axes[0], ARCS["vehicle"]["critical", "policy"]
     for mode, side in ((0, 1), (1, -1)):
-        ways = lines_of(panel, style.mode_colour(mode))
+        ways = lines_of(panel, colours.mode_colour(mode))
         assert len(ways) == 6
         assert all((side * way[way[:, 0] > 1.2][:, 1] > 0.75).all() for way in ways)
         assert inside(filled(panel, style.mode_tint(mode)), (0.5, side), (0.5, -side)) == [
             True,
             False,
         ]
-    (path,) = [way for way in lines_of(panel, style.POLICY_COLOUR) if len(way) == len(noisy.z)]
+    (path,) = [way for way in lines_of(panel, colours.POLICY) if len(way) == len(noisy.z)]
     np.testing.assert_allclose(path, noisy.z, atol=1e-9)
-    np.testing.assert_allclose(marks_of(panel, "x", style.RED), noisy.z[-1:])
-    np.testing.assert_allclose(marks_of(panel, "+", style.GREEN), [VEHICLE.set_point])
-    np.testing.assert_allclose(marks_of(panel, "o", style.INK), decisions(VEHICLE).points)
-    np.testing.assert_allclose(marks_of(panel, ".", style.RED), noisy.measured[:-1])
+    np.testing.assert_allclose(marks_of(panel, "x", colours.BAD), noisy.z[-1:])
+    np.testing.assert_allclose(marks_of(panel, "+", colours.GOOD), [VEHICLE.set_point])
+    np.testing.assert_allclose(marks_of(panel, "o", colours.INK), decisions(VEHICLE).points)
+    np.testing.assert_allclose(marks_of(panel, ".", colours.BAD), noisy.measured[:-1])
 
 
 def test_the_band_is_all_that_can_be_observed():
     figure = draw("overview", VEHICLE)
-    band = filled(figure.axes[0], style.PALE_RED)
+    band = filled(figure.axes[0], colours.OBSERVED)
     z = ARCS["vehicle"]["critical", "policy"].z
     for y, held in ((-1.02, False), (-0.98, True), (0.0, True), (0.98, True), (1.02, False)):
         shift = np.array([0.0, y * EPS])
@@ -233,16 +233,16 @@ def test_overview_of_a_ring():
     figure = draw("overview", CIRCLE)
     panel, noisy = figure.axes[0], ARCS["unit_circle"]["critical", "policy"]
     for mode, side in ((0, 1), (1, -1)):
-        ways = lines_of(panel, style.mode_colour(mode))
+        ways = lines_of(panel, colours.mode_colour(mode))
         assert ways
         assert all((side * way[:, 1] > -0.02).all() for way in ways)
         assert all(np.isclose(np.linalg.norm(way[0]), runs.CORE) for way in ways)
-    (spiral,) = [way for way in lines_of(panel, style.POLICY_COLOUR) if len(way) == len(noisy.z)]
+    (spiral,) = [way for way in lines_of(panel, colours.POLICY) if len(way) == len(noisy.z)]
     radius = runs.CORE + (1 - runs.CORE) * noisy.t / CIRCLE.scene.time
     np.testing.assert_allclose(np.linalg.norm(spiral, axis=1), radius)
     np.testing.assert_allclose(spiral[:, 0] / radius, np.cos(noisy.z[:, 0]), atol=1e-12)
-    np.testing.assert_allclose(marks_of(panel, "x", style.RED), [[-1, 0]], atol=0.02)
-    np.testing.assert_allclose(marks_of(panel, "+", style.GREEN), [[1, 0]], atol=1e-9)
+    np.testing.assert_allclose(marks_of(panel, "x", colours.BAD), [[-1, 0]], atol=0.02)
+    np.testing.assert_allclose(marks_of(panel, "+", colours.GOOD), [[1, 0]], atol=1e-9)
 
 
 # ---- policy
@@ -258,14 +258,14 @@ def test_policy_of_a_plane():
     assert (values[height > 0.92] == 0).all()
     np.testing.assert_allclose(bar.get_yticks(), [-1, -0.5, 0, 0.5, 1])
     assert bar.get_ylabel() == "lateral velocity [m/s]"
-    np.testing.assert_allclose(marks_of(image, "o", style.RED), decisions(VEHICLE).points)
+    np.testing.assert_allclose(marks_of(image, "o", colours.BAD), decisions(VEHICLE).points)
     circles = [line for line in beside.lines if line.get_marker() == "o"]
     found = sorted(tuple(np.ravel(line.get_data())) for line in circles)
     assert found == sorted(VEHICLE.scene.policy_starts)
-    assert len(marks_of(beside, "x", style.RED)) == 1
+    assert len(marks_of(beside, "x", colours.BAD)) == 1
     # The planted policy passes the pillar and goes straight on.
-    assert len(marks_of(beside, "x", style.PALE)) == 2
-    ((*_, last),) = lines_of(beside, style.POLICY_COLOUR)
+    assert len(marks_of(beside, "x", colours.PALE)) == 2
+    ((*_, last),) = lines_of(beside, colours.POLICY)
     assert VEHICLE.clearance(last) == 0
 
 
@@ -278,12 +278,12 @@ def test_policy_of_a_ring():
         at = [w for w in wedges if (angle - w.theta1) % 360 < (w.theta2 - w.theta1) % 360.001]
         assert [to_hex(w.get_facecolor()) for w in at] == [colour]
     assert bar.get_ylabel() == "turn rate [rad/s]"
-    (spoke,) = lines_of(ring, style.RED)
+    (spoke,) = lines_of(ring, colours.BAD)
     assert (spoke[:, 0] < 0).all()
     np.testing.assert_allclose(spoke[:, 1], 0, atol=1e-9)
     ends = [line.get_xdata()[0] for line in beside.lines if line.get_marker() == "x"]
     assert ends == [pytest.approx(4.0)] * 3
-    np.testing.assert_allclose(marks_of(beside, "x", style.RED), [[4, np.pi]], atol=EPS)
+    np.testing.assert_allclose(marks_of(beside, "x", colours.BAD), [[4, np.pi]], atol=EPS)
 
 
 def test_the_papers_starts_of_the_policy():
@@ -299,13 +299,13 @@ def test_the_papers_starts_of_the_policy():
 def test_extended_sets_of_a_plane():
     figure = draw("extended_sets", VEHICLE)
     whole, near = figure.axes
-    shared = filled(whole, extended_sets.SHARED)
+    shared = filled(whole, colours.OVERLAP)
     at = ((0.3, 0.0), (0.3, 0.18), (0.3, -0.18), (0.3, 0.22), (0.3, -0.22), (2.5, 1.0))
     assert inside(shared, *at) == [True, True, True, False, False, True]
     for mode, side in ((0, 1), (1, -1)):
         tint = filled(whole, style.mode_tint(mode))
         assert inside(tint, (0.3, 0.5 * side), (0.3, -0.5 * side)) == [True, False]
-    (room,) = lines_of(near, style.RED)
+    (room,) = lines_of(near, colours.BAD)
     assert np.ptp(room[:, 1]) == pytest.approx(2 * EPS)
     assert near.get_ylim() == pytest.approx((-0.4, 0.4))
 
@@ -318,12 +318,12 @@ def test_extended_sets_of_a_ring_have_their_ends_in_multiples_of_pi():
     for mode, values in enumerate(expected):
         for value in values:
             text = ends.pop(f"{value / np.pi:.2f}π")
-            assert to_hex(text.get_color()) == style.mode_colour(mode)
+            assert to_hex(text.get_color()) == colours.mode_colour(mode)
             x, y = text.get_position()
             assert np.arctan2(y, x) % (2 * np.pi) == pytest.approx(value)
     assert not ends
     (far,) = [w for w in panel.patches
-              if isinstance(w, Wedge) and to_hex(w.get_facecolor()) == style.mode_colour(0)]  # fmt: skip
+              if isinstance(w, Wedge) and to_hex(w.get_facecolor()) == colours.mode_colour(0)]  # fmt: skip
     assert far.theta2 % 360 == pytest.approx(np.degrees(np.pi + 0.2), abs=1.5)
 
 
@@ -339,15 +339,15 @@ def test_runs_in_a_plane():
     ]
     for q, panel in enumerate(panels):
         expected = [arcs[f"start{i}", "policy"].z for i in range(5)]
-        found = lines_of(panel, style.POLICY_COLOUR)
+        found = lines_of(panel, colours.POLICY)
         assert len(found) == 5, "the run from M* is none of the paper's"
         for way, z in zip(found, expected, strict=True):
             np.testing.assert_allclose(way, z)
-        assert lines_of(panel, style.mode_colour(q))
+        assert lines_of(panel, colours.mode_colour(q))
         crashed = sum(arcs[f"start{i}", "policy"].outcome == "crashed" for i in range(5))
-        assert len(marks_of(panel, "x", style.RED)) == crashed > 0
+        assert len(marks_of(panel, "x", colours.BAD)) == crashed > 0
         jumps = [arcs[f"start{i}", f"hyrl_q{q}"].j[-1] for i in range(5)]
-        assert len(marks_of(panel, "D", style.INK)) == sum(jumps)
+        assert len(marks_of(panel, "D", colours.INK)) == sum(jumps)
 
 
 def test_jumps_over_time_are_marked_and_change_the_colour():
@@ -357,10 +357,10 @@ def test_jumps_over_time_are_marked_and_change_the_colour():
             for (start, who), arc in arcs.items() if who == "hyrl_q0" and start != "critical"]  # fmt: skip
     expected = [(arc.t[k], arc.z[k, 0]) for arc, at in rows for k in at]
     assert expected
-    np.testing.assert_allclose(marks_of(panel, "D", style.INK), expected)
-    assert min(way[0, 1] for way in lines_of(panel, style.mode_colour(1))) > np.pi
+    np.testing.assert_allclose(marks_of(panel, "D", colours.INK), expected)
+    assert min(way[0, 1] for way in lines_of(panel, colours.mode_colour(1))) > np.pi
     assert panel.get_ylabel() == "theta [rad]"
-    heights = {float(np.ravel(way[:, 1])[0]) for way in lines_of(panel, style.GREEN, "--")}
+    heights = {float(np.ravel(way[:, 1])[0]) for way in lines_of(panel, colours.GOOD, "--")}
     assert heights == {0.0, 2 * np.pi}
 
 
@@ -410,7 +410,7 @@ def test_of_three_dimensions_a_section_is_drawn_and_the_runs_over_time():
     assert [panel.get_ylabel() for panel in panels[:, 0]] == ["a [m]", "b [m]", "c [m]"]
     for row, coordinate in zip(panels, range(3), strict=True):
         for panel in row:
-            (way,) = lines_of(panel, style.POLICY_COLOUR)
+            (way,) = lines_of(panel, colours.POLICY)
             np.testing.assert_allclose(way[:, 1], arcs["start0", "policy"].z[:, coordinate])
 
 
@@ -422,7 +422,7 @@ def test_an_obstacle_of_any_shape_is_drawn_where_runs_end():
             return np.where(wall, Outcome.CRASHED, Outcome.RUNNING)
 
     figure = draw("runs", VEHICLE, section=Section(Walled()))
-    over = filled(figure.axes[0], style.GREY)
+    over = filled(figure.axes[0], colours.GREY)
     at = ((1.0, 1.0), (1.0, 0.4), (1.17, 1.4), (1.23, 1.4), (1.5, 0.0))
     assert inside(over, *at) == [True, False, True, False, False]
 
@@ -438,8 +438,8 @@ def test_a_set_reaches_to_the_end_of_a_period():
     begins, ends = grid.nodes[:, 0] < 1, grid.nodes[:, 0] > 5
     with style.style.context("default"):
         panel = Figure().subplots()
-        charts.region(panel, GridSet.from_mask(grid, begins | ends), style.GREY)
-    over = filled(panel, style.GREY)
+        charts.region(panel, GridSet.from_mask(grid, begins | ends), colours.GREY)
+    over = filled(panel, colours.GREY)
     assert inside(over, (0.1, 3.0), (3.0, 3.0), (6.2, 3.0)) == [True, False, True]
 
 

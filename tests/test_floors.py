@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from gl import needs_gl
+from PIL import ImageColor
 from planted import halves
 from test_gate import expert, met
 
@@ -14,7 +15,8 @@ from hyrl_mj import Noise, simulate
 from hyrl_mj.physics.rendering import Canvas
 from hyrl_mj.sets import Chart
 from hyrl_mj.viz import section as section_module
-from hyrl_mj.viz.replay.marks import CRITICAL, Floor, Floors
+from hyrl_mj.viz.colours import CRITICAL
+from hyrl_mj.viz.replay.marks import Floor, Floors
 from hyrl_mj.viz.replay.panel import Panel, Track
 from hyrl_mj.viz.section import SECTIONS, Section, critical_sets, sections
 
@@ -118,7 +120,10 @@ def test_a_replay_draws_them_anew_as_the_phase_goes_on(gate, floors):
     first, _ = drawn(0.0)
     here, there = (floors.at(tracks[0].z(t)) for t in (1.2, 0.0))
     assert here is not there
-    red = [(np.abs(picture.astype(int) - CRITICAL).max(axis=-1) < 24) for picture in (later, first)]
+    red = [
+        (np.abs(picture.astype(int) - ImageColor.getrgb(CRITICAL)).max(axis=-1) < 24)
+        for picture in (later, first)
+    ]
     for floor, shown in ((here, red[0]), (there, red[1])):
         pixels = panel._renderer.project(floor.critical)[0].round().astype(int)
         assert shown[pixels[:, 1], pixels[:, 0]].mean() > 0.5

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hyrl_mj.runs.improvement import improvements, profile
-from hyrl_mj.runs.sweeps import DONE, Common, Row, Setting, Sweep
+from hyrl_mj.runs.sweeps import Common, Row, Setting, Sweep
 from hyrl_mj.viz.sweep_page import draw_profiles
 from hyrl_mj.viz.sweep_tables import improvement_table
 
@@ -13,7 +13,7 @@ CIRCLE, VEHICLE = Setting("unit_circle", "", 0.1), Setting("vehicle", "", 0.1)
 
 def row(setting, seed, policy, hyrl, figure="proved"):
     figures = {f"policy_{figure}": policy, f"hyrl_{figure}": hyrl}
-    return Row(setting, seed, DONE, "all is well", "WON", 10.0, figures)
+    return Row(setting, seed, "done", "all is well", "WON", 10.0, figures)
 
 
 def test_means_differences_and_the_probability_of_improvement():

@@ -9,6 +9,7 @@ from hyrl_mj.game import NEVER, Game
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.sets import Grid
 from hyrl_mj.stages import sort_losses
+from hyrl_mj.viz.diagnosis import losses_sentence
 
 EPS, CELLS = 0.1, 120
 
@@ -32,7 +33,9 @@ def test_a_policy_that_only_cannot_decide_is_cured_by_hysteresis(vehicle):
     assert not len(losses.grazing)
     assert not len(losses.unaided)
     assert np.abs(losses.undecided[:, 1]).max() <= 3 * EPS, "around the axis"
-    assert "(100%: noise at M* keeps it undecided, hysteresis cures that)" in losses.sentence()
+    assert "(100%: noise at M* keeps it undecided, hysteresis cures that)" in losses_sentence(
+        losses
+    )
 
 
 def test_a_policy_that_passes_too_close_is_not(vehicle):
@@ -41,11 +44,11 @@ def test_a_policy_that_passes_too_close_is_not(vehicle):
     sizes = [len(z) for z in (losses.unaided, losses.undecided, losses.grazing)]
     assert sum(sizes) == len(lost_by(vehicle, policy))
     assert sizes[2] > 5 * sizes[1]
-    assert "it passes closer than the noise" in losses.sentence()
+    assert "it passes closer than the noise" in losses_sentence(losses)
     # Right of the pillar it has no room to turn left: what it loses there it loses by itself.
     assert (
         f"it loses {sizes[0]:,} without noise, too (46%: it fails there by itself"
-        in losses.sentence()
+        in losses_sentence(losses)
     )
     for z, outcome in ((losses.unaided, "crashed"), (losses.grazing, "reached")):
         assert {arc.outcome for arc in simulate(vehicle, policy, z[:: len(z) // 100])} == {outcome}
@@ -57,7 +60,7 @@ def test_a_policy_that_stands_still_fails_without_noise(circle):
     assert len(losses.unaided) == len(lost_by(circle, policy)) > 5
     assert not len(losses.undecided)
     assert not len(losses.grazing)
-    said = losses.sentence()
+    said = losses_sentence(losses)
     assert said.startswith(
         f"it loses all {len(losses.unaided)} lost nodes without noise, too: it fails"
     )
@@ -67,4 +70,4 @@ def test_a_policy_that_stands_still_fails_without_noise(circle):
 @pytest.mark.parametrize("eps", [0.0])
 def test_without_noise_nothing_is_lost(vehicle, eps):
     losses = sort_losses(vehicle, sign_policy(vehicle), halves(vehicle), eps, CELLS)
-    assert losses.sentence() == "it loses none of them on the nodes"
+    assert losses_sentence(losses) == "it loses none of them on the nodes"

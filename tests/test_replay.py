@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 from gl import needs_gl
-from PIL import Image
+from PIL import Image, ImageColor
 from planted import circle_controller, circle_policy, decisions, halves
 
 import hyrl_mj
@@ -22,17 +22,11 @@ from hyrl_mj.physics.rendering import Canvas
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.viz import ReplayOptions
+from hyrl_mj.viz.colours import BAD, CRITICAL, GOOD, MODES, OPEN, OVERLAP, POLICY, WHITE
 from hyrl_mj.viz.replay import Show, render_replay
 from hyrl_mj.viz.replay.captions import Layout
 from hyrl_mj.viz.replay.marks import (
-    BAD,
-    CRITICAL,
     CRITICAL_RADIUS,
-    GOOD,
-    MODE_COLOURS,
-    OPEN,
-    OVERLAP,
-    POLICY_COLOUR,
     Floor,
     Floors,
     bar,
@@ -101,9 +95,9 @@ def frames_of(path: Path) -> np.ndarray:
     return np.frombuffer(raw.stdout, np.uint8).reshape(-1, SIZE[1], SIZE[0], 3)
 
 
-def near(picture: np.ndarray, colour: tuple[int, int, int], within: int = 24) -> np.ndarray:
+def near(picture: np.ndarray, colour: str, within: int = 24) -> np.ndarray:
     """Which pixels have nearly that colour."""
-    return np.abs(picture.astype(int) - colour).max(axis=-1) < within
+    return np.abs(picture.astype(int) - ImageColor.getrgb(colour)).max(axis=-1) < within
 
 
 def coarse(picture: np.ndarray) -> np.ndarray:
@@ -186,10 +180,10 @@ def test_an_overlay_has_both_paths_in_one_scene(tmp_path, show):
         TASK, [show], tmp_path / "one.png", ReplayOptions(size=(640, 480), layout="overlay")
     )
     picture = np.asarray(Image.open(tmp_path / "one.png"))
-    for colour in (POLICY_COLOUR, *MODE_COLOURS[:2], GOOD, BAD):
+    for colour in (POLICY, *MODES[:2], GOOD, BAD):
         assert near(picture, colour).sum() > 8
     # One arena, in the middle: the pillar's centre is seen once.
-    pillar = near(picture[262], (168, 175, 188), within=16)
+    pillar = near(picture[262], "#a8afbc", within=16)
     assert pillar.sum() > 150
     assert np.ptp(np.flatnonzero(pillar)) < 210
 
@@ -205,15 +199,15 @@ def test_the_path_has_the_colours_of_its_modes(crash, jump):
     middles = (track.points[1:] + track.points[:-1]) / 2
     for points, colour in ((middles[2 : row - 2], 1), (middles[row + 3 : row + 20], 0)):
         column, line = pixel(points).T
-        assert near(picture[line, column], MODE_COLOURS[colour]).all()
+        assert near(picture[line, column], MODES[colour]).all()
     column, line = pixel(track.points[row])[0]
-    assert near(picture[line, column], (255, 255, 255)), "the jump is marked"
+    assert near(picture[line, column], WHITE), "the jump is marked"
     start, _ = drawn([track], 0.0)
     policy, _ = drawn([Track(TASK, crash)], 3.0)
-    for colour in MODE_COLOURS[:2]:
+    for colour in MODES[:2]:
         assert not near(start, colour).any()
         assert not near(policy, colour).any()
-    assert near(policy, POLICY_COLOUR).sum() > near(start, POLICY_COLOUR).sum() + 20
+    assert near(policy, POLICY).sum() > near(start, POLICY).sum() + 20
     column, line = pixel(Track(TASK, crash).points[-1])[0]
     assert near(policy[line - 3 : line + 4, column - 3 : column + 4], BAD).sum() > 5, "its end, too"
 
@@ -252,7 +246,7 @@ def test_nothing_is_left_where_a_capsule_was(jump):
             for moment in (*before, 1.53):
                 panel.draw(moment, picture)
         pictures.append(picture.astype(int))
-    assert near(pictures[0], (204, 26, 26), 90).sum() > 500
+    assert near(pictures[0], "#cc1a1a", 90).sum() > 500
     assert (np.abs(pictures[0] - pictures[1]).max(axis=-1) > 2).sum() <= 20
 
 
@@ -288,7 +282,7 @@ def test_the_bound_of_an_angle_is_an_arc(circle):
 def test_a_mark_is_no_geom_of_the_model_that_was_drawn_in_its_place():
     scene = mujoco.MjvScene(TASK.model, 3)
     scene.geoms[0].objtype, scene.geoms[0].objid = mujoco.mjtObj.mjOBJ_GEOM, 99
-    disc(scene, np.zeros(3), 0.1, 0.0, (1, 2, 3))
+    disc(scene, np.zeros(3), 0.1, 0.0, "#010203")
     assert scene.ngeom == 1
     assert scene.geoms[0].objtype == mujoco.mjtObj.mjOBJ_UNKNOWN
 
@@ -365,7 +359,7 @@ def test_between_samples_the_robot_is_between_its_places(jump):
 def test_a_bar_lies_between_its_ends_with_its_flat_side_up(end):
     scene = mujoco.MjvScene(TASK.model, maxgeom=5)
     start, end = np.array([0.3, -0.2, 0.1]), np.array([0.3, -0.2, 0.1]) + end
-    bar(scene, start, end, (1, 2, 3), width=0.05)
+    bar(scene, start, end, "#010203", width=0.05)
     geom = scene.geoms[0]
     axes = np.array(geom.mat).reshape(3, 3)
     np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-6)
@@ -405,8 +399,8 @@ def test_captions_tell_mode_and_outcome(jump):
     early, late = (layout.below(group, t) for t in (0.0, 3.0))
     # Mode 1 at first, mode 0 after the jump; the outcome appears only at the end.
     for picture, mode in ((early, 1), (late, 0)):
-        assert near(picture, MODE_COLOURS[mode]).sum() > 200
-        assert near(picture, MODE_COLOURS[1 - mode]).sum() == 0
+        assert near(picture, MODES[mode]).sum() > 200
+        assert near(picture, MODES[1 - mode]).sum() == 0
     assert near(late, GOOD).sum() > 200 > near(early, GOOD).sum()
     assert early.shape == late.shape == (layout.bar, 640, 3)
 

@@ -29,7 +29,7 @@ from hyrl_mj.pipeline.board import Board
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.runs import sweeps
 from hyrl_mj.runs.directory import Run, write_config
-from hyrl_mj.runs.sweeps import DONE, Common, Row, Setting, Sweep
+from hyrl_mj.runs.sweeps import Common, Row, Setting, Sweep
 from hyrl_mj.stages import Regions, episodes, noisy_episodes
 from hyrl_mj.system import cores, progress
 from hyrl_mj.viz import commands, sweep_tables
@@ -203,7 +203,7 @@ def test_without_ray_one_sentence_says_how_to_install_it(tmp_path):
 
 
 def row(seed, **figures):
-    return Row(CIRCLE, seed, DONE, "all is well", "WON", 10.0, figures)
+    return Row(CIRCLE, seed, "done", "all is well", "WON", 10.0, figures)
 
 
 def test_tables_show_median_least_and_greatest():
@@ -320,7 +320,7 @@ def test_a_sweep_makes_the_runs_that_are_made_one_by_one(swept, tmp_path, monkey
 
     monkeypatch.setattr("hyrl_mj.viz.replay.render_replay", no_renderer)
     out, result, said, _ = swept
-    assert [row.state for row in result.rows] == [DONE, DONE]
+    assert [row.state for row in result.rows] == ["done", "done"]
     assert any("unit_circle-0.1-1" in line and "retrain" in line for line in said)
     run = hyrl_mj.run("unit_circle", seed=1, out=tmp_path / "run", say=str, **SMOKE)
     names = ("policy", "mode_0", "mode_1")
@@ -359,7 +359,7 @@ def test_a_run_that_fails_does_not_stop_the_others(swept, tmp_path):
     shutil.rmtree(broken)
     broken.write_text("a file where the run directory should be")
     result = hyrl_mj.sweep("unit_circle", seeds=(0, 1), out=tmp_path / "sweep", say=str, **SMOKE)
-    assert [row.state for row in result.rows] == ["stopped", DONE]
+    assert [row.state for row in result.rows] == ["stopped", "done"]
     assert str(broken) in result.rows[0].sentence
 
 
@@ -422,7 +422,7 @@ def test_a_cluster_of_two_machines_makes_runs_on_both(swept, tmp_path):
         two.stdin.close()
     assert sweep.returncode in (0, 1), said
     assert len(raylets) == 2
-    assert [row.state for row in Sweep.load(tmp_path / "sweep").rows] == [DONE, DONE], said
+    assert [row.state for row in Sweep.load(tmp_path / "sweep").rows] == ["done", "done"], said
 
 
 def test_a_machine_that_keeps_its_files_is_told_of(tmp_path):

@@ -10,15 +10,14 @@ from pathlib import Path
 from hyrl_mj import pipeline
 from hyrl_mj.environments import EnvironmentOptions, chosen_task, explained
 from hyrl_mj.errors import BadInput, printable, unknown
-from hyrl_mj.fields import DriveOptions, for_posts, read_field
+from hyrl_mj.fields import DriveOptions, exported_controller
 from hyrl_mj.files import trust
 from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions, SweepOptions
 from hyrl_mj.policies import check_agent_file
 from hyrl_mj.runs.arcs import noisy_arcs
 from hyrl_mj.runs.directory import Run
-from hyrl_mj.runs.sweeps import DONE
 from hyrl_mj.runs.verdict import FAILED
-from hyrl_mj.tasks import Field, Task, get_task, task_names, write_task
+from hyrl_mj.tasks import Task, get_task, task_names, write_task
 from hyrl_mj.viz import ReplayOptions, print_robustness, print_summary, print_sweep
 
 
@@ -128,7 +127,7 @@ def sweep(
         result, folder = pipeline.sweep(tasks, options), Path(options.out)
     print_sweep(result)
     print(f"tables in {folder}/sweep.html, sweep.csv and sweep.json")
-    if any(row.state != DONE or row.verdict == FAILED for row in result.rows):
+    if any(not row.done or row.verdict == FAILED for row in result.rows):
         raise SystemExit(1)
 
 
@@ -360,14 +359,7 @@ def export(run: Run, *, to: str, out: Path, field: Path | None = None, force: bo
     from hyrl_mj.export import export, files_of
 
     with trust.output(*files_of(to, out), force=force):
-        if isinstance(run.task, Field):
-            posts = 1 if field is None else read_field(field).layouts.posts
-            controller = for_posts(run.task, run.mode_networks, run.settings.noise, posts)
-            export(controller, to, out)
-        elif field is not None:
-            raise BadInput(f"{run.task.name} has no field of posts: leave --field out")
-        else:
-            export(run.controller, to, out)
+        export(exported_controller(run.controller, field), to, out)
     print(f"controller at {out}")
 
 

@@ -16,17 +16,14 @@ from hyrl_mj.gl import spare_matplotlib
 from hyrl_mj.system import progress
 from hyrl_mj.system.streams import Streams
 
-HEAD = """\
-usage: hyrl-mj [-h] [--version] COMMAND ...
-
-Hysteresis-Based RL on MuJoCo: policies that withstand measurement noise.
-
-commands (hyrl-mj COMMAND --help shows the options of one):"""
-
 
 def overview() -> str:
     """Returns the help of `hyrl-mj`."""
-    lines = [HEAD]
+    lines = [
+        "usage: hyrl-mj [-h] [--version] COMMAND ...\n",
+        "Hysteresis-Based RL on MuJoCo: policies that withstand measurement noise.\n",
+        "commands (hyrl-mj COMMAND --help shows the options of one):",
+    ]
     for name, command in COMMANDS.items():
         summary = documented(command)[0].partition("\n")[0]
         lines.append(textwrap.fill(f"  {name:15}{summary}", 80, subsequent_indent=" " * 17))

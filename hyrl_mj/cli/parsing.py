@@ -114,7 +114,6 @@ KINDS: dict[Any, Kind] = {
         "WIDTHxHEIGHT", "WIDTHxHEIGHT in pixels, as 640x480", _size, "{0[0]}x{0[1]}".format
     ),
 }
-BY_DEFAULT = "; by default "
 
 
 @dataclass(frozen=True)
@@ -145,7 +144,7 @@ class Argument:
 
         tyro marks required arguments in its help; `call` has the better sentence when one is missing.
         """
-        text, _, by_default = self.text.rstrip(".").partition(BY_DEFAULT)
+        text, _, by_default = self.text.rstrip(".").partition("; by default ")
         required = self.default is MISSING
         hint = "required" if required else f"default: {by_default or self.kind.show(self.default)}"
         shown = tyro.conf.arg(help=f"{text}.", help_behavior_hint=f"({hint})")
@@ -172,16 +171,6 @@ class Argument:
         except ValueError:
             wrong = f"{self.title} {shlex.join(words)!r}"
             raise BadInput(f"{wrong} cannot be used: give {self.kind.meaning}") from None
-
-
-# An option of each command that opens a run.
-TASK = Argument(
-    "task",
-    KINDS[Path],
-    None,
-    "the Python file of the run's task, which is executed; by default only a file that you have run before",
-    positional=False,
-)
 
 
 def documented(thing: Any) -> tuple[str, dict[str, str]]:
@@ -222,8 +211,10 @@ def call(function: Callable[..., None], name: str, words: Sequence[str]) -> None
         BadInput: the words cannot be used.
     """
     every = [*arguments(function)]
-    if any(argument.kind is RUN for argument in every):
-        every.append(TASK)
+    opens_run = any(argument.kind is RUN for argument in every)
+    if opens_run:
+        text = "the Python file of the run's task, which is executed; by default only a file that you have "
+        every.append(Argument("task", KINDS[Path], None, f"{text}run before", positional=False))
     options = {argument.title: argument for argument in every if not argument.positional}
     titles = [word.partition("=")[0].replace("_", "-") for word in words]
     for (word, following), title in zip(pairwise([*words, "--"]), titles, strict=True):
@@ -257,8 +248,8 @@ def call(function: Callable[..., None], name: str, words: Sequence[str]) -> None
             keywords[argument.name] = typed if typed is True else argument.read(typed)
         elif argument.default is MISSING:
             raise BadInput(f"{name} needs {argument.title}: {argument.text}")
-    if TASK in every:
-        keywords["run"] = load_run(keywords["run"], task=keywords.pop(TASK.name, None))
+    if opens_run:
+        keywords["run"] = load_run(keywords["run"], task=keywords.pop("task", None))
     for parameter, kind in get_type_hints(function).items():
         if _has_options(kind):
             inside = [option.name for option in fields(kind) if option.name in keywords]

@@ -23,16 +23,9 @@ if TYPE_CHECKING:
     import onnx
 
 TEMPLATE = Path(__file__).parent / "templates" / "controller.py"
-# The task's part of the template begins and ends with these; the rest of a controller that is no
-# `HybridController` begins where the template's own does.
-BEGIN, END = "# ---- the task", "# ---- the controller\n"
-REST = "LOW, SIDES, PERIODIC ="
-# Sizes of the batches on which an exported form is compared with the controller; the share of rows in which
-# rounding may decide differently between two levels or modes; the allowed error of other inputs [share of
-# their range].
-CHECKED, TIES, CLOSE = (1, 7, 1000), 0.002, 1e-5
-# The signed distance of a set without an edge: deeper than any other, and finite.
-DEEPEST = -1e300
+# What an exported form may do differently from the controller: the share of rows in which rounding decides
+# between two levels or modes, and the error of other inputs [share of their range].
+TIES, CLOSE = 0.002, 1e-5
 
 
 class Traceable(Controller, Protocol):
@@ -155,7 +148,7 @@ def export(controller: HybridController | Traceable, form: str, out: Path) -> No
 def _write(controller: HybridController | Traceable, folder: Path) -> tuple[Path, Path]:
     """Writes controller.py and controller.npz."""
     text = TEMPLATE.read_text(encoding="utf-8")
-    begin, end, rest = text.index(BEGIN), text.index(END), text.index(REST)
+    begin, end = text.index("# ---- the task"), text.index("# ---- the controller\n")
     if isinstance(controller, HybridController):
         networks = [_network(controller, q) for q in controller.modes]
         arrays = _arrays(controller, networks)
@@ -163,7 +156,8 @@ def _write(controller: HybridController | Traceable, folder: Path) -> tuple[Path
     else:
         arrays = {"modes": np.array(controller.modes, dtype=np.int64)}
         task_part = _constants(controller.task) + "\n\n\n"
-        text = text[:begin] + task_part + text[end:rest] + _traced_step(controller, arrays)
+        checks = text[end : text.index("LOW, SIDES, PERIODIC =")]
+        text = text[:begin] + task_part + checks + _traced_step(controller, arrays)
     path = folder / TEMPLATE.name
     with artifacts.replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -239,7 +233,8 @@ def _grid_set(state_set: StateSet, task: Task, what: str) -> GridSet:
         return state_set
     if isinstance(state_set, Everything):
         grid = Grid(task.chart, (2,) * task.chart.dimension)
-        return GridSet(grid, np.full(len(grid.nodes), DEEPEST))
+        # Deeper than any other set, and finite.
+        return GridSet(grid, np.full(len(grid.nodes), -1e300))
     raise BadInput(
         f"the {what} is a {type(state_set).__name__}: only a GridSet on the chart of "
         f"{task.name}, or Everything, can be exported"
@@ -269,7 +264,7 @@ def _constants(task: Task) -> str:
     units = task.input_units or ("",) * len(task.inputs)
     inputs = tuple(f"{i} [{u}]" if u else i for i, u in zip(task.inputs, units, strict=True))
     lines = [
-        f"{BEGIN} {task.name}",
+        f"# ---- the task {task.name}",
         f"TASK = {task.name!r}",
         f"SAMPLE_TIME = {task.dt!r}  # [s]",
         f"MEASUREMENT_COLUMNS = {task.measurement_columns}",
@@ -304,13 +299,13 @@ def _measurements(task: Task, n: int, rng: np.random.Generator) -> np.ndarray:
 
 def _check(controller: HybridController | Traceable, step: Step, form: str) -> None:
     """Raises `BadInput` where a form does not do what the controller does."""
-    task, rng, wrong = controller.task, np.random.default_rng(1), 0
+    task, rng, wrong, rows = controller.task, np.random.default_rng(1), 0, (1, 7, 1000)
     refusal = (
         f"{form} of {task.name} cannot be exported: it does not do what the controller does ({{}}); do z() "
         "and observation() of the task compute each row from that row alone, whatever its values are?"
     )
     low, high = task.input_limits
-    for n in CHECKED:
+    for n in rows:
         measured = _measurements(task, n, rng)
         q = rng.choice(controller.modes, n)
         u, q_next = controller.step(q, measured)
@@ -322,5 +317,5 @@ def _check(controller: HybridController | Traceable, step: Step, form: str) -> N
             raise BadInput(refusal.format(f"u has shape {exported_u.shape} for a batch of {n}"))
         far = np.abs(exported_u - u) > CLOSE * (high - low)
         wrong += int(np.count_nonzero(far.any(axis=1) | (exported_q != q_next)))
-    if wrong > TIES * sum(CHECKED):
-        raise BadInput(refusal.format(f"{wrong} of {sum(CHECKED)} answers differ"))
+    if wrong > TIES * sum(rows):
+        raise BadInput(refusal.format(f"{wrong} of {sum(rows)} answers differ"))

@@ -11,8 +11,6 @@ from onnx import helper, numpy_helper
 
 from hyrl_mj.tracing import BATCH, ELEMENTWISE, Operation, Program, Traced, apply
 
-# The versions that the oldest supported onnxruntime reads.
-OPSET, IR_VERSION = 18, 8
 REDUCED = {
     "sum": "ReduceSum", "max": "ReduceMax", "min": "ReduceMin", "any": "ReduceMax", "all": "ReduceMin",
 }  # fmt: skip
@@ -39,8 +37,9 @@ def write_graph(
             [_described(n, o) for n, o in results],
             [numpy_helper.from_array(a, key) for key, a in graph.constants.values()],
         ),
-        opset_imports=[helper.make_opsetid("", OPSET)],
-        ir_version=IR_VERSION,
+        # The versions that the oldest supported onnxruntime reads.
+        opset_imports=[helper.make_opsetid("", 18)],
+        ir_version=8,
         producer_name="hyrl_mj",
     )
     helper.set_model_props(model, dict(metadata))

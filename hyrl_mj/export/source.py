@@ -10,8 +10,6 @@ import numpy as np
 
 from hyrl_mj.tracing import BATCH, Operation, Program
 
-# Arrays with more elements than this are not written into the code.
-FEW = 16
 # Operations that are not written as a call of the function of their name.
 WRITTEN = {
     "add": "{} + {}", "subtract": "{} - {}", "multiply": "{} * {}", "divide": "{} / {}",
@@ -30,7 +28,7 @@ def write_function(
         name: the name of the function.
         sentence: its docstring.
         program: its inputs are the arguments; with several outputs the function returns a tuple.
-        arrays: receives constants that are too large for a line, under names that begin with `name`.
+        arrays: receives constants of more than 16 elements, under names that begin with `name`.
     """
     arguments = [argument.operands[0] for argument in program.inputs]
     names = dict(zip(program.inputs, arguments, strict=True))
@@ -38,7 +36,7 @@ def write_function(
     def write(x: Any) -> str:
         if isinstance(x, Operation):
             return names[x]
-        if isinstance(x, np.ndarray) and (x.size > FEW or not np.isfinite(x).all()):
+        if isinstance(x, np.ndarray) and (x.size > 16 or not np.isfinite(x).all()):
             key = f"{name}_{sum(k.startswith(name) for k in arrays)}"
             arrays[key] = x
             return f"ARRAYS[{key!r}]"

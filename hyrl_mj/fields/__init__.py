@@ -12,6 +12,7 @@ from hyrl_mj.fields.drives import (
 )
 from hyrl_mj.fields.driving import Bounds, Driving
 from hyrl_mj.fields.files import FieldFile, read_field
+from hyrl_mj.fields.given import acting_policy, exported_controller, is_local
 from hyrl_mj.fields.modes import decoded, encoded
 from hyrl_mj.fields.survey import cautions, check_passable
 
@@ -23,6 +24,7 @@ __all__ = [
     "FieldFile",
     "FocusController",
     "GuardedPolicy",
+    "acting_policy",
     "cautions",
     "changes",
     "check_passable",
@@ -31,7 +33,9 @@ __all__ = [
     "drive",
     "encoded",
     "ending",
+    "exported_controller",
     "for_posts",
+    "is_local",
     "least_clearance",
     "noise_cautions",
     "read_field",

@@ -9,12 +9,6 @@ import numpy as np
 
 from hyrl_mj.errors import BadArtifact
 
-# The most members of a zip, each of which begins with this mark in the directory.
-MOST_MEMBERS, MARK = 10_000, b"PK\x01\x02"
-
-# How members are packed: Python unpacks others, as LZMA, without a limit.
-PACKED = (ZIP_STORED, ZIP_DEFLATED)
-
 
 def open_zip(content: bytes) -> ZipFile:
     """Opens a zip, whose directory `ZipFile` reads at once.
@@ -22,14 +16,15 @@ def open_zip(content: bytes) -> ZipFile:
     Raises:
         BadArtifact: its directory names far too many members.
     """
-    if content.count(MARK) > MOST_MEMBERS:
-        raise BadArtifact(f"it has more than {MOST_MEMBERS:,} members, which no such file has")
+    if content.count(b"PK\x01\x02") > 10_000:  # with this mark each member begins in the directory
+        raise BadArtifact("it has more than 10,000 members, which no such file has")
     return ZipFile(io.BytesIO(content))
 
 
 def read_member(file: ZipFile, name: str, limit: int) -> bytes:
     """Returns the content of a member of a zip, if it is no longer than the limit [bytes]."""
-    if file.getinfo(name).compress_type not in PACKED:
+    # Python unpacks others, as LZMA, without a limit.
+    if file.getinfo(name).compress_type not in (ZIP_STORED, ZIP_DEFLATED):
         raise BadArtifact(f"its {name} is packed in a way that such files never are")
     with file.open(name) as member:
         content = member.read(limit + 1)  # unpacks no more than that

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cache
-from hashlib import sha256
+from hashlib import file_digest, sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, get_args, get_type_hints
 
@@ -34,8 +34,6 @@ REMEDY = "run the stage that writes it again"
 
 # Limits on what is read [bytes], so that a crafted file cannot fill the memory.
 LARGEST_JSON, LARGEST = 2**22, 2**27
-# Of a file of tensors, and of the names and shapes at its beginning.
-LARGEST_TENSORS, LARGEST_NAMES = 2**25 + 2**20, 2**20
 # Rows of an array that stands for a tuple, of which there is one for each mode.
 MOST_ROWS = 1_000
 # The names of temporary files, which only a process that was killed leaves behind.
@@ -107,14 +105,10 @@ def read_limited(path: Path, limit: int = LARGEST) -> bytes:
     return content
 
 
-def digest(*paths: Path) -> str:
-    """Returns the SHA-256 of the content of files."""
-    content = sha256()
-    for path in paths:
-        with path.open("rb") as file:
-            while part := file.read(2**20):
-                content.update(part)
-    return content.hexdigest()
+def digest(path: Path) -> str:
+    """Returns the SHA-256 of the content of a file."""
+    with path.open("rb") as file:
+        return file_digest(file, "sha256").hexdigest()
 
 
 def write_json(path: Path, content: Any, kind: str) -> None:
@@ -338,7 +332,8 @@ def write_tensors(path: Path, tensors: dict[str, np.ndarray]) -> None:
 def read_tensors(path: Path) -> dict[str, np.ndarray]:
     """Returns the tensors that `write_tensors` wrote."""
     with reading(path):
-        content = read_limited(path, LARGEST_TENSORS)
-        if int.from_bytes(content[:8], "little") > LARGEST_NAMES:
-            raise BadArtifact(f"its names take more than {LARGEST_NAMES / 2**20:g} MiB")
+        names = 2**20  # the names and shapes at its beginning [bytes]
+        content = read_limited(path, 2**25 + names)
+        if int.from_bytes(content[:8], "little") > names:
+            raise BadArtifact("its names take more than 1 MiB")
         return load(content)

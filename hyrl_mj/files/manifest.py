@@ -24,26 +24,21 @@ from hyrl_mj.files import artifacts
 from hyrl_mj.files.artifacts import digest
 
 NAME, LOCK = "manifest.json", ".lock"
-# The largest manifest [bytes], which is read many times, and the most folders within each other.
-LARGEST_MANIFEST, DEEPEST = 2**20, 8
 # The names of the files that each stage may write: no other file is ever believed or removed.
-PICTURE = r"\.(png|pdf)"
 FILES = {
     "train": r"policy\.(safetensors|json|onnx)|vecnormalize\.npz|arrivals\.json",
     "critical-set": r"critical_set\.npz",
     "partition": r"partition\.npz",
-    "diagnose": r"diagnosis\.html|diagnosis/(robustness\.json|worst\.(npz|mp4)|\w+" + PICTURE + ")",
+    "diagnose": r"diagnosis\.html|diagnosis/(robustness\.json|worst\.(npz|mp4)|\w+\.(png|pdf))",
     "extended-sets": r"(extended_sets|split)\.npz",
     "retrain": r"mode_\d+(\.safetensors|(_part)?\.json|_table\.npz)|retraining\.json",
-    "robustness": r"robustness\.(json|npz)|arcs/attack_\w+\.npz|figures/robustness_\w+" + PICTURE,
+    "robustness": r"robustness\.(json|npz)|arcs/attack_\w+\.npz|figures/robustness_\w+\.(png|pdf)",
     "simulate": r"arcs/(start\d+|critical)_(policy|hyrl_q\d+)\.npz",
     "simulate --start": r"arcs/latest_\w+\.npz",
-    "figures": r"figures/(?!robustness_)\w+" + PICTURE,
+    "figures": r"figures/(?!robustness_)\w+\.(png|pdf)",
     "replay": r"replay\.(mp4|png)",
     "report": r"report\.html",
 }
-# The files of a stage are no larger together [bytes]: all of them are hashed where a run is opened.
-LARGEST_STAGE = 2**28
 
 
 class Busy(BadInput):
@@ -73,7 +68,7 @@ class _Stages:
 
 
 # What the stage at work has read, as `Entry.inputs`.
-_READ: ContextVar[dict[str, str] | None] = ContextVar("read", default=None)
+_read: ContextVar[dict[str, str] | None] = ContextVar("read", default=None)
 
 
 @dataclass(frozen=True)
@@ -114,11 +109,11 @@ class Manifest:
                         self._write(entries)
 
             read: dict[str, str] = {}
-            tokens = _READ.set(read), artifacts.before_writing.set(before_writing)
+            tokens = _read.set(read), artifacts.before_writing.set(before_writing)
             try:
                 yield
             finally:
-                _READ.reset(tokens[0])
+                _read.reset(tokens[0])
                 artifacts.before_writing.reset(tokens[1])
             if not written:
                 return
@@ -134,7 +129,8 @@ class Manifest:
         """Returns whether a stage is finished, and all of its files are to be believed."""
         entries = self._entries()
         entry = entries.get(stage)
-        if entry is None or sum(map(self._size, entry.outputs)) > LARGEST_STAGE:
+        # All of its files are hashed where a run is opened, so they are no larger together [bytes].
+        if entry is None or sum(map(self._size, entry.outputs)) > 2**28:
             return False
         return not any(self._doubt(name, entries) for name in entry.outputs)
 
@@ -203,7 +199,7 @@ class Manifest:
 
     def _note(self, name: str, content: str) -> None:
         """Records that the stage at work has read a file."""
-        if (read := _READ.get()) is not None:
+        if (read := _read.get()) is not None:
             read[name] = content
 
     def _name(self, path: Path) -> str:
@@ -214,7 +210,7 @@ class Manifest:
         if not path.is_file():
             return {}
         remedy = "remove it, and all stages run again"
-        if path.stat().st_size > LARGEST_MANIFEST:
+        if path.stat().st_size > 2**20:  # it is read many times
             raise BadArtifact(f"{path} is larger than any manifest: {remedy}")
         stages = artifacts.read_record(path, "manifest", _Stages, remedy).stages
         for stage, entry in stages.items():
@@ -317,9 +313,9 @@ def check_contents(folder: Path) -> None:
     These are links, a lock that is a second name of another file, and folders far within each other.
     """
     for root, folders, files in os.walk(folder):
-        if len(Path(root).relative_to(folder).parts) > DEEPEST:
+        if len(Path(root).relative_to(folder).parts) > 8:
             raise BadArtifact(
-                f"{folder} holds more than {DEEPEST} folders within each other: it is no run directory"
+                f"{folder} holds more than 8 folders within each other: it is no run directory"
             )
         for name in (*folders, *files):
             path = Path(root, name)

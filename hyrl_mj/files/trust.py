@@ -23,9 +23,10 @@ from typing import Any
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files.artifacts import digest, replacing
 
-# The keys of the hashes of texts and of written files, which are no paths, and how many are kept of each.
-_TEXT, _WRITTEN, MOST = "texts", "written", 1_000
-_RECEIVED: ContextVar[bool] = ContextVar("received", default=False)
+# The records hold hashes of files by path, and of texts and written files by keys that are no paths: of each
+# of these two as many.
+MOST = 1_000
+_received: ContextVar[bool] = ContextVar("received", default=False)
 
 
 @contextmanager
@@ -34,16 +35,16 @@ def received() -> Iterator[None]:
 
     Tasks and environments ask `is_received` before they run code or open a file that has been named.
     """
-    token = _RECEIVED.set(True)
+    token = _received.set(True)
     try:
         yield
     finally:
-        _RECEIVED.reset(token)
+        _received.reset(token)
 
 
 def is_received() -> bool:
     """Returns whether what is made now is described by a file."""
-    return _RECEIVED.get()
+    return _received.get()
 
 
 @contextmanager
@@ -106,7 +107,7 @@ def is_known(path: Path) -> bool:
 def remember_text(text: str) -> None:
     """Records that the user has described something by this text."""
     if not is_known_text(text):
-        _record(_TEXT, [*_texts(), _digest_of(text)][-MOST:])
+        _record("texts", [*_texts(), _digest_of(text)][-MOST:])
 
 
 def is_known_text(text: str) -> bool:
@@ -138,11 +139,11 @@ def output(*paths: Path, force: bool = False) -> Iterator[None]:
         after = {path: digest(path) for path in paths if path.is_file()}
         new = {str(p.resolve()): d for p, d in after.items() if before.get(p) != d or force}
         kept = {path: value for path, value in _written().items() if path not in new} | new
-        _record(_WRITTEN, dict([*kept.items()][-MOST:]))
+        _record("written", dict([*kept.items()][-MOST:]))
 
 
 def _written() -> dict[str, str]:
-    known = _records().get(_WRITTEN)
+    known = _records().get("written")
     return known if isinstance(known, dict) else {}
 
 
@@ -151,7 +152,7 @@ def _digest_of(text: str) -> str:
 
 
 def _texts() -> list[str]:
-    texts = _records().get(_TEXT)
+    texts = _records().get("texts")
     return texts if isinstance(texts, list) else []
 
 

@@ -6,7 +6,7 @@ import sys
 import time
 from typing import Any, Self
 
-from hyrl_mj.runs.sweeps import DONE, Row
+from hyrl_mj.runs.sweeps import Row
 from hyrl_mj.system.progress import Say
 
 
@@ -48,7 +48,7 @@ class Board:
         self._ended += 1
         self._latest.pop(row.name, None)
         end = row.sentence if row.verdict == "" else f"{row.verdict}: {row.sentence}"
-        end = end if row.state == DONE else f"stopped: {end}"
+        end = end if row.done else f"stopped: {end}"
         self._print(f"{row.name}: {row.seconds:.0f} s: {how}{end} ({self._ended} of {self._count})")
 
     def _print(self, text: str) -> None:

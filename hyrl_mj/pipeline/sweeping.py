@@ -18,7 +18,7 @@ from hyrl_mj.pipeline.board import Board
 from hyrl_mj.pipeline.runs import RunOptions, complete, settings_of, usable_task
 from hyrl_mj.ranges import Integer, Number
 from hyrl_mj.runs import sweeps
-from hyrl_mj.runs.sweeps import DONE, MOST_RUNS, OPEN, STOPPED, Common, Row, Setting, Sweep
+from hyrl_mj.runs.sweeps import MOST_RUNS, Common, Row, Setting, Sweep
 from hyrl_mj.system.progress import Say
 from hyrl_mj.tasks import reference
 
@@ -103,7 +103,7 @@ def sweep(
     planned = [row for row, _ in jobs.values()]
     result = sweeps.opened(folder, common, planned)
     rows = [row.on_disk(folder) for row in result.rows if row.name in jobs]
-    missing = [(row, jobs[row.name][1]) for row in rows if row.state != DONE]
+    missing = [(row, jobs[row.name][1]) for row in rows if not row.done]
     with ExitStack() as stack:
         stack.enter_context(locked(folder))
         result = sweeps.opened(folder, common, planned)  # what others have added meanwhile
@@ -114,14 +114,14 @@ def sweep(
         result.save(folder)
         board = stack.enter_context(Board(say, len(rows)))
         for row in rows:
-            if row.state == DONE:
+            if row.done:
                 result = result.with_row(row)
                 board.end(row, "done before: ")
         if engine is not None:
             memory = options.memory
             with closing(cluster.work(engine, missing, share, memory, board.tell)) as ended:
                 for row in ended:
-                    row = row if row.state == STOPPED else _seen(row, folder)
+                    row = row if row.state == "stopped" else _seen(row, folder)
                     result = result.with_row(row)
                     result.save(folder)
                     board.end(row)
@@ -142,7 +142,7 @@ def report(folder: str | Path) -> Sweep:
         result = Sweep.load(folder)
         for row in result.rows:
             found = row.on_disk(folder)
-            told = row.state == STOPPED and found.state == OPEN
+            told = row.state == "stopped" and found.state == "open"
             result = result.with_row(row.stopped(row.sentence) if told else found)
         write(result, folder)
     return result
@@ -205,7 +205,7 @@ def _check(names: tuple[str | Path, ...], options: SweepOptions) -> None:
 def _seen(row: Row, folder: Path) -> Row:
     """Returns the row of a finished run, as this machine sees its run directory."""
     row = row.on_disk(folder)
-    if row.state == OPEN:
+    if row.state == "open":
         return row.stopped(
             f"this machine does not see its results: share {folder} between all machines"
         )

@@ -15,12 +15,6 @@ from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, noise_kinds, samples,
 from hyrl_mj.stages import Budget, attack
 from hyrl_mj.tasks import Task
 
-OVERVIEW_RUNS = 12  # without noise; of an even number none starts in the middle
-PAPER = "alternating"  # the noise of the paper
-WORST = "worst"  # the noise of the worst-case game; the registered kinds do without one
-ATTACK = "attack"  # the strongest noise that a search finds
-ROUNDS = 4  # of this search
-
 
 def from_middle(task: Task, z: np.ndarray) -> np.ndarray:
     """Returns the distances (n,) of chart points (n, d) from the middle of the replay starts."""
@@ -49,7 +43,7 @@ def noisy_arcs(
         run: with its mode policies.
         z0: starts.
         noise: a registered kind; "worst": that of the worst-case game, for each controller; or "attack": the
-            strongest signal that a short search finds, for each controller.
+            strongest signal that a search of four rounds finds, for each controller.
         eps: bound of the noise, by default the run's.
         q0s: start modes of the hybrid controller; with None it picks its start mode.
         horizon: time [s], by default the task's.
@@ -62,12 +56,12 @@ def noisy_arcs(
         BadInput: a value that cannot be used, or a worst case that cannot be played.
     """
     task = run.task  # first: the file of a user's task may register noise
-    if noise not in (kinds := (*noise_kinds(), WORST, ATTACK)):
+    if noise not in (kinds := (*noise_kinds(), "worst", "attack")):
         raise unknown("noise", noise, kinds)
     bound = task.check_noise(run.settings.noise if eps is None else eps)
     steps = None if horizon is None else samples(task, horizon)
     game = None
-    if noise == WORST:
+    if noise == "worst":
         if why := run.why_no_game:
             raise BadInput(f"{why}: {EPISODES_INSTEAD}")
         usual = LATTICE[task.chart.dimension]
@@ -78,9 +72,9 @@ def noisy_arcs(
     for name, loop in run.loops.items():
         for q0 in q0s if name == "hyrl" else (None,):
             signal: AnyNoise
-            if noise == ATTACK:
+            if noise == "attack":
                 begun = loop if q0 is None else _Begun(loop, q0)
-                signal = attack(task, {name: begun}, z0, bound, Budget(rounds=ROUNDS))[name].signal
+                signal = attack(task, {name: begun}, z0, bound, Budget(rounds=4))[name].signal
             elif game is None:
                 signal = Noise(noise, bound)
             else:
@@ -124,8 +118,8 @@ def replay_arcs(
     """
     starts, modes, seed = replay_starts(run), run.controller.modes, run.settings.seed
     arcs: dict[tuple[str, str], HybridArc] = {}
-    strongest = WORST if run.exact else PAPER
-    for on_critical, usual in ((False, PAPER), (True, strongest)):
+    strongest = "worst" if run.exact else "alternating"
+    for on_critical, usual in ((False, "alternating"), (True, strongest)):
         chosen = {name: z for name, z in starts.items() if (name == "critical") == on_critical}
         if chosen:
             z0 = np.array([*chosen.values()], dtype=float)
@@ -153,19 +147,20 @@ def overview_arcs(task: Task, policy: Policy) -> list[HybridArc]:
     chart, low, high = task.chart, np.array(task.start_low), np.array(task.start_high)
     flat = slice(2)
     whole = np.allclose([low[flat], high[flat]], [chart.low[flat], chart.high[flat]])
-    starts = np.tile(np.array(task.scene.starts[0], dtype=float), (OVERVIEW_RUNS, 1))
+    runs = 12  # of an even number none starts in the middle
+    starts = np.tile(np.array(task.scene.starts[0], dtype=float), (runs, 1))
     if chart.dimension > 1 and whole:
         starts = np.tile(starts, (2, 1))
         drawn = task.starts(len(starts), np.random.default_rng(0))
         starts[:, flat] = drawn[:, flat]
     else:
         starts[:, flat], axis = low[flat], int(np.argmax((high - low)[flat]))
-        shares = (np.arange(OVERVIEW_RUNS) + 0.5) / OVERVIEW_RUNS
+        shares = (np.arange(runs) + 0.5) / runs
         starts[:, axis] = low[axis] + shares * (high - low)[axis]
     return simulate_batch(task, policy, starts, horizon=task.scene.time)
 
 
 def policy_start_arcs(task: Task, policy: Policy, eps: float, seed: int) -> list[HybridArc]:
     """Simulates a policy from the scene's starts, under the paper's noise (Section III) of bound `eps`."""
-    starts, noise = task.scene.policy_starts, Noise(PAPER, eps)
+    starts, noise = task.scene.policy_starts, Noise("alternating", eps)
     return simulate_batch(task, policy, starts, noise, horizon=task.scene.time, seed=seed)

@@ -16,7 +16,7 @@ import mujoco
 
 from hyrl_mj import policies
 from hyrl_mj.errors import BadArtifact, BadInput
-from hyrl_mj.fields import GuardedPolicy
+from hyrl_mj.fields import acting_policy
 from hyrl_mj.files import artifacts
 from hyrl_mj.files.manifest import FILES, Manifest, check_contents, locked, may_hold
 from hyrl_mj.game import Lattice, Robustness, lattice_grid
@@ -37,14 +37,7 @@ from hyrl_mj.stages import (
     Retraining,
     TablePolicy,
 )
-from hyrl_mj.tasks import Field, Task, described_task, get_task, reference
-
-# The packages whose versions `config.json` records.
-PACKAGES = (
-    "hyrl-mj", "mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "mediapy",
-)  # fmt: skip
-# What the headers of an arc's file may take [bytes].
-SLACK = 2**16
+from hyrl_mj.tasks import Task, described_task, get_task, reference
 
 
 @dataclass(frozen=True)
@@ -236,12 +229,10 @@ class Run:
     def controller(self) -> HybridController:
         """The hybrid controller, from stage 7."""
         extended, starts = self.extended_sets, None
-        mode_policies: dict[int, Policy] = {**self.mode_policies}
-        if isinstance(self.task, Field):
-            mode_policies = {
-                q: GuardedPolicy(self.task, policy, q, self.settings.noise)
-                for q, policy in self.mode_networks.items()
-            }
+        mode_policies = {
+            q: acting_policy(self.task, policy, q, self.settings.noise)
+            for q, policy in self.mode_policies.items()
+        }
         flow_sets = dict(zip(extended.modes, extended.sets, strict=True))
         if self.agent is not None:
             # The flow sets of an agent may reach farther to one side of its decision than to the other.
@@ -306,7 +297,7 @@ class Run:
         numbers += mujoco.mj_stateSize(task.model, mujoco.mjtState.mjSTATE_INTEGRATION)
         # A jump has a row of its own.
         rows = 2 * round(time / task.dt + 2)
-        limit = min(8 * numbers * rows + SLACK, artifacts.LARGEST)
+        limit = min(8 * numbers * rows + 2**16, artifacts.LARGEST)  # with headers [bytes]
         arc = HybridArc.load(self.manifest.checked(path), limit=limit)
         if len(arc.t) > rows:
             raise BadArtifact(f"{path} is longer than {time:g} s: simulate it again")
@@ -386,7 +377,10 @@ def load_run(
 def write_config(run: Run, versions: dict[str, str] | None = None) -> None:
     """Writes `config.json`: every setting, and the versions of Python and the packages, by default of now."""
     if versions is None:
-        versions = {name: version(name) for name in PACKAGES}
+        packages = (
+            "hyrl-mj", "mujoco", "gymnasium", "stable-baselines3", "torch", "numpy", "mediapy",
+        )  # fmt: skip
+        versions = {name: version(name) for name in packages}
         versions["python"] = platform.python_version()
     artifacts.write_json(run.path / "config.json", Config(run.settings, versions), kind="run")
 

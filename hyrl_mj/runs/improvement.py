@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hyrl_mj.runs.sweeps import DONE, Row, Setting
+from hyrl_mj.runs.sweeps import Row, Setting
 
 # Figures that both controllers have, without their names, and whether more of it is better.
 COMPARED = {
@@ -63,7 +63,7 @@ class Improvement:
 
 def improvements(rows: Iterable[Row]) -> list[Improvement]:
     """Returns what HyRL improves, for each figure that both controllers have in all runs that are done."""
-    done = [row for row in rows if row.state == DONE]
+    done = [row for row in rows if row.done]
     found = []
     for figure, more in COMPARED.items():
         groups: dict[Setting, list[tuple[float, float]]] = {}
@@ -124,7 +124,7 @@ def profile(rows: Iterable[Row], figure: str, thresholds: np.ndarray) -> dict[st
         By controller the share (k,) of the runs in which its figure is at least as large; {} if no run has
         the figure.
     """
-    done = [row.figures for row in rows if row.state == DONE]
+    done = [row.figures for row in rows if row.done]
     shares = {}
     for who in ("policy", "hyrl"):
         values = [value for own in done if (value := own.get(f"{who}_{figure}")) is not None]

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -21,14 +21,6 @@ from hyrl_mj.runs.directory import Run, load_run
 
 NAME = "sweep.json"
 MOST_RUNS = 1_000
-# A spreadsheet takes a text that begins so for a formula.
-FORMULAS = ("=", "+", "-", "@", "\t", "\r")
-# States of a run.
-OPEN: Final = "open"
-DONE: Final = "done"
-STOPPED: Final = "stopped"
-# The stages that have to be finished. Pictures are missing where nothing can be drawn.
-STAGES = ("train", "critical-set", "partition", "extended-sets", "retrain", "robustness", "report")
 
 
 @dataclass(frozen=True)
@@ -69,7 +61,7 @@ class Row:
     Attributes:
         setting: all but the seed.
         seed: the seed.
-        state: `OPEN`, `DONE`, or `STOPPED` by an error.
+        state: "open", "done", or "stopped" by an error.
         sentence: the verdict in a sentence, or the error.
         verdict: the word of the verdict, "" if there is none.
         seconds: how long the stages took that this sweep has run [s].
@@ -78,7 +70,7 @@ class Row:
 
     setting: Setting
     seed: int
-    state: Literal["open", "done", "stopped"] = OPEN
+    state: Literal["open", "done", "stopped"] = "open"
     sentence: str = ""
     verdict: str = ""
     seconds: float = 0.0
@@ -88,6 +80,11 @@ class Row:
     def name(self) -> str:
         """The name of the run directory."""
         return f"{self.setting.stem}-{self.seed}"
+
+    @property
+    def done(self) -> bool:
+        """Whether the run is finished."""
+        return self.state == "done"
 
     def on_disk(self, folder: Path) -> Row:
         """Returns the row with what its run directory holds: its results if it is finished, else none."""
@@ -101,7 +98,7 @@ class Row:
         verdict = run.verdict
         return replace(
             row,
-            state=DONE,
+            state="done",
             sentence=verdict.sentence,
             verdict=verdict.word,
             figures=_figures(run.robustness),
@@ -109,7 +106,7 @@ class Row:
 
     def stopped(self, sentence: str) -> Row:
         """Returns the row without results, because of an error."""
-        return Row(self.setting, self.seed, STOPPED, sentence, seconds=self.seconds)
+        return Row(self.setting, self.seed, "stopped", sentence, seconds=self.seconds)
 
 
 @dataclass(frozen=True)
@@ -214,9 +211,10 @@ class Sweep:
 
 def _plain(text: str) -> str:
     """Returns a text that a spreadsheet does not take for a formula."""
+    formulas = ("=", "+", "-", "@", "\t", "\r")
     # A spreadsheet passes over spaces, and takes wide characters for the usual ones.
     seen = unicodedata.normalize("NFKC", text).lstrip()
-    return f"'{text}" if seen.startswith(FORMULAS) or text.startswith(FORMULAS) else text
+    return f"'{text}" if seen.startswith(formulas) or text.startswith(formulas) else text
 
 
 def opened(folder: Path, common: Common, rows: Iterable[Row]) -> Sweep:
@@ -259,9 +257,19 @@ def finished_run(path: Path) -> Run | None:
     """
     if not (path / "config.json").is_file():
         return None
+    # Not those that draw: pictures are missing where nothing can be drawn.
+    stages = (
+        "train",
+        "critical-set",
+        "partition",
+        "extended-sets",
+        "retrain",
+        "robustness",
+        "report",
+    )
     try:
         run = load_run(path)
-        done = all(run.manifest.is_done(stage) for stage in STAGES) and run.is_examined_as_usual
+        done = all(map(run.manifest.is_done, stages)) and run.is_examined_as_usual
     except BadArtifact:
         return None
     return run if done else None

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Real
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -130,9 +131,50 @@ class HybridArc(Saved):
         """Returns whether the arc ends at the set-point, not elsewhere on the finishing line."""
         return self.outcome == "reached" and bool(task.arrived(self.z[-1:])[0])
 
+    def ending(self, task: Task) -> str:
+        """Returns the outcome; "missed" if the arc ends on the finishing line off the set-point."""
+        missed = self.outcome == "reached" and not self.arrives(task)
+        return "missed" if missed else self.outcome
+
     def at(self, t: float) -> int:
         """Returns the last row at or before a time [s]."""
         return int(np.searchsorted(self.t, t + 1e-9, side="right") - 1)
+
+
+@overload
+def simulate(
+    task: Task,
+    controller: Controller | Policy,
+    z0: Sequence[float],
+    noise: AnyNoise | None = None,
+    q0: int | np.ndarray | None = None,
+    horizon: float | None = None,
+    seed: int = 0,
+) -> HybridArc: ...
+
+
+@overload
+def simulate(
+    task: Task,
+    controller: Controller | Policy,
+    z0: Sequence[Sequence[float]],
+    noise: AnyNoise | None = None,
+    q0: int | np.ndarray | None = None,
+    horizon: float | None = None,
+    seed: int = 0,
+) -> list[HybridArc]: ...
+
+
+@overload
+def simulate(
+    task: Task,
+    controller: Controller | Policy,
+    z0: ArrayLike,
+    noise: AnyNoise | None = None,
+    q0: int | np.ndarray | None = None,
+    horizon: float | None = None,
+    seed: int = 0,
+) -> HybridArc | list[HybridArc]: ...
 
 
 def simulate(
@@ -143,7 +185,7 @@ def simulate(
     q0: int | np.ndarray | None = None,
     horizon: float | None = None,
     seed: int = 0,
-) -> Any:
+) -> HybridArc | list[HybridArc]:
     """Simulates the closed loop in MuJoCo.
 
     Args:

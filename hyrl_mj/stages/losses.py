@@ -29,27 +29,6 @@ class Losses:
     undecided: np.ndarray
     grazing: np.ndarray
 
-    def sentence(self) -> str:
-        """Returns the shares, what is lost without noise first, and what to do."""
-        alone, n, close = len(self.unaided), len(self.undecided), len(self.grazing)
-        total = alone + n + close
-        if not total:
-            return "it loses none of them on the nodes"
-        fails = "it fails there by itself, train it further first"
-        if alone == total:
-            return f"it loses all {total:,} lost nodes without noise, too: {fails}"
-        first = (
-            f"loses {alone:,} without noise, too ({100 * alone / total:.0f}%: {fails}), "
-            if alone
-            else ""
-        )
-        return (
-            f"of {total:,} lost nodes it {first}would win {n:,} if it held the way of its first measurement "
-            f"({100 * n / total:.0f}%: noise at M* keeps it undecided, hysteresis cures that), and loses "
-            f"{close:,} all the same ({100 * close / total:.0f}%: it passes closer than the noise, "
-            "training under noise cures that); hyrl-mj robustify does both"
-        )
-
 
 def sort_losses(task: Task, policy: Policy, partition: Partition, eps: float, cells: int) -> Losses:
     """Sorts the winnable starts that a policy loses to the worst noise.

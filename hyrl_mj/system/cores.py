@@ -25,7 +25,7 @@ class Pool(Protocol):
         """Returns the results of the jobs, in their order."""
 
 
-_POOL: ContextVar[Pool | None] = ContextVar("pool", default=None)
+_pool: ContextVar[Pool | None] = ContextVar("pool", default=None)
 
 
 def count() -> int:
@@ -55,21 +55,21 @@ def using_pool(pool: Pool) -> Iterator[None]:
             f"{pool!r} is no pool of processes: give one with a method map(function, jobs), such as "
             "multiprocessing.Pool()"
         )
-    token = _POOL.set(pool)
+    token = _pool.set(pool)
     try:
         yield
     finally:
-        _POOL.reset(token)
+        _pool.reset(token)
 
 
 def given() -> bool:
     """Returns whether there is a pool."""
-    return _POOL.get() is not None
+    return _pool.get() is not None
 
 
 def spread(work: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[Result]:
     """Yields the results of jobs in their order: from the pool if there is one, else one after the other."""
-    pool = _POOL.get()
+    pool = _pool.get()
     yield from map(work, jobs) if pool is None else pool.map(partial(_alone, work), jobs)
 
 

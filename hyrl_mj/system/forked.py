@@ -5,19 +5,19 @@ import os
 from typing import Any
 from weakref import WeakSet
 
-_OWN: WeakSet[Any] = WeakSet()
-_LEFT: WeakSet[Any] = WeakSet()
-_ENDS: WeakSet[Any] = WeakSet()
+_owned: WeakSet[Any] = WeakSet()
+_left: WeakSet[Any] = WeakSet()
+_ends: WeakSet[Any] = WeakSet()
 
 
 def own(thing: Any) -> None:
     """Records that a thing can be used, and deleted, in this process only."""
-    _OWN.add(thing)
+    _owned.add(thing)
 
 
 def is_left(thing: Any) -> bool:
     """Returns whether a thing was made by the process that this one was forked from."""
-    return thing in _LEFT
+    return thing in _left
 
 
 def own_end(end: Any) -> Any:
@@ -25,19 +25,19 @@ def own_end(end: Any) -> Any:
 
     Who waits at the other end learns only so that this process has let go of it.
     """
-    _ENDS.add(end)
+    _ends.add(end)
     return end
 
 
 def _after_fork() -> None:
-    for end in list(_ENDS):
+    for end in list(_ends):
         end.close()
-    _ENDS.clear()
-    for thing in list(_OWN):
-        _LEFT.add(thing)
+    _ends.clear()
+    for thing in list(_owned):
+        _left.add(thing)
         # It is never deleted: to delete it waits for threads or drivers that do not answer here.
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(thing))
-    _OWN.clear()
+    _owned.clear()
 
 
 if hasattr(os, "register_at_fork"):  # not on Windows

@@ -22,14 +22,10 @@ from typing import Any, TextIO
 
 from hyrl_mj.errors import BadInput, HyrlError, brief, printable
 
-# A narrower terminal breaks the lines itself: libraries that lay out text cannot [columns].
-NARROWEST = 60
-# A bar on a narrower terminal would be a column of its pieces.
-NARROWEST_BAR = 30
 # An interrupt can strike while one of Python's locks is taken, which is then waited for without end: after
 # this time the process ends by itself [s].
 GRACE = 5.0
-INTERRUPTED, INTERRUPTED_STATUS = "interrupted; finished work is kept, run again to resume", 130
+INTERRUPTED = "interrupted; finished work is kept, run again to resume"
 
 
 # What may be written beside printable characters: breaks, and on a terminal sequences that libraries write:
@@ -81,8 +77,9 @@ class Streams:
                 os.fstat(number)
             except OSError:
                 os.open(os.devnull, os.O_RDWR)  # the lowest free number, which is this one
-        if shutil.get_terminal_size().columns < NARROWEST:
-            os.environ["COLUMNS"] = str(NARROWEST)
+        # A narrower terminal breaks the lines itself: libraries that lay out text cannot.
+        if shutil.get_terminal_size().columns < 60:
+            os.environ["COLUMNS"] = "60"
         self._raw: dict[int, _Raw] = {}
         self._has_complained = False
         sys.stdout, sys.stderr = self._lasting(sys.stdout, 1), self._lasting(sys.stderr, 2)
@@ -110,7 +107,8 @@ class Streams:
         if not sys.stderr.isatty():
             return False
         width = os.get_terminal_size(sys.stderr.fileno()).columns
-        return width == 0 or width >= NARROWEST_BAR  # 0 where the terminal does not know
+        # On a narrower terminal a bar is a column of its pieces; 0 is one that does not know its width.
+        return width == 0 or width >= 30
 
     def run(self, command: Callable[[], None]) -> int:
         """Runs a command, says what went wrong, and returns the exit status."""
@@ -142,7 +140,7 @@ class Streams:
             return 1
         except KeyboardInterrupt:
             self._complain(INTERRUPTED)
-            return INTERRUPTED_STATUS
+            return 128 + signal.SIGINT
         except SystemExit as error:
             return error.code if isinstance(error.code, int) else int(error.code is not None)
         except Exception as error:
@@ -186,7 +184,7 @@ class Streams:
         if not self._has_complained:
             with suppress(OSError):
                 os.write(2, f"hyrl-mj: {INTERRUPTED}\n".encode())
-        os._exit(INTERRUPTED_STATUS)
+        os._exit(128 + signal.SIGINT)
 
     @property
     def _is_deaf(self) -> bool:

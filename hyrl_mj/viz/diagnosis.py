@@ -23,12 +23,9 @@ from hyrl_mj.viz.tables import margin_text, percent
 
 # In the run directory: the page, and the folder with its pictures and data.
 PAGE, FOLDER = "diagnosis.html", "diagnosis"
-BUDGET = Budget(rounds=1, enough=1)  # of an attack
-LARGER = (1, 2, 4, 8)  # times the bound that attacks try
-ATTACKED, AGAIN = 48, 3  # starts that are attacked; every third of them is with larger noise
+ATTACKED = 48  # starts that are attacked
 # Where every episode is played to its end, attacked starts have about so many samples together.
 SAMPLES, FEWEST = 20_000, 16
-TRIED = 64  # lost starts that are simulated, the nearest to the middle of the replay starts first
 REPLAY = ReplayOptions(size=(960, 720))  # of the policy alone
 
 
@@ -44,14 +41,15 @@ def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
     """Returns a run that the policy loses, or None if no such run was found.
 
     Where the game decides its adversary gives the noise, from the starts of the more frequent kind of
-    losses first. Otherwise an attack searches for noise, from starts half of which are near M*. If it finds
-    none, attacks from a third of these starts search for larger noise.
+    losses first: of each kind from the 64 that are nearest to the middle of the replay starts. Otherwise an
+    attack searches for noise, from starts half of which are near M*. If it finds none, attacks from a third
+    of these starts search for noise of 2, 4 and 8 times the bound.
     """
     task, eps, loop = run.task, run.settings.noise, PolicyController(run.policy)
     if losses is not None:
         parts = losses.grazing, losses.undecided, losses.unaided
         kinds = sorted(parts, key=len, reverse=True)
-        z0 = np.vstack([z[np.argsort(from_middle(task, z), kind="stable")[:TRIED]] for z in kinds])
+        z0 = np.vstack([z[np.argsort(from_middle(task, z), kind="stable")[:64]] for z in kinds])
         if not len(z0):
             return None
         game = Game(task, run.partition, {"policy": loop}, eps, grid=run.lattice_grid)
@@ -61,13 +59,13 @@ def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
     if not task.abilities.arrival_ends:
         count = int(np.clip(SAMPLES / task.max_steps, FEWEST, ATTACKED))
     starts = attack_starts(task, Regions(run.critical_set.points), eps, count, run.settings.seed)
-    for factor in LARGER:
+    for factor in (1, 2, 4, 8):
         try:
             task.check_noise(factor * eps)
         except BadInput:  # it would hide the whole chart
             break
-        some = starts if factor == 1 else starts[::AGAIN]
-        found = attack(task, {"policy": loop}, some, factor * eps, BUDGET)
+        some = starts if factor == 1 else starts[::3]
+        found = attack(task, {"policy": loop}, some, factor * eps, Budget(rounds=1, enough=1))
         if (lost := _first_lost(found["policy"].arcs)) is not None:
             return lost
     return None
@@ -124,7 +122,7 @@ def sentences(
         elif score.proved is not None:
             results.append(f"it is proved to win {percent(score.proved)} of them")
         if losses is not None:
-            results.append(losses.sentence())
+            results.append(losses_sentence(losses))
         if (margin := robustness.deciding.margin["policy"]) is None:
             results.append("on the nodes it does not win all of them even without noise")
         else:
@@ -157,6 +155,28 @@ def sentences(
     if alone.outcome != "reached":
         end += ", and without noise, too"
     return [*results, f"from {start} {end}"]
+
+
+def losses_sentence(losses: Losses) -> str:
+    """Returns why starts are lost: the shares, what is lost without noise first, and what to do."""
+    alone, n, close = len(losses.unaided), len(losses.undecided), len(losses.grazing)
+    total = alone + n + close
+    if not total:
+        return "it loses none of them on the nodes"
+    fails = "it fails there by itself, train it further first"
+    if alone == total:
+        return f"it loses all {total:,} lost nodes without noise, too: {fails}"
+    first = (
+        f"loses {alone:,} without noise, too ({100 * alone / total:.0f}%: {fails}), "
+        if alone
+        else ""
+    )
+    return (
+        f"of {total:,} lost nodes it {first}would win {n:,} if it held the way of its first measurement "
+        f"({100 * n / total:.0f}%: noise at M* keeps it undecided, hysteresis cures that), and loses "
+        f"{close:,} all the same ({100 * close / total:.0f}%: it passes closer than the noise, "
+        "training under noise cures that); hyrl-mj robustify does both"
+    )
 
 
 def write_page(run: Run, robustness: Robustness, arc: HybridArc | None, results: list[str]) -> None:

@@ -15,6 +15,7 @@ from hyrl_mj.fields import (
     check_passable,
     drive,
     ending,
+    is_local,
     least_clearance,
     noise_cautions,
     read_field,
@@ -23,11 +24,9 @@ from hyrl_mj.policies import MlpPolicy
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import LEFT, RIGHT, Field
-from hyrl_mj.viz.options import ReplayOptions
+from hyrl_mj.viz.options import USUAL, ReplayOptions
 from hyrl_mj.viz.replay import Show, check_replay, render_replay
 from hyrl_mj.viz.tables import NAMES, Table, print_table
-
-USUAL = ReplayOptions()
 
 
 def drive_tables(drives: Drives, noise: str, seed: int) -> list[Table]:
@@ -147,7 +146,7 @@ def _parts(run: Run) -> tuple[Field, MlpPolicy, Mapping[int, MlpPolicy]]:
     """
     remedy = "make one with hyrl-mj run field --out runs/field"
     local = run.task
-    if not isinstance(local, Field):
+    if not is_local(local):
         raise BadInput(
             f"{run.path} is a run of {local.name}, but drive takes a run of field: {remedy}"
         )

@@ -1,6 +1,7 @@
 """Videos, written frame by frame by mediapy, with one clear message where that fails.
 
 mediapy itself waits for ever for an ffmpeg that takes no frame, and does not see that a file is not whole.
+To kill ffmpeg does not end the wait, because a child of it may hold the pipe: so a thread of its own waits.
 """
 
 from __future__ import annotations
@@ -21,16 +22,15 @@ from hyrl_mj.files import artifacts
 if TYPE_CHECKING:
     import mediapy
 
-FFMPEG_CURE = (
-    "check that the disk is writable and has room, and reinstall the encoder: "
-    "pip install --force-reinstall imageio-ffmpeg"
-)
-# The time for which ffmpeg may neither take a frame nor write [s], and how often that is looked at.
-PATIENCE, GLANCE = 30.0, 0.1
+# The time for which ffmpeg may neither take a frame nor write [s].
+PATIENCE = 30.0
 # How a video is encoded, by its suffix: H.264 as browsers play it, or a GIF. More threads slow the drawing.
-H264 = "-preset veryfast -threads 2 -sws_flags fast_bilinear -movflags +faststart"
 ENCODERS: dict[str, dict[str, Any]] = {
-    ".mp4": {"codec": "h264", "crf": 20, "ffmpeg_args": H264},
+    ".mp4": {
+        "codec": "h264",
+        "crf": 20,
+        "ffmpeg_args": "-preset veryfast -threads 2 -sws_flags fast_bilinear -movflags +faststart",
+    },
     ".gif": {"codec": "gif"},
 }
 
@@ -113,7 +113,7 @@ class Encoder:
                 size, since = now, time.monotonic()
             if time.monotonic() > since + PATIENCE:
                 raise EncodingFailed(f"ffmpeg wrote nothing for {PATIENCE:g} s")
-            self._feeding.join(GLANCE)
+            self._feeding.join(0.1)
         if self._problem:
             raise EncodingFailed(self._problem)
 
@@ -133,7 +133,7 @@ class Encoder:
             if not self._feeding.is_alive():
                 raise EncodingFailed(self._problem or "ffmpeg has ended")
             with suppress(queue.Full):
-                return self._frames.put(frame, timeout=GLANCE)
+                return self._frames.put(frame, timeout=0.1)
         raise EncodingFailed(f"ffmpeg took no frame for {PATIENCE:g} s")
 
     def _feed(self) -> None:
@@ -181,4 +181,7 @@ def _boxes(content: bytes) -> Iterator[bytes]:
 
 
 def _failed(path: Path, cause: str) -> NoRenderer:
-    return NoRenderer(f"{path} cannot be encoded ({cause}): {FFMPEG_CURE}")
+    return NoRenderer(
+        f"{path} cannot be encoded ({cause}): check that the disk is writable and has room, and reinstall "
+        "the encoder: pip install --force-reinstall imageio-ffmpeg"
+    )

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-# A video of a run has about so many frames at most: long episodes have fewer a second, down to so many.
-FRAMES, SLOWEST = 600, 10
-
 
 @dataclass(frozen=True)
 class ReplayOptions:
@@ -27,6 +24,9 @@ class ReplayOptions:
     slow_motion: float = 1.0
 
     def lasting(self, seconds: float) -> ReplayOptions:
-        """Returns these options with no more frames per second than so many seconds [s] may have."""
+        """Returns these options with at most 600 frames in so many seconds [s], but at least 10 a second."""
         # An arc that ends where it begins lasts no time.
-        return replace(self, fps=max(SLOWEST, min(self.fps, int(FRAMES / max(seconds, 1.0)))))
+        return replace(self, fps=max(10, min(self.fps, int(600 / max(seconds, 1.0)))))
+
+
+USUAL = ReplayOptions()

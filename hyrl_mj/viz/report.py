@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from base64 import b64encode
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from PIL import Image
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files import artifacts
-from hyrl_mj.game import LIMIT, MAP_CLASSES, NO_NOISE, EpisodeCount, GameResult, Robustness
+from hyrl_mj.game import MAP_CLASSES, Robustness
 from hyrl_mj.learning import Training
 from hyrl_mj.policies import Agent, MlpPolicy
 from hyrl_mj.runs.arcs import attack_replay
@@ -24,28 +24,6 @@ from hyrl_mj.viz import tables
 from hyrl_mj.viz.commands import changed, commands
 from hyrl_mj.viz.figures import CLASS_COLOURS, FIGURES
 from hyrl_mj.viz.figures.style import task_title
-
-CONTROLLERS = ("policy", "hyrl")  # the columns of the numbers
-# What the classes of the maps mean, in the order of MAP_CLASSES.
-MEANINGS = (
-    "Whatever the noise does, in whichever mode the controller starts, the run ends well. This is proved for "
-    "all states around.",
-    "Whatever the noise does, the run ends well if the controller picks its start mode from the first "
-    "measurement, which is proved. Started in the other mode it may be lost.",
-    "No noise that makes the run fail was found on the nodes, but that there is none is not proved.",
-    "Some noise within the bound makes the run fail, although it could be won.",
-    "Decided by what is measured, neither way can be held against the worst noise.",
-    "Nothing is left to be decided: an obstacle, the edge of the arena, or the goal.",
-)
-
-
-@dataclass(frozen=True)
-class Number:
-    """A number at the top of the page: its name, the values of `CONTROLLERS` with unit, and a note."""
-
-    what: str
-    values: Sequence[str]
-    note: str
 
 
 @dataclass(frozen=True)
@@ -80,9 +58,6 @@ def render(run: Run) -> str:
     has = run.manifest.has
     robustness = run.robustness if has(run.path / "robustness.json") else None
     arcs = run.arcs() if all(map(has, run.arc_paths().values())) else None
-    arrived = (
-        {who: tables.arrivals(run, arcs, who == "policy") for who in CONTROLLERS} if arcs else None
-    )
     facts = [run.path / name for name in ("arrivals.json", "retraining.json")]
     stages = run.settings.stage1, run.settings.stage6
     options = [stage.options if isinstance(stage, Training) else {} for stage in stages]
@@ -97,10 +72,10 @@ def render(run: Run) -> str:
         video=film(run.path / "replay.mp4", has),
         pictures=pictures(run.path / "figures", has),
         arcs=arcs,
-        arrivals=arrived,
+        arrivals=arcs
+        and {who: tables.arrivals(run, arcs, who == "policy") for who in ("policy", "hyrl")},
         attacked=bool(attack_replay(run)),
         verdict=run.verdict if robustness and all(map(has, facts)) else None,
-        numbers=_numbers(run, robustness, arrived),
         replays=arcs and tables.replay_table(run, arcs),
         stages=_stages(run, robustness, arcs),
         table=_texts(vars(run.settings)),
@@ -108,78 +83,8 @@ def render(run: Run) -> str:
         versions=run.versions,
         commands=commands(run, robustness),
         changed=changed(run),
-        classes=list(zip(MAP_CLASSES, CLASS_COLOURS, MEANINGS, strict=True)),
+        classes=list(zip(MAP_CLASSES, CLASS_COLOURS, strict=True)),
     )
-
-
-# ---- numbers
-
-
-def _numbers(
-    run: Run, robustness: Robustness | None, arrived: Mapping[str, tuple[int, int]] | None
-) -> list[Number]:
-    """Returns the key scores."""
-    numbers: list[Number] = []
-    if robustness and robustness.deciding:
-        numbers += _game_numbers(run, robustness.deciding)
-    elif robustness:
-        numbers += _episode_numbers(robustness.episodes)
-    if robustness and robustness.attacks:
-        attacks = robustness.attacks
-        shares = [tables.percent(c.lost / max(c.attacked, 1), surely=False) for c in attacks]
-        won = " and ".join(f"{c.attacked:,}" for c in attacks)
-        note = f"of {won} starts that are won without noise; {attacks[0].rounds} rounds of search"
-        numbers.append(Number("starts from which the attack breaks it", shares, note))
-    if arrived:
-        counts = [f"{count} of {total}" for count, total in arrived.values()]
-        note = f"the scene's starts, alternating noise {run.settings.noise:g}"
-        numbers.append(Number("replays that reach the set-point", counts, note))
-    return numbers
-
-
-def _game_numbers(run: Run, game: GameResult) -> list[Number]:
-    """Returns the scores of the worst case at the largest noise bound, and the margins."""
-    where, unit = run.task.noise_on(game.everywhere)
-    scores = [game.scores[who][-1] for who in CONTROLLERS]
-    noise = f"worst noise on {where} up to {scores[0].eps:g} {unit}"
-    limit = f"{noise}; the limit is {tables.percent(game.scores[LIMIT][-1].won_any)}"
-    lost = [tables.percent(1 - s.not_broken) for s in scores]
-    margins = [tables.margin_text(game.margin[who], unit) for who in CONTROLLERS]
-    worst = f"the margin: worst noise on {where}"
-    numbers = [
-        Number(
-            "winnable starts proved to be won",
-            [tables.proved_text(s.proved) for s in scores],
-            noise,
-        ),
-        Number("winnable starts known to be lost", lost, f"{noise}; each was lost on the plant"),
-        Number(
-            "winnable starts proved to be won from every start mode",
-            [tables.proved_text(s.proved_any) for s in scores],
-            limit,
-        ),
-        Number("noise up to which no node is lost", margins, worst),
-    ]
-    if game.lasting:
-        off = [f"{tables.excursion_text(s.excursion)} {unit}" for s in scores]
-        numbers.append(Number("kept off the set-point for ever, at most", off, noise))
-    return numbers
-
-
-def _episode_numbers(counts: Sequence[EpisodeCount]) -> list[Number]:
-    """Returns the shares under the worst kind of noise, by start region."""
-    noisy = [c for c in counts if c.noise != NO_NOISE] or counts
-    note = f"the least over {', '.join(dict.fromkeys(c.noise for c in noisy))} noise"
-    numbers = []
-    for region in dict.fromkeys(c.region for c in noisy):
-        least = [
-            min(c.reached for c in noisy if (c.region, c.controller) == (region, who))
-            for who in CONTROLLERS
-        ]
-        what = f"episodes that reach the set-point, starts {region}"
-        shares = [tables.percent(share, surely=False) for share in least]
-        numbers.append(Number(what, shares, note))
-    return numbers
 
 
 # ---- stages and settings
@@ -264,6 +169,7 @@ def fill(template: str, run: Run, robustness: Robustness | None, **values: Any) 
             critical=run.critical_set,
             unit=task.noise_on()[1],
             percent=tables.percent,
+            tables=tables,
             robustness=robustness,
             game=game,
             deciding=robustness.deciding if robustness else None,

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.ndimage import gaussian_filter
 
 from hyrl_mj.game import Maps
 from hyrl_mj.runs.directory import Run
@@ -14,12 +16,9 @@ from hyrl_mj.sets import Chart, Grid, GridSet
 from hyrl_mj.stages import CriticalSet, ExtendedSets, Partition, critical_points
 from hyrl_mj.tasks import Task
 
-# Sections over the period of a coordinate.
-SECTIONS = 24
+SECTIONS = 24  # over the period of a coordinate
 # Least number of cells along the longest side in the search for the critical points of a section.
 CELLS = 40
-# Nodes along each side of a section through sets on scattered nodes.
-CELLS_OF_CLOUD = 96
 
 
 class Section:
@@ -66,15 +65,20 @@ class Section:
         rest = np.broadcast_to(self.rest, (*z.shape[:-1], len(self.rest)))
         return np.concatenate([z, rest], axis=-1)
 
-    def project(self, z: np.ndarray) -> np.ndarray:
-        """Returns points (..., d) of the whole chart without the coordinates that are not drawn."""
-        return z[..., :2]
-
     def failed(self, z: np.ndarray) -> np.ndarray:
         """Returns (n,) bool: whether a run ends without success at points (n, 2) of the plane."""
         plant = self.task.plant(len(z))
         plant.set_state(*self.task.state(self.lift(z)))
         return self.task.failed(plant.measurement)
+
+    @cached_property
+    def over(self) -> GridSet | None:
+        """The points at which a run ends without success, with a smooth outline; None if there are none."""
+        grid = Grid.with_cells(self.chart, 240)
+        over = self.failed(grid.nodes).reshape(grid.counts)
+        # Blurred, the mask has a smooth outline where it is one half, without the steps of its cells.
+        blurred = gaussian_filter(over.astype(float), 1.5, mode="nearest")
+        return GridSet(grid, 0.5 - blurred.ravel()) if over.any() else None
 
     # ---- results in the section
 
@@ -113,7 +117,7 @@ class Section:
 
     def _set(self, members: GridSet) -> GridSet:
         whole = members.grid
-        counts = whole.counts[:2] if isinstance(whole, Grid) else (CELLS_OF_CLOUD,) * 2
+        counts = whole.counts[:2] if isinstance(whole, Grid) else (96, 96)  # nodes are scattered
         grid = Grid(self.chart, counts)
         return GridSet(grid, members.signed_distance(self.lift(grid.nodes)))
 

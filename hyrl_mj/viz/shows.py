@@ -8,8 +8,6 @@ from hyrl_mj.runs.directory import Run
 from hyrl_mj.viz.replay import Floor, Floors, Show
 from hyrl_mj.viz.section import critical_sets, sections
 
-STARTS = ("critical", "paper", "latest")  # of a replay
-
 
 def replay_shows(
     run: Run, starts: str = "critical", noise: str | None = None, eps: float | None = None
@@ -27,8 +25,8 @@ def replay_shows(
     Raises:
         BadInput: a value that cannot be used.
     """
-    if starts not in STARTS:
-        raise unknown("starts", starts, STARTS)
+    if starts not in (known := ("critical", "paper", "latest")):
+        raise unknown("starts", starts, known)
     is_new, modes = noise is not None or eps is not None, run.extended_sets.modes
     if starts == "latest":
         if is_new:

@@ -16,18 +16,10 @@ from PIL import Image
 from hyrl_mj.game import Curve
 from hyrl_mj.runs.directory import load_run
 from hyrl_mj.runs.improvement import LEAST_SEEDS, profile
-from hyrl_mj.runs.sweeps import DONE, Row, Setting, Sweep
+from hyrl_mj.runs.sweeps import Row, Setting, Sweep
 from hyrl_mj.viz import colours, sweep_tables as tables
 from hyrl_mj.viz.figures import style
 from hyrl_mj.viz.report import Picture, data_uri, environment, write
-
-# Curves: controller, column of its `Wins`, label, colour and line style.
-LINES = (
-    ("policy", "won", "RL policy", style.POLICY_COLOUR, "-"),
-    ("hyrl", "proved", "HyRL proved, own q0", colours.MODES[0], "-"),
-    ("hyrl", "proved_any", "HyRL proved, any q0", colours.MODES[0], "--"),
-)
-HEIGHT = 2.7  # [inches] of a row of panels
 
 
 def write_page(sweep: Sweep, folder: Path) -> None:
@@ -48,8 +40,8 @@ def write_page(sweep: Sweep, folder: Path) -> None:
                 (setting, tables.run_table(rows), _links(rows), tables.worst(rows))
                 for setting, rows in groups.items()
             ],
-            open_rows=[row for row in sweep.rows if row.state != DONE],
-            done=sum(row.state == DONE for row in sweep.rows),
+            open_rows=[row for row in sweep.rows if not row.done],
+            done=sum(row.done for row in sweep.rows),
             total=len(sweep.rows),
         )
     )
@@ -58,7 +50,7 @@ def write_page(sweep: Sweep, folder: Path) -> None:
 
 def _links(rows: list[Row]) -> dict[str, str]:
     """Returns the addresses of the reports of the finished runs, by name."""
-    return {row.name: f"{quote(row.name)}/report.html" for row in rows if row.state == DONE}
+    return {row.name: f"{quote(row.name)}/report.html" for row in rows if row.done}
 
 
 def _picture(groups: dict[Setting, list[Row]], folder: Path) -> Picture | None:
@@ -66,7 +58,7 @@ def _picture(groups: dict[Setting, list[Row]], folder: Path) -> Picture | None:
     curves: dict[Setting, list[Curve]] = {}
     for setting, rows in groups.items():
         for row in rows:
-            game = load_run(folder / row.name).robustness.deciding if row.state == DONE else None
+            game = load_run(folder / row.name).robustness.deciding if row.done else None
             if game is not None:
                 curves.setdefault(setting, []).append(game.curve)
     if not curves:
@@ -104,7 +96,7 @@ def draw_profiles(sweep: Sweep) -> Figure | None:
     names = ("proved", "not_broken", "withstood_attack")
     found = {name: profile(sweep.rows, name, thresholds) for name in names}
     shown = {name: shares for name, shares in found.items() if len(shares) == 2}
-    if not shown or sum(row.state == DONE for row in sweep.rows) < LEAST_SEEDS:
+    if not shown or sum(row.done for row in sweep.rows) < LEAST_SEEDS:
         return None
     with matplotlib_style.context(["default", style.STYLE]):
         figure = Figure(figsize=(style.WIDTH, 3.2), layout="constrained")
@@ -128,13 +120,13 @@ def draw_curves(curves: dict[Setting, list[Curve]]) -> Figure:
     columns = min(len(curves), style.COLUMNS)
     count = -(-len(curves) // columns)
     with matplotlib_style.context(["default", style.STYLE]):
-        figure = Figure(figsize=(style.WIDTH, 0.8 + HEIGHT * count), layout="constrained")
+        figure = Figure(figsize=(style.WIDTH, 0.8 + 2.7 * count), layout="constrained")
         panels = figure.subplots(count, columns, squeeze=False, sharey=True).ravel()
         for panel, (setting, group) in zip(panels, curves.items(), strict=False):
             _draw(panel, group)
             panel.set_title(f"{setting.title} ({len(group)} seeds)", parse_math=False)
             panel.axvline(
-                setting.eps, color=style.INK, linewidth=1, linestyle=(0, (1, 2)), zorder=1
+                setting.eps, color=colours.INK, linewidth=1, linestyle=(0, (1, 2)), zorder=1
             )
             panel.set_xlabel("noise bound eps")
         for panel in panels[len(curves) :]:
@@ -149,7 +141,11 @@ def _draw(panel: Axes, curves: list[Curve]) -> None:
     """Draws the median and the band of each controller."""
     eps = np.array(curves[0].eps)
     alike = [curve.wins for curve in curves if curve.eps == curves[0].eps]
-    for who, column, label, colour, dashes in LINES:
+    for who, column, label, colour, dashes in (  # of `Wins`
+        ("policy", "won", "RL policy", colours.POLICY, "-"),
+        ("hyrl", "proved", "HyRL proved, own q0", colours.MODES[0], "-"),
+        ("hyrl", "proved_any", "HyRL proved, any q0", colours.MODES[0], "--"),
+    ):
         shares = 100 * np.array([getattr(wins[who], column) for wins in alike])
         panel.fill_between(
             eps, shares.min(axis=0), shares.max(axis=0), color=colour, alpha=0.18, lw=0

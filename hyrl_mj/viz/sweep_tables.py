@@ -8,10 +8,11 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 
 from hyrl_mj.game import percent
 from hyrl_mj.runs.improvement import Mean, improvements
-from hyrl_mj.runs.sweeps import DONE, Row, Sweep, summary
+from hyrl_mj.runs.sweeps import Row, Sweep, summary
 from hyrl_mj.viz.tables import Table, print_table
 
 
@@ -30,18 +31,8 @@ class Column:
     least: bool | None = None
 
 
-def _number(value: float) -> str:
-    return f"{value:.3g}"
-
-
-def _seconds(value: float) -> str:
-    return f"{value:.2f} s"
-
-
-def _tried(value: float) -> str:
-    return percent(value, surely=False)
-
-
+# The texts of numbers, and of shares that are not proved.
+_number, _seconds, _tried = "{:.3g}".format, "{:.2f} s".format, partial(percent, surely=False)
 # The figures in tables, the most important first: by these the worst run is found.
 COLUMNS = {
     "open": Column("open starts", percent),
@@ -99,7 +90,7 @@ def shown(rows: Iterable[Row]) -> list[str]:
 def summary_table(sweep: Sweep) -> Table:
     """Returns median, least and greatest of each figure over the seeds: a column for each setting."""
     groups = sweep.groups()
-    done = {setting: [row for row in rows if row.state == DONE] for setting, rows in groups.items()}
+    done = {setting: [row for row in rows if row.done] for setting, rows in groups.items()}
     rows = [
         ["runs", *(f"{len(done[setting])} of {len(group)}" for setting, group in groups.items())],
         ["verdicts", *(_verdicts(group) for group in done.values())],
@@ -168,7 +159,7 @@ def worst(group: Iterable[Row]) -> Row | None:
             if least is not None
         ]
 
-    return min((row for row in group if row.state == DONE), key=goodness, default=None)
+    return min((row for row in group if row.done), key=goodness, default=None)
 
 
 def markdown(table: Table) -> str:
@@ -188,7 +179,7 @@ def print_sweep(sweep: Sweep) -> None:
     if (improved := improvement_table(sweep)) is not None:
         print_table(improved)
     for row in sweep.rows:
-        if row.state != DONE:
+        if not row.done:
             print(f"{row.name}: {row.state}{f': {row.sentence}' if row.sentence else ''}")
 
 

@@ -23,8 +23,6 @@ from hyrl_mj.runs.directory import Run
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
 
-# No table is wider [columns].
-WIDEST = 10_000
 # With more modes than these, headings hold their numbers alone.
 NAMED = 2
 NAMES = {"policy": "RL policy", "hyrl": "HyRL", LIMIT: "limit"}
@@ -77,11 +75,10 @@ def replay_table(run: Run, arcs: Arcs) -> Table:
 
 
 def _ending(task: Task, arc: HybridArc) -> Ending:
-    """Returns how an arc ended; "missed" if it ended as a success off the set-point."""
-    end, success = _point(task.chart.wrap(arc.z[-1:])[0]), arc.arrives(task)
-    outcome = arc.outcome.replace("_", " ") if success or arc.outcome != "reached" else "missed"
+    """Returns how an arc ended, as `HybridArc.ending`."""
+    end = _point(task.chart.wrap(arc.z[-1:])[0])
     details = f"{arc.t[-1]:.2f} s, {arc.j[-1]} jump{'' if arc.j[-1] == 1 else 's'}"
-    return Ending(outcome, details, end, success)
+    return Ending(arc.ending(task).replace("_", " "), details, end, arc.arrives(task))
 
 
 def arrivals(run: Run, arcs: Arcs, policy: bool) -> tuple[int, int]:
@@ -397,7 +394,7 @@ def print_table(table: Table) -> None:
     # Off a terminal rich assumes 80 columns, which would cut the cells.
     width = None if Console().is_terminal else 160
     console = Console(width=width, markup=False, emoji=False, highlight=False)
-    wide = console.options.update(max_width=WIDEST)
+    wide = console.options.update(max_width=10_000)  # no table is wider
     if Measurement.get(console, wide, drawn).minimum <= console.width:
         console.print(drawn)
         return

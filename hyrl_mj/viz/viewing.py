@@ -31,7 +31,6 @@ from hyrl_mj.viz.replay.panel import Track
 FPS = 60
 PAUSE = 1.0  # [s] between the end of an arc and its beginning
 LOOPBACK = "127.0.0.1"
-FIRST_PORT = 8080  # the first to try without a port from the user
 
 
 def view(task: Task, arc: HybridArc, port: int = 0, say: Say = print) -> None:
@@ -108,7 +107,7 @@ def _web(model: mujoco.MjModel, data: mujoco.MjData, port: int, say: Say) -> Ite
             f"port {port} cannot be used ({error}): give a free one, 1024 to 65535, or none"
         ) from error
     with redirect_stdout(StringIO()), _for_this_machine():  # viser prints where it listens
-        server = viser.ViserServer(host=LOOPBACK, port=port or FIRST_PORT, verbose=False)
+        server = viser.ViserServer(host=LOOPBACK, port=port or 8080, verbose=False)
     try:
         # The button would ask a server on the internet for an address that everyone can open.
         server.gui.configure_theme(show_share_button=False)

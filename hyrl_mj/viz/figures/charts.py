@@ -4,29 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.patches import Circle, Wedge
 from matplotlib.ticker import MultipleLocator
-from scipy.ndimage import gaussian_filter
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.sets import Chart, Grid, GridSet
 from hyrl_mj.tasks import Task
-from hyrl_mj.viz.figures.style import CASING, GREEN, GREY, INK, PALE, PAPER, angle, axis_label
+from hyrl_mj.viz.colours import GOOD, GREY, INK, PALE, WHITE
+from hyrl_mj.viz.figures.style import angle, axis_label
 from hyrl_mj.viz.section import Section
 
-# Radii of a ring, its ticks, their labels, and the edge of its panel.
-OUTER, INNER, TICK, LABEL, EDGE = 1.0, 0.7, 1.05, 1.18, 1.25
-# Cells along the longest side of the grid that shows where runs are over, and its blur in cells.
-OVER_CELLS, OVER_BLUR = 240, 1.5
-# Where runs are over, by section: a picture has several panels of one.
-_OVER: WeakKeyDictionary[Section, np.ndarray] = WeakKeyDictionary()
-# Periods to either side at which the set-point is drawn over time.
-TURNS = 9
+OUTER, INNER, TICK = 1.0, 0.7, 1.05  # radii of a ring, and the ends of its ticks
 
 
 def is_ring(chart: Chart) -> bool:
@@ -66,14 +58,8 @@ def plane(panel: Axes, section: Section) -> None:
     panel.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
     label_axis(panel.xaxis, section.chart, 0)
     label_axis(panel.yaxis, section.chart, 1)
-    grid = Grid.with_cells(section.chart, OVER_CELLS)
-    if section not in _OVER:
-        _OVER[section] = section.failed(grid.nodes).reshape(grid.counts)
-    over = _OVER[section]
-    if over.any():
-        # Blurred, the mask has a smooth outline where it is one half, without the steps of its cells.
-        blurred = gaussian_filter(over.astype(float), OVER_BLUR, mode="nearest")
-        region(panel, GridSet(grid, 0.5 - blurred.ravel()), GREY, PALE, zorder=2.2)
+    if section.over is not None:
+        region(panel, section.over, GREY, PALE, zorder=2.2)
         legend_field(panel, "obstacle, or out of bounds", GREY, PALE)
     if section.set_point is not None:
         cross(panel, *section.set_point)
@@ -123,9 +109,9 @@ def ring(panel: Axes, chart: Chart, radii: Sequence[float], note: str = "") -> N
         at = np.array(on_ring(chart, quarter))
         panel.plot(*np.outer(at, (OUTER, TICK)), color=INK, linewidth=0.8)
         text = angle(quarter) if chart.units[0] == "rad" else f"{quarter:g}"
-        panel.text(LABEL * at[0], LABEL * at[1], text, ha="center", va="center")
+        panel.text(*(1.18 * at), text, ha="center", va="center")
     panel.text(0, 0, axis_label(chart, 0) + note, ha="center", va="center")
-    panel.set(xlim=(-EDGE, EDGE), ylim=(-EDGE, EDGE), aspect="equal", anchor="S")
+    panel.set(xlim=(-1.25, 1.25), ylim=(-1.25, 1.25), aspect="equal", anchor="S")
     panel.set_axis_off()
 
 
@@ -164,7 +150,7 @@ def arcs(
 def cross(panel: Axes, x: float, y: float) -> None:
     """Marks the set-point."""
     looks: dict[str, Any] = {"markersize": 11, "markeredgewidth": 2.5, "clip_on": False}
-    panel.plot(x, y, "+", color=GREEN, zorder=5, label="set-point", **looks)
+    panel.plot(x, y, "+", color=GOOD, zorder=5, label="set-point", **looks)
 
 
 def set_point_lines(panel: Axes, task: Task, coordinate: int = 0) -> None:
@@ -172,11 +158,12 @@ def set_point_lines(panel: Axes, task: Task, coordinate: int = 0) -> None:
     if task.set_point is None:
         return
     low, high = panel.get_ylim()
-    turns = np.arange(-TURNS, TURNS + 1) if task.chart.periodic[coordinate] else np.zeros(1)
+    # A run that turns more often has left the panel.
+    turns = np.arange(-9, 10) if task.chart.periodic[coordinate] else np.zeros(1)
     looks: dict[str, Any] = {"linewidth": 1.2, "linestyle": "--", "label": "set-point"}
     for height in task.set_point[coordinate] + task.chart.sides[coordinate] * turns:
         if low <= height <= high:
-            panel.axhline(height, color=GREEN, zorder=1, **looks)
+            panel.axhline(height, color=GOOD, zorder=1, **looks)
 
 
 def dots(panel: Axes, points: np.ndarray, colour: str = INK) -> None:
@@ -185,14 +172,14 @@ def dots(panel: Axes, points: np.ndarray, colour: str = INK) -> None:
         return
     looks: dict[str, Any] = {"markeredgewidth": 0, "clip_on": False, "zorder": 3.5}
     # All white edges first, so that points close to each other merge into one line.
-    panel.plot(*points.T, "o", markersize=5.0, color=PAPER, **looks)
+    panel.plot(*points.T, "o", markersize=5.0, color=WHITE, **looks)
     panel.plot(*points.T, "o", markersize=3.6, color=colour, label="critical set M*", **looks)
 
 
 def spokes(panel: Axes, chart: Chart, z: np.ndarray, start: float, colour: str = INK) -> None:
     """Marks points (n, 1) of M* by lines from radius `start` to the ring's edge."""
     x, y = on_ring(chart, z[:, 0])
-    for line, (_, width) in zip((PAPER, colour), CASING, strict=True):
+    for line, width in ((WHITE, 2.8), (colour, 1.4)):
         ends = [start * x, OUTER * x], [start * y, OUTER * y]
         panel.plot(*ends, color=line, linewidth=width, zorder=3)
     dots(panel, np.stack([start * x, start * y], axis=1), colour)

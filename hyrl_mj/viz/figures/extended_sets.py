@@ -11,17 +11,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from hyrl_mj.sets import Chart, GridSet
-from hyrl_mj.viz import colours
+from hyrl_mj.viz.colours import BAD, INK, OVERLAP, mode_colour
 from hyrl_mj.viz.figures import charts, style
 from hyrl_mj.viz.figures.charts import OUTER
 from hyrl_mj.viz.figures.shown import ShownRun
 
-# States that several extended sets hold.
-SHARED = colours.OVERLAP
-# Inner radius of the innermost ring, the gap between rings, and the radii of the text at the ends of a set.
-CORE, GAP, OUTSIDE, INSIDE = 0.6, 0.05, 1.14, 0.47
-# How far the enlarged panel reaches around M*, in noise bounds.
-AROUND = 4.0
+CORE, GAP = 0.6, 0.05  # the inner radius of the innermost ring, and the gap between rings
 
 
 def draw_extended_sets(shown: ShownRun, path: Path | None = None) -> Figure:
@@ -38,10 +33,10 @@ def draw_extended_sets(shown: ShownRun, path: Path | None = None) -> Figure:
         panels = figure.subplots(1, 1 + enlarged, squeeze=False).ravel()
         for i, mode in enumerate(sets.modes):
             label = f"$M^{{ext}}_{{{mode}}}$, of mode {task.mode_name(mode)}"
-            colour, tint = style.mode_colour(i), style.mode_tint(i)
+            colour, tint = mode_colour(i), style.mode_tint(i)
             charts.legend_field(panels[0], label, colour if ring else tint, colour)
         if shared.any():
-            charts.legend_field(panels[0], "in several of them", SHARED, SHARED)
+            charts.legend_field(panels[0], "in several of them", OVERLAP, OVERLAP)
         for panel in panels:
             (_set_rings if ring else _set_plane)(panel, shown, shared)
         if enlarged:
@@ -53,14 +48,14 @@ def draw_extended_sets(shown: ShownRun, path: Path | None = None) -> Figure:
 def _set_rings(panel: Axes, shown: ShownRun, shared: np.ndarray) -> None:
     """Draws a ring for each set, with its ends beside it."""
     chart, sets = shown.task.chart, shown.sets
-    charts.arcs(panel, chart, shared.astype(int), (None, SHARED), OUTER, CORE)
+    charts.arcs(panel, chart, shared.astype(int), (None, OVERLAP), OUTER, CORE)
     width = (OUTER - CORE - GAP) / len(sets.sets)
     for i, members in enumerate(sets.sets):
-        outer, colour = OUTER - GAP - i * width, style.mode_colour(i)
+        outer, colour = OUTER - GAP - i * width, mode_colour(i)
         inside = members.mask.astype(int)
         charts.arcs(panel, chart, inside, (None, colour), outer, outer - width + GAP)
         # The first set's ends are written outside the rings, the others' inside, one below the other.
-        _ends(panel, chart, members, OUTSIDE if i == 0 else INSIDE - 0.1 * (i - 1), colour)
+        _ends(panel, chart, members, 1.14 if i == 0 else 0.47 - 0.1 * (i - 1), colour)
     charts.ring(panel, chart, (OUTER, CORE))
     charts.spokes(panel, chart, shown.critical.points, CORE - 0.06)
 
@@ -80,20 +75,20 @@ def _set_plane(panel: Axes, shown: ShownRun, shared: np.ndarray) -> None:
     sets = shown.sets
     for i, members in enumerate(sets.sets):
         charts.region(panel, members, style.mode_tint(i))
-    charts.region(panel, GridSet.from_mask(sets.sets[0].grid, shared), SHARED)
+    charts.region(panel, GridSet.from_mask(sets.sets[0].grid, shared), OVERLAP)
     for i, members in enumerate(sets.sets):
-        charts.region(panel, members, "none", style.mode_colour(i), zorder=2)
+        charts.region(panel, members, "none", mode_colour(i), zorder=2)
     charts.plane(panel, shown.section)
     charts.dots(panel, shown.critical.points)
 
 
 def _enlarge(whole: Axes, near: Axes, shown: ShownRun) -> None:
-    """Shows the neighbourhood of M* in the second panel, with the width that noise requires."""
+    """Shows four noise bounds around M* in the second panel, with the width that noise requires."""
     section, points, eps = shown.section, shown.critical.points, shown.sets.noise
-    low = np.maximum(points.min(axis=0) - AROUND * eps, section.chart.low)
-    high = np.minimum(points.max(axis=0) + AROUND * eps, section.chart.high)
+    low = np.maximum(points.min(axis=0) - 4 * eps, section.chart.low)
+    high = np.minimum(points.max(axis=0) + 4 * eps, section.chart.high)
     near.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), title="around M*")
-    box = Rectangle(low, *(high - low), fill=False, edgecolor=style.INK, linestyle=":", zorder=3)
+    box = Rectangle(low, *(high - low), fill=False, edgecolor=INK, linestyle=":", zorder=3)
     whole.add_patch(box)
     for drawn in near.lines:
         drawn.set_clip_on(True)  # marks outside this panel would show beside it
@@ -104,6 +99,6 @@ def _enlarge(whole: Axes, near: Axes, shown: ShownRun) -> None:
     axis = int(np.where(noisy, np.ptp(points, axis=0), np.inf).argmin())
     step = eps * np.eye(2)[axis]
     ends = np.stack([middle - step, middle + step]).T
-    looks: dict[str, Any] = {"color": style.RED, "linewidth": 2, "markersize": 9, "zorder": 4}
+    looks: dict[str, Any] = {"color": BAD, "linewidth": 2, "markersize": 9, "zorder": 4}
     label = f"2 eps = {2 * eps:g} {section.chart.units[axis]}"
     near.plot(*ends, marker="_|"[axis == 0], label=label, **looks)

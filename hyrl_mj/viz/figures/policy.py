@@ -15,17 +15,12 @@ from matplotlib.figure import Figure
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages import Partition
 from hyrl_mj.tasks import Task
+from hyrl_mj.viz.colours import BAD, INK, OBSERVED, PALE, POLICY
 from hyrl_mj.viz.figures import charts, runs, style
 from hyrl_mj.viz.figures.charts import INNER, OUTER
 from hyrl_mj.viz.figures.runs import CORE, View
 from hyrl_mj.viz.figures.shown import ShownPolicy
-from hyrl_mj.viz.figures.style import PALE_RED
-
-# An arrowhead shows the direction of a run after 1/ARROW of its samples.
-ARROW = 7
-# Nodes at which the policy is evaluated: of a ring, and along the longest side of a plane.
-RING_NODES, PLANE_CELLS = 720, 240
-INPUT_COLOURS = "PRGn"
+from hyrl_mj.viz.tables import NAMED
 
 
 def draw_overview(shown: ShownPolicy, path: Path | None = None) -> Figure:
@@ -38,7 +33,7 @@ def draw_overview(shown: ShownPolicy, path: Path | None = None) -> Figure:
         panel.set_title(style.noise_label(task, arc.noise, arc.bound))
         for i, mode in enumerate(shown.partition.modes):
             part = f"only in the part $M_{{{mode}}}$"
-            if len(shown.partition.modes) > style.NAMED:  # names are said here, once
+            if len(shown.partition.modes) > NAMED:  # names are said here, once
                 part = f"only in $M_{{{mode}}}$, of mode {task.mode_name(mode)}"
             charts.legend_field(panel, part, style.mode_tint(i))
         if charts.is_ring(task.chart):
@@ -59,11 +54,11 @@ def _field(panel: Axes, shown: ShownPolicy) -> None:
     view = runs.plane_view(panel, section)
     _noiseless_runs(panel, shown, view)
     band = _band(view.points(arc.t, arc.z), section.noise(arc.bound), view.longest)
-    panel.add_collection(PolyCollection(list(band), color=PALE_RED, linewidth=0.3, zorder=2))
+    panel.add_collection(PolyCollection(list(band), color=OBSERVED, linewidth=0.3, zorder=2))
     _noisy_run(panel, shown, view)
     ahead = arc.z[-1] - arc.z[0]
     triangle = (3, 0, float(np.degrees(np.arctan2(ahead[1], ahead[0]))) - 90)
-    looks = {"markersize": 13, "markerfacecolor": style.PALE, "markeredgecolor": style.INK}
+    looks = {"markersize": 13, "markerfacecolor": PALE, "markeredgecolor": INK}
     runs.mark(panel, view, arc, 0, triangle, label="robot at its start", **looks)
     charts.dots(panel, shown.critical.points)
 
@@ -99,7 +94,7 @@ def _spirals(panel: Axes, shown: ShownPolicy) -> None:
     _noiseless_runs(panel, shown, view)
     eps = task.noise_in_chart(arc.bound)
     rim = np.vstack([view.points(arc.t, arc.z - eps), view.points(arc.t, arc.z + eps)[::-1]])
-    panel.fill(*rim.T, color=PALE_RED, linewidth=0, zorder=2)
+    panel.fill(*rim.T, color=OBSERVED, linewidth=0, zorder=2)
     _noisy_run(panel, shown, view)
     if task.set_point is not None:
         charts.cross(panel, *np.ravel(charts.on_ring(task.chart, task.set_point)))
@@ -107,12 +102,12 @@ def _spirals(panel: Axes, shown: ShownPolicy) -> None:
 
 
 def _noiseless_runs(panel: Axes, shown: ShownPolicy, view: View) -> None:
-    """Draws the runs without noise, with arrowheads."""
+    """Draws the runs without noise, with an arrowhead after a seventh of their samples."""
     looks = {"linewidth": 1.3, "zorder": 3}
-    brief = len(shown.partition.modes) > style.NAMED
+    brief = len(shown.partition.modes) > NAMED
     for arc in shown.noiseless:
         drawn = runs.chosen_way(panel, shown, view, arc, "without noise: ", brief, **looks)
-        row = len(arc.t) // ARROW
+        row = len(arc.t) // 7
         points = view.points(arc.t[row : row + 2], arc.z[row : row + 2])
         if len(points) < 2 or (np.abs(points[1] - points[0]) > view.longest).any():
             continue  # the run ends where it starts, or crosses the seam at this sample
@@ -124,10 +119,10 @@ def _noiseless_runs(panel: Axes, shown: ShownPolicy, view: View) -> None:
 def _noisy_run(panel: Axes, shown: ShownPolicy, view: View) -> None:
     """Draws the run under noise and what it measures."""
     task, arc = shown.task, shown.noisy
-    looks = {"color": style.POLICY_COLOUR, "linewidth": 1.4, "zorder": 4}
+    looks = {"color": POLICY, "linewidth": 1.4, "zorder": 4}
     runs.line(panel, view, arc.t, arc.z, label=f"{shown.policy_title}, with noise", **looks)
-    charts.legend_field(panel, "what it can observe", PALE_RED, PALE_RED)
-    looks = {"linestyle": "none", "marker": ".", "color": style.RED, "markersize": 4, "zorder": 4.5}
+    charts.legend_field(panel, "what it can observe", OBSERVED, OBSERVED)
+    looks = {"linestyle": "none", "marker": ".", "color": BAD, "markersize": 4, "zorder": 4.5}
     measured = task.z(arc.measured[:-1])
     runs.line(panel, view, arc.t[:-1], measured, label="what it observes", **looks)
     runs.end(panel, task, view, arc)
@@ -144,7 +139,7 @@ def draw_policy_map(shown: ShownPolicy, path: Path | None = None) -> Figure:
     with style.drawing(path, 5.2, section, f"the {shown.algorithm} policy") as figure:
         *maps, panel = figure.subplots(1, len(task.inputs) + 1)
         ring = charts.is_ring(chart)
-        grid = Grid(chart, (RING_NODES,)) if ring else Grid.with_cells(chart, PLANE_CELLS)
+        grid = Grid(chart, (720,)) if ring else Grid.with_cells(chart, 240)
         inputs = shown.policy.act(task.at(section.lift(grid.nodes)))
         for i, input_panel in enumerate(maps):
             _input_map(input_panel, shown, grid, inputs, i)
@@ -175,11 +170,11 @@ def _input_map(panel: Axes, shown: ShownPolicy, grid: Grid, inputs: np.ndarray, 
         shades, classes = np.unique(colours(scale(values)), axis=0, return_inverse=True)
         charts.arcs(panel, task.chart, classes.ravel(), shades, OUTER, INNER)
         charts.ring(panel, task.chart, (OUTER, INNER))
-        charts.spokes(panel, task.chart, shown.critical.points, 0.6, style.RED)
+        charts.spokes(panel, task.chart, shown.critical.points, 0.6, BAD)
     else:
         charts.image(panel, grid, values, cmap=colours, norm=scale)
         charts.plane(panel, shown.section)
-        charts.dots(panel, shown.critical.points, style.RED)
+        charts.dots(panel, shown.critical.points, BAD)
     # After the ring, whose place in the panel the colour bar sets.
     bar = panel.figure.colorbar(
         ScalarMappable(scale, colours),
@@ -193,7 +188,7 @@ def _input_colours(task: Task, i: int) -> tuple[Colormap, Normalize, np.ndarray 
     """Returns the colours of an input, their scale, and the ticks of a discrete input."""
     low, high = (float(limit[i]) for limit in task.input_limits)
     # Without the darkest shades, on which no other mark can be seen.
-    shades = ListedColormap(colormaps[INPUT_COLOURS](np.linspace(0.08, 0.92, 256)))
+    shades = ListedColormap(colormaps["PRGn"](np.linspace(0.08, 0.92, 256)))
     if task.input_levels is None:
         return shades, Normalize(low, high), None
     levels = np.unique(task.input_levels[:, i])

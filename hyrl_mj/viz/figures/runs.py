@@ -15,18 +15,13 @@ from matplotlib.lines import Line2D
 from hyrl_mj.sets import Chart
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import ANY, Task, pattern_of
-from hyrl_mj.viz.colours import place
+from hyrl_mj.viz.colours import BAD, INK, PALE, POLICY, WHITE, mode_colour
 from hyrl_mj.viz.figures import charts, style
 from hyrl_mj.viz.figures.shown import ShownPolicy, ShownRun
-from hyrl_mj.viz.figures.style import INK, NAMED, PALE, PAPER, POLICY_COLOUR, RED, mode_colour
 from hyrl_mj.viz.section import Section
+from hyrl_mj.viz.tables import NAMED
 
-# Radius at which spirals begin; they end at 1.
-CORE = 0.4
-# Planes beside each other.
-ACROSS = 4
-# What the legend calls the end of a run, by its outcome, where "end: outcome" is not clear.
-ENDS = {"running": "end, not there yet", "out_of_bounds": "end: out of bounds"}
+CORE = 0.4  # the radius at which spirals begin; they end at 1
 
 
 @dataclass(frozen=True)
@@ -47,7 +42,7 @@ def plane_view(panel: Axes, section: Section) -> View:
     chart = section.chart
     charts.plane(panel, section)
     longest = np.where(chart.periodic, chart.sides / 2, np.inf)
-    return View(lambda t, z: chart.wrap(section.project(z)), longest)
+    return View(lambda t, z: chart.wrap(z[..., :2]), longest)
 
 
 def time_view(panel: Axes, chart: Chart, coordinate: int) -> View:
@@ -93,7 +88,7 @@ def mark(panel: Axes, view: View, arc: HybridArc, row: int, shape: Any, **looks:
 
 def ends(panel: Axes, task: Task, view: View, arc: HybridArc) -> None:
     """Marks where a run starts and ends."""
-    mark(panel, view, arc, 0, "o", markerfacecolor=PAPER, markeredgecolor=INK, label="start")
+    mark(panel, view, arc, 0, "o", markerfacecolor=WHITE, markeredgecolor=INK, label="start")
     end(panel, task, view, arc)
 
 
@@ -101,7 +96,9 @@ def end(panel: Axes, task: Task, view: View, arc: HybridArc) -> None:
     """Marks where a run ends, in red if it has failed."""
     label, colour = ("end", INK) if arc.arrives(task) else ("end: off the set-point", PALE)
     if arc.outcome != "reached":
-        label, colour = ENDS.get(arc.outcome, f"end: {arc.outcome}"), RED
+        label, colour = f"end: {arc.outcome.replace('_', ' ')}", BAD
+        if arc.outcome == "running":
+            label = "end, not there yet"
     mark(panel, view, arc, -1, "x", color=colour, markeredgewidth=2, label=label)
 
 
@@ -121,10 +118,10 @@ def chosen_way(
     task, modes = shown.task, shown.partition.modes
     going = modes_of(task, modes, int(task.direction(arc.z[:, None])[0]))
     if arc.outcome != "reached":
-        colour, label = POLICY_COLOUR, "neither way" if len(modes) < 3 else "no way to the end"
+        colour, label = POLICY, "neither way" if len(modes) < 3 else "no way to the end"
     elif len(going) == 1:
         mode = going[0]
-        colour = mode_colour(place(mode, modes))
+        colour = mode_colour(modes.index(mode))
         label = f"way of mode {mode if brief else task.mode_name(mode)}"
     else:
         colour, label = PALE, "nothing to decide" if going else "way of no mode"
@@ -153,7 +150,7 @@ def hybrid_way(panel: Axes, task: Task, view: View, arc: HybridArc, modes: Seque
         rows = arc.j == j
         mode = int(arc.q[rows][0])
         looks = {
-            "color": mode_colour(place(mode, modes)),
+            "color": mode_colour(modes.index(mode)),
             "label": f"HyRL in mode {task.mode_name(mode)}",
         }
         line(panel, view, arc.t[rows], arc.z[rows], linewidth=2.0, **looks)
@@ -173,12 +170,12 @@ def draw_runs(shown: ShownRun, path: Path | None = None) -> Figure:
     loops = list(dict.fromkeys(who for _, who in replays if who != "policy"))
     starts = list(dict.fromkeys(start for start, _ in replays if start.startswith("start")))
     plane, count = task.chart.dimension == 2, len(loops)
-    rows = -(-count // ACROSS) if plane else task.chart.dimension
+    rows = -(-count // 4) if plane else task.chart.dimension
     columns = -(-count // rows) if plane else count
     first = replays[starts[0], "policy"]
     noise = style.noise_label(task, first.noise, first.bound)
     title = f"HyRL and {policy_title}\nunder the same {noise}"
-    thin = {"color": POLICY_COLOUR, "linewidth": 1.0, "zorder": 4}
+    thin = {"color": POLICY, "linewidth": 1.0, "zorder": 4}
     with style.drawing(path, 1.6 + 3.4 * rows, task, title) as figure:
         panels = figure.subplots(rows, columns, sharex=True, sharey="row", squeeze=False)
         for (row, column), panel in np.ndenumerate(panels):

@@ -21,24 +21,15 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from hyrl_mj.files import artifacts
 from hyrl_mj.sets import Chart
 from hyrl_mj.tasks import Task
-from hyrl_mj.viz import colours
+from hyrl_mj.viz.colours import INK, mode_colour
 from hyrl_mj.viz.section import Section
-from hyrl_mj.viz.tables import NAMED as NAMED
 
 DPI = 200  # [pixels/inch]
 WIDTH, PAD = 7.8, 0.1  # [inches] of a figure, and of the margin around it
 COLUMNS = 2  # panels beside each other, and columns of a legend
-LETTERS = 105  # of the longest labels of a legend's columns together; with more there is one column
-INK, PAPER, PALE = colours.INK, colours.WHITE, "#8b919b"
-GREY = "#dcdee2"  # states at which a run is over
-POLICY_COLOUR, RED, PALE_RED = colours.POLICY, colours.BAD, "#f4c9c7"
-GREEN = colours.GOOD  # of the set-point
-# The share of colour in a tint; the rest is white.
-TINT = 0.22
-# Colour and width of lines over a map: a white edge, then the line.
-CASING = ((PAPER, 2.8), (INK, 1.4))
-_IN_INK = ("axes.edgecolor", "text.color", "axes.labelcolor", "xtick.color", "ytick.color")
-STYLE = dict.fromkeys(_IN_INK, INK) | {
+STYLE = dict.fromkeys(
+    ("axes.edgecolor", "text.color", "axes.labelcolor", "xtick.color", "ytick.color"), INK
+) | {
     "font.size": 10,
     "axes.titlesize": 10,
     "axes.linewidth": 0.8,
@@ -49,14 +40,9 @@ STYLE = dict.fromkeys(_IN_INK, INK) | {
 }
 
 
-def mode_colour(place: int) -> str:
-    """Returns the colour of the first (0), second, ... mode of a run, as in the replay; 8 differ."""
-    return colours.MODES[place % len(colours.MODES)]
-
-
 def mode_tint(place: int) -> str:
     """Returns a pale shade of the colour of the first (0), second, ... mode of a run, for areas."""
-    red, green, blue = (1 - TINT * (1 - share) for share in to_rgb(mode_colour(place)))
+    red, green, blue = (1 - 0.22 * (1 - share) for share in to_rgb(mode_colour(place)))
     return to_hex((red, green, blue))
 
 
@@ -120,7 +106,7 @@ def legend(figure: Figure, by_label: bool = False, **looks: Any) -> None:
     widths = [
         max(map(len, order[i : i + rows]), default=0) for i in range(0, len(order), rows or 1)
     ]
-    columns = COLUMNS if sum(widths) <= LETTERS else 1
+    columns = COLUMNS if sum(widths) <= 105 else 1  # letters that stand beside each other
     figure.legend(artists, order, loc="outside lower center", ncols=columns, **looks)
 
 

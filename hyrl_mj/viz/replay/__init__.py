@@ -12,13 +12,9 @@ from hyrl_mj.physics import mjcf
 from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.encoding import ENCODERS, video
-from hyrl_mj.viz.options import ReplayOptions
+from hyrl_mj.viz.options import USUAL, ReplayOptions
 from hyrl_mj.viz.replay.marks import Floor, Floors
-from hyrl_mj.viz.replay.screen import LAYOUTS, Screen, Show
-
-FASTEST, SLOWEST_MOTION = 240, 100  # frames/s, and times slower than real time
-FORMATS = (*ENCODERS, ".png")
-DEFAULTS = ReplayOptions()
+from hyrl_mj.viz.replay.screen import Screen, Show
 
 __all__ = ["Floor", "Floors", "Show", "check_replay", "render_replay"]
 
@@ -27,7 +23,7 @@ def render_replay(
     task: Task,
     shows: Sequence[Show],
     path: Path,
-    options: ReplayOptions = DEFAULTS,
+    options: ReplayOptions = USUAL,
     *,
     floor: Floors | None = None,
 ) -> None:
@@ -64,16 +60,15 @@ def render_replay(
 
 def check_replay(task: Task, path: Path, options: ReplayOptions) -> None:
     """Raises `BadInput` if no replay of a task can be written to a path with these options."""
-    if path.suffix not in FORMATS:
-        raise BadInput(f"{path} is no replay: give a name that ends in one of {', '.join(FORMATS)}")
-    if options.layout not in LAYOUTS:
-        raise unknown("layout", options.layout, LAYOUTS)
-    if not 1 <= options.fps <= FASTEST:
-        raise BadInput(f"no video has {options.fps} frames a second: give 1 to {FASTEST}")
-    if not 1 <= options.slow_motion <= SLOWEST_MOTION:
+    if path.suffix not in (formats := (*ENCODERS, ".png")):
+        raise BadInput(f"{path} is no replay: give a name that ends in one of {', '.join(formats)}")
+    if options.layout not in (layouts := ("side-by-side", "overlay")):
+        raise unknown("layout", options.layout, layouts)
+    if not 1 <= options.fps <= 240:
+        raise BadInput(f"no video has {options.fps} frames a second: give 1 to 240")
+    if not 1 <= options.slow_motion <= 100:
         raise BadInput(
-            f"slow motion {options.slow_motion:g} cannot be played: give 1 (real time) to "
-            f"{SLOWEST_MOTION}"
+            f"slow motion {options.slow_motion:g} cannot be played: give 1 (real time) to 100"
         )
     camera = options.camera or task.scene.camera
     mjcf.camera_of(task.model, camera)

@@ -12,14 +12,11 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from hyrl_mj.simulation import HybridArc
-from hyrl_mj.viz.colours import RGB, light
-from hyrl_mj.viz.replay.marks import BAD, GOOD, INK, OPEN, PAPER, WHITE
+from hyrl_mj.viz.colours import BAD, GOOD, INK, OPEN, WHITE, is_light
 from hyrl_mj.viz.replay.panel import Track
 
 Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
-EDGE = (205, 208, 213)
-SMALLEST_TEXT = 8  # [pixels]
-OUTCOMES: dict[str, tuple[str, RGB]] = {
+OUTCOMES = {
     "reached": ("arrived", GOOD),
     "crashed": ("crashed", BAD),
     "out_of_bounds": ("left the arena", BAD),
@@ -46,7 +43,7 @@ class Layout:
     def text(self) -> int:
         """Height of the letters [pixels]."""
         seen = min(self.width / 32, self.height / 30) / self.finer
-        return max(SMALLEST_TEXT, int(seen)) * self.finer
+        return max(8, int(seen)) * self.finer
 
     @property
     def bar(self) -> int:
@@ -81,13 +78,13 @@ class Layout:
             if len(groups) > 1:
                 line.words(title, INK)
             if len(tracks) == 1 and tracks[0].modes:
-                arc, row = tracks[0].arc, tracks[0].arc.at(t)
-                jumps = int((tracks[0].jumps <= row).sum())
-                line.words(f"j = {jumps}", INK, room="j = 00")
-                room = self.fonts[1].getlength(OUTCOMES[_outcome(tracks[0])][0]) + self.text
-                mode = tracks[0].task.mode_name(int(arc.q[row]))
-                line.badge(line.fitting(f"q = {mode}", room), tracks[0].colour(row))
-            ended = Counter(_outcome(track) for track in tracks if t >= track.end)
+                (track,) = tracks
+                task, arc, row = track.task, track.arc, track.arc.at(t)
+                line.words(f"j = {int((track.jumps <= row).sum())}", INK, room="j = 00")
+                room = self.fonts[1].getlength(OUTCOMES[arc.ending(task)][0]) + self.text
+                mode = task.mode_name(int(arc.q[row]))
+                line.badge(line.fitting(f"q = {mode}", room), track.colour(row))
+            ended = Counter(track.arc.ending(track.task) for track in tracks if t >= track.end)
             for outcome, number in sorted(ended.items()):
                 words, colour = OUTCOMES[outcome]
                 share = f"{number} of {len(tracks)} " if len(tracks) > 1 else ""
@@ -100,12 +97,12 @@ class _Line:
 
     def __init__(self, layout: Layout):
         self._large, self._small = layout.fonts
-        self._image = Image.new("RGB", (layout.width, layout.bar), PAPER)
+        self._image = Image.new("RGB", (layout.width, layout.bar), "#f6f7f9")
         self._draw = ImageDraw.Draw(self._image)
         self._gap, self._middle = layout.text, layout.bar // 2
         self._x = self._gap / 2
         edge = layout.width - 1
-        self._draw.line([(edge, 0), (edge, layout.bar)], EDGE)
+        self._draw.line([(edge, 0), (edge, layout.bar)], "#cdd0d5")
 
     @property
     def pixels(self) -> np.ndarray:
@@ -118,18 +115,18 @@ class _Line:
         ends = self._x + font.getlength(words) + beside + 2 * self._gap
         return words if ends <= self._image.width else re.sub(r" \(.*\)", "", words)
 
-    def words(self, words: str, colour: RGB, *, large: bool = False, room: str = "") -> None:
+    def words(self, words: str, colour: str, *, large: bool = False, room: str = "") -> None:
         """Writes words, which take at least as much room as the text `room`."""
         font = self._large if large else self._small
         self._draw.text((self._x, self._middle), words, colour, font, anchor="lm")
         self._x += max(font.getlength(words), font.getlength(room)) + self._gap
 
-    def badge(self, words: str, colour: RGB) -> None:
+    def badge(self, words: str, colour: str) -> None:
         """Writes words on a coloured plate: white ones, or dark ones if it is light."""
         pad, half = self._gap / 3, 0.75 * self._gap
         end = self._x + self._small.getlength(words) + 2 * pad
         self._draw.rectangle((self._x, self._middle - half, end, self._middle + half), colour)
-        ink = INK if light(colour) else WHITE
+        ink = INK if is_light(colour) else WHITE
         self._draw.text((self._x + pad, self._middle), words, ink, self._small, anchor="lm")
         self._x = end + self._gap / 2
 
@@ -137,9 +134,3 @@ class _Line:
         """Writes words at the right end."""
         x = self._image.width - self._gap / 2
         self._draw.text((x, self._middle), words, OPEN, self._small, anchor="rm")
-
-
-def _outcome(track: Track) -> str:
-    """Returns the outcome of an arc; "missed" if it crosses the finishing line off the set-point."""
-    arc = track.arc
-    return "missed" if arc.outcome == "reached" and not arc.arrives(track.task) else arc.outcome

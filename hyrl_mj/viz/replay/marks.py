@@ -13,33 +13,20 @@ from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
 from hyrl_mj.stages import CriticalSet, ExtendedSets, Partition
 from hyrl_mj.tasks import Task
-from hyrl_mj.viz import colours
-from hyrl_mj.viz.colours import RGB, rgb
+from hyrl_mj.viz.colours import CRITICAL, OVERLAP, rgba
 from hyrl_mj.viz.section import Section
 
-MODE_COLOURS = tuple(map(rgb, colours.MODES))
-POLICY_COLOUR, INK, WHITE = map(rgb, (colours.POLICY, colours.INK, colours.WHITE))
-GOOD, BAD = rgb(colours.GOOD), rgb(colours.BAD)
-PAPER, OPEN = (246, 247, 249), (110, 116, 126)
-OVERLAP, CRITICAL, BOUND = rgb(colours.OVERLAP), (205, 30, 45), (120, 95, 200, 115)
-
-# Heights above the tracked site [m], from the floor up: higher marks hide lower ones.
-ON_FLOOR, ON_SETS, ON_BOUND, ON_PATH, ON_TOP = -0.006, -0.004, -0.002, 0.0, 0.006
-THICKNESS = 0.004  # [m]
-FLYING = 0.3  # a robot flies if its tracked site is higher than this above the floor [m]
-CRITICAL_RADIUS, OVERLAP_WIDTH = 0.02, 0.16  # [m]
-# From so many nodes it is found out whether the tracked point moves at all.
-TRIED = 64
-# Cells of a strip of the overlap: short enough to follow a bent coordinate.
-STRIP = 16
-UP = np.array([0.0, 0.0, 1.0])
+# Heights above the tracked site [m], from the floor up: higher marks hide lower ones. Paths have none.
+ON_FLOOR, ON_SETS, ON_BOUND, ON_TOP = -0.006, -0.004, -0.002, 0.006
+THICKNESS = 0.004  # of a mark [m]
+CRITICAL_RADIUS = 0.02  # of a point of M* [m]
 
 
 def bar(
     scene: mujoco.MjvScene,
     start: np.ndarray,
     end: np.ndarray,
-    colour: tuple[int, ...],
+    colour: str,
     width: float,
     height: float = 0.0,
     reach: float = 0.0,
@@ -48,7 +35,7 @@ def bar(
 
     Args:
         scene, start, end: the scene, and the points [m].
-        colour: red, green, blue and, if the bar is not opaque, its opacity, 0 to 255.
+        colour: like "#0072b2", or "#0072b280" if the bar is not opaque.
         width: across [m].
         height: of the bar above the points [m].
         reach: how far the bar goes on beyond either end [m].
@@ -62,16 +49,23 @@ def bar(
     # Along the bar, across it on the level, and the third axis: NumPy's cross product is slower.
     axes = np.array([[x, -sin, -cos * z], [y, cos, -sin * z], [z, 0.0, flat]])
     size = (length / 2 + reach, width / 2, THICKNESS / 2)
-    middle = (start + end) / 2 + height * UP
+    middle = np.add((start + end) / 2, (0.0, 0.0, height))
     _add(scene, mujoco.mjtGeom.mjGEOM_BOX, size, middle, colour, axes)
 
 
 def disc(
-    scene: mujoco.MjvScene, centre: np.ndarray, radius: float, height: float, colour: RGB
+    scene: mujoco.MjvScene, centre: np.ndarray, radius: float, height: float, colour: str
 ) -> None:
     """Adds a flat disc around a point (3,), a height above it [m]."""
     size = (radius, THICKNESS / 2, 0.0)
-    _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, centre + height * UP, colour, np.eye(3))
+    _add(
+        scene,
+        mujoco.mjtGeom.mjGEOM_CYLINDER,
+        size,
+        np.add(centre, (0.0, 0.0, height)),
+        colour,
+        np.eye(3),
+    )
 
 
 def _add(
@@ -79,18 +73,18 @@ def _add(
     kind: mujoco.mjtGeom,
     size: tuple[float, float, float],
     pos: np.ndarray,
-    colour: tuple[int, ...],
+    colour: str,
     axes: np.ndarray,
 ) -> None:
     """Adds a geom to the scene, unless a very long path has used up all geoms."""
     if scene.ngeom < scene.maxgeom:
         geom = scene.geoms[scene.ngeom]
-        rgba = np.append(colour, 255)[:4].astype(np.float32) / 255
-        mujoco.mjv_initGeom(geom, kind, np.array(size), pos, axes.ravel(), rgba)
+        look = rgba(colour)
+        mujoco.mjv_initGeom(geom, kind, np.array(size), pos, axes.ravel(), look)
         # MuJoCo leaves the number of the model's geom that was drawn in this place before.
         geom.objtype, geom.objid = mujoco.mjtObj.mjOBJ_UNKNOWN, -1
         geom.specular = 0  # marks keep the colours of the captions
-        geom.transparent = int(rgba[3] < 1)
+        geom.transparent = int(look[3] < 1)
         scene.ngeom += 1
 
 
@@ -138,10 +132,12 @@ class Floor:
             points = places(np.vstack([ends, middle, side]))
             strips.append(points[:2])
             across = 2 * float(np.linalg.norm(points[3] - points[2]))
-            widths.append(OVERLAP_WIDTH if len(half) == 1 else across)
+            # Along a single coordinate a strip has no width of its own.
+            widths.append(0.16 if len(half) == 1 else across)
         points, nodes = critical.points, partition.grid.nodes
-        if np.ptp(places(nodes[:: max(len(nodes) // TRIED, 1)]), axis=0).max() < 1e-9:
-            points = points[:0]  # the tracked point stays where it is, and tells nothing about M*
+        # Some 64 nodes tell whether the tracked point moves at all: if not, it tells nothing about M*.
+        if np.ptp(places(nodes[:: max(len(nodes) // 64, 1)]), axis=0).max() < 1e-9:
+            points = points[:0]
         return Floor(places(points), np.reshape(strips, (-1, 2, 3)), np.array(widths))
 
     def draw(self, scene: mujoco.MjvScene, larger: float) -> None:
@@ -179,12 +175,15 @@ class Floors:
 
 
 def on_floor(task: Task, points: np.ndarray) -> np.ndarray:
-    """Returns the points (n, 3) [m] on the floor below robots that fly; those of others unchanged."""
+    """Returns the points (n, 3) [m] on the floor below robots that fly; those of others unchanged.
+
+    A robot flies if its point is more than 0.3 m above the floor.
+    """
     floor = mujoco.mj_name2id(task.model, mujoco.mjtObj.mjOBJ_GEOM, "floor")
     if floor < 0:
         return points
     ground = task.model.geom_pos[floor, 2]
-    flies = points[:, 2] > ground + FLYING
+    flies = points[:, 2] > ground + 0.3
     height = np.where(flies, ground - 2 * ON_FLOOR, points[:, 2])
     return np.column_stack([points[:, :2], height])
 
@@ -196,7 +195,7 @@ def _strips(
 
     Where the ways have joined again all sets overlap, and no strip is drawn.
     """
-    grid = extended.sets[0].regular
+    grid, cells = extended.sets[0].regular, 16  # of a strip: it is to follow a bent coordinate
     if not len(critical.points) or len(extended.sets) < 2:
         return  # nothing overlaps
     joined = np.sum([part.contains(grid.nodes) for part in partition.parts], axis=0) > 1
@@ -209,8 +208,8 @@ def _strips(
     for row in np.arange(overlap.size).reshape(-1, grid.counts[-1]):
         inside = row[overlap.ravel()[row]]
         for run in np.split(inside, np.flatnonzero(np.diff(inside) > 1) + 1):
-            for piece in range(0, len(run), STRIP):
-                strip = run[piece : piece + STRIP]
+            for piece in range(0, len(run), cells):
+                strip = run[piece : piece + cells]
                 ends = grid.nodes[strip[[0, -1]]]
                 ends[:, -1] += [-grid.spacing[-1] / 2, grid.spacing[-1] / 2]
                 yield ends

@@ -15,17 +15,10 @@ from hyrl_mj.physics import mjcf
 from hyrl_mj.physics.rendering import GEOMS, HIDDEN, Box, Canvas, SceneRenderer
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import Task
-from hyrl_mj.viz.colours import RGB
+from hyrl_mj.viz.colours import BAD, INK, POLICY, WHITE, mode_colour, rgba
 from hyrl_mj.viz.replay import marks
 
-PATH_WIDTH, BOUND_WIDTH, START_RADIUS, JUMP_RADIUS, CROSS = 0.032, 0.05, 0.035, 0.055, 0.075  # [m]
-BOUND_PIECES, GHOST_ALPHA = 4, 0.35
-# Marks are larger where a picture shows more than the first across, and smaller where less than the second;
-# they are made for the third [m].
-WIDE, SMALL, USUAL = 6.0, 1.6, 3.0
-# The part that is redrawn is this much larger than what has moved [pixels].
-MARGIN = 2
-FAILED = ("crashed", "out_of_bounds", "stalled", "unstable")
+PATH_WIDTH, JUMP_RADIUS = 0.032, 0.055  # [m]
 
 
 class Track:
@@ -77,12 +70,11 @@ class Track:
         kept = [names[int(self.arc.q[row - 1])] != names[int(self.arc.q[row])] for row in rows]
         return rows[np.array(kept, dtype=bool)]
 
-    def colour(self, row: int) -> RGB:
+    def colour(self, row: int) -> str:
         """Returns the colour of the path from a row on."""
         if not self.modes:
-            return marks.POLICY_COLOUR
-        colours = marks.MODE_COLOURS
-        return colours[self.task.colour_of(int(self.arc.q[row]), self._of) % len(colours)]
+            return POLICY
+        return mode_colour(self.task.colour_of(int(self.arc.q[row]), self._of))
 
     def tinted(self, row: int) -> frozenset[int]:
         """Returns the ids of the geoms that have the colour of the path from a row on."""
@@ -109,7 +101,7 @@ class Track:
         """Returns a line (k, 3) [m] for each noisy coordinate: the points that may be measured."""
         z, qpos = self.z(t), self.qpos(t)
         noise = self.task.noise_in_chart(self.arc.bound)
-        share = np.linspace(-1, 1, BOUND_PIECES + 1)[:, None]
+        share = np.linspace(-1, 1, 5)[:, None]
         lines = [z + share * noise * (np.arange(len(z)) == i) for i in np.flatnonzero(noise)]
         shifts = [self.task.state(line)[0] - self.task.state(z[None])[0] for line in lines]
         return [marks.tracked_points(self.task, qpos + shift) for shift in shifts]
@@ -154,7 +146,10 @@ class Panel:
         self._begin(self._floor_at(0.0))
 
     def _scale(self) -> float:
-        """Returns by how much marks are larger than usual in a wide field, or smaller in a small scene."""
+        """Returns by how much marks are larger than usual in a wide field, or smaller in a small scene.
+
+        They are made for a picture that shows 3 m across, and are larger beyond 6 m and smaller below 1.6 m.
+        """
         if not self._rests:
             return 1.0
         self._renderer.look(self._tracks[0].qpos(0.0), self._camera)
@@ -162,7 +157,7 @@ class Panel:
         _, scale = self._renderer.project(points)
         shown = min(self._renderer.width, self._renderer.height) / scale
         side = float(np.median(shown))
-        return side / USUAL if side < SMALL else max(side / WIDE, 1.0)
+        return side / 3.0 if side < 1.6 else max(side / 6.0, 1.0)
 
     def _begin(self, floor: marks.Floor | None) -> None:
         """Draws anew what stays: the marks on the floor, and where the tracks start."""
@@ -172,7 +167,7 @@ class Panel:
         if floor:
             floor.draw(scene, self._larger)
         for track in self._tracks:
-            marks.disc(scene, track.points[0], self._larger * START_RADIUS, marks.ON_TOP, marks.INK)
+            marks.disc(scene, track.points[0], self._larger * 0.035, marks.ON_TOP, INK)
         self._renderer.keep()
         self._drawn = [_Drawn() for _ in self._tracks]
 
@@ -213,15 +208,15 @@ class Panel:
         for row in track.jumps[(track.jumps > first) & (track.jumps <= last)]:
             height = marks.ON_TOP + marks.THICKNESS
             radius, above = self._larger * JUMP_RADIUS, height + marks.THICKNESS
-            marks.disc(scene, track.points[row], radius, height, marks.INK)
-            marks.disc(scene, track.points[row], 0.6 * radius, above, marks.WHITE)
+            marks.disc(scene, track.points[row], radius, height, INK)
+            marks.disc(scene, track.points[row], 0.6 * radius, above, WHITE)
         return track.points[first : last + 1]
 
     def _segment(self, track: Track, row: int, end: np.ndarray) -> None:
         """Adds the path from a row to a point (3,) to the scene."""
         # Where a path comes back in another mode the later one is drawn over the earlier. Square ends
         # as long as half the width close the gaps at bends.
-        height = marks.ON_PATH + 2e-4 * (track.arc.j[row] % 20)
+        height = 2e-4 * (track.arc.j[row] % 20)
         start, colour = track.points[row], track.colour(row)
         width = self._larger * PATH_WIDTH
         marks.bar(self._renderer.scene, start, end, colour, width, height, width / 2)
@@ -235,27 +230,27 @@ class Panel:
         robot = [scene.geoms[number] for number in renderer.add_robot(track.qpos(t))]
         for geom in robot:
             if geom.objid in tinted:
-                geom.rgba[:3] = np.array(track.colour(row)) / 255
+                geom.rgba[:3] = rgba(track.colour(row))[:3]
         if t < track.end and track.arc.bound > 0:
             for line in track.bounds(t):
                 for start, end in pairwise(line):
-                    width = self._larger * BOUND_WIDTH
-                    marks.bar(scene, start, end, marks.BOUND, width, marks.ON_BOUND)
+                    width = self._larger * 0.05
+                    marks.bar(scene, start, end, "#785fc873", width, marks.ON_BOUND)
             if np.isfinite(ghost := track.measured(t)).all():
                 for geom, number in zip(robot, renderer.add_robot(ghost), strict=True):
-                    scene.geoms[number].rgba[3] = GHOST_ALPHA
+                    scene.geoms[number].rgba[3] = 0.35
                     scene.geoms[number].transparent = 1
                     if np.array_equal(geom.pos, scene.geoms[number].pos):  # noise does not move it
                         scene.geoms[number].type = HIDDEN
-        if t >= track.end and track.arc.outcome in FAILED:
-            for side in ((CROSS, CROSS, 0.0), (CROSS, -CROSS, 0.0)):
+        if t >= track.end and track.arc.outcome not in ("reached", "running"):
+            for side in ((0.075, 0.075, 0.0), (0.075, -0.075, 0.0)):  # of a cross
                 ends = point - self._larger * np.array(side), point + self._larger * np.array(side)
-                marks.bar(scene, *ends, marks.BAD, self._larger * PATH_WIDTH, marks.ON_TOP + 0.18)
+                marks.bar(scene, *ends, BAD, self._larger * PATH_WIDTH, marks.ON_TOP + 0.18)
         geoms = scene.geoms[first : scene.ngeom]
         points = np.vstack([path, *[geom.pos for geom in geoms]])
         radii = [self._larger * JUMP_RADIUS] * len(path) + [renderer.reach(geom) for geom in geoms]
         low, high = renderer.extent(points, np.array(radii))
-        size = (renderer.width, renderer.height)
-        left, top = np.floor(low.min(axis=0) - MARGIN).clip(0, size).astype(int)
-        right, bottom = np.ceil(high.max(axis=0) + MARGIN).clip(0, size).astype(int)
+        size = (renderer.width, renderer.height)  # two pixels more than what has moved
+        left, top = np.floor(low.min(axis=0) - 2).clip(0, size).astype(int)
+        right, bottom = np.ceil(high.max(axis=0) + 2).clip(0, size).astype(int)
         return left, top, right, bottom

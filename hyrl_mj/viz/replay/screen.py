@@ -18,10 +18,6 @@ from hyrl_mj.viz.replay.captions import Layout
 from hyrl_mj.viz.replay.marks import Floors
 from hyrl_mj.viz.replay.panel import Panel, Track
 
-LAYOUTS = ("side-by-side", "overlay")
-SMALLEST = (240, 160)  # [pixels] of a panel, for captions that can be read
-# A poster is drawn this many times larger, if it can be, and then reduced, for smooth edges.
-FINER = 2
 HOLD = 1.0  # [s] that the last frame stays
 AROUND = 0.25  # [s] before and after a jump that are played slowly
 
@@ -70,7 +66,8 @@ class Screen:
             modes = {int(arc.q[0]) for arc in show.hybrid}
             where = "each mode" if len(modes) > 1 else f"q = {task.mode_name(*modes)}"
             self._panels[f"HyRL, started in {where}"] = hybrid
-        size, least = options.size, (len(self._panels) * SMALLEST[0], SMALLEST[1])
+        # The captions of smaller panels cannot be read.
+        size, least = options.size, (240 * len(self._panels), 160)
         if any(n % 2 or not small <= n <= LARGEST for n, small in zip(size, least, strict=True)):
             raise BadInput(
                 f"a video of {size[0]} x {size[1]} pixels cannot be drawn: give even numbers from "
@@ -116,8 +113,8 @@ class Screen:
                 yield frame
 
     def poster(self) -> Image.Image:
-        """Returns the last frame, with smooth edges."""
-        finer = min(FINER, LARGEST // max(self._size))
+        """Returns the last frame, drawn twice as large if that can be, and reduced for smooth edges."""
+        finer = min(2, LARGEST // max(self._size))
         (frame,) = self.frames([self._end], finer)
         return Image.fromarray(frame).reduce(finer)
 
