@@ -8,7 +8,6 @@ from fields import Field
 from planted import ChartPolicy
 
 import hyrl_mj
-from hyrl_mj.learning import rehearsal
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.learning.rehearsal import Rehearsal, running_points
 from hyrl_mj.learning.training import TaskGround, build, train
@@ -117,7 +116,6 @@ def test_a_training_rehearses_what_its_checkpoints_lose(monkeypatch):
     task = hyrl_mj.get_task("gaps")
     tried = []
     update = Rehearsal.update
-    monkeypatch.setattr(rehearsal, "TRIED", 64)
     monkeypatch.setattr(Rehearsal, "update", lambda self, p: (tried.append(p), update(self, p)))
     settings = preset(task, "smoke").stage1
     assert settings.rehearse == 0.4

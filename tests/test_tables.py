@@ -181,9 +181,9 @@ def test_a_table_is_read_as_it_was_written(puck, held, tmp_path):
     table.save(tmp_path / "mode_0.safetensors")
     again = TablePolicy.load(tmp_path / "mode_0_table.npz")
     measured = puck.plant(3).measurement
-    np.testing.assert_array_equal(again.of(puck).act(measured), table.act(measured))
+    np.testing.assert_array_equal(again.bound_to(puck).act(measured), table.act(measured))
     with pytest.raises(BadInput, match="does not fit"):
-        TablePolicy(again.counts, again.inputs[1:]).of(puck)
+        TablePolicy(again.counts, again.inputs[1:]).bound_to(puck)
 
 
 @pytest.mark.parametrize(

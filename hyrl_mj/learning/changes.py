@@ -24,7 +24,6 @@ OPTIONS = {
 }
 # Names of options that differ from those of their settings.
 NAMES = {"noise": "eps", "stage1": "policy", "everywhere": "all_coordinates"}
-WORDS = {"True": True, "False": False, "None": None}
 
 
 def changed(settings: Settings, changes: Mapping[str, object]) -> Settings:
@@ -96,7 +95,7 @@ def setting_value(value: object) -> object:
     try:
         return json.loads(value if isinstance(value, str) else json.dumps(value))
     except ValueError:
-        return WORDS.get(value, value)  # type: ignore[call-overload]
+        return {"True": True, "False": False, "None": None}.get(value, value)  # type: ignore[call-overload]
     except TypeError:
         raise BadInput(
             f"a setting cannot be {value!r}: give a number, a text, a list or None"
@@ -123,7 +122,7 @@ def changes(settings: Settings, of: Settings) -> dict[str, Any]:
 def differing(old: Any, new: Any, of: str = "") -> Iterator[str]:
     """Yields a description of each setting that differs, by the name of its option.
 
-    Of trainings with two algorithms, and of two agents, that is all.
+    Trainings with different algorithms, and agents, are described as a whole.
     """
     groups = dict(_records(old))
     for name, before in vars(old).items():

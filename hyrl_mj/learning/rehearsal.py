@@ -7,9 +7,6 @@ from hyrl_mj.policies import Policy
 from hyrl_mj.simulation import WayRuns, way_runs
 from hyrl_mj.tasks import Outcome, Task
 
-# Chart points that starts are drawn from, and that a policy is tried from: fewer for plants with dynamics,
-# whose samples are slower to simulate.
-POINTS, TRIED, TRIED_DYNAMIC = 16_384, 2_048, 256
 # A policy decides between a point that it is tried from and one of so many nearest ones.
 NEIGHBOURS = 4
 
@@ -29,10 +26,11 @@ class Rehearsal:
 
     def __init__(self, task: Task, settings: Training):
         self._task, self._settings = task, settings
-        self._points = running_points(task, POINTS, np.random.default_rng(0))
+        self._points = running_points(task, 16_384, np.random.default_rng(0))
         self._lost = self._deciding = self._points[:0]
         self._weight, self._tried = np.empty(0), 0
-        self._count = TRIED if task.kinematic else TRIED_DYNAMIC
+        # A policy is tried from fewer points with dynamics, whose samples are slower to simulate.
+        self._count = 2_048 if task.kinematic else 256
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draws n starts (n, d)."""

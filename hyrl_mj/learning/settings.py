@@ -29,8 +29,7 @@ from hyrl_mj.tasks import SEARCHES, Task
 
 PRESETS = ("fast", "paper", "smoke")
 
-# Samples of the longest episode, and grid cells along the longest side of a chart.
-LONGEST = 100_000
+# Grid cells along the longest side of a chart.
 CELLS = Integer(2, 10**6)
 
 
@@ -85,7 +84,7 @@ class Training:
     rehearse_lost: Annotated[float, Number(0, 1)] = 0.4
     rehearse_deciding: Annotated[float, Number(0, 1)] = 0.4
     warm_start: Annotated[bool, Flag()] = False
-    episode: Annotated[int | None, Optional(Integer(1, LONGEST))] = None
+    episode: Annotated[int | None, Optional(Integer(1, 100_000))] = None
     attempts: Annotated[int, Integer(1, 1_000)] = 1
     action_noise: Annotated[float, Number(0, 10)] = 0.0
     options: dict[str, Any] = field(default_factory=dict)

@@ -26,7 +26,7 @@ from hyrl_mj.stages.partition import (
     part_policies,
 )
 from hyrl_mj.stages.reach import backward_reach, forward_reach, outside, shortest
-from hyrl_mj.stages.refinement import spread
+from hyrl_mj.stages.refinement import refined
 from hyrl_mj.tasks import Task
 
 
@@ -197,7 +197,7 @@ class _Case:
         # The same runs from outside of a part tell from where its way succeeds, and when they enter the part.
         self._told = [
             cache(partial(
-                spread, task, self.grid, candidate & ~part.mask, points, radius,
+                refined, task, self.grid, candidate & ~part.mask, points, radius,
                 partial(
                     outside, task, pi, partition, part, None if self._backward else rim, longest
                 ), 2,

@@ -19,7 +19,7 @@ from hyrl_mj.sets import GridSet, Nodes, resolving
 from hyrl_mj.simulation import WayRuns, policy_runs, way_runs
 from hyrl_mj.stages import strips
 from hyrl_mj.stages.critical_set import check_points
-from hyrl_mj.stages.refinement import spread, thinned
+from hyrl_mj.stages.refinement import refined, thinned
 from hyrl_mj.stages.ways import Ways
 from hyrl_mj.tasks import ANY, Outcome, Task, number_of
 
@@ -172,7 +172,7 @@ def make_partition(
 
     everywhere, columns = np.ones(grid.size, dtype=bool), len(ways.modes) + 2
     wedge = settings.wedge * noise
-    known = spread(task, grid, everywhere, points, wedge, tell, columns).astype(bool)
+    known = refined(task, grid, everywhere, points, wedge, tell, columns).astype(bool)
     members, succeeds = known[:, :-2], known[:, -1]
     works, failed = np.flatnonzero(known[:, -2]), np.flatnonzero(~known[:, -2])
     if modes and len(failed):

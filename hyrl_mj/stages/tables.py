@@ -52,7 +52,7 @@ class TablePolicy(Saved):
     counts: np.ndarray
     inputs: np.ndarray
 
-    def of(self, task: Task) -> BoundTable:
+    def bound_to(self, task: Task) -> BoundTable:
         """Returns the policy on the chart of a task.
 
         Raises:
