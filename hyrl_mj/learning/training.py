@@ -229,18 +229,13 @@ def threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def evaluate(
-    task: Task,
-    policy: MlpPolicy,
-    domain: Domain | None = None,
-    gamma: float = 1.0,
-    episodes: int = 256,
-) -> tuple[float, float]:
+def evaluate(task: Task, policy: MlpPolicy, gamma: float = 1.0) -> tuple[float, float]:
     """Returns the share of episodes that end at the set-point, and the mean return, discounted by gamma.
 
     The starts are drawn from the start distribution and are always the same.
     """
-    env = BatchedEnv(task, episodes, domain=domain)
+    episodes = 256
+    env = BatchedEnv(task, episodes)
     env.seed(0)
     observation = env.reset()
     returns, weight = np.zeros(episodes), np.ones(episodes)
@@ -281,7 +276,7 @@ class TaskGround:
 
     def __call__(self, policy: MlpPolicy) -> Score:
         self.note_losses(policy)
-        return evaluate(self._task, policy, gamma=self._gamma)
+        return evaluate(self._task, policy, self._gamma)
 
 
 class _Watch(BaseCallback):

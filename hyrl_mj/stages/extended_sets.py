@@ -25,7 +25,7 @@ from hyrl_mj.stages.partition import (
     open_ways,
     part_policies,
 )
-from hyrl_mj.stages.reach import backward_reach, forward_reach, outside, shortest
+from hyrl_mj.stages.reach import backward_reach, forward_reach, runs_from_outside, shortest
 from hyrl_mj.stages.refinement import refined
 from hyrl_mj.tasks import Task
 
@@ -199,7 +199,8 @@ class _Case:
             cache(partial(
                 refined, task, self.grid, candidate & ~part.mask, points, radius,
                 partial(
-                    outside, task, pi, partition, part, None if self._backward else rim, longest
+                    runs_from_outside, task, pi, partition, part,
+                    None if self._backward else rim, longest,
                 ), 2,
             ))
             for pi, part, rim, candidate in zip(

@@ -36,7 +36,7 @@ def shortest(
     return best
 
 
-def outside(
+def runs_from_outside(
     task: Task,
     pi: PartPolicy,
     partition: Partition,
