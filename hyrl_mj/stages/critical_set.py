@@ -138,7 +138,8 @@ def _by_rods(
     axis = np.tile(np.arange(d), len(grid.nodes))
     length = grid.spacing[axis]
     while True:
-        part = _part(task, policy, *_ends(task, centre, axis, length), settings)
+        a, b = _ends(task, centre, axis, length)
+        part = _part(task, policy, a, b, settings)
         centre, axis, length = centre[part], axis[part], length[part]
         if not len(centre) or length.max() <= resolution * grid.cell:
             break

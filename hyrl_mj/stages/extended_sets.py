@@ -37,7 +37,8 @@ class ExtendedSets(Saved):
     Attributes:
         modes: the modes.
         sets: M_ext_i of each mode, in the same order.
-        winning: W_i as (N,) bool over the grid's nodes, from where pi_i reaches the set-point.
+        winning: W_i, the winning region of each mode, as (N,) bool over the grid's nodes: from there pi_i
+            reaches the set-point.
         horizon: time T of the backward propagation [s]; 0 without propagation.
         noise: bound eps of the measurement noise that the sets are made for.
         points: (K, d) points of M* where modes meet, and the way of one of them is open.

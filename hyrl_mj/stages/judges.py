@@ -177,9 +177,9 @@ class Episodes:
         """
         rows, states, task = self.batches[batch], self.states, self.states.task
         settings = LoopSettings(plant=self._plants[len(rows)], vary=True, quiet=True)
-        noise, loop = Noise(kind, self.noise.bound), PolicyController(policy)
+        noise, controller = Noise(kind, self.noise.bound), PolicyController(policy)
         starts, noisy = self.starts[rows], task.with_noise(states.shares)
-        run = closed_loop(noisy, loop, starts, noise, seed=int(rows[0]), settings=settings)
+        run = closed_loop(noisy, controller, starts, noise, seed=int(rows[0]), settings=settings)
         ends, won = run.path[-1], run.outcome == Outcome.REACHED
         won = won & task.arrived(ends) if kind == QUIET else won
         return won, task.miss(ends)
@@ -294,8 +294,8 @@ class ByAttack:
         if won < self.settings.worth_attacking:
             return Judged((won / 2, 0.0, -1.0), False, lost, weight)
         task = self.states.task.with_noise(self.states.shares)
-        loops = {"mode": PolicyController(policy)}
-        found = attack(task, loops, self.attacked, self.noise.bound, Budget(rounds=1))["mode"]
+        controllers = {"mode": PolicyController(policy)}
+        found = attack(task, controllers, self.attacked, self.noise.bound, Budget(rounds=1))["mode"]
         withstood = 1 - found.count.lost / len(self.attacked)
         both = (won + withstood) / 2
         if both < 1:
