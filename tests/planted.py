@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 
 import mujoco
 import numpy as np
@@ -394,7 +395,7 @@ def believe(path, task=None):
     files = {p.relative_to(path).as_posix(): digest(p) for p in path.rglob("*") if p.is_file()}
     Manifest(path, run.digests)._write(
         {
-            stage: Entry(run.digests[stage], code, {}, outputs)
+            stage: Entry(run.digests[stage], code, {}, outputs, version("hyrl-mj"))
             for stage, names in FILES.items()
             if (outputs := {n: content for n, content in files.items() if re.fullmatch(names, n)})
         }

@@ -7,7 +7,7 @@ import pytest
 from junctions import EPS, NUMBERS, Gates, four_ways, thin_way, three_ways
 
 from hyrl_mj import Noise, extend, find_critical_set, make_partition, simulate
-from hyrl_mj.stages.meeting import meetings
+from hyrl_mj.stages import meeting
 
 JUNCTIONS = pytest.mark.parametrize("make", [three_ways, four_ways])
 CELLS = 60
@@ -154,12 +154,12 @@ def test_neighbours_meet_along_their_edge_and_all_in_the_junction(split, make):
     case, task = split[make], split[make].task
     k = len(task.modes)
     far = 0.5 * np.stack([np.cos(task.edges), np.sin(task.edges)], axis=1)
-    found = meetings(far, case.parts.parts)
+    found = meeting.meet(meeting.around(far, case.parts.parts))
     for i, meet in enumerate(found):
         expected = np.zeros((k, k), dtype=bool)
         expected[i - 1, i] = expected[i, i - 1] = True
         np.testing.assert_array_equal(meet, expected)
-    (middle,) = meetings(np.zeros((1, 2)), case.parts.parts)
+    (middle,) = meeting.meet(meeting.around(np.zeros((1, 2)), case.parts.parts))
     np.testing.assert_array_equal(middle, ~np.eye(k, dtype=bool))
 
 

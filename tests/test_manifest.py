@@ -86,6 +86,14 @@ def test_other_settings_or_code_make_a_stage_undone(folder):
     assert done(folder, code="a changed robot") == []
 
 
+def test_another_version_runs_every_stage_again_and_can_read_what_is_there(folder, monkeypatch):
+    monkeypatch.setattr(manifest, "version", lambda name: "0.0.9")
+    assert done(folder) == []
+    assert Manifest(folder, SETTINGS).checked(folder / "partition.npz") == folder / "partition.npz"
+    write(folder, "train", "policy.json", "a")
+    assert done(folder) == ["train"]
+
+
 def test_a_stage_that_breaks_off_is_not_believed(folder):
     def break_off():
         with Manifest(folder, SETTINGS).stage("train"):

@@ -5,7 +5,7 @@ import pytest
 
 import hyrl_mj
 from hyrl_mj.sets import Grid, covering, enough_cells
-from hyrl_mj.stages.refinement import THIN, spread, strides, thinned
+from hyrl_mj.stages.refinement import THIN, refined, strides, thinned
 
 NOISE = 0.1
 
@@ -65,12 +65,12 @@ def test_near_the_critical_set_it_is_known_as_if_all_were_simulated(rover, grid)
         [np.tile([0.0, 1.0, 2.0, 3.0, 4.0], 60), np.repeat(y, 5), np.repeat(-y / 1.3, 5)], 1
     )
     everywhere = np.ones(grid.size, dtype=bool)
-    known = spread(rover, grid, everywhere, points, 1.0, tell, 1)[:, 0]
+    known = refined(rover, grid, everywhere, points, 1.0, tell, 1)[:, 0]
     assert sum(asked) < 0.25 * grid.size
     near = np.abs(grid.nodes[:, 1]) < 1.0
     np.testing.assert_array_equal(known[near], side(grid.nodes)[near])
     # Far from it they take after others, no farther than two nodes away.
-    far = spread(rover, grid, everywhere, points[:0], 1.0, tell, 1)[:, 0]
+    far = refined(rover, grid, everywhere, points[:0], 1.0, tell, 1)[:, 0]
     wrong = far != side(grid.nodes)
     assert 0 < wrong.mean() < 0.1
     reach = (np.array([0, 1, 1]) * THIN * grid.spacing * [0, 1, 1.3]).sum()
@@ -85,5 +85,5 @@ def test_only_what_is_wanted_is_asked_for(rover, grid):
         asked.extend(rows)
         return side(grid.nodes[rows])[:, None]
 
-    spread(rover, grid, wanted, np.zeros((1, 3)), 1.0, tell, 1)
+    refined(rover, grid, wanted, np.zeros((1, 3)), 1.0, tell, 1)
     assert np.abs(grid.nodes[asked, 1]).max() <= 0.2 + THIN * grid.spacing[1]

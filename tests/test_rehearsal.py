@@ -8,7 +8,6 @@ from fields import Field
 from planted import ChartPolicy
 
 import hyrl_mj
-from hyrl_mj.learning import rehearsal
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.learning.rehearsal import Rehearsal, running_points
 from hyrl_mj.learning.training import TaskGround, build, train
@@ -19,6 +18,12 @@ POST = {"": (2, 0, 0.5)}
 @pytest.fixture
 def field():
     return Field(POST)
+
+
+def rehearsal_of(task, share):
+    """The rehearsal of a training of which this share of the episodes starts anywhere."""
+    training = preset(hyrl_mj.get_task("gaps"), "smoke").stage1
+    return Rehearsal(task, replace(training, rehearse=share))
 
 
 def straight(task):
@@ -47,7 +52,7 @@ def in_front(z):
 
 def test_a_share_of_the_episodes_starts_anywhere_outside_obstacles(field):
     rng = np.random.default_rng(0)
-    z = Rehearsal(field, 0.4).starts(20_000, rng)
+    z = rehearsal_of(field, 0.4).starts(20_000, rng)
     elsewhere = z[~among_starts(field, z)]
     box = field.chart.sides.prod()
     inside = np.prod(np.subtract(field.start_high, field.start_low)) / (box - np.pi * 0.25)
@@ -57,7 +62,7 @@ def test_a_share_of_the_episodes_starts_anywhere_outside_obstacles(field):
 
 
 def test_many_of_these_start_where_the_latest_policy_lost(field):
-    drawn = Rehearsal(field, 1.0)
+    drawn = rehearsal_of(field, 1.0)
     rng = np.random.default_rng(0)
     usual = in_front(drawn.starts(20_000, rng)).mean()
     drawn.update(straight(field))
@@ -69,7 +74,7 @@ def test_many_of_these_start_where_the_latest_policy_lost(field):
 
 
 def test_many_of_these_start_where_the_latest_policy_goes_two_ways(field):
-    drawn = Rehearsal(field, 1.0)
+    drawn = rehearsal_of(field, 1.0)
     rng = np.random.default_rng(0)
     at = 0.7
 
@@ -86,7 +91,7 @@ def test_many_of_these_start_where_the_latest_policy_goes_two_ways(field):
 
 
 def test_what_is_lost_late_is_rehearsed_more_often(field):
-    drawn = Rehearsal(field, 1.0)
+    drawn = rehearsal_of(field, 1.0)
     drawn.update(straight(field))
     rng = np.random.default_rng(0)
     x = (z := drawn.starts(40_000, rng))[in_front(z), 0]
@@ -96,7 +101,7 @@ def test_what_is_lost_late_is_rehearsed_more_often(field):
 
 def test_a_policy_that_wins_everything_leaves_nothing_to_rehearse(field):
     field = Field({"": (9, 9, 0.1)})
-    drawn = Rehearsal(field, 0.5)
+    drawn = rehearsal_of(field, 0.5)
     drawn.update(straight(field))
     assert drawn.starts(100, np.random.default_rng(0)).shape == (100, 2)
 
@@ -111,14 +116,14 @@ def test_a_training_rehearses_what_its_checkpoints_lose(monkeypatch):
     task = hyrl_mj.get_task("gaps")
     tried = []
     update = Rehearsal.update
-    monkeypatch.setattr(rehearsal, "TRIED", 64)
     monkeypatch.setattr(Rehearsal, "update", lambda self, p: (tried.append(p), update(self, p)))
     settings = preset(task, "smoke").stage1
     assert settings.rehearse == 0.4
     settings = replace(settings, samples=8_192, envs=64)
     train(task, settings, 0)
     assert len(tried) > 1
-    env = build(task, settings, 0, domain=TaskGround(task, 0.9, rehearse=1.0).domain(0.9)).env.core
+    domain = TaskGround(task, replace(settings, rehearse=1.0)).domain(0.9)
+    env = build(task, settings, 0, domain=domain).env.core
     env.reset()
     assert not task.may_start(env.z).all()
 
@@ -126,5 +131,6 @@ def test_a_training_rehearses_what_its_checkpoints_lose(monkeypatch):
 @pytest.mark.parametrize("name", ["unit_circle", "vehicle"])
 def test_tuned_robots_start_where_their_task_starts(name):
     task = hyrl_mj.get_task(name)
-    assert preset(task).stage1.rehearse == 0
-    assert TaskGround(task, 0.9).domain(0.9) is None
+    stage1 = preset(task).stage1
+    assert stage1.rehearse == 0
+    assert TaskGround(task, stage1).domain(0.9) is None

@@ -17,14 +17,14 @@ from hyrl_mj import closed_loop
 from hyrl_mj.envs import BatchedEnv
 from hyrl_mj.envs.core import cautious_reward
 from hyrl_mj.game import Game
-from hyrl_mj.learning import symmetry, training
+from hyrl_mj.learning import ModeSettings, symmetry, training
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.stages import grounds
 from hyrl_mj.stages.extended_sets import ExtendedSets, extend
-from hyrl_mj.stages.grounds import FEW_PLAYS, PLAYS, ByEpisodes, ByGame
+from hyrl_mj.stages.grounds import mode_ground
 from hyrl_mj.stages.hybrid import HybridController
+from hyrl_mj.stages.judges import ByEpisodes, ByGame, Episodes, Judged
 from hyrl_mj.stages.results import ModeResult
 from hyrl_mj.stages.retraining import retrain
 
@@ -41,7 +41,7 @@ def vehicle_sets(vehicle):
 
 
 def test_mode_starts_cover_the_set_with_room_for_the_noise(vehicle, vehicle_sets):
-    domain = ByGame(vehicle, vehicle_sets, 0).domain(gamma=0.9)
+    domain = mode_ground(vehicle, vehicle_sets, 0).domain(gamma=0.9)
     z = domain.starts(5000, np.random.default_rng(0))
     cell = vehicle_sets.sets[0].grid.cell
     assert vehicle.chart.contains(z).all()
@@ -53,14 +53,14 @@ def test_mode_starts_cover_the_set_with_room_for_the_noise(vehicle, vehicle_sets
 
 
 def test_a_mode_that_leaves_its_set_pays_for_ever(vehicle, circle, vehicle_sets):
-    domain = ByGame(vehicle, vehicle_sets, 1).domain(gamma=0.9)
+    domain = mode_ground(vehicle, vehicle_sets, 1).domain(gamma=0.9)
     inside = domain.contains(np.array([[0.1, 0.22], [0.1, 0.28], [0.1, -1.0]]))
     np.testing.assert_array_equal(inside, [True, False, True])
     assert domain.exit_reward == 0.0
     grid = Grid.with_cells(circle.chart, 60)
     whole = GridSet.from_mask(grid, np.ones(60, dtype=bool))
     sets = ExtendedSets((0,), (whole,), (whole.mask,), 0.5, 0.1, np.empty((0, 1)), np.empty(0))
-    assert ByGame(circle, sets, 0).domain(gamma=0.9).exit_reward == pytest.approx(-10.0)
+    assert mode_ground(circle, sets, 0).domain(gamma=0.9).exit_reward == pytest.approx(-10.0)
 
 
 # ---- the way beyond the mode's part
@@ -89,7 +89,7 @@ def discounted(circle, domain, start, u, gamma=0.95):
 @pytest.mark.parametrize("eps", [0.05, 0.15, 0.25, 0.29])
 def test_it_pays_to_go_back_from_the_farthest_edge(circle, eps):
     parts, sets = circle_sets(circle, eps)
-    domain = ByGame(circle, sets, 0, parts).domain(gamma=0.95)
+    domain = mode_ground(circle, sets, 0, parts).domain(gamma=0.95)
     edge = sets.sets[0].pieces()[0][1] + eps - 0.06  # a little inside
     assert domain.contains(np.array([[edge]])).all()
     assert edge > np.pi + 3 * eps - 0.06
@@ -101,7 +101,7 @@ def test_only_in_its_part_does_a_mode_earn_the_reward_of_the_task(circle):
     parts, sets = circle_sets(circle, 0.25)
     here, beyond, common = np.pi - 1.0, np.pi + 0.5, 0.1
     for mode, sign in ((0, 1.0), (1, -1.0)):
-        domain = ByGame(circle, sets, mode, parts).domain(gamma=0.95)
+        domain = mode_ground(circle, sets, mode, parts).domain(gamma=0.95)
         z = np.array([[np.pi + sign * (x - np.pi)] for x in (here, beyond, common)])
         env = BatchedEnv(circle, 3, domain=domain)
         env.reset(z=z)
@@ -120,8 +120,10 @@ def test_the_modes_of_the_circle_settle_as_early_as_can_be_at_any_noise(circle, 
     # No controller settles within 0.3 rad of the set-point under greater noise than that.
     parts, sets = circle_sets(circle, eps, cells=2880)
     settings = preset(circle, "fast", noise=eps).stage6
-    first, result = retrain(ByGame(circle, sets, 0, parts), settings, seed=1)
-    second, _ = retrain(ByGame(circle, sets, 1, parts), settings, seed=1, others=[(first, result)])
+    first, result = retrain(mode_ground(circle, sets, 0, parts), settings, seed=1)
+    second, _ = retrain(
+        mode_ground(circle, sets, 1, parts), settings, seed=1, others=[(first, result)]
+    )
     flow_sets = dict(zip(sets.modes, sets.sets, strict=True))
     controller = HybridController(circle, {0: first, 1: second}, flow_sets)
     game = Game(circle, parts, {"hyrl": controller}, eps, grid=parts.grid)
@@ -132,6 +134,11 @@ def test_the_modes_of_the_circle_settle_as_early_as_can_be_at_any_noise(circle, 
 
 
 # ---- the judge of stage 6
+
+
+def lost_by(ground):
+    """The nodes from which the latest policy lost that a ground has judged."""
+    return ground._latest[1].lost
 
 
 def test_a_cautious_reward_is_the_least_around(vehicle):
@@ -160,17 +167,17 @@ def left(vehicle):
     sets = tuple(GridSet(grid, ideal.flow_set(q).signed_distance(grid.nodes)) for q in (0, 1))
     open_ = grid.nodes[:, 1] > -(0.4 - grid.nodes[:, 0])
     found = ExtendedSets((0, 1), sets, (open_, ~open_), 0.3, 0.1, np.empty((0, 2)), np.empty(0))
-    return ByGame(vehicle, found, 0)
+    return mode_ground(vehicle, found, 0)
 
 
 def test_the_judge_prefers_a_policy_that_loses_nothing(vehicle, left):
     wide = left(one_way_policy(vehicle, 1.0, clear=1.0))
     assert wide[0] == 0.0
-    assert not len(left.lost)
+    assert not len(lost_by(left))
     grazing = left(one_way_policy(vehicle, 1.0, clear=0.8))
     wrong = left(one_way_policy(vehicle, -1.0))
     assert wrong < grazing < wide
-    assert len(left.lost)
+    assert len(lost_by(left))
 
 
 def test_where_runs_end_is_judged_as_they_are_simulated(vehicle, left):
@@ -179,7 +186,7 @@ def test_where_runs_end_is_judged_as_they_are_simulated(vehicle, left):
     late = one_way_policy(vehicle, 1.0, clear=1.11)
     swerving = ChartPolicy(vehicle, lambda z: np.where(z[:, :1] > 2.96, late.rule(z), wide.rule(z)))
     for policy in (wide, one_way_policy(vehicle, 1.0, clear=1.06), swerving):
-        starts = left.grid.nodes[left.early]
+        starts = left.states.grid.nodes[left.states.early]
         ends = closed_loop(vehicle, PolicyController(policy), starts).path[-1]
         miss = -left(policy)[1] * vehicle.precision
         assert miss == pytest.approx(vehicle.miss(ends).max(), abs=1e-6)
@@ -199,7 +206,7 @@ def test_a_few_states_at_which_the_mode_is_never_selected_may_be_lost(
     vehicle, left, monkeypatch, wide, few, suffices
 ):
     """About x = 0.2 m it goes the wrong way; y >= -0.1 m are selected."""
-    monkeypatch.setattr("hyrl_mj.stages.grounds.FEW", few)
+    monkeypatch.setattr(left.judge, "settings", ModeSettings(few=few))
     right = one_way_policy(vehicle, 1.0, clear=1.0)
 
     def rule(z):
@@ -207,8 +214,8 @@ def test_a_few_states_at_which_the_mode_is_never_selected_may_be_lost(
 
     policy = ChartPolicy(vehicle, rule)
     assert left(policy) < left.enough
-    assert (left.grid.nodes[left.lost, 1].max() < -0.1) == (wide == 0.02)
-    assert 1e-4 < len(left.lost) / len(left.nodes) < 0.05
+    assert (left.states.grid.nodes[lost_by(left), 1].max() < -0.1) == (wide == 0.02)
+    assert 1e-4 < len(lost_by(left)) / len(left.states.nodes) < 0.05
     assert left.suffices(policy) == suffices
 
 
@@ -216,9 +223,9 @@ def test_training_goes_on_where_the_game_is_lost(vehicle, left):
     left(one_way_policy(vehicle, 1.0, clear=0.8))
     rng = np.random.default_rng(0)
     z = left.starts(4000, rng)
-    lost = np.isin(left.grid.nearest(z), left.lost)
+    lost = np.isin(left.states.grid.nearest(z), lost_by(left))
     left(one_way_policy(vehicle, 1.0, clear=1.0))
-    elsewhere = np.isin(left.grid.nearest(left.starts(4000, rng)), left.nodes)
+    elsewhere = np.isin(left.states.grid.nearest(left.starts(4000, rng)), left.states.nodes)
     assert lost.mean() > 0.15
     assert elsewhere.all()
 
@@ -242,8 +249,8 @@ def untrained(vehicle, quick):
 def test_a_mirror_image_that_will_do_is_taken(vehicle, vehicle_sets, quick, monkeypatch):
     other = untrained(vehicle, quick)
     image = symmetry.mirrored(other)
-    monkeypatch.setattr(ByGame, "score", lambda ground, policy: (0.0, -0.5))
-    found, _ = retrain(ByGame(vehicle, vehicle_sets, 1), quick, seed=0, others=[(other, HALF)])
+    monkeypatch.setattr(ByGame, "judge", lambda *_, **__: Judged((0.0, -0.5), True))
+    found, _ = retrain(mode_ground(vehicle, vehicle_sets, 1), quick, seed=0, others=[(other, HALF)])
     for name, weight in image.weights.items():
         np.testing.assert_array_equal(found.weights[name], weight)
 
@@ -252,9 +259,9 @@ def test_a_mirror_image_that_will_do_is_taken(vehicle, vehicle_sets, quick, monk
 def test_one_that_will_not_do_is_not_taken(vehicle, vehicle_sets, quick):
     # An untrained policy drives into the pillar.
     other = untrained(vehicle, quick)
-    assert ByGame(vehicle, vehicle_sets, 1)(symmetry.mirrored(other)) < (0.0, -1.0)
-    alone, _ = retrain(ByGame(vehicle, vehicle_sets, 1), quick, seed=0)
-    found, _ = retrain(ByGame(vehicle, vehicle_sets, 1), quick, seed=0, others=[(other, HALF)])
+    assert mode_ground(vehicle, vehicle_sets, 1)(symmetry.mirrored(other)) < (0.0, -1.0)
+    alone, _ = retrain(mode_ground(vehicle, vehicle_sets, 1), quick, seed=0)
+    found, _ = retrain(mode_ground(vehicle, vehicle_sets, 1), quick, seed=0, others=[(other, HALF)])
     for name, weight in alone.weights.items():
         np.testing.assert_array_equal(found.weights[name], weight)
 
@@ -263,14 +270,16 @@ def test_one_that_will_not_do_is_not_taken(vehicle, vehicle_sets, quick):
 
 
 # A quarter of the usual episodes.
-FEW = tuple(n // 4 for n in grounds.BATCHES)
+FEW = tuple(n // 4 for n in ModeSettings.batches)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def few_episodes():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(grounds, "BATCHES", FEW)
-        yield
+def by_episodes(puck, sets, mode, policy=None, **changes):
+    """The ground of a mode, with few episodes."""
+    ground = mode_ground(
+        puck, sets, mode, policy=policy, settings=ModeSettings(batches=FEW, **changes)
+    )
+    assert isinstance(ground.judge, ByEpisodes)
+    return ground
 
 
 @pytest.fixture(scope="module")
@@ -290,60 +299,59 @@ def round_it(puck, side, clear=0.9):
 
 @pytest.mark.slow
 def test_episodes_tell_policies_apart(puck, puck_sets):
-    ground = ByEpisodes(puck, puck_sets, 0)
+    ground = by_episodes(puck, puck_sets, 0)
     wrong = ground(one_way_policy(puck, 1.0))
     assert wrong[0] == 0, "it never comes back to the set-point"
-    assert len(ground.lost) == round(-wrong[1] * FEW[0]) > 0
+    assert len(lost_by(ground)) == round(-wrong[1] * FEW[0]) > 0
     # As close as it gets without noise, but not with it.
     grazing = ground(round_it(puck, 1.0, clear=0.6))
     good = ground(round_it(puck, 1.0))
     assert wrong < grazing < ground.enough <= good
     assert grazing[0] == 3, "chance does not find it, the adversary does"
-    assert not len(ground.lost)
+    assert not len(lost_by(ground))
 
 
 @pytest.mark.slow
-def test_a_policy_that_just_survives_the_noise_is_not_good_enough(puck, puck_sets, monkeypatch):
+def test_a_policy_that_just_survives_the_noise_is_not_good_enough(puck, puck_sets):
     narrowly = round_it(puck, 1.0, clear=0.685)
-    assert not ByEpisodes(puck, puck_sets, 0).suffices(narrowly)
-    monkeypatch.setattr(ByEpisodes, "margin", 1.0)
-    assert ByEpisodes(puck, puck_sets, 0).suffices(narrowly)
+    assert not by_episodes(puck, puck_sets, 0).suffices(narrowly)
+    assert by_episodes(puck, puck_sets, 0, margin=1.0).suffices(narrowly)
 
 
 def test_the_judge_s_noise_never_hides_the_chart(puck, puck_sets):
     share = puck.noise_in_chart(1.0)[1]
     limit = puck.chart.sides[1] / (2 * share)
     for noise in (0.1, 0.95 * limit):
-        ground = ByEpisodes(puck, replace(puck_sets, noise=noise), 0)
+        ground = by_episodes(puck, replace(puck_sets, noise=noise), 0)
         assert noise < puck.check_noise(ground.noise.bound) <= 1.2 * noise + 1e-12
 
 
 @pytest.mark.slow
 def test_a_policy_that_parks_off_the_goal_is_not_good_enough(puck, puck_sets):
     precise = round_it(puck, 1.0)
-    ground = ByEpisodes(puck, puck_sets, 0, policy=precise)
+    ground = by_episodes(puck, puck_sets, 0, policy=precise)
     # It goes the same way, and then to a place beside the set-point that counts as arrived.
-    off = ground.allowed + 0.05
+    off = ground.judge.allowed + 0.05
     assert off < puck.close
     parking = ChartPolicy(
         puck,
         lambda z: np.where(z[:, :1] < 1.8, precise.rule(z), np.clip(3 * (off - z[:, 1:]), -1, 1)),
     )
-    assert ByEpisodes(puck, puck_sets, 0)(parking) >= ground.enough
+    assert by_episodes(puck, puck_sets, 0)(parking) >= ground.enough
     score = ground(parking)
     assert ground.won(parking) == 1.0
     assert score < ground.enough <= ground(precise)
     assert ground.won(precise) == 1.0
-    assert -score[1] * ground.allowed == pytest.approx(off, abs=0.06)
+    assert -score[1] * ground.judge.allowed == pytest.approx(off, abs=0.06)
 
 
 @pytest.mark.slow
 def test_a_task_may_say_how_far_off_is_good_enough(puck, puck_sets, monkeypatch):
     precise = round_it(puck, 1.0)
-    usual = ByEpisodes(puck, puck_sets, 0, policy=precise).allowed
+    usual = by_episodes(puck, puck_sets, 0, policy=precise).judge.allowed
     for precision, expected in ((3 * usual, 3 * usual), (1e-3, usual)):
         monkeypatch.setattr(puck, "precision", precision)
-        allowed = ByEpisodes(puck, puck_sets, 0, policy=precise).allowed
+        allowed = by_episodes(puck, puck_sets, 0, policy=precise).judge.allowed
         assert allowed <= expected + 1e-12
         assert (allowed > usual) == (precision > usual)
     assert allowed > 1e-3, "as far off as the stage-1 policy is allowed in any case"
@@ -351,7 +359,7 @@ def test_a_task_may_say_how_far_off_is_good_enough(puck, puck_sets, monkeypatch)
 
 @pytest.mark.slow
 def test_the_share_won_of_a_good_policy_is_that_of_its_score(puck, puck_sets):
-    ground = ByEpisodes(puck, puck_sets, 0)
+    ground = by_episodes(puck, puck_sets, 0)
     assert ground.won(round_it(puck, 1.0)) == 1.0
     assert 0.0 < ground.won(round_it(puck, 1.0, clear=0.6)) < 1.0
 
@@ -359,43 +367,44 @@ def test_the_share_won_of_a_good_policy_is_that_of_its_score(puck, puck_sets):
 @pytest.mark.slow
 def test_they_start_where_the_mode_may_be_picked(puck, puck_sets):
     for mode, side in ((0, 1.0), (1, -1.0)):
-        ground = ByEpisodes(puck, puck_sets, mode)
-        cell = ground.grid.cell
-        y = side * ground.judged[:, 1]
+        ground = by_episodes(puck, puck_sets, mode)
+        cell = ground.states.grid.cell
+        y = side * ground.judge.episodes.starts[:, 1]
         assert -0.1 - 2 * cell <= y.min() < 0.0
         assert y.max() > 0.6
-        assert puck.may_start(ground.grid.nodes[ground.grid.nearest(ground.judged)]).all()
+        grid, starts = ground.states.grid, ground.judge.episodes.starts
+        assert puck.may_start(grid.nodes[grid.nearest(starts)]).all()
 
 
 @pytest.mark.slow
 def test_a_mirror_image_is_taken_there_too(puck, puck_sets, monkeypatch):
     settings = replace(preset(puck, "smoke").stage6, samples=4_096)
     other = training.export(training.build(puck, settings, seed=0), puck)
-    monkeypatch.setattr(ByEpisodes, "score", lambda ground, policy: ground.enough)
-    found, _ = retrain(ByEpisodes(puck, puck_sets, 1), settings, seed=0, others=[(other, HALF)])
+    monkeypatch.setattr(ByEpisodes, "judge", lambda *_, **__: Judged((20.0, -1.0), True))
+    found, _ = retrain(by_episodes(puck, puck_sets, 1), settings, seed=0, others=[(other, HALF)])
     for name, weight in symmetry.mirrored(other).weights.items():
         np.testing.assert_array_equal(found.weights[name], weight)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("won", "plays"), [(0.5, len(PLAYS)), (1.0, len(FEW_PLAYS))])
+@pytest.mark.parametrize(("won", "plays"), [(0.5, 20), (1.0, 12)])
 def test_the_image_of_a_policy_that_wins_all_is_judged_by_fewer_episodes(
     puck, puck_sets, monkeypatch, won, plays
 ):
-    ground, played = ByEpisodes(puck, puck_sets, 1), []
+    ground, played = by_episodes(puck, puck_sets, 1), []
 
     def play(ground, policy, batch, kind):
         played.append((batch, kind))
         return np.ones(FEW[batch], dtype=bool), np.zeros(FEW[batch])
 
-    monkeypatch.setattr(ByEpisodes, "_play", play)
+    monkeypatch.setattr(Episodes, "play", play)
     assert ground.won_by_image(object(), won) == 1.0
-    assert played == PLAYS[:plays]
+    assert played == ground.judge.plays[:plays]
 
 
 @pytest.mark.slow
 def test_an_image_that_loses_is_not_taken(puck, puck_sets):
-    ground = ByEpisodes(puck, puck_sets, 0)
+    ground = by_episodes(puck, puck_sets, 0)
     assert ground.won_by_image(round_it(puck, 1.0), 1.0) == 1.0
     assert ground.won_by_image(round_it(puck, 1.0, clear=0.6), 1.0) is None
 
@@ -406,10 +415,10 @@ def test_they_start_where_all_nodes_around_can_be_won(puck, puck_sets):
         puck_sets.winning[0] & (puck_sets.sets[0].grid.nodes[:, 0] < 0.7),
         puck_sets.winning[1],
     )
-    ground = ByEpisodes(puck, replace(puck_sets, winning=winning), 0)
-    nodes, spacing = ground.grid.nodes, ground.grid.spacing
-    assert len(ground.judged) == sum(FEW)
-    for z in ground.judged:
+    ground = by_episodes(puck, replace(puck_sets, winning=winning), 0)
+    nodes, spacing = ground.states.grid.nodes, ground.states.grid.spacing
+    assert len(ground.judge.episodes.starts) == sum(FEW)
+    for z in ground.judge.episodes.starts:
         around = (np.abs(nodes - z) < spacing - 1e-9).all(axis=1)
         assert around.any()
-        assert ground.wanted[around].all()
+        assert ground.states.wanted[around].all()

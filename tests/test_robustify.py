@@ -31,7 +31,8 @@ from hyrl_mj.policies.external import read_agent, reopen_agent
 from hyrl_mj.runs.arcs import noisy_arcs
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages import Partition, boundary, with_room
-from hyrl_mj.stages.grounds import ByGame, mode_ground
+from hyrl_mj.stages.grounds import mode_ground
+from hyrl_mj.stages.judges import ByGame, Judged
 from hyrl_mj.stages.retraining import retrain, start_policy
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_runs")]  # whole runs on agents
@@ -299,7 +300,7 @@ def test_without_a_critical_set_one_policy_is_trained_under_noise(tmp_path):
 
 @pytest.fixture(scope="module")
 def ground(circle_run):
-    return ByGame(circle_run.task, circle_run.extended_sets, 0)
+    return mode_ground(circle_run.task, circle_run.extended_sets, 0)
 
 
 def start_of(run, policy, ground, **changed):
@@ -311,7 +312,7 @@ def test_a_function_is_distilled_part_by_part(circle_run, ground):
     found = start_of(circle_run, circle_run.policy, ground)
     assert found.algorithm == "ppo"
     # Mode 0 goes on clockwise beyond the decision at 2.5.
-    assert ground.within.contains(np.array([[2.6]])).all()
+    assert ground.states.within.contains(np.array([[2.6]])).all()
     assert (found.act(np.linspace(0.5, 2.65, 50)[:, None]) < 0).all()
 
 
@@ -333,7 +334,7 @@ def test_dqn_goes_on_from_weights_that_fit_and_else_afresh(robust, vehicle):
 
 
 def test_a_start_that_will_do_is_not_trained(circle_run, monkeypatch):
-    monkeypatch.setattr(ByGame, "score", lambda ground, policy: (0.0, -0.5))
+    monkeypatch.setattr(ByGame, "judge", lambda *_, **__: Judged((0.0, -0.5), True))
     monkeypatch.setattr("hyrl_mj.stages.retraining.train", None)
     run, settings = circle_run, circle_run.settings.stage6
     warm_start = partial(start_policy, run.policy, run.partition)

@@ -1,6 +1,7 @@
 """Every setting has a type and a range, where it is made and where it is read."""
 
 import inspect
+import json
 import math
 from dataclasses import asdict, fields, replace
 
@@ -10,11 +11,20 @@ import pytest
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, Outcome
 from hyrl_mj.files import artifacts
+from hyrl_mj.files.manifest import FILES
 from hyrl_mj.game import Lattice
-from hyrl_mj.learning import Settings, Training, preset, training
+from hyrl_mj.learning import (
+    Settings,
+    Training,
+    changed,
+    changes,
+    differing,
+    preset,
+    training,
+)
 from hyrl_mj.learning.options import OPTIONS, OWN
 from hyrl_mj.policies import algorithms
-from hyrl_mj.runs.directory import Config
+from hyrl_mj.runs.directory import Config, Run
 from hyrl_mj.sets import MOST_NODES, Grid
 
 NAN, INF = math.nan, math.inf
@@ -40,6 +50,40 @@ OF_RUNS = {
     "resolution": ([0, -1, NAN, 2, 1e-9, "1"], "a number from 1e-06 to 1"),
     "search": (["rod", 1, []], "rods, outcome"),
     "everywhere": ([1, "yes", None], "True or False"),
+    "ways": ([None, {}, 4.0], "a WaySettings"),
+    "overlap": ([None, {}], "OverlapSettings"),
+    "modes": ([None, {}], "a ModeSettings"),
+    "table": ([None, {}], "a TableSettings"),
+}
+# The same of the groups of settings.
+OF_GROUPS = {
+    "ways.samples": ([0, 1.5, "few"], "an integer from 1 to"),
+    "ways.parting": ([0, 1.1, NAN], "> 0 and <= 1"),
+    "ways.link": ([0.5, NAN, None], "a number from 1 to"),
+    "ways.wedge": ([-1, INF], "a number from 0 to"),
+    "ways.least_share": ([-0.1, 2, True], "a number from 0 to 1"),
+    "ways.near_share": ([1.01, NAN], "a number from 0 to 1"),
+    "overlap.filled": ([0, 1.1], "> 0 and <= 1"),
+    "overlap.gap": ([-1, NAN], "a number from 0 to"),
+    "overlap.longest": ([0, -1, INF], "> 0 and <= 3600"),
+    "overlap.patience": ([-1, NAN], "a number from 0 to 3600"),
+    "modes.lost_share": ([-0.1, 1.1], "a number from 0 to 1"),
+    "modes.task_share": ([NAN, "most"], "a number from 0 to 1"),
+    "modes.urgency": ([11, NAN], "a number from -10 to 10"),
+    "modes.allowed_delay": ([0, -1], "> 0 and <= 10"),
+    "modes.few": ([2, -1], "a number from 0 to 1"),
+    "modes.margin": ([0.9, INF], "a number from 1 to 10"),
+    "modes.batches": ([(), (0,), 64, (64.0,)], "batches"),
+    "modes.allowed_miss": ([-1, NAN], "a number from 0 to 100"),
+    "modes.miss_share": ([0, 1.5], "> 0 and <= 1"),
+    "modes.alike": ([-0.1, 2], "a number from 0 to 1"),
+    "modes.worth_attacking": ([-0.1, 2], "a number from 0 to 1"),
+    "modes.may_break": ([-0.1, 2], "a number from 0 to 1"),
+    "table.cells": ([-1, NAN], "a number from 0 to 100"),
+    "table.bounds": ([-1, 101], "a number from 0 to 100"),
+    "table.longest": ([0, 1.5], "an integer from 1 to"),
+    "table.tables": ([0, True], "an integer from 1 to 100"),
+    "table.worst": ([-0.1, 1.1], "a number from 0 to 1"),
 }
 OF_TRAININGS = {
     "algorithm": ([False, None, "sarsa", ""], "algorithm|a text"),
@@ -53,7 +97,10 @@ OF_TRAININGS = {
     "symmetric": ([0, None], "True or False"),
     "spread": ([0, None], "True or False"),
     "normalize": ([0, None], "True or False"),
+    "final_rate": ([-0.1, 1.5, NAN], "a number from 0 to 1"),
     "rehearse": ([-0.1, 1.5, NAN, "half"], "a number from 0 to 1"),
+    "rehearse_lost": ([-0.1, 1.5, NAN], "a number from 0 to 1"),
+    "rehearse_deciding": ([-0.1, 0.7, NAN], "a number from 0 to 1|together give at most 1"),
     "warm_start": ([0, None], "True or False"),
     "episode": ([0, -3, 2.5, True], "an integer from 1 to"),
     "attempts": ([0, 1.5, 10**6], "an integer from 1 to"),
@@ -69,6 +116,11 @@ def cases(table):
 def test_the_tables_leave_out_no_setting():
     assert set(OF_RUNS) == {field.name for field in fields(Settings)}
     assert set(OF_TRAININGS) == {field.name for field in fields(Training)}
+    groups = {name: OF_RUNS[name] for name in ("ways", "overlap", "modes", "table")}
+    names = (
+        f"{g}.{f.name}" for g in groups for f in fields(Settings.__dataclass_fields__[g].default)
+    )
+    assert set(OF_GROUPS) == {*names}
 
 
 @pytest.mark.parametrize(("name", "value", "says"), cases(OF_RUNS))
@@ -86,6 +138,29 @@ def test_a_setting_of_a_training_out_of_its_range_is_one_sentence(settings, name
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize(("name", "value", "says"), cases(OF_GROUPS))
+def test_a_setting_of_a_stage_out_of_its_range_is_one_sentence(settings, name, value, says):
+    group, _, field = name.partition(".")
+    with pytest.raises(BadInput, match=says) as refused:
+        changed(settings, {name: value})
+    assert str(refused.value).startswith(f"{group}: {field}")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("name", OF_GROUPS)
+def test_a_setting_of_a_stage_can_be_set_and_makes_the_stages_run_again(settings, tmp_path, name):
+    group, _, field = name.partition(".")
+    usual = getattr(getattr(settings, group), field)
+    other = usual[:3] if name == "modes.batches" else usual + 1 if isinstance(usual, int) else 0.6
+    other = 1.3 if name in ("ways.link", "modes.margin") else other
+    new = changed(settings, {name: json.dumps(other)})
+    assert getattr(getattr(new, group), field) == other
+    assert [*changes(new, settings)] == [name]
+    assert next(differing(settings, new)).startswith(f"{name}: ")
+    before, after = (Run(tmp_path, s).digests for s in (settings, new))
+    assert all(before[stage] != after[stage] for stage in FILES)
+
+
 @pytest.mark.parametrize(("name", "value", "says"), cases(OF_RUNS) + cases(OF_TRAININGS))
 def test_a_file_with_such_a_setting_is_refused(settings, tmp_path, name, value, says):
     content = {"settings": asdict(settings), "versions": {}}
@@ -101,7 +176,10 @@ def test_a_file_with_such_a_setting_is_refused(settings, tmp_path, name, value, 
     assert name in str(refused.value) or "control characters" in str(refused.value)
 
 
-@pytest.mark.parametrize("where", ["resolution", "everywhere", "stage1.episode", "stage6.options"])
+@pytest.mark.parametrize(
+    "where",
+    ["resolution", "everywhere", "stage1.episode", "stage6.options", "ways", "modes.margin"],
+)
 def test_a_file_without_a_setting_is_refused(settings, tmp_path, where):
     content = {"settings": asdict(settings), "versions": {}}
     inner = content["settings"]

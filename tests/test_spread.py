@@ -9,7 +9,7 @@ from torch import nn
 
 import hyrl_mj
 from hyrl_mj.learning import preset, presets, training
-from hyrl_mj.learning.spread import DRAWN, spread_kinks
+from hyrl_mj.learning.spread import spread_kinks
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def kinks_among(layer, observations):
 
 def drawn(task, seed):
     """The observations among which the kinks are: those of states that end no episode."""
-    z = np.random.default_rng(seed).uniform(task.chart.low, task.chart.high, (DRAWN, 2))
+    z = np.random.default_rng(seed).uniform(task.chart.low, task.chart.high, (4_096, 2))
     return task.observation(z[task.ending(z) == hyrl_mj.Outcome.RUNNING])
 
 

@@ -1,5 +1,6 @@
 """Tables of inputs as the policies of modes, and the game on environments whose chart is their state."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,12 +15,12 @@ from hyrl_mj.proof import examine
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import Signal, closed_loop, policy_runs
 from hyrl_mj.stages import ExtendedSets, PartPolicy
-from hyrl_mj.stages.grounds import ByAttack, mode_ground
+from hyrl_mj.stages.grounds import mode_ground
+from hyrl_mj.stages.judges import ByAttack
 from hyrl_mj.stages.retraining import retrain
 from hyrl_mj.stages.tables import (
-    WORST,
     BoundTable,
-    Held,
+    HeldInputs,
     TablePolicy,
     _in_reach,
     _left,
@@ -61,7 +62,7 @@ def held(puck):
     """Mode 0 passes on the upper side of the rock, mode 1 on any."""
     grid = Grid.with_cells(puck.chart, 24)
     x, y = grid.nodes.T
-    return Held.from_sets(
+    return HeldInputs.from_sets(
         puck, extended(grid, (y > -0.3) | (x > 0.6), np.ones(grid.size, dtype=bool))
     )
 
@@ -95,9 +96,9 @@ def test_what_noise_may_hide_is_found_as_by_one_node_after_another(held, how):
 
 
 def test_how_far_arrival_is_under_noise_is_found_as_by_one_node_after_another(held):
-    """The noise takes the worst of what it can show with the probability `WORST`, and anything otherwise."""
+    """Noise takes the worst of what it can show with the probability `worst`, and anything otherwise."""
     nodes, grid, rng = held.grid.nodes, held.grid, np.random.default_rng(0)
-    table = rng.integers(len(held.inputs), size=grid.size)
+    table, worst = rng.integers(len(held.inputs), size=grid.size), held.settings.worst
     left = rng.uniform(0, 100, len(held.rows))
     after = held.after(left, 0)
     found = _under_noise(held, table)(after)
@@ -112,7 +113,7 @@ def test_how_far_arrival_is_under_noise_is_found_as_by_one_node_after_another(he
                 value = 0.0
             lost = held.failed[a, i] or held.leaves[0, a, i]
             costs.append(held.never if lost else value)
-        expected = WORST * max(costs) + (1 - WORST) * np.mean(costs)
+        expected = worst * max(costs) + (1 - worst) * np.mean(costs)
         assert found[i] == pytest.approx(expected)
 
 
@@ -120,7 +121,7 @@ def test_a_held_input_leaves_the_set_if_it_does_after_some_sample(puck):
     """A strip that the robot jumps over in the time for which an input is held is not passed."""
     grid = Grid.with_cells(puck.chart, 24)
     column = np.unique(grid.nodes[:, 0])[5]
-    held = Held.from_sets(puck, extended(grid, np.abs(grid.nodes[:, 0] - column) > 1e-9))
+    held = HeldInputs.from_sets(puck, extended(grid, np.abs(grid.nodes[:, 0] - column) > 1e-9))
     starts, ends = grid.nodes[held.rows][:, 0], held.ends[..., 0]
     over = (starts < column) & (ends > column + 0.6 * grid.spacing[0])
     assert over.any()
@@ -152,15 +153,15 @@ def test_a_table_goes_the_way_of_its_mode_whatever_noise_shows(puck, held):
         assert (run.outcome == Outcome.REACHED).all(), corner
 
 
-def test_later_tables_reckon_with_the_noise_and_arrive_earlier(held, monkeypatch):
-    def usual(mode):
-        inputs = table_for(held, mode).inputs
+def test_later_tables_reckon_with_the_noise_and_arrive_earlier(held):
+    def usual(mode, tables):
+        settings = replace(held.settings, tables=tables)
+        inputs = table_for(replace(held, settings=settings), mode).inputs
         table = np.abs(held.inputs[:, None] - inputs).sum(axis=2).argmin(axis=0)
         return _left(held, mode, _under_noise(held, table))[held.own(mode)].mean()
 
-    later = [usual(mode) for mode in (0, 1)]
-    monkeypatch.setattr("hyrl_mj.stages.tables.TABLES", 1)
-    first = [usual(mode) for mode in (0, 1)]
+    later = [usual(mode, 6) for mode in (0, 1)]
+    first = [usual(mode, 1) for mode in (0, 1)]
     assert later[0] < first[0]
     assert later[1] < first[1]
     assert sum(later) < 0.95 * sum(first)
@@ -180,9 +181,9 @@ def test_a_table_is_read_as_it_was_written(puck, held, tmp_path):
     table.save(tmp_path / "mode_0.safetensors")
     again = TablePolicy.load(tmp_path / "mode_0_table.npz")
     measured = puck.plant(3).measurement
-    np.testing.assert_array_equal(again.of(puck).act(measured), table.act(measured))
+    np.testing.assert_array_equal(again.bound_to(puck).act(measured), table.act(measured))
     with pytest.raises(BadInput, match="does not fit"):
-        TablePolicy(again.counts, again.inputs[1:]).of(puck)
+        TablePolicy(again.counts, again.inputs[1:]).bound_to(puck)
 
 
 @pytest.mark.parametrize(
@@ -201,11 +202,8 @@ def test_the_best_of_what_is_given_is_taken_and_nothing_is_trained(puck, held, s
     """The first that wins all is; without a table the agent, too, and what wins nearly all."""
     made = BoundTable(puck, held.grid, np.zeros((held.grid.size, 2)))
 
-    class Ground(ByAttack):
+    class Ground:
         task, mode, enough = puck, 1, (1.0,)
-
-        def __init__(self):
-            pass
 
         def kind(self, policy):
             if policy is made:
@@ -217,6 +215,9 @@ def test_the_best_of_what_is_given_is_taken_and_nothing_is_trained(puck, held, s
 
         def suffices(self, policy):
             return self(policy) >= self.enough
+
+        def nearly_won(self, score):
+            return score >= (0.95,)
 
         def won(self, policy):
             return scores[self.kind(policy)]
@@ -237,7 +238,7 @@ def test_a_policy_is_judged_without_noise_and_by_an_attack(puck):
     grid = Grid.with_cells(puck.chart, 24)
     sets = extended(grid, np.ones(grid.size, dtype=bool))
     ground = mode_ground(puck, sets, 0)
-    assert isinstance(ground, ByAttack)
+    assert isinstance(ground.judge, ByAttack)
     policy = SimpleNamespace(act=lambda m: np.clip(puck_agent(puck.observation(m)), -4, 4))
     idle = SimpleNamespace(act=lambda m: np.zeros((len(m), 2)))
     both = ground(policy)[0]
@@ -249,7 +250,7 @@ def test_a_policy_is_judged_without_noise_and_by_an_attack(puck):
 def test_no_table_where_arrival_does_not_end_an_episode(puck, held):
     kept = from_gymnasium(Puck, steps=40, success="reward >= -0.25")
     grid = Grid.with_cells(kept.chart, 8)
-    assert Held.from_sets(kept, extended(grid, np.ones(grid.size, dtype=bool))) is None
+    assert HeldInputs.from_sets(kept, extended(grid, np.ones(grid.size, dtype=bool))) is None
     assert kept.learning.cells == round((800_000 / 40) ** 0.5 - 0.5), (
         "fewer cells for whole episodes"
     )

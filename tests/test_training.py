@@ -14,7 +14,7 @@ from planted import few_checkpoints
 
 import hyrl_mj
 from hyrl_mj import BadInput, MlpPolicy, Noise
-from hyrl_mj.envs.core import BatchedEnv, Domain
+from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.learning import training
 from hyrl_mj.learning.presets import preset
 
@@ -25,7 +25,6 @@ FEW = {"ppo": 8_192, "dqn": 4_000}
 @pytest.fixture
 def quick(task, monkeypatch):
     few_checkpoints(monkeypatch, 2)
-    monkeypatch.setattr(training, "EPISODES", 64)
     return replace(preset(task, "smoke").stage1, samples=FEW[task.learning.algorithm])
 
 
@@ -64,7 +63,7 @@ def test_training_returns_the_best_policy_that_it_met_and_logs_the_latest(
 def test_dqn_learns_the_vehicle_with_some_more_samples(vehicle):
     settings = replace(preset(vehicle, "smoke").stage1, samples=60_000)
     policy = training.train(vehicle, settings, seed=0)
-    assert training.evaluate(vehicle, policy, Noise())[1] > 85
+    assert training.evaluate(vehicle, policy)[1] > 85
 
 
 @pytest.mark.slow
@@ -73,7 +72,8 @@ def test_the_seed_fixes_every_weight_whatever_the_threads_of_the_physics(
 ):
     monkeypatch.chdir(tmp_path)
     policies = []
-    noisy = training.TaskGround(task, quick.gamma, Noise("uniform", 0.1))
+    noisy = training.TaskGround(task, quick)
+    noisy.noise = Noise("uniform", 0.1)
     for threads, seed in ((1, 4), (2, 4), (2, 5)):
         monkeypatch.setattr(training, "BatchedEnv", partial(BatchedEnv, threads=threads))
         policies.append(training.train(task, quick, seed=seed, ground=noisy))
@@ -91,7 +91,7 @@ import hyrl_mj
 from hyrl_mj.learning import preset, training
 from hyrl_mj.tasks import Effort, Task
 
-Task.effort, training.EPISODES = Effort(checkpoints=2), 16
+Task.effort = Effort(checkpoints=2)
 for name, algorithm, samples in (
     ("unit_circle", "ppo", 4096), ("vehicle", "dqn", 2600), ("unit_circle", "sac", 1500)
 ):
@@ -163,13 +163,13 @@ def test_an_unknown_algorithm_lists_the_known(vehicle):
 # ---- returns
 
 
-def test_evaluation_of_a_known_policy(circle):
+def test_evaluation_of_a_known_policy(circle, monkeypatch):
     """A policy that never moves: 150 times the reward of its start, or the discounted sum."""
     policy = untrained(circle)
     still = replace(policy, weights={n: 0 * w for n, w in policy.weights.items()})
-    starts = Domain(lambda n, rng: np.full((n, 1), 1.0), lambda z: np.full(len(z), True), -1.0)
+    monkeypatch.setattr(circle, "starts", lambda n, rng: np.full((n, 1), 1.0))
     for gamma, factor in ((1.0, 150), (0.9, (1 - 0.9**150) / 0.1)):
-        success, value = training.evaluate(circle, still, Noise(), starts, gamma, episodes=4)
+        success, value = training.evaluate(circle, still, gamma)
         assert success == 0
         assert value == pytest.approx(-factor / np.pi, rel=1e-6)
 
@@ -185,7 +185,7 @@ def test_training_ends_when_a_policy_is_good_enough(vehicle):
             return (self.asked / 2,)
 
     settings = preset(vehicle, "smoke").stage6
-    ground = Counted(vehicle, settings.gamma)
+    ground = Counted(vehicle, settings)
     training.train(vehicle, settings, seed=0, ground=ground)
     assert ground.asked == 2
 
@@ -233,7 +233,7 @@ def test_a_ground_sees_a_policy_from_the_first_checkpoint_and_scores_it_after_ha
     calls = []
 
     class Ground(training.TaskGround):
-        def see(self, policy):
+        def note_losses(self, policy):
             calls.append("seen")
 
         def __call__(self, policy):
@@ -243,7 +243,7 @@ def test_a_ground_sees_a_policy_from_the_first_checkpoint_and_scores_it_after_ha
     few_checkpoints(monkeypatch, 8)
     settings = preset(vehicle, "smoke", algorithm="ppo").stage1
     settings = replace(settings, samples=8_192, envs=16, hidden=(8, 8))
-    training.train(vehicle, settings, 0, ground=Ground(vehicle, 0.9))
+    training.train(vehicle, settings, 0, ground=Ground(vehicle, settings))
     half = calls.index("scored")
     assert half == 3
     assert set(calls[:half]) == {"seen"}

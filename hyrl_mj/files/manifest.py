@@ -15,6 +15,7 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -54,12 +55,14 @@ class Entry:
         code: SHA-256 of the files that define the user's task; "" for a task of an installed package.
         inputs: SHA-256 of each file that it read; "" for a file that it did without.
         outputs: SHA-256 of each file that it wrote.
+        version: the version of this package that made it.
     """
 
     settings: str
     code: str
     inputs: dict[str, str]
     outputs: dict[str, str]
+    version: str
 
 
 @dataclass(frozen=True)
@@ -122,15 +125,20 @@ class Manifest:
                 name = self._name(path)
                 if re.fullmatch(FILES[stage], name) and name not in outputs and path.is_file():
                     path.unlink()
-            entry = Entry(self.settings[stage], self.code, read, outputs)
+            entry = Entry(self.settings[stage], self.code, read, outputs, version("hyrl-mj"))
             self._write(self._entries() | {stage: entry})
 
     def is_done(self, stage: str) -> bool:
-        """Returns whether a stage is finished, and all of its files are to be believed."""
+        """Returns whether a stage is finished by this version, and all of its files are to be believed.
+
+        What another version has made can still be read.
+        """
         entries = self._entries()
         entry = entries.get(stage)
+        if entry is None or entry.version != version("hyrl-mj"):
+            return False
         # All of its files are hashed where a run is opened, so they are no larger together [bytes].
-        if entry is None or sum(map(self._size, entry.outputs)) > 2**28:
+        if sum(map(self._size, entry.outputs)) > 2**28:
             return False
         return not any(self._doubt(name, entries) for name in entry.outputs)
 

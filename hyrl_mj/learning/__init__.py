@@ -6,11 +6,21 @@ The modules `training`, `distillation` and `symmetry` import torch: import them 
 from hyrl_mj.learning.changes import STAGES, changed, changes, differing, setting_value
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.learning.settings import Settings, Training
+from hyrl_mj.learning.stage_settings import (
+    ModeSettings,
+    OverlapSettings,
+    TableSettings,
+    WaySettings,
+)
 
 __all__ = [
     "STAGES",
+    "ModeSettings",
+    "OverlapSettings",
     "Settings",
+    "TableSettings",
     "Training",
+    "WaySettings",
     "changed",
     "changes",
     "differing",

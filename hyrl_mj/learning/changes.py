@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import fields, replace
+from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 from hyrl_mj.errors import BadInput, unknown
@@ -24,7 +24,6 @@ OPTIONS = {
 }
 # Names of options that differ from those of their settings.
 NAMES = {"noise": "eps", "stage1": "policy", "everywhere": "all_coordinates"}
-WORDS = {"True": True, "False": False, "None": None}
 
 
 def changed(settings: Settings, changes: Mapping[str, object]) -> Settings:
@@ -32,43 +31,53 @@ def changed(settings: Settings, changes: Mapping[str, object]) -> Settings:
 
     Args:
         settings: of a preset.
-        changes: the new values by name, as "lattice", "stage1.samples" or "stage6.options.n_epochs"; a text
-            is read as JSON where it can be.
+        changes: the new values by name, as "lattice", "ways.wedge", "stage1.samples" or
+            "stage6.options.n_epochs"; a text is read as JSON where it can be.
 
     Raises:
         BadInput: an unknown setting, a value that it cannot have, or a setting with an option of its own.
     """
     groups: dict[str, dict[str, Any]] = {}
-    known = dict(_leaves(settings))
+    known, records = dict(_leaves(settings)), dict(_records(settings))
+    of_sb3 = [f"{name}.options" for name, record in records.items() if isinstance(record, Training)]
     for name, value in changes.items():
         if name in OPTIONS:
             raise BadInput(
                 f"the setting {name} has an option of its own: give it with {OPTIONS[name]}"
             )
-        record, _, field = name.rpartition(".")
-        if name not in known and record not in [f"{stage}.options" for stage in STAGES]:
-            alike = [n for n in known if n.rpartition(".")[0] == record and n not in OPTIONS]
+        group, _, field = name.rpartition(".")
+        if name not in known and group not in of_sb3:
+            alike = [n for n in known if n.rpartition(".")[0] == group and n not in OPTIONS]
             raise unknown("setting", name, alike or known)
-        groups.setdefault(record, {})[field] = _value(value, known.get(name))
+        groups.setdefault(group, {})[field] = _value(value, known.get(name))
     top = groups.pop("", {})
-    for stage in STAGES:
-        training, new = getattr(settings, stage), groups.get(stage, {})
-        if more := groups.get(f"{stage}.options"):
-            new["options"] = training.options | more
+    for group, record in records.items():
+        new = groups.get(group, {})
+        if more := groups.get(f"{group}.options"):
+            new["options"] = record.options | more
         if new:
             try:
-                top[stage] = replace(training, **new)
+                top[group] = replace(record, **new)
             except BadInput as error:
-                raise BadInput(f"{stage}: {error}") from error
+                raise BadInput(f"{group}: {error}") from error
     return replace(settings, **top)
 
 
-def _leaves(record: Settings | Training, prefix: str = "") -> list[tuple[str, Any]]:
+def _records(settings: Any) -> Iterator[tuple[str, Any]]:
+    """Yields the groups of settings within others, by name; an agent has none that can be changed."""
+    for field in fields(settings):
+        value = getattr(settings, field.name)
+        if is_dataclass(value) and not isinstance(value, Agent):
+            yield field.name, value
+
+
+def _leaves(record: Any, prefix: str = "") -> list[tuple[str, Any]]:
     """Returns the settings that can be changed, with their values, by name."""
     leaves: list[tuple[str, Any]] = []
+    groups = dict(_records(record))
     for field in fields(record):
         name, value = prefix + field.name, getattr(record, field.name)
-        if isinstance(value, Training):
+        if field.name in groups:
             leaves += _leaves(value, f"{name}.")
         elif field.name == "options":
             leaves += [(f"{name}.{option}", known) for option, known in value.items()]
@@ -86,7 +95,7 @@ def setting_value(value: object) -> object:
     try:
         return json.loads(value if isinstance(value, str) else json.dumps(value))
     except ValueError:
-        return WORDS.get(value, value)  # type: ignore[call-overload]
+        return {"True": True, "False": False, "None": None}.get(value, value)  # type: ignore[call-overload]
     except TypeError:
         raise BadInput(
             f"a setting cannot be {value!r}: give a number, a text, a list or None"
@@ -110,12 +119,16 @@ def changes(settings: Settings, of: Settings) -> dict[str, Any]:
     }
 
 
-def differing(old: Settings | Training, new: Settings | Training, of: str = "") -> Iterator[str]:
-    """Yields a description of each setting that differs, by the name of its option."""
+def differing(old: Any, new: Any, of: str = "") -> Iterator[str]:
+    """Yields a description of each setting that differs, by the name of its option.
+
+    Trainings with different algorithms, and agents, are described as a whole.
+    """
+    groups = dict(_records(old))
     for name, before in vars(old).items():
         now = getattr(new, name)
-        trainings = isinstance(before, Training) and isinstance(now, Training)
-        if trainings and before.algorithm == now.algorithm:
+        alike = type(before) is type(now) and name in groups
+        if alike and getattr(before, "algorithm", "") == getattr(now, "algorithm", ""):
             yield from differing(before, now, f"{name}.")
         elif before != now:
             option = of + NAMES.get(name, name)

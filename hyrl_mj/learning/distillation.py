@@ -14,8 +14,8 @@ from hyrl_mj.tasks import Task
 
 # A function that draws n chart points (n, d).
 Starts = Callable[[int, np.random.Generator], np.ndarray]
-# States, steps and batch size of the regression.
-STATES, STEPS, BATCH = 16_384, 1_500, 512
+# States of the regression.
+STATES = 16_384
 
 
 def fits(task: Task, settings: Training, policy: MlpPolicy) -> bool:
@@ -54,8 +54,8 @@ def distil(task: Task, policy: Policy, starts: Starts, settings: Training, seed:
     actor = [weights for name, weights in parameters if name.startswith(parts)]
     optimizer = torch.optim.Adam(actor, lr=settings.learning_rate)
     with threads(1):
-        for _ in progress_bar(range(STEPS), "distilling the agent", "steps"):
-            rows = torch.as_tensor(rng.integers(STATES, size=BATCH))
+        for _ in progress_bar(range(1_500), "distilling the agent", "steps"):
+            rows = torch.as_tensor(rng.integers(STATES, size=512))
             _, likelihood, _ = model.policy.evaluate_actions(observations[rows], actions[rows])
             optimizer.zero_grad()
             (-likelihood.mean()).backward()

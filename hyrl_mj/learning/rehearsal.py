@@ -2,16 +2,11 @@
 
 import numpy as np
 
+from hyrl_mj.learning.settings import Training
 from hyrl_mj.policies import Policy
 from hyrl_mj.simulation import WayRuns, way_runs
 from hyrl_mj.tasks import Outcome, Task
 
-# Of the episodes that start anywhere, the share that starts where the latest policy lost, and the share that
-# starts where it decides.
-LOST_SHARE, DECIDING_SHARE = 0.4, 0.4
-# Chart points that starts are drawn from, and that a policy is tried from: fewer for plants with dynamics,
-# whose samples are slower to simulate.
-POINTS, TRIED, TRIED_DYNAMIC = 16_384, 2_048, 256
 # A policy decides between a point that it is tried from and one of so many nearest ones.
 NEIGHBOURS = 4
 
@@ -26,15 +21,16 @@ class Rehearsal:
 
     Args:
         task: the robot and its problem.
-        share: share of the episodes that start anywhere on the chart.
+        settings: give the shares of these episodes.
     """
 
-    def __init__(self, task: Task, share: float):
-        self._task, self._share = task, share
-        self._points = running_points(task, POINTS, np.random.default_rng(0))
+    def __init__(self, task: Task, settings: Training):
+        self._task, self._settings = task, settings
+        self._points = running_points(task, 16_384, np.random.default_rng(0))
         self._lost = self._deciding = self._points[:0]
         self._weight, self._tried = np.empty(0), 0
-        self._count = TRIED if task.kinematic else TRIED_DYNAMIC
+        # A policy is tried from fewer points with dynamics, whose samples are slower to simulate.
+        self._count = 2_048 if task.kinematic else 256
 
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draws n starts (n, d)."""
@@ -42,11 +38,12 @@ class Rehearsal:
         which = rng.random((n, 1))
         if len(self._lost):
             lost = self._lost[rng.choice(len(self._lost), n, p=self._weight)]
-            z = np.where(which < LOST_SHARE, lost, z)
+            z = np.where(which < self._settings.rehearse_lost, lost, z)
         if len(self._deciding):
             deciding = self._deciding[rng.integers(len(self._deciding), size=n)]
-            z = np.where(which > 1 - DECIDING_SHARE, deciding, z)
-        return np.where(rng.random((n, 1)) < self._share, z, self._task.starts(n, rng))
+            z = np.where(which > 1 - self._settings.rehearse_deciding, deciding, z)
+        anywhere = rng.random((n, 1)) < self._settings.rehearse
+        return np.where(anywhere, z, self._task.starts(n, rng))
 
     def update(self, policy: Policy) -> None:
         """Notes where a policy loses and decides; what it loses late counts more, as it is easier to mend."""

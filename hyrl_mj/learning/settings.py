@@ -5,6 +5,12 @@ from typing import Annotated, Any
 
 from hyrl_mj.errors import BadInput, check_bound, check_seed, unknown
 from hyrl_mj.learning.options import check_options
+from hyrl_mj.learning.stage_settings import (
+    ModeSettings,
+    OverlapSettings,
+    TableSettings,
+    WaySettings,
+)
 from hyrl_mj.policies import ACTIVATIONS, ALGORITHMS, Agent, algorithms
 from hyrl_mj.ranges import (
     By,
@@ -23,8 +29,7 @@ from hyrl_mj.tasks import SEARCHES, Task
 
 PRESETS = ("fast", "paper", "smoke")
 
-# Samples of the longest episode, and grid cells along the longest side of a chart.
-LONGEST = 100_000
+# Grid cells along the longest side of a chart.
 CELLS = Integer(2, 10**6)
 
 
@@ -39,7 +44,8 @@ class Training:
         hidden: widths of the hidden layers.
         activation: function between the layers, one of `hyrl_mj.policies.ACTIVATIONS`.
         learning_rate: learning rate at the start.
-        anneal: whether the learning rate falls linearly to (almost) zero.
+        anneal: whether the learning rate falls linearly,
+        final_rate: to this share of its first value, not to zero: the last samples count, too.
         gamma: discount factor.
         symmetric: whether the network respects the task's mirror symmetry, if it has one. The weights are
             used twice, and the policy has twice the width.
@@ -47,9 +53,10 @@ class Training:
             first, and do not all pass through the origin.
         normalize: whether rewards are divided by the standard deviation of the return so far, as SB3's
             `VecNormalize` does. Without it, PPO learns slowly from returns that are far from 1.
-        rehearse: share of the episodes that start anywhere on the chart, and not where the task starts: two
-            fifths of them where the latest policy lost, and two fifths where it decided between ways
-            (stage 1 only).
+        rehearse: share of the episodes that start anywhere on the chart, and not where the task starts
+            (stage 1 only),
+        rehearse_lost: of them, the share that starts where the latest policy lost,
+        rehearse_deciding: and the share that starts where it decided between ways.
         warm_start: whether the first attempt continues from the policy of stage 1 (stage 6 only): DQN from
             its weights, PPO from its distilled actions on the mode's part. A Gaussian policy of small spread
             does not explore the other way any more.
@@ -72,9 +79,12 @@ class Training:
     symmetric: Annotated[bool, Flag()]
     spread: Annotated[bool, Flag()] = False
     normalize: Annotated[bool, Flag()] = False
+    final_rate: Annotated[float, Number(0, 1)] = 0.02
     rehearse: Annotated[float, Number(0, 1)] = 0.0
+    rehearse_lost: Annotated[float, Number(0, 1)] = 0.4
+    rehearse_deciding: Annotated[float, Number(0, 1)] = 0.4
     warm_start: Annotated[bool, Flag()] = False
-    episode: Annotated[int | None, Optional(Integer(1, LONGEST))] = None
+    episode: Annotated[int | None, Optional(Integer(1, 100_000))] = None
     attempts: Annotated[int, Integer(1, 1_000)] = 1
     action_noise: Annotated[float, Number(0, 10)] = 0.0
     options: dict[str, Any] = field(default_factory=dict)
@@ -84,6 +94,11 @@ class Training:
         if ":" not in self.algorithm and self.algorithm not in ALGORITHMS:
             raise unknown("algorithm", self.algorithm, [*ALGORITHMS, "or module:Class"])
         check_options(self.algorithm, self.options, samples=self.samples, envs=self.envs)
+        if self.rehearse_lost + self.rehearse_deciding > 1:
+            raise BadInput(
+                f"rehearse_lost {self.rehearse_lost:g} and rehearse_deciding {self.rehearse_deciding:g} "
+                "cannot be used, because they are shares of the same episodes: together give at most 1"
+            )
         if self.action_noise and self.algorithm in ("ppo", "a2c", "dqn"):
             raise BadInput(
                 f"action_noise {self.action_noise:g} cannot be used, because {self.algorithm} explores "
@@ -117,6 +132,10 @@ class Settings:
         resolution: length of the last rods, as a share of the first.
         search: search method for critical points, "rods" or "outcome".
         everywhere: whether the noise acts on all coordinates, not only on the task's noisy ones.
+        ways: how ways are told apart (stages 2 and 3).
+        overlap: how far the parts are extended (stages 4 and 5).
+        modes: where the policies of modes are trained, and when they are good enough (stage 6).
+        table: how tables of inputs are made (stage 6).
     """
 
     task: Annotated[str, Text()]
@@ -132,6 +151,10 @@ class Settings:
     resolution: Annotated[float, Number(1e-6, 1)] = 1 / 32
     search: Annotated[str, OneOf(SEARCHES)] = "rods"
     everywhere: Annotated[bool, Flag()] = False
+    ways: Annotated[WaySettings, Instance((WaySettings,))] = WaySettings()
+    overlap: Annotated[OverlapSettings, Instance((OverlapSettings,))] = OverlapSettings()
+    modes: Annotated[ModeSettings, Instance((ModeSettings,))] = ModeSettings()
+    table: Annotated[TableSettings, Instance((TableSettings,))] = TableSettings()
 
     def __post_init__(self) -> None:
         check_fields(self)

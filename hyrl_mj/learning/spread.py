@@ -7,9 +7,6 @@ from torch import nn
 from hyrl_mj.learning.rehearsal import running_points
 from hyrl_mj.tasks import Task
 
-# Chart points from which observations are drawn.
-DRAWN = 4_096
-
 
 def spread_kinks(policy: nn.Module, task: Task, seed: int) -> None:
     """Moves the kink of every unit that reads the observation to an observation of the chart.
@@ -23,7 +20,7 @@ def spread_kinks(policy: nn.Module, task: Task, seed: int) -> None:
         seed: seed of the draw.
     """
     rng = np.random.default_rng(seed)
-    z = running_points(task, DRAWN, rng)
+    z = running_points(task, 4_096, rng)
     plant = task.plant(len(z))
     plant.set_state(*task.state(z, rng))
     seen = torch.as_tensor(task.observation(plant.measurement))

@@ -36,18 +36,6 @@ from hyrl_mj.tasks import Outcome, Task
 
 Score = tuple[float, ...]
 ACTIVATIONS = {name: getattr(nn, torch_name) for name, torch_name in TORCH_NAMES.items()}
-# Interval of TensorBoard's points: on-policy algorithms count rollouts, the others episodes.
-LOG_ROLLOUTS, LOG_EPISODES = 1, 100
-# The learning rate falls to this share of its first value, not to zero: the last samples count too.
-FINAL_RATE = 0.02
-# Number of episodes of each checkpoint at which a policy is judged.
-EPISODES = 256
-# The kinds of noise under which a policy that is trained for noise is judged.
-JUDGES = ("none", "uniform", "alternating")
-# Threads that orthogonalise the initial weights: one gives other sums than two or more, which agree.
-FOR_BUILDING = 2
-# Number of observations for the check of a foreign policy, and the change of its weights before the check.
-CHECKED, MOVED = 64, 0.05
 
 
 class Ground(Protocol):
@@ -66,8 +54,8 @@ class Ground(Protocol):
     def domain(self, gamma: float) -> Domain | None:
         """Returns where episodes start and stay, for a discount gamma; None for the task's starts."""
 
-    def see(self, policy: MlpPolicy) -> None:
-        """Looks at a policy whose score does not count yet."""
+    def note_losses(self, policy: MlpPolicy) -> None:
+        """Notes where a policy loses whose score does not count yet, for the starts of later episodes."""
 
     def __call__(self, policy: MlpPolicy) -> Score:
         """Returns the score of a policy; higher is better, compared from left to right."""
@@ -89,7 +77,7 @@ def train(
         task, settings: the robot and its problem, and the settings of the training.
         seed: seed of weights, exploration, starts and noise; the same seed gives the same policy on the
             same kind of processor, with any number of cores and threads.
-        ground: where the policy is trained and judged; by default `TaskGround`, without noise.
+        ground: where the policy is trained and judged; by default `TaskGround`.
         start_from: a policy whose weights to continue from; its network replaces `settings.hidden`.
         log_dir: folder of TensorBoard logs and checkpoints; none are written by default.
         label: label of the progress bar.
@@ -97,12 +85,13 @@ def train(
     Raises:
         BadInput: settings that SB3 cannot train with, or a training whose weights grow without bound.
     """
-    ground = ground or TaskGround(task, settings.gamma, rehearse=settings.rehearse)
+    ground = ground or TaskGround(task, settings)
     domain = ground.domain(settings.gamma)
     model = build(task, settings, seed, noise=ground.noise, domain=domain, start_from=start_from)
     if log_dir is not None:
         model.set_logger(configure(str(log_dir / "tensorboard"), ["tensorboard"]))
-    interval = LOG_ROLLOUTS if isinstance(model, OnPolicyAlgorithm) else LOG_EPISODES
+    # TensorBoard gets a point after each rollout, or after so many episodes.
+    interval = 1 if isinstance(model, OnPolicyAlgorithm) else 100
     watch = _Watch(settings.samples, task.effort.checkpoints, ground, log_dir, label)
     try:
         with threads(1):  # faster for small networks
@@ -147,14 +136,15 @@ def build(
         options["action_noise"] = NormalActionNoise(np.zeros(m), np.full(m, settings.action_noise))
     kind = algorithms.sb3_class(settings.algorithm)
     try:
-        with threads(FOR_BUILDING):
+        # One thread orthogonalises the initial weights with other sums than two or more, which agree.
+        with threads(2):
             model = kind(
                 "MlpPolicy",
                 env,
                 seed=seed,
                 device="cpu",
                 gamma=settings.gamma,
-                learning_rate=(lambda left: rate * max(left, FINAL_RATE))
+                learning_rate=(lambda left: rate * max(left, settings.final_rate))
                 if settings.anneal
                 else rate,
                 policy_kwargs={"net_arch": list(hidden), "activation_fn": ACTIVATIONS[activation]},
@@ -196,13 +186,13 @@ def check_foreign(task: Task, settings: Training) -> None:
     generator = torch.Generator().manual_seed(0)
     for tensor in model.policy.state_dict().values():
         if tensor.is_floating_point():
-            tensor += MOVED * torch.rand(tensor.shape, generator=generator)
+            tensor += 0.05 * torch.rand(tensor.shape, generator=generator)
     plain = f"the policy of {name} cannot be used, only plain multilayer perceptrons can"
     try:
         policy = export(model, task)
     except Exception as error:
         raise BadInput(f"{plain}: {brief(error)}") from error
-    core = BatchedEnv(task, CHECKED)
+    core = BatchedEnv(task, 64)
     core.seed(0)
     observation = core.reset()
     actions, _ = model.predict(observation, deterministic=True)
@@ -239,19 +229,13 @@ def threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def evaluate(
-    task: Task,
-    policy: MlpPolicy,
-    noise: Noise,
-    domain: Domain | None = None,
-    gamma: float = 1.0,
-    episodes: int = EPISODES,
-) -> tuple[float, float]:
+def evaluate(task: Task, policy: MlpPolicy, gamma: float = 1.0) -> tuple[float, float]:
     """Returns the share of episodes that end at the set-point, and the mean return, discounted by gamma.
 
     The starts are drawn from the start distribution and are always the same.
     """
-    env = BatchedEnv(task, episodes, noise=noise, domain=domain)
+    episodes = 256
+    env = BatchedEnv(task, episodes)
     env.seed(0)
     observation = env.reset()
     returns, weight = np.zeros(episodes), np.ones(episodes)
@@ -269,34 +253,30 @@ def evaluate(
 class TaskGround:
     """All starts of a task, where a policy is judged on the same episodes every time.
 
-    The score is the share of episodes that end at the set-point, then the mean return discounted by `gamma`,
-    both averaged over the kinds of noise in `JUDGES`, with the bound of the `noise` during training. A share
-    `rehearse` of the training's episodes starts anywhere, also where the latest policy lost or decided.
+    The score is the share of episodes that end at the set-point without noise, then the mean discounted
+    return. Some of the training's episodes start anywhere, as its settings of `rehearse` say.
     """
 
+    noise = Noise()
     enough: Score = (np.inf,)
     settled = 0.5  # an untrained policy can score well by chance
 
-    def __init__(self, task: Task, gamma: float, noise: Noise | None = None, rehearse: float = 0.0):
-        self.noise, self._task, self._gamma = noise or Noise(), task, gamma
-        bound = self.noise.bound
-        self._noises = [Noise(kind, bound) for kind in JUDGES] if bound else [Noise()]
-        self._rehearsal = Rehearsal(task, rehearse) if rehearse else None
+    def __init__(self, task: Task, settings: Training):
+        self._task, self._gamma = task, settings.gamma
+        self._rehearsal = Rehearsal(task, settings) if settings.rehearse else None
 
     def domain(self, gamma: float) -> Domain | None:
         """Returns where episodes start if not where the task starts; they are not restricted."""
         return Domain(self._rehearsal.starts) if self._rehearsal else None
 
-    def see(self, policy: MlpPolicy) -> None:
+    def note_losses(self, policy: MlpPolicy) -> None:
         """Notes where a policy loses and decides, for the starts of later episodes."""
         if self._rehearsal:
             self._rehearsal.update(policy)
 
     def __call__(self, policy: MlpPolicy) -> Score:
-        self.see(policy)
-        results = [evaluate(self._task, policy, n, None, self._gamma) for n in self._noises]
-        success, returns = np.mean(results, axis=0)
-        return float(success), float(returns)
+        self.note_losses(policy)
+        return evaluate(self._task, policy, self._gamma)
 
 
 class _Watch(BaseCallback):
@@ -335,7 +315,7 @@ class _Watch(BaseCallback):
         if self._log_dir is not None:
             policy.save(self._log_dir / "checkpoint.safetensors")
         if self.num_timesteps < self._settled:
-            self._ground.see(policy)
+            self._ground.note_losses(policy)
             return
         score = self._ground(policy)
         for i, value in enumerate(score):

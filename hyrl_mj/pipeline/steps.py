@@ -27,7 +27,7 @@ from hyrl_mj.runs.directory import Run
 from hyrl_mj.runs.sentences import mode_sentence
 from hyrl_mj.stages import (
     Arrivals,
-    Held,
+    HeldInputs,
     ModeResult,
     PartPolicy,
     Retraining,
@@ -74,7 +74,9 @@ def train_stage(run: Run, say: Say) -> None:
 def critical_set_stage(run: Run, say: Say) -> None:
     """Stage 2: finds the critical set."""
     s = run.settings
-    critical = find_critical_set(run.task, run.steady, s.rods, s.resolution, s.search, s.noise)
+    critical = find_critical_set(
+        run.task, run.steady, s.rods, s.resolution, s.search, s.noise, s.ways
+    )
     critical.save(run.path / "critical_set.npz")
     say(critical.sentence(run.task))
 
@@ -82,9 +84,10 @@ def critical_set_stage(run: Run, say: Say) -> None:
 def partition_stage(run: Run, say: Say) -> None:
     """Stage 3: partitions the chart."""
     s = run.settings
-    partition = make_partition(run.task, run.steady, run.critical_set.points, s.cells, s.noise)
+    points = run.critical_set.points
+    partition = make_partition(run.task, run.steady, points, s.cells, s.noise, s.ways)
     partition.save(run.path / "partition.npz")
-    say(partition.sentence(run.task))
+    say(partition.sentence(run.task, s.ways))
 
 
 def extended_sets_stage(run: Run, say: Say) -> None:
@@ -99,7 +102,7 @@ def extended_sets_stage(run: Run, say: Say) -> None:
             ways = Limit.solve(lattice, split)
             points = boundary(split)
         split.save(run.path / "split.npz")
-    sets = extend(task, run.steady, points, split, s.noise, s.horizon, ways)
+    sets = extend(task, run.steady, points, split, s.noise, s.horizon, ways, s.overlap)
     sets.save(run.path / "extended_sets.npz")
     say(sets.sentence(task))
 
@@ -115,10 +118,16 @@ def retrain_stage(run: Run, say: Say) -> None:
     part_of = partial(part_policy, run.task, run.steady, run.partition, noise=sets.noise)
     parts, table_of = None, None
     if run.task.effort.attacked:
-        parts, held = part_of, Held.from_sets(run.task, sets)
+        parts, held = part_of, HeldInputs.from_sets(run.task, sets, s.table)
         table_of = None if held is None else partial(table_for, held)
     ground_of = partial(
-        mode_ground, run.task, sets, parts=run.split, policy=run.steady, table=table_of is not None
+        mode_ground,
+        run.task,
+        sets,
+        parts=run.split,
+        policy=run.steady,
+        table=table_of is not None,
+        settings=s.modes,
     )
     work = partial(_retrained, s, ground_of, warm_start, parts, table_of, run.path / "logs")
     done: list[tuple[ModePolicy, ModeResult]] = []

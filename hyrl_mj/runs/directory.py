@@ -334,7 +334,7 @@ class Run:
     def _mode_policy(self, mode: int) -> MlpPolicy | PartPolicy | BoundTable:
         table = self.path / f"mode_{mode}_table.npz"
         if self.manifest.has(table):
-            return TablePolicy.load(self.manifest.checked(table)).of(self.task)
+            return TablePolicy.load(self.manifest.checked(table)).bound_to(self.task)
         path = self.path / f"mode_{mode}_part.json"
         if not self.manifest.has(path):
             return self._load_policy(f"mode_{mode}")

@@ -11,15 +11,13 @@ from hyrl_mj.sets.chart import Chart
 from hyrl_mj.sets.clouds import MOST_NODES, Cloud
 from hyrl_mj.sets.grids import Grid
 
-# Charts of more dimensions than these have no square cells, no grid, and no nodes at all.
-SQUARE, CUBIC, MOST_DIMENSIONS = 2, 3, 6
+# Charts of more dimensions have no nodes.
+MOST_DIMENSIONS = 6
 # A cloud has this power of the number of cells as nodes, in every dimension.
 POWER = 4
 # Cells along noisy coordinates are at most this share of the noise bound there; a cloud's nodes lie this
 # share of it beside M* and, the farthest, so many times it.
 SHARE, BESIDE, FARTHEST = 0.5, 0.125, 3.0
-# Cells along the longest side without noise, at least, where those with noise are finer.
-FEWEST = 16
 
 
 def covering(chart: Chart, cells: int, noise: np.ndarray | None = None) -> Grid | Cloud:
@@ -41,7 +39,7 @@ def covering(chart: Chart, cells: int, noise: np.ndarray | None = None) -> Grid 
             f"a chart of {chart.dimension} coordinates cannot be covered: give at most {MOST_DIMENSIONS}, "
             "those in which the decision is made"
         )
-    if chart.dimension > CUBIC:
+    if chart.dimension > 3:
         if cells**POWER > MOST_NODES:
             raise BadInput(
                 f"{cells} cells make a cloud of {cells**POWER:,} nodes: give at most "
@@ -51,7 +49,7 @@ def covering(chart: Chart, cells: int, noise: np.ndarray | None = None) -> Grid 
         most = shares.max(initial=0.0)
         return Cloud.even(chart, max(cells**POWER, 100), shares / (most or 1.0))
     square = Grid.with_cells(chart, cells)
-    return square if noise is None or chart.dimension <= SQUARE else _by_noise(square, noise)
+    return square if noise is None or chart.dimension <= 2 else _by_noise(square, noise)
 
 
 def resolving(chart: Chart, cells: int, points: np.ndarray, noise: np.ndarray) -> Grid | Cloud:
@@ -124,7 +122,7 @@ def _by_noise(square: Grid, noise: np.ndarray) -> Grid:
         return np.maximum(number, 2) + ~np.array(chart.periodic)
 
     longest = float((chart.sides / square.spacing)[free].max())
-    coarsest = max(longest / FEWEST, 1.0)
+    coarsest = max(longest / 16, 1.0)  # at least so many cells along the longest side without noise
     for coarser in np.geomspace(1.0, coarsest, 50):
         if math.prod(counts(coarser, 1.0)) <= most:
             return Grid(chart, tuple(int(n) for n in counts(coarser, 1.0)))

@@ -22,12 +22,8 @@ MOST_NODES = 2**19
 LINKS, BLENDED = 8, 3
 # Neighbours a dimension: the pairs that a search for decisions goes through.
 NEIGHBOURS = 2
-# A point that is projected on a set lies this deep in it, in cells, and is looked for in so many steps.
-DEPTH, STEPS = 0.1, 4
 # Least distance of a point from a node, and least weight of a node, as shares.
 LEAST = 1e-9  # also in the template of an exported controller
-# Squared slope along the noisy coordinates below which a step is cut short.
-GENTLE = 0.01
 
 
 @dataclass(frozen=True)
@@ -290,14 +286,15 @@ class Cloud:
         """Returns points (n, d) of a set, given by values and slopes at all nodes and by the nodes inside."""
         chart, points, left = self.chart, z.copy(), np.arange(len(z))
         along = self.shares / chart.scale
-        for _ in range(STEPS):
+        for _ in range(4):
             value, slope = self._continued(values, slopes, points[left])
             outside = value > 0
             left, value, slope = left[outside], value[outside, None], slope[outside] * along
             if not len(left):
                 return points
-            size = np.maximum((slope**2).sum(axis=1, keepdims=True), GENTLE)
-            step = (value + DEPTH * self.cell) * slope / size * self.shares
+            # Where the slope is gentle the step is cut short; it leads a tenth of a cell into the set.
+            size = np.maximum((slope**2).sum(axis=1, keepdims=True), 0.01)
+            step = (value + 0.1 * self.cell) * slope / size * self.shares
             moved = points[left] - step
             points[left] = np.where(chart.periodic, moved, np.clip(moved, chart.low, chart.high))
         left = left[self._blended(values, slopes, points[left]) > 0]

@@ -14,9 +14,6 @@ from hyrl_mj.files.artifacts import MOST_ROWS
 from hyrl_mj.sets.clouds import Cloud, evenly
 from hyrl_mj.sets.grids import Grid
 
-# Points from which the share of a set on scattered nodes is estimated.
-EVEN = 4_000
-
 
 class StateSet(Protocol):
     """A closed set of chart points, given by its signed distance."""
@@ -148,7 +145,7 @@ class GridSet(StateSet):
         """The share of the chart that lies in the set."""
         if isinstance(self.grid, Grid):
             return float(self.mask.mean())
-        return float(self.contains(evenly(self.grid.chart, EVEN)).mean())
+        return float(self.contains(evenly(self.grid.chart, 4_000)).mean())
 
     def pieces(self) -> list[tuple[float, float]]:
         """Returns the first and last node of each piece of a set in one dimension.

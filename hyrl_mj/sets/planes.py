@@ -6,15 +6,14 @@ import numpy as np
 
 from hyrl_mj.sets.chart import Chart
 
-# Steps of the fit of a plane between two classes of points, and the weight of the size of its normal.
-FITS, RIDGE = 12, 1e-4
-# Points that are worked on at once, which limits the memory.
-BATCH = 4_096
+# The weight of the size of a plane's normal in its fit.
+RIDGE = 1e-4
 
 
 def batches(n: int) -> list[slice]:
-    """Returns slices that cover n rows."""
-    return [slice(first, first + BATCH) for first in range(0, n, BATCH)]
+    """Returns slices that cover n rows, so short that what is worked on at once fits into the memory."""
+    size = 4_096
+    return [slice(first, first + size) for first in range(0, n, size)]
 
 
 def closeness(distance: np.ndarray) -> np.ndarray:
@@ -50,7 +49,7 @@ def separating(
     size = np.full(x.shape[2], RIDGE)
     size[-1] = 1e-9  # where the plane lies costs nothing
     theta, active = np.zeros((len(x), x.shape[2])), np.ones(sign.shape, dtype=bool)
-    for _ in range(FITS):
+    for _ in range(12):
         used = np.swapaxes(x * (weight * active)[..., None], 1, 2)
         theta = np.linalg.solve(used @ x + np.diag(size), used @ sign[..., None])[..., 0]
         active = sign * (x @ theta[..., None])[..., 0] < 1

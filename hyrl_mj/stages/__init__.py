@@ -20,7 +20,7 @@ from hyrl_mj.stages.partition import (
     with_room,
 )
 from hyrl_mj.stages.results import Arrivals, ModeResult, Retraining
-from hyrl_mj.stages.tables import BoundTable, Held, TableOf, TablePolicy, table_for
+from hyrl_mj.stages.tables import BoundTable, HeldInputs, TableOf, TablePolicy, table_for
 
 __all__ = [
     "ON_EDGE",
@@ -30,7 +30,7 @@ __all__ = [
     "Budget",
     "CriticalSet",
     "ExtendedSets",
-    "Held",
+    "HeldInputs",
     "HybridController",
     "Losses",
     "ModeResult",

@@ -9,19 +9,12 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.files.artifacts import Saved
+from hyrl_mj.learning import WaySettings
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import Chart, Nodes, covering, surface_distance
 from hyrl_mj.simulation import WayRuns, policy_runs, way_runs
 from hyrl_mj.stages.search import critical_points
 from hyrl_mj.tasks import SEARCHES, Task
-
-# Samples simulated from both ends of a rod: enough for runs to part, too few to pass an obstacle.
-SAMPLES = 5
-# Two runs part if their distance grows by this share of the sum of their displacements. Displacements of
-# equal length with 50 degrees between them reach it: sin(25 degrees).
-PARTING = 0.42
-# Points of M* closer than this many grid cells belong to one piece.
-LINK = 2.5
 
 
 @dataclass(frozen=True)
@@ -93,6 +86,7 @@ def find_critical_set(
     resolution: float,
     method: str = "rods",
     noise: float = 0.0,
+    settings: WaySettings = WaySettings(),
 ) -> CriticalSet:
     """Searches for the critical set M*: property (*) and equation (8) of the paper.
 
@@ -110,7 +104,9 @@ def find_critical_set(
         cells: grid points along the longest side of the chart from which the search starts.
         resolution: length of the shortest rods, as a share of the first.
         method: "rods" or "outcome".
-        noise: bound eps of the measurement noise; "outcome" finds M* across failures up to 4 eps wide.
+        noise: bound eps of the measurement noise; "outcome" finds M* across failures that are a few times
+            as wide.
+        settings: when runs part, and what is one piece of M*.
 
     Returns:
         The critical set; it may be empty.
@@ -122,23 +118,28 @@ def find_critical_set(
         raise unknown("method", method, SEARCHES)
     grid = covering(task.chart, cells)
     if method == "rods":
-        centres = _by_rods(task, policy, grid, resolution)
+        centres = _by_rods(task, policy, grid, resolution, settings)
     else:
         pairs = grid.neighbours()
-        centres = critical_points(task, policy, grid.nodes, pairs, grid.cell, resolution, noise)
+        centres = critical_points(
+            task, policy, grid.nodes, pairs, grid.cell, resolution, noise, settings
+        )
     points = np.unique(task.chart.wrap(centres), axis=0)
-    component = _pieces(task, points, LINK * grid.cell)
+    component = _pieces(task, points, settings.link * grid.cell)
     return CriticalSet(points, component, resolution * grid.cell, grid.cell)
 
 
-def _by_rods(task: Task, policy: Policy, grid: Nodes, resolution: float) -> np.ndarray:
+def _by_rods(
+    task: Task, policy: Policy, grid: Nodes, resolution: float, settings: WaySettings
+) -> np.ndarray:
     """Returns the centres (N, d) of the shortest rods that part."""
     d = task.chart.dimension
     centre = np.repeat(grid.nodes, d, axis=0)
     axis = np.tile(np.arange(d), len(grid.nodes))
     length = grid.spacing[axis]
     while True:
-        part = _part(task, policy, *_ends(task, centre, axis, length))
+        a, b = _ends(task, centre, axis, length)
+        part = _part(task, policy, a, b, settings)
         centre, axis, length = centre[part], axis[part], length[part]
         if not len(centre) or length.max() <= resolution * grid.cell:
             break
@@ -163,10 +164,12 @@ def _ends(task: Task, centre: np.ndarray, axis: np.ndarray, length: np.ndarray) 
     return np.where(chart.periodic, ends, np.clip(ends, chart.low, chart.high))
 
 
-def _part(task: Task, policy: Policy, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Returns whether the runs from a and b (n, d) part within `SAMPLES`: (n,) bool."""
+def _part(
+    task: Task, policy: Policy, a: np.ndarray, b: np.ndarray, settings: WaySettings
+) -> np.ndarray:
+    """Returns whether the runs from a and b (n, d) part within a few samples: (n,) bool."""
     n = len(a)
-    rollout = policy_runs(task, policy, np.vstack([a, b]), steps=SAMPLES)
+    rollout = policy_runs(task, policy, np.vstack([a, b]), steps=settings.samples)
     # If one run ends early, by a crash for instance, the two are compared at its last sample.
     last = np.minimum(rollout.length[:n], rollout.length[n:])
     moved = rollout.path[np.tile(last, 2), np.arange(2 * n)] - rollout.path[0]
@@ -174,7 +177,7 @@ def _part(task: Task, policy: Policy, a: np.ndarray, b: np.ndarray) -> np.ndarra
     displacement = np.linalg.norm(moved[:n], axis=1) + np.linalg.norm(moved[n:], axis=1)
     rod = (b - a) / task.chart.scale
     growth = np.linalg.norm(rod + moved[n:] - moved[:n], axis=1) - np.linalg.norm(rod, axis=1)
-    return growth > np.maximum(PARTING * displacement, 1e-9)
+    return growth > np.maximum(settings.parting * displacement, 1e-9)
 
 
 def _pieces(task: Task, points: np.ndarray, reach: float) -> np.ndarray:

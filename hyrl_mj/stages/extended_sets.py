@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
 from typing import ClassVar
@@ -12,31 +12,22 @@ import numpy as np
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files.artifacts import Saved
 from hyrl_mj.game import Limit, nearest_of
+from hyrl_mj.learning import OverlapSettings
 from hyrl_mj.policies import Policy
-from hyrl_mj.sets import Cloud, Grid, GridSet
-from hyrl_mj.simulation import Rollout, policy_runs
+from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.critical_set import check_points, distance_to
 from hyrl_mj.stages.meeting import least_room, narrow_sentence
 from hyrl_mj.stages.partition import (
     Partition,
-    PartPolicy,
     check_sets,
     longest_hop,
     neighbourhood,
     open_ways,
     part_policies,
 )
-from hyrl_mj.stages.refinement import spread
-from hyrl_mj.tasks import Outcome, Task
-
-# A horizon is long enough when the propagated sets fill this share of the overlap that the noise needs.
-FILLED = 0.995
-# Gaps of this many cells between the samples of the backward runs are closed.
-GAP_CELLS = 1.5
-# The longest horizon that is tried [s].
-LONGEST_HORIZON = 2.0
-# No longer horizon is tried once the sets have not gained for this time [s].
-PATIENCE = 0.5
+from hyrl_mj.stages.reach import backward_reach, forward_reach, runs_from_outside, shortest
+from hyrl_mj.stages.refinement import refined
+from hyrl_mj.tasks import Task
 
 
 @dataclass(frozen=True)
@@ -46,7 +37,8 @@ class ExtendedSets(Saved):
     Attributes:
         modes: the modes.
         sets: M_ext_i of each mode, in the same order.
-        winning: W_i as (N,) bool over the grid's nodes, from where pi_i reaches the set-point.
+        winning: W_i, the winning region of each mode, as (N,) bool over the grid's nodes: from there pi_i
+            reaches the set-point.
         horizon: time T of the backward propagation [s]; 0 without propagation.
         noise: bound eps of the measurement noise that the sets are made for.
         points: (K, d) points of M* where modes meet, and the way of one of them is open.
@@ -117,6 +109,7 @@ def extend(
     noise: float,
     horizon: float | None = None,
     ways: Limit | None = None,
+    settings: OverlapSettings = OverlapSettings(),
 ) -> ExtendedSets:
     """Extends the parts over M* (paper, Steps 4 and 5).
 
@@ -142,8 +135,9 @@ def extend(
         ways: from where each way is open, for an agent. Beyond its decision an agent may be unable to go
             the other way, but stage 6 trains the mode to do so: W_i is then where way i is open. Without a
             horizon, every set reaches 2 eps and one sample over the boundary of its part.
+        settings: when a horizon is long enough, and what is a gap.
     """
-    case = _Case(task, policy, check_points(task, points), partition, noise, horizon)
+    case = _Case(task, policy, check_points(task, points), partition, noise, horizon, settings)
     winning = case.winning() if ways is None else open_ways(ways, partition.grid)
     roomy = case.trim(winning)
     if ways is None or horizon is not None:
@@ -182,8 +176,10 @@ class _Case:
         partition: Partition,
         noise: float,
         horizon: float | None,
+        settings: OverlapSettings,
     ):
-        self.task, self.points, self.partition, self.horizon = task, points, partition, horizon
+        self.task, self.points, self.partition = task, points, partition
+        self.horizon, self.settings = horizon, settings
         self.grid, self.parts = partition.grid, partition.parts
         self.eps, self.hop = task.noise_in_chart(noise), longest_hop(task, policy, self.grid)
         near = neighbourhood(partition, noise, self.hop)
@@ -198,11 +194,15 @@ class _Case:
         # The cells that backward runs visit are those of a grid.
         self._backward = task.kinematic and isinstance(self.grid, Grid)
         self._rims = [part.mask & (off <= near) for part in self.parts]
+        longest = round(settings.longest / task.dt)
         # The same runs from outside of a part tell from where its way succeeds, and when they enter the part.
         self._told = [
             cache(partial(
-                spread, task, self.grid, candidate & ~part.mask, points, radius,
-                partial(_outside, task, pi, partition, part, None if self._backward else rim), 2,
+                refined, task, self.grid, candidate & ~part.mask, points, radius,
+                partial(
+                    runs_from_outside, task, pi, partition, part,
+                    None if self._backward else rim, longest,
+                ), 2,
             ))
             for pi, part, rim, candidate in zip(
                 self._pis, self.parts, self._rims, self._candidates, strict=True
@@ -232,10 +232,10 @@ class _Case:
         """Returns M_i u X_i, and the time T of the propagation [s]."""
         if len(self.parts) < 2:
             return (self.wanted if self.horizon is None else [*self.parts]), self.horizon or 0.0
-        reach = [
-            _backward_reach(self.task, pi, part, rim)
+        within = [
+            backward_reach(self.task, pi, part, rim, self.settings.gap)
             if self._backward
-            else _forward_reach(part, known()[:, 2])
+            else forward_reach(part, known()[:, 2])
             for pi, part, rim, known in zip(
                 self._pis, self.parts, self._rims, self._told, strict=True
             )
@@ -245,8 +245,8 @@ class _Case:
             for w, room, part in zip(self.wanted, roomy, self.parts, strict=True)
         ]
         given = max(round(self.horizon / self.task.dt), 1) if self.horizon else None
-        k = given or _shortest(self.task, reach, goals)
-        reached = [part | within(k) for part, within in zip(self.parts, reach, strict=True)]
+        k = given or shortest(self.task, within, goals, self.settings)
+        reached = [part | reach(k) for part, reach in zip(self.parts, within, strict=True)]
         if self.horizon is None:
             reached = [r & w for r, w in zip(reached, self.wanted, strict=True)]
         return reached, self.horizon or k * self.task.dt
@@ -266,130 +266,3 @@ class _Case:
             beside = nearest_of(self.grid, ~self.walls)
             sets = tuple(GridSet.from_mask(self.grid, own.mask[beside]) for own in sets)
         return sets
-
-
-def _shortest(task: Task, reach: list[Callable[[int], GridSet]], goals: list[np.ndarray]) -> int:
-    """Returns the least number of samples with which every set fills its goal (N,) bool.
-
-    What some set never reaches does not count, as a corner behind the place where three parts meet.
-    """
-    most, best = [0] * len(goals), 1
-    for k in range(1, round(LONGEST_HORIZON / task.dt) + 1):
-        pairs = zip(reach, goals, strict=True)
-        filled = [int(np.count_nonzero(within(k).mask[goal])) for within, goal in pairs]
-        if all(n >= FILLED * goal.sum() for n, goal in zip(filled, goals, strict=True)):
-            return k
-        if any(n > before for n, before in zip(filled, most, strict=True)):
-            most, best = np.maximum(filled, most).tolist(), k
-        if k * task.dt > PATIENCE + best * task.dt:
-            break
-    return best
-
-
-def _outside(
-    task: Task,
-    pi: PartPolicy,
-    partition: Partition,
-    part: GridSet,
-    rim: np.ndarray | None,
-    rows: np.ndarray,
-) -> np.ndarray:
-    """Returns what is known of nodes `rows` (k,) by the runs of pi_i from those outside of M_i: (k, 3).
-
-    These are whether they belong to W_i, from where pi_i arrives by its own way, whether the runs enter M_i
-    on the rim (N,) bool, and after how many samples, infinite for others. Past obstacles, a run from outside
-    M_i may go another way into it (see `Partition.astray`). Scattered nodes lie too far apart for a
-    rim: there it counts wherever the runs enter M_i. Without a rim, only W_i is asked for.
-    """
-    arrives = partition.succeeds & part.mask
-    entry = np.full(len(rows), np.inf)
-    wins = arrives[rows]
-    if rim is not None:
-        entry[part.mask[rows] & rim[rows]] = 1.0  # of those beside them
-    outside = np.flatnonzero(~part.mask[rows])
-    if len(outside):
-        nodes = part.grid.nodes[rows[outside]]
-        rollout = policy_runs(task, pi, nodes, label="extended sets")
-        wins[outside] = rollout.outcome == Outcome.REACHED
-        if not task.gives_direction:
-            wins[outside] &= ~_astray(partition, part, arrives, rows[outside], rollout)
-        if rim is not None:
-            entry[outside] = _entries(task, part, rim, rollout)
-    return np.column_stack([wins, np.isfinite(entry), entry])
-
-
-def _astray(
-    partition: Partition, part: GridSet, arrives: np.ndarray, starts: np.ndarray, rollout: Rollout
-) -> np.ndarray:
-    """Returns which runs (k,) bool from nodes `starts` enter M_i by another way than its own.
-
-    They enter M_i where they first come to one of the nodes (N,) bool of it from which pi_i `arrives`.
-    """
-    entered, astray = np.zeros((2, len(rollout.outcome)), dtype=bool)
-    for z in rollout.path[1:]:
-        at = part.grid.nearest(z)
-        rows = np.flatnonzero(~entered & arrives[at])
-        astray[rows] = partition.astray(part, starts[rows], at[rows])
-        entered[rows] = True
-    return astray
-
-
-def _entries(task: Task, part: GridSet, rim: np.ndarray, rollout: Rollout) -> np.ndarray:
-    """Returns after how many samples runs enter M_i on the rim (N,) bool: (k,), infinite for the others."""
-    entry = np.full(len(rollout.outcome), np.inf)
-    under_way = np.ones(len(entry), dtype=bool)
-    longest = round(LONGEST_HORIZON / task.dt)
-    for k, z in enumerate(rollout.path[1 : longest + 1], 1):
-        rows = np.flatnonzero(under_way)
-        rows = rows[part.contains(z[rows])]
-        on_rim = rows if isinstance(part.grid, Cloud) else rows[rim[part.grid.nearest(z[rows])]]
-        entry[on_rim] = k
-        under_way[rows] = False
-    return entry
-
-
-def _backward_reach(
-    task: Task, pi: PartPolicy, part: GridSet, rim: np.ndarray
-) -> Callable[[int], GridSet]:
-    """Returns M_i u X_i as a function of the number of samples.
-
-    X_i are the states that backward runs reach from the rim (N,) bool, the nodes of M_i near M*.
-    """
-    grid, gap = part.regular, GAP_CELLS * part.grid.cell
-    nodes = grid.nodes[rim]
-    path = nodes[None]
-
-    def within(samples: int) -> GridSet:
-        nonlocal path
-        visited = np.zeros(len(grid.nodes), dtype=bool)
-        if len(nodes):
-            if len(path) <= samples:  # more than asked for: longer times are asked for in turn
-                steps = max(samples, 2 * len(path))
-                path = policy_runs(
-                    task, pi, nodes, steps=steps, backward=True, label="backward"
-                ).path
-            z = _between_samples(path[: samples + 1], grid)
-            visited[grid.nearest(z[task.chart.contains(z)])] = True
-        # A closing, together with M_i, fills the gaps between the samples.
-        wide = GridSet.from_mask(grid, visited | part.mask).dilated(gap)
-        return GridSet.from_mask(grid, wide.mask).eroded(gap)
-
-    return within
-
-
-def _forward_reach(part: GridSet, entry: np.ndarray) -> Callable[[int], GridSet]:
-    """As `_backward_reach`, but X_i are the nodes whose forward runs enter M_i on its rim.
-
-    `entry` (N,) is after how many samples they do, not above zero where that is not known.
-    """
-    entry = np.where(entry > 0, entry, np.inf)
-    return lambda samples: GridSet.from_mask(part.grid, part.mask | (entry <= samples))
-
-
-def _between_samples(path: np.ndarray, grid: Grid) -> np.ndarray:
-    """Returns points (N, d) along paths (K + 1, n, d), so close that they miss no cell of the grid."""
-    hops = np.diff(path, axis=0)
-    count = max(int(np.ceil(np.abs(hops / grid.spacing).max(initial=0.0))), 1)
-    shares = np.arange(count)[:, None, None, None] / count
-    d = path.shape[-1]
-    return np.concatenate([(path[:-1] + shares * hops).reshape(-1, d), path[-1]])

@@ -15,32 +15,28 @@ from hyrl_mj.tasks import Task
 AROUND = 1.5
 # The room is found to this share of what the noise needs.
 STEP = 0.02
-# No more pieces of M* than these are spelled out.
-SPELLED = 3
 
 
-def meetings(points: np.ndarray, parts: Sequence[GridSet]) -> np.ndarray:
-    """Returns which parts meet at points (N, d) of M*: (N, Q, Q) bool, symmetric.
+def meet(inside: np.ndarray) -> np.ndarray:
+    """Returns which parts meet at points of M*: (N, Q, Q) bool, symmetric.
 
     Two parts meet at a point if each holds a state around it that the other does not hold. Parts that are the
     same there, or of which one holds all that the other does, leave nothing to decide between them.
+
+    Args:
+        inside: (N, Q, k) bool, as `around` returns it.
     """
-    return _apart(_inside(points, parts))
-
-
-def _apart(inside: np.ndarray) -> np.ndarray:
-    """Returns which of the parts that hold states `inside` (N, Q, k) bool meet: (N, Q, Q) bool."""
     alone = [(inside[:, [i]] & ~inside).any(axis=2) for i in range(inside.shape[1])]
     return np.stack(alone, axis=1) & np.stack(alone, axis=2)
 
 
-def _inside(points: np.ndarray, parts: Sequence[GridSet]) -> np.ndarray:
+def around(points: np.ndarray, parts: Sequence[GridSet]) -> np.ndarray:
     """Returns whether parts hold the states around points (N, d) of M*: (N, Q, k) bool."""
-    z = (points[:, None] + _around(parts[0].grid)).reshape(-1, points.shape[1])
+    z = (points[:, None] + _steps(parts[0].grid)).reshape(-1, points.shape[1])
     return np.stack([part.contains(z).reshape(len(points), -1) for part in parts], axis=1)
 
 
-def _around(grid: Nodes) -> np.ndarray:
+def _steps(grid: Nodes) -> np.ndarray:
     """Returns the steps (k, d) from a point to those around it: of a cloud, along each noisy coordinate."""
     d = grid.chart.dimension
     if isinstance(grid, Cloud):
@@ -93,9 +89,9 @@ def least_room(
         return np.empty(0, dtype=int), np.empty((0, 2), dtype=int), np.empty(0)
     grid = parts[0].grid
     wins = np.stack([wins[grid.nearest(points)] for wins in winning], axis=1)
-    inside = _inside(points, parts)
-    meet = _apart(inside) & (wins[:, :, None] | wins[:, None])
-    rows = np.flatnonzero(meet.any(axis=(1, 2)))
+    inside = around(points, parts)
+    pairs = meet(inside) & (wins[:, :, None] | wins[:, None])
+    rows = np.flatnonzero(pairs.any(axis=(1, 2)))
     if not len(rows):
         return rows, np.empty((0, 2), dtype=int), np.empty(0)
     room = rooms(points[rows], grid, winning, eps)
@@ -105,13 +101,13 @@ def least_room(
     for i in range(len(parts)):
         same = (inside == inside[:, [i]]).all(axis=2)
         best[:, i] = np.where(same, room, 0.0).max(axis=1)
-    of_pair = np.where(meet[rows], np.minimum(best[:, :, None], best[:, None]), np.inf)
+    of_pair = np.where(pairs[rows], np.minimum(best[:, :, None], best[:, None]), np.inf)
     # Of pairs with the same room that whose parts have most in common, with its modes in order.
     masks = np.stack([part.mask for part in parts])
     of_pair -= STEP / 2 * (masks[:, None] == masks).mean(axis=2)
-    pair = of_pair.reshape(-1, len(parts) ** 2).argmin(axis=1)
-    pairs = np.stack(np.divmod(pair, len(parts)), axis=1)
-    return rows, pairs, np.take_along_axis(best, pairs, axis=1).min(axis=1)
+    least = of_pair.reshape(-1, len(parts) ** 2).argmin(axis=1)
+    pair = np.stack(np.divmod(least, len(parts)), axis=1)
+    return rows, pair, np.take_along_axis(best, pair, axis=1).min(axis=1)
 
 
 def narrow_sentence(
@@ -137,7 +133,7 @@ def narrow_sentence(
     unit = task.noise_on()[1]
     pairs, counts = np.unique(between[narrow], axis=0, return_counts=True)
     said = []
-    for pair in pairs[np.argsort(-counts, kind="stable")][:SPELLED]:
+    for pair in pairs[np.argsort(-counts, kind="stable")][:3]:
         here = (between == pair).all(axis=1)
         first, second = map(task.mode_name, pair.tolist())
         left = room[here & narrow].min()

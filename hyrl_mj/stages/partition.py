@@ -13,22 +13,20 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.files import artifacts
 from hyrl_mj.files.artifacts import Saved
 from hyrl_mj.game import NEVER, Limit
+from hyrl_mj.learning import WaySettings
 from hyrl_mj.policies import Policy
 from hyrl_mj.sets import GridSet, Nodes, resolving
 from hyrl_mj.simulation import WayRuns, policy_runs, way_runs
 from hyrl_mj.stages import strips
 from hyrl_mj.stages.critical_set import check_points
-from hyrl_mj.stages.refinement import spread, thinned
-from hyrl_mj.stages.search import WEDGE
-from hyrl_mj.stages.ways import LEAST_SHARE, Ways
+from hyrl_mj.stages.refinement import refined, thinned
+from hyrl_mj.stages.ways import Ways
 from hyrl_mj.tasks import ANY, Outcome, Task, number_of
 
 # The neighbourhood of M* is at least this many cells wide, and as wide as the longest hop in one sample.
 # Of more than two parts some are wedges: without a wide neighbourhood they begin far from M*, where a policy
 # goes straight on because it is clear of the obstacle.
 NEIGHBOURHOOD_CELLS, CELLS_OF_WEDGES = 4, 1.5
-# Nodes lie opposite to each other across M* up to so many cells from it, or 2 eps.
-ACROSS_CELLS = 2
 
 
 @dataclass(frozen=True)
@@ -83,8 +81,8 @@ class Partition(Saved):
         masks = np.stack([other.mask for other in self.parts])
         return np.asarray(part.mask[ends] & (masks[:, starts] & masks[:, ends]).any(axis=0))
 
-    def sentence(self, task: Task) -> str:
-        """Returns a one-line description."""
+    def sentence(self, task: Task, settings: WaySettings = WaySettings()) -> str:
+        """Returns a one-line description; `settings` are those that the partition was made with."""
         shares = ", ".join(
             f"{task.mode_name(q)} {100 * part.share:.0f}%"
             for q, part in zip(self.modes, self.parts, strict=True)
@@ -92,12 +90,13 @@ class Partition(Saved):
         notes = ""
         if self.dropped:
             rare = ", ".join(map(task.mode_name, self.dropped))
-            notes += f"; less than {LEAST_SHARE:.0%} goes {rare}: no mode"
+            notes += f"; less than {settings.least_share:.0%} goes {rare}: no mode"
         if self.unparted:
             found = ", ".join(map(task.mode_name, self.unparted))
             notes += (
                 f"; runs go {found}, but no critical set was found between these ways, so that they are no "
-                f"modes: if the policy fails over more than {WEDGE:g} eps between them, train it longer"
+                f"modes: if the policy fails over more than {settings.wedge:g} eps between them, train it "
+                "longer"
             )
         if len(self.modes) > 1 and (unseen := self._unseen(task)):
             notes += f"; no run that arrives goes {', '.join(map(task.mode_name, unseen))}"
@@ -121,7 +120,12 @@ def check_sets(
 
 
 def make_partition(
-    task: Task, policy: Policy, points: np.ndarray, cells: int, noise: float = 0.0
+    task: Task,
+    policy: Policy,
+    points: np.ndarray,
+    cells: int,
+    noise: float = 0.0,
+    settings: WaySettings = WaySettings(),
 ) -> Partition:
     """Splits the nodes of a grid by the way that the closed loop goes from each (paper, Step 3).
 
@@ -135,6 +139,7 @@ def make_partition(
         cells: cells of the grid along the longest side of the chart, if they were square.
         noise: bound eps of the measurement noise; in charts of three and more dimensions the nodes lie close
             enough to tell states apart that it does, as far as `cells` allows.
+        settings: which ways are modes.
     """
     points = check_points(task, points)
     grid = resolving(task.chart, cells, points, task.noise_in_chart(max(noise, 1e-6)))
@@ -147,13 +152,13 @@ def make_partition(
         width = strips.width(task, noise, longest_hop(task, policy, grid))
         eps = float((task.noise_in_chart(noise) / task.chart.scale).max())
         a, b = neighbours
-        across = strips.across(task, nodes, points, max(2 * eps, ACROSS_CELLS * grid.cell))
+        across = strips.across(task, nodes, points, 2 * max(eps, grid.cell))
         neighbours = np.append(a, across[0]), np.append(b, across[1])
 
         def near(rows: np.ndarray) -> np.ndarray:
             return strips.around_walls(task, nodes, (a, b), first.alive, rows, width) <= width
 
-    ways = Ways.from_runs(task, first, neighbours, near)
+    ways = Ways.from_runs(task, first, neighbours, near, settings)
     modes = ways.modes if len(points) else ()
 
     def tell(rows: np.ndarray) -> np.ndarray:
@@ -166,7 +171,8 @@ def make_partition(
         return np.column_stack([ways.members(runs), ways.works(runs), runs.arrived])
 
     everywhere, columns = np.ones(grid.size, dtype=bool), len(ways.modes) + 2
-    known = spread(task, grid, everywhere, points, WEDGE * noise, tell, columns).astype(bool)
+    wedge = settings.wedge * noise
+    known = refined(task, grid, everywhere, points, wedge, tell, columns).astype(bool)
     members, succeeds = known[:, :-2], known[:, -1]
     works, failed = np.flatnonzero(known[:, -2]), np.flatnonzero(~known[:, -2])
     if modes and len(failed):

@@ -10,8 +10,8 @@ from hyrl_mj.sets import Grid, Nodes
 from hyrl_mj.stages.critical_set import distance_to
 from hyrl_mj.tasks import Task
 
-# Along a noisy coordinate one in so many nodes is simulated, in charts of at least so many dimensions.
-THIN, DIMENSIONS = 4, 3
+# Along a noisy coordinate one in so many nodes is simulated.
+THIN = 4
 # Node indices (k,) -> what is known of these nodes (k, c).
 Tell = Callable[[np.ndarray], np.ndarray]
 
@@ -23,7 +23,7 @@ def strides(task: Task, nodes: Nodes) -> np.ndarray:
     to be simulated from all of these nodes.
     """
     chart = nodes.chart
-    fine = isinstance(nodes, Grid) and chart.dimension >= DIMENSIONS and not task.kinematic
+    fine = isinstance(nodes, Grid) and chart.dimension >= 3 and not task.kinematic
     thin = (task.noise_in_chart(1.0) > 0) & ~np.array(chart.periodic)
     return np.where(thin & fine, THIN, 1)
 
@@ -38,7 +38,7 @@ def thinned(task: Task, nodes: Nodes) -> tuple[np.ndarray, tuple[np.ndarray, np.
     return rows, Grid(nodes.chart, tuple(map(len, axes))).neighbours()
 
 
-def spread(
+def refined(
     task: Task,
     nodes: Nodes,
     wanted: np.ndarray,

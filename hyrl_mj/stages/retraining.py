@@ -40,7 +40,7 @@ def start_policy(
     task = ground.task
     if not ALGORITHMS[settings.algorithm].is_actor_critic:
         return policy if isinstance(policy, MlpPolicy) and fits(task, settings, policy) else None
-    pi = part_policy(task, policy, partition, ground.mode, ground.extended.noise)
+    pi = part_policy(task, policy, partition, ground.mode, ground.states.extended.noise)
     return distil(task, pi, ground.starts, settings, seed)
 
 
@@ -84,10 +84,10 @@ def retrain(
     tried: list[tuple[Score, ModePolicy]] = []
     if part is not None:
         # Without a table only trainings could follow: the agent is tried unchanged, too.
-        for given in (part,) if table else (part, part.undivided):
-            tried.append((ground(given), given))
-            if ground.suffices(given):
-                return given, _result(ground, given, 0)
+        for untrained in (part,) if table else (part, part.undivided):
+            tried.append((ground(untrained), untrained))
+            if ground.suffices(untrained):
+                return untrained, _result(ground, untrained, 0)
     if task.mirror is not None:
         for other, result in others:
             if not isinstance(other, MlpPolicy):

@@ -6,13 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hyrl_mj.learning import WaySettings
 from hyrl_mj.policies import Policy, PolicyController
 from hyrl_mj.simulation import Rollout, Sample, Signal, WayRuns, closed_loop, way_runs
 from hyrl_mj.stages.ways import Ways
 from hyrl_mj.tasks import Outcome, Task
-
-# M* is found across failures up to this many noise bounds wide: the noise can push a run there.
-WEDGE = 4.0
 
 
 def critical_points(
@@ -23,6 +21,7 @@ def critical_points(
     cell: float,
     resolution: float,
     noise: float = 0.0,
+    settings: WaySettings = WaySettings(),
 ) -> np.ndarray:
     """Searches by outcome: returns middles (N, d) between close starts whose runs go different ways.
 
@@ -30,18 +29,19 @@ def critical_points(
     as a policy with inertia may crash in between, the middle of these is critical.
 
     Args:
-        task, policy, resolution, noise: as in `find_critical_set`.
+        task, policy, resolution, noise, settings: as in `find_critical_set`.
         nodes: (n, d) starts.
         neighbours: (k,), (k,) indices of starts that lie next to each other.
         cell: the usual distance between two neighbours, in scaled units.
     """
     rollout = way_runs(task, policy, nodes, label="critical set")
     runs, paths = WayRuns.from_rollout(task, rollout), _paths(task, rollout)
-    ways = Ways.from_runs(task, runs, neighbours)
+    ways = Ways.from_runs(task, runs, neighbours, settings=settings)
     works = ways.works(runs)
     if not works.any():
         return np.empty((0, task.chart.dimension))
-    wedge = max(WEDGE * (task.noise_in_chart(noise) / task.chart.scale).max(), resolution * cell)
+    bound = (task.noise_in_chart(noise) / task.chart.scale).max()
+    wedge = max(settings.wedge * bound, resolution * cell)
     longest = np.linalg.norm(_gap(task, nodes, *neighbours) / task.chart.scale, axis=1).max()
     first, second = _across(task, nodes, neighbours, works, runs.alive)
     first, second = first[pair := runs[first].differ(runs[second])], second[pair]

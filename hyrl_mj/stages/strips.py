@@ -11,9 +11,6 @@ import numpy as np
 
 from hyrl_mj.tasks import Task
 
-# At no more points of M*, one after the other, nodes are looked at.
-MOST_POINTS = 500
-
 
 def width(task: Task, noise: float, hop: np.ndarray) -> float:
     """Returns the width that a strip needs, in scaled units.
@@ -43,7 +40,8 @@ def across(task: Task, nodes: np.ndarray, points: np.ndarray, reach: float) -> n
         reach: how far from a point both may lie, in scaled units.
     """
     chart = task.chart
-    points = points[np.unique(np.linspace(0, len(points) - 1, MOST_POINTS).astype(int))]
+    # Of many points of M* a few hundred show the same nodes.
+    points = points[np.unique(np.linspace(0, len(points) - 1, 500).astype(int))]
     tree = chart.tree(nodes)
     close = tree.query_ball_point(chart.in_box(points), reach)
     first = np.concatenate([np.empty(0, dtype=int), *map(np.asarray, close)]).astype(int)

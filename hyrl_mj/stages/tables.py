@@ -20,6 +20,7 @@ import numpy as np
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files.artifacts import Saved
 from hyrl_mj.game import nearest_of
+from hyrl_mj.learning import TableSettings
 from hyrl_mj.sets import Grid, Nodes
 from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Outcome, Task
@@ -31,15 +32,10 @@ if TYPE_CHECKING:
 
 # Values of each of m inputs that are tried.
 VALUES = {1: 9, 2: 5, 3: 3, 4: 3}
-# Inputs are held until the robot has usually gone so many cells, and so many times the noise bound, but for
-# no more than so many samples. That is found out from so many nodes.
-CELLS, BOUNDS, LONGEST, TRIED = 2.0, 1.5, 64, 64
-# Tables that are made one from the other. Noise shows what is worst for a table with this probability, and
-# anything else otherwise, once for each held input. If it always showed the worst, it would hold the robot
-# somewhere on nearly all ways through narrow corridors, and all tables would be equally bad.
-TABLES, WORST = 6, 0.8
-# Values that change by less have converged [samples]. Shares that are smaller are errors of rounding.
-SETTLED, SWEEPS, NONE = 1e-2, 2_000, 1e-9
+# Values that change by less have converged [samples].
+SETTLED = 1e-2
+# Shares that are smaller are errors of rounding.
+ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -56,7 +52,7 @@ class TablePolicy(Saved):
     counts: np.ndarray
     inputs: np.ndarray
 
-    def of(self, task: Task) -> BoundTable:
+    def bound_to(self, task: Task) -> BoundTable:
         """Returns the policy on the chart of a task.
 
         Raises:
@@ -96,7 +92,7 @@ class BoundTable:
 
 
 @dataclass(frozen=True)
-class Held:
+class HeldInputs:
     """Where held inputs lead a robot that begins at rest at the nodes of a grid.
 
     Attributes:
@@ -109,6 +105,7 @@ class Held:
         arrived: (A, k) bool, whether the robot arrives before.
         failed: (A, k) bool, whether it fails before.
         leaves: (M, A, k) bool, whether it leaves M_ext_i after a sample, or is outside of it at the end.
+        settings: for how long inputs are held, and what noise shows.
     """
 
     task: Task
@@ -120,9 +117,12 @@ class Held:
     arrived: np.ndarray
     failed: np.ndarray
     leaves: np.ndarray
+    settings: TableSettings
 
     @staticmethod
-    def from_sets(task: Task, extended: ExtendedSets) -> Held | None:
+    def from_sets(
+        task: Task, extended: ExtendedSets, settings: TableSettings = TableSettings()
+    ) -> HeldInputs | None:
         """Returns these runs, None where no table is `possible`, or the robot takes too long to get away."""
         grid = extended.sets[0].grid
         if not possible(task, grid):
@@ -134,8 +134,9 @@ class Held:
             inputs = np.array(list(product(*axes)))
         rows = np.flatnonzero(task.goes_on(grid.nodes))
         bound = task.noise_in_chart(extended.noise)
-        away = max(CELLS * grid.cell, BOUNDS * float((bound / task.chart.scale).max()))
-        samples = _samples(task, grid.nodes[rows], inputs, away)
+        scaled = float((bound / task.chart.scale).max())
+        away = max(settings.cells * grid.cell, settings.bounds * scaled)
+        samples = _samples(task, grid.nodes[rows], inputs, away, settings.longest)
         if not samples:
             return None
         z = grid.nodes[rows]
@@ -158,7 +159,9 @@ class Held:
             leaves[:, a] |= ~np.stack(inside)
         arrived = outcome == Outcome.REACHED
         failed = (outcome != Outcome.RUNNING) & ~arrived
-        return Held(task, extended, rows, inputs, samples, ends, arrived, failed, leaves)
+        return HeldInputs(
+            task, extended, rows, inputs, samples, ends, arrived, failed, leaves, settings
+        )
 
     @property
     def grid(self) -> Grid:
@@ -223,14 +226,17 @@ def possible(task: Task, grid: Nodes) -> bool:
     )
 
 
-def _samples(task: Task, z: np.ndarray, inputs: np.ndarray, away: float) -> int:
-    """Returns after how many samples a held input usually has led away far enough, 0 if too many."""
-    z = z[np.random.default_rng(0).choice(len(z), min(len(z), TRIED), replace=False)]
+def _samples(task: Task, z: np.ndarray, inputs: np.ndarray, away: float, longest: int) -> int:
+    """Returns after how many samples a held input usually has led away far enough, 0 if beyond the longest.
+
+    That is found out from some of the points z (n, d).
+    """
+    z = z[np.random.default_rng(0).choice(len(z), min(len(z), 64), replace=False)]
     n = len(z)
     plant = task.tabulating(n * len(inputs))
     starts, u = np.tile(z, (len(inputs), 1)), np.repeat(inputs, n, axis=0)
     plant.set_state(*task.state(starts))
-    for k in range(1, LONGEST + 1):
+    for k in range(1, longest + 1):
         on = np.flatnonzero(task.ending(plant.measurement) == Outcome.RUNNING)
         plant.step(u[on], on)
         gone = task.chart.distance(task.z(plant.measurement), starts).reshape(len(inputs), n)
@@ -239,7 +245,7 @@ def _samples(task: Task, z: np.ndarray, inputs: np.ndarray, away: float) -> int:
     return 0
 
 
-def table_for(held: Held, mode: int) -> BoundTable:
+def table_for(held: HeldInputs, mode: int) -> BoundTable:
     """Returns the policy of a mode: at each node the input that does well wherever noise may hide the robot.
 
     The measure of an input at a node is how many samples farther from arrival it leads, at the worst and on
@@ -258,7 +264,7 @@ def table_for(held: Held, mode: int) -> BoundTable:
     own = held.own(mode)
     left = _left(held, mode, lambda after: after.min(axis=0))
     tables: list[tuple[float, np.ndarray]] = []
-    for _ in range(TABLES):
+    for _ in range(held.settings.tables):
         after = held.after(left, mode)
         table = _best(held, after - np.where(own, left, after.min(axis=0)))
         left = _left(held, mode, _under_noise(held, table))
@@ -267,7 +273,7 @@ def table_for(held: Held, mode: int) -> BoundTable:
     return BoundTable(held.task, held.grid, held.inputs[table])
 
 
-def _left(held: Held, mode: int, follow: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+def _left(held: HeldInputs, mode: int, follow: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """Returns the samples (k,) from the rows to arrival.
 
     `follow` returns those (k,) after the input that is held next, from those (A, k) after each input. From
@@ -275,7 +281,7 @@ def _left(held: Held, mode: int, follow: Callable[[np.ndarray], np.ndarray]) -> 
     """
     own = held.own(mode)
     left = np.full(len(held.rows), held.never)
-    for _ in range(SWEEPS):
+    for _ in range(2_000):  # far more than are needed
         new = np.minimum(held.samples + follow(held.after(left, mode)), held.never)
         new[~own] = held.never
         change, left = np.abs(new - left).max(), new
@@ -284,10 +290,10 @@ def _left(held: Held, mode: int, follow: Callable[[np.ndarray], np.ndarray]) -> 
     return left
 
 
-def _under_noise(held: Held, table: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+def _under_noise(held: HeldInputs, table: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     """Returns what follows, for `_left`, where noise chooses among the inputs (N,) of a table.
 
-    The share `WORST` of its choices are the worst, the others are as likely as each other.
+    Of its choices the share `worst` of the settings are the worst, the others are as likely as each other.
     """
     anywhere = np.ones(held.grid.size, dtype=bool)
     shares = np.stack(
@@ -296,13 +302,14 @@ def _under_noise(held: Held, table: np.ndarray) -> Callable[[np.ndarray], np.nda
             for a in range(len(held.inputs))
         ]
     )
-    choices = np.where(shares > NONE, 0.0, -np.inf)
+    worst = held.settings.worst
+    choices = np.where(shares > ROUNDING, 0.0, -np.inf)
     return lambda after: (
-        WORST * (after + choices).max(axis=0) + (1 - WORST) * (shares * after).sum(axis=0)
+        worst * (after + choices).max(axis=0) + (1 - worst) * (shares * after).sum(axis=0)
     )
 
 
-def _best(held: Held, farther: np.ndarray) -> np.ndarray:
+def _best(held: HeldInputs, farther: np.ndarray) -> np.ndarray:
     """Returns the best inputs (N,), from how many samples farther each of them leads from the rows (A, k)."""
     robots = np.zeros(held.grid.size, dtype=bool)
     robots[held.rows] = True
@@ -339,7 +346,7 @@ def _in_reach(
         for v in (np.where(among, values, 0.0), among.astype(float))
     )
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(count > NONE, total / count, np.inf)
+        return np.where(count > ROUNDING, total / count, np.inf)
 
 
 # Returns the table of a mode.

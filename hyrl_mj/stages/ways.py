@@ -9,13 +9,12 @@ from itertools import islice
 import numpy as np
 
 from hyrl_mj.errors import BadInput
+from hyrl_mj.learning import WaySettings
 from hyrl_mj.simulation import Passing, WayRuns, windings
 from hyrl_mj.tasks import ANY, LEFT, RIGHT, Task, number_of, sides, wrapped
 
-# A way that fewer of the nodes go from which a run can start is no mode, and the most modes of a controller.
-LEAST_SHARE, MOST_MODES = 0.01, 32
-# Near where ways part, a start decides if an obstacle lies between it and the end at this share of the angle.
-NEAR_SHARE = 0.5
+# The most modes of a controller.
+MOST_MODES = 32
 # Indices (k,) of nodes -> which of all nodes (n,) bool lie near them.
 Near = Callable[[np.ndarray], np.ndarray]
 
@@ -33,7 +32,7 @@ class Ways:
     Attributes:
         patterns: (Q, K) the pattern of each mode; a task's own direction is a pattern of one.
         modes: their numbers.
-        dropped: numbers of the ways that less than `LEAST_SHARE` of the nodes go from which a run can start.
+        dropped: numbers of the ways that too few of the nodes go from which a run can start.
         end: (K,) the usual bearing of the end of a run from each obstacle [rad].
         half: (K,) an obstacle lies between start and end if they are seen from it at more than this angle: at
             most a right one (Thales), lowered to the smallest angle at which the ways part, and to that of
@@ -56,6 +55,7 @@ class Ways:
         runs: WayRuns,
         neighbours: tuple[np.ndarray, np.ndarray],
         near: Near | None = None,
+        settings: WaySettings = WaySettings(),
     ) -> Ways:
         """Returns the ways of runs from all nodes of a chart.
 
@@ -67,6 +67,7 @@ class Ways:
             neighbours: (k,), (k,) indices of nodes that lie next to each other.
             near: tells which nodes are so close to others, where ways part, that they have to decide, too
                 (see `strips`). By default none are.
+            settings: how few nodes make no mode, and what is near.
 
         Raises:
             BadInput: there are more than `MOST_MODES` ways.
@@ -87,13 +88,14 @@ class Ways:
                 at = np.unique([first[pairs], second[pairs]])
                 if len(at):
                     close = counted & near(at) if near else at
-                    least = max(angle[close, k].min(), NEAR_SHARE * angle[at, k].min())
+                    near_by = settings.near_share * angle[at, k].min()
+                    least = max(angle[close, k].min(), near_by)
                     half[k] = min(half[k], least)
             seen = sides(_angles(passing, end), half)[counted]
             decides = (seen == LEFT).any(axis=0) & (seen == RIGHT).any(axis=0)
         found = Ways(np.empty((0, len(decides)), dtype=int), (), (), end, half, decides, True)
         patterns = found.of_runs(runs)[counted]
-        kept, dropped = _modes(patterns, LEAST_SHARE * runs.alive.sum())
+        kept, dropped = _modes(patterns, settings.least_share * runs.alive.sum())
         if len(kept):
             kept = _complete(kept, dropped)
         if len(kept) > MOST_MODES:

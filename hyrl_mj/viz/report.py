@@ -112,7 +112,7 @@ def _stages(
     return [
         ("train", first),
         ("critical-set", run.critical_set.sentence(task)),
-        ("partition", run.partition.sentence(task)),
+        ("partition", run.partition.sentence(task, run.settings.ways)),
         ("extended-sets", f"{run.extended_sets.sentence(task)}; {reach}"),
         ("retrain", retrained),
         (

@@ -146,8 +146,10 @@ def critical_sets(run: Run, cuts: Sequence[Section]) -> list[CriticalSet]:
     nodes = np.vstack([cut.lift(grid.nodes) for cut in cuts])
     firsts = len(grid.nodes) * np.arange(len(cuts))[:, None]
     first, second = ((firsts + ends).ravel() for ends in grid.neighbours())
-    rods = first, second
-    points = critical_points(cuts[0].task, run.steady, nodes, rods, grid.cell, resolution, noise)
+    rods, ways = (first, second), run.settings.ways
+    points = critical_points(
+        cuts[0].task, run.steady, nodes, rods, grid.cell, resolution, noise, ways
+    )
     found = []
     for cut in cuts:
         # A point between two nodes of a section lies in it.

@@ -51,7 +51,7 @@ class _Quality(TaskGround):
     settled = 0.0
 
     def __init__(self, task: Task, quality: Callable[[Task, MlpPolicy], float], enough: float):
-        super().__init__(task, gamma=1.0)
+        super().__init__(task, preset(task).stage1)
         self._quality, self.enough = quality, (enough,)
 
     def __call__(self, policy: MlpPolicy) -> Score:

@@ -13,10 +13,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from benchmarks import Figure
 from benchmarks.runs import Runs
 from hyrl_mj import Run, Task, extend, find_critical_set
+from hyrl_mj.learning import WaySettings
 from hyrl_mj.learning.training import build
 from hyrl_mj.simulation import LoopSettings
 from hyrl_mj.stages import critical_set
-from hyrl_mj.stages.critical_set import PARTING, SAMPLES
 from hyrl_mj.stages.partition import PartPolicy
 from hyrl_mj.tasks import Outcome
 
@@ -138,11 +138,12 @@ class _OneRod:
     def _search(self, centre, axis, length, least, found) -> None:
         ends = [centre - axis * length / 2, centre + axis * length / 2]
         paths = [
-            _one_start(self._task, self._predict, end, SAMPLES, backward=False) for end in ends
+            _one_start(self._task, self._predict, end, WaySettings.samples, backward=False)
+            for end in ends
         ]
         moves = [path[-1] - path[0] for path in paths]
         apart = np.linalg.norm(moves[1] - moves[0])
-        if apart <= PARTING * sum(np.linalg.norm(move) for move in moves):
+        if apart <= WaySettings.parting * sum(np.linalg.norm(move) for move in moves):
             return
         if length <= least:
             found.append(centre)

@@ -28,7 +28,10 @@ TRAINING: dict[str, tuple[Any, ...]] = {
     "activation": ("Tanh", "os.system", 1, "relu\n"),
     "learning_rate": (0, -1e-3, NAN, INF, -INF),
     "anneal": (1, 0, 2, "yes", NAN),
+    "final_rate": (-0.1, 1.1, NAN, INF),
     "gamma": (-0.1, 1.1, NAN, INF, 100),
+    "rehearse_lost": (-0.1, 1.1, NAN),
+    "rehearse_deciding": (-0.1, 0.7, NAN),
     "symmetric": (1, "no", NAN),
     "warm_start": (1, "no", NAN),
     "episode": COUNTS,
@@ -55,6 +58,16 @@ SETTINGS: dict[str, tuple[Any, ...]] = {
     "lattice": (*COUNTS[1:], HUGE),
     "resolution": (0, -1, 2, NAN, INF, -INF),
     "search": ("rod", "Rods", 5, LONG),
+    **dict.fromkeys(("ways", "overlap", "modes", "table"), ("abc", None, [], {}, {"wedge": 4}, 3)),
+}
+# The same of the groups of settings: of the first numbers in each, which stand for the others.
+GROUPS: dict[tuple[str, str], tuple[Any, ...]] = {
+    ("ways", "samples"): COUNTS,
+    ("ways", "parting"): (0, 1.1, NAN, INF),
+    ("overlap", "longest"): (0, -1, NAN, INF),
+    ("modes", "margin"): (0.9, NAN, INF),
+    ("modes", "batches"): ([], [0], [1.5], ["a"], [HUGE], 8),
+    ("table", "tables"): (*COUNTS, HUGE),
 }
 # What is no mistake: a missing horizon or episode has a meaning.
 MEANT = {("horizon", "null"), ("episode", "null"), ("options", "{}"), ("anneal", "true"),
@@ -85,6 +98,8 @@ def _places() -> Iterator[Place]:
     for stage in ("stage1", "stage6"):
         for name, values in TRAINING.items():
             yield ("settings", stage, name), values
+    for place, values in GROUPS.items():
+        yield ("settings", *place), values
     yield ("settings",), ()
     yield ("versions",), ()
 

@@ -14,7 +14,6 @@ from typing import Any
 
 from matplotlib.mathtext import MathTextParser
 
-import hyrl_mj.learning.training as training
 import hyrl_mj.proof.examination as examination
 import hyrl_mj.stages.results as results
 import hyrl_mj.viz.figures.style as style
@@ -72,7 +71,7 @@ def shorten() -> None:
     presets._SMOKE |= {"ppo": 1_024, "dqn": 3_000}
     presets._SMOKE_MODES = 1_024
     examination.CURVE = examination.CURVE[::8]
-    training.EPISODES = results.EPISODES = 64
+    results.EPISODES = 64
     for kind in (Task, EnvironmentTask):
         kind.effort = replace(kind.effort, checkpoints=2)
     style.DPI = 30
