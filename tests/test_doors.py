@@ -20,7 +20,7 @@ from command_line import call
 
 from hyrl_mj.environments import from_gymnasium
 from hyrl_mj.environments.making import from_spec
-from hyrl_mj.errors import LONGEST, BadInput
+from hyrl_mj.errors import BadInput
 from hyrl_mj.fields import read_field
 from hyrl_mj.fields.driving import Driving
 from hyrl_mj.files import trust
@@ -34,6 +34,7 @@ from hyrl_mj.viz.sweep_tables import markdown
 from hyrl_mj.viz.tables import Table
 
 CIRCLE = "hyrl_mj/UnitCircle-v0"
+LONGEST = 500  # of a sentence [characters], without the mark of what is left out
 
 
 def spec_of(env, **given):

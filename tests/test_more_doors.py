@@ -10,6 +10,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from attacks import child, crafted_agents
@@ -162,6 +163,24 @@ def test_a_pipe_in_place_of_a_file_is_no_file(command, tmp_path):
         return
     done = call("diagnose", "--explain", "--env", ENV, "--env-args", "pipe", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (2, "hyrl-mj: pipe is no file: give a JSON file\n")
+
+
+# ---- processes of others
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("context", ["fork", "spawn"])
+def test_an_async_vector_env_plays_what_a_sync_one_does(context):
+    def played(mode, **options):
+        envs = gym.make_vec(ENV, 2, vectorization_mode=mode, **options)
+        found, rng = [envs.reset(seed=1)[0]], np.random.default_rng(0)
+        for _ in range(160):  # past the end of an episode
+            found += envs.step(rng.uniform(-1, 1, (2, 1)).astype(np.float32))[:4]
+        envs.close()
+        return np.concatenate([np.ravel(part) for part in found])
+
+    ours = played("async", vector_kwargs={"context": context})
+    np.testing.assert_array_equal(ours, played("sync"))
 
 
 # ---- what fills the disk and the memory
