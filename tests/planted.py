@@ -16,6 +16,7 @@ from hyrl_mj.pipeline import steps
 from hyrl_mj.proof import examination, replays
 from hyrl_mj.runs.directory import load_run
 from hyrl_mj.sets import Chart, Grid, GridSet
+from hyrl_mj.stages import grounds
 from hyrl_mj.stages.critical_set import CriticalSet
 from hyrl_mj.stages.hybrid import HybridController
 from hyrl_mj.stages.partition import Partition
@@ -25,6 +26,8 @@ from hyrl_mj.viz.figures import style
 
 # Settings of a smoke run on the circle whose worst-case game takes two seconds.
 FEW_CELLS = {"lattice": 130}
+# Settings of the runs of a sweep, which are made in processes that `shorten` does not reach.
+TINY = {"stage1.samples": 4096, "stage6.samples": 4096, "lattice": 130, "rods": 120, "cells": 240}
 
 
 def shorten(patch):
@@ -38,13 +41,21 @@ def shorten(patch):
         for key, value in new.items():
             patch.setitem(values, key, value)
     patch.setattr(presets, "_SMOKE_MODES", 4_096)
-    few_checkpoints(patch, 4)
+    spare(patch, checkpoints=4, batches=2, nodes=12, episodes=100)
+    spare_environments(patch)
 
 
-def few_checkpoints(patch, count):
-    """Patches at how many checkpoints of a training its policy is judged."""
+def spare(patch, **effort):
+    """Patches how much is spent on every task: checkpoints at which a policy is judged, and the like."""
     for kind in (Task, EnvironmentTask):
-        patch.setattr(kind, "effort", replace(kind.effort, checkpoints=count))
+        patch.setattr(kind, "effort", replace(kind.effort, **effort))
+
+
+def spare_environments(patch):
+    """Patches how many runs judge controllers in environments, of which each takes tenths of a second."""
+    few = {"batches": 1, "nodes": 6, "episodes": 24}
+    patch.setattr(EnvironmentTask, "effort", replace(EnvironmentTask.effort, **few))
+    patch.setattr(grounds, "ATTACKED", 12)
 
 
 def coarsen(patch):

@@ -399,12 +399,17 @@ class Pushed(Puck):
         return np.concatenate([parts[key] for key in sorted(parts)])
 
 
+@pytest.fixture(scope="module")
+def pushed():
+    return hyrl_mj.from_gymnasium(Pushed, steps=20)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("wrapped", ["plain", "VecNormalize", "NormalizeObservation"])
 @pytest.mark.parametrize("algorithm", [SAC, PPO])
-def test_the_type_of_observations_tells_of_wrappers(algorithm, wrapped, tmp_path):
+def test_the_type_of_observations_tells_of_wrappers(algorithm, wrapped, pushed, tmp_path):
     """Both wrappers give float32, and most environments of MuJoCo float64."""
-    task, inside = hyrl_mj.from_gymnasium(Pushed, steps=20), wrapped == "NormalizeObservation"
+    inside = wrapped == "NormalizeObservation"
     make = Pushed if not inside else lambda: gym.wrappers.NormalizeObservation(Pushed())
     env = DummyVecEnv([lambda: gym.wrappers.TimeLimit(make(), 20)])
     env = VecNormalize(env) if wrapped == "VecNormalize" else env
@@ -412,9 +417,9 @@ def test_the_type_of_observations_tells_of_wrappers(algorithm, wrapped, tmp_path
     model = algorithm("MlpPolicy", env, seed=0, device="cpu", **options)
     path = saved(model.learn(64), tmp_path)
     if wrapped == "plain":
-        load_agent(path, task)
+        load_agent(path, pushed)
     else:
-        refused(path, task, "normalised observations .VecNormalize.*--vecnormalize")
+        refused(path, pushed, "normalised observations .VecNormalize.*--vecnormalize")
 
 
 def test_limits_leave_room_for_large_mlps(circle, tmp_path):

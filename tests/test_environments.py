@@ -1,5 +1,6 @@
 """Environments of others as tasks: plant, noise, what is found out about them, and what is refused."""
 
+import functools
 import importlib
 import json
 import os
@@ -30,10 +31,13 @@ from environments import (
 )
 from gl import needs_gl
 from gymnasium.wrappers import TimeLimit
+from manual import arguments_of_environments
+from planted import spare_environments
 
 import hyrl_mj
 from hyrl_mj import BadInput, Outcome, from_gymnasium
 from hyrl_mj.environments import making
+from hyrl_mj.environments.coordinates import coordinates
 from hyrl_mj.environments.instance import Instance, flat
 from hyrl_mj.learning import presets
 from hyrl_mj.physics.mjcf import camera_of, point_of, rests
@@ -43,21 +47,10 @@ from hyrl_mj.system import cores
 from hyrl_mj.tasks import check_task, described_task, reference
 from hyrl_mj.viz.replay.marks import tracked_points
 
-# What the environments of other packages need, beside their ids.
-OTHERS = {
-    "Reacher-v5": {
-        "chart": {"shoulder": "qpos[0]", "elbow": "qpos[1]"},
-        "pinned": {"qpos[2]": -0.15, "qpos[3]": 0.0},
-        "success": "distance(fingertip, target) <= 0.05",
-    },
-    "PointMaze_Medium-v3": {"reset": {"goal_cell": [6, 6]}},
-    "PointMaze_Large-v3": {"reset": {"goal_cell": [3, 6]}},
-    "pointmaze-medium-singletask-v0": {},
-    "dm_control/pendulum-swingup-v0": {
-        "chart": {"angle": "qpos[0]", "rate": "qvel[0]"},
-        "success": "reward >= 1",
-    },
-}
+pytestmark = pytest.mark.slow  # a second for each environment
+
+# What the environments of other packages need, beside their ids; episodes are short.
+OTHERS = {name: {**given, "steps": 60} for name, given in arguments_of_environments().items()}
 
 
 @pytest.fixture(scope="module")
@@ -65,13 +58,18 @@ def puck():
     return from_gymnasium(Puck)
 
 
-def others(*names):
-    return pytest.mark.parametrize("name", names or OTHERS)
+@pytest.fixture(scope="module")
+def other():
+    """Returns the task of an environment of another package, by its name; each is made once."""
+    return functools.cache(lambda name: from_gymnasium(name, **OTHERS[name]))
 
 
-@others()
-def test_copies_go_on_as_the_environment_alone_does(name):
-    task, rng = from_gymnasium(name, **OTHERS[name]), np.random.default_rng(0)
+others = pytest.mark.parametrize("name", OTHERS)
+
+
+@others
+def test_copies_go_on_as_the_environment_alone_does(name, other):
+    task, rng = other(name), np.random.default_rng(0)
     z = task.starts(3, rng)
     plant = task.plant(3)
     plant.set_state(*task.state(z))
@@ -107,10 +105,9 @@ def test_an_environment_that_counts_its_steps_ends_the_episode_of_each_copy():
     ]
 
 
-@pytest.mark.slow
-@others()
-def test_the_tasks_of_other_packages_are_complete(name):
-    task = from_gymnasium(name, steps=60, **OTHERS[name])
+@others
+def test_the_tasks_of_other_packages_are_complete(name, other):
+    task = other(name)
     check_task(task)
     assert set(task.found) >= {"bounds", "starts", "ways"}
     point_of(task.model, task.scene.tracked)
@@ -126,8 +123,8 @@ def test_the_tasks_of_other_packages_are_complete(name):
         ("Reacher-v5", 0),
     ],
 )
-def test_islands_are_the_walls_that_can_be_passed_on_both_sides(name, islands):
-    task = from_gymnasium(name, **OTHERS[name])
+def test_islands_are_the_walls_that_can_be_passed_on_both_sides(name, islands, other):
+    task = other(name)
     assert len(task.obstacles) == islands
     assert task.gives_direction == (islands == 0)
 
@@ -275,11 +272,11 @@ def test_an_episode_ends_where_info_tells_success(puck):
     z = np.array([[1.0, 0.0]])
     run = closed_loop(puck, Constant(puck, (4.0, 0.0)), z, Noise())
     assert run.outcome.tolist() == [1]
-    at_end = from_gymnasium(Puck, success="reward >= -0.3", steps=30)
+    success = "reward >= -0.3 and distance(puck, goal) < 0.3"
+    at_end = from_gymnasium(Puck, success=success, steps=30)
     late = closed_loop(at_end, Constant(at_end, (0.0, 0.0)), np.array([[1.3, 0.0]]), Noise())
     assert (late.outcome.tolist(), late.length.tolist()) == ([1], [30])
-    near = from_gymnasium(Puck, success="distance(puck, goal) < 0.3").specification
-    assert near.criterion.points == ((("xpos", 1), ("site_xpos", 0)),)
+    assert at_end.specification.criterion.points == ((("xpos", 1), ("site_xpos", 0)),)
 
 
 class Constant:
@@ -310,12 +307,12 @@ class Constant:
         (["position[7]"], None),
     ],
 )
-def test_charts_are_named_as_users_name_things(chart, names):
+def test_charts_are_named_as_users_name_things(chart, names, puck):
     if names is not None:
-        assert list(from_gymnasium(Puck, chart=chart).chart.names) == names
+        assert [c.name for c in coordinates(puck._instance, chart)] == names
         return
     with pytest.raises(BadInput, match=r"no single position|twice|unknown coordinate"):
-        from_gymnasium(Puck, chart=chart)
+        coordinates(puck._instance, chart)
 
 
 def test_what_was_not_given_is_found_and_said(puck):
@@ -388,22 +385,22 @@ def test_what_cannot_work_is_refused_before_anything_is_trained(what):
 
 
 @pytest.mark.parametrize("own", [True, False])
-@pytest.mark.parametrize("allowed", [0, 1])
-def test_random_numbers_that_few_steps_draw_are_refused_when_they_are(own, allowed, monkeypatch):
-    monkeypatch.setattr(cores, "allowed", allowed)
+def test_random_numbers_that_few_steps_draw_are_refused_when_they_are(own, monkeypatch):
     task = from_gymnasium(lambda: Gambling(own))
-    plant, u = task.plant(60), np.zeros((60, 2))
-    plant.set_state(*task.state(np.tile([[-1.0, 0.5]], (60, 1))))
-    plant.step(u)
-    plant.end()
-    plant.set_state(*task.state(np.tile([[-1.0, 0.5]], (60, 1))))
 
     def gamble():
         plant.step(u + 3.9)
         plant.end()
 
-    with pytest.raises(BadInput, match=r"draws random numbers in step\(\)"):
-        gamble()
+    for allowed in (2, 1):
+        monkeypatch.setattr(cores, "allowed", allowed)
+        plant, u = task.plant(60), np.zeros((60, 2))
+        plant.set_state(*task.state(np.tile([[-1.0, 0.5]], (60, 1))))
+        plant.step(u)
+        plant.end()
+        plant.set_state(*task.state(np.tile([[-1.0, 0.5]], (60, 1))))
+        with pytest.raises(BadInput, match=r"draws random numbers in step\(\)"):
+            gamble()
 
 
 @pytest.mark.parametrize("wrapper", [Secret, Growing])
@@ -475,38 +472,36 @@ def test_wrong_arguments_are_refused_with_what_is_allowed(options, message):
         from_gymnasium(Puck, **options)
 
 
-@pytest.mark.slow
 def test_what_resets_draw_is_pinned_by_options_that_they_heed_or_by_a_seed():
     with pytest.raises(
         BadInput, match=r"change nothing in PointMaze_Medium-v3, which draws .*goal"
     ):
         from_gymnasium("PointMaze_Medium-v3", reset={"goal_cel": [6, 6]})
-    for seed in (0, 3):
-        task = from_gymnasium("PointMaze_Medium-v3", seed=seed)
-        assert f"with seed {seed}" in task.found["goal"]
-        np.testing.assert_array_equal(task._instance.inner.goal, reset_goal(seed))
+    task = from_gymnasium("PointMaze_Medium-v3", seed=3)
+    assert "with seed 3" in task.found["goal"]
+    np.testing.assert_array_equal(task._instance.inner.goal, reset_goal(3))
     assert (reset_goal(0) != reset_goal(3)).any()
 
 
 def test_an_obstacle_that_resets_draw_is_pinned_by_a_seed():
-    places = {seed: from_gymnasium(Moved, seed=seed).model.geom_pos[0, 1] for seed in (0, 3)}
-    env = Moved()
-    for seed, place in places.items():
-        env.reset(seed=seed)
-        assert place == env.model.geom_pos[0, 1]
-    assert places[0] != places[3]
+    place, env = from_gymnasium(Moved, seed=3).model.geom_pos[0, 1], Moved()
+    env.reset(seed=0)
+    assert place != env.model.geom_pos[0, 1]
+    env.reset(seed=3)
+    assert place == env.model.geom_pos[0, 1]
     assert from_gymnasium(Moved, reset={"rock": 0.2}).model.geom_pos[0, 1] == 0.2
 
 
-@pytest.mark.slow
-def test_the_code_of_an_environment_is_that_of_its_files(tmp_path, monkeypatch):
+def test_the_code_of_an_environment_is_that_of_its_files(tmp_path, monkeypatch, puck):
     monkeypatch.syspath_prepend(tmp_path)
     path = tmp_path / "my_puck.py"
     path.write_text("from environments import Puck\nclass Mine(Puck):\n    push = 1\n")
     module = importlib.import_module("my_puck")
-    codes = [from_gymnasium(Puck).code, from_gymnasium(module.Mine).code]
+    mine = from_gymnasium(module.Mine)
+    codes = [puck.code, mine.code]
     path.write_text(path.read_text() + "# changed\n")
-    assert from_gymnasium(module.Mine).code == codes[1], "it has not been imported again"
+    del mine.code  # which is kept
+    assert mine.code == codes[1], "it has not been imported again"
     codes.append(from_gymnasium(importlib.reload(module).Mine).code)
     assert len({*codes}) == 3
 
@@ -517,10 +512,9 @@ def test_a_free_joint_has_places_that_a_chart_may_name_but_no_orientation():
     assert task.chart.units == ("m", "m")
     np.testing.assert_allclose(task.chart.low, (-2.3, -1.7))
     assert list(task.obstacles) == ["island 1"]
-    rate = from_gymnasium(Floating, chart=["qpos[0]", "qpos[1]", "qvel[1]"])
-    assert rate.chart.units[2] == "m/s"
+    assert coordinates(task._instance, ["qvel[1]"])[0].unit == "m/s"
     with pytest.raises(BadInput, match=r"qpos\[4\] is a part of an orientation"):
-        from_gymnasium(Floating, chart=["qpos[0]", "qpos[4]"])
+        coordinates(task._instance, ["qpos[0]", "qpos[4]"])
 
 
 def reset_goal(seed):
@@ -529,8 +523,8 @@ def reset_goal(seed):
     return env.unwrapped.goal
 
 
-def test_a_task_is_made_again_from_its_text():
-    task = from_gymnasium("PointMaze_Medium-v3", reset={"goal_cell": np.array([6, 6])})
+def test_a_task_is_made_again_from_its_text(other):
+    task = other("PointMaze_Medium-v3")
     assert reference(task).startswith("env:")
     assert described_task(reference(task)) is task
     assert pickle.loads(pickle.dumps(task)).chart == task.chart
@@ -629,8 +623,8 @@ def test_a_module_is_imported_again_only_as_it_was_when_it_was_named(tmp_path, m
         ("dm_control/pendulum-swingup-v0", "mass", "geom_xpos"),
     ],
 )
-def test_replays_draw_the_path_of_what_goes_farthest(name, tracked, kind):
-    task = from_gymnasium(name, **OTHERS[name])
+def test_replays_draw_the_path_of_what_goes_farthest(name, tracked, kind, other):
+    task = other(name)
     assert task.scene.tracked == tracked
     assert tracked in task.found["camera"]
     assert point_of(task.model, tracked)[0] == kind
@@ -638,8 +632,8 @@ def test_replays_draw_the_path_of_what_goes_farthest(name, tracked, kind):
     assert np.ptp(points, axis=0).max() > 0.1
 
 
-def test_free_cameras_are_there_for_every_model():
-    model = from_gymnasium(Puck).model
+def test_free_cameras_are_there_for_every_model(puck):
+    model = puck.model
     assert rests(model, camera_of(model, "free"))
     assert camera_of(model, "overhead").elevation == -90
     assert point_of(model, "tracked") == ("xpos", 1)
@@ -647,10 +641,10 @@ def test_free_cameras_are_there_for_every_model():
         camera_of(model, "chase")
 
 
-@pytest.mark.slow
-def test_the_command_line_explains_what_was_found(tmp_path):
+def test_the_command_line_explains_what_was_found(tmp_path, other):
+    other("PointMaze_Medium-v3")
     path = tmp_path / "goal.json"
-    path.write_text(json.dumps({"reset": {"goal_cell": [6, 6]}}))
+    path.write_text(json.dumps(OTHERS["PointMaze_Medium-v3"]))
     env = ("--env", "PointMaze_Medium-v3", "--env-args", str(path))
     status, out, _ = command("diagnose", *env, "--explain")
     assert status == 0
@@ -687,11 +681,11 @@ def test_the_command_line_explains_what_was_found(tmp_path):
     assert "need an --env" in command("run", "vehicle", "--explain")[2]
 
 
-@pytest.mark.slow
 def test_an_agent_is_diagnosed_and_made_robust_in_its_own_environment(tmp_path, monkeypatch):
-    task = from_gymnasium(Puck, steps=60)
+    spare_environments(monkeypatch)
+    monkeypatch.setitem(presets._GRIDS_DYNAMIC, 2, (20, 30))  # coarser than preset smoke
+    task = from_gymnasium(Puck, steps=45)
     path, said = tmp_path / "puck", []
-    monkeypatch.setitem(presets._GRIDS_DYNAMIC, 2, (20, 40))  # coarser than preset smoke
     options = {"preset": "smoke", "eps": 0.1, "out": path, "say": said.append}
     diagnosed = hyrl_mj.diagnose(task, puck_agent, **options)
     assert (path / "diagnosis.html").is_file()

@@ -1,5 +1,6 @@
 """Environments of which a sample misleads: they are run as they are, or refused by name."""
 
+import functools
 import time
 from dataclasses import replace
 
@@ -21,6 +22,7 @@ from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import LoopSettings, Programmes, Recorded, Rules
 from hyrl_mj.system.generators import global_state, kept_generators
 
+pytestmark = pytest.mark.slow  # a second for each environment
 BOX = spaces.Box(-np.inf, np.inf, (4,))
 
 
@@ -366,17 +368,22 @@ def test_a_wrapper_is_kept_that_only_has_the_name_of_one_that_counts():
     assert arc.z[-1, 0] < arc.z[0, 0]
 
 
-@pytest.mark.parametrize(
-    "wrap", [lambda e: e, lambda e: FrameStackObservation(FlattenObservation(e), 2)]
-)
+@pytest.fixture(scope="module")
+def short():
+    """Returns the task of the puck, bare or wrapped, with few steps."""
+    stacked = lambda: FrameStackObservation(FlattenObservation(Puck()), 2)  # noqa: E731
+    return functools.cache(lambda wrapped: from_gymnasium(stacked if wrapped else Puck, steps=25))
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
 @pytest.mark.parametrize("kind", ["none", "uniform", "alternating", "attack"])
-def test_runs_do_not_depend_on_how_many_are_played_side_by_side(wrap, kind):
-    task, rng = from_gymnasium(lambda: wrap(Puck()), steps=25), np.random.default_rng(0)
+def test_runs_do_not_depend_on_how_many_are_played_side_by_side(wrapped, kind, short, monkeypatch):
+    task, rng = short(wrapped), np.random.default_rng(0)
     loop = PolicyController(from_callable(east, task))
     z, found, settings = task.starts(9, rng), [], LoopSettings(record=True, passing=True)
     assert task.abilities.side_by_side > 9
     for side in (9, 2):
-        task.abilities = replace(task.abilities, side_by_side=side)
+        monkeypatch.setattr(task, "abilities", replace(task.abilities, side_by_side=side))
         noise = Noise() if kind in ("none", "attack") else Noise(kind, 0.1)
         if kind == "attack":
             rules = Rules(task, loop, 0.1, np.array(task.noisy))
@@ -425,7 +432,6 @@ def test_what_lags_by_a_physics_step_is_moved_by_noise_where_the_robot_was_then(
     np.testing.assert_allclose(alike[seen] - true[seen], noise[1, :2], rtol=0, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_forces_of_neither_the_end_of_a_step_nor_a_physics_step_before_are_refused_under_noise():
     given = {"reset": {"goal_cell": [6, 6]}, "chart": ["qpos[0]", "qpos[1]"]}
     with pytest.raises(

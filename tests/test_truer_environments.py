@@ -1,5 +1,6 @@
 """What runs leave behind, what wrappers look at, what an id stands for: as a new process would have it."""
 
+import functools
 import gc
 import itertools
 import multiprocessing
@@ -20,6 +21,7 @@ from hyrl_mj.environments import making
 from hyrl_mj.environments.fingerprint import Unknown, fingerprint
 from hyrl_mj.simulation import Recorded
 
+pytestmark = pytest.mark.slow  # a second for each environment
 STARTS = np.array([[1.0, 0.9], [0.9, -0.9], [-1.4, 0.5]])
 
 
@@ -36,7 +38,11 @@ def pilot(observation):
 
 def outcomes(make, noise=0.0, steps=60, starts=STARTS, **given):
     """Returns how the pilot's runs end, and after how many samples."""
-    task = from_gymnasium(make, steps=steps, **given)
+    return ends(from_gymnasium(make, steps=steps, **given), noise, starts)
+
+
+def ends(task, noise=0.0, starts=STARTS):
+    """The same, of a task."""
     signal = None
     if noise:
         shape = task.max_steps + 1, len(starts), len(task.noisy)
@@ -46,7 +52,9 @@ def outcomes(make, noise=0.0, steps=60, starts=STARTS, **given):
     return [(arc.outcome, len(arc.t) - 1) for arc in simulate(task, agent, starts, signal)]
 
 
+@functools.cache
 def plain(noise=0.0):
+    """How they end in the puck as it is."""
     return outcomes(lambda: FlattenObservation(Puck()), noise)
 
 
@@ -202,9 +210,9 @@ class Sticky(Puck):
 
 
 def test_a_second_state_of_mujoco_that_outlasts_resets_makes_no_difference():
-    first, again = outcomes(Sticky), outcomes(Sticky)
-    assert first == again
-    assert not from_gymnasium(Sticky, steps=60).abilities.restarts
+    task = from_gymnasium(Sticky, steps=60)
+    assert ends(task) == ends(task)
+    assert not task.abilities.restarts
 
 
 def test_variables_of_a_script_are_not_those_of_its_environment(monkeypatch):
@@ -338,8 +346,8 @@ class Rare(Puck):
 
 
 def test_an_entry_of_info_that_only_a_success_brings_is_taken():
-    assert outcomes(Rare, success='info["is_success"]') == outcomes(Puck)
-    assert outcomes(Rare) == outcomes(Puck)
+    assert outcomes(Rare, success='info["is_success"]') == plain()
+    assert outcomes(Rare) == plain()
     with pytest.raises(BadInput, match="no method of it has that word"):
         from_gymnasium(Rare, success='info["solved"]')
 
@@ -392,11 +400,11 @@ class Legs(Puck):
 
 
 def test_options_of_a_reset_are_what_they_were_given_as(monkeypatch):
-    assert outcomes(Legs, reset={"goals": [1.0, 2.0]}) == outcomes(Puck)
-    assert outcomes(Legs, reset={"goals": np.array([1.0, 2.0])}) != outcomes(Puck)
+    assert outcomes(Legs, reset={"goals": [1.0, 2.0]}) == plain()
     gym.register("Legs-v0", Legs, max_episode_steps=60)
     try:
         task = from_gymnasium("Legs-v0", reset={"goals": np.array([1.0, 2.0])})
+        assert ends(task) != plain()
         assert '{"array": [1.0, 2.0]}' in task.spec
         monkeypatch.setattr(making, "_MADE", {})
         again = get_task(task.spec).specification.description.reset["goals"]

@@ -13,13 +13,14 @@ from gymnasium.wrappers import DtypeObservation, FlattenObservation, TimeLimit
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.sac.policies import SACPolicy
-from test_truer_environments import STARTS, outcomes, pilot
+from test_truer_environments import STARTS, outcomes, pilot, plain
 
 from hyrl_mj import BadInput, from_callable, from_gymnasium, load_agent, simulate
 from hyrl_mj.envs import BatchedEnv
 from hyrl_mj.envs.sb3_env import TaskVecEnv
 from hyrl_mj.tasks import check_task
 
+pytestmark = pytest.mark.slow  # a second for each environment
 NARROW = spaces.Box(-np.inf, np.inf, (6,), dtype=np.float64)
 
 
@@ -126,7 +127,7 @@ class Ragged(Flat):
 
 
 def test_attributes_of_any_kind_are_taken():
-    assert outcomes(lambda: DtypeObservation(Ragged(), np.float64)) == outcomes(Flat)
+    assert outcomes(lambda: DtypeObservation(Ragged(), np.float64)) == plain()
 
 
 @pytest.mark.parametrize(("wrapper", "way"), [(ByInfo, "info x"), (ByAttribute, "attribute pose")])
@@ -337,7 +338,7 @@ class Seeded(Flat):
 
 @pytest.mark.parametrize("make", [Column, Seeded])
 def test_usual_habits_are_taken(make):
-    assert outcomes(make) == outcomes(Flat)
+    assert outcomes(make) == plain()
 
 
 def test_code_that_is_imported_again_is_another_environment(tmp_path, monkeypatch):
@@ -396,4 +397,4 @@ def test_functions_get_the_precision_of_the_environment():
     origin = np.array([652_341.0, 5_404_123.0, 0, 0, 0, 0])
     agent = from_callable(lambda seen: np.clip(pilot(seen - origin), -4, 4), task)
     found = [(arc.outcome, len(arc.t) - 1) for arc in simulate(task, agent, STARTS)]
-    assert found == outcomes(Flat)
+    assert found == plain()
