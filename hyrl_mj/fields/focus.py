@@ -119,7 +119,7 @@ def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float) ->
         ahead = dot(seen.x, seen.y, x[:, None], y[:, None]) > 0
         nearest = dot(near_x, near_y, near_x, near_y)
         blocks = (nearest < reach * reach) & ahead & ~passed
-        more = blocks.any(axis=1)
+        more: np.ndarray = blocks.any(axis=1)
         if isinstance(more, np.ndarray) and not more.any():  # an export does not know
             break
         post = np.where(blocks, seen.room, np.inf).argmin(axis=1)

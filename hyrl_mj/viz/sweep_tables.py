@@ -67,7 +67,7 @@ COLUMNS |= {
     for who, title in (("policy", "RL policy"), ("hyrl", "HyRL"))
 }
 # The headings of figures that both controllers have.
-FIGURES = {
+FIGURES: dict[str, tuple[str, Callable[[float], str]]] = {
     "proved": ("proved, own q0", percent),
     "not_broken": ("not broken, own q0", _tried),
     "margin": ("margin", _number),
