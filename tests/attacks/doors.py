@@ -17,7 +17,7 @@ from attacks import Trial, child, command, crafted_agents, folders, resisted
 from attacks.crafted_runs import evil
 from attacks.folders import ESCAPE, plant_modules
 from attacks.forgery import setting
-from attacks.honest import diagnose, drive, explain, most
+from attacks.honest import ARGUMENTS, diagnose, drive, explain, most
 from attacks.material import TASK, Material
 from hyrl_mj.errors import BadInput
 
@@ -137,16 +137,9 @@ def _described(draw: Random, folder: Path) -> dict[str, Any]:
     """Returns the arguments of `from_gymnasium` as a stranger may write them."""
     given: dict[str, Any] = {}
     keys = ("task", "xml_file", "frame_skip", "width", "noise", "id", "entry_point", "evil")
-    meant: dict[str, Callable[[], Any]] = {
-        "task": lambda: str(evil(folder)),
-        "xml_file": lambda: str(_written(draw, folder)),
-        "frame_skip": lambda: 10**9,
-    }
     if draw.random() < 0.7:
-        chosen = {draw.choice(keys) for _ in range(draw.randint(1, 2))}
         given["kwargs"] = {
-            key: meant[key]() if key in meant and draw.random() < 0.5 else _value(draw, folder)
-            for key in sorted(chosen)
+            draw.choice(keys): _value(draw, folder) for _ in range(draw.randint(1, 2))
         }
     for name in draw.sample(("reset", "pinned", "chart", "noisy", "bounds", "success", "failure",
                              "steps", "starts", "seed", "evil", "reset"), draw.randrange(3)):  # fmt: skip
@@ -157,6 +150,20 @@ def _described(draw: Random, folder: Path) -> dict[str, Any]:
         else:
             given[name] = _value(draw, folder)
     return given
+
+
+def _pointed(draw: Random, folder: Path) -> tuple[str, dict[str, Any]]:
+    """Returns the id and the arguments of an environment in which nothing is wrong but one thing, at most."""
+    name = draw.choice(NAMES)
+    return draw.choice(
+        (
+            ("hyrl_mj/UnitCircle-v0", {"kwargs": {"task": str(evil(folder))}}),
+            ("hyrl_mj/UnitCircle-v0", {"chart": {name: "theta"}}),
+            ("Reacher-v5", {"kwargs": {"xml_file": str(_written(draw, folder))}}),
+            ("Reacher-v5", {"kwargs": {"frame_skip": 10**9}}),
+            ("Reacher-v5", ARGUMENTS),
+        )
+    )
 
 
 def _written(draw: Random, folder: Path) -> Path:
@@ -194,7 +201,10 @@ def _spec(material: Material, memory: float, draw: Random, folder: Path) -> str:
     """A received run whose task is an environment."""
     path = material.copy(folder)
     plant_modules(folder)
-    spec = f"env:{json.dumps({'env': draw.choice(IDS), **_described(draw, folder)})}"
+    env, given = draw.choice(IDS), _described(draw, folder)
+    if draw.random() < 0.4:
+        env, given = _pointed(draw, folder)
+    spec = f"env:{json.dumps({'env': env, **given})}"
     spec = draw.choice(
         [spec] * 9 + ["env:", "env:{", "env:[" + "[" * 100_000, "env:null", 'env:{"env":1}']
     )
@@ -213,14 +223,13 @@ def _spec(material: Material, memory: float, draw: Random, folder: Path) -> str:
 def _arguments(material: Material, memory: float, draw: Random, folder: Path) -> str:
     """A file of arguments that a stranger wrote, for an environment that the user names."""
     plant_modules(folder)
+    env = draw.choice(("Reacher-v5", "hyrl_mj/UnitCircle-v0", "Ant-v5"))
     given = _described(draw, folder)
+    if draw.random() < 0.4:
+        env, given = _pointed(draw, folder)
     text = json.dumps(given)
     text = draw.choice([text] * 9 + ["[" * 100_000, "{" * 1_000, '{"a":' * 50_000, "null", "1e400"])
     (folder / "arguments.json").write_text(text, encoding="utf-8")
-    env = draw.choice(("Reacher-v5", "hyrl_mj/UnitCircle-v0", "Ant-v5"))
-    if draw.random() < 0.2:  # nothing is wrong but a name
-        env, text = "hyrl_mj/UnitCircle-v0", json.dumps({"chart": {draw.choice(NAMES): "theta"}})
-        (folder / "arguments.json").write_text(text, encoding="utf-8")
     # The user's own command may import a task that the file names: `task` is code by its name.
     if "evil" in text:
         (folder / "evil.py").write_text("raise SystemExit", encoding="utf-8")

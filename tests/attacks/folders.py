@@ -121,7 +121,7 @@ def sweep(material: Material, memory: float, draw: Random, folder: Path) -> str:
     plant_modules(folder)
     (folder / "sweep").mkdir()
     texts = (
-        "=cmd|'/c calc'!A0", "@SUM(1)", "| a |", "<img src=x onerror=alert(1)>", ESCAPE, "evil.py",
+        "=cmd|'calc'!A0", "@SUM(1)", "| a |", "<img src=x onerror=alert(1)>", ESCAPE, "evil.py",
         "[x](javascript:alert(1))", "env:{}", "../..", f"env:{json.dumps({'env': 'evil:X-v0'})}",
     )  # fmt: skip
     setting(material.copy(folder / "sweep"), "task", draw.choice(texts))
