@@ -71,7 +71,6 @@ def render(run: Run) -> str:
         worst=task.noise_on(bool(robustness and robustness.everywhere)),
         video=film(run.path / "replay.mp4", has),
         pictures=pictures(run.path / "figures", has),
-        arcs=arcs,
         arrivals=arcs
         and {who: tables.arrivals(run, arcs, who == "policy") for who in ("policy", "hyrl")},
         attacked=bool(attack_replay(run)),
@@ -80,7 +79,6 @@ def render(run: Run) -> str:
         stages=_stages(run, robustness, arcs),
         table=_texts(vars(run.settings)),
         training=[(name, first.get(name, ""), sixth.get(name, "")) for name in first | sixth],
-        versions=run.versions,
         commands=commands(run, robustness),
         changed=changed(run),
         classes=list(zip(MAP_CLASSES, CLASS_COLOURS, strict=True)),
