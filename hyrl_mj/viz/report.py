@@ -71,8 +71,9 @@ def render(run: Run) -> str:
         worst=task.noise_on(bool(robustness and robustness.everywhere)),
         video=film(run.path / "replay.mp4", has),
         pictures=pictures(run.path / "figures", has),
-        arrivals=arcs
-        and {who: tables.arrivals(run, arcs, who == "policy") for who in ("policy", "hyrl")},
+        arrivals={who: tables.arrivals(run, arcs, who == "policy") for who in ("policy", "hyrl")}
+        if arcs
+        else None,
         attacked=bool(attack_replay(run)),
         verdict=run.verdict if robustness and all(map(has, facts)) else None,
         replays=arcs and tables.replay_table(run, arcs),

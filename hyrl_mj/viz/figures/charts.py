@@ -109,7 +109,7 @@ def ring(panel: Axes, chart: Chart, radii: Sequence[float], note: str = "") -> N
         at = np.array(on_ring(chart, quarter))
         panel.plot(*np.outer(at, (OUTER, TICK)), color=INK, linewidth=0.8)
         text = angle(quarter) if chart.units[0] == "rad" else f"{quarter:g}"
-        panel.text(*(1.18 * at), text, ha="center", va="center")
+        panel.text(1.18 * at[0], 1.18 * at[1], text, ha="center", va="center")
     panel.text(0, 0, axis_label(chart, 0) + note, ha="center", va="center")
     panel.set(xlim=(-1.25, 1.25), ylim=(-1.25, 1.25), aspect="equal", anchor="S")
     panel.set_axis_off()
