@@ -259,14 +259,8 @@ def finished_run(path: Path) -> Run | None:
         return None
     # Not those that draw: pictures are missing where nothing can be drawn.
     stages = (
-        "train",
-        "critical-set",
-        "partition",
-        "extended-sets",
-        "retrain",
-        "robustness",
-        "report",
-    )
+        "train", "critical-set", "partition", "extended-sets", "retrain", "robustness", "report",
+    )  # fmt: skip
     try:
         run = load_run(path)
         done = all(map(run.manifest.is_done, stages)) and run.is_examined_as_usual

@@ -15,11 +15,8 @@ MODES = (
 POLICY = "#2d323c"  # the stage-1 policy
 OVERLAP, CRITICAL = "#c9b8d8", "#cd1e2d"  # where extended sets overlap, and M* on the floor
 OBSERVED = "#f4c9c7"  # what a policy can observe
-GOOD, BAD, OPEN = (
-    "#007d55",
-    "#be2823",
-    "#6e747e",
-)  # the set-point, failures, and what is not decided
+GOOD, BAD = "#007d55", "#be2823"
+OPEN = "#6e747e"  # what has not ended yet
 
 
 def mode_colour(place: int) -> str:

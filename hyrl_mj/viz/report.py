@@ -71,16 +71,15 @@ def render(run: Run) -> str:
         worst=task.noise_on(bool(robustness and robustness.everywhere)),
         video=film(run.path / "replay.mp4", has),
         pictures=pictures(run.path / "figures", has),
-        arcs=arcs,
-        arrivals=arcs
-        and {who: tables.arrivals(run, arcs, who == "policy") for who in ("policy", "hyrl")},
+        arrivals={who: tables.arrivals(run, arcs, who == "policy") for who in ("policy", "hyrl")}
+        if arcs
+        else None,
         attacked=bool(attack_replay(run)),
         verdict=run.verdict if robustness and all(map(has, facts)) else None,
         replays=arcs and tables.replay_table(run, arcs),
         stages=_stages(run, robustness, arcs),
         table=_texts(vars(run.settings)),
         training=[(name, first.get(name, ""), sixth.get(name, "")) for name in first | sixth],
-        versions=run.versions,
         commands=commands(run, robustness),
         changed=changed(run),
         classes=list(zip(MAP_CLASSES, CLASS_COLOURS, strict=True)),
@@ -150,38 +149,21 @@ def write(path: Path, text: str) -> None:
 
 def fill(template: str, run: Run, robustness: Robustness | None, **values: Any) -> str:
     """Returns a page from its template, with the values that every page of a run shows."""
-    task, game = run.task, robustness.game if robustness else None
-    episodes = robustness.episodes if robustness else ()
-    attacks = robustness.attacks if robustness else ()
-    compared = robustness.comparisons if robustness else ()
-    return (
-        environment()
-        .get_template(template)
-        .render(
-            # A name that is not Unicode must not keep the page from being written.
-            name=os.fsencode(run.path.resolve().name).decode("utf-8", "replace"),
-            title=task_title(task),
-            task=task,
-            settings=run.settings,
-            agent=run.agent,
-            exact=run.exact,
-            why_no_game=run.why_no_game,
-            critical=run.critical_set,
-            unit=task.noise_on()[1],
-            percent=tables.percent,
-            tables=tables,
-            robustness=robustness,
-            game=game,
-            deciding=robustness.deciding if robustness else None,
-            scores=tables.score_table(task, game) if game else None,
-            margins=tables.margin_table(task, game) if game and not game.estimate else None,
-            replayed=tables.replays_table(task, game.replays) if game and game.replays else None,
-            episodes=tables.episode_table(task, episodes) if episodes else None,
-            attacks=tables.attack_table(task, attacks) if attacks else None,
-            signals=tables.signals_table(task, attacks) if attacks else None,
-            comparisons=tables.comparison_table(task, compared) if compared else None,
-            **values,
-        )
+    page = environment().get_template(template)
+    return page.render(
+        # A name that is not Unicode must not keep the page from being written.
+        name=os.fsencode(run.path.resolve().name).decode("utf-8", "replace"),
+        title=task_title(run.task),
+        run=run,
+        task=run.task,
+        settings=run.settings,
+        critical=run.critical_set,
+        unit=run.task.noise_on()[1],
+        tables=tables,
+        robustness=robustness,
+        game=robustness.game if robustness else None,
+        episodes=robustness.episodes if robustness else (),
+        **values,
     )
 
 
