@@ -262,8 +262,8 @@ def test_one_that_will_not_do_is_not_taken(vehicle, vehicle_sets, quick):
 # ---- where the worst case cannot be played
 
 
-# A quarter of the usual episodes.
-FEW = tuple(n // 4 for n in grounds.BATCHES)
+# An eighth of the usual episodes.
+FEW = tuple(n // 8 for n in grounds.BATCHES)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -333,7 +333,6 @@ def test_a_policy_that_parks_off_the_goal_is_not_good_enough(puck, puck_sets):
     score = ground(parking)
     assert ground.won(parking) == 1.0
     assert score < ground.enough <= ground(precise)
-    assert ground.won(precise) == 1.0
     assert -score[1] * ground.allowed == pytest.approx(off, abs=0.06)
 
 
