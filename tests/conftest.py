@@ -1,6 +1,8 @@
 """Fixtures that many tests share: the registered tasks."""
 
+import json
 import os
+import shutil
 
 # Before NumPy is there: matrices are small here, and BLAS threads that wait for a busy core take
 # ten times as long as none.
@@ -8,6 +10,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import hypothesis
 import pytest
+from filelock import FileLock
 
 import hyrl_mj
 from hyrl_mj.tasks.scaffold import write_task
@@ -20,12 +23,38 @@ hypothesis.settings.register_profile("long", deadline=None, database=None, max_e
 hypothesis.settings.load_profile("repeatable")
 
 
+@pytest.fixture(scope="session")
+def together(tmp_path_factory):
+    """The folder of all processes that run these tests."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "together"
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
 @pytest.fixture(scope="session", autouse=True)
-def no_trace_at_home(tmp_path_factory):
+def no_trace_at_home(together):
     """Which files of code have run is recorded in a folder of the tests."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        patch.setenv("XDG_STATE_HOME", str(together / "state"))
         yield
+
+
+@pytest.fixture(scope="session")
+def made_once(together):
+    """Returns a folder, by its name, that the first process that needs it has filled with make(folder)."""
+
+    def folder(name, make):
+        path, made = together / name, together / f"{name}.made"
+        with FileLock(together / f"{name}.lock"):
+            if not made.exists():
+                shutil.rmtree(path, ignore_errors=True)
+                path.mkdir()
+                make(path)
+                made.touch()
+        return path
+
+    return folder
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -68,24 +97,28 @@ def puck(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def planted_circle(tmp_path_factory):
+def planted_circle(made_once):
     """A run of the circle whose policies are planted and whose other stages ran; and what was said.
 
     As on a machine that cannot draw: there is no video.
     """
-    from planted import FEW_CELLS, decisions, halves
+    from planted import FEW_CELLS, decisions, halves, without_pdfs
     from test_report import plant
 
     def no_renderer(*arguments, **options):
         raise hyrl_mj.NoRenderer("no GL library here")
 
-    task, said = hyrl_mj.get_task("unit_circle"), []
-    path = tmp_path_factory.mktemp("planted") / "unit_circle"
-    plant(path, task, decisions(task), halves(task), **FEW_CELLS)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hyrl_mj.viz.replay.render_replay", no_renderer)
-        run = hyrl_mj.run("unit_circle", preset="smoke", set=FEW_CELLS, out=path, say=said.append)
-    return run, said
+    def make(folder):
+        task, said, path = hyrl_mj.get_task("unit_circle"), [], folder / "unit_circle"
+        plant(path, task, decisions(task), halves(task), **FEW_CELLS)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("hyrl_mj.viz.replay.render_replay", no_renderer)
+            without_pdfs(patch)
+            hyrl_mj.run("unit_circle", preset="smoke", set=FEW_CELLS, out=path, say=said.append)
+        (folder / "said.json").write_text(json.dumps(said))
+
+    folder = made_once("planted", make)
+    return hyrl_mj.load_run(folder / "unit_circle"), json.loads((folder / "said.json").read_text())
 
 
 @pytest.fixture(scope="module")
@@ -99,8 +132,16 @@ def small_runs():
 
 
 # The files that take longest, in this order, each more than half a minute.
-LONGEST = ("docs", "demo", "sweep", "attack", "trapped_environments", "environments", "robustify")
-LONGEST += ("algorithms", "surroundings", "cli", "report", "retraining", "training", "tables")
+LONGEST = ("docs", "demo", "attack", "environments", "trapped_environments", "true_environments")
+LONGEST += (
+    "truer_environments",
+    "wrapped_environments",
+    "robustify",
+    "sweep",
+    "retraining",
+    "algorithms",
+)
+LONGEST += ("surroundings", "cli", "report", "training", "tables", "doors")
 
 
 def pytest_collection_modifyitems(items):

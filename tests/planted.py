@@ -4,9 +4,11 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import version
+from pathlib import Path
 
 import mujoco
 import numpy as np
+from matplotlib.figure import Figure
 
 from hyrl_mj.environments.task import EnvironmentTask
 from hyrl_mj.files.artifacts import digest
@@ -16,7 +18,7 @@ from hyrl_mj.pipeline import steps
 from hyrl_mj.proof import examination, replays
 from hyrl_mj.runs.directory import load_run
 from hyrl_mj.sets import Chart, Grid, GridSet
-from hyrl_mj.stages import grounds
+from hyrl_mj.stages import judges
 from hyrl_mj.stages.critical_set import CriticalSet
 from hyrl_mj.stages.hybrid import HybridController
 from hyrl_mj.stages.partition import Partition
@@ -27,7 +29,7 @@ from hyrl_mj.viz.figures import style
 # Settings of a smoke run on the circle whose worst-case game takes two seconds.
 FEW_CELLS = {"lattice": 130}
 # Settings of the runs of a sweep, which are made in processes that `shorten` does not reach.
-TINY = {"stage1.samples": 4096, "stage6.samples": 4096, "lattice": 130, "rods": 120, "cells": 240}
+TINY = {"stage1.samples": 4096, "stage6.samples": 4096, "lattice": 130, "rods": 100, "cells": 240}
 
 
 def shorten(patch):
@@ -43,6 +45,20 @@ def shorten(patch):
     patch.setattr(presets, "_SMOKE_MODES", 4_096)
     spare(patch, checkpoints=4, batches=2, nodes=12, episodes=100)
     spare_environments(patch)
+    without_pdfs(patch)
+
+
+def without_pdfs(patch):
+    """Patches figures so that beside each PNG lies no drawing, but a file that could be one."""
+    write = Figure.savefig
+
+    def savefig(figure, path, *, format, **options):
+        if format == "pdf":
+            Path(path).write_bytes(b"%PDF-1.4\n")
+        else:
+            write(figure, path, format=format, **options)
+
+    patch.setattr(Figure, "savefig", savefig)
 
 
 def spare(patch, **effort):
@@ -55,7 +71,7 @@ def spare_environments(patch):
     """Patches how many runs judge controllers in environments, of which each takes tenths of a second."""
     few = {"batches": 1, "nodes": 6, "episodes": 24}
     patch.setattr(EnvironmentTask, "effort", replace(EnvironmentTask.effort, **few))
-    patch.setattr(grounds, "ATTACKED", 12)
+    patch.setattr(judges, "ATTACKED", 12)
 
 
 def coarsen(patch):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from command_line import call
-from planted import few_checkpoints
+from planted import spare
 from sentences import assert_has_ended
 
 import hyrl_mj
@@ -144,7 +144,8 @@ def quick(task, algorithm, known=None):
 @pytest.fixture
 def quickly_judged(monkeypatch):
     """Judging policies takes most of the time of a short training."""
-    few_checkpoints(monkeypatch, 2)
+    spare(monkeypatch, checkpoints=2)
+    monkeypatch.setattr(training, "EPISODES", 64)
 
 
 # ---- the algorithms of SB3
@@ -214,7 +215,7 @@ def values(critic, o, a):
 @pytest.mark.parametrize("algorithm", ["ppo", "a2c", "sac", "td3", "ddpg"])
 @pytest.mark.slow
 def test_the_smoke_preset_learns_the_circle(algorithm, circle, monkeypatch):
-    few_checkpoints(monkeypatch, 8)
+    spare(monkeypatch, checkpoints=8)
     settings = preset(circle, "smoke", algorithm=algorithm).stage1
     before = evaluate(circle, export(build(circle, settings, 0), circle))[1]
     assert evaluate(circle, train(circle, settings, 0))[1] > before + 10
@@ -322,38 +323,37 @@ def test_a_module_in_the_current_folder_is_found(tmp_path, monkeypatch):
 # ---- whole runs
 
 
-@pytest.mark.slow
-def test_a_whole_run_names_its_algorithm_and_keeps_to_it(small_runs, tmp_path):
-    out = tmp_path / "run"
-    whole = (
-        "run",
-        "unit_circle",
-        "--preset",
-        "smoke",
-        "--set",
-        "stage1.samples=2000",
-        "--out",
-        out,
-    )
-    done = call(*whole, "--algorithm", "td3")
+WHOLE = ("run", "unit_circle", "--preset", "smoke", "--out")
+
+
+def make_sac_run(folder):
+    """Makes the run of the manual's page about algorithms."""
+    done = call(*WHOLE, folder / "run", "--algorithm", "sac")
     assert_has_ended(done)
-    assert "policy (TD3)" in done.stdout
+    (folder / "said").write_text(done.stdout)
+
+
+@pytest.mark.slow
+def test_a_whole_run_names_its_algorithm_and_keeps_to_it(small_runs, made_once):
+    folder = made_once("circle_sac", make_sac_run)
+    out = folder / "run"
+    assert "policy (SAC)" in (folder / "said").read_text()
     settings = json.loads((out / "config.json").read_text())["settings"]
-    assert settings["stage1"]["algorithm"] == "td3"
+    assert settings["stage1"]["algorithm"] == "sac"
     assert settings["stage6"]["algorithm"] == "ppo"
     page = (out / "report.html").read_text()
-    assert "TD3, 2,000 samples" in page
-    assert "--algorithm td3" in page
+    assert "SAC, 1,500 samples" in page
+    assert "--algorithm sac" in page
     run = hyrl_mj.load_run(out)
-    assert run.settings.stage1.algorithm == run.policy.algorithm == "td3"
-    assert run.policy_title == "RL policy (TD3)"
+    assert run.settings.stage1.algorithm == run.policy.algorithm == "sac"
+    assert run.policy_title == "RL policy (SAC)"
     assert run.task.learning.algorithm == "ppo", "the task keeps its default"
-    assert "train: done before" in call(*whole, "--algorithm", "td3").stdout
-    for others in ((), ("--algorithm", "sac")):
-        refused = call(*whole, *others)
+    assert "train: done before" in call(*WHOLE, out, "--algorithm", "sac").stdout
+    for others in ((), ("--algorithm", "td3")):
+        refused = call(*WHOLE, out, *others)
         assert refused.returncode == 2
         other = others[-1] if others else "ppo"
-        assert f"policy: training with td3 there, training with {other} given" in refused.stderr
+        assert f"policy: training with sac there, training with {other} given" in refused.stderr
 
 
 def test_short_episodes_are_for_tasks_that_start_everywhere(circle, monkeypatch):

@@ -162,6 +162,7 @@ def test_a_robot_from_its_own_folder_goes_through_the_whole_pipeline(small_runs,
     assert (out.parent / "v.png").is_file()
 
 
+@pytest.mark.slow
 def test_its_critical_set_is_found_and_its_parts_are_the_two_sides(wasp):
     task = check_task(hyrl_mj.get_task(wasp))
 

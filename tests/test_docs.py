@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 
@@ -14,6 +15,9 @@ import pytest
 import unmeasured
 from gl import needs_gl
 from manual import LANGUAGES, PAGES, ROOT, SHORTER, blocks
+from test_algorithms import make_sac_run
+from test_robustify import make_robust
+from test_sweep import make_sweep
 
 import hyrl_mj
 from hyrl_mj import cli
@@ -154,9 +158,16 @@ BROKEN = {
 
 
 @pytest.fixture(scope="module")
-def answers(tmp_path_factory):
+def answers(small_runs, made_once, tmp_path_factory):
     """What happened to the blocks of each page, and of broken ones, by its name without the suffix."""
     folder = tmp_path_factory.mktemp("manual")
+    sweep = made_once("sweep", make_sweep) / "sweep"
+    shutil.copytree(sweep, folder / "sweeps" / "runs" / "circle_seeds")
+    sac = made_once("circle_sac", make_sac_run) / "run"
+    shutil.copytree(sac, folder / "algorithms" / "runs" / "circle_sac")
+    robust = made_once("robust", make_robust)
+    shutil.copytree(robust / "run", folder / "your-agent" / "runs" / "vehicle_robust")
+    shutil.copy(robust / "agent.zip", folder / "your-agent" / "made.zip")
     broken = [folder / f"broken_{name}.md" for name in BROKEN]
     for page, text in zip(broken, BROKEN.values(), strict=True):
         page.write_text(text)

@@ -103,6 +103,7 @@ def test_a_file_of_arguments_runs_no_task_file(tmp_path):
     assert not (tmp_path / "executed").exists()
 
 
+@pytest.mark.slow
 def test_a_file_in_another_folder_is_another_file(tmp_path, monkeypatch):
     path = Path(gym.envs.mujoco.__file__).parent / "assets" / "reacher.xml"
     folders = [tmp_path / name for name in ("own", "theirs")]
@@ -125,6 +126,7 @@ def test_a_file_in_another_folder_is_another_file(tmp_path, monkeypatch):
         assert from_spec(own.spec).spec == own.spec
 
 
+@pytest.mark.slow
 def test_what_this_machine_has_described_opens_again(monkeypatch):
     spec = spec_of(CIRCLE, kwargs={"task": "unit_circle"}, steps=17, seed=3)
     with trust.received():
@@ -148,6 +150,7 @@ def test_what_a_file_asks_for_is_not_recorded(tmp_path):
     assert not trust.is_known_text("text")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "given",
     [
@@ -179,10 +182,12 @@ def test_a_damaged_description_is_one_sentence(text):
 # ---- limits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", doors.MODELS)
 def test_a_hostile_model_is_one_sentence(name, tmp_path, monkeypatch):
     monkeypatch.setattr(doors, "MODELS", {name: doors.MODELS[name]})
-    monkeypatch.setitem(limits.tried.__kwdefaults__, "longest", 5)
+    monkeypatch.setitem(limits.tried.__kwdefaults__, "seconds", 1)
+    monkeypatch.setitem(limits.tried.__kwdefaults__, "longest", 3)
     path = doors._written(Random(0), tmp_path)
     began = time.monotonic()
     refusal(lambda: mjcf.load(path))
@@ -205,11 +210,13 @@ def test_an_environment_of_a_hostile_model_is_one_sentence(tmp_path):
     assert "crash" in sentence
 
 
+@pytest.mark.slow
 def test_an_environment_that_never_ends_a_step_is_one_sentence():
     sentence = refusal(lambda: from_gymnasium("Reacher-v5", kwargs={"frame_skip": 10**9}))
     assert "takes longer than" in sentence
 
 
+@pytest.mark.slow
 def test_an_environment_that_this_process_registered_takes_arguments():
     def make(**kwargs):
         return gym.make("Reacher-v5", **kwargs).unwrapped
@@ -233,11 +240,13 @@ def test_a_step_that_takes_long_is_one_sentence(monkeypatch):
     assert "whose step takes less than" in sentence
 
 
+@pytest.mark.slow
 def test_a_pinned_attribute_that_never_ends_a_step_is_one_sentence():
     pinned = {"frame_skip": 2_000_000_000, "qpos[2]": 0.1, "qpos[3]": 0.1}
     refusal(lambda: from_gymnasium("Reacher-v5", pinned=pinned, success="reward >= 1"))
 
 
+@pytest.mark.slow
 def test_arrays_as_arguments_are_the_users_own():
     def make(goal, **kwargs):
         assert isinstance(goal, np.ndarray)

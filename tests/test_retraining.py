@@ -269,8 +269,8 @@ def test_one_that_will_not_do_is_not_taken(vehicle, vehicle_sets, quick):
 # ---- where the worst case cannot be played
 
 
-# A quarter of the usual episodes.
-FEW = tuple(n // 4 for n in ModeSettings.batches)
+# An eighth of the usual episodes.
+FEW = tuple(n // 8 for n in ModeSettings.batches)
 
 
 def by_episodes(puck, sets, mode, policy=None, **changes):

@@ -1,6 +1,7 @@
 """Agents that were trained elsewhere: diagnosed, and made robust."""
 
 import json
+import pickle
 import shutil
 import zipfile
 from dataclasses import asdict, replace
@@ -61,29 +62,40 @@ def one_way(observation):
     return np.clip(-5 * angle, -1, 1)
 
 
-@pytest.fixture(scope="module")
-def dqn(vehicle, tmp_path_factory):
-    """A DQN agent of the vehicle that has learned something, saved by SB3 itself."""
+def make_dqn(folder):
+    """Saves, by SB3 itself, a DQN agent of the vehicle that has learned something."""
+    vehicle = hyrl_mj.get_task("vehicle")
     settings = replace(preset(vehicle, "smoke").stage1, samples=10_000)
     learned = training.train(vehicle, settings, seed=0)
     env = TaskVecEnv(BatchedEnv(vehicle, 1))
     model = DQN("MlpPolicy", env, policy_kwargs={"net_arch": list(learned.hidden)}, buffer_size=10)
     state = {name: training.torch.as_tensor(np.array(w)) for name, w in learned.weights.items()}
     model.policy.load_state_dict(state)
-    return saved(model, tmp_path_factory.mktemp("agents"))
+    saved(model, folder)
 
 
-@pytest.fixture(scope="module")
-def robust(small_runs, dqn, tmp_path_factory):
-    """A whole run on it, made by the command line after a diagnosis in the same folder."""
-    path = tmp_path_factory.mktemp("runs") / "vehicle"
-    options = ["vehicle", "--policy", dqn, "--preset", "smoke", "--out", path]
+def make_robust(folder):
+    """Makes a whole run on such an agent by the command line, after a diagnosis in the same folder."""
+    make_dqn(folder)
+    path = folder / "run"
+    options = ["vehicle", "--policy", folder / "agent.zip", "--preset", "smoke", "--out", path]
     diagnosed = call("diagnose", *options)
     assert diagnosed.returncode == 0, diagnosed.stderr
     before = contents(path)
     done = call("robustify", *options)
     assert_has_ended(done)
-    return path, diagnosed.stdout, before, done.stdout
+    (folder / "told").write_bytes(pickle.dumps((diagnosed.stdout, before, done.stdout)))
+
+
+@pytest.fixture(scope="module")
+def robust(small_runs, made_once):
+    folder = made_once("robust", make_robust)
+    return folder / "run", *pickle.loads((folder / "told").read_bytes())
+
+
+@pytest.fixture(scope="module")
+def dqn(robust):
+    return robust[0].parent / "agent.zip"
 
 
 @pytest.fixture(scope="module")
@@ -156,14 +168,13 @@ def test_the_report_says_that_the_policy_was_given(robust, dqn):
 
 
 def test_again_nothing_is_done_again_whatever_the_age_of_the_file(robust, dqn, tmp_path):
-    before = contents(robust[0])
+    path = shutil.copytree(robust[0], tmp_path / "run")
+    before = contents(path)
     moved = Path(shutil.copy(dqn, tmp_path / "moved.zip"))
     said = []
-    hyrl_mj.robustify("vehicle", moved, out=robust[0], preset="smoke", say=said.append)
+    hyrl_mj.robustify("vehicle", moved, out=path, preset="smoke", say=said.append)
     assert sum("done before" in line for line in said) >= len(STAGES) - 2
-    changed = {
-        p.name for p in robust[0].rglob("*") if p.is_file() and before.get(p) != p.read_bytes()
-    }
+    changed = {p.name for p, content in contents(path).items() if before.get(p) != content}
     assert not changed - {"replay.mp4", "replay.png", "report.html"}, "a video takes GL"
 
 

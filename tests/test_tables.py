@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from environments import Puck, Slid, puck_agent
-from planted import ChartPolicy
+from planted import ChartPolicy, spare_environments
 
 from hyrl_mj import BadInput, from_gymnasium
 from hyrl_mj.game import Lattice, lattice_grid
@@ -32,6 +32,11 @@ from hyrl_mj.tasks import Outcome
 pytestmark = pytest.mark.slow  # tables take seconds
 
 EPS = 0.15
+
+
+@pytest.fixture(autouse=True)
+def few_runs(monkeypatch):
+    spare_environments(monkeypatch)
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 import unmeasured
-from planted import few_checkpoints
+from planted import spare
 
 import hyrl_mj
 from hyrl_mj import BadInput, MlpPolicy, Noise
@@ -24,7 +24,8 @@ FEW = {"ppo": 8_192, "dqn": 4_000}
 
 @pytest.fixture
 def quick(task, monkeypatch):
-    few_checkpoints(monkeypatch, 2)
+    spare(monkeypatch, checkpoints=2)
+    monkeypatch.setattr(training, "EPISODES", 64)
     return replace(preset(task, "smoke").stage1, samples=FEW[task.learning.algorithm])
 
 
@@ -137,6 +138,7 @@ def test_torch_gets_its_threads_back(fails):
         torch.set_num_threads(before)
 
 
+@pytest.mark.slow
 def test_training_restores_torchs_threads(vehicle):
     before = torch.get_num_threads()
     try:
@@ -227,6 +229,7 @@ def test_the_papers_problems_learn_from_plain_rewards(name):
     assert not settings.stage6.normalize
 
 
+@pytest.mark.slow
 def test_a_ground_sees_a_policy_from_the_first_checkpoint_and_scores_it_after_half(
     vehicle, monkeypatch
 ):
@@ -240,7 +243,7 @@ def test_a_ground_sees_a_policy_from_the_first_checkpoint_and_scores_it_after_ha
             calls.append("scored")
             return (0.0,)
 
-    few_checkpoints(monkeypatch, 8)
+    spare(monkeypatch, checkpoints=8)
     settings = preset(vehicle, "smoke", algorithm="ppo").stage1
     settings = replace(settings, samples=8_192, envs=16, hidden=(8, 8))
     training.train(vehicle, settings, 0, ground=Ground(vehicle, settings))

@@ -14,8 +14,8 @@ from hyrl_mj.tasks import Task
 
 # A function that draws n chart points (n, d).
 Starts = Callable[[int, np.random.Generator], np.ndarray]
-# States of the regression.
-STATES = 16_384
+# States and steps of the regression.
+STATES, STEPS = 16_384, 1_500
 
 
 def fits(task: Task, settings: Training, policy: MlpPolicy) -> bool:
@@ -54,7 +54,7 @@ def distil(task: Task, policy: Policy, starts: Starts, settings: Training, seed:
     actor = [weights for name, weights in parameters if name.startswith(parts)]
     optimizer = torch.optim.Adam(actor, lr=settings.learning_rate)
     with threads(1):
-        for _ in progress_bar(range(1_500), "distilling the agent", "steps"):
+        for _ in progress_bar(range(STEPS), "distilling the agent", "steps"):
             rows = torch.as_tensor(rng.integers(STATES, size=512))
             _, likelihood, _ = model.policy.evaluate_actions(observations[rows], actions[rows])
             optimizer.zero_grad()

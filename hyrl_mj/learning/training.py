@@ -35,6 +35,8 @@ from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Outcome, Task
 
 Score = tuple[float, ...]
+# Episodes by which a policy is judged on the starts of its task.
+EPISODES = 256
 ACTIVATIONS = {name: getattr(nn, torch_name) for name, torch_name in TORCH_NAMES.items()}
 
 
@@ -234,12 +236,11 @@ def evaluate(task: Task, policy: MlpPolicy, gamma: float = 1.0) -> tuple[float, 
 
     The starts are drawn from the start distribution and are always the same.
     """
-    episodes = 256
-    env = BatchedEnv(task, episodes)
+    env = BatchedEnv(task, EPISODES)
     env.seed(0)
     observation = env.reset()
-    returns, weight = np.zeros(episodes), np.ones(episodes)
-    success = np.zeros(episodes, dtype=bool)
+    returns, weight = np.zeros(EPISODES), np.ones(EPISODES)
+    success = np.zeros(EPISODES, dtype=bool)
     while weight.any():
         result = env.step(policy.inputs(observation))
         returns += weight * result.reward

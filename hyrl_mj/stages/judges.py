@@ -23,6 +23,8 @@ from hyrl_mj.tasks import Outcome
 # The kinds of noise that judge a policy where the worst case cannot be computed, the mildest first.
 KINDS = ("none", "uniform", "alternating", "adversarial")
 QUIET = KINDS[0]
+# Starts from which a policy is attacked.
+ATTACKED = 64
 # A number of a batch, and the kind of noise that it is played with.
 Play = tuple[int, str]
 
@@ -276,7 +278,7 @@ class ByAttack:
         self.noise, self.margin = self.noisy.noise, self.noisy.margin
         self.enough: Score = (1.0, *self.noisy.enough)
         self.nearly: Score = (1 - settings.may_break,)
-        task, bound, count = states.task, states.bound, 64
+        task, bound, count = states.task, states.bound, ATTACKED
         off = distance_to(task, states.extended.points, states.grid.nodes[states.nodes])
         near = states.nodes[off <= 2 * float(np.linalg.norm(bound / task.chart.scale))]
         half, starts = count // 2 if len(near) else 0, self.noisy.episodes.starts
