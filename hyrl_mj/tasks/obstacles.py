@@ -45,11 +45,7 @@ def touching(model: mujoco.MjModel, data: mujoco.MjData, ids: Sequence[int]) -> 
     for k, i in combinations(range(len(ids)), 2):
         touch[i, k] = _touch(model, data, ids[i], ids[k])
     count, group = connected_components(touch, directed=False)
-<<<<<<< HEAD
-    return [[ids[int(i)] for i in np.flatnonzero(group == number)] for number in range(count)]
-=======
     return [[ids[i] for i in np.flatnonzero(group == k).tolist()] for k in range(count)]
->>>>>>> w-tasks
 
 
 def _touch(model: mujoco.MjModel, data: mujoco.MjData, a: int, b: int) -> bool:
