@@ -27,23 +27,30 @@ PLANTED = {
     ),
     "artifacts": "from hyrl_mj.files.manifest import Manifest; Manifest.checked = lambda self, path: path",
 }
-# Mends that are taken out, by a generated description that finds it. What would take a minute has a second.
+# Mends that are taken out, by a generated description that finds it.
 OPENED = {
-    "spec 4226648945": "from hyrl_mj.files import trust; trust.is_received = lambda: False",
-    "agent 2362031800": (
-        "from hyrl_mj.policies import pickled\n"
-        "pickled.arrays = lambda content: {str(name): None for name, _ in pickled.read(content).items}",
-    ),
-    "field 627631548": (
+    "field 130423781": (
         "from hyrl_mj.fields import files\n"
         "def once(pairs):\n"
         "    names = [name for name, _ in pairs]\n"
-        "    raise files._Repeated(max(names, key=names.count))\n"
+        "    if twice := [name for name in names if names.count(name) > 1]:\n"
+        "        raise files._Repeated(twice[0])\n"
+        "    return dict(pairs)\n"
         "files._once = once"
     ),
-    "arguments 3357133556": "from hyrl_mj import errors; errors.LONGEST = 10**9",
+    "model 3821611": "from hyrl_mj.physics import mjcf; mjcf._try = lambda path: None",
+    "sweep 1611288506": "from hyrl_mj.runs import sweeps; sweeps._plain = str",
+    "arguments 585595967": (
+        "import io\n"
+        "from hyrl_mj import errors\n"
+        "from hyrl_mj.environments import making\n"
+        "from hyrl_mj.sets import chart\n"
+        "from hyrl_mj.system import streams\n"
+        "chart.has_controls = lambda text: False\n"
+        "errors.printable = making.printable = str\n"
+        "streams._Escaping.write = io.TextIOWrapper.write"
+    ),
 }
-HURRY = "from attacks import doors; doors._broke.__defaults__ = (1.0,)"
 
 
 def attack(*words, weakness=""):
@@ -73,8 +80,8 @@ def test_planted_weaknesses_are_found():
 
 @pytest.mark.long
 def test_doors_that_are_opened_again_are_found():
-    words = ("--only", "doors", "--match", "|".join(OPENED), "--seed", "1", "--count", "240")
-    answer = attack(*words, weakness="\n".join([*OPENED.values(), HURRY]))
+    words = ("--only", "doors", "--match", "|".join(OPENED), "--seed", "1", "--count", "520")
+    answer = attack(*words, weakness="\n".join(OPENED.values()))
     assert answer.returncode == 1, answer.stdout + answer.stderr
     assert [name for name in OPENED if f"doors: {name}: " not in answer.stdout] == []
 
