@@ -137,14 +137,20 @@ def test_files_of_an_earlier_run_go_and_others_stay(folder):
 
 @pytest.mark.parametrize("name", ["../victim.json", "/etc/passwd", "config.json", "notes.txt"])
 def test_a_manifest_that_names_other_files_is_refused(name, folder):
-    entry = {"settings": "these", "code": "", "inputs": {}, "outputs": {name: "0"}}
+    entry = {
+        "settings": "these",
+        "code": "",
+        "version": "0.1.0",
+        "inputs": {},
+        "outputs": {name: "0"},
+    }
     artifacts.write_json(folder / NAME, {"stages": {"train": entry}}, "manifest")
     with pytest.raises(BadArtifact, match=re.escape(f"no stage 'train' writes {name!r}")):
         done(folder)
 
 
 def test_inputs_in_a_circle_end(folder):
-    entry = {"settings": "these", "code": "", "outputs": {"policy.json": "0"}}
+    entry = {"settings": "these", "code": "", "version": "0.1.0", "outputs": {"policy.json": "0"}}
     entry["inputs"] = {"policy.json": "0", "partition.npz": "1"}
     artifacts.write_json(folder / NAME, {"stages": {"train": entry}}, "manifest")
     assert done(folder) == []
