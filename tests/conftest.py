@@ -23,26 +23,20 @@ hypothesis.settings.register_profile("long", deadline=None, database=None, max_e
 hypothesis.settings.load_profile("repeatable")
 
 
-@pytest.fixture(scope="session")
-def together(tmp_path_factory):
-    """The folder of all processes that run these tests."""
-    base = tmp_path_factory.getbasetemp()
-    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "together"
-    folder.mkdir(exist_ok=True)
-    return folder
-
-
 @pytest.fixture(scope="session", autouse=True)
-def no_trace_at_home(together):
+def no_trace_at_home(tmp_path_factory):
     """Which files of code have run is recorded in a folder of the tests."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_STATE_HOME", str(together / "state"))
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         yield
 
 
 @pytest.fixture(scope="session")
-def made_once(together):
+def made_once(tmp_path_factory):
     """Returns a folder, by its name, that the first process that needs it has filled with make(folder)."""
+    base = tmp_path_factory.getbasetemp()
+    together = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "together"
+    together.mkdir(exist_ok=True)
 
     def folder(name, make):
         path, made = together / name, together / f"{name}.made"
