@@ -33,6 +33,7 @@ from hyrl_mj.environments.specification import (
 )
 from hyrl_mj.environments.wrappers import changes_by_reset, check_told, senses
 from hyrl_mj.errors import BadInput
+from hyrl_mj.files import trust
 from hyrl_mj.physics import mjcf
 from hyrl_mj.sets import Chart
 
@@ -58,6 +59,11 @@ def inspect(
     fresh, spec = Fresh(description), EnvironmentSpec(description)  # before anything has been made
     if untried and fresh.available:
         fresh.try_out(spec)
+    elif untried and trust.is_received():
+        raise BadInput(
+            f"{spec.name} comes from a file of others, and this process cannot fork another one that tries it "
+            "within limits of time and memory: open it once in the main process of a program"
+        )
     instance = Instance(spec)
     _check_times(instance)
     instance.reset()
