@@ -61,8 +61,8 @@ def inspect(
         fresh.try_out(spec)
     elif untried and trust.is_received():
         raise BadInput(
-            f"{spec.name} comes from a file of others, and this process cannot fork another one that tries it "
-            "within limits of time and memory: open it once in the main process of a program"
+            f"{spec.name} comes from a file of others, and this process cannot fork another one that tries "
+            "it within limits of time and memory: open it once in the main process of a program"
         )
     instance = Instance(spec)
     _check_times(instance)
