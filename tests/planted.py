@@ -4,7 +4,6 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import version
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -52,11 +51,11 @@ def without_pdfs(patch):
     """Patches figures so that beside each PNG lies no drawing, but a file that could be one."""
     write = Figure.savefig
 
-    def savefig(figure, path, *, format, **options):
+    def savefig(figure, content, *, format, **options):
         if format == "pdf":
-            Path(path).write_bytes(b"%PDF-1.4\n")
+            content.write(b"%PDF-1.4\n")
         else:
-            write(figure, path, format=format, **options)
+            write(figure, content, format=format, **options)
 
     patch.setattr(Figure, "savefig", savefig)
 
