@@ -82,7 +82,7 @@ def shorten() -> None:
     render = replay.render_replay
 
     def render_small(
-        task: Any, shows: Any, path: Any, options: Any = replay.DEFAULTS, **more: Any
+        task: Any, shows: Any, path: Any, options: Any = replay.USUAL, **more: Any
     ) -> None:
         render(task, shows, path, replace(options, size=SIZE, fps=FPS), **more)
 
