@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from base64 import b64encode
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -123,8 +123,16 @@ def _stages(
 
 
 def _texts(settings: Mapping[str, object]) -> dict[str, str]:
-    """Returns the texts of settings by their names in words, without those that hold other settings."""
-    plain = {n: v for n, v in settings.items() if not isinstance(v, Training | Agent | Mapping)}
+    """Returns the texts of settings by their names in words, without trainings, agents and options.
+
+    The settings of a group stand one by one.
+    """
+    plain: dict[str, object] = {}
+    for name, value in settings.items():
+        if is_dataclass(value) and not isinstance(value, Training | Agent):
+            plain |= {f"{name}: {field}": one for field, one in vars(value).items()}
+        elif not isinstance(value, Training | Agent | Mapping):
+            plain[name] = value
     return {name.replace("_", " "): _text(value) for name, value in plain.items()}
 
 
