@@ -1,7 +1,6 @@
 """The settings of stages 2 to 6 beside their trainings, in frozen dataclasses: what decides in them.
 
-Each field has a unit and a range. The defaults are what serves all tasks, and no preset changes them; the
-manual has the results with other values.
+Each field has a unit and a range. The defaults serve all tasks, and no preset changes them.
 """
 
 from dataclasses import dataclass
