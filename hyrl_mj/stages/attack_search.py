@@ -7,7 +7,6 @@ from collections import Counter
 from typing import Any
 
 import numpy as np
-from scipy.stats import rankdata
 
 from hyrl_mj.game import Ends
 from hyrl_mj.policies import Controller
@@ -186,6 +185,7 @@ class Search:
     def _evolve(self, rows: np.ndarray) -> None:
         """Evolves levels and switching times by CMA-ES, at the most dangerous of the starts `rows` (r,)."""
         import cma  # slow to import, and seldom needed
+        from scipy.stats import rankdata
 
         focused = rows[np.argsort(-self._worst[rows], kind="stable")[:FOCUSED]]
         for row in focused:
