@@ -365,7 +365,7 @@ REFUSED = {
     "several copies": (lambda: gym.make_vec("Reacher-v5", 2), "single gymnasium.Env"),
     "a namespace": (
         "metaworld/reach-v3",
-        "installed has environments metaworld/.*install their package",
+        "no environment 'metaworld/reach-v3'.*if another package has it, name the module",
     ),
     "misspelt": ("PointMaze_Mediun-v3", "no environment.*PointMaze_Medium-v3"),
     "broken": (lambda: 1 / 0, r"cannot be made .ZeroDivisionError"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -135,9 +134,9 @@ def test_a_run_without_a_critical_set_is_drawn(task, name):
 def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch, fails):
     written = []
 
-    def savefig(self, path, **_):
-        written.append(path)
-        Path(path).write_bytes(b"half")
+    def savefig(self, content, **_):
+        written.append(content)
+        content.write(b"half")
         if len(written) == fails:
             raise OSError("no space left on device")
 

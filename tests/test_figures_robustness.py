@@ -204,8 +204,8 @@ def test_without_a_path_the_figure_is_returned_and_nothing_is_written(tmp_path, 
 
 @pytest.mark.parametrize("fails", ["on its way", "while it is written"])
 def test_nothing_is_left_behind_when_drawing_fails(tmp_path, monkeypatch, fails):
-    def half(self, path, **_):
-        path.write_bytes(b"\x89PNG")
+    def half(self, content, **_):
+        content.write(b"\x89PNG")
         raise OSError("no space left on device")
 
     path, game = tmp_path / "curve.png", game_of(["hyrl"])

@@ -12,6 +12,7 @@ from test_gate import expert, met
 
 import hyrl_mj
 from hyrl_mj import Noise, simulate
+from hyrl_mj.learning import WaySettings
 from hyrl_mj.physics.rendering import Canvas
 from hyrl_mj.sets import Chart
 from hyrl_mj.viz import section as section_module
@@ -39,7 +40,7 @@ def cuts(gate):
 @pytest.fixture(scope="module")
 def found(gate, cuts):
     """M* of the expert in each section."""
-    settings = SimpleNamespace(rods=12, resolution=1 / 16, noise=0.0)
+    settings = SimpleNamespace(rods=12, resolution=1 / 16, noise=0.0, ways=WaySettings())
     run = SimpleNamespace(
         task=gate,
         steady=expert(gate),

@@ -74,7 +74,7 @@ def test_loops_do_not_share_its_memory(vehicle, drift):
 def test_it_works_in_noisy_episodes(vehicle):
     loops = {"ideal": ideal_controller(vehicle, 0.154, clear=1.004)}
     noises = (Noise("drift", 0.1), Noise("uniform", 0.1))
-    records = noisy_episodes(vehicle, Regions(decisions(vehicle).points), loops, noises, 200)
+    records = noisy_episodes(vehicle, Regions(decisions(vehicle).points), loops, noises, 200).counts
     assert {r.noise for r in records} == {"drift", "uniform"}
     assert sum(r.episodes for r in records if r.noise == "drift") == 200
 

@@ -9,6 +9,7 @@ from planted import ChartPolicy, Cube, sphere_policy
 
 import hyrl_mj
 from hyrl_mj import find_critical_set
+from hyrl_mj.learning import WaySettings
 from hyrl_mj.runs.arcs import overview_arcs
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
@@ -65,7 +66,7 @@ def test_a_ball_becomes_a_disc(section, ball):
 def test_its_critical_set_is_searched_for_in_the_plane(cube, section, monkeypatch):
     policy = sphere_policy(cube, RADIUS)
     whole = find_critical_set(cube, policy, 8, 1 / 4)
-    settings = SimpleNamespace(rods=20, resolution=1 / 16, noise=0.1)
+    settings = SimpleNamespace(rods=20, resolution=1 / 16, noise=0.1, ways=WaySettings())
     run = SimpleNamespace(critical_set=whole, steady=policy, settings=settings)
     monkeypatch.setattr(section_module, "CELLS", 20)
     found = section.critical_set(run)

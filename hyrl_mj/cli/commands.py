@@ -49,7 +49,7 @@ def run(task: str | None = None, *, environment: EnvironmentOptions, options: Ru
 
     An existing run directory is resumed: only what is missing is done.
 
-    The verdict is PROVED, WON, HELD, UNDECIDED, WEAK, or FAILED, which gives exit status 1.
+    The verdict is PROVED, WON, HELD, UNDECIDED, WEAK, or FAILED (exit status 1).
 
     Args:
         task: a task, see `hyrl-mj list`, or a Python file that defines one, see `hyrl-mj new-task`; by
@@ -73,7 +73,7 @@ def robustify(
 
     An existing run directory is resumed: only what is missing is done.
 
-    The verdict is PROVED, WON, HELD, UNDECIDED, WEAK, or FAILED, which gives exit status 1.
+    The verdict is PROVED, WON, HELD, UNDECIDED, WEAK, or FAILED (exit status 1).
 
     Args:
         task: a task, see `hyrl-mj list`, or a Python file that defines one; by default none, with --env.
