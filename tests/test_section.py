@@ -85,7 +85,6 @@ def test_it_says_where_it_is(section):
 def test_runs_of_the_whole_task_are_cut_to_it():
     rover = hyrl_mj.get_task("rover")
     section, z = Section(rover), rover.starts(20, np.random.default_rng(0))
-    np.testing.assert_array_equal(section.project(z), z[:, :2])
     np.testing.assert_array_equal(section.lift(z[:, :2]), z * [1, 1, 0])
     np.testing.assert_array_equal(section.noise(0.1), rover.noise_in_chart(0.1)[:2])
     np.testing.assert_array_equal(section.failed(z[:, :2]), rover.failed(rover.at(z * [1, 1, 0])))
