@@ -6,6 +6,7 @@ The way to the goal bends around the posts that block it. The focus is the post 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -119,7 +120,7 @@ def first_bend(seen: Seen, focus: np.ndarray, side: np.ndarray, wider: float) ->
         ahead = dot(seen.x, seen.y, x[:, None], y[:, None]) > 0
         nearest = dot(near_x, near_y, near_x, near_y)
         blocks = (nearest < reach * reach) & ahead & ~passed
-        more: np.ndarray = blocks.any(axis=1)
+        more: Any = blocks.any(axis=1)
         if isinstance(more, np.ndarray) and not more.any():  # an export does not know
             break
         post = np.where(blocks, seen.room, np.inf).argmin(axis=1)

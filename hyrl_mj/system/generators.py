@@ -24,7 +24,7 @@ def kept_generators() -> Iterator[None]:
 
 def global_state() -> tuple[Any, ...]:
     """Returns how far the global generators are."""
-    generator = np.random.get_bit_generator()
+    generator: Any = np.random.get_bit_generator()  # type: ignore[attr-defined]
     if not isinstance(generator, np.random.MT19937):  # one that its user has set
         return repr(generator.state), random.getstate()
     # A table of 624 words of 4 bytes, and the place in it: `get_state` copies them one by one, fifty times
