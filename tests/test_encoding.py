@@ -6,6 +6,7 @@ import shlex
 import stat
 import threading
 import time
+from types import SimpleNamespace
 
 import imageio_ffmpeg
 import numpy as np
@@ -151,3 +152,25 @@ def test_a_place_that_cannot_be_written_is_said_before_anything_is_drawn(tmp_pat
     (tmp_path / "file").write_text("mine")
     with pytest.raises(BadInput, match="cannot be written"):
         write(tmp_path / "file" / "film.mp4")
+
+
+def test_a_full_disk_is_no_missing_encoder(tmp_path, monkeypatch):
+    # A run goes on without a video where nothing encodes one; where there is no room it must not.
+    def fails(encoder):
+        raise encoding.EncodingFailed("ffmpeg has ended")
+
+    monkeypatch.setattr(encoding.Encoder, "finish", fails)
+    frame = np.zeros((48, 64, 3), np.uint8)
+    for free, error, words in (
+        (0, BadInput, "No space left on device"),
+        (2**40, NoRenderer, "cannot be encoded"),
+    ):
+        monkeypatch.setattr(
+            encoding.shutil, "disk_usage", lambda _, free=free: SimpleNamespace(free=free)
+        )
+        with (
+            pytest.raises(error, match=words),
+            encoding.video(tmp_path / "a.mp4", 64, 48, 5) as add,
+        ):
+            add(frame)
+        assert list(tmp_path.iterdir()) == []

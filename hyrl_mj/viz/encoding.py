@@ -6,7 +6,10 @@ To kill ffmpeg does not end the wait, because a child of it may hold the pipe: s
 
 from __future__ import annotations
 
+import errno
+import os
 import queue
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -68,6 +71,9 @@ def video(
             encoder.finish()
             check_whole(temporary)
         except EncodingFailed as error:
+            # ffmpeg does not tell why. Where not even a frame has room, a run must not go on without a video.
+            if shutil.disk_usage(temporary.parent).free < height * width * 3:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
             raise _failed(path, str(error)) from error
         finally:
             encoder.stop()
