@@ -21,13 +21,11 @@ from scipy.spatial import cKDTree
 
 import hyrl_mj
 from hyrl_mj.game import Lattice
-from hyrl_mj.simulation import WayRuns, way_runs
+from hyrl_mj.simulation import KINDS, WayRuns, way_runs
 from hyrl_mj.stages import Budget, Regions, attack, noisy_episodes
 from hyrl_mj.system import progress
 from hyrl_mj.tasks import ANY, LEFT, RIGHT, pattern_of
 from hyrl_mj.tasks.posts import PostsTask
-
-KINDS = ("none", "uniform", "alternating", "adversarial")
 
 
 def confirmed(run: hyrl_mj.Run) -> float:
@@ -100,11 +98,12 @@ def measure(run: hyrl_mj.Run, count: int) -> dict[str, str]:
     near = Regions(points, near=True)
     noises = tuple(hyrl_mj.Noise(kind, eps) for kind in KINDS)
     starts = near.draw(task, eps, count, np.random.default_rng(0))
+    # From the same starts, with the same signals in the same order.
+    attacks = attack(task, run.loops, starts, eps, Budget(rounds=1))
     for name, loop in run.loops.items():
         ends = noisy_episodes(task, near, {name: loop}, noises, count).counts
         lost = " / ".join(str(end.lost) for end in ends)
-        found = attack(task, {name: loop}, starts, eps, Budget(rounds=1))[name]
-        row[f"{name} lost: {' / '.join(KINDS)} / attack"] = f"{lost} / {found.count.lost}"
+        row[f"{name} lost: {' / '.join(KINDS)} / attack"] = f"{lost} / {attacks[name].count.lost}"
     if (game := run.robustness.game) is not None:
         for name in run.loops:
             score = game.scores[name][-1]

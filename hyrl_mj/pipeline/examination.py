@@ -13,7 +13,7 @@ from hyrl_mj.policies import Controller
 from hyrl_mj.proof import examine
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.sets import Grid
-from hyrl_mj.simulation import Noise
+from hyrl_mj.simulation import Noise, usual_kinds
 from hyrl_mj.stages import (
     Attack,
     Budget,
@@ -145,9 +145,8 @@ def examine_controllers(
         count = effort_of(run).episodes
     if count is not None and count < 1:
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
-    # Where samples take long, an adversary that looks ahead takes too long; the attack is there.
-    usual = ("none", "uniform", "alternating", *["adversarial"] * task.effort.looks_ahead)
-    noises = tuple(Noise(kind, eps, everywhere) for kind in options.noise or usual)
+    kinds = options.noise or usual_kinds(task)
+    noises = tuple(Noise(kind, eps, everywhere) for kind in kinds)
     game, maps = None, None
     if run.why_no_game is None:
         bounds = tuple(dict.fromkeys((0.0, eps / 2, eps)))

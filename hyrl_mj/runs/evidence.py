@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 from hyrl_mj.game import NEARLY, NO_NOISE, Robustness, wilson
 
-# What HELD needs at least: kinds of noise in the episodes, where noise can look ahead and where not,
-# episodes of each kind, and attacked starts. Of 300 starts none is lost if 99% are won at the lower end of a
-# one-sided 95% interval (3 / 300 = 1%); the two-sided one that is asked for takes about 400.
-KINDS = ("none", "uniform", "alternating", "adversarial")
+# What HELD needs at least: episodes of each kind of noise, and attacked starts. Of 300 starts none is lost if
+# 99% are won at the lower end of a one-sided 95% interval (3 / 300 = 1%); the two-sided one that is asked for
+# takes about 400.
 LEAST_EPISODES, LEAST_ATTACKED, ENOUGH_ATTACKED = 1_000, 300, 400
 
 

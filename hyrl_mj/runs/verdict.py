@@ -12,7 +12,7 @@ from hyrl_mj.game import (
     Robustness,
     percent,
 )
-from hyrl_mj.runs.evidence import KINDS, Sample, Wins, by_kind
+from hyrl_mj.runs.evidence import Sample, Wins, by_kind
 from hyrl_mj.runs.sentences import (
     POLICIES,
     comparison_sentence,
@@ -21,6 +21,7 @@ from hyrl_mj.runs.sentences import (
     replays_sentence,
     share_sentence,
 )
+from hyrl_mj.simulation import usual_kinds
 from hyrl_mj.stages import Arrivals, Retraining
 from hyrl_mj.tasks import Task
 
@@ -255,10 +256,9 @@ class _Case:
     def samples(self) -> list[Sample]:
         """What HELD rests on: episodes without noise and of each kind of noise, and attacked starts."""
         counts = by_kind(self.robustness, "hyrl")
-        kinds = KINDS if self.task.effort.looks_ahead else KINDS[:-1]
         samples = [
             Sample(kind, *counts.get(kind, (0, 0)), False)
-            for kind in dict.fromkeys((*kinds, *counts))
+            for kind in dict.fromkeys((*usual_kinds(self.task), *counts))
         ]
         attacks = [c for c in self.robustness.attacks if c.controller == "hyrl"]
         won, total = next(((c.attacked - c.lost, c.attacked) for c in attacks), (0, 0))

@@ -11,6 +11,7 @@ from pkgutil import iter_modules
 from hyrl_mj.simulation.arc import LONGEST, HybridArc, samples, simulate, simulate_batch
 from hyrl_mj.simulation.lookahead import Ahead, Lookahead
 from hyrl_mj.simulation.noise import (
+    KINDS,
     NOT_STARTED,
     AnyNoise,
     Noise,
@@ -21,6 +22,7 @@ from hyrl_mj.simulation.noise import (
     noise_kinds,
     register_noise,
     signal_for,
+    usual_kinds,
 )
 from hyrl_mj.simulation.passing import Passing, windings
 from hyrl_mj.simulation.programmes import GIVEN, Programmes
@@ -31,6 +33,7 @@ from hyrl_mj.simulation.way_runs import WayRuns, policy_runs, way_runs
 
 __all__ = [
     "GIVEN",
+    "KINDS",
     "LONGEST",
     "NOT_STARTED",
     "Ahead",
@@ -59,6 +62,7 @@ __all__ = [
     "signal_for",
     "simulate",
     "simulate_batch",
+    "usual_kinds",
     "way_runs",
     "windings",
 ]

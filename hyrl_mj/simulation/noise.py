@@ -21,6 +21,8 @@ from hyrl_mj.tasks import Task, read_only, writes
 
 # The mode of a run before its first measurement, from which the controller picks its start mode.
 NOT_STARTED = -1
+# The kinds of noise by which controllers are judged, the mildest first.
+KINDS = ("none", "uniform", "alternating", "adversarial")
 # By so much noise may exceed what is allowed: a few roundings of it, or of the measurement that it is the
 # difference of [units in the last place].
 ULPS = 8
@@ -126,6 +128,14 @@ def register_noise(signal: type[AnySignal]) -> type[AnySignal]:
 def noise_kinds() -> tuple[str, ...]:
     """Returns the registered kinds of noise."""
     return tuple(_KINDS)
+
+
+def usual_kinds(task: Task) -> tuple[str, ...]:
+    """Returns the kinds of noise by which controllers of a task are judged.
+
+    Where samples take long, an adversary that looks ahead takes too long; an attack is there.
+    """
+    return KINDS if task.effort.looks_ahead else KINDS[:-1]
 
 
 @register_noise

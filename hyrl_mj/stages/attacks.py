@@ -75,7 +75,7 @@ class Attack:
         count: from how many starts it loses.
         signal: the strongest signal that is known for each start.
         arcs: the run from each start under its signal.
-        quiet: how the runs end without noise.
+        quiet, ends: how the runs end without noise, and under the signals.
         strongest: index of the start of the strongest signal: of the earliest failure, or where nothing is
             lost of the run with the greatest danger.
     """
@@ -84,18 +84,8 @@ class Attack:
     signal: Recorded
     arcs: tuple[HybridArc, ...]
     quiet: Ends
+    ends: Ends
     strongest: int
-
-    @property
-    def ends(self) -> Ends:
-        """How the runs end under the signals."""
-        return Ends(
-            lost=np.array([arc.outcome != Outcome.REACHED.label for arc in self.arcs]),
-            time=np.array([arc.t[-1] for arc in self.arcs]),
-            way=np.array(
-                [np.linalg.norm(np.diff(arc.z, axis=0), axis=1).sum() for arc in self.arcs]
-            ),
-        )
 
     @staticmethod
     def from_arcs(
@@ -114,9 +104,14 @@ class Attack:
             dangerous: index of the start of the greatest danger.
             begun: the count, in which the losses are put.
         """
-        lost = np.array([arc.outcome != Outcome.REACHED.label for arc in arcs]) & ~quiet.lost
-        ends = np.where(lost, [arc.t[-1] for arc in arcs], np.inf)
-        strongest, losses = int(np.argmin(ends)) if lost.any() else dangerous, int(lost.sum())
+        ends = Ends(
+            lost=np.array([arc.outcome != Outcome.REACHED.label for arc in arcs]),
+            time=np.array([arc.t[-1] for arc in arcs]),
+            way=np.array([np.linalg.norm(np.diff(arc.z, axis=0), axis=1).sum() for arc in arcs]),
+        )
+        lost = ends.lost & ~quiet.lost
+        first = int(np.argmin(np.where(lost, ends.time, np.inf)))
+        strongest, losses = first if lost.any() else dangerous, int(lost.sum())
         count = replace(
             begun,
             unaided=int(quiet.lost.sum()),
@@ -125,7 +120,7 @@ class Attack:
             start=tuple(map(float, arcs[strongest].z[0])),
             outcome=arcs[strongest].outcome,
         )
-        return Attack(count, signal, tuple(arcs), quiet, strongest)
+        return Attack(count, signal, tuple(arcs), quiet, ends, strongest)
 
     def on(self, name: str, task: Task, controller: Controller) -> Attack:
         """Returns the attack of the same signals on another controller, of a name."""

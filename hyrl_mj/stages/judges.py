@@ -14,14 +14,12 @@ from hyrl_mj import game
 from hyrl_mj.learning import ModeSettings
 from hyrl_mj.learning.training import Score
 from hyrl_mj.policies import Policy, PolicyController
-from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
+from hyrl_mj.simulation import KINDS, LoopSettings, Noise, closed_loop
 from hyrl_mj.stages.attacks import Budget, attack
 from hyrl_mj.stages.critical_set import distance_to
 from hyrl_mj.stages.mode_states import ModeStates
 from hyrl_mj.tasks import Outcome
 
-# The kinds of noise that judge a policy where the worst case cannot be computed, the mildest first.
-KINDS = ("none", "uniform", "alternating", "adversarial")
 QUIET = KINDS[0]
 # Starts from which a policy is attacked.
 ATTACKED = 64
