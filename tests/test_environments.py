@@ -492,6 +492,20 @@ def test_an_obstacle_that_resets_draw_is_pinned_by_a_seed():
     assert from_gymnasium(Moved, reset={"rock": 0.2}).model.geom_pos[0, 1] == 0.2
 
 
+class Worn(Puck):
+    """Its motors wear out a little at each reset, by as much as the reset draws."""
+
+    def reset(self, *, seed=None, options=None):
+        seen = super().reset(seed=seed)
+        self.model.actuator_gainprm[:, 0] *= self.np_random.uniform(0.9, 1.0)
+        return seen
+
+
+def test_what_is_drawn_and_outlasts_a_reset_too_is_pinned_by_a_seed():
+    with pytest.raises(BadInput, match=r"draws actuator_gainprm of its model"):
+        from_gymnasium(Worn)
+
+
 def test_the_code_of_an_environment_is_that_of_its_files(tmp_path, monkeypatch, puck):
     monkeypatch.syspath_prepend(tmp_path)
     path = tmp_path / "my_puck.py"

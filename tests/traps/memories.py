@@ -88,8 +88,8 @@ class Unlatched(Region):
 
     unlatches = "dof_damping"
 
-    def begin(self):
-        super().begin()
+    def draw(self):
+        # What a reset draws afterwards stays.
         if self.unlatches == "dof_damping":
             self.model.dof_damping[self.rates] = self.plan.damping
         elif self.unlatches == "wind":
@@ -97,6 +97,7 @@ class Unlatched(Region):
         else:
             self.model.geom("rock").contype = 1
             self.model.geom("rock").conaffinity = 1
+        super().draw()
 
     def remember(self):
         super().remember()
