@@ -24,6 +24,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -85,20 +86,27 @@ ATTACKS = {
     "surroundings": Attack("each pair of bad surroundings", surroundings.trials, 10_000, 1),
 }
 
+# An attack, a trial of it, what broke, how long it took and was busy [s].
+Result = tuple[str, str, str, float, float]
 # The trials that are under way, for the forked processes that make them.
 UNDER_WAY: list[tuple[str, Trial]] = []
 
 
-def attempt(index: int) -> tuple[str, str, str, float]:
-    """Makes a trial, and returns its attack, its name, what broke, and how long it took [s]."""
+def attempt(index: int) -> Result:
+    """Makes a trial, and returns its attack, its name, what broke, and how long it took and was busy [s]."""
     attack, trial = UNDER_WAY[index]
-    began = time.monotonic()
+    began, busy = time.monotonic(), spent()
     with scratch() as folder:
         try:
             broke = trial.attempt(folder)
         except Exception:  # a mistake of the attack's own must not end the others
             broke = f"the attack itself failed: {traceback.format_exc()}"
-    return attack, trial.name, broke, time.monotonic() - began
+    return attack, trial.name, broke, time.monotonic() - began, spent() - busy
+
+
+def spent() -> float:
+    """Returns for how long this process and those of its own that have ended were busy [s]."""
+    return sum(os.times()[:4])
 
 
 @contextmanager
@@ -113,17 +121,17 @@ def scratch() -> Iterator[Path]:
         subprocess.run(["rm", "-rf", folder], check=True)
 
 
-def table(results: list[tuple[str, str, str, float]]) -> Table:
+def table(results: list[Result]) -> Table:
     """Returns the numbers of trials by attack."""
     printed = Table()
-    for heading in ("attack", "what", "tried", "survived", "broke", "seconds"):
+    for heading in ("attack", "what", "tried", "survived", "broke", "seconds", "busy"):
         printed.add_column(heading)
     for name in dict.fromkeys(result[0] for result in results):
         own = [result for result in results if result[0] == name]
         broke = sum(bool(result[2]) for result in own)
         counts = (len(own), len(own) - broke, broke)
-        seconds = f"{sum(result[3] for result in own):.0f}"
-        printed.add_row(name, ATTACKS[name].what, *map(str, counts), seconds)
+        seconds = (f"{sum(result[i] for result in own):.0f}" for i in (3, 4))
+        printed.add_row(name, ATTACKS[name].what, *map(str, counts), *seconds)
     return printed
 
 
@@ -156,15 +164,16 @@ def main() -> int:
             UNDER_WAY.extend((name, trial) for trial in matching)
         for _, trial in UNDER_WAY:
             trial.prepare()
-        with multiprocessing.get_context("fork").Pool(PROCESSES) as pool:
-            for result in pool.imap_unordered(attempt, range(len(UNDER_WAY))):
-                results.append(result)
+        # Not the processes of a `Pool`: those of a daemon may not fork the ones that try an environment.
+        with ProcessPoolExecutor(PROCESSES, multiprocessing.get_context("fork")) as pool:
+            for future in as_completed([pool.submit(attempt, i) for i in range(len(UNDER_WAY))]):
+                results.append(result := future.result())
                 if options.verbose or result[2]:
-                    how = result[2] or f"survived in {result[3]:.1f} s"
+                    how = result[2] or f"survived in {result[3]:.1f} s, busy for {result[4]:.1f} s"
                     print(f"{result[0]}: {result[1]}: {how}", file=sys.stderr)
     results.sort(key=lambda result: chosen.index(result[0]))
     Console(width=None if sys.stdout.isatty() else 120).print(table(results))
-    for name, trial, broke, _ in results:
+    for name, trial, broke, *_ in results:
         if broke:
             print(f"{name}: {trial}: {broke}")
     return int(any(result[2] for result in results))

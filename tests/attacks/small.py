@@ -15,7 +15,10 @@ from typing import Any
 from matplotlib.mathtext import MathTextParser
 
 import hyrl_mj.proof.examination as examination
+import hyrl_mj.proof.replays as replays
 import hyrl_mj.stages.results as results
+import hyrl_mj.viz.diagnosis as diagnosis
+import hyrl_mj.viz.drives as drives
 import hyrl_mj.viz.figures.style as style
 import hyrl_mj.viz.replay as replay
 from hyrl_mj import cli
@@ -72,6 +75,7 @@ def shorten() -> None:
     presets._SMOKE_MODES = 1_024
     examination.CURVE = examination.CURVE[::8]
     results.EPISODES = 64
+    replays.STARTS = dict.fromkeys(replays.STARTS, 40)
     for kind in (Task, EnvironmentTask):
         kind.effort = replace(kind.effort, checkpoints=2)
     style.DPI = 30
@@ -86,7 +90,8 @@ def shorten() -> None:
     ) -> None:
         render(task, shows, path, replace(options, size=SIZE, fps=FPS), **more)
 
-    replay.render_replay = render_small
+    for module in (replay, diagnosis, drives):
+        module.render_replay = render_small  # type: ignore[attr-defined]
 
 
 def become_nobody() -> None:
