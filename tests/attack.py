@@ -48,7 +48,8 @@ from attacks.material import Material
 from rich.console import Console
 from rich.table import Table
 
-PROCESSES = 2
+# One more than a small machine has cores: some trials wait for what never comes.
+PROCESSES = 3
 
 
 @dataclass(frozen=True)

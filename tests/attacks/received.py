@@ -6,7 +6,7 @@ from pathlib import Path
 from random import Random
 
 from attacks import Trial, crafted_agents, crafted_models, crafted_runs, resisted
-from attacks.honest import diagnose, most, opened_in_every_way
+from attacks.honest import agent, most, opened_in_every_way
 from attacks.material import TASK, Material
 
 # What must neither change nor be shown: it lies beside what was received.
@@ -28,10 +28,10 @@ def trials(material: Material, draw: Random, count: int) -> list[Trial]:
 
 
 def _agent(build: Callable[[Path], str], memory: float, folder: Path) -> str:
-    """Examines a crafted agent, which must be refused."""
+    """Reads a crafted agent, which must be refused."""
     _hide(folder)
     name = build(folder)
-    return resisted(diagnose(name), folder, memory, ended=(2,)) or _touched(folder)
+    return resisted(agent(name), folder, memory, ended=(2,)) or _touched(folder)
 
 
 def _run(

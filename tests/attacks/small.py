@@ -24,12 +24,15 @@ import hyrl_mj.viz.replay as replay
 from hyrl_mj import cli
 from hyrl_mj.environments.task import EnvironmentTask
 from hyrl_mj.learning import presets
+from hyrl_mj.system import limits
 from hyrl_mj.tasks import Task
 from hyrl_mj.tasks.unit_circle import UnitCircle
 from hyrl_mj.viz.figures import FIGURES
 
 SIZE, FPS = (480, 160), 2
 LATTICE = 130  # about the least with cells no longer than a sample on the circle
+# Within which what is tried in a process of its own must end: of the processor, and in all [s].
+SECONDS, LONGEST = 4, 10.0
 KEPT = {"extended_sets", "robustness_map"}  # of the figures
 # Set where the program has to run without the rights of root, in a folder that cannot be written.
 NOBODY = "ATTACK_AS_NOBODY"
@@ -78,6 +81,10 @@ def shorten() -> None:
     replays.STARTS = dict.fromkeys(replays.STARTS, 40)
     for kind in (Task, EnvironmentTask):
         kind.effort = replace(kind.effort, checkpoints=2)
+    # What never ends is stopped earlier, but not before a busy machine has started what is honest.
+    limits.limit.__defaults__ = (SECONDS, limits.MEMORY)
+    limits.tried.__kwdefaults__ |= {"seconds": SECONDS, "longest": LONGEST}
+    limits.LONGEST = LONGEST
     style.DPI = 30
     style.STYLE["pdf.fonttype"] = 3
     for name in FIGURES.keys() - KEPT:
