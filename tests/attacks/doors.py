@@ -43,6 +43,10 @@ EXPRESSIONS = (
     "__import__('os').system('touch executed')", "open('executed', 'w')", "(" * 5_000, "x" * 100_000,
     "info['a'].__class__", "reward >= 1e400", "distance('a', 'b') <= 1 ** 99999999", ESCAPE, "lambda: 1",
 )  # fmt: skip
+# Share of the descriptions in which one thing is wrong: in the others there are several.
+POINTED = 0.6
+# What tells arguments of the robot arm from those of the circle.
+ROBOT = {"xml_file", "frame_skip", *ARGUMENTS}
 # Arguments of which one is wrong.
 WRONG: tuple[dict[str, Any], ...] = (
     {"pinned": {"qpos[²]": 1}}, {"pinned": {"core": 1}}, {"pinned": {"__class__": 1}},
@@ -163,16 +167,17 @@ def _described(draw: Random, folder: Path) -> dict[str, Any]:
 def _pointed(draw: Random, folder: Path) -> tuple[str, dict[str, Any]]:
     """Returns the id and the arguments of an environment in which nothing is wrong but one thing, at most."""
     name = draw.choice(NAMES)
-    return draw.choice(
+    given = draw.choice(
         (
-            (CIRCLE, {"kwargs": {"task": str(evil(folder))}}),
-            (CIRCLE, {"chart": {name: "theta"}}),
-            ("Reacher-v5", {"kwargs": {"xml_file": str(_written(draw, folder))}}),
-            ("Reacher-v5", {"kwargs": {"frame_skip": 10**9}}),
-            ("Reacher-v5", ARGUMENTS),
-            *((CIRCLE, wrong) for wrong in draw.sample(WRONG, 3)),
+            {"kwargs": {"task": str(evil(folder))}},
+            {"chart": {name: "theta"}},
+            {"kwargs": {"xml_file": str(_written(draw, folder))}},
+            {"kwargs": {"frame_skip": 10**9}},
+            ARGUMENTS,
+            *WRONG,
         )
     )
+    return "Reacher-v5" if ROBOT & given.get("kwargs", given).keys() else CIRCLE, given
 
 
 def _written(draw: Random, folder: Path) -> Path:
@@ -211,7 +216,7 @@ def _spec(material: Material, memory: float, draw: Random, folder: Path) -> str:
     path = material.copy(folder)
     plant_modules(folder)
     env, given = draw.choice(IDS), _described(draw, folder)
-    if draw.random() < 0.4:
+    if draw.random() < POINTED:
         env, given = _pointed(draw, folder)
     spec = f"env:{json.dumps({'env': env, **given})}"
     spec = draw.choice(
@@ -234,7 +239,7 @@ def _arguments(material: Material, memory: float, draw: Random, folder: Path) ->
     plant_modules(folder)
     env = draw.choice(("Reacher-v5", CIRCLE, "Ant-v5"))
     given = _described(draw, folder)
-    if draw.random() < 0.4:
+    if draw.random() < POINTED:
         env, given = _pointed(draw, folder)
     text = json.dumps(given)
     text = draw.choice([text] * 9 + ["[" * 100_000, "{" * 1_000, '{"a":' * 50_000, "null", "1e400"])
