@@ -86,11 +86,11 @@ MODELS = {
 
 def trials(material: Material, draw: Random, count: int) -> list[Trial]:
     """Returns trials of each kind, drawn at random."""
-    # What makes a trial, what its memory is compared with, and how many of 22 are of this kind.
+    # What makes a trial, what its memory is compared with, and how many of 23 are of this kind.
     kinds = {
         "spec": (_spec, "run", 4),
         "arguments": (_arguments, "environment", 4),
-        "agent": (_agent, "agent", 4),
+        "agent": (_agent, "agent", 5),
         "model": (_model, "model", 3),
         "field": (_field, "field", 2),
         "sweep": (folders.sweep, "run", 1),
@@ -99,7 +99,7 @@ def trials(material: Material, draw: Random, count: int) -> list[Trial]:
         "user": (folders.user, "run", 1),
         "modules": (folders.modules, "environment", 1),
     }
-    turns = [kind for turn in range(4) for kind in kinds if kinds[kind][2] > turn]
+    turns = [kind for turn in range(5) for kind in kinds if kinds[kind][2] > turn]
     made = []
     for number in range(count):
         kind, seed = turns[number % len(turns)], draw.randrange(2**32)

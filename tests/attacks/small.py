@@ -14,6 +14,8 @@ from typing import Any
 
 from matplotlib.mathtext import MathTextParser
 
+import hyrl_mj.proof.assumptions as assumptions
+import hyrl_mj.proof.cells as cells
 import hyrl_mj.proof.examination as examination
 import hyrl_mj.proof.replays as replays
 import hyrl_mj.stages.results as results
@@ -78,6 +80,7 @@ def shorten() -> None:
     presets._SMOKE_MODES = 1_024
     examination.CURVE = examination.CURVE[::8]
     results.EPISODES = 64
+    assumptions.COMPARED = cells.STATES = 300
     replays.STARTS = dict.fromkeys(replays.STARTS, 40)
     for kind in (Task, EnvironmentTask):
         kind.effort = replace(kind.effort, checkpoints=2)
