@@ -24,7 +24,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -156,14 +156,19 @@ def main() -> int:
         os.environ["PYTHONPATH"] = str(Path(__file__).resolve().parents[1])  # of new processes
         tempfile.tempdir = str(folder)
         material = Material(folder)
-        for name in chosen:
+
+        def prepared(name: str) -> list[tuple[str, Trial]]:
             attack = ATTACKS[name]
             count = options.count or (attack.short if options.short else attack.count)
             trials = attack.trials(material, Random(f"{options.seed} {name}"), count)
-            matching = (t for t in trials if re.search(options.match, t.name))
-            UNDER_WAY.extend((name, trial) for trial in matching)
-        for _, trial in UNDER_WAY:
-            trial.prepare()
+            matching = [trial for trial in trials if re.search(options.match, trial.name)]
+            for trial in matching:
+                trial.prepare()
+            return [(name, trial) for trial in matching]
+
+        with ThreadPoolExecutor(PROCESSES) as threads:  # each of which waits for processes
+            for trials in threads.map(prepared, chosen):
+                UNDER_WAY.extend(trials)
         # Not the processes of a `Pool`: those of a daemon may not fork the ones that try an environment.
         with ProcessPoolExecutor(PROCESSES, multiprocessing.get_context("fork")) as pool:
             for future in as_completed([pool.submit(attempt, i) for i in range(len(UNDER_WAY))]):

@@ -8,13 +8,13 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from random import Random
 
 from attacks import Trial, child, command, crafted_agents, differences
 from attacks.honest import FIELD
-from attacks.material import RUN, TASK, Material
+from attacks.material import RUN, TASK, Material, once
 
 SIGNALS = (signal.SIGKILL, signal.SIGINT, signal.SIGTERM)
 AGENT = (
@@ -67,7 +67,7 @@ def trials(material: Material, draw: Random, count: int) -> list[Trial]:
     return found
 
 
-@cache
+@once
 def whole(material: Material, name: str) -> Whole:
     """Gives a command that nothing disturbs."""
     folder = material.folder / f"whole_{name}"
