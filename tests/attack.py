@@ -2,7 +2,7 @@
 
     python tests/attack.py                        # all of it
     python tests/attack.py --short                # a sample of each attack
-    python tests/attack.py --only received --match zip --seed 3
+    python tests/attack.py --only agents --match zip --seed 3
 
 Prints for each attack how many trials were made, survived and broke, and a line about each trial that broke;
 the exit status is 1 if any did.
@@ -24,6 +24,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,7 +48,8 @@ from attacks.material import Material
 from rich.console import Console
 from rich.table import Table
 
-PROCESSES = 2
+# One more than a small machine has cores: some trials wait for what never comes.
+PROCESSES = 3
 
 
 @dataclass(frozen=True)
@@ -67,38 +69,44 @@ class Attack:
 
 
 ATTACKS = {
-    "crashes": Attack(
-        "crashed before and after every rename, then resumed", crashes.trials, 10_000, 2
-    ),
+    "crashes": Attack("crashed before and after a rename, then resumed", crashes.trials, 10, 2),
     "kills": Attack(
         "killed at a random moment, resumed while the clock is set back", kills.trials, 50, 1
     ),
-    "disks": Attack("a disk that is full, and then has room", disks.trials, 15, 1),
-    "artifacts": Attack("truncated, or one bit flipped", damage.trials, 80, 3),
-    "received": Attack("crafted files of a stranger", received.trials, 60, 3),
-    "doors": Attack("generated descriptions of a stranger", doors.trials, 600, 8),
+    "disks": Attack("a disk that is full, and then has room", disks.trials, 6, 1),
+    "artifacts": Attack("truncated, or one bit flipped", damage.trials, 20, 3),
+    "agents": Attack("crafted agents of a stranger", received.agents, 100, 2),
+    "received": Attack("crafted run directories of a stranger", received.runs, 25, 1),
+    "doors": Attack("generated descriptions of a stranger", doors.trials, 575, 8),
     "configurations": Attack(
         "one setting changed, through every stage", configurations.trials, 200, 4
     ),
-    "tasks": Attack("task file or MJCF with one mistake", tasks.trials, 120, 2),
-    "writers": Attack("two and four writers, and a reader", writers.trials, 20, 1),
-    "surroundings": Attack("each pair of bad surroundings", surroundings.trials, 10_000, 1),
+    "tasks": Attack("task file or MJCF with one mistake", tasks.trials, 100, 2),
+    "writers": Attack("two and four writers, and a reader", writers.trials, 3, 1),
+    "surroundings": Attack("pairs of bad surroundings", surroundings.trials, 4, 1),
 }
 
+# An attack, a trial of it, what broke, how long it took and was busy [s].
+Result = tuple[str, str, str, float, float]
 # The trials that are under way, for the forked processes that make them.
 UNDER_WAY: list[tuple[str, Trial]] = []
 
 
-def attempt(index: int) -> tuple[str, str, str, float]:
-    """Makes a trial, and returns its attack, its name, what broke, and how long it took [s]."""
+def attempt(index: int) -> Result:
+    """Makes a trial, and returns its attack, its name, what broke, and how long it took and was busy [s]."""
     attack, trial = UNDER_WAY[index]
-    began = time.monotonic()
+    began, busy = time.monotonic(), spent()
     with scratch() as folder:
         try:
             broke = trial.attempt(folder)
         except Exception:  # a mistake of the attack's own must not end the others
             broke = f"the attack itself failed: {traceback.format_exc()}"
-    return attack, trial.name, broke, time.monotonic() - began
+    return attack, trial.name, broke, time.monotonic() - began, spent() - busy
+
+
+def spent() -> float:
+    """Returns for how long this process and those of its own that have ended were busy [s]."""
+    return sum(os.times()[:4])
 
 
 @contextmanager
@@ -113,17 +121,17 @@ def scratch() -> Iterator[Path]:
         subprocess.run(["rm", "-rf", folder], check=True)
 
 
-def table(results: list[tuple[str, str, str, float]]) -> Table:
+def table(results: list[Result]) -> Table:
     """Returns the numbers of trials by attack."""
     printed = Table()
-    for heading in ("attack", "what", "tried", "survived", "broke", "seconds"):
+    for heading in ("attack", "what", "tried", "survived", "broke", "seconds", "busy"):
         printed.add_column(heading)
     for name in dict.fromkeys(result[0] for result in results):
         own = [result for result in results if result[0] == name]
         broke = sum(bool(result[2]) for result in own)
         counts = (len(own), len(own) - broke, broke)
-        seconds = f"{sum(result[3] for result in own):.0f}"
-        printed.add_row(name, ATTACKS[name].what, *map(str, counts), seconds)
+        seconds = (f"{sum(result[i] for result in own):.0f}" for i in (3, 4))
+        printed.add_row(name, ATTACKS[name].what, *map(str, counts), *seconds)
     return printed
 
 
@@ -148,23 +156,29 @@ def main() -> int:
         os.environ["PYTHONPATH"] = str(Path(__file__).resolve().parents[1])  # of new processes
         tempfile.tempdir = str(folder)
         material = Material(folder)
-        for name in chosen:
+
+        def prepared(name: str) -> list[tuple[str, Trial]]:
             attack = ATTACKS[name]
             count = options.count or (attack.short if options.short else attack.count)
             trials = attack.trials(material, Random(f"{options.seed} {name}"), count)
-            matching = (t for t in trials if re.search(options.match, t.name))
-            UNDER_WAY.extend((name, trial) for trial in matching)
-        for _, trial in UNDER_WAY:
-            trial.prepare()
-        with multiprocessing.get_context("fork").Pool(PROCESSES) as pool:
-            for result in pool.imap_unordered(attempt, range(len(UNDER_WAY))):
-                results.append(result)
+            matching = [trial for trial in trials if re.search(options.match, trial.name)]
+            for trial in matching:
+                trial.prepare()
+            return [(name, trial) for trial in matching]
+
+        with ThreadPoolExecutor(PROCESSES) as threads:  # each of which waits for processes
+            for trials in threads.map(prepared, chosen):
+                UNDER_WAY.extend(trials)
+        # Not the processes of a `Pool`: those of a daemon may not fork the ones that try an environment.
+        with ProcessPoolExecutor(PROCESSES, multiprocessing.get_context("fork")) as pool:
+            for future in as_completed([pool.submit(attempt, i) for i in range(len(UNDER_WAY))]):
+                results.append(result := future.result())
                 if options.verbose or result[2]:
-                    how = result[2] or f"survived in {result[3]:.1f} s"
+                    how = result[2] or f"survived in {result[3]:.1f} s, busy for {result[4]:.1f} s"
                     print(f"{result[0]}: {result[1]}: {how}", file=sys.stderr)
     results.sort(key=lambda result: chosen.index(result[0]))
     Console(width=None if sys.stdout.isatty() else 120).print(table(results))
-    for name, trial, broke, _ in results:
+    for name, trial, broke, *_ in results:
         if broke:
             print(f"{name}: {trial}: {broke}")
     return int(any(result[2] for result in results))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
@@ -27,20 +28,40 @@ PLANTED = {
     ),
     "artifacts": "from hyrl_mj.files.manifest import Manifest; Manifest.checked = lambda self, path: path",
 }
-# Mends that are taken out, by a generated description that finds it.
+# Mends that are taken out: the trials that find it, of so many, what they say, and how it is taken out.
 OPENED = {
-    "field 130423781": (
+    "code of a stranger": (
+        "^spec", 218, "was executed",
+        "from hyrl_mj.files import trust; trust.is_received = lambda: False",
+    ),
+    "an environment without limits": (
+        "^arguments", 58, "hangs",
+        "from hyrl_mj.environments.fresh import Fresh; Fresh.try_out = lambda *given: None",
+    ),
+    "modules in the current folder": (
+        "^modules", 46, "was executed",
+        "from attacks import folders\n"
+        "folders.PROGRAM = f'import sys; sys.path.insert(0, \"\"); {folders.PROGRAM}'",
+    ),
+    "an agent without end": (
+        "^agent", 46, "hangs",
+        "import inspect\n"
+        "from hyrl_mj.policies import pickled\n"
+        "source = inspect.getsource(pickled.arrays).replace('{name:', '{str(name):')\n"
+        "exec(source.replace(' if isinstance(name, str)', ''), vars(pickled))",
+    ),
+    "keys that are there twice": (
+        "^field", 61, "hangs",
         "from hyrl_mj.fields import files\n"
         "def once(pairs):\n"
         "    names = [name for name, _ in pairs]\n"
         "    if twice := [name for name in names if names.count(name) > 1]:\n"
         "        raise files._Repeated(twice[0])\n"
         "    return dict(pairs)\n"
-        "files._once = once"
+        "files._once = once",
     ),
-    "model 3821611": "from hyrl_mj.physics import mjcf; mjcf._try = lambda path: None",
-    "sweep 1611288506": "from hyrl_mj.runs import sweeps; sweeps._plain = str",
-    "arguments 585595967": (
+    "a name that controls the terminal": (
+        "^arguments", 481, "control characters",
         "import io\n"
         "from hyrl_mj import errors\n"
         "from hyrl_mj.environments import making\n"
@@ -48,9 +69,25 @@ OPENED = {
         "from hyrl_mj.system import streams\n"
         "chart.has_controls = lambda text: False\n"
         "errors.printable = making.printable = str\n"
-        "streams._Escaping.write = io.TextIOWrapper.write"
+        "streams._Escaping.write = io.TextIOWrapper.write",
     ),
-}
+    "formulas in a table": (
+        "^sweep", 115, "formula", "from hyrl_mj.runs import sweeps; sweeps._plain = str",
+    ),
+    "a file that is overwritten": (
+        "^path", 115, "overwrites",
+        "from contextlib import nullcontext\n"
+        "from hyrl_mj.files import trust\n"
+        "trust.output = lambda *paths, force=False: nullcontext()",
+    ),
+    "a sentence without end": (
+        "^arguments", 44, "a sentence of", "from hyrl_mj import errors; errors.LONGEST = 10**9",
+    ),
+    "a model without limits": (
+        "^model", 46, "exit status -11|hangs",
+        "from hyrl_mj.physics import mjcf; mjcf._try = lambda path: None",
+    ),
+}  # fmt: skip
 
 
 def attack(*words, weakness=""):
@@ -79,11 +116,13 @@ def test_planted_weaknesses_are_found():
 
 
 @pytest.mark.long
-def test_doors_that_are_opened_again_are_found():
-    words = ("--only", "doors", "--match", "|".join(OPENED), "--seed", "1", "--count", "520")
-    answer = attack(*words, weakness="\n".join(OPENED.values()))
+@pytest.mark.parametrize("door", OPENED)
+def test_a_door_that_is_opened_again_is_found(door):
+    trials, count, said, weakness = OPENED[door]
+    words = ("--only", "doors", "--match", trials, "--count", str(count))
+    answer = attack(*words, weakness=weakness)
     assert answer.returncode == 1, answer.stdout + answer.stderr
-    assert [name for name in OPENED if f"doors: {name}: " not in answer.stdout] == []
+    assert re.search(f"^doors: .*({said})", answer.stdout, re.MULTILINE), answer.stdout
 
 
 # ---- one process

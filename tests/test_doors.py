@@ -151,25 +151,7 @@ def test_what_a_file_asks_for_is_not_recorded(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "given",
-    [
-        {"pinned": {"qpos[²]": 1}},
-        {"pinned": {"core": 1}},
-        {"pinned": {"__class__": 1}},
-        {"reset": {"z": [1, [2]]}},
-        {"pinned": {"qpos[0]": doors.DIGITS}},
-        {"noisy": [10**400]},
-        {"bounds": {"theta": [0, float("inf")]}},
-        {"chart": {"\x1b[31m": "theta"}},
-        {"chart": ["a" * 3_000_000]},
-        {"success": "(" * 5_000},
-        {"success": "a" * 100_000},
-        {"kwargs": {"\x1b": 1}},
-        {"steps": 10**400},
-        {"seed": -(10**400)},
-    ],
-)
+@pytest.mark.parametrize("given", doors.WRONG)
 def test_an_argument_that_is_none_is_one_sentence(given):
     refusal(lambda: from_gymnasium(CIRCLE, **given))
 
@@ -306,11 +288,16 @@ def test_a_nested_pickle_takes_no_time(seed):
 def test_nothing_is_imported_from_the_current_folder(words, tmp_path):
     for name in folders.MODULES:
         code(tmp_path, f"{name}.py")
-    program = "import sys; from hyrl_mj.cli import main; sys.argv[0] = 'hyrl-mj'; main()"
     with socket.create_server(("127.0.0.1", 0)) as listener:  # it answers, and is no cluster
         port = listener.getsockname()[1]
         subprocess.run(
-            [sys.executable, "-P", "-c", program, *(word.format(port=port) for word in words)],
+            [
+                sys.executable,
+                "-P",
+                "-c",
+                folders.PROGRAM,
+                *(word.format(port=port) for word in words),
+            ],
             cwd=tmp_path,
             capture_output=True,
             check=False,

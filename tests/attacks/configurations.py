@@ -70,7 +70,7 @@ GROUPS: dict[tuple[str, str], tuple[Any, ...]] = {
     ("table", "tables"): (*COUNTS, HUGE),
 }
 # What is no mistake: a missing horizon or episode has a meaning.
-MEANT = {("horizon", "null"), ("episode", "null"), ("options", "{}"), ("anneal", "true"),
+MEANT = {("horizon", "null"), ("hidden", "[1]"), ("episode", "null"), ("options", "{}"), ("anneal", "true"),
          ("anneal", "false"), ("symmetric", "true"), ("symmetric", "false"), ("warm_start", "true"),
          ("warm_start", "false"), ("versions", "{}")}  # fmt: skip
 

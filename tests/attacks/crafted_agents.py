@@ -308,7 +308,10 @@ FILES: dict[str, Callable[[Path], str]] = {
     ),
     "zip, trained under VecNormalize": lambda folder: write_zip(
         folder,
-        data={"clip_range": 0.2, "_last_original_obs": {":type:": "ndarray", ":serialized:": "gA=="}},
+        data={
+            "num_timesteps": 1_000, "clip_range": 0.2,
+            "_last_original_obs": {":type:": "ndarray", ":serialized:": "gA=="},
+        },
     ),
     "zip, CrossQ": lambda folder: write_zip(
         folder,

@@ -5,7 +5,6 @@ None may run code, import what lies in the current folder, end in a traceback, o
 
 import json
 import os
-import sys
 from base64 import b64encode
 from collections.abc import Callable
 from functools import partial
@@ -17,16 +16,16 @@ from attacks import Trial, child, command, crafted_agents, folders, resisted
 from attacks.crafted_runs import evil
 from attacks.folders import ESCAPE, plant_modules
 from attacks.forgery import setting
-from attacks.honest import ARGUMENTS, diagnose, drive, explain, most
+from attacks.honest import ARGUMENTS, agent, answering, drive, explain, most, robot
 from attacks.material import TASK, Material
-from hyrl_mj.errors import BadInput
 
 # Seconds of the processor within which what is tried in a process of its own must be refused.
 LONGEST = 20.0
+CIRCLE = "hyrl_mj/UnitCircle-v0"
 IDS = (
-    *4 * ("hyrl_mj/UnitCircle-v0", "hyrl_mj/Vehicle-v0", "Reacher-v5", "Ant-v5"), "CartPole-v1",
+    *4 * (CIRCLE, "hyrl_mj/Vehicle-v0", "Reacher-v5", "Ant-v5"), "CartPole-v1",
     "evil:Env-v0", "evil:UnitCircle-v0", "os:Env-v0", "evil", "", ".", "../evil", "a" * 5_000, ESCAPE,
-    "hyrl_mj/UnitCircle-v0 ", "evil.sub:Env-v0", ":Env-v0", "evil:hyrl_mj/UnitCircle-v0",
+    f"{CIRCLE} ", "evil.sub:Env-v0", ":Env-v0", "evil:hyrl_mj/UnitCircle-v0",
 )  # fmt: skip
 DIGITS = int("9" * 400)
 NAMES = (
@@ -43,6 +42,18 @@ NAMES = (
 EXPRESSIONS = (
     "__import__('os').system('touch executed')", "open('executed', 'w')", "(" * 5_000, "x" * 100_000,
     "info['a'].__class__", "reward >= 1e400", "distance('a', 'b') <= 1 ** 99999999", ESCAPE, "lambda: 1",
+)  # fmt: skip
+# Share of the descriptions in which one thing is wrong: in the others there are several.
+POINTED = 0.6
+# What tells arguments of the robot arm from those of the circle.
+ROBOT = {"xml_file", "frame_skip", *ARGUMENTS}
+# Arguments of which one is wrong.
+WRONG: tuple[dict[str, Any], ...] = (
+    {"pinned": {"qpos[²]": 1}}, {"pinned": {"core": 1}}, {"pinned": {"__class__": 1}},
+    {"reset": {"z": [1, [2]]}}, {"pinned": {"qpos[0]": DIGITS}}, {"noisy": [10**400]},
+    {"bounds": {"theta": [0, float("inf")]}}, {"chart": {"\x1b[31m": "theta"}},
+    {"chart": ["a" * 3_000_000]}, {"success": "(" * 5_000}, {"success": "a" * 100_000},
+    {"kwargs": {"\x1b": 1}}, {"steps": 10**400}, {"seed": -(10**400)},
 )  # fmt: skip
 # Hostile models: the text of an MJCF, in which {fifo} is a file that nobody writes to.
 # fmt: off
@@ -75,19 +86,20 @@ MODELS = {
 
 def trials(material: Material, draw: Random, count: int) -> list[Trial]:
     """Returns trials of each kind, drawn at random."""
-    # What makes a trial, what its memory is compared with, and how many of twenty are of this kind.
+    # What makes a trial, what its memory is compared with, and how many of 23 are of this kind.
     kinds = {
         "spec": (_spec, "run", 4),
         "arguments": (_arguments, "environment", 4),
-        "agent": (_agent, "agent", 4),
+        "agent": (_agent, "agent", 5),
         "model": (_model, "model", 3),
         "field": (_field, "field", 2),
         "sweep": (folders.sweep, "run", 1),
         "path": (folders.path, "run", 1),
         "threads": (folders.threads, "run", 1),
         "user": (folders.user, "run", 1),
+        "modules": (folders.modules, "environment", 1),
     }
-    turns = [kind for turn in range(4) for kind in kinds if kinds[kind][2] > turn]
+    turns = [kind for turn in range(5) for kind in kinds if kinds[kind][2] > turn]
     made = []
     for number in range(count):
         kind, seed = turns[number % len(turns)], draw.randrange(2**32)
@@ -155,15 +167,15 @@ def _described(draw: Random, folder: Path) -> dict[str, Any]:
 def _pointed(draw: Random, folder: Path) -> tuple[str, dict[str, Any]]:
     """Returns the id and the arguments of an environment in which nothing is wrong but one thing, at most."""
     name = draw.choice(NAMES)
-    return draw.choice(
-        (
-            ("hyrl_mj/UnitCircle-v0", {"kwargs": {"task": str(evil(folder))}}),
-            ("hyrl_mj/UnitCircle-v0", {"chart": {name: "theta"}}),
-            ("Reacher-v5", {"kwargs": {"xml_file": str(_written(draw, folder))}}),
-            ("Reacher-v5", {"kwargs": {"frame_skip": 10**9}}),
-            ("Reacher-v5", ARGUMENTS),
-        )
+    doors = (
+        {"kwargs": {"task": str(evil(folder))}},
+        {"chart": {name: "theta"}},
+        {"kwargs": {"xml_file": str(_written(draw, folder))}},
+        {"kwargs": {"frame_skip": 10**9}},
+        ARGUMENTS,
     )
+    given = draw.choice((*3 * doors, *WRONG))
+    return "Reacher-v5" if ROBOT & given.get("kwargs", given).keys() else CIRCLE, given
 
 
 def _written(draw: Random, folder: Path) -> Path:
@@ -202,7 +214,7 @@ def _spec(material: Material, memory: float, draw: Random, folder: Path) -> str:
     path = material.copy(folder)
     plant_modules(folder)
     env, given = draw.choice(IDS), _described(draw, folder)
-    if draw.random() < 0.4:
+    if draw.random() < POINTED:
         env, given = _pointed(draw, folder)
     spec = f"env:{json.dumps({'env': env, **given})}"
     spec = draw.choice(
@@ -223,9 +235,9 @@ def _spec(material: Material, memory: float, draw: Random, folder: Path) -> str:
 def _arguments(material: Material, memory: float, draw: Random, folder: Path) -> str:
     """A file of arguments that a stranger wrote, for an environment that the user names."""
     plant_modules(folder)
-    env = draw.choice(("Reacher-v5", "hyrl_mj/UnitCircle-v0", "Ant-v5"))
+    env = draw.choice(("Reacher-v5", CIRCLE, "Ant-v5"))
     given = _described(draw, folder)
-    if draw.random() < 0.4:
+    if draw.random() < POINTED:
         env, given = _pointed(draw, folder)
     text = json.dumps(given)
     text = draw.choice([text] * 9 + ["[" * 100_000, "{" * 1_000, '{"a":' * 50_000, "null", "1e400"])
@@ -241,16 +253,16 @@ def _model(material: Material, memory: float, draw: Random, folder: Path) -> str
     if broke := child(command("new-task", "robot"), folder).broke(ended=(0,)):
         return broke
     _written(draw, folder)
-    work = command("run", "robot.py", "--preset", "smoke")
-    return resisted(work, folder, memory, seconds=LONGEST)
+    return resisted(answering(robot), folder, memory, seconds=LONGEST)
 
 
 def _agent(material: Material, memory: float, draw: Random, folder: Path) -> str:
     """An agent whose pickles are nested, shared, or refer to themselves."""
     keys = ("_last_obs", "_last_original_obs", "observation_space", "action_space")
     pickled = {":type:": "x", ":serialized:": b64encode(_pickle(draw)).decode()}
-    data = {"num_timesteps": 1_000, **dict.fromkeys(draw.sample(keys, 3), pickled)}
-    return resisted(diagnose(crafted_agents.write_zip(folder, data=data)), folder, memory)
+    # By its clip_range it is an agent of PPO, whose observations are looked at.
+    data = {"num_timesteps": 1_000, "clip_range": 0.2, **dict.fromkeys(keys, pickled)}
+    return resisted(agent(crafted_agents.write_zip(folder, data=data)), folder, memory)
 
 
 def _pickle(draw: Random) -> bytes:
@@ -294,12 +306,5 @@ def _field(material: Material, memory: float, draw: Random, folder: Path) -> str
     if draw.random() < 0.3:
         text = "{" + ",".join(f'"k{i % 20_000}":1' for i in range(40_000)) + "}"
 
-    def work() -> None:
-        try:
-            drive()
-        except BadInput as error:
-            print(f"hyrl-mj: {error}", file=sys.stderr)
-            sys.exit(2)
-
     (folder / "field.json").write_text(text, encoding="utf-8")
-    return resisted(work, folder, memory)
+    return resisted(answering(drive), folder, memory)

@@ -3,6 +3,8 @@
 import csv
 import json
 import re
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from html import unescape
 from itertools import chain
@@ -16,6 +18,7 @@ import hyrl_mj
 from attacks import child, command, resisted
 from attacks.crafted_runs import evil
 from attacks.forgery import setting, write
+from attacks.honest import ARGUMENTS
 from attacks.material import RUN, TASK, Material
 from attacks.small import become_nobody
 
@@ -30,8 +33,12 @@ MODULES = (
     "mujoco",
     "evil",
     "gymnasium_robotics",
+    "ogbench",
+    "shimmy",
     "sitecustomize",
 )
+# The command line in a new process.
+PROGRAM = "import sys; from hyrl_mj.cli import main; sys.argv[0] = 'hyrl-mj'; main()"
 # Names of run directories that a shell, a format or a parser could take for something else.
 PATHS = (
     " a b ", "it's", 'q"q', "-dash", "--out", "x" * 200, "über", "$(touch executed)", "`touch executed`",
@@ -44,6 +51,20 @@ def plant_modules(folder: Path) -> None:
     """Puts modules into the current folder that leave the marker behind."""
     for name in MODULES:
         evil(folder, f"{name}.py")
+
+
+def modules(material: Material, memory: float, draw: Random, folder: Path) -> str:
+    """Modules in the current folder of a new process, which has imported nothing yet."""
+    plant_modules(folder)
+    explain = ("diagnose", "--explain", "--env", "Reacher-v5", "--env-args", "arguments.json")
+    (folder / "arguments.json").write_text(json.dumps(ARGUMENTS), encoding="utf-8")
+    words = draw.choice((("doctor",), ("list",), ("report", "."), explain, explain))
+
+    def work() -> None:
+        command = [sys.executable, "-P", "-c", PROGRAM, *words]
+        sys.exit(subprocess.run(command, check=False).returncode)
+
+    return resisted(work, folder, memory, seconds=60)
 
 
 def path(material: Material, memory: float, draw: Random, folder: Path) -> str:

@@ -1,13 +1,19 @@
 """The memory that something honest takes, with which that of something hostile is compared."""
 
 import json
+import sys
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
 from attacks import child, command, crafted_agents
 from attacks.damage import open_everything
-from attacks.material import RUN, TASK, Material
+from attacks.material import RUN, TASK, Material, once
+from hyrl_mj.errors import HyrlError
+from hyrl_mj.fields import read_field
+from hyrl_mj.fields.driving import Driving
+from hyrl_mj.policies import read_agent
+from hyrl_mj.tasks import get_task
 
 Work = Callable[[], object]
 FIELD = {
@@ -19,7 +25,7 @@ FIELD = {
 ARGUMENTS = {"pinned": {"qpos[2]": -0.15, "qpos[3]": 0.0}, "success": "reward >= 1"}
 
 
-@cache
+@once
 def most(material: Material, kind: str) -> float:
     """Returns the most memory that a process takes for what is honest [MB], which must not be refused."""
     folder, highest = material.folder / f"honest_{kind}", 0.0
@@ -53,15 +59,34 @@ def opened_in_every_way(path: Path) -> list[Work]:
     ]
 
 
+def agent(name: str) -> Work:
+    """Reads an agent, as all commands that take one do."""
+    return answering(lambda: read_agent(get_task(TASK), name))
+
+
+def robot() -> None:
+    """Compiles the model of robot.py."""
+    assert get_task("robot.py").model is not None
+
+
 def drive() -> None:
     """Reads field.json, and makes what drives through it."""
-    from hyrl_mj.fields import read_field
-    from hyrl_mj.fields.driving import Driving
-    from hyrl_mj.tasks import get_task
-
     field = read_field("field.json")
     task = Driving(get_task("field"), field.layouts, time=field.time, starts=field.starts)
     assert task.model is not None
+
+
+def answering(work: Work) -> Work:
+    """Returns some work whose error is a sentence, as that of the command line."""
+
+    def answered() -> None:
+        try:
+            work()
+        except HyrlError as error:
+            print(f"hyrl-mj: {error}", file=sys.stderr)
+            sys.exit(error.exit_status)
+
+    return answered
 
 
 def _runs(material: Material, folder: Path) -> list[Work]:
@@ -69,7 +94,7 @@ def _runs(material: Material, folder: Path) -> list[Work]:
 
 
 def _agents(material: Material, folder: Path) -> list[Work]:
-    return [diagnose(name) for name in crafted_agents.honest(folder)]
+    return [agent(name) for name in crafted_agents.honest(folder)]
 
 
 def _arguments(material: Material, folder: Path) -> list[Work]:
@@ -78,12 +103,12 @@ def _arguments(material: Material, folder: Path) -> list[Work]:
 
 
 def _models(material: Material, folder: Path) -> list[Work]:
-    return [command("new-task", "robot"), command("run", "robot.py", "--preset", "smoke")]
+    return [command("new-task", "robot"), answering(robot)]
 
 
 def _fields(material: Material, folder: Path) -> list[Work]:
     (folder / "field.json").write_text(json.dumps(FIELD), encoding="utf-8")
-    return [drive]
+    return [answering(drive)]
 
 
 WORKS: dict[str, Callable[[Material, Path], list[Work]]] = {

@@ -8,13 +8,13 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from random import Random
 
 from attacks import Trial, child, command, crafted_agents, differences
 from attacks.honest import FIELD
-from attacks.material import RUN, TASK, Material
+from attacks.material import RUN, TASK, Material, once
 
 SIGNALS = (signal.SIGKILL, signal.SIGINT, signal.SIGTERM)
 AGENT = (
@@ -40,8 +40,8 @@ COMMANDS = {
     "drive": ("drive", "field", "--field", "field.json", "--out", PICTURE),
     "sweep": SWEEP,
 }
-# A sweep takes half a minute, of which Ray takes most: it is killed once where others are several times.
-OFTEN = {"sweep": 1 / 5}
+# Of so many kills those of each command: of those that take long fewer.
+SHARES = {"run": 4, "diagnose": 14, "robustify": 4, "drive": 26, "sweep": 2}
 
 
 @dataclass(frozen=True)
@@ -54,10 +54,10 @@ class Whole:
 
 def trials(material: Material, draw: Random, count: int) -> list[Trial]:
     """Returns trials at moments that are spread over the time that each command takes."""
-    found, chosen = [], [*COMMANDS][:count]
-    for place, name in enumerate(chosen):
-        made, several = whole(material, name), len(range(place, count, len(chosen)))
-        several = max(round(several * OFTEN.get(name, 1)), 1)
+    found = []
+    for name in [*COMMANDS][:count]:
+        made = whole(material, name)
+        several = max(count * SHARES[name] // sum(SHARES.values()), 1)
         for number in range(several):
             moment = made.seconds * (number + draw.random()) / several
             sent = SIGNALS[number % len(SIGNALS)]
@@ -67,7 +67,7 @@ def trials(material: Material, draw: Random, count: int) -> list[Trial]:
     return found
 
 
-@cache
+@once
 def whole(material: Material, name: str) -> Whole:
     """Gives a command that nothing disturbs."""
     folder = material.folder / f"whole_{name}"

@@ -1,9 +1,12 @@
 """The finished runs that are attacked, made when they are first asked for."""
 
 import shutil
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cache, wraps
 from pathlib import Path
+from threading import Lock
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,6 +23,21 @@ TASK = "unit_circle"
 RUN = ("run", TASK, "--preset", "smoke", "--out", TASK)
 
 
+Made = TypeVar("Made")
+
+
+def once(make: Callable[..., Made]) -> Callable[..., Made]:
+    """Caches what a function makes: one thread makes it, and others that ask for it wait."""
+    kept, lock = cache(make), Lock()
+
+    @wraps(make)
+    def found(*arguments: object) -> Made:
+        with lock:
+            return kept(*arguments)
+
+    return found
+
+
 @dataclass(frozen=True)
 class Material:
     """Runs of preset smoke, which nothing disturbed.
@@ -30,19 +48,18 @@ class Material:
 
     folder: Path
 
+    @once
     def finished(self, *options: str) -> Path:
         """Returns the run directory of `hyrl-mj run` with these options."""
         path = self.folder / "_".join(("material", *options)).replace("-", "")
-        if not path.exists():
-            path.mkdir()
-            self.do(path, [(*RUN, *options)])
+        path.mkdir()
+        self.do(path, [(*RUN, *options)])
         return path / TASK
 
+    @once
     def field(self) -> Path:
         """Returns a run directory of `field` whose policies, which are not trained, drive straight on."""
         path = self.folder / "material_field" / "field"
-        if path.exists():
-            return path
         task = hyrl_mj.get_task("field")
         levels, observed = task.input_levels, len(task.observation_low)
         weights = {

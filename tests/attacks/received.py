@@ -6,42 +6,56 @@ from pathlib import Path
 from random import Random
 
 from attacks import Trial, crafted_agents, crafted_models, crafted_runs, resisted
-from attacks.honest import diagnose, most, opened_in_every_way
+from attacks.honest import agent, most, opened_in_every_way
 from attacks.material import TASK, Material
 
 # What must neither change nor be shown: it lies beside what was received.
 VICTIM, SECRET = "victim", "this is the user's own text, and nobody else's"
 
 
-def trials(material: Material, draw: Random, count: int) -> list[Trial]:
-    """Returns a trial for each crafted file, or some of them."""
-    agents = crafted_agents.FILES | crafted_models.FILES
-    every = [
-        Trial(f"agent: {name}", partial(_agent, build, most(material, "agent")))
-        for name, build in agents.items()
+def agents(material: Material, draw: Random, count: int) -> list[Trial]:
+    """Returns a trial for each crafted agent, or some of them."""
+    built = crafted_agents.FILES | crafted_models.FILES
+    return [
+        Trial(name, partial(_agent, built[name], most(material, "agent")))
+        for name in draw.sample([*built], min(count, len(built)))
     ]
-    every += [
-        Trial(f"run directory: {name}", partial(_run, material, build, most(material, "run")))
-        for name, build in crafted_runs.DIRECTORIES.items()
+
+
+def runs(material: Material, draw: Random, count: int) -> list[Trial]:
+    """Returns a trial for each crafted run directory, or some of them; each is used in two more ways."""
+    built = crafted_runs.DIRECTORIES
+    return [
+        Trial(
+            name,
+            partial(
+                _run, material, built[name], draw.sample(range(1, 5), 2), most(material, "run")
+            ),
+        )
+        for name in draw.sample([*built], min(count, len(built)))
     ]
-    return every if count >= len(every) else draw.sample(every, count)
 
 
 def _agent(build: Callable[[Path], str], memory: float, folder: Path) -> str:
-    """Examines a crafted agent, which must be refused."""
+    """Reads a crafted agent, which must be refused."""
     _hide(folder)
     name = build(folder)
-    return resisted(diagnose(name), folder, memory, ended=(2,)) or _touched(folder)
+    return resisted(agent(name), folder, memory, ended=(2,)) or _touched(folder)
 
 
 def _run(
-    material: Material, build: Callable[[Path, Path], None], memory: float, folder: Path
+    material: Material,
+    build: Callable[[Path, Path], None],
+    ways: list[int],
+    memory: float,
+    folder: Path,
 ) -> str:
-    """Opens a crafted run directory in every way, none of which may do harm."""
+    """Opens a crafted run directory, and uses it in some ways, none of which may do harm."""
     _hide(folder)
     path = material.copy(folder)
     build(folder, path)
-    for work in opened_in_every_way(path):
+    every = opened_in_every_way(path)
+    for work in every[:1] + [every[way] for way in sorted(ways)]:
         if broke := resisted(work, folder, memory) or _touched(folder):
             return broke
     return ""

@@ -14,19 +14,27 @@ from typing import Any
 
 from matplotlib.mathtext import MathTextParser
 
+import hyrl_mj.proof.assumptions as assumptions
+import hyrl_mj.proof.cells as cells
 import hyrl_mj.proof.examination as examination
+import hyrl_mj.proof.replays as replays
 import hyrl_mj.stages.results as results
+import hyrl_mj.viz.diagnosis as diagnosis
+import hyrl_mj.viz.drives as drives
 import hyrl_mj.viz.figures.style as style
 import hyrl_mj.viz.replay as replay
 from hyrl_mj import cli
 from hyrl_mj.environments.task import EnvironmentTask
 from hyrl_mj.learning import presets
+from hyrl_mj.system import limits
 from hyrl_mj.tasks import Task
 from hyrl_mj.tasks.unit_circle import UnitCircle
 from hyrl_mj.viz.figures import FIGURES
 
 SIZE, FPS = (480, 160), 2
 LATTICE = 130  # about the least with cells no longer than a sample on the circle
+# Within which what is tried in a process of its own must end: of the processor, and in all [s].
+SECONDS, LONGEST = 4, 10.0
 KEPT = {"extended_sets", "robustness_map"}  # of the figures
 # Set where the program has to run without the rights of root, in a folder that cannot be written.
 NOBODY = "ATTACK_AS_NOBODY"
@@ -72,8 +80,14 @@ def shorten() -> None:
     presets._SMOKE_MODES = 1_024
     examination.CURVE = examination.CURVE[::8]
     results.EPISODES = 64
+    assumptions.COMPARED = cells.STATES = 300
+    replays.STARTS = dict.fromkeys(replays.STARTS, 40)
     for kind in (Task, EnvironmentTask):
         kind.effort = replace(kind.effort, checkpoints=2)
+    # What never ends is stopped earlier, but not before a busy machine has started what is honest.
+    limits.limit.__defaults__ = (SECONDS, limits.MEMORY)
+    limits.tried.__kwdefaults__ |= {"seconds": SECONDS, "longest": LONGEST}
+    limits.LONGEST = LONGEST
     style.DPI = 30
     style.STYLE["pdf.fonttype"] = 3
     for name in FIGURES.keys() - KEPT:
@@ -86,7 +100,8 @@ def shorten() -> None:
     ) -> None:
         render(task, shows, path, replace(options, size=SIZE, fps=FPS), **more)
 
-    replay.render_replay = render_small
+    for module in (replay, diagnosis, drives):
+        module.render_replay = render_small  # type: ignore[attr-defined]
 
 
 def become_nobody() -> None:
