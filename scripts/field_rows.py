@@ -182,9 +182,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=style)
     parser.add_argument("run", type=Path)
     parser.add_argument("--fields", type=int, default=100)
-    parser.add_argument(
-        "--posts", type=int, help="posts of each field; by default 3 to 12, by turns"
-    )
+    parser.add_argument("--posts", type=int, nargs="+", default=(4, 8, 12), help="of a field")
     parser.add_argument("--starts", type=int, default=4, help="of each field, half of them on M*")
     parser.add_argument(
         "--moving", action="store_true", help="half of the posts move, at up to 0.4 m/s"
@@ -197,7 +195,7 @@ def main() -> None:
     given = parser.parse_args()
     run = hyrl_mj.load_run(given.run)
     rows: dict[str, Row] = {}
-    sizes = [given.posts] if given.posts else range(3, 13)
+    sizes = given.posts
     bounds = Bounds(speeds=0.5) if given.moving else Bounds()
     for posts in sizes:
         rng = np.random.default_rng([given.seed, posts])

@@ -257,6 +257,10 @@ def test_half_of_the_starts_lie_near_the_critical_set(vehicle):
     assert vehicle.may_start(starts).all()
     np.testing.assert_array_equal(starts, attack_starts(vehicle, Regions(points), EPS, 100, seed=0))
     assert len(attack_starts(vehicle, Regions(np.empty((0, 2))), EPS, 100, seed=0)) == 100
+    near = attack_starts(vehicle, Regions(points, near=True), EPS, 100, seed=0)
+    assert Regions(points).split(vehicle, EPS, near)["near M*"].all()
+    with pytest.raises(BadInput, match="the critical set is empty"):
+        attack_starts(vehicle, Regions(np.empty((0, 2)), near=True), EPS, 100, seed=0)
 
 
 def test_only_starts_are_attacked_all_of_whose_nodes_are_winnable(vehicle):

@@ -45,7 +45,7 @@ class ExamineOptions:
             last in environments of others.
         all_coordinates: add noise to every coordinate of the measurement, not only to the noisy ones of the
             task; always, if the run was made so.
-        near_critical: start all episodes within twice the bound of the critical set.
+        near_critical: start all episodes and the attack within twice the bound of the critical set.
         seed: seed of starts and noise of the episodes and of the attack.
         attack_starts: number of starts of an attack; by default 400, or 100 in environments of others and
             with preset smoke.
@@ -108,7 +108,7 @@ def examine_stage(run: Run, say: Say, options: ExamineOptions = USUAL) -> None:
     budget = options.budget(run)  # a wrong one is refused before the work
     robustness, maps = examine_controllers(run, run.loops, run.split, options)
     if budget is not None:
-        regions = Regions(run.critical_set.points, _winnable(run, maps))
+        regions = Regions(run.critical_set.points, _winnable(run, maps), options.near_critical)
         attacks = attack_controllers(run, run.loops, regions, budget, options)
         counts = tuple(found.count for found in attacks.values())
         quiet = {name: found.quiet for name, found in attacks.items()}

@@ -132,11 +132,14 @@ class Attack:
 
 
 def attack_starts(task: Task, regions: Regions, bound: float, n: int, seed: int) -> np.ndarray:
-    """Returns n starts (n, d): half of them within twice the bound of M*.
+    """Returns n starts (n, d): half of them within twice the bound of M*, or all if the regions say so.
 
     The others are drawn as the task draws them; so are all where M* is empty or far from the starts. Where
     it is known which starts are winnable, only these are taken: fewer than n if they are rare. If none is
     found, all starts are taken.
+
+    Raises:
+        BadInput: all are to lie near M*, and no start does, or none that may be won.
     """
     check_seed(seed)
     rng = np.random.default_rng([seed, 2])
@@ -150,6 +153,14 @@ def attack_starts(task: Task, regions: Regions, bound: float, n: int, seed: int)
                 break
         return kept[:count]
 
+    if regions.near:
+        starts = drawn(regions, n)
+        if not len(starts):
+            raise BadInput(
+                f"no start of {task.name} near its critical set is known to be winnable: leave "
+                "--near-critical out"
+            )
+        return starts
     near = np.empty((0, task.chart.dimension))
     with suppress(BadInput):  # where no start lies near M*
         near = drawn(replace(regions, near=True), n // 2)
