@@ -26,26 +26,13 @@ import hyrl_mj
 from hyrl_mj.fields import Bounds, Driving, FocusController
 from hyrl_mj.fields.controller import WithoutMemory
 from hyrl_mj.fields.guard import Guard
+from hyrl_mj.fields.law import TangentLaw
 from hyrl_mj.policies import Controller, PolicyController
 from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
 from hyrl_mj.stages import Budget, attack
 from hyrl_mj.tasks import LEFT, RIGHT, Outcome
 
 LATE = 2.0
-
-
-@dataclass(frozen=True)
-class Law:
-    """Drives along the way past a post, on one side: speed cos t, rate of turn 4 t, for the angle t to it."""
-
-    side: int
-
-    def inputs(self, observed: np.ndarray) -> np.ndarray:
-        """Returns inputs (n, 2) for observations (n, 17) of `Field`."""
-        sign = 1.0 if self.side == LEFT else -1.0
-        cos, sin = (observed[:, 10:12] + sign * observed[:, 12:14]).T
-        turn = np.arctan2(sin, cos)
-        return np.stack([np.clip(np.cos(turn), 0, 1), np.clip(4 * turn, -1, 1)], axis=1)
 
 
 class Random:
@@ -101,7 +88,7 @@ class Parts(FocusController):
 def rows_of(run: hyrl_mj.Run, task: Driving, seed: int) -> dict[str, Controller]:
     """Returns the controllers by what they are made of."""
     noise, trained = run.settings.noise, run.mode_policies
-    law: Mapping = {side: Law(side) for side in (LEFT, RIGHT)}
+    law: Mapping = {side: TangentLaw(task.local, side) for side in (LEFT, RIGHT)}
     drawing: Mapping = dict.fromkeys((LEFT, RIGHT), Random(seed))
 
     def parts(policies: Mapping, memory: bool, guarded: bool) -> Parts:

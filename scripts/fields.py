@@ -236,7 +236,7 @@ def try_published(run: hyrl_mj.Run, path: Path, rounds: int, table: Table) -> No
             task = Driving(run.task, layouts, Bounds(), 0.1 + place, TIME, starts)
             for who, loop in loops_of(run, task).items():
                 tally = Tally()
-                for side in (None, 0, 1) if who == "hyrl" else (None,):
+                for side in (None, 0, 1) if who != "policy" else (None,):
                     begun = loop if side is None else loop.on_side(side)
                     drive(
                         task,
@@ -250,7 +250,7 @@ def try_published(run: hyrl_mj.Run, path: Path, rounds: int, table: Table) -> No
             task = Driving(run.task, layouts, Bounds(), 0.2, TIME, starts)
             for who, loop in loops_of(run, task).items():
                 tally = Tally()
-                for side in (None, 0, 1) if who == "hyrl" else (None,):
+                for side in (None, 0, 1) if who != "policy" else (None,):
                     begun = loop if side is None else loop.on_side(side)
                     drive_attacked(task, who, begun, starts, rounds, tally)
                 table.add_row(name, "attack 0.1, 0.05", who, *tally.row())

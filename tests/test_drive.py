@@ -29,8 +29,9 @@ from hyrl_mj.fields import (
     read_field,
 )
 from hyrl_mj.fields.drives import bounds_asked_for, bounds_made_for
+from hyrl_mj.fields.law import TangentLaw
 from hyrl_mj.policies import ObservationPolicy
-from hyrl_mj.tasks import LEFT, RIGHT
+from hyrl_mj.tasks import LEFT, RIGHT, wrapped
 from hyrl_mj.viz.colours import MODES
 from hyrl_mj.viz.drives import drive_sentences
 
@@ -296,10 +297,24 @@ def test_the_observation_of_the_tests_is_that_of_the_task(planted):
         np.testing.assert_allclose(policy.inputs(observed)[0, 1], turn, atol=1e-9)
 
 
+def test_the_law_of_the_modes_turns_to_the_way_on_its_side():
+    task = hyrl_mj.get_task("field")
+    nothing, usual = np.zeros(50), np.full(50, len(task.layouts) - 1)
+    measured = task.measured_at(task.starts(50, np.random.default_rng(0)), nothing, usual)
+    measured = np.column_stack([measured, nothing])  # no sense of turning
+    directions, _ = task.directions(measured)
+    for side in (LEFT, RIGHT):
+        turn = wrapped(directions[:, side] - measured[:, 2])
+        expected = np.stack([np.maximum(np.cos(turn), 0), np.clip(4 * turn, -1, 1)], axis=1)
+        np.testing.assert_allclose(TangentLaw(task, side).act(measured), expected, atol=1e-9)
+
+
 def test_both_controllers_drive_from_every_start(planted, read):
     field = read(posts=[POST, post(-4.5, 2)], starts=[start(-6, 0.3), start(-6, -0.3)])
     result = driven(planted, field)
-    assert {name: len(arcs) for name, arcs in result.arcs.items()} == {"policy": 2, "hyrl": 2}
+    assert {name: len(arcs) for name, arcs in result.arcs.items()} == dict.fromkeys(
+        ("policy", "hyrl", "law"), 2
+    )
     assert result.attacked == {}
     task = result.task
     assert task.reached == pytest.approx(0.2)
@@ -432,7 +447,7 @@ def test_more_noise_than_that_of_the_run_is_said(planted):
 def test_an_attack_is_at_least_as_bad(planted, read, monkeypatch):
     monkeypatch.setattr(drives, "ROUNDS", 1)
     result = driven(planted, read(time_s=8), attack=True, eps=0.05)
-    assert set(result.attacked) == {"policy", "hyrl"}
+    assert set(result.attacked) == {"policy", "hyrl", "law"}
     assert result.attacked["hyrl"][0].noise == "attack"
     clearance = [
         least_clearance(result.task, arcs["hyrl"][0]) for arcs in (result.attacked, result.arcs)
@@ -465,7 +480,7 @@ def test_the_command_prints_a_table_and_writes_nothing(command, written, tmp_pat
     flat = " ".join(out.split())
     assert "2 posts: alternating noise of 0.12 m, 0.06 rad, seed 0" in flat
     assert "-6.00 m, 0.10 m, 0.00 rad" in flat
-    assert "RL policy arrives from 0 of 1 starts, HyRL from 1" in flat
+    assert "RL policy arrives from 0 of 1 starts, HyRL from 1, and HyRL from 1 if its modes" in flat
     assert any("0.5 m apart" in record.getMessage() for record in caplog.records)
     assert any("noise of 0.12 m" in record.getMessage() for record in caplog.records)
     assert [p.name for p in tmp_path.iterdir()] == ["field.json"]

@@ -13,6 +13,7 @@ from hyrl_mj.fields.driving import Driving
 from hyrl_mj.fields.files import MOST_POSTS
 from hyrl_mj.fields.focus import choose, turn_sense
 from hyrl_mj.fields.guard import Guard
+from hyrl_mj.fields.law import TangentLaw
 from hyrl_mj.fields.modes import MODES_OF_POST, decoded, encoded
 from hyrl_mj.fields.seen import Seen
 from hyrl_mj.policies import (
@@ -217,11 +218,14 @@ def controllers(
     policies: Mapping[int, ObservationPolicy],
     noise: float,
 ) -> dict[str, Controller]:
-    """Returns the controllers of a field by name: the stage-1 policy alone, and the hybrid controller.
+    """Returns the controllers of a field by name: the stage-1 policy alone, HyRL, and HyRL without learning.
 
-    The noise [m] is what the hybrid controller has to bear.
+    In the modes of the last one a law acts, which tells what is gained by learning. The noise [m] is what
+    the hybrid controllers have to bear.
     """
+    laws = {side: TangentLaw(task.local, side) for side in (LEFT, RIGHT)}
     return {
         "policy": PolicyController(WithoutMemory(task, policy)),
         "hyrl": FocusController(task, policies, noise),
+        "law": FocusController(task, laws, noise),
     }

@@ -1,4 +1,4 @@
-"""Drives: both controllers go through a field from its starts, under the same noise."""
+"""Drives: controllers go through a field from its starts, under the same noise."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def bounds_asked_for(options: DriveOptions, made_for: Bounds) -> Bounds:
 
 @dataclass(frozen=True)
 class Drives:
-    """Runs through a field: an arc for each start, by controller, "policy" and "hyrl".
+    """Runs through a field: an arc for each start, by controller, "policy", "hyrl" and "law".
 
     A run that arrives comes within `task.reached` of the goal, and touches no post on the whole way.
 
@@ -93,7 +93,7 @@ def drive(
     field: FieldFile,
     options: DriveOptions = DriveOptions(),
 ) -> Drives:
-    """Drives through a field from all its starts, with the stage-1 policy alone and with HyRL.
+    """Drives through a field from all its starts, with the controllers of `controllers`.
 
     Args:
         local: the task on which the policies were trained.

@@ -28,6 +28,9 @@ from hyrl_mj.viz.options import USUAL, ReplayOptions
 from hyrl_mj.viz.replay import Show, check_replay, render_replay
 from hyrl_mj.viz.tables import NAMES, Table, print_table
 
+# The controllers with columns of their own, and panes in a replay.
+SHOWN = ("policy", "hyrl")
+
 
 def drive_tables(drives: Drives, noise: str, seed: int) -> list[Table]:
     """Returns how the runs ended, a row for each start; under the worst noise, too, if it was looked for."""
@@ -44,13 +47,13 @@ def drive_tables(drives: Drives, noise: str, seed: int) -> list[Table]:
 
 def _table(drives: Drives, arcs: Mapping[str, Sequence[HybridArc]], title: str) -> Table:
     task, rows = drives.task, []
-    for number, (policy, hyrl) in enumerate(zip(*arcs.values(), strict=True)):
+    for number, (policy, hyrl) in enumerate(zip(*(arcs[n] for n in SHOWN), strict=True)):
         x, y, heading = hyrl.z[0]
         row = [f"{number}", f"{x:.2f} m, {y:.2f} m, {heading:.2f} rad"]
         for arc in (policy, hyrl):
             row += [f"{ending(task, arc)} {arc.t[-1]:.2f} s", f"{least_clearance(task, arc):.2f} m"]
         rows.append([*row, f"{changes(hyrl)}"])
-    both = [title for name in arcs for title in (NAMES[name], "least clearance")]
+    both = [title for name in SHOWN for title in (NAMES[name], "least clearance")]
     return Table(title, ["", "start", *both, "changes of focus or side"], rows)
 
 
@@ -64,12 +67,15 @@ def drive_sentences(drives: Drives) -> list[str]:
 
 def _arrivals(drives: Drives, arcs: Mapping[str, Sequence[HybridArc]]) -> str:
     counts = []
-    for name in ("policy", "hyrl"):
+    for name in arcs:
         ends = [ending(drives.task, arc) for arc in arcs[name]]
         arrives = f"{ends.count('arrived')}" + f" of {len(ends)} starts" * (name == "policy")
         waits = ends.count("waited")
         counts.append(arrives + f" and waits near a post at the goal from {waits}" * (waits > 0))
-    return f"RL policy arrives from {counts[0]}, HyRL from {counts[1]}"
+    return (
+        f"RL policy arrives from {counts[0]}, HyRL from {counts[1]}, and HyRL from {counts[2]} if its modes "
+        "drive by a law without learning"
+    )
 
 
 def drive_shows(drives: Drives, title: str, starts: Sequence[int] | None = None) -> list[Show]:
