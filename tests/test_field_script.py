@@ -3,13 +3,14 @@
 import json
 import runpy
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import hyrl_mj
 from hyrl_mj.fields import Driving
-from hyrl_mj.tasks import Layouts
+from hyrl_mj.tasks import LEFT, RIGHT, Layouts
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "fields.py"
 
@@ -74,3 +75,27 @@ def test_outcomes_are_counted(script):
     script["drive"](task, Ahead(), z, None, tally)
     assert tally.outcomes == {"crashed": 1, "reached": 1, "stalled": 1}
     assert tally.row()[:3] == ["3", "1", "1"]
+
+
+def test_the_rows_lack_what_their_names_say(script, monkeypatch):
+    monkeypatch.syspath_prepend(SCRIPT.parent)
+    rows_of = runpy.run_path(str(SCRIPT.with_name("field_rows.py")))["rows_of"]
+    task = hyrl_mj.get_task("field")
+    layouts = script["drawn"](np.random.default_rng(0), 4, 2, moving=False)
+    ahead = SimpleNamespace(inputs=lambda observed: np.tile([1.0, 0.0], (len(observed), 1)))
+    settings, policies = SimpleNamespace(noise=0.1), dict.fromkeys((LEFT, RIGHT), ahead)
+    run = SimpleNamespace(settings=settings, policy=ahead, mode_policies=policies)
+    loops = rows_of(run, Driving(task, layouts), seed=0)
+    # 0.15 m in front of the first post of the first field, with the face to it.
+    post, radius = layouts.tracks[0, 0, 0], layouts.radii[0, 0]
+    pose = np.array([[post[0] - radius - 0.25, post[1], 0.0]])
+    measured = loops["law, both"].task.measured_at(pose, np.zeros(1), np.zeros(1, int))
+    measured = np.column_stack([measured, [0]])
+    q = np.array([2])  # the first post is in focus, and is passed on the right
+    answers = {name: loops[name].step(q, measured) for name in list(loops)[1:-1]}
+    speed = {name: u[0, 0] for name, (u, _) in answers.items()}
+    assert speed["learned, neither"] == speed["learned, memory"] == 1.0
+    assert speed["learned, guard"] == speed["learned, both (HyRL)"] < 0.1
+    assert [answers[name][1][0] for name in ("learned, memory", "learned, both (HyRL)")] == [2, 2]
+    left, right = (loops["learned, guard"].step(np.array([q]), measured) for q in (0, 2))
+    np.testing.assert_array_equal(left[1], right[1])  # without a memory of the side
