@@ -16,7 +16,7 @@ RATE = 3.0
 # A robot retreats only from a post that is ahead of it or behind it: the cosine of the angle between its axis
 # and the post's direction is at least this. Elsewhere that would not take it away.
 STEEP = 0.5
-# With its face to its way a robot drives ahead with at least this speed [m/s].
+# With its face to its way a robot drives ahead with at least this speed [m/s], or turns so [rad/s].
 LEAST = 0.3
 
 
@@ -47,7 +47,7 @@ class Guard:
 
         A policy may have headings at which it stands, and noise can hold a robot at the edge of such. So a
         robot with its back to its way turns round in the sense of its mode, and one with its face to it
-        drives ahead, no faster than it can turn to the goal. One that a post beside it holds back turns away
+        drives ahead, no faster than it can turn to the goal, and turns to its way if it hardly goes on. One that a post beside it holds back turns away
         from that post. It drives backward only from a post that comes.
 
         Args:
@@ -60,7 +60,14 @@ class Guard:
         back = creep < 0
         speed = np.minimum(np.maximum(u[:, 0], creep), self._approach(seen))
         speed = np.where(back, 0.0, speed)
-        rates = np.where(back, sense * self.rate, u[:, 1])
+        # Along the way, or with the face towards it: one that stands beside its way turns to it.
+        going = speed * np.cos(turn) + u[:, 1] * np.sin(turn)
+        least_rate = LEAST * np.sin(turn)
+        turning = np.where(
+            turn < 0, np.minimum(u[:, 1], least_rate), np.maximum(u[:, 1], least_rate)
+        )
+        rates = np.where(going < LEAST, towards, u[:, 1])
+        rates = np.where(back, sense * self.rate, rates)
         least, most, aside = self.bounds(seen)
         bounded = np.minimum(np.maximum(speed, least), most)
         bounded = np.where(least > most, (least + most) / 2, bounded)
