@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from test_certificate import linear
+from test_checks import PY as PYTHON, XML, changed
 from test_truer_tasks import PY, write
 from trapped_plants import dial, drawn
 
@@ -193,3 +194,22 @@ def test_noise_of_columns_in_another_order_than_the_chart_is_refused(tmp_path):
     path = write(tmp_path, {"methods": methods, "ending": ending})
     with pytest.raises(BadInput, match="moves the chart's x by 1, and its share in noisy is 0"):
         check_task(get_task(path))
+
+
+SWAPPED = (XML, r'name="x"(.*)"1 0 0"/>\n(.*)"0 1 0"', r'name="x"\1"0 1 0"/>\n\2"1 0 0"')
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        SWAPPED,
+        (PYTHON, "max_steps = 70", "max_steps = 70\n    plane = (1, 0)"),
+        (PYTHON, "max_steps = 70", "max_steps = 70\n    plane = (0, 2)"),
+    ],
+)
+def test_a_chart_that_begins_with_another_place_is_refused(edit, tmp_path):
+    task = changed(tmp_path, edit, (PYTHON, r"mirror = Mirror\(.*\)", "mirror = None"))
+    with pytest.raises(
+        BadInput, match="begins with x and y, and these are not the place of tracked"
+    ):
+        check_task(task)

@@ -102,10 +102,11 @@ class Boxes:
         if type(members) is Everything:
             nowhere = np.full(self.counts, -np.inf)
             return nowhere, nowhere
-        chart = self.cells.lattice.grid.chart
-        if type(members) is not GridSet or members.regular.chart != chart:
+        if type(members) is not GridSet:
+            raise Unbounded(f"a {type(members).__name__} cannot be bounded: give sets on grids")
+        if members.regular.chart != self.cells.lattice.grid.chart:
             raise Unbounded(
-                f"a {type(members).__name__} cannot be bounded: give sets on grids of the chart"
+                "a set in another chart cannot be bounded: give sets in that of the task"
             )
         grid, values = members.regular, members.values.reshape(members.regular.counts)
         steep = 0.0

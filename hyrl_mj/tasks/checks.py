@@ -19,6 +19,7 @@ from hyrl_mj.tasks.trial import (
     try_extreme,
     try_inputs,
     try_methods,
+    try_place,
     try_random,
     try_where,
 )
@@ -348,6 +349,7 @@ def _check_episodes(task: Task) -> None:
     try_mirror(task)
     if not task.gives_direction:
         try_where(task)
+        try_place(task)
     z = task.starts(STARTS, np.random.default_rng(0))
     arrived = task.arrived(z)
     # Where the end says which runs have arrived, any start may be as near to the set-point as they are.
