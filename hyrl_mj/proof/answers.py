@@ -10,10 +10,12 @@ import numpy as np
 
 from hyrl_mj.policies import Controller, PolicyController
 from hyrl_mj.proof.affine import Unbounded
+from hyrl_mj.proof.assumptions import check_assumptions
 from hyrl_mj.proof.cells import TINY, Cells
 from hyrl_mj.proof.networks import BoundedPolicy
 from hyrl_mj.sets import Everything, Grid, GridSet, StateSet
 from hyrl_mj.stages import ON_EDGE, HybridController
+from hyrl_mj.tasks import Task
 
 # Boxes of measurements along one side of a cell, for coordinates with noise.
 FINE = 2
@@ -97,11 +99,15 @@ class Boxes:
         Raises:
             Unbounded: a set that is not on a grid.
         """
-        if isinstance(members, Everything):
+        if type(members) is Everything:
             nowhere = np.full(self.counts, -np.inf)
             return nowhere, nowhere
-        if not isinstance(members, GridSet):
+        if type(members) is not GridSet:
             raise Unbounded(f"a {type(members).__name__} cannot be bounded: give sets on grids")
+        if members.regular.chart != self.cells.lattice.grid.chart:
+            raise Unbounded(
+                "a set in another chart cannot be bounded: give sets in that of the task"
+            )
         grid, values = members.regular, members.values.reshape(members.regular.counts)
         steep = 0.0
         for axis, periodic in enumerate(grid.chart.periodic):
@@ -146,6 +152,15 @@ class Boxes:
             begin = first + fine * np.arange(n)
             mask = np.take(total, begin + fine + 2 * reach, axis) > np.take(total, begin, axis)
         return np.asarray(mask.ravel())
+
+
+def _check_task(cells: Cells, task: Task) -> None:
+    """Raises `Unbounded` unless a part of a controller that has a task of its own sees as a proof assumes."""
+    if task is cells.lattice.task:
+        return
+    if task.chart != cells.lattice.task.chart:
+        raise Unbounded(f"the controller is one for another chart, that of {task.name}")
+    check_assumptions(task)
 
 
 def _all(counts: np.ndarray) -> np.ndarray:
@@ -213,16 +228,18 @@ class BoundedAnswers:
             Unbounded: the controller, one of its policies or sets, or the task cannot be bounded.
         """
         boxes = Boxes.around(cells, bound)
-        if isinstance(controller, PolicyController):
+        if type(controller) is PolicyController:
             policies, goes = [controller.policy], np.ones((2, 1, *boxes.counts), dtype=bool)
-        elif isinstance(controller, HybridController):
+        elif type(controller) is HybridController:
+            _check_task(cells, controller.task)
             policies = [controller.policies[q] for q in controller.modes]
             goes = _modes_after(boxes, controller)
         else:
             raise Unbounded(f"a controller that is a {type(controller).__name__} cannot be bounded")
-        shifts = tuple(
-            tuple(_shifts(boxes, BoundedPolicy.from_policy(policy))) for policy in policies
-        )
+        bounded = [BoundedPolicy.from_policy(policy) for policy in policies]
+        for policy in bounded:
+            _check_task(cells, policy.network.task)
+        shifts = tuple(tuple(_shifts(boxes, policy)) for policy in bounded)
         return BoundedAnswers(boxes, controller.modes, goes, shifts)
 
     def possible(self, bound: np.ndarray) -> Iterator[Iterator[tuple[int, np.ndarray, np.ndarray]]]:

@@ -74,9 +74,9 @@ class BoundedPolicy:
             Unbounded: it is no network, has memory, or its task's observation cannot be followed.
         """
         inner, normalize = policy, None
-        if isinstance(policy, PreprocessedPolicy) and policy.preprocessing.n_stack == 1:
+        if type(policy) is PreprocessedPolicy and policy.preprocessing.n_stack == 1:
             inner, normalize = policy.policy, policy.preprocessing.normalization
-        if not isinstance(inner, MlpPolicy):
+        if type(inner) is not MlpPolicy:  # a class of its own may act otherwise
             raise Unbounded(f"a policy that is a {type(policy).__name__} cannot be bounded")
         task = inner.task
         observation = program_of(task, task.observation, _observation_of(task))

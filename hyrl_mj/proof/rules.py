@@ -138,7 +138,10 @@ def _rounding(operation: Operation, found: Affine, operands: list[Any]) -> np.nd
         terms = max(2, *(int(np.prod(o.centre.shape[1:], dtype=int)) for o in operands))
         whole = RULES["add" if operation.name == "subtract" else operation.name]
         size = terms * whole(*sizes, **operation.options).centre
-    return np.asarray(ROUNDING * np.finfo(operation.value.dtype).eps * size)
+    kind = np.finfo(operation.value.dtype)
+    # Near 0 numbers of less than double precision are coarser than their size tells.
+    least = kind.smallest_subnormal if kind.bits < np.finfo(float).bits else 0.0
+    return np.asarray(ROUNDING * (kind.eps * size + float(least)))
 
 
 def as_form(x: Any, d: int) -> Affine:

@@ -293,7 +293,9 @@ def signal_for(noise: AnyNoise | None, task: Task, controller: Controller | None
         raise BadInput(
             f'noise {noise!r:.80} cannot be used: give a hyrl_mj.Noise("uniform", 0.1), say'
         )
-    return noise.against(task, controller)
+    signal = noise.against(task, controller)
+    object.__setattr__(signal, "_begun", _limits(signal).copy())  # a recorded one is frozen
+    return signal
 
 
 def drawn(signal: Signal, now: Sample) -> np.ndarray:
@@ -330,6 +332,12 @@ def drawn(signal: Signal, now: Sample) -> np.ndarray:
         raise BadInput(
             f"{signal.kind} noise gives {given.dtype} of shape {given.shape}, where {true.shape} floats are "
             "needed: a row for each simulation, a column for each of the measurement"
+        )
+    begun = getattr(signal, "_begun", limits)
+    if limits.shape != true.shape[1:] or not np.array_equal(limits, begun):
+        raise BadInput(
+            f"{signal.kind} noise has {limits} as its largest magnitudes at sample {now.k.max()} and had "
+            f"{begun} at first: give one share a column, and let sample() leave bound and shares as they are"
         )
     bad = ~_within(noise, limits, true)
     if bad.any():

@@ -19,6 +19,7 @@ from hyrl_mj.tasks.trial import (
     try_extreme,
     try_inputs,
     try_methods,
+    try_place,
     try_random,
     try_where,
 )
@@ -40,6 +41,16 @@ RULES: dict[str, Rule] = {
     "input_units": Several(Text(), 0, 100),
 }
 LONGEST = 3_600  # time that is shown [s]
+# What is computed of a task, so that a method or an attribute of that name means something else.
+COMPUTED = (
+    "dt", "measurement_columns", "has_inner_loop", "gives_direction", "kinematic", "chart_is_state",
+    "obstacles", "plant", "placed", "tabulating", "verify", "draw_inputs", "check_measurement", "check_noise",
+    "at", "perturbed", "outcome", "failed", "goes_on", "noise_in_chart", "noise_on", "noisy_everywhere",
+    "with_noise", "code", "spec",
+)  # fmt: skip
+# A noisy column moves a chart point by its share of the noise, up to this factor: cosine and sine together
+# move their angle by 1.4 times theirs.
+APART = 2.0
 
 
 def check_task(task: Task) -> Task:
@@ -50,6 +61,7 @@ def check_task(task: Task) -> Task:
     """
     where = task.source or task.name
     try:
+        _check_names(task)
         _check_parts(task)
         _check_training(task)
         _check_model(task)
@@ -63,6 +75,16 @@ def check_task(task: Task) -> Task:
         line = line_in(error, task.source)
         raise BadInput(f"the task of {where} cannot be used: {brief(error)}{line}") from error
     return task
+
+
+def _check_names(task: Task) -> None:
+    """Raises `BadInput` if a user's task has a name of its own for what the package computes."""
+    own = (kind for kind in type(task).__mro__ if not kind.__module__.startswith("hyrl_mj."))
+    names = {name for kind in own for name in vars(kind)}
+    if task.source is not None and (taken := sorted(names.intersection(COMPUTED))):
+        raise BadInput(
+            f"it defines {', '.join(taken)}, which hyrl_mj computes and asks for: give it another name"
+        )
 
 
 def _check_parts(task: Task) -> None:
@@ -213,8 +235,11 @@ def _check_starts(task: Task) -> None:
         raise BadInput(
             f"it measures {measurement.shape[1]} column(s), and `noisy` has {p}: make them as many"
         )
-    task.with_z(measurement, z[::-1])
+    moved = task.z(task.with_z(measurement, z[::-1]))
     _check_round_trip(task, z, task.z(measurement))
+    _check_round_trip(task, z[::-1], moved, "with_z() and z()")
+    _check_inverse(task, measurement)
+    _check_noise_of_chart(task, measurement)
     if task.effort.everywhere:
         anywhere = task.chart.draw(task.effort.starts, np.random.default_rng(3))
         _check_round_trip(task, anywhere, task.z(task.placed(anywhere).measurement))
@@ -227,15 +252,51 @@ def _check_starts(task: Task) -> None:
         )
 
 
-def _check_round_trip(task: Task, z: np.ndarray, back: np.ndarray) -> None:
+def _check_round_trip(
+    task: Task, z: np.ndarray, back: np.ndarray, methods: str = "state() and z()"
+) -> None:
     """Raises `BadInput` unless chart points (n, d) are measured as what they are."""
     off = np.abs(task.chart.difference(back, z)).max(axis=1)
     if off.max() > 1e-6:
         worst = int(off.argmax())
         raise BadInput(
-            f"state() and z() do not belong to each other: {task.chart.format(z[worst])} is measured as "
+            f"{methods} do not belong to each other: {task.chart.format(z[worst])} is measured as "
             f"{task.chart.format(back[worst])}; let them agree all over the chart, with sensors that do not "
             "clip there (cutoff)"
+        )
+
+
+def _check_inverse(task: Task, measurement: np.ndarray) -> None:
+    """Raises `BadInput` unless measured(), if there is one, is the inverse of observation()."""
+    if type(task).measured is Problem.measured:
+        return
+    seen = task.observation(measurement)
+    again = task.observation(task.measured(seen))
+    if not np.allclose(again, seen, rtol=1e-5, atol=1e-5):  # single precision will do
+        row, column = np.unravel_index(np.abs(again - seen).argmax(), seen.shape)
+        raise BadInput(
+            f"measured() is not the inverse of observation(): observation[{column}] is "
+            f"{seen[row, column]:g}, and {again[row, column]:g} of what measured() makes of it"
+        )
+
+
+def _check_noise_of_chart(task: Task, measurement: np.ndarray) -> None:
+    """Raises `BadInput` unless noise moves chart points by about the shares that `noisy` begins with."""
+    if type(task).z is Problem.z:
+        return
+    z, step, shares = task.z(measurement), 1e-6, np.array(task.noisy, dtype=float)
+    by = sum(
+        np.abs(task.chart.difference(task.z(measurement + column), z))
+        for column in step * np.diag(shares)
+    )
+    moved, said = np.max(by, axis=0) / step, shares[: task.chart.dimension]
+    wrong = (moved > APART * said + 1e-6) | (moved * APART < said - 1e-6)
+    if wrong.any():
+        i = int(wrong.argmax())
+        raise BadInput(
+            f"noise of 1 in the noisy columns moves the chart's {task.chart.names[i]} by {moved[i]:.3g}, and "
+            f"its share in noisy is {said[i]:g}: let the measurement begin with the columns of the chart, in "
+            "its units"
         )
 
 
@@ -288,6 +349,7 @@ def _check_episodes(task: Task) -> None:
     try_mirror(task)
     if not task.gives_direction:
         try_where(task)
+        try_place(task)
     z = task.starts(STARTS, np.random.default_rng(0))
     arrived = task.arrived(z)
     # Where the end says which runs have arrived, any start may be as near to the set-point as they are.

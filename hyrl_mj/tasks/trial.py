@@ -8,10 +8,11 @@ from functools import cached_property
 from itertools import product
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.physics import mujoco_log
+from hyrl_mj.physics import mjcf, mujoco_log
 from hyrl_mj.sets import Grid
 from hyrl_mj.tasks.base import Task
 from hyrl_mj.tasks.description import Outcome
@@ -158,6 +159,34 @@ def try_where(task: Task) -> None:
         raise BadInput(
             f"where() puts all states of the chart {shape}, as {places[0][0].tolist()}: give two coordinates "
             "of a plane that change with the state, or give the task a direction() of its own"
+        )
+
+
+def try_place(task: Task) -> None:
+    """Raises `BadInput` if the chart does not begin with the place of the tracked point, as where() takes it.
+
+    Obstacles are at places of the world: in other units, or in another order, runs pass them on no side.
+    """
+    model, tracked = task.model, task.scene.tracked
+    kinds = mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_GEOM
+    named = any(mujoco.mj_name2id(model, kind, tracked) >= 0 for kind in kinds)
+    if type(task).where is not Task.where or type(task).plant is not Task.plant or not named:
+        return
+    rng = np.random.default_rng(0)
+    z = task.chart.draw(STARTS, rng)
+    where, number = mjcf.point_of(model, tracked)
+    data, places = mujoco.MjData(model), []
+    for qpos in task.state(z, rng)[0]:
+        mjcf.place(model, data, qpos, task.mocap)
+        places.append(getattr(data, where)[number][list(task.plane)].copy())
+    moved = np.ptp(places, axis=0)
+    apart = np.ptp(task.where(task.placed(z).measurement) - places, axis=0)
+    if (apart > moved / 2).any():  # a point may be off the middle of a robot that turns
+        names = " and ".join(task.chart.names[:2])
+        raise BadInput(
+            f"its chart begins with {names}, and these are not the place of {tracked} in the plane "
+            f"{task.plane} of the world, in metres: give the task a where(measured), or name another point "
+            "in scene.tracked"
         )
 
 
