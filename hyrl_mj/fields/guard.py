@@ -47,8 +47,9 @@ class Guard:
 
         A policy may have headings at which it stands, and noise can hold a robot at the edge of such. So a
         robot with its back to its way turns round in the sense of its mode, and one with its face to it
-        drives ahead, no faster than it can turn to the goal, and turns to its way if it hardly goes on. One that a post beside it holds back turns away
-        from that post. It drives backward only from a post that comes.
+        drives ahead, no faster than it can turn to the goal, and turns to its way if it hardly goes on. One
+        that a post beside it holds back turns away from that post. It drives backward only from a post that
+        comes.
 
         Args:
             seen: what was measured.
@@ -63,7 +64,7 @@ class Guard:
         # Along the way, or with the face towards it: one that stands beside its way turns to it.
         going = speed * np.cos(turn) + u[:, 1] * np.sin(turn)
         least_rate = LEAST * np.sin(turn)
-        turning = np.where(
+        towards = np.where(
             turn < 0, np.minimum(u[:, 1], least_rate), np.maximum(u[:, 1], least_rate)
         )
         rates = np.where(going < LEAST, towards, u[:, 1])
