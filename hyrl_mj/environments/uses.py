@@ -143,14 +143,12 @@ def check_noted(spec: EnvironmentSpec) -> None:
     rng, usual, led = np.random.default_rng(11), Instance(spec), Instance(spec)
     for z in rng.uniform(spec.start_low, spec.start_high, (EPISODES, spec.dimension)):
         state = spec.state_at(z[None])[0]
-        usual.reset()
+        usual.put(state)
         with _leading(led, state):
-            led.reset()
+            led.put(state)
         noted = differing(led.memory(), usual.memory())
         if not noted:
             return
-        for instance in (usual, led):
-            instance.arrive(state)
         if usual.physics.depth(spec.solid) > spec.depth:
             continue
         u = usual.drawn(rng)
@@ -167,7 +165,8 @@ def check_noted(spec: EnvironmentSpec) -> None:
 
 def _told(instance: Instance, u: np.ndarray) -> np.ndarray:
     """Returns numbers (k,) that tell how a step with inputs u (m,) went, and what it is judged by."""
-    instance.take(instance.stepped(u))
+    instance.act(u)
+    instance.sense(np.zeros(instance.spec.dimension))
     judged = instance.report[0 if instance.spec.criterion.asks("reward") else 1 :]
     return np.concatenate([instance.physics.read(), instance.observation, judged])
 
