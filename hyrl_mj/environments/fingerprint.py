@@ -170,7 +170,7 @@ def _walk(value: Any, path: str, found: Fingerprint, seen: set[int], depth: int)
     elif isinstance(value, mujoco.MjData | mujoco.MjModel):  # another one than that of its state
         seen.add(id(value))
         found[path] = _of_data(value) if isinstance(value, mujoco.MjData) else of_model(value)
-    elif _has_no_memory(value):
+    elif has_no_memory(value):
         return
     elif depth > DEEPEST or len(found) > MOST:
         found[path] = Unknown()
@@ -252,7 +252,8 @@ def _written(value: Any) -> Any:
         return Unknown(id(value))
 
 
-def _has_no_memory(value: Any) -> bool:
+def has_no_memory(value: Any) -> bool:
+    """Returns whether a value is of a kind that remembers nothing outside of MuJoCo's state."""
     if isinstance(value, FUNCTIONS):
         return not _variables_of(value)
     if isinstance(value, type | ModuleType | BuiltinFunctionType | property):

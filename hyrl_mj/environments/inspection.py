@@ -31,6 +31,7 @@ from hyrl_mj.environments.specification import (
     Criterion,
     EnvironmentSpec,
 )
+from hyrl_mj.environments.uses import check_noted, check_use
 from hyrl_mj.environments.wrappers import changes_by_reset, check_told, senses
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files import trust
@@ -80,6 +81,8 @@ def inspect(
     _learn_bounds(instance, instance.spec.z(states), instance.spec.z(begun))
     step = trials.MOVED * instance.spec.chart.sides * (np.array(instance.spec.noisy) > 0)
     trials.check_observer(instance, step)
+    check_use(instance.spec)
+    check_noted(instance.spec)
     derived, late = trials.derived_of(instance, step)
     if late:
         instance.spec.found["lag"] = f"observation {', '.join(map(str, late))} {LAG[derived]}"

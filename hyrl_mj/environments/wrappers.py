@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from hyrl_mj.environments.fingerprint import differing
+from hyrl_mj.environments import fingerprint as written
 from hyrl_mj.environments.instance import Instance
 from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.environments.trials import EPISODES, HELD, PLACES, SAMPLES
@@ -39,8 +40,8 @@ def changes_by_reset(spec: EnvironmentSpec) -> bool:
             instance.reset()
         observation = instance.put(spec.state)
         found.append((observation, instance.remembered()))
-    usual = set(differing(found[0][1], found[1][1]))  # such as names of files
-    changed = set(differing(found[0][1], found[2][1])) - usual
+    usual = set(written.differing(found[0][1], found[1][1]))  # such as names of files
+    changed = set(written.differing(found[0][1], found[2][1])) - usual
     return bool(changed) or not np.array_equal(found[0][0], found[2][0], equal_nan=True)
 
 
@@ -142,12 +143,9 @@ def _run(
         new = {} if changes is None else changes[len(told)]
         told.append(_told(instance.inner, rest[-1]))
         info = dict(rest[-1])
-        for name, value in new.items():
-            kind, key = name.split(" ", 1)
-            if kind == "info":
-                info[key] = copy.deepcopy(value)
-            else:
-                setattr(instance.inner, key, copy.deepcopy(value))
+        for name, owner, key in [*_held(instance.inner, info)] if new else ():
+            if name in new:
+                owner[key] = copy.deepcopy(new[name])
         return (*rest[:-1], info)
 
     instance.quit()
@@ -166,25 +164,44 @@ def _run(
 
 
 def _told(inner: Any, info: Any) -> Told:
-    """Returns the numbers in `info` and in attributes of an environment, not those of its objects."""
-    attributes = dict(getattr(inner, "__dict__", {}))
-    found = {f"info {key}": value for key, value in dict(info).items()}
-    found |= {f"attribute {key}": value for key, value in attributes.items()}
-    return {k: copy.deepcopy(value) for k, value in found.items() if _numbers(value) is not None}
+    """Returns the numbers in `info` and in attributes of an environment, also within objects, by name."""
+    return {name: copy.deepcopy(owner[key]) for name, owner, key in _held(inner, dict(info))}
+
+
+def _held(inner: Any, info: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """Yields the name, the owner and the key of all numbers that an environment tells beside observing."""
+    seen = {id(inner)}
+    for kind, owner in (("info", info), ("attribute", getattr(inner, "__dict__", {}))):
+        yield from _within(owner, f"{kind} ", seen, 0)
+
+
+def _within(owner: Any, path: str, seen: set[int], depth: int) -> Iterator[tuple[str, Any, Any]]:
+    """Yields names, owners and keys of the numbers in a dictionary or a list, and in what it holds."""
+    for key, value in [*owner.items()] if isinstance(owner, dict) else [*enumerate(owner)]:
+        if _numbers(value) is not None:
+            yield f"{path}{key}", owner, key
+        elif depth < written.DEEPEST and id(value) not in seen:
+            seen.add(id(value))
+            parts = value
+            if isinstance(value, tuple | deque):
+                parts = [*value]
+            elif not isinstance(value, dict | list):
+                passed = isinstance(value, written.FUNCTIONS) or written.has_no_memory(value)
+                parts = {} if passed else getattr(value, "__dict__", {})
+            yield from _within(parts, f"{path}{key}.", seen, depth + 1)
 
 
 def _numbers(value: Any) -> np.ndarray | None:
-    """Returns the numbers (k,) that a value holds, or all values of a dictionary; None if it holds others."""
+    """Returns the numbers (k,) that a value is, or all parts of a collection are; None if it holds others."""
     if isinstance(value, dict):
-        parts = [_numbers(part) for part in value.values()]
+        value = [*value.values()]
+    if isinstance(value, list | tuple | deque):
+        parts = [_numbers(part) for part in value]
         numbers = [part for part in parts if part is not None]
         return np.concatenate(numbers) if 0 < len(numbers) == len(parts) else None
-    if not isinstance(value, int | float | np.number | np.ndarray | list | tuple):
+    if not isinstance(value, int | float | np.number | np.ndarray):
         return None
-    try:
-        array = np.asarray(value)
-    except ValueError:  # lists of different lengths
-        return None
+    array = np.asarray(value)
     return array.ravel().astype(float) if array.dtype.kind in "iuf" else None
 
 

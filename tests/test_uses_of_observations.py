@@ -1,0 +1,115 @@
+"""What steps, resets and wrappers do with observations and places that noise or a start does not reach."""
+
+from types import SimpleNamespace
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from test_truer_environments import outcomes
+from test_wrapped_environments import Flat, Home
+
+from hyrl_mj import BadInput, from_gymnasium
+
+pytestmark = pytest.mark.slow  # a second for each environment
+
+
+class Noting(Home):
+    """Keeps its place in an object, and in one of a list in its info."""
+
+    def begin(self):
+        self.robot = SimpleNamespace(place=self.data.qpos.copy())
+
+    def after(self):
+        self.robot.place = self.data.qpos.copy()
+
+    def step(self, action):
+        observation, *rest, info = super().step(action)
+        return observation, *rest, info | {"bodies": [{"name": "puck", "at": observation[:2]}]}
+
+
+class ByObject(gym.ObservationWrapper):
+    def observation(self, observation):
+        return np.append(self.unwrapped.robot.place, observation[2:])
+
+
+class ByList(gym.Wrapper):
+    def step(self, action):
+        observation, *rest, info = self.env.step(action)
+        return np.append(info["bodies"][0]["at"], observation[2:]), *rest, info
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "way"), [(ByObject, r"attribute robot\.place"), (ByList, r"info bodies\.0\.at")]
+)
+def test_wrappers_that_observe_what_objects_hold_are_refused(wrapper, way):
+    with pytest.raises(
+        BadInput, match=rf"a wrapper of .* observes .*{way}.*, which follows the place"
+    ):
+        from_gymnasium(lambda: wrapper(Noting()))
+
+
+class Servo(Flat):
+    """Brakes beside the right wall, by the observation of the step before."""
+
+    def reset(self, **options):
+        self.last, info = super().reset(**options)
+        return self.last, info
+
+    def step(self, action):
+        beyond = max(self.last[0] - 1.2, 0.0)
+        self.last, *rest = super().step(np.asarray(action) - [2.0 * beyond, 0.0])
+        return self.last, *rest
+
+
+def test_a_controller_within_an_environment_that_noise_does_not_reach_is_refused():
+    with pytest.raises(BadInput, match=r"step\(\) of Servo moves the robot by what _get_obs"):
+        from_gymnasium(Servo)
+
+
+class Clipped(Flat):
+    """Clips what it observes to the room, which only noise leaves."""
+
+    def step(self, action):
+        observation, *rest = super().step(action)
+        observation[0] = np.clip(observation[0], -2.05, 2.05)
+        return observation, *rest
+
+
+def test_what_a_step_does_where_only_noise_shows_the_robot_is_refused():
+    with pytest.raises(BadInput, match=r"step\(\) of Clipped changes what _get_obs\(\) gives"):
+        from_gymnasium(Clipped)
+
+
+class Judging(Flat):
+    """Judges by its own observation, which it is given without noise."""
+
+    def step(self, action):
+        observation, _, terminated, truncated, info = super().step(action)
+        off = float(np.linalg.norm(observation[2:4]))
+        return observation, -off, terminated, truncated, info | {"success": off < 0.25}
+
+
+def test_an_environment_may_judge_by_its_own_observation():
+    assert outcomes(Judging, 0.1) == outcomes(Flat, 0.1)
+
+
+class Speeding(Home):
+    """Ends where it has moved by more than it could in a sample, from where the reset led to."""
+
+    limit = 0.5
+
+    def begin(self):
+        mujoco.mj_forward(self.model, self.data)
+        self.before = self.data.qpos.copy()
+
+    def step(self, action):
+        observation, reward, _, truncated, info = super().step(action)
+        moved, self.before = np.linalg.norm(self.data.qpos - self.before), self.data.qpos.copy()
+        return observation, reward, bool(moved > self.limit), truncated, info
+
+
+def test_a_place_that_a_reset_notes_and_a_step_goes_by_is_refused_on_the_chart():
+    with pytest.raises(BadInput, match=r"reset\(\) of Speeding notes where it leads to \(before\)"):
+        from_gymnasium(Speeding)
+    assert from_gymnasium(Speeding, starts="reset", steps=5).max_steps == 5
