@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hyrl_mj.environments import fingerprint as written
+from hyrl_mj.environments.fingerprint import DEEPEST, FUNCTIONS, differing, has_no_memory
 from hyrl_mj.environments.instance import Instance
 from hyrl_mj.environments.specification import EnvironmentSpec
 from hyrl_mj.environments.trials import EPISODES, HELD, PLACES, SAMPLES
@@ -40,8 +40,8 @@ def changes_by_reset(spec: EnvironmentSpec) -> bool:
             instance.reset()
         observation = instance.put(spec.state)
         found.append((observation, instance.remembered()))
-    usual = set(written.differing(found[0][1], found[1][1]))  # such as names of files
-    changed = set(written.differing(found[0][1], found[2][1])) - usual
+    usual = set(differing(found[0][1], found[1][1]))  # such as names of files
+    changed = set(differing(found[0][1], found[2][1])) - usual
     return bool(changed) or not np.array_equal(found[0][0], found[2][0], equal_nan=True)
 
 
@@ -180,13 +180,13 @@ def _within(owner: Any, path: str, seen: set[int], depth: int) -> Iterator[tuple
     for key, value in [*owner.items()] if isinstance(owner, dict) else [*enumerate(owner)]:
         if _numbers(value) is not None:
             yield f"{path}{key}", owner, key
-        elif depth < written.DEEPEST and id(value) not in seen:
+        elif depth < DEEPEST and id(value) not in seen:
             seen.add(id(value))
             parts = value
             if isinstance(value, tuple | deque):
                 parts = [*value]
             elif not isinstance(value, dict | list):
-                passed = isinstance(value, written.FUNCTIONS) or written.has_no_memory(value)
+                passed = isinstance(value, FUNCTIONS) or has_no_memory(value)
                 parts = {} if passed else getattr(value, "__dict__", {})
             yield from _within(parts, f"{path}{key}.", seen, depth + 1)
 
