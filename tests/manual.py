@@ -33,6 +33,7 @@ EPISODES, FRAMES = "200", "4"
 # Scripts that have tests of their own; here their options are looked up.
 TESTED = (
     "scripts/benchmark.py",
+    "scripts/field_rows.py",
     "scripts/fields.py",
     "scripts/outside_agents.py",
     "scripts/reproduce_paper.py",
