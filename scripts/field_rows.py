@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -27,12 +27,11 @@ from hyrl_mj.fields import Bounds, Driving, FocusController
 from hyrl_mj.fields.controller import WithoutMemory
 from hyrl_mj.fields.guard import Guard
 from hyrl_mj.fields.law import TangentLaw
+from hyrl_mj.game import LATE
 from hyrl_mj.policies import Controller, PolicyController
 from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
 from hyrl_mj.stages import Budget, attack
 from hyrl_mj.tasks import LEFT, RIGHT, Outcome
-
-LATE = 2.0
 
 
 class Random:
@@ -58,13 +57,12 @@ class Counting(Guard):
     """A guard that counts, and changes nothing if it is not `acting`."""
 
     acting: bool = True
-    count: Count | None = None
+    count: Count = field(default_factory=Count)
 
     def inputs(self, seen, u, turn, sense):
         guarded = super().inputs(seen, u, turn, sense)
-        if self.count is not None:
-            self.count.seen += len(u)
-            self.count.changed += int((np.abs(guarded - u) > 1e-6).any(axis=1).sum())
+        self.count.seen += len(u)
+        self.count.changed += int((np.abs(guarded - u) > 1e-6).any(axis=1).sum())
         return guarded if self.acting else u
 
 
@@ -74,7 +72,7 @@ class Parts(FocusController):
 
     remembers: bool = True
     guarded: bool = True
-    count: Count | None = None
+    count: Count = field(default_factory=Count)
 
     @cached_property
     def guard(self) -> Guard:
@@ -92,7 +90,7 @@ def rows_of(run: hyrl_mj.Run, task: Driving, seed: int) -> dict[str, Controller]
     drawing: Mapping = dict.fromkeys((LEFT, RIGHT), Random(seed))
 
     def parts(policies: Mapping, memory: bool, guarded: bool) -> Parts:
-        return Parts(task, policies, noise, remembers=memory, guarded=guarded, count=Count())
+        return Parts(task, policies, noise, remembers=memory, guarded=guarded)
 
     return {
         "policy of stage 1 alone": PolicyController(WithoutMemory(task, run.policy)),
@@ -109,12 +107,12 @@ def rows_of(run: hyrl_mj.Run, task: Driving, seed: int) -> dict[str, Controller]
 class Row:
     """What became of the runs of one controller: outcomes, times [s], ways [m], times without noise."""
 
-    outcome: list[np.ndarray]
-    time: list[np.ndarray]
-    way: list[np.ndarray]
-    quiet: list[np.ndarray]
-    lost: list[np.ndarray]
-    tally: Tally
+    outcome: list[np.ndarray] = field(default_factory=list)
+    time: list[np.ndarray] = field(default_factory=list)
+    way: list[np.ndarray] = field(default_factory=list)
+    quiet: list[np.ndarray] = field(default_factory=list)
+    lost: list[np.ndarray] = field(default_factory=list)
+    tally: Tally = field(default_factory=Tally)
     seen: int = 0
     changed: int = 0
 
@@ -131,16 +129,15 @@ def played(task: Driving, loop: Controller, z0: np.ndarray, kind: str, seed: int
 def add(row: Row, task: Driving, loop: Controller, z0: np.ndarray, kind: str, given) -> None:
     """Plays a controller from starts, and adds what became of it."""
     _, quiet, _, _ = played(task, loop, z0, "none", given.seed)
-    count = getattr(loop, "count", None)
-    if count is not None:
-        count.seen = count.changed = 0
+    if isinstance(loop, Parts):
+        loop.count.seen = loop.count.changed = 0
     outcome, time, way, run = played(task, loop, z0, kind, given.seed)
     row.outcome.append(outcome)
     row.time.append(time)
     row.way.append(way)
     row.quiet.append(quiet)
-    if count is not None:
-        row.seen, row.changed = row.seen + count.seen, row.changed + count.changed
+    if isinstance(loop, Parts):
+        row.seen, row.changed = row.seen + loop.count.seen, row.changed + loop.count.changed
         count_changes(task, z0, run, row.tally)
 
 
@@ -182,11 +179,10 @@ def main() -> None:
     given = parser.parse_args()
     run = hyrl_mj.load_run(given.run)
     rows: dict[str, Row] = {}
-    sizes = given.posts
     bounds = Bounds(speeds=0.5) if given.moving else Bounds()
-    for posts in sizes:
+    for posts in given.posts:
         rng = np.random.default_rng([given.seed, posts])
-        layouts = drawn(rng, posts, max(given.fields // len(sizes), 2), given.moving)
+        layouts = drawn(rng, posts, max(given.fields // len(given.posts), 2), given.moving)
         task = Driving(run.task, layouts, bounds, 0.2, LONG)
         near = given.starts // 2
         z0 = starts_anywhere(layouts, given.starts - near, rng)
@@ -194,7 +190,7 @@ def main() -> None:
             z0 = np.vstack([starts_on_critical(layouts, run.critical_set.points, near, rng), z0])
         loops = rows_of(run, task, given.seed)
         for name, loop in loops.items():
-            row = rows.setdefault(name, Row([], [], [], [], [], Tally()))
+            row = rows.setdefault(name, Row())
             add(row, task, loop, z0, given.noise, given)
         if given.rounds:
             tried = {name: loop for name, loop in loops.items() if not name.startswith("random")}

@@ -83,9 +83,10 @@ def _drawn(instance: Instance, states: np.ndarray) -> list[str]:
     names = [name for name, v in zip(_names_of_state(instance), varies, strict=True) if v]
     again = [_begun(instance, states[:1], 0)[0] for _ in range(2)]
     lasting = set(differing(*again))  # what outlasts a reset is not drawn by it
-    begun = []
-    for seed in range(COMPARED):
-        begun.append(_begun(Instance(instance.spec) if lasting else instance, states[:3], seed))
+    begun = [
+        _begun(Instance(instance.spec) if lasting else instance, states[:3], seed)
+        for seed in range(COMPARED)
+    ]
     if lasting:  # nothing has outlasted the first reset of a new instance
         lasting = set(differing(begun[0][0], _begun(Instance(instance.spec), states[:1], 0)[0]))
     first, told = begun[0]
