@@ -254,6 +254,15 @@ def test_a_robot_with_its_back_to_its_way_turns_round():
     np.testing.assert_allclose(guarded((0, 0, 0.0), FAR_OFF, (-1.0, 0.2), 0.0), [0.3, 0.2])
 
 
+@pytest.mark.parametrize("turn", [-1.5, -0.8, 0.8, 1.5])
+def test_a_robot_that_stands_beside_its_way_turns_to_it(turn):
+    speed, rate = guarded((0, 0, 0.0), FAR_OFF, (0.0, 0.0), turn)
+    assert speed * np.cos(turn) + rate * np.sin(turn) >= 0.3 - 1e-9
+    # One that goes on is left alone, also where it turns away for a while.
+    u = (0.3 / np.cos(turn) + 0.3, -0.1 * np.sign(turn)) if abs(turn) < 1 else (0.0, np.sign(turn))
+    np.testing.assert_allclose(guarded((0, 0, 0.0), FAR_OFF, u, turn)[1], u[1])
+
+
 def test_a_robot_that_a_post_beside_it_holds_back_turns_away_from_it():
     for side in (1, -1):
         u = guarded((0, 0, 0.0), [(-0.05, 0.6 * side, 0.5)], (1.0, side * 0.5), 0.0)
