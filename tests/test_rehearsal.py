@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fields import Field
 from planted import ChartPolicy
+from planted_field import Field
 
 import hyrl_mj
 from hyrl_mj.learning.presets import preset

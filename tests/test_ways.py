@@ -7,8 +7,8 @@ from itertools import product
 import mujoco
 import numpy as np
 import pytest
-from fields import Driven, Field, along, followed, runs_along
 from planted import ChartPolicy
+from planted_field import Driven, Field, along, followed, runs_along
 
 from hyrl_mj import BadInput
 from hyrl_mj.policies import PolicyController

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fields import Field
 from planted import ChartPolicy, halves
+from planted_field import Field
 
 import hyrl_mj
 from hyrl_mj import BadInput, Chart, Partition, extend, find_critical_set, make_partition
