@@ -7,10 +7,10 @@ package needs neither torch nor a GL library.
 
 import lazy_loader
 
-from hyrl_mj import (
-    gl as gl,  # first: imports mujoco, with a GL backend that exists here
-    tasks as tasks,  # which Gymnasium can make after `import hyrl_mj`
-)
+from hyrl_mj.system import gl as gl  # first: imports mujoco, with a GL backend that exists here
+
+# isort: split
+from hyrl_mj import tasks as tasks  # which Gymnasium can make after `import hyrl_mj`
 
 __version__ = "0.1.0"
 # The names of `__init__.pyi`, each imported when it is first used.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hyrl_mj import gl
+from hyrl_mj.system import gl
 
 HIDDEN = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY", "WAYLAND_DISPLAY", "PYTHONPATH")
 

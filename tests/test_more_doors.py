@@ -135,7 +135,7 @@ def test_a_run_in_a_folder_that_is_not_in_utf_8_is_reported(planted_circle, tmp_
 
 
 def test_a_matplotlibrc_of_the_current_folder_has_no_part(tmp_path):
-    code = "from hyrl_mj.gl import spare_matplotlib; spare_matplotlib()\n"
+    code = "from hyrl_mj.system.gl import spare_matplotlib; spare_matplotlib()\n"
     code += (
         "from hyrl_mj.viz.figures import style; import matplotlib; print(matplotlib.get_backend())"
     )

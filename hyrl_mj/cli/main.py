@@ -12,8 +12,8 @@ from hyrl_mj import __version__
 from hyrl_mj.cli.commands import COMMANDS
 from hyrl_mj.cli.parsing import call, documented
 from hyrl_mj.errors import BadInput, unknown
-from hyrl_mj.gl import spare_matplotlib
 from hyrl_mj.system import progress
+from hyrl_mj.system.gl import spare_matplotlib
 from hyrl_mj.system.streams import Streams
 
 

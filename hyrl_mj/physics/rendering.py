@@ -14,9 +14,9 @@ import mujoco
 import numpy as np
 
 from hyrl_mj.errors import BadInput, NoRenderer, brief
-from hyrl_mj.gl import GL_PROBLEM
 from hyrl_mj.physics import mjcf
 from hyrl_mj.system import forked
+from hyrl_mj.system.gl import GL_PROBLEM
 
 GL_CURE = "on Debian or Ubuntu: apt-get install libegl1 libgl1-mesa-dri, and set MUJOCO_GL=egl"
 

@@ -14,10 +14,10 @@ from typing import Any
 
 from hyrl_mj.errors import BadInput, HyrlError, brief
 from hyrl_mj.files.manifest import Busy
-from hyrl_mj.gl import spare_matplotlib
 from hyrl_mj.pipeline.runs import RunOptions, run
 from hyrl_mj.runs.sweeps import Row
 from hyrl_mj.system import cores
+from hyrl_mj.system.gl import spare_matplotlib
 
 PATIENCE = 7.0  # seconds within which an address must answer
 # How often the process of a run may die before the run is given up.

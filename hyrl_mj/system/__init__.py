@@ -1,3 +1,3 @@
-"""What the machine gives: cores, processes with limits, generators, output streams and progress bars."""
+"""What the machine gives: cores, processes with limits, generators, streams, progress bars, a GL backend."""
 
-__all__ = ["cores", "forked", "generators", "limits", "progress", "streams"]
+__all__ = ["cores", "forked", "generators", "gl", "limits", "progress", "streams"]

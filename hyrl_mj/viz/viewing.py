@@ -21,9 +21,9 @@ from urllib.parse import urlsplit
 import mujoco
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.gl import has_display
 from hyrl_mj.physics import mjcf
 from hyrl_mj.simulation import HybridArc
+from hyrl_mj.system.gl import has_display
 from hyrl_mj.system.progress import Say
 from hyrl_mj.tasks import Task
 from hyrl_mj.viz.replay.panel import Track
