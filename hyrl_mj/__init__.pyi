@@ -3,13 +3,12 @@ from . import (
     envs as envs,
     export as export,
     fields as fields,
-    game as game,
     gl as gl,
+    judging as judging,
     learning as learning,
     physics as physics,
     pipeline as pipeline,
     policies as policies,
-    proof as proof,
     runs as runs,
     sets as sets,
     simulation as simulation,
@@ -20,13 +19,13 @@ from . import (
 from .environments import from_gymnasium
 from .errors import BadArtifact, BadInput, HyrlError, NoRenderer
 from .export import export_numpy, export_onnx
-from .game import Game, Robustness, Score
+from .judging import Verdict
+from .judging.game import Game, Robustness, Score
 from .learning import Settings
 from .physics import mjcf as mjcf
 from .pipeline import AgentOptions, RunOptions, SweepOptions, diagnose, robustify, run, sweep
-from .policies import Controller, MlpPolicy, Policy, from_callable, load_agent
+from .policies import Controller, HybridController, MlpPolicy, Policy, from_callable, load_agent
 from .runs.directory import Run, load_run
-from .runs.verdict import Verdict
 from .sets import Chart, StateSet
 from .simulation import (
     HybridArc,
@@ -43,7 +42,6 @@ from .simulation import (
 from .stages import (
     CriticalSet,
     ExtendedSets,
-    HybridController,
     Partition,
     extend,
     find_critical_set,

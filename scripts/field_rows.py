@@ -27,10 +27,10 @@ from hyrl_mj.fields import Bounds, Driving, FocusController
 from hyrl_mj.fields.controller import WithoutMemory
 from hyrl_mj.fields.guard import Guard
 from hyrl_mj.fields.law import TangentLaw
-from hyrl_mj.game import LATE
+from hyrl_mj.judging import Budget, attack
+from hyrl_mj.judging.game import LATE
 from hyrl_mj.policies import Controller, PolicyController
 from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
-from hyrl_mj.stages import Budget, attack
 from hyrl_mj.tasks import LEFT, RIGHT, Outcome
 
 

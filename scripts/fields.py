@@ -25,9 +25,9 @@ from rich.table import Table
 
 import hyrl_mj
 from hyrl_mj.fields import Bounds, Driving, controllers, decoded
+from hyrl_mj.judging import Budget, attack
 from hyrl_mj.policies import Controller
 from hyrl_mj.simulation import AnyNoise, LoopSettings, Noise, Recorded, closed_loop
-from hyrl_mj.stages import Budget, attack
 from hyrl_mj.tasks import Layouts, Outcome
 
 # Random fields: half the side of the square of the posts [m], radii [m], least gap [m], speed [m/s], and the

@@ -20,9 +20,9 @@ from rich.table import Table
 from scipy.spatial import cKDTree
 
 import hyrl_mj
-from hyrl_mj.game import Lattice
+from hyrl_mj.judging import Budget, Regions, attack, noisy_episodes
+from hyrl_mj.judging.game import Lattice
 from hyrl_mj.simulation import KINDS, WayRuns, way_runs
-from hyrl_mj.stages import Budget, Regions, attack, noisy_episodes
 from hyrl_mj.system import progress
 from hyrl_mj.tasks import ANY, LEFT, RIGHT, pattern_of
 from hyrl_mj.tasks.posts import PostsTask

@@ -18,8 +18,8 @@ import numpy as np
 
 import hyrl_mj
 from hyrl_mj import Noise
-from hyrl_mj.game import NEVER, Game
-from hyrl_mj.proof import CellNoise, Certificate
+from hyrl_mj.judging.game import NEVER, Game
+from hyrl_mj.judging.proof import CellNoise, Certificate
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import LoopSettings, Sample, Signal, closed_loop
 from hyrl_mj.system.progress import progress_bar

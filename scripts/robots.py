@@ -19,10 +19,10 @@ from rich.console import Console
 from rich.table import Table
 
 import hyrl_mj
+from hyrl_mj.judging import Regions, noisy_episodes
 from hyrl_mj.policies import Controller, PolicyController
 from hyrl_mj.runs.sweeps import Row
 from hyrl_mj.simulation import LoopSettings, closed_loop
-from hyrl_mj.stages import Regions, noisy_episodes
 from hyrl_mj.system import progress
 
 KINDS = ("alternating", "adversarial")

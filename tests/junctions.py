@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 from planted import AnalyticSet, ChartPolicy, Cube
 
-from hyrl_mj.stages.hybrid import HybridController
+from hyrl_mj.policies.hybrid import HybridController
 from hyrl_mj.tasks import Outcome, Scene
 
 # The numbers of the modes have gaps.

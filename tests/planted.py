@@ -12,14 +12,15 @@ from matplotlib.figure import Figure
 from hyrl_mj.environments.task import EnvironmentTask
 from hyrl_mj.files.artifacts import digest
 from hyrl_mj.files.manifest import FILES, Entry, Manifest
+from hyrl_mj.judging import worst_case as examination
+from hyrl_mj.judging.proof import replays
 from hyrl_mj.learning import presets
 from hyrl_mj.pipeline import steps
-from hyrl_mj.proof import examination, replays
+from hyrl_mj.policies.hybrid import HybridController
 from hyrl_mj.runs.directory import load_run
 from hyrl_mj.sets import Chart, Grid, GridSet
 from hyrl_mj.stages import judges
 from hyrl_mj.stages.critical_set import CriticalSet
-from hyrl_mj.stages.hybrid import HybridController
 from hyrl_mj.stages.partition import Partition
 from hyrl_mj.tasks import Learning, Outcome, Scene, Task
 from hyrl_mj.viz import diagnosis

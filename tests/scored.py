@@ -1,6 +1,6 @@
 """Planted results of the worst-case game, for the tests of what is made of them."""
 
-from hyrl_mj.game import LatticeSpacing, LostReplay, ReplayCount, Score
+from hyrl_mj.judging.game import LatticeSpacing, LostReplay, ReplayCount, Score
 
 SPACING = LatticeSpacing((0.1,), exact=True, cells=True, curve_spacing=(0.1,))
 

@@ -17,16 +17,16 @@ from planted import (
 )
 
 from hyrl_mj import BadInput, Noise, Outcome, Recorded, Sample, simulate
-from hyrl_mj.game import NEVER, Game
+from hyrl_mj.judging.attack_search import POPULATION, Search, Waves
+from hyrl_mj.judging.attacks import Budget, attack, attack_starts
+from hyrl_mj.judging.episodes import Regions
+from hyrl_mj.judging.game import NEVER, Game
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.policies import PolicyController
+from hyrl_mj.policies.hybrid import HybridController
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import GIVEN, Programmes, Rules, closed_loop
-from hyrl_mj.stages.attack_search import POPULATION, Search, Waves
-from hyrl_mj.stages.attacks import Budget, attack, attack_starts
-from hyrl_mj.stages.episodes import Regions
-from hyrl_mj.stages.hybrid import HybridController
 from hyrl_mj.stages.partition import PartPolicy
 from hyrl_mj.system import cores
 from hyrl_mj.tasks import Effort

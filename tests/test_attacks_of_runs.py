@@ -10,11 +10,11 @@ from test_verdict import ALL, EPS, HOLDS, enough, episodes
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, load_run
-from hyrl_mj.game import AttackCount, Robustness, wilson
+from hyrl_mj.judging.game import AttackCount, Robustness, wilson
+from hyrl_mj.judging.verdict import HELD, Verdict
 from hyrl_mj.pipeline import ExamineOptions, examine_run, run_stage
 from hyrl_mj.runs.arcs import noisy_arcs
 from hyrl_mj.runs.directory import Run
-from hyrl_mj.runs.verdict import HELD, Verdict
 from hyrl_mj.tasks import SPARING
 from hyrl_mj.viz.commands import commands
 from hyrl_mj.viz.report import render
@@ -104,10 +104,10 @@ def test_both_controllers_are_compared_from_the_same_starts(examined):
 def test_a_run_with_a_game_is_attacked_only_on_request(examined, monkeypatch):
     monkeypatch.setattr(Run, "why_no_game", None)
     run = load_run(examined)
-    assert ExamineOptions().budget(run) is None
-    assert ExamineOptions(attack_seconds=2.0).budget(run).seconds == 2.0
-    assert ExamineOptions(attack_rounds=5).budget(run).rounds == 5
-    assert ExamineOptions(attack_starts=9).budget(run).rounds == SPARING.attack_rounds
+    assert ExamineOptions().budget(SPARING, run.exact) is None
+    assert ExamineOptions(attack_seconds=2.0).budget(SPARING, run.exact).seconds == 2.0
+    assert ExamineOptions(attack_rounds=5).budget(SPARING, run.exact).rounds == 5
+    assert ExamineOptions(attack_starts=9).budget(SPARING, run.exact).rounds == SPARING.attack_rounds
 
 
 def test_the_rounds_of_a_time_repeat_it(copied):

@@ -10,12 +10,12 @@ from test_truer_tasks import PY, write
 from trapped_plants import dial, drawn
 
 from hyrl_mj import BadInput, HybridController, Noise, get_task, simulate
-from hyrl_mj.game import Lattice
+from hyrl_mj.judging.game import Lattice
+from hyrl_mj.judging.proof.affine import Affine, Unbounded
+from hyrl_mj.judging.proof.answers import BoundedAnswers
+from hyrl_mj.judging.proof.cells import Cells
+from hyrl_mj.judging.proof.rules import bounds
 from hyrl_mj.policies import MlpPolicy, PolicyController
-from hyrl_mj.proof.affine import Affine, Unbounded
-from hyrl_mj.proof.answers import BoundedAnswers
-from hyrl_mj.proof.cells import Cells
-from hyrl_mj.proof.rules import bounds
 from hyrl_mj.sets import Everything, Grid
 from hyrl_mj.simulation import Signal, noise as noises
 from hyrl_mj.tasks import check_task

@@ -7,7 +7,13 @@ import pytest
 from planted import AnalyticSet
 from test_export import WHOLE
 
-from hyrl_mj.game import Lattice
+from hyrl_mj.judging.game import Lattice
+from hyrl_mj.judging.proof.affine import Affine, Unbounded
+from hyrl_mj.judging.proof.answers import Boxes
+from hyrl_mj.judging.proof.assumptions import check_assumptions
+from hyrl_mj.judging.proof.cells import Cells
+from hyrl_mj.judging.proof.networks import BoundedPolicy
+from hyrl_mj.judging.proof.rules import RULES, Truth, bounds
 from hyrl_mj.policies import (
     ACTIVATIONS,
     MlpPolicy,
@@ -15,12 +21,6 @@ from hyrl_mj.policies import (
     PreprocessedPolicy,
     Preprocessing,
 )
-from hyrl_mj.proof.affine import Affine, Unbounded
-from hyrl_mj.proof.answers import Boxes
-from hyrl_mj.proof.assumptions import check_assumptions
-from hyrl_mj.proof.cells import Cells
-from hyrl_mj.proof.networks import BoundedPolicy
-from hyrl_mj.proof.rules import RULES, Truth, bounds
 from hyrl_mj.sets import Everything, Grid, GridSet
 from hyrl_mj.tasks import Outcome, get_task
 from hyrl_mj.tracing import BATCH, trace

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.proof.affine import Affine, Unbounded
-from hyrl_mj.proof.rules import Truth, bounds
+from hyrl_mj.judging.proof.affine import Affine, Unbounded
+from hyrl_mj.judging.proof.rules import Truth, bounds
 from hyrl_mj.tracing import BATCH, trace
 
 # Number of programs; more of them by HYRL_MJ_PROGRAMS=20000.

@@ -7,9 +7,10 @@ import pytest
 from planted import halves, ideal_controller, sign_policy
 
 from hyrl_mj import HybridController, MlpPolicy, Noise
-from hyrl_mj.game import NEVER, OVER, UNCLEAR, WON, WON_FROM_SOME, Game
+from hyrl_mj.judging.game import NEVER, OVER, UNCLEAR, WON, WON_FROM_SOME, Game
+from hyrl_mj.judging.proof import CellNoise, Certificate, attack
+from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies import PolicyController
-from hyrl_mj.proof import CellNoise, Certificate, attack, examine
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import Outcome
@@ -207,7 +208,7 @@ def test_what_cannot_be_bounded_is_attacked_all_the_same(vehicle):
 @pytest.mark.slow
 def test_an_examination_carries_what_is_proved(vehicle):
     loops = {"policy": PolicyController(sideways(vehicle, 1, 1.1)), "hyrl": hybrid(vehicle)}
-    result, maps = examine(
+    result, maps = worst_case(
         vehicle, np.array([[0.0, 0.0], [0.2, 0.0]]), halves(vehicle), loops, (0.0, EPS), cells=120
     )
     for name in loops:
@@ -259,6 +260,6 @@ def test_nothing_is_proved_of_a_start_region_that_is_thinner_than_a_cell(vehicle
     game = Game(task, halves(task), loops, EPS, grid=Grid.with_cells(task.chart, 60))
     certificate = Certificate.certify(game, loops)
     assert certificate.wins("hyrl", EPS) == (0.0, 0.0, 0.0, 0.0)
-    result, _ = examine(task, np.empty((0, 2)), halves(task), loops, (EPS,), cells=60)
+    result, _ = worst_case(task, np.empty((0, 2)), halves(task), loops, (EPS,), cells=60)
     score = result.scores["hyrl"][0]
     assert (score.proved, score.not_broken) == (0.0, score.won)

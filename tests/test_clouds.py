@@ -9,25 +9,18 @@ from memory import Peak
 from planted import Hall, hall_distance, hall_level, hall_policy, hall_slope
 
 from hyrl_mj import BadInput, Chart, Noise, closed_loop
-from hyrl_mj.policies import PolicyController
+from hyrl_mj.policies import HybridController, PolicyController
 from hyrl_mj.sets import (
     Cloud,
     Grid,
     GridSet,
     coarseness,
     covering,
+    distance_to,
     resolving,
-    surface_distance,
 )
 from hyrl_mj.simulation import LoopSettings
-from hyrl_mj.stages import (
-    ExtendedSets,
-    HybridController,
-    Partition,
-    extend,
-    find_critical_set,
-    make_partition,
-)
+from hyrl_mj.stages import ExtendedSets, Partition, extend, find_critical_set, make_partition
 
 EPS = 0.1
 SHARES = np.array([1.0, 1, 1, 0, 0, 0])
@@ -181,14 +174,14 @@ def test_the_scale_stretches_distances():
 def test_points_of_a_surface_are_joined_by_planes(close_by):
     z, exact = close_by
     points = on_surface(4_000)
-    off = surface_distance(BOX, points, z)
+    off = distance_to(BOX, points, z)
     plain = BOX.tree(points).query(BOX.in_box(z))[0]
     inner = (np.abs(z) < 0.8).all(axis=1)
     assert np.abs(off - np.abs(exact))[inner].mean() < 0.3 * EPS
     assert np.abs(plain - np.abs(exact))[inner].mean() > EPS
     assert (off <= plain + 1e-12).all()
     apart = np.linalg.norm(points[1] - points[0])
-    np.testing.assert_allclose(surface_distance(BOX, points[:1], points[1:2]), apart)
+    np.testing.assert_allclose(distance_to(BOX, points[:1], points[1:2]), apart)
 
 
 # ---- which nodes a chart gets

@@ -8,6 +8,7 @@ from planted import ChartPolicy, homing_policy, sign_policy
 
 import hyrl_mj
 from hyrl_mj import HybridArc, NoRenderer
+from hyrl_mj.runs.diagnosis import losses_of, losses_sentence, usual_arc, worst_arc
 from hyrl_mj.viz import diagnosis
 
 pytestmark = pytest.mark.slow  # a diagnosis of each task
@@ -79,13 +80,13 @@ def test_without_noise_nothing_is_lost(run):
     # Its files were made with other settings, so they are not read again.
     results = ("policy", "critical_set", "partition")
     vars(quiet).update({name: getattr(run, name) for name in results})
-    losses = diagnosis.losses_of(quiet)
-    assert diagnosis.worst_arc(quiet, losses) is None
-    assert diagnosis.losses_sentence(losses) == "it loses none of them on the nodes"
+    losses = losses_of(quiet)
+    assert worst_arc(quiet, losses) is None
+    assert losses_sentence(losses) == "it loses none of them on the nodes"
 
 
 def test_the_usual_arc_begins_on_the_critical_set_under_alternating_noise(run):
-    arc = diagnosis.usual_arc(run)
+    arc = usual_arc(run)
     assert from_critical_set(run, arc) == pytest.approx(0, abs=1e-9)
     off = (arc.measured[:-1] - arc.z[:-1])[:, np.array(run.task.noisy)]
     np.testing.assert_allclose(off[::2], EPS)

@@ -5,12 +5,12 @@ import pytest
 from planted import decisions, halves, ideal_controller, one_way_policy, sign_policy
 
 from hyrl_mj import BadInput, LoopSettings, Noise, closed_loop
-from hyrl_mj.game import Ends, compare
-from hyrl_mj.game.scores import Game
+from hyrl_mj.judging import episodes as bulk
+from hyrl_mj.judging.episodes import Regions, noisy_episodes
+from hyrl_mj.judging.game import Ends, compare
+from hyrl_mj.judging.game.scores import Game
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid
-from hyrl_mj.stages import episodes as bulk
-from hyrl_mj.stages.episodes import Regions, noisy_episodes
 
 
 @pytest.fixture(scope="module")

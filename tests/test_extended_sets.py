@@ -9,7 +9,7 @@ from environments import Puck, puck_agent
 from planted import circle_policy, one_way_policy, sign_policy
 
 from hyrl_mj import BadInput, extend, find_critical_set, from_gymnasium, make_partition
-from hyrl_mj.stages.critical_set import distance_to
+from hyrl_mj.sets import distance_to
 
 PI = np.pi
 # From the axis an obstacle of radius 0.75 at x = 1.5 can be passed only if x <= this.
@@ -160,13 +160,13 @@ def test_a_single_mode_keeps_everything(vehicle):
     assert sets.modes == (0,)
     assert sets.sets[0].mask.all()
     assert sets.sentence(vehicle) == "one mode, whose set is the whole chart"
-    far = distance_to(vehicle, case.critical.points, np.zeros((3, 2)))
+    far = distance_to(vehicle.chart, case.critical.points, np.zeros((3, 2)))
     np.testing.assert_array_equal(far, [np.inf] * 3)
 
 
 def test_the_distance_to_the_critical_set_goes_the_short_way(circle, on_circle):
     distance = distance_to(
-        circle, on_circle.critical.points, np.array([[0.0], [PI + 1], [7 * PI - 1]])
+        circle.chart, on_circle.critical.points, np.array([[0.0], [PI + 1], [7 * PI - 1]])
     )
     np.testing.assert_allclose(distance, [PI, 1.0, 1.0], atol=2e-3)
 

@@ -12,7 +12,7 @@ from scored import SPACING, score
 
 import hyrl_mj
 from hyrl_mj import BadInput
-from hyrl_mj.game.result import (
+from hyrl_mj.judging.game.result import (
     BEATEN,
     LIMIT,
     MAP_CLASSES,
@@ -26,7 +26,7 @@ from hyrl_mj.game.result import (
     Profile,
     Wins,
 )
-from hyrl_mj.game.scores import CURVE
+from hyrl_mj.judging.game.scores import CURVE
 from hyrl_mj.sets import Grid
 from hyrl_mj.viz import colours, figures
 from hyrl_mj.viz.figures import robustness, style

@@ -19,9 +19,9 @@ from planted import (
 
 from hyrl_mj import HybridController, Noise, simulate
 from hyrl_mj.errors import BadInput
-from hyrl_mj.game.lattice import ON_NODE, Lattice
-from hyrl_mj.game.scores import Game, worst_signal
-from hyrl_mj.game.solver import (
+from hyrl_mj.judging.game.lattice import ON_NODE, Lattice
+from hyrl_mj.judging.game.scores import Game, worst_signal
+from hyrl_mj.judging.game.solver import (
     LOST,
     NEVER,
     Answers,

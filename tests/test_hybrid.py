@@ -8,8 +8,8 @@ from planted import AnalyticSet, ChartPolicy, ideal_controller, random_states
 
 import hyrl_mj
 from hyrl_mj import BadInput, HybridController
+from hyrl_mj.policies import ON_EDGE
 from hyrl_mj.sets import Everything
-from hyrl_mj.stages import ON_EDGE
 
 
 def constant(task, value):

@@ -9,8 +9,8 @@ from planted import Cube
 
 import hyrl_mj
 from hyrl_mj.errors import BadInput
-from hyrl_mj.game import lattice as lattice_module
-from hyrl_mj.game.lattice import Lattice
+from hyrl_mj.judging.game import lattice as lattice_module
+from hyrl_mj.judging.game.lattice import Lattice
 from hyrl_mj.sets import Chart, Grid
 from hyrl_mj.tasks import Outcome, Task, get_task
 from hyrl_mj.tasks.vehicle import Vehicle

@@ -15,10 +15,10 @@ from planted import (
 )
 
 from hyrl_mj import make_partition
-from hyrl_mj.game.lattice import Lattice
-from hyrl_mj.game.limit import Limit, fewest_samples
-from hyrl_mj.game.scores import LIMIT, Game
-from hyrl_mj.game.solver import NEVER, solve
+from hyrl_mj.judging.game.lattice import Lattice
+from hyrl_mj.judging.game.limit import Limit, fewest_samples
+from hyrl_mj.judging.game.scores import LIMIT, Game
+from hyrl_mj.judging.game.solver import NEVER, solve
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid
 from hyrl_mj.tasks import get_task

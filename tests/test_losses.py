@@ -5,13 +5,20 @@ import pytest
 from planted import ChartPolicy, halves, pass_on, sign_policy
 
 from hyrl_mj import simulate
-from hyrl_mj.game import NEVER, Game
+from hyrl_mj.judging import sort_losses
+from hyrl_mj.judging.game import NEVER, Game
 from hyrl_mj.policies import PolicyController
+from hyrl_mj.runs.diagnosis import losses_sentence
 from hyrl_mj.sets import Grid
-from hyrl_mj.stages import sort_losses
-from hyrl_mj.viz.diagnosis import losses_sentence
+from hyrl_mj.stages import part_policy
 
 EPS, CELLS = 0.1, 120
+
+
+def sorted_losses(task, policy, eps):
+    parts = halves(task)
+    pis = [part_policy(task, policy, parts, mode, eps) for mode in parts.modes]
+    return sort_losses(task, policy, parts.parts, pis, eps, CELLS)
 
 
 def lost_by(task, policy):
@@ -28,7 +35,7 @@ def grazing_policy(task):
 
 def test_a_policy_that_only_cannot_decide_is_cured_by_hysteresis(vehicle):
     policy = sign_policy(vehicle)
-    losses = sort_losses(vehicle, policy, halves(vehicle), EPS, CELLS)
+    losses = sorted_losses(vehicle, policy, EPS)
     assert len(losses.undecided) == len(lost_by(vehicle, policy)) > 20
     assert not len(losses.grazing)
     assert not len(losses.unaided)
@@ -40,7 +47,7 @@ def test_a_policy_that_only_cannot_decide_is_cured_by_hysteresis(vehicle):
 
 def test_a_policy_that_passes_too_close_is_not(vehicle):
     policy = grazing_policy(vehicle)
-    losses = sort_losses(vehicle, policy, halves(vehicle), EPS, CELLS)
+    losses = sorted_losses(vehicle, policy, EPS)
     sizes = [len(z) for z in (losses.unaided, losses.undecided, losses.grazing)]
     assert sum(sizes) == len(lost_by(vehicle, policy))
     assert sizes[2] > 5 * sizes[1]
@@ -56,7 +63,7 @@ def test_a_policy_that_passes_too_close_is_not(vehicle):
 
 def test_a_policy_that_stands_still_fails_without_noise(circle):
     policy = ChartPolicy(circle, lambda z: np.zeros((len(z), 1)))
-    losses = sort_losses(circle, policy, halves(circle), EPS, CELLS)
+    losses = sorted_losses(circle, policy, EPS)
     assert len(losses.unaided) == len(lost_by(circle, policy)) > 5
     assert not len(losses.undecided)
     assert not len(losses.grazing)
@@ -69,5 +76,5 @@ def test_a_policy_that_stands_still_fails_without_noise(circle):
 
 @pytest.mark.parametrize("eps", [0.0])
 def test_without_noise_nothing_is_lost(vehicle, eps):
-    losses = sort_losses(vehicle, sign_policy(vehicle), halves(vehicle), eps, CELLS)
+    losses = sorted_losses(vehicle, sign_policy(vehicle), eps)
     assert losses_sentence(losses) == "it loses none of them on the nodes"

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from hyrl_mj import Recorded, simulate_batch
+from hyrl_mj.judging import Budget, attack
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.policies.preprocessing import PreprocessedPolicy
-from hyrl_mj.stages import Budget, attack
 from hyrl_mj.tasks import Effort
 
 EPS, WINDOW, FIRST = 0.1, 16, 4

@@ -10,7 +10,7 @@ from sentences import assert_one_sentence_about
 import hyrl_mj
 from hyrl_mj import BadArtifact
 from hyrl_mj.files import artifacts
-from hyrl_mj.game.result import (
+from hyrl_mj.judging.game.result import (
     LIMIT,
     Curve,
     EpisodeCount,

@@ -12,10 +12,12 @@ from test_certificate import EPS, hybrid
 
 import hyrl_mj
 from hyrl_mj import BadInput, Noise, pipeline
-from hyrl_mj.game import NEVER, Game
+from hyrl_mj.judging import worst_case as examination
+from hyrl_mj.judging.game import NEVER, Game
+from hyrl_mj.judging.proof import Certificate, replays
+from hyrl_mj.judging.verdict import Verdict
+from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies import PolicyController
-from hyrl_mj.proof import Certificate, examination, examine, replays
-from hyrl_mj.runs.verdict import Verdict
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import NOT_STARTED, LoopSettings, closed_loop, judge, judge_task
 from hyrl_mj.tasks import Outcome
@@ -103,7 +105,7 @@ def test_a_proof_of_everything_is_refuted(vehicle, monkeypatch):
 def test_starts_that_are_won_are_replayed_where_nothing_is_proved(vehicle):
     """Of policies that are no networks nothing is proved."""
     loops = {"hyrl": ideal_controller(vehicle), "policy": PolicyController(one_way_policy(vehicle))}
-    result, _ = examine(vehicle, np.empty((0, 2)), halves(vehicle), loops, (EPS,), cells=120)
+    result, _ = worst_case(vehicle, np.empty((0, 2)), halves(vehicle), loops, (EPS,), cells=120)
     (won,) = [c for c in result.replays if result.scores[c.controller][-1].not_broken == 1]
     assert (won.controller, won.of, won.failures) == ("hyrl", "won", 0)
     assert [*won.starts] == ["none", "uniform", "alternating", "worst"]
@@ -311,7 +313,7 @@ def test_the_tasks_of_this_package_are_simulated_as_plain_mujoco_does(name):
 
 
 def test_every_examination_by_episodes_is_judged(puck, monkeypatch):
-    from hyrl_mj.stages import Regions, episodes, noisy_episodes
+    from hyrl_mj.judging import Regions, episodes, noisy_episodes
 
     asked = []
 

@@ -21,12 +21,12 @@ from planted import Cube, believe, decisions, halves
 
 from hyrl_mj import BadArtifact, BadInput, MlpPolicy, load_run
 from hyrl_mj.files.artifacts import replacing, write_json
+from hyrl_mj.judging import Arrivals, ModeResult, Retraining
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.pipeline import ExamineOptions, examine_run, run_stage
 from hyrl_mj.policies import Agent
 from hyrl_mj.runs.directory import Run, write_config
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.stages import Arrivals, ModeResult, Retraining
 from hyrl_mj.stages.critical_set import CriticalSet
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.partition import Partition

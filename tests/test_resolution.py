@@ -12,7 +12,7 @@ from planted import UNICYCLE, ChartPolicy, Cube, Unicycle, steering_policy
 
 import hyrl_mj
 from hyrl_mj.errors import BadInput
-from hyrl_mj.game import (
+from hyrl_mj.judging.game import (
     Game,
     Lattice,
     curve_grid,
@@ -20,14 +20,14 @@ from hyrl_mj.game import (
     lattice_grid,
     resolution,
 )
-from hyrl_mj.game.resolution import level_counts, longest, probed_hops, resolves
-from hyrl_mj.game.solver import NEVER, nodes_within
+from hyrl_mj.judging.game.resolution import level_counts, longest, probed_hops, resolves
+from hyrl_mj.judging.game.solver import NEVER, nodes_within
+from hyrl_mj.judging.proof.affine import Unbounded
+from hyrl_mj.judging.proof.cells import Cells
+from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.learning import preset
-from hyrl_mj.pipeline.examination import examination_plan
+from hyrl_mj.pipeline.runs import examination_plan
 from hyrl_mj.policies import PolicyController
-from hyrl_mj.proof import examine
-from hyrl_mj.proof.affine import Unbounded
-from hyrl_mj.proof.cells import Cells
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.sets import Chart, Grid, GridSet
 from hyrl_mj.simulation import LoopSettings, closed_loop
@@ -264,7 +264,7 @@ def test_in_three_dimensions_nothing_is_proved_and_only_what_was_tried_is_not_br
     grid = lattice_grid(cube, 40)
     parts = [GridSet.from_mask(grid, np.ones(len(grid.nodes), dtype=bool))]
     loops = {"policy": still, "hyrl": goes}
-    result, _ = examine(cube, np.empty((0, 3)), parts, loops, (0.0, 0.1), cells=40)
+    result, _ = worst_case(cube, np.empty((0, 3)), parts, loops, (0.0, 0.1), cells=40)
     assert result.estimate
     assert [score.not_broken for score in result.scores["policy"]] == [0.0, 0.0]
     assert [score.not_broken for score in result.scores["hyrl"]] == [1.0, 1.0]
@@ -299,7 +299,7 @@ def planned(name):
 def test_a_map_is_cut_to_the_section_that_is_drawn(unicycle, rough):
     section = Section(unicycle)
     heading = np.round(rough.grid.nodes[:, 2] / rough.grid.spacing[2]).astype(np.int8)
-    maps = hyrl_mj.game.Maps(0.1, np.array(rough.grid.counts), {"policy": heading})
+    maps = hyrl_mj.judging.game.Maps(0.1, np.array(rough.grid.counts), {"policy": heading})
     cut = section.maps(maps)
     assert tuple(cut.grid_counts) == rough.grid.counts[:2]
     assert len(cut.map["policy"]) == math.prod(rough.grid.counts[:2])

@@ -16,16 +16,16 @@ from planted import (
 from hyrl_mj import closed_loop
 from hyrl_mj.envs import BatchedEnv
 from hyrl_mj.envs.core import cautious_reward
-from hyrl_mj.game import Game
+from hyrl_mj.judging.game import Game
+from hyrl_mj.judging.results import ModeResult
 from hyrl_mj.learning import ModeSettings, symmetry, training
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.policies.controllers import PolicyController
+from hyrl_mj.policies.hybrid import HybridController
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.stages.extended_sets import ExtendedSets, extend
 from hyrl_mj.stages.grounds import mode_ground
-from hyrl_mj.stages.hybrid import HybridController
 from hyrl_mj.stages.judges import ByEpisodes, ByGame, Episodes, Judged
-from hyrl_mj.stages.results import ModeResult
 from hyrl_mj.stages.retraining import retrain
 
 # ---- where modes are trained

@@ -22,8 +22,8 @@ from hyrl_mj import BadInput, MlpPolicy
 from hyrl_mj.envs.core import BatchedEnv
 from hyrl_mj.envs.sb3_env import TaskVecEnv
 from hyrl_mj.files import artifacts, manifest
-from hyrl_mj.game.lattice import Lattice
-from hyrl_mj.game.limit import Limit
+from hyrl_mj.judging.game.lattice import Lattice
+from hyrl_mj.judging.game.limit import Limit
 from hyrl_mj.learning import training
 from hyrl_mj.learning.presets import preset
 from hyrl_mj.learning.settings import Settings

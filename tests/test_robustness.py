@@ -16,7 +16,8 @@ from planted import (
 
 from hyrl_mj import BadArtifact, BadInput, Noise, simulate
 from hyrl_mj.files import artifacts
-from hyrl_mj.game import (
+from hyrl_mj.judging import worst_case as examination
+from hyrl_mj.judging.game import (
     BEATEN,
     CURVE,
     LIMIT,
@@ -29,9 +30,9 @@ from hyrl_mj.game import (
     Robustness,
     worst_signal,
 )
-from hyrl_mj.game.solver import NEVER
+from hyrl_mj.judging.game.solver import NEVER
+from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies.controllers import PolicyController
-from hyrl_mj.proof import examination, examine
 from hyrl_mj.sets import Grid
 
 PI = np.pi
@@ -166,7 +167,9 @@ def test_won_is_what_arrives_before_the_episode_ends(circle):
     assert (game.map("slow", 0.0) == BEATEN).any(), "faster controllers arrive"
     assert game.margin("slow") is None
     named = {"policy": loop["slow"], "hyrl": loop["slow"]}
-    result, maps = examine(circle, np.empty((0, 1)), halves(circle), named, (0.0, 0.1), cells=503)
+    result, maps = worst_case(
+        circle, np.empty((0, 1)), halves(circle), named, (0.0, 0.1), cells=503
+    )
     assert result.curve.wins["hyrl"].won[0] == score.won
     assert (maps.map["hyrl"] == UNCLEAR).mean() == result.scores["hyrl"][-1].won
 
@@ -297,7 +300,7 @@ def examined(request, vehicle, circle, on_vehicle, on_circle):
     }[request.param]
     named = {"policy": controllers["sign"], "hyrl": controllers[list(controllers)[-1]]}
     cells = CELLS[request.param]
-    result, maps = examine(
+    result, maps = worst_case(
         task, decisions(task).points, halves(task), named, (0.05, 0.1), cells=cells
     )
     return task, named, result, maps

@@ -6,7 +6,7 @@ from sentences import assert_one_sentence_about
 
 from hyrl_mj import BadArtifact, BadInput, CriticalSet
 from hyrl_mj.files import artifacts
-from hyrl_mj.game import Maps
+from hyrl_mj.judging.game import Maps
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import HybridArc
 from hyrl_mj.stages.extended_sets import ExtendedSets

@@ -12,7 +12,7 @@ import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, Outcome
 from hyrl_mj.files import artifacts
 from hyrl_mj.files.manifest import FILES
-from hyrl_mj.game import Lattice
+from hyrl_mj.judging.game import Lattice
 from hyrl_mj.learning import (
     Settings,
     Training,

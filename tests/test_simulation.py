@@ -26,7 +26,7 @@ from hyrl_mj import (
     simulate,
     simulate_batch,
 )
-from hyrl_mj.game import Game, worst_signal
+from hyrl_mj.judging.game import Game, worst_signal
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import NOT_STARTED, Programmes, Rules

@@ -23,6 +23,7 @@ from planted import TINY, coarsen, shorten
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, pipeline
 from hyrl_mj.files import artifacts
+from hyrl_mj.judging import Regions, episodes, noisy_episodes
 from hyrl_mj.learning import changed, preset
 from hyrl_mj.physics import mjcf
 from hyrl_mj.pipeline import cluster, report
@@ -31,7 +32,6 @@ from hyrl_mj.policies import PolicyController
 from hyrl_mj.runs import sweeps
 from hyrl_mj.runs.directory import Run, write_config
 from hyrl_mj.runs.sweeps import Common, Row, Setting, Sweep
-from hyrl_mj.stages import Regions, episodes, noisy_episodes
 from hyrl_mj.system import cores, progress
 from hyrl_mj.viz import commands, sweep_tables
 
@@ -176,7 +176,9 @@ def test_a_stranger_s_sweep_leads_nowhere_else(tmp_path):
 
 def test_the_least_share_of_episodes_may_be_none(circle):
     counts = tuple(
-        hyrl_mj.game.EpisodeCount("none", 0.1, False, "hyrl", region, 5, {}, reached, (0.0, 1.0))
+        hyrl_mj.judging.game.EpisodeCount(
+            "none", 0.1, False, "hyrl", region, 5, {}, reached, (0.0, 1.0)
+        )
         for region, reached in (("near M*", 0.0), ("elsewhere", 0.8))
     )
     found = sweeps._figures(hyrl_mj.Robustness(0.1, False, None, counts, 0))

@@ -9,9 +9,9 @@ from environments import Puck, Slid, puck_agent
 from planted import ChartPolicy, spare_environments
 
 from hyrl_mj import BadInput, from_gymnasium
-from hyrl_mj.game import Lattice, lattice_grid
+from hyrl_mj.judging.game import Lattice, lattice_grid
+from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies import PolicyController
-from hyrl_mj.proof import examine
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import Signal, closed_loop, policy_runs
 from hyrl_mj.stages import ExtendedSets, PartPolicy
@@ -293,7 +293,7 @@ def test_the_game_on_an_environment_is_an_estimate_with_its_reason(slid):
         )
     }
     points = np.array([[-1.0, 0.0]])
-    result, maps = examine(slid, points, halves, loops, (0.0, 0.2), False, 40)
+    result, maps = worst_case(slid, points, halves, loops, (0.0, 0.2), False, 40)
     assert result.estimate
     assert "contacts" in result.why_not_proved["policy"]
     quiet, noisy = result.scores["policy"]

@@ -9,10 +9,10 @@ import trapped_plants
 from trapped_plants import TRAPS, Robot, dial, drawn, ends, examined, methods, vehicle
 
 from hyrl_mj import BadInput
-from hyrl_mj.game import Lattice
-from hyrl_mj.proof import why_no_cells
-from hyrl_mj.proof.affine import Unbounded
-from hyrl_mj.proof.assumptions import check_assumptions
+from hyrl_mj.judging.game import Lattice
+from hyrl_mj.judging.proof import why_no_cells
+from hyrl_mj.judging.proof.affine import Unbounded
+from hyrl_mj.judging.proof.assumptions import check_assumptions
 from hyrl_mj.sets import Grid
 from hyrl_mj.tasks import check_task
 from hyrl_mj.tasks.anew import begins_anew
@@ -85,7 +85,7 @@ def test_a_saturated_servo_is_no_direct_one(tmp_path, monkeypatch):
 )
 @pytest.mark.filterwarnings("ignore:invalid value", "ignore:divide by zero")
 def test_an_end_by_nan_is_not_proved(tmp_path, monkeypatch, code, bad):
-    from hyrl_mj.proof.cells import Cells
+    from hyrl_mj.judging.proof.cells import Cells
 
     crash = f"ends[~({code}) & (x > 0.5)] = Outcome.CRASHED"
     task = task_of(ends(vehicle(), crash), tmp_path, monkeypatch)
@@ -206,7 +206,7 @@ def test_a_callback_is_a_memory(vehicle):
 
 def test_hops_between_the_nodes_count(vehicle, monkeypatch):
     """A plant that moves some states farther, but no node."""
-    from hyrl_mj.proof import cells as module
+    from hyrl_mj.judging.proof import cells as module
 
     lattice = Lattice.tabulate(vehicle, Grid.with_cells(vehicle.chart, 60))
     plant = type(vehicle.plant(1))

@@ -9,7 +9,8 @@ from scored import SPACING, replays, score
 
 from hyrl_mj import BadArtifact
 from hyrl_mj.files import artifacts
-from hyrl_mj.game import (
+from hyrl_mj.judging import Arrivals, ModeResult, Retraining
+from hyrl_mj.judging.game import (
     LIMIT,
     AttackCount,
     Curve,
@@ -21,10 +22,9 @@ from hyrl_mj.game import (
     compare,
     wilson,
 )
+from hyrl_mj.judging.verdict import FAILED, HELD, PROVED, UNDECIDED, WEAK, WON, Verdict
 from hyrl_mj.policies import PolicyController
-from hyrl_mj.runs.verdict import FAILED, HELD, PROVED, UNDECIDED, WEAK, WON, Verdict
 from hyrl_mj.simulation import simulate
-from hyrl_mj.stages import Arrivals, ModeResult, Retraining
 from hyrl_mj.viz.tables import print_verdict
 
 EPS = 0.1

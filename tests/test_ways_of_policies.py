@@ -9,7 +9,7 @@ from planted_field import Field
 
 import hyrl_mj
 from hyrl_mj import BadInput, Chart, Partition, extend, find_critical_set, make_partition
-from hyrl_mj.stages.critical_set import distance_to
+from hyrl_mj.sets import distance_to
 from hyrl_mj.tasks import check_task
 
 ROW = {"_a": (1, 0, 0.3), "_b": (2, 0.2, 0.3)}
@@ -104,7 +104,7 @@ def test_a_part_is_wide_enough_beside_m_star_for_the_set_of_the_other_mode_to_en
     partition = make_partition(field, policy, points, 40, eps)
     assert partition.modes == (0, 1)
     shared = partition.parts[0] & partition.parts[1]
-    off = distance_to(field, points, partition.grid.nodes[shared.mask]).min()
+    off = distance_to(field.chart, points, partition.grid.nodes[shared.mask]).min()
     if eps:
         assert off > 5 * eps
         sets = extend(field, policy, points, partition, eps)

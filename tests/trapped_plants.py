@@ -16,9 +16,9 @@ from test_certificate import linear
 
 import hyrl_mj
 from hyrl_mj import BadInput
-from hyrl_mj.game import NEVER, Game, Lattice
+from hyrl_mj.judging.game import NEVER, Game, Lattice
+from hyrl_mj.judging.proof import Certificate, why_no_cells
 from hyrl_mj.policies import PolicyController
-from hyrl_mj.proof import Certificate, why_no_cells
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import LoopSettings, Noise, closed_loop
 from hyrl_mj.stages.partition import Partition

@@ -12,11 +12,11 @@ from hyrl_mj.environments import EnvironmentOptions, chosen_task, explained
 from hyrl_mj.errors import BadInput, printable, unknown
 from hyrl_mj.fields import DriveOptions, exported_controller
 from hyrl_mj.files import trust
+from hyrl_mj.judging import FAILED
 from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions, SweepOptions
 from hyrl_mj.policies import check_agent_file
 from hyrl_mj.runs.arcs import noisy_arcs
 from hyrl_mj.runs.directory import Run
-from hyrl_mj.runs.verdict import FAILED
 from hyrl_mj.tasks import Task, get_task, task_names, write_task
 from hyrl_mj.viz import ReplayOptions, print_robustness, print_summary, print_sweep
 

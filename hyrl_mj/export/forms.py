@@ -13,9 +13,8 @@ import numpy as np
 from hyrl_mj.errors import BadInput, brief, unknown
 from hyrl_mj.export.source import write_function
 from hyrl_mj.files import artifacts
-from hyrl_mj.policies import ACTIVATIONS, Controller, MlpPolicy
+from hyrl_mj.policies import ACTIVATIONS, ON_EDGE, Controller, HybridController, MlpPolicy
 from hyrl_mj.sets import Cloud, Everything, Grid, GridSet, StateSet
-from hyrl_mj.stages import ON_EDGE, HybridController
 from hyrl_mj.tasks import Task
 from hyrl_mj.tracing import BATCH, trace
 

@@ -12,9 +12,9 @@ from hyrl_mj.fields.controller import controllers
 from hyrl_mj.fields.driving import Bounds, Driving
 from hyrl_mj.fields.files import FieldFile
 from hyrl_mj.fields.modes import decoded
+from hyrl_mj.judging import Budget, attack
 from hyrl_mj.policies import MlpPolicy, ObservationPolicy
 from hyrl_mj.simulation import HybridArc, Noise, simulate_batch
-from hyrl_mj.stages import Budget, attack
 from hyrl_mj.tasks import POSE, Field, length
 
 # The rounds of the attack.

@@ -8,8 +8,7 @@ from typing import Any, TypeGuard
 from hyrl_mj.errors import BadInput
 from hyrl_mj.fields.controller import FocusController, GuardedPolicy, for_posts
 from hyrl_mj.fields.files import read_field
-from hyrl_mj.policies import MlpPolicy, Policy
-from hyrl_mj.stages import HybridController
+from hyrl_mj.policies import HybridController, MlpPolicy, Policy
 from hyrl_mj.tasks import Field, Task
 
 

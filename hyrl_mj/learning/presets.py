@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from hyrl_mj.errors import BadInput, unknown
-from hyrl_mj.game import LATTICE, Lattice, aligned_cells
+from hyrl_mj.judging.game import LATTICE, Lattice, aligned_cells
 from hyrl_mj.learning.settings import PRESETS, Settings, Training
 from hyrl_mj.policies import Agent, algorithms
 from hyrl_mj.sets import enough_cells

@@ -3,7 +3,7 @@
 `run`, `robustify` and `diagnose` make a whole run; `run_stage` runs one stage again from the files on disk.
 """
 
-from hyrl_mj.pipeline.examination import ExamineOptions
+from hyrl_mj.judging import ExamineOptions
 from hyrl_mj.pipeline.runs import AgentOptions, RunOptions, diagnose, extend_again, robustify, run
 from hyrl_mj.pipeline.steps import as_stage, examine_run, run_stage
 from hyrl_mj.pipeline.sweeping import SweepOptions, report, sweep

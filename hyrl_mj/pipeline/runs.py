@@ -14,14 +14,14 @@ from typing import Any, TypeVar
 
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.files.manifest import locked
+from hyrl_mj.judging import Arrivals
+from hyrl_mj.judging.game import LATTICE
 from hyrl_mj.learning import Settings, Training, changed, preset
-from hyrl_mj.pipeline.examination import examination_plan
 from hyrl_mj.pipeline.steps import DIAGNOSIS, STAGES, extended_sets_stage, run_stage
 from hyrl_mj.policies import ALGORITHMS, FUNCTION, AnyPolicy, algorithms, read_agent
 from hyrl_mj.runs.directory import Run, load_run, opened, write_config
 from hyrl_mj.sets import coarseness
 from hyrl_mj.simulation import judge_task
-from hyrl_mj.stages import Arrivals
 from hyrl_mj.system.progress import Say
 from hyrl_mj.tasks import Task, check_as_made, check_task, get_task
 from hyrl_mj.viz import beginning
@@ -263,3 +263,17 @@ def _with_agent(task: str | Path | Task, policy: AnyPolicy, options: AgentOption
                 external.store(run.path)
                 arrivals.save(run.path / "arrivals.json")
         yield run
+
+
+def examination_plan(run: Run) -> str:
+    """Returns how a run will be examined, and why not in another way, before anything is trained."""
+    if run.why_no_game:
+        return f"by noisy episodes and an attack, because {run.why_no_game}"
+    grid = run.lattice_grid
+    wanted = run.settings.lattice or LATTICE[run.task.chart.dimension]
+    nodes = f"{' x '.join(map(str, grid.counts))} nodes"
+    if max(grid.counts) < wanted:
+        nodes += f" (fewer than {wanted:,} on a side, which would not fit into the memory)"
+    if run.exact:
+        return f"by the worst-case game on {nodes}"
+    return f"by noisy episodes and an attack, and by the worst-case game on {nodes}: {run.why_estimate}"

@@ -11,26 +11,28 @@ from typing import TYPE_CHECKING
 from threadpoolctl import threadpool_limits
 
 from hyrl_mj.errors import BadInput, NoRenderer, unknown
-from hyrl_mj.game import Lattice, Limit, Robustness
+from hyrl_mj.judging import (
+    USUAL,
+    Arrivals,
+    Examination,
+    ExamineOptions,
+    ModeResult,
+    Retraining,
+    Subject,
+    examine,
+    mode_sentence,
+)
+from hyrl_mj.judging.game import Lattice, Limit, Robustness
 from hyrl_mj.learning import Settings
 from hyrl_mj.physics import mujoco_log
-from hyrl_mj.pipeline.examination import (
-    USUAL,
-    ExamineOptions,
-    draw_robustness,
-    examine_controllers,
-    examine_stage,
-)
-from hyrl_mj.policies import Agent, PolicyController, algorithms
+from hyrl_mj.policies import Agent, Controller, PolicyController, algorithms
 from hyrl_mj.runs.arcs import replay_arcs
+from hyrl_mj.runs.diagnosis import losses_of, sentences, usual_arc, worst_arc
 from hyrl_mj.runs.directory import Run
-from hyrl_mj.runs.sentences import mode_sentence
 from hyrl_mj.stages import (
-    Arrivals,
     HeldInputs,
-    ModeResult,
+    Partition,
     PartPolicy,
-    Retraining,
     TableOf,
     boundary,
     extend,
@@ -42,7 +44,8 @@ from hyrl_mj.stages import (
 )
 from hyrl_mj.system import cores
 from hyrl_mj.system.progress import Say
-from hyrl_mj.viz import ReplayOptions, replay_sentence
+from hyrl_mj.tasks import SPARING
+from hyrl_mj.viz import ReplayOptions, replay_sentence, robustness_sentence
 
 if TYPE_CHECKING:
     from hyrl_mj.stages.grounds import ModeGround
@@ -168,6 +171,48 @@ def _retrained(
     )
 
 
+def examine_stage(run: Run, say: Say, options: ExamineOptions = USUAL) -> None:
+    """Examines policy and hybrid controller under noise; all files are written at the end."""
+    subject = replace(subject_of(run, run.loops, run.split), alike=run.keeps_agent)
+    budget = options.budget(subject.effort, subject.exact)  # a wrong one is refused before the work
+    found = examine(subject, options, budget)
+    for name, arc in found.arcs.items():
+        arc.save(run.attack_path(name))
+    if found.maps is not None:
+        draw_robustness(run, found, run.path / "figures")
+        found.maps.save(run.path / "robustness.npz")
+    found.robustness.save(run.path / "robustness.json")
+    if run.agent and run.agent.why_no_function:
+        say(f"{run.agent.why_no_function}: noisy episodes stand in for the worst case")
+    say(robustness_sentence(found.robustness))
+
+
+def subject_of(run: Run, controllers: dict[str, Controller], partition: Partition) -> Subject:
+    """Returns what is examined of a run; `partition` decides which mode the first measurement selects."""
+    s = run.settings
+    return Subject(
+        run.task,
+        controllers,
+        run.critical_set.points,
+        partition.parts,
+        s.noise,
+        s.everywhere,
+        s.lattice,
+        playable=run.why_no_game is None,
+        exact=run.exact,
+        effort=SPARING if s.preset == "smoke" else run.task.effort,
+    )
+
+
+def draw_robustness(run: Run, found: Examination, folder: Path) -> None:
+    """Draws the maps and the curve of the game."""
+    from hyrl_mj.viz import figures
+
+    assert found.robustness.game is not None
+    assert found.maps is not None
+    figures.draw_all(figures.shown_game(run, found.robustness.game, found.maps), folder)
+
+
 def simulate_stage(run: Run, say: Say) -> None:
     """Stage 7: simulates the paper's replay starts, and one on M*, under the paper's noise."""
     arcs, paths = replay_arcs(run), run.arc_paths()
@@ -214,18 +259,17 @@ def diagnose_stage(run: Run, say: Say) -> None:
     from hyrl_mj.viz import diagnosis, figures
 
     folder = run.path / diagnosis.FOLDER
-    robustness, maps = examine_controllers(
-        run, {"policy": PolicyController(run.policy)}, run.partition
-    )
-    losses = diagnosis.losses_of(run)
-    arc = diagnosis.worst_arc(run, losses)
-    figures.draw_all(figures.shown_policy(run, arc or diagnosis.usual_arc(run)), folder)
-    if maps is not None:
-        draw_robustness(run, robustness, maps, folder)
+    alone: dict[str, Controller] = {"policy": PolicyController(run.policy)}
+    found = examine(subject_of(run, alone, run.partition))
+    losses = losses_of(run)
+    arc = worst_arc(run, losses)
+    figures.draw_all(figures.shown_policy(run, arc or usual_arc(run)), folder)
+    if found.maps is not None:
+        draw_robustness(run, found, folder)
     diagnosis.write_worst(run, arc, say)
-    robustness.save(folder / "robustness.json")
-    results = diagnosis.sentences(run, robustness, arc, losses)
-    diagnosis.write_page(run, robustness, arc, results)
+    found.robustness.save(folder / "robustness.json")
+    results = sentences(run, found.robustness, arc, losses)
+    diagnosis.write_page(run, found.robustness, arc, results)
     for sentence in results:
         say(sentence)
     say(f"page at {run.path / diagnosis.PAGE}")

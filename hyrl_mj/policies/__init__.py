@@ -27,6 +27,7 @@ from hyrl_mj.policies.external import (
     reopen_agent,
 )
 from hyrl_mj.policies.functions import from_callable
+from hyrl_mj.policies.hybrid import ON_EDGE, HybridController
 from hyrl_mj.policies.memoryless import Asked
 from hyrl_mj.policies.mlp import (
     ACTIVATIONS,
@@ -52,12 +53,14 @@ __all__ = [
     "BLAS",
     "FUNCTION",
     "ONNX",
+    "ON_EDGE",
     "STATISTICS",
     "TORCH_NAMES",
     "Agent",
     "AnyPolicy",
     "Asked",
     "Controller",
+    "HybridController",
     "MlpPolicy",
     "Normalization",
     "ObservationPolicy",

@@ -12,7 +12,7 @@ from hyrl_mj.policies.preprocessing import PreprocessedPolicy
 
 
 class Controller(Protocol):
-    """A pure function of mode and measurement; see `hyrl_mj.stages.hybrid.HybridController`."""
+    """A pure function of mode and measurement; see `hyrl_mj.policies.hybrid.HybridController`."""
 
     @property
     def modes(self) -> tuple[int, ...]:

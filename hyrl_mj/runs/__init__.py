@@ -1,3 +1,3 @@
-"""Run directories: what they hold, the replays of a run, its verdict, and many runs in a sweep."""
+"""Run directories: what they hold, the replays and the diagnosis of a run, and many runs in a sweep."""
 
-__all__ = ["arcs", "directory", "improvement", "sentences", "sweeps", "verdict"]
+__all__ = ["arcs", "diagnosis", "directory", "improvement", "sweeps"]

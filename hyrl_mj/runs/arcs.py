@@ -8,11 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from hyrl_mj.errors import BadInput, unknown
-from hyrl_mj.game import CURVE_CELLS, EPISODES_INSTEAD, LATTICE, Game, lattice_grid, worst_signal
+from hyrl_mj.judging import Budget, attack
+from hyrl_mj.judging.game import (
+    CURVE_CELLS,
+    EPISODES_INSTEAD,
+    LATTICE,
+    Game,
+    lattice_grid,
+    worst_signal,
+)
 from hyrl_mj.policies import Controller, Policy
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.simulation import AnyNoise, HybridArc, Noise, noise_kinds, samples, simulate_batch
-from hyrl_mj.stages import Budget, attack
 from hyrl_mj.tasks import Task
 
 

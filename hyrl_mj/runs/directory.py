@@ -19,24 +19,14 @@ from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.fields import acting_policy
 from hyrl_mj.files import artifacts
 from hyrl_mj.files.manifest import FILES, Manifest, check_contents, locked, may_hold
-from hyrl_mj.game import Lattice, Robustness, lattice_grid
+from hyrl_mj.judging import Arrivals, Retraining, Verdict
+from hyrl_mj.judging.game import Lattice, Robustness, lattice_grid
+from hyrl_mj.judging.proof import why_no_cells
 from hyrl_mj.learning import Settings, differing
-from hyrl_mj.policies import Agent, AnyPolicy, MlpPolicy, Policy
-from hyrl_mj.proof import why_no_cells
-from hyrl_mj.runs.verdict import Verdict
+from hyrl_mj.policies import Agent, AnyPolicy, HybridController, MlpPolicy, Policy
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import LONGEST, HybridArc
-from hyrl_mj.stages import (
-    Arrivals,
-    BoundTable,
-    CriticalSet,
-    ExtendedSets,
-    HybridController,
-    Partition,
-    PartPolicy,
-    Retraining,
-    TablePolicy,
-)
+from hyrl_mj.stages import BoundTable, CriticalSet, ExtendedSets, Partition, PartPolicy, TablePolicy
 from hyrl_mj.tasks import Task, described_task, get_task, reference
 
 

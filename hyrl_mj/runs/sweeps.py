@@ -16,7 +16,7 @@ import numpy as np
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.files import artifacts
 from hyrl_mj.files.manifest import check_contents, may_hold
-from hyrl_mj.game import LIMIT, Robustness
+from hyrl_mj.judging.game import LIMIT, Robustness
 from hyrl_mj.runs.directory import Run, load_run
 
 NAME = "sweep.json"

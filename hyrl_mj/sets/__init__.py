@@ -9,7 +9,7 @@ from hyrl_mj.sets.choice import MOST_DIMENSIONS, coarseness, covering, enough_ce
 from hyrl_mj.sets.clouds import MOST_NODES, Cloud
 from hyrl_mj.sets.grids import Grid, within_reach
 from hyrl_mj.sets.members import Complement, Everything, GridSet, Nodes, StateSet
-from hyrl_mj.sets.planes import surface_distance
+from hyrl_mj.sets.planes import check_points, distance_to
 
 __all__ = [
     "MOST_DIMENSIONS",
@@ -22,10 +22,11 @@ __all__ = [
     "GridSet",
     "Nodes",
     "StateSet",
+    "check_points",
     "coarseness",
     "covering",
+    "distance_to",
     "enough_cells",
     "resolving",
-    "surface_distance",
     "within_reach",
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from hyrl_mj.errors import BadInput
 from hyrl_mj.sets.chart import Chart
 
 # The weight of the size of a plane's normal in its fit.
@@ -57,7 +58,35 @@ def separating(
     return theta[:, -1] / length, theta[:, :-1] / length[:, None]
 
 
-def surface_distance(chart: Chart, points: np.ndarray, z: np.ndarray) -> np.ndarray:
+def check_points(chart: Chart, points: np.ndarray, owner: str) -> np.ndarray:
+    """Returns points (N, d) of M* as an array of floats; raises `BadInput` if they do not fit a chart."""
+    try:
+        points = np.asarray(points, dtype=float)
+    except (TypeError, ValueError):
+        raise BadInput(
+            f"{points!r:.80} cannot be used as points of M*: give points (N, d)"
+        ) from None
+    if points.ndim != 2 or points.shape[1] != chart.dimension:
+        raise BadInput(
+            f"points of shape {points.shape} cannot lie on M* in the chart of {owner}: give "
+            f"(N, {chart.dimension}), none as (0, {chart.dimension})"
+        )
+    return points
+
+
+def distance_to(chart: Chart, points: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Returns the distance (n,) of z (n, d) to points (N, d) of M*, in scaled units; inf without points.
+
+    In charts of more than three dimensions M* is the surface through its points.
+    """
+    if not len(points):
+        return np.full(len(z), np.inf)
+    if chart.dimension > 3:
+        return _surface_distance(chart, points, z)
+    return np.asarray(chart.tree(points).query(chart.in_box(z))[0])
+
+
+def _surface_distance(chart: Chart, points: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Returns the distance (n,) of z (n, d) from the surface through points (N, d), in scaled units.
 
     Points of a surface in many dimensions lie far apart: the nearest ones are joined by a plane. Beyond the

@@ -11,7 +11,7 @@ from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.files.artifacts import Saved
 from hyrl_mj.learning import WaySettings
 from hyrl_mj.policies import Policy
-from hyrl_mj.sets import Chart, Nodes, covering, surface_distance
+from hyrl_mj.sets import Chart, Nodes, covering
 from hyrl_mj.simulation import WayRuns, policy_runs, way_runs
 from hyrl_mj.stages.search import critical_points
 from hyrl_mj.tasks import SEARCHES, Task
@@ -189,28 +189,3 @@ def _pieces(task: Task, points: np.ndarray, reach: float) -> np.ndarray:
     tree = task.chart.tree(points)
     near = tree.sparse_distance_matrix(tree, reach)
     return connected_components(near, directed=False)[1]
-
-
-def check_points(task: Task, points: np.ndarray) -> np.ndarray:
-    """Returns points (N, d) of M* as an array of floats; raises `BadInput` if they do not fit the chart."""
-    if isinstance(points, CriticalSet):
-        raise BadInput(f"{points!r} cannot be used as points of M*: give its points (N, d)")
-    points = np.asarray(points, dtype=float)
-    if points.ndim != 2 or points.shape[1] != task.chart.dimension:
-        raise BadInput(
-            f"points of shape {points.shape} cannot lie on M* in the chart of {task.name}: give "
-            f"(N, {task.chart.dimension}), none as (0, {task.chart.dimension})"
-        )
-    return points
-
-
-def distance_to(task: Task, points: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Returns the distance (n,) of z (n, d) to points (N, d) of M*, in scaled units; inf without points.
-
-    In charts of more than three dimensions M* is the surface through its points.
-    """
-    if not len(points):
-        return np.full(len(z), np.inf)
-    if task.chart.dimension > 3:
-        return surface_distance(task.chart, points, z)
-    return task.chart.tree(points).query(task.chart.in_box(z))[0]

@@ -11,11 +11,10 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files.artifacts import Saved
-from hyrl_mj.game import Limit, nearest_of
+from hyrl_mj.judging.game import Limit, nearest_of
 from hyrl_mj.learning import OverlapSettings
 from hyrl_mj.policies import Policy
-from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.stages.critical_set import check_points, distance_to
+from hyrl_mj.sets import Grid, GridSet, check_points, distance_to
 from hyrl_mj.stages.meeting import least_room, narrow_sentence
 from hyrl_mj.stages.partition import (
     Partition,
@@ -137,7 +136,8 @@ def extend(
             horizon, every set reaches 2 eps and one sample over the boundary of its part.
         settings: when a horizon is long enough, and what is a gap.
     """
-    case = _Case(task, policy, check_points(task, points), partition, noise, horizon, settings)
+    points = check_points(task.chart, points, task.name)
+    case = _Case(task, policy, points, partition, noise, horizon, settings)
     winning = case.winning() if ways is None else open_ways(ways, partition.grid)
     roomy = case.trim(winning)
     if ways is None or horizon is not None:
@@ -189,7 +189,7 @@ class _Case:
         # The extended sets lie among these candidates.
         radius = 3 * noise + near + (0.0 if horizon is None else horizon / task.dt * near)
         self._candidates = [part.dilated(radius).mask for part in self.parts]
-        off = distance_to(task, points, self.grid.nodes)
+        off = distance_to(task.chart, points, self.grid.nodes)
         self.around = off <= float(np.linalg.norm((2 * self.eps + self.hop) / task.chart.scale))
         # The cells that backward runs visit are those of a grid.
         self._backward = task.kinematic and isinstance(self.grid, Grid)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hyrl_mj import game
 from hyrl_mj.envs import Domain
+from hyrl_mj.judging import game
 from hyrl_mj.learning import ModeSettings
 from hyrl_mj.learning.training import Score
 from hyrl_mj.policies import MlpPolicy, Policy

@@ -10,13 +10,12 @@ from typing import Protocol
 
 import numpy as np
 
-from hyrl_mj import game
+from hyrl_mj.judging import Budget, attack, game
 from hyrl_mj.learning import ModeSettings
 from hyrl_mj.learning.training import Score
 from hyrl_mj.policies import Policy, PolicyController
+from hyrl_mj.sets import distance_to
 from hyrl_mj.simulation import KINDS, LoopSettings, Noise, closed_loop
-from hyrl_mj.stages.attacks import Budget, attack
-from hyrl_mj.stages.critical_set import distance_to
 from hyrl_mj.stages.mode_states import ModeStates
 from hyrl_mj.tasks import Outcome
 
@@ -277,7 +276,7 @@ class ByAttack:
         self.enough: Score = (1.0, *self.noisy.enough)
         self.nearly: Score = (1 - settings.may_break,)
         task, bound, count = states.task, states.bound, ATTACKED
-        off = distance_to(task, states.extended.points, states.grid.nodes[states.nodes])
+        off = distance_to(task.chart, states.extended.points, states.grid.nodes[states.nodes])
         near = states.nodes[off <= 2 * float(np.linalg.norm(bound / task.chart.scale))]
         half, starts = count // 2 if len(near) else 0, self.noisy.episodes.starts
         self.attacked = starts[: count - half]

@@ -12,13 +12,12 @@ import numpy as np
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files import artifacts
 from hyrl_mj.files.artifacts import Saved
-from hyrl_mj.game import NEVER, Limit
+from hyrl_mj.judging.game import NEVER, Limit
 from hyrl_mj.learning import WaySettings
 from hyrl_mj.policies import Policy
-from hyrl_mj.sets import GridSet, Nodes, resolving
+from hyrl_mj.sets import GridSet, Nodes, check_points, resolving
 from hyrl_mj.simulation import WayRuns, policy_runs, way_runs
 from hyrl_mj.stages import strips
-from hyrl_mj.stages.critical_set import check_points
 from hyrl_mj.stages.refinement import refined, thinned
 from hyrl_mj.stages.ways import Ways
 from hyrl_mj.tasks import ANY, Outcome, Task, number_of
@@ -141,7 +140,7 @@ def make_partition(
             enough to tell states apart that it does, as far as `cells` allows.
         settings: which ways are modes.
     """
-    points = check_points(task, points)
+    points = check_points(task.chart, points, task.name)
     grid = resolving(task.chart, cells, points, task.noise_in_chart(max(noise, 1e-6)))
     simulated, neighbours = thinned(task, grid)
     first = WayRuns.from_rollout(

@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hyrl_mj.sets import Grid, Nodes
-from hyrl_mj.stages.critical_set import distance_to
+from hyrl_mj.sets import Grid, Nodes, distance_to
 from hyrl_mj.tasks import Task
 
 # Along a noisy coordinate one in so many nodes is simulated.
@@ -77,7 +76,7 @@ def refined(
     nearest = np.where(index - below <= above - index, below, above)
     known[rows] = known[np.ravel_multi_index(tuple(nearest), nodes.counts)]
     asked = rows[differ]
-    asked = asked[distance_to(task, points, nodes.nodes[asked]) <= reach]
+    asked = asked[distance_to(task.chart, points, nodes.nodes[asked]) <= reach]
     if len(asked):
         known[asked] = tell(asked)
     return known

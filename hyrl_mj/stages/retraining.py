@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from hyrl_mj.judging import Kind, ModeResult
 from hyrl_mj.learning import Training, symmetry
 from hyrl_mj.learning.distillation import distil, fits
 from hyrl_mj.learning.training import Score, train
 from hyrl_mj.policies import ALGORITHMS, MlpPolicy, Policy
 from hyrl_mj.stages.grounds import ModeGround
 from hyrl_mj.stages.partition import Partition, PartPolicy, part_policy
-from hyrl_mj.stages.results import Kind, ModeResult
 from hyrl_mj.stages.tables import BoundTable, TableOf
 
 # The policy of a mode: a trained network, pi_i, or a table.

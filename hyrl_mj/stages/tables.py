@@ -19,7 +19,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files.artifacts import Saved
-from hyrl_mj.game import nearest_of
+from hyrl_mj.judging.game import nearest_of
 from hyrl_mj.learning import TableSettings
 from hyrl_mj.sets import Grid, Nodes
 from hyrl_mj.system.progress import progress_bar

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from hyrl_mj import learning
-from hyrl_mj.game import Robustness
+from hyrl_mj.judging.game import Robustness
 from hyrl_mj.learning import STAGES, Settings, preset
 from hyrl_mj.policies import ALGORITHMS
 from hyrl_mj.runs.directory import Run

@@ -14,12 +14,12 @@ from PIL import Image
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files import artifacts
-from hyrl_mj.game import MAP_CLASSES, Robustness
+from hyrl_mj.judging import POLICIES, listed
+from hyrl_mj.judging.game import MAP_CLASSES, Robustness
 from hyrl_mj.learning import Training
 from hyrl_mj.policies import Agent, MlpPolicy
 from hyrl_mj.runs.arcs import attack_replay
 from hyrl_mj.runs.directory import Run
-from hyrl_mj.runs.sentences import POLICIES, listed
 from hyrl_mj.viz import tables
 from hyrl_mj.viz.commands import changed, commands
 from hyrl_mj.viz.figures import CLASS_COLOURS, FIGURES

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter
 
-from hyrl_mj.game import Maps
+from hyrl_mj.judging.game import Maps
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.sets import Chart, Grid, GridSet
 from hyrl_mj.stages import CriticalSet, ExtendedSets, Partition, critical_points

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-from hyrl_mj.game import Curve
+from hyrl_mj.judging.game import Curve
 from hyrl_mj.runs.directory import load_run
 from hyrl_mj.runs.improvement import LEAST_SEEDS, profile
 from hyrl_mj.runs.sweeps import Row, Setting, Sweep

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 
-from hyrl_mj.game import percent
+from hyrl_mj.judging.game import percent
 from hyrl_mj.runs.improvement import Mean, improvements
 from hyrl_mj.runs.sweeps import Row, Sweep, summary
 from hyrl_mj.viz.tables import Table, print_table

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hyrl_mj.game import (
+from hyrl_mj.judging import margin_text
+from hyrl_mj.judging.game import (
     LIMIT,
     NEARLY,
     NO_NOISE,
@@ -156,11 +157,6 @@ def margin_table(task: Task, game: GameResult) -> Table:
 def excursion_text(excursion: float | None) -> str:
     """Returns how far off the set-point noise keeps a run; "-" where every run ends."""
     return "-" if excursion is None else f"{excursion:.3f}"
-
-
-def margin_text(margin: float | None, unit: str) -> str:
-    """Returns a margin with its unit; "none" where some run is lost even without noise."""
-    return "none" if margin is None else f"{margin:.3g} {unit}"
 
 
 def replays_table(task: Task, counts: Sequence[ReplayCount]) -> Table:

@@ -50,8 +50,8 @@ def measure(kind: str, size: int, run: Path) -> tuple[float, float]:
         began = time.perf_counter()
         hyrl_mj.find_critical_set(task, policy, size, 1 / 32)
     else:
+        from hyrl_mj.judging import Regions, noisy_episodes
         from hyrl_mj.simulation import Noise
-        from hyrl_mj.stages import Regions, noisy_episodes
 
         finished = hyrl_mj.load_run(run)
         began = time.perf_counter()

@@ -13,11 +13,12 @@ import numpy as np
 import hyrl_mj
 from attacks import Answer, child, command
 from attacks.small import shorten  # noqa: F401
+from hyrl_mj.judging import Arrivals, ModeResult, Retraining
 from hyrl_mj.learning import preset
 from hyrl_mj.policies import MlpPolicy
 from hyrl_mj.runs.directory import Run, write_config
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.stages import Arrivals, ExtendedSets, ModeResult, Retraining
+from hyrl_mj.stages import ExtendedSets
 
 TASK = "unit_circle"
 RUN = ("run", TASK, "--preset", "smoke", "--out", TASK)

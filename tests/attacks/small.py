@@ -14,11 +14,11 @@ from typing import Any
 
 from matplotlib.mathtext import MathTextParser
 
-import hyrl_mj.proof.assumptions as assumptions
-import hyrl_mj.proof.cells as cells
-import hyrl_mj.proof.examination as examination
-import hyrl_mj.proof.replays as replays
-import hyrl_mj.stages.results as results
+import hyrl_mj.judging.proof.assumptions as assumptions
+import hyrl_mj.judging.proof.cells as cells
+import hyrl_mj.judging.proof.replays as replays
+import hyrl_mj.judging.results as results
+import hyrl_mj.judging.worst_case as examination
 import hyrl_mj.viz.diagnosis as diagnosis
 import hyrl_mj.viz.drives as drives
 import hyrl_mj.viz.figures.style as style

@@ -11,7 +11,7 @@ from matplotlib.colors import ListedColormap, NoNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle, Wedge
 
-from hyrl_mj.game import LIMIT, MAP_CLASSES, OVER, Score, Wins
+from hyrl_mj.judging.game import LIMIT, MAP_CLASSES, OVER, Score, Wins
 from hyrl_mj.sets import Chart, Grid
 from hyrl_mj.viz import colours
 from hyrl_mj.viz.figures import charts, style

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from hyrl_mj.game import GameResult, Maps
+from hyrl_mj.judging.game import GameResult, Maps
 from hyrl_mj.policies import Policy
 from hyrl_mj.runs.arcs import overview_arcs, policy_start_arcs
 from hyrl_mj.runs.directory import Run

@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hyrl_mj.game import NEVER, Game, Moves, share, solve
+from hyrl_mj.judging.game import NEVER, Game, Moves, share, solve
+from hyrl_mj.judging.proof.affine import Unbounded
+from hyrl_mj.judging.proof.answers import BoundedAnswers
+from hyrl_mj.judging.proof.cells import Cells
 from hyrl_mj.policies import Controller
-from hyrl_mj.proof.affine import Unbounded
-from hyrl_mj.proof.answers import BoundedAnswers
-from hyrl_mj.proof.cells import Cells
 
 
 class Proved(NamedTuple):

@@ -8,11 +8,11 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.game import Lattice
-from hyrl_mj.proof.affine import Affine, Unbounded
-from hyrl_mj.proof.assumptions import check_assumptions
-from hyrl_mj.proof.networks import bounds_of, program_of
-from hyrl_mj.proof.rules import as_form
+from hyrl_mj.judging.game import Lattice
+from hyrl_mj.judging.proof.affine import Affine, Unbounded
+from hyrl_mj.judging.proof.assumptions import check_assumptions
+from hyrl_mj.judging.proof.networks import bounds_of, program_of
+from hyrl_mj.judging.proof.rules import as_form
 from hyrl_mj.sets import Grid, Nodes
 from hyrl_mj.tasks import Outcome, Task
 

@@ -7,10 +7,10 @@ from itertools import product
 
 import numpy as np
 
-from hyrl_mj.game import FIRST, NEVER, Game
+from hyrl_mj.judging.game import FIRST, NEVER, Game
+from hyrl_mj.judging.proof.cells import Cells
+from hyrl_mj.judging.proof.certificate import Certificate
 from hyrl_mj.policies import Controller
-from hyrl_mj.proof.cells import Cells
-from hyrl_mj.proof.certificate import Certificate
 from hyrl_mj.simulation import (
     NOT_STARTED,
     AnyNoise,

@@ -7,8 +7,8 @@ from itertools import product
 
 import numpy as np
 
-from hyrl_mj.game.lattice import Lattice, nearest_of
-from hyrl_mj.game.solver import (
+from hyrl_mj.judging.game.lattice import Lattice, nearest_of
+from hyrl_mj.judging.game.solver import (
     AT_ONCE,
     FIRST,
     LOST,

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from hyrl_mj.errors import brief
-from hyrl_mj.proof import affine, functions
-from hyrl_mj.proof.affine import Affine, Unbounded
+from hyrl_mj.judging.proof import affine, functions
+from hyrl_mj.judging.proof.affine import Affine, Unbounded
 from hyrl_mj.tracing import BATCH, Operation, Program
 
 # Rounding errors of NumPy's functions and of ours, in units in the last place.

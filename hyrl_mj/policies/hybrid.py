@@ -9,7 +9,8 @@ from functools import cached_property
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.policies import Policy, check_inputs, check_modes
+from hyrl_mj.policies.controllers import check_inputs, check_modes
+from hyrl_mj.policies.mlp import Policy
 from hyrl_mj.sets import Complement, StateSet
 from hyrl_mj.tasks import Task
 

@@ -6,13 +6,13 @@ from functools import cached_property
 import numpy as np
 
 from hyrl_mj.errors import BadInput, unknown
-from hyrl_mj.game import result
-from hyrl_mj.game.adversary import WorstEstimate, WorstNoise
-from hyrl_mj.game.lattice import Lattice
-from hyrl_mj.game.limit import Limit
-from hyrl_mj.game.resolution import lattice_grid
-from hyrl_mj.game.result import LIMIT, NodeScore
-from hyrl_mj.game.solver import NEVER, Answers, Moves, lasting, noisy_moves, solve
+from hyrl_mj.judging.game import result
+from hyrl_mj.judging.game.adversary import WorstEstimate, WorstNoise
+from hyrl_mj.judging.game.lattice import Lattice
+from hyrl_mj.judging.game.limit import Limit
+from hyrl_mj.judging.game.resolution import lattice_grid
+from hyrl_mj.judging.game.result import LIMIT, NodeScore
+from hyrl_mj.judging.game.solver import NEVER, Answers, Moves, lasting, noisy_moves, solve
 from hyrl_mj.policies import Controller, Policy, as_controller
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import LoopSettings, Recorded, Signal, closed_loop

@@ -7,11 +7,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hyrl_mj.game import NEARLY, NEVER, PROVED_STARTS, WON_STARTS, LostReplay, ReplayCount, Score
+from hyrl_mj.judging.game import (
+    NEARLY,
+    NEVER,
+    PROVED_STARTS,
+    WON_STARTS,
+    LostReplay,
+    ReplayCount,
+    Score,
+)
+from hyrl_mj.judging.proof.cells import Cells
+from hyrl_mj.judging.proof.certificate import Certificate
+from hyrl_mj.judging.proof.counterexamples import CellNoise
 from hyrl_mj.policies import Controller
-from hyrl_mj.proof.cells import Cells
-from hyrl_mj.proof.certificate import Certificate
-from hyrl_mj.proof.counterexamples import CellNoise
 from hyrl_mj.sets import Grid
 from hyrl_mj.simulation import NOT_STARTED, AnyNoise, LoopSettings, Noise, closed_loop, judge
 from hyrl_mj.tasks import Outcome, Task

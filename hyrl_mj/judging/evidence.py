@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hyrl_mj.game import NEARLY, NO_NOISE, Robustness, wilson
+from hyrl_mj.judging.game import NEARLY, NO_NOISE, Robustness, wilson
 
 # What HELD needs at least: episodes of each kind of noise, and attacked starts. Of 300 starts none is lost if
 # 99% are won at the lower end of a one-sided 95% interval (3 / 300 = 1%); the two-sided one that is asked for

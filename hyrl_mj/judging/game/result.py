@@ -11,7 +11,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadArtifact
 from hyrl_mj.files import artifacts
-from hyrl_mj.game.counts import AttackCount, Comparison, EpisodeCount, ReplayCount
+from hyrl_mj.judging.game.counts import AttackCount, Comparison, EpisodeCount, ReplayCount
 from hyrl_mj.sets import Chart, Grid
 
 # Name of the limit, a controller that is scored beside the examined ones.

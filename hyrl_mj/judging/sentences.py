@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hyrl_mj.game import NO_NOISE, PROVED_STARTS, Comparison, ReplayCount, Score, percent
-from hyrl_mj.stages import ModeResult
+from hyrl_mj.judging.game import NO_NOISE, PROVED_STARTS, Comparison, ReplayCount, Score, percent
+from hyrl_mj.judging.results import ModeResult
 from hyrl_mj.tasks import Task
 
 
@@ -42,6 +42,11 @@ def replays_sentence(task: Task, count: ReplayCount) -> str:
         f"{noise} {who} ends {first.outcome.replace('_', ' ')}, and {count.failures:,} of "
         f"{count.played:,} such replays in MuJoCo are lost"
     )
+
+
+def margin_text(margin: float | None, unit: str) -> str:
+    """Returns a margin with its unit; "none" where some run is lost even without noise."""
+    return "none" if margin is None else f"{margin:.3g} {unit}"
 
 
 def share_sentence(score: Score) -> str:

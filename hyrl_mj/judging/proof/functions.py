@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hyrl_mj.proof.affine import (
+from hyrl_mj.judging.proof.affine import (
     Affine,
     Unbounded,
     choose,

@@ -14,8 +14,8 @@ from itertools import count
 
 import numpy as np
 
-from hyrl_mj.game.lattice import Lattice
-from hyrl_mj.game.solver import NEVER, Moves, by_target, count_down, entries, nodes_within
+from hyrl_mj.judging.game.lattice import Lattice
+from hyrl_mj.judging.game.solver import NEVER, Moves, by_target, count_down, entries, nodes_within
 from hyrl_mj.sets import GridSet, within_reach
 
 # Parts whose depths differ by no more than this meet there [chart units].

@@ -16,7 +16,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hyrl_mj.errors import BadInput, check_seed
-from hyrl_mj.game import AttackCount, Ends, wilson
+from hyrl_mj.judging.attack_search import Search
+from hyrl_mj.judging.episodes import Regions, ends_of
+from hyrl_mj.judging.game import AttackCount, Ends, wilson
 from hyrl_mj.policies import Controller
 from hyrl_mj.simulation import (
     HybridArc,
@@ -26,8 +28,6 @@ from hyrl_mj.simulation import (
     closed_loop,
     simulate_batch,
 )
-from hyrl_mj.stages.attack_search import Search
-from hyrl_mj.stages.episodes import Regions, ends_of
 from hyrl_mj.tasks import Outcome, Task
 
 # The longest attack [s], a day, and the most rounds.

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from hyrl_mj.game import Ends
+from hyrl_mj.judging.episodes import ends_of
+from hyrl_mj.judging.game import Ends
 from hyrl_mj.policies import Controller
 from hyrl_mj.simulation import GIVEN, LoopSettings, Programmes, Rules, closed_loop
-from hyrl_mj.stages.episodes import ends_of
 from hyrl_mj.tasks import Outcome, Task
 
 # Segments of a programme, each of the same time; together as long as a run without noise.

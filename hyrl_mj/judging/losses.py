@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from hyrl_mj.game import NEVER, Game, curve_grid
+from hyrl_mj.judging.game import NEVER, Game, curve_grid
 from hyrl_mj.policies import Policy, PolicyController
-from hyrl_mj.sets import within_reach
-from hyrl_mj.stages.partition import Partition, longest_hop, neighbourhood, part_policies
+from hyrl_mj.sets import GridSet, within_reach
 from hyrl_mj.tasks import Task
 
 
@@ -30,7 +30,14 @@ class Losses:
     grazing: np.ndarray
 
 
-def sort_losses(task: Task, policy: Policy, partition: Partition, eps: float, cells: int) -> Losses:
+def sort_losses(
+    task: Task,
+    policy: Policy,
+    parts: Sequence[GridSet],
+    pis: Sequence[Policy],
+    eps: float,
+    cells: int,
+) -> Losses:
     """Sorts the winnable starts that a policy loses to the worst noise.
 
     Each part's policy pi_i (paper, Step 4) plays the game alone. A start is won by holding the way if all
@@ -39,15 +46,14 @@ def sort_losses(task: Task, policy: Policy, partition: Partition, eps: float, ce
     Args:
         task: the robot and its problem.
         policy: the policy, a function of the measurement.
-        partition: M_i, from stage 3.
+        parts: M_i of each mode.
+        pis: pi_i of each mode.
         eps: the noise bound.
         cells: lattice cells along the longest side, as in `curve_grid`.
     """
-    near = neighbourhood(partition, eps, longest_hop(task, policy, partition.grid))
-    pis = part_policies(task, policy, partition, near)
     loops = {f"part {i}": PolicyController(pi) for i, pi in enumerate(pis)}
     grid = curve_grid(task, cells)
-    game = Game(task, partition, {"policy": PolicyController(policy), **loops}, eps, grid=grid)
+    game = Game(task, parts, {"policy": PolicyController(policy), **loops}, eps, grid=grid)
     lost = game.starts & game.winnable(eps) & (game.value("policy", eps)[-1, :-2] >= NEVER)
     held = np.ones(len(lost), dtype=bool)
     window = np.ceil(game.bound(eps) / grid.spacing).astype(int)

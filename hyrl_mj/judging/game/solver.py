@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.game.lattice import Lattice
+from hyrl_mj.judging.game.lattice import Lattice
 from hyrl_mj.policies import Controller
 from hyrl_mj.sets import within_reach
 

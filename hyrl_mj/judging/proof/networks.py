@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from hyrl_mj.errors import BadInput
+from hyrl_mj.judging.proof.affine import Affine, Unbounded
+from hyrl_mj.judging.proof.rules import Truth, as_form, bounds
 from hyrl_mj.policies import ACTIVATIONS, BLAS, MlpPolicy, Policy, PreprocessedPolicy
-from hyrl_mj.proof.affine import Affine, Unbounded
-from hyrl_mj.proof.rules import Truth, as_form, bounds
 from hyrl_mj.system import cores
 from hyrl_mj.tasks import Task
 from hyrl_mj.tracing import BATCH, Program, trace

@@ -1,4 +1,4 @@
-"""The examination of controllers in the worst case: what is proved, what is lost, margins, curve and maps."""
+"""Controllers in the worst case: what is proved, what is lost, margins, curve and maps."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hyrl_mj.game import (
+from hyrl_mj.judging.game import (
     CURVE,
     LARGEST,
     LIMIT,
@@ -32,11 +32,11 @@ from hyrl_mj.game import (
     lattice_grid,
     share,
 )
+from hyrl_mj.judging.proof.cells import decides
+from hyrl_mj.judging.proof.certificate import Certificate, Proved
+from hyrl_mj.judging.proof.counterexamples import Broken, attack
+from hyrl_mj.judging.proof.replays import Replays, play
 from hyrl_mj.policies import BLAS, Controller
-from hyrl_mj.proof.cells import decides
-from hyrl_mj.proof.certificate import Certificate, Proved
-from hyrl_mj.proof.counterexamples import Broken, attack
-from hyrl_mj.proof.replays import Replays, play
 from hyrl_mj.sets import GridSet
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.system import cores
@@ -49,7 +49,7 @@ QUIET_EPISODES = 1000
 THREADS = 4
 
 
-def examine(
+def worst_case(
     task: Task,
     points: np.ndarray,
     parts: Iterable[GridSet],

@@ -4,8 +4,8 @@ The plant is tabulated on a lattice of states, and the game is solved on it by b
 `Game` scores controllers on the nodes, and `Limit` is what a split of the states could win.
 """
 
-from hyrl_mj.game.adversary import WorstNoise
-from hyrl_mj.game.counts import (
+from hyrl_mj.judging.game.adversary import WorstNoise
+from hyrl_mj.judging.game.counts import (
     LATE,
     NO_NOISE,
     PROVED_STARTS,
@@ -19,10 +19,16 @@ from hyrl_mj.game.counts import (
     compare,
     wilson,
 )
-from hyrl_mj.game.lattice import EPISODES_INSTEAD, Lattice, nearest_of
-from hyrl_mj.game.limit import Limit, fewest_samples
-from hyrl_mj.game.resolution import CURVE_CELLS, LATTICE, aligned_cells, curve_grid, lattice_grid
-from hyrl_mj.game.result import (
+from hyrl_mj.judging.game.lattice import EPISODES_INSTEAD, Lattice, nearest_of
+from hyrl_mj.judging.game.limit import Limit, fewest_samples
+from hyrl_mj.judging.game.resolution import (
+    CURVE_CELLS,
+    LATTICE,
+    aligned_cells,
+    curve_grid,
+    lattice_grid,
+)
+from hyrl_mj.judging.game.result import (
     BEATEN,
     LIMIT,
     MAP_CLASSES,
@@ -43,8 +49,8 @@ from hyrl_mj.game.result import (
     Wins,
     percent,
 )
-from hyrl_mj.game.scores import CURVE, LARGEST, Game, share, worst_signal
-from hyrl_mj.game.solver import (
+from hyrl_mj.judging.game.scores import CURVE, LARGEST, Game, share, worst_signal
+from hyrl_mj.judging.game.solver import (
     FIRST,
     LOST,
     NEVER,

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.game.resolution import (
+from hyrl_mj.judging.game.resolution import (
     LATTICE,
     MOST_TRANSITIONS,
     lattice_grid,

@@ -8,13 +8,12 @@ from itertools import product
 
 import numpy as np
 
-from hyrl_mj.policies import Controller, PolicyController
-from hyrl_mj.proof.affine import Unbounded
-from hyrl_mj.proof.assumptions import check_assumptions
-from hyrl_mj.proof.cells import TINY, Cells
-from hyrl_mj.proof.networks import BoundedPolicy
+from hyrl_mj.judging.proof.affine import Unbounded
+from hyrl_mj.judging.proof.assumptions import check_assumptions
+from hyrl_mj.judging.proof.cells import TINY, Cells
+from hyrl_mj.judging.proof.networks import BoundedPolicy
+from hyrl_mj.policies import ON_EDGE, Controller, HybridController, PolicyController
 from hyrl_mj.sets import Everything, Grid, GridSet, StateSet
-from hyrl_mj.stages import ON_EDGE, HybridController
 from hyrl_mj.tasks import Task
 
 # Boxes of measurements along one side of a cell, for coordinates with noise.

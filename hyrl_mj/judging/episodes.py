@@ -11,12 +11,11 @@ from itertools import product
 import numpy as np
 
 from hyrl_mj.errors import BadInput, check_seed
-from hyrl_mj.game import NO_NOISE, Comparison, Ends, EpisodeCount, compare, wilson
+from hyrl_mj.judging.game import NO_NOISE, Comparison, Ends, EpisodeCount, compare, wilson
 from hyrl_mj.physics.plant import Plant
 from hyrl_mj.policies import Controller
-from hyrl_mj.sets import Grid
+from hyrl_mj.sets import Grid, check_points, distance_to
 from hyrl_mj.simulation import LoopSettings, Noise, Rollout, closed_loop, judge
-from hyrl_mj.stages.critical_set import check_points, distance_to
 from hyrl_mj.system import cores
 from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Outcome, Task
@@ -85,7 +84,7 @@ class Regions:
 
     def _close(self, task: Task, bound: float, z: np.ndarray) -> np.ndarray:
         """Returns whether starts (n, d) lie within twice the noise bound of M*: (n,) bool."""
-        return np.asarray(distance_to(task, self.points, z) <= 2 * bound)
+        return np.asarray(distance_to(task.chart, self.points, z) <= 2 * bound)
 
 
 @dataclass(frozen=True)
@@ -130,7 +129,7 @@ def noisy_episodes(
             plain MuJoCo plays otherwise.
     """
     check_seed(seed)
-    check_points(task, regions.points)
+    check_points(task.chart, regions.points, task.name)
     if count < 1:
         raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
     for noise in noises:

@@ -11,11 +11,11 @@ import mujoco
 import numpy as np
 
 from hyrl_mj.errors import BadInput
+from hyrl_mj.judging.proof.affine import Affine, Unbounded
+from hyrl_mj.judging.proof.networks import bounds_of, program_of
+from hyrl_mj.judging.proof.rules import Truth
+from hyrl_mj.judging.proof.turns import tells_turns
 from hyrl_mj.physics import memory, mjcf
-from hyrl_mj.proof.affine import Affine, Unbounded
-from hyrl_mj.proof.networks import bounds_of, program_of
-from hyrl_mj.proof.rules import Truth
-from hyrl_mj.proof.turns import tells_turns
 from hyrl_mj.sets import Chart
 from hyrl_mj.tasks import Task
 from hyrl_mj.tracing import Program

@@ -5,15 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from hyrl_mj.game import (
-    NEARLY,
-    NO_NOISE,
-    ReplayCount,
-    Robustness,
-    percent,
-)
-from hyrl_mj.runs.evidence import Sample, Wins, by_kind
-from hyrl_mj.runs.sentences import (
+from hyrl_mj.judging.evidence import Sample, Wins, by_kind
+from hyrl_mj.judging.game import NEARLY, NO_NOISE, ReplayCount, Robustness, percent
+from hyrl_mj.judging.results import Arrivals, Retraining
+from hyrl_mj.judging.sentences import (
     POLICIES,
     comparison_sentence,
     listed,
@@ -22,7 +17,6 @@ from hyrl_mj.runs.sentences import (
     share_sentence,
 )
 from hyrl_mj.simulation import usual_kinds
-from hyrl_mj.stages import Arrivals, Retraining
 from hyrl_mj.tasks import Task
 
 PROVED, WON, HELD, UNDECIDED, WEAK, FAILED = (

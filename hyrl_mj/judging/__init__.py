@@ -1,0 +1,43 @@
+"""The one place where controllers are judged: `examine` asks all that is asked of them under noise.
+
+Behind it are the worst-case game (`game`), what is proved between its nodes (`proof`), both together
+(`worst_case`), noisy episodes, and an attack that searches for noise. `Verdict` is a function of the results.
+"""
+
+from hyrl_mj.judging.attacks import Attack, Budget, attack, attack_starts
+from hyrl_mj.judging.episodes import NoisyEpisodes, Regions, noisy_episodes
+from hyrl_mj.judging.examination import USUAL, Examination, ExamineOptions, Subject, examine
+from hyrl_mj.judging.losses import Losses, sort_losses
+from hyrl_mj.judging.results import Arrivals, Kind, ModeResult, Retraining
+from hyrl_mj.judging.sentences import POLICIES, listed, margin_text, mode_sentence, replays_sentence
+from hyrl_mj.judging.verdict import FAILED, Verdict
+
+__all__ = [
+    "FAILED",
+    "POLICIES",
+    "USUAL",
+    "Arrivals",
+    "Attack",
+    "Budget",
+    "Examination",
+    "ExamineOptions",
+    "Kind",
+    "Losses",
+    "ModeResult",
+    "NoisyEpisodes",
+    "Regions",
+    "Retraining",
+    "Subject",
+    "Verdict",
+    "attack",
+    "attack_starts",
+    "examine",
+    "game",
+    "listed",
+    "margin_text",
+    "mode_sentence",
+    "noisy_episodes",
+    "proof",
+    "replays_sentence",
+    "sort_losses",
+]

@@ -1,0 +1,195 @@
+"""What is asked of controllers under noise: the worst-case game, noisy episodes, and an attack."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hyrl_mj.errors import BadInput
+from hyrl_mj.judging.attacks import Attack, Budget, attack, attack_starts, shown_arcs
+from hyrl_mj.judging.episodes import NoisyEpisodes, Regions, noisy_episodes
+from hyrl_mj.judging.game import OVER, UNWINNABLE, Maps, Robustness, compare
+from hyrl_mj.judging.worst_case import worst_case
+from hyrl_mj.policies import Controller
+from hyrl_mj.sets import Grid, GridSet
+from hyrl_mj.simulation import HybridArc, Noise, usual_kinds
+from hyrl_mj.tasks import Effort, Task
+
+# The most starts of an attack: each keeps signals of a whole episode.
+MOST_STARTS = 100_000
+
+
+@dataclass(frozen=True)
+class ExamineOptions:
+    """The options of an examination under noise.
+
+    Attributes:
+        eps: bound of the noise, in the units of the chart; by default the run's.
+        episodes: noisy episodes for each kind of noise and each controller; by default none where the worst
+            case can be computed and not only estimated, on charts of one or two dimensions.
+        noise: kinds of noise in the episodes; by default none,uniform,alternating,adversarial, without the
+            last in environments of others.
+        all_coordinates: add noise to every coordinate of the measurement, not only to the noisy ones of the
+            task; always, if the run was made so.
+        near_critical: start all episodes and the attack within twice the bound of the critical set.
+        seed: seed of starts and noise of the episodes and of the attack.
+        attack_starts: number of starts of an attack; by default 400, or 100 in environments of others and
+            with preset smoke.
+        attack_seconds: time [s] of an attack, a search for noise that makes policy and hybrid controller
+            fail; by default a few rounds where the worst case cannot be computed, else none.
+        attack_rounds: number of rounds of the attack instead of a time, which repeats an earlier one of as
+            many; by default the time decides.
+    """
+
+    eps: float | None = None
+    episodes: int | None = None
+    noise: tuple[str, ...] = ()
+    all_coordinates: bool = False
+    near_critical: bool = False
+    seed: int = 0
+    attack_starts: int | None = None
+    attack_seconds: float | None = None
+    attack_rounds: int | None = None
+
+    def budget(self, effort: Effort, exact: bool) -> Budget | None:
+        """Returns how long controllers are attacked, or None if they are not.
+
+        Raises:
+            BadInput: an impossible time or number of rounds, or both.
+        """
+        if self.attack_starts is not None and not 1 <= self.attack_starts <= MOST_STARTS:
+            raise BadInput(
+                f"{self.attack_starts} starts cannot be attacked: give a number from 1 to {MOST_STARTS:,}"
+            )
+        if self.attack_seconds is None and self.attack_rounds is None:
+            attacked = self.attack_starts is not None or not exact
+            return Budget(rounds=effort.attack_rounds) if attacked else None
+        return Budget(self.attack_seconds, self.attack_rounds)
+
+
+USUAL = ExamineOptions()
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Controllers of a task that are examined together, from the same starts.
+
+    Attributes:
+        task: the robot and its problem.
+        controllers: by name.
+        points: (N, d) of M*.
+        parts: of each mode the states in which the first measurement should select it.
+        eps: the noise bound that they were made for.
+        everywhere: whether noise acts on all coordinates.
+        cells: lattice cells along the longest side of the chart, as in `lattice_grid`.
+        playable: whether the worst-case game can be played against them.
+        exact: whether it decides where it is played, and is more than an estimate.
+        effort: what may be spent.
+        alike: whether all of them answer as the controller "policy" does.
+    """
+
+    task: Task
+    controllers: Mapping[str, Controller]
+    points: np.ndarray
+    parts: Sequence[GridSet]
+    eps: float
+    everywhere: bool
+    cells: int
+    playable: bool
+    exact: bool
+    effort: Effort
+    alike: bool = False
+
+
+@dataclass(frozen=True)
+class Examination:
+    """What noise can do to controllers.
+
+    Attributes:
+        robustness: the results.
+        maps: of the worst-case game; None if it was not played.
+        arcs: a run under attack of each controller that was attacked.
+    """
+
+    robustness: Robustness
+    maps: Maps | None = None
+    arcs: Mapping[str, HybridArc] = field(default_factory=dict)
+
+
+def examine(
+    subject: Subject, options: ExamineOptions = USUAL, budget: Budget | None = None
+) -> Examination:
+    """Examines controllers under noise, by the game where it can be played, by episodes, and by an attack.
+
+    Args:
+        subject: the controllers and their task.
+        options: noise bound and kinds, numbers of episodes and attacked starts.
+        budget: of the attack; by default there is none.
+
+    Raises:
+        BadInput: a bound or a number that cannot be used.
+    """
+    task, points = subject.task, subject.points
+    eps = subject.eps if options.eps is None else options.eps
+    everywhere = options.all_coordinates or subject.everywhere
+    task.check_noise(eps, everywhere)
+    count = options.episodes
+    if count is None and not subject.exact:
+        count = subject.effort.episodes
+    if count is not None and count < 1:
+        raise BadInput(f"{count} episodes cannot be simulated: give at least 1")
+    noises = [Noise(kind, eps, everywhere) for kind in options.noise or usual_kinds(task)]
+    game, maps = None, None
+    if subject.playable:
+        bounds = tuple(dict.fromkeys((0.0, eps / 2, eps)))
+        game, maps = worst_case(
+            task, points, subject.parts, subject.controllers, bounds, everywhere, subject.cells
+        )
+    regions = Regions(points, _winnable(subject, maps), options.near_critical)
+    episodes = NoisyEpisodes((), ())
+    if count is not None:
+        episodes = noisy_episodes(task, regions, subject.controllers, noises, count, options.seed)
+    results = Robustness(
+        eps, everywhere, game, episodes.counts, options.seed, comparisons=episodes.comparisons
+    )
+    if budget is None:
+        return Examination(results, maps)
+    starts = options.attack_starts or subject.effort.attack_starts
+    z0 = attack_starts(task, regions, eps, starts, options.seed)
+    attacks = _attacks(subject, z0, eps, budget, everywhere, options.seed)
+    quiet = {name: found.quiet for name, found in attacks.items()}
+    under = compare("attack", quiet, {name: found.ends for name, found in attacks.items()})
+    results = replace(
+        results,
+        attacks=tuple(found.count for found in attacks.values()),
+        comparisons=(*results.comparisons, under),
+    )
+    return Examination(results, maps, shown_arcs(attacks))
+
+
+def _winnable(subject: Subject, maps: Maps | None) -> tuple[Grid, np.ndarray] | None:
+    """Returns the game's nodes with those (N,) bool that are winnable, None where that is not known."""
+    if maps is None or not subject.exact:
+        return None
+    classes = [*maps.map.values()][-1]  # of the hybrid controller
+    return maps.grid(subject.task.chart), ~np.isin(classes, (UNWINNABLE, OVER))
+
+
+def _attacks(
+    subject: Subject, z0: np.ndarray, eps: float, budget: Budget, everywhere: bool, seed: int
+) -> dict[str, Attack]:
+    """Attacks controllers by name from starts (n, d).
+
+    Where all of them answer as the policy does, they are tried under the signals that were found against it.
+    """
+    task, controllers = subject.task, subject.controllers
+    if not subject.alike:
+        return attack(task, controllers, z0, eps, budget, everywhere, seed)
+    alone = {"policy": controllers["policy"]}
+    found = attack(task, alone, z0, eps, budget, everywhere, seed)["policy"]
+    return {
+        name: found if name in alone else found.on(name, task, controller)
+        for name, controller in controllers.items()
+    }
