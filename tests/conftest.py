@@ -4,9 +4,10 @@ import json
 import os
 import shutil
 
-# Before NumPy is there: matrices are small here, and BLAS threads that wait for a busy core take
+# Before NumPy and torch are there: matrices are small here, and threads that wait for a busy core take
 # ten times as long as none.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
 
 import hypothesis
 import pytest

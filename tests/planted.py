@@ -14,7 +14,7 @@ from hyrl_mj.files.artifacts import digest
 from hyrl_mj.files.manifest import FILES, Entry, Manifest
 from hyrl_mj.judging import worst_case as examination
 from hyrl_mj.judging.proof import replays
-from hyrl_mj.learning import presets
+from hyrl_mj.learning import distillation, presets
 from hyrl_mj.pipeline import steps
 from hyrl_mj.policies.hybrid import HybridController
 from hyrl_mj.runs.directory import load_run
@@ -43,6 +43,7 @@ def shorten(patch):
         for key, value in new.items():
             patch.setitem(values, key, value)
     patch.setattr(presets, "_SMOKE_MODES", 4_096)
+    patch.setattr(distillation, "STEPS", 200)
     spare(patch, checkpoints=4, batches=2, nodes=12, episodes=100)
     spare_environments(patch)
     without_pdfs(patch)
@@ -79,10 +80,10 @@ def coarsen(patch):
     patch.setattr(examination, "CURVE", examination.CURVE[::4])
     patch.setattr(style, "DPI", 60)
     patch.setitem(style.STYLE, "pdf.fonttype", 3)
-    few = {"size": (480, 160), "fps": 4}
+    few = {"size": (480, 160), "fps": 2}
     patch.setattr(steps, "SMOKE", replace(steps.SMOKE, **few))
     patch.setattr(diagnosis, "REPLAY", replace(diagnosis.REPLAY, **few))
-    starts = {"none": 200, "uniform": 200, "alternating": 200, "worst": 100, "cells": 10}
+    starts = {"none": 60, "uniform": 60, "alternating": 60, "worst": 60, "cells": 10}
     patch.setattr(replays, "STARTS", starts)
     patch.setattr(replays, "WHOLE", 10)
 
