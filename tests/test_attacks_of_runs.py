@@ -107,7 +107,9 @@ def test_a_run_with_a_game_is_attacked_only_on_request(examined, monkeypatch):
     assert ExamineOptions().budget(SPARING, run.exact) is None
     assert ExamineOptions(attack_seconds=2.0).budget(SPARING, run.exact).seconds == 2.0
     assert ExamineOptions(attack_rounds=5).budget(SPARING, run.exact).rounds == 5
-    assert ExamineOptions(attack_starts=9).budget(SPARING, run.exact).rounds == SPARING.attack_rounds
+    assert (
+        ExamineOptions(attack_starts=9).budget(SPARING, run.exact).rounds == SPARING.attack_rounds
+    )
 
 
 def test_the_rounds_of_a_time_repeat_it(copied):

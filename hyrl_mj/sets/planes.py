@@ -64,7 +64,7 @@ def check_points(chart: Chart, points: np.ndarray, owner: str) -> np.ndarray:
         points = np.asarray(points, dtype=float)
     except (TypeError, ValueError):
         raise BadInput(
-            f"{points!r:.80} cannot be used as points of M*: give points (N, d)"
+            f"{points!r:.80} cannot be used as points of M*: give its points (N, d)"
         ) from None
     if points.ndim != 2 or points.shape[1] != chart.dimension:
         raise BadInput(
