@@ -6,8 +6,8 @@ import shutil
 
 # Before NumPy and torch are there: matrices are small here, and threads that wait for a busy core take
 # ten times as long as none.
-for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import hypothesis
 import pytest

@@ -236,7 +236,7 @@ def test_noise_is_rounded_to_whole_cells_and_never_to_none(rough):
 @pytest.mark.slow
 def test_the_estimate_agrees_with_runs_of_the_plant(unicycle):
     loop = PolicyController(steering_policy(unicycle, gain=0.4))
-    grid = lattice_grid(unicycle, 70)
+    grid = lattice_grid(unicycle, 80)
     everything = [GridSet.from_mask(grid, np.ones(len(grid.nodes), dtype=bool))]
     game = Game(unicycle, everything, {"policy": loop}, 0.1, grid=grid)
     starts = np.flatnonzero(game.starts)[::7]
