@@ -76,6 +76,12 @@ class Verdict:
     def __str__(self) -> str:
         return f"{self.word}: {self.sentence}"
 
+    @property
+    def tone(self) -> str:
+        """How a page shows the word: "good", "undecided" or "bad"."""
+        good = self.word in (PROVED, WON, HELD)
+        return "good" if good else "undecided" if self.word == UNDECIDED else "bad"
+
     @staticmethod
     def judge(
         task: Task,

@@ -91,10 +91,6 @@ class Affine:
         """Returns the form with a larger remainder."""
         return replace(self, remainder=self.remainder + by)
 
-    def or_nan(self, where: np.ndarray) -> Affine:
-        """Returns the form that may be NaN also where a mask (n, ...) holds."""
-        return replace(self, nan=self.nan | where)
-
     def each(self, change: Callable[[np.ndarray], np.ndarray]) -> Affine:
         """Returns the form with all its parts changed by a function that only moves entries."""
         generators = [change(part) for part in self.generators]
