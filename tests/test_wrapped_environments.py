@@ -98,16 +98,13 @@ class ByAttribute(gym.Wrapper):
 
 
 class Usual(Flat):
-    """Has attributes of any kind, an array for a reward, None for `truncated`, and no options of resets."""
+    """Has attributes of any kind, an array for a reward, and None for `truncated`."""
 
     walls = [[1, 2], [3]]
 
     def __init__(self):
         super().__init__()
         self.rooms, self.rows = [[1, 2], [3]], iter([1])
-
-    def reset(self, seed=None):
-        return Flat.reset(self, seed=seed)
 
     def step(self, action):
         observation, reward, terminated, _, info = super().step(action)
@@ -353,7 +350,10 @@ def test_a_policy_class_of_one_s_own_is_refused(algorithm, policy, circle, tmp_p
 
 
 class Far(Flat):
-    """Observes places on a map, of which single precision rounds half a metre."""
+    """Observes places on a map, of which single precision rounds half a metre; a reset has no options."""
+
+    def reset(self, seed=None):
+        return Flat.reset(self, seed=seed)
 
     def seen(self):
         return self.data.qpos + np.array([652_341.0, 5_404_123.0])
@@ -362,7 +362,7 @@ class Far(Flat):
         return np.concatenate([self.seen(), GOAL - self.data.qpos, self.data.qvel])
 
 
-def test_functions_get_the_precision_of_the_environment():
+def test_functions_get_the_precision_of_the_environment_and_a_reset_may_have_no_options():
     task = from_gymnasium(Far, steps=60)
     origin = np.array([652_341.0, 5_404_123.0, 0, 0, 0, 0])
     agent = from_callable(lambda seen: np.clip(pilot(seen - origin), -4, 4), task)
