@@ -231,7 +231,7 @@ class Slid(Puck):
         self.action_space = spaces.Box(-1.0, 1.0, (2,), dtype=np.float64)
 
     def step(self, action):
-        self.data.qpos[:] += 0.1 * np.clip(action, -1, 1)
+        self.data.qpos[:] += 0.2 * np.clip(action, -1, 1)
         self.data.qvel[:] = 0.0
         mujoco.mj_step(self.model, self.data)
         self.data.qvel[:] = 0.0
