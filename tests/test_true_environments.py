@@ -376,9 +376,10 @@ def test_walls_in_the_open_do_not_end_the_chart(behind):
     assert np.all(np.greater(behind.chart.high, [0.5, 1.2]))
 
 
-def test_what_lags_by_a_physics_step_is_moved_by_noise_where_the_robot_was_then(behind):
+def test_what_lags_by_a_physics_step_is_moved_by_noise_where_the_robot_was_then(behind, short):
     task = behind
     assert "a physics step before" in task.found["lag"]
+    assert "lag" not in short(False).found
     plant, rows = task.plant(2), np.arange(2)
     plant.set_state(*task.state(np.array([[-1.2, 0.4], [-1.2, 0.4]])))
     noise = np.zeros_like(plant.measurement)
