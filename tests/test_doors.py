@@ -236,9 +236,7 @@ def test_a_step_that_takes_long_is_one_sentence(monkeypatch):
     monkeypatch.setitem(limits.tried.__kwdefaults__, "seconds", limits.SECONDS)
     monkeypatch.setattr(limits.limit, "__defaults__", (limits.SECONDS, limits.MEMORY))
     given = {"pinned": {"qpos[2]": -0.15, "qpos[3]": 0.0}, "success": "reward >= 1"}
-    sentence = refusal(
-        lambda: from_gymnasium("Reacher-v5", kwargs={"frame_skip": 60_000}, **given)
-    )
+    sentence = refusal(lambda: from_gymnasium("Reacher-v5", kwargs={"frame_skip": 60_000}, **given))
     assert "whose step takes less than" in sentence
 
 
