@@ -175,37 +175,35 @@ class Noisy(gym.Wrapper):
         return self.env.step(action + self.unwrapped.np_random.normal(size=2))
 
 
-class Gambling(Puck):
-    """Draws random numbers in its steps, but only under one input, which is not drawn at random."""
-
-    def __init__(self, own=False):
-        super().__init__()
-        self.own = own
-
-    def step(self, action):
-        result = super().step(action)
-        if np.all(np.asarray(action) == 3.9):
-            self.np_random.random() if self.own else np.random.rand()
-        return result
-
-
 class Moved(Puck):
     """Each reset puts the rock elsewhere, in the model itself, unless its options say where."""
 
     def reset(self, *, seed=None, options=None):
         gym.Env.reset(self, seed=seed)
-        drawn = self.np_random.uniform(-0.3, 0.3)
-        self.model.geom_pos[0, 1] = (options or {}).get("rock", drawn)
+        self.goal = (options or {}).get("rock", self.np_random.uniform(-0.3, 0.3))
+        self.model.geom_pos[0, 1] = self.goal
         return super().reset(seed=seed)
 
 
-class Grid(Puck):
-    """What it observes is one array of two rows."""
+class Gambling(Puck):
+    """It observes one array of two rows, and draws random numbers or fails under inputs of which none is
+    drawn at random.
+    """
 
     observation_space = spaces.Box(-np.inf, np.inf, (2, 2))
 
     def _get_obs(self):
         return np.stack([self.data.qpos, self.data.qvel])
+
+    def step(self, action):
+        result = super().step(action)
+        if np.all(np.asarray(action) == 3.9):
+            self.np_random.random()
+        if np.all(np.asarray(action) == 3.8):
+            np.random.rand()
+        if np.all(np.asarray(action) == 3.7):
+            raise RuntimeError("broken")
+        return result
 
 
 class Seen(gym.ObservationWrapper):
@@ -233,7 +231,7 @@ class Slid(Puck):
         self.action_space = spaces.Box(-1.0, 1.0, (2,), dtype=np.float64)
 
     def step(self, action):
-        self.data.qpos[:] += 0.1 * np.clip(action, -1, 1)
+        self.data.qpos[:] += 0.2 * np.clip(action, -1, 1)
         self.data.qvel[:] = 0.0
         mujoco.mj_step(self.model, self.data)
         self.data.qvel[:] = 0.0

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from random import Random
 
@@ -18,7 +19,7 @@ import pytest
 from attacks import doors, folders
 from command_line import call
 
-from hyrl_mj.environments import from_gymnasium
+from hyrl_mj.environments import from_gymnasium, making
 from hyrl_mj.environments.making import from_spec
 from hyrl_mj.errors import BadInput
 from hyrl_mj.fields import read_field
@@ -62,6 +63,22 @@ def refusal(work):
 def hurried(monkeypatch):
     """What never ends is stopped after two seconds of the processor, and not after twelve."""
     monkeypatch.setitem(limits.tried.__kwdefaults__, "seconds", 2)
+    monkeypatch.setattr(limits.limit, "__defaults__", (2, limits.MEMORY))
+
+
+@pytest.fixture
+def inspected(monkeypatch):
+    """Returns a function after which environments are found to be as that of a task was."""
+
+    def as_of(task):
+        def inspect(description, untried):
+            spec = replace(task.specification, description=description, max_steps=description.steps)
+            return spec, task._pool, task._instance
+
+        monkeypatch.setattr(making, "inspect", inspect)
+        monkeypatch.setattr(making, "_MADE", {})
+
+    return as_of
 
 
 # ---- what a file describes
@@ -104,7 +121,7 @@ def test_a_file_of_arguments_runs_no_task_file(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_file_in_another_folder_is_another_file(tmp_path, monkeypatch):
+def test_a_file_in_another_folder_is_another_file(tmp_path, monkeypatch, inspected):
     path = Path(gym.envs.mujoco.__file__).parent / "assets" / "reacher.xml"
     folders = [tmp_path / name for name in ("own", "theirs")]
     for folder in folders:
@@ -115,9 +132,9 @@ def test_a_file_in_another_folder_is_another_file(tmp_path, monkeypatch):
     pinned = {"qpos[2]": -0.15, "qpos[3]": 0.0}
     own = from_gymnasium(
         "Reacher-v5", kwargs={"xml_file": "./r.xml"}, chart=chart, pinned=pinned,
-        success="distance(fingertip, target) <= 0.05",
+        success="distance(fingertip, target) <= 0.05", steps=9,
     )  # fmt: skip
-    monkeypatch.setattr("hyrl_mj.environments.making._MADE", {})
+    inspected(own)
     monkeypatch.chdir(folders[1])
     with trust.received():
         refusal(lambda: from_spec(own.spec))
@@ -127,15 +144,16 @@ def test_a_file_in_another_folder_is_another_file(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_what_this_machine_has_described_opens_again(monkeypatch):
+def test_what_this_machine_has_described_opens_again(inspected):
     spec = spec_of(CIRCLE, kwargs={"task": "unit_circle"}, steps=17, seed=3)
     with trust.received():
         task = from_spec(spec)  # plain words
     assert task.max_steps == 17
     assert not trust.is_known_text(task.spec)
+    inspected(task)
     own = from_gymnasium(CIRCLE, kwargs={"task": "unit_circle", "camera": None}, steps=18)
     assert trust.is_known_text(own.spec)
-    monkeypatch.setattr("hyrl_mj.environments.making._MADE", {})
+    making._MADE.clear()
     with trust.received():
         assert from_spec(own.spec).max_steps == 18
 
@@ -199,26 +217,26 @@ def test_an_environment_that_never_ends_a_step_is_one_sentence():
 
 
 @pytest.mark.slow
-def test_an_environment_that_this_process_registered_takes_arguments():
-    def make(**kwargs):
+def test_an_environment_that_this_process_registered_takes_arguments_also_arrays():
+    def make(goal, **kwargs):
+        assert isinstance(goal, np.ndarray)
         return gym.make("Reacher-v5", **kwargs).unwrapped
 
     gym.register("OwnReacher-v0", make, max_episode_steps=50)
     chart = {"shoulder": "qpos[0]", "elbow": "qpos[1]"}
     pinned = {"qpos[2]": -0.15, "qpos[3]": 0.0}
     task = from_gymnasium(
-        "OwnReacher-v0", kwargs={"frame_skip": 3}, chart=chart, pinned=pinned,
-        success="distance(fingertip, target) <= 0.05",
+        "OwnReacher-v0", kwargs={"goal": np.array([1.0, 2.0]), "frame_skip": 3}, chart=chart,
+        pinned=pinned, success="distance(fingertip, target) <= 0.05",
     )  # fmt: skip
     assert task.max_steps == 50
 
 
 def test_a_step_that_takes_long_is_one_sentence(monkeypatch):
     monkeypatch.setitem(limits.tried.__kwdefaults__, "seconds", limits.SECONDS)
+    monkeypatch.setattr(limits.limit, "__defaults__", (limits.SECONDS, limits.MEMORY))
     given = {"pinned": {"qpos[2]": -0.15, "qpos[3]": 0.0}, "success": "reward >= 1"}
-    sentence = refusal(
-        lambda: from_gymnasium("Reacher-v5", kwargs={"frame_skip": 150_000}, **given)
-    )
+    sentence = refusal(lambda: from_gymnasium("Reacher-v5", kwargs={"frame_skip": 60_000}, **given))
     assert "whose step takes less than" in sentence
 
 
@@ -226,21 +244,6 @@ def test_a_step_that_takes_long_is_one_sentence(monkeypatch):
 def test_a_pinned_attribute_that_never_ends_a_step_is_one_sentence():
     pinned = {"frame_skip": 2_000_000_000, "qpos[2]": 0.1, "qpos[3]": 0.1}
     refusal(lambda: from_gymnasium("Reacher-v5", pinned=pinned, success="reward >= 1"))
-
-
-@pytest.mark.slow
-def test_arrays_as_arguments_are_the_users_own():
-    def make(goal, **kwargs):
-        assert isinstance(goal, np.ndarray)
-        return gym.make("Reacher-v5", **kwargs).unwrapped
-
-    gym.register("GoalReacher-v0", make, max_episode_steps=50)
-    task = from_gymnasium(
-        "GoalReacher-v0", kwargs={"goal": np.array([1.0, 2.0])},
-        chart={"shoulder": "qpos[0]", "elbow": "qpos[1]"}, pinned={"qpos[2]": -0.15, "qpos[3]": 0.0},
-        success="distance(fingertip, target) <= 0.05",
-    )  # fmt: skip
-    assert task.max_steps == 50
 
 
 def test_a_model_writes_no_warnings_into_the_current_folder(tmp_path, monkeypatch):

@@ -8,10 +8,10 @@ from dataclasses import replace
 import gymnasium as gym
 import numpy as np
 import pytest
-from trapped_environments import honest, is_failure, judged, trapped
+from trapped_environments import both, honest, is_failure, judged, together, trapped
 from traps.honest import HONEST
 from traps.judge import difference, played
-from traps.kinds import TRAPS
+from traps.kinds import ALONE, TRAPS
 from traps.worlds import World
 
 import hyrl_mj
@@ -24,6 +24,22 @@ HARMLESS = (
     "cached value", "order of a Dict", "no method observes", "success and collision terminate",
     "wrapper order", "frames and filters",
 )  # fmt: skip
+# Of traps that an environment is accepted with, two are in one, as some seed draws it.
+TWO = {
+    ("latch", "action delay"): 0,
+    ("latch in the model", "initial motion"): 1,
+    ("sticky success", "recalled input or observation"): 2,
+    ("rare attribute", "wrapper order"): 0,
+    ("stale fields", "order of a Dict"): 1,
+    ("outlives resets", "smoothing"): 2,
+    ("frames and filters", "success and collision terminate"): 0,
+}
+PAIRED = [name for pair in TWO for name in pair]
+# What is honest, each once: what lies around an environment, and what is in it.
+TOGETHER = (
+    (("hinge",), *HONEST[1:4], *HONEST[5:7], HONEST[9]),
+    (ALONE, HONEST[0], HONEST[4], *HONEST[7:9]),
+)
 
 
 def tried(case):
@@ -34,16 +50,33 @@ def tried(case):
     )
 
 
+def later(values):
+    """Cases that only the long lane tries."""
+    return [pytest.param(value, marks=pytest.mark.long) for value in values]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", TRAPS)
+@pytest.mark.parametrize("name", [*(name for name in TRAPS if name not in PAIRED), *later(PAIRED)])
 def test_no_trap_is_wrong_in_silence(name):
     assert not tried(trapped(2 * [*TRAPS].index(name)))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("i", range(len(HONEST)))
+@pytest.mark.parametrize("pair", TWO, ids=", ".join)
+def test_two_traps_in_one_environment_are_accepted_and_right(pair):
+    assert judged(both(*pair, TWO[pair]), FEW) == ("right", "")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("i", later(range(len(HONEST))))
 def test_honest_environments_are_accepted_and_right(i):
     assert not tried(honest(i))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kinds", "plants"), [(kinds, plants) for kinds, *plants in TOGETHER])
+def test_whatever_is_honest_is_accepted_and_right_together(kinds, plants):
+    assert not tried(together(kinds, *plants))
 
 
 # ---- traps and judge themselves

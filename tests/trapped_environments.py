@@ -153,6 +153,17 @@ def trapped(i, seed=0):
             return made(f"trapped {i}", found, plan, planted, rng)
 
 
+def both(first, second, seed=0):
+    """Returns a case with two traps, by their names."""
+    rng = np.random.default_rng([3, seed, *f"{first}, {second}".encode()])
+    kinds = [kind for kind in TRAPS[first].kinds if kind in TRAPS[second].kinds]
+    while True:
+        plan = drawn_plan(rng, kinds)
+        planted = [TRAPS[name].plant(rng, plan) for name in (first, second)]
+        if _fit(planted):
+            return made(f"{first}, {second}", (first, second), plan, planted, rng)
+
+
 def _fit(planted):
     """Whether traps can be in one environment."""
     changed = [name for one in planted for name in one.plan]
@@ -169,6 +180,14 @@ def honest(i, seed=0):
         plan = replace(plan, view="unsorted")
     planted = HONEST[i % len(HONEST)](rng, plan)
     return made(f"honest {i}", ("honest",), plan, [planted], rng)
+
+
+def together(kinds, *plants):
+    """Returns an honest case of one of some kinds, with all of some of `HONEST`."""
+    rng = np.random.default_rng([4, *map(HONEST.index, plants)])
+    plan = drawn_plan(rng, kinds)
+    name = ", ".join(plant.__name__ for plant in plants)
+    return made(name, ("honest",), plan, [plant(rng, plan) for plant in plants], rng)
 
 
 # ---- the table
