@@ -162,6 +162,12 @@ class Terminating(Puck):
         return observation, (5.0 if info["success"] else reward), info["success"], truncated, {}
 
 
+@pytest.mark.parametrize("success", ["reward >= 4", "distance(puck, goal) < 0.3"])
+def test_an_end_at_the_goal_is_an_arrival_by_a_condition_that_does_not_ask_for_ends(success):
+    task = from_gymnasium(Terminating, success=success, steps=30)
+    assert simulate(task, from_callable(east, task), [1.2, 0.0]).outcome == "reached"
+
+
 class Monitor(gym.Wrapper):
     """A user's wrapper with the name of one that only counts: this one turns the actions."""
 
