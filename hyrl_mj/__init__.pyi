@@ -3,7 +3,6 @@ from . import (
     envs as envs,
     export as export,
     fields as fields,
-    gl as gl,
     judging as judging,
     learning as learning,
     physics as physics,
@@ -47,6 +46,7 @@ from .stages import (
     find_critical_set,
     make_partition,
 )
+from .system import gl as gl
 from .system.cores import using_pool
 from .tasks import Learning, Mirror, Outcome, Scene, Task, get_task, register, task_names
 
