@@ -22,7 +22,7 @@ from hyrl_mj.policies import PolicyController
 from hyrl_mj.runs.arcs import critical_start, from_middle
 from hyrl_mj.runs.directory import Run
 from hyrl_mj.simulation import HybridArc, Noise, simulate_batch
-from hyrl_mj.stages import part_policy
+from hyrl_mj.stages import all_part_policies
 
 ATTACKED = 48  # starts that are attacked
 # Where every episode is played to its end, attacked starts have about so many samples together.
@@ -34,7 +34,7 @@ def losses_of(run: Run) -> Losses | None:
     if not run.exact:
         return None
     task, policy, parts, s = run.task, run.steady, run.partition, run.settings
-    pis = [part_policy(task, policy, parts, mode, s.noise) for mode in parts.modes]
+    pis = all_part_policies(task, policy, parts, s.noise)
     return sort_losses(task, policy, parts.parts, pis, s.noise, s.lattice)
 
 

@@ -10,6 +10,7 @@ from hyrl_mj.stages.extended_sets import ExtendedSets, extend
 from hyrl_mj.stages.partition import (
     Partition,
     PartPolicy,
+    all_part_policies,
     boundary,
     make_partition,
     part_policy,
@@ -26,6 +27,7 @@ __all__ = [
     "Partition",
     "TableOf",
     "TablePolicy",
+    "all_part_policies",
     "boundary",
     "critical_points",
     "extend",

@@ -295,8 +295,15 @@ def part_policy(
     task: Task, policy: Policy, partition: Partition, mode: int, noise: float
 ) -> PartPolicy:
     """Returns pi_i of a mode, with as wide a neighbourhood of M* as the noise and the steps need."""
+    return all_part_policies(task, policy, partition, noise)[partition.modes.index(mode)]
+
+
+def all_part_policies(
+    task: Task, policy: Policy, partition: Partition, noise: float
+) -> tuple[PartPolicy, ...]:
+    """Returns pi_i of each mode, with as wide a neighbourhood of M* as `part_policy` takes."""
     near = neighbourhood(partition, noise, longest_hop(task, policy, partition.grid))
-    return part_policies(task, policy, partition, near)[partition.modes.index(mode)]
+    return part_policies(task, policy, partition, near)
 
 
 def neighbourhood(partition: Partition, noise: float, hop: np.ndarray) -> float:
