@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hyrl_mj.environments.observations import flat, shaped
 from hyrl_mj.errors import BadInput, brief
 
 if TYPE_CHECKING:
@@ -120,7 +119,7 @@ class Chain:
         return self._observed(instance.inner_seen, result[1:])
 
     def _observed(self, observation: Any, rest: tuple[Any, ...]) -> tuple[Any, ...]:
-        instance, space = self._instance, self._instance.inner.observation_space
+        instance = self._instance
         if not self._busy:
             return (observation, *rest)
         if self.tamper is not None:
@@ -134,9 +133,7 @@ class Chain:
         self._news.put(("sensing", None))
         noise = self._noise.get()
         if noise.any():
-            observation = shaped(
-                flat(observation, space) + instance.displaced(noise), observation, space
-            )
+            observation = instance.displaced(noise)
             if instance.spec.sensing:
                 # Wrappers that read MuJoCo's state for what they observe see it where the sensor does.
                 shown = instance.moved(instance.physics.read(), noise)

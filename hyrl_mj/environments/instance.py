@@ -224,8 +224,7 @@ class Instance:
         """Has the environment observe under noise (d,) on the chart's coordinates."""
         if self._chain is None:
             if noise.any():
-                moved = self.observation + self.displaced(noise)
-                self.observation = self._flat(shaped(moved, self.inner_seen, self._space))
+                self.observation = self._flat(self.displaced(noise))
             return
         result = self._chain.answer(noise)
         if self.start is None:
@@ -287,42 +286,47 @@ class Instance:
                 f"{self.spec.observer}() of {self.name} raises {brief(error)}: repair it"
             ) from error
 
-    def displaced(self, noise: np.ndarray) -> np.ndarray:
-        """Returns by how much the innermost observation changes (o,) where the chart's coordinates do.
+    def displaced(self, noise: np.ndarray) -> Any:
+        """Returns what the innermost environment observes with noise (d,) on the chart's coordinates.
 
         Where what is observed is known to show derived quantities of a physics step before, these are
-        computed where the robot was then, with the noise. Where it is not known which they are, it is the
-        difference of two observations with all of them up to date.
+        computed where the robot was then, with the noise. Where it is not known which they are, what is
+        observed changes by the difference of two observations with all of them up to date.
         """
-        state = self.physics.read()
+        state, space = self.physics.read(), self.inner.observation_space
         derived: Derived = "now" if self._at_start else self.spec.derived
-        given = flat(self.inner_seen, self.inner.observation_space)
-        before = given
+        given = flat(self.inner_seen, space)
+        self.physics.leave()
+        seen = self._seen(derived, state, noise)
         if derived == "unknown":
-            before = self.seen_as("now", state, np.zeros(len(noise)))
-        moved = self.seen_as(derived, state, noise) - before
-        again = flat(self.watched(), self.inner.observation_space)
-        if not np.array_equal(again, given, equal_nan=True):
+            seen = given + (seen - self._seen("now", state, np.zeros(len(noise))))
+        self.physics.come_back()
+        again = flat(self.watched(), space)
+        if again.tobytes() != given.tobytes() and not np.array_equal(again, given, equal_nan=True):
             column = int(((again != given) & ~(np.isnan(again) & np.isnan(given))).argmax())
             raise BadInput(
                 f"{self.name} has observed {given[column]:.6g} in observation[{column}], and "
                 f"{self.spec.observer}() gives {again[column]:.6g} in the same state: let it compute all "
                 "that is observed, and remember nothing"
             )
-        return moved
+        return shaped(seen, self.inner_seen, space)
 
     def seen_as(self, derived: Derived, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Returns the innermost observation (o,) of a state (S,) under noise (d,), as `derived` says."""
         self.physics.leave()
+        seen = self._seen(derived, state, noise)
+        self.physics.come_back()
+        return seen
+
+    def _seen(self, derived: Derived, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Does what `seen_as` does, and stays in the state."""
         moved = self.moved(state, noise)
         if derived == "earlier":
             self.physics.write(self.moved(self.physics.earlier(state), noise))
             self.physics.show(moved)
         else:
             self.physics.write(moved)
-        seen = flat(self.watched(), self.inner.observation_space)
-        self.physics.come_back()
-        return seen
+        return flat(self.watched(), self.inner.observation_space)
 
     def moved(self, state: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Returns a state of MuJoCo (S,) with noise (d,) added to the coordinates of the chart."""
@@ -383,7 +387,7 @@ class Instance:
         observation, reward, terminated, truncated, info = result
         self.observation = self._flat(observation)
         # The limit of `steps`, or that of a wrapper which episodes are played without.
-        over = self.spec.criterion.asks("truncated") and self._samples == self.spec.max_steps
+        over = self._samples == self.spec.max_steps and self.spec.criterion.asks("truncated")
         truncated = bool(truncated) or over
         touch = bool(terminated) and bool(
             self.physics.touched(self.spec.solid) - self.spec.harmless

@@ -32,7 +32,8 @@ def columns_of(space: spaces.Space[Any]) -> dict[str, slice]:
 def flat(observation: Any, space: spaces.Space[Any]) -> np.ndarray:
     """Returns an observation as a vector, as SB3 does: the parts of a Dict in the order of its space."""
     if isinstance(space, spaces.Dict):
-        return np.concatenate([np.ravel(observation[k]) for k in space.spaces], dtype=float)
+        parts = [np.asarray(observation[k]).reshape(-1) for k in space.spaces]
+        return np.concatenate(parts, dtype=float)
     return np.array(observation, dtype=float).ravel()
 
 
@@ -41,12 +42,12 @@ def shaped(vector: np.ndarray, like: Any, space: spaces.Space[Any]) -> Any:
     if not isinstance(space, spaces.Dict):
         array = np.asarray(like)
         return vector.astype(array.dtype).reshape(array.shape)
-    columns = columns_of(space)
-    return {
-        key: shaped(vector[columns[key]], like[key], space.spaces[key])
-        for key in like
-        if key in columns
-    }
+    parts, at = {}, 0
+    for key, part in space.spaces.items():
+        array = np.asarray(like[key])
+        parts[key] = shaped(vector[at : at + array.size], array, part)
+        at += array.size
+    return {key: parts[key] for key in like if key in parts}
 
 
 def observers(env: gym.Env) -> dict[str, Callable[[], Any]]:

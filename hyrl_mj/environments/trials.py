@@ -165,7 +165,7 @@ def derived_of(instance: Instance, step: np.ndarray) -> tuple[Derived, list[int]
             size.append(np.abs(seen))
             for derived, differences in off.items():
                 differences.append(_apart(instance.seen_as(derived, state, 0 * step), seen))
-            moving.append(np.abs(instance.displaced(step)))
+            moving.append(np.abs(flat(instance.displaced(step), space) - seen))
     if not np.any(moving):
         spec = instance.spec
         noisy = [c.name for c, share in zip(spec.coordinates, spec.noisy, strict=True) if share]
