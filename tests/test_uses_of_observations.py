@@ -109,6 +109,24 @@ class Speeding(Home):
         return observation, reward, bool(moved > self.limit), truncated, info
 
 
+class Leashed(Home):
+    """Ends far from where the reset led to, where a run comes late or never."""
+
+    def begin(self):
+        mujoco.mj_forward(self.model, self.data)
+        self.home = self.data.qpos.copy()
+
+    def step(self, action):
+        observation, reward, _, truncated, info = super().step(action)
+        away = np.linalg.norm(self.data.qpos - self.home)
+        return observation, reward, bool(away > 2.9), truncated, info
+
+
+def test_a_place_that_matters_late_is_found():
+    with pytest.raises(BadInput, match=r"reset\(\) of Leashed notes where it leads to \(home\)"):
+        from_gymnasium(Leashed)
+
+
 def test_a_place_that_a_reset_notes_and_a_step_goes_by_is_refused_on_the_chart():
     with pytest.raises(BadInput, match=r"reset\(\) of Speeding notes where it leads to \(before\)"):
         from_gymnasium(Speeding)
