@@ -28,16 +28,6 @@ PLANTED = {
     ),
     "artifacts": "from hyrl_mj.files.manifest import Manifest; Manifest.checked = lambda self, path: path",
 }
-# How fields are made, with a part in place of another.
-DRIVING = (
-    "import inspect\n"
-    "from attacks import honest\n"
-    "from hyrl_mj.fields import driving\n"
-    "source = inspect.getsource(driving)\n"
-    "assert '{0}' in source\n"
-    "exec(source.replace('{0}', '{1}'), vars(driving))\n"
-    "honest.Driving = driving.Driving"
-)
 # Mends that are taken out: the trials that find it, of so many, what they say, and how it is taken out.
 OPENED = {
     "code of a stranger": (
@@ -62,11 +52,6 @@ OPENED = {
     ),
     "a name that doubles itself": (
         "^agent", 41, "MB more", "from hyrl_mj.policies import pickled; pickled.LONGEST = 10**12",
-    ),
-    "a post that is thin": ("^field", 15, "traceback", DRIVING.format("radii[number] / 2", "-1.0")),
-    "a field that is wide": (
-        "^field", 38, "traceback",
-        DRIVING.format("self._middle\\n", "self._middle; camera.fovy = 2 * wide\\n"),
     ),
     "keys that are there twice": (
         "^field", 61, "hangs",

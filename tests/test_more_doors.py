@@ -135,7 +135,7 @@ def test_a_command_that_is_shown_can_be_copied(tmp_path):
     with pytest.raises(BadInput, match=r"--algorithm '\$\(touch x\):X'$"):
         algorithms.check_named("$(touch x):X")
     folder = tmp_path / "a;touch x"
-    with pytest.raises(BadArtifact, match="with hyrl-mj partition '.*/a;touch x' or"):
+    with pytest.raises(BadArtifact, match=r"with hyrl-mj partition '.*/a;touch x' or"):
         Manifest(folder, {}).checked(folder / "partition.npz")
 
 

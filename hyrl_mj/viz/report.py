@@ -25,8 +25,7 @@ from hyrl_mj.viz.commands import changed, commands
 from hyrl_mj.viz.figures import CLASS_COLOURS, FIGURES
 from hyrl_mj.viz.figures.style import task_title
 
-
-# The largest picture and the largest video that a page shows [bytes]: there they take several times the memory.
+# The largest picture and video that a page shows [bytes]: there they take several times the memory.
 PICTURE, VIDEO = 2**22, 2**25
 
 
