@@ -62,7 +62,7 @@ def has_controls(text: str) -> bool:
 def unknown(what: str, value: object, allowed: Iterable[str]) -> BadInput:
     """Returns the error for a name that is not one of `allowed`."""
     names = list(allowed)
-    close = get_close_matches(str(value), names, n=1)
+    close = get_close_matches(str(value)[:LONGEST], names, n=1)
     hint = f" Did you mean {close[0]!r}?" if close else ""
     return BadInput(f"unknown {what} {value!r}: choose one of {', '.join(names)}.{hint}")
 

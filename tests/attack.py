@@ -82,7 +82,7 @@ ATTACKS = {
         "one setting changed, through every stage", configurations.trials, 200, 4
     ),
     "tasks": Attack("task file or MJCF with one mistake", tasks.trials, 100, 2),
-    "writers": Attack("two and four writers, and a reader", writers.trials, 3, 1),
+    "writers": Attack("two and four writers, and a reader", writers.trials, 4, 1),
     "surroundings": Attack("pairs of bad surroundings", surroundings.trials, 4, 1),
 }
 
@@ -169,7 +169,6 @@ def main() -> int:
         with ThreadPoolExecutor(PROCESSES) as threads:  # each of which waits for processes
             for trials in threads.map(prepared, chosen):
                 UNDER_WAY.extend(trials)
-        # Not the processes of a `Pool`: those of a daemon may not fork the ones that try an environment.
         with ProcessPoolExecutor(PROCESSES, multiprocessing.get_context("fork")) as pool:
             for future in as_completed([pool.submit(attempt, i) for i in range(len(UNDER_WAY))]):
                 results.append(result := future.result())

@@ -44,11 +44,14 @@ OPENED = {
         "folders.PROGRAM = f'import sys; sys.path.insert(0, \"\"); {folders.PROGRAM}'",
     ),
     "an agent without end": (
-        "^agent", 46, "hangs",
+        "^agent", 64, "hangs",
         "import inspect\n"
         "from hyrl_mj.policies import pickled\n"
         "source = inspect.getsource(pickled.arrays).replace('{name:', '{str(name):')\n"
         "exec(source.replace(' if isinstance(name, str)', ''), vars(pickled))",
+    ),
+    "a name that doubles itself": (
+        "^agent", 41, "MB more", "from hyrl_mj.policies import pickled; pickled.LONGEST = 10**12",
     ),
     "keys that are there twice": (
         "^field", 61, "hangs",
@@ -61,7 +64,7 @@ OPENED = {
         "files._once = once",
     ),
     "a name that controls the terminal": (
-        "^arguments", 481, "control characters",
+        "^arguments", 81, "control characters",
         "import io\n"
         "from hyrl_mj import errors\n"
         "from hyrl_mj.environments import making\n"

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import multiprocessing
 import os
 import resource
 import shutil
@@ -15,19 +16,27 @@ import numpy as np
 import pytest
 from attacks import child, crafted_agents
 from command_line import call
+from PIL import Image
 
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, from_gymnasium
 from hyrl_mj.environments import making
 from hyrl_mj.environments.making import explained
+from hyrl_mj.environments.opening import with_arrays
 from hyrl_mj.fields import read_field
 from hyrl_mj.files import artifacts, trust
-from hyrl_mj.files.manifest import locked
+from hyrl_mj.files.manifest import Manifest, locked
+from hyrl_mj.files.sources import digest_of
 from hyrl_mj.physics import mjcf
+from hyrl_mj.policies import algorithms
 from hyrl_mj.policies.preprocessing import Normalization
-from hyrl_mj.runs.sweeps import Common, Row, Setting, Sweep
+from hyrl_mj.runs.sweeps import MOST_RUNS, Common, Row, Setting, Sweep
+from hyrl_mj.system import limits
 from hyrl_mj.system.streams import _SEQUENCES
+from hyrl_mj.tasks import described_task, registry
 from hyrl_mj.tasks.scaffold import write_task
+from hyrl_mj.viz import report
+from hyrl_mj.viz.encoding import video
 from hyrl_mj.viz.figures import style
 
 ENV = "hyrl_mj/UnitCircle-v0"
@@ -96,7 +105,55 @@ def test_a_link_that_leads_to_nothing_is_not_replaced(tmp_path):
         pass
 
 
+# ---- code
+
+
+def test_code_is_known_with_all_that_is_imported_with_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "robot.py").write_text("import helper\n")
+    (tmp_path / "package").mkdir()
+    for name in ("helper.py", "package/__init__.py", "package/part.py"):
+        (tmp_path / name).write_text("")
+    for named, changed in (("robot", "helper.py"), ("package:Env-v0", "package/part.py")):
+        path = trust.module_file(named)
+        trust.remember(path)
+        assert trust.is_known(path)
+        (tmp_path / changed).write_text("# another one\n")
+        assert not trust.is_known(path)
+
+
+def test_code_that_a_file_names_is_not_even_read(tmp_path, monkeypatch):
+    path = tmp_path / "robot.py"
+    path.write_text("-" * 200_000 + "1")  # Python's parser gives up
+    monkeypatch.setattr(registry, "digest_of", None)
+    with pytest.raises(BadInput, match="executes no file"):
+        described_task(str(path))
+    assert len(digest_of(path)) == 64
+
+
+def test_a_command_that_is_shown_can_be_copied(tmp_path):
+    with pytest.raises(BadInput, match=r"--algorithm '\$\(touch x\):X'$"):
+        algorithms.check_named("$(touch x):X")
+    folder = tmp_path / "a;touch x"
+    with pytest.raises(BadArtifact, match=r"with hyrl-mj partition '.*/a;touch x' or"):
+        Manifest(folder, {}).checked(folder / "partition.npz")
+
+
 # ---- names
+
+
+@pytest.mark.parametrize("name", ["a:b.gif", "http:c.gif"])
+def test_a_name_of_a_video_is_no_protocol(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with video(Path(name), 16, 16, 5) as add:
+        add(np.zeros((16, 16, 3), dtype=np.uint8))
+    assert os.listdir(tmp_path) == [name]
+
+
+def test_a_name_is_no_formula(tmp_path, circle):
+    with style.drawing(tmp_path / "a.png", 3.0, circle, "$\\frac{$") as figure:
+        figure.subplots().set_xlabel("$$")
+    assert (tmp_path / "a.pdf").exists()
 
 
 def test_the_name_of_an_agent_that_no_file_can_hold_leaves_no_folder(tmp_path):
@@ -183,7 +240,44 @@ def test_an_async_vector_env_plays_what_a_sync_one_does(context):
     np.testing.assert_array_equal(ours, played("sync"))
 
 
+@pytest.mark.slow
+def test_an_environment_that_a_daemon_makes_has_limits(monkeypatch):
+    monkeypatch.setattr(limits.limit, "__defaults__", (1, limits.MEMORY))
+    with multiprocessing.get_context("fork").Pool(1) as pool:
+        given = {"kwargs": {"frame_skip": 10**9}}
+        with pytest.raises(BadInput, match="takes longer than"):
+            pool.apply(from_gymnasium, ("Reacher-v5",), given)
+
+
 # ---- what fills the disk and the memory
+
+
+def test_an_array_holds_numbers():
+    texts = ["a" * 1_000_000] + [""] * 400  # as an array they would take 1.6 GB
+    assert with_arrays({"array": [[6, 6]]}).dtype == int
+    with pytest.raises(ValueError, match="numbers alone"):
+        with_arrays({"array": texts})
+    with pytest.raises(BadInput, match="a number, or a list of numbers"):
+        from_gymnasium(ENV, pinned={"qpos[0]": texts})
+    with pytest.raises(BadInput, match="describes no environment"):
+        making.from_spec('env:{"array": ["a"]}')
+
+
+def test_arguments_that_are_nested_far_are_one_sentence():
+    deep = []
+    for _ in range(3_000):
+        deep = [deep]
+    with pytest.raises(BadInput, match="cannot be made as it is described"):
+        from_gymnasium(ENV, kwargs={"a": deep})
+
+
+def test_a_video_that_fills_the_memory_is_not_shown(tmp_path):
+    Image.new("RGB", (4, 4)).save(tmp_path / "replay.png")
+    (tmp_path / "replay.mp4").write_bytes(b"video")
+    assert report.film(tmp_path / "replay.mp4") is not None
+    with (tmp_path / "replay.mp4").open("r+b") as file:
+        file.truncate(report.VIDEO + 1)
+    assert report.film(tmp_path / "replay.mp4") is None
 
 
 def test_a_figure_on_a_full_disk_is_one_sentence(tmp_path, monkeypatch, circle):
@@ -268,6 +362,12 @@ def test_an_arc_is_as_long_as_its_run_at_most(planted_circle, tmp_path):
             longer.save(other)
     with pytest.raises(BadArtifact, match=r"unpacks to more than|is longer than"):
         hyrl_mj.load_run(copied).arc(path)
+
+
+def test_a_sweep_has_as_many_runs_as_one_makes(tmp_path):
+    sweep_of(*(row(seed) for seed in range(MOST_RUNS + 1))).save(tmp_path)
+    with pytest.raises(BadInput, match="at most 1,000 runs"):
+        Sweep.load(tmp_path)
 
 
 def test_a_sweep_has_each_run_once(tmp_path):

@@ -198,7 +198,7 @@ def test_the_digest_of_a_task_is_the_same_in_each_process(tmp_path):
     path = tmp_path / "whole.py"
     path.write_text("".join(f"import {name}\n" for name in names))
     code = (
-        "from pathlib import Path; from hyrl_mj.tasks.sources import digest_of; "
+        "from pathlib import Path; from hyrl_mj.files.sources import digest_of; "
         f"print(digest_of(Path({str(path)!r})))"
     )
     told = {

@@ -42,15 +42,22 @@ class Fresh:
         preload(description)
         self._owner, self._lock = os.getpid(), Lock()
         self._hand: Connection | None = None
-        forks = "fork" in multiprocessing.get_all_start_methods()
-        if forks and not multiprocessing.current_process().daemon:
+        if "fork" in multiprocessing.get_all_start_methods():
             context = multiprocessing.get_context("fork")
             ours, theirs = context.Pipe()
             self._hand = own_end(ours)
             server = context.Process(target=_fork, args=(theirs, description), daemon=True)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", DeprecationWarning)  # of threads, which stay here
-                server.start()
+            # A daemon may have no children, which nobody would end: these end with their pipe.
+            here = multiprocessing.current_process()
+            of_daemon, here.daemon = here.daemon, False
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter(
+                        "ignore", DeprecationWarning
+                    )  # of threads, which stay here
+                    server.start()
+            finally:
+                here.daemon = of_daemon
             theirs.close()
 
     @property

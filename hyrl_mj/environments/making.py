@@ -86,10 +86,10 @@ def from_gymnasium(
     }
     with described(_shown(env)):
         description = Description(**given)
-    told = given | {"env": env if isinstance(env, str) else {"function": _where(env)}}
-    if starts == "chart":
-        del told["starts"]
-    spec = ENVIRONMENT + json.dumps(told, default=_plain)
+        told = given | {"env": env if isinstance(env, str) else {"function": _where(env)}}
+        if starts == "chart":
+            del told["starts"]
+        spec = ENVIRONMENT + json.dumps(told, default=_plain)
     task = _MADE.get(spec)
     same = task is not None and _same(task.made_of, _made_of(description))
     if task is None or not same or not isinstance(env, str):

@@ -108,15 +108,25 @@ def _all(values: Any, kind: type) -> bool:
 
 def _is_numeric(value: Any) -> bool:
     """Returns whether a value is a finite number, or an array of them."""
-    with suppress(ValueError):  # lists of different lengths
-        array = np.asarray(value)
+    with suppress(ValueError):  # lists of different lengths, or of texts
+        array = _array(value)
         return array.dtype.kind in "biuf" and bool(np.isfinite(array).all())
     return False
 
 
 def with_arrays(content: dict[str, Any]) -> Any:
     """Returns the array that an object of JSON stands for, else the object."""
-    return np.array(content["array"]) if content.keys() == {"array"} else content
+    return _array(content["array"]) if content.keys() == {"array"} else content
+
+
+def _array(value: Any) -> np.ndarray:
+    """Returns an array of numbers; raises ValueError for others.
+
+    In an array of texts each takes the room of the longest, so that a small file fills the memory.
+    """
+    if not all(isinstance(one, Real | np.bool_) for one in np.array(value, dtype=object).flat):
+        raise ValueError("an array holds numbers alone")
+    return np.array(value)
 
 
 def made(description: Description) -> gym.Env:
@@ -209,7 +219,7 @@ def _adapt_dm_control() -> None:
 def _why_not_made(name: str, error: BaseException) -> str:
     if name not in gym.registry and isinstance(error, gym.error.Error):
         missing = {e: m for m, e in PACKAGES.items() if importlib.util.find_spec(m) is None}
-        close = get_close_matches(name, list(gym.registry), n=3, cutoff=0.5)
+        close = get_close_matches(name[:80], list(gym.registry), n=3, cutoff=0.5)
         near = f"; near it are {', '.join(close)}" if close else ""
         install = "".join(
             f'; if it is of {module}: pip install "hyrl-mj[{extra}]"'

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import stat
 import time
 from collections.abc import Collection, Iterator, Mapping
@@ -238,11 +239,12 @@ def _remedy(stage: str, folder: Path, done: Collection[str]) -> str:
     if "diagnose" in done and not {stage, "extended-sets"} & {*done}:
         return "the run is a diagnosis, go on with hyrl-mj robustify and the same arguments"
     if stage == "simulate --start":
-        return f"simulate it again with hyrl-mj simulate {folder} --start ..."
+        return f"simulate it again with hyrl-mj simulate {shlex.quote(str(folder))} --start ..."
     resumed = "by giving the command again that made the run"
     if stage in ("train", "diagnose"):
         return f"run the stage {stage} again {resumed}"
-    return f"run the stage that writes it again, with hyrl-mj {stage} {folder} or {resumed}"
+    again = f"hyrl-mj {stage} {shlex.quote(str(folder))}"
+    return f"run the stage that writes it again, with {again} or {resumed}"
 
 
 @contextmanager

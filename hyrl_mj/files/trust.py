@@ -22,6 +22,7 @@ from typing import Any
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files.artifacts import digest, replacing
+from hyrl_mj.files.sources import digest_of
 
 # The records hold hashes of files by path, and of texts and written files by keys that are no paths: of each
 # of these two as many.
@@ -94,14 +95,22 @@ def store() -> Path | None:
 
 def remember(path: Path) -> None:
     """Records that the user has named this file of code, or that this model was tried."""
-    _record(str(path.resolve()), digest(path))
+    _record(str(path.resolve()), _digest(path))
 
 
 def is_known(path: Path) -> bool:
     """Returns whether the file has been recorded by `remember`, as it is now."""
     # A file without a record is not even read: it may have no end.
     known = _records().get(str(path.resolve()))
-    return known is not None and path.is_file() and known == digest(path)
+    return known is not None and path.is_file() and known == _digest(path)
+
+
+def _digest(path: Path) -> str:
+    """Returns the SHA-256 of a file; of code with all that is imported with it from its folder or package."""
+    if path.suffix != ".py":
+        return digest(path)
+    parts = sorted(path.parent.rglob("*.py")) if path.name == "__init__.py" else []
+    return sha256("".join([digest_of(path), *map(digest, parts)]).encode()).hexdigest()
 
 
 def remember_text(text: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -130,7 +131,7 @@ def check_named(name: str) -> None:
     if source is None or not trust.is_known(source):
         raise BadInput(
             f"the run trains with {name}, from a module that you have not named before, as it is now: if "
-            f"you trust it, name it with hyrl-mj run TASK --algorithm {name}"
+            f"you trust it, name it with hyrl-mj run TASK --algorithm {shlex.quote(name)}"
         )
 
 

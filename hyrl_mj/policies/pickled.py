@@ -19,6 +19,7 @@ import numpy as np
 
 # Limit on the pickled text around the numbers [bytes]: a network of ten layers takes a few kilobytes.
 LARGEST = 2**19
+LONGEST = 200  # characters of the name of a function
 _MARK = object()
 # The functions that make dictionaries, whose entries are the items of the call.
 DICTS = ("dict", "collections.OrderedDict")
@@ -95,6 +96,8 @@ def _step(name: str, argument: Any, stack: list[Any], memo: dict[int, Any]) -> N
         case "STACK_GLOBAL":
             module, attribute = stack.pop(-2), stack.pop()
             plain = isinstance(module, str) and isinstance(attribute, str)
+            # A name that is made of itself again and again doubles each time.
+            plain = plain and len(module) + len(attribute) <= LONGEST
             stack.append(f"{module}.{attribute}" if plain else "")
         case "REDUCE" | "NEWOBJ":
             arguments, function = stack.pop(), stack.pop()

@@ -162,10 +162,11 @@ class Sweep:
 
         Raises:
             BadArtifact: there is none, it is damaged, or the folder holds a link.
+            BadInput: it has more runs than any sweep.
         """
         check_contents(folder)
         remedy = "give the folder of a sweep, or make one with hyrl-mj sweep TASK --out DIR"
-        found = artifacts.read_record(folder / NAME, "sweep", Sweep, remedy)
+        found = artifacts.read_record(folder / NAME, "sweep", Sweep, remedy).checked()
         names = Counter(row.name for row in found.rows)
         if len(names) < len(found.rows):
             twice = names.most_common(1)[0][0]

@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.util
+import shlex
 import sys
 from collections.abc import Callable
 from functools import cached_property
@@ -15,8 +16,8 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput, brief, line_in, unknown
 from hyrl_mj.files import trust
+from hyrl_mj.files.sources import check_helpers, digest_of, forget_helpers
 from hyrl_mj.tasks.base import Task
-from hyrl_mj.tasks.sources import check_helpers, digest_of, forget_helpers
 
 _REGISTRY: dict[str, type[Task]] = {}
 # The task that each file defines, as the file is at that time.
@@ -83,14 +84,15 @@ def get_task(name: str | Path | Task) -> Task:
     if str(name).endswith(".py"):
         path = Path(name).resolve()
         if not path.is_file():
-            remedy = f"hyrl-mj new-task {path.stem} writes one to start from"
+            remedy = f"hyrl-mj new-task {shlex.quote(path.stem)} writes one to start from"
             if trust.is_received():
                 remedy = (
                     "if it lies elsewhere, name it with --task FILE, in Python with "
                     "load_run(path, task=FILE)"
                 )
             raise BadInput(f"there is no task file {path}: {remedy}")
-        has_run = (path, digest_of(path)) in _FILES
+        # A file that nobody has run is not even read: it may have no end.
+        has_run = any(known == path for known, _ in _FILES) and (path, digest_of(path)) in _FILES
         if trust.is_received() and not has_run and not trust.is_known(path):
             raise BadInput(
                 f"the task is defined in {path}, and opening a run executes no file that you have not run "

@@ -65,7 +65,9 @@ def video(
         raise _failed(path, brief(error)) from error
     with artifacts.replacing(path) as temporary:
         options = ENCODERS[path.suffix]
-        encoder = Encoder(mediapy.VideoWriter(temporary, (height, width), fps=fps, **options))
+        # ffmpeg takes what stands before a colon, as in a name of a folder, for a protocol.
+        place = temporary.absolute()
+        encoder = Encoder(mediapy.VideoWriter(place, (height, width), fps=fps, **options))
         try:
             yield encoder.add
             encoder.finish()

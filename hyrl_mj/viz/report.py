@@ -25,6 +25,9 @@ from hyrl_mj.viz.commands import changed, commands
 from hyrl_mj.viz.figures import CLASS_COLOURS, FIGURES
 from hyrl_mj.viz.figures.style import task_title
 
+# The largest picture and video that a page shows [bytes]: there they take several times the memory.
+PICTURE, VIDEO = 2**22, 2**25
+
 
 @dataclass(frozen=True)
 class Picture:
@@ -189,7 +192,7 @@ def environment() -> Environment:
 def film(path: Path, has: Callable[[Path], bool] = Path.is_file) -> Picture | None:
     """Returns the poster of a replay with its video, or None unless both files can be shown."""
     poster = path.with_suffix(".png")
-    if not (has(path) and has(poster)):
+    if not (_fits(path, VIDEO, has) and _fits(poster, PICTURE, has)):
         return None
     return replace(_picture(poster, "replay", ""), video=data_uri(path.read_bytes(), "video/mp4"))
 
@@ -199,8 +202,13 @@ def pictures(folder: Path, has: Callable[[Path], bool] = Path.is_file) -> list[P
     return [
         _picture(path, name.replace("_", " "), entry.caption)
         for name, entry in FIGURES.items()
-        if has(path := folder / f"{name}.png")
+        if _fits(path := folder / f"{name}.png", PICTURE, has)
     ]
+
+
+def _fits(path: Path, most: int, has: Callable[[Path], bool]) -> bool:
+    """Returns whether a file can be shown, and is no larger than so many bytes."""
+    return has(path) and path.stat().st_size <= most
 
 
 def _picture(path: Path, name: str, caption: str) -> Picture:

@@ -124,7 +124,7 @@ def draw_curves(curves: dict[Setting, list[Curve]]) -> Figure:
         panels = figure.subplots(count, columns, squeeze=False, sharey=True).ravel()
         for panel, (setting, group) in zip(panels, curves.items(), strict=False):
             _draw(panel, group)
-            panel.set_title(f"{setting.title} ({len(group)} seeds)", parse_math=False)
+            panel.set_title(f"{setting.title} ({len(group)} seeds)")
             panel.axvline(
                 setting.eps, color=colours.INK, linewidth=1, linestyle=(0, (1, 2)), zorder=1
             )

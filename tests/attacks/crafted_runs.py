@@ -43,6 +43,15 @@ def config_names_code(folder: Path, path: Path, task: str) -> None:
     setting(path, "task", task.format(folder=folder, path=path))
 
 
+def names_endless_code(folder: Path, path: Path, text: str) -> None:
+    """A file of code of 4 GB, or one that Python's parser cannot read: it must not even be read."""
+    with evil(path).open("w") as file:
+        file.write(text)
+        if not text:
+            file.truncate(2**32)
+    setting(path, "task", str(path / "evil.py"))
+
+
 def names_module(folder: Path, path: Path, stage: str) -> None:
     evil(folder, "evilmod.py")
     evil(path, "evilmod.py")
@@ -207,6 +216,10 @@ DIRECTORIES: dict[str, Callable[[Path, Path], None]] = {
     "config.json names a file of code": partial(config_names_code, task="{folder}/evil.py"),
     "config.json names a file of code in itself": partial(config_names_code, task="{path}/evil.py"),
     "config.json names a file of code near by": partial(config_names_code, task="evil.py"),
+    "config.json names a file of code of 4 GB": partial(names_endless_code, text=""),
+    "config.json names a file of code that is nested": partial(
+        names_endless_code, text="-" * 200_000 + "1"
+    ),
     "config.json names a module for stage 1": partial(names_module, stage="stage1"),
     "config.json names a module for stage 6": partial(names_module, stage="stage6"),
     "a pickled array": pickled_array,

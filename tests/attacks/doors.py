@@ -54,6 +54,7 @@ WRONG: tuple[dict[str, Any], ...] = (
     {"bounds": {"theta": [0, float("inf")]}}, {"chart": {"\x1b[31m": "theta"}},
     {"chart": ["a" * 3_000_000]}, {"success": "(" * 5_000}, {"success": "a" * 100_000},
     {"kwargs": {"\x1b": 1}}, {"steps": 10**400}, {"seed": -(10**400)},
+    {"reset": {"a": {"array": ["a" * 10**6] + [""] * 400}}}, {"pinned": {"z": ["a" * 10**6] + [""] * 400}},
 )  # fmt: skip
 # Hostile models: the text of an MJCF, in which {fifo} is a file that nobody writes to.
 # fmt: off
@@ -86,27 +87,29 @@ MODELS = {
 
 def trials(material: Material, draw: Random, count: int) -> list[Trial]:
     """Returns trials of each kind, drawn at random."""
-    # What makes a trial, what its memory is compared with, and how many of 23 are of this kind.
+    # What makes a trial, what its memory is compared with, how many of 23 are of this kind, and how many at
+    # most: of those in which little is drawn there are few.
     kinds = {
-        "spec": (_spec, "run", 4),
-        "arguments": (_arguments, "environment", 4),
-        "agent": (_agent, "agent", 5),
-        "model": (_model, "model", 3),
-        "field": (_field, "field", 2),
-        "sweep": (folders.sweep, "run", 1),
-        "path": (folders.path, "run", 1),
-        "threads": (folders.threads, "run", 1),
-        "user": (folders.user, "run", 1),
-        "modules": (folders.modules, "environment", 1),
+        "spec": (_spec, "run", 4, count),
+        "arguments": (_arguments, "environment", 4, count),
+        "agent": (_agent, "agent", 5, count),
+        "model": (_model, "model", 3, count),
+        "field": (_field, "field", 2, count),
+        "sweep": (folders.sweep, "run", 1, count),
+        "path": (folders.path, "run", 1, count),
+        "threads": (folders.threads, "run", 1, 2),
+        "user": (folders.user, "run", 1, count),
+        "modules": (folders.modules, "environment", 1, 8),
     }
     turns = [kind for turn in range(5) for kind in kinds if kinds[kind][2] > turn]
-    made = []
+    made: list[Trial] = []
     for number in range(count):
         kind, seed = turns[number % len(turns)], draw.randrange(2**32)
-        make, compared, _ = kinds[kind]
-        honest = partial(most, material, compared)
-        attempt = partial(_attempt, make, material, honest, seed)
-        made.append(Trial(f"{kind} {seed}", attempt, honest))
+        make, compared, _, at_most = kinds[kind]
+        if number // len(turns) < at_most:
+            honest = partial(most, material, compared)
+            attempt = partial(_attempt, make, material, honest, seed)
+            made.append(Trial(f"{kind} {seed}", attempt, honest))
     return made
 
 
@@ -271,12 +274,15 @@ def _pickle(draw: Random) -> bytes:
     several = range(draw.randint(20, 90))
     doubled = b")\x94" + b"".join(b"h%c\x86\x94" % number for number in several)
     last = b"h%c" % (doubled.count(b"\x94") - 1)
-    kind = draw.choice(("key", "value", "itself", "shape", "type"))
+    kind = draw.choice(("key", "value", "itself", "shape", "type", "name"))
     reconstruct = b"cnumpy.core.multiarray\n_reconstruct\n"
     bodies = {
         "key": b"}(" + doubled + b"K\x01u",
         "value": b"}(X\x01\x00\x00\x00a" + doubled + b"u",
         "itself": b"]\x94h\x00a",
+        # The name of a function of the module and attribute that it is itself: twice as long each time.
+        "name": b"X\x01\x00\x00\x00a\x94"
+        + b"".join(b"h%ch%c\x93\x94" % (number, number) for number in several),
         "shape": reconstruct + b"N\x85R(K\x01" + doubled + b"N\x89C\x01atb",
         "type": b"cnumpy.core.numeric\n_frombuffer\n(C\x01a"
         + doubled

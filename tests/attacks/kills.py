@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from random import Random
 
-from attacks import Trial, child, command, crafted_agents, differences
+from attacks import Trial, child, command, crafted_agents, differences, small
 from attacks.honest import FIELD
 from attacks.material import RUN, TASK, Material, once
 
@@ -32,7 +32,9 @@ AGENT = (
 TRIAL, ENDED = "ATTACK_TRIAL", 10.0
 DAY = 86_400.0  # [s]
 PICTURE = "drive.png"
-SWEEP = ("sweep", TASK, "--preset", "smoke", "--seeds", "0", "--cores", "1", "--out", "sweep")
+# Ray's processes make no smaller runs than these.
+FEW = [f"{name}={value}" for name, value in small.FEW.items()]
+SWEEP = ("sweep", TASK, "--preset", "smoke", "--cores", "1", "--set", *FEW, "--out", "sweep")
 COMMANDS = {
     "run": RUN,
     "diagnose": ("diagnose", *AGENT),

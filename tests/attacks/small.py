@@ -12,8 +12,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from matplotlib.mathtext import MathTextParser
-
 import hyrl_mj.judging.proof.assumptions as assumptions
 import hyrl_mj.judging.proof.cells as cells
 import hyrl_mj.judging.proof.replays as replays
@@ -32,9 +30,14 @@ from hyrl_mj.tasks.unit_circle import UnitCircle
 from hyrl_mj.viz.figures import FIGURES
 
 SIZE, FPS = (480, 160), 2
+STEPS = 40  # of an episode
 LATTICE = 130  # about the least with cells no longer than a sample on the circle
+# The same for processes of Ray's: settings of their runs.
+FEW = {
+    "stage1.samples": 1_024, "stage6.samples": 1_024, "cells": 130, "rods": 24, "lattice": LATTICE,
+}  # fmt: skip
 # Within which what is tried in a process of its own must end: of the processor, and in all [s].
-SECONDS, LONGEST = 4, 10.0
+SECONDS, LONGEST = 2, 10.0
 KEPT = {"extended_sets", "robustness_map"}  # of the figures
 # Set where the program has to run without the rights of root, in a folder that cannot be written.
 NOBODY = "ATTACK_AS_NOBODY"
@@ -66,7 +69,6 @@ def import_late() -> None:
     """Imports once what every forked process would import."""
     for name in LATE:
         import_module(name)
-    MathTextParser("agg").parse("$x$")  # the first formula builds the grammar of all
 
 
 def shorten() -> None:
@@ -92,6 +94,7 @@ def shorten() -> None:
     style.STYLE["pdf.fonttype"] = 3
     for name in FIGURES.keys() - KEPT:
         del FIGURES[name]
+    UnitCircle.max_steps = STEPS
     UnitCircle.scene = replace(UnitCircle.scene, starts=UnitCircle.scene.starts[:2], time=0.5)
     render = replay.render_replay
 

@@ -24,7 +24,7 @@ TRAINED = ("policy.safetensors", "mode_0.safetensors", "mode_1.safetensors", "ro
 def trials(material: Material, draw: Random, count: int) -> list[Trial]:
     """Returns a trial for each pair, or some of them."""
     material.finished()
-    pairs = [pair for pair in combinations(CONDITIONS, 2) if set(pair) != {"no GL", "broken GL"}]
+    pairs = [pair for pair in combinations(CONDITIONS, 2) if set(pair) not in EITHER]
     pairs = pairs if count >= len(pairs) else draw.sample(pairs, count)
     return [
         Trial(
@@ -83,6 +83,12 @@ def ascii_only() -> None:
     os.environ |= {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
 
 
+def latin_1() -> None:
+    """A locale with an encoding that is not UTF-8, made here, because few machines have one."""
+    subprocess.run(["localedef", "-i", "en_US", "-f", "ISO-8859-1", "./latin_1"], check=False)
+    os.environ |= {"LOCPATH": os.getcwd(), "LC_ALL": "latin_1", "PYTHONUTF8": "0"}
+
+
 def narrow() -> None:
     os.environ["COLUMNS"] = "1"
 
@@ -97,10 +103,13 @@ CONDITIONS: dict[str, Callable[[], None]] = {
     "closed stdout": partial(closed, 1),
     "closed stderr": partial(closed, 2),
     "an ASCII locale": ascii_only,
+    "a Latin-1 locale": latin_1,
     "COLUMNS=1": narrow,
 }
 # What a process only learns when it starts.
-FRESH = {"no GL", "broken GL", "an ASCII locale"}
+FRESH = {"no GL", "broken GL", "an ASCII locale", "a Latin-1 locale"}
+# Of these a process has one at most.
+EITHER = ({"no GL", "broken GL"}, {"an ASCII locale", "a Latin-1 locale"})
 DISK = {"a full disk", "a read-only folder"}
 NO_VIDEO = {name for name in CONDITIONS if "GL" in name or "ffmpeg" in name}
 

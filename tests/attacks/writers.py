@@ -9,6 +9,7 @@ from random import Random
 
 import hyrl_mj
 from attacks import Answer, Process, Trial, child, command, differences
+from attacks.kills import SWEEP, made_by, whole
 from attacks.material import RUN, TASK, Material
 from hyrl_mj import BadArtifact
 
@@ -26,13 +27,16 @@ HONEST = (
 
 
 def trials(material: Material, draw: Random, count: int) -> list[Trial]:
-    """Returns rounds: whole runs, stages of a finished run, and pages, by two and by four."""
+    """Returns rounds: whole runs, stages of a finished run, pages and sweeps, by two and by four."""
     material.finished()
     kinds: list[tuple[str, list[tuple[str, ...]], bool]] = [
         ("whole runs", [RUN], False),
         ("stages of a finished run", AGAIN, True),
         ("reports to one page", PAGES, True),
+        ("sweeps", [SWEEP], False),
     ]
+    if count >= len(kinds):
+        whole(material, "sweep")
     rounds = []
     for number in range(count):
         writers = 2 if number % 2 else 4
@@ -61,10 +65,14 @@ def _round(
             return f"{' '.join(words)}: a sentence about something else: {answer.err!r}"
     if not any(answer.status in (0, 1) for answer in answers):
         return "nobody won"
-    resumed = child(command(*RUN), folder)
+    swept = SWEEP in commands
+    resumed = child(command(*(SWEEP if swept else RUN)), folder)
     if broke := resumed.broke(ended=(0, 1)):
         return broke
-    wrong = differences(folder / TASK, material.finished())
+    made, sound = TASK, material.finished()
+    if swept:
+        made, sound = made_by("sweep"), whole(material, "sweep").path
+    wrong = differences(folder / made, sound)
     return f"in the end not as one writer alone: {wrong}" if wrong else ""
 
 

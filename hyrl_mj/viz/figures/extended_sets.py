@@ -32,7 +32,7 @@ def draw_extended_sets(shown: ShownRun, path: Path | None = None) -> Figure:
     with style.drawing(path, 5.6, shown.section, title) as figure:
         panels = figure.subplots(1, 1 + enlarged, squeeze=False).ravel()
         for i, mode in enumerate(sets.modes):
-            label = f"$M^{{ext}}_{{{mode}}}$, of mode {task.mode_name(mode)}"
+            label = f"{style.set_label(mode, extended=True)}, of mode {task.mode_name(mode)}"
             colour, tint = mode_colour(i), style.mode_tint(i)
             charts.legend_field(panels[0], label, colour if ring else tint, colour)
         if shared.any():

@@ -32,9 +32,9 @@ def draw_overview(shown: ShownPolicy, path: Path | None = None) -> Figure:
         panel = figure.subplots()
         panel.set_title(style.noise_label(task, arc.noise, arc.bound))
         for i, mode in enumerate(shown.partition.modes):
-            part = f"only in the part $M_{{{mode}}}$"
+            part = f"only in the part {style.set_label(mode)}"
             if len(shown.partition.modes) > NAMED:  # names are said here, once
-                part = f"only in $M_{{{mode}}}$, of mode {task.mode_name(mode)}"
+                part = f"only in {style.set_label(mode)}, of mode {task.mode_name(mode)}"
             charts.legend_field(panel, part, style.mode_tint(i))
         if charts.is_ring(task.chart):
             _spirals(panel, shown)

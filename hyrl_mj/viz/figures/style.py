@@ -37,7 +37,10 @@ STYLE = dict.fromkeys(
     "legend.fontsize": 9.5,
     # Text in a PDF stays text, which can be searched and edited.
     "pdf.fonttype": 42,
+    # A name is no formula, whatever dollars are in it.
+    "text.parse_math": False,
 }
+_SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
 
 def mode_tint(place: int) -> str:
@@ -122,6 +125,11 @@ def _in_order(label: str) -> list[tuple[bool, int, str]]:
 def task_title(task: Task) -> str:
     """Returns the title of a task: "Unit circle"."""
     return task.scene.title or task.name.replace("_", " ").capitalize()
+
+
+def set_label(mode: int, extended: bool = False) -> str:
+    """Returns the label of the set of a mode: "M₀", or the extended one, "Mᵉˣᵗ₀"."""
+    return f"M{'ᵉˣᵗ' * extended}{str(mode).translate(_SUBSCRIPTS)}"
 
 
 def noise_label(task: Task, kind: str, eps: float) -> str:

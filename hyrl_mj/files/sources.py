@@ -69,7 +69,7 @@ def _imported(code: bytes) -> frozenset[str]:
     """Returns the first names of the modules that the code of a file imports anywhere."""
     try:
         tree = ast.parse(code)
-    except (SyntaxError, ValueError):  # which running it tells of
+    except (SyntaxError, ValueError, RecursionError, MemoryError):  # which running it tells of
         return frozenset()
     names: list[str] = []
     for node in ast.walk(tree):
