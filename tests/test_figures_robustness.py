@@ -24,7 +24,7 @@ from hyrl_mj.judging.game.result import (
     GameResult,
     Maps,
     Profile,
-    Wins,
+    WinningShares,
 )
 from hyrl_mj.judging.game.scores import CURVE
 from hyrl_mj.sets import Grid
@@ -52,7 +52,7 @@ def coarse(monkeypatch):
 def wins_of(won, won_any, times):
     """What a controller wins; a hundredth less is proved."""
     proved = [tuple(np.maximum(share - 0.01, 0)) for share in (won, won_any)]
-    return Wins(tuple(won), tuple(won_any), *proved, tuple(times))
+    return WinningShares(tuple(won), tuple(won_any), *proved, tuple(times))
 
 
 def game_of(names, excursion=None, margin=0.05):
@@ -62,7 +62,7 @@ def game_of(names, excursion=None, margin=0.05):
     wins = {
         name: wins_of(fall, fall if name == "policy" else 0.9 * fall, 3 * fall) for name in names
     }
-    wins[LIMIT] = Wins((1.0,) * len(eps), tuple(1 - 0.3 * eps), (), (), (3.0,) * len(eps))
+    wins[LIMIT] = WinningShares((1.0,) * len(eps), tuple(1 - 0.3 * eps), (), (), (3.0,) * len(eps))
     scores = {
         name: (score(EPS, 0.9, 0.8, 0.72, proved=0.7, excursion=excursion),) for name in names
     }

@@ -56,7 +56,7 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Wins:
+class SuccessRates:
     """What a controller is not known to lose: shares of the winnable starts, or of the episodes.
 
     Attributes:
@@ -68,7 +68,7 @@ class Wins:
     noisy: float | None
 
     @staticmethod
-    def count(robustness: Robustness, who: str) -> Wins:
+    def count(robustness: Robustness, who: str) -> SuccessRates:
         """Returns what "policy" or "hyrl" wins."""
         attacked = [
             1 - c.lost / c.attacked
@@ -81,14 +81,14 @@ class Wins:
             replayed = replays.shares if replays else (1.0, 1.0)
             quiet = [min(score.not_broken, replayed[0]) for score in scores if score.eps == 0]
             noisy = min(scores[-1].not_broken, replayed[1], *attacked, 1.0)
-            return Wins(quiet[0] if quiet else None, noisy)
+            return SuccessRates(quiet[0] if quiet else None, noisy)
         shares = {
             kind: arrived / episodes
             for kind, (arrived, episodes) in by_kind(robustness, who).items()
         }
         quiet_share = shares.pop(NO_NOISE, None)
         under_noise = [*shares.values(), *attacked]
-        return Wins(quiet_share, min(under_noise) if under_noise else None)
+        return SuccessRates(quiet_share, min(under_noise) if under_noise else None)
 
 
 def by_kind(robustness: Robustness, who: str) -> dict[str, tuple[int, int]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from hyrl_mj.judging.evidence import Sample, Wins, by_kind
+from hyrl_mj.judging.evidence import Sample, SuccessRates, by_kind
 from hyrl_mj.judging.game import NEARLY, NO_NOISE, ReplayCount, Robustness, percent
 from hyrl_mj.judging.results import Arrivals, Retraining
 from hyrl_mj.judging.sentences import (
@@ -124,12 +124,12 @@ class _Case:
     arrivals: Arrivals
 
     @property
-    def policy(self) -> Wins:
-        return Wins.count(self.robustness, "policy")
+    def policy(self) -> SuccessRates:
+        return SuccessRates.count(self.robustness, "policy")
 
     @property
-    def hyrl(self) -> Wins:
-        return Wins.count(self.robustness, "hyrl")
+    def hyrl(self) -> SuccessRates:
+        return SuccessRates.count(self.robustness, "hyrl")
 
     @property
     def noise(self) -> str:

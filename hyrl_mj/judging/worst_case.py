@@ -27,14 +27,14 @@ from hyrl_mj.judging.game import (
     Profile,
     ReplayCount,
     Score,
-    Wins,
+    WinningShares,
     curve_grid,
     lattice_grid,
     share,
 )
 from hyrl_mj.judging.proof.cells import decides
 from hyrl_mj.judging.proof.certificate import Certificate, Proved
-from hyrl_mj.judging.proof.counterexamples import Broken, attack
+from hyrl_mj.judging.proof.counterexamples import Broken, find_counterexamples
 from hyrl_mj.judging.proof.replays import Replays, play
 from hyrl_mj.policies import BLAS, Controller
 from hyrl_mj.sets import GridSet
@@ -93,9 +93,8 @@ def worst_case(
         margins = dict(zip(controllers, _in_threads("margins", fine.margin, likely), strict=True))
     spacing, curve_spacing = (tuple(g.lattice.grid.spacing.tolist()) for g in (fine, coarse))
     lattice = LatticeSpacing(
-        spacing, fine.lattice.exact, certificate.cells is not None, curve_spacing,
-        task.abilities.stopped_by_walls,
-    )  # fmt: skip
+        spacing, fine.lattice.exact, certificate.cells is not None, curve_spacing
+    )
     proved = {name: _proved_margin(curve, curve.wins[name]) for name in controllers}
     misses = _misses(coarse, controllers)
     result = GameResult(
@@ -115,10 +114,10 @@ def _scores(
     game = certificate.game
     games = [(name, eps) for eps in bounds for name in names]
     results = list(_in_threads("worst-case scores", game.score, games))
-    tried = [(certificate, name, controllers[name], eps) for name, eps in games if name != LIMIT]
-    broken = dict(
-        zip([g for g in games if g[0] != LIMIT], _in_threads("attacks", attack, tried), strict=True)
-    )
+    tried = [(name, eps) for name, eps in games if name != LIMIT]
+    asked = [(certificate, name, controllers[name], eps) for name, eps in tried]
+    found_against = _in_threads("attacks", find_counterexamples, asked)
+    broken = dict(zip(tried, found_against, strict=True))
     scores = {
         name: tuple(
             _score(certificate, name, found, broken.get((name, found.eps)))
@@ -215,7 +214,7 @@ def _sweep(certificate: Certificate, names: list[str], points: np.ndarray) -> tu
     for name, row in rows.items():
         own, some, *_ = zip(*proved[name], strict=True) if name in proved else ((), ())
         won, won_any, times = zip(*row, strict=True)
-        wins[name] = Wins(won, won_any, own, some, times)
+        wins[name] = WinningShares(won, won_any, own, some, times)
     return Curve(CURVE, tuple(winnable), wins), profile
 
 
@@ -224,18 +223,18 @@ def _known(bounds: tuple[float, ...], scores: Mapping[str, tuple[Score, ...]]) -
     wins = {}
     for name, level in scores.items():
         own, some = zip(*((s.not_broken, s.not_broken_any) for s in level), strict=True)
-        wins[name] = Wins(own, some, (), (), tuple(s.time_any for s in level))
+        wins[name] = WinningShares(own, some, (), (), tuple(s.time_any for s in level))
     winnable = tuple(score.winnable for score in next(iter(scores.values())))
     return Curve(bounds, winnable, wins)
 
 
-def _last_won(curve: Curve, wins: Wins) -> tuple[float, float]:
+def _last_won(curve: Curve, wins: WinningShares) -> tuple[float, float]:
     """Returns the bounds of the curve between which some nodes begin to be lost."""
     lost = next((i for i, won in enumerate(wins.won) if won < 1), len(curve.eps) - 1)
     return curve.eps[max(lost - 1, 0)], curve.eps[lost]
 
 
-def _proved_margin(curve: Curve, wins: Wins) -> float | None:
+def _proved_margin(curve: Curve, wins: WinningShares) -> float | None:
     """Returns the largest bound of the curve up to which nearly all winnable starts are proved."""
     margin = None
     for eps, proved in zip(curve.eps, wins.proved, strict=False):

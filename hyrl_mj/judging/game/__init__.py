@@ -46,7 +46,7 @@ from hyrl_mj.judging.game.result import (
     Profile,
     Robustness,
     Score,
-    Wins,
+    WinningShares,
     percent,
 )
 from hyrl_mj.judging.game.scores import CURVE, LARGEST, Game, share, worst_signal
@@ -104,7 +104,7 @@ __all__ = [
     "ReplayCount",
     "Robustness",
     "Score",
-    "Wins",
+    "WinningShares",
     "WorstNoise",
     "aligned_cells",
     "compare",

@@ -100,7 +100,7 @@ class Score(NodeScore):
 
 
 @dataclass(frozen=True)
-class Wins:
+class WinningShares:
     """What a controller wins at each noise bound of a curve.
 
     Attributes:
@@ -131,7 +131,7 @@ class Curve:
 
     eps: tuple[float, ...]
     winnable: tuple[float, ...]
-    wins: dict[str, Wins]
+    wins: dict[str, WinningShares]
 
 
 @dataclass(frozen=True)
@@ -156,14 +156,12 @@ class LatticeSpacing:
         exact: whether every sample leads from node to node.
         cells: whether the starts of the scores are cells.
         curve_spacing: distance on the lattice on which the curve is computed.
-        contacts: whether contacts stop the robot between the nodes.
     """
 
     spacing: tuple[float, ...]
     exact: bool
     cells: bool
     curve_spacing: tuple[float, ...]
-    contacts: bool = False
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ class Broken:
     tried: np.ndarray
 
 
-def attack(
+def find_counterexamples(
     certificate: Certificate, name: str, controller: Controller, eps: float, seed: int = 0
 ) -> Broken:
     """Attacks a controller where it may lose, and returns where it lost.

@@ -11,7 +11,7 @@ from matplotlib.colors import ListedColormap, NoNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle, Wedge
 
-from hyrl_mj.judging.game import LIMIT, MAP_CLASSES, OVER, Score, Wins
+from hyrl_mj.judging.game import LIMIT, MAP_CLASSES, OVER, Score, WinningShares
 from hyrl_mj.sets import Chart, Grid
 from hyrl_mj.viz import colours
 from hyrl_mj.viz.figures import charts, style
@@ -160,7 +160,7 @@ def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
     return figure
 
 
-def _won(panel: Axes, title: str, eps: np.ndarray, wins: Wins, name: str) -> None:
+def _won(panel: Axes, title: str, eps: np.ndarray, wins: WinningShares, name: str) -> None:
     """Draws what is proved, and dashed what is proved from every start mode if that differs.
 
     Between it and what is won on the nodes lies the gap. Of a controller that could not be bounded, and of
@@ -180,7 +180,7 @@ def _won(panel: Axes, title: str, eps: np.ndarray, wins: Wins, name: str) -> Non
         panel.plot(eps, 100 * np.array(some), label=label, **_dashed(name))
 
 
-def _same(wins: Wins) -> bool:
+def _same(wins: WinningShares) -> bool:
     """Returns whether the start mode makes no difference."""
     pairs = (wins.won, wins.won_any), (wins.proved, wins.proved_any)
     return all(np.allclose(own, some, atol=1e-9) for own, some in pairs)
