@@ -21,6 +21,7 @@ from hyrl_mj.judging.episodes import Regions, ends_of
 from hyrl_mj.judging.game import AttackCount, Ends, wilson
 from hyrl_mj.policies import Controller
 from hyrl_mj.simulation import (
+    AttackSettings,
     HybridArc,
     Noise,
     Programmes,
@@ -186,6 +187,7 @@ def attack(
     budget: Budget,
     everywhere: bool = False,
     seed: int = 0,
+    settings: AttackSettings = AttackSettings(),
 ) -> dict[str, Attack]:
     """Searches for noise signals that make closed loops fail.
 
@@ -204,6 +206,7 @@ def attack(
         budget: how long to search.
         everywhere: whether the noise acts on all columns of the measurement, not only on the noisy ones.
         seed: seed of the search.
+        settings: what signals are tried.
 
     Returns:
         The attack on each controller, by name. The same rounds give the same on any number of threads.
@@ -216,7 +219,8 @@ def attack(
     shares = Noise("none", bound, everywhere).against(task, None).shares
     began = time.monotonic()
     searches = {
-        name: Search(task, loop, starts, bound, shares, seed) for name, loop in controllers.items()
+        name: Search(task, loop, starts, bound, shares, seed, settings)
+        for name, loop in controllers.items()
     }
     length = max(search.length for search in searches.values())
     for search in searches.values():

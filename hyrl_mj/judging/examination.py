@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from hyrl_mj.judging.game import OVER, UNWINNABLE, Maps, Robustness, compare
 from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies import Controller
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.simulation import HybridArc, Noise, usual_kinds
+from hyrl_mj.simulation import AttackSettings, HybridArc, Noise, usual_kinds
 from hyrl_mj.tasks import Effort, Task
 
 # The most starts of an attack: each keeps signals of a whole episode.
@@ -87,6 +88,7 @@ class Subject:
         playable: whether the worst-case game can be played against them.
         exact: whether it decides where it is played, and is more than an estimate.
         effort: what may be spent.
+        attacks: what signals an attack tries.
         alike: whether all of them answer as the controller "policy" does.
     """
 
@@ -100,6 +102,7 @@ class Subject:
     playable: bool
     exact: bool
     effort: Effort
+    attacks: AttackSettings = AttackSettings()
     alike: bool = False
 
 
@@ -185,10 +188,19 @@ def _attacks(
     Where all of them answer as the policy does, they are tried under the signals that were found against it.
     """
     task, controllers = subject.task, subject.controllers
+    search = partial(
+        attack,
+        starts=z0,
+        bound=eps,
+        budget=budget,
+        everywhere=everywhere,
+        seed=seed,
+        settings=subject.attacks,
+    )
     if not subject.alike:
-        return attack(task, controllers, z0, eps, budget, everywhere, seed)
+        return search(task, controllers)
     alone = {"policy": controllers["policy"]}
-    found = attack(task, alone, z0, eps, budget, everywhere, seed)["policy"]
+    found = search(task, alone)["policy"]
     return {
         name: found if name in alone else found.on(name, task, controller)
         for name, controller in controllers.items()

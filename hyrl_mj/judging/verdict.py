@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from hyrl_mj.judging.evidence import Sample, SuccessRates, by_kind
+from hyrl_mj.judging.evidence import Sample, SuccessRates, VerdictSettings, by_kind
 from hyrl_mj.judging.game import NEARLY, NO_NOISE, ReplayCount, Robustness, percent
 from hyrl_mj.judging.results import Arrivals, Retraining
 from hyrl_mj.judging.sentences import (
@@ -27,9 +27,6 @@ PROVED, WON, HELD, UNDECIDED, WEAK, FAILED = (
     "WEAK",
     "FAILED",
 )
-# PROVED and WON speak of winnable starts: at least this share of those that are open to one who sees the
-# state. Else a split that makes most starts unwinnable would have the first word.
-LEAST_WINNABLE = 0.9
 
 
 @dataclass(frozen=True)
@@ -89,6 +86,7 @@ class Verdict:
         robustness: Robustness,
         retraining: Retraining,
         arrivals: Arrivals,
+        settings: VerdictSettings = VerdictSettings(),
     ) -> Verdict:
         """Returns the verdict on a run.
 
@@ -98,8 +96,9 @@ class Verdict:
             robustness: the result of the examination.
             retraining: the result of stage 6.
             arrivals: from how many starts the policy of stage 1, or the agent, arrives without noise.
+            settings: what the words ask for.
         """
-        case = _Case(task, bound, robustness, retraining, arrivals)
+        case = _Case(task, bound, robustness, retraining, arrivals, settings)
         reasons = tuple(case.reasons())
         for word, grounds in (
             (PROVED, case.proofs()),
@@ -122,6 +121,7 @@ class _Case:
     robustness: Robustness
     retraining: Retraining
     arrivals: Arrivals
+    settings: VerdictSettings
 
     @property
     def policy(self) -> SuccessRates:
@@ -255,20 +255,22 @@ class _Case:
     @property
     def samples(self) -> list[Sample]:
         """What HELD rests on: episodes without noise and of each kind of noise, and attacked starts."""
-        counts = by_kind(self.robustness, "hyrl")
+        counts, s = by_kind(self.robustness, "hyrl"), self.settings
         samples = [
-            Sample(kind, *counts.get(kind, (0, 0)), False)
+            Sample(kind, *counts.get(kind, (0, 0)), False, s.episodes)
             for kind in dict.fromkeys((*usual_kinds(self.task), *counts))
         ]
         attacks = [c for c in self.robustness.attacks if c.controller == "hyrl"]
         won, total = next(((c.attacked - c.lost, c.attacked) for c in attacks), (0, 0))
-        return [*samples, Sample("attack", won, total, True)]
+        return [*samples, Sample("attack", won, total, True, s.attacked)]
 
     @property
     def fair(self) -> bool:
         """Whether most of the starts that are open to one who sees the state are winnable."""
         game = self.robustness.deciding
-        return game is None or self.winnable >= LEAST_WINNABLE * game.scores["hyrl"][-1].open
+        return (
+            game is None or self.winnable >= self.settings.winnable * game.scores["hyrl"][-1].open
+        )
 
     def failures(self) -> Iterator[str]:
         """Yields why the run FAILED, if it did for sure."""

@@ -66,7 +66,8 @@ def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
         except BadInput:  # it would hide the whole chart
             break
         some = starts if factor == 1 else starts[::3]
-        found = attack(task, {"policy": loop}, some, factor * eps, Budget(rounds=1, enough=1))
+        budget, settings = Budget(rounds=1, enough=1), run.settings.attack
+        found = attack(task, {"policy": loop}, some, factor * eps, budget, settings=settings)
         if (lost := _first_lost(found["policy"].arcs)) is not None:
             return lost
     return None

@@ -252,7 +252,7 @@ class Run:
     @cached_property
     def verdict(self) -> Verdict:
         """What the run is worth, in one word with its reasons."""
-        facts = self.robustness, self.retraining, self.arrivals
+        facts = self.robustness, self.retraining, self.arrivals, self.settings.verdict
         return Verdict.judge(self.task, self.settings.noise, *facts)
 
     @property

@@ -9,7 +9,7 @@ import numpy as np
 from hyrl_mj.policies import Controller, answer, nothing_past
 from hyrl_mj.simulation.lookahead import each_answer
 from hyrl_mj.simulation.noise import NOT_STARTED, Sample, Signal
-from hyrl_mj.simulation.rules import CONTRARY, JUMP, REVERSE, STAY, STRAIGHT, Rules
+from hyrl_mj.simulation.rules import RuleKind, Rules
 from hyrl_mj.tasks import Outcome, Task
 
 # A change of the mode counts for more than any change of the inputs.
@@ -124,15 +124,15 @@ class Programmes(Signal):
         jumps, contrary = DECISIVE * (q != usual_mode), np.linalg.norm(u - u[0], axis=2)
         last = self._scaled(self._last[now.rows[rows]])
         values = {
-            CONTRARY: contrary,
-            STRAIGHT: -np.linalg.norm(u, axis=2),
-            REVERSE: np.linalg.norm(u - np.where(np.isnan(last), u[0], last), axis=2),
-            JUMP: contrary + jumps,
-            STAY: contrary - jumps,
+            RuleKind.CONTRARY: contrary,
+            RuleKind.STRAIGHT: -np.linalg.norm(u, axis=2),
+            RuleKind.REVERSE: np.linalg.norm(u - np.where(np.isnan(last), u[0], last), axis=2),
+            RuleKind.JUMP: contrary + jumps,
+            RuleKind.STAY: contrary - jumps,
         }
         for number in np.unique(rule):
             wish, mine = self.rules.all[number].wish, rule == number
-            if isinstance(wish, str):
+            if isinstance(wish, RuleKind):
                 value = values[wish]
             else:
                 assert wish is not None

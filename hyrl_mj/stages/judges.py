@@ -15,7 +15,7 @@ from hyrl_mj.learning import ModeSettings
 from hyrl_mj.learning.training import Score
 from hyrl_mj.policies import Policy, PolicyController
 from hyrl_mj.sets import distance_to
-from hyrl_mj.simulation import KINDS, LoopSettings, Noise, closed_loop
+from hyrl_mj.simulation import KINDS, AttackSettings, LoopSettings, Noise, closed_loop
 from hyrl_mj.stages.mode_states import ModeStates
 from hyrl_mj.tasks import Outcome
 
@@ -269,8 +269,14 @@ class ByAttack:
 
     settled = 0.0
 
-    def __init__(self, states: ModeStates, settings: ModeSettings, policy: Policy | None):
-        self.states, self.settings = states, settings
+    def __init__(
+        self,
+        states: ModeStates,
+        settings: ModeSettings,
+        policy: Policy | None,
+        attacks: AttackSettings,
+    ):
+        self.states, self.settings, self.attacks = states, settings, attacks
         self.noisy = ByEpisodes(states, settings, policy, KINDS[:-1])
         self.noise, self.margin = self.noisy.noise, self.noisy.margin
         self.enough: Score = (1.0, *self.noisy.enough)
@@ -295,8 +301,11 @@ class ByAttack:
         task = self.states.task.with_noise(self.states.shares)
         controllers = {"mode": PolicyController(policy)}
         # What is reported comes from the attack of the examination: other starts, another seed, more rounds.
-        starts, budget = self.attacked, Budget(rounds=1)
-        found = attack(task, controllers, starts, self.noise.bound, budget, seed=20_220_608)["mode"]
+        starts, budget, seed = self.attacked, Budget(rounds=1), 20_220_608
+        attacks = attack(
+            task, controllers, starts, self.noise.bound, budget, seed=seed, settings=self.attacks
+        )
+        found = attacks["mode"]
         withstood = 1 - (found.count.unaided + found.count.lost) / len(starts)
         both = (won + withstood) / 2
         if both < 1:

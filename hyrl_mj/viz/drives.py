@@ -133,7 +133,7 @@ def drive_run(
     made_for = run.settings.noise
     for caution in (*cautions(field, local.body), *noise_cautions(local, made_for, options)):
         logging.getLogger("hyrl_mj").warning("warning: %s", printable(caution))
-    drives = drive(local, policy, policies, made_for, field, options)
+    drives = drive(local, policy, policies, made_for, field, options, run.settings.attack)
     for table in drive_tables(drives, options.noise, options.seed):
         print_table(table)
     for sentence in drive_sentences(drives):
