@@ -7,13 +7,15 @@ import pytest
 from planted import halves, ideal_controller, sign_policy
 
 from hyrl_mj import HybridController, MlpPolicy, Noise
-from hyrl_mj.judging.game import NEVER, OVER, UNCLEAR, WON, WON_FROM_SOME, Game
+from hyrl_mj.judging.game import NEVER, Game, MapClass
 from hyrl_mj.judging.proof import CellNoise, Certificate, find_counterexamples
 from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import Outcome
+
+WON, WON_FROM_SOME, UNCLEAR, BEATEN, UNWINNABLE, OVER = MapClass
 
 EPS = 0.1
 

@@ -13,15 +13,10 @@ from scored import SPACING, score
 import hyrl_mj
 from hyrl_mj import BadInput
 from hyrl_mj.judging.game.result import (
-    BEATEN,
     LIMIT,
-    MAP_CLASSES,
-    UNCLEAR,
-    UNWINNABLE,
-    WON,
-    WON_FROM_SOME,
     Curve,
     GameResult,
+    MapClass,
     Maps,
     Profile,
     WinningShares,
@@ -31,6 +26,8 @@ from hyrl_mj.sets import Grid
 from hyrl_mj.viz import colours, figures
 from hyrl_mj.viz.figures import robustness, style
 from hyrl_mj.viz.section import Section
+
+WON, WON_FROM_SOME, UNCLEAR, BEATEN, UNWINNABLE, OVER = MapClass
 
 CIRCLE, VEHICLE = hyrl_mj.get_task("unit_circle"), hyrl_mj.get_task("vehicle")
 HYRL = colours.MODES[0]
@@ -113,7 +110,7 @@ def test_each_class_that_occurs_has_its_colour(tmp_path, task):
     critical = critical_of(task.scene.starts[2])
     draw_map(task, game_of(names), maps, critical, path)
     for k, colour in enumerate(figures.CLASS_COLOURS):
-        assert (len(where(path, colour)) > 1000) == (k in occurring), MAP_CLASSES[k]
+        assert (len(where(path, colour)) > 1000) == (k in occurring), MapClass(k).label
     width, height = size_of(path)
     assert 1200 < width <= 1600
     assert 800 < height < 1600

@@ -98,7 +98,7 @@ OF_GROUPS = {
     "attack.pieces": ([0, 101], "an integer from 1 to 100"),
     "attack.spread": ([0, INF], "> 0 and <= 10"),
     "verdict.winnable": ([-0.1, 1.1], "a number from 0 to 1"),
-    "verdict.episodes": ([0, 1e3], "an integer from 1 to"),
+    "verdict.episodes": ([0, 1.5], "an integer from 1 to"),
     "verdict.attacked": ([0, True], "an integer from 1 to"),
 }
 OF_TRAININGS = {

@@ -11,10 +11,9 @@ from hyrl_mj.judging.examination import USUAL, Examination, ExamineOptions, Subj
 from hyrl_mj.judging.losses import Losses, sort_losses
 from hyrl_mj.judging.results import Arrivals, Kind, ModeResult, Retraining
 from hyrl_mj.judging.sentences import POLICIES, listed, margin_text, mode_sentence, replays_sentence
-from hyrl_mj.judging.verdict import FAILED, Verdict
+from hyrl_mj.judging.verdict import Verdict, Word
 
 __all__ = [
-    "FAILED",
     "POLICIES",
     "USUAL",
     "Arrivals",
@@ -31,6 +30,7 @@ __all__ = [
     "Subject",
     "Verdict",
     "VerdictSettings",
+    "Word",
     "attack",
     "attack_starts",
     "examine",

@@ -11,7 +11,7 @@ import numpy as np
 from hyrl_mj.errors import BadInput
 from hyrl_mj.judging.attacks import Attack, Budget, attack, attack_starts, shown_arcs
 from hyrl_mj.judging.episodes import NoisyEpisodes, Regions, noisy_episodes
-from hyrl_mj.judging.game import OVER, UNWINNABLE, Maps, Robustness, compare
+from hyrl_mj.judging.game import MapClass, Maps, Robustness, compare
 from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies import Controller
 from hyrl_mj.sets import Grid, GridSet
@@ -177,7 +177,7 @@ def _winnable(subject: Subject, maps: Maps | None) -> tuple[Grid, np.ndarray] | 
     if maps is None or not subject.exact:
         return None
     classes = [*maps.map.values()][-1]  # of the hybrid controller
-    return maps.grid(subject.task.chart), ~np.isin(classes, (UNWINNABLE, OVER))
+    return maps.grid(subject.task.chart), ~np.isin(classes, (MapClass.UNWINNABLE, MapClass.OVER))
 
 
 def _attacks(

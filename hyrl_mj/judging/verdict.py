@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import StrEnum
 
 from hyrl_mj.judging.evidence import Sample, SuccessRates, VerdictSettings, by_kind
 from hyrl_mj.judging.game import NEARLY, NO_NOISE, ReplayCount, Robustness, percent
@@ -19,14 +20,16 @@ from hyrl_mj.judging.sentences import (
 from hyrl_mj.simulation import usual_kinds
 from hyrl_mj.tasks import Task
 
-PROVED, WON, HELD, UNDECIDED, WEAK, FAILED = (
-    "PROVED",
-    "WON",
-    "HELD",
-    "UNDECIDED",
-    "WEAK",
-    "FAILED",
-)
+
+class Word(StrEnum):
+    """The first word of a verdict; `Verdict` says what each asks for."""
+
+    PROVED = "PROVED"
+    WON = "WON"
+    HELD = "HELD"
+    UNDECIDED = "UNDECIDED"
+    WEAK = "WEAK"
+    FAILED = "FAILED"
 
 
 @dataclass(frozen=True)
@@ -61,12 +64,12 @@ class Verdict:
     counts; the attack is one of these kinds. It is counted from starts that are won without noise.
 
     Attributes:
-        word: "PROVED", "WON", "HELD", "UNDECIDED", "WEAK" or "FAILED".
+        word: the word.
         sentence: what decided.
         reasons: the results behind it, a sentence each.
     """
 
-    word: str
+    word: Word
     sentence: str
     reasons: tuple[str, ...]
 
@@ -76,8 +79,8 @@ class Verdict:
     @property
     def tone(self) -> str:
         """How a page shows the word: "good", "undecided" or "bad"."""
-        good = self.word in (PROVED, WON, HELD)
-        return "good" if good else "undecided" if self.word == UNDECIDED else "bad"
+        good = self.word in (Word.PROVED, Word.WON, Word.HELD)
+        return "good" if good else "undecided" if self.word == Word.UNDECIDED else "bad"
 
     @staticmethod
     def judge(
@@ -101,15 +104,17 @@ class Verdict:
         case = _Case(task, bound, robustness, retraining, arrivals, settings)
         reasons = tuple(case.reasons())
         for word, grounds in (
-            (PROVED, case.proofs()),
-            (WON if robustness.deciding else HELD, case.success()),
-            (UNDECIDED, case.doubts()),
-            (FAILED, case.failures()),
-            (WEAK, case.weaknesses()),
+            (Word.PROVED, case.proofs()),
+            (Word.WON if robustness.deciding else Word.HELD, case.success()),
+            (Word.UNDECIDED, case.doubts()),
+            (Word.FAILED, case.failures()),
+            (Word.WEAK, case.weaknesses()),
         ):
             if sentence := "; ".join(grounds):
                 return Verdict(word, sentence, reasons)
-        return Verdict(FAILED, f"HyRL is no better than the policy under {case.noise}", reasons)
+        return Verdict(
+            Word.FAILED, f"HyRL is no better than the policy under {case.noise}", reasons
+        )
 
 
 @dataclass(frozen=True)

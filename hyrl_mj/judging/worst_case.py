@@ -14,14 +14,12 @@ from hyrl_mj.judging.game import (
     LIMIT,
     NEARLY,
     NEVER,
-    UNCLEAR,
-    WON,
-    WON_FROM_SOME,
     Curve,
     Game,
     GameResult,
     Lattice,
     LatticeSpacing,
+    MapClass,
     Maps,
     NodeScore,
     Profile,
@@ -165,7 +163,7 @@ def _score(certificate: Certificate, name: str, nodes: NodeScore, broken: Broken
 def _map(certificate: Certificate, name: str, eps: float) -> np.ndarray:
     """Returns the class (N,) of every node; what is won counts as proved if all cells around it are."""
     classes = certificate.game.map(name, eps)
-    won = np.isin(classes, (WON, WON_FROM_SOME))
+    won = np.isin(classes, (MapClass.WON, MapClass.WON_FROM_SOME))
     some = every = np.zeros_like(won)
     if name in certificate.answers and certificate.cells is not None:
         value, cells = certificate.value(name, eps)[:, :-2], certificate.cells
@@ -173,7 +171,9 @@ def _map(certificate: Certificate, name: str, eps: float) -> np.ndarray:
             cells.all_around(wins | ~cells.running) & ~cells.all_around(~(wins & cells.running))
             for wins in (value[-1] < NEVER, (value < NEVER).all(axis=0))
         )
-    classes[won] = np.where(every, WON, np.where(some, WON_FROM_SOME, UNCLEAR))[won]
+    classes[won] = np.where(
+        every, MapClass.WON, np.where(some, MapClass.WON_FROM_SOME, MapClass.UNCLEAR)
+    )[won]
     return classes
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -16,18 +17,26 @@ from hyrl_mj.sets import Chart, Grid
 
 # Name of the limit, a controller that is scored beside the examined ones.
 LIMIT = "limit"
-# Classes of the maps.
-WON, WON_FROM_SOME, UNCLEAR, BEATEN, UNWINNABLE, OVER = range(6)
-MAP_CLASSES = (
-    "proved to be won from every start mode",
-    "proved to be won if the controller picks the start mode",
-    "neither proved nor lost",
-    "lost to the worst noise",
-    "not winnable by this split",
-    "over",
-)
 # A share of at least this much counts as nearly all.
 NEARLY = 0.99
+
+
+class MapClass(IntEnum):
+    """What a map says of a node; `label` says it in words."""
+
+    label: str
+
+    WON = 0, "proved to be won from every start mode"
+    WON_FROM_SOME = 1, "proved to be won if the controller picks the start mode"
+    UNCLEAR = 2, "neither proved nor lost"
+    BEATEN = 3, "lost to the worst noise"
+    UNWINNABLE = 4, "not winnable by this split"
+    OVER = 5, "over"
+
+    def __new__(cls, value: int, label: str) -> Self:
+        member = int.__new__(cls, value)
+        member._value_, member.label = value, label
+        return member
 
 
 def percent(share: float, surely: bool = True) -> str:
@@ -331,7 +340,7 @@ class Maps(artifacts.Saved):
     Attributes:
         eps: bound of the noise.
         grid_counts: (d,) number of nodes along each coordinate.
-        map: for each controller, the class (N,) of every node, an index into `MAP_CLASSES`.
+        map: for each controller, the `MapClass` (N,) of every node.
     """
 
     KIND: ClassVar[str] = "robustness maps"
