@@ -120,10 +120,9 @@ def test_what_is_not_finite_is_refused(task: Task, value: float) -> None:
         task.check_measurement(measured)
 
 
-ILL_SHAPED = [np.zeros((2, 9)), np.zeros((2, 2, 2)), [], "here", [[0.0], [0.0, 1.0]]]
-
-
-@pytest.mark.parametrize("z", ILL_SHAPED)
+@pytest.mark.parametrize(
+    "z", [np.zeros((2, 9)), np.zeros((2, 2, 2)), [], "here", [[0.0], [0.0, 1.0]]]
+)
 def test_a_state_of_the_wrong_shape_names_the_task(task: Task, z: object) -> None:
     with pytest.raises(BadInput, match=task.name):
         task.chart.check(z, task.name)  # type: ignore[arg-type]

@@ -33,8 +33,6 @@ from hyrl_mj.tasks import Outcome, Task
 
 # The longest attack [s], a day, and the most rounds.
 LONGEST, MOST_ROUNDS = 86_400.0, 100_000
-# How often starts are drawn until enough of them are winnable.
-MOST_DRAWS = 100
 
 
 @dataclass(frozen=True)
@@ -147,7 +145,7 @@ def attack_starts(task: Task, regions: Regions, bound: float, n: int, seed: int)
 
     def drawn(where: Regions, count: int) -> np.ndarray:
         kept = np.empty((0, task.chart.dimension))
-        for _ in range(MOST_DRAWS if count else 0):
+        for _ in range(100 if count else 0):  # fewer are kept where winnable ones are rare
             z = where.draw(task, bound, count, rng)
             kept = np.vstack([kept, z[regions.may_win(z)]])
             if len(kept) >= count:

@@ -41,8 +41,6 @@ from hyrl_mj.system import cores
 from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Task
 
-# Approximate number of episodes without noise.
-QUIET_EPISODES = 1000
 # Games that are solved at the same time; each takes tens of megabytes.
 THREADS = 4
 
@@ -250,7 +248,7 @@ def _misses(game: Game, controllers: Mapping[str, Controller]) -> dict[str, floa
     starts = game.lattice.grid.nodes[game.starts & game.winnable(0.0)]
     if not len(starts):
         return dict.fromkeys(controllers, 0.0)
-    starts = starts[:: max(len(starts) // QUIET_EPISODES, 1)]
+    starts = starts[:: max(len(starts) // 1_000, 1)]  # about as many episodes
     quiet = LoopSettings(quiet=True)
     return {
         name: float(task.miss(closed_loop(task, loop, starts, settings=quiet).path[-1]).max())

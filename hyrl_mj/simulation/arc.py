@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 # The longest time that `simulate` records [s]: an hour.
 LONGEST = 3600.0
-# Of a user's robot, so many of the runs are played again by plain MuJoCo.
-JUDGED = 4
 
 
 @dataclass(frozen=True)
@@ -233,7 +231,7 @@ def simulate_batch(
     rollout = closed_loop(task, loop, starts, noise, q0, seed, settings)
     task.verify(starts, rollout, range(n))
     if task.source is not None and type(task).plant is Task.plant:
-        judge_beginning(task, rollout, task.state(starts), np.arange(n)[:JUDGED])
+        judge_beginning(task, rollout, task.state(starts), np.arange(min(n, 4)))
     name = "policy" if isinstance(loop, PolicyController) else "hyrl"
     return [_arc(task, name, rollout, i, noise) for i in range(n)]
 

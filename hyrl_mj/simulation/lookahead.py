@@ -17,12 +17,8 @@ from hyrl_mj.tasks import Outcome, Task
 
 # Samples by which a plant with inertia is simulated ahead.
 AHEAD = 6
-# So many noisy columns have their noise combined; of more of them, so many.
-COMBINED, FEW = 6, 3
 # Simulations side by side.
 BATCH = 2_048
-# A controller is asked about so many measurements at once: more do not stay in a processor's cache.
-TOGETHER = 1_024
 
 
 @dataclass
@@ -71,7 +67,7 @@ def each_answer(
         Inputs (k, n, m) and modes (k, n) for the next k of the candidates.
     """
     n = len(true)
-    several = max(TOGETHER // max(n, 1), 1)
+    several = max(1_024 // max(n, 1), 1)  # more measurements do not stay in a processor's cache
     for first in range(0, len(candidates), several):
         some = candidates[first : first + several]
         each = np.broadcast_to(some[:, None], (len(some), *true.shape)).reshape(-1, true.shape[1])
@@ -126,11 +122,11 @@ class Lookahead(Signal):
     def _directions(self, kinematic: bool) -> np.ndarray:
         """Returns the candidates (c, p) as shares of the bound, the first of which is no noise.
 
-        With more than `COMBINED` noisy columns, combinations are too many: then the first `FEW` of them are
-        combined, and each of the others acts alone.
+        With more than six noisy columns, combinations are too many: then the first three of them are combined,
+        and each of the others acts alone.
         """
         columns = np.flatnonzero(self.shares)
-        few = len(columns) if len(columns) <= COMBINED else FEW
+        few = len(columns) if len(columns) <= 6 else 3
         first, rest = columns[:few], columns[few:]
         fine = len(columns) <= (2 if kinematic else 1)
         factors = (0.0, -1.0, 1.0, -0.5, 0.5) if fine else (0.0, -1.0, 1.0)

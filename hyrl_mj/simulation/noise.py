@@ -23,9 +23,6 @@ from hyrl_mj.tasks import Task, read_only, writes
 NOT_STARTED = -1
 # The kinds of noise by which controllers are judged, the mildest first.
 KINDS = ("none", "uniform", "alternating", "adversarial")
-# By so much noise may exceed what is allowed: a few roundings of it, or of the measurement that it is the
-# difference of [units in the last place].
-ULPS = 8
 # What follows the last sample of a recorded signal.
 After = Literal["refuse", "hold", "repeat", "none"]
 
@@ -396,7 +393,8 @@ def _within(
     if not within.all():  # seldom, so that the usual case stays cheap
         scale = limits if measured is None else limits + np.abs(measured)
         eps = np.finfo(noise.dtype if noise.dtype.kind == "f" else float).eps
-        within = largest <= limits + ULPS * eps * np.where(limits > 0, scale, 0.0)
+        # A few roundings of it, or of the measurement that it is the difference of.
+        within = largest <= limits + 8 * eps * np.where(limits > 0, scale, 0.0)
     return np.asarray(within)
 
 

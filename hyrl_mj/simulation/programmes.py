@@ -12,8 +12,6 @@ from hyrl_mj.simulation.noise import NOT_STARTED, Sample, Signal
 from hyrl_mj.simulation.rules import RuleKind, Rules
 from hyrl_mj.tasks import Outcome, Task
 
-# A change of the mode counts for more than any change of the inputs.
-DECISIVE = 1e3
 # The number of a signal that is given, in a programme: no rule.
 GIVEN = -1
 
@@ -121,7 +119,8 @@ class Programmes(Signal):
         u, q = (np.concatenate(parts) for parts in zip(*answers, strict=True))
         u = self._scaled(u)
         usual_mode = np.where(now.q[rows] == NOT_STARTED, q[0], now.q[rows])
-        jumps, contrary = DECISIVE * (q != usual_mode), np.linalg.norm(u - u[0], axis=2)
+        # A change of the mode counts for more than any change of the inputs.
+        jumps, contrary = 1e3 * (q != usual_mode), np.linalg.norm(u - u[0], axis=2)
         last = self._scaled(self._last[now.rows[rows]])
         values = {
             RuleKind.CONTRARY: contrary,

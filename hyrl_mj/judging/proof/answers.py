@@ -16,8 +16,6 @@ from hyrl_mj.policies import ON_EDGE, Controller, HybridController, PolicyContro
 from hyrl_mj.sets import Everything, Grid, GridSet, StateSet
 from hyrl_mj.tasks import Task
 
-# Boxes of measurements along one side of a cell, for coordinates with noise.
-FINE = 2
 # The most cells that one sample can lead to; each takes a mask of all boxes.
 MOST_SHIFTS = 512
 # The answers are first bounded in blocks of so many boxes along each side.
@@ -42,7 +40,7 @@ class Boxes:
     def around(cells: Cells, bound: np.ndarray) -> Boxes:
         """Returns the boxes for noise within bounds (d,)."""
         grid = cells.lattice.grid
-        fine = np.where(bound > 0, FINE, 1)
+        fine = np.where(bound > 0, 2, 1)  # boxes along one side of a cell
         pad = np.ceil(bound / grid.spacing + 1).astype(int)
         return Boxes(cells, fine, np.where(grid.chart.periodic, 0, pad))
 

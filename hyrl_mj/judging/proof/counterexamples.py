@@ -22,8 +22,6 @@ from hyrl_mj.simulation import (
 )
 from hyrl_mj.tasks import Outcome
 
-# Measurements along each noisy coordinate among which the noise between the nodes chooses.
-CANDIDATES = 17
 # Cells without a verdict in which a start is attacked, for each start mode.
 MOST_CELLS = 128
 
@@ -152,7 +150,7 @@ class CellNoise(Signal):
         super().__init__(largest, bound / (largest or 1.0))
         self._cells, self._controller = certificate.cells, controller
         self._outer, self._inner = outer, inner
-        steps = [np.linspace(-b, b, CANDIDATES if b else 1) for b in bound]
+        steps = [np.linspace(-b, b, 17 if b else 1) for b in bound]
         candidates = np.array([*product(*steps)])
         # Among equals the largest noise comes first.
         self._candidates = candidates[np.argsort(-np.abs(candidates).sum(axis=1), kind="stable")]
