@@ -88,7 +88,7 @@ OF_GROUPS = {
     "table.tables": ([0, True], "an integer from 1 to 100"),
     "table.worst": ([-0.1, 1.1], "a number from 0 to 1"),
     "attack.flips": ([0, 1.5], "an integer from 1 to"),
-    "attack.period_ratio": ([1, NAN], "a number from 1.01 to 10"),
+    "attack.period_step": ([0, NAN], "a number from 0.01 to 10"),
     "attack.segments": ([0, True], "an integer from 1 to"),
     "attack.population": ([0, None], "an integer from 1 to"),
     "attack.elites": ([0, 2.5], "an integer from 1 to"),

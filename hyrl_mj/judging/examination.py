@@ -18,9 +18,6 @@ from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import AttackSettings, HybridArc, Noise, usual_kinds
 from hyrl_mj.tasks import Effort, Task
 
-# The most starts of an attack: each keeps signals of a whole episode.
-MOST_STARTS = 100_000
-
 
 @dataclass(frozen=True)
 class ExamineOptions:
@@ -60,9 +57,10 @@ class ExamineOptions:
         Raises:
             BadInput: an impossible time or number of rounds, or both.
         """
-        if self.attack_starts is not None and not 1 <= self.attack_starts <= MOST_STARTS:
+        most = 100_000  # each keeps signals of a whole episode
+        if self.attack_starts is not None and not 1 <= self.attack_starts <= most:
             raise BadInput(
-                f"{self.attack_starts} starts cannot be attacked: give a number from 1 to {MOST_STARTS:,}"
+                f"{self.attack_starts} starts cannot be attacked: give a number from 1 to {most:,}"
             )
         if self.attack_seconds is None and self.attack_rounds is None:
             attacked = self.attack_starts is not None or not exact

@@ -12,8 +12,8 @@ class AttackSettings:
 
     Attributes:
         flips: times at which the sign of a signal changes once, spread over the length of a run.
-        period_ratio: two neighbouring periods of alternating signals have this ratio: a resonance with a
-            quality factor of five still answers to the nearer of them.
+        period_step: of two neighbouring periods of alternating signals the longer is longer by this share: a
+            resonance with a quality factor of five still answers to the nearer of them.
         segments: segments of a programme of rules, each of the same time; together as long as a run without
             noise.
         population: signals that are tried in a round from each start, after one that won from a start nearby.
@@ -27,7 +27,7 @@ class AttackSettings:
     """
 
     flips: Annotated[int, Integer(1, 1_000)] = 8
-    period_ratio: Annotated[float, Number(1.01, 10)] = 1.2
+    period_step: Annotated[float, Number(0.01, 10)] = 0.2
     segments: Annotated[int, Integer(1, 1_000)] = 10
     population: Annotated[int, Integer(1, 1_000)] = 8
     elites: Annotated[int, Integer(1, 1_000)] = 3

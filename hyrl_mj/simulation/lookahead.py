@@ -122,8 +122,8 @@ class Lookahead(Signal):
     def _directions(self, kinematic: bool) -> np.ndarray:
         """Returns the candidates (c, p) as shares of the bound, the first of which is no noise.
 
-        With more than six noisy columns, combinations are too many: then the first three of them are combined,
-        and each of the others acts alone.
+        With more than six noisy columns, combinations are too many: then the first three of them are
+        combined, and each of the others acts alone.
         """
         columns = np.flatnonzero(self.shares)
         few = len(columns) if len(columns) <= 6 else 3

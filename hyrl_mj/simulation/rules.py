@@ -184,7 +184,7 @@ class Rules:
 
 def _timed(noise: np.ndarray, length: int, settings: AttackSettings) -> Iterator[Rule]:
     """Yields the rules of a noise (p,) that turns once, or with a period, in runs of a length."""
-    flips, ratio = settings.flips, settings.period_ratio
+    flips, ratio = settings.flips, 1 + settings.period_step
     times = np.ceil(length * np.arange(1, flips + 1) / (flips + 1)).astype(int)
     for flip in np.unique(times[times > 0]):
         yield from (Rule(RuleKind.FLIP, sign * noise, flip=int(flip)) for sign in (1, -1))

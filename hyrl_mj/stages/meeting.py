@@ -11,8 +11,6 @@ from hyrl_mj.sets import Chart, Cloud, GridSet, Nodes
 from hyrl_mj.stages.critical_set import ranges
 from hyrl_mj.tasks import Task
 
-# How far around a point of M* parts are looked at, in cells.
-AROUND = 1.5
 # The room is found to this share of what the noise needs.
 STEP = 0.02
 
@@ -38,11 +36,11 @@ def around(points: np.ndarray, parts: Sequence[GridSet]) -> np.ndarray:
 
 def _steps(grid: Nodes) -> np.ndarray:
     """Returns the steps (k, d) from a point to those around it: of a cloud, along each noisy coordinate."""
-    d = grid.chart.dimension
+    d, cells = grid.chart.dimension, 1.5
     if isinstance(grid, Cloud):
-        along = np.diag(AROUND * grid.cell * grid.shares * grid.chart.scale)
+        along = np.diag(cells * grid.cell * grid.shares * grid.chart.scale)
         return np.vstack([np.zeros(d), along, -along])
-    return AROUND * grid.spacing * np.array(list(product((-1, 0, 1), repeat=d)))
+    return cells * grid.spacing * np.array(list(product((-1, 0, 1), repeat=d)))
 
 
 def rooms(

@@ -304,8 +304,8 @@ def all_part_policies(
 def neighbourhood(partition: Partition, noise: float, hop: np.ndarray) -> float:
     """Returns the width of the neighbourhood of M*: the noise, some cells, or one sample's hop (d,)."""
     grid = partition.grid
-    # Of more than two parts some are wedges: without a wide neighbourhood they begin far from M*, where a policy
-    # goes straight on because it is clear of the obstacle.
+    # Of more than two parts some are wedges: without a wide neighbourhood they begin far from M*, where a
+    # policy goes straight on because it is clear of the obstacle.
     cells = 4 if len(partition.parts) <= 2 else 1.5
     return max(noise, cells * grid.cell, float(np.linalg.norm(hop / grid.chart.scale)))
 

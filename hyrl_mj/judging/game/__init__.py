@@ -8,8 +8,6 @@ from hyrl_mj.judging.game.adversary import WorstNoise
 from hyrl_mj.judging.game.counts import (
     LATE,
     NO_NOISE,
-    PROVED_STARTS,
-    WON_STARTS,
     AttackCount,
     Comparison,
     Ends,
@@ -69,8 +67,6 @@ __all__ = [
     "NEARLY",
     "NEVER",
     "NO_NOISE",
-    "PROVED_STARTS",
-    "WON_STARTS",
     "Answers",
     "AttackCount",
     "Comparison",

@@ -24,8 +24,6 @@ from hyrl_mj.tracing import BATCH, Program, trace
 CHUNK = 2048
 # Relative rounding error of numbers of 32 bits, in which networks are computed.
 ROUNDING = 2.0**-24
-# Points at which a curved activation is evaluated between two numbers.
-POINTS = 9
 # A layer's values in boxes: middle (n, k), generators (d, n, k) and remainder (n, k), as `Affine`.
 Relaxed = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -229,10 +227,11 @@ def _curved(name: str, curvature: float) -> Callable[[Relaxed], Relaxed]:
         width = high - low
         rise = activate(high) - activate(low)
         slope = np.where(width > 0, rise / np.where(width > 0, width, 1), 0)
-        shares = np.linspace(0, 1, POINTS, dtype=np.float32).reshape(-1, *[1] * low.ndim)
+        points = 9  # at which it is evaluated between the two ends
+        shares = np.linspace(0, 1, points, dtype=np.float32).reshape(-1, *[1] * low.ndim)
         at = low + shares * width
         off = activate(at) - slope * at
-        between = curvature * (width / (POINTS - 1)) ** 2 / 8
+        between = curvature * (width / (points - 1)) ** 2 / 8
         return _parallel(x, slope, off.min(axis=0) - between, off.max(axis=0) + between)
 
     return relax

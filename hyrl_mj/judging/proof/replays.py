@@ -10,8 +10,6 @@ import numpy as np
 from hyrl_mj.judging.game import (
     NEARLY,
     NEVER,
-    PROVED_STARTS,
-    WON_STARTS,
     LostReplay,
     ReplayCount,
     Score,
@@ -106,7 +104,7 @@ class Replays:
         whole = score.not_broken == 1
         if not (nearly or whole or score.proved):
             return None
-        of = WON_STARTS if whole and not nearly else PROVED_STARTS
+        of = "won" if whole and not nearly else "proved"
         # A tenth of the starts is played where so little is proved that no word follows from it.
         rng, few = np.random.default_rng(seed), 1 if nearly or whole else 10
         pools = _pools(certificate, name, controller, score.eps, of)
@@ -219,7 +217,7 @@ def _pools(
     grid, rng, pools = game.lattice.grid, np.random.default_rng(0), []
     # With one mode the controller cannot pick another one.
     modes = [*(controller.modes if len(controller.modes) > 1 else ()), NOT_STARTED]
-    proved = of == PROVED_STARTS and cells is not None
+    proved = of == "proved" and cells is not None
     values = (certificate if proved else game).value(name, eps)[:, :-2]
     if cells is not None and not proved:
         values = values[:, grid.nearest(cells.middle(np.arange(cells.nodes)))]
