@@ -31,9 +31,6 @@ from hyrl_mj.simulation import (
 )
 from hyrl_mj.tasks import Outcome, Task
 
-# The longest attack [s], a day, and the most rounds.
-LONGEST, MOST_ROUNDS = 86_400.0, 100_000
-
 
 @dataclass(frozen=True)
 class Budget:
@@ -52,17 +49,18 @@ class Budget:
     enough: int | None = None
 
     def __post_init__(self) -> None:
+        longest, most_rounds = 86_400.0, 100_000  # a day [s]
         if (self.seconds is None) == (self.rounds is None):
             raise BadInput("an attack has a time or a number of rounds: give one of the two")
         if self.seconds is not None and not (
-            math.isfinite(self.seconds) and 0 < self.seconds <= LONGEST
+            math.isfinite(self.seconds) and 0 < self.seconds <= longest
         ):
             raise BadInput(
-                f"an attack cannot last {self.seconds:g} s: give a time > 0 and <= {LONGEST:g} s"
+                f"an attack cannot last {self.seconds:g} s: give a time > 0 and <= {longest:g} s"
             )
-        if self.rounds is not None and not 1 <= self.rounds <= MOST_ROUNDS:
+        if self.rounds is not None and not 1 <= self.rounds <= most_rounds:
             raise BadInput(
-                f"an attack cannot have {self.rounds} rounds: give a number from 1 to {MOST_ROUNDS}"
+                f"an attack cannot have {self.rounds} rounds: give a number from 1 to {most_rounds}"
             )
 
 

@@ -22,9 +22,6 @@ from hyrl_mj.simulation import (
 )
 from hyrl_mj.tasks import Outcome
 
-# Cells without a verdict in which a start is attacked, for each start mode.
-MOST_CELLS = 128
-
 
 @dataclass(frozen=True)
 class Broken:
@@ -48,7 +45,7 @@ def find_counterexamples(
 
     From the nodes that are lost in the game its adversary gives the noise. Where the game is an estimate, as
     many nodes as the task's effort says are attacked, won or lost, and adversarial noise is tried, too. Cells
-    that are neither proved nor lost at a corner, up to `MOST_CELLS` of them for each start mode, are attacked
+    that are neither proved nor lost at a corner, up to 128 of them for each start mode, are attacked
     from a start inside: at each sample the noise tries measurements in its range, and takes the answer that
     leads to the worst state.
 
@@ -87,11 +84,9 @@ def find_counterexamples(
         outer = certificate.value(name, eps)
         inside = CellNoise(certificate, controller, outer, value, game.bound(eps))
         unclear = (outer[-len(modes) :, :-2] >= NEVER) & certificate.region(eps) & ~broken
-        chosen = [
-            (np.full(min(len(of_mode), MOST_CELLS), row), *_inside(cells, of_mode, rng))
-            for row, of_mode in enumerate(map(np.flatnonzero, unclear))
-        ]
-        row, at, starts = (np.concatenate(parts) for parts in zip(*chosen, strict=True))
+        chosen = [_inside(cells, np.flatnonzero(of_mode), rng) for of_mode in unclear]
+        at, starts = (np.concatenate(parts) for parts in zip(*chosen, strict=True))
+        row = np.repeat(np.arange(len(chosen)), [len(some) for some, _ in chosen])
         broken[row, at] = _beaten(game, controller, starts, modes[row], inside)
     all_cells = np.ones(cells.nodes, dtype=bool)
     return Broken(broken[-1], np.asarray(broken.any(axis=0)), all_cells)
@@ -100,12 +95,9 @@ def find_counterexamples(
 def _inside(
     cells: Cells, of_mode: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns up to `MOST_CELLS` of some cells (n,), and a point inside of each: (k,), (k, d)."""
-    at = (
-        rng.choice(of_mode, min(len(of_mode), MOST_CELLS), replace=False)
-        if len(of_mode)
-        else of_mode
-    )
+    """Returns up to 128 of some cells (n,), and a point inside of each: (k,), (k, d)."""
+    count = min(len(of_mode), 128)
+    at = rng.choice(of_mode, count, replace=False) if count else of_mode
     off = rng.uniform(-0.5, 0.5, (len(at), len(cells.counts)))
     return at, cells.middle(at) + off * cells.lattice.grid.spacing
 
