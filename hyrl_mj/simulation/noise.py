@@ -9,15 +9,18 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Self, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, get_args
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput, brief, check_bound, unknown
-from hyrl_mj.physics.plant import Plant
-from hyrl_mj.policies import Controller
 from hyrl_mj.system.generators import global_state
-from hyrl_mj.tasks import Task, read_only, writes
+from hyrl_mj.tasks import read_only, writes
+
+if TYPE_CHECKING:
+    from hyrl_mj.physics.plant import Plant
+    from hyrl_mj.policies import Controller
+    from hyrl_mj.tasks import Task
 
 # The mode of a run before its first measurement, from which the controller picks its start mode.
 NOT_STARTED = -1

@@ -1,13 +1,15 @@
 """The closed loop of task, noise and controller, for many starts at once."""
 
+from __future__ import annotations
+
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from itertools import count
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hyrl_mj.physics.plant import Plant
 from hyrl_mj.policies import Asked, Controller, nothing_past, remembering
 from hyrl_mj.simulation.noise import (
     NOT_STARTED,
@@ -21,7 +23,11 @@ from hyrl_mj.simulation.noise import (
 )
 from hyrl_mj.simulation.passing import Follower, Passing
 from hyrl_mj.system.progress import progress_bar
-from hyrl_mj.tasks import Outcome, Task
+from hyrl_mj.tasks import Outcome
+
+if TYPE_CHECKING:
+    from hyrl_mj.physics.plant import Plant
+    from hyrl_mj.tasks import Task
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ from itertools import product
 import numpy as np
 
 from hyrl_mj.sets import Chart, Cloud, GridSet, Nodes
-from hyrl_mj.stages.critical_set import ranges
 from hyrl_mj.tasks import Task
 
 # The room is found to this share of what the noise needs.
@@ -157,3 +156,15 @@ def _where(chart: Chart, points: np.ndarray, narrow: np.ndarray) -> str:
     if not chart.periodic[axis] and (narrow == (along <= last)).all():
         return f"up to {name} = {last:.3g} {unit}"
     return f"in places at {ranges(chart, points[narrow], 1e-3)}"
+
+
+def ranges(chart: Chart, points: np.ndarray, resolution: float) -> str:
+    """Returns the range of points (N, d) along each coordinate: "x 0 to 0.45 m, y 0.1 m"."""
+    ends = zip(chart.names, chart.units, points.min(axis=0), points.max(axis=0), strict=True)
+    fine = resolution / 100 or 1e-12  # what is hardly off 0 is 0
+    return ", ".join(
+        f"{name} {a:.4g} to {b:.4g} {unit}"
+        if b - a > resolution
+        else f"{name} {round((a + b) / 2 / fine) * fine + 0.0:.4g} {unit}"
+        for name, unit, a, b in ends
+    )
