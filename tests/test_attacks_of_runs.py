@@ -22,9 +22,9 @@ from hyrl_mj.viz.shows import replay_shows
 from hyrl_mj.viz.tables import (
     attack_table,
     comparison_table,
-    print_robustness,
     robustness_sentence,
 )
+from hyrl_mj.viz.terminal import print_robustness
 
 FEW = {"episodes": 20, "noise": ("none", "uniform")}
 

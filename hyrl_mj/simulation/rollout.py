@@ -11,14 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hyrl_mj.policies import Asked, Controller, nothing_past, remembering
+from hyrl_mj.simulation.checked_noise import check_repeats, drawn, is_own
 from hyrl_mj.simulation.noise import (
     NOT_STARTED,
     AnyNoise,
     Sample,
     Signal,
-    check_repeats,
-    drawn,
-    is_own,
     signal_for,
 )
 from hyrl_mj.simulation.passing import Follower, Passing

@@ -13,7 +13,8 @@ from functools import partial
 from hyrl_mj.judging.game import percent
 from hyrl_mj.runs.improvement import Mean, improvements
 from hyrl_mj.runs.sweeps import Row, Sweep, summary
-from hyrl_mj.viz.tables import Table, print_table
+from hyrl_mj.viz.tables import Table
+from hyrl_mj.viz.terminal import print_table
 
 
 @dataclass(frozen=True)
