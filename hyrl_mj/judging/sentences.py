@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from hyrl_mj.errors import counted
 from hyrl_mj.judging.game import NO_NOISE, Comparison, ReplayCount, Score, percent
 from hyrl_mj.judging.results import ModeResult
 from hyrl_mj.tasks import Task
@@ -71,8 +72,11 @@ POLICIES = {
 
 def mode_sentence(task: Task, result: ModeResult) -> str:
     """Returns how well the policy of a mode holds its set."""
-    trainings = f"{result.attempts} training{'' if result.attempts == 1 else 's'}"
-    how = f"after {trainings}" if result.attempts else "without a training of its own"
+    how = (
+        f"after {counted(result.attempts, 'training')}"
+        if result.attempts
+        else "without a training of its own"
+    )
     mode = f"the policy of mode {task.mode_name(result.mode)}{POLICIES.get(result.policy, '')}"
     won = (
         "all of its set that was tried" if result.won == 1 else f"{percent(result.won)} of its set"

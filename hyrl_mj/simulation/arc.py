@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hyrl_mj.errors import BadInput, check_seed
+from hyrl_mj.errors import BadInput, check_seed, counted
 from hyrl_mj.files.artifacts import Saved
 from hyrl_mj.policies import Controller, Policy, PolicyController, as_controller, check_modes
 from hyrl_mj.simulation.noise import AnyNoise, Noise
@@ -88,11 +88,10 @@ class HybridArc(Saved):
 
     @property
     def _summary(self) -> str:
-        jumps = int(self.j[-1])
         noise = f"{self.noise} noise of {self.bound:g}" if self.bound else "no noise"
         return (
             f"{self.controller}: {self.outcome} after {self.t[-1]:.2f} s, "
-            f"{jumps} jump{'s' * (jumps != 1)}, {noise}"
+            f"{counted(self.j[-1], 'jump')}, {noise}"
         )
 
     def plot(self) -> Figure:

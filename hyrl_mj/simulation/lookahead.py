@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from itertools import product
 from typing import Self
@@ -46,9 +46,26 @@ class Ahead:
             getattr(self, field.name)[rows] = getattr(other, field.name)
 
 
+def answer_of(
+    controller: Controller, measured: np.ndarray, q: np.ndarray, past: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns a controller's inputs (n, m) and modes (n,) for measurements (n, p).
+
+    Args:
+        controller: the controller, which picks the mode of a run that has not begun.
+        measured: (n, p) measurements.
+        q: (n,) modes, or `NOT_STARTED`.
+        past: (n, memory, p) past measurements, of a controller that takes them.
+    """
+    begins = q == NOT_STARTED
+    if begins.any():
+        q = np.where(begins, controller.initial_mode(measured), q)
+    return answer(controller, q, measured, past)
+
+
 def each_answer(
     task: Task,
-    act: Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
+    controller: Controller,
     true: np.ndarray,
     candidates: np.ndarray,
     q: np.ndarray,
@@ -58,10 +75,10 @@ def each_answer(
 
     Args:
         task: tells what would be measured under noise.
-        act: returns inputs (n, m) and modes (n,) for measurements (n, p), modes (n,) and past (n, memory, p).
+        controller: the controller.
         true: (n, p) measurements without noise.
         candidates: (c, p) noise.
-        q, past: as `act` takes them, of the n runs.
+        q, past: as in `answer_of`, of the n runs.
 
     Yields:
         Inputs (k, n, m) and modes (k, n) for the next k of the candidates.
@@ -72,7 +89,8 @@ def each_answer(
         some = candidates[first : first + several]
         each = np.broadcast_to(some[:, None], (len(some), *true.shape)).reshape(-1, true.shape[1])
         measured = task.perturbed(np.tile(true, (len(some), 1)), each)
-        u, modes = act(measured, np.tile(q, len(some)), np.tile(past, (len(some), 1, 1)))
+        modes, before = np.tile(q, len(some)), np.tile(past, (len(some), 1, 1))
+        u, modes = answer_of(controller, measured, modes, before)
         yield u.reshape(len(some), n, -1), modes.reshape(len(some), n)
 
 
@@ -153,7 +171,7 @@ class Lookahead(Signal):
             [
                 np.concatenate([u, q[..., None]], axis=2)
                 for u, q in each_answer(
-                    self.task, self._act, true[running], self._candidates, q, past
+                    self.task, self.controller, true[running], self._candidates, q, past
                 )
             ]
         )
@@ -241,7 +259,7 @@ class Lookahead(Signal):
             if not len(rows):
                 break
             after, q, past = after[goes_on], q[goes_on], past[goes_on]
-            answers = np.column_stack(self._act(after, q, past))
+            answers = np.column_stack(answer_of(self.controller, after, q, past))
             past = remembering(past, after)
         next_answers[rows] = answers[: len(rows)]
         end = np.hstack([plant.qpos, plant.qvel])[: len(danger)]
@@ -253,12 +271,3 @@ class Lookahead(Signal):
         nq = self._copies.model.nq
         self._copies.set_state(state[:, :nq], state[:, nq:], np.arange(len(state)))
         return self._copies
-
-    def _act(
-        self, measured: np.ndarray, q: np.ndarray, past: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the controller's inputs (n, m) and modes (n,) for measurements (n, p) in modes (n,)."""
-        begins = q == NOT_STARTED
-        if begins.any():
-            q = np.where(begins, self.controller.initial_mode(measured), q)
-        return answer(self.controller, q, measured, past)

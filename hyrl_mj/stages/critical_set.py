@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.errors import BadInput, counted, unknown
 from hyrl_mj.files.artifacts import Saved
 from hyrl_mj.learning import WaySettings
 from hyrl_mj.policies import Policy
@@ -51,7 +51,7 @@ class CriticalSet(Saved):
     @property
     def _counts(self) -> str:
         counts = {"piece": self.pieces, "point": len(self.points)}
-        return ", ".join(f"{n} {name}{'s' * (n != 1)}" for name, n in counts.items())
+        return ", ".join(counted(n, name) for name, n in counts.items())
 
     @property
     def pieces(self) -> int:

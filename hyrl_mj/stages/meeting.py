@@ -7,6 +7,7 @@ from itertools import product
 
 import numpy as np
 
+from hyrl_mj.errors import counted
 from hyrl_mj.sets import Chart, Cloud, GridSet, Nodes
 from hyrl_mj.tasks import Task
 
@@ -140,7 +141,7 @@ def narrow_sentence(
             f"{2 * eps:g} {unit} of room are needed, and as little as {left:.2g} is left"
         )
     if more := len(pairs) - len(said):
-        said.append(f"nor in places between {more} other pair{'s' * (more > 1)} of modes")
+        said.append(f"nor in places between {counted(more, 'other pair')} of modes")
     return "; ".join(said)
 
 

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from hyrl_mj.errors import BadInput, printable
+from hyrl_mj.errors import BadInput, counted, printable
 from hyrl_mj.fields import (
     DriveOptions,
     Drives,
@@ -35,8 +35,7 @@ SHOWN = ("policy", "hyrl")
 
 def drive_tables(drives: Drives, noise: str, seed: int) -> list[Table]:
     """Returns how the runs ended, a row for each start; under the worst noise, too, if it was looked for."""
-    posts = drives.task.layouts.posts
-    what = f"{posts} post{'s' * (posts != 1)}"
+    what = counted(drives.task.layouts.posts, "post")
     named = "no noise" if noise == "none" else f"{noise} noise of {drives.bounds}"
     near = f"arrived: within {drives.task.reached:g} m of the goal"
     tables = [_table(drives, drives.arcs, f"{what}: {named}, seed {seed}; {near}")]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hyrl_mj.errors import counted
 from hyrl_mj.judging import margin_text
 from hyrl_mj.judging.game import (
     LIMIT,
@@ -78,7 +79,7 @@ def replay_table(run: Run, arcs: Arcs) -> Table:
 def _ending(task: Task, arc: HybridArc) -> Ending:
     """Returns how an arc ended, as `HybridArc.ending`."""
     end = _point(task.chart.wrap(arc.z[-1:])[0])
-    details = f"{arc.t[-1]:.2f} s, {arc.j[-1]} jump{'' if arc.j[-1] == 1 else 's'}"
+    details = f"{arc.t[-1]:.2f} s, {counted(arc.j[-1], 'jump')}"
     return Ending(arc.ending(task).replace("_", " "), details, end, arc.arrives(task))
 
 
