@@ -17,8 +17,6 @@ Measure = Callable[[np.ndarray], np.ndarray]
 # Inputs (n, m), positions (n, nq), velocities (n, nv) -> controls of all actuators (n, nu).
 Control = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 MOST = 2**24  # copies
-# Tolerated excess over an input limit: float32 policies have rounding errors.
-INPUT_TOLERANCE = 1e-6
 
 
 class Plant:
@@ -363,7 +361,8 @@ def checked_inputs(
         BadInput: a wrong shape, a value that is not finite, or one outside the limits.
     """
     u = checked("input", u, len(low), rows)
-    wrong = (u < low - INPUT_TOLERANCE) | (u > high + INPUT_TOLERANCE)
+    excess = 1e-6  # that is tolerated: float32 policies have rounding errors
+    wrong = (u < low - excess) | (u > high + excess)
     if wrong.any():
         row, column = np.argwhere(wrong)[0]
         raise BadInput(

@@ -20,8 +20,8 @@ from hyrl_mj.tasks import Outcome, Task
 # and NumPy rounds the methods of a task otherwise in batches of another size. Nothing that lags, leaks or is
 # held is as near as this. How episodes end has no tolerance.
 ROUNDING = 1e-8
-# Episodes that are tried when a run begins, and their longest duration [samples].
-TRIED, SAMPLES = 50, 40
+# The longest duration of episodes that are tried [samples].
+SAMPLES = 40
 # MuJoCo's warnings about states that it resets.
 BAD = [
     int(kind)
@@ -102,13 +102,13 @@ def judge_task(task: Task) -> int:
     if type(task).plant is not Task.plant:
         return 0
     rng = np.random.default_rng(0)
-    z = task.starts(TRIED, rng)
+    z = task.starts(50, rng)
     settings = LoopSettings(
         min(task.max_steps, SAMPLES), record=True, states=False, vary=True, quiet=True
     )
     run = closed_loop(task, PolicyController(_AnyInputs(task, rng)), z, settings=settings)
     start = task.state(z, settings.rng_of_starts(0))
-    return judge(task, run, start, np.arange(TRIED)[::-1])
+    return judge(task, run, start, np.arange(len(z))[::-1])
 
 
 def judge_beginning(

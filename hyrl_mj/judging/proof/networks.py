@@ -20,8 +20,6 @@ from hyrl_mj.system import cores
 from hyrl_mj.tasks import Task
 from hyrl_mj.tracing import BATCH, Program, trace
 
-# Boxes that go through a network at a time.
-CHUNK = 2048
 # Relative rounding error of numbers of 32 bits, in which networks are computed.
 ROUNDING = 2.0**-24
 # A layer's values in boxes: middle (n, k), generators (d, n, k) and remainder (n, k), as `Affine`.
@@ -156,7 +154,8 @@ def _observation_of(task: Task) -> str:
 def _in_chunks(
     work: Callable[[np.ndarray, np.ndarray], np.ndarray], centre: np.ndarray, half: np.ndarray
 ) -> np.ndarray:
-    parts = [centre[i : i + CHUNK] for i in range(0, len(centre), CHUNK)]
+    size = 2048  # boxes that go through a network at a time
+    parts = [centre[i : i + size] for i in range(0, len(centre), size)]
     with BLAS.limit(limits=1, user_api="blas"), ThreadPoolExecutor(cores.count()) as pool:
         return np.concatenate(list(pool.map(lambda part: work(part, half), parts)))
 
