@@ -287,7 +287,7 @@ def _graph(controller: HybridController | Traceable, module: dict[str, Any]) -> 
 
 def _measurements(task: Task, n: int, rng: np.random.Generator) -> np.ndarray:
     """Draws noisy measurements (n, p) from the whole chart."""
-    z = rng.uniform(task.chart.low, task.chart.high, (n, task.chart.dimension))
+    z = task.chart.draw(n, rng)
     plant = task.plant(n)
     plant.set_state(*task.state(z, rng))
     return plant.measurement + rng.uniform(-0.1, 0.1, (n, task.measurement_columns))

@@ -165,6 +165,12 @@ class _Case:
         return game.scores["hyrl"][-1].winnable if game else 1.0
 
     @property
+    def open(self) -> float:
+        """The share of the starts that are open to one who sees the state."""
+        game = self.robustness.deciding
+        return game.scores["hyrl"][-1].open if game else 1.0
+
+    @property
     def replays(self) -> ReplayCount | None:
         """The replays of HyRL in MuJoCo, None if there were none."""
         game = self.robustness.deciding
@@ -272,10 +278,7 @@ class _Case:
     @property
     def fair(self) -> bool:
         """Whether most of the starts that are open to one who sees the state are winnable."""
-        game = self.robustness.deciding
-        return (
-            game is None or self.winnable >= self.settings.winnable * game.scores["hyrl"][-1].open
-        )
+        return self.winnable >= self.settings.winnable * self.open
 
     def failures(self) -> Iterator[str]:
         """Yields why the run FAILED, if it did for sure."""
@@ -321,11 +324,9 @@ class _Case:
                 f"({percent(1 - policy)})"
             )
         if not self.fair:
-            assert self.robustness.deciding
-            open_ = self.robustness.deciding.scores["hyrl"][-1].open
             yield (
                 f"this split can win only {percent(self.winnable)} of the starts under {self.noise}, where "
-                f"{percent(open_)} are open to one who sees the state"
+                f"{percent(self.open)} are open to one who sees the state"
             )
         if not self.examined:
             yield (
@@ -355,11 +356,9 @@ class _Case:
     def _shares(self) -> Iterator[str]:
         """Yields what is won in the worst-case game."""
         if self.winnable < 1:
-            assert self.robustness.deciding
-            open_ = self.robustness.deciding.scores["hyrl"][-1].open
             yield (
                 f"under {self.noise} this split can win {percent(self.winnable)} of the starts; to one who "
-                f"sees the state {percent(open_)} are open"
+                f"sees the state {percent(self.open)} are open"
             )
         assert self.robustness.deciding
         policy, hyrl = (self.robustness.deciding.scores[who] for who in ("policy", "hyrl"))

@@ -84,7 +84,7 @@ def probed_hops(task: Task) -> np.ndarray:
     # Values of each input. Without an inner loop the distance is linear in the inputs.
     values = levels or ({1: 17, 2: 9, 3: 5}.get(m, 3) if task.has_inner_loop else 2)
     rng, chart = np.random.default_rng(0), task.chart
-    z = rng.uniform(chart.low, chart.high, (PROBES, chart.dimension))
+    z = chart.draw(PROBES, rng)
     if task.abilities.stopped_by_walls:  # outside of them
         z = task.starts(PROBES, rng)
     plant, hops = task.plant(PROBES), []

@@ -33,7 +33,7 @@ def program_of(task: Task, function: Callable[[np.ndarray], np.ndarray], name: s
         Unbounded: its operations cannot be followed.
     """
     rng = np.random.default_rng(0)
-    z = rng.uniform(task.chart.low, task.chart.high, (BATCH, task.chart.dimension))
+    z = task.chart.draw(BATCH, rng)
     try:
         return trace(function, {"measured": z}, name, "bounded")
     except BadInput as error:
