@@ -6,7 +6,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 
@@ -22,21 +22,26 @@ NEARLY = 0.99
 
 
 class MapClass(IntEnum):
-    """What a map says of a node; `label` says it in words."""
+    """What a map says of a node."""
 
-    label: str
+    WON = 0
+    WON_FROM_SOME = 1
+    UNCLEAR = 2
+    BEATEN = 3
+    UNWINNABLE = 4
+    OVER = 5
 
-    WON = 0, "proved to be won from every start mode"
-    WON_FROM_SOME = 1, "proved to be won if the controller picks the start mode"
-    UNCLEAR = 2, "neither proved nor lost"
-    BEATEN = 3, "lost to the worst noise"
-    UNWINNABLE = 4, "not winnable by this split"
-    OVER = 5, "over"
-
-    def __new__(cls, value: int, label: str) -> Self:
-        member = int.__new__(cls, value)
-        member._value_, member.label = value, label
-        return member
+    @property
+    def label(self) -> str:
+        """The class in words."""
+        return (
+            "proved to be won from every start mode",
+            "proved to be won if the controller picks the start mode",
+            "neither proved nor lost",
+            "lost to the worst noise",
+            "not winnable by this split",
+            "over",
+        )[self]
 
 
 def percent(share: float, surely: bool = True) -> str:
