@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hyrl_mj.judging.episodes import ends_of
+from hyrl_mj.judging.episodes import BATCH, ends_of
 from hyrl_mj.judging.game import Ends
 from hyrl_mj.policies import Controller
 from hyrl_mj.simulation import (
@@ -23,8 +23,6 @@ from hyrl_mj.tasks import Outcome, Task
 
 # What is looked for in programmes that do not win yet: danger on the way, late arrival, dithering.
 GOALS = 3
-# Runs that are simulated at once, which limits the memory.
-BATCH = 4_096
 
 
 class Waves:

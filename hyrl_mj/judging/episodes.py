@@ -20,7 +20,7 @@ from hyrl_mj.system import cores
 from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Outcome, Task
 
-# Episodes that are simulated at once, which limits the memory.
+# Episodes, also of attacks, that are simulated at once, which limits the memory.
 BATCH = 4_096
 # Episodes that plain MuJoCo plays once more, spread over all kinds of noise and controllers; lost ones first.
 JUDGED = 500
