@@ -22,6 +22,11 @@ from hyrl_mj.stages.refinement import refined, thinned
 from hyrl_mj.stages.ways import Ways
 from hyrl_mj.tasks import ANY, Outcome, Task, number_of
 
+# The neighbourhood of M* is at least this many cells wide, and as wide as the longest hop in one sample.
+# Of more than two parts some are wedges: without a wide neighbourhood they begin far from M*, where a policy
+# goes straight on because it is clear of the obstacle.
+NEIGHBOURHOOD_CELLS, CELLS_OF_WEDGES = 4, 1.5
+
 
 @dataclass(frozen=True)
 class Partition(Saved):
@@ -304,9 +309,7 @@ def all_part_policies(
 def neighbourhood(partition: Partition, noise: float, hop: np.ndarray) -> float:
     """Returns the width of the neighbourhood of M*: the noise, some cells, or one sample's hop (d,)."""
     grid = partition.grid
-    # Of more than two parts some are wedges: without a wide neighbourhood they begin far from M*, where a
-    # policy goes straight on because it is clear of the obstacle.
-    cells = 4 if len(partition.parts) <= 2 else 1.5
+    cells = NEIGHBOURHOOD_CELLS if len(partition.parts) <= 2 else CELLS_OF_WEDGES
     return max(noise, cells * grid.cell, float(np.linalg.norm(hop / grid.chart.scale)))
 
 

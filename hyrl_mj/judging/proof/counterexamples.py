@@ -142,6 +142,7 @@ class CellNoise(Signal):
         super().__init__(largest, bound / (largest or 1.0))
         self._cells, self._controller = certificate.cells, controller
         self._outer, self._inner = outer, inner
+        # So many measurements along each noisy coordinate the noise between the nodes chooses from.
         steps = [np.linspace(-b, b, 17 if b else 1) for b in bound]
         candidates = np.array([*product(*steps)])
         # Among equals the largest noise comes first.
