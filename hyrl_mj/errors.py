@@ -59,6 +59,11 @@ def has_controls(text: str) -> bool:
     return printable(text) != text
 
 
+def counted(n: int, noun: str) -> str:
+    """Returns "1 jump", "2 jumps"."""
+    return f"{n} {noun}{'' if n == 1 else 's'}"
+
+
 def unknown(what: str, value: object, allowed: Iterable[str]) -> BadInput:
     """Returns the error for a name that is not one of `allowed`."""
     names = list(allowed)

@@ -70,9 +70,7 @@ def test_what_the_plant_returns_is_not_its_memory(task: Task) -> None:
 
 def test_chart_and_state_belong_together(task: Task) -> None:
     rng = np.random.default_rng(0)
-    z, other = (
-        rng.uniform(task.chart.low, task.chart.high, (100, task.chart.dimension)) for _ in range(2)
-    )
+    z, other = (task.chart.draw(100, rng) for _ in range(2))
     plant = task.plant(100)
     plant.set_state(*task.state(z))
     np.testing.assert_allclose(task.z(plant.measurement), z, atol=1e-9)
@@ -85,7 +83,7 @@ def test_an_observation_leads_back_to_its_measurement(task: Task) -> None:
             task.measured(np.zeros((1, len(task.observation_low))))
         return
     rng, plant = np.random.default_rng(0), task.plant(500)
-    z = rng.uniform(task.chart.low, task.chart.high, (500, task.chart.dimension))
+    z = task.chart.draw(500, rng)
     plant.set_state(*task.state(z, rng))
     seen = task.observation(plant.measurement).astype(np.float32).astype(float)
     measured = task.measured(seen)
@@ -120,10 +118,9 @@ def test_what_is_not_finite_is_refused(task: Task, value: float) -> None:
         task.check_measurement(measured)
 
 
-ILL_SHAPED = [np.zeros((2, 9)), np.zeros((2, 2, 2)), [], "here", [[0.0], [0.0, 1.0]]]
-
-
-@pytest.mark.parametrize("z", ILL_SHAPED)
+@pytest.mark.parametrize(
+    "z", [np.zeros((2, 9)), np.zeros((2, 2, 2)), [], "here", [[0.0], [0.0, 1.0]]]
+)
 def test_a_state_of_the_wrong_shape_names_the_task(task: Task, z: object) -> None:
     with pytest.raises(BadInput, match=task.name):
         task.chart.check(z, task.name)  # type: ignore[arg-type]

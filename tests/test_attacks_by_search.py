@@ -17,7 +17,7 @@ from planted import (
 )
 
 from hyrl_mj import BadInput, Noise, Outcome, Recorded, Sample, simulate
-from hyrl_mj.judging.attack_search import POPULATION, Search, Waves
+from hyrl_mj.judging.attack_search import Search, Waves
 from hyrl_mj.judging.attacks import Budget, attack, attack_starts
 from hyrl_mj.judging.episodes import Regions
 from hyrl_mj.judging.game import NEVER, Game
@@ -293,14 +293,14 @@ def test_the_first_rounds_hold_every_rule(vehicle):
         search.prepare(search.length)
         held = []
         search._try = lambda rows, programmes, held=held: held.append(programmes[0])
-        rounds = math.ceil(len(search.rules.common) / POPULATION)
+        rounds = math.ceil(len(search.rules.common) / search.settings.population)
         for number in range(1, rounds + 1):
             search.round(number)
         constant = {int(row[0]) for row in np.concatenate(held) if (row == row[0]).all()}
         assert {*search.rules.common, *search.rules.own} <= constant
         first = {int(row[0]) for row in held[0]}
         assert {*search.rules.own} <= first, "the rules about modes come on top"
-        assert {*search.rules.common[:POPULATION]} <= first
+        assert {*search.rules.common[: search.settings.population]} <= first
         assert rounds < Effort().attack_rounds, "some rounds are left to search"
 
 
@@ -359,7 +359,7 @@ def test_rules_are_held_for_their_segments(vehicle):
 
 
 def test_levels_and_times_that_evolve_stay_within_the_bound():
-    waves = Waves(np.array([0.0, EPS, 2 * EPS]), 40, 60)
+    waves = Waves(np.array([0.0, EPS, 2 * EPS]), 40, 60, 4)
     signals = waves(np.random.default_rng(0).normal(0, 2, (200, waves.size)))
     assert signals.shape == (60, 200, 3)
     assert not signals[:, :, 0].any()

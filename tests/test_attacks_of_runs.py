@@ -11,7 +11,7 @@ from test_verdict import ALL, EPS, HOLDS, enough, episodes
 import hyrl_mj
 from hyrl_mj import BadArtifact, BadInput, load_run
 from hyrl_mj.judging.game import AttackCount, Robustness, wilson
-from hyrl_mj.judging.verdict import HELD, Verdict
+from hyrl_mj.judging.verdict import Verdict, Word
 from hyrl_mj.pipeline import ExamineOptions, examine_run, run_stage
 from hyrl_mj.runs.arcs import noisy_arcs
 from hyrl_mj.runs.directory import Run
@@ -22,9 +22,9 @@ from hyrl_mj.viz.shows import replay_shows
 from hyrl_mj.viz.tables import (
     attack_table,
     comparison_table,
-    print_robustness,
     robustness_sentence,
 )
+from hyrl_mj.viz.terminal import print_robustness
 
 FEW = {"episodes": 20, "noise": ("none", "uniform")}
 
@@ -204,7 +204,7 @@ def test_a_start_of_ones_own_is_attacked_in_each_mode(examined):
 
 def test_what_the_attack_breaks_is_among_the_reasons(circle):
     verdict = Verdict.judge(circle, EPS, enough({}, lost=0), HOLDS, ALL)
-    assert verdict.word == HELD
+    assert verdict.word == Word.HELD
     said = "the attack breaks HyRL from 0 of 400 starts"
     assert said in verdict.sentence
     assert f"{said}, the policy from 200 of 400 starts" in verdict.reasons

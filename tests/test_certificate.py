@@ -7,13 +7,15 @@ import pytest
 from planted import halves, ideal_controller, sign_policy
 
 from hyrl_mj import HybridController, MlpPolicy, Noise
-from hyrl_mj.judging.game import NEVER, OVER, UNCLEAR, WON, WON_FROM_SOME, Game
-from hyrl_mj.judging.proof import CellNoise, Certificate, attack
+from hyrl_mj.judging.game import NEVER, Game, MapClass
+from hyrl_mj.judging.proof import CellNoise, Certificate, find_counterexamples
 from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.sets import Grid, GridSet
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import Outcome
+
+WON, WON_FROM_SOME, UNCLEAR, BEATEN, UNWINNABLE, OVER = MapClass
 
 EPS = 0.1
 
@@ -120,7 +122,7 @@ def test_the_gap_closes_as_the_cells_become_smaller(vehicle):
         )
         certificate = Certificate.certify(game, loops)
         own, some, time, _ = certificate.wins("hyrl", EPS)
-        broken = attack(certificate, "hyrl", loops["hyrl"], EPS)
+        broken = find_counterexamples(certificate, "hyrl", loops["hyrl"], EPS)
         region = certificate.region(EPS)
         gaps.append((~broken.own[region]).mean() - own)
         assert some <= own
@@ -162,7 +164,7 @@ def test_the_time_to_arrival_is_bounded(certified):
 def test_starts_that_count_as_broken_are_lost_on_the_plant(certified):
     game, loops, certificate = certified
     for name, loop in loops.items():
-        broken = attack(certificate, name, loop, EPS)
+        broken = find_counterexamples(certificate, name, loop, EPS)
         region = certificate.region(EPS)
         proved = certificate.value(name, EPS)[:, :-2] < NEVER
         assert not (broken.own & proved[-1] & region).any()
@@ -183,7 +185,10 @@ def test_noise_between_the_nodes_beats_what_the_game_calls_won(vehicle):
     loops = {"hyrl": hybrid(vehicle, overlap=EPS - 0.004)}
     game = Game(vehicle, halves(vehicle), loops, EPS, grid=Grid.with_cells(vehicle.chart, 120))
     certificate = Certificate.certify(game, loops)
-    broken, region = attack(certificate, "hyrl", loops["hyrl"], EPS), certificate.region(EPS)
+    broken, region = (
+        find_counterexamples(certificate, "hyrl", loops["hyrl"], EPS),
+        certificate.region(EPS),
+    )
     nodes = game.score("hyrl", EPS)
     own, *_ = certificate.wins("hyrl", EPS)
     assert own <= (~broken.own[region]).mean() <= nodes.won
@@ -197,9 +202,9 @@ def test_what_cannot_be_bounded_is_attacked_all_the_same(vehicle):
         "policy": "a policy that is a ChartPolicy cannot be bounded",
         "hyrl": "a AnalyticSet cannot be bounded: give sets on grids",
     }
-    assert attack(certificate, "policy", loops["policy"], EPS).own.any()
+    assert find_counterexamples(certificate, "policy", loops["policy"], EPS).own.any()
     none = Certificate(game, None, {}, {})
-    nodes = attack(none, "policy", loops["policy"], EPS)
+    nodes = find_counterexamples(none, "policy", loops["policy"], EPS)
     assert nodes.own.shape == (game.lattice.nodes,)
     assert nodes.own.any()
     assert (none.region(EPS) == (game.starts & game.winnable(EPS))).all()

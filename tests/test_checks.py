@@ -11,7 +11,7 @@ from dm_control.mujoco.wrapper import core
 import hyrl_mj
 from hyrl_mj import BadInput, Outcome
 from hyrl_mj.envs import BatchedEnv
-from hyrl_mj.physics import mjcf, mujoco_log
+from hyrl_mj.physics import compiled, mjcf, mujoco_log
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import LoopSettings, closed_loop
 from hyrl_mj.tasks import SPARING, check_task, trial
@@ -117,7 +117,7 @@ MISTAKES = {
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_is_one_sentence(tmp_path, monkeypatch, mistake, caplog):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(mjcf, "WRONG_VERSION", mjcf.mujoco.__version__)
+    monkeypatch.setattr(compiled, "WRONG_VERSION", compiled.mujoco.__version__)
     edits, says = MISTAKES[mistake]
     edits = edits if isinstance(edits[0], tuple) else (edits,)
     with pytest.raises(BadInput, match=says) as refused:

@@ -13,24 +13,21 @@ from scored import SPACING, score
 import hyrl_mj
 from hyrl_mj import BadInput
 from hyrl_mj.judging.game.result import (
-    BEATEN,
     LIMIT,
-    MAP_CLASSES,
-    UNCLEAR,
-    UNWINNABLE,
-    WON,
-    WON_FROM_SOME,
     Curve,
     GameResult,
+    MapClass,
     Maps,
     Profile,
-    Wins,
+    WinningShares,
 )
 from hyrl_mj.judging.game.scores import CURVE
 from hyrl_mj.sets import Grid
 from hyrl_mj.viz import colours, figures
 from hyrl_mj.viz.figures import robustness, style
 from hyrl_mj.viz.section import Section
+
+WON, WON_FROM_SOME, UNCLEAR, BEATEN, UNWINNABLE, OVER = MapClass
 
 CIRCLE, VEHICLE = hyrl_mj.get_task("unit_circle"), hyrl_mj.get_task("vehicle")
 HYRL = colours.MODES[0]
@@ -52,7 +49,7 @@ def coarse(monkeypatch):
 def wins_of(won, won_any, times):
     """What a controller wins; a hundredth less is proved."""
     proved = [tuple(np.maximum(share - 0.01, 0)) for share in (won, won_any)]
-    return Wins(tuple(won), tuple(won_any), *proved, tuple(times))
+    return WinningShares(tuple(won), tuple(won_any), *proved, tuple(times))
 
 
 def game_of(names, excursion=None, margin=0.05):
@@ -62,7 +59,7 @@ def game_of(names, excursion=None, margin=0.05):
     wins = {
         name: wins_of(fall, fall if name == "policy" else 0.9 * fall, 3 * fall) for name in names
     }
-    wins[LIMIT] = Wins((1.0,) * len(eps), tuple(1 - 0.3 * eps), (), (), (3.0,) * len(eps))
+    wins[LIMIT] = WinningShares((1.0,) * len(eps), tuple(1 - 0.3 * eps), (), (), (3.0,) * len(eps))
     scores = {
         name: (score(EPS, 0.9, 0.8, 0.72, proved=0.7, excursion=excursion),) for name in names
     }
@@ -113,7 +110,7 @@ def test_each_class_that_occurs_has_its_colour(tmp_path, task):
     critical = critical_of(task.scene.starts[2])
     draw_map(task, game_of(names), maps, critical, path)
     for k, colour in enumerate(figures.CLASS_COLOURS):
-        assert (len(where(path, colour)) > 1000) == (k in occurring), MAP_CLASSES[k]
+        assert (len(where(path, colour)) > 1000) == (k in occurring), MapClass(k).label
     width, height = size_of(path)
     assert 1200 < width <= 1600
     assert 800 < height < 1600

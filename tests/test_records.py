@@ -17,7 +17,7 @@ from hyrl_mj.judging.game.result import (
     GameResult,
     Profile,
     Robustness,
-    Wins,
+    WinningShares,
 )
 from hyrl_mj.learning import preset
 from hyrl_mj.runs.directory import Config
@@ -122,7 +122,9 @@ GAME = GameResult(
     why_not_proved={},
     miss_without_noise={"policy": 0.025},
     curve=Curve(
-        (0.0, 0.1), (1.0, 0.98), {"policy": Wins((1.0, 0.9), (1.0, 0.9), (), (), (3.0, None))}
+        (0.0, 0.1),
+        (1.0, 0.98),
+        {"policy": WinningShares((1.0, 0.9), (1.0, 0.9), (), (), (3.0, None))},
     ),
     profile=Profile(((0.0, 0.1),), {"policy": (None,)}),
     replays=(replays("policy", lost=2),),
@@ -154,7 +156,7 @@ def test_scores_margins_and_episodes_are_where_readers_of_the_file_expect_them(t
 
 def test_replays_are_read_as_they_were_and_damage_is_named(tmp_path):
     path = tmp_path / "r.json"
-    wins = GAME.curve.wins | {LIMIT: Wins((1.0, 1.0), (1.0, 1.0), (), (), (3.0, 3.0))}
+    wins = GAME.curve.wins | {LIMIT: WinningShares((1.0, 1.0), (1.0, 1.0), (), (), (3.0, 3.0))}
     profile = replace(GAME.profile, eps=dict.fromkeys(("policy", LIMIT), (None,)))
     game = replace(GAME, curve=replace(GAME.curve, wins=wins), profile=profile)
     replace(ROBUSTNESS, game=game).save(path)

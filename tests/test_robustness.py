@@ -18,15 +18,10 @@ from hyrl_mj import BadArtifact, BadInput, Noise, simulate
 from hyrl_mj.files import artifacts
 from hyrl_mj.judging import worst_case as examination
 from hyrl_mj.judging.game import (
-    BEATEN,
     CURVE,
     LIMIT,
-    OVER,
-    UNCLEAR,
-    UNWINNABLE,
-    WON,
-    WON_FROM_SOME,
     Game,
+    MapClass,
     Robustness,
     worst_signal,
 )
@@ -34,6 +29,8 @@ from hyrl_mj.judging.game.solver import NEVER
 from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies.controllers import PolicyController
 from hyrl_mj.sets import Grid
+
+WON, WON_FROM_SOME, UNCLEAR, BEATEN, UNWINNABLE, OVER = MapClass
 
 PI = np.pi
 # On 754 nodes full speed leads from node to node on the circle.

@@ -54,7 +54,10 @@ OF_RUNS = {
     "overlap": ([None, {}], "OverlapSettings"),
     "modes": ([None, {}], "a ModeSettings"),
     "table": ([None, {}], "a TableSettings"),
+    "attack": ([None, {}], "an? AttackSettings"),
+    "verdict": ([None, {}], "a VerdictSettings"),
 }
+GROUPS = ("ways", "overlap", "modes", "table", "attack", "verdict")
 # The same of the groups of settings.
 OF_GROUPS = {
     "ways.samples": ([0, 1.5, "few"], "an integer from 1 to"),
@@ -84,6 +87,19 @@ OF_GROUPS = {
     "table.longest": ([0, 1.5], "an integer from 1 to"),
     "table.tables": ([0, True], "an integer from 1 to 100"),
     "table.worst": ([-0.1, 1.1], "a number from 0 to 1"),
+    "attack.flips": ([0, 1.5], "an integer from 1 to"),
+    "attack.period_step": ([0, NAN], "a number from 0.01 to 10"),
+    "attack.segments": ([0, True], "an integer from 1 to"),
+    "attack.population": ([0, None], "an integer from 1 to"),
+    "attack.elites": ([0, 2.5], "an integer from 1 to"),
+    "attack.explore": ([-0.1, 1.1], "a number from 0 to 1"),
+    "attack.focused": ([0, "all"], "an integer from 1 to"),
+    "attack.offspring": ([1, NAN], "an integer from 2 to"),
+    "attack.pieces": ([0, 101], "an integer from 1 to 100"),
+    "attack.spread": ([0, INF], "> 0 and <= 10"),
+    "verdict.winnable": ([-0.1, 1.1], "a number from 0 to 1"),
+    "verdict.episodes": ([0, 1.5], "an integer from 1 to"),
+    "verdict.attacked": ([0, True], "an integer from 1 to"),
 }
 OF_TRAININGS = {
     "algorithm": ([False, None, "sarsa", ""], "algorithm|a text"),
@@ -116,7 +132,7 @@ def cases(table):
 def test_the_tables_leave_out_no_setting():
     assert set(OF_RUNS) == {field.name for field in fields(Settings)}
     assert set(OF_TRAININGS) == {field.name for field in fields(Training)}
-    groups = {name: OF_RUNS[name] for name in ("ways", "overlap", "modes", "table")}
+    groups = {name: OF_RUNS[name] for name in GROUPS}
     names = (
         f"{g}.{f.name}" for g in groups for f in fields(Settings.__dataclass_fields__[g].default)
     )

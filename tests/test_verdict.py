@@ -22,10 +22,12 @@ from hyrl_mj.judging.game import (
     compare,
     wilson,
 )
-from hyrl_mj.judging.verdict import FAILED, HELD, PROVED, UNDECIDED, WEAK, WON, Verdict
+from hyrl_mj.judging.verdict import Verdict, Word
 from hyrl_mj.policies import PolicyController
 from hyrl_mj.simulation import simulate
-from hyrl_mj.viz.tables import print_verdict
+from hyrl_mj.viz.terminal import print_verdict
+
+PROVED, WON, HELD, UNDECIDED, WEAK, FAILED = Word
 
 EPS = 0.1
 NONE_LOST = (replays(),)

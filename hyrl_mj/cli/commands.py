@@ -12,7 +12,7 @@ from hyrl_mj.environments import EnvironmentOptions, chosen_task, explained
 from hyrl_mj.errors import BadInput, printable, unknown
 from hyrl_mj.fields import DriveOptions, exported_controller
 from hyrl_mj.files import trust
-from hyrl_mj.judging import FAILED
+from hyrl_mj.judging import Word
 from hyrl_mj.pipeline import AgentOptions, ExamineOptions, RunOptions, SweepOptions
 from hyrl_mj.policies import check_agent_file
 from hyrl_mj.runs.arcs import noisy_arcs
@@ -102,7 +102,7 @@ def given_agent(
 def finish(run: Run) -> None:
     """Prints the results of a whole run; if it FAILED, ends with exit status 1."""
     print_summary(run)
-    if run.verdict.word == FAILED:
+    if run.verdict.word == Word.FAILED:
         raise SystemExit(1)
 
 
@@ -127,7 +127,7 @@ def sweep(
         result, folder = pipeline.sweep(tasks, options), Path(options.out)
     print_sweep(result)
     print(f"tables in {folder}/sweep.html, sweep.csv and sweep.json")
-    if any(not row.done or row.verdict == FAILED for row in result.rows):
+    if any(not row.done or row.verdict == Word.FAILED for row in result.rows):
         raise SystemExit(1)
 
 

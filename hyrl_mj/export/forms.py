@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     import onnx
 
 TEMPLATE = Path(__file__).parent / "templates" / "controller.py"
-# What an exported form may do differently from the controller: the share of rows in which rounding decides
-# between two levels or modes, and the error of other inputs [share of their range].
-TIES, CLOSE = 0.002, 1e-5
 
 
 class Traceable(Controller, Protocol):
@@ -290,7 +287,7 @@ def _graph(controller: HybridController | Traceable, module: dict[str, Any]) -> 
 
 def _measurements(task: Task, n: int, rng: np.random.Generator) -> np.ndarray:
     """Draws noisy measurements (n, p) from the whole chart."""
-    z = rng.uniform(task.chart.low, task.chart.high, (n, task.chart.dimension))
+    z = task.chart.draw(n, rng)
     plant = task.plant(n)
     plant.set_state(*task.state(z, rng))
     return plant.measurement + rng.uniform(-0.1, 0.1, (n, task.measurement_columns))
@@ -304,6 +301,9 @@ def _check(controller: HybridController | Traceable, step: Step, form: str) -> N
         "and observation() of the task compute each row from that row alone, whatever its values are?"
     )
     low, high = task.input_limits
+    # What may be different: the share of rows in which rounding decides between two levels or modes, and the
+    # error of other inputs [share of their range].
+    ties, close = 0.002, 1e-5
     for n in rows:
         measured = _measurements(task, n, rng)
         q = rng.choice(controller.modes, n)
@@ -314,7 +314,7 @@ def _check(controller: HybridController | Traceable, step: Step, form: str) -> N
             raise BadInput(refusal.format(brief(error))) from error
         if exported_u.shape != u.shape or exported_q.shape != q.shape:
             raise BadInput(refusal.format(f"u has shape {exported_u.shape} for a batch of {n}"))
-        far = np.abs(exported_u - u) > CLOSE * (high - low)
+        far = np.abs(exported_u - u) > close * (high - low)
         wrong += int(np.count_nonzero(far.any(axis=1) | (exported_q != q_next)))
-    if wrong > TIES * sum(rows):
+    if wrong > ties * sum(rows):
         raise BadInput(refusal.format(f"{wrong} of {sum(rows)} answers differ"))

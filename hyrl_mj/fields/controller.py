@@ -11,7 +11,7 @@ import numpy as np
 from hyrl_mj.errors import BadInput
 from hyrl_mj.fields.driving import Driving
 from hyrl_mj.fields.files import MOST_POSTS
-from hyrl_mj.fields.focus import choose, turn_sense
+from hyrl_mj.fields.focus import FocusSettings, choose, turn_sense
 from hyrl_mj.fields.guard import Guard
 from hyrl_mj.fields.law import TangentLaw
 from hyrl_mj.fields.modes import MODES_OF_POST, decoded, encoded
@@ -95,12 +95,14 @@ class FocusController:
         policies: the policy of each side, trained on `task.local`.
         noise: largest error of a measured coordinate [m] that the guard keeps away from posts for.
         first_side: the side on which the first post in focus is passed; None for the shorter way.
+        settings: when the focus and its side change.
     """
 
     task: Driving
     policies: Mapping[int, ObservationPolicy]
     noise: float
     first_side: int | None = None
+    settings: FocusSettings = FocusSettings()
 
     @cached_property
     def modes(self) -> tuple[int, ...]:
@@ -146,7 +148,7 @@ class FocusController:
         The mode -1 stands for none: the answer begins in the initial mode.
         """
         seen, (focus, side, sense) = Seen(measured), decoded(q)
-        focus, side = choose(seen, focus, side, self.swing, self.guard.margin)
+        focus, side = choose(seen, focus, side, self.swing, self.guard.margin, self.settings)
         if self.first_side is not None:
             side = np.where(q < 0, self.first_side, side)
         turn, sense, observed = way_past(self.task.local, only_post(measured, focus), side, sense)

@@ -14,7 +14,7 @@ from hyrl_mj.fields.files import FieldFile
 from hyrl_mj.fields.modes import decoded
 from hyrl_mj.judging import Budget, attack
 from hyrl_mj.policies import MlpPolicy, ObservationPolicy
-from hyrl_mj.simulation import HybridArc, Noise, simulate_batch
+from hyrl_mj.simulation import AttackSettings, HybridArc, Noise, simulate_batch
 from hyrl_mj.tasks import POSE, Field, length
 
 # The rounds of the attack.
@@ -92,6 +92,7 @@ def drive(
     made_for: float,
     field: FieldFile,
     options: DriveOptions = DriveOptions(),
+    attacks: AttackSettings = AttackSettings(),
 ) -> Drives:
     """Drives through a field from all its starts, with the controllers of `controllers`.
 
@@ -102,6 +103,7 @@ def drive(
         made_for: bound of the noise that they were made for [m].
         field: posts, goal and starts.
         options: the noise.
+        attacks: what signals an attack tries.
 
     Raises:
         BadInput: a noise or a seed that cannot be used.
@@ -120,8 +122,15 @@ def drive(
     }
     attacked = {}
     if options.attack:
-        budget = Budget(rounds=ROUNDS)
-        found = attack(task, loops, field.starts, bounds.largest, budget, seed=options.seed)
+        found = attack(
+            task,
+            loops,
+            field.starts,
+            bounds.largest,
+            Budget(rounds=ROUNDS),
+            seed=options.seed,
+            settings=attacks,
+        )
         attacked = {name: _checked(task, one.arcs) for name, one in found.items()}
     return Drives(task, bounds, arcs, attacked)
 

@@ -11,8 +11,6 @@ from hyrl_mj.fields.files import FieldFile
 from hyrl_mj.fields.focus import ROOM
 from hyrl_mj.tasks import FASTEST, RADII, TAKEN, length
 
-# The gap between posts that the policies were made for [m].
-MADE_FOR = 0.8
 # How many posts, or gaps, a sentence names.
 NAMED = 4
 
@@ -103,7 +101,8 @@ def _cautions(field: FieldFile, body: float) -> Iterator[str]:
     order = np.argsort(gap, kind="stable")
     pairs = [(int(first[i]), int(second[i]), float(gap[i])) for i in order]
     one = [pair for pair in pairs if pair[2] < ROOM]
-    narrow = [pair for pair in pairs if ROOM <= pair[2] < MADE_FOR]
+    made_for = 0.8  # the gap that the policies were made for [m]
+    narrow = [pair for pair in pairs if ROOM <= pair[2] < made_for]
     if one:
         yield (
             f"{_pairs(one)}, less than {ROOM:g} m (the robot is {2 * body:g} m wide): such posts are passed "
@@ -111,7 +110,7 @@ def _cautions(field: FieldFile, body: float) -> Iterator[str]:
         )
     if narrow:
         yield (
-            f"{_pairs(narrow)}, less than the {MADE_FOR:g} m that the policies were made for: a robot under "
+            f"{_pairs(narrow)}, less than the {made_for:g} m that the policies were made for: a robot under "
             "noise may touch a post there"
         )
     odd = np.flatnonzero((radii < RADII[0]) | (radii > RADII[1]))

@@ -6,14 +6,14 @@ Behind it are the worst-case game (`game`), what is proved between its nodes (`p
 
 from hyrl_mj.judging.attacks import Attack, Budget, attack, attack_starts
 from hyrl_mj.judging.episodes import NoisyEpisodes, Regions, noisy_episodes
+from hyrl_mj.judging.evidence import VerdictSettings
 from hyrl_mj.judging.examination import USUAL, Examination, ExamineOptions, Subject, examine
 from hyrl_mj.judging.losses import Losses, sort_losses
 from hyrl_mj.judging.results import Arrivals, Kind, ModeResult, Retraining
 from hyrl_mj.judging.sentences import POLICIES, listed, margin_text, mode_sentence, replays_sentence
-from hyrl_mj.judging.verdict import FAILED, Verdict
+from hyrl_mj.judging.verdict import Verdict, Word
 
 __all__ = [
-    "FAILED",
     "POLICIES",
     "USUAL",
     "Arrivals",
@@ -29,6 +29,8 @@ __all__ = [
     "Retraining",
     "Subject",
     "Verdict",
+    "VerdictSettings",
+    "Word",
     "attack",
     "attack_starts",
     "examine",

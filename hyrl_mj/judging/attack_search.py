@@ -8,58 +8,50 @@ from typing import Any
 
 import numpy as np
 
-from hyrl_mj.judging.episodes import ends_of
+from hyrl_mj.judging.episodes import BATCH, ends_of
 from hyrl_mj.judging.game import Ends
 from hyrl_mj.policies import Controller
-from hyrl_mj.simulation import GIVEN, LoopSettings, Programmes, Rules, closed_loop
+from hyrl_mj.simulation import (
+    GIVEN,
+    AttackSettings,
+    LoopSettings,
+    Programmes,
+    Rules,
+    closed_loop,
+)
 from hyrl_mj.tasks import Outcome, Task
 
-# Segments of a programme, each of the same time; together as long as a run without noise.
-SEGMENTS = 10
 # What is looked for in programmes that do not win yet: danger on the way, late arrival, dithering.
 GOALS = 3
-# Signals that are tried in a round from each start, after one that won from a start nearby.
-POPULATION = 8
-# Kinds of signals beside the rules that are held throughout.
-SEGMENTED, EVOLVED = "segments", "evolved"
-# The best programmes so far, for each start and goal, that new ones are drawn from; and the share of the
-# segments that take any rule instead.
-ELITES, EXPLORE = 3, 0.25
-# Runs that are simulated at once, which limits the memory.
-BATCH = 4_096
-# At so many open starts, the most dangerous ones, levels and switching times are evolved, by so many
-# signals in a generation.
-FOCUSED, CMA_POPULATION = 16, 12
-# Pieces of such a signal, and the spread in which the search begins, where 1 is the whole bound.
-PIECES, SPREAD = 4, 0.5
 
 
 class Waves:
     """Noise that is constant in pieces, or changes its sign with a period in them, from vectors of numbers.
 
-    A vector holds the levels of `PIECES` pieces on each noisy column, the times of the pieces, and the
-    period. Levels beyond -1 and 1 are the ends of the bound, so that most signals are at its ends, where
-    noise is strongest.
+    A vector holds the levels of the pieces on each noisy column, the times of the pieces, and the period.
+    Levels beyond -1 and 1 are the ends of the bound, so that most signals are at its ends, where noise is
+    strongest.
 
     Args:
         limits: (p,) the largest magnitude of the noise on each column.
         length: length of a run without noise [samples]; switching times are spread over 1.5 times of it.
         samples: number of samples of the signals.
+        pieces: number of pieces.
     """
 
-    def __init__(self, limits: np.ndarray, length: int, samples: int):
-        self.limits, self.length, self.samples = limits, length, samples
+    def __init__(self, limits: np.ndarray, length: int, samples: int, pieces: int):
+        self.limits, self.length, self.samples, self.pieces = limits, length, samples, pieces
         self.noisy = np.flatnonzero(limits)
-        self.size = PIECES * len(self.noisy) + PIECES + 1
+        self.size = pieces * len(self.noisy) + pieces + 1
 
     def __call__(self, vectors: np.ndarray) -> np.ndarray:
         """Returns the signals (samples, n, p) of vectors (n, size)."""
         n, k = len(vectors), np.arange(self.samples)[:, None]
-        levels, times, period = np.split(vectors, [-PIECES - 1, -1], axis=1)
+        levels, times, period = np.split(vectors, [-self.pieces - 1, -1], axis=1)
         shares = np.exp(2 * times)
         begins = np.cumsum(shares, axis=1) / shares.sum(axis=1, keepdims=True) * 1.5 * self.length
         piece = (k[:, :, None] >= begins[None, :, :-1]).sum(axis=2)
-        levels = np.clip(2 * levels, -1, 1).reshape(n, PIECES, len(self.noisy))
+        levels = np.clip(2 * levels, -1, 1).reshape(n, self.pieces, len(self.noisy))
         half = np.maximum(self.length ** np.clip(np.abs(period[:, 0]), 0, 1), 1)
         swings = (period[:, 0] > 0) & ((k // half) % 2 == 1)
         sign = np.where(swings, -1.0, 1.0)
@@ -91,16 +83,18 @@ class Search:
         bound: float,
         shares: np.ndarray,
         seed: int,
+        settings: AttackSettings = AttackSettings(),
     ):
         self.task, self.controller, self.starts, self.seed = task, controller, starts, seed
-        self.rules = Rules(task, controller, bound, shares)
+        self.settings, segments = settings, settings.segments
+        self.rules = Rules(task, controller, bound, shares, settings=settings)
         self._label, n = "attack, without noise", len(starts)
         self.open, self.segment = np.ones(n, dtype=bool), task.max_steps
         self.signals = np.zeros((task.max_steps, n, len(shares)))
         self._worst = np.full(n, -np.inf)
-        self._winners = np.full((n, SEGMENTS), self.rules.nothing)
-        self._values = np.full((n, GOALS, ELITES), -np.inf)
-        self._elites = np.full((n, GOALS, ELITES, SEGMENTS), self.rules.nothing)
+        self._winners = np.full((n, segments), self.rules.nothing)
+        self._values = np.full((n, GOALS, settings.elites), -np.inf)
+        self._elites = np.full((*self._values.shape, segments), self.rules.nothing)
         self._known: list[set[bytes]] = [set() for _ in starts]
         self._evolved: dict[int, Any] = {}
         self.samples, self.tried = 0, Counter[str]()
@@ -116,10 +110,11 @@ class Search:
     def prepare(self, length: int) -> None:
         """Prepares the rounds, for runs of a length [samples], which is the same for all controllers."""
         nothing, bound, shares = self.rules.nothing, self.rules.bound, self.rules.shares
-        self.rules = Rules(self.task, self.controller, bound, shares, length)
+        self.rules = Rules(self.task, self.controller, bound, shares, length, self.settings)
         self._elites[self._elites == nothing] = self.rules.nothing
-        self.waves = Waves(bound * np.abs(shares), length, self.task.max_steps)
-        self.segment = max(math.ceil(length / SEGMENTS), 1)
+        limits, pieces = bound * np.abs(shares), self.settings.pieces
+        self.waves = Waves(limits, length, self.task.max_steps, pieces)
+        self.segment = max(math.ceil(length / self.settings.segments), 1)
 
     def round(self, number: int) -> None:
         """Tries some signals from each open start; the rounds are numbered from 1.
@@ -129,12 +124,12 @@ class Search:
         levels and switching times.
         """
         self._label = f"attack, round {number}"
-        first = (number - 1) * POPULATION
-        held = self.rules.common[first : first + POPULATION]
+        first = (number - 1) * self.settings.population
+        held = self.rules.common[first : first + self.settings.population]
         if number == 1:
             held = np.concatenate([held, self.rules.own])
         self._copy()
-        late = number - math.ceil(len(self.rules.common) / POPULATION)
+        late = number - math.ceil(len(self.rules.common) / self.settings.population)
         rows, rng = np.flatnonzero(self.open), np.random.default_rng([self.seed, number])
         if not len(rows):
             return
@@ -166,19 +161,21 @@ class Search:
     def _population(
         self, rows: np.ndarray, held: np.ndarray, rng: np.random.Generator
     ) -> np.ndarray:
-        """Returns programmes (r, c, SEGMENTS) for the starts `rows` (r,): rules held, then drawn ones."""
-        shape = len(rows), max(POPULATION, len(held)), SEGMENTS
+        """Returns programmes (r, c, segments) for the starts `rows` (r,): rules held, then drawn ones."""
+        s = self.settings
+        shape = len(rows), max(s.population, len(held)), s.segments
         goal = np.broadcast_to(np.arange(shape[1])[:, None] % GOALS, shape)
-        elite, segment = rng.integers(ELITES, size=shape), np.arange(SEGMENTS)
+        elite, segment = rng.integers(s.elites, size=shape), np.arange(s.segments)
         drawn = self._elites[rows[:, None, None], goal, elite, segment]
-        explores = rng.random(shape) < EXPLORE
+        explores = rng.random(shape) < s.explore
         programmes = np.where(explores, rng.choice(self.rules.parts, size=shape), drawn)
         programmes[:, : len(held)] = held[:, None]
         return programmes
 
     def _try(self, rows: np.ndarray, programmes: np.ndarray) -> None:
-        """Simulates programmes (r, c, SEGMENTS) from the starts `rows` (r,), and keeps the best."""
-        each, flat = np.repeat(rows, programmes.shape[1]), programmes.reshape(-1, SEGMENTS)
+        """Simulates programmes (r, c, segments) from the starts `rows` (r,), and keeps the best."""
+        each = np.repeat(rows, programmes.shape[1])
+        flat = programmes.reshape(-1, programmes.shape[2])
         for first in range(0, len(each), BATCH):
             self._simulate(each[first : first + BATCH], flat[first : first + BATCH])
 
@@ -187,19 +184,20 @@ class Search:
         import cma  # slow to import, and seldom needed
         from scipy.stats import rankdata
 
-        focused = rows[np.argsort(-self._worst[rows], kind="stable")[:FOCUSED]]
+        s = self.settings
+        focused = rows[np.argsort(-self._worst[rows], kind="stable")[: s.focused]]
         for row in focused:
             if row not in self._evolved:
                 own = np.random.default_rng([self.seed, 1, row])
                 options = {
-                    "popsize": CMA_POPULATION,
+                    "popsize": s.offspring,
                     "randn": lambda *shape, own=own: own.standard_normal(shape),
                     "seed": np.nan,  # the global generator stays as it is
                     "verbose": -9,
                 }
-                begin = own.normal(0, SPREAD, self.waves.size)
-                self._evolved[row] = cma.CMAEvolutionStrategy(begin, SPREAD, options)
-        generations = math.ceil(len(rows) / len(focused) * POPULATION / CMA_POPULATION)
+                begin = own.normal(0, s.spread, self.waves.size)
+                self._evolved[row] = cma.CMAEvolutionStrategy(begin, s.spread, options)
+        generations = math.ceil(len(rows) / len(focused) * s.population / s.offspring)
         for _ in range(generations):
             focused = focused[self.open[focused]]
             if not len(focused):
@@ -207,7 +205,7 @@ class Search:
             asked = [np.array(self._evolved[row].ask()) for row in focused]
             each = np.repeat(focused, [len(vectors) for vectors in asked])
             given = self.waves(np.concatenate(asked))
-            _, values = self._simulate(each, np.full((len(each), SEGMENTS), GIVEN), given)
+            _, values = self._simulate(each, np.full((len(each), s.segments), GIVEN), given)
             for row, vectors in zip(focused, asked, strict=True):
                 # The better rank in danger or in lateness counts; CMA-ES minimises.
                 ranks = rankdata(-values[each == row, :2], method="min", axis=0)
@@ -252,7 +250,7 @@ class Search:
         return ends_of(self.task, run), values
 
     def _kind(self, programme: np.ndarray) -> str:
-        """Returns the kind of a programme (SEGMENTS,), for the count of what was tried."""
+        """Returns the kind of a programme (segments,), for the count of what was tried."""
         if programme[0] == GIVEN:
-            return EVOLVED
-        return self.rules.all[programme[0]].kind if np.ptp(programme) == 0 else SEGMENTED
+            return "evolved"
+        return self.rules.all[programme[0]].kind.value if np.ptp(programme) == 0 else "segments"

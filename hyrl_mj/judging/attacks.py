@@ -21,6 +21,7 @@ from hyrl_mj.judging.episodes import Regions, ends_of
 from hyrl_mj.judging.game import AttackCount, Ends, wilson
 from hyrl_mj.policies import Controller
 from hyrl_mj.simulation import (
+    AttackSettings,
     HybridArc,
     Noise,
     Programmes,
@@ -29,11 +30,6 @@ from hyrl_mj.simulation import (
     simulate_batch,
 )
 from hyrl_mj.tasks import Outcome, Task
-
-# The longest attack [s], a day, and the most rounds.
-LONGEST, MOST_ROUNDS = 86_400.0, 100_000
-# How often starts are drawn until enough of them are winnable.
-MOST_DRAWS = 100
 
 
 @dataclass(frozen=True)
@@ -53,17 +49,18 @@ class Budget:
     enough: int | None = None
 
     def __post_init__(self) -> None:
+        longest, most_rounds = 86_400.0, 100_000  # a day [s]
         if (self.seconds is None) == (self.rounds is None):
             raise BadInput("an attack has a time or a number of rounds: give one of the two")
         if self.seconds is not None and not (
-            math.isfinite(self.seconds) and 0 < self.seconds <= LONGEST
+            math.isfinite(self.seconds) and 0 < self.seconds <= longest
         ):
             raise BadInput(
-                f"an attack cannot last {self.seconds:g} s: give a time > 0 and <= {LONGEST:g} s"
+                f"an attack cannot last {self.seconds:g} s: give a time > 0 and <= {longest:g} s"
             )
-        if self.rounds is not None and not 1 <= self.rounds <= MOST_ROUNDS:
+        if self.rounds is not None and not 1 <= self.rounds <= most_rounds:
             raise BadInput(
-                f"an attack cannot have {self.rounds} rounds: give a number from 1 to {MOST_ROUNDS}"
+                f"an attack cannot have {self.rounds} rounds: give a number from 1 to {most_rounds}"
             )
 
 
@@ -146,7 +143,7 @@ def attack_starts(task: Task, regions: Regions, bound: float, n: int, seed: int)
 
     def drawn(where: Regions, count: int) -> np.ndarray:
         kept = np.empty((0, task.chart.dimension))
-        for _ in range(MOST_DRAWS if count else 0):
+        for _ in range(100 if count else 0):  # fewer are kept where winnable ones are rare
             z = where.draw(task, bound, count, rng)
             kept = np.vstack([kept, z[regions.may_win(z)]])
             if len(kept) >= count:
@@ -186,6 +183,7 @@ def attack(
     budget: Budget,
     everywhere: bool = False,
     seed: int = 0,
+    settings: AttackSettings = AttackSettings(),
 ) -> dict[str, Attack]:
     """Searches for noise signals that make closed loops fail.
 
@@ -204,6 +202,7 @@ def attack(
         budget: how long to search.
         everywhere: whether the noise acts on all columns of the measurement, not only on the noisy ones.
         seed: seed of the search.
+        settings: what signals are tried.
 
     Returns:
         The attack on each controller, by name. The same rounds give the same on any number of threads.
@@ -216,7 +215,8 @@ def attack(
     shares = Noise("none", bound, everywhere).against(task, None).shares
     began = time.monotonic()
     searches = {
-        name: Search(task, loop, starts, bound, shares, seed) for name, loop in controllers.items()
+        name: Search(task, loop, starts, bound, shares, seed, settings)
+        for name, loop in controllers.items()
     }
     length = max(search.length for search in searches.values())
     for search in searches.values():

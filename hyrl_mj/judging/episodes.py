@@ -20,12 +20,10 @@ from hyrl_mj.system import cores
 from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Outcome, Task
 
-# Episodes that are simulated at once, which limits the memory.
+# Episodes, also of attacks, that are simulated at once, which limits the memory.
 BATCH = 4_096
 # Episodes that plain MuJoCo plays once more, spread over all kinds of noise and controllers; lost ones first.
 JUDGED = 500
-# The search for starts near M* ends after this many draws without one.
-RARE = 100_000
 
 
 @dataclass(frozen=True)
@@ -60,7 +58,7 @@ class Regions:
             z = task.starts(n, rng)
             kept = np.vstack([kept, z[self._close(task, bound, z)]])
             drawn += n
-            if not len(kept) and drawn >= RARE:
+            if not len(kept) and drawn >= 100_000:
                 raise BadInput(
                     f"of {drawn:,} starts of {task.name} none lies within {2 * bound:g} of its critical "
                     "set: leave --near-critical out, or start elsewhere"

@@ -2,14 +2,33 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Annotated
 
 from hyrl_mj.judging.game import NEARLY, NO_NOISE, Robustness, wilson
+from hyrl_mj.judging.game.counts import NORMAL_95
+from hyrl_mj.ranges import Integer, Number, check_fields
 
-# What HELD needs at least: episodes of each kind of noise, and attacked starts. Of 300 starts none is lost if
-# 99% are won at the lower end of a one-sided 95% interval (3 / 300 = 1%); the two-sided one that is asked for
-# takes about 400.
-LEAST_EPISODES, LEAST_ATTACKED, ENOUGH_ATTACKED = 1_000, 300, 400
+
+@dataclass(frozen=True)
+class VerdictSettings:
+    """What a verdict asks for.
+
+    Attributes:
+        winnable: PROVED and WON speak of winnable starts: at least this share of those that are open to one
+            who sees the state. Else a split that makes most starts unwinnable would have the first word.
+        episodes: the fewest episodes of each kind of noise for HELD.
+        attacked: the fewest attacked starts for HELD: of 300 starts none is lost if 99% are won at the lower
+            end of a one-sided 95% interval (3 / 300 = 1%).
+    """
+
+    winnable: Annotated[float, Number(0, 1)] = 0.9
+    episodes: Annotated[int, Integer(1, 10**9)] = 1_000
+    attacked: Annotated[int, Integer(1, 10**9)] = 300
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 @dataclass(frozen=True)
@@ -20,23 +39,20 @@ class Sample:
         kind: the kind of noise.
         won, total: how many were won, and of how many.
         attack: whether they are starts that were attacked.
+        least: the fewest that HELD needs.
     """
 
     kind: str
     won: int
     total: int
     attack: bool
+    least: int
 
     def __str__(self) -> str:
         what = "attacked starts" if self.attack else f"episodes under {self.kind} noise"
         if self.kind == NO_NOISE:
             what = "episodes without noise"
         return f"{self.won:,} of {self.total:,} {what}"
-
-    @property
-    def least(self) -> int:
-        """The fewest that HELD needs."""
-        return LEAST_ATTACKED if self.attack else LEAST_EPISODES
 
     @property
     def held(self) -> bool:
@@ -50,13 +66,16 @@ class Sample:
 
     @property
     def enough(self) -> int:
-        """How many may be enough: four times as many where there were enough, but too many lost."""
-        least = ENOUGH_ATTACKED if self.attack else LEAST_EPISODES
-        return max(least, 4 * self.total if self.total >= self.least else 0)
+        """How many may be enough, in hundreds: four times as many where there were enough, but too many lost.
+
+        If all are won, the lower end of the 95% interval (Wilson) is n / (n + z^2): nearly all from 400 on.
+        """
+        if_all_won = 100 * math.ceil(NORMAL_95**2 * NEARLY / (1 - NEARLY) / 100)
+        return max(self.least, if_all_won, 4 * self.total if self.total >= self.least else 0)
 
 
 @dataclass(frozen=True)
-class Wins:
+class SuccessRates:
     """What a controller is not known to lose: shares of the winnable starts, or of the episodes.
 
     Attributes:
@@ -68,7 +87,7 @@ class Wins:
     noisy: float | None
 
     @staticmethod
-    def count(robustness: Robustness, who: str) -> Wins:
+    def count(robustness: Robustness, who: str) -> SuccessRates:
         """Returns what "policy" or "hyrl" wins."""
         attacked = [
             1 - c.lost / c.attacked
@@ -81,14 +100,14 @@ class Wins:
             replayed = replays.shares if replays else (1.0, 1.0)
             quiet = [min(score.not_broken, replayed[0]) for score in scores if score.eps == 0]
             noisy = min(scores[-1].not_broken, replayed[1], *attacked, 1.0)
-            return Wins(quiet[0] if quiet else None, noisy)
+            return SuccessRates(quiet[0] if quiet else None, noisy)
         shares = {
             kind: arrived / episodes
             for kind, (arrived, episodes) in by_kind(robustness, who).items()
         }
         quiet_share = shares.pop(NO_NOISE, None)
         under_noise = [*shares.values(), *attacked]
-        return Wins(quiet_share, min(under_noise) if under_noise else None)
+        return SuccessRates(quiet_share, min(under_noise) if under_noise else None)
 
 
 def by_kind(robustness: Robustness, who: str) -> dict[str, tuple[int, int]]:

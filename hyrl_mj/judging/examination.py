@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.judging.attacks import Attack, Budget, attack, attack_starts, shown_arcs
 from hyrl_mj.judging.episodes import NoisyEpisodes, Regions, noisy_episodes
-from hyrl_mj.judging.game import OVER, UNWINNABLE, Maps, Robustness, compare
+from hyrl_mj.judging.game import MapClass, Maps, Robustness, compare
 from hyrl_mj.judging.worst_case import worst_case
 from hyrl_mj.policies import Controller
 from hyrl_mj.sets import Grid, GridSet
-from hyrl_mj.simulation import HybridArc, Noise, usual_kinds
+from hyrl_mj.simulation import AttackSettings, HybridArc, Noise, usual_kinds
 from hyrl_mj.tasks import Effort, Task
-
-# The most starts of an attack: each keeps signals of a whole episode.
-MOST_STARTS = 100_000
 
 
 @dataclass(frozen=True)
@@ -59,9 +57,10 @@ class ExamineOptions:
         Raises:
             BadInput: an impossible time or number of rounds, or both.
         """
-        if self.attack_starts is not None and not 1 <= self.attack_starts <= MOST_STARTS:
+        most = 100_000  # each keeps signals of a whole episode
+        if self.attack_starts is not None and not 1 <= self.attack_starts <= most:
             raise BadInput(
-                f"{self.attack_starts} starts cannot be attacked: give a number from 1 to {MOST_STARTS:,}"
+                f"{self.attack_starts} starts cannot be attacked: give a number from 1 to {most:,}"
             )
         if self.attack_seconds is None and self.attack_rounds is None:
             attacked = self.attack_starts is not None or not exact
@@ -87,6 +86,7 @@ class Subject:
         playable: whether the worst-case game can be played against them.
         exact: whether it decides where it is played, and is more than an estimate.
         effort: what may be spent.
+        attacks: what signals an attack tries.
         alike: whether all of them answer as the controller "policy" does.
     """
 
@@ -100,6 +100,7 @@ class Subject:
     playable: bool
     exact: bool
     effort: Effort
+    attacks: AttackSettings = AttackSettings()
     alike: bool = False
 
 
@@ -174,7 +175,7 @@ def _winnable(subject: Subject, maps: Maps | None) -> tuple[Grid, np.ndarray] | 
     if maps is None or not subject.exact:
         return None
     classes = [*maps.map.values()][-1]  # of the hybrid controller
-    return maps.grid(subject.task.chart), ~np.isin(classes, (UNWINNABLE, OVER))
+    return maps.grid(subject.task.chart), ~np.isin(classes, (MapClass.UNWINNABLE, MapClass.OVER))
 
 
 def _attacks(
@@ -185,10 +186,19 @@ def _attacks(
     Where all of them answer as the policy does, they are tried under the signals that were found against it.
     """
     task, controllers = subject.task, subject.controllers
+    search = partial(
+        attack,
+        starts=z0,
+        bound=eps,
+        budget=budget,
+        everywhere=everywhere,
+        seed=seed,
+        settings=subject.attacks,
+    )
     if not subject.alike:
-        return attack(task, controllers, z0, eps, budget, everywhere, seed)
+        return search(task, controllers)
     alone = {"policy": controllers["policy"]}
-    found = attack(task, alone, z0, eps, budget, everywhere, seed)["policy"]
+    found = search(task, alone)["policy"]
     return {
         name: found if name in alone else found.on(name, task, controller)
         for name, controller in controllers.items()

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hyrl_mj.judging.game import NO_NOISE, PROVED_STARTS, Comparison, ReplayCount, Score, percent
+from hyrl_mj.errors import counted
+from hyrl_mj.judging.game import NO_NOISE, Comparison, ReplayCount, Score, percent
 from hyrl_mj.judging.results import ModeResult
 from hyrl_mj.tasks import Task
 
@@ -27,7 +28,7 @@ def comparison_sentence(compared: Comparison) -> str:
 def replays_sentence(task: Task, count: ReplayCount) -> str:
     """Returns how many replays a controller lost, and the first of them."""
     who = "the policy" if count.controller == "policy" else "HyRL"
-    said = "proved" if count.of == PROVED_STARTS else "winnable"
+    said = "proved" if count.of == "proved" else "winnable"
     if count.first is None:
         return (
             f"{who} lost none of {count.played:,} {said} starts when they were replayed in MuJoCo"
@@ -35,7 +36,7 @@ def replays_sentence(task: Task, count: ReplayCount) -> str:
     first = count.first
     mode = "" if first.q0 is None else f" in mode {task.mode_name(first.q0)}"
     noise = "without noise" if first.noise == NO_NOISE else f"under {first.noise} noise"
-    said = "a proved start" if count.of == PROVED_STARTS else "a start that no known noise beats"
+    said = "a proved start" if count.of == "proved" else "a start that no known noise beats"
     withdrawn = "withdrawn: " if count.controller == "hyrl" else ""
     return (
         f"{withdrawn}{said} was lost in a replay: from {task.chart.format(np.array(first.start))}{mode} "
@@ -71,8 +72,11 @@ POLICIES = {
 
 def mode_sentence(task: Task, result: ModeResult) -> str:
     """Returns how well the policy of a mode holds its set."""
-    trainings = f"{result.attempts} training{'' if result.attempts == 1 else 's'}"
-    how = f"after {trainings}" if result.attempts else "without a training of its own"
+    how = (
+        f"after {counted(result.attempts, 'training')}"
+        if result.attempts
+        else "without a training of its own"
+    )
     mode = f"the policy of mode {task.mode_name(result.mode)}{POLICIES.get(result.policy, '')}"
     won = (
         "all of its set that was tried" if result.won == 1 else f"{percent(result.won)} of its set"

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import StrEnum
 
-from hyrl_mj.judging.evidence import Sample, Wins, by_kind
+from hyrl_mj.judging.evidence import Sample, SuccessRates, VerdictSettings, by_kind
 from hyrl_mj.judging.game import NEARLY, NO_NOISE, ReplayCount, Robustness, percent
 from hyrl_mj.judging.results import Arrivals, Retraining
 from hyrl_mj.judging.sentences import (
@@ -19,17 +20,16 @@ from hyrl_mj.judging.sentences import (
 from hyrl_mj.simulation import usual_kinds
 from hyrl_mj.tasks import Task
 
-PROVED, WON, HELD, UNDECIDED, WEAK, FAILED = (
-    "PROVED",
-    "WON",
-    "HELD",
-    "UNDECIDED",
-    "WEAK",
-    "FAILED",
-)
-# PROVED and WON speak of winnable starts: at least this share of those that are open to one who sees the
-# state. Else a split that makes most starts unwinnable would have the first word.
-LEAST_WINNABLE = 0.9
+
+class Word(StrEnum):
+    """The first word of a verdict; `Verdict` says what each asks for."""
+
+    PROVED = "PROVED"
+    WON = "WON"
+    HELD = "HELD"
+    UNDECIDED = "UNDECIDED"
+    WEAK = "WEAK"
+    FAILED = "FAILED"
 
 
 @dataclass(frozen=True)
@@ -64,12 +64,12 @@ class Verdict:
     counts; the attack is one of these kinds. It is counted from starts that are won without noise.
 
     Attributes:
-        word: "PROVED", "WON", "HELD", "UNDECIDED", "WEAK" or "FAILED".
+        word: the word.
         sentence: what decided.
         reasons: the results behind it, a sentence each.
     """
 
-    word: str
+    word: Word
     sentence: str
     reasons: tuple[str, ...]
 
@@ -79,8 +79,8 @@ class Verdict:
     @property
     def tone(self) -> str:
         """How a page shows the word: "good", "undecided" or "bad"."""
-        good = self.word in (PROVED, WON, HELD)
-        return "good" if good else "undecided" if self.word == UNDECIDED else "bad"
+        good = self.word in (Word.PROVED, Word.WON, Word.HELD)
+        return "good" if good else "undecided" if self.word == Word.UNDECIDED else "bad"
 
     @staticmethod
     def judge(
@@ -89,6 +89,7 @@ class Verdict:
         robustness: Robustness,
         retraining: Retraining,
         arrivals: Arrivals,
+        settings: VerdictSettings = VerdictSettings(),
     ) -> Verdict:
         """Returns the verdict on a run.
 
@@ -98,19 +99,22 @@ class Verdict:
             robustness: the result of the examination.
             retraining: the result of stage 6.
             arrivals: from how many starts the policy of stage 1, or the agent, arrives without noise.
+            settings: what the words ask for.
         """
-        case = _Case(task, bound, robustness, retraining, arrivals)
+        case = _Case(task, bound, robustness, retraining, arrivals, settings)
         reasons = tuple(case.reasons())
         for word, grounds in (
-            (PROVED, case.proofs()),
-            (WON if robustness.deciding else HELD, case.success()),
-            (UNDECIDED, case.doubts()),
-            (FAILED, case.failures()),
-            (WEAK, case.weaknesses()),
+            (Word.PROVED, case.proofs()),
+            (Word.WON if robustness.deciding else Word.HELD, case.success()),
+            (Word.UNDECIDED, case.doubts()),
+            (Word.FAILED, case.failures()),
+            (Word.WEAK, case.weaknesses()),
         ):
             if sentence := "; ".join(grounds):
                 return Verdict(word, sentence, reasons)
-        return Verdict(FAILED, f"HyRL is no better than the policy under {case.noise}", reasons)
+        return Verdict(
+            Word.FAILED, f"HyRL is no better than the policy under {case.noise}", reasons
+        )
 
 
 @dataclass(frozen=True)
@@ -122,14 +126,15 @@ class _Case:
     robustness: Robustness
     retraining: Retraining
     arrivals: Arrivals
+    settings: VerdictSettings
 
     @property
-    def policy(self) -> Wins:
-        return Wins.count(self.robustness, "policy")
+    def policy(self) -> SuccessRates:
+        return SuccessRates.count(self.robustness, "policy")
 
     @property
-    def hyrl(self) -> Wins:
-        return Wins.count(self.robustness, "hyrl")
+    def hyrl(self) -> SuccessRates:
+        return SuccessRates.count(self.robustness, "hyrl")
 
     @property
     def noise(self) -> str:
@@ -158,6 +163,12 @@ class _Case:
         """The share of the starts that can be won under the noise."""
         game = self.robustness.deciding
         return game.scores["hyrl"][-1].winnable if game else 1.0
+
+    @property
+    def open(self) -> float:
+        """The share of the starts that are open to one who sees the state."""
+        game = self.robustness.deciding
+        return game.scores["hyrl"][-1].open if game else 1.0
 
     @property
     def replays(self) -> ReplayCount | None:
@@ -255,20 +266,19 @@ class _Case:
     @property
     def samples(self) -> list[Sample]:
         """What HELD rests on: episodes without noise and of each kind of noise, and attacked starts."""
-        counts = by_kind(self.robustness, "hyrl")
+        counts, s = by_kind(self.robustness, "hyrl"), self.settings
         samples = [
-            Sample(kind, *counts.get(kind, (0, 0)), False)
+            Sample(kind, *counts.get(kind, (0, 0)), False, s.episodes)
             for kind in dict.fromkeys((*usual_kinds(self.task), *counts))
         ]
         attacks = [c for c in self.robustness.attacks if c.controller == "hyrl"]
         won, total = next(((c.attacked - c.lost, c.attacked) for c in attacks), (0, 0))
-        return [*samples, Sample("attack", won, total, True)]
+        return [*samples, Sample("attack", won, total, True, s.attacked)]
 
     @property
     def fair(self) -> bool:
         """Whether most of the starts that are open to one who sees the state are winnable."""
-        game = self.robustness.deciding
-        return game is None or self.winnable >= LEAST_WINNABLE * game.scores["hyrl"][-1].open
+        return self.winnable >= self.settings.winnable * self.open
 
     def failures(self) -> Iterator[str]:
         """Yields why the run FAILED, if it did for sure."""
@@ -314,11 +324,9 @@ class _Case:
                 f"({percent(1 - policy)})"
             )
         if not self.fair:
-            assert self.robustness.deciding
-            open_ = self.robustness.deciding.scores["hyrl"][-1].open
             yield (
                 f"this split can win only {percent(self.winnable)} of the starts under {self.noise}, where "
-                f"{percent(open_)} are open to one who sees the state"
+                f"{percent(self.open)} are open to one who sees the state"
             )
         if not self.examined:
             yield (
@@ -348,11 +356,9 @@ class _Case:
     def _shares(self) -> Iterator[str]:
         """Yields what is won in the worst-case game."""
         if self.winnable < 1:
-            assert self.robustness.deciding
-            open_ = self.robustness.deciding.scores["hyrl"][-1].open
             yield (
                 f"under {self.noise} this split can win {percent(self.winnable)} of the starts; to one who "
-                f"sees the state {percent(open_)} are open"
+                f"sees the state {percent(self.open)} are open"
             )
         assert self.robustness.deciding
         policy, hyrl = (self.robustness.deciding.scores[who] for who in ("policy", "hyrl"))

@@ -14,27 +14,25 @@ from hyrl_mj.judging.game import (
     LIMIT,
     NEARLY,
     NEVER,
-    UNCLEAR,
-    WON,
-    WON_FROM_SOME,
     Curve,
     Game,
     GameResult,
     Lattice,
     LatticeSpacing,
+    MapClass,
     Maps,
     NodeScore,
     Profile,
     ReplayCount,
     Score,
-    Wins,
+    WinningShares,
     curve_grid,
     lattice_grid,
     share,
 )
 from hyrl_mj.judging.proof.cells import decides
 from hyrl_mj.judging.proof.certificate import Certificate, Proved
-from hyrl_mj.judging.proof.counterexamples import Broken, attack
+from hyrl_mj.judging.proof.counterexamples import Broken, find_counterexamples
 from hyrl_mj.judging.proof.replays import Replays, play
 from hyrl_mj.policies import BLAS, Controller
 from hyrl_mj.sets import GridSet
@@ -43,8 +41,6 @@ from hyrl_mj.system import cores
 from hyrl_mj.system.progress import progress_bar
 from hyrl_mj.tasks import Task
 
-# Approximate number of episodes without noise.
-QUIET_EPISODES = 1000
 # Games that are solved at the same time; each takes tens of megabytes.
 THREADS = 4
 
@@ -93,9 +89,8 @@ def worst_case(
         margins = dict(zip(controllers, _in_threads("margins", fine.margin, likely), strict=True))
     spacing, curve_spacing = (tuple(g.lattice.grid.spacing.tolist()) for g in (fine, coarse))
     lattice = LatticeSpacing(
-        spacing, fine.lattice.exact, certificate.cells is not None, curve_spacing,
-        task.abilities.stopped_by_walls,
-    )  # fmt: skip
+        spacing, fine.lattice.exact, certificate.cells is not None, curve_spacing
+    )
     proved = {name: _proved_margin(curve, curve.wins[name]) for name in controllers}
     misses = _misses(coarse, controllers)
     result = GameResult(
@@ -115,10 +110,10 @@ def _scores(
     game = certificate.game
     games = [(name, eps) for eps in bounds for name in names]
     results = list(_in_threads("worst-case scores", game.score, games))
-    tried = [(certificate, name, controllers[name], eps) for name, eps in games if name != LIMIT]
-    broken = dict(
-        zip([g for g in games if g[0] != LIMIT], _in_threads("attacks", attack, tried), strict=True)
-    )
+    tried = [(name, eps) for name, eps in games if name != LIMIT]
+    asked = [(certificate, name, controllers[name], eps) for name, eps in tried]
+    found_against = _in_threads("attacks", find_counterexamples, asked)
+    broken = dict(zip(tried, found_against, strict=True))
     scores = {
         name: tuple(
             _score(certificate, name, found, broken.get((name, found.eps)))
@@ -166,7 +161,7 @@ def _score(certificate: Certificate, name: str, nodes: NodeScore, broken: Broken
 def _map(certificate: Certificate, name: str, eps: float) -> np.ndarray:
     """Returns the class (N,) of every node; what is won counts as proved if all cells around it are."""
     classes = certificate.game.map(name, eps)
-    won = np.isin(classes, (WON, WON_FROM_SOME))
+    won = np.isin(classes, (MapClass.WON, MapClass.WON_FROM_SOME))
     some = every = np.zeros_like(won)
     if name in certificate.answers and certificate.cells is not None:
         value, cells = certificate.value(name, eps)[:, :-2], certificate.cells
@@ -174,7 +169,9 @@ def _map(certificate: Certificate, name: str, eps: float) -> np.ndarray:
             cells.all_around(wins | ~cells.running) & ~cells.all_around(~(wins & cells.running))
             for wins in (value[-1] < NEVER, (value < NEVER).all(axis=0))
         )
-    classes[won] = np.where(every, WON, np.where(some, WON_FROM_SOME, UNCLEAR))[won]
+    classes[won] = np.where(
+        every, MapClass.WON, np.where(some, MapClass.WON_FROM_SOME, MapClass.UNCLEAR)
+    )[won]
     return classes
 
 
@@ -215,7 +212,7 @@ def _sweep(certificate: Certificate, names: list[str], points: np.ndarray) -> tu
     for name, row in rows.items():
         own, some, *_ = zip(*proved[name], strict=True) if name in proved else ((), ())
         won, won_any, times = zip(*row, strict=True)
-        wins[name] = Wins(won, won_any, own, some, times)
+        wins[name] = WinningShares(won, won_any, own, some, times)
     return Curve(CURVE, tuple(winnable), wins), profile
 
 
@@ -224,18 +221,18 @@ def _known(bounds: tuple[float, ...], scores: Mapping[str, tuple[Score, ...]]) -
     wins = {}
     for name, level in scores.items():
         own, some = zip(*((s.not_broken, s.not_broken_any) for s in level), strict=True)
-        wins[name] = Wins(own, some, (), (), tuple(s.time_any for s in level))
+        wins[name] = WinningShares(own, some, (), (), tuple(s.time_any for s in level))
     winnable = tuple(score.winnable for score in next(iter(scores.values())))
     return Curve(bounds, winnable, wins)
 
 
-def _last_won(curve: Curve, wins: Wins) -> tuple[float, float]:
+def _last_won(curve: Curve, wins: WinningShares) -> tuple[float, float]:
     """Returns the bounds of the curve between which some nodes begin to be lost."""
     lost = next((i for i, won in enumerate(wins.won) if won < 1), len(curve.eps) - 1)
     return curve.eps[max(lost - 1, 0)], curve.eps[lost]
 
 
-def _proved_margin(curve: Curve, wins: Wins) -> float | None:
+def _proved_margin(curve: Curve, wins: WinningShares) -> float | None:
     """Returns the largest bound of the curve up to which nearly all winnable starts are proved."""
     margin = None
     for eps, proved in zip(curve.eps, wins.proved, strict=False):
@@ -251,7 +248,7 @@ def _misses(game: Game, controllers: Mapping[str, Controller]) -> dict[str, floa
     starts = game.lattice.grid.nodes[game.starts & game.winnable(0.0)]
     if not len(starts):
         return dict.fromkeys(controllers, 0.0)
-    starts = starts[:: max(len(starts) // QUIET_EPISODES, 1)]
+    starts = starts[:: max(len(starts) // 1_000, 1)]  # about as many episodes
     quiet = LoopSettings(quiet=True)
     return {
         name: float(task.miss(closed_loop(task, loop, starts, settings=quiet).path[-1]).max())

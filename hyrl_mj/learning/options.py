@@ -6,9 +6,6 @@ from typing import Any
 from hyrl_mj.errors import BadInput, unknown
 from hyrl_mj.ranges import Flag, Integer, Number, Optional, Rule, Text, refused
 
-# The most samples that a rollout of PPO or A2C holds in memory.
-ROLLOUT = 2**24
-
 _SHARE, _POSITIVE, _ANY = Number(0, 1), Number(0, 1e6, above=True), Number(0, 1e6)
 _COUNT = Integer(1, 10**6)
 _ON_POLICY: dict[str, Rule] = {
@@ -81,10 +78,11 @@ def check_options(algorithm: str, options: Mapping[str, Any], *, samples: int, e
             f"options.learning_starts {first:,} cannot be used, because nothing would be learned in "
             f"{samples:,} samples: give fewer"
         )
-    if algorithm in ("ppo", "a2c") and options.get("n_steps", 1) * envs > ROLLOUT:
+    most = 2**24  # a rollout of PPO or A2C lies in memory
+    if algorithm in ("ppo", "a2c") and options.get("n_steps", 1) * envs > most:
         raise BadInput(
             f"options.n_steps {options['n_steps']:,} in {envs:,} episodes side by side cannot be used: "
-            f"together give at most {ROLLOUT:,} samples"
+            f"together give at most {most:,} samples"
         )
 
 

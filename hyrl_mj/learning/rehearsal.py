@@ -7,9 +7,6 @@ from hyrl_mj.policies import Policy
 from hyrl_mj.simulation import WayRuns, way_runs
 from hyrl_mj.tasks import Outcome, Task
 
-# A policy decides between a point that it is tried from and one of so many nearest ones.
-NEIGHBOURS = 4
-
 
 class Rehearsal:
     """Draws the starts of a training: some of them anywhere, and where the policy lately lost or decided.
@@ -61,8 +58,9 @@ class Rehearsal:
     def _between(self, z: np.ndarray, runs: WayRuns) -> np.ndarray:
         """Returns the middles (k, d) between neighbours among z (n, d) from which runs go different ways."""
         chart = self._task.chart
-        near = chart.tree(z).query(chart.in_box(z), NEIGHBOURS + 1)[1][:, 1:]
-        first, second = np.repeat(np.arange(len(z)), NEIGHBOURS), near.ravel()
+        neighbours = 4
+        near = chart.tree(z).query(chart.in_box(z), neighbours + 1)[1][:, 1:]
+        first, second = np.repeat(np.arange(len(z)), neighbours), near.ravel()
         part = runs.shows[first] & runs.shows[second] & runs[first].differ(runs[second])
         a, b = z[first[part]], z[second[part]]
         return chart.wrap(a + chart.difference(b, a) / 2)
@@ -70,7 +68,7 @@ class Rehearsal:
 
 def running_points(task: Task, n: int, rng: np.random.Generator) -> np.ndarray:
     """Returns those of n drawn chart points (k, d) at which no episode ends at once; all n if all end."""
-    z = rng.uniform(task.chart.low, task.chart.high, (n, task.chart.dimension))
+    z = task.chart.draw(n, rng)
     plant = task.plant(n)
     plant.set_state(*task.state(z, rng))
     running = task.ending(plant.measurement) == Outcome.RUNNING

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from hyrl_mj.errors import BadInput, check_bound, check_seed, unknown
+from hyrl_mj.judging import VerdictSettings
 from hyrl_mj.learning.options import check_options
 from hyrl_mj.learning.stage_settings import (
     ModeSettings,
@@ -25,6 +26,7 @@ from hyrl_mj.ranges import (
     check_fields,
 )
 from hyrl_mj.sets import Grid, covering
+from hyrl_mj.simulation import AttackSettings
 from hyrl_mj.tasks import SEARCHES, Task
 
 PRESETS = ("fast", "paper", "smoke")
@@ -136,6 +138,8 @@ class Settings:
         overlap: how far the parts are extended (stages 4 and 5).
         modes: where the policies of modes are trained, and when they are good enough (stage 6).
         table: how tables of inputs are made (stage 6).
+        attack: what signals attacks try, in stage 6 and in the examination.
+        verdict: what a verdict asks for.
     """
 
     task: Annotated[str, Text()]
@@ -155,6 +159,8 @@ class Settings:
     overlap: Annotated[OverlapSettings, Instance((OverlapSettings,))] = OverlapSettings()
     modes: Annotated[ModeSettings, Instance((ModeSettings,))] = ModeSettings()
     table: Annotated[TableSettings, Instance((TableSettings,))] = TableSettings()
+    attack: Annotated[AttackSettings, Instance((AttackSettings,))] = AttackSettings()
+    verdict: Annotated[VerdictSettings, Instance((VerdictSettings,))] = VerdictSettings()
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -1,4 +1,4 @@
-"""The settings of stages 2 to 6 beside their trainings, in frozen dataclasses: what decides in them.
+"""The settings of stages 2 to 6 beside trainings and attacks, in frozen dataclasses: what decides in them.
 
 Each field has a unit and a range. The defaults serve all tasks, and no preset changes them.
 """

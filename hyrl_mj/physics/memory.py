@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from hyrl_mj.physics import mjcf
+from hyrl_mj.physics import compiled
 
 
 def remembers(model: mujoco.MjModel) -> str:
@@ -33,12 +33,12 @@ def remembers(model: mujoco.MjModel) -> str:
 
 def late_sensor(model: mujoco.MjModel) -> str:
     """Returns which sensor holds or delays its values, and the remedy, as a sentence; "" if none does."""
-    for i, name in enumerate(mjcf.names(model, mujoco.mjtObj.mjOBJ_SENSOR)):
+    for i, name in enumerate(compiled.names(model, mujoco.mjtObj.mjOBJ_SENSOR)):
         period, delay = float(model.sensor_interval[i].max()), float(model.sensor_delay[i])
         if period > 0 or delay > 0:
             does = f"holds its value for {period:g} s" if period > 0 else f"is {delay:g} s late"
             return (
-                f"sensor {name} of {mjcf.model_name(model)} {does}, and the true state is taken from the "
+                f"sensor {name} of {compiled.model_name(model)} {does}, and the true state is taken from the "
                 "sensors: leave out its interval and delay"
             )
     return ""
@@ -49,7 +49,7 @@ def why_not_direct(model: mujoco.MjModel) -> str:
 
     Without contacts and constraints, nothing is left that changes suddenly from one place to the next.
     """
-    actuators = mjcf.names(model, mujoco.mjtObj.mjOBJ_ACTUATOR)
+    actuators = compiled.names(model, mujoco.mjtObj.mjOBJ_ACTUATOR)
     drives = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
     biases = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
     for i, name in enumerate(actuators):

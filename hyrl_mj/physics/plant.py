@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.physics import memory, mjcf, mujoco_log
+from hyrl_mj.physics import compiled, memory, mujoco_log
 from hyrl_mj.ranges import Integer
 from hyrl_mj.system import cores, forked
 
@@ -17,8 +17,6 @@ Measure = Callable[[np.ndarray], np.ndarray]
 # Inputs (n, m), positions (n, nq), velocities (n, nv) -> controls of all actuators (n, nu).
 Control = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 MOST = 2**24  # copies
-# Tolerated excess over an input limit: float32 policies have rounding errors.
-INPUT_TOLERANCE = 1e-6
 
 
 class Plant:
@@ -34,7 +32,7 @@ class Plant:
         threads: threads of the physics, 0 for all cores. Results do not depend on it.
         measure: computes the measurement from the sensor values; by default the sensor values.
         mocap: computes the poses of the mocap bodies from the positions of the joints, see
-            `mjcf.mocap_poses`, at every physics step; by default they stay where the MJCF puts them.
+            `compiled.mocap_poses`, at every physics step; by default they stay where the MJCF puts them.
         control: inner loop that computes the controls of all actuators from u and the true state, at every
             physics step; they are clipped to each actuator's ctrlrange. `inputs` are then names of MJCF
             numerics that hold the limits of u.
@@ -54,10 +52,10 @@ class Plant:
         *,
         measure: Measure = lambda sensors: sensors,
         control: Control | None = None,
-        mocap: mjcf.Mocap | None = None,
+        mocap: compiled.Mocap | None = None,
         steady: bool = False,
     ):
-        if problem := mjcf.wrong_physics(model) or memory.late_sensor(model):
+        if problem := compiled.wrong_physics(model) or memory.late_sensor(model):
             raise BadInput(problem)
         n = Integer(1, MOST).checked("the number of copies of a robot", n)
         self.n, self._threads, self._measure, self._control = n, threads, measure, control
@@ -68,7 +66,7 @@ class Plant:
         # checked here, and clamping would prevent backward steps.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
-        self.substeps = max(round(mjcf.sample_time(model) / model.opt.timestep), 1)
+        self.substeps = max(round(compiled.sample_time(model) / model.opt.timestep), 1)
         self.low, self.high = input_limits(model, inputs, of_actuators=control is None)
         self._columns = [] if control else actuator_columns(model, inputs)
         limited = model.actuator_ctrllimited.astype(bool)[:, None]
@@ -82,8 +80,8 @@ class Plant:
             self._held[:] = np.clip(held, self._ctrl_low, self._ctrl_high) if clamps else held
         self._unstable = np.zeros(n, dtype=bool)
         # Some sensors are read from the state; MuJoCo has to compute others after each step.
-        self._columns_of_state = mjcf.state_columns(self.model)
-        self._quaternions = mjcf.quaternion_columns(self.model)
+        self._columns_of_state = compiled.state_columns(self.model)
+        self._quaternions = compiled.quaternion_columns(self.model)
         self._stage = mujoco.mjtStage.mjSTAGE_NONE
         if self._columns_of_state is None:
             self._stage = mujoco.mjtStage(int(self.model.sensor_needstage.max()))
@@ -102,7 +100,7 @@ class Plant:
             self._batch = Batch(self.model, self.n, self._threads or cores.count())
         except ValueError as error:
             raise BadInput(
-                f"MuJoCo cannot simulate copies of {mjcf.model_name(self.model)} side by side ({error}): "
+                f"MuJoCo cannot simulate copies of {compiled.model_name(self.model)} side by side ({error}): "
                 "leave that out of its MJCF"
             ) from error
         forked.own(self._batch)
@@ -189,8 +187,8 @@ class Plant:
     def geom_positions(self, ids: Sequence[int]) -> np.ndarray:
         """Returns the positions of geoms in the world: (n, k, 3) [m], or (1, k, 3) if none of them moves."""
         ids = list(ids)
-        if not mjcf.geoms_move(self.model, ids):
-            return mjcf.geom_positions(self.model, ids)[None]
+        if not compiled.geoms_move(self.model, ids):
+            return compiled.geom_positions(self.model, ids)[None]
         if self._geom_positions is None:  # from now on they are computed after each step
             self._geom_positions = self._batch.bind("geom_xpos")
             if self._stage == mujoco.mjtStage.mjSTAGE_NONE:
@@ -245,7 +243,7 @@ class Plant:
         """
         if not self.invertible:
             raise BadInput(
-                f"the plant {mjcf.model_name(self.model)} cannot be run backward: that takes a "
+                f"the plant {compiled.model_name(self.model)} cannot be run backward: that takes a "
                 "velocity actuator with kv >= 1e6 on every degree of freedom, one to one"
             )
         self._wake()
@@ -299,7 +297,7 @@ class Plant:
     def _drive(self, rows: np.ndarray) -> None:
         """Puts the mocap bodies of the copies `rows` (k,) where their joints' positions say."""
         if self._mocap is not None:
-            poses = mjcf.mocap_poses(self.model, self._mocap, self._qpos[rows])
+            poses = compiled.mocap_poses(self.model, self._mocap, self._qpos[rows])
             self._mocap_pos[rows], self._mocap_quat[rows] = poses[..., :3], poses[..., 3:]
 
     def _advance(
@@ -327,7 +325,7 @@ class Plant:
 
 def actuator_columns(model: mujoco.MjModel, names: Sequence[str]) -> list[int]:
     """Returns the ids of the named actuators, or raises `BadInput` with the names that the model has."""
-    return [mjcf.object_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in names]
+    return [compiled.object_id(model, mujoco.mjtObj.mjOBJ_ACTUATOR, name) for name in names]
 
 
 def input_limits(
@@ -350,7 +348,7 @@ def input_limits(
                 raise BadInput(f"actuator {name} needs a ctrlrange in the MJCF: its input limits")
         ranges = model.actuator_ctrlrange[columns]
     else:
-        ranges = np.array([mjcf.numeric(model, name, 2) for name in inputs])
+        ranges = np.array([compiled.numeric(model, name, 2) for name in inputs])
     return ranges[:, 0], ranges[:, 1]
 
 
@@ -363,7 +361,8 @@ def checked_inputs(
         BadInput: a wrong shape, a value that is not finite, or one outside the limits.
     """
     u = checked("input", u, len(low), rows)
-    wrong = (u < low - INPUT_TOLERANCE) | (u > high + INPUT_TOLERANCE)
+    excess = 1e-6  # that is tolerated: float32 policies have rounding errors
+    wrong = (u < low - excess) | (u > high + excess)
     if wrong.any():
         row, column = np.argwhere(wrong)[0]
         raise BadInput(

@@ -131,6 +131,7 @@ def retrain_stage(run: Run, say: Say) -> None:
         policy=run.steady,
         table=table_of is not None,
         settings=s.modes,
+        attacks=s.attack,
     )
     work = partial(_retrained, s, ground_of, warm_start, parts, table_of, run.path / "logs")
     done: list[tuple[ModePolicy, ModeResult]] = []
@@ -201,6 +202,7 @@ def subject_of(run: Run, controllers: dict[str, Controller], partition: Partitio
         playable=run.why_no_game is None,
         exact=run.exact,
         effort=SPARING if s.preset == "smoke" else run.task.effort,
+        attacks=s.attack,
     )
 
 

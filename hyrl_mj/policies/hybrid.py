@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,7 +13,9 @@ from hyrl_mj.errors import BadInput
 from hyrl_mj.policies.controllers import check_inputs, check_modes
 from hyrl_mj.policies.mlp import Policy
 from hyrl_mj.sets import Complement, StateSet
-from hyrl_mj.tasks import Task
+
+if TYPE_CHECKING:
+    from hyrl_mj.tasks import Task
 
 # A point this close to the edge of a flow set is on the edge [chart units].
 ON_EDGE = 1e-9

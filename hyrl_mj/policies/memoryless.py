@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,7 +17,10 @@ from hyrl_mj.errors import BadInput, brief
 from hyrl_mj.policies.controllers import Controller, PolicyController, answer, check_inputs
 from hyrl_mj.policies.mlp import Policy, SampledPolicy
 from hyrl_mj.policies.preprocessing import PreprocessedPolicy, as_function
-from hyrl_mj.tasks import Outcome, Task
+from hyrl_mj.tasks import Outcome
+
+if TYPE_CHECKING:
+    from hyrl_mj.tasks import Task
 
 # The trial of an agent: runs side by side, half of them by random inputs; and their samples. Of what takes a
 # call a batch, every fourth one does.

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
@@ -16,7 +16,9 @@ from threadpoolctl import ThreadpoolController
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.files import artifacts
 from hyrl_mj.policies.algorithms import ALGORITHMS, Algorithm
-from hyrl_mj.tasks import Task, get_task, task_names
+
+if TYPE_CHECKING:
+    from hyrl_mj.tasks import Task
 
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:
@@ -246,6 +248,8 @@ class MlpPolicy(ObservationPolicy):
             BadArtifact: a file is missing, truncated, or not a policy of this version; or the policy is for
                 another task.
         """
+        from hyrl_mj.tasks import get_task, task_names  # for who does not give the task
+
         weights = artifacts.read_tensors(path)
 
         def described(about: dict[str, Any]) -> MlpPolicy:

@@ -7,13 +7,16 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hyrl_mj.errors import BadArtifact, BadInput
 from hyrl_mj.files import archives, artifacts
 from hyrl_mj.policies.mlp import MlpPolicy, ObservationPolicy, Policy, SampledPolicy
-from hyrl_mj.tasks import Task
+
+if TYPE_CHECKING:
+    from hyrl_mj.tasks import Task
 
 LARGEST_NUMBER = 1e30  # of statistics: its square is a number, too
 NONE = "none"  # in place of a file of statistics: the agent saw plain observations

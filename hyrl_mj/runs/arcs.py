@@ -81,7 +81,10 @@ def noisy_arcs(
             signal: AnyNoise
             if noise == "attack":
                 begun = loop if q0 is None else _Begun(loop, q0)
-                signal = attack(task, {name: begun}, z0, bound, Budget(rounds=4))[name].signal
+                found = attack(
+                    task, {name: begun}, z0, bound, Budget(rounds=4), settings=run.settings.attack
+                )
+                signal = found[name].signal
             elif game is None:
                 signal = Noise(noise, bound)
             else:

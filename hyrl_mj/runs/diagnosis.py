@@ -24,10 +24,6 @@ from hyrl_mj.runs.directory import Run
 from hyrl_mj.simulation import HybridArc, Noise, simulate_batch
 from hyrl_mj.stages import all_part_policies
 
-ATTACKED = 48  # starts that are attacked
-# Where every episode is played to its end, attacked starts have about so many samples together.
-SAMPLES, FEWEST = 20_000, 16
-
 
 def losses_of(run: Run) -> Losses | None:
     """Returns why the policy loses starts, where the game decides."""
@@ -56,9 +52,10 @@ def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
         game = Game(task, run.partition, {"policy": loop}, eps, grid=run.lattice_grid)
         noise = worst_signal(game, "policy", loop, z0, eps)
         return _first_lost(simulate_batch(task, loop, z0, noise))
-    count = ATTACKED
+    count = 48
     if not task.abilities.arrival_ends:
-        count = int(np.clip(SAMPLES / task.max_steps, FEWEST, ATTACKED))
+        # Where every episode is played to its end, they have about 20,000 samples together.
+        count = int(np.clip(20_000 / task.max_steps, 16, count))
     starts = attack_starts(task, Regions(run.critical_set.points), eps, count, run.settings.seed)
     for factor in (1, 2, 4, 8):
         try:
@@ -66,7 +63,8 @@ def worst_arc(run: Run, losses: Losses | None) -> HybridArc | None:
         except BadInput:  # it would hide the whole chart
             break
         some = starts if factor == 1 else starts[::3]
-        found = attack(task, {"policy": loop}, some, factor * eps, Budget(rounds=1, enough=1))
+        budget, settings = Budget(rounds=1, enough=1), run.settings.attack
+        found = attack(task, {"policy": loop}, some, factor * eps, budget, settings=settings)
         if (lost := _first_lost(found["policy"].arcs)) is not None:
             return lost
     return None

@@ -185,11 +185,9 @@ class Run:
     @cached_property
     def split(self) -> Partition:
         """The parts that stage 5 extends: M_i, for an agent changed where they leave no room."""
-        return (
-            self.partition
-            if self.agent is None
-            else Partition.load(self._checked("split.npz"), self.task)
-        )
+        if self.agent is None:
+            return self.partition
+        return Partition.load(self._checked("split.npz"), self.task)
 
     @cached_property
     def extended_sets(self) -> ExtendedSets:
@@ -212,8 +210,7 @@ class Run:
     @property
     def mode_networks(self) -> dict[int, MlpPolicy]:
         """Those policies of modes that are networks."""
-        found = self.mode_policies.items()
-        return {q: policy for q, policy in found if isinstance(policy, MlpPolicy)}
+        return {q: pi for q, pi in self.mode_policies.items() if isinstance(pi, MlpPolicy)}
 
     @cached_property
     def controller(self) -> HybridController:
@@ -252,14 +249,13 @@ class Run:
     @cached_property
     def verdict(self) -> Verdict:
         """What the run is worth, in one word with its reasons."""
-        facts = self.robustness, self.retraining, self.arrivals
+        facts = self.robustness, self.retraining, self.arrivals, self.settings.verdict
         return Verdict.judge(self.task, self.settings.noise, *facts)
 
     @property
     def is_examined_as_usual(self) -> bool:
         """Whether the examination on disk is under the run's own noise, and not under another one."""
-        found = self.robustness
-        own = self.settings
+        found, own = self.robustness, self.settings
         return (found.eps, found.everywhere) == (own.noise, own.everywhere)
 
     @cached_property

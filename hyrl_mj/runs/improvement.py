@@ -27,7 +27,6 @@ COMPARED = {
     "late": False,
     "longest": False,
 }
-RESAMPLES = 9_999
 # Seeds of each setting from which an interval is computed.
 LEAST_SEEDS = 3
 
@@ -104,7 +103,7 @@ def _mean(groups: Sequence[np.ndarray], of: Callable[[np.ndarray], np.ndarray]) 
     found = bootstrap(
         values,
         mean,
-        n_resamples=RESAMPLES,
+        n_resamples=9_999,
         method="percentile",
         vectorized=True,
         random_state=np.random.default_rng(0),

@@ -15,9 +15,8 @@ from hyrl_mj.sets.grids import Grid
 MOST_DIMENSIONS = 6
 # A cloud has this power of the number of cells as nodes, in every dimension.
 POWER = 4
-# Cells along noisy coordinates are at most this share of the noise bound there; a cloud's nodes lie this
-# share of it beside M* and, the farthest, so many times it.
-SHARE, BESIDE, FARTHEST = 0.5, 0.125, 3.0
+# Cells along noisy coordinates are at most this share of the noise bound there.
+SHARE = 0.5
 
 
 def covering(chart: Chart, cells: int, noise: np.ndarray | None = None) -> Grid | Cloud:
@@ -67,9 +66,10 @@ def resolving(chart: Chart, cells: int, points: np.ndarray, noise: np.ndarray) -
         return nodes
     half = nodes.size // 2
     # Where there is hardly any noise, the cells of the chart say what is near.
-    reach = np.maximum(FARTHEST * noise, nodes.cell * nodes.shares * chart.scale)
-    away = float((reach / chart.scale).max()) / FARTHEST
-    return Cloud.even(chart, half, nodes.shares).beside(points, half, reach, BESIDE * away)
+    beside, farthest = 0.125, 3.0  # where nodes lie beside M* [noise bounds]
+    reach = np.maximum(farthest * noise, nodes.cell * nodes.shares * chart.scale)
+    away = float((reach / chart.scale).max()) / farthest
+    return Cloud.even(chart, half, nodes.shares).beside(points, half, reach, beside * away)
 
 
 def enough_cells(chart: Chart, noise: np.ndarray, least: int, most: int) -> int:

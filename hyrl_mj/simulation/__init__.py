@@ -9,6 +9,8 @@ from importlib import import_module
 from pkgutil import iter_modules
 
 from hyrl_mj.simulation.arc import LONGEST, HybridArc, samples, simulate, simulate_batch
+from hyrl_mj.simulation.attack_settings import AttackSettings
+from hyrl_mj.simulation.checked_noise import drawn
 from hyrl_mj.simulation.lookahead import Ahead, Lookahead
 from hyrl_mj.simulation.noise import (
     KINDS,
@@ -18,7 +20,6 @@ from hyrl_mj.simulation.noise import (
     Recorded,
     Sample,
     Signal,
-    drawn,
     noise_kinds,
     register_noise,
     signal_for,
@@ -38,6 +39,7 @@ __all__ = [
     "NOT_STARTED",
     "Ahead",
     "AnyNoise",
+    "AttackSettings",
     "HybridArc",
     "Lookahead",
     "LoopSettings",

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hyrl_mj.errors import BadInput, check_seed
+from hyrl_mj.errors import BadInput, check_seed, counted
 from hyrl_mj.files.artifacts import Saved
 from hyrl_mj.policies import Controller, Policy, PolicyController, as_controller, check_modes
 from hyrl_mj.simulation.noise import AnyNoise, Noise
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 # The longest time that `simulate` records [s]: an hour.
 LONGEST = 3600.0
-# Of a user's robot, so many of the runs are played again by plain MuJoCo.
-JUDGED = 4
 
 
 @dataclass(frozen=True)
@@ -90,11 +88,10 @@ class HybridArc(Saved):
 
     @property
     def _summary(self) -> str:
-        jumps = int(self.j[-1])
         noise = f"{self.noise} noise of {self.bound:g}" if self.bound else "no noise"
         return (
             f"{self.controller}: {self.outcome} after {self.t[-1]:.2f} s, "
-            f"{jumps} jump{'s' * (jumps != 1)}, {noise}"
+            f"{counted(self.j[-1], 'jump')}, {noise}"
         )
 
     def plot(self) -> Figure:
@@ -233,7 +230,7 @@ def simulate_batch(
     rollout = closed_loop(task, loop, starts, noise, q0, seed, settings)
     task.verify(starts, rollout, range(n))
     if task.source is not None and type(task).plant is Task.plant:
-        judge_beginning(task, rollout, task.state(starts), np.arange(n)[:JUDGED])
+        judge_beginning(task, rollout, task.state(starts), np.arange(min(n, 4)))
     name = "policy" if isinstance(loop, PolicyController) else "hyrl"
     return [_arc(task, name, rollout, i, noise) for i in range(n)]
 

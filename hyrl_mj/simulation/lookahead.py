@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from itertools import product
 from typing import Self
@@ -17,12 +17,8 @@ from hyrl_mj.tasks import Outcome, Task
 
 # Samples by which a plant with inertia is simulated ahead.
 AHEAD = 6
-# So many noisy columns have their noise combined; of more of them, so many.
-COMBINED, FEW = 6, 3
 # Simulations side by side.
 BATCH = 2_048
-# A controller is asked about so many measurements at once: more do not stay in a processor's cache.
-TOGETHER = 1_024
 
 
 @dataclass
@@ -50,9 +46,26 @@ class Ahead:
             getattr(self, field.name)[rows] = getattr(other, field.name)
 
 
+def answer_of(
+    controller: Controller, measured: np.ndarray, q: np.ndarray, past: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns a controller's inputs (n, m) and modes (n,) for measurements (n, p).
+
+    Args:
+        controller: the controller, which picks the mode of a run that has not begun.
+        measured: (n, p) measurements.
+        q: (n,) modes, or `NOT_STARTED`.
+        past: (n, memory, p) past measurements, of a controller that takes them.
+    """
+    begins = q == NOT_STARTED
+    if begins.any():
+        q = np.where(begins, controller.initial_mode(measured), q)
+    return answer(controller, q, measured, past)
+
+
 def each_answer(
     task: Task,
-    act: Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
+    controller: Controller,
     true: np.ndarray,
     candidates: np.ndarray,
     q: np.ndarray,
@@ -62,21 +75,22 @@ def each_answer(
 
     Args:
         task: tells what would be measured under noise.
-        act: returns inputs (n, m) and modes (n,) for measurements (n, p), modes (n,) and past (n, memory, p).
+        controller: the controller.
         true: (n, p) measurements without noise.
         candidates: (c, p) noise.
-        q, past: as `act` takes them, of the n runs.
+        q, past: as in `answer_of`, of the n runs.
 
     Yields:
         Inputs (k, n, m) and modes (k, n) for the next k of the candidates.
     """
     n = len(true)
-    several = max(TOGETHER // max(n, 1), 1)
+    several = max(1_024 // max(n, 1), 1)  # more measurements do not stay in a processor's cache
     for first in range(0, len(candidates), several):
         some = candidates[first : first + several]
         each = np.broadcast_to(some[:, None], (len(some), *true.shape)).reshape(-1, true.shape[1])
         measured = task.perturbed(np.tile(true, (len(some), 1)), each)
-        u, modes = act(measured, np.tile(q, len(some)), np.tile(past, (len(some), 1, 1)))
+        modes, before = np.tile(q, len(some)), np.tile(past, (len(some), 1, 1))
+        u, modes = answer_of(controller, measured, modes, before)
         yield u.reshape(len(some), n, -1), modes.reshape(len(some), n)
 
 
@@ -126,11 +140,11 @@ class Lookahead(Signal):
     def _directions(self, kinematic: bool) -> np.ndarray:
         """Returns the candidates (c, p) as shares of the bound, the first of which is no noise.
 
-        With more than `COMBINED` noisy columns, combinations are too many: then the first `FEW` of them are
+        With more than six noisy columns, combinations are too many: then the first three of them are
         combined, and each of the others acts alone.
         """
         columns = np.flatnonzero(self.shares)
-        few = len(columns) if len(columns) <= COMBINED else FEW
+        few = len(columns) if len(columns) <= 6 else 3
         first, rest = columns[:few], columns[few:]
         fine = len(columns) <= (2 if kinematic else 1)
         factors = (0.0, -1.0, 1.0, -0.5, 0.5) if fine else (0.0, -1.0, 1.0)
@@ -157,7 +171,7 @@ class Lookahead(Signal):
             [
                 np.concatenate([u, q[..., None]], axis=2)
                 for u, q in each_answer(
-                    self.task, self._act, true[running], self._candidates, q, past
+                    self.task, self.controller, true[running], self._candidates, q, past
                 )
             ]
         )
@@ -245,7 +259,7 @@ class Lookahead(Signal):
             if not len(rows):
                 break
             after, q, past = after[goes_on], q[goes_on], past[goes_on]
-            answers = np.column_stack(self._act(after, q, past))
+            answers = np.column_stack(answer_of(self.controller, after, q, past))
             past = remembering(past, after)
         next_answers[rows] = answers[: len(rows)]
         end = np.hstack([plant.qpos, plant.qvel])[: len(danger)]
@@ -257,12 +271,3 @@ class Lookahead(Signal):
         nq = self._copies.model.nq
         self._copies.set_state(state[:, :nq], state[:, nq:], np.arange(len(state)))
         return self._copies
-
-    def _act(
-        self, measured: np.ndarray, q: np.ndarray, past: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the controller's inputs (n, m) and modes (n,) for measurements (n, p) in modes (n,)."""
-        begins = q == NOT_STARTED
-        if begins.any():
-            q = np.where(begins, self.controller.initial_mode(measured), q)
-        return answer(self.controller, q, measured, past)

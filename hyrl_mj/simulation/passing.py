@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hyrl_mj.physics.plant import Plant
-from hyrl_mj.tasks import Task, wrapped
+from hyrl_mj.tasks import wrapped
+
+if TYPE_CHECKING:
+    from hyrl_mj.physics.plant import Plant
+    from hyrl_mj.tasks import Task
 
 
 @dataclass(frozen=True)

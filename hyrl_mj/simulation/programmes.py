@@ -6,14 +6,12 @@ from typing import Self
 
 import numpy as np
 
-from hyrl_mj.policies import Controller, answer, nothing_past
-from hyrl_mj.simulation.lookahead import each_answer
+from hyrl_mj.policies import Controller, nothing_past
+from hyrl_mj.simulation.lookahead import answer_of, each_answer
 from hyrl_mj.simulation.noise import NOT_STARTED, Sample, Signal
-from hyrl_mj.simulation.rules import CONTRARY, JUMP, REVERSE, STAY, STRAIGHT, Rules
+from hyrl_mj.simulation.rules import RuleKind, Rules
 from hyrl_mj.tasks import Outcome, Task
 
-# A change of the mode counts for more than any change of the inputs.
-DECISIVE = 1e3
 # The number of a signal that is given, in a programme: no rule.
 GIVEN = -1
 
@@ -94,7 +92,7 @@ class Programmes(Signal):
             part = Sample(runs, now.k[mine], true[mine], now.q[mine], now.plant, past[mine])
             noise[mine] = self.rules.lookahead.sample(part)
         measured = self.task.perturbed(true[rows], noise[rows])
-        u, q = self._answers(measured, now.q[rows], past[rows])
+        u, q = answer_of(self.controller, measured, now.q[rows], past[rows])
         self._observe(true[rows], now.rows[rows], u, q != now.q[rows])
         self._samples = max(self._samples, int(now.k.max(initial=-1)) + 1)
         self._noise[now.k, now.rows] = noise
@@ -116,23 +114,24 @@ class Programmes(Signal):
             return
         true, candidates = now.measurement[rows], self.rules.candidates
         answers = [
-            *each_answer(self.task, self._answers, true, candidates, now.q[rows], past[rows])
+            *each_answer(self.task, self.controller, true, candidates, now.q[rows], past[rows])
         ]
         u, q = (np.concatenate(parts) for parts in zip(*answers, strict=True))
         u = self._scaled(u)
         usual_mode = np.where(now.q[rows] == NOT_STARTED, q[0], now.q[rows])
-        jumps, contrary = DECISIVE * (q != usual_mode), np.linalg.norm(u - u[0], axis=2)
+        # A change of the mode counts for more than any change of the inputs.
+        jumps, contrary = 1e3 * (q != usual_mode), np.linalg.norm(u - u[0], axis=2)
         last = self._scaled(self._last[now.rows[rows]])
         values = {
-            CONTRARY: contrary,
-            STRAIGHT: -np.linalg.norm(u, axis=2),
-            REVERSE: np.linalg.norm(u - np.where(np.isnan(last), u[0], last), axis=2),
-            JUMP: contrary + jumps,
-            STAY: contrary - jumps,
+            RuleKind.CONTRARY: contrary,
+            RuleKind.STRAIGHT: -np.linalg.norm(u, axis=2),
+            RuleKind.REVERSE: np.linalg.norm(u - np.where(np.isnan(last), u[0], last), axis=2),
+            RuleKind.JUMP: contrary + jumps,
+            RuleKind.STAY: contrary - jumps,
         }
         for number in np.unique(rule):
             wish, mine = self.rules.all[number].wish, rule == number
-            if isinstance(wish, str):
+            if isinstance(wish, RuleKind):
                 value = values[wish]
             else:
                 assert wish is not None
@@ -155,12 +154,3 @@ class Programmes(Signal):
         """Returns inputs (..., m) between -1 and 1, their limits."""
         low, high = self.task.input_limits
         return np.asarray((2 * u - low - high) / (high - low))
-
-    def _answers(
-        self, measured: np.ndarray, q: np.ndarray, past: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the controller's inputs (r, m) and modes (r,) for measurements (r, p) in modes (r,)."""
-        begins = q == NOT_STARTED
-        if begins.any():
-            q = np.where(begins, self.controller.initial_mode(measured), q)
-        return answer(self.controller, q, measured, past)

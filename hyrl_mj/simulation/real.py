@@ -20,11 +20,8 @@ from hyrl_mj.tasks import Outcome, Task
 # and NumPy rounds the methods of a task otherwise in batches of another size. Nothing that lags, leaks or is
 # held is as near as this. How episodes end has no tolerance.
 ROUNDING = 1e-8
-# Episodes whose samples are shown to the task one by one, and not together.
-ALONE = 2
-# Episodes that are tried when a run begins, and their longest duration [samples].
-TRIED, SAMPLES = 50, 40
-LONGER = 10**9  # than any episode [samples]
+# The longest duration of episodes that are tried [samples].
+SAMPLES = 40
 # MuJoCo's warnings about states that it resets.
 BAD = [
     int(kind)
@@ -73,7 +70,8 @@ def judge(
             lasted = "runs on" if broke is None else "becomes unstable"
             raise _differs(task, run, row, "the end", broke or k, outcome.label, lasted)
         theirs = tuple(values[: k + 1, number] for values in seen)
-        _compare(task, run, row, theirs, mine, alone=number < ALONE)
+        # The first two are shown to the task sample by sample, and not whole.
+        _compare(task, run, row, theirs, mine, alone=number < 2)
     return len(judged)
 
 
@@ -104,13 +102,13 @@ def judge_task(task: Task) -> int:
     if type(task).plant is not Task.plant:
         return 0
     rng = np.random.default_rng(0)
-    z = task.starts(TRIED, rng)
+    z = task.starts(50, rng)
     settings = LoopSettings(
         min(task.max_steps, SAMPLES), record=True, states=False, vary=True, quiet=True
     )
     run = closed_loop(task, PolicyController(_AnyInputs(task, rng)), z, settings=settings)
     start = task.state(z, settings.rng_of_starts(0))
-    return judge(task, run, start, np.arange(TRIED)[::-1])
+    return judge(task, run, start, np.arange(len(z))[::-1])
 
 
 def judge_beginning(
@@ -125,7 +123,7 @@ def judge_beginning(
     beginning = replace(
         run,
         length=np.minimum(run.length, SAMPLES),
-        limit=np.where(cut, LONGER, run.limit),
+        limit=np.where(cut, 10**9, run.limit),  # longer than any episode
         outcome=np.where(cut, Outcome.RUNNING, run.outcome),
         true=run.true[: SAMPLES + 1],
         u=run.u[:SAMPLES],

@@ -1,32 +1,31 @@
 """The closed loop of task, noise and controller, for many starts at once."""
 
+from __future__ import annotations
+
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from itertools import count
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hyrl_mj.physics.plant import Plant
 from hyrl_mj.policies import Asked, Controller, nothing_past, remembering
+from hyrl_mj.simulation.checked_noise import check_repeats, drawn, is_own
 from hyrl_mj.simulation.noise import (
     NOT_STARTED,
     AnyNoise,
     Sample,
     Signal,
-    check_repeats,
-    drawn,
-    is_own,
     signal_for,
 )
 from hyrl_mj.simulation.passing import Follower, Passing
 from hyrl_mj.system.progress import progress_bar
-from hyrl_mj.tasks import Outcome, Task
+from hyrl_mj.tasks import Outcome
 
-# Samples for which a record has room at first; then it doubles.
-GROWS = 64
-# Samples in which noise of a user's class is drawn twice, to see whether its seed decides it.
-TWINS = 8
+if TYPE_CHECKING:
+    from hyrl_mj.physics.plant import Plant
+    from hyrl_mj.tasks import Task
 
 
 @dataclass(frozen=True)
@@ -162,7 +161,8 @@ def closed_loop(
         rows = every if together else active
         now = Sample(rows, k[rows], measurement[rows], q[rows], plant, past[rows])
         errors = _noise(signal, now, ahead, measurement)
-        if twin is not None and ahead is None and tick < TWINS:
+        # Noise of a user's class is drawn twice at first, to see whether its seed decides it.
+        if twin is not None and ahead is None and tick < 8:
             check_repeats(signal, errors, twin, now)
         measured = plant.observe(now.measurement, errors, rows)
         if plant.late:  # what the last step came to is known only now
@@ -248,10 +248,13 @@ def _noise(
 
 
 class _Table:
-    """Values (K, n, ...) of n runs, which may be at different samples; NaN where there are none."""
+    """Values (K, n, ...) of n runs, which may be at different samples; NaN where there are none.
+
+    There is room for 64 samples at first; then it doubles.
+    """
 
     def __init__(self, n: int, shape: tuple[int, ...]):
-        self.values = np.full((GROWS, n, *shape), np.nan)
+        self.values = np.full((64, n, *shape), np.nan)
 
     def put(self, k: np.ndarray, rows: np.ndarray, values: np.ndarray) -> None:
         """Takes values (r, ...) of the samples k (r,) of the runs `rows` (r,)."""

@@ -5,28 +5,35 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import StrEnum
 from itertools import product
 
 import numpy as np
 
 from hyrl_mj.policies import Controller
+from hyrl_mj.simulation.attack_settings import AttackSettings
 from hyrl_mj.simulation.lookahead import Lookahead
 from hyrl_mj.tasks import Task
 
-# What the answers of a controller to noise are chosen for, beside steering to either end of an input.
-CONTRARY, STRAIGHT, REVERSE, JUMP, STAY = "contrary", "straight", "reverse", "jump", "stay"
-# The kinds of the other rules.
-STEER, CONSTANT, ALTERNATING, FLIP, PERIODIC = (
-    "steer",
-    "constant",
-    "alternating",
-    "flip",
-    "periodic",
-)
-TURN, NOTHING, AHEAD = "turn", "none", "ahead"
-# A flip is tried at so many times, spread over the length of a run, and two neighbouring periods have this
-# ratio: a resonance with a quality factor of five still answers to the nearer of them.
-FLIPS, PERIOD_RATIO = 8, 1.2
+
+class RuleKind(StrEnum):
+    """The kinds of rules; the first five say what the answers of a controller to noise are chosen for."""
+
+    CONTRARY = "contrary"
+    STRAIGHT = "straight"
+    REVERSE = "reverse"
+    JUMP = "jump"
+    STAY = "stay"
+    STEER = "steer"
+    CONSTANT = "constant"
+    ALTERNATING = "alternating"
+    FLIP = "flip"
+    PERIODIC = "periodic"
+    TURN = "turn"
+    NOTHING = "none"
+    AHEAD = "ahead"
+
+
 # With more noisy columns than this, rules of noise act on each of them alone and on all together, since
 # their combinations are too many.
 COMBINED = 3
@@ -46,9 +53,9 @@ class Rule:
         turns: whether the sign is the other one while the mode is not the first of the run.
     """
 
-    kind: str
+    kind: RuleKind
     noise: np.ndarray
-    wish: str | tuple[int, int] | None = None
+    wish: RuleKind | tuple[int, int] | None = None
     period: int = 0
     flip: int = 0
     turns: bool = False
@@ -77,6 +84,7 @@ class Rules:
         shares: (p,) how much of the bound acts on each column of the measurement.
         length: the length of a run without noise [samples], over which the times of flips are spread; by
             default that of an episode.
+        settings: at how many times, and with which periods, signs change.
 
     Attributes:
         bound, shares: as above.
@@ -95,23 +103,29 @@ class Rules:
         bound: float,
         shares: np.ndarray,
         length: int | None = None,
+        settings: AttackSettings = AttackSettings(),
     ):
         self.bound, self.shares = bound, shares
         self.candidates = bound * _directions(shares != 0) * shares
         none, inputs = np.zeros(len(shares)), len(task.inputs)
         ends = list(self._ends())
         first, *others = ends if ends else [none]
-        wishes = [Rule(wish, none, wish) for wish in (CONTRARY, STRAIGHT, REVERSE)]
-        wishes += [Rule(STEER, none, wish) for wish in product(range(inputs), (1, -1))]
+        wishes = [
+            Rule(wish, none, wish)
+            for wish in (RuleKind.CONTRARY, RuleKind.STRAIGHT, RuleKind.REVERSE)
+        ]
+        wishes += [Rule(RuleKind.STEER, none, wish) for wish in product(range(inputs), (1, -1))]
         own = []
         if len(controller.modes) > 1:
-            own = [Rule(wish, none, wish) for wish in (JUMP, STAY)]
-            own += [Rule(TURN, sign * noise, turns=True) for noise in ends for sign in (1, -1)]
+            own = [Rule(wish, none, wish) for wish in (RuleKind.JUMP, RuleKind.STAY)]
+            own += [
+                Rule(RuleKind.TURN, sign * noise, turns=True) for noise in ends for sign in (1, -1)
+            ]
         common = [*wishes, *_simple(first)]
         for noise in others:
             common += _simple(noise)
-        common += self._timed(first, length or task.max_steps)
-        self.all = [*common, *own, Rule(NOTHING, none), Rule(AHEAD, none)]
+        common += _timed(first, length or task.max_steps, settings)
+        self.all = [*common, *own, Rule(RuleKind.NOTHING, none), Rule(RuleKind.AHEAD, none)]
         self.own = np.arange(len(common), len(common) + len(own))
         # An environment cannot be simulated ahead from the middle of an episode.
         self.lookahead = (
@@ -122,7 +136,11 @@ class Rules:
         self.common = np.arange(len(common))
         if self.lookahead is not None:  # it is the strongest, and takes longer than the others
             self.common = np.insert(self.common, len(wishes) + 3, self.ahead)
-        held = [number for number, r in enumerate(self.all) if not r.flip and r.kind != PERIODIC]
+        held = [
+            number
+            for number, r in enumerate(self.all)
+            if not r.flip and r.kind != RuleKind.PERIODIC
+        ]
         self.parts = np.array(held[:-1])  # without `ahead`
         self.noise = np.array([rule.noise for rule in self.all])
         self.period = np.array([rule.period for rule in self.all])
@@ -163,21 +181,22 @@ class Rules:
             noise[noisy] = np.array(factors) * self.bound * np.abs(self.shares[noisy])
             yield noise
 
-    @staticmethod
-    def _timed(noise: np.ndarray, length: int) -> Iterator[Rule]:
-        """Yields the rules of a noise (p,) that turns once, or with a period, in runs of a length."""
-        times = np.ceil(length * np.arange(1, FLIPS + 1) / (FLIPS + 1)).astype(int)
-        for flip in np.unique(times[times > 0]):
-            yield from (Rule(FLIP, sign * noise, flip=int(flip)) for sign in (1, -1))
-        periods = 3 * PERIOD_RATIO ** np.arange(math.ceil(math.log(max(length, 3), PERIOD_RATIO)))
-        for period in np.unique(np.rint(periods[periods <= length]).astype(int)):
-            yield Rule(PERIODIC, noise, period=int(period))
+
+def _timed(noise: np.ndarray, length: int, settings: AttackSettings) -> Iterator[Rule]:
+    """Yields the rules of a noise (p,) that turns once, or with a period, in runs of a length."""
+    flips, ratio = settings.flips, 1 + settings.period_step
+    times = np.ceil(length * np.arange(1, flips + 1) / (flips + 1)).astype(int)
+    for flip in np.unique(times[times > 0]):
+        yield from (Rule(RuleKind.FLIP, sign * noise, flip=int(flip)) for sign in (1, -1))
+    periods = 3 * ratio ** np.arange(math.ceil(math.log(max(length, 3), ratio)))
+    for period in np.unique(np.rint(periods[periods <= length]).astype(int)):
+        yield Rule(RuleKind.PERIODIC, noise, period=int(period))
 
 
 def _simple(noise: np.ndarray) -> list[Rule]:
     """Returns the rules of a noise (p,) of both signs and of alternating ones."""
-    constant = [Rule(CONSTANT, sign * noise) for sign in (1, -1)]
-    return [*constant, Rule(ALTERNATING, noise, period=2)]
+    constant = [Rule(RuleKind.CONSTANT, sign * noise) for sign in (1, -1)]
+    return [*constant, Rule(RuleKind.ALTERNATING, noise, period=2)]
 
 
 def _directions(noisy: np.ndarray) -> np.ndarray:

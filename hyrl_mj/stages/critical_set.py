@@ -7,12 +7,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from hyrl_mj.errors import BadInput, unknown
+from hyrl_mj.errors import BadInput, counted, unknown
 from hyrl_mj.files.artifacts import Saved
 from hyrl_mj.learning import WaySettings
 from hyrl_mj.policies import Policy
-from hyrl_mj.sets import Chart, Nodes, covering
+from hyrl_mj.sets import Nodes, covering
 from hyrl_mj.simulation import WayRuns, policy_runs, way_runs
+from hyrl_mj.stages.meeting import ranges
 from hyrl_mj.stages.search import critical_points
 from hyrl_mj.tasks import SEARCHES, Task
 
@@ -50,7 +51,7 @@ class CriticalSet(Saved):
     @property
     def _counts(self) -> str:
         counts = {"piece": self.pieces, "point": len(self.points)}
-        return ", ".join(f"{n} {name}{'s' * (n != 1)}" for name, n in counts.items())
+        return ", ".join(counted(n, name) for name, n in counts.items())
 
     @property
     def pieces(self) -> int:
@@ -65,18 +66,6 @@ class CriticalSet(Saved):
                 f"{self.resolution:.3g} {task.chart.units[0]})"
             )
         return f"critical set of {self._counts}, {ranges(task.chart, self.points, self.resolution)}"
-
-
-def ranges(chart: Chart, points: np.ndarray, resolution: float) -> str:
-    """Returns the range of points (N, d) along each coordinate: "x 0 to 0.45 m, y 0.1 m"."""
-    ends = zip(chart.names, chart.units, points.min(axis=0), points.max(axis=0), strict=True)
-    fine = resolution / 100 or 1e-12  # what is hardly off 0 is 0
-    return ", ".join(
-        f"{name} {a:.4g} to {b:.4g} {unit}"
-        if b - a > resolution
-        else f"{name} {round((a + b) / 2 / fine) * fine + 0.0:.4g} {unit}"
-        for name, unit, a, b in ends
-    )
 
 
 def find_critical_set(

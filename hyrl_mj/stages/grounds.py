@@ -10,6 +10,7 @@ from hyrl_mj.learning import ModeSettings
 from hyrl_mj.learning.training import Score
 from hyrl_mj.policies import MlpPolicy, Policy
 from hyrl_mj.sets import GridSet
+from hyrl_mj.simulation import AttackSettings
 from hyrl_mj.stages.extended_sets import ExtendedSets
 from hyrl_mj.stages.judges import ByAttack, ByEpisodes, ByGame, ByShare, Judge, Judged
 from hyrl_mj.stages.mode_states import ModeStates
@@ -25,6 +26,7 @@ def mode_ground(
     policy: Policy | None = None,
     table: bool = False,
     settings: ModeSettings = ModeSettings(),
+    attacks: AttackSettings = AttackSettings(),
 ) -> ModeGround:
     """Returns the ground of a mode.
 
@@ -39,13 +41,14 @@ def mode_ground(
         policy: the stage-1 policy, or the agent, which shows how close to the set-point a run can end.
         table: whether a table of inputs can be made, which may succeed where the agent does not.
         settings: where trainings start, and when a policy is good enough.
+        attacks: what signals an attack tries.
     """
     states = ModeStates(task, extended, mode, anywhere=table)
     judge: Judge
     if states.rewarded:
         judge, parts = ByShare(states, settings), None
     elif task.effort.attacked:
-        judge = ByAttack(states, settings, policy)
+        judge = ByAttack(states, settings, policy, attacks)
     elif game.Lattice.decides(task, states.grid):
         judge = ByGame(states, settings)
     else:

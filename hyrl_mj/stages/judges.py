@@ -15,11 +15,10 @@ from hyrl_mj.learning import ModeSettings
 from hyrl_mj.learning.training import Score
 from hyrl_mj.policies import Policy, PolicyController
 from hyrl_mj.sets import distance_to
-from hyrl_mj.simulation import KINDS, LoopSettings, Noise, closed_loop
+from hyrl_mj.simulation import KINDS, AttackSettings, LoopSettings, Noise, closed_loop
 from hyrl_mj.stages.mode_states import ModeStates
 from hyrl_mj.tasks import Outcome
 
-QUIET = KINDS[0]
 # Starts from which a policy is attacked.
 ATTACKED = 64
 # A number of a batch, and the kind of noise that it is played with.
@@ -180,7 +179,7 @@ class Episodes:
         starts, noisy = self.starts[rows], task.with_noise(states.shares)
         run = closed_loop(noisy, controller, starts, noise, seed=int(rows[0]), settings=settings)
         ends, won = run.path[-1], run.outcome == Outcome.REACHED
-        won = won & task.arrived(ends) if kind == QUIET else won
+        won = won & task.arrived(ends) if kind == game.NO_NOISE else won
         return won, task.miss(ends)
 
     def share(self, policy: Policy, plays: Sequence[Play]) -> float:
@@ -228,7 +227,9 @@ class ByEpisodes:
         self.few_plays = self.plays[: 3 * len(kinds)]
         self.enough: Score = (float(len(self.plays)), -1.0)
         # As close as the stage-1 policy ends where it arrives, if it does.
-        quiet = [self.episodes.play(policy, k, QUIET) for k in range(count)] if policy else []
+        quiet = (
+            [self.episodes.play(policy, k, game.NO_NOISE) for k in range(count)] if policy else []
+        )
         ends = np.concatenate([np.empty(0), *(miss[won] for won, miss in quiet)])
         farthest, task = float(ends.max(initial=0.0)), states.task
         if np.isfinite(task.precision):
@@ -241,7 +242,7 @@ class ByEpisodes:
         farthest, plays = 0.0, self.few_plays if twin == 1 else self.plays
         for survived, (batch, kind) in enumerate(plays):
             won, miss = self.episodes.play(policy, batch, kind)
-            farthest = max(farthest, miss.max()) if kind == QUIET else farthest
+            farthest = max(farthest, miss.max()) if kind == game.NO_NOISE else farthest
             if not won.all():
                 lost = self.episodes.nodes(batch, won)
                 return Judged(
@@ -269,8 +270,14 @@ class ByAttack:
 
     settled = 0.0
 
-    def __init__(self, states: ModeStates, settings: ModeSettings, policy: Policy | None):
-        self.states, self.settings = states, settings
+    def __init__(
+        self,
+        states: ModeStates,
+        settings: ModeSettings,
+        policy: Policy | None,
+        attacks: AttackSettings,
+    ):
+        self.states, self.settings, self.attacks = states, settings, attacks
         self.noisy = ByEpisodes(states, settings, policy, KINDS[:-1])
         self.noise, self.margin = self.noisy.noise, self.noisy.margin
         self.enough: Score = (1.0, *self.noisy.enough)
@@ -287,7 +294,7 @@ class ByAttack:
 
     def judge(self, policy: Policy, twin: float | None = None) -> Judged:
         episodes = self.noisy.episodes
-        quiet = [episodes.play(policy, k, QUIET)[0] for k in range(episodes.count)]
+        quiet = [episodes.play(policy, k, game.NO_NOISE)[0] for k in range(episodes.count)]
         lost = np.concatenate([episodes.nodes(k, won) for k, won in enumerate(quiet)])
         weight, won = np.ones(len(lost)), float(np.concatenate(quiet).mean())
         if won < self.settings.worth_attacking:
@@ -295,8 +302,11 @@ class ByAttack:
         task = self.states.task.with_noise(self.states.shares)
         controllers = {"mode": PolicyController(policy)}
         # What is reported comes from the attack of the examination: other starts, another seed, more rounds.
-        starts, budget = self.attacked, Budget(rounds=1)
-        found = attack(task, controllers, starts, self.noise.bound, budget, seed=20_220_608)["mode"]
+        starts, budget, seed = self.attacked, Budget(rounds=1), 20_220_608
+        attacks = attack(
+            task, controllers, starts, self.noise.bound, budget, seed=seed, settings=self.attacks
+        )
+        found = attacks["mode"]
         withstood = 1 - (found.count.unaided + found.count.lost) / len(starts)
         both = (won + withstood) / 2
         if both < 1:

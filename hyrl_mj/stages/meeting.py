@@ -7,12 +7,10 @@ from itertools import product
 
 import numpy as np
 
+from hyrl_mj.errors import counted
 from hyrl_mj.sets import Chart, Cloud, GridSet, Nodes
-from hyrl_mj.stages.critical_set import ranges
 from hyrl_mj.tasks import Task
 
-# How far around a point of M* parts are looked at, in cells.
-AROUND = 1.5
 # The room is found to this share of what the noise needs.
 STEP = 0.02
 
@@ -38,11 +36,11 @@ def around(points: np.ndarray, parts: Sequence[GridSet]) -> np.ndarray:
 
 def _steps(grid: Nodes) -> np.ndarray:
     """Returns the steps (k, d) from a point to those around it: of a cloud, along each noisy coordinate."""
-    d = grid.chart.dimension
+    d, cells = grid.chart.dimension, 1.5
     if isinstance(grid, Cloud):
-        along = np.diag(AROUND * grid.cell * grid.shares * grid.chart.scale)
+        along = np.diag(cells * grid.cell * grid.shares * grid.chart.scale)
         return np.vstack([np.zeros(d), along, -along])
-    return AROUND * grid.spacing * np.array(list(product((-1, 0, 1), repeat=d)))
+    return cells * grid.spacing * np.array(list(product((-1, 0, 1), repeat=d)))
 
 
 def rooms(
@@ -143,7 +141,7 @@ def narrow_sentence(
             f"{2 * eps:g} {unit} of room are needed, and as little as {left:.2g} is left"
         )
     if more := len(pairs) - len(said):
-        said.append(f"nor in places between {more} other pair{'s' * (more > 1)} of modes")
+        said.append(f"nor in places between {counted(more, 'other pair')} of modes")
     return "; ".join(said)
 
 
@@ -159,3 +157,15 @@ def _where(chart: Chart, points: np.ndarray, narrow: np.ndarray) -> str:
     if not chart.periodic[axis] and (narrow == (along <= last)).all():
         return f"up to {name} = {last:.3g} {unit}"
     return f"in places at {ranges(chart, points[narrow], 1e-3)}"
+
+
+def ranges(chart: Chart, points: np.ndarray, resolution: float) -> str:
+    """Returns the range of points (N, d) along each coordinate: "x 0 to 0.45 m, y 0.1 m"."""
+    ends = zip(chart.names, chart.units, points.min(axis=0), points.max(axis=0), strict=True)
+    fine = resolution / 100 or 1e-12  # what is hardly off 0 is 0
+    return ", ".join(
+        f"{name} {a:.4g} to {b:.4g} {unit}"
+        if b - a > resolution
+        else f"{name} {round((a + b) / 2 / fine) * fine + 0.0:.4g} {unit}"
+        for name, unit, a, b in ends
+    )

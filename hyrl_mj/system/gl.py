@@ -16,9 +16,6 @@ import sys
 from contextlib import chdir
 from pathlib import Path
 
-# GL backends that need no screen, in the order in which they are tried.
-HEADLESS = ("egl", "osmesa")
-
 
 def has_display() -> bool:
     """Returns whether windows can be opened: without a display they cannot on Linux."""
@@ -30,7 +27,8 @@ def import_mujoco() -> str:
     """Imports MuJoCo with the first GL backend that can be loaded, or else without one.
 
     The backend that `MUJOCO_GL` names is tried; where it is not set, MuJoCo's own choice if there is a
-    display, else `HEADLESS`. `MUJOCO_GL` is left at the backend in use or, without one, at the first tried.
+    display, else those that need no screen. `MUJOCO_GL` is left at the backend in use or, without one, at the
+    first tried.
     Returns why all backends failed; empty if one was loaded or none was needed.
     """
     chosen = os.environ.get("MUJOCO_GL", "")
@@ -38,7 +36,7 @@ def import_mujoco() -> str:
         importlib.import_module("mujoco")
         return ""
     problems = []
-    backends = (chosen,) if chosen else HEADLESS
+    backends = (chosen,) if chosen else ("egl", "osmesa")
     for backend in backends:
         if not (problem := _attempt(backend)):
             return ""

@@ -22,9 +22,6 @@ from typing import Any, TextIO
 
 from hyrl_mj.errors import BadInput, HyrlError, brief, printable
 
-# An interrupt can strike while one of Python's locks is taken, which is then waited for without end: after
-# this time the process ends by itself [s].
-GRACE = 5.0
 INTERRUPTED = "interrupted; finished work is kept, run again to resume"
 
 
@@ -151,7 +148,7 @@ class Streams:
 
     @contextmanager
     def _interruptible(self) -> Iterator[None]:
-        """Lets an interrupt end the process within `GRACE`, in the block and after it."""
+        """Lets an interrupt end the process within five seconds, in the block and after it."""
         usual = signal.getsignal(signal.SIGINT)
         if (
             usual is not signal.default_int_handler
@@ -177,7 +174,8 @@ class Streams:
 
     def _interrupted(self, *_: object) -> None:
         signal.signal(signal.SIGALRM, self._give_up)
-        signal.setitimer(signal.ITIMER_REAL, GRACE)
+        # It can strike while one of Python's locks is taken, which is then waited for without end.
+        signal.setitimer(signal.ITIMER_REAL, 5.0)  # [s] after which the process ends by itself
         raise KeyboardInterrupt
 
     def _give_up(self, *_: object) -> None:

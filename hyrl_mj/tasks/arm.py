@@ -86,7 +86,7 @@ class Arm(Task):
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         drawn = np.empty((0, 2))
         while len(drawn) < n:
-            z = rng.uniform(self.chart.low, self.chart.high, (2 * n, 2))
+            z = self.chart.draw(2 * n, rng)
             drawn = np.vstack([drawn, z[self.may_start(z)]])
         return drawn[:n]
 

@@ -26,10 +26,6 @@ from hyrl_mj.tasks.trial import (
 
 # Number of starts that are tried.
 STARTS = 64
-# Most combinations of the levels of the inputs.
-MOST_LEVELS = 1_000
-# Most physics steps of a sample.
-SUBSTEPS = 5_000
 # What the values of a task's attributes may be.
 RULES: dict[str, Rule] = {
     "max_steps": Integer(1, 100_000),
@@ -48,9 +44,6 @@ COMPUTED = (
     "at", "perturbed", "outcome", "failed", "goes_on", "noise_in_chart", "noise_on", "noisy_everywhere",
     "with_noise", "code", "spec",
 )  # fmt: skip
-# A noisy column moves a chart point by its share of the noise, up to this factor: cosine and sine together
-# move their angle by 1.4 times theirs.
-APART = 2.0
 
 
 def check_task(task: Task) -> Task:
@@ -163,10 +156,11 @@ def _check_training(task: Task) -> None:
     Number(0, LONGEST, above=True).checked("learning.horizon", learning.horizon)
     Optional(Integer(2, 10**6)).checked("learning.cells", learning.cells)
     Optional(Integer(1, 1_000)).checked("learning.levels", learning.levels)
-    if learning.levels is not None and not 2 <= learning.levels ** len(task.inputs) <= MOST_LEVELS:
+    most = 1_000
+    if learning.levels is not None and not 2 <= learning.levels ** len(task.inputs) <= most:
         raise BadInput(
             f"{learning.levels} levels of each of {len(task.inputs)} input(s) cannot be used: give 2 or "
-            f"more, with at most {MOST_LEVELS:,} combinations, or none"
+            f"more, with at most {most:,} combinations, or none"
         )
     if task.mirror is not None and not isinstance(task.mirror, Mirror):
         raise BadInput(f"mirror is {task.mirror!r}: give a hyrl_mj.Mirror(...), or None")
@@ -205,10 +199,10 @@ def _check_model(task: Task) -> None:
             f"its sample time {task.dt:g} s is no multiple of the physics step "
             f"{model.opt.timestep:g} s in {path.name}: change one of them"
         )
-    if steps > SUBSTEPS:
+    if steps > (most := 5_000):
         raise BadInput(
             f"its sample time {task.dt:g} s takes {steps:,.0f} physics steps of {model.opt.timestep:g} s in "
-            f"{path.name}: give at most {SUBSTEPS:,}"
+            f"{path.name}: give at most {most:,}"
         )
     if problem := mjcf.wrong_physics(model) or memory.late_sensor(model):
         raise BadInput(problem)
@@ -290,7 +284,9 @@ def _check_noise_of_chart(task: Task, measurement: np.ndarray) -> None:
         for column in step * np.diag(shares)
     )
     moved, said = np.max(by, axis=0) / step, shares[: task.chart.dimension]
-    wrong = (moved > APART * said + 1e-6) | (moved * APART < said - 1e-6)
+    # Cosine and sine together move their angle by 1.4 times their share of the noise.
+    apart = 2.0
+    wrong = (moved > apart * said + 1e-6) | (moved * apart < said - 1e-6)
     if wrong.any():
         i = int(wrong.argmax())
         raise BadInput(

@@ -74,7 +74,7 @@ class UnitCircle(Task):
     def starts(self, n: int, rng: np.random.Generator) -> np.ndarray:
         # Half of them are the paper's, around the decision; the others lie all over the circle.
         opposite = self.set_point + np.pi + rng.uniform(-0.2, 0.2, (n, 1))
-        anywhere = rng.uniform(self.chart.low, self.chart.high, (n, 1))
+        anywhere = self.chart.draw(n, rng)
         return np.where(rng.random((n, 1)) < 0.5, opposite, anywhere)
 
     def direction(self, path: np.ndarray) -> np.ndarray:

@@ -7,7 +7,8 @@ matplotlib, Pillow or a GL library, so they are imported only where they are nee
 from hyrl_mj.viz.commands import beginning
 from hyrl_mj.viz.options import ReplayOptions
 from hyrl_mj.viz.sweep_tables import print_sweep
-from hyrl_mj.viz.tables import print_robustness, print_summary, replay_sentence, robustness_sentence
+from hyrl_mj.viz.tables import replay_sentence, robustness_sentence
+from hyrl_mj.viz.terminal import print_robustness, print_summary
 
 __all__ = [
     "ReplayOptions",

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from hyrl_mj.errors import BadInput, printable
+from hyrl_mj.errors import BadInput, counted, printable
 from hyrl_mj.fields import (
     DriveOptions,
     Drives,
@@ -26,7 +26,8 @@ from hyrl_mj.simulation import HybridArc
 from hyrl_mj.tasks import LEFT, RIGHT, Field
 from hyrl_mj.viz.options import USUAL, ReplayOptions
 from hyrl_mj.viz.replay import Show, check_replay, render_replay
-from hyrl_mj.viz.tables import NAMES, Table, print_table
+from hyrl_mj.viz.tables import NAMES, Table
+from hyrl_mj.viz.terminal import print_table
 
 # The controllers with columns of their own, and panes in a replay.
 SHOWN = ("policy", "hyrl")
@@ -34,8 +35,7 @@ SHOWN = ("policy", "hyrl")
 
 def drive_tables(drives: Drives, noise: str, seed: int) -> list[Table]:
     """Returns how the runs ended, a row for each start; under the worst noise, too, if it was looked for."""
-    posts = drives.task.layouts.posts
-    what = f"{posts} post{'s' * (posts != 1)}"
+    what = counted(drives.task.layouts.posts, "post")
     named = "no noise" if noise == "none" else f"{noise} noise of {drives.bounds}"
     near = f"arrived: within {drives.task.reached:g} m of the goal"
     tables = [_table(drives, drives.arcs, f"{what}: {named}, seed {seed}; {near}")]
@@ -133,7 +133,7 @@ def drive_run(
     made_for = run.settings.noise
     for caution in (*cautions(field, local.body), *noise_cautions(local, made_for, options)):
         logging.getLogger("hyrl_mj").warning("warning: %s", printable(caution))
-    drives = drive(local, policy, policies, made_for, field, options)
+    drives = drive(local, policy, policies, made_for, field, options, run.settings.attack)
     for table in drive_tables(drives, options.noise, options.seed):
         print_table(table)
     for sentence in drive_sentences(drives):

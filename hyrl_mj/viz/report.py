@@ -15,7 +15,7 @@ from PIL import Image
 from hyrl_mj.errors import BadInput
 from hyrl_mj.files import artifacts
 from hyrl_mj.judging import POLICIES, listed
-from hyrl_mj.judging.game import MAP_CLASSES, Robustness
+from hyrl_mj.judging.game import MapClass, Robustness
 from hyrl_mj.learning import Training
 from hyrl_mj.policies import Agent, MlpPolicy
 from hyrl_mj.runs.arcs import attack_replay
@@ -85,7 +85,7 @@ def render(run: Run) -> str:
         training=[(name, first.get(name, ""), sixth.get(name, "")) for name in first | sixth],
         commands=commands(run, robustness),
         changed=changed(run),
-        classes=list(zip(MAP_CLASSES, CLASS_COLOURS, strict=True)),
+        classes=[(c.label, colour) for c, colour in zip(MapClass, CLASS_COLOURS, strict=True)],
     )
 
 

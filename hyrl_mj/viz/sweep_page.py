@@ -141,7 +141,7 @@ def _draw(panel: Axes, curves: list[Curve]) -> None:
     """Draws the median and the band of each controller."""
     eps = np.array(curves[0].eps)
     alike = [curve.wins for curve in curves if curve.eps == curves[0].eps]
-    for who, column, label, colour, dashes in (  # of `Wins`
+    for who, column, label, colour, dashes in (  # of `WinningShares`
         ("policy", "won", "RL policy", colours.POLICY, "-"),
         ("hyrl", "proved", "HyRL proved, own q0", colours.MODES[0], "-"),
         ("hyrl", "proved_any", "HyRL proved, any q0", colours.MODES[0], "--"),

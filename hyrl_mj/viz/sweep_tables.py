@@ -13,7 +13,9 @@ from functools import partial
 from hyrl_mj.judging.game import percent
 from hyrl_mj.runs.improvement import Mean, improvements
 from hyrl_mj.runs.sweeps import Row, Sweep, summary
-from hyrl_mj.viz.tables import Table, print_table
+from hyrl_mj.simulation import KINDS
+from hyrl_mj.viz.tables import NAMES, Table
+from hyrl_mj.viz.terminal import print_table
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,10 @@ class Column:
 
 # The texts of numbers, and of shares that are not proved.
 _number, _seconds, _tried = "{:.3g}".format, "{:.2f} s".format, partial(percent, surely=False)
+# The headings of how often a controller arrives, by the figure of each kind of noise.
+_ARRIVES = {
+    f"reached_{kind}": f"arrives, {'no' if kind == 'none' else kind} noise" for kind in KINDS
+}
 # The figures in tables, the most important first: by these the worst run is found.
 COLUMNS = {
     "open": Column("open starts", percent),
@@ -51,30 +57,26 @@ COLUMNS = {
     "hyrl_excursion": Column("excursion", _number, False),
     "hyrl_miss_without_noise": Column("HyRL off the set-point, no noise", _number, False),
 } | {
-    f"{who}_reached_{kind}": Column(f"{title} arrives, {word} noise", percent, least)
-    for who, title, least in (("policy", "RL policy", None), ("hyrl", "HyRL", True))
-    for kind in ("none", "uniform", "alternating", "adversarial")
-    for word in ("no" if kind == "none" else kind,)
+    f"{who}_{name}": Column(f"{NAMES[who]} {heading}", percent, True if who == "hyrl" else None)
+    for who in ("policy", "hyrl")
+    for name, heading in _ARRIVES.items()
 }
 COLUMNS |= {
-    f"{who}_{name}": Column(f"{title} {heading}", show, least if who == "hyrl" else None)
+    f"{who}_{name}": Column(f"{NAMES[who]} {heading}", show, least if who == "hyrl" else None)
     for name, heading, show, least in (
         ("withstood_attack", "not lost under attack", _tried, True),
         ("lost_without_noise", "lost without noise", percent, False),
         ("late", "late", percent, False),
         ("longest", "time, 99%", _number, False),
     )
-    for who, title in (("policy", "RL policy"), ("hyrl", "HyRL"))
+    for who in ("policy", "hyrl")
 }
 # The headings of figures that both controllers have.
 FIGURES: dict[str, tuple[str, Callable[[float], str]]] = {
     "proved": ("proved, own q0", percent),
     "not_broken": ("not broken, own q0", _tried),
     "margin": ("margin", _number),
-    "reached_none": ("arrives, no noise", percent),
-    "reached_uniform": ("arrives, uniform noise", percent),
-    "reached_alternating": ("arrives, alternating noise", percent),
-    "reached_adversarial": ("arrives, adversarial noise", percent),
+    **{name: (heading, percent) for name, heading in _ARRIVES.items()},
     "withstood_attack": ("not lost under attack", _tried),
     "late": ("late", percent),
     "longest": ("time relative to that without noise, 99%", _number),

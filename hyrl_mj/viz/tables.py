@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hyrl_mj.errors import counted
 from hyrl_mj.judging import margin_text
 from hyrl_mj.judging.game import (
     LIMIT,
@@ -78,7 +79,7 @@ def replay_table(run: Run, arcs: Arcs) -> Table:
 def _ending(task: Task, arc: HybridArc) -> Ending:
     """Returns how an arc ended, as `HybridArc.ending`."""
     end = _point(task.chart.wrap(arc.z[-1:])[0])
-    details = f"{arc.t[-1]:.2f} s, {arc.j[-1]} jump{'' if arc.j[-1] == 1 else 's'}"
+    details = f"{arc.t[-1]:.2f} s, {counted(arc.j[-1], 'jump')}"
     return Ending(arc.ending(task).replace("_", " "), details, end, arc.arrives(task))
 
 
@@ -330,72 +331,3 @@ def _point(z: np.ndarray) -> str:
 def _seconds(time: float, won: float) -> str:
     """Returns a worst time to arrival; "-" where nothing is won."""
     return f"{time:.2f} s" if won else "-"
-
-
-# ---- the terminal
-
-
-def print_summary(run: Run) -> None:
-    """Prints the verdict, and the results of policy and hybrid controller in replays and worst case."""
-    arcs = run.arcs()
-    print_verdict(run)
-    print_table(replay_table(run, arcs))
-    print(run.critical_set.sentence(run.task))
-    for q in run.extended_sets.modes:
-        print(f"mode {run.task.mode_name(q)}: {extent(run, q)}")
-    print(replay_sentence(run, arcs))
-    print_robustness(run)
-    print(f"run directory {run.path}")
-    for what, name in (("video", "replay.mp4"), ("report", "report.html")):
-        path = run.path / name
-        print(f"{what} {path}" if run.manifest.has(path) else f"no {what}")
-
-
-def print_verdict(run: Run) -> None:
-    """Prints the verdict with its reasons."""
-    print(run.verdict)
-    for reason in run.verdict.reasons:
-        print(f"- {reason}")
-
-
-def print_robustness(run: Run) -> None:
-    """Prints the scores of the worst-case game and the counts of the noisy episodes."""
-    game, episodes = run.robustness.game, run.robustness.episodes
-    if game is not None:
-        print_table(score_table(run.task, game))
-        if not game.estimate:
-            print_table(margin_table(run.task, game))
-        if game.replays:
-            print_table(replays_table(run.task, game.replays))
-        for who, why in game.why_not_proved.items():
-            print(f"{NAMES[who]} is not proved: {why}")
-    if episodes:
-        print_table(episode_table(run.task, episodes))
-    if attacks := run.robustness.attacks:
-        print_table(attack_table(run.task, attacks))
-        print_table(signals_table(run.task, attacks))
-    if comparisons := run.robustness.comparisons:
-        print_table(comparison_table(run.task, comparisons))
-
-
-def print_table(table: Table) -> None:
-    """Prints a table, every cell whole; on a terminal too narrow for its words, a line for each cell."""
-    import rich.table  # slow to import, and --help does not need it
-    from rich.console import Console
-    from rich.measure import Measurement
-
-    drawn = rich.table.Table(*table.headings, title=table.title)
-    for row in table.rows:
-        drawn.add_row(*map(str, row))
-    # Off a terminal rich assumes 80 columns, which would cut the cells.
-    width = None if Console().is_terminal else 160
-    console = Console(width=width, markup=False, emoji=False, highlight=False)
-    wide = console.options.update(max_width=10_000)  # no table is wider
-    if Measurement.get(console, wide, drawn).minimum <= console.width:
-        console.print(drawn)
-        return
-    print(table.title)
-    for row in table.rows:
-        print()
-        for heading, cell in zip(table.headings, row, strict=True):
-            print(f"{heading}: {cell}")

@@ -221,10 +221,6 @@ def _quantiles(values: np.ndarray) -> tuple[float, float]:
     return float(median), float(most)
 
 
-# What is said of the starts that are replayed: proved, or not known to be lost.
-PROVED_STARTS, WON_STARTS = "proved", "won"
-
-
 @dataclass(frozen=True)
 class LostReplay:
     """A start that is said to be won, and was lost in MuJoCo.
@@ -249,7 +245,7 @@ class ReplayCount:
     Attributes:
         controller: name of the controller.
         eps, everywhere: the bound of the noise, and whether it acts on all coordinates.
-        of: what is said of the starts, "proved" or "won".
+        of: what is said of the starts: "proved", or "won", not known to be lost.
         starts: number of starts that were played, by kind of noise.
         lost: number of those that did not reach the set-point, by kind of noise.
         judged: how many of these episodes, all lost ones among them, were played once more by plain MuJoCo
@@ -289,7 +285,7 @@ class ReplayCount:
     def is_whole(self) -> bool:
         """Whether there are starts, no more of them are lost than there are, and a loss is named."""
         return (
-            self.of in (PROVED_STARTS, WON_STARTS)
+            self.of in ("proved", "won")
             and [*self.starts] == [*self.lost]
             and self.played > 0
             and all(0 <= lost <= self.starts[kind] for kind, lost in self.lost.items())

@@ -28,8 +28,6 @@ from hyrl_mj.tasks import Outcome, Task
 ON_NODE = 1e-3
 # Nodes from which a plant is stepped that moves all of them alike, up to this distance [chart units].
 SAMPLE, ALIKE = 1_000, 1e-9
-# States that are drawn to find out whether an episode can end as a success.
-DRAWN = 20_000
 EPISODES_INSTEAD = (
     "use noisy episodes instead (hyrl-mj robustness RUN --episodes N --noise adversarial)"
 )
@@ -235,8 +233,8 @@ def _ends_well(task: Task) -> bool:
     """Returns whether some episode ends as a success, in the chart or one sample beyond."""
     chart, rng = task.chart, np.random.default_rng(0)
     beyond = np.where(chart.periodic, 0.0, longest(probed_hops(task)))
-    z = rng.uniform(chart.low - beyond, chart.high + beyond, (DRAWN, chart.dimension))
-    plant = task.plant(DRAWN)
+    z = rng.uniform(chart.low - beyond, chart.high + beyond, (20_000, chart.dimension))
+    plant = task.plant(len(z))
     plant.set_state(*task.state(z))
     return bool((task.ending(plant.measurement) == Outcome.REACHED).any())
 

@@ -18,9 +18,6 @@ from hyrl_mj.judging.game.lattice import Lattice
 from hyrl_mj.judging.game.solver import NEVER, Moves, by_target, count_down, entries, nodes_within
 from hyrl_mj.sets import GridSet, within_reach
 
-# Parts whose depths differ by no more than this meet there [chart units].
-ON_BOUNDARY = 1e-9
-
 
 @dataclass(frozen=True)
 class Limit:
@@ -63,7 +60,8 @@ class Limit:
         ends = after[:, 0]
         moved = lattice.grid.chart.difference(nodes[np.minimum(ends, lattice.nodes - 1)], nodes)
         hop = np.abs(moved[ends < lattice.nodes]).max(axis=0)
-        sides = depth <= depth.min(axis=0) + ON_BOUNDARY
+        # Parts of the same depth meet there.
+        sides = depth <= depth.min(axis=0) + 1e-9  # [chart units]
         return Limit(lattice, inside, sides, samples, level, hop)
 
     @cached_property

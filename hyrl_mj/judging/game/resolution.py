@@ -18,15 +18,10 @@ CURVE_CELLS = {1: 3_000, 2: 240, 3: 80}
 # Transitions of a lattice that is asked for, at most: the whole game takes up to 200 bytes for each. One that
 # is chosen has as many as the task's effort says.
 MOST_TRANSITIONS = 2**24
-# Share of the cells that is left where a lattice is too large.
-FEWER = 0.97
-# States from which a plant is stepped to find out how far it moves, and values of each of m inputs. Without
-# an inner loop the distance is linear in the inputs.
-PROBES, ENDS = 200, 2
-# Distances that differ by less than this share of a chart's side are the same. To align nodes with hops, the
-# number of cells changes by this share at most.
-SAME, SHIFTED = 1e-6, 0.4
-VALUES = {1: 17, 2: 9, 3: 5}
+# States from which a plant is stepped to find out how far it moves.
+PROBES = 200
+# Distances that differ by less than this share of a chart's side are the same.
+SAME = 1e-6
 
 
 def lattice_grid(task: Task, cells: int = 0, most: int | None = None) -> Grid:
@@ -56,9 +51,9 @@ def lattice_grid(task: Task, cells: int = 0, most: int | None = None) -> Grid:
     hop_counts, most_of_all = common_hops(task, hops), task.effort.transitions
     while True:
         number = np.maximum(np.round(cells * sides / sides.max()).astype(int), 2)
-        # Samples that lead from node to node are worth a few cells more or less.
+        # Samples that lead from node to node are worth a change of the number of cells by 40%.
         aligned = np.round(number / hop_counts).astype(int) * hop_counts
-        aligned = np.where(np.abs(aligned - number) <= SHIFTED * number, aligned, number)
+        aligned = np.where(np.abs(aligned - number) <= 0.4 * number, aligned, number)
         for counts in (aligned, number):
             grid = Grid(chart, tuple(int(k) for k in counts + ~np.array(chart.periodic)))
             fits = (
@@ -67,7 +62,7 @@ def lattice_grid(task: Task, cells: int = 0, most: int | None = None) -> Grid:
             )
             if fits or cells <= 2:
                 return grid
-        cells = int(cells * FEWER)
+        cells = int(cells * 0.97)
 
 
 def curve_grid(task: Task, cells: int = 0) -> Grid:
@@ -86,9 +81,10 @@ def probed_hops(task: Task) -> np.ndarray:
     """
     low, high = task.input_limits
     m, levels = len(low), task.learning.levels
-    values = levels or (VALUES.get(m, 3) if task.has_inner_loop else ENDS)
+    # Values of each input. Without an inner loop the distance is linear in the inputs.
+    values = levels or ({1: 17, 2: 9, 3: 5}.get(m, 3) if task.has_inner_loop else 2)
     rng, chart = np.random.default_rng(0), task.chart
-    z = rng.uniform(chart.low, chart.high, (PROBES, chart.dimension))
+    z = chart.draw(PROBES, rng)
     if task.abilities.stopped_by_walls:  # outside of them
         z = task.starts(PROBES, rng)
     plant, hops = task.plant(PROBES), []

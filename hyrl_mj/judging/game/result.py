@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 from typing import ClassVar
 
@@ -16,18 +17,31 @@ from hyrl_mj.sets import Chart, Grid
 
 # Name of the limit, a controller that is scored beside the examined ones.
 LIMIT = "limit"
-# Classes of the maps.
-WON, WON_FROM_SOME, UNCLEAR, BEATEN, UNWINNABLE, OVER = range(6)
-MAP_CLASSES = (
-    "proved to be won from every start mode",
-    "proved to be won if the controller picks the start mode",
-    "neither proved nor lost",
-    "lost to the worst noise",
-    "not winnable by this split",
-    "over",
-)
 # A share of at least this much counts as nearly all.
 NEARLY = 0.99
+
+
+class MapClass(IntEnum):
+    """What a map says of a node."""
+
+    WON = 0
+    WON_FROM_SOME = 1
+    UNCLEAR = 2
+    BEATEN = 3
+    UNWINNABLE = 4
+    OVER = 5
+
+    @property
+    def label(self) -> str:
+        """The class in words."""
+        return (
+            "proved to be won from every start mode",
+            "proved to be won if the controller picks the start mode",
+            "neither proved nor lost",
+            "lost to the worst noise",
+            "not winnable by this split",
+            "over",
+        )[self]
 
 
 def percent(share: float, surely: bool = True) -> str:
@@ -100,7 +114,7 @@ class Score(NodeScore):
 
 
 @dataclass(frozen=True)
-class Wins:
+class WinningShares:
     """What a controller wins at each noise bound of a curve.
 
     Attributes:
@@ -131,7 +145,7 @@ class Curve:
 
     eps: tuple[float, ...]
     winnable: tuple[float, ...]
-    wins: dict[str, Wins]
+    wins: dict[str, WinningShares]
 
 
 @dataclass(frozen=True)
@@ -156,14 +170,12 @@ class LatticeSpacing:
         exact: whether every sample leads from node to node.
         cells: whether the starts of the scores are cells.
         curve_spacing: distance on the lattice on which the curve is computed.
-        contacts: whether contacts stop the robot between the nodes.
     """
 
     spacing: tuple[float, ...]
     exact: bool
     cells: bool
     curve_spacing: tuple[float, ...]
-    contacts: bool = False
 
 
 @dataclass(frozen=True)
@@ -333,7 +345,7 @@ class Maps(artifacts.Saved):
     Attributes:
         eps: bound of the noise.
         grid_counts: (d,) number of nodes along each coordinate.
-        map: for each controller, the class (N,) of every node, an index into `MAP_CLASSES`.
+        map: for each controller, the `MapClass` (N,) of every node.
     """
 
     KIND: ClassVar[str] = "robustness maps"

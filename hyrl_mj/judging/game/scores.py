@@ -6,12 +6,11 @@ from functools import cached_property
 import numpy as np
 
 from hyrl_mj.errors import BadInput, unknown
-from hyrl_mj.judging.game import result
 from hyrl_mj.judging.game.adversary import WorstEstimate, WorstNoise
 from hyrl_mj.judging.game.lattice import Lattice
 from hyrl_mj.judging.game.limit import Limit
 from hyrl_mj.judging.game.resolution import lattice_grid
-from hyrl_mj.judging.game.result import LIMIT, NodeScore
+from hyrl_mj.judging.game.result import LIMIT, MapClass, NodeScore
 from hyrl_mj.judging.game.solver import NEVER, Answers, Moves, lasting, noisy_moves, solve
 from hyrl_mj.policies import Controller, Policy, as_controller
 from hyrl_mj.sets import Grid, GridSet
@@ -124,13 +123,13 @@ class Game:
         return value
 
     def map(self, name: str, eps: float) -> np.ndarray:
-        """Returns the class (N,) of every node, an index into `MAP_CLASSES`, as if nodes were all states."""
+        """Returns the `MapClass` (N,) of every node, as if nodes were all states."""
         value = self.value(name, eps)[:, :-2]
-        classes = np.full(self.lattice.nodes, result.BEATEN, dtype=np.int8)
-        classes[value[-1] < NEVER] = result.WON_FROM_SOME
-        classes[(value < NEVER).all(axis=0)] = result.WON
-        classes[(classes == result.BEATEN) & ~self.winnable(eps)] = result.UNWINNABLE
-        classes[~self.lattice.running] = result.OVER
+        classes = np.full(self.lattice.nodes, MapClass.BEATEN, dtype=np.int8)
+        classes[value[-1] < NEVER] = MapClass.WON_FROM_SOME
+        classes[(value < NEVER).all(axis=0)] = MapClass.WON
+        classes[(classes == MapClass.BEATEN) & ~self.winnable(eps)] = MapClass.UNWINNABLE
+        classes[~self.lattice.running] = MapClass.OVER
         return classes
 
     def margin(self, name: str, near: tuple[float, float] | None = None) -> float | None:

@@ -20,8 +20,6 @@ from hyrl_mj.judging.game.lattice import Lattice
 from hyrl_mj.policies import Controller
 from hyrl_mj.sets import within_reach
 
-# Distance from a node within which its answer has to be the same, in cells.
-BESIDE = 1e-4
 # The greater a value, the worse for the controller: k < NEVER means "arrives after k samples at the latest",
 # LOST - k means "fails after k samples".
 NEVER = 1 << 20
@@ -83,7 +81,8 @@ class Answers:
             return np.concatenate([answer(q, part) for part in parts])
 
         answers, all_settled = [], []
-        beside = BESIDE * grid.spacing * np.eye(len(axes))[bound > 0]
+        # An answer is settled if it is the same this far beside its measurement.
+        beside = 1e-4 * grid.spacing * np.eye(len(axes))[bound > 0]
         for q in (*modes, None):
             index = answers_of(q, measured.reshape(-1, len(axes))).reshape(measured.shape[:-1])
             settled = np.ones(index.shape, dtype=bool)

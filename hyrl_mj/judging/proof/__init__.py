@@ -1,12 +1,12 @@
 """What is proved of a controller: the worst-case game on closed cells, with its answers bounded from outside.
 
-`Certificate` proves what is won from every state and under every noise signal within a bound; `attack` finds
-signals that really win against the controller. The game decides where cells cover the chart (`decides`);
-`why_no_cells` tells what is in the way.
+`Certificate` proves what is won from every state and under every noise signal within a bound;
+`find_counterexamples` finds signals that really win against the controller. The game decides where cells
+cover the chart (`decides`); `why_no_cells` tells what is in the way.
 """
 
 from hyrl_mj.judging.proof.cells import decides, why_no_cells
 from hyrl_mj.judging.proof.certificate import Certificate
-from hyrl_mj.judging.proof.counterexamples import Broken, CellNoise, attack
+from hyrl_mj.judging.proof.counterexamples import Broken, CellNoise, find_counterexamples
 
-__all__ = ["Broken", "CellNoise", "Certificate", "attack", "decides", "why_no_cells"]
+__all__ = ["Broken", "CellNoise", "Certificate", "decides", "find_counterexamples", "why_no_cells"]

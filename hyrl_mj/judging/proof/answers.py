@@ -16,13 +16,6 @@ from hyrl_mj.policies import ON_EDGE, Controller, HybridController, PolicyContro
 from hyrl_mj.sets import Everything, Grid, GridSet, StateSet
 from hyrl_mj.tasks import Task
 
-# Boxes of measurements along one side of a cell, for coordinates with noise.
-FINE = 2
-# The most cells that one sample can lead to; each takes a mask of all boxes.
-MOST_SHIFTS = 512
-# The answers are first bounded in blocks of so many boxes along each side.
-BLOCK = 8
-
 
 @dataclass(frozen=True)
 class Boxes:
@@ -42,7 +35,7 @@ class Boxes:
     def around(cells: Cells, bound: np.ndarray) -> Boxes:
         """Returns the boxes for noise within bounds (d,)."""
         grid = cells.lattice.grid
-        fine = np.where(bound > 0, FINE, 1)
+        fine = np.where(bound > 0, 2, 1)  # boxes along one side of a cell
         pad = np.ceil(bound / grid.spacing + 1).astype(int)
         return Boxes(cells, fine, np.where(grid.chart.periodic, 0, pad))
 
@@ -70,7 +63,8 @@ class Boxes:
                 answers, or the ends of intervals (n, 2, m).
         """
         counts, d = np.array(self.counts), len(self.counts)
-        size = np.where(counts >= BLOCK, BLOCK, 1)
+        block = 8  # boxes along each side, at first
+        size = np.where(counts >= block, block, 1)
         index = _all(-(-counts // size)) * size
         whole: np.ndarray | None = None
         while len(index):
@@ -271,9 +265,10 @@ def _shifts(boxes: Boxes, policy: BoundedPolicy) -> Iterator[tuple[np.ndarray, n
 def _between(first: np.ndarray, last: np.ndarray) -> Iterator[np.ndarray]:
     """Yields all shifts (d,) from the least of the first (n, d) to the greatest of the last (n, d)."""
     ranges = [*zip(first.min(axis=0), last.max(axis=0) + 1, strict=True)]
-    if (number := int(np.prod([b - a for a, b in ranges]))) > MOST_SHIFTS:
+    most = 512  # each takes a mask of all boxes
+    if (number := int(np.prod([b - a for a, b in ranges]))) > most:
         raise Unbounded(
-            f"one sample can lead to {number:,} different cells, more than {MOST_SHIFTS}: give fewer cells "
+            f"one sample can lead to {number:,} different cells, more than {most}: give fewer cells "
             "(`lattice` in the settings)"
         )
     yield from map(np.array, product(*(range(a, b) for a, b in ranges)))

@@ -25,11 +25,8 @@ DEFAULTS = (
     "z", "at", "with_z", "state", "measure", "mocap", "outcome", "plant", "placed", "check_measurement",
     "check_noise", "noise_in_chart",
 )  # fmt: skip
-FOLLOWED = ("observation", "ending", "verdict")
 # States at which the operations that were followed are compared with the method.
 COMPARED = 1_000
-# Sizes of other batches in which it is asked for the same rows.
-SIZES = (1, 2, 7, 33, 150, 600)
 
 
 def check_assumptions(task: Task) -> None:
@@ -55,7 +52,7 @@ def check_assumptions(task: Task) -> None:
         )
     if why := memory.remembers(model) or memory.why_not_direct(model):
         raise Unbounded(f"the plant of {task.name} may not follow its inputs at once: {why}")
-    for name in FOLLOWED:
+    for name in ("observation", "ending", "verdict"):
         program = program_of(task, getattr(task, name), _method(task, name))
         _check_turns(task, name, program)
         _check_program(task, name, program)
@@ -92,9 +89,9 @@ def _check_program(task: Task, name: str, program: Program) -> None:
     beyond = chart.sides * (0.1 + np.array(chart.periodic))
     z = rng.uniform(chart.low - beyond, chart.high + beyond, (COMPARED, chart.dimension))
     found = bounds_of(program, _method(task, name), Affine.box(z, np.zeros(chart.dimension)))
-    order = rng.permutation(COMPARED)
+    order, fewer = rng.permutation(COMPARED), (1, 2, 7, 33, 150, 600)
     try:
-        parts = [method(z), method(z[order])[np.argsort(order)], *(method(z[:k]) for k in SIZES)]
+        parts = [method(z), method(z[order])[np.argsort(order)], *(method(z[:k]) for k in fewer)]
     except BadInput as error:
         raise Unbounded(f"{_method(task, name)} cannot be followed: {error}") from error
     for given in parts:

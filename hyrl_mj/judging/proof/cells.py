@@ -248,7 +248,7 @@ def _error(lattice: Lattice, slope: np.ndarray, offset: np.ndarray) -> np.ndarra
     off = np.abs(lattice.hops - lattice.levels @ slope.T - offset).max(axis=0)
     spread = np.zeros_like(off)
     rng, low, high = np.random.default_rng(0), *task.input_limits
-    z = rng.uniform(task.chart.low, task.chart.high, (STATES, task.chart.dimension))
+    z = task.chart.draw(STATES, rng)
     plant = task.plant(STATES)
     plant.set_state(*task.state(z))
     for _ in range(SAMPLES):

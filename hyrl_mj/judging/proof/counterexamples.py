@@ -22,11 +22,6 @@ from hyrl_mj.simulation import (
 )
 from hyrl_mj.tasks import Outcome
 
-# Measurements along each noisy coordinate among which the noise between the nodes chooses.
-CANDIDATES = 17
-# Cells without a verdict in which a start is attacked, for each start mode.
-MOST_CELLS = 128
-
 
 @dataclass(frozen=True)
 class Broken:
@@ -43,14 +38,14 @@ class Broken:
     tried: np.ndarray
 
 
-def attack(
+def find_counterexamples(
     certificate: Certificate, name: str, controller: Controller, eps: float, seed: int = 0
 ) -> Broken:
     """Attacks a controller where it may lose, and returns where it lost.
 
     From the nodes that are lost in the game its adversary gives the noise. Where the game is an estimate, as
     many nodes as the task's effort says are attacked, won or lost, and adversarial noise is tried, too. Cells
-    that are neither proved nor lost at a corner, up to `MOST_CELLS` of them for each start mode, are attacked
+    that are neither proved nor lost at a corner, up to 128 of them for each start mode, are attacked
     from a start inside: at each sample the noise tries measurements in its range, and takes the answer that
     leads to the worst state.
 
@@ -89,11 +84,9 @@ def attack(
         outer = certificate.value(name, eps)
         inside = CellNoise(certificate, controller, outer, value, game.bound(eps))
         unclear = (outer[-len(modes) :, :-2] >= NEVER) & certificate.region(eps) & ~broken
-        chosen = [
-            (np.full(min(len(of_mode), MOST_CELLS), row), *_inside(cells, of_mode, rng))
-            for row, of_mode in enumerate(map(np.flatnonzero, unclear))
-        ]
-        row, at, starts = (np.concatenate(parts) for parts in zip(*chosen, strict=True))
+        chosen = [_inside(cells, np.flatnonzero(of_mode), rng) for of_mode in unclear]
+        at, starts = (np.concatenate(parts) for parts in zip(*chosen, strict=True))
+        row = np.repeat(np.arange(len(chosen)), [len(some) for some, _ in chosen])
         broken[row, at] = _beaten(game, controller, starts, modes[row], inside)
     all_cells = np.ones(cells.nodes, dtype=bool)
     return Broken(broken[-1], np.asarray(broken.any(axis=0)), all_cells)
@@ -102,12 +95,9 @@ def attack(
 def _inside(
     cells: Cells, of_mode: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns up to `MOST_CELLS` of some cells (n,), and a point inside of each: (k,), (k, d)."""
-    at = (
-        rng.choice(of_mode, min(len(of_mode), MOST_CELLS), replace=False)
-        if len(of_mode)
-        else of_mode
-    )
+    """Returns up to 128 of some cells (n,), and a point inside of each: (k,), (k, d)."""
+    count = min(len(of_mode), 128)
+    at = rng.choice(of_mode, count, replace=False) if count else of_mode
     off = rng.uniform(-0.5, 0.5, (len(at), len(cells.counts)))
     return at, cells.middle(at) + off * cells.lattice.grid.spacing
 
@@ -152,7 +142,8 @@ class CellNoise(Signal):
         super().__init__(largest, bound / (largest or 1.0))
         self._cells, self._controller = certificate.cells, controller
         self._outer, self._inner = outer, inner
-        steps = [np.linspace(-b, b, CANDIDATES if b else 1) for b in bound]
+        # So many measurements along each noisy coordinate the noise between the nodes chooses from.
+        steps = [np.linspace(-b, b, 17 if b else 1) for b in bound]
         candidates = np.array([*product(*steps)])
         # Among equals the largest noise comes first.
         self._candidates = candidates[np.argsort(-np.abs(candidates).sum(axis=1), kind="stable")]

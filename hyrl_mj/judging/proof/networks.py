@@ -20,12 +20,8 @@ from hyrl_mj.system import cores
 from hyrl_mj.tasks import Task
 from hyrl_mj.tracing import BATCH, Program, trace
 
-# Boxes that go through a network at a time.
-CHUNK = 2048
 # Relative rounding error of numbers of 32 bits, in which networks are computed.
 ROUNDING = 2.0**-24
-# Points at which a curved activation is evaluated between two numbers.
-POINTS = 9
 # A layer's values in boxes: middle (n, k), generators (d, n, k) and remainder (n, k), as `Affine`.
 Relaxed = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -37,7 +33,7 @@ def program_of(task: Task, function: Callable[[np.ndarray], np.ndarray], name: s
         Unbounded: its operations cannot be followed.
     """
     rng = np.random.default_rng(0)
-    z = rng.uniform(task.chart.low, task.chart.high, (BATCH, task.chart.dimension))
+    z = task.chart.draw(BATCH, rng)
     try:
         return trace(function, {"measured": z}, name, "bounded")
     except BadInput as error:
@@ -158,7 +154,8 @@ def _observation_of(task: Task) -> str:
 def _in_chunks(
     work: Callable[[np.ndarray, np.ndarray], np.ndarray], centre: np.ndarray, half: np.ndarray
 ) -> np.ndarray:
-    parts = [centre[i : i + CHUNK] for i in range(0, len(centre), CHUNK)]
+    size = 2048  # boxes that go through a network at a time
+    parts = [centre[i : i + size] for i in range(0, len(centre), size)]
     with BLAS.limit(limits=1, user_api="blas"), ThreadPoolExecutor(cores.count()) as pool:
         return np.concatenate(list(pool.map(lambda part: work(part, half), parts)))
 
@@ -229,10 +226,11 @@ def _curved(name: str, curvature: float) -> Callable[[Relaxed], Relaxed]:
         width = high - low
         rise = activate(high) - activate(low)
         slope = np.where(width > 0, rise / np.where(width > 0, width, 1), 0)
-        shares = np.linspace(0, 1, POINTS, dtype=np.float32).reshape(-1, *[1] * low.ndim)
+        points = 9  # at which it is evaluated between the two ends
+        shares = np.linspace(0, 1, points, dtype=np.float32).reshape(-1, *[1] * low.ndim)
         at = low + shares * width
         off = activate(at) - slope * at
-        between = curvature * (width / (POINTS - 1)) ** 2 / 8
+        between = curvature * (width / (points - 1)) ** 2 / 8
         return _parallel(x, slope, off.min(axis=0) - between, off.max(axis=0) + between)
 
     return relax

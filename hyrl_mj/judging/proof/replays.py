@@ -10,8 +10,6 @@ import numpy as np
 from hyrl_mj.judging.game import (
     NEARLY,
     NEVER,
-    PROVED_STARTS,
-    WON_STARTS,
     LostReplay,
     ReplayCount,
     Score,
@@ -28,10 +26,8 @@ from hyrl_mj.tasks import Outcome, Task
 # the nodes asks the controller about seventeen measurements at each sample, and the worst on nodes is looked
 # up, which takes twice as long as other noise: these get fewer starts.
 STARTS = {"none": 3_000, "uniform": 3_000, "alternating": 2_900, "worst": 1_000, "cells": 100}
-# A tenth of them where so little is proved that no word follows from it.
-FEWER = 10
-# Runs side by side, and how many of them plain MuJoCo plays once more: every twentieth, 500 in all.
-BATCH, EVERY = 1_000, 20
+# Runs side by side.
+BATCH = 1_000
 # Runs of each kind of noise that are played to their end, though they are proved to have arrived before.
 WHOLE = 100
 
@@ -108,8 +104,9 @@ class Replays:
         whole = score.not_broken == 1
         if not (nearly or whole or score.proved):
             return None
-        of = WON_STARTS if whole and not nearly else PROVED_STARTS
-        rng, few = np.random.default_rng(seed), 1 if nearly or whole else FEWER
+        of = "won" if whole and not nearly else "proved"
+        # A tenth of the starts is played where so little is proved that no word follows from it.
+        rng, few = np.random.default_rng(seed), 1 if nearly or whole else 10
         pools = _pools(certificate, name, controller, score.eps, of)
         batches = []
         for kind, noise in _noises(certificate, name, controller, score.eps).items():
@@ -151,7 +148,7 @@ def play(task: Task, batch: Batch) -> Played:
         if steps is None or not lost.any():
             break
     judged = lost.copy()
-    judged[::EVERY] = True
+    judged[::20] = True
     judge(task, run, task.state(batch.z0), np.flatnonzero(judged))
     first = None
     if lost.any():
@@ -220,7 +217,7 @@ def _pools(
     grid, rng, pools = game.lattice.grid, np.random.default_rng(0), []
     # With one mode the controller cannot pick another one.
     modes = [*(controller.modes if len(controller.modes) > 1 else ()), NOT_STARTED]
-    proved = of == PROVED_STARTS and cells is not None
+    proved = of == "proved" and cells is not None
     values = (certificate if proved else game).value(name, eps)[:, :-2]
     if cells is not None and not proved:
         values = values[:, grid.nearest(cells.middle(np.arange(cells.nodes)))]

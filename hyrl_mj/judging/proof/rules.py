@@ -15,10 +15,7 @@ from hyrl_mj.tracing import BATCH, Operation, Program
 
 # Rounding errors of NumPy's functions and of ours, in units in the last place.
 ROUNDING = 8
-# Operations whose rounding errors go with their operands, not with their result.
-ADDING = ("add", "subtract", "sum", "matmul")
-# Operations that only move entries, and those that NumPy takes for others if all operands are bool.
-MOVING = ("reshape", "transpose", "concatenate", "take")
+# Operations that NumPy takes for others if all operands are bool.
 OF_BOOLS = {
     "add": "logical_or",
     "maximum": "logical_or",
@@ -78,9 +75,10 @@ def _apply(
     if dtype.kind == "b" and name in OF_BOOLS and all(map(_is_condition, operands)):
         name = OF_BOOLS[name]
         rule = RULES[name]
-    if name in LOGICAL:
+    if name.startswith("logical_"):
         return rule(*map(_truth, operands))
-    forms = [o if name in AS_THEY_ARE and _is_condition(o) else as_form(o, d) for o in operands]
+    takes_both = name in ("where", "astype", "any", "all")  # conditions and numbers as they are
+    forms = [o if takes_both and _is_condition(o) else as_form(o, d) for o in operands]
     found: Affine | Truth
     if name == "multiply" and operands[0] is operands[1] and isinstance(operands[0], Affine):
         found = affine.square(operands[0])
@@ -88,7 +86,8 @@ def _apply(
         found = rule(*forms, **options)
     if not isinstance(found, Affine):
         return found
-    if dtype.kind == "b" and name in MOVING:
+    # What only moves entries leaves conditions as they are.
+    if dtype.kind == "b" and name in ("reshape", "transpose", "concatenate", "take"):
         return Truth(found.low > 0.5, found.high > 0.5)
     if dtype.kind == "b":
         raise Unbounded(f"uses np.{name} of conditions, for which there are no bounds")
@@ -128,7 +127,8 @@ def _rounding(operation: Operation, found: Affine, operands: list[Any]) -> np.nd
     if operation.value.dtype.kind != "f":
         return np.zeros(found.centre.shape)
     size = np.abs(found.centre) + found.radius
-    if operation.name in ADDING:
+    # The errors of sums go with their operands, not with their result.
+    if operation.name in ("add", "subtract", "sum", "matmul"):
         sizes = [
             Affine(
                 np.abs(o.centre) + o.radius, np.zeros_like(o.generators), np.zeros_like(o.centre)
@@ -250,9 +250,6 @@ def _reduced(name: str) -> Callable[..., Affine]:
     return rule
 
 
-# Operations on conditions, and operations that take conditions and numbers as they are.
-LOGICAL = ("logical_and", "logical_or", "logical_xor", "logical_not")
-AS_THEY_ARE = ("where", "astype", "any", "all")
 RULES: dict[str, Callable[..., Any]] = {
     "add": affine.add,
     "subtract": affine.subtract,

@@ -13,12 +13,6 @@ import numpy as np
 
 from hyrl_mj.tracing import EVALUATED, Operation, Program
 
-# Whole numbers are recognised up to this.
-WHOLE = 1e-9
-# Operations that change as their operands do, and those that only move entries.
-LINEAR = ("add", "subtract", "negative", "sum")
-MOVING = ("reshape", "transpose", "concatenate")
-
 
 def tells_turns(program: Program, turn: np.ndarray) -> bool:
     """Returns whether a program may give something else after any whole number of turns.
@@ -103,11 +97,13 @@ def _cast(operation: Operation, by: list[np.ndarray]) -> np.ndarray | None:
 
 
 def _are_whole(values: np.ndarray) -> bool:
-    return bool((np.abs(values - np.round(values)) <= WHOLE).all())
+    return bool((np.abs(values - np.round(values)) <= 1e-9).all())
 
 
 RULES: dict[str, Callable[[Operation, list[np.ndarray]], np.ndarray | None]] = {
-    **dict.fromkeys((*LINEAR, *MOVING), _applied),
+    # What changes as its operands do, and what only moves entries.
+    **dict.fromkeys(("add", "subtract", "negative", "sum"), _applied),
+    **dict.fromkeys(("reshape", "transpose", "concatenate"), _applied),
     **dict.fromkeys(("multiply", "divide", "matmul"), _scaled),
     **dict.fromkeys(("sin", "cos", "remainder"), _periodic),
     **dict.fromkeys(("rint", "floor", "ceil"), _rounded),

@@ -11,7 +11,7 @@ from matplotlib.colors import ListedColormap, NoNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle, Wedge
 
-from hyrl_mj.judging.game import LIMIT, MAP_CLASSES, OVER, Score, Wins
+from hyrl_mj.judging.game import LIMIT, MapClass, Score, WinningShares
 from hyrl_mj.sets import Chart, Grid
 from hyrl_mj.viz import colours
 from hyrl_mj.viz.figures import charts, style
@@ -19,7 +19,7 @@ from hyrl_mj.viz.figures.charts import INNER, OUTER, TICK
 from hyrl_mj.viz.figures.shown import ShownGame
 from hyrl_mj.viz.tables import NAMES, percent
 
-# Of MAP_CLASSES, in their order; colour-blind readers can tell them apart, too.
+# Of `MapClass`, in their order; colour-blind readers can tell them apart, too.
 CLASS_COLOURS = ("#7cc0e8", "#f2c530", "#009e73", colours.MODES[1], "#5c2a6b", colours.GREY)
 Looks = dict[str, Any]
 # The curves by controller: every sixth node has a marker. Where curves coincide that of the policy is thin
@@ -50,7 +50,9 @@ def draw_robustness_map(shown: ShownGame, path: Path | None = None) -> Figure:
     with style.drawing(path, 1.6 + _panel_height(section.chart), section, title) as figure:
         panels = figure.subplots(1, len(names), squeeze=False).ravel()
         for k in np.unique(np.concatenate([maps.map[name] for name in names])):
-            label = "over: obstacle, or the run has ended" if k == OVER else MAP_CLASSES[k]
+            label = (
+                "over: obstacle, or the run has ended" if k == MapClass.OVER else MapClass(k).label
+            )
             charts.legend_field(panels[0], label, CLASS_COLOURS[k])
         for panel, name in zip(panels, names, strict=True):
             draw(panel, shown, grid, maps.map[name])
@@ -160,7 +162,7 @@ def draw_robustness_curve(shown: ShownGame, path: Path | None = None) -> Figure:
     return figure
 
 
-def _won(panel: Axes, title: str, eps: np.ndarray, wins: Wins, name: str) -> None:
+def _won(panel: Axes, title: str, eps: np.ndarray, wins: WinningShares, name: str) -> None:
     """Draws what is proved, and dashed what is proved from every start mode if that differs.
 
     Between it and what is won on the nodes lies the gap. Of a controller that could not be bounded, and of
@@ -180,7 +182,7 @@ def _won(panel: Axes, title: str, eps: np.ndarray, wins: Wins, name: str) -> Non
         panel.plot(eps, 100 * np.array(some), label=label, **_dashed(name))
 
 
-def _same(wins: Wins) -> bool:
+def _same(wins: WinningShares) -> bool:
     """Returns whether the start mode makes no difference."""
     pairs = (wins.won, wins.won_any), (wins.proved, wins.proved_any)
     return all(np.allclose(own, some, atol=1e-9) for own, some in pairs)
