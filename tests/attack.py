@@ -69,12 +69,12 @@ class Attack:
 
 
 ATTACKS = {
-    "crashes": Attack("crashed before and after a rename, then resumed", crashes.trials, 10, 2),
+    "crashes": Attack("crashed before and after a rename, then resumed", crashes.trials, 10, 1),
     "kills": Attack(
         "killed at a random moment, resumed while the clock is set back", kills.trials, 50, 1
     ),
     "disks": Attack("a disk that is full, and then has room", disks.trials, 6, 1),
-    "artifacts": Attack("truncated, or one bit flipped", damage.trials, 20, 3),
+    "artifacts": Attack("truncated, or one bit flipped", damage.trials, 20, 2),
     "agents": Attack("crafted agents of a stranger", received.agents, 100, 2),
     "received": Attack("crafted run directories of a stranger", received.runs, 25, 1),
     "doors": Attack("generated descriptions of a stranger", doors.trials, 575, 8),

@@ -29,7 +29,7 @@ SHORTER = {
     "eps=0.1, seed=0)": 'eps=0.1, seed=0, preset="smoke")',
 }
 TRAINING = ("run", "robustify", "diagnose", "sweep")
-EPISODES, FRAMES = "200", "4"
+EPISODES, FRAMES, SIZE = "60", "2", "480x160"
 # Scripts that have tests of their own; here their options are looked up.
 TESTED = (
     "scripts/benchmark.py",
@@ -78,16 +78,17 @@ def blocks(page: Path) -> list[Block]:
 
 
 def shortened(words: list[str]) -> list[str]:
-    """A command of `hyrl-mj` that takes seconds: preset smoke, few episodes and frames."""
+    """A command of `hyrl-mj` that takes seconds: preset smoke, few episodes, frames and pixels."""
     words = list(words)
     if words[0] in TRAINING and not {"--preset", "--report"} & {*words}:
         words += ["--preset", "smoke"]
     if words[0] == "sweep" and "--report" not in words:
         words += ["--set", *(f"{name}={value}" for name, value in TINY.items())]
-    if "--episodes" in words:
-        words[words.index("--episodes") + 1] = EPISODES
     if words[0] == "replay":
-        words += ["--fps", FRAMES]
+        words += ["--fps", FRAMES, *(() if "--size" in words else ("--size", SIZE))]
+    for option, value in (("--episodes", EPISODES), ("--size", SIZE)):
+        if option in words:
+            words[words.index(option) + 1] = value
     return words
 
 

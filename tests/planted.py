@@ -8,12 +8,13 @@ from importlib.metadata import version
 import mujoco
 import numpy as np
 from matplotlib.figure import Figure
+from PIL import Image
 
 from hyrl_mj.environments.task import EnvironmentTask
 from hyrl_mj.files.artifacts import digest
 from hyrl_mj.files.manifest import FILES, Entry, Manifest
 from hyrl_mj.judging import worst_case as examination
-from hyrl_mj.judging.proof import replays
+from hyrl_mj.judging.proof import counterexamples, replays
 from hyrl_mj.learning import distillation, presets
 from hyrl_mj.pipeline import steps
 from hyrl_mj.policies.hybrid import HybridController
@@ -44,14 +45,19 @@ def shorten(patch):
             patch.setitem(values, key, value)
     patch.setattr(presets, "_SMOKE_MODES", 4_096)
     patch.setattr(distillation, "STEPS", 200)
-    spare(patch, checkpoints=4, batches=2, nodes=12, episodes=100)
+    patch.setattr(counterexamples, "MOST_CELLS", 24)
+    attack = {"attack_starts": 60, "attack_rounds": 2}
+    spare(patch, checkpoints=2, batches=2, nodes=12, episodes=60, **attack)
     spare_environments(patch)
-    without_pdfs(patch)
+    without_pictures(patch)
 
 
-def without_pdfs(patch):
+# How a figure is written where nothing is patched.
+WRITE = Figure.savefig
+
+
+def without_pdfs(patch, write=WRITE):
     """Patches figures so that beside each PNG lies no drawing, but a file that could be one."""
-    write = Figure.savefig
 
     def savefig(figure, content, *, format, **options):
         if format == "pdf":
@@ -60,6 +66,16 @@ def without_pdfs(patch):
             write(figure, content, format=format, **options)
 
     patch.setattr(Figure, "savefig", savefig)
+
+
+def without_pictures(patch):
+    """The same, and the PNG is blank: everything is drawn, but not laid out and coloured in."""
+
+    def write(figure, content, *, format, dpi, **options):
+        width, height = (round(side * dpi) for side in figure.get_size_inches())
+        Image.new("RGB", (width, height), "white").save(content, format)
+
+    without_pdfs(patch, write)
 
 
 def spare(patch, **effort):

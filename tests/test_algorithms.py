@@ -213,10 +213,18 @@ def values(critic, o, a):
         )
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "a2c", "sac", "td3", "ddpg"])
+@pytest.mark.parametrize(
+    "algorithm",
+    # One that learns from its latest samples, and one that keeps all of them.
+    [
+        "ppo",
+        "sac",
+        *(pytest.param(name, marks=pytest.mark.long) for name in ("a2c", "td3", "ddpg")),
+    ],
+)
 @pytest.mark.slow
 def test_the_smoke_preset_learns_the_circle(algorithm, circle, monkeypatch):
-    spare(monkeypatch, checkpoints=8)
+    spare(monkeypatch, checkpoints=3)
     settings = preset(circle, "smoke", algorithm=algorithm).stage1
     before = evaluate(circle, export(build(circle, settings, 0), circle))[1]
     assert evaluate(circle, train(circle, settings, 0))[1] > before + 10

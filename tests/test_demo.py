@@ -53,7 +53,7 @@ def demo(request, tmp_path_factory):
         return request.param, Path(os.environ[FOLDER]) / request.param
     path = tmp_path_factory.mktemp("demo") / request.param
     command = (sys.executable, "-m", "hyrl_mj.cli", "run", request.param, "--out", path)
-    environment = unmeasured.environment()
+    environment = unmeasured.environment(MUJOCO_GL="disable")  # the video tells no number
     subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL, env=environment, check=True)
     return request.param, path
 

@@ -8,10 +8,11 @@ from planted import ChartPolicy, homing_policy, sign_policy
 
 import hyrl_mj
 from hyrl_mj import HybridArc, NoRenderer
+from hyrl_mj.learning import presets
 from hyrl_mj.runs.diagnosis import losses_of, losses_sentence, usual_arc, worst_arc
 from hyrl_mj.viz import diagnosis
 
-pytestmark = pytest.mark.slow  # a diagnosis of each task
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_runs")]  # a diagnosis of each task
 
 EPS = 0.1
 PLANTED = {"unit_circle": homing_policy, "vehicle": sign_policy}
@@ -22,7 +23,7 @@ def no_renderer(*arguments, **options):
 
 
 @pytest.fixture(scope="module", params=["unit_circle", "vehicle"])
-def diagnosed(request, tmp_path_factory):
+def diagnosed(request, small_runs, tmp_path_factory):
     """The diagnosis of a policy that decides at pi, or on y = 0: the run, and what was said.
 
     As on a machine that cannot draw: no video is waited for.
@@ -30,6 +31,7 @@ def diagnosed(request, tmp_path_factory):
     task, said = hyrl_mj.get_task(request.param), []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(diagnosis, "render_replay", no_renderer)
+        patch.setitem(presets._LATTICE_SMOKE, 1, 1_200)  # fewer nodes would tell another margin
         run = hyrl_mj.diagnose(
             task.name,
             PLANTED[task.name](task),

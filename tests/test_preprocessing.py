@@ -175,7 +175,7 @@ def test_it_comes_back_from_a_run_directory(wrapped, circle, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_run_on_such_an_agent_says_so_and_goes_on(circle, tmp_path):
+def test_a_run_on_such_an_agent_says_so_and_goes_on(small_runs, circle, tmp_path):
     _, path, needs = agent(PPO, circle, tmp_path, WRAPPED["normalised, stacked"])
     said, out = [], tmp_path / "run"
     run = hyrl_mj.diagnose("unit_circle", path, preset="smoke", out=out, say=said.append, **needs)

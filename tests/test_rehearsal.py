@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planted import ChartPolicy
+from planted import ChartPolicy, spare
 from planted_field import Field
 
 import hyrl_mj
@@ -113,6 +113,7 @@ def test_where_every_episode_ends_at_once_all_points_count(field, monkeypatch):
 
 @pytest.mark.slow
 def test_a_training_rehearses_what_its_checkpoints_lose(monkeypatch):
+    spare(monkeypatch, checkpoints=4)
     task = hyrl_mj.get_task("gaps")
     tried = []
     update = Rehearsal.update

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from browser import chromium, needs_chromium
 from PIL import Image
-from planted import Cube, believe, decisions, halves
+from planted import Cube, believe, decisions, halves, without_pdfs
 
 from hyrl_mj import BadArtifact, BadInput, MlpPolicy, load_run
 from hyrl_mj.files.artifacts import replacing, write_json
@@ -112,7 +112,9 @@ def runs(small_runs, tmp_path_factory):
         task = registry.get_task(name)
         run = plant(path, task, decisions(task), halves(task, 60))
         run_stage(run, "simulate", say=str)
-        examine_run(run, ExamineOptions(noise=("uniform",), episodes=200), say=str)
+        with pytest.MonkeyPatch.context() as patch:
+            without_pdfs(patch)  # the pictures are looked at
+            examine_run(run, ExamineOptions(noise=("uniform",), episodes=200), say=str)
         film(path)
     return paths
 

@@ -66,7 +66,7 @@ def sentences(text):
 @pytest.mark.parametrize(
     ("streams", "said"),
     [
-        (">&-", "standard output is closed"),
+        pytest.param(">&-", "standard output is closed", marks=pytest.mark.long),  # below, too
         (">/dev/full", "No space left on device"),
         ("| head -1", "the reader of standard output has gone"),
     ],
@@ -157,7 +157,10 @@ def test_a_narrow_terminal_gets_no_bars(columns, shown):
 
 
 @needs_gl
-@pytest.mark.parametrize("script", ["exit 1", "for last; do :; done; echo x >$last"])
+@pytest.mark.parametrize(
+    "script",
+    [pytest.param("exit 1", marks=pytest.mark.long), "for last; do :; done; echo x >$last"],
+)
 def test_with_a_broken_encoder_there_is_no_video_and_all_else(folder, tmp_path, script):
     program = tmp_path / "ffmpeg"
     program.write_text(f"#!/bin/sh\n{script}\n")

@@ -92,7 +92,7 @@ import hyrl_mj
 from hyrl_mj.learning import preset, training
 from hyrl_mj.tasks import Effort, Task
 
-Task.effort = Effort(checkpoints=2)
+Task.effort, training.EPISODES = Effort(checkpoints=2), 64
 for name, algorithm, samples in (
     ("unit_circle", "ppo", 4096), ("vehicle", "dqn", 2600), ("unit_circle", "sac", 1500)
 ):

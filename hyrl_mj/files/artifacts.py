@@ -138,21 +138,27 @@ def read_json(
         BadArtifact: the file is missing or damaged, or `parse` refuses its content.
     """
     with reading(path, remedy):
-        text = read_limited(path, LARGEST_JSON).decode()
-        whole = json.loads(text)
-        if not isinstance(whole, dict):
-            raise BadArtifact("it holds no JSON object")
-        if (odd := next(_unprintable(whole), None)) is not None:
-            raise BadArtifact(f"it holds control characters, in {odd!r}")
-        content = {name: whole[name] for name in whole if name not in ("kind", "version", "sha256")}
-        check_version(whole.get("version"), whole.get("kind"), kind)
-        value = parse(content)  # before its SHA-256 is compared: the message names the field
-        whole.pop("sha256", None)
-        if text != _json(whole):
-            raise BadArtifact(
-                f"it was changed after it was written (its sha256 does not fit): {remedy}"
-            )
-        return value
+        return parsed_json(read_limited(path, LARGEST_JSON).decode(), kind, parse, remedy)
+
+
+def parsed_json(
+    text: str, kind: str, parse: Callable[[dict[str, Any]], Record], remedy: str = REMEDY
+) -> Record:
+    """Returns what `read_json` does, of the text of a file."""
+    whole = json.loads(text)
+    if not isinstance(whole, dict):
+        raise BadArtifact("it holds no JSON object")
+    if (odd := next(_unprintable(whole), None)) is not None:
+        raise BadArtifact(f"it holds control characters, in {odd!r}")
+    content = {name: whole[name] for name in whole if name not in ("kind", "version", "sha256")}
+    check_version(whole.get("version"), whole.get("kind"), kind)
+    value = parse(content)  # before its SHA-256 is compared: the message names the field
+    whole.pop("sha256", None)
+    if text != _json(whole):
+        raise BadArtifact(
+            f"it was changed after it was written (its sha256 does not fit): {remedy}"
+        )
+    return value
 
 
 def _unprintable(content: Any) -> Iterator[str]:

@@ -16,6 +16,7 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -26,6 +27,8 @@ from hyrl_mj.files import artifacts
 from hyrl_mj.files.artifacts import digest
 
 NAME, LOCK = "manifest.json", ".lock"
+LARGEST = 2**20  # [bytes]; a manifest is read many times
+REMEDY = "remove it, and all stages run again"
 # The names of the files that each stage may write: no other file is ever believed or removed.
 FILES = {
     "train": r"policy\.(safetensors|json|onnx)|vecnormalize\.npz|arrivals\.json",
@@ -218,20 +221,31 @@ class Manifest:
         path = self.folder / NAME
         if not path.is_file():
             return {}
-        remedy = "remove it, and all stages run again"
-        if path.stat().st_size > 2**20:  # it is read many times
-            raise BadArtifact(f"{path} is larger than any manifest: {remedy}")
-        stages = artifacts.read_record(path, "manifest", _Stages, remedy).stages
-        for stage, entry in stages.items():
-            for name in entry.outputs:
-                if stage not in FILES or not re.fullmatch(FILES[stage], name):
-                    raise BadArtifact(f"{path}: no stage {stage!r} writes {name!r}: {remedy}")
-        return stages
+        if path.stat().st_size > LARGEST:
+            raise BadArtifact(f"{path} is larger than any manifest: {REMEDY}")
+        with artifacts.reading(path, REMEDY):
+            return dict(_recorded(artifacts.read_limited(path, LARGEST)))
 
     def _write(self, entries: dict[str, Entry]) -> None:
         """Writes the manifest; in whichever order stages ran, the same results are the same bytes."""
         in_order = {stage: entries[stage] for stage in FILES if stage in entries}
         artifacts.write_json(self.folder / NAME, _Stages(in_order), kind="manifest")
+
+
+@lru_cache(8)
+def _recorded(text: bytes) -> dict[str, Entry]:
+    """Returns the entries in a manifest. Nearly always it is as it was when it was last asked."""
+    stages = artifacts.parsed_json(
+        text.decode(),
+        "manifest",
+        lambda content: artifacts.parsed(content, _Stages, REMEDY),
+        REMEDY,
+    ).stages
+    for stage, entry in stages.items():
+        for name in entry.outputs:
+            if stage not in FILES or not re.fullmatch(FILES[stage], name):
+                raise BadArtifact(f"no stage {stage!r} writes {name!r}: {REMEDY}")
+    return stages
 
 
 def _remedy(stage: str, folder: Path, done: Collection[str]) -> str:

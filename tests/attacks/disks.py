@@ -19,7 +19,7 @@ NEWNS, NEWUSER, PRIVATE, REMOUNT = 0x20000, 0x10000000, 0x44000, 0x20  # flags o
 
 def trials(material: Material, draw: Random, count: int) -> list[Trial]:
     """Returns trials in which less and less of what each command writes has room."""
-    found, chosen = [], ("diagnose", "drive", "sweep")[:count]
+    found, chosen = [], ("drive", "diagnose", "sweep")[:count]
     for place, name in enumerate(chosen):
         made, several = whole(material, name), len(range(place, count, len(chosen)))
         size = sum(p.stat().st_size for p in [made.path, *made.path.rglob("*")] if p.is_file())

@@ -22,6 +22,8 @@ from hyrl_mj.stages import ExtendedSets
 
 TASK = "unit_circle"
 RUN = ("run", TASK, "--preset", "smoke", "--out", TASK)
+# The file beside a finished run that tells how long it took.
+SECONDS = "seconds"
 
 
 Made = TypeVar("Made")
@@ -54,7 +56,8 @@ class Material:
         """Returns the run directory of `hyrl-mj run` with these options."""
         path = self.folder / "_".join(("material", *options)).replace("-", "")
         path.mkdir()
-        self.do(path, [(*RUN, *options)])
+        (answer,) = self.do(path, [(*RUN, *options)])
+        (path / SECONDS).write_text(f"{answer.seconds[0]}", encoding="utf-8")
         return path / TASK
 
     @once

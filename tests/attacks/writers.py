@@ -39,7 +39,7 @@ def trials(material: Material, draw: Random, count: int) -> list[Trial]:
         whole(material, "sweep")
     rounds = []
     for number in range(count):
-        writers = 2 if number % 2 else 4
+        writers = 4 if number % 2 else 2
         what, commands, finished = kinds[number % len(kinds)]
         chosen = [draw.choice(commands) for _ in range(writers)]
         name = f"round {number}: {writers} x {what}"
