@@ -13,16 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from hyrl_mj.runs.sweeps import Row, Setting
+from hyrl_mj.simulation import KINDS
 
 # Figures that both controllers have, without their names, and whether more of it is better.
 COMPARED = {
     "proved": True,
     "not_broken": True,
     "margin": True,
-    "reached_none": True,
-    "reached_uniform": True,
-    "reached_alternating": True,
-    "reached_adversarial": True,
+    **{f"reached_{kind}": True for kind in KINDS},
     "withstood_attack": True,
     "late": False,
     "longest": False,
