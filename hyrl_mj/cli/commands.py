@@ -190,8 +190,8 @@ def simulate(
             starts of the paper's replays.
         q0: start mode; by default the controller selects it from the first measurement.
         noise: kind of noise: none, uniform, alternating, adversarial (looks a few samples ahead),
-            attack (the strongest signal that a search finds), or worst (the signal with which the worst-case
-            game is lost, or arrival is latest).
+            attack (the strongest signal that a search finds for each controller), or worst (the signal with
+            which each controller loses the worst-case game, or arrives latest).
         eps: bound of the noise, in the units of the chart; by default the run's.
         time: time to simulate [s]; by default the task's.
         seed: seed of the noise.
@@ -246,10 +246,9 @@ def replay(
         starts: critical (the start on the critical set, once for each start mode; where no game can be
             played, the strongest signals of the attack), paper (all of the
             paper's at once), or latest (what `hyrl-mj simulate --start` simulated last).
-        noise: kind of noise under which to simulate anew: none, uniform, alternating, adversarial (looks
-            a few samples ahead), attack (the strongest signal that a search finds, for each controller),
-            or worst (of the worst-case game, for each controller); by default the arcs of the run, which
-            are under alternating noise, and from the critical set under the strongest noise that is known.
+        noise: kind of noise under which to simulate anew, as in `hyrl-mj simulate`; by default the arcs of
+            the run, which are under alternating noise, and from the critical set under the strongest noise
+            that is known.
         eps: bound of the noise, in the units of the chart; by default the run's.
         force: overwrite a file that hyrl-mj has not written.
     """

@@ -26,7 +26,7 @@ class DriveOptions:
     """The noise on what a robot measures while it drives through a field.
 
     Attributes:
-        noise: kind of noise: none, uniform, alternating, or adversarial (looks a few samples ahead).
+        noise: kind of noise, as in `hyrl-mj simulate`, but neither attack nor worst.
         eps: bound of the noise on the robot's position [m]; by default the run's.
         eps_heading: bound of the noise on its heading [rad]; by default half the number of --eps.
         eps_posts: bound of the noise on the posts' positions [m].
