@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from importlib import import_module
 from itertools import product
 from typing import Any
 from unittest import mock
@@ -16,7 +17,6 @@ from hyrl_mj import Run, Task, extend, find_critical_set
 from hyrl_mj.learning import WaySettings
 from hyrl_mj.learning.training import build
 from hyrl_mj.simulation import LoopSettings
-from hyrl_mj.stages import critical_set
 from hyrl_mj.stages.partition import PartPolicy
 from hyrl_mj.tasks import Outcome
 
@@ -45,13 +45,16 @@ def _extension(run: Run) -> Figure:
     task, settings = run.task, run.settings
     args = (task, run.policy, run.critical_set.points, run.partition, settings.noise)
     calls: list[tuple[Any, np.ndarray, LoopSettings]] = []
-    batched = critical_set.closed_loop
+    runs_of_ways = import_module(
+        "hyrl_mj.simulation.way_runs"
+    )  # the package has a function of that name
+    batched = runs_of_ways.closed_loop
 
     def noted(task: Task, controller: Any, z0: np.ndarray, *, settings: LoopSettings) -> Any:
         calls.append((controller.policy, z0, settings))
         return batched(task, controller, z0, settings=settings)
 
-    with mock.patch.object(critical_set, "closed_loop", noted):
+    with mock.patch.object(runs_of_ways, "closed_loop", noted):
         extend(*args)
     starts = sum(len(z0) for _, z0, _ in calls)
     predict = _Predict(run)

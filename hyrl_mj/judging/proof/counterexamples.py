@@ -22,6 +22,9 @@ from hyrl_mj.simulation import (
 )
 from hyrl_mj.tasks import Outcome
 
+# Cells without a verdict in which a start is attacked, for each start mode.
+MOST_CELLS = 128
+
 
 @dataclass(frozen=True)
 class Broken:
@@ -45,7 +48,7 @@ def find_counterexamples(
 
     From the nodes that are lost in the game its adversary gives the noise. Where the game is an estimate, as
     many nodes as the task's effort says are attacked, won or lost, and adversarial noise is tried, too. Cells
-    that are neither proved nor lost at a corner, up to 128 of them for each start mode, are attacked
+    that are neither proved nor lost at a corner, up to `MOST_CELLS` of them for each start mode, are attacked
     from a start inside: at each sample the noise tries measurements in its range, and takes the answer that
     leads to the worst state.
 
@@ -95,8 +98,8 @@ def find_counterexamples(
 def _inside(
     cells: Cells, of_mode: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns up to 128 of some cells (n,), and a point inside of each: (k,), (k, d)."""
-    count = min(len(of_mode), 128)
+    """Returns up to `MOST_CELLS` of some cells (n,), and a point inside of each: (k,), (k, d)."""
+    count = min(len(of_mode), MOST_CELLS)
     at = rng.choice(of_mode, count, replace=False) if count else of_mode
     off = rng.uniform(-0.5, 0.5, (len(at), len(cells.counts)))
     return at, cells.middle(at) + off * cells.lattice.grid.spacing

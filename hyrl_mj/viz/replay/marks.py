@@ -19,6 +19,7 @@ from hyrl_mj.viz.section import Section
 # Heights above the tracked site [m], from the floor up: higher marks hide lower ones. Paths have none.
 ON_FLOOR, ON_SETS, ON_BOUND, ON_TOP = -0.006, -0.004, -0.002, 0.006
 THICKNESS = 0.004  # of a mark [m]
+CRITICAL_RADIUS = 0.02  # of a point of M* [m]
 
 
 def bar(
@@ -145,7 +146,7 @@ class Floor:
             # The strips are a little longer, so that no gap is seen where they turn.
             bar(scene, start, end, OVERLAP, width, ON_FLOOR, width / 50)
         # Of discs that lie on each other one is drawn: hundreds take a while in each frame.
-        radius = larger * 0.02  # [m]
+        radius = larger * CRITICAL_RADIUS
         first = np.unique(np.round(self.critical / radius), axis=0, return_index=True)[1]
         for point in self.critical[first]:
             disc(scene, point, radius, ON_SETS, CRITICAL)
