@@ -31,6 +31,7 @@ from hyrl_mj.fields import (
 from hyrl_mj.fields.drives import bounds_asked_for, bounds_made_for
 from hyrl_mj.fields.law import TangentLaw
 from hyrl_mj.policies import ObservationPolicy
+from hyrl_mj.simulation import AttackSettings
 from hyrl_mj.tasks import LEFT, RIGHT, wrapped
 from hyrl_mj.viz.colours import MODES
 from hyrl_mj.viz.drives import drive_sentences
@@ -277,7 +278,7 @@ def planted():
         task=task,
         policy=policy,
         policy_title="RL policy (PPO)",
-        settings=SimpleNamespace(noise=0.1),
+        settings=SimpleNamespace(noise=0.1, attack=AttackSettings()),
         mode_networks={side: Steering(task, side) for side in (LEFT, RIGHT)},
     )
 

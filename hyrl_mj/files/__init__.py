@@ -3,4 +3,4 @@
 Every file is written under a temporary name and renamed, and nothing that is read is a pickle.
 """
 
-__all__ = ["archives", "artifacts", "manifest", "trust"]
+__all__ = ["archives", "artifacts", "manifest", "sources", "trust"]
