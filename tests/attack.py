@@ -24,7 +24,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -166,9 +166,11 @@ def main() -> int:
                 trial.prepare()
             return [(name, trial) for trial in matching]
 
-        with ThreadPoolExecutor(PROCESSES) as threads:  # each of which waits for processes
-            for trials in threads.map(prepared, chosen):
-                UNDER_WAY.extend(trials)
+        # Not in threads: a forked process inherits the locks that others hold at that time, of which Python
+        # 3.11 has one for each cached property, and waits for ever.
+        for name in chosen:
+            UNDER_WAY.extend(prepared(name))
+        # Not the processes of a `Pool`: those of a daemon have no children that are waited for.
         with ProcessPoolExecutor(PROCESSES, multiprocessing.get_context("fork")) as pool:
             for future in as_completed([pool.submit(attempt, i) for i in range(len(UNDER_WAY))]):
                 results.append(result := future.result())
