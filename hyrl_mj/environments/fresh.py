@@ -51,10 +51,8 @@ class Fresh:
             here = multiprocessing.current_process()
             of_daemon, here.daemon = here.daemon, False
             try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter(
-                        "ignore", DeprecationWarning
-                    )  # of threads, which stay here
+                with warnings.catch_warnings():  # of threads, which stay here
+                    warnings.simplefilter("ignore", DeprecationWarning)
                     server.start()
             finally:
                 here.daemon = of_daemon

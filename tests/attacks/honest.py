@@ -3,12 +3,12 @@
 import json
 import sys
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 from attacks import child, command, crafted_agents
 from attacks.damage import open_everything
-from attacks.material import RUN, TASK, Material, once
+from attacks.material import RUN, TASK, Material
 from hyrl_mj.errors import HyrlError
 from hyrl_mj.fields import read_field
 from hyrl_mj.fields.driving import Driving
@@ -25,7 +25,7 @@ FIELD = {
 ARGUMENTS = {"pinned": {"qpos[2]": -0.15, "qpos[3]": 0.0}, "success": "reward >= 1"}
 
 
-@once
+@cache
 def most(material: Material, kind: str) -> float:
     """Returns the most memory that a process takes for what is honest [MB], which must not be refused."""
     folder, highest = material.folder / f"honest_{kind}", 0.0

@@ -8,13 +8,13 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from random import Random
 
 from attacks import Trial, child, command, crafted_agents, differences, small
 from attacks.honest import FIELD
-from attacks.material import RUN, SECONDS, TASK, Material, once
+from attacks.material import RUN, SECONDS, TASK, Material
 
 SIGNALS = (signal.SIGKILL, signal.SIGINT, signal.SIGTERM)
 AGENT = (
@@ -69,7 +69,7 @@ def trials(material: Material, draw: Random, count: int) -> list[Trial]:
     return found
 
 
-@once
+@cache
 def whole(material: Material, name: str) -> Whole:
     """Gives a command that nothing disturbs."""
     if name == "run":

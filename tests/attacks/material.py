@@ -1,12 +1,10 @@
 """The finished runs that are attacked, made when they are first asked for."""
 
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cache, wraps
+from functools import cache
 from pathlib import Path
-from threading import Lock
-from typing import TypeVar
 
 import numpy as np
 
@@ -26,21 +24,6 @@ RUN = ("run", TASK, "--preset", "smoke", "--out", TASK)
 SECONDS = "seconds"
 
 
-Made = TypeVar("Made")
-
-
-def once(make: Callable[..., Made]) -> Callable[..., Made]:
-    """Caches what a function makes: one thread makes it, and others that ask for it wait."""
-    kept, lock = cache(make), Lock()
-
-    @wraps(make)
-    def found(*arguments: object) -> Made:
-        with lock:
-            return kept(*arguments)
-
-    return found
-
-
 @dataclass(frozen=True)
 class Material:
     """Runs of preset smoke, which nothing disturbed.
@@ -51,7 +34,7 @@ class Material:
 
     folder: Path
 
-    @once
+    @cache  # noqa: B019 - there is one material
     def finished(self, *options: str) -> Path:
         """Returns the run directory of `hyrl-mj run` with these options."""
         path = self.folder / "_".join(("material", *options)).replace("-", "")
@@ -60,7 +43,7 @@ class Material:
         (path / SECONDS).write_text(f"{answer.seconds[0]}", encoding="utf-8")
         return path / TASK
 
-    @once
+    @cache  # noqa: B019 - there is one material
     def field(self) -> Path:
         """Returns a run directory of `field` whose policies, which are not trained, drive straight on."""
         path = self.folder / "material_field" / "field"
