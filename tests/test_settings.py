@@ -97,9 +97,9 @@ OF_GROUPS = {
     "attack.offspring": ([1, NAN], "an integer from 2 to"),
     "attack.pieces": ([0, 101], "an integer from 1 to 100"),
     "attack.spread": ([0, INF], "> 0 and <= 10"),
-    "verdict.winnable": ([-0.1, 1.1], "a number from 0 to 1"),
-    "verdict.episodes": ([0, 1.5], "an integer from 1 to"),
-    "verdict.attacked": ([0, True], "an integer from 1 to"),
+    "verdict.winnable": ([0.8, 1.1], "a number from 0.9 to 1"),
+    "verdict.episodes": ([999, 1.5], "an integer from 1,000 to"),
+    "verdict.attacked": ([299, True], "an integer from 300 to"),
 }
 OF_TRAININGS = {
     "algorithm": ([False, None, "sarsa", ""], "algorithm|a text"),
@@ -169,6 +169,7 @@ def test_a_setting_of_a_stage_can_be_set_and_makes_the_stages_run_again(settings
     usual = getattr(getattr(settings, group), field)
     other = usual[:3] if name == "modes.batches" else usual + 1 if isinstance(usual, int) else 0.6
     other = 1.3 if name in ("ways.link", "modes.margin") else other
+    other = 0.95 if name == "verdict.winnable" else other
     new = changed(settings, {name: json.dumps(other)})
     assert getattr(getattr(new, group), field) == other
     assert [*changes(new, settings)] == [name]

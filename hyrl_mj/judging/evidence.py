@@ -13,7 +13,7 @@ from hyrl_mj.ranges import Integer, Number, check_fields
 
 @dataclass(frozen=True)
 class VerdictSettings:
-    """What a verdict asks for.
+    """What a verdict asks for: more than the defaults if wanted, never less, or a run could praise itself.
 
     Attributes:
         winnable: PROVED and WON speak of winnable starts: at least this share of those that are open to one
@@ -23,9 +23,9 @@ class VerdictSettings:
             end of a one-sided 95% interval (3 / 300 = 1%).
     """
 
-    winnable: Annotated[float, Number(0, 1)] = 0.9
-    episodes: Annotated[int, Integer(1, 10**9)] = 1_000
-    attacked: Annotated[int, Integer(1, 10**9)] = 300
+    winnable: Annotated[float, Number(0.9, 1)] = 0.9
+    episodes: Annotated[int, Integer(1_000, 10**9)] = 1_000
+    attacked: Annotated[int, Integer(300, 10**9)] = 300
 
     def __post_init__(self) -> None:
         check_fields(self)
