@@ -195,6 +195,9 @@ def _(rng, plan):
     # What is below may be anything; what is stacked is stacked last, so that the last frame is the newest.
     names = [str(name) for name in rng.permutation([*outer])[: int(rng.integers(1, 4))]]
     names.sort(key=lambda name: name == "stack")
+    if {"clip", "rescale"} <= {*names}:  # what has been clipped has no limits to be rescaled
+        clip, rescale = sorted(map(names.index, ("clip", "rescale")))
+        names[clip], names[rescale] = "rescale", "clip"
     chain = [outer[name] for name in names]
     chain.insert(
         int(rng.integers(len(chain) + 1)) if "time" not in names else 0, limited(limit, steps)
