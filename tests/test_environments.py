@@ -360,6 +360,13 @@ class Late(Puck):
         raise RuntimeError("no file")
 
 
+class Sampling(Puck):
+    """Its drive is as rough as its action space draws, which no seed of reset() decides."""
+
+    def step(self, action):
+        return super().step(0.9 * action + 0.1 * self.action_space.sample())
+
+
 class Rebuilding(Puck):
     """It builds its model anew at each reset."""
 
@@ -372,6 +379,7 @@ REFUSED = {
     "late": (Late, "Late cannot be reset .RuntimeError: no file"),
     "rebuilding": (Rebuilding, "reset.. of Rebuilding builds another model"),
     "an obstacle that is drawn": (Moved, r"draws geom_pos of its model.*pin it"),
+    "random numbers of a space": (Sampling, r"draws random numbers in step\(\) .action_space"),
     "random": (lambda: Noisy(Puck()), r"draws random numbers in step\(\)"),
     "image": (lambda: Seen(Puck()), r"observes images \(8, 8, 3\).*vectors"),
     "several": (Several, "several agents"),

@@ -21,6 +21,7 @@ from typing import Any
 import gymnasium as gym
 import mujoco
 import numpy as np
+from gymnasium import spaces
 
 from hyrl_mj.environments.opening import layers
 from hyrl_mj.environments.physics import STATE
@@ -165,6 +166,12 @@ def _walk(value: Any, path: str, found: Fingerprint, seen: set[int], depth: int)
         found[path] = value.shape, value.dtype.str, value.tobytes()
     elif isinstance(value, np.random.Generator | np.random.RandomState):
         found[path], found.generators[path] = state_of(value), value
+    elif isinstance(value, spaces.Space):
+        parts: Any = getattr(value, "spaces", ())  # of a Dict or a Tuple
+        numbered = parts.items() if isinstance(parts, Mapping) else enumerate(parts)
+        _walk(value._np_random, f"{path}.np_random", found, seen, depth)
+        for name, part in numbered:
+            _walk(part, f"{path}[{name!r:.40}]", found, seen, depth + 1)
     elif id(value) in seen:
         return
     elif isinstance(value, mujoco.MjData | mujoco.MjModel):  # another one than that of its state

@@ -137,7 +137,8 @@ class Rolling:
         if self.rolls_by == "speed":
             self.data.qvel[self.rest] = value
         else:
-            self.data.qpos[self.beside] = 0.4 * value
+            goal = range(self.goal_at, self.goal_at + 2) if self.plan.goal_in == "qpos" else ()
+            self.data.qpos[[i for i in self.beside if i not in goal]] = 0.4 * value
 
 
 class Rough(Region, Looking):
