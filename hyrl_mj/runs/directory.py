@@ -339,7 +339,7 @@ def load_run(
 
     Args:
         path: the directory.
-        policy: the agent of the run, if it is a function, which no file can hold.
+        policy: the agent of the run, if it is Python code, which no file can hold.
         task: the Python file that defines the task, if the task is the user's and this machine has not run
             it before. The file is executed.
 
