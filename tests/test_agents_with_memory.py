@@ -240,6 +240,42 @@ def test_it_closes_a_loop_as_it_does_alone(kind, noise, puck):
             np.testing.assert_array_equal(simulate(puck, policy, start, Noise(noise, 0.1)).u, arc.u)
 
 
+class Phases:
+    """One of three gains, which changes on stripes: as an agent with a memory, and as a controller."""
+
+    modes = (0, 1, 2)
+
+    def start(self, n):
+        return np.zeros((n, 1))
+
+    def act(self, memory, observation):
+        gain = np.array([1.0, 0.4, -0.6])[memory.astype(int)]
+        return gain * turn(observation), (memory + np.floor(14 * observation[:, 1:2]) % 2) % 3
+
+    def initial_mode(self, measured):
+        return np.zeros(len(measured), int)
+
+    def step(self, q, measured):
+        observation = measured[:, :3].astype(np.float32)
+        u, memory = self.act(q[:, None].astype(float), observation)
+        return u, memory[:, 0].astype(int)
+
+
+def test_noise_that_looks_ahead_knows_the_memory(puck):
+    """It chooses as against a controller whose modes are the memory."""
+    starts = puck.starts(8, np.random.default_rng(0))
+    noise = Noise("adversarial", 0.1)
+    settings = LoopSettings(steps=30, record=True, quiet=True)
+    agent = PolicyController(from_callable(Phases(), puck))
+    one, two = (
+        closed_loop(puck, loop, starts, noise, settings=settings) for loop in (agent, Phases())
+    )
+    assert len(np.unique(two.q)) == 3
+    assert len(np.unique(two.noise)) > 2
+    np.testing.assert_array_equal(one.outcome, two.outcome)
+    np.testing.assert_allclose(one.u, two.u, rtol=0, atol=1e-9)
+
+
 def test_an_attack_asks_and_changes_no_memory(puck):
     loop = PolicyController(from_callable(Chunked(), puck))
     rules = Rules(puck, loop, 0.1, np.array(puck.noisy, dtype=float))
