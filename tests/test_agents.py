@@ -364,7 +364,7 @@ def add(name):
         (add("pi_features_extractor.cnn.0.weight"), "CNN policy"),
         (add("features_extractor.extractors.image.cnn.0.weight"), "observations are a dict"),
         (add("features_extractor.layer.weight"), "features extractor of its own"),
-        (add("lstm_actor.weight_ih_l0"), "recurrent policy"),
+        (add("lstm_actor.weight_ih_l0"), "recurrent policy .* give the model itself"),
         (add("mlp_extractor.policy_net.1.weight"), "no linear layer with a bias"),
         (lambda state: {"encoder.weight": torch.zeros(2, 2)}, r"its tensors \(encoder.weight\)"),
         (lambda state: {n: t for n, t in state.items() if n != "action_net.bias"}, "with a bias"),

@@ -1,4 +1,4 @@
-"""An agent that is no function of what it sees is refused by name, wherever it is examined."""
+"""Agents with a memory that they declare close loops; who remembers anything else is refused by name."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,14 @@ from planted import sign_policy
 from trapped import HONEST, TRAPS
 
 import hyrl_mj
-from hyrl_mj import BadInput, Noise, simulate
+from hyrl_mj import BadInput, Noise, from_callable, simulate
+from hyrl_mj.envs.core import BatchedEnv
+from hyrl_mj.envs.sb3_env import TaskVecEnv
+from hyrl_mj.judging.game import Answers, Lattice
+from hyrl_mj.policies import PolicyController, memory_at_start
 from hyrl_mj.policies.external import read_agent
+from hyrl_mj.sets import Grid
+from hyrl_mj.simulation import LoopSettings, Programmes, Rules, closed_loop
 
 TASKS = ("unit_circle", "vehicle")
 
@@ -132,3 +138,330 @@ def test_two_traps_at_once_are_noticed_as_well(vehicle):
             agent = TRAPS[trap](agent, vehicle)
         with pytest.raises(BadInput):
             read_agent(vehicle, agent)
+
+
+# ---- agents that declare their memory, and the same as plain Python, one robot at a time
+
+
+def turn(observation):
+    """Goes to the side on which it is: observations (n, k) -> inputs (n, 1)."""
+    return np.tanh(3 * observation[:, 1:2])
+
+
+class Chunked:
+    """Plans four inputs and plays them one after the other; it remembers how many are left, and them."""
+
+    def start(self, n):
+        return np.zeros((n, 5))
+
+    def act(self, memory, observation):
+        left = memory[:, :1]
+        plan = np.where(left > 0, memory[:, 1:], turn(observation) * [1.0, 0.8, 0.6, 0.4])
+        left = np.where(left > 0, left, 4) - 1
+        return plan[:, :1], np.hstack([left, np.roll(plan, -1, axis=1)])
+
+
+def chunked(observations):
+    plan = []
+    for observation in observations:
+        plan = plan or [
+            float(turn(observation[None])[0, 0]) * part for part in (1.0, 0.8, 0.6, 0.4)
+        ]
+        yield plan.pop(0)
+
+
+class Filtered:
+    """Acts by a moving average of the observation; it remembers whether there is one, and it."""
+
+    def start(self, n):
+        return np.zeros((n, 3), dtype=np.float32)
+
+    def act(self, memory, observation):
+        begun, observation = memory[:, :1] > 0, observation[:, :2]
+        mean = np.where(begun, 0.75 * memory[:, 1:] + 0.25 * observation, observation)
+        return turn(mean), np.hstack([np.ones_like(mean[:, :1]), mean])
+
+
+def filtered(observations):
+    mean = observations[0]
+    for observation in observations:
+        mean = np.float32(0.75) * mean + np.float32(0.25) * observation
+        yield turn(mean[None])[0, 0]
+
+
+class Recurrent:
+    """As RecurrentPPO: `predict` takes and gives a state of two arrays (layers, n, size)."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        assert deterministic
+        n = len(observation)
+        h, c = state or (np.zeros((2, n, 2), np.float32), np.zeros((1, n, 2), np.float32))
+        goes_on = 1 - np.asarray(episode_start, np.float32)[:, None]
+        h, c = h * goes_on, c * goes_on
+        c = 0.5 * c + observation[:, :2]
+        h = np.stack([np.tanh(h[1] + c[0]), 0.5 * h[0]])
+        return turn(h[0]), (h, c)
+
+
+def recurrent(observations):
+    model, state = Recurrent(), None
+    for k, observation in enumerate(observations):
+        start = np.array([k == 0])
+        action, state = model.predict(observation[None], state, start, deterministic=True)
+        yield action[0, 0]
+
+
+AGENTS = {
+    "chunked": (Chunked, chunked),
+    "filtered": (Filtered, filtered),
+    "recurrent": (Recurrent, recurrent),
+}
+
+
+def as_alone(task, plain, measured):
+    """What the same agent in plain Python answers to the measurements (K, p) of one run: (K, 1)."""
+    return np.array(list(plain(task.observation(measured).astype(np.float32))))[:, None]
+
+
+@pytest.mark.parametrize("kind", AGENTS)
+@pytest.mark.parametrize("noise", ["none", "uniform", "adversarial"])
+def test_it_closes_a_loop_as_it_does_alone(kind, noise, puck):
+    """Under noise that looks ahead, too, which asks the controller often."""
+    make, plain = AGENTS[kind]
+    policy = from_callable(make(), puck)
+    starts = puck.starts(5, np.random.default_rng(0))
+    arcs = simulate(puck, policy, starts, Noise(noise, 0.1))
+    assert len({len(arc.t) for arc in arcs}) > 1  # so that rows are left out on the way
+    for start, arc in zip(starts, arcs, strict=True):
+        expected = as_alone(puck, plain, arc.measured[:-1])
+        np.testing.assert_allclose(arc.u[:-1], expected, rtol=0, atol=1e-6)
+        assert np.abs(arc.u[:-1] - policy.act(arc.measured[:-1])).max() > 1e-3
+        if noise != "uniform":  # which is drawn for all runs at once
+            np.testing.assert_array_equal(simulate(puck, policy, start, Noise(noise, 0.1)).u, arc.u)
+
+
+class Phases:
+    """One of three gains, which changes on stripes: as an agent with a memory, and as a controller."""
+
+    modes = (0, 1, 2)
+
+    def start(self, n):
+        return np.zeros((n, 1))
+
+    def act(self, memory, observation):
+        gain = np.array([1.0, 0.4, -0.6])[memory.astype(int)]
+        return gain * turn(observation), (memory + np.floor(14 * observation[:, 1:2]) % 2) % 3
+
+    def initial_mode(self, measured):
+        return np.zeros(len(measured), int)
+
+    def step(self, q, measured):
+        observation = measured[:, :3].astype(np.float32)
+        u, memory = self.act(q[:, None].astype(float), observation)
+        return u, memory[:, 0].astype(int)
+
+
+def test_noise_that_looks_ahead_knows_the_memory(puck):
+    """It chooses as against a controller whose modes are the memory."""
+    starts = puck.starts(8, np.random.default_rng(0))
+    noise = Noise("adversarial", 0.1)
+    settings = LoopSettings(steps=30, record=True, quiet=True)
+    agent = PolicyController(from_callable(Phases(), puck))
+    one, two = (
+        closed_loop(puck, loop, starts, noise, settings=settings) for loop in (agent, Phases())
+    )
+    assert len(np.unique(two.q)) == 3
+    assert len(np.unique(two.noise)) > 2
+    np.testing.assert_array_equal(one.outcome, two.outcome)
+    np.testing.assert_allclose(one.u, two.u, rtol=0, atol=1e-9)
+
+
+def test_an_attack_asks_and_changes_no_memory(puck):
+    loop = PolicyController(from_callable(Chunked(), puck))
+    rules = Rules(puck, loop, 0.1, np.array(puck.noisy, dtype=float))
+    rng, starts = np.random.default_rng(0), puck.starts(6, np.random.default_rng(1))
+    programmes = rng.integers(len(rules.all), size=(6, 4))
+    programmes[:, 1] = rules.ahead
+    signal = Programmes(puck, loop, rules, programmes, segment=3)
+    run = closed_loop(puck, loop, starts, signal, settings=LoopSettings(record=True, quiet=True))
+    assert np.ptp(run.noise)
+    for row, end in enumerate(run.length):
+        expected = as_alone(puck, chunked, run.measured[:end, row])
+        np.testing.assert_allclose(run.u[:end, row], expected, rtol=0, atol=1e-6)
+
+
+def test_a_run_backward_has_no_memory(circle):
+    policy = from_callable(Chunked(), circle)
+    settings = LoopSettings(steps=6, backward=True, record=True, quiet=True)
+    run = closed_loop(circle, PolicyController(policy), np.array([[1.0]]), settings=settings)
+    np.testing.assert_array_equal(run.u[:, 0], policy.act(run.measured[:, 0]))
+
+
+def test_a_model_of_sb3_contrib_acts_as_there(circle):
+    contrib = pytest.importorskip("sb3_contrib")
+    env = TaskVecEnv(BatchedEnv(circle, 1, threads=1))
+    kwargs = {"lstm_hidden_size": 8, "n_lstm_layers": 2, "net_arch": [8]}
+    model = contrib.RecurrentPPO("MlpLstmPolicy", env, seed=0, device="cpu", policy_kwargs=kwargs)
+    policy = read_agent(circle, model).policy
+    assert memory_at_start(PolicyController(policy), 3).shape == (3, 33)
+    starts = circle.starts(3, np.random.default_rng(0))
+    for arc in simulate(circle, policy, starts, Noise("uniform", 0.1), horizon=0.5):
+        state, theirs = None, []
+        for k, observation in enumerate(circle.observation(arc.measured[:-1]).astype(np.float32)):
+            begins = np.array([k == 0])
+            action, state = model.predict(observation[None], state, begins, deterministic=True)
+            theirs.append(action[0])
+        np.testing.assert_allclose(arc.u[:-1], theirs, atol=1e-5)
+
+
+def test_a_model_without_a_state_is_a_function(circle):
+    class Plain:
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            return turn(observation), None
+
+    given = read_agent(circle, Plain())
+    assert not given.agent.remembers
+    assert given.agent.sha256 == read_agent(circle, turn).agent.sha256
+
+
+# ---- what is no such agent
+
+
+class Honest(Chunked):
+    """Spoils nothing; those below change one thing of it."""
+
+
+class Hidden(Honest):
+    calls = 0
+
+    def act(self, memory, observation):
+        u, memory = super().act(memory, observation)
+        self.calls += len(observation) == 1
+        return u * (1 + 0.1 * np.sin(self.calls)), memory
+
+
+class HiddenLater(Honest):
+    """Remembers beside its memory, and shows it only in the next one."""
+
+    last = 0.0
+
+    def act(self, memory, observation):
+        u, memory = super().act(memory, observation)
+        memory[:, -1] += self.last
+        self.last = 0.01 * observation[-1, 0]
+        return u, memory
+
+
+class OfTheBatch(Honest):
+    def act(self, memory, observation):
+        u, memory = super().act(memory, observation)
+        memory[:, 1] = memory[:, 1].mean()
+        return u, memory
+
+
+class Growing(Honest):
+    def act(self, memory, observation):
+        return turn(observation), np.hstack([memory, observation])
+
+
+def remembering(memory):
+    """An agent with another memory at its start, or after it."""
+
+    class Other(Honest):
+        def act(self, before, observation):
+            return turn(observation), memory(len(before))
+
+    return Other
+
+
+def starting(memory):
+    class Other(Honest):
+        def start(self, n):
+            return memory(n)
+
+    return Other
+
+
+SPOILT = {
+    "hidden": (
+        Hidden,
+        r"the agent answers .* and, asked again .* without chance or another",
+    ),
+    "later": (HiddenLater, r"with a memory of .* and, asked again later, with a memory of"),
+    "of the batch": (OfTheBatch, r"with a memory of .* and, in a batch of"),
+    "grows": (Growing, r"of shape \(256, 7\) of one float64 of shape \(256, 5\): keep the shape"),
+    "of another type": (remembering(lambda n: np.zeros((n, 5), "f")), "memory float32 of shape"),
+    "integers": (
+        remembering(lambda n: np.zeros((n, 5), int)),
+        "of type int64: give an array of fl",
+    ),
+    "a list": (remembering(lambda n: [0.0] * n), "a memory of type list: give an array of floats"),
+    "not finite": (remembering(lambda n: np.full((n, 5), np.nan)), "a memory of nan: give finite"),
+    "of other runs": (remembering(lambda n: np.zeros((n + 1, 5))), r"\(257, 5\) for 256 runs"),
+    "starts as integers": (
+        starting(lambda n: np.zeros((n, 5), int)),
+        r"start\(\) of the agent giv",
+    ),
+    "starts by row": (
+        starting(lambda n: np.arange(5.0 * n).reshape(n, 5)),
+        r"other rows than start",
+    ),
+    "starts at random": (starting(lambda n: np.random.rand(n, 5)), r"other rows than start\(1\)"),
+    "starts with an error": (starting(lambda n: 1 / 0), r"start\(1\) raised ZeroDivisionError"),
+}
+
+
+@pytest.mark.parametrize("kind", SPOILT)
+def test_a_memory_that_is_none_is_refused(kind, circle):
+    make, message = SPOILT[kind]
+    read_agent(circle, Honest())
+    with pytest.raises(BadInput, match=message):
+        read_agent(circle, make())
+
+
+def test_a_closed_loop_notices_a_hidden_memory_too(circle):
+    starts = circle.starts(20, np.random.default_rng(0))
+    for make in (HiddenLater, OfTheBatch):
+        with pytest.raises(BadInput, match=r"the agent answers .* with a memory of"):
+            simulate(circle, from_callable(make(), circle), starts)
+
+
+def test_what_it_lacks_is_said(circle):
+    class NoPair(Honest):
+        def act(self, memory, observation):
+            return turn(observation)
+
+    class Flat(Recurrent):
+        def predict(self, *args, **kwargs):
+            return super().predict(*args, **kwargs)[0], np.zeros(1)
+
+    with pytest.raises(
+        BadInput, match=r"act\(\) gives no pair: give the inputs and the next memory"
+    ):
+        from_callable(NoPair(), circle).act(np.zeros((2, 1)))
+    with pytest.raises(BadInput, match=r"give a tuple of arrays of shape \(layers, n, size\)"):
+        from_callable(Flat(), circle)
+    with pytest.raises(BadInput, match=r"as hyrl_mj\.from_callable\(function, task\)"):
+        simulate(circle, Chunked(), [1.0])
+    lattice = Lattice.tabulate(circle, Grid.with_cells(circle.chart, 60))
+    loop = PolicyController(from_callable(Chunked(), circle))
+    with pytest.raises(
+        BadInput, match="a function of the measurement, and this policy has a memory"
+    ):
+        Answers.ask(lattice, loop, np.zeros(1))
+
+
+# ---- in a run
+
+
+@pytest.mark.slow
+def test_a_diagnosis_says_so_and_goes_on(circle, tmp_path):
+    said, out = [], tmp_path / "run"
+    run = hyrl_mj.diagnose("unit_circle", Chunked(), preset="smoke", out=out, say=said.append)
+    assert any("it has a memory: noisy episodes stand in for the worst" in line for line in said)
+    assert "which this policy is not (it has a memory)" in run.why_no_game
+    assert "function, with a memory" in (out / "diagnosis.html").read_text()
+    again = hyrl_mj.load_run(out, policy=Chunked())
+    assert again.agent.remembers
+    with pytest.raises(BadInput, match="answers otherwise"):
+        _ = hyrl_mj.load_run(out, policy=Filtered()).policy

@@ -76,8 +76,8 @@ def opposite(policy):
 
 
 class Lazy(PolicyController):
-    def step(self, q, measured, past=None):
-        u, q = super().step(q, measured, past)
+    def step(self, q, measured):
+        u, q = super().step(q, measured)
         return 0 * u, q
 
 

@@ -10,7 +10,6 @@ import pytest
 from hyrl_mj import Recorded, simulate_batch
 from hyrl_mj.judging import Budget, attack
 from hyrl_mj.policies import PolicyController
-from hyrl_mj.policies.preprocessing import PreprocessedPolicy
 from hyrl_mj.tasks import Effort
 
 EPS, WINDOW, FIRST = 0.1, 16, 4
@@ -63,18 +62,21 @@ class Watcher:
         return np.where(leaves, 1.0, 0.0)[:, None], following
 
 
-class Rememberer(PreprocessedPolicy):
+@dataclass(frozen=True)
+class Rememberer:
     """As `Watcher`, a policy with one mode that remembers what it measured."""
 
-    memory = 60
+    signal: np.ndarray
+    y: float
+    everywhere: bool = False
 
-    def __init__(self, signal, y, everywhere=False):
-        vars(self).update(signal=signal, y=y, everywhere=everywhere, policy=None)
+    def start(self, n):
+        return np.full((n, 60, 2), np.nan)
 
     def act(self, measured):
         return np.zeros((len(measured), 1))
 
-    def act_after(self, measured, past):
+    def act_after(self, past, measured):
         k = np.isfinite(past[:, :, 1]).sum(axis=1)
         u = np.zeros((len(measured), 1))
         for row in np.flatnonzero(k >= FIRST + WINDOW):
@@ -82,7 +84,7 @@ class Rememberer(PreprocessedPolicy):
             x = 0.05 * np.arange(FIRST, FIRST + WINDOW)
             noise = seen - np.stack([x, np.full(WINDOW, self.y)], axis=1)
             u[row] = matches(noise, self.signal, self.everywhere).sum() >= ENOUGH
-        return u
+        return u, np.concatenate([past[:, 1:], measured[:, None]], axis=1)
 
 
 @dataclass(frozen=True)

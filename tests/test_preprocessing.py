@@ -19,7 +19,10 @@ from hyrl_mj.policies import (
     PolicyController,
     PreprocessedPolicy,
     SampledPolicy,
+    answer,
     as_function,
+    is_memory,
+    memory_at_start,
 )
 from hyrl_mj.policies.external import read_agent, reopen_agent
 from hyrl_mj.policies.preprocessing import Normalization
@@ -100,16 +103,15 @@ def test_its_steady_answer_is_that_to_an_unchanged_measurement(vehicle, tmp_path
     _, path, needs = agent(DQN, vehicle, tmp_path, WRAPPED["normalised, stacked"])
     policy = load_agent(path, vehicle, **needs)
     measured = random_states(vehicle, 50, np.random.default_rng(0))
-    held = np.repeat(measured[:, None], 2, axis=1)
-    np.testing.assert_array_equal(policy.act(measured), policy.act_after(measured, held))
-    loop = PolicyController(policy)
-    assert loop.memory == 2
-    modes = np.zeros(50, int)
+    held = np.repeat(vehicle.observation(measured)[:, None], 2, axis=1)
+    np.testing.assert_array_equal(policy.act_after(held, measured)[0], policy.act(measured))
+    loop, modes = PolicyController(policy), np.zeros(50, int)
+    fresh = memory_at_start(loop, 50)
+    assert fresh.shape == (50, 2, 3)
+    assert (answer(loop, modes, measured, fresh)[0] != policy.act(measured)).any()
     np.testing.assert_array_equal(loop.step(modes, measured)[0], policy.act(measured))
-    fresh = np.full((50, 2, 2), np.nan)
-    assert (loop.step(modes, measured, fresh)[0] != policy.act(measured)).any()
     steady = as_function(policy)
-    assert PolicyController(steady).memory == 0
+    assert not is_memory(memory_at_start(PolicyController(steady), 50))
     np.testing.assert_array_equal(steady.act(measured), policy.act(measured))
 
 
@@ -166,7 +168,7 @@ def test_it_comes_back_from_a_run_directory(wrapped, circle, tmp_path):
     measured = random_states(circle, 50, np.random.default_rng(0))
     np.testing.assert_array_equal(back.act(measured), given.policy.act(measured))
     assert isinstance(back, PreprocessedPolicy)
-    assert back.memory == given.policy.memory
+    assert back.start(1).shape == given.policy.start(1).shape
     # The same weights that see something else are another agent; where its files lie does not count.
     assert read_agent(circle, given.policy).agent == given.agent
     with np.load(tmp_path / "stats.npz") as old:
@@ -324,6 +326,6 @@ def test_a_module_that_does_not_fit_is_named(circle, vehicle):
 def test_sb3s_evaluation_refuses_a_policy_with_memory(circle, tmp_path):
     _, path, needs = agent(PPO, circle, tmp_path, WRAPPED["stacked"])
     policy = load_agent(path, circle, **needs)
-    with pytest.raises(BadInput, match="remembers 2 measurements"):
+    with pytest.raises(BadInput, match="the policy has a memory"):
         Sb3Policy(circle, policy)
     Sb3Policy(circle, as_function(policy))

@@ -8,7 +8,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.policies import Controller, Policy, as_controller, check_modes
+from hyrl_mj.policies import (
+    Controller,
+    Policy,
+    as_controller,
+    check_modes,
+    is_memory,
+    memory_at_start,
+)
 from hyrl_mj.tasks import Task
 
 
@@ -25,10 +32,10 @@ class Sb3Policy:
     controller: Controller | Policy
 
     def __post_init__(self) -> None:
-        if memory := getattr(as_controller(self.controller), "memory", 0):
+        if is_memory(memory_at_start(as_controller(self.controller), 1)):
             raise BadInput(
-                f"the policy remembers {memory} measurements, and SB3 only passes on its mode: use "
-                "hyrl_mj.simulate or closed_loop, where it has its memory"
+                "the policy has a memory, and SB3 only passes on its mode: use hyrl_mj.simulate or "
+                "closed_loop, where it has its memory"
             )
 
     def predict(

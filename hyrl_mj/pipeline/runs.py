@@ -145,8 +145,8 @@ def robustify(
 
     Args:
         task: as for `run`.
-        policy: the agent: a file (.zip of SB3, .onnx, .safetensors), a function from observations (n, k)
-            to inputs (n, m) or levels (n,), or a `Policy`.
+        policy: the agent: a file (.zip of SB3, .onnx, .safetensors), a `Policy`, or what `from_callable`
+            takes, such as a function from observations (n, k) to inputs (n, m) or levels (n,).
         options: the options, by default `AgentOptions()`.
         say: as for `run`.
         changes: as for `run`.

@@ -12,8 +12,8 @@ from hyrl_mj.policies.controllers import (
     as_controller,
     check_inputs,
     check_modes,
-    nothing_past,
-    remembering,
+    is_memory,
+    memory_at_start,
 )
 from hyrl_mj.policies.external import (
     FUNCTION,
@@ -26,13 +26,14 @@ from hyrl_mj.policies.external import (
     read_agent,
     reopen_agent,
 )
-from hyrl_mj.policies.functions import from_callable
+from hyrl_mj.policies.functions import AgentWithMemory, from_callable
 from hyrl_mj.policies.hybrid import ON_EDGE, HybridController
 from hyrl_mj.policies.memoryless import Asked
 from hyrl_mj.policies.mlp import (
     ACTIVATIONS,
     BLAS,
     TORCH_NAMES,
+    MemoryPolicy,
     MlpPolicy,
     ObservationPolicy,
     Policy,
@@ -57,10 +58,12 @@ __all__ = [
     "STATISTICS",
     "TORCH_NAMES",
     "Agent",
+    "AgentWithMemory",
     "AnyPolicy",
     "Asked",
     "Controller",
     "HybridController",
+    "MemoryPolicy",
     "MlpPolicy",
     "Normalization",
     "ObservationPolicy",
@@ -78,10 +81,10 @@ __all__ = [
     "check_modes",
     "from_callable",
     "infer_algorithm",
+    "is_memory",
     "load_agent",
+    "memory_at_start",
     "network",
-    "nothing_past",
     "read_agent",
-    "remembering",
     "reopen_agent",
 ]

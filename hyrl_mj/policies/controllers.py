@@ -7,8 +7,8 @@ from typing import Protocol
 import numpy as np
 
 from hyrl_mj.errors import BadInput
-from hyrl_mj.policies.mlp import Policy
-from hyrl_mj.policies.preprocessing import PreprocessedPolicy
+from hyrl_mj.policies.functions import declares_memory
+from hyrl_mj.policies.mlp import MemoryPolicy, Policy
 
 
 class Controller(Protocol):
@@ -29,7 +29,7 @@ class Controller(Protocol):
 class PolicyController:
     """A single policy as a controller with one mode, 0, that never jumps.
 
-    A policy with memory needs the past measurements; without them it gives its steady answer.
+    One with memory acts with it in closed loops, which ask by `answer`; `step` answers without it.
     """
 
     policy: Policy
@@ -41,32 +41,33 @@ class PolicyController:
     def initial_mode(self, measured: np.ndarray) -> np.ndarray:
         return np.zeros(len(measured), dtype=int)
 
-    @property
-    def memory(self) -> int:
-        """The number of past measurements that `step` takes."""
-        return self.policy.memory if isinstance(self.policy, PreprocessedPolicy) else 0
-
-    def step(
-        self, q: np.ndarray, measured: np.ndarray, past: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns inputs (n, m) and next modes (n,); `past` (n, memory, p) is NaN before the start."""
-        if past is not None and isinstance(self.policy, PreprocessedPolicy) and self.memory:
-            return self.policy.act_after(measured, past), q
+    def step(self, q: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self.policy.act(measured), q
 
 
-def nothing_past(controller: Controller, n: int, columns: int) -> np.ndarray:
-    """Returns the past (n, memory, p) of n runs at their start; most controllers have a memory of 0."""
-    return np.full((n, getattr(controller, "memory", 0), columns), np.nan)
+def memory_at_start(controller: Controller, n: int) -> np.ndarray:
+    """Returns the memory (n, ...) of n runs at their start; most controllers have none, (n, 0)."""
+    policy = controller.policy if isinstance(controller, PolicyController) else None
+    return np.array(policy.start(n) if isinstance(policy, MemoryPolicy) else np.zeros((n, 0)))
+
+
+def is_memory(memory: np.ndarray) -> bool:
+    """Returns whether a memory (n, ...) holds anything."""
+    return 0 not in memory.shape[1:]
 
 
 def answer(
-    controller: Controller, q: np.ndarray, measured: np.ndarray, past: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Returns inputs (n, m) and next modes (n,) of a controller that may have a memory."""
-    if past.shape[1] and isinstance(controller, PolicyController):
-        return controller.step(q, measured, past)
-    return controller.step(q, measured)
+    controller: Controller, q: np.ndarray, measured: np.ndarray, memory: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns inputs (n, m), next modes (n,) and the next memory (n, ...) of a controller.
+
+    The memory that it is given stays as it is, so that asking changes no run.
+    """
+    if is_memory(memory) and isinstance(controller, PolicyController):
+        assert isinstance(controller.policy, MemoryPolicy)
+        u, memory = controller.policy.act_after(memory, measured)
+        return u, q, memory
+    return *controller.step(q, measured), memory
 
 
 def check_inputs(u: np.ndarray, n: int, m: int) -> np.ndarray:
@@ -78,25 +79,21 @@ def check_inputs(u: np.ndarray, n: int, m: int) -> np.ndarray:
     return u
 
 
-def remembering(past: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """Returns the past (n, memory, p) after measurements (n, p)."""
-    return np.concatenate([past[:, 1:], measured[:, None]], axis=1) if past.shape[1] else past
-
-
 def as_controller(loop: Controller | Policy) -> Controller:
     """Returns a controller itself, or a policy as a controller.
 
     Raises:
         BadInput: it is neither.
     """
-    if isinstance(loop, Policy):
-        return PolicyController(loop)
-    if not callable(getattr(loop, "step", None)):
-        raise BadInput(
-            f"{loop!r:.80} can close no loop: give a controller or a policy, and a function as "
-            "hyrl_mj.from_callable(function, task)"
-        )
-    return loop
+    if not declares_memory(loop):
+        if isinstance(loop, Policy):
+            return PolicyController(loop)
+        if callable(getattr(loop, "step", None)):
+            return loop
+    raise BadInput(
+        f"{loop!r:.80} can close no loop: give a controller or a policy, and a function or an agent with a "
+        "memory as hyrl_mj.from_callable(function, task)"
+    )
 
 
 def check_modes(q: np.ndarray, modes: Sequence[int]) -> np.ndarray:

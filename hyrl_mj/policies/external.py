@@ -1,17 +1,17 @@
 """External agents, which `robustify` starts from: how they are read, described and stored."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import numpy as np
 
 from hyrl_mj.errors import BadArtifact, BadInput, check_seed, unknown
 from hyrl_mj.files import artifacts
 from hyrl_mj.policies import algorithms
-from hyrl_mj.policies.functions import from_callable
+from hyrl_mj.policies.controllers import PolicyController, is_memory, memory_at_start
+from hyrl_mj.policies.functions import PythonAgent, declares_memory, from_callable
 from hyrl_mj.policies.memoryless import answers, check_memoryless
 from hyrl_mj.policies.mlp import (
     ACTIVATIONS,
@@ -44,6 +44,7 @@ class Agent:
         statistics: hash of the statistics of `VecNormalize` that its observations go through; "" without.
         n_stack: number of observations that it sees at once.
         vecnormalize: the path of the statistics; "" without, or for a Python object. Comparisons ignore it.
+        remembers: whether it is Python code with a memory.
     """
 
     algorithm: str
@@ -54,20 +55,25 @@ class Agent:
     statistics: str = ""
     n_stack: int = 1
     vecnormalize: str = field(default="", compare=False)
+    remembers: bool = False
 
     def __str__(self) -> str:
         """Returns a one-line description: "agent.zip (DQN, sampled)"."""
         words = [self.title]
         words += ["normalised"] * bool(self.statistics)
         words += [f"{self.n_stack} observations"] * (self.n_stack > 1)
-        words += ["sampled"] * self.stochastic
+        words += ["sampled"] * self.stochastic + ["with a memory"] * self.remembers
         return f"{self.source or 'an agent of Python code'} ({', '.join(words)})"
 
     @property
     def why_no_function(self) -> str:
         """Why its input is no function of the measurement, as "it draws its inputs"; "" if it is one."""
-        memory = f"it sees its last {self.n_stack} observations" if self.n_stack > 1 else ""
-        return " and ".join(filter(None, ["it draws its inputs" * self.stochastic, memory]))
+        whys = {
+            "it draws its inputs": self.stochastic,
+            f"it sees its last {self.n_stack} observations": self.n_stack > 1,
+            "it has a memory": self.remembers,
+        }
+        return " and ".join(why for why, holds in whys.items() if holds)
 
     @property
     def title(self) -> str:
@@ -87,8 +93,8 @@ class Agent:
         return options + ["--stochastic"] * self.stochastic
 
 
-# The values that stand for an agent: a path, a policy, or a function of the observation.
-AnyPolicy = str | Path | Policy | Callable[[np.ndarray], Any]
+# The values that stand for an agent: a path, a policy, or Python code.
+AnyPolicy = str | Path | Policy | PythonAgent
 # The statistics of `VecNormalize` in a run directory.
 STATISTICS = "vecnormalize.npz"
 # Kinds of agents besides those that SB3 trains.
@@ -215,7 +221,7 @@ def read_agent(
     vecnormalize: str | Path | None = None,
     n_stack: int = 1,
 ) -> ExternalAgent:
-    """Returns an external agent: a file for `load_agent`, a policy, or a function for `from_callable`.
+    """Returns an external agent: a file for `load_agent`, a policy, or what `from_callable` takes.
 
     The options are about files, as in `load_agent`.
 
@@ -238,7 +244,9 @@ def read_agent(
         )
     if isinstance(policy, Policy) and network(policy) is not None:
         return _network(policy, task)
-    function = policy if isinstance(policy, Policy) else from_callable(policy, task)
+    if declares_memory(policy) or not isinstance(policy, Policy):
+        policy = from_callable(cast(PythonAgent, policy), task)
+    function: Policy = policy
     agent = Agent(FUNCTION, "", _fingerprint(function, task))
     check_memoryless(function, task)
     return ExternalAgent(function, _seeing(agent, function))
@@ -300,11 +308,14 @@ def _seeing(agent: Agent, policy: Policy) -> Agent:
     """Returns the description of an agent with that of what it sees."""
     preprocessing = _preprocessing(policy)
     statistics = preprocessing.normalization.sha256 if preprocessing.normalization else ""
-    return replace(agent, statistics=statistics, n_stack=preprocessing.n_stack)
+    remembers = preprocessing.n_stack == 1 and is_memory(
+        memory_at_start(PolicyController(policy), 1)
+    )
+    return replace(agent, statistics=statistics, n_stack=preprocessing.n_stack, remembers=remembers)
 
 
 def _fingerprint(policy: Policy, task: Task) -> str:
-    """Returns a hash of a function's answers to fixed measurements.
+    """Returns a hash of a function's answers to fixed measurements, one after the other if it has a memory.
 
     These are of starts, of places all over the chart, and of where random inputs lead from both.
     """
@@ -316,5 +327,10 @@ def _fingerprint(policy: Policy, task: Task) -> str:
     for _ in range(4):
         plant.step(task.draw_inputs(len(z), rng))
         met.append(plant.measurement)
-    first = answers(policy, task, np.concatenate(met), "the policy")
-    return sha256((np.round(first.astype(float), 6) + 0.0).tobytes()).hexdigest()
+    memory, first = memory_at_start(PolicyController(policy), len(z)), []
+    if not is_memory(memory):
+        met, memory = [np.concatenate(met)], np.zeros((len(met) * len(z), 0))
+    for measured in met:
+        u, memory = answers(policy, task, measured, memory, "the policy")
+        first.append(np.round(u.astype(float), 6) + 0.0)
+    return sha256(np.concatenate(first).tobytes()).hexdigest()

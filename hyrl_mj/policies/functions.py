@@ -1,14 +1,14 @@
-"""Policies that are functions of the observation: Python functions, modules of torch."""
+"""Policies of Python code: functions of the observation, modules of torch, and agents with a memory."""
 
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, cast
 
 import numpy as np
 
 from hyrl_mj.errors import BadInput, brief
-from hyrl_mj.policies.mlp import ObservationPolicy
+from hyrl_mj.policies.mlp import MemoryPolicy, ObservationPolicy
 from hyrl_mj.tasks import Task, at_levels, get_task
 
 
@@ -68,28 +68,196 @@ class FunctionPolicy(ObservationPolicy):
         return np.clip(actions, *self.task.input_limits)
 
 
-def from_callable(function: Callable[[np.ndarray], Any], task: Task) -> FunctionPolicy:
-    """Returns a function of the observation as a policy.
+class AgentWithMemory(Protocol):
+    """What `from_callable` takes as an agent with a memory.
+
+    All that it remembers is in one array (n, ...) of floats, with a row for each run, which keeps its shape
+    and type.
+    """
+
+    def start(self, n: int) -> np.ndarray:
+        """Returns the memory (n, ...) of n runs at their start, the same for each: a robot's at rest."""
+
+    def act(self, memory: np.ndarray, observation: np.ndarray) -> tuple[Any, np.ndarray]:
+        """Returns inputs for observations (n, k), as a function does, and the next memory (n, ...)."""
+
+
+class Predicts(Protocol):
+    """What `from_callable` takes as a model of SB3, recurrent or not."""
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = False,
+    ) -> tuple[Any, Any]:
+        """Returns inputs for observations (n, k), and the next state, None without one."""
+
+
+# What `from_callable` takes.
+PythonAgent = Callable[[np.ndarray], Any] | AgentWithMemory | Predicts
+
+
+@dataclass(frozen=True)
+class RememberingPolicy(ObservationPolicy):
+    """An agent with a memory as a policy; `act` gives its first answer, that of a robot at rest there.
+
+    Attributes:
+        agent: the agent.
+        name: what messages call it.
+    """
+
+    task: Task
+    agent: AgentWithMemory
+    name: str = "the agent"
+
+    def start(self, n: int) -> np.ndarray:
+        try:
+            one, memory = self.agent.start(1), self.agent.start(n)
+        except Exception as error:  # a user's code can raise anything
+            raise BadInput(
+                f"{self.name} cannot be used: start({n}) raised {brief(error)}"
+            ) from error
+        if problem := _no_memory(one, 1) or _no_memory(memory, n):
+            raise BadInput(f"start() of {self.name} {problem}")
+        if one.shape[1:] != memory.shape[1:] or not (memory == one).all():
+            raise BadInput(
+                f"start({n}) of {self.name} gives other rows than start(1): give each run the memory of a "
+                "robot at rest"
+            )
+        return np.array(memory)
+
+    def act_after(self, memory: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        measured = self.task.check_measurement(measured)
+        return self._after(memory, self.task.observation(measured))
+
+    def inputs(self, observation: np.ndarray) -> np.ndarray:
+        return self._after(self.start(len(observation)), observation)[0]
+
+    def _after(self, memory: np.ndarray, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns inputs (n, m) for observations (n, k), and the next memory (n, ...)."""
+        next_memory = memory
+
+        def function(observation: np.ndarray) -> Any:
+            nonlocal next_memory
+            answer = self.agent.act(memory.copy(), observation)
+            if not isinstance(answer, tuple) or len(answer) != 2:
+                raise BadInput("its act() gives no pair: give the inputs and the next memory")
+            if problem := _no_memory(answer[1], len(memory)):
+                raise BadInput(f"its act() {problem}")
+            if (now := (answer[1].shape, answer[1].dtype)) != (memory.shape, memory.dtype):
+                raise BadInput(
+                    f"its act() makes a memory {now[1]} of shape {now[0]} of one {memory.dtype} of shape "
+                    f"{memory.shape}: keep the shape and the type"
+                )
+            next_memory = np.array(answer[1])
+            return answer[0]
+
+        return FunctionPolicy(self.task, function, self.name).inputs(observation), next_memory
+
+
+def _no_memory(memory: object, n: int) -> str:
+    """Returns why something is no memory of n runs, "" if it is one."""
+    if not isinstance(memory, np.ndarray) or memory.dtype.kind != "f":
+        kind = memory.dtype if isinstance(memory, np.ndarray) else type(memory).__name__
+        return f"gives a memory of type {kind}: give an array of floats of shape ({n}, ...)"
+    if memory.shape[:1] != (n,):
+        return f"gives a memory of shape {memory.shape} for {n} runs: give one row for each"
+    if not np.isfinite(memory).all():
+        return f"gives a memory of {memory[~np.isfinite(memory)][0]}: give finite numbers"
+    return ""
+
+
+@dataclass(frozen=True)
+class _Predicting:
+    """A recurrent model with SB3's `predict` as an agent with a memory.
+
+    Its memory (n, 1 + size) is whether a run begins, and the state of the model.
+
+    Attributes:
+        model: the model, whose state is a tuple of arrays (layers, n, size).
+        state: its state after one observation.
+    """
+
+    model: Predicts
+    state: tuple[np.ndarray, ...]
+
+    def start(self, n: int) -> np.ndarray:
+        memory = np.zeros((n, 1 + sum(part.size for part in self.state)))
+        memory[:, 0] = 1.0
+        return memory
+
+    def act(self, memory: np.ndarray, observation: np.ndarray) -> tuple[Any, np.ndarray]:
+        n, ends = len(memory), np.cumsum([part.size for part in self.state])[:-1]
+        state = tuple(
+            np.moveaxis(flat.reshape(n, *part[:, 0].shape), 0, 1).astype(part.dtype)
+            for flat, part in zip(np.split(memory[:, 1:], ends, axis=1), self.state, strict=True)
+        )
+        actions, state = self.model.predict(
+            observation, state=state, episode_start=memory[:, 0] == 1, deterministic=True
+        )
+        flat = [np.moveaxis(part, 1, 0).reshape(n, -1) for part in state]
+        return actions, np.hstack([np.zeros((n, 1)), *flat])
+
+
+def _predicting(model: Predicts, task: Task) -> FunctionPolicy | RememberingPolicy:
+    """Returns a model with SB3's `predict` as a policy, which has a memory if the model has a state."""
+    observation = np.zeros((1, len(task.observation_low)), dtype=np.float32)
+    begins = np.ones(1, dtype=bool)
+    try:
+        _, state = model.predict(observation, None, episode_start=begins, deterministic=True)
+    except Exception as error:  # a user's code can raise anything
+        raise BadInput(f"predict() of {model!r:.80} raised {brief(error)}") from error
+    if state is None:
+        return FunctionPolicy(task, lambda o: model.predict(o, deterministic=True)[0], "the model")
+    arrays = isinstance(state, tuple) and all(isinstance(part, np.ndarray) for part in state)
+    if not arrays or not all(part.ndim == 3 and part.shape[1] == 1 for part in state):
+        raise BadInput(
+            f"predict() of {model!r:.80} gives a state {state!r:.80}: give a tuple of arrays of shape "
+            "(layers, n, size), or an object with start(n) and act(memory, observation)"
+        )
+    return RememberingPolicy(task, _Predicting(model, state), "the model")
+
+
+def declares_memory(agent: object) -> bool:
+    """Returns whether an object is an `AgentWithMemory`, for which a task has to be known."""
+    methods = (getattr(agent, name, None) for name in ("start", "act"))
+    return all(map(callable, methods)) and not isinstance(agent, MemoryPolicy)
+
+
+def from_callable(function: PythonAgent, task: Task) -> FunctionPolicy | RememberingPolicy:
+    """Returns a function of the observation as a policy, or an agent that has a memory.
 
     Args:
         function: observations (n, k), float32, or float64 where an environment of others observes that ->
             inputs (n, m) in the plant's units, which are clipped to the task's limits. For a discrete task:
             the numbers of the levels, (n,) integers, or preferences (n, levels). Or a `torch.nn.Module` that
-            does so with tensors, which is put into evaluation mode.
+            does so with tensors, which is put into evaluation mode. Or an `AgentWithMemory`: an object with
+            `start(n)`, which returns the memory (n, ...) of a robot at rest, and `act(memory, observation)`,
+            which returns such inputs and the next memory. Or a model with SB3's `predict`, also one with a
+            state, such as RecurrentPPO.
         task: the robot and its problem.
 
     Raises:
-        BadInput: it is not callable. `act` of the policy raises it, too, if the function raises, or
-            returns another shape, a number that is not finite, or an integer out of range.
+        BadInput: it is none of these. `act` of the policy raises it, too, if the function raises, or
+            returns another shape, a number that is not finite, an integer out of range, or no such memory.
     """
     task = get_task(task)
-    if not callable(function):
-        raise BadInput(
-            f"{function!r} cannot be called: give a function from observations (n, k) to inputs (n, m)"
-        )
+    if declares_memory(function):
+        policy = RememberingPolicy(task, cast(AgentWithMemory, function))
+        policy.start(1)
+        return policy
     if _is_module(function):
         return FunctionPolicy(task, _of_arrays(function), "the module")
-    return FunctionPolicy(task, function)
+    if callable(function):
+        return FunctionPolicy(task, function)
+    if callable(getattr(function, "predict", None)):
+        return _predicting(cast(Predicts, function), task)
+    raise BadInput(
+        f"{function!r} cannot be called: give a function from observations (n, k) to inputs (n, m), or an "
+        "agent with start(n) and act(memory, observation)"
+    )
 
 
 def _is_module(function: object) -> bool:

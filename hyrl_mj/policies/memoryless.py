@@ -1,7 +1,8 @@
 """Whether an agent is a function of what it sees: asked again, in other ways, it has to answer the same.
 
-An agent that remembers, draws at random, or looks at the other rows of a batch would act otherwise in a
-batch of runs, where it is examined, than on a robot. `check_memoryless` tries one when it is accepted;
+What it sees is a measurement and the memory that it has declared, if any. An agent that remembers anything
+else, draws at random, or looks at the other rows of a batch would act otherwise in a batch of runs, where it
+is examined, than on a robot. `check_memoryless` tries one when it is accepted;
 `Asked` goes on trying it, at little cost, in every closed loop.
 """
 
@@ -14,7 +15,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hyrl_mj.errors import BadInput, brief
-from hyrl_mj.policies.controllers import Controller, PolicyController, answer, check_inputs
+from hyrl_mj.policies.controllers import (
+    Controller,
+    PolicyController,
+    answer,
+    check_inputs,
+    memory_at_start,
+)
 from hyrl_mj.policies.mlp import Policy, SampledPolicy
 from hyrl_mj.policies.preprocessing import PreprocessedPolicy, as_function
 from hyrl_mj.tasks import Outcome
@@ -28,7 +35,7 @@ RUNS, SAMPLES, SOME = 16, 64, 4
 # Sums of 256 numbers in another order differ by some 16 roundings of float32; a network has a few of them.
 ROUNDING = 32 * float(np.finfo(np.float32).eps)
 
-# Returns answers (n, m) to n measurements, of the given rows of some table, moved by (n, p).
+# Returns answers (n, m + k) to n measurements, of the given rows of some table, moved by (n, p).
 Ask = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -40,13 +47,13 @@ def draws(policy: object) -> bool:
 
 
 def check_memoryless(policy: Policy, task: Task, name: str = "the policy") -> None:
-    """Tries whether a policy is a function of the measurement, where it would act.
+    """Tries whether a policy is a function of the measurement, and of its memory, where it would act.
 
     It acts in a few runs without noise, and watches as many that random inputs drive elsewhere. It is then
     asked about their measurements again: in the same batches, later first, and with only the first row in its
     place; in one batch, and in another order; in a few rows, and one by one, many times, in an array
-    that is used again; and once more in the first batches. Of a policy that draws its inputs, or sees several
-    observations, this is about `as_function` of it.
+    that is used again; and once more in the first batches. This is about `as_function` of it, which neither
+    draws its inputs nor sees several observations.
 
     Raises:
         BadInput: it answers a measurement otherwise than before, or changes an array that is not its own.
@@ -54,15 +61,20 @@ def check_memoryless(policy: Policy, task: Task, name: str = "the policy") -> No
     _Trial(as_function(policy), task, getattr(policy, "name", name)).run()
 
 
-def answers(policy: Policy, task: Task, measured: np.ndarray, name: str) -> np.ndarray:
-    """Returns what a policy answers to measurements (n, p), an array (n, m), which is the policy's own.
+def answers(
+    policy: Policy, task: Task, measured: np.ndarray, memory: np.ndarray, name: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns what a policy answers to measurements (n, p) and memories (n, ...), and the next memories.
+
+    The answers (n, m) are the policy's own array.
 
     Raises:
         BadInput: it raises an error, changes the measurements, or gives no finite inputs of that shape.
     """
     kept = measured.copy()
     try:
-        u = np.asarray(policy.act(measured))
+        u, _, memory = answer(PolicyController(policy), np.zeros(len(kept), int), measured, memory)
+        u = np.asarray(u)
     except BadInput:
         raise
     except Exception as error:  # a user's code can raise anything
@@ -77,7 +89,7 @@ def answers(policy: Policy, task: Task, measured: np.ndarray, name: str) -> np.n
         )
     if not np.isfinite(u).all():
         raise BadInput(f"{name} gives inputs that are not finite: {task.name} takes numbers")
-    return u
+    return u, memory
 
 
 class _Trial:
@@ -85,12 +97,14 @@ class _Trial:
 
     Attributes:
         batches: the measurements (n, p) that were asked about together.
-        answers: the first answers (n, m) to them.
+        memories: the memories (n, ...) with them.
+        answers: the first answers (n, m + k) to them: inputs, and the numbers of the next memories.
     """
 
     def __init__(self, policy: Policy, task: Task, name: str):
         self.policy, self.task, self.name = policy, task, name
         self.batches: list[np.ndarray] = []
+        self.memories: list[np.ndarray] = []
         self.answers: list[np.ndarray] = []
         self._before = (np.zeros(0), np.zeros(0))  # the latest answer, and a copy of it
         low, high = task.input_limits
@@ -100,8 +114,8 @@ class _Trial:
         self._act()
         for k in reversed(range(len(self.batches))):
             self._again(k, "asked again later")
-        rows, rng = np.concatenate(self.batches), np.random.default_rng(1)
-        first = np.concatenate(self.answers)
+        rows, memory = np.concatenate(self.batches), np.concatenate(self.memories)
+        first, rng = np.concatenate(self.answers), np.random.default_rng(1)
         whole = np.arange(len(rows))
         ends = np.cumsum([len(batch) for batch in self.batches])
         orders = [whole, rng.permutation(whole)]
@@ -110,18 +124,19 @@ class _Trial:
             others = rng.choice(whole, len(batch) - 1)
             orders.append(np.append(end - len(batch), others))
         for order in orders:
-            self._compare(rows, first, order, self._ask(rows[order]), f"in a batch of {len(order)}")
+            again = self._ask(rows[order], memory[order])
+            self._compare(rows, memory, first, order, again, f"in a batch of {len(order)}")
         one = np.empty((1, rows.shape[1]))
-        for i in rng.permutation(len(rows))[:128]:
+        for i in rng.permutation(len(rows))[:128, None]:
             one[:] = rows[i]
-            self._compare(rows, first, np.array([i]), self._ask(one), "alone")
+            self._compare(rows, memory, first, i, self._ask(one, memory[i]), "alone")
         for k in range(0, len(self.batches), SOME):
             self._again(k, f"asked again after {len(rows)} others")
 
     def _act(self) -> None:
         """Acts in runs from the start distribution; what has ended begins anew once all have."""
         task, rng = self.task, np.random.default_rng(0)
-        plant, active = task.plant(RUNS), np.zeros(0, dtype=int)
+        plant, active, m = task.plant(RUNS), np.zeros(0, dtype=int), len(task.inputs)
         for k in range(SAMPLES):
             measured = plant.measurement
             if len(active):
@@ -130,44 +145,53 @@ class _Trial:
             if not len(active):
                 plant.set_state(*task.state(task.starts(RUNS, rng), rng))
                 measured, active = plant.measurement, np.arange(RUNS)
+                memory = memory_at_start(PolicyController(self.policy), RUNS)
             self.batches.append(measured[active])
-            self.answers.append(self._ask(self.batches[-1]))
+            self.memories.append(memory[active])
+            self.answers.append(self._ask(self.batches[-1], self.memories[-1]))
+            memory[active] = self.answers[-1][:, m:].reshape(self.memories[-1].shape)
             if k % 8 == 0:  # inputs are held for so many samples
                 low, high = task.input_limits
                 drawn = rng.uniform(low, high, (RUNS, len(low)))
             mine = (active < RUNS // 2)[:, None]
             try:
-                plant.step(np.where(mine, self.answers[-1], drawn[active]), active)
+                plant.step(np.where(mine, self.answers[-1][:, :m], drawn[active]), active)
             except BadInput:  # inputs beyond the limits are named where a run is really made
                 active = active[:0]
 
-    def _ask(self, measured: np.ndarray) -> np.ndarray:
-        """Returns a copy of the answers (n, m) to measurements (n, p)."""
-        u = answers(self.policy, self.task, measured, self.name)
+    def _ask(self, measured: np.ndarray, memory: np.ndarray) -> np.ndarray:
+        """Returns a copy of the answers (n, m + k) to measurements (n, p) and memories (n, ...)."""
+        u, after = answers(self.policy, self.task, measured, memory, self.name)
         latest, copy = self._before
         if not np.array_equal(latest, copy):
             raise BadInput(
                 f"{self.name} changes an answer that it gave before: let it return a new array each time"
             )
         self._before = u, u.copy()
-        return u.astype(float)
+        return np.column_stack([u.astype(float), after.reshape(len(u), -1)])
 
     def _again(self, k: int, words: str) -> None:
         """Asks about a batch as it was asked about first, where not even sums differ."""
-        rows, first = self.batches[k], self.answers[k]
-        compare(self.name, rows, first, self._ask(rows), ROUNDING * self._span, words)
+        rows, memory, first = self.batches[k], self.memories[k], self.answers[k]
+        compare(self.name, rows, first, self._ask(rows, memory), self._span, words)
 
     def _compare(
-        self, rows: np.ndarray, first: np.ndarray, chosen: np.ndarray, u: np.ndarray, words: str
+        self,
+        rows: np.ndarray,
+        memory: np.ndarray,
+        first: np.ndarray,
+        chosen: np.ndarray,
+        again: np.ndarray,
+        words: str,
     ) -> None:
         """Compares answers to `chosen` rows (k,) with those of before."""
 
         def ask(some: np.ndarray, shift: np.ndarray) -> np.ndarray:
-            moved = rows[chosen[some]] + shift
-            return np.concatenate([self._ask(row) for row in moved[:, None]])
+            at = chosen[some]
+            pairs = zip((rows[at] + shift)[:, None], memory[at, None], strict=True)
+            return np.concatenate([self._ask(*pair) for pair in pairs])
 
-        margin = ROUNDING * self._span
-        compare(self.name, rows[chosen], first[chosen], u, margin, words, ask)
+        compare(self.name, rows[chosen], first[chosen], again, self._span, words, ask)
 
 
 def compare(
@@ -175,19 +199,23 @@ def compare(
     rows: np.ndarray,
     first: np.ndarray,
     again: np.ndarray,
-    margin: np.ndarray,
+    span: np.ndarray,
     words: str,
     ask: Ask | None = None,
 ) -> None:
-    """Compares two answers (n, m) to the same measurements `rows` (n, p).
+    """Compares two answers (n, m + k) to the same measurements `rows` (n, p): inputs, and next memories.
 
-    They may differ by a margin (m,). With `ask`, which asks about one measurement at a time, also by as much
-    as the answer changes within roundings of the measurement: where it is steep, or where two levels tie.
+    Inputs may differ by roundings of their `span` (m,), the range of the inputs, and memories by those of
+    their largest number. With `ask`, which asks about one measurement at a time, also by as much as the
+    answer changes within roundings of the measurement: where it is steep, or where two levels tie.
 
     Raises:
         BadInput: they differ by more.
     """
-    off = np.abs(again - first) - margin
+    m = len(span)
+    largest = np.nan_to_num(np.abs(first[:, m:])).max(initial=0.0)
+    margin = ROUNDING * np.append(span, np.full(first.shape[1] - m, largest))
+    off = np.nan_to_num(np.abs(again - first)) - margin
     if not (off > 0).any():
         return
     # A larger difference is a rounding, too, where the answer changes as much over one of the measurement.
@@ -200,10 +228,18 @@ def compare(
             near = ask(np.full(len(shifts), i), shifts)
             off[i] -= np.abs(near - near[0]).max(axis=0)
         if (off[i] > 0).any():
+            shown, what = slice(m), ""
+            if not (off[i, :m] > 0).any():
+                shown, what = slice(off[i].argmax(), off[i].argmax() + 1), "a memory of "
+            alone = "observation alone, without chance or memory"
+            if m < first.shape[1]:
+                alone = (
+                    "observation and the memory that it is given, without chance or another memory"
+                )
             raise BadInput(
-                f"{name} answers the measurement {_row(rows[i])} with {_row(first[i])} and, {words}, with "
-                f"{_row(again[i])}: give one whose answer depends on its own observation alone, without "
-                "chance or memory"
+                f"{name} answers the measurement {_row(rows[i])} with {what}{_row(first[i, shown])} and, "
+                f"{words}, with {what}{_row(again[i, shown])}: give one whose answer depends on its own "
+                f"{alone}"
             )
 
 
@@ -226,17 +262,17 @@ class Asked:
     _next: int = 0
 
     def __call__(
-        self, k: int, q: np.ndarray, measured: np.ndarray, past: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns inputs (n, m) and next modes (n,) at sample k of runs, as `answer`."""
-        u, after = answer(self.controller, q, measured, past)
-        check_inputs(u, len(measured), len(self.task.inputs))
+        self, k: int, q: np.ndarray, measured: np.ndarray, memory: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns inputs (n, m), next modes (n,) and memories (n, ...) at sample k of runs, as `answer`."""
+        answered = answer(self.controller, q, measured, memory)
+        check_inputs(answered[0], len(measured), len(self.task.inputs))
         # Samples 0, 1, 4, 16, ...; with many runs, which takes longer, the first two.
         if k == self._next and (k < 2 or len(measured) <= 256):
-            rows = (q, measured, past, np.column_stack([u, after]))
+            rows = (q, measured, memory, _beside(answered))
             self._kept.append(tuple(values.copy() for values in rows))
             self._next = max(4 * k, 1)
-        return u, after
+        return answered
 
     def again(self) -> None:
         """Asks about these measurements again, later ones first, and about a few of each at once.
@@ -249,25 +285,27 @@ class Asked:
             return
         low, high = self.task.input_limits
         span = np.zeros_like(low) if self.task.input_levels is not None else high - low
-        margin, name, words = ROUNDING * np.append(span, 0.0), "the controller", "asked again later"
+        span, name, words = np.append(span, 0.0), "the controller", "asked again later"
         if isinstance(controller, PolicyController):
             name = getattr(controller.policy, "name", "the policy")
-        for q, measured, past, first in reversed(self._kept):
-            again = np.column_stack(answer(controller, q, measured, past))
-            compare(name, measured, first, again, margin, words)
+        for *asked, first in reversed(self._kept):
+            again = _beside(answer(controller, *asked))
+            compare(name, asked[1], first, again, span, words)
         if not self._kept:
             return
         few = ([values[:8] for values in batch] for batch in self._kept)
-        q, measured, past, first = map(np.concatenate, zip(*few, strict=True))
+        q, measured, memory, first = map(np.concatenate, zip(*few, strict=True))
 
         def ask(rows: np.ndarray, shift: np.ndarray) -> np.ndarray:
             moved = measured[rows] + shift
-            return np.concatenate(
-                [
-                    np.column_stack(answer(controller, q[i : i + 1], row, past[i : i + 1]))
-                    for i, row in zip(rows, moved[:, None], strict=True)
-                ]
-            )
+            alone = zip(q[rows, None], moved[:, None], memory[rows, None], strict=True)
+            return np.concatenate([_beside(answer(controller, *one)) for one in alone])
 
-        again = np.column_stack(answer(controller, q, measured, past))
-        compare(name, measured, first, again, margin, f"in a batch of {len(q)}", ask)
+        again = _beside(answer(controller, q, measured, memory))
+        compare(name, measured, first, again, span, f"in a batch of {len(q)}", ask)
+
+
+def _beside(answered: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+    """Returns inputs (n, m), modes (n,) and memories (n, ...) beside each other, (n, m + 1 + k)."""
+    u, q, memory = answered
+    return np.column_stack([u, q, memory.reshape(len(u), -1)])

@@ -63,6 +63,21 @@ class Policy(Protocol):
         """Returns inputs (n, m) in the plant's units for measurements (n, p)."""
 
 
+@runtime_checkable
+class MemoryPolicy(Policy, Protocol):
+    """A policy that acts with a memory in closed loops; its `act` answers as if there were none.
+
+    A memory is an array (n, ...) of floats with a row for each run, so that rows can be picked and copied; of
+    width 0, (n, 0), it is none. The next memory is a function of the memory and the measurement alone.
+    """
+
+    def start(self, n: int) -> np.ndarray:
+        """Returns the memory (n, ...) of n runs at their start: that of a robot at rest there."""
+
+    def act_after(self, memory: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns inputs (n, m) for measurements (n, p), and the next memory (n, ...)."""
+
+
 class ObservationPolicy(ABC):
     """A policy that sees a measurement only through its task's observation.
 

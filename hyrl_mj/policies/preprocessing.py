@@ -189,8 +189,8 @@ class Preprocessing:
 class PreprocessedPolicy(ObservationPolicy):
     """An agent that sees more or something else than the observation of the task.
 
-    `act` is its steady answer: to a measurement that has not changed for as long as it remembers. With
-    its memory it acts in closed loops, which call `act_after`.
+    `act` is its steady answer: to a measurement that has not changed for as long as it remembers. In closed
+    loops it acts with its memory, the past observations (n, n_stack - 1, k), which are NaN before the start.
 
     Attributes:
         policy: the agent.
@@ -206,35 +206,26 @@ class PreprocessedPolicy(ObservationPolicy):
     def task(self) -> Task:  # type: ignore[override]
         return self.policy.task
 
-    @property
-    def memory(self) -> int:
-        """The number of past measurements that it reads in a closed loop."""
-        return self.preprocessing.n_stack - 1 if self.remembers else 0
-
     def inputs(self, observation: np.ndarray) -> np.ndarray:
         frames = np.repeat(observation[:, None], self.preprocessing.n_stack, axis=1)
         return self.policy.inputs(self.preprocessing(frames))
 
-    def act_after(self, measured: np.ndarray, past: np.ndarray) -> np.ndarray:
-        """Returns inputs (n, m) for measurements (n, p) and those before them, (n, memory, p), oldest first.
+    def start(self, n: int) -> np.ndarray:
+        frames = self.preprocessing.n_stack - 1 if self.remembers else 0
+        return np.full((n, frames, len(self.task.observation_low)), np.nan)
 
-        Past measurements are NaN before the start.
-        """
-        task = self.task
-        frames = [task.observation(task.check_measurement(measured))]
-        for before in np.moveaxis(past, 1, 0)[::-1]:
-            started = np.isfinite(before).all(axis=1)
-            frame = np.full(frames[0].shape, np.nan)
-            if started.any():
-                frame[started] = task.observation(before[started])
-            frames.insert(0, frame)
-        return self.policy.inputs(self.preprocessing(np.stack(frames, axis=1)))
+    def act_after(self, memory: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        observation = self.task.observation(self.task.check_measurement(measured))
+        frames = np.concatenate([memory, observation[:, None]], axis=1)
+        return self.policy.inputs(self.preprocessing(frames)), frames[:, 1:]
 
 
 def as_function(policy: Policy) -> Policy:
     """Returns a policy as a function of the measurement.
 
-    Of one that draws its inputs this is its mean or mode, of one with memory its steady answer.
+    Of one that draws its inputs this is its mean or mode, of one that sees several observations its steady
+    answer. Python code with a memory stays as it is: where it starts, its `act` is its answer, and runs go on
+    with its memory.
     """
     if isinstance(policy, SampledPolicy):
         return policy.policy

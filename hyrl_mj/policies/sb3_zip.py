@@ -91,9 +91,13 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 def _check_plain(tensors: Mapping[str, np.ndarray], about: Mapping[str, Any], task: Task) -> None:
     """Raises `BadArtifact` if an agent is more than an MLP on a vector, or on a Dict of vectors."""
+    if any("lstm" in name for name in tensors):
+        raise BadArtifact(
+            "it has a recurrent policy (lstm): load it with sb3-contrib in Python, and give the model "
+            "itself, as hyrl_mj.diagnose(task, model)"
+        )
     # Parts of tensor names, and what they mean.
     foreign = {
-        "lstm": "it has a recurrent policy (lstm)",
         "features_extractor.extractors.": "its observations are a dict",
         "features_extractor.cnn.": "it has a CNN policy, which looks at images",
         "features_extractor.": "it has a features extractor of its own",

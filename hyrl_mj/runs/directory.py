@@ -123,7 +123,7 @@ class Run:
     def steady(self) -> Policy:
         """The policy as a function of the measurement.
 
-        Of one that draws its inputs this is its mean or mode, of one with memory its steady answer.
+        Of one that draws its inputs this is its mean or mode, and the others are as in `as_function`.
         """
         return policies.as_function(self.policy)
 
@@ -201,9 +201,9 @@ class Run:
 
     @property
     def keeps_agent(self) -> bool:
-        """Whether the policy of every mode is the agent itself, everywhere as it is."""
+        """Whether the policy of every mode is the agent itself, everywhere as it is, without a memory."""
         kept = self.mode_policies.values()
-        return all(
+        return not (self.agent and self.agent.remembers) and all(
             isinstance(pi, PartPolicy) and pi.whole and pi.policy is self.policy for pi in kept
         )
 
@@ -339,7 +339,7 @@ def load_run(
 
     Args:
         path: the directory.
-        policy: the agent of the run, if it is a function, which no file can hold.
+        policy: the agent of the run, if it is Python code, which no file can hold.
         task: the Python file that defines the task, if the task is the user's and this machine has not run
             it before. The file is executed.
 

@@ -24,7 +24,7 @@ def drawn(signal: Signal, now: Sample) -> np.ndarray:
     """
     before = None if is_own(signal) else global_state()
     arrays = {
-        name: read_only(getattr(now, name)) for name in ("rows", "k", "measurement", "q", "past")
+        name: read_only(getattr(now, name)) for name in ("rows", "k", "measurement", "q", "memory")
     }
     plant: Any = _Seen(now.plant)
     shown = replace(now, plant=plant, **arrays)

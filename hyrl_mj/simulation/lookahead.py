@@ -11,7 +11,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.physics.plant import Plant
-from hyrl_mj.policies import Controller, answer, nothing_past, remembering
+from hyrl_mj.policies import Controller, answer, is_memory, memory_at_start
 from hyrl_mj.simulation.noise import NOT_STARTED, Sample, Signal, register_noise
 from hyrl_mj.tasks import Outcome, Task
 
@@ -46,21 +46,26 @@ class Ahead:
             getattr(self, field.name)[rows] = getattr(other, field.name)
 
 
+def memory_of(controller: Controller, now: Sample) -> np.ndarray:
+    """Returns the memory (n, ...) of a controller at a sample of n runs."""
+    return memory_at_start(controller, len(now.rows)) if now.memory is None else now.memory
+
+
 def answer_of(
-    controller: Controller, measured: np.ndarray, q: np.ndarray, past: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a controller's inputs (n, m) and modes (n,) for measurements (n, p).
+    controller: Controller, measured: np.ndarray, q: np.ndarray, memory: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns a controller's inputs (n, m), modes (n,) and next memory (n, ...) for measurements (n, p).
 
     Args:
         controller: the controller, which picks the mode of a run that has not begun.
         measured: (n, p) measurements.
         q: (n,) modes, or `NOT_STARTED`.
-        past: (n, memory, p) past measurements, of a controller that takes them.
+        memory: (n, ...) its memory before them.
     """
     begins = q == NOT_STARTED
     if begins.any():
         q = np.where(begins, controller.initial_mode(measured), q)
-    return answer(controller, q, measured, past)
+    return answer(controller, q, measured, memory)
 
 
 def each_answer(
@@ -69,8 +74,8 @@ def each_answer(
     true: np.ndarray,
     candidates: np.ndarray,
     q: np.ndarray,
-    past: np.ndarray,
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    memory: np.ndarray,
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Yields a controller's answers to candidates of the noise, to several of them at once.
 
     Args:
@@ -78,10 +83,10 @@ def each_answer(
         controller: the controller.
         true: (n, p) measurements without noise.
         candidates: (c, p) noise.
-        q, past: as in `answer_of`, of the n runs.
+        q, memory: as in `answer_of`, of the n runs.
 
     Yields:
-        Inputs (k, n, m) and modes (k, n) for the next k of the candidates.
+        Inputs (k, n, m), modes (k, n) and memories (k, n, ...) for the next k of the candidates.
     """
     n = len(true)
     several = max(1_024 // max(n, 1), 1)  # more measurements do not stay in a processor's cache
@@ -89,9 +94,10 @@ def each_answer(
         some = candidates[first : first + several]
         each = np.broadcast_to(some[:, None], (len(some), *true.shape)).reshape(-1, true.shape[1])
         measured = task.perturbed(np.tile(true, (len(some), 1)), each)
-        modes, before = np.tile(q, len(some)), np.tile(past, (len(some), 1, 1))
-        u, modes = answer_of(controller, measured, modes, before)
-        yield u.reshape(len(some), n, -1), modes.reshape(len(some), n)
+        at = np.tile(np.arange(n), len(some))
+        found = answer_of(controller, measured, q[at], memory[at])
+        u, modes, after = (values.reshape(len(some), n, *values.shape[1:]) for values in found)
+        yield u, modes, after
 
 
 @register_noise
@@ -165,31 +171,25 @@ class Lookahead(Signal):
         unstable = now.plant.unstable[now.rows]
         running = np.flatnonzero(self.task.outcome(true, unstable) == Outcome.RUNNING)
         q, rows, k = now.q[running], now.rows[running], now.k[running]
-        past = nothing_past(self.controller, *true.shape) if now.past is None else now.past
-        past = past[running]
-        answers = np.concatenate(
-            [
-                np.concatenate([u, q[..., None]], axis=2)
-                for u, q in each_answer(
-                    self.task, self.controller, true[running], self._candidates, q, past
-                )
-            ]
-        )
+        memory = memory_of(self.controller, now)[running]
+        found = each_answer(self.task, self.controller, true[running], self._candidates, q, memory)
+        u, q, memory = map(np.concatenate, zip(*found, strict=True))
+        answers, remembers = np.concatenate([u, q[..., None]], axis=2), is_memory(memory[0])
         # Simulate each distinct answer once, and only where the candidates' answers differ. With memory
         # the same answer to two candidates does not make them equal.
-        differs = (answers != answers[0]).any(axis=(0, 2)) | (past.shape[1] > 0)
+        differs = (answers != answers[0]).any(axis=(0, 2)) | remembers
         repeated = [
-            (answers[:i] == answers[i]).all(axis=2).any(axis=0) & (past.shape[1] == 0)
+            (answers[:i] == answers[i]).all(axis=2).any(axis=0) & (not remembers)
             for i in range(len(answers))
         ]
         candidate, at = np.nonzero(differs & ~np.stack(repeated))
-        past = remembering(past[at], true[running[at]] + self._candidates[candidate])
-        runs = self._ahead(now.plant, rows[at], k[at], candidate, answers[candidate, at], past)
+        after = answers[candidate, at], memory[candidate, at]
+        runs = self._ahead(now.plant, rows[at], k[at], candidate, *after)
         danger = np.full(answers.shape[:2], -np.inf)
         danger[candidate, at] = runs.danger.max(axis=1)
         best = danger.argmax(axis=0)
         chosen[running] = self._candidates[best]
-        if self.samples > 1 and not past.shape[1]:
+        if self.samples > 1 and not remembers:
             self._keep(now.plant.n, rows[at], k[at], runs, candidate == best[at])
         return chosen
 
@@ -200,7 +200,7 @@ class Lookahead(Signal):
         k: np.ndarray,
         candidate: np.ndarray,
         answers: np.ndarray,
-        past: np.ndarray,
+        memory: np.ndarray,
     ) -> Ahead:
         """Returns the simulations of candidates (c,) from the states of a plant's `rows` (c,).
 
@@ -209,7 +209,7 @@ class Lookahead(Signal):
             k: (c,) the number of the sample.
             candidate: (c,) indices of the candidates.
             answers: (c, m + 1) the controller's answers to them, inputs and mode.
-            past: (c, memory, p) the measurements up to these answers.
+            memory: (c, ...) its memory after these answers.
         """
         state = np.hstack([plant.qpos[rows], plant.qvel[rows]])
         danger = np.full((len(rows), self.samples), -np.inf)
@@ -223,7 +223,7 @@ class Lookahead(Signal):
             numbers = np.flatnonzero(some)
             for first in range(0, len(numbers), BATCH):
                 batch = numbers[first : first + BATCH]
-                later = self._simulate(runs[batch], past[batch], samples)
+                later = self._simulate(runs[batch], memory[batch], samples)
                 later.danger = np.hstack([runs.danger[batch, :-samples], later.danger])
                 runs.put(batch, later)
         return runs
@@ -239,10 +239,10 @@ class Lookahead(Signal):
         self._kept_at[rows[chosen]] = k[chosen]
         self._kept.put(rows[chosen], runs[chosen])
 
-    def _simulate(self, begun: Ahead, past: np.ndarray, samples: int) -> Ahead:
+    def _simulate(self, begun: Ahead, memory: np.ndarray, samples: int) -> Ahead:
         """Simulates from the states of `begun` (k,), with its answers first, over so many samples.
 
-        `past` (k, memory, p) are the measurements up to these answers.
+        `memory` (k, ...) is that after these answers.
         """
         plant = self._placed(begun.state)
         answers, rows = begun.answers, np.arange(len(begun.answers))
@@ -258,9 +258,9 @@ class Lookahead(Signal):
             rows = rows[goes_on]
             if not len(rows):
                 break
-            after, q, past = after[goes_on], q[goes_on], past[goes_on]
-            answers = np.column_stack(answer_of(self.controller, after, q, past))
-            past = remembering(past, after)
+            before = after[goes_on], q[goes_on], memory[goes_on]
+            u, q, memory = answer_of(self.controller, *before)
+            answers = np.column_stack([u, q])
         next_answers[rows] = answers[: len(rows)]
         end = np.hstack([plant.qpos, plant.qvel])[: len(danger)]
         return Ahead(danger, end, next_answers, np.isin(np.arange(len(danger)), rows))

@@ -39,7 +39,7 @@ class Sample:
         measurement: (n, p) true measurements.
         q: (n,) int modes; `NOT_STARTED` where none has been picked.
         plant: all simulations.
-        past: (n, memory, p) past measurements, for a controller that takes them; None for others.
+        memory: (n, ...) the controller's memory, (n, 0) for one without; None where each run begins.
     """
 
     rows: np.ndarray
@@ -47,7 +47,7 @@ class Sample:
     measurement: np.ndarray
     q: np.ndarray
     plant: Plant
-    past: np.ndarray | None = None
+    memory: np.ndarray | None = None
 
 
 class Signal(ABC):

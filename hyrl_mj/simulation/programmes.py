@@ -6,8 +6,8 @@ from typing import Self
 
 import numpy as np
 
-from hyrl_mj.policies import Controller, nothing_past
-from hyrl_mj.simulation.lookahead import answer_of, each_answer
+from hyrl_mj.policies import Controller
+from hyrl_mj.simulation.lookahead import answer_of, each_answer, memory_of
 from hyrl_mj.simulation.noise import NOT_STARTED, Sample, Signal
 from hyrl_mj.simulation.rules import RuleKind, Rules
 from hyrl_mj.tasks import Outcome, Task
@@ -84,15 +84,15 @@ class Programmes(Signal):
         given = rows[(rule == GIVEN) & (now.k[rows] < len(self.given))]
         noise[rows[rule == GIVEN]] = 0.0
         noise[given] = self.given[now.k[given], now.rows[given]]
-        past = nothing_past(self.controller, *true.shape) if now.past is None else now.past
-        self._fulfil(noise, rows, rule, now, past)
+        memory = memory_of(self.controller, now)
+        self._fulfil(noise, rows, rule, now, memory)
         mine = rows[rule == self.rules.ahead]
         if len(mine) and self.rules.lookahead is not None:
             runs = now.rows[mine]
-            part = Sample(runs, now.k[mine], true[mine], now.q[mine], now.plant, past[mine])
+            part = Sample(runs, now.k[mine], true[mine], now.q[mine], now.plant, memory[mine])
             noise[mine] = self.rules.lookahead.sample(part)
         measured = self.task.perturbed(true[rows], noise[rows])
-        u, q = answer_of(self.controller, measured, now.q[rows], past[rows])
+        u, q, _ = answer_of(self.controller, measured, now.q[rows], memory[rows])
         self._observe(true[rows], now.rows[rows], u, q != now.q[rows])
         self._samples = max(self._samples, int(now.k.max(initial=-1)) + 1)
         self._noise[now.k, now.rows] = noise
@@ -105,7 +105,7 @@ class Programmes(Signal):
         return np.asarray(q != first)
 
     def _fulfil(
-        self, noise: np.ndarray, rows: np.ndarray, rule: np.ndarray, now: Sample, past: np.ndarray
+        self, noise: np.ndarray, rows: np.ndarray, rule: np.ndarray, now: Sample, memory: np.ndarray
     ) -> None:
         """Writes the noise of those `rows` (r,) whose `rule` (r,) is a wish into `noise` (n, p)."""
         wishful = self.rules.wishful[rule] & (rule != GIVEN)
@@ -113,10 +113,9 @@ class Programmes(Signal):
         if not len(rows):
             return
         true, candidates = now.measurement[rows], self.rules.candidates
-        answers = [
-            *each_answer(self.task, self.controller, true, candidates, now.q[rows], past[rows])
-        ]
-        u, q = (np.concatenate(parts) for parts in zip(*answers, strict=True))
+        before = now.q[rows], memory[rows]
+        answers = each_answer(self.task, self.controller, true, candidates, *before)
+        u, q, _ = map(np.concatenate, zip(*answers, strict=True))
         u = self._scaled(u)
         usual_mode = np.where(now.q[rows] == NOT_STARTED, q[0], now.q[rows])
         # A change of the mode counts for more than any change of the inputs.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hyrl_mj.policies import Asked, Controller, nothing_past, remembering
+from hyrl_mj.policies import Asked, Controller, memory_at_start
 from hyrl_mj.simulation.checked_noise import check_repeats, drawn, is_own
 from hyrl_mj.simulation.noise import (
     NOT_STARTED,
@@ -136,7 +136,8 @@ def closed_loop(
             one.reset(n, np.random.default_rng(seed))
     ahead: list[np.ndarray] | None = [] if signal.unseeing and not together else None
     ask, measurement = Asked(task, controller), plant.measurement
-    past = nothing_past(controller, n, measurement.shape[1])
+    # A run backward has no past that could be remembered.
+    memory = np.zeros((n, 0)) if backward else memory_at_start(controller, n)
     q = np.full(n, NOT_STARTED) if q0 is None else np.asarray(q0, dtype=int).copy()
     outcome = np.full(n, Outcome.RUNNING) if backward else task.outcome(measurement, plant.unstable)
     k, length, first_mode = np.zeros(n, dtype=int), np.zeros(n, dtype=int), q.copy()
@@ -159,7 +160,7 @@ def closed_loop(
         if not len(active):
             break
         rows = every if together else active
-        now = Sample(rows, k[rows], measurement[rows], q[rows], plant, past[rows])
+        now = Sample(rows, k[rows], measurement[rows], q[rows], plant, memory[rows])
         errors = _noise(signal, now, ahead, measurement)
         # Noise of a user's class is drawn twice at first, to see whether its seed decides it.
         if twin is not None and ahead is None and tick < 8:
@@ -173,8 +174,8 @@ def closed_loop(
         before, on = q[rows], np.searchsorted(rows, active)
         u = np.full((len(rows), len(task.inputs)), np.nan)
         if len(active):
-            u[on], q[active] = ask(tick, q[active], measured[on], past[active])
-        past[rows] = remembering(past[rows], measured)
+            now_asked = q[active], measured[on], memory[active]
+            u[on], q[active], memory[active] = ask(tick, *now_asked)
         if len(active):
             (plant.step_backward if backward else plant.step)(u[on], active)
         lost = plant.unstable

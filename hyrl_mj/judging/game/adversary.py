@@ -108,7 +108,7 @@ class WorstEstimate(Lookahead):
         ):  # beside a wall, what lies inside of it is not worse
             self._worth = self._worth[:, nearest_of(lattice.grid, lattice.running)]
 
-    def _simulate(self, begun: Ahead, past: np.ndarray, samples: int) -> Ahead:
+    def _simulate(self, begun: Ahead, memory: np.ndarray, samples: int) -> Ahead:
         task, grid = self._lattice.task, self._lattice.grid
         answers, rows = begun.answers, np.arange(len(begun.answers))
         plant = self._placed(begun.state)

@@ -17,7 +17,7 @@ import numpy as np
 
 from hyrl_mj.errors import BadInput
 from hyrl_mj.judging.game.lattice import Lattice
-from hyrl_mj.policies import Controller
+from hyrl_mj.policies import Controller, is_memory, memory_at_start
 from hyrl_mj.sets import within_reach
 
 # The greater a value, the worse for the controller: k < NEVER means "arrives after k samples at the latest",
@@ -55,8 +55,13 @@ class Answers:
         """Returns the answers of a controller to measurements with noise of at most `bound` (d,).
 
         Raises:
-            BadInput: the controller gives an invalid input or an unknown mode.
+            BadInput: the controller has a memory, or gives an invalid input or an unknown mode.
         """
+        if is_memory(memory_at_start(controller, 1)):
+            raise BadInput(
+                "the worst-case game takes a function of the measurement, and this policy has a memory: "
+                "use noisy episodes or an attack"
+            )
         grid, modes = lattice.grid, controller.modes
         pad = np.where(grid.chart.periodic, 0, nodes_within(lattice, bound))
         axes = [
